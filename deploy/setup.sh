@@ -62,19 +62,25 @@ may_be_root() {
 }
 
 apt_get() {
-    as_root env DEBIAN_FRONTEND=noninteractive NEEDRESTART_SUSPEND=1 apt-get -q -y -o DPkg::Lock::Timeout=300 "$@"
+    as_root env DEBIAN_FRONTEND=noninteractive NEEDRESTART_SUSPEND=1 \
+        apt-get -qq -y -o Dpkg::Use-Pty=0 -o DPkg::Lock::Timeout=300 "$@"
 }
 
 install_system_packages() {
-    local missing=() words
+    local missing=() words log
     mapfile -t missing < <(missing_packages "$@")
     [ ${#missing[@]} -gt 0 ] || return 0
     words="apt-get install --no-install-recommends ${missing[*]}"
     if ! have apt-get; then
         say "this is not Debian or Ubuntu; wanted, under its Debian names: ${missing[*]}"
     elif may_be_root; then
-        say "installing system packages: ${missing[*]}"
-        { apt_get update && apt_get install --no-install-recommends "${missing[@]}"; } >&2 || say "apt-get failed; going on"
+        say "installing system packages, a minute or so: ${missing[*]}"
+        log=$(mktemp)
+        if ! { apt_get update && apt_get install --no-install-recommends "${missing[@]}"; } >"$log" 2>&1; then
+            tail -n 20 "$log" >&2
+            say "this failed; going on without: $words"
+        fi
+        rm -f "$log"
     else
         say "packages are missing, and this user is neither root nor may use sudo. An administrator may run: $words"
     fi
