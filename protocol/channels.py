@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: MIT
+"""Every channel in one table: key, message, sender, rate, size limits, logged or not, purpose."""
+
+import re
+from dataclasses import dataclass
+
+from protocol.refused import Refused
+
+PROTOCOL = 1  # wire version; grows when a message changes its meaning
+ROOT = "warpfactor"
+SERVER_NAME = "sim"
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"  # loopback: a server listens on other interfaces only when asked
+
+KIB, MIB, GIB = 1 << 10, 1 << 20, 1 << 30
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One row. limit bounds the encoded message, bulk the array that travels beside it (0: none), in bytes."""
+
+    key: str
+    message: str
+    sender: str
+    rate: str
+    limit: int
+    bulk: int
+    logged: bool
+    purpose: str
+
+
+# A message with bulk travels as attachment, the array as payload or in a slot of shared memory.
+CHANNELS: dict[str, Channel] = {
+    "status": Channel("status", "Status", "server", "1 Hz, queryable", MIB, 0, True, "health of the whole scene"),
+    "scene": Channel("scene", "Scene", "server", "queryable", 4 * MIB, 0, True, "what is being simulated"),
+    "topology": Channel(
+        "topology/{object}", "Topology", "server", "once per epoch, queryable", 256 * MIB, 0, True, "mesh, pattern of A"
+    ),
+    "matrix": Channel(
+        "matrix/{worker}/{object}", "Matrix", "server", "one in flight per object", 64 * KIB, GIB, False, "job"
+    ),
+    "pattern": Channel(
+        "pattern/{object}", "FactorPattern", "worker", "once per epoch and library", 256 * MIB, 0, False, "pattern of L"
+    ),
+    "factor": Channel("factor/{object}", "Factor", "worker", "one per matrix", 64 * KIB, GIB, False, "values of L"),
+    "worker": Channel("worker/{worker}", "WorkerInfo", "worker", "5 Hz", 16 * KIB, 0, False, "hello, then heartbeat"),
+    "echo": Channel("echo/{worker}", "Echo", "worker", "query, at join", 4 * KIB, 0, False, "does shared memory work?"),
+    "steps": Channel("steps", "Steps", "server", "20 Hz batches", 8 * MIB, 0, True, "iterations, residuals, times"),
+    "state": Channel("state/{object}", "State", "server", "at most 30 Hz", 256 * MIB, 0, True, "positions, velocities"),
+    "command": Channel("command", "Command", "client", "query", 64 * KIB, 0, True, "push, grab, cut, pause, ..."),
+    "reply": Channel("command", "Reply", "server", "per command", MIB, 0, False, "what became of a command"),
+    "alive_server": Channel("alive/server/{incarnation}", "", "server", "liveliness", 0, 0, False, "the server lives"),
+    "alive_worker": Channel("alive/worker/{worker}", "", "worker", "liveliness", 0, 0, False, "a worker lives"),
+    "alive_client": Channel("alive/client/{client}", "", "client", "liveliness", 0, 0, False, "a client lives"),
+}
+
+_NAME = re.compile(r"[A-Za-z0-9_.-]{1,64}")
+
+
+def check_name(name: str, what: str) -> str:
+    """The name itself if it may stand in a key; raises Refused (a ValueError) otherwise."""
+    if not isinstance(name, str) or not _NAME.fullmatch(name):
+        shown = repr(name[:80]) if isinstance(name, str) else type(name).__name__
+        raise Refused(f"{what} is {shown}; allowed: 1 to 64 characters of A-Z a-z 0-9 _ . -", "malformed")
+    return name
+
+
+def key(channel: str, server: str = SERVER_NAME, **names: str) -> str:
+    """Key of a channel, for example key("matrix", worker="w1", object="beam"); "*" stands for any name.
+
+    A name that is left out is any name too.
+    """
+    template = CHANNELS[channel].key
+    fields = re.findall(r"{(\w+)}", template)
+    unknown = set(names) - set(fields)
+    if unknown:
+        raise TypeError(f"channel {channel} has no {sorted(unknown)}; it has {fields}")
+    filled = {field: names.get(field, "*") for field in fields}
+    for field, name in filled.items():
+        if name != "*":
+            check_name(name, f"{field} name")
+    return f"{ROOT}/{check_name(server, 'server name')}/{template.format(**filled)}"
+
+
+def everything(server: str = SERVER_NAME) -> str:
+    """Key expression that takes in all channels of a server."""
+    return f"{ROOT}/{check_name(server, 'server name')}/**"
+
+
+def name_in(channel: str, key_expression: object, field: str) -> str:
+    """The object, worker, client or incarnation that a received key names; raises Refused if it names none."""
+    template = CHANNELS[channel].key
+    pattern = re.escape(template).replace(r"\{", "{").replace(r"\}", "}")
+    pattern = re.sub(r"{(\w+)}", r"(?P<\1>[^/*]+)", pattern)
+    match = re.fullmatch(rf"{ROOT}/[^/]+/{pattern}", str(key_expression))
+    if match is None:
+        raise Refused(f"key {str(key_expression)[:200]!r} is not of the form {template}", "malformed")
+    return check_name(match.group(field), f"{field} name in a key")

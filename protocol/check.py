@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: MIT
+"""Checks of what came over the network. Each raises Refused; sizes are looked at before anything is allocated."""
+
+from collections.abc import Collection
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+import xxhash
+from google.protobuf.message import DecodeError, Message
+from numpy.typing import DTypeLike, NDArray
+
+from protocol.channels import PROTOCOL, check_name
+from protocol.messages_pb2 import Header
+from protocol.refused import Refused
+
+M = TypeVar("M", bound=Message)
+CHUNK = 1 << 18  # values looked at together: the scratch of a check stays in cache
+
+
+class Sized(Protocol):
+    """bytes, or a zenoh payload, whose length is known before it is copied."""
+
+    def __len__(self) -> int: ...
+    def __bytes__(self) -> bytes: ...
+
+
+def take(payload: Sized | None, limit: int, what: str) -> bytes:
+    """The payload as bytes if it holds at most limit bytes."""
+    if payload is None:
+        raise Refused(f"{what} is missing", "malformed")
+    if len(payload) > limit:
+        raise Refused(f"{what} has {len(payload)} bytes; allowed: at most {limit}", "size")
+    return bytes(payload)
+
+
+def parse(kind: type[M], payload: Sized | None, limit: int) -> M:
+    """A protobuf message of at most limit bytes."""
+    name = kind.DESCRIPTOR.name
+    data = take(payload, limit, name)
+    try:
+        return kind.FromString(data)
+    except DecodeError as error:
+        raise Refused(f"{name} of {len(data)} bytes is not a valid message", "malformed") from error
+
+
+def check_header(
+    message: Any,
+    *,
+    incarnation: int | None = None,
+    object: str | Collection[str] | None = None,
+    epoch: int | None = None,
+    after: int | None = None,
+) -> Header:
+    """Header of a message, checked against what the receiver expects; None = anything goes.
+
+    object is a name or the names that are known; after is the last sequence number seen on the channel.
+    """
+    name = message.DESCRIPTOR.name
+    header: Header = message.header
+    if header.protocol != PROTOCOL:
+        raise Refused(f"{name}.header.protocol is {header.protocol}; allowed: {PROTOCOL}", "version")
+    if incarnation is not None and header.incarnation != incarnation:
+        raise Refused(
+            f"{name}.header.incarnation is {header.incarnation:016x}; allowed: {incarnation:016x}, the server's",
+            "incarnation",
+        )
+    if object is not None:
+        check_name(header.object, f"{name}.header.object")
+        if header.object not in ([object] if isinstance(object, str) else object):
+            allowed = object if isinstance(object, str) else ", ".join(list(object)[:8]) or "none yet"
+            raise Refused(f"{name}.header.object is {header.object!r}; allowed: {allowed}", "object")
+    if epoch is not None and header.epoch != epoch:
+        raise Refused(f"{name}.header.epoch is {header.epoch}; allowed: {epoch}", "epoch")
+    if after is not None and header.sequence <= after:
+        raise Refused(f"{name}.header.sequence is {header.sequence}; allowed: more than {after}", "sequence")
+    return header
+
+
+def array(data: bytes, dtype: DTypeLike, shape: tuple[int, ...], what: str, *, finite: bool = False) -> NDArray[Any]:
+    """Read-only array over data (no copy), little-endian, C order; one extent of shape may be -1."""
+    kind = np.dtype(dtype).newbyteorder("<")
+    known = int(np.prod([n for n in shape if n >= 0], dtype=np.int64)) * kind.itemsize
+    fits = (known > 0 and len(data) % known == 0) if -1 in shape else len(data) == known
+    if not fits:
+        raise Refused(f"{what} has {len(data)} bytes; allowed: {kind.name} of shape {shape}, {known} bytes", "shape")
+    values = np.frombuffer(data, kind).reshape(shape)
+    if finite and not all_finite(values):
+        raise Refused(f"{what} holds NaN or infinite values; allowed: finite", "not_finite")
+    return values
+
+
+def all_finite(values: NDArray[Any]) -> bool:
+    """No NaN, no infinity."""
+    flat = values.reshape(-1)
+    return all(bool(np.isfinite(flat[i : i + CHUNK]).all()) for i in range(0, flat.size, CHUNK))
+
+
+def check_range(values: NDArray[Any], low: int, high: int, what: str) -> None:
+    """Raises Refused unless low <= values < high."""
+    if values.size and (int(values.min()) < low or int(values.max()) >= high):
+        raise Refused(f"{what} runs from {values.min()} to {values.max()}; allowed: {low} to {high - 1}", "shape")
+
+
+def check_strings(message: Message, limit: int = 4096) -> None:
+    """Raises Refused if a text field of the message is longer than limit characters."""
+    for field, value in message.ListFields():
+        if isinstance(value, str) and len(value) > limit:
+            raise Refused(
+                f"{message.DESCRIPTOR.name}.{field.name} has {len(value)} characters; allowed: {limit}", "size"
+            )
+
+
+def checksum(values: NDArray[Any] | bytes) -> int:
+    """xxh3_64 of the bytes of a contiguous array."""
+    data = values if isinstance(values, bytes) else np.ascontiguousarray(values).reshape(-1).view(np.uint8).data
+    return int(xxhash.xxh3_64_intdigest(data))

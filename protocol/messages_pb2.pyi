@@ -1,0 +1,405 @@
+from google.protobuf.internal import containers as _containers
+from google.protobuf.internal import enum_type_wrapper as _enum_type_wrapper
+from google.protobuf import descriptor as _descriptor
+from google.protobuf import message as _message
+from collections.abc import Iterable as _Iterable, Mapping as _Mapping
+from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
+
+DESCRIPTOR: _descriptor.FileDescriptor
+
+class SolveStatus(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    CONVERGED: _ClassVar[SolveStatus]
+    MAX_ITERATIONS: _ClassVar[SolveStatus]
+    BUDGET: _ClassVar[SolveStatus]
+    BREAKDOWN_MATRIX: _ClassVar[SolveStatus]
+    BREAKDOWN_PRECONDITIONER: _ClassVar[SolveStatus]
+    NOT_FINITE: _ClassVar[SolveStatus]
+CONVERGED: SolveStatus
+MAX_ITERATIONS: SolveStatus
+BUDGET: SolveStatus
+BREAKDOWN_MATRIX: SolveStatus
+BREAKDOWN_PRECONDITIONER: SolveStatus
+NOT_FINITE: SolveStatus
+
+class Header(_message.Message):
+    __slots__ = ("protocol", "incarnation", "object", "epoch", "sequence")
+    PROTOCOL_FIELD_NUMBER: _ClassVar[int]
+    INCARNATION_FIELD_NUMBER: _ClassVar[int]
+    OBJECT_FIELD_NUMBER: _ClassVar[int]
+    EPOCH_FIELD_NUMBER: _ClassVar[int]
+    SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    protocol: int
+    incarnation: int
+    object: str
+    epoch: int
+    sequence: int
+    def __init__(self, protocol: _Optional[int] = ..., incarnation: _Optional[int] = ..., object: _Optional[str] = ..., epoch: _Optional[int] = ..., sequence: _Optional[int] = ...) -> None: ...
+
+class Slot(_message.Message):
+    __slots__ = ("segment", "offset", "capacity", "generation")
+    SEGMENT_FIELD_NUMBER: _ClassVar[int]
+    OFFSET_FIELD_NUMBER: _ClassVar[int]
+    CAPACITY_FIELD_NUMBER: _ClassVar[int]
+    GENERATION_FIELD_NUMBER: _ClassVar[int]
+    segment: str
+    offset: int
+    capacity: int
+    generation: int
+    def __init__(self, segment: _Optional[str] = ..., offset: _Optional[int] = ..., capacity: _Optional[int] = ..., generation: _Optional[int] = ...) -> None: ...
+
+class Scene(_message.Message):
+    __slots__ = ("header", "name", "toml", "resolved", "dt", "started_ns", "software", "objects")
+    HEADER_FIELD_NUMBER: _ClassVar[int]
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    TOML_FIELD_NUMBER: _ClassVar[int]
+    RESOLVED_FIELD_NUMBER: _ClassVar[int]
+    DT_FIELD_NUMBER: _ClassVar[int]
+    STARTED_NS_FIELD_NUMBER: _ClassVar[int]
+    SOFTWARE_FIELD_NUMBER: _ClassVar[int]
+    OBJECTS_FIELD_NUMBER: _ClassVar[int]
+    header: Header
+    name: str
+    toml: str
+    resolved: str
+    dt: float
+    started_ns: int
+    software: str
+    objects: _containers.RepeatedScalarFieldContainer[str]
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., name: _Optional[str] = ..., toml: _Optional[str] = ..., resolved: _Optional[str] = ..., dt: _Optional[float] = ..., started_ns: _Optional[int] = ..., software: _Optional[str] = ..., objects: _Optional[_Iterable[str]] = ...) -> None: ...
+
+class Topology(_message.Message):
+    __slots__ = ("header", "nodes", "rest", "tets", "triangles", "row_start", "columns", "fixed", "young", "poisson")
+    HEADER_FIELD_NUMBER: _ClassVar[int]
+    NODES_FIELD_NUMBER: _ClassVar[int]
+    REST_FIELD_NUMBER: _ClassVar[int]
+    TETS_FIELD_NUMBER: _ClassVar[int]
+    TRIANGLES_FIELD_NUMBER: _ClassVar[int]
+    ROW_START_FIELD_NUMBER: _ClassVar[int]
+    COLUMNS_FIELD_NUMBER: _ClassVar[int]
+    FIXED_FIELD_NUMBER: _ClassVar[int]
+    YOUNG_FIELD_NUMBER: _ClassVar[int]
+    POISSON_FIELD_NUMBER: _ClassVar[int]
+    header: Header
+    nodes: int
+    rest: bytes
+    tets: bytes
+    triangles: bytes
+    row_start: bytes
+    columns: bytes
+    fixed: bytes
+    young: bytes
+    poisson: bytes
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., nodes: _Optional[int] = ..., rest: _Optional[bytes] = ..., tets: _Optional[bytes] = ..., triangles: _Optional[bytes] = ..., row_start: _Optional[bytes] = ..., columns: _Optional[bytes] = ..., fixed: _Optional[bytes] = ..., young: _Optional[bytes] = ..., poisson: _Optional[bytes] = ...) -> None: ...
+
+class Matrix(_message.Message):
+    __slots__ = ("header", "step", "warp", "blocks", "checksum", "factor_dtype", "method", "known_patterns", "lease", "factor_slot", "matrix_slot", "worker")
+    HEADER_FIELD_NUMBER: _ClassVar[int]
+    STEP_FIELD_NUMBER: _ClassVar[int]
+    WARP_FIELD_NUMBER: _ClassVar[int]
+    BLOCKS_FIELD_NUMBER: _ClassVar[int]
+    CHECKSUM_FIELD_NUMBER: _ClassVar[int]
+    FACTOR_DTYPE_FIELD_NUMBER: _ClassVar[int]
+    METHOD_FIELD_NUMBER: _ClassVar[int]
+    KNOWN_PATTERNS_FIELD_NUMBER: _ClassVar[int]
+    LEASE_FIELD_NUMBER: _ClassVar[int]
+    FACTOR_SLOT_FIELD_NUMBER: _ClassVar[int]
+    MATRIX_SLOT_FIELD_NUMBER: _ClassVar[int]
+    WORKER_FIELD_NUMBER: _ClassVar[int]
+    header: Header
+    step: int
+    warp: bool
+    blocks: int
+    checksum: int
+    factor_dtype: str
+    method: str
+    known_patterns: _containers.RepeatedScalarFieldContainer[int]
+    lease: float
+    factor_slot: Slot
+    matrix_slot: Slot
+    worker: str
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., warp: _Optional[bool] = ..., blocks: _Optional[int] = ..., checksum: _Optional[int] = ..., factor_dtype: _Optional[str] = ..., method: _Optional[str] = ..., known_patterns: _Optional[_Iterable[int]] = ..., lease: _Optional[float] = ..., factor_slot: _Optional[_Union[Slot, _Mapping]] = ..., matrix_slot: _Optional[_Union[Slot, _Mapping]] = ..., worker: _Optional[str] = ...) -> None: ...
+
+class FactorPattern(_message.Message):
+    __slots__ = ("header", "id", "size", "supernodes", "nonzeros", "permutation", "super_start", "row_start", "rows")
+    HEADER_FIELD_NUMBER: _ClassVar[int]
+    ID_FIELD_NUMBER: _ClassVar[int]
+    SIZE_FIELD_NUMBER: _ClassVar[int]
+    SUPERNODES_FIELD_NUMBER: _ClassVar[int]
+    NONZEROS_FIELD_NUMBER: _ClassVar[int]
+    PERMUTATION_FIELD_NUMBER: _ClassVar[int]
+    SUPER_START_FIELD_NUMBER: _ClassVar[int]
+    ROW_START_FIELD_NUMBER: _ClassVar[int]
+    ROWS_FIELD_NUMBER: _ClassVar[int]
+    header: Header
+    id: int
+    size: int
+    supernodes: int
+    nonzeros: int
+    permutation: bytes
+    super_start: bytes
+    row_start: bytes
+    rows: bytes
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., id: _Optional[int] = ..., size: _Optional[int] = ..., supernodes: _Optional[int] = ..., nonzeros: _Optional[int] = ..., permutation: _Optional[bytes] = ..., super_start: _Optional[bytes] = ..., row_start: _Optional[bytes] = ..., rows: _Optional[bytes] = ...) -> None: ...
+
+class Factor(_message.Message):
+    __slots__ = ("header", "step", "warp", "pattern", "dtype", "nonzeros", "checksum", "slot", "worker", "seconds", "failure", "job", "matrix_shared")
+    HEADER_FIELD_NUMBER: _ClassVar[int]
+    STEP_FIELD_NUMBER: _ClassVar[int]
+    WARP_FIELD_NUMBER: _ClassVar[int]
+    PATTERN_FIELD_NUMBER: _ClassVar[int]
+    DTYPE_FIELD_NUMBER: _ClassVar[int]
+    NONZEROS_FIELD_NUMBER: _ClassVar[int]
+    CHECKSUM_FIELD_NUMBER: _ClassVar[int]
+    SLOT_FIELD_NUMBER: _ClassVar[int]
+    WORKER_FIELD_NUMBER: _ClassVar[int]
+    SECONDS_FIELD_NUMBER: _ClassVar[int]
+    FAILURE_FIELD_NUMBER: _ClassVar[int]
+    JOB_FIELD_NUMBER: _ClassVar[int]
+    MATRIX_SHARED_FIELD_NUMBER: _ClassVar[int]
+    header: Header
+    step: int
+    warp: bool
+    pattern: int
+    dtype: str
+    nonzeros: int
+    checksum: int
+    slot: Slot
+    worker: str
+    seconds: float
+    failure: str
+    job: int
+    matrix_shared: bool
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., warp: _Optional[bool] = ..., pattern: _Optional[int] = ..., dtype: _Optional[str] = ..., nonzeros: _Optional[int] = ..., checksum: _Optional[int] = ..., slot: _Optional[_Union[Slot, _Mapping]] = ..., worker: _Optional[str] = ..., seconds: _Optional[float] = ..., failure: _Optional[str] = ..., job: _Optional[int] = ..., matrix_shared: _Optional[bool] = ...) -> None: ...
+
+class WorkerInfo(_message.Message):
+    __slots__ = ("header", "worker", "pid", "host", "library", "threads", "shared_memory", "jobs", "failures", "superseded", "refused", "bulk_shared", "bulk_copied")
+    HEADER_FIELD_NUMBER: _ClassVar[int]
+    WORKER_FIELD_NUMBER: _ClassVar[int]
+    PID_FIELD_NUMBER: _ClassVar[int]
+    HOST_FIELD_NUMBER: _ClassVar[int]
+    LIBRARY_FIELD_NUMBER: _ClassVar[int]
+    THREADS_FIELD_NUMBER: _ClassVar[int]
+    SHARED_MEMORY_FIELD_NUMBER: _ClassVar[int]
+    JOBS_FIELD_NUMBER: _ClassVar[int]
+    FAILURES_FIELD_NUMBER: _ClassVar[int]
+    SUPERSEDED_FIELD_NUMBER: _ClassVar[int]
+    REFUSED_FIELD_NUMBER: _ClassVar[int]
+    BULK_SHARED_FIELD_NUMBER: _ClassVar[int]
+    BULK_COPIED_FIELD_NUMBER: _ClassVar[int]
+    header: Header
+    worker: str
+    pid: int
+    host: str
+    library: str
+    threads: int
+    shared_memory: bool
+    jobs: int
+    failures: int
+    superseded: int
+    refused: int
+    bulk_shared: int
+    bulk_copied: int
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., worker: _Optional[str] = ..., pid: _Optional[int] = ..., host: _Optional[str] = ..., library: _Optional[str] = ..., threads: _Optional[int] = ..., shared_memory: _Optional[bool] = ..., jobs: _Optional[int] = ..., failures: _Optional[int] = ..., superseded: _Optional[int] = ..., refused: _Optional[int] = ..., bulk_shared: _Optional[int] = ..., bulk_copied: _Optional[int] = ...) -> None: ...
+
+class Echo(_message.Message):
+    __slots__ = ("header", "slot", "nonce")
+    HEADER_FIELD_NUMBER: _ClassVar[int]
+    SLOT_FIELD_NUMBER: _ClassVar[int]
+    NONCE_FIELD_NUMBER: _ClassVar[int]
+    header: Header
+    slot: Slot
+    nonce: int
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., slot: _Optional[_Union[Slot, _Mapping]] = ..., nonce: _Optional[int] = ...) -> None: ...
+
+class ObjectStep(_message.Message):
+    __slots__ = ("header", "step", "time", "iterations", "status", "residual", "factor_step", "factor_age", "preconditioner", "assemble_seconds", "solve_seconds", "integrate_seconds", "step_seconds", "late_seconds", "fallbacks", "excess", "interactions")
+    HEADER_FIELD_NUMBER: _ClassVar[int]
+    STEP_FIELD_NUMBER: _ClassVar[int]
+    TIME_FIELD_NUMBER: _ClassVar[int]
+    ITERATIONS_FIELD_NUMBER: _ClassVar[int]
+    STATUS_FIELD_NUMBER: _ClassVar[int]
+    RESIDUAL_FIELD_NUMBER: _ClassVar[int]
+    FACTOR_STEP_FIELD_NUMBER: _ClassVar[int]
+    FACTOR_AGE_FIELD_NUMBER: _ClassVar[int]
+    PRECONDITIONER_FIELD_NUMBER: _ClassVar[int]
+    ASSEMBLE_SECONDS_FIELD_NUMBER: _ClassVar[int]
+    SOLVE_SECONDS_FIELD_NUMBER: _ClassVar[int]
+    INTEGRATE_SECONDS_FIELD_NUMBER: _ClassVar[int]
+    STEP_SECONDS_FIELD_NUMBER: _ClassVar[int]
+    LATE_SECONDS_FIELD_NUMBER: _ClassVar[int]
+    FALLBACKS_FIELD_NUMBER: _ClassVar[int]
+    EXCESS_FIELD_NUMBER: _ClassVar[int]
+    INTERACTIONS_FIELD_NUMBER: _ClassVar[int]
+    header: Header
+    step: int
+    time: float
+    iterations: int
+    status: SolveStatus
+    residual: float
+    factor_step: int
+    factor_age: int
+    preconditioner: str
+    assemble_seconds: float
+    solve_seconds: float
+    integrate_seconds: float
+    step_seconds: float
+    late_seconds: float
+    fallbacks: int
+    excess: float
+    interactions: _containers.RepeatedCompositeFieldContainer[Interaction]
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., time: _Optional[float] = ..., iterations: _Optional[int] = ..., status: _Optional[_Union[SolveStatus, str]] = ..., residual: _Optional[float] = ..., factor_step: _Optional[int] = ..., factor_age: _Optional[int] = ..., preconditioner: _Optional[str] = ..., assemble_seconds: _Optional[float] = ..., solve_seconds: _Optional[float] = ..., integrate_seconds: _Optional[float] = ..., step_seconds: _Optional[float] = ..., late_seconds: _Optional[float] = ..., fallbacks: _Optional[int] = ..., excess: _Optional[float] = ..., interactions: _Optional[_Iterable[_Union[Interaction, _Mapping]]] = ...) -> None: ...
+
+class Steps(_message.Message):
+    __slots__ = ("header", "steps")
+    HEADER_FIELD_NUMBER: _ClassVar[int]
+    STEPS_FIELD_NUMBER: _ClassVar[int]
+    header: Header
+    steps: _containers.RepeatedCompositeFieldContainer[ObjectStep]
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., steps: _Optional[_Iterable[_Union[ObjectStep, _Mapping]]] = ...) -> None: ...
+
+class State(_message.Message):
+    __slots__ = ("header", "step", "time", "nodes", "x", "v")
+    HEADER_FIELD_NUMBER: _ClassVar[int]
+    STEP_FIELD_NUMBER: _ClassVar[int]
+    TIME_FIELD_NUMBER: _ClassVar[int]
+    NODES_FIELD_NUMBER: _ClassVar[int]
+    X_FIELD_NUMBER: _ClassVar[int]
+    V_FIELD_NUMBER: _ClassVar[int]
+    header: Header
+    step: int
+    time: float
+    nodes: int
+    x: bytes
+    v: bytes
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., time: _Optional[float] = ..., nodes: _Optional[int] = ..., x: _Optional[bytes] = ..., v: _Optional[bytes] = ...) -> None: ...
+
+class Vector(_message.Message):
+    __slots__ = ("x", "y", "z")
+    X_FIELD_NUMBER: _ClassVar[int]
+    Y_FIELD_NUMBER: _ClassVar[int]
+    Z_FIELD_NUMBER: _ClassVar[int]
+    x: float
+    y: float
+    z: float
+    def __init__(self, x: _Optional[float] = ..., y: _Optional[float] = ..., z: _Optional[float] = ...) -> None: ...
+
+class Interaction(_message.Message):
+    __slots__ = ("id", "client", "object", "kind", "point", "radius", "force", "duration", "target", "stiffness", "max_force", "nodes", "start")
+    ID_FIELD_NUMBER: _ClassVar[int]
+    CLIENT_FIELD_NUMBER: _ClassVar[int]
+    OBJECT_FIELD_NUMBER: _ClassVar[int]
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    POINT_FIELD_NUMBER: _ClassVar[int]
+    RADIUS_FIELD_NUMBER: _ClassVar[int]
+    FORCE_FIELD_NUMBER: _ClassVar[int]
+    DURATION_FIELD_NUMBER: _ClassVar[int]
+    TARGET_FIELD_NUMBER: _ClassVar[int]
+    STIFFNESS_FIELD_NUMBER: _ClassVar[int]
+    MAX_FORCE_FIELD_NUMBER: _ClassVar[int]
+    NODES_FIELD_NUMBER: _ClassVar[int]
+    START_FIELD_NUMBER: _ClassVar[int]
+    id: int
+    client: str
+    object: str
+    kind: str
+    point: Vector
+    radius: float
+    force: Vector
+    duration: float
+    target: Vector
+    stiffness: float
+    max_force: float
+    nodes: int
+    start: float
+    def __init__(self, id: _Optional[int] = ..., client: _Optional[str] = ..., object: _Optional[str] = ..., kind: _Optional[str] = ..., point: _Optional[_Union[Vector, _Mapping]] = ..., radius: _Optional[float] = ..., force: _Optional[_Union[Vector, _Mapping]] = ..., duration: _Optional[float] = ..., target: _Optional[_Union[Vector, _Mapping]] = ..., stiffness: _Optional[float] = ..., max_force: _Optional[float] = ..., nodes: _Optional[int] = ..., start: _Optional[float] = ...) -> None: ...
+
+class Command(_message.Message):
+    __slots__ = ("header", "client", "verb", "interaction")
+    HEADER_FIELD_NUMBER: _ClassVar[int]
+    CLIENT_FIELD_NUMBER: _ClassVar[int]
+    VERB_FIELD_NUMBER: _ClassVar[int]
+    INTERACTION_FIELD_NUMBER: _ClassVar[int]
+    header: Header
+    client: str
+    verb: str
+    interaction: Interaction
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., client: _Optional[str] = ..., verb: _Optional[str] = ..., interaction: _Optional[_Union[Interaction, _Mapping]] = ...) -> None: ...
+
+class Reply(_message.Message):
+    __slots__ = ("header", "error", "interaction", "status")
+    HEADER_FIELD_NUMBER: _ClassVar[int]
+    ERROR_FIELD_NUMBER: _ClassVar[int]
+    INTERACTION_FIELD_NUMBER: _ClassVar[int]
+    STATUS_FIELD_NUMBER: _ClassVar[int]
+    header: Header
+    error: str
+    interaction: Interaction
+    status: Status
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., error: _Optional[str] = ..., interaction: _Optional[_Union[Interaction, _Mapping]] = ..., status: _Optional[_Union[Status, _Mapping]] = ...) -> None: ...
+
+class ObjectStatus(_message.Message):
+    __slots__ = ("object", "nodes", "tets", "last", "mean_iterations", "excess", "factors_used", "factors_refused", "in_flight")
+    OBJECT_FIELD_NUMBER: _ClassVar[int]
+    NODES_FIELD_NUMBER: _ClassVar[int]
+    TETS_FIELD_NUMBER: _ClassVar[int]
+    LAST_FIELD_NUMBER: _ClassVar[int]
+    MEAN_ITERATIONS_FIELD_NUMBER: _ClassVar[int]
+    EXCESS_FIELD_NUMBER: _ClassVar[int]
+    FACTORS_USED_FIELD_NUMBER: _ClassVar[int]
+    FACTORS_REFUSED_FIELD_NUMBER: _ClassVar[int]
+    IN_FLIGHT_FIELD_NUMBER: _ClassVar[int]
+    object: str
+    nodes: int
+    tets: int
+    last: ObjectStep
+    mean_iterations: float
+    excess: float
+    factors_used: int
+    factors_refused: int
+    in_flight: bool
+    def __init__(self, object: _Optional[str] = ..., nodes: _Optional[int] = ..., tets: _Optional[int] = ..., last: _Optional[_Union[ObjectStep, _Mapping]] = ..., mean_iterations: _Optional[float] = ..., excess: _Optional[float] = ..., factors_used: _Optional[int] = ..., factors_refused: _Optional[int] = ..., in_flight: _Optional[bool] = ...) -> None: ...
+
+class Status(_message.Message):
+    __slots__ = ("header", "scene", "state", "step", "time", "dt", "step_p50", "step_p99", "step_max", "late_steps", "objects", "workers", "clients", "bulk_shared", "bulk_copied", "refused", "frames_dropped", "device", "pid", "uptime")
+    HEADER_FIELD_NUMBER: _ClassVar[int]
+    SCENE_FIELD_NUMBER: _ClassVar[int]
+    STATE_FIELD_NUMBER: _ClassVar[int]
+    STEP_FIELD_NUMBER: _ClassVar[int]
+    TIME_FIELD_NUMBER: _ClassVar[int]
+    DT_FIELD_NUMBER: _ClassVar[int]
+    STEP_P50_FIELD_NUMBER: _ClassVar[int]
+    STEP_P99_FIELD_NUMBER: _ClassVar[int]
+    STEP_MAX_FIELD_NUMBER: _ClassVar[int]
+    LATE_STEPS_FIELD_NUMBER: _ClassVar[int]
+    OBJECTS_FIELD_NUMBER: _ClassVar[int]
+    WORKERS_FIELD_NUMBER: _ClassVar[int]
+    CLIENTS_FIELD_NUMBER: _ClassVar[int]
+    BULK_SHARED_FIELD_NUMBER: _ClassVar[int]
+    BULK_COPIED_FIELD_NUMBER: _ClassVar[int]
+    REFUSED_FIELD_NUMBER: _ClassVar[int]
+    FRAMES_DROPPED_FIELD_NUMBER: _ClassVar[int]
+    DEVICE_FIELD_NUMBER: _ClassVar[int]
+    PID_FIELD_NUMBER: _ClassVar[int]
+    UPTIME_FIELD_NUMBER: _ClassVar[int]
+    header: Header
+    scene: str
+    state: str
+    step: int
+    time: float
+    dt: float
+    step_p50: float
+    step_p99: float
+    step_max: float
+    late_steps: int
+    objects: _containers.RepeatedCompositeFieldContainer[ObjectStatus]
+    workers: _containers.RepeatedCompositeFieldContainer[WorkerInfo]
+    clients: _containers.RepeatedScalarFieldContainer[str]
+    bulk_shared: int
+    bulk_copied: int
+    refused: int
+    frames_dropped: int
+    device: str
+    pid: int
+    uptime: float
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., scene: _Optional[str] = ..., state: _Optional[str] = ..., step: _Optional[int] = ..., time: _Optional[float] = ..., dt: _Optional[float] = ..., step_p50: _Optional[float] = ..., step_p99: _Optional[float] = ..., step_max: _Optional[float] = ..., late_steps: _Optional[int] = ..., objects: _Optional[_Iterable[_Union[ObjectStatus, _Mapping]]] = ..., workers: _Optional[_Iterable[_Union[WorkerInfo, _Mapping]]] = ..., clients: _Optional[_Iterable[str]] = ..., bulk_shared: _Optional[int] = ..., bulk_copied: _Optional[int] = ..., refused: _Optional[int] = ..., frames_dropped: _Optional[int] = ..., device: _Optional[str] = ..., pid: _Optional[int] = ..., uptime: _Optional[float] = ...) -> None: ...
