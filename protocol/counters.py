@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: MIT
+"""Counts of what a link did and dropped, with one warning for each kind of trouble."""
+
+import logging
+import threading
+from collections import Counter
+
+from protocol.refused import Refused
+
+
+class Counters:
+    """Safe to use from several threads. Attributes not yet counted read as 0."""
+
+    def __init__(self, logger: logging.Logger):
+        self._logger = logger
+        self._lock = threading.Lock()
+        self._counts: Counter[str] = Counter()
+        self._warned: set[str] = set()
+        self.refusals: Counter[str] = Counter()
+
+    def add(self, name: str, amount: int = 1) -> None:
+        """Count something that is no trouble."""
+        with self._lock:
+            self._counts[name] += amount
+
+    def refuse(self, refusal: Refused) -> None:
+        """Count a refused message under its kind; the first of a kind is logged."""
+        with self._lock:
+            self.refusals[refusal.kind] += 1
+        self.warn(f"refused:{refusal.kind}", f"message refused: {refusal} (counted from now on)")
+
+    def trouble(self, name: str, text: str) -> None:
+        """Count trouble under a name; the first of it is logged."""
+        self.add(name)
+        self.warn(name, f"{text} (counted from now on)")
+
+    def warn(self, kind: str, text: str) -> None:
+        """Log a warning, once for each kind."""
+        with self._lock:
+            first = kind not in self._warned
+            self._warned.add(kind)
+        if first:
+            self._logger.warning(text)
+
+    @property
+    def refused(self) -> int:
+        """Messages refused, of all kinds."""
+        return sum(self.refusals.values())
+
+    def __getattr__(self, name: str) -> int:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        return self._counts[name]
+
+    def as_dict(self) -> dict[str, int]:
+        """All counts; refusals as refused:KIND."""
+        with self._lock:
+            return dict(self._counts) | {f"refused:{kind}": n for kind, n in self.refusals.items()}

@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: MIT
+"""Does shared memory work between this worker and its server? Tried end to end before it is relied on.
+
+The worker asks for the server's echo slot: its bytes must arrive by reference, and the same bytes must stand in the
+worker's own mapping of the segment. It then writes a number there and asks the server to read it.
+"""
+
+import logging
+import secrets
+
+import numpy as np
+import zenoh
+
+from protocol.channels import CHANNELS, PROTOCOL, key
+from protocol.check import check_header, parse
+from protocol.messages_pb2 import Echo, Header
+from protocol.refused import Refused
+from protocol.slotmap import SlotMap
+from protocol.slots import HEADER, Slot
+
+LANES = 64  # askers that may be at it at the same time
+NUMBERS = 2 * LANES  # of 8 bytes: the server's, then the worker's
+LIMIT = CHANNELS["echo"].limit
+
+log = logging.getLogger(__name__)
+
+
+def answer(slot: Slot, query: Echo, incarnation: int) -> tuple[Echo, zenoh.ZBytes]:
+    """Server: the reply to one question, and the payload to send with it."""
+    lane = query.header.sequence % LANES
+    numbers = slot.array(np.uint64, NUMBERS)
+    numbers[lane] = query.nonce
+    header = Header(protocol=PROTOCOL, incarnation=incarnation, sequence=query.header.sequence)
+    return Echo(header=header, slot=slot.message(), nonce=int(numbers[LANES + lane])), slot.payload
+
+
+def obstacle(session: zenoh.Session, server: str, worker: str, slots: SlotMap, timeout: float = 2.0) -> str:
+    """Worker: why shared memory cannot be used with this server; empty if it works both ways."""
+    lane = secrets.randbelow(LANES)
+    try:
+        nonce = secrets.randbits(63)
+        reply, payload = _ask(session, server, worker, lane, nonce, timeout)
+        if not reply.HasField("slot"):
+            return "the server offers none"
+        if payload.as_shm() is None:
+            return "what the server put there arrived as a copy"
+        numbers = slots.array(reply.slot, np.uint64, NUMBERS)
+        sent = np.frombuffer(payload.to_bytes(), np.uint64, LANES, HEADER)
+        if int(numbers[lane]) != nonce or int(sent[lane]) != nonce:
+            return "the mapped segment does not show what the server wrote"
+        numbers[LANES + lane] = nonce ^ 1
+        reply, _ = _ask(session, server, worker, lane, nonce, timeout)
+        return "" if reply.nonce == nonce ^ 1 else "the server does not see what is written there"
+    except (Refused, zenoh.ZError, ValueError) as error:
+        return str(error)
+
+
+def _ask(
+    session: zenoh.Session, server: str, worker: str, lane: int, nonce: int, timeout: float
+) -> tuple[Echo, zenoh.ZBytes]:
+    question = Echo(header=Header(protocol=PROTOCOL, sequence=lane), nonce=nonce)
+    selector = key("echo", server, worker=worker)
+    for reply in session.get(selector, payload=question.SerializeToString(), timeout=timeout):
+        if reply.ok is None:
+            break
+        message = parse(Echo, reply.ok.attachment, LIMIT)
+        check_header(message)
+        return message, reply.ok.payload
+    raise Refused(f"the server did not answer on {selector} within {timeout} s", "malformed")

@@ -1,0 +1,30 @@
+# SPDX-License-Identifier: MIT
+"""Endpoints as people type them: tcp/127.0.0.1:7447, tls/host:7447, unixsock-stream//run/sim.sock."""
+
+import re
+
+from protocol.channels import DEFAULT_ENDPOINT
+
+NETWORK = ("tcp", "udp", "tls", "quic", "ws")
+LOCAL = ("unixsock-stream",)
+_ADDRESS = re.compile(r"(\[[0-9A-Fa-f:.%\w]+\]|[^:\s/\[\]]+):(\d{1,5})")
+
+
+class BadEndpoint(ValueError):
+    """An endpoint that cannot be used; the text says what is allowed."""
+
+
+def check_endpoint(endpoint: str, *, listen: bool = False) -> str:
+    """The endpoint itself; raises BadEndpoint. Port 0 (any free one) is allowed for listening alone."""
+    protocol, _, rest = endpoint.partition("/")
+    address = re.split(r"[?#]", rest, maxsplit=1)[0]
+    if protocol in LOCAL and address:
+        return endpoint
+    match = _ADDRESS.fullmatch(address)
+    low = 0 if listen else 1
+    if protocol not in NETWORK or match is None or not low <= int(match.group(2)) <= 65535:
+        raise BadEndpoint(
+            f"endpoint {endpoint!r} cannot be used; allowed: PROTOCOL/HOST:PORT with PROTOCOL one of "
+            f"{', '.join(NETWORK)} and PORT {low} to 65535, or unixsock-stream/PATH; for example {DEFAULT_ENDPOINT}"
+        )
+    return endpoint

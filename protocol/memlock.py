@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: MIT
+"""May this process lock the shared memory that it needs?
+
+zenoh locks every shared memory pool it creates or reads. A reader over its limit loses messages without an error
+(eclipse-zenoh/zenoh issue 2788), so shared memory is switched off beforehand where the limit is too low.
+"""
+
+import os
+import resource
+from pathlib import Path
+
+SHM = Path("/dev/shm")
+POOL_LIMIT = 1 << 30  # bytes that a server puts into slots at most
+METADATA = 64 << 20  # zenoh's own segments, generously
+CAP_IPC_LOCK = 14
+
+
+def may_lock_anything() -> bool:
+    """This process has CAP_IPC_LOCK, so that no limit applies."""
+    try:
+        status = Path("/proc/self/status").read_text()
+    except OSError:
+        return False
+    effective = next((line.split()[1] for line in status.splitlines() if line.startswith("CapEff:")), "0")
+    return bool(int(effective, 16) >> CAP_IPC_LOCK & 1)
+
+
+def obstacle(pools: int = POOL_LIMIT) -> str:
+    """Why shared memory pools of so many bytes cannot be used here; empty if they can."""
+    if not os.access(SHM, os.W_OK | os.X_OK):
+        return f"{SHM} is not writable"
+    limit, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
+    needed = pools + METADATA
+    if limit != resource.RLIM_INFINITY and limit < needed and not may_lock_anything():
+        return f"the locked-memory limit is {limit >> 10} KiB, {needed >> 10} KiB are needed (raise it with ulimit -l)"
+    return ""
+
+
+def free_bytes() -> int:
+    """Bytes still free in /dev/shm; a container often has 64 MiB in all."""
+    try:
+        fs = os.statvfs(SHM)
+    except OSError:
+        return 0
+    return fs.f_bavail * fs.f_frsize

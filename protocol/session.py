@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: MIT
+"""A zenoh session that connects only where told, says clearly why it cannot, and always closes."""
+
+import json
+import logging
+import os
+import re
+import threading
+from collections.abc import Sequence
+from typing import Any, Literal, Self
+
+import zenoh
+
+from protocol import memlock
+from protocol.channels import DEFAULT_ENDPOINT
+from protocol.endpoints import BadEndpoint, check_endpoint
+
+log = logging.getLogger(__name__)
+
+LINK_LEASE = 2000  # ms without a keep-alive until a hung process or a cut link is taken for dead
+EXTRA_CONFIG = "WARPFACTOR_ZENOH_CONFIG"  # JSON5 file: certificates, users, access control
+
+
+class ConnectionFailed(Exception):
+    """No session; the text says where it was tried and why not."""
+
+
+def open_session(
+    role: Literal["server", "client"],
+    *,
+    listen: Sequence[str] | None = None,
+    connect: Sequence[str] | None = None,
+    shared_memory: bool = True,
+    timeout: float = 2.0,
+) -> "Session":
+    """Open a session: the server listens and passes messages on between clients, a client connects.
+
+    listen (server) and connect (client) default to loopback, port 7447. timeout: seconds a client tries to connect.
+    Raises BadEndpoint or ConnectionFailed.
+    """
+    server = role == "server"
+    listening = [DEFAULT_ENDPOINT] if server and listen is None else list(listen or [])
+    connecting = list(connect or []) or ([] if server else [DEFAULT_ENDPOINT])
+    for endpoint in listening:
+        check_endpoint(endpoint, listen=True)
+    for endpoint in connecting:
+        check_endpoint(endpoint)
+    shared_memory = shared_memory and _shared_memory_works()
+    config = _config(server, listening, connecting, shared_memory, timeout)
+    try:
+        return Session(zenoh.open(config), shared_memory)
+    except zenoh.ZError as error:
+        where = f"listen on {', '.join(listening)}" if server else f"connect to {', '.join(connecting)}"
+        raise ConnectionFailed(f"cannot {where}: {_reason(error)}") from error
+
+
+def _shared_memory_works() -> bool:
+    obstacle = memlock.obstacle()
+    if obstacle:
+        log.warning("shared memory is off, arrays travel as bytes: %s", obstacle)
+    return not obstacle
+
+
+def _config(server: bool, listen: list[str], connect: list[str], shared_memory: bool, timeout: float) -> zenoh.Config:
+    extra = os.environ.get(EXTRA_CONFIG)
+    try:
+        config = zenoh.Config.from_file(extra) if extra else zenoh.Config()
+    except zenoh.ZError as error:
+        raise BadEndpoint(f"{EXTRA_CONFIG}={extra} cannot be used: {_reason(error)}") from error
+    settings: dict[str, Any] = {
+        # A router passes messages on between its clients, so that no router process is needed.
+        "mode": "router" if server else "client",
+        "listen/endpoints": listen,
+        "connect/endpoints": connect,
+        "connect/timeout_ms": -1 if server else int(timeout * 1000),
+        "connect/exit_on_failure": not server,
+        "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 1.5},
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "scouting/delay": 0,
+        "adminspace/enabled": False,
+        "transport/link/tx/lease": LINK_LEASE,
+        "transport/shared_memory/enabled": shared_memory,
+        # Only the server's slots use shared memory. An implicit pool in each worker would stay mapped and locked
+        # in the server for every worker that ever lived (eclipse-zenoh/zenoh issue 2787).
+        "transport/shared_memory/transport_optimization/enabled": False,
+    }
+    for key, value in settings.items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+def _reason(error: Exception) -> str:
+    text = re.sub(r"\s+at /\S+\.rs:\d+\.?", "", str(error)).strip()
+    return "no answer" if "Unable to connect" in text else text
+
+
+class Session:
+    """zenoh is the open session, shared_memory whether it may use shared memory.
+
+    A process whose zenoh threads still run when the interpreter ends hangs or aborts. Use it as a context manager;
+    a guardian thread closes it all the same when the main thread ends without having done so.
+    """
+
+    def __init__(self, session: zenoh.Session, shared_memory: bool):
+        self.zenoh = session
+        self.shared_memory = shared_memory
+        self._closed = threading.Event()
+        self._closing = threading.Lock()
+        threading.Thread(target=self._guard, name="session-guardian", daemon=False).start()
+
+    def _guard(self) -> None:
+        while threading.main_thread().is_alive():
+            if self._closed.wait(0.25):
+                return
+        self.close()
+
+    def close(self) -> None:
+        """Close the session; a second call does nothing."""
+        with self._closing:
+            if self._closed.is_set():
+                return
+            try:
+                self.zenoh.close()
+            except zenoh.ZError as error:
+                log.warning("the session did not close cleanly: %s", _reason(error))
+            finally:
+                self._closed.set()
+
+    @property
+    def closed(self) -> bool:
+        """Closed by either side of the program."""
+        return self._closed.is_set()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
