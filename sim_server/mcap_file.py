@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: MIT
+"""An MCAP file being written: chunks of 1 MiB, one embedded protobuf schema per message type."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+
+from google.protobuf.message import Message
+from mcap.well_known import MessageEncoding
+from mcap.writer import CompressionType, Writer
+from mcap_protobuf.schema import register_schema
+
+from protocol import PROTOCOL
+
+CHUNK_BYTES = 1 << 20
+PROFILE = "warpfactor"
+COMPRESSIONS = {"lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD, "none": CompressionType.NONE}
+
+
+class McapFile:
+    """Thin layer over mcap.writer: registers channels and schemas at their first message."""
+
+    def __init__(self, path: Path, compression: str, overwrite: bool) -> None:
+        if compression not in COMPRESSIONS:
+            raise ValueError(f"recording: compression = {compression!r}: allowed are {', '.join(COMPRESSIONS)}")
+        try:
+            self._stream = path.open("wb" if overwrite else "xb")
+        except FileExistsError:
+            raise FileExistsError(
+                f"{path}: the file exists; a log is never overwritten: remove it or choose another name"
+            ) from None
+        except OSError as error:
+            raise type(error)(f"{path}: cannot record there: {error.strerror}") from None
+        self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES, compression=COMPRESSIONS[compression])
+        self._schemas: dict[type[Message], int] = {}
+        self._channels: dict[str, int] = {}
+        self._writer.start(profile=PROFILE)
+        self._writer.add_metadata("warpfactor", {"protocol": str(PROTOCOL)})
+
+    def write(
+        self, topic: str, kind: type[Message], log_time: int, publish_time: int, sequence: int, data: bytes
+    ) -> None:
+        """Appends one serialized message; times in ns. Raises OSError."""
+        channel = self._channels.get(topic)
+        if channel is None:
+            channel = self._channels[topic] = self._register(topic, kind)
+        self._writer.add_message(channel, log_time, data, publish_time, sequence)
+
+    def flush(self) -> None:
+        """Ends the chunk in progress and hands everything to the operating system."""
+        self._writer.flush()
+
+    def finish(self, notes: dict[str, str]) -> None:
+        """Writes `notes` and the index, and closes."""
+        self._writer.add_metadata("recorder", notes)
+        self._writer.finish()
+        self._stream.close()
+
+    def abandon(self) -> None:
+        """Closes without index after an error; what was flushed stays readable."""
+        with contextlib.suppress(OSError, ValueError):
+            self._stream.close()
+
+    def _register(self, topic: str, kind: type[Message]) -> int:
+        if kind not in self._schemas:
+            self._schemas[kind] = register_schema(self._writer, kind)
+        return self._writer.register_channel(topic, MessageEncoding.Protobuf, self._schemas[kind])
