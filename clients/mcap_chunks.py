@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: MIT
+"""Reading an MCAP file that may be cut off, damaged or hostile: chunk by chunk, every size checked before use.
+
+The readers of the mcap package want the index at the end of the file, or raise at the first broken byte; a log whose
+server was killed has no index, and everything up to the last complete chunk is good.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from io import BytesIO
+from pathlib import Path
+from typing import BinaryIO
+
+import lz4.frame  # type: ignore[import-untyped]
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, Header, McapRecord, Message, Metadata
+from mcap.stream_reader import breakup_chunk
+from mcap.writer import MCAP0_MAGIC
+
+from clients.errors import BadInput
+
+RECORD_LIMIT = 1 << 30  # bytes of one record, compressed or not
+BROKEN = (McapError, struct.error, UnicodeDecodeError, ValueError, RuntimeError, zstandard.ZstdError)
+
+
+@dataclass
+class ChunkFile:
+    """The records of one file. `problems` and `complete` are known once `scan` has ended.
+
+    Raises BadInput from `open` if there is no such file or it is no MCAP file.
+    """
+
+    path: Path
+    stream: BinaryIO
+    size: int  # bytes
+    header: Header = field(default_factory=lambda: Header("", ""))
+    metadata: dict[str, dict[str, str]] = field(default_factory=dict)
+    problems: list[str] = field(default_factory=list)
+    complete: bool = False  # the end mark was seen: the writer closed the file
+
+    @classmethod
+    def open(cls, path: Path) -> ChunkFile:
+        try:
+            stream = path.open("rb")
+            size = os.fstat(stream.fileno()).st_size
+            magic = stream.read(len(MCAP0_MAGIC))
+        except OSError as error:
+            raise BadInput(f"{path}: cannot be read: {error.strerror}") from None
+        if magic != MCAP0_MAGIC:
+            stream.close()
+            raise BadInput(
+                f"{path}: {'an empty file' if size == 0 else 'not an MCAP file'}, a log of sim-server is wanted"
+            )
+        return cls(path, stream, size)
+
+    def close(self) -> None:
+        self.stream.close()
+
+    def scan(self, progress: Callable[[int], None] = lambda _: None) -> Iterator[tuple[int, list[McapRecord]]]:
+        """Yields (byte offset, records) of every readable chunk in file order; `progress` gets the offset reached."""
+        for offset, opcode, body in self._records():
+            progress(offset)
+            try:
+                if opcode == Opcode.HEADER:
+                    self.header = Header.read(body)
+                elif opcode == Opcode.METADATA:
+                    record = Metadata.read(body)
+                    self.metadata[record.name] = record.metadata
+                elif opcode == Opcode.CHUNK:
+                    chunk = Chunk.read(body)
+                    yield offset, _unpack(chunk)
+            except BROKEN as error:
+                self.problems.append(f"the block at byte {offset} is damaged and left out ({error})")
+        progress(self.size)
+
+    def chunk(self, offset: int) -> list[McapRecord]:
+        """Records of the chunk at `offset`, one that `scan` has yielded."""
+        self.stream.seek(offset)
+        _, length = struct.unpack("<BQ", self.stream.read(9))
+        return _unpack(Chunk.read(ReadDataStream(BytesIO(self.stream.read(length)))))
+
+    def _records(self) -> Iterator[tuple[int, int, ReadDataStream]]:
+        offset = len(MCAP0_MAGIC)
+        while offset + 9 <= self.size:
+            self.stream.seek(offset)
+            opcode, length = struct.unpack("<BQ", self.stream.read(9))
+            if opcode == Opcode.DATA_END:
+                self.complete = True
+                return
+            if opcode == 0 or length > RECORD_LIMIT:
+                self.problems.append(f"damaged at byte {offset}: nothing after that is read")
+                return
+            if offset + 9 + length > self.size:
+                break
+            wanted = opcode in (Opcode.HEADER, Opcode.METADATA, Opcode.CHUNK)
+            yield offset, opcode, ReadDataStream(BytesIO(self.stream.read(length) if wanted else b""))
+            offset += 9 + length
+        self.problems.append(
+            f"ends at byte {self.size} without an end mark: the server was killed, or is still recording"
+        )
+
+
+def _unpack(chunk: Chunk) -> list[McapRecord]:
+    """Channels and messages of a chunk after size and checksum were found right; raises one of BROKEN."""
+    size = chunk.uncompressed_size
+    if size > RECORD_LIMIT:
+        raise ValueError(f"a chunk of {size} bytes, at most {RECORD_LIMIT} are read")
+    if chunk.compression == "lz4":
+        data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
+    elif chunk.compression == "zstd":
+        data = zstandard.ZstdDecompressor().stream_reader(chunk.data).read(size + 1)
+    elif chunk.compression == "":
+        data = chunk.data
+    else:
+        raise ValueError(f"compression {chunk.compression!r} is not known")
+    if len(data) != size:
+        raise ValueError(f"{len(data)} bytes instead of {size}")
+    if chunk.uncompressed_crc not in (0, zlib.crc32(data)):
+        raise ValueError("wrong checksum")
+    plain = Chunk("", data, chunk.message_end_time, chunk.message_start_time, 0, size)
+    return [record for record in breakup_chunk(plain) if isinstance(record, Channel | Message)]

@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: MIT
+"""Per-step scalars of an object as columns: names, types and order for export, plots and tables."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol import messages_pb2 as pb
+
+Columns = dict[str, NDArray]
+
+# Names as in the ObjectStep message; seconds are wall-clock, time is simulated.
+DTYPES: dict[str, str] = {
+    "step": "i8",
+    "time": "f8",  # s
+    "iterations": "i8",
+    "residual": "f8",  # true, |b - A dv| / |b|
+    "status": "U24",
+    "factor_step": "i8",  # -1: no factor
+    "factor_age": "i8",  # steps; -1: no factor
+    "preconditioner": "U24",
+    "assemble_seconds": "f8",
+    "solve_seconds": "f8",
+    "integrate_seconds": "f8",
+    "step_seconds": "f8",
+    "late_seconds": "f8",
+    "fallbacks": "i8",
+    "excess": "f8",
+}
+
+
+def status_name(value: int) -> str:
+    """'converged', 'max_iterations', ...; a number this version does not know as 'unknown_7'."""
+    return pb.SolveStatus.Name(value).lower() if value in pb.SolveStatus.values() else f"unknown_{value}"  # type: ignore[arg-type]
+
+
+def row(message: pb.ObjectStep) -> tuple:
+    """Values of one step in the order of DTYPES."""
+    return tuple(status_name(message.status) if name == "status" else getattr(message, name) for name in DTYPES)
+
+
+def columns(rows: Iterable[tuple]) -> Columns:
+    """Turns rows into one array per scalar, ascending in step."""
+    table = list(zip(*sorted(rows, key=lambda r: r[0]), strict=True)) or [()] * len(DTYPES)
+    return {name: np.array(values, dtype) for (name, dtype), values in zip(DTYPES.items(), table, strict=True)}

@@ -1,0 +1,181 @@
+# SPDX-License-Identifier: MIT
+"""Logs that are cut off, damaged, foreign or hostile: read as far as they go, or refused in one sentence."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from pathlib import Path
+
+import lz4.frame  # type: ignore[import-untyped]
+import numpy as np
+import pytest
+import zstandard
+from mcap.records import Chunk
+from mcap.writer import Writer
+
+from clients import mcap_chunks
+from clients.errors import BadInput
+from clients.log import Log
+from protocol import PROTOCOL
+from sim_server.mcap_file import McapFile
+from tests.sample_run import object_step, positions, record, state, topology
+
+
+@pytest.fixture
+def whole(tmp_path: Path) -> bytes:
+    """A log of several chunks."""
+    path = tmp_path / "whole.mcap"
+    file = McapFile(path, "lz4", overwrite=False)
+    for step in range(40):
+        for topic, message in (
+            ("/topology/beam", topology("beam")),
+            ("/state/beam", state("beam", step)),
+            ("/step/beam", object_step("beam", step + 1)),
+        ):
+            if topic != "/topology/beam" or step == 0:
+                file.write(topic, type(message), step, step, step, message.SerializeToString())
+        if step % 5 == 4:
+            file.flush()
+    file.finish({})
+    return path.read_bytes()
+
+
+def test_cut_anywhere_reads_as_far_as_it_goes(whole: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "cut.mcap"
+    counts = []
+    for cut in [*range(0, 120), *range(120, len(whole), 61), len(whole) - 1]:
+        path.write_bytes(whole[:cut])
+        try:
+            log = Log(path)
+        except BadInput as error:
+            assert "cut.mcap" in str(error)
+            counts.append(0)
+            continue
+        with log:
+            frames = list(log.frames("beam")) if log.objects else []
+            assert [frame.step for frame in frames] == list(range(len(frames)))
+            for frame in frames:
+                np.testing.assert_array_equal(frame.x, positions(frame.step))
+            counts.append(len(frames))
+            assert len(frames) % 5 == 0  # whole chunks
+            assert log.notes or len(frames) == 40
+    assert counts == sorted(counts) and counts[-1] == 40 and set(counts) >= {0, 5, 20, 35}
+
+
+def test_flipped_bytes_never_raise_anything_else(whole: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "flipped.mcap"
+    random = np.random.default_rng(3)
+    for position in random.integers(8, len(whole), 300):
+        damaged = bytearray(whole)
+        damaged[position] ^= 1 << int(random.integers(8))
+        path.write_bytes(damaged)
+        try:
+            with Log(path) as log:
+                for frame in log.frames("beam") if log.objects else ():
+                    np.testing.assert_array_equal(frame.x, positions(frame.step))  # damaged chunks are not believed
+        except BadInput as error:
+            assert "flipped.mcap" in str(error)
+
+
+def test_a_damaged_chunk_is_left_out_and_said(whole: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "damaged.mcap"
+    damaged = bytearray(whole)
+    at = [i for i in range(len(whole)) if whole.startswith(b"\x03\x00\x00\x00lz4", i)][3] + 40
+    damaged[at] ^= 0xFF
+    path.write_bytes(damaged)
+    with Log(path) as log:
+        steps = [frame.step for frame in log.frames("beam")]
+        assert len(steps) == 35 and set(range(40)) - set(steps) == set(range(15, 20))
+        assert not log.complete and len(log.notes) == 1 and "is damaged and left out" in log.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"", "an empty file"),
+        (b"hello, this is a text file", "not an MCAP file"),
+        (b"\x89MCAP0\r\n", "nothing readable"),
+        (b"\x89MCAP0\r\n" + bytes(1000), "nothing readable"),
+        (b"\x89MCAP0\r\n\x01" + struct.pack("<Q", 1 << 60), "nothing readable"),
+    ],
+)
+def test_no_log_at_all(tmp_path: Path, content: bytes, said: str) -> None:
+    path = tmp_path / "x.mcap"
+    path.write_bytes(content)
+    with pytest.raises(BadInput, match=rf"x\.mcap: {said}"):
+        Log(path)
+
+
+def test_missing_file_and_directory(tmp_path: Path) -> None:
+    with pytest.raises(BadInput, match=r"gone\.mcap: cannot be read: No such file"):
+        Log(tmp_path / "gone.mcap")
+    with pytest.raises(BadInput, match="cannot be read: Is a directory"):
+        Log(tmp_path)
+
+
+def test_foreign_mcap_file(tmp_path: Path) -> None:
+    path = tmp_path / "ros.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="ros2")
+        writer.finish()
+    with pytest.raises(BadInput, match="not a log of sim-server"):
+        Log(path)
+
+
+def test_another_protocol_version(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sim_server.mcap_file.PROTOCOL", PROTOCOL + 41)
+    path = record(tmp_path / "new.mcap", 1)
+    with pytest.raises(BadInput, match=f"protocol version {PROTOCOL + 41}; this program reads version {PROTOCOL}"):
+        Log(path)
+
+
+def test_malformed_messages_are_left_out(tmp_path: Path) -> None:
+    path = tmp_path / "odd.mcap"
+    file = McapFile(path, "none", overwrite=False)
+    short = state("beam", 1)
+    short.x = short.x[:-1]
+    wild = topology("beam")
+    wild.tets = np.array([[0, 1, 2, 99]], np.int32).tobytes()
+    huge = state("beam", 2)
+    huge.nodes = 1 << 31
+    for topic, message in (
+        ("/state/beam", short),
+        ("/topology/beam", wild),
+        ("/state/beam", huge),
+        ("/state/beam", state("beam", 3)),
+    ):
+        file.write(topic, type(message), 0, 0, 0, message.SerializeToString())
+    file.write("/step/beam", type(object_step("beam", 1)), 0, 0, 0, b"\xff\xff\xff")
+    file.finish({})
+    with Log(path) as log:
+        assert [frame.step for frame in log.frames("beam")] == [3]
+        assert "4 malformed messages left out" in log.notes[0]
+        with pytest.raises(BadInput, match="mesh of object 'beam', epoch 1, is not in the log"):
+            log.mesh("beam", 1)
+        with pytest.raises(BadInput, match="no object 'liver'; objects in the log: beam"):
+            log.object_log("liver")
+
+
+@pytest.mark.parametrize("compression", ["lz4", "zstd"])
+def test_a_chunk_that_unpacks_to_more_than_it_says(compression: str) -> None:
+    """Not a byte more than announced is kept, and no more than RECORD_LIMIT is announced."""
+    plain = bytes(50_000_000)
+    packed = lz4.frame.compress(plain) if compression == "lz4" else zstandard.compress(plain)
+    bomb = Chunk(compression, packed, 0, 0, zlib.crc32(b""), 100)
+    with pytest.raises(ValueError, match="101 bytes instead of 100"):
+        mcap_chunks._unpack(bomb)
+    bomb.uncompressed_size = mcap_chunks.RECORD_LIMIT + 1
+    with pytest.raises(ValueError, match="at most"):
+        mcap_chunks._unpack(bomb)
+
+
+def test_dropped_frames_are_told(tmp_path: Path) -> None:
+    path = tmp_path / "gaps.mcap"
+    file = McapFile(path, "lz4", overwrite=False)
+    file.write("/topology/beam", type(topology("beam")), 0, 0, 0, topology("beam").SerializeToString())
+    file.finish({"frames_dropped": "12", "records_lost": "0"})
+    with Log(path) as log:
+        assert log.complete
+        assert log.notes == [f"{path}: the recorder could not keep up: frames dropped: 12"]
