@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: MIT
+"""What an effect is to the simulation: elements that couple nodes, and launches that add to the system of a step."""
+
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_server.backend import Launch
+from sim_server.system import Stencil, System
+from sim_server.world import Body, World
+
+
+class Effect:
+    """Base of all effects. A file under effects/ has `build(world, listed) -> Effect`.
+
+    tets (m, 4): node numbers (of the scene) of the elements whose corners the effect couples, or None.
+    rotated: the bodies whose elements have rotations, for the warp.
+    """
+
+    tets: NDArray[np.int32] | None = None
+    rotated: tuple[Body, ...] = ()
+
+    def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
+        """What adds the effect to system.b, .diagonal and .sums. accumulate: another effect wrote sums before."""
+        return []
+
+    def energy(self) -> float:
+        """Potential energy of the present state [J]; 0 for an effect without one."""
+        return 0.0
+
+
+class Build(Protocol):
+    """Of an effect's module. listed: the bodies that have it, each with its parameters (scene effects: all bodies)."""
+
+    def __call__(self, world: World, listed: list[tuple[Body, Any]]) -> Effect: ...
+
+
+def per_node(world: World, listed: list[tuple[Body, Any]], value: str) -> NDArray[np.float64]:
+    """(nodes,) with the parameter `value` of each listed body at its nodes, 0 elsewhere."""
+    out = np.zeros(world.nodes)
+    for body, params in listed:
+        out[body.nodes] = getattr(params, value)
+    return out

@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: MIT
+"""Uniform gravity on every object of the scene.
+
+Nodal force::
+
+    f_i = m_i g
+
+with the lumped mass m_i [kg] of node i. The force depends on neither x nor v, so nothing enters the system matrix.
+
+Usual values: (0, -9.81, 0) m/s2 with y up, (0, 0, -9.81) with z up. With g = 0, leave the effect out instead: a scene
+that does not list gravity has none. The static sag of a cantilever of length L, area A and second moment I under its
+own weight is rho g A L^4 / (8 E I) as long as that is small against L (Euler and Bernoulli), a useful check.
+"""
+
+from typing import Any
+
+import numpy as np
+from pydantic import Field
+
+from sim_server.backend import Launch, module
+from sim_server.effect import Effect
+from sim_server.parameters import Parameters, Vector
+from sim_server.system import Stencil, System
+from sim_server.world import Body, World
+
+SCOPE = "scene"
+
+
+class Params(Parameters):
+    g: Vector = Field(default=(0.0, -9.81, 0.0), description="acceleration [m/s2]")
+
+
+class Gravity(Effect):
+    """b += h m g."""
+
+    def __init__(self, world: World, g: tuple[float, float, float]):
+        self.world, self.g = world, np.array(g, dtype=float)
+
+    def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
+        w = self.world
+        return [module("effects/gravity.cu").bind("gravity", w.nodes, mass=w.mass, g=self.g, h=w.dt, b=system.b)]
+
+    def energy(self) -> float:
+        """-sum m g . x, zero at the origin [J]."""
+        return -float(self.world.mass @ (self.world.x @ self.g))
+
+
+def build(world: World, listed: list[tuple[Body, Any]]) -> Gravity:
+    """Gravity on all nodes."""
+    return Gravity(world, listed[0][1].g)

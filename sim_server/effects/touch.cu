@@ -1,0 +1,63 @@
+// SPDX-License-Identifier: MIT
+// Pushes and grabs of remote clients (touch.py).
+#include "mat3.cuh"
+
+struct Begin {
+    int n;              // interactions
+    const real* clock;  // (1,) time at the start of the step [s]
+    real* start;        // (n,) in, out: time it began; negative: now [s]
+};
+
+KERNEL(begin, Begin) {
+    if (p.start[i] < 0) p.start[i] = p.clock[0];
+}
+
+struct Apply {
+    int n;                  // nodes touched
+    const int* node;        // (n,)
+    const int* first;       // (n + 1,) into the entries
+    const int* entry;       // (first[n],) interaction of each entry
+    const real* offset;     // (first[n], 3) of the node from the grabbed point [m]
+    const real* share;      // (interactions,) 1 / nodes of the interaction
+    const real* start;      // (interactions,) [s]
+    const real* duration;   // (interactions,) [s]
+    const real* force;      // (interactions, 3) push [N]
+    const real* target;     // (interactions, 3) of a grab [m]
+    const real* stiffness;  // (interactions,) of a grab; 0: a push [N/m]
+    const real* limit;      // (interactions,) largest force of a grab [N]
+    const real* clock;      // (1,) [s]
+    const real* x;          // (nodes, 3) [m]
+    const real* v;          // (nodes, 3) [m/s]
+    const real* free;       // (nodes,) 1, or 0 at fixed nodes
+    real h;                 // [s]
+    real* diagonal;         // (nodes,) in, out: += h2 k [kg]
+    real* b;                // (nodes, 3) in, out: += h f - h2 k v [N s]
+};
+
+// A grab is a spring, implicit while it is below its limit and a constant force above: stable at any stiffness.
+KERNEL(apply, Apply) {
+    int node = p.node[i];
+    vec3 x = load3(p.x, node), v = load3(p.v, node), b = load3(p.b, node);
+    real diagonal = p.diagonal[node];
+    for (int e = p.first[i]; e < p.first[i + 1]; ++e) {
+        int k = p.entry[e];
+        if (p.clock[0] >= p.start[k] + p.duration[k]) continue;
+        real share = p.share[k];
+        if (p.stiffness[k] == 0) {
+            b = b + (p.h * share) * load3(p.force, k);
+            continue;
+        }
+        real spring = share * p.stiffness[k], limit = share * p.limit[k];
+        vec3 pull = spring * (load3(p.target, k) + load3(p.offset, e) - x);
+        real size = sqrt(dot(pull, pull));
+        if (size > limit) {
+            b = b + (p.h * limit / size) * pull;
+        } else {
+            b = b + p.h * pull - (p.h * p.h * spring) * v;
+            diagonal += p.h * p.h * spring;
+        }
+    }
+    if (p.free[node] == 0) return;
+    store3(p.b, node, b);
+    p.diagonal[node] = diagonal;
+}

@@ -1,0 +1,279 @@
+# SPDX-License-Identifier: MIT
+"""The native simulation loop as seen from Python: its memory, its mailboxes and what it reports.
+
+`Engine.run` lets go of Python's lock for as long as it runs. Everything else here only puts things into mailboxes or
+reads what the loop has left in its rings, and may be called from another thread meanwhile. Layouts: native/loop.cpp.
+"""
+
+import ctypes as c
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol.factor import FactorPattern
+from sim_server.backend import Launch, native
+
+Reals = NDArray[np.float64]
+
+
+class Kind(IntEnum):
+    """Preconditioners that the loop can apply."""
+
+    NONE = 0
+    JACOBI = 1
+    BLOCK_JACOBI = 2
+    CHOLESKY = 3
+
+
+class _Pattern(c.Structure):
+    _fields_ = [
+        ("size", c.c_int32), ("supernodes", c.c_int32), ("permutation", c.c_void_p), ("super_start", c.c_void_p),
+        ("row_start", c.c_void_p), ("rows", c.c_void_p), ("value_start", c.c_void_p),
+    ]  # fmt: skip
+
+
+class _Factor(c.Structure):
+    _fields_ = [
+        ("pattern", c.POINTER(_Pattern)), ("values", c.c_void_p), ("step", c.c_int64), ("bytes", c.c_int32),
+        ("unused", c.c_int32),
+    ]  # fmt: skip
+
+
+class _Settings(c.Structure):
+    _fields_ = [
+        ("tolerance", c.c_double), ("budget", c.c_double), ("max_iterations", c.c_int32), ("kind", c.c_int32),
+        ("warm_start", c.c_int32), ("probe", c.c_int32),
+    ]  # fmt: skip
+
+
+class _Binding(c.Structure):
+    _fields_ = [("params", c.c_void_p), ("items", c.c_int32), ("unused", c.c_int32)]
+
+
+class _Launch(c.Structure):
+    _fields_ = [("kernel", c.c_void_p), ("binding", c.c_void_p), ("mail", c.c_void_p)]
+
+
+class _Body(c.Structure):
+    _fields_ = [
+        ("first", c.c_int32), ("last", c.c_int32), ("settings", _Settings), ("factor", c.c_void_p),
+        ("mail", c.c_void_p), ("snapshot", c.c_void_p), ("snapshot_step", c.c_int64), ("steps", c.c_int64),
+    ]  # fmt: skip
+
+
+RECORD = np.dtype(
+    [
+        ("step", "i8"), ("factor_step", "i8"), ("time", "f8"), ("residual", "f8"), ("assemble", "f8"), ("solve", "f8"),
+        ("integrate", "f8"), ("whole", "f8"), ("late", "f8"), ("begin", "f8"), ("body", "i4"), ("iterations", "i4"),
+        ("status", "i4"), ("kind", "i4"), ("fallbacks", "i4"), ("bad_node", "i4"),
+    ]
+)  # fmt: skip
+"""One body, one step: what the loop reports. Seconds, except step numbers; `step` counts completed steps."""
+
+
+class _Loop(c.Structure):
+    _fields_ = [
+        ("launches", c.c_int32), ("before", c.c_int32), ("launch", c.POINTER(_Launch)), ("bodies", c.c_int32),
+        ("nodes", c.c_int32), ("body", c.POINTER(_Body)), ("row_start", c.c_void_p), ("columns", c.c_void_p),
+        ("values", c.c_void_p), ("b", c.c_void_p), ("y", c.c_void_p), ("x", c.c_void_p), ("v", c.c_void_p),
+        ("work", c.c_void_p), ("clock", c.c_void_p), ("dt", c.c_double), ("start_time", c.c_double),
+        ("step", c.c_int64), ("records", c.c_void_p), ("record_capacity", c.c_int64), ("record_head", c.c_int64),
+        ("record_tail", c.c_int64), ("frames", c.c_void_p), ("frame_steps", c.c_void_p), ("frame_capacity", c.c_int64),
+        ("frame_every", c.c_int64), ("frame_head", c.c_int64), ("frame_tail", c.c_int64),
+        ("frames_dropped", c.c_int64), ("records_dropped", c.c_int64), ("late_steps", c.c_int64),
+        ("realtime", c.c_int32), ("patient", c.c_int32), ("threads", c.c_int32), ("stop", c.c_int32),
+        ("pause", c.c_int32), ("deadline", c.c_double), ("assemble_begin", c.c_double),
+        ("assemble_seconds", c.c_double), ("late", c.c_double),
+    ]  # fmt: skip
+
+
+def _library() -> c.CDLL:
+    loop, p = c.POINTER(_Loop), c.c_void_p
+    library = native(
+        "native/loop.cpp",
+        {
+            "wf_assemble": (None, [loop]), "wf_solve": (None, [loop]), "wf_run": (c.c_int64, [loop, c.c_int64]),
+            "wf_post_factor": (p, [c.POINTER(_Body), p]), "wf_post_binding": (p, [c.POINTER(_Launch), p]),
+            "wf_apply_factor": (None, [c.POINTER(_Factor), p, p, p]), "wf_sizes": (c.c_int32, [p]),
+        },
+    )  # fmt: skip
+    sizes = (c.c_int32 * 6)()
+    library.wf_sizes(sizes)
+    ours = [c.sizeof(t) for t in (_Launch, _Body)] + [RECORD.itemsize] + [c.sizeof(t) for t in (_Loop, _Factor, _Pattern)]
+    if list(sizes) != ours:
+        raise RuntimeError(f"native/loop.cpp and engine.py disagree on layouts: {list(sizes)} and {ours}")
+    return library
+
+
+class NativeFactor:
+    """A factor in memory that the loop can apply; values are copied when it is filled."""
+
+    def __init__(self, pattern: FactorPattern, dtype: np.dtype | type):
+        self.pattern = pattern
+        self.values = np.zeros(pattern.nonzeros, dtype)
+        width, height = np.diff(pattern.super_start).astype(np.int64), np.diff(pattern.row_start)
+        sizes = width * height - width * (width - 1) // 2
+        self._value_start = np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64)
+        self._pattern = _Pattern(
+            pattern.size, len(width), pattern.permutation.ctypes.data, pattern.super_start.ctypes.data,
+            pattern.row_start.ctypes.data, pattern.rows.ctypes.data, self._value_start.ctypes.data,
+        )  # fmt: skip
+        self.native = _Factor(c.pointer(self._pattern), self.values.ctypes.data, -1, self.values.itemsize, 0)
+
+    @property
+    def address(self) -> int:
+        """What mailboxes hold."""
+        return c.addressof(self.native)
+
+    def fill(self, values: NDArray[Any], step: int) -> None:
+        """Takes over the values of L made from the matrix of `step`."""
+        self.values[:] = values
+        self.native.step = step
+
+    def apply(self, r: Reals) -> Reals:
+        """P^-1 r, (size,), outside of any step: for tests and measurements."""
+        r = np.ascontiguousarray(r, dtype=np.float64)
+        z, work = np.empty_like(r), np.empty(2 * len(r))
+        _library().wf_apply_factor(c.byref(self.native), r.ctypes.data, z.ctypes.data, work.ctypes.data)
+        return z
+
+
+@dataclass
+class Mailbox:
+    """Factor buffers of a body: one in use, one perhaps waiting, one to fill."""
+
+    buffers: list[NativeFactor]
+
+
+class Engine:
+    """The loop over one system.
+
+    assemble, integrate: the launches of a step, in order. ranges: nodes [first, last) of each body. arrays: those of the
+    system by name (row_start, columns, values, b, y, x, v, clock).
+    """
+
+    def __init__(
+        self, assemble: Sequence[Launch], integrate: Sequence[Launch], ranges: Sequence[tuple[int, int]], dt: float,
+        records: int = 8192, frames: int = 8, threads: int = 1, **arrays: NDArray[Any],
+    ):  # fmt: skip
+        self._native = _library()
+        launches = [*assemble, *integrate]
+        nodes, bodies = len(arrays["x"]), len(ranges)
+        self.launches, self._bindings = launches, [_Binding(c.addressof(x.params), x.items, 0) for x in launches]
+        self._launch = (_Launch * max(len(launches), 1))()
+        for entry, launch, binding in zip(self._launch, launches, self._bindings, strict=False):
+            entry.kernel, entry.binding = launch.function, c.addressof(binding)
+        self._body = (_Body * bodies)()
+        for entry_body, (first, last) in zip(self._body, ranges, strict=True):
+            entry_body.first, entry_body.last, entry_body.snapshot_step = first, last, -1
+        self._records = np.zeros(max(records, 4 * bodies), RECORD)
+        self._frames = np.zeros((frames, 2, nodes, 3))
+        self._frame_steps = np.zeros(frames, np.int64)
+        self._work = np.zeros(45 * nodes)
+        self._arrays = arrays
+        self._mail: list[Mailbox] = [Mailbox([]) for _ in ranges]
+        self._copies: list[Reals | None] = [None] * bodies
+        self._posted: dict[int, Any] = {}
+        loop = self.loop = _Loop()
+        loop.launches, loop.before, loop.launch = len(launches), len(assemble), self._launch
+        loop.bodies, loop.nodes, loop.body, loop.dt = bodies, nodes, self._body, dt
+        for name in ("row_start", "columns", "values", "b", "y", "x", "v", "clock"):
+            setattr(loop, name, arrays[name].ctypes.data)
+        loop.work, loop.threads = self._work.ctypes.data, threads
+        loop.records, loop.record_capacity = self._records.ctypes.data, len(self._records)
+        loop.frames, loop.frame_steps, loop.frame_capacity = self._frames.ctypes.data, self._frame_steps.ctypes.data, frames
+
+    # --- running ------------------------------------------------------------------------------------------------
+
+    def run(self, steps: int) -> int:
+        """Runs up to `steps` steps without Python; returns those done (fewer only after `stop`)."""
+        return int(self._native.wf_run(c.byref(self.loop), steps))
+
+    def assemble(self) -> None:
+        """First half of one step: the system matrix and right-hand side."""
+        self._native.wf_assemble(c.byref(self.loop))
+
+    def solve(self) -> None:
+        """Second half: solve, integrate, report."""
+        self._native.wf_solve(c.byref(self.loop))
+
+    @property
+    def step(self) -> int:
+        """Steps completed."""
+        return int(self.loop.step)
+
+    def settings(self, body: int) -> _Settings:
+        """Solver settings of a body; what is set holds from its next solve on."""
+        return self._body[body].settings
+
+    # --- mailboxes ----------------------------------------------------------------------------------------------
+
+    def post_factor(self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int) -> None:
+        """Copies a factor into a free buffer; the loop takes it up before its next solve of the body."""
+        buffer = self._free_buffer(body, pattern, values.dtype)
+        buffer.fill(values, step)
+        self._native.wf_post_factor(c.byref(self._body[body]), buffer.address)
+
+    def _free_buffer(self, body: int, pattern: FactorPattern, dtype: np.dtype) -> NativeFactor:
+        """Not the one in use and not the one waiting (which is taken back: a newer one is coming)."""
+        entry, mail = self._body[body], self._mail[body]
+        self._native.wf_post_factor(c.byref(entry), None)
+        in_use = entry.factor
+        for i, buffer in enumerate(mail.buffers):
+            if buffer.address == in_use:
+                continue
+            if buffer.pattern is not pattern or buffer.values.dtype != dtype:
+                mail.buffers[i] = NativeFactor(pattern, dtype)
+            return mail.buffers[i]
+        mail.buffers.append(NativeFactor(pattern, dtype))
+        return mail.buffers[-1]
+
+    def factor_step(self, body: int) -> int:
+        """Step of the factor in use, -1 without one."""
+        address = self._body[body].factor
+        return int(c.cast(address, c.POINTER(_Factor)).contents.step) if address else -1
+
+    def request_matrix(self, body: int, target: Reals) -> None:
+        """The loop copies the values of A into `target` once they are next assembled."""
+        self._copies[body] = target
+        self._body[body].snapshot_step = -1
+        self._body[body].snapshot = target.ctypes.data
+
+    def matrix_step(self, body: int) -> int:
+        """Step of the copy asked for last, -1 while it is not there. `step` counts the steps completed before it."""
+        return int(self._body[body].snapshot_step)
+
+    def cancel_matrix(self, body: int) -> None:
+        """Forget the copy asked for (only while the loop stands still)."""
+        self._body[body].snapshot = None
+
+    def replace(self, launch: int, new: Launch) -> None:
+        """Gives a launch other arguments, from the next step on."""
+        binding = _Binding(c.addressof(new.params), new.items, 0)
+        kept = self._posted.setdefault(launch, [])
+        kept.append((binding, new))
+        del kept[:-4]  # the loop may still hold the one before the last
+        self._native.wf_post_binding(c.byref(self._launch[launch]), c.addressof(binding))
+
+    # --- reports ------------------------------------------------------------------------------------------------
+
+    def records(self) -> NDArray[Any]:
+        """New records since the last call, oldest first, (k,) of RECORD."""
+        head, tail, size = int(self.loop.record_head), int(self.loop.record_tail), len(self._records)
+        out = self._records[np.arange(tail, head) % size]
+        self.loop.record_tail = head
+        return out
+
+    def frames(self) -> list[tuple[int, Reals, Reals]]:
+        """New frames since the last call: (step, x (n, 3), v (n, 3)), copied."""
+        head, tail = int(self.loop.frame_head), int(self.loop.frame_tail)
+        out = []
+        for k in range(tail, head):
+            slot = k % len(self._frame_steps)
+            out.append((int(self._frame_steps[slot]), self._frames[slot, 0].copy(), self._frames[slot, 1].copy()))
+            self.loop.frame_tail = k + 1
+        return out

@@ -1,0 +1,98 @@
+// SPDX-License-Identifier: MIT
+// One text, two compilers. A kernel is a function of independent items:
+//
+//     struct Push { int n; const real* v; real* x; real h; };                      // n = items, always first
+//     KERNEL(push, Push) { put(p.x, i, at(p.x, i) + p.h * at(p.v, i)); }           // `p` parameters, `i` item
+//
+// NVRTC turns it into a __global__ function, one thread per item; a C++ compiler into a loop over a range of items.
+// A text that defines WIDE first is written on `number` and `index`: scalars on a GPU, as many items at once as a vector
+// register holds on a CPU (past the end the last item is repeated; an item loads before it stores, so that does no harm).
+// Structs hold 4-byte ints, reals and pointers; the Python side reads their layout from this very text (backend.py), so that
+// names and order stand nowhere else.
+#pragma once
+
+#ifndef real
+#define real double
+#endif
+
+#ifdef __CUDACC_RTC__
+
+#define INLINE __device__ __forceinline__
+typedef real number;
+typedef int index;
+#define KERNEL(name, Params)                                                \
+    __device__ __forceinline__ void name##_item(const Params& p, index i);  \
+    extern "C" __global__ void name(const Params p) {                       \
+        int i = blockIdx.x * blockDim.x + threadIdx.x;                      \
+        if (i < p.n) name##_item(p, i);                                     \
+    }                                                                       \
+    __device__ __forceinline__ void name##_item(const Params& p, index i)
+
+#else
+
+#include <cmath>
+#define INLINE static inline __attribute__((always_inline))
+// `begin`..`end` lets the caller share a launch between threads.
+#define KERNEL(name, Params)                                                          \
+    INLINE void name##_item(const Params& p, index i);                                \
+    extern "C" void name(const void* params, int begin, int end) {                    \
+        const Params p = *static_cast<const Params*>(params);                         \
+        for (int i = begin; i < end; i += LANES) name##_item(p, items(i, end - 1));   \
+    }                                                                                 \
+    INLINE void name##_item(const Params& p, index i)
+
+#ifdef WIDE
+
+#if defined(__AVX512F__)
+#define REGISTER 64
+#elif defined(__AVX__)
+#define REGISTER 32
+#else
+#define REGISTER 16
+#endif
+constexpr int LANES = REGISTER / sizeof(real);
+typedef real number __attribute__((vector_size(REGISTER)));
+typedef int index __attribute__((vector_size(LANES * sizeof(int))));
+
+INLINE index items(int first, int last) {
+    index i;
+    for (int k = 0; k < LANES; ++k) i[k] = first + k < last ? first + k : last;
+    return i;
+}
+INLINE number at(const real* a, index i) {
+    number r;
+    for (int k = 0; k < LANES; ++k) r[k] = a[i[k]];
+    return r;
+}
+INLINE index at(const int* a, index i) {
+    index r;
+    for (int k = 0; k < LANES; ++k) r[k] = a[i[k]];
+    return r;
+}
+INLINE void put(real* a, index i, number v) {
+    for (int k = 0; k < LANES; ++k) a[i[k]] = v[k];
+}
+INLINE number sqrt(number a) {
+    for (int k = 0; k < LANES; ++k) a[k] = std::sqrt(a[k]);
+    return a;
+}
+
+#else
+
+constexpr int LANES = 1;
+typedef real number;
+typedef int index;
+INLINE index items(int first, int) { return first; }
+using std::sqrt;
+
+#endif
+#endif
+
+#if !defined(WIDE) || defined(__CUDACC_RTC__)
+INLINE number at(const real* a, index i) { return a[i]; }
+INLINE index at(const int* a, index i) { return a[i]; }
+INLINE void put(real* a, index i, number v) { a[i] = v; }
+#endif
+
+INLINE number constant(real c) { return number{} + c; }
+INLINE number larger(number a, number b) { return a > b ? a : b; }

@@ -1,0 +1,103 @@
+// SPDX-License-Identifier: MIT
+// Block CSR of 3x3 blocks, and the vector loops of the conjugate gradient method fused so that each vector is read once.
+#pragma once
+#include <cmath>
+#include <cstdint>
+
+struct BlockCsr {
+    int32_t first, last;        // nodes [first, last) of a body; vectors below start at its first node
+    const int32_t* row_start;   // (nodes + 1,) of the scene, into columns and values
+    const int32_t* columns;     // node numbers in the scene
+    const double* values;       // (blocks, 3, 3)
+    int size() const { return 3 * (last - first); }
+};
+
+// y = A x; returns x . y
+static double multiply(const BlockCsr& A, const double* x, double* y) {
+    double sum = 0;
+    for (int i = A.first; i < A.last; ++i) {
+        double y0 = 0, y1 = 0, y2 = 0;
+        for (int k = A.row_start[i]; k < A.row_start[i + 1]; ++k) {
+            const double* a = A.values + 9 * (int64_t)k;
+            const double* v = x + 3 * (A.columns[k] - A.first);
+            y0 += a[0] * v[0] + a[1] * v[1] + a[2] * v[2];
+            y1 += a[3] * v[0] + a[4] * v[1] + a[5] * v[2];
+            y2 += a[6] * v[0] + a[7] * v[1] + a[8] * v[2];
+        }
+        double* w = y + 3 * (i - A.first);
+        const double* u = x + 3 * (i - A.first);
+        w[0] = y0; w[1] = y1; w[2] = y2;
+        sum += u[0] * y0 + u[1] * y1 + u[2] * y2;
+    }
+    return sum;
+}
+
+static double dot(int n, const double* a, const double* b) {
+    double s = 0;
+#pragma omp simd reduction(+ : s)
+    for (int i = 0; i < n; ++i) s += a[i] * b[i];
+    return s;
+}
+
+// r = b - A x; returns |r|^2
+static double residual(const BlockCsr& A, const double* b, const double* x, double* r) {
+    multiply(A, x, r);
+    double s = 0;
+    int n = A.size();
+#pragma omp simd reduction(+ : s)
+    for (int i = 0; i < n; ++i) {
+        double d = b[i] - r[i];
+        r[i] = d;
+        s += d * d;
+    }
+    return s;
+}
+
+// x += alpha p, r -= alpha q; returns |r|^2
+static double descend(int n, double alpha, const double* p, const double* q, double* x, double* r) {
+    double s = 0;
+#pragma omp simd reduction(+ : s)
+    for (int i = 0; i < n; ++i) {
+        x[i] += alpha * p[i];
+        double d = r[i] - alpha * q[i];
+        r[i] = d;
+        s += d * d;
+    }
+    return s;
+}
+
+// p = z + beta p
+static void conjugate(int n, double beta, const double* z, double* p) {
+#pragma omp simd
+    for (int i = 0; i < n; ++i) p[i] = z[i] + beta * p[i];
+}
+
+// Inverses of the diagonal blocks (whole = true) or of the diagonal entries.
+static void invert_diagonal(const BlockCsr& A, bool whole, double* inverse) {
+    for (int i = A.first; i < A.last; ++i) {
+        int k = A.row_start[i];
+        while (A.columns[k] != i) ++k;
+        const double* a = A.values + 9 * (int64_t)k;
+        double* v = inverse + 9 * (i - A.first);
+        if (!whole) {
+            for (int m = 0; m < 9; ++m) v[m] = 0;
+            v[0] = 1 / a[0]; v[4] = 1 / a[4]; v[8] = 1 / a[8];
+            continue;
+        }
+        double c0 = a[4] * a[8] - a[5] * a[7], c1 = a[5] * a[6] - a[3] * a[8], c2 = a[3] * a[7] - a[4] * a[6];
+        double d = 1 / (a[0] * c0 + a[1] * c1 + a[2] * c2);
+        v[0] = d * c0; v[4] = d * (a[0] * a[8] - a[2] * a[6]); v[8] = d * (a[0] * a[4] - a[1] * a[3]);
+        v[1] = v[3] = d * c1; v[2] = v[6] = d * c2; v[5] = v[7] = d * (a[1] * a[6] - a[0] * a[7]);
+    }
+}
+
+static void apply_diagonal(int nodes, const double* inverse, const double* r, double* z) {
+#pragma omp simd
+    for (int i = 0; i < nodes; ++i) {
+        const double *v = inverse + 9 * i, *s = r + 3 * i;
+        double* t = z + 3 * i;
+        t[0] = v[0] * s[0] + v[1] * s[1] + v[2] * s[2];
+        t[1] = v[3] * s[0] + v[4] * s[1] + v[5] * s[2];
+        t[2] = v[6] * s[0] + v[7] * s[1] + v[8] * s[2];
+    }
+}

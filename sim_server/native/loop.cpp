@@ -1,0 +1,221 @@
+// SPDX-License-Identifier: MIT
+// The simulation loop. It runs the launches of a step, solves each body, and exchanges data with the rest of the server only
+// through mailboxes: an atomic pointer or flag each, looked at between solves, never waited for. The caller (ctypes) has let
+// go of Python's lock, so no Python code, network, worker or disk can delay a step.
+#include <atomic>
+#include <cmath>
+#include <cstring>
+#include <ctime>
+
+#include "pcg.h"
+
+typedef void (*Kernel)(const void* params, int begin, int end);
+
+struct Binding {           // arguments of a launch, replaceable between steps
+    const void* params;
+    int32_t items;
+    int32_t unused;
+};
+
+struct Launch {
+    Kernel kernel;
+    const Binding* binding;
+    std::atomic<const Binding*> mail;   // the next one, or null
+};
+
+struct Body {
+    int32_t first, last;                // nodes
+    SolveSettings settings;
+    const Factor* factor;               // in use
+    std::atomic<const Factor*> mail;    // a newer one, or null
+    std::atomic<double*> snapshot;      // where to copy the values of A, or null
+    std::atomic<int64_t> snapshot_step; // step of the last copy made, -1: none
+    int64_t steps;                      // solved so far
+};
+
+struct Record {
+    int64_t step;          // steps completed
+    int64_t factor_step;   // -1: no factor used
+    double time;           // s, at the end of the step
+    double residual;
+    double assemble, solve, integrate, whole, late, begin;  // s; begin: steady clock
+    int32_t body, iterations, status, kind, fallbacks, bad_node;
+};
+
+struct Loop {
+    int32_t launches, before;          // launches; how many of them assemble (the others integrate)
+    Launch* launch;
+    int32_t bodies, nodes;
+    Body* body;
+    const int32_t* row_start;
+    const int32_t* columns;
+    const double* values;
+    const double* b;                   // (nodes, 3) right-hand side in the material frame
+    double* y;                         // (nodes, 3) start in, solution out
+    double* x;                         // (nodes, 3) for frames
+    double* v;
+    double* work;                      // 45 doubles a node
+    double* clock;                     // (1,) s, read by kernels
+    double dt;
+    double start_time;
+    int64_t step;                      // completed
+
+    Record* records;                   // ring
+    int64_t record_capacity;
+    std::atomic<int64_t> record_head, record_tail;
+    double* frames;                    // ring of (2, nodes, 3): x, v
+    int64_t* frame_steps;
+    int64_t frame_capacity, frame_every;   // every 0: none
+    std::atomic<int64_t> frame_head, frame_tail;
+    std::atomic<int64_t> frames_dropped, records_dropped, late_steps;
+
+    int32_t realtime;                  // keep pace with the wall clock
+    int32_t patient;                   // wait for room in the rings instead of dropping (no deadline to miss)
+    int32_t threads;                   // of this process, for launches and bodies
+    std::atomic<int32_t> stop, pause;
+    double deadline;                   // steady clock, of the next step; 0: now
+    double assemble_begin;
+    double assemble_seconds;
+    double late;
+};
+
+static void nap(double seconds) {
+    timespec t{(time_t)seconds, (long)((seconds - std::floor(seconds)) * 1e9)};
+    nanosleep(&t, nullptr);
+}
+
+static void run(Launch& l, int threads) {
+    if (const Binding* next = l.mail.exchange(nullptr)) l.binding = next;
+    const int64_t items = l.binding->items, grain = 512;
+    int parts = (int)(items / grain < threads ? items / grain : threads);
+    if (parts < 2) {
+        if (items > 0) l.kernel(l.binding->params, 0, (int)items);
+        return;
+    }
+#pragma omp parallel for num_threads(parts) schedule(static, 1)
+    for (int k = 0; k < parts; ++k) l.kernel(l.binding->params, (int)(items * k / parts), (int)(items * (k + 1) / parts));
+}
+
+static void copy_matrix(Loop& loop, Body& body) {
+    double* target = body.snapshot.load(std::memory_order_acquire);
+    if (!target) return;
+    int64_t begin = loop.row_start[body.first], end = loop.row_start[body.last];
+    std::memcpy(target, loop.values + 9 * begin, 9 * sizeof(double) * (end - begin));
+    body.snapshot.store(nullptr, std::memory_order_relaxed);
+    body.snapshot_step.store(loop.step, std::memory_order_release);
+}
+
+// A full ring: wait if nobody minds, else say no.
+static bool room(Loop& loop, std::atomic<int64_t>& head, std::atomic<int64_t>& tail, int64_t capacity) {
+    while (head.load() - tail.load(std::memory_order_acquire) >= capacity) {
+        if (!loop.patient || loop.stop.load()) return false;
+        nap(2e-4);
+    }
+    return true;
+}
+
+static void write_frame(Loop& loop) {
+    if (loop.frame_every <= 0 || loop.step % loop.frame_every) return;
+    if (!room(loop, loop.frame_head, loop.frame_tail, loop.frame_capacity)) { ++loop.frames_dropped; return; }
+    int64_t slot = loop.frame_head.load() % loop.frame_capacity, size = 3 * (int64_t)loop.nodes;
+    double* frame = loop.frames + 2 * size * slot;
+    std::memcpy(frame, loop.x, sizeof(double) * size);
+    std::memcpy(frame + size, loop.v, sizeof(double) * size);
+    loop.frame_steps[slot] = loop.step;
+    loop.frame_head.fetch_add(1, std::memory_order_release);
+}
+
+static int first_bad_node(const Loop& loop, const Body& body) {
+    for (int i = body.first; i < body.last; ++i)
+        for (int k = 0; k < 3; ++k)
+            if (!std::isfinite(loop.b[3 * i + k])) return i - body.first;
+    return -1;
+}
+
+extern "C" {
+
+void wf_assemble(Loop* loop) {
+    double begin = now();
+    loop->clock[0] = loop->start_time + loop->step * loop->dt;
+    for (int i = 0; i < loop->before; ++i) run(loop->launch[i], loop->threads);
+    for (int i = 0; i < loop->bodies; ++i) copy_matrix(*loop, loop->body[i]);
+    loop->assemble_begin = begin;
+    loop->assemble_seconds = now() - begin;
+}
+
+void wf_solve(Loop* loop) {
+    double entered = now();
+    int64_t first = loop->record_head.load();
+    bool keep = room(*loop, loop->record_head, loop->record_tail, loop->record_capacity - loop->bodies);
+#pragma omp parallel for num_threads(loop->threads) schedule(dynamic, 1) if (loop->threads > 1 && loop->bodies > 1)
+    for (int i = 0; i < loop->bodies; ++i) {
+        Body& body = loop->body[i];
+        if (const Factor* next = body.mail.exchange(nullptr)) body.factor = next;
+        BlockCsr A{body.first, body.last, loop->row_start, loop->columns, loop->values};
+        SolveResult r = pcg(A, loop->b + 3 * body.first, body.factor, body.settings, loop->y + 3 * body.first,
+                            loop->work + 45 * (int64_t)body.first);
+        ++body.steps;
+        if (!keep) continue;
+        Record& record = loop->records[(first + i) % loop->record_capacity];
+        bool used = r.kind == CHOLESKY || r.fallbacks;
+        record = Record{loop->step + 1, used ? body.factor->step : -1, loop->start_time + (loop->step + 1) * loop->dt, r.residual,
+                        loop->assemble_seconds, r.seconds, 0, 0, loop->late, loop->assemble_begin, i, r.iterations, r.status,
+                        r.kind, r.fallbacks, r.status == NOT_FINITE ? first_bad_node(*loop, body) : -1};
+    }
+    double solved = now();
+    for (int i = loop->before; i < loop->launches; ++i) run(loop->launch[i], loop->threads);
+    double end = now();
+    ++loop->step;
+    if (!keep) { loop->records_dropped += loop->bodies; }
+    else {
+        for (int i = 0; i < loop->bodies; ++i) {
+            Record& record = loop->records[(first + i) % loop->record_capacity];
+            record.integrate = end - solved;
+            record.whole = loop->assemble_seconds + (end - entered);
+        }
+        loop->record_head.store(first + loop->bodies, std::memory_order_release);
+    }
+    write_frame(*loop);
+}
+
+// Runs until `steps` are done or `stop` is set; returns the steps done.
+int64_t wf_run(Loop* loop, int64_t steps) {
+    int64_t done = 0;
+    for (; done < steps && !loop->stop.load(std::memory_order_relaxed); ++done) {
+        while (loop->pause.load(std::memory_order_relaxed) && !loop->stop.load()) {
+            nap(1e-3);
+            loop->deadline = 0;
+        }
+        if (loop->stop.load()) break;
+        loop->late = 0;
+        if (loop->realtime) {
+            double t = now();
+            if (loop->deadline == 0) loop->deadline = t;
+            if (t < loop->deadline) nap(loop->deadline - t);
+            else if (t > loop->deadline) {
+                loop->late = t - loop->deadline;
+                if (loop->late > loop->dt) { ++loop->late_steps; loop->deadline = t; }  // do not chase lost time
+            }
+            loop->deadline += loop->dt;
+        }
+        wf_assemble(loop);
+        wf_solve(loop);
+    }
+    return done;
+}
+
+const Factor* wf_post_factor(Body* body, const Factor* factor) { return body->mail.exchange(factor); }
+const Binding* wf_post_binding(Launch* launch, const Binding* binding) { return launch->mail.exchange(binding); }
+
+// One application of a factor, for tests and measurements: z = P^-1 r.
+void wf_apply_factor(const Factor* factor, const double* r, double* z, double* work) {
+    if (factor->bytes == 4) apply_factor(*factor->pattern, (const float*)factor->values, r, 1, z, (float*)work);
+    else apply_factor(*factor->pattern, (const double*)factor->values, r, 1, z, work);
+}
+
+int32_t wf_sizes(int32_t* sizes) {  // layouts, checked against the Python side
+    sizes[0] = sizeof(Launch); sizes[1] = sizeof(Body); sizes[2] = sizeof(Record); sizes[3] = sizeof(Loop);
+    sizes[4] = sizeof(Factor); sizes[5] = sizeof(Pattern);
+    return 6;
+}
+}

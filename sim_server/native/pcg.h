@@ -1,0 +1,139 @@
+// SPDX-License-Identifier: MIT
+// Preconditioned conjugate gradients for one body, numbered after Saad, Iterative Methods for Sparse Linear Systems, 2nd
+// edition, algorithm 9.1. What differs from the book:
+//   - a step counts as solved only by its true residual |b - A x| <= tolerance |b|, computed at the end; where the recursive one was
+//     too good the iteration starts again from the true one;
+//   - it starts from the last solution where that is better than zero;
+//   - p'Ap <= 0 and z'r <= 0 are looked for and named; a factor with z'r <= 0 is left for block Jacobi on the spot, so that a
+//     useless factor costs iterations and never the answer.
+// An iteration is one application of A after the initial residual.
+#pragma once
+#include <chrono>
+
+#include "block_csr.h"
+#include "supernodal.h"
+
+enum Kind { NONE = 0, JACOBI = 1, BLOCK_JACOBI = 2, CHOLESKY = 3 };
+enum Status { CONVERGED = 0, MAX_ITERATIONS = 1, BUDGET = 2, BREAKDOWN_MATRIX = 3, BREAKDOWN_PRECONDITIONER = 4, NOT_FINITE = 5 };
+
+struct Factor {
+    const Pattern* pattern;
+    const void* values;
+    int64_t step;      // of the matrix it was made from
+    int32_t bytes;     // of a value: 4 or 8
+    int32_t unused;
+};
+
+struct SolveSettings {
+    double tolerance;       // of |b|
+    double budget;          // s of wall time, 0: none
+    int32_t max_iterations;
+    int32_t kind;           // Kind wanted; CHOLESKY without a factor is BLOCK_JACOBI
+    int32_t warm_start;
+    int32_t probe;          // > 0: after so many iterations go from block Jacobi to the factor, or the other way
+};
+
+struct SolveResult {
+    double residual;        // true, relative
+    double seconds;
+    int32_t iterations, status;
+    int32_t kind;           // used at the end
+    int32_t fallbacks;      // 1: the factor was left in this solve
+};
+
+static double now() {
+    return std::chrono::duration<double>(std::chrono::steady_clock::now().time_since_epoch()).count();
+}
+
+struct Preconditioner {
+    const BlockCsr& A;
+    const Factor* factor;
+    int kind;
+    double* inverse;  // (nodes, 9)
+    void* work;       // 2 n doubles
+
+    void prepare() {
+        if (kind == JACOBI || kind == BLOCK_JACOBI) invert_diagonal(A, kind == BLOCK_JACOBI, inverse);
+    }
+    // z = P^-1 r; returns z . r
+    double apply(const double* r, double r_norm, double* z) {
+        int n = A.size();
+        if (kind == CHOLESKY && factor->bytes == 4)
+            apply_factor(*factor->pattern, (const float*)factor->values, r, 1 / r_norm, z, (float*)work);
+        else if (kind == CHOLESKY)
+            apply_factor(*factor->pattern, (const double*)factor->values, r, 1 / r_norm, z, (double*)work);
+        else if (kind == NONE)
+            for (int i = 0; i < n; ++i) z[i] = r[i];
+        else
+            apply_diagonal(n / 3, inverse, r, z);
+        return dot(n, z, r);
+    }
+};
+
+// work: 15 n doubles. x: start in, solution out.
+static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor, const SolveSettings& settings, double* x,
+                       double* work) {
+    double start = now();
+    int n = A.size();
+    double *r = work, *z = r + n, *p = z + n, *q = p + n, *inverse = q + n, *scratch = inverse + 3 * n;
+    SolveResult out{0, 0, 0, CONVERGED, settings.kind, 0};
+    if (out.kind == CHOLESKY && !factor) out.kind = BLOCK_JACOBI;
+    auto finish = [&](int status, double r2, double b2) {
+        out.status = status;
+        out.residual = b2 > 0 ? std::sqrt(r2 / b2) : 0;
+        out.seconds = now() - start;
+        return out;
+    };
+    auto zero = [&] { for (int i = 0; i < n; ++i) x[i] = 0; };
+
+    double b2 = dot(n, b, b);
+    if (!std::isfinite(b2)) { zero(); return finish(NOT_FINITE, b2, 1); }
+    if (b2 == 0) { zero(); return finish(CONVERGED, 0, 0); }
+    double goal = settings.tolerance * settings.tolerance * b2;
+    double r2 = settings.warm_start ? residual(A, b, x, r) : b2;                 // 1. r = b - A x
+    if (!settings.warm_start || !(r2 < b2)) {
+        zero();
+        for (int i = 0; i < n; ++i) r[i] = b[i];
+        r2 = b2;
+    }
+    if (r2 <= goal) return finish(CONVERGED, r2, b2);
+
+    Preconditioner P{A, factor, out.kind, inverse, scratch};
+    P.prepare();
+    double rz = 0, last_true = INFINITY;
+    bool restart = true, switched = false;
+    for (;;) {
+        double zr = P.apply(r, std::sqrt(r2), z);                                // 1. 6. z = P^-1 r
+        if (!(zr > 0)) {                                                         // also NaN
+            if (P.kind != CHOLESKY) return finish(BREAKDOWN_PRECONDITIONER, residual(A, b, x, r), b2);
+            P.kind = out.kind = BLOCK_JACOBI;
+            out.fallbacks = 1;
+            P.prepare();
+            r2 = residual(A, b, x, r);
+            restart = true;
+            continue;
+        }
+        conjugate(n, restart ? 0 : zr / rz, z, p);                               // 7. 8. p = z + beta p
+        rz = zr;
+        restart = false;
+        if (out.iterations == settings.max_iterations) return finish(MAX_ITERATIONS, residual(A, b, x, r), b2);
+        if (out.iterations == settings.probe && settings.probe > 0 && factor && P.kind >= BLOCK_JACOBI && !switched) {
+            P.kind = out.kind = P.kind == CHOLESKY ? BLOCK_JACOBI : CHOLESKY;
+            P.prepare();
+            switched = restart = true;
+            continue;
+        }
+        if (settings.budget > 0 && now() - start > settings.budget) return finish(BUDGET, residual(A, b, x, r), b2);
+
+        double pq = multiply(A, p, q);
+        ++out.iterations;
+        if (!(pq > 0)) return finish(BREAKDOWN_MATRIX, residual(A, b, x, r), b2);
+        r2 = descend(n, rz / pq, p, q, x, r);                                    // 3. 4. 5.
+        if (r2 > goal) continue;
+        r2 = residual(A, b, x, r);
+        if (r2 <= goal) return finish(CONVERGED, r2, b2);
+        if (!(r2 < 0.25 * last_true)) return finish(MAX_ITERATIONS, r2, b2);     // rounding is reached: more does not help
+        last_true = r2;
+        restart = true;
+    }
+}

@@ -1,0 +1,103 @@
+// SPDX-License-Identifier: MIT
+// z = P^T L^-T L^-1 P r for a Cholesky factor in supernodal form (format: protocol/factor.py).
+//
+// Column k of a supernode with nr rows starts at its diagonal; the columns lie one after another. Four columns at a time, so
+// that a row's sum is read and written once for four multiplications; L itself, which is most of the bytes, is read once.
+#pragma once
+#include <cstdint>
+
+struct Pattern {
+    int32_t size;                // degrees of freedom
+    int32_t supernodes;
+    const int32_t* permutation;  // (size,)
+    const int32_t* super_start;  // (supernodes + 1,)
+    const int64_t* row_start;    // (supernodes + 1,) into rows
+    const int32_t* rows;
+    const int64_t* value_start;  // (supernodes,) into the values
+};
+
+template <class T>
+struct Panel {
+    const T* values;
+    int columns, height;
+    // entry (r, k), r >= k
+    const T* column(int k) const { return values + (int64_t)k * height - (int64_t)k * (k + 1) / 2; }
+};
+
+// below -= L_below x for the rows under the triangle; `sum` is scratch
+template <class T>
+static void forward_panel(const Panel<T>& L, T* x, const int32_t* rows, T* y, T* sum) {
+    for (int k = 0; k < L.columns; ++k) {
+        const T* c = L.column(k);
+        T xk = x[k] / c[k];
+        x[k] = xk;
+        for (int r = k + 1; r < L.columns; ++r) x[r] -= c[r] * xk;
+    }
+    int n = L.columns, h = L.height;
+    if (h == n) return;
+    int k = 0;
+    for (int r = n; r < h; ++r) sum[r] = 0;
+    for (; k + 4 <= n; k += 4) {
+        const T *a = L.column(k), *b = L.column(k + 1), *c = L.column(k + 2), *d = L.column(k + 3);
+        T xa = x[k], xb = x[k + 1], xc = x[k + 2], xd = x[k + 3];
+#pragma omp simd
+        for (int r = n; r < h; ++r) sum[r] += a[r] * xa + b[r] * xb + c[r] * xc + d[r] * xd;
+    }
+    for (; k < n; ++k) {
+        const T* a = L.column(k);
+        T xa = x[k];
+#pragma omp simd
+        for (int r = n; r < h; ++r) sum[r] += a[r] * xa;
+    }
+    for (int r = n; r < h; ++r) y[rows[r]] -= sum[r];
+}
+
+// x = L_triangle^-T (x - L_below^T y_below)
+template <class T>
+static void backward_panel(const Panel<T>& L, T* x, const int32_t* rows, const T* y, T* below) {
+    int n = L.columns, h = L.height;
+    for (int r = n; r < h; ++r) below[r] = y[rows[r]];
+    int k = 0;
+    for (; k + 4 <= n; k += 4) {
+        const T *a = L.column(k), *b = L.column(k + 1), *c = L.column(k + 2), *d = L.column(k + 3);
+        T sa = 0, sb = 0, sc = 0, sd = 0;
+#pragma omp simd reduction(+ : sa, sb, sc, sd)
+        for (int r = n; r < h; ++r) {
+            T w = below[r];
+            sa += a[r] * w; sb += b[r] * w; sc += c[r] * w; sd += d[r] * w;
+        }
+        x[k] -= sa; x[k + 1] -= sb; x[k + 2] -= sc; x[k + 3] -= sd;
+    }
+    for (; k < n; ++k) {
+        const T* a = L.column(k);
+        T sa = 0;
+#pragma omp simd reduction(+ : sa)
+        for (int r = n; r < h; ++r) sa += a[r] * below[r];
+        x[k] -= sa;
+    }
+    for (k = n - 1; k >= 0; --k) {
+        const T* c = L.column(k);
+        T s = x[k];
+        for (int r = k + 1; r < n; ++r) s -= c[r] * x[r];
+        x[k] = s / c[k];
+    }
+}
+
+// scale: 1 / |r|, so that a float factor neither overflows nor underflows. work: 2 size entries.
+template <class T>
+static void apply_factor(const Pattern& p, const T* values, const double* r, double scale, double* z, T* work) {
+    T *y = work, *scratch = work + p.size;
+    for (int i = 0; i < p.size; ++i) y[i] = (T)(scale * r[p.permutation[i]]);
+    for (int s = 0; s < p.supernodes; ++s) {
+        int64_t start = p.row_start[s];
+        Panel<T> L{values + p.value_start[s], p.super_start[s + 1] - p.super_start[s], (int)(p.row_start[s + 1] - start)};
+        forward_panel(L, y + p.super_start[s], p.rows + start, y, scratch);
+    }
+    for (int s = p.supernodes - 1; s >= 0; --s) {
+        int64_t start = p.row_start[s];
+        Panel<T> L{values + p.value_start[s], p.super_start[s + 1] - p.super_start[s], (int)(p.row_start[s + 1] - start)};
+        backward_panel(L, y + p.super_start[s], p.rows + start, y, scratch);
+    }
+    double back = 1 / scale;
+    for (int i = 0; i < p.size; ++i) z[p.permutation[i]] = back * (double)y[i];
+}

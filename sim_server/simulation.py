@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: MIT
+"""A scene made ready to run: effects built, the launches of a step listed, the native loop set up.
+
+THE STEP is the list made in `launches`: backward Euler with one linearization (Courtecuisse et al. 2010, eq. 5),
+    (M - h B - h^2 K) dv = h f + h^2 K v,    v += dv,    x += h v.
+Start reading there.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_server.backend import Launch
+from sim_server.effect import Effect
+from sim_server.effects import effect
+from sim_server.engine import Engine, Kind
+from sim_server.scene import Scene, load
+from sim_server.system import System
+from sim_server.world import Body, World
+
+KINDS = {"none": Kind.NONE, "jacobi": Kind.JACOBI, "block_jacobi": Kind.BLOCK_JACOBI, "cholesky": Kind.CHOLESKY}
+
+
+class Simulation:
+    """A scene on the CPU. `engine.run(n)` makes n steps; policies for factors are driver.py's business.
+
+    Raises InputError for a scene that cannot be built.
+    """
+
+    def __init__(self, scene: Scene, record_frames: bool = False):
+        self.scene = scene
+        self.world = World(scene)
+        self.effects = build_effects(scene, self.world)
+        stencilled = [e for e in self.effects.values() if e.tets is not None]
+        self.system = System(self.world, [e.tets for e in stencilled if e.tets is not None], self._warped())
+        assemble, integrate = self.launches()
+        w, s = self.world, self.system
+        self.engine = Engine(
+            assemble, integrate, [(b.first, b.last) for b in w.bodies], w.dt, threads=scene.solver.threads,
+            row_start=s.row_start, columns=s.columns, values=s.values, b=s.b_material, y=s.y, x=w.x, v=w.v,
+            clock=s.clock,
+        )  # fmt: skip
+        self.engine.loop.frame_every = scene.record.every if record_frames else 0
+        for body in w.bodies:
+            self._settle(body)
+
+    @classmethod
+    def load(cls, path: str | Path, overrides: Sequence[str] = ()) -> "Simulation":
+        """From a scene file."""
+        return cls(load(path, overrides))
+
+    def launches(self) -> tuple[list[Launch], list[Launch]]:
+        """What a step runs: before and after the solve."""
+        system = self.system
+        assemble = [system.start()]
+        stencils = iter(system.stencils)
+        accumulate = False
+        for e in self.effects.values():
+            stencil = next(stencils) if e.tets is not None else None
+            assemble += e.launches(system, stencil, accumulate)  # f and K, M, B of each effect
+            accumulate = accumulate or stencil is not None
+        assemble += system.finish()  # into the material frame (eq. 12 and 13)
+        return assemble, [system.advance()]
+
+    def _warped(self) -> NDArray[np.float64]:
+        """1 at nodes whose solve happens in the material frame."""
+        warped = np.zeros(self.world.nodes)
+        if self.scene.solver.warp is not False:
+            for e in self.effects.values():
+                for body in e.rotated:
+                    warped[body.nodes] = 1
+        return warped
+
+    def _settle(self, body: Body) -> None:
+        solver, native = self.scene.solver, self.engine.settings(body.index)
+        native.tolerance, native.max_iterations = solver.tolerance, solver.max_iterations
+        native.budget, native.warm_start = solver.budget, int(solver.warm_start)
+        native.kind = KINDS.get(solver.preconditioner, Kind.CHOLESKY)
+
+    def potential_energy(self) -> float:
+        """Of all effects [J]."""
+        return sum(e.energy() for e in self.effects.values())
+
+    def kinetic_energy(self) -> float:
+        """m v^2 / 2 of all nodes [J]."""
+        return 0.5 * float(self.world.mass @ (self.world.v**2).sum(axis=1))
+
+    def matrix(self, body: int = 0) -> Any:
+        """A' of a body as it was last assembled, scipy.sparse (3 n, 3 n)."""
+        from scipy.sparse import bsr_array
+
+        b = self.world.bodies[body]
+        row_start, columns = self.system.body_pattern(b.first, b.last)
+        n = 3 * (b.last - b.first)
+        return bsr_array((self.system.body_values(b.first, b.last).copy(), columns, row_start), shape=(n, n)).tocsc()
+
+
+def build_effects(scene: Scene, world: World) -> dict[str, Effect]:
+    """The effects that the scene lists, and no others. Those that change node data come before those that use it."""
+    built: dict[str, Effect] = {}
+    for name in sorted({n for o in scene.objects for n in o.effects}, key=_order):
+        built[name] = effect(name).build(world, world.with_effect(name))
+    for name, params in scene.effects.items():
+        built[name] = effect(name).build(world, [(body, params) for body in world.bodies])
+    return built
+
+
+def _order(name: str) -> tuple[int, str]:
+    return (getattr(effect(name), "ORDER", 1), name)
