@@ -1,0 +1,10 @@
+# SPDX-License-Identifier: MIT
+"""The one error that a user of the commands is meant to read."""
+
+
+class InputError(Exception):
+    """Bad input: a scene, mesh, option or expression that cannot be used.
+
+    The text names the file, the field, the value and what is allowed. Commands print it without a traceback
+    and exit with code 2.
+    """
