@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: MIT
+"""Tetrahedral meshes: bars made here, files read through meshio, checks, and the pose."""
+
+import contextlib
+import io
+import itertools
+import logging
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from os.path import isfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sim_server.errors import InputError
+from sim_server.mesh_check import complaints, indices
+from sim_server.surface import volumes
+
+log = logging.getLogger(__name__)
+
+MOST_TETS = 10_000_000  # of a bar: what a typing error may ask for
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Nodes at rest, before the pose, and tetrahedra.
+
+    rest: float64 (n, 3) [m]; tets: int32 (m, 4), positive volume once checked; name: for messages.
+    """
+
+    rest: NDArray[np.float64]
+    tets: NDArray[np.int32]
+    name: str = "mesh"
+
+
+def bar(cells: Sequence[int], size: Sequence[float]) -> Mesh:
+    """A box of `size` [m] with a corner at the origin, each of its nx ny nz hexahedra split into 6 tetrahedra.
+
+    Kuhn split: one tetrahedron per order of the axes along which a path leads from the lowest corner of the cell to
+    the opposite one, so neighbouring cells match. Nodes are numbered x fastest, then y, then z; so are the cells.
+    Raises InputError unless there are three counts >= 1 and three finite sizes > 0.
+    """
+    if len(cells) != 3 or min(cells) < 1 or 6 * math.prod(cells) > MOST_TETS:
+        raise InputError(f"bar = {list(cells)}: must be three counts of cells >= 1, at most {MOST_TETS} tets in all")
+    if len(size) != 3 or not all(np.isfinite(s) and s > 0 for s in size):
+        raise InputError(f"size = {list(size)}: must be three lengths > 0 [m]")
+    nx, ny, nz = cells
+    k, j, i = (axis.ravel() for axis in np.mgrid[: nz + 1, : ny + 1, : nx + 1])
+    rest = np.stack([i * size[0] / nx, j * size[1] / ny, k * size[2] / nz], axis=1)
+
+    stride = np.array([1, nx + 1, (nx + 1) * (ny + 1)])
+    k, j, i = (axis.ravel() for axis in np.mgrid[:nz, :ny, :nx])
+    corner = np.stack([i, j, k], axis=1) @ stride
+    tets = corner[:, None, None] + _kuhn_paths(stride)
+    name = "bar " + "x".join(str(c) for c in cells)
+    return Mesh(rest, tets.reshape(-1, 4).astype(np.int32), name)
+
+
+def _kuhn_paths(stride: NDArray[np.integer]) -> NDArray[np.integer]:
+    """Node offsets of the six tetrahedra of a cell, (6, 4); odd orders of the axes have their last nodes swapped."""
+    paths = []
+    for order in itertools.permutations(range(3)):
+        path = np.concatenate([[0], np.cumsum(stride[list(order)])])
+        odd = np.linalg.det(np.eye(3)[list(order)]) < 0
+        paths.append(path[[0, 1, 3, 2]] if odd else path)
+    return np.array(paths)
+
+
+def read(path: str | Path) -> Mesh:
+    """The tetrahedra of a file in any format that meshio knows; unchecked, see `check`.
+
+    10-node tetrahedra are reduced to their corners. Triangles, lines and points of the file are left out.
+    Raises InputError naming the file: missing, unreadable, unknown format, or no tetrahedra.
+    """
+    path = Path(path)
+    if not isfile(path):
+        raise InputError(f"mesh {path}: no such file")
+    data = _meshio_read(path)
+    rest = np.asarray(data.points, dtype=np.float64)
+    linear = [np.asarray(block.data) for block in data.cells if block.type == "tetra"]
+    quadratic = [np.asarray(block.data) for block in data.cells if block.type == "tetra10"]
+    if not linear and not quadratic:
+        found = ", ".join(sorted({block.type for block in data.cells})) or "none"
+        raise InputError(f"mesh {path}: no tetrahedra; cells in it: {found}; needed: tetra or tetra10")
+    tets = np.concatenate([block[:, :4] for block in linear + quadratic]).astype(np.int64)
+    if wrong := indices(rest, tets):
+        raise InputError(f"mesh {path}: {wrong}")
+    if quadratic:
+        rest, tets = _without_midnodes(rest, tets, np.concatenate(quadratic)[:, 4:])
+        log.info("mesh %s: 10-node tetrahedra reduced to their 4 corners, mid-edge nodes dropped", path)
+    return Mesh(rest, tets.astype(np.int32), path.name)
+
+
+def _meshio_read(path: Path) -> Any:
+    import meshio
+    from meshio._helpers import extension_to_filetypes
+
+    formats = f"formats by extension: {' '.join(sorted(extension_to_filetypes))}"
+    said = io.StringIO()  # meshio prints its reasons, and ends the process where it cannot read a file
+    try:
+        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+            return meshio.read(path)
+    except ImportError as error:
+        raise InputError(f"mesh {path}: reading it needs the Python package {error.name!r}") from error
+    except (Exception, SystemExit) as error:
+        text = said.getvalue().strip() or str(error)
+        reason = " ".join(text.split())[:200] or type(error).__name__
+        raise InputError(f"mesh {path}: cannot be read ({reason}); {formats}") from error
+
+
+def _without_midnodes(
+    rest: NDArray[np.float64], tets: NDArray[np.int64], midnodes: NDArray[np.integer]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    keep = np.ones(len(rest), dtype=bool)
+    keep[midnodes[(midnodes >= 0) & (midnodes < len(rest))]] = False
+    keep[tets] = True
+    number = np.cumsum(keep) - 1
+    return rest[keep], number[tets]
+
+
+def check(mesh: Mesh) -> Mesh:
+    """`mesh` with every tetrahedron wound to positive volume; how many were turned is logged.
+
+    Raises InputError that names the first nodes or tetrahedra concerned: not finite, out of range, flat, duplicate,
+    coincident or unused.
+    """
+    if wrong := list(complaints(mesh.rest, mesh.tets)):
+        raise InputError("\n".join(f"mesh {mesh.name}: {text}" for text in wrong))
+    inverted = volumes(mesh.rest, mesh.tets) < 0
+    if not inverted.any():
+        return mesh
+    tets = mesh.tets.copy()
+    tets[inverted] = tets[inverted][:, [0, 1, 3, 2]]
+    log.warning("mesh %s: winding of %d of %d tets repaired", mesh.name, int(inverted.sum()), len(tets))
+    return replace(mesh, tets=tets)
+
+
+def pose_matrix(rotate: ArrayLike) -> NDArray[np.float64]:
+    """Rotation (3, 3) by `rotate` = three angles [degrees] about the fixed axes x, then y, then z: Rz Ry Rx."""
+    (cx, cy, cz), (sx, sy, sz) = (f(np.radians(np.asarray(rotate, dtype=float))) for f in (np.cos, np.sin))
+    about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
+    about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
+    about_z = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
+    return about_z @ about_y @ about_x
+
+
+def posed(points: NDArray[np.float64], rotate: ArrayLike, translate: ArrayLike) -> NDArray[np.float64]:
+    """`points` (n, 3) [m] rotated by `pose_matrix`, then moved by `translate` [m]."""
+    return points @ pose_matrix(rotate).T + np.asarray(translate, dtype=float)

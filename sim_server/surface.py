@@ -1,0 +1,33 @@
+# SPDX-License-Identifier: MIT
+"""Volumes and the outer surface of a tetrahedral mesh."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+# Faces of a tetrahedron of positive volume, normals outward by the right-hand rule.
+FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+
+
+def volumes(rest: NDArray[np.float64], tets: NDArray[np.integer]) -> NDArray[np.float64]:
+    """Signed volumes [m3], (m,): det(x1 - x0, x2 - x0, x3 - x0) / 6."""
+    a, b, c = (rest[tets[:, k]] - rest[tets[:, 0]] for k in (1, 2, 3))
+    return np.einsum("ij,ij->i", np.cross(a, b), c) / 6.0
+
+
+def centroids(rest: NDArray[np.float64], tets: NDArray[np.integer]) -> NDArray[np.float64]:
+    """Centroids [m], (m, 3)."""
+    return rest[tets].mean(axis=1)
+
+
+def surface_triangles(tets: NDArray[np.integer]) -> NDArray[np.int32]:
+    """The faces that belong to one tetrahedron only: int32 (t, 3), outward for positive volumes.
+
+    They come in the order of the tetrahedra.
+    """
+    faces = tets[:, FACES].reshape(-1, 3)
+    corners = np.sort(faces, axis=1)
+    order = np.lexsort(corners.T)
+    differs = np.any(np.diff(corners[order], axis=0) != 0, axis=1)
+    starts = np.concatenate([[True], differs])  # where a new face begins in sorted order
+    single = starts & np.concatenate([differs, [True]])
+    return faces[np.sort(order[single])].astype(np.int32)
