@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: MIT
+"""KEY=VALUE overrides of a scene: ``--set solver.tolerance=1e-8`` on the command line."""
+
+import re
+import tomllib
+from typing import Any
+
+from sim_server.errors import InputError
+from sim_server.parameters import nearest
+
+
+def apply(override: str, table: dict[str, Any]) -> None:
+    """Set one value of a parsed scene: ``solver.tolerance=1e-8``, ``object.NAME.effects.corotational.young=1e6``.
+
+    Tables on the way are made if they are missing, so an override may list an effect; whether the key exists is left
+    to the validation. Raises InputError for an unknown object or a key below something that is no table.
+    """
+    key, equals, text = override.partition("=")
+    key = key.strip()
+    if not equals or not key or not all(key.split(".")):
+        raise InputError("must be KEY=VALUE, as solver.tolerance=1e-8 or object.beam.density=900")
+    place = table
+    if key == "object" or key.startswith("object."):
+        place, key = _object(key.removeprefix("object").lstrip("."), table)
+    *parents, last = key.split(".")
+    for depth, part in enumerate(parents):
+        below = place.get(part)
+        if below is None or below is True:  # an effect listed as true: its defaults
+            below = place[part] = {}
+        if not isinstance(below, dict):
+            raise InputError(f"{'.'.join(parents[: depth + 1])} = {below!r} is no table, so it has no keys")
+        place = below
+    place[last] = value(text.strip())
+
+
+def _object(key: str, table: dict[str, Any]) -> tuple[dict[str, Any], str]:
+    """The object's table and the key inside it. Names may hold dots, so the longest name that fits wins."""
+    entries = table.get("object")
+    entries = [e for e in entries if isinstance(e, dict)] if isinstance(entries, list) else []
+    named = {e["name"]: e for e in entries if isinstance(e.get("name"), str)}
+    fitting = [name for name in named if key.startswith(name + ".")]
+    if not fitting:
+        wanted = key.split(".")[0]
+        raise InputError(f"no object {wanted!r} with a key after it" + nearest(wanted, list(named), "objects"))
+    name = max(fitting, key=len)
+    return named[name], key[len(name) + 1 :]
+
+
+def value(text: str) -> Any:
+    """`text` as a TOML value; a bare word that is not TOML is a string."""
+    try:
+        parsed = tomllib.loads(f"value = {text}")
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        if not text or re.match(r"[\[{\"']", text):
+            raise InputError(f"value {text!r} is not valid TOML: {error}") from None
+        return text
+    return parsed["value"] if len(parsed) == 1 else text

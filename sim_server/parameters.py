@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: MIT
+"""Base of everything that is read from a scene file: strict types, no unknown keys, finite numbers.
+
+The tables of a scene and the `Params` of each effect derive from `Parameters`, so that one wrong key or value is
+reported in the same words everywhere, together with the keys that exist.
+"""
+
+from difflib import get_close_matches
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic_core import InitErrorDetails, PydanticCustomError
+from pydantic_core.core_schema import ValidatorFunctionWrapHandler
+
+from sim_server import where
+from sim_server.errors import InputError
+
+
+class Parameters(BaseModel):
+    """A table of a scene file. TOML types are taken as they are: "1" is no number and 1 is no boolean."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _name_the_known_keys(cls, table: Any, validate: ValidatorFunctionWrapHandler) -> Any:
+        try:
+            return validate(table)
+        except ValidationError as error:
+            known = [field.alias or name for name, field in cls.model_fields.items()]
+            details = [_with_known_keys(e, known) for e in error.errors(include_url=False)]
+            raise ValidationError.from_exception_data(cls.__name__, details) from None
+
+
+def _with_known_keys(error: Any, known: list[str]) -> InitErrorDetails:
+    kind, message = error["type"], error["msg"]
+    if kind == "extra_forbidden" and len(error["loc"]) == 1:
+        kind, message = "unknown_key", "unknown key" + nearest(str(error["loc"][0]), known, "keys")
+    return InitErrorDetails(type=complaint(message, kind), loc=error["loc"], input=error["input"])
+
+
+def complaint(message: str, kind: str = "refused") -> PydanticCustomError:
+    """An error of a validator; its message stands in the report as it is, after the place and the value."""
+    return PydanticCustomError(kind, "{message}", {"message": message})  # type: ignore[arg-type]
+
+
+def nearest(word: str, known: list[str], what: str) -> str:
+    """The end of a message about an unknown word: the nearest known ones, then all."""
+    near = get_close_matches(word, known, n=3, cutoff=0.6)
+    guess = f"; did you mean {' or '.join(repr(n) for n in near)}?" if near else ""
+    return f"{guess} (known {what}: {', '.join(sorted(known))})"
+
+
+def _as_tuple(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value
+
+
+def _readable_expression(text: str) -> str:
+    try:
+        where.parse(text)
+    except InputError as error:
+        raise complaint(str(error)) from None
+    return text
+
+
+Vector = Annotated[tuple[float, float, float], BeforeValidator(_as_tuple)]
+Positive = Annotated[float, Field(gt=0)]
+Sizes = Annotated[tuple[Positive, Positive, Positive], BeforeValidator(_as_tuple)]
+Count = Annotated[int, Field(ge=1, le=1_000_000)]
+Counts = Annotated[tuple[Count, Count, Count], BeforeValidator(_as_tuple)]
+Where = Annotated[str, AfterValidator(_readable_expression)]

@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: MIT
+"""Validation errors in words: file, object, key = value, what is allowed; one line each."""
+
+import re
+from typing import Any
+
+from pydantic import ValidationError
+
+from sim_server.errors import InputError
+
+# Where pydantic's own words are about Python rather than about a scene file.
+WORDS = {
+    "missing": "missing",
+    "float_type": "must be a number",
+    "int_type": "must be a whole number",
+    "bool_type": "must be true or false",
+    "string_type": "must be a string",
+    "tuple_type": "must be an array",
+    "list_type": "must be an array",
+    "model_type": "must be a table",
+    "model_attributes_type": "must be a table",
+}
+LONGEST = 80  # characters of a value in a message
+
+
+def readable(error: ValidationError, file: str, table: dict[str, Any]) -> InputError:
+    """One InputError for all of `error`, met while validating `table` read from `file`."""
+    return InputError("\n".join(f"scene {file}, {_line(e, table)}" for e in error.errors(include_url=False)))
+
+
+def _line(error: Any, table: dict[str, Any]) -> str:
+    path = [part for part in error["loc"] if not str(part).startswith("<")]
+    message = _message(error)
+    if path == ["object"] and error["type"] == "missing":
+        message = "a scene needs at least one [[object]]"
+    elif path == ["object"] and isinstance(error["input"], dict):
+        message = "write [[object]] with double brackets, once per object"
+    place = _place(path, table)
+    if error["type"] != "missing" and not isinstance(error["input"], dict) and path[:1] and path != ["object"]:
+        place += f" = {_toml(error['input'])}"
+    return f"{place}: {message}"
+
+
+def _message(error: Any) -> str:
+    if error["type"] == "literal_error":
+        expected = error["msg"].removeprefix("Input should be ")
+        return "must be " + expected.replace("True", "true").replace("False", "false")
+    words = re.sub(r"^(Input|Tuple|List|String) should", "must", error["msg"])
+    return WORDS.get(error["type"], words.replace(" after validation", ""))
+
+
+def _place(path: list[str | int], table: dict[str, Any]) -> str:
+    if len(path) >= 2 and path[0] == "object" and isinstance(path[1], int):
+        where = [_object(path[1], table), _dotted(path[2:])]
+        return ", ".join(part for part in where if part)
+    return _dotted(path)
+
+
+def _object(index: int, table: dict[str, Any]) -> str:
+    entry = table["object"][index]
+    name = entry.get("name") if isinstance(entry, dict) else None
+    return f"object {name!r}" if isinstance(name, str) and name else f"object {index + 1}"
+
+
+def _dotted(path: list[str | int]) -> str:
+    """a.b[2].c; arrays are counted from 1, as people do."""
+    text = ""
+    for part in path:
+        text += f"[{part + 1}]" if isinstance(part, int) else f".{part}"
+    return text.lstrip(".")
+
+
+def _toml(value: Any) -> str:
+    text = str(value).lower() if isinstance(value, bool) else repr(value)
+    return text if len(text) <= LONGEST else text[:LONGEST] + "..."

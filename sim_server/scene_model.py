@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: MIT
+"""The tables of a scene file, checked, with defaults filled in. How a file becomes one: scene.py."""
+
+from functools import partial
+from os.path import isfile
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    Field,
+    PlainSerializer,
+    PlainValidator,
+    PrivateAttr,
+    ValidationInfo,
+    model_validator,
+)
+
+from protocol.channels import check_name
+from protocol.refused import Refused
+from sim_server import where
+from sim_server.errors import InputError
+from sim_server.mesh import Mesh, bar, check, read
+from sim_server.parameters import Count, Counts, Parameters, Positive, Sizes, Vector, complaint
+from sim_server.scene_effects import checked_effects
+from sim_server.solver_options import Solver
+
+
+class Pose(Parameters):
+    """Where the object stands: turned about the fixed axes x, then y, then z, then moved."""
+
+    rotate: Vector = Field(default=(0.0, 0.0, 0.0), description="angles [degrees]")
+    translate: Vector = Field(default=(0.0, 0.0, 0.0), description="[m]")
+
+
+def _found(name: str, info: ValidationInfo) -> str:
+    path = Path((info.context or {}).get("folder", ".")) / name
+    if not isfile(path):  # unlike Path.is_file, never raises: names may be too long or hold a null byte
+        raise complaint(
+            f"no such file ({where.shortened(str(path), 200)}); a relative path starts at the folder of the scene file"
+        )
+    return str(path.resolve())
+
+
+class MeshSource(Parameters):
+    """{ bar = cells, size = m } or { file = path }."""
+
+    bar: Counts | None = Field(default=None, description="cells along x, y, z; each is split into 6 tetrahedra")
+    size: Sizes | None = Field(default=None, description="size of the bar along x, y, z [m]")
+    file: Annotated[str, AfterValidator(_found)] | None = Field(default=None, description="a file that meshio reads")
+
+    @model_validator(mode="after")
+    def _one_source(self) -> "MeshSource":
+        given = [name for name in ("bar", "size", "file") if getattr(self, name) is not None]
+        if given not in (["bar", "size"], ["file"]):
+            raise complaint(f"must be {{ bar = [nx, ny, nz], size = [sx, sy, sz] }} or {{ file = ... }}, not {given}")
+        return self
+
+
+def _object_name(name: str) -> str:
+    try:
+        return check_name(name, "name")  # it becomes part of a channel's key
+    except Refused:
+        raise complaint("must be 1 to 64 characters of A-Z a-z 0-9 _ . -") from None
+
+
+def _effects(scope: str) -> tuple[PlainValidator, PlainSerializer]:
+    """A table of effects of one scope; it dumps as it was validated, one table per effect."""
+    return PlainValidator(partial(checked_effects, scope)), PlainSerializer(_dumped_effects)
+
+
+def _dumped_effects(effects: dict[str, BaseModel]) -> dict[str, Any]:
+    return {name: params.model_dump(mode="json") for name, params in effects.items()}
+
+
+class SceneObject(Parameters):
+    """One deformable object."""
+
+    name: Annotated[str, AfterValidator(_object_name)]
+    mesh: MeshSource
+    pose: Pose = Pose()
+    density: Positive | None = Field(default=None, description="[kg/m3]; 1000 if neither density nor mass is given")
+    mass: Positive | None = Field(default=None, description="of the whole object, instead of density [kg]")
+    masses: Literal["volume", "equal"] = Field(
+        default="volume", description="nodal masses: a quarter of each adjacent element, or the same for every node"
+    )
+    effects: Annotated[dict[str, BaseModel], *_effects("object")] = Field(default_factory=dict)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _water_by_default(cls, table: Any) -> Any:
+        if isinstance(table, dict) and table.get("density") is None and table.get("mass") is None:
+            return {**table, "density": 1000.0}
+        return table
+
+    @model_validator(mode="after")
+    def _density_or_mass(self) -> "SceneObject":
+        if self.density is not None and self.mass is not None:
+            raise complaint(f"give density or mass, not both (density = {self.density:g}, mass = {self.mass:g})")
+        return self
+
+    def load_mesh(self) -> Mesh:
+        """The checked mesh at rest, before the pose. Raises InputError naming the object."""
+        source = self.mesh
+        try:
+            if source.file is not None:
+                return check(read(source.file))
+            assert source.bar is not None and source.size is not None
+            return bar(source.bar, source.size)
+        except InputError as error:
+            raise InputError(f"object {self.name!r}: {error}") from error
+
+
+class Record(Parameters):
+    """What a log holds."""
+
+    every: Count = Field(default=1, description="a state frame each k-th step; per-step scalars are always recorded")
+    compression: Literal["lz4", "zstd", "none"] = "lz4"
+
+
+def _some_objects(objects: list[SceneObject]) -> list[SceneObject]:
+    if not objects:
+        raise complaint("a scene needs at least one [[object]]")
+    names = [o.name for o in objects]
+    if twice := sorted({n for n in names if names.count(n) > 1}):
+        raise complaint(f"names must differ; more than once: {', '.join(twice)}")
+    return objects
+
+
+class Scene(Parameters):
+    """A whole scene file. `resolved()` is a valid scene again."""
+
+    dt: Positive = Field(description="time step [s]")
+    name: Annotated[str, Field(min_length=1, max_length=200)]
+    effects: Annotated[dict[str, BaseModel], *_effects("scene")] = Field(default_factory=dict)
+    solver: Solver = Solver()
+    record: Record = Record()
+    objects: Annotated[list[SceneObject], AfterValidator(_some_objects)] = Field(alias="object")
+
+    _path: Path = PrivateAttr(Path())
+    _text: str = PrivateAttr("")
+
+    @property
+    def path(self) -> Path:
+        """The file that the scene was read from."""
+        return self._path
+
+    @property
+    def text(self) -> str:
+        """The file as read, before overrides."""
+        return self._text
+
+    def resolved(self) -> dict[str, Any]:
+        """The scene with defaults filled in, of JSON types only, with the keys of a scene file."""
+        return self.model_dump(mode="json", by_alias=True, exclude_none=True)

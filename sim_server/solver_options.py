@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: MIT
+"""The [solver] table of a scene."""
+
+import re
+from typing import Annotated, Any, Literal, NamedTuple
+
+from pydantic import Field, PlainSerializer, PlainValidator
+
+from sim_server.parameters import Parameters, complaint
+
+PRECONDITIONERS = ("auto", "none", "jacobi", "block_jacobi", "cholesky")
+NOT_YET = ("ssor", "incomplete_cholesky")
+
+Preconditioner = Literal["auto", "none", "jacobi", "block_jacobi", "cholesky"]
+
+
+class Update(NamedTuple):
+    """When a factor is renewed: kind and n (0 for never and async).
+
+    never: made once, from the first matrix. every: made at each n-th step, the step waiting for it.
+    async: made beside the simulation, adopted when it comes. lockstep: as async, but adopted exactly n steps after
+    the step that its matrix is from; deterministic.
+    """
+
+    kind: Literal["never", "every", "async", "lockstep"]
+    n: int = 0
+
+    def __str__(self) -> str:
+        return f"{self.kind}-{self.n}" if self.kind in ("every", "lockstep") else self.kind
+
+
+def _update(value: Any) -> Update:
+    if isinstance(value, Update):
+        return value
+    if value in ("never", "async"):
+        return Update(value)
+    if isinstance(value, str) and (match := re.fullmatch(r"(every|lockstep)-([1-9][0-9]{0,5})", value)):
+        return Update(match[1], int(match[2]))  # type: ignore[arg-type]  # one of two words by the pattern
+    raise complaint('must be "never", "async", "every-N" or "lockstep-D" with a whole number of steps, as "every-30"')
+
+
+def _preconditioner(value: Any) -> str:
+    if isinstance(value, str) and value in PRECONDITIONERS:
+        return value
+    allowed = ", ".join(PRECONDITIONERS)
+    if isinstance(value, str) and value in NOT_YET:
+        raise complaint(f"{value} is a known preconditioner but not available yet; available: {allowed}")
+    raise complaint(f"must be one of {allowed}")
+
+
+def _warp(value: Any) -> bool | str:
+    if value == "auto" or isinstance(value, bool):  # Literal[True] alone would take 1 as well
+        return value
+    raise complaint('must be true, false or "auto"')
+
+
+class Solver(Parameters):
+    """How each step's linear system is solved."""
+
+    tolerance: float = Field(default=1e-6, gt=0, lt=1, description="of the true residual: |b - A dv| <= tolerance |b|")
+    max_iterations: int = Field(default=500, ge=1, le=1_000_000)
+    preconditioner: Annotated[Preconditioner, PlainValidator(_preconditioner)] = "auto"
+    warp: Annotated[Literal[True, False, "auto"], PlainValidator(_warp)] = Field(
+        default="auto", description="solve in the material frame"
+    )
+    update: Annotated[Update, PlainValidator(_update), PlainSerializer(str)] = Update("async")
+    factor_precision: Literal["float32", "float64"] = "float32"
+    budget: float = Field(default=0.0, ge=0, description="wall time per solve [s]; 0 = none")
+    threads: int = Field(default=1, ge=1, le=1024)
+    warm_start: bool = Field(default=True, description="start from the last step's dv")
+    update_floor_iterations: int = Field(
+        default=3, ge=0, le=1_000_000, description="iterations above this count as excess"
+    )
+    update_floor_steps: int = Field(
+        default=1, ge=1, le=1_000_000, description="fewest steps between two factors of an object"
+    )

@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: MIT
+"""Young's modulus and Poisson's ratio per element."""
+
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sim_server.errors import InputError
+from sim_server.regions import Region, region_values
+from sim_server.scene import load
+from sim_server.surface import centroids
+
+POINTS = np.array([[0.5, 0, 0], [1.5, 0, 0], [2.5, 0, 0]])
+
+
+def test_one_value_for_all():
+    young, poisson = region_values(1e6, 0.3, POINTS)
+    assert young.tolist() == [1e6] * 3 and poisson.tolist() == [0.3] * 3
+
+
+def test_first_region_that_holds_wins_and_the_last_takes_the_rest(caplog):
+    regions = [
+        Region(where="X < 1", young=1.0, poisson=0.1),
+        Region(where="X < 2", young=2.0),
+        Region(where="X < 1.5", young=9.0),
+        Region(young=3.0, poisson=0.49),
+    ]
+    with caplog.at_level(logging.WARNING):
+        young, poisson = region_values(regions, 0.3, POINTS)
+    assert young.tolist() == [1, 2, 3] and poisson.tolist() == [0.1, 0.3, 0.49]
+    assert "region 3 (where = 'X < 1.5', young = 9 Pa) holds no element" in caplog.text
+
+
+def test_element_in_no_region():
+    with pytest.raises(InputError) as error:
+        region_values([Region(where="X < 1", young=1.0)], 0.3, POINTS)
+    assert "element 1 with centroid (1.5, 0, 0) m is in no region of young (2 such elements)" in str(error.value)
+
+
+def test_bands_of_the_heterogeneous_scene():
+    scene = load(Path(__file__).parents[2] / "deploy" / "scenes" / "heterogeneous.toml")
+    mesh = scene.objects[0].load_mesh()
+    params = scene.objects[0].effects["corotational"]
+    young, poisson = region_values(params.young, params.poisson, centroids(mesh.rest, mesh.tets))
+    values, counts = np.unique(young, return_counts=True)
+    assert values.tolist() == [5e4, 2.5e5, 5e6] and counts.tolist() == [1050, 1050, 1050]
+    assert set(poisson) == {0.4}
