@@ -1,0 +1,13 @@
+# SPDX-License-Identifier: MIT
+"""Why a matrix has no factor."""
+
+
+class NotPositiveDefinite(ValueError):
+    """The matrix has no Cholesky factor in the precision asked for.
+
+    column: first column of L whose pivot failed, -1 if that is not known.
+    """
+
+    def __init__(self, text: str, column: int = -1):
+        super().__init__(text)
+        self.column = column
