@@ -33,11 +33,13 @@ have_software_vulkan() { compgen -G '/usr/share/vulkan/icd.d/lvp_icd*.json' >/de
 
 # missing_packages [mesa-vulkan-drivers]: names of the Debian packages for what is not there.
 missing_packages() {
-    have_python || echo python3
-    have_venv || echo python3-venv
+    if [ -z "${PYTHON:-}" ]; then  # another interpreter brings its own
+        have_python || echo python3
+        have_venv || echo python3-venv
+        have_python_headers || echo python3-dev
+    fi
     have_compiler || echo g++
-    # scikit-sparse is built here, with CHOLMOD on OpenBLAS: on the reference BLAS a factorization takes 4 to 10 times as long.
-    have_python_headers || echo python3-dev
+    # CHOLMOD, and OpenBLAS for it: on the reference BLAS a factorization takes 4 to 10 times as long.
     have_suitesparse || echo libsuitesparse-dev
     have_openblas || echo libopenblas-dev
     if [ "${1:-}" = mesa-vulkan-drivers ]; then
