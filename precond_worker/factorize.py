@@ -21,10 +21,7 @@ from protocol.check import all_finite
 __all__ = ["CHOICE", "Analysis", "NotPositiveDefinite", "default_library"]
 
 CHOICE = "WARPFACTOR_FACTORIZATION"  # environment: cholmod or superlu
-SUPERLU_COST = (
-    "SciPy's SuperLU factorizes instead of CHOLMOD, about 1.5 times slower at 3,000 tetrahedra, 2 at 24,000 and 3 at "
-    "100,000, so factors are older by as much"
-)
+SUPERLU_COST = "SciPy's SuperLU factorizes instead of CHOLMOD, 2 to 3 times slower, so factors are older by as much"
 
 
 class Numeric(Protocol):
