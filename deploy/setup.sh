@@ -83,6 +83,9 @@ install_system_packages() {
     else
         say "packages are missing, and this user is neither root nor may use sudo. An administrator may run: $words"
     fi
+}
+
+require_essentials() {
     have_python || stop 2 "Python 3.11 or later is needed (Debian: python3); PYTHON=... names another than python3"
     have_venv || stop 2 "Python's venv module is needed (Debian: python3-venv)"
     have_compiler || stop 2 "a C++ compiler is needed: kernels are compiled at run time (Debian: g++)"
@@ -176,6 +179,7 @@ set_up() {
         flock 9
     fi
     install_system_packages "$@"
+    require_essentials
     check_blas
     install_python_packages "$extras"
     if have flock; then
