@@ -97,6 +97,7 @@ def _library() -> c.CDLL:
         "native/loop.cpp",
         {
             "wf_assemble": (None, [loop]), "wf_solve": (None, [loop]), "wf_run": (c.c_int64, [loop, c.c_int64]),
+            "wf_wait": (c.c_int32, [loop]),
             "wf_post_factor": (p, [c.POINTER(_Body), p]), "wf_post_binding": (p, [c.POINTER(_Launch), p]),
             "wf_apply_factor": (None, [c.POINTER(_Factor), p, p, p]), "wf_sizes": (c.c_int32, [p]),
         },
@@ -201,6 +202,10 @@ class Engine:
         """Second half: solve, integrate, report."""
         self._native.wf_solve(c.byref(self.loop))
 
+    def wait(self) -> None:
+        """Sleeps until the next step is due (real time) and while paused, as `run` does before each step."""
+        self._native.wf_wait(c.byref(self.loop))
+
     @property
     def step(self) -> int:
         """Steps completed."""
@@ -236,6 +241,11 @@ class Engine:
         """Step of the factor in use, -1 without one."""
         address = self._body[body].factor
         return int(c.cast(address, c.POINTER(_Factor)).contents.step) if address else -1
+
+    def factor_bytes(self, body: int) -> int:
+        """Size of the values of the factor buffers of a body, 0 while there are none."""
+        buffers = self._mail[body].buffers
+        return buffers[-1].values.nbytes if buffers else 0
 
     def request_matrix(self, body: int, target: Reals) -> None:
         """The loop copies the values of A into `target` once they are next assembled."""

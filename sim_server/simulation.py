@@ -99,14 +99,11 @@ class Simulation:
 
 
 def build_effects(scene: Scene, world: World) -> dict[str, Effect]:
-    """The effects that the scene lists, and no others. Those that change node data come before those that use it."""
+    """The effects that the scene lists, and no others."""
     built: dict[str, Effect] = {}
-    for name in sorted({n for o in scene.objects for n in o.effects}, key=_order):
+    for name in sorted({n for o in scene.objects for n in o.effects}):
         built[name] = effect(name).build(world, world.with_effect(name))
     for name, params in scene.effects.items():
         built[name] = effect(name).build(world, [(body, params) for body in world.bodies])
     return built
 
-
-def _order(name: str) -> tuple[int, str]:
-    return (getattr(effect(name), "ORDER", 1), name)

@@ -2,16 +2,6 @@
 // Pushes and grabs of remote clients (touch.py).
 #include "mat3.cuh"
 
-struct Begin {
-    int n;              // interactions
-    const real* clock;  // (1,) time at the start of the step [s]
-    real* start;        // (n,) in, out: time it began; negative: now [s]
-};
-
-KERNEL(begin, Begin) {
-    if (p.start[i] < 0) p.start[i] = p.clock[0];
-}
-
 struct Apply {
     int n;                  // nodes touched
     const int* node;        // (n,)
@@ -19,7 +9,7 @@ struct Apply {
     const int* entry;       // (first[n],) interaction of each entry
     const real* offset;     // (first[n], 3) of the node from the grabbed point [m]
     const real* share;      // (interactions,) 1 / nodes of the interaction
-    const real* start;      // (interactions,) [s]
+    real* start;            // (interactions,) in, out: negative until its first step [s]
     const real* duration;   // (interactions,) [s]
     const real* force;      // (interactions, 3) push [N]
     const real* target;     // (interactions, 3) of a grab [m]
@@ -41,7 +31,9 @@ KERNEL(apply, Apply) {
     real diagonal = p.diagonal[node];
     for (int e = p.first[i]; e < p.first[i + 1]; ++e) {
         int k = p.entry[e];
-        if (p.clock[0] >= p.start[k] + p.duration[k]) continue;
+        real now = p.clock[0];
+        if (p.start[k] < 0) p.start[k] = now;  // whoever comes first writes the same
+        if (now >= p.start[k] + p.duration[k]) continue;
         real share = p.share[k];
         if (p.stiffness[k] == 0) {
             b = b + (p.h * share) * load3(p.force, k);

@@ -13,9 +13,19 @@ Usual ranges: max_force a few times the weight of the object (a 4000 kg beam wei
 of a grab near young times the size of the grabbed patch moves that patch without tearing it from its neighbours.
 """
 
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
+from sim_server.backend import Launch, module
+from sim_server.effect import Effect
 from sim_server.parameters import Parameters
+from sim_server.system import Stencil, System
+from sim_server.world import Body, World
 
 SCOPE = "object"
 
@@ -23,3 +33,180 @@ SCOPE = "object"
 class Params(Parameters):
     max_force: float = Field(default=1e4, gt=0, description="largest total force of one push or grab [N]")
     max_interactions: int = Field(default=16, ge=1, le=1024, description="pushes and grabs alive at once on the object")
+
+
+Point = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Interaction:
+    """A push (stiffness 0) or a grab. nodes (k,): of the scene; offset (k, 3): of each from the grabbed point [m]."""
+
+    id: int
+    client: str
+    object: str
+    point: Point  # m
+    radius: float  # m
+    nodes: NDArray[np.int32]
+    offset: NDArray[np.float64]
+    duration: float  # s of simulation
+    force: Point = (0.0, 0.0, 0.0)  # N
+    target: Point = (0.0, 0.0, 0.0)  # m
+    stiffness: float = 0.0  # N/m
+    limit: float = 0.0  # N
+    start: float = -1.0  # s; negative until its first step
+
+
+class TouchError(ValueError):
+    """An interaction that is refused; the text is for the client."""
+
+
+@dataclass
+class _Arrays:
+    """What the launch in use reads; `start` is written by it."""
+
+    interactions: list[Interaction]
+    start: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+
+
+class Touch(Effect):
+    """All interactions of a scene. Changes go to the loop as a new launch, through `publish`."""
+
+    def __init__(self, world: World, listed: list[tuple[Body, Any]]):
+        self.world = world
+        self.params: dict[str, Params] = {body.name: params for body, params in listed}
+        self.publish: Callable[[Launch], None] = lambda launch: None  # set by the server
+        self._system: System | None = None
+        self._now = _Arrays([])
+        self._last_id = 0
+
+    def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
+        self._system = system
+        return [self._bind([])]
+
+    def push(self, client: str, name: str, point: Point, radius: float, force: Point, duration: float) -> Interaction:
+        """A force [N] shared by the free nodes within `radius` [m] of `point` (0: the nearest one), for a while [s].
+
+        Raises TouchError.
+        """
+        limit = self._params(name).max_force
+        size = float(np.linalg.norm(force))
+        if size > limit:
+            raise TouchError(f"push of {size:g} N on {name!r}: at most max_force = {limit:g} N")
+        if not duration > 0:
+            raise TouchError(f"push with duration = {duration:g} s: must be above 0")
+        nodes, offset = self._near(name, point, radius)
+        return self._add(Interaction(0, client, name, point, radius, nodes, offset, duration, force=force))
+
+    def grab(
+        self, client: str, name: str, point: Point, radius: float, target: Point, stiffness: float, max_force: float,
+        duration: float,
+    ) -> Interaction:  # fmt: skip
+        """Ties the free nodes near `point` to `target` by springs [N/m in all] of bounded force [N]. Raises TouchError."""
+        limit = min(max_force, self._params(name).max_force) if max_force > 0 else self._params(name).max_force
+        if not stiffness > 0 or not duration > 0:
+            raise TouchError(f"grab with stiffness = {stiffness:g} N/m, duration = {duration:g} s: must be above 0")
+        nodes, offset = self._near(name, point, radius)
+        return self._add(
+            Interaction(
+                0, client, name, point, radius, nodes, offset, duration, target=target, stiffness=stiffness, limit=limit
+            )
+        )
+
+    def move(self, client: str, id: int, target: Point) -> Interaction:
+        """Moves the target of a grab of this client. Raises TouchError."""
+        old = self._find(client, id)
+        if old.stiffness == 0:
+            raise TouchError(f"interaction {id} is a push; only a grab has a target")
+        alive = self.alive()
+        moved = replace(next(a for a in alive if a.id == id), target=target)
+        self._put([moved if a.id == id else a for a in alive])
+        return moved
+
+    def release(self, client: str, id: int) -> Interaction:
+        """Ends an interaction of this client. Raises TouchError."""
+        old = self._find(client, id)
+        self._put([a for a in self.alive() if a.id != id])
+        return old
+
+    def release_all(self, client: str) -> int:
+        """Ends everything of a client that has gone; returns how many."""
+        alive = self.alive()
+        kept = [a for a in alive if a.client != client]
+        if len(kept) < len(alive):
+            self._put(kept)
+        return len(alive) - len(kept)
+
+    def alive(self) -> list[Interaction]:
+        """Interactions that are not over, with the time at which they began."""
+        assert self._system is not None
+        time = float(self._system.clock[0])
+        known = [replace(a, start=float(s)) for a, s in zip(self._now.interactions, self._now.start, strict=True)]
+        return [a for a in known if a.start < 0 or time < a.start + a.duration]
+
+    def _params(self, name: str) -> Params:
+        if name not in self.params:
+            listed = ", ".join(sorted(self.params))
+            raise TouchError(f"object {name!r} does not list the effect touch; these do: {listed}")
+        return self.params[name]
+
+    def _find(self, client: str, id: int) -> Interaction:
+        found = next((a for a in self.alive() if a.id == id and a.client == client), None)
+        if found is None:
+            raise TouchError(f"client {client!r} has no interaction {id}; it may be over")
+        return found
+
+    def _near(self, name: str, point: Point, radius: float) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+        body = self.world.body(name)
+        if radius < 0:
+            raise TouchError(f"radius = {radius:g} m: must not be negative (0 = the nearest node)")
+        x, free = self.world.x[body.nodes].copy(), self.world.free[body.nodes] > 0
+        distance = np.where(free, np.linalg.norm(x - point, axis=1), np.inf)
+        near = np.flatnonzero(distance <= radius) if radius > 0 else np.array([int(distance.argmin())])
+        if len(near) == 0:
+            raise TouchError(
+                f"no free node of {name!r} within {radius:g} m of {point}; the nearest is {distance.min():.4g} m away"
+            )
+        return (near + body.first).astype(np.int32), x[near] - point
+
+    def _add(self, new: Interaction) -> Interaction:
+        alive = self.alive()
+        most = self._params(new.object).max_interactions
+        if sum(a.object == new.object for a in alive) >= most:
+            raise TouchError(f"object {new.object!r} has {most} interactions already (max_interactions)")
+        self._last_id += 1
+        new = replace(new, id=self._last_id)
+        self._put([*alive, new])
+        return new
+
+    def _put(self, interactions: list[Interaction]) -> None:
+        self.publish(self._bind(interactions))
+
+    def _bind(self, interactions: list[Interaction]) -> Launch:
+        """The launch that applies these interactions, sorted by node."""
+        w, system, n = self.world, self._system, len(interactions)
+        assert system is not None
+        count = [len(a.nodes) for a in interactions]
+        nodes = np.concatenate([a.nodes for a in interactions]) if n else np.zeros(0, np.int32)
+        order = np.argsort(nodes, kind="stable")
+        touched, first = np.unique(nodes[order], return_index=True)
+        entry = np.repeat(np.arange(n, dtype=np.int32), count)[order]
+        offset = np.concatenate([a.offset for a in interactions])[order] if n else np.zeros((0, 3))
+        start = np.array([a.start for a in interactions], dtype=float)
+        self._now = _Arrays(interactions, start)
+
+        def per(value: str) -> NDArray[np.float64]:
+            return np.array([getattr(a, value) for a in interactions], dtype=float)
+
+        return module("effects/touch.cu").bind(
+            "apply", len(touched), node=touched.astype(np.int32), first=np.append(first, len(nodes)).astype(np.int32),
+            entry=entry, offset=np.ascontiguousarray(offset), share=1.0 / np.array(count, dtype=float), start=start,
+            duration=per("duration"), force=per("force"), target=per("target"), stiffness=per("stiffness"),
+            limit=per("limit"), clock=system.clock, x=w.x, v=w.v, free=w.free, h=w.dt, diagonal=system.diagonal,
+            b=system.b,
+        )  # fmt: skip
+
+
+def build(world: World, listed: list[tuple[Body, Any]]) -> Touch:
+    """No interactions yet."""
+    return Touch(world, listed)

@@ -178,26 +178,28 @@ void wf_solve(Loop* loop) {
     write_frame(*loop);
 }
 
+// Before a step: sleep while paused and until it is due. 0 if the loop is to stop.
+int32_t wf_wait(Loop* loop) {
+    while (loop->pause.load(std::memory_order_relaxed) && !loop->stop.load()) {
+        nap(1e-3);
+        loop->deadline = 0;
+    }
+    loop->late = 0;
+    if (loop->realtime && !loop->stop.load()) {
+        double t = now();
+        if (loop->deadline == 0) loop->deadline = t;
+        if (t < loop->deadline) nap(loop->deadline - t);
+        else loop->late = t - loop->deadline;
+        if (loop->late > loop->dt) { ++loop->late_steps; loop->deadline = t; }  // do not chase lost time
+        loop->deadline += loop->dt;
+    }
+    return !loop->stop.load();
+}
+
 // Runs until `steps` are done or `stop` is set; returns the steps done.
 int64_t wf_run(Loop* loop, int64_t steps) {
     int64_t done = 0;
-    for (; done < steps && !loop->stop.load(std::memory_order_relaxed); ++done) {
-        while (loop->pause.load(std::memory_order_relaxed) && !loop->stop.load()) {
-            nap(1e-3);
-            loop->deadline = 0;
-        }
-        if (loop->stop.load()) break;
-        loop->late = 0;
-        if (loop->realtime) {
-            double t = now();
-            if (loop->deadline == 0) loop->deadline = t;
-            if (t < loop->deadline) nap(loop->deadline - t);
-            else if (t > loop->deadline) {
-                loop->late = t - loop->deadline;
-                if (loop->late > loop->dt) { ++loop->late_steps; loop->deadline = t; }  // do not chase lost time
-            }
-            loop->deadline += loop->dt;
-        }
+    for (; done < steps && wf_wait(loop); ++done) {
         wf_assemble(loop);
         wf_solve(loop);
     }

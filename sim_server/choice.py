@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: MIT
+"""preconditioner = "auto": block Jacobi or the factor, whichever costs less time per solve.
+
+At small time steps the matrix is easy and block Jacobi beats any factor; at large ones the factor wins many times over.
+Neither is known beforehand, so both are measured. The one not in use is tried again now and then by a *probe*: a solve
+that begins with it and goes over to the other after as many iterations as that one's whole solve costs, so that a probe at
+worst doubles one solve. A pure state machine over (kind, iterations, cost); whoever drives it decides whether cost is
+seconds or, where runs must repeat exactly, bytes moved.
+"""
+
+from dataclasses import dataclass
+
+from sim_server.engine import Kind
+
+MEMORY = 0.2  # weight of the newest solve in the running means
+EVERY = 200  # solves between probes
+HARDER = 2.0  # probe at once when solves cost so many times what they did at the last one
+MARGIN = 1.1  # switch only for a clear gain
+
+
+@dataclass
+class _Mean:
+    cost: float = -1.0  # of a solve
+    per_iteration: float = -1.0
+
+    def add(self, iterations: int, cost: float) -> None:
+        each = cost / max(iterations, 1)
+        if self.cost < 0:
+            self.cost, self.per_iteration = cost, each
+        self.cost += MEMORY * (cost - self.cost)
+        self.per_iteration += MEMORY * (each - self.per_iteration)
+
+
+class Choice:
+    """Of one body. `kind` and `probe` (iterations, 0: none) are the settings of its next solve."""
+
+    def __init__(self) -> None:
+        self.kind = Kind.BLOCK_JACOBI
+        self.probe = 0
+        self._means = {Kind.BLOCK_JACOBI: _Mean(), Kind.CHOLESKY: _Mean()}
+        self._since = 0
+        self._reference = -1.0
+        self._has_factor = False
+        self._pending: Kind | None = None  # what the next solve goes back to if its probe is no gain
+
+    def factor_arrived(self) -> None:
+        """The first factor is tried out; later ones only make the next probe sooner if block Jacobi is in use."""
+        if not self._has_factor:
+            self._has_factor = True
+            self._begin_probe(Kind.CHOLESKY)
+        elif self.kind is Kind.BLOCK_JACOBI and self._since > EVERY // 4 and self._pending is None:
+            self._begin_probe(Kind.CHOLESKY)
+
+    def observe(self, kind: Kind, iterations: int, cost: float) -> None:
+        """A solve was made that ended with `kind`."""
+        if self._pending is not None:
+            self._end_probe(kind, iterations, cost)
+            return
+        if kind not in self._means:
+            return
+        self._means[kind].add(iterations, cost)
+        self._since += 1
+        mean = self._means[kind].cost
+        if self._reference < 0:
+            self._reference = mean
+        if self._has_factor and (self._since >= EVERY or mean > HARDER * self._reference):
+            self._begin_probe(Kind.CHOLESKY if self.kind is Kind.BLOCK_JACOBI else Kind.BLOCK_JACOBI)
+
+    def _begin_probe(self, other: Kind) -> None:
+        known, probed = self._means[self.kind], self._means[other]
+        each = probed.per_iteration if probed.per_iteration > 0 else known.per_iteration
+        self.probe = max(2, int(known.cost / each)) if known.cost > 0 and each > 0 else 0
+        self._pending, self.kind = self.kind, other
+
+    def _end_probe(self, kind: Kind, iterations: int, cost: float) -> None:
+        before, tried = self._pending, self.kind
+        assert before is not None
+        self._pending, self.probe, self._since = None, 0, 0
+        gave_up = kind is not tried
+        if not gave_up:
+            self._means[tried] = _Mean(cost, cost / max(iterations, 1))
+        better = not gave_up and (self._means[before].cost < 0 or cost * MARGIN < self._means[before].cost)
+        self.kind = tried if better else before
+        self._reference = self._means[self.kind].cost

@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: MIT
+"""Where factors come from: one interface, for workers elsewhere (link.py) and for this process (here)."""
+
+import logging
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol.factor import Factor
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Job:
+    """A matrix to factorize. values (blocks, 3, 3) float64, read during `submit` only; dtype: of the factor wanted."""
+
+    object: str
+    epoch: int
+    step: int
+    warp: bool
+    values: NDArray[np.float64]
+    dtype: str = "float32"
+
+
+class FactorSource(Protocol):
+    """Takes matrices, gives factors; nothing here waits."""
+
+    def ready(self) -> bool:
+        """Somebody idle can take a job now."""
+        ...
+
+    def submit(self, job: Job) -> bool:
+        """Hands a job over; False if it could not be taken."""
+        ...
+
+    def poll(self) -> list[Factor]:
+        """Factors that came since the last call."""
+        ...
+
+    def failures(self) -> list[tuple[str, str]]:
+        """Objects whose job came to nothing since the last call, and why."""
+        ...
+
+
+class Inline:
+    """Factorizes in this process, during submit. patterns: block pattern (row_start, columns) of each object."""
+
+    def __init__(self, patterns: dict[str, tuple[NDArray[np.int32], NDArray[np.int32]]]):
+        self._patterns = patterns
+        self._analyses: dict[str, Any] = {}
+        self._done: list[Factor] = []
+        self._failed: list[tuple[str, str]] = []
+
+    def ready(self) -> bool:
+        """Always."""
+        return True
+
+    def submit(self, job: Job) -> bool:
+        """Factorizes now; the result waits for `poll`."""
+        from time import perf_counter
+
+        from precond_worker.factorize import NotPositiveDefinite  # lazily: only in-process updates need a library
+
+        start = perf_counter()
+        analysis = self._analysis(job.object)
+        try:
+            values = analysis.factorize(job.values, np.dtype(job.dtype))
+        except (NotPositiveDefinite, ValueError) as error:
+            self._failed.append((job.object, str(error)))
+            return True
+        seconds = perf_counter() - start
+        self._done.append(
+            Factor(job.object, job.epoch, job.step, job.warp, analysis.pattern, values, "in process", seconds)
+        )
+        return True
+
+    def _analysis(self, name: str) -> Any:
+        from precond_worker.factorize import Analysis, default_library
+
+        if name not in self._analyses:
+            if not self._analyses and (message := default_library()[1]):
+                log.warning("%s", message)
+            self._analyses[name] = Analysis(*self._patterns[name])
+        return self._analyses[name]
+
+    def poll(self) -> list[Factor]:
+        """Factors made since the last call."""
+        done, self._done = self._done, []
+        return done
+
+    def failures(self) -> list[tuple[str, str]]:
+        """Matrices that were not positive definite."""
+        failed, self._failed = self._failed, []
+        return failed
