@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Checks of what came over the network. Each raises Refused; sizes are looked at before anything is allocated."""
 
+import math
 from collections.abc import Collection
 from typing import Any, Protocol, TypeVar
 
@@ -108,6 +109,15 @@ def check_strings(message: Message, limit: int = 4096) -> None:
             raise Refused(
                 f"{message.DESCRIPTOR.name}.{field.name} has {len(value)} characters; allowed: {limit}", "size"
             )
+
+
+def check_numbers(message: Message) -> None:
+    """Raises Refused if a number in the message, or in a message within it, is NaN or infinite."""
+    for field, value in message.ListFields():
+        if isinstance(value, float) and not math.isfinite(value):
+            raise Refused(f"{message.DESCRIPTOR.name}.{field.name} is {value}; allowed: finite", "not_finite")
+        if isinstance(value, Message):
+            check_numbers(value)
 
 
 def checksum(values: NDArray[Any] | bytes) -> int:

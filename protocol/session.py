@@ -7,6 +7,7 @@ import os
 import re
 import threading
 from collections.abc import Sequence
+from functools import cache
 from typing import Any, Literal, Self
 
 import zenoh
@@ -57,8 +58,13 @@ def open_session(
 def _shared_memory_works() -> bool:
     obstacle = memlock.obstacle()
     if obstacle:
-        log.warning("shared memory is off, arrays travel as bytes: %s", obstacle)
+        _say_once(f"shared memory is off, arrays travel as bytes: {obstacle}")
     return not obstacle
+
+
+@cache
+def _say_once(text: str) -> None:
+    log.warning(text)
 
 
 def _config(server: bool, listen: list[str], connect: list[str], shared_memory: bool, timeout: float) -> zenoh.Config:
