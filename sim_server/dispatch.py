@@ -1,0 +1,245 @@
+# SPDX-License-Identifier: MIT
+"""Matrices out to workers, factors back: who gets a job, and what becomes of it."""
+
+import logging
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+import zenoh
+from zenoh.handlers import RingChannel
+
+from protocol import Factor
+from protocol.channels import CHANNELS, key, name_in
+from protocol.check import take
+from protocol.counters import Counters
+from protocol.messages_pb2 import Topology, WorkerInfo
+from protocol.refused import Refused
+from protocol.slots import Slot, SlotPool
+from sim_server.answers import Answers
+from sim_server.jobs import LATE, Flight, Jobs
+from sim_server.outbox import Outbox
+from sim_server.roster import Roster
+from sim_server.shipment import load, matrix_message
+
+if TYPE_CHECKING:
+    from sim_server.factors import Job
+
+log = logging.getLogger(__name__)
+
+RINGS = {"pattern": 64, "factor": 64, "worker": 1024}  # messages that may wait; beyond that the oldest is lost
+
+
+class Dispatch:
+    """Jobs, workers and answers of one server. For one thread."""
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        server: str,
+        incarnation: int,
+        pool: SlotPool | None,
+        outbox: Outbox,
+        counters: Counters,
+        silence: float,
+        clock: Callable[[], float],
+    ):
+        self._session, self._server, self._incarnation = session, server, incarnation
+        self._pool, self._outbox, self._counters, self._clock = pool, outbox, counters, clock
+        self._answers = Answers(incarnation)
+        self._roster = Roster(incarnation, silence)
+        self._jobs = Jobs(pool)
+        self._last_worker: dict[str, str] = {}  # of each object: it knows the pattern already
+        self._factors: list[Factor] = []
+        self._failures: list[tuple[str, str]] = []
+        self._tokens = session.liveliness().declare_subscriber(
+            key("alive_worker", server), RingChannel(4096), history=True
+        )
+        self._arrivals = {
+            channel: session.declare_subscriber(key(channel, server), RingChannel(depth))
+            for channel, depth in RINGS.items()
+        }
+
+    def announce(self, topology: Topology) -> None:
+        """A new epoch of an object."""
+        self._answers.announce(topology)
+        self._jobs.forget(topology.header.object)
+
+    def ready(self) -> bool:
+        """Somebody idle can take a job."""
+        self._receive()
+        return bool(self._idle())
+
+    def workers(self) -> list[WorkerInfo]:
+        """Workers that may be given work."""
+        self._receive()
+        infos = (self._roster.info(name) for name in self._roster.fit(self._clock(), self._jobs.deadlines()))
+        return [info for info in infos if info is not None]
+
+    def poll(self) -> list[Factor]:
+        """Good factors since the last call."""
+        self._receive()
+        factors, self._factors = self._factors, []
+        return factors
+
+    def failures(self) -> list[tuple[str, str]]:
+        """(object, reason) of jobs that ended without a factor since the last call."""
+        failures, self._failures = self._failures, []
+        return failures
+
+    def close(self) -> None:
+        """Forget all jobs."""
+        self._factors.clear()
+        self._failures.clear()
+
+    # ---- out -------------------------------------------------------------------------------------------------
+
+    def submit(self, job: "Job") -> bool:
+        """Send a job to an idle worker; False if there is none or the object is in flight."""
+        known = self._answers.known.get(job.object)
+        if known is None or known.epoch != job.epoch:
+            raise ValueError(f"job for {job.object} epoch {job.epoch}, which was not announced")
+        if job.values.shape != (known.blocks, 3, 3) or job.values.dtype != np.float64:
+            raise ValueError(
+                f"job for {job.object}: values {job.values.shape}, allowed: float64 ({known.blocks}, 3, 3)"
+            )
+        self._receive()
+        idle = self._idle()
+        if job.object in self._jobs.by_object or not idle:
+            return False
+        worker = self._choose(idle, job.object)
+        matrix_slot, factor_slot = self._lend(worker, job)
+        lease = self._jobs.lease(job.object, known.blocks)
+        flight = Flight(
+            self._jobs.next_number(),
+            job.object,
+            job.epoch,
+            job.step,
+            job.warp,
+            np.dtype(job.dtype).name,
+            worker,
+            self._clock() + lease,
+            factor_slot,
+            factor_slot.generation if factor_slot else 0,
+            tuple(slot for slot in (matrix_slot, factor_slot) if slot is not None),
+        )
+        self._jobs.start(flight)
+        if self._post(flight, job, lease, matrix_slot):
+            self._last_worker[job.object] = worker
+            self._counters.add("jobs")
+            return True
+        self._jobs.cancel(flight)
+        return False
+
+    def _idle(self) -> list[str]:
+        fit = self._roster.fit(self._clock(), self._jobs.deadlines())
+        return [name for name in fit if name not in self._jobs.by_worker]
+
+    def _choose(self, idle: list[str], object: str) -> str:
+        """Nobody late if it can be helped; then who knows the object; then who did least."""
+
+        def rank(name: str) -> tuple[int, bool, int]:
+            info = self._roster.info(name)
+            return self._jobs.lateness(name), self._last_worker.get(object) != name, info.jobs if info else 0
+
+        return min(idle, key=rank)
+
+    def _lend(self, worker: str, job: "Job") -> tuple[Slot | None, Slot | None]:
+        """Slots for the matrix and its factor; None for what must travel as bytes."""
+        info = self._roster.info(worker)
+        if self._pool is None or info is None or not info.shared_memory or self._jobs.lateness(worker) >= LATE:
+            return None, None
+        nonzeros = self._answers.known[job.object].nonzeros
+        matrix = self._pool.lend(job.values.nbytes)
+        factor = self._pool.lend(nonzeros * np.dtype(job.dtype).itemsize) if nonzeros else None
+        if matrix is None or (nonzeros and factor is None):
+            self._counters.trouble("slots_exhausted", "no slot of shared memory is left, an array travels as bytes")
+        return matrix, factor
+
+    def _post(self, flight: Flight, job: "Job", lease: float, slot: Slot | None) -> bool:
+        message = matrix_message(flight, self._answers.known[job.object], self._incarnation, lease)
+        payload = load(message, job.values, slot)
+        name = key("matrix", self._server, worker=flight.worker, object=flight.object)
+        attachment = message.SerializeToString()
+        return self._outbox.post(
+            lambda: self._session.put(
+                name, payload, attachment=attachment, congestion_control=zenoh.CongestionControl.BLOCK
+            )
+        )
+
+    # ---- in --------------------------------------------------------------------------------------------------
+
+    def _receive(self) -> None:
+        """Take in all that arrived. Factors before tokens: a worker may answer and then leave."""
+        for channel, take_in in (
+            ("worker", self._take_hello),
+            ("pattern", self._take_pattern),
+            ("factor", self._take_factor),
+        ):
+            while (sample := self._arrivals[channel].try_recv()) is not None:
+                try:
+                    take_in(sample)
+                except Refused as refusal:
+                    self._counters.refuse(refusal)
+        while (sample := self._tokens.try_recv()) is not None:
+            self._take_token(sample)
+        for flight in self._jobs.expire(self._clock()):
+            self._counters.add("leases_over")
+            self._fail(flight, "was not answered within its lease")
+
+    def _take_token(self, sample: zenoh.Sample) -> None:
+        try:
+            name = name_in("alive_worker", sample.key_expr, "worker")
+        except Refused as refusal:
+            return self._counters.refuse(refusal)
+        if self._roster.token(name, sample.kind == zenoh.SampleKind.PUT):
+            self._leave(name)
+
+    def _take_hello(self, sample: zenoh.Sample) -> None:
+        data = take(sample.payload, CHANNELS["worker"].limit, "WorkerInfo")
+        name, new = self._roster.hello(sample.key_expr, data, self._clock())
+        if new:
+            self._leave(name)  # what an earlier process of this name had in hand is lost
+            info = self._roster.info(name)
+            log.info("worker %s joined: %s", name, info.library if info else "")
+            if info and self._pool is not None and not info.shared_memory:
+                self._counters.warn("worker_copies", f"worker {name} has no shared memory with us, arrays are copied")
+
+    def _leave(self, name: str) -> None:
+        flight = self._jobs.lost(name)
+        if flight is not None:
+            self._counters.add("jobs_lost")
+            self._fail(flight, f"was lost with worker {name}")
+
+    def _take_pattern(self, sample: zenoh.Sample) -> None:
+        self._answers.take_pattern(sample.key_expr, sample.payload)
+
+    def _take_factor(self, sample: zenoh.Sample) -> None:
+        message = self._answers.parse_factor(sample.key_expr, sample.attachment)
+        flight = self._jobs.answered(message.job, message.worker)
+        self._roster.heard(flight.worker, self._clock())
+        seconds = None
+        try:
+            if message.failure:
+                self._counters.add("failures")
+                return self._fail(flight, f"failed: {message.failure}")
+            self._factors.append(self._answers.factor(message, sample.payload, flight))
+            seconds = message.seconds
+        except Refused as refusal:
+            self._fail(flight, f"was refused: {refusal}")
+            raise
+        finally:
+            self._jobs.end(flight, seconds)
+        self._counters.add("factors")
+        self._count_bulk("matrix", flight, message.matrix_shared, bool(flight.slots))
+        self._count_bulk("factor", flight, message.HasField("slot"), flight.factor_slot is not None)
+
+    def _count_bulk(self, what: str, flight: Flight, shared: bool, lent: bool) -> None:
+        self._counters.add("bulk_shared" if shared else "bulk_copied")
+        if lent and not shared:
+            self._counters.trouble(
+                "slots_unused", f"a slot was lent to worker {flight.worker}, but its {what} travelled as bytes"
+            )
+
+    def _fail(self, flight: Flight, why: str) -> None:
+        self._failures.append((flight.object, f"factorization of {flight.object} at step {flight.step} {why}"))

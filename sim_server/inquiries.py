@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: MIT
+"""Questions that others ask the server: status, scene, topology, shared memory, commands."""
+
+import logging
+import threading
+from collections import deque
+from collections.abc import Callable
+
+import zenoh
+
+from protocol import echo
+from protocol.channels import CHANNELS, PROTOCOL, everything, key
+from protocol.check import check_header, check_numbers, check_strings, parse
+from protocol.counters import Counters
+from protocol.messages_pb2 import Command, Echo, Header, Reply
+from protocol.refused import Refused
+from protocol.slots import Slot
+
+log = logging.getLogger(__name__)
+
+WAITING = 64  # commands that may wait for the simulation
+ASKED = 256  # queries that may wait for the thread below; beyond that the oldest goes unanswered
+ReplyFunction = Callable[[Reply], None]
+
+
+class Inquiries:
+    """One queryable and one thread for all keys of the server.
+
+    What was published under a key is answered at once; commands wait for the simulation. A full queue turns new
+    commands away with an error, so that nothing here grows or blocks.
+    """
+
+    def __init__(self, session: zenoh.Session, server: str, incarnation: int, counters: Counters, slot: Slot | None):
+        self._server = server
+        self._incarnation = incarnation
+        self._counters = counters
+        self._echo_slot = slot
+        self._command_key = key("command", server)
+        self._echo_prefix = key("echo", server, worker="*")[:-1]
+        self._answers: dict[str, bytes] = {}
+        self._commands: deque[tuple[Command, ReplyFunction]] = deque()
+        self._queryable = session.declare_queryable(everything(server), zenoh.handlers.RingChannel(ASKED))
+        threading.Thread(target=self._run, name="inquiries", daemon=True).start()
+
+    def offer(self, name: str, answer: bytes) -> None:
+        """From now on a query of this key gets this answer."""
+        self._answers[name] = answer
+
+    def commands(self) -> list[tuple[Command, ReplyFunction]]:
+        """Commands that came since the last call, each with the function that answers it."""
+        return [self._commands.popleft() for _ in range(len(self._commands))]
+
+    def _run(self) -> None:
+        while True:
+            try:
+                query = self._queryable.recv()
+            except zenoh.ZError:
+                return  # the session was closed
+            try:
+                self._serve(query)
+            except Refused as refusal:
+                self._counters.refuse(refusal)
+                query.drop()
+            except zenoh.ZError as error:
+                log.debug("a query was not answered: %s", error)
+            except Exception:
+                log.exception("a query was not answered")
+
+    def _serve(self, query: zenoh.Query) -> None:
+        asked = str(query.key_expr)
+        if asked == self._command_key:
+            return self._command(query)
+        with query:
+            if asked.startswith(self._echo_prefix):
+                return self._echo(query)
+            for name, answer in list(self._answers.items()):
+                if query.key_expr.intersects(zenoh.KeyExpr(name)):
+                    query.reply(name, answer)
+
+    def _echo(self, query: zenoh.Query) -> None:
+        question = parse(Echo, query.payload, CHANNELS["echo"].limit)
+        check_header(question)
+        if self._echo_slot is None:
+            header = Header(protocol=PROTOCOL, incarnation=self._incarnation)
+            query.reply(query.key_expr, b"", attachment=Echo(header=header).SerializeToString())
+        else:
+            reply, payload = echo.answer(self._echo_slot, question, self._incarnation)
+            query.reply(query.key_expr, payload, attachment=reply.SerializeToString())
+
+    def _command(self, query: zenoh.Query) -> None:
+        def reply(answer: Reply) -> None:
+            answer.header.protocol = PROTOCOL
+            answer.header.incarnation = self._incarnation
+            try:
+                query.reply(self._command_key, answer.SerializeToString())
+            except zenoh.ZError as error:
+                log.debug("a command was not answered: %s", error)
+            finally:
+                query.drop()
+
+        try:
+            command = parse(Command, query.payload, CHANNELS["command"].limit)
+            check_header(command, incarnation=self._incarnation if command.header.incarnation else None)
+            check_strings(command)
+            check_numbers(command)
+        except Refused as refusal:
+            self._counters.refuse(refusal)
+            return reply(Reply(error=str(refusal)))
+        if len(self._commands) >= WAITING:
+            return reply(Reply(error=f"the server is busy: {WAITING} commands wait already"))
+        self._commands.append((command, reply))

@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: MIT
+"""Jobs in flight: at most one per object and per worker, each with a lease, and the slots lent for them.
+
+Pure bookkeeping, without a network or a clock of its own.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from protocol.refused import Refused
+from protocol.slots import Slot
+
+SHORTEST = 2.0  # s
+LONGEST = 120.0  # s
+DOUBLINGS = 8
+TIMES = 20  # a lease is so many times what the last factorization took
+UNKNOWN_PER_BLOCK = 1e-4  # s: the first lease of an object, analysis and all
+LATE = 2  # late jobs with which a worker may still be asked again through shared memory
+
+
+class Lender(Protocol):
+    """Where slots come from."""
+
+    def give_back(self, slot: Slot) -> None: ...
+
+
+@dataclass(frozen=True)
+class Flight:
+    """One job sent to one worker; deadline [s, monotonic] is the end of its lease."""
+
+    number: int
+    object: str
+    epoch: int
+    step: int
+    warp: bool
+    dtype: str
+    worker: str
+    deadline: float
+    factor_slot: Slot | None = None
+    factor_generation: int = 0
+    slots: tuple[Slot, ...] = ()
+
+
+class Jobs:
+    """All flights. A late one stays known, its slots lent, until its worker answers it or a later one, or leaves."""
+
+    def __init__(self, lender: Lender | None):
+        self._lender = lender
+        self.by_object: dict[str, Flight] = {}
+        self.by_worker: dict[str, Flight] = {}
+        self._late: dict[str, list[Flight]] = {}
+        self._seconds: dict[str, float] = {}
+        self._patience: dict[str, int] = {}  # doublings of the lease after jobs of the object that were late
+        self._last = 0
+
+    def next_number(self) -> int:
+        """Number of the next job, growing by one."""
+        self._last += 1
+        return self._last
+
+    def lease(self, object: str, blocks: int) -> float:
+        """How long [s] an answer is waited for; twice as long after each one that was late."""
+        known = self._seconds.get(object)
+        base = max(SHORTEST, TIMES * known if known is not None else UNKNOWN_PER_BLOCK * blocks)
+        return float(min(LONGEST, base * 2 ** self._patience.get(object, 0)))
+
+    def start(self, flight: Flight) -> None:
+        """The job is on its way."""
+        self.by_object[flight.object] = flight
+        self.by_worker[flight.worker] = flight
+
+    def cancel(self, flight: Flight) -> None:
+        """The job was never sent."""
+        del self.by_object[flight.object], self.by_worker[flight.worker]
+        self._give_back(flight)
+
+    def lateness(self, worker: str) -> int:
+        """Late jobs of a worker that it may still be busy with."""
+        return len(self._late.get(worker, ()))
+
+    def answered(self, number: int, worker: str) -> Flight:
+        """The flight that an answer belongs to, still in flight; raises Refused."""
+        flight = self.by_worker.get(worker)
+        if flight is not None and flight.number == number:
+            if self.by_object.get(flight.object) is flight:
+                return flight
+            self.end(flight)
+            raise Refused(f"Factor.job is {number} of an epoch of {flight.object} that is over", "epoch")
+        late = self._late.get(worker, [])
+        if any(old.number == number for old in late):
+            self._release_late(worker, number)
+            raise Refused(f"Factor.job is {number}, whose lease of worker {worker} is over", "late")
+        if 0 < number <= self._last:
+            raise Refused(f"Factor.job is {number}, already answered or not for worker {worker}", "duplicate")
+        raise Refused(f"Factor.job is {number}; allowed: a job in flight, at most {self._last}", "sequence")
+
+    def end(self, flight: Flight, seconds: float | None = None) -> None:
+        """The worker has answered: the object and the worker are free, all slots up to this job come back."""
+        if self.by_object.get(flight.object) is flight:
+            del self.by_object[flight.object]
+        if self.by_worker.get(flight.worker) is flight:
+            del self.by_worker[flight.worker]
+        self._give_back(flight)
+        self._release_late(flight.worker, flight.number)
+        if seconds is not None:
+            self._seconds[flight.object] = seconds
+            self._patience.pop(flight.object, None)
+
+    def expire(self, now: float) -> list[Flight]:
+        """Flights whose lease ended: object and worker may be used again; the slots stay lent."""
+        over = [flight for flight in self.by_worker.values() if now > flight.deadline]
+        for flight in over:
+            del self.by_worker[flight.worker]
+            self._late.setdefault(flight.worker, []).append(flight)
+        expired = [flight for flight in over if self.by_object.get(flight.object) is flight]
+        for flight in expired:
+            del self.by_object[flight.object]
+            self._patience[flight.object] = min(DOUBLINGS, self._patience.get(flight.object, 0) + 1)
+        return expired
+
+    def forget(self, object: str) -> None:
+        """The object has a new epoch: what is in flight is worth nothing. Its worker stays busy until it answers."""
+        self.by_object.pop(object, None)
+        self._seconds.pop(object, None)
+        self._patience.pop(object, None)
+
+    def lost(self, worker: str) -> Flight | None:
+        """The worker is gone: all its slots come back; the job of a living object that was lost with it."""
+        for old in self._late.pop(worker, []):
+            self._give_back(old)
+        flight = self.by_worker.pop(worker, None)
+        if flight is None:
+            return None
+        self._give_back(flight)
+        if self.by_object.get(flight.object) is not flight:
+            return None
+        del self.by_object[flight.object]
+        return flight
+
+    def deadlines(self) -> dict[str, float]:
+        """By worker, the end of the lease that it works under."""
+        return {worker: flight.deadline for worker, flight in self.by_worker.items()}
+
+    def _release_late(self, worker: str, number: int) -> None:
+        # A worker does its jobs one after another: having answered this one it writes to no earlier slot.
+        late = self._late.get(worker, [])
+        for old in [old for old in late if old.number <= number]:
+            late.remove(old)
+            self._give_back(old)
+
+    def _give_back(self, flight: Flight) -> None:
+        if self._lender is not None:
+            for slot in flight.slots:
+                self._lender.give_back(slot)

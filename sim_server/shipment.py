@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: MIT
+"""A job as it travels: the message and the values, in a slot or as bytes."""
+
+from typing import Any
+
+import numpy as np
+import zenoh
+from numpy.typing import NDArray
+
+from protocol.channels import PROTOCOL
+from protocol.check import checksum
+from protocol.messages_pb2 import Header, Matrix
+from protocol.slots import Slot
+from sim_server.answers import Known
+from sim_server.jobs import Flight
+
+
+def matrix_message(flight: Flight, known: Known, incarnation: int, lease: float) -> Matrix:
+    """The message beside the values; checksum and matrix slot are filled in by load."""
+    message = Matrix(
+        header=Header(
+            protocol=PROTOCOL,
+            incarnation=incarnation,
+            object=flight.object,
+            epoch=flight.epoch,
+            sequence=flight.number,
+        ),
+        step=flight.step,
+        warp=flight.warp,
+        blocks=known.blocks,
+        factor_dtype=flight.dtype,
+        method="cholesky",
+        known_patterns=list(known.patterns),
+        lease=lease,
+        worker=flight.worker,
+    )
+    if flight.factor_slot is not None:
+        message.factor_slot.CopyFrom(flight.factor_slot.message())
+    return message
+
+
+def load(message: Matrix, values: NDArray[np.float64], slot: Slot | None) -> Any:
+    """The payload: values (blocks, 3, 3), copied into the slot or, without one, into bytes."""
+    if slot is None:
+        data = values.tobytes()
+        message.checksum = checksum(data)
+        return zenoh.ZBytes(data)
+    copy = slot.array(np.float64, values.size)
+    np.copyto(copy.reshape(values.shape), values)
+    message.checksum = checksum(copy)
+    message.matrix_slot.CopyFrom(slot.message())
+    return slot.payload
