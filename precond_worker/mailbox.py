@@ -1,0 +1,33 @@
+# SPDX-License-Identifier: MIT
+"""What arrived and was not looked at yet: a bounded queue that network threads only append to."""
+
+import threading
+from collections import deque
+from typing import Generic, TypeVar
+
+T = TypeVar("T")
+
+
+class Mailbox(Generic[T]):
+    """The oldest item goes when it is full, so that it never blocks a sender."""
+
+    def __init__(self, capacity: int):
+        self._items: deque[T] = deque(maxlen=capacity)
+        self._arrived = threading.Condition()
+        self.dropped = 0
+
+    def put(self, item: T) -> None:
+        """Append an item; never waits for the reader."""
+        with self._arrived:
+            self.dropped += len(self._items) == self._items.maxlen
+            self._items.append(item)
+            self._arrived.notify()
+
+    def take(self, timeout: float) -> list[T]:
+        """All items, oldest first; waits up to timeout seconds for the first."""
+        with self._arrived:
+            if not self._items:
+                self._arrived.wait(timeout)
+            items = list(self._items)
+            self._items.clear()
+            return items

@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: MIT
+"""The worker's side of the network: which server lives, matrices in, patterns and factors out."""
+
+import logging
+import os
+import socket
+import threading
+from collections import Counter
+from dataclasses import dataclass
+from typing import Self
+
+import zenoh
+
+from precond_worker.heartbeat import Heartbeat
+from precond_worker.mailbox import Mailbox
+from protocol import FactorPattern, echo
+from protocol.channels import CHANNELS, PROTOCOL, check_name, key, name_in
+from protocol.check import check_header, parse
+from protocol.counters import Counters
+from protocol.messages_pb2 import Factor, Header, Topology, WorkerInfo
+from protocol.refused import Refused
+from protocol.session import Session
+from protocol.slotmap import SlotMap
+
+log = logging.getLogger(__name__)
+
+BLOCK = zenoh.CongestionControl.BLOCK
+TIMEOUT = 5.0  # s for a topology
+
+
+@dataclass(frozen=True)
+class ServerEvent:
+    """A life of the server began or ended."""
+
+    incarnation: int
+    alive: bool
+
+
+class Uplink:
+    """One worker on the network. mailbox holds what came: ServerEvent, or a sample with a matrix."""
+
+    def __init__(self, session: Session, server: str, name: str, threads: int, library: str, counters: Counters):
+        self.server, self.name = check_name(server, "server name"), check_name(name, "worker name")
+        self.library = library
+        self.counters = counters
+        self.mailbox: Mailbox[ServerEvent | zenoh.Sample] = Mailbox(256)
+        self.slots = SlotMap()
+        self.incarnation = 0  # of the server that this worker works for; 0: none
+        self.shared_memory = False
+        self._session, self._threads = session, threads
+        self._sequence: Counter[str] = Counter()
+        self._saying = threading.Lock()
+        zs = session.zenoh
+        # Subscribed first, announced last: the server sends as soon as it has heard of us.
+        self._matrices = zs.declare_subscriber(key("matrix", server, worker=name), self.mailbox.put)
+        self._token = zs.liveliness().declare_token(key("alive_worker", server, worker=name))
+        self._servers = zs.liveliness().declare_subscriber(
+            key("alive_server", server), self._server_event, history=True
+        )
+        self._heartbeat = Heartbeat(self._say)
+
+    def _server_event(self, sample: zenoh.Sample) -> None:
+        try:
+            incarnation = int(name_in("alive_server", sample.key_expr, "incarnation"), 16)
+        except ValueError as error:
+            self.counters.refuse(error if isinstance(error, Refused) else Refused(f"{sample.key_expr}: {error}"))
+            return
+        self.mailbox.put(ServerEvent(incarnation, sample.kind == zenoh.SampleKind.PUT))
+
+    def follow(self, incarnation: int) -> None:
+        """Work for this life of the server from now on; 0: for none. Tries its shared memory and says hello."""
+        self.incarnation = 0
+        self.slots.clear()
+        self.shared_memory = False
+        if incarnation:
+            obstacle = "switched off here"
+            if self._session.shared_memory:
+                obstacle = echo.obstacle(self._session.zenoh, self.server, self.name, self.slots)
+            self.shared_memory = not obstacle
+            if obstacle and self._session.shared_memory:
+                self.counters.warn("no_shared_memory", f"arrays travel as bytes: {obstacle}")
+            self.incarnation = incarnation
+            self._heartbeat.wake()
+
+    def _say(self) -> None:
+        if not self.incarnation:
+            return
+        with self._saying:
+            info = WorkerInfo(
+                header=self.header("", 0, "worker"),
+                worker=self.name,
+                pid=os.getpid(),
+                host=socket.gethostname()[:64],
+                library=self.library,
+                threads=self._threads,
+                shared_memory=self.shared_memory,
+                jobs=self.counters.jobs,
+                failures=self.counters.failures,
+                superseded=self.counters.superseded + self.mailbox.dropped,
+                refused=self.counters.refused,
+                bulk_shared=self.counters.bulk_shared,
+                bulk_copied=self.counters.bulk_copied,
+            )
+            self._session.zenoh.put(key("worker", self.server, worker=self.name), info.SerializeToString())
+
+    def header(self, object: str, epoch: int, channel: str) -> Header:
+        """Header of the next message on a channel."""
+        self._sequence[channel + object] += 1
+        return Header(
+            protocol=PROTOCOL,
+            incarnation=self.incarnation,
+            object=object,
+            epoch=epoch,
+            sequence=self._sequence[channel + object],
+        )
+
+    def topology(self, object: str, epoch: int) -> Topology:
+        """Ask the server for the topology of an object; raises Refused if it has not that of this epoch."""
+        for reply in self._session.zenoh.get(key("topology", self.server, object=object), timeout=TIMEOUT):
+            if reply.ok is None:
+                break
+            topology = parse(Topology, reply.ok.payload, CHANNELS["topology"].limit)
+            check_header(topology, incarnation=self.incarnation, object=object, epoch=epoch)
+            return topology
+        raise Refused(f"the server has no topology of {object}", "object")
+
+    def send_pattern(self, pattern: FactorPattern, object: str, epoch: int) -> None:
+        """Send the pattern of an object's factors."""
+        message = pattern.message(self.header(object, epoch, "pattern"))
+        name = key("pattern", self.server, object=object)
+        self._session.zenoh.put(name, message.SerializeToString(), congestion_control=BLOCK)
+
+    def send_factor(self, message: Factor, values: bytes = b"") -> None:
+        """Send an answer; values only if they are in no slot."""
+        name = key("factor", self.server, object=message.header.object)
+        self._session.zenoh.put(name, values, attachment=message.SerializeToString(), congestion_control=BLOCK)
+
+    def close(self) -> None:
+        """End the heartbeat; the session is closed by its owner."""
+        self._heartbeat.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: MIT
+"""The worker's loop: take the newest matrix of an object, factorize it, send the factor."""
+
+import logging
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+import zenoh
+from numpy.typing import NDArray
+
+from precond_worker.job import Job, accept
+from precond_worker.uplink import ServerEvent, Uplink
+from protocol import FactorPattern
+from protocol.check import array, checksum
+from protocol.messages_pb2 import Factor
+from protocol.refused import Refused
+
+log = logging.getLogger(__name__)
+
+
+class Factorization(Protocol):
+    """What the worker needs of precond_worker.factorize.Analysis."""
+
+    pattern: FactorPattern
+    library: str
+
+    def factorize(self, values: Any, dtype: Any) -> NDArray[Any]: ...
+
+
+Analyse = Callable[[NDArray[np.int32], NDArray[np.int32]], Factorization]
+
+
+class Worker:
+    """Works for one server at a time, one job at a time, the oldest object first, the newest matrix of each."""
+
+    def __init__(self, uplink: Uplink, analyse: Analyse, on_server: Callable[[bool], None] = lambda found: None):
+        self._uplink = uplink
+        self._counters = uplink.counters
+        self._analyse = analyse
+        self._on_server = on_server
+        self._analyses: dict[str, tuple[int, Factorization]] = {}  # by object, with its epoch
+        self._pending: dict[str, Job] = {}
+
+    def run(self) -> None:
+        """Work until an exception, such as KeyboardInterrupt, ends it."""
+        while True:
+            self.step(1.0)
+
+    def step(self, timeout: float) -> None:
+        """Take in what came, waiting up to timeout seconds for it, and do one job."""
+        self._take_in(self._uplink.mailbox.take(0.0 if self._pending else timeout))
+        if self._pending:
+            self._do(self._pending.pop(next(iter(self._pending))))
+
+    def _take_in(self, items: Sequence[ServerEvent | zenoh.Sample]) -> None:
+        for item in items:
+            try:
+                if isinstance(item, ServerEvent):
+                    self._change_server(item)
+                else:
+                    self._enqueue(accept(item, self._uplink.name, self._uplink.incarnation))
+            except Refused as refusal:
+                self._counters.refuse(refusal)
+
+    def _change_server(self, event: ServerEvent) -> None:
+        current = self._uplink.incarnation
+        if event.alive and event.incarnation != current:
+            self._forget()
+            self._uplink.follow(event.incarnation)
+            self._on_server(True)
+        elif not event.alive and event.incarnation == current:
+            self._forget()
+            self._uplink.follow(0)
+            self._on_server(False)
+
+    def _forget(self) -> None:
+        self._counters.add("superseded", len(self._pending))
+        self._pending.clear()
+        self._analyses.clear()
+
+    def _enqueue(self, job: Job) -> None:
+        waiting = self._pending.get(job.object)
+        if waiting is not None:
+            self._counters.add("superseded")
+            if waiting.message.header.sequence >= job.message.header.sequence:
+                return
+        self._pending[job.object] = job
+
+    def _do(self, job: Job) -> None:
+        self._counters.add("jobs")
+        self._counters.add("bulk_shared" if job.shared else "bulk_copied")
+        if job.message.HasField("matrix_slot") and not job.shared:
+            self._counters.warn("copied", "a matrix came as a copy although shared memory was tried and found to work")
+        try:
+            self._factorize(job)
+        except Refused as refusal:
+            self._counters.refuse(refusal)
+            self._answer(job, failure=str(refusal))
+        except (ValueError, MemoryError) as error:
+            self._counters.add("failures")
+            self._answer(job, failure=str(error) or type(error).__name__)
+        except zenoh.ZError as error:
+            self._counters.trouble("unsent", f"a factor was not sent: {error}")
+        except Exception as error:
+            log.exception("factorization of %s failed", job.object)
+            self._counters.add("failures")
+            self._answer(job, failure=f"{type(error).__name__}: {error}")
+
+    def _factorize(self, job: Job) -> None:
+        message = job.message
+        analysis = self._analysis(job.object, message.header.epoch, message.blocks)
+        values = job.values(self._uplink.slots)
+        begin = time.perf_counter()
+        # Into memory of our own, so that the checksum is of what was computed whatever happens to the slot.
+        factor = np.ascontiguousarray(analysis.factorize(values, np.dtype(message.factor_dtype)))
+        seconds = time.perf_counter() - begin
+        if analysis.pattern.id not in message.known_patterns:
+            self._uplink.send_pattern(analysis.pattern, job.object, message.header.epoch)
+        self._answer(job, analysis.pattern, factor, seconds)
+
+    def _analysis(self, object: str, epoch: int, blocks: int) -> Factorization:
+        """The symbolic phase, once per epoch of an object."""
+        known = self._analyses.get(object)
+        if known is None or known[0] != epoch:
+            topology = self._uplink.topology(object, epoch)
+            row_start = array(topology.row_start, np.int32, (topology.nodes + 1,), "Topology.row_start")
+            columns = array(topology.columns, np.int32, (-1,), "Topology.columns")
+            if len(columns) != blocks:
+                raise Refused(f"Matrix.blocks is {blocks}; allowed: {len(columns)}, as in the topology", "shape")
+            known = self._analyses[object] = (epoch, self._analyse(row_start, columns))
+            self._uplink.library = known[1].library
+        return known[1]
+
+    def _answer(
+        self,
+        job: Job,
+        pattern: FactorPattern | None = None,
+        values: NDArray[Any] | None = None,
+        seconds: float = 0.0,
+        failure: str = "",
+    ) -> None:
+        message, uplink = job.message, self._uplink
+        answer = Factor(
+            header=uplink.header(job.object, message.header.epoch, "factor"),
+            step=message.step,
+            warp=message.warp,
+            dtype=message.factor_dtype,
+            worker=uplink.name,
+            seconds=seconds,
+            failure=failure[:500],
+            job=message.header.sequence,
+            matrix_shared=job.shared,
+        )
+        payload = b""
+        if pattern is not None and values is not None:
+            answer.pattern, answer.nonzeros, answer.checksum = pattern.id, pattern.nonzeros, checksum(values)
+            if not self._into_slot(message, answer, values):
+                payload = values.tobytes()
+        uplink.send_factor(answer, payload)
+
+    def _into_slot(self, message: Any, answer: Factor, values: NDArray[Any]) -> bool:
+        """Write the values into the slot lent for them, if there is one and it is still ours."""
+        if not message.HasField("factor_slot") or message.factor_slot.capacity < values.nbytes:
+            return False
+        slot = message.factor_slot
+        target = self._uplink.slots.array(slot, values.dtype, values.size)
+        if not self._uplink.slots.is_current(slot):
+            raise Refused("the slot for the factor was lent to somebody else: this answer is late", "late")
+        np.copyto(target, values)
+        answer.slot.CopyFrom(slot)
+        return True
