@@ -1,0 +1,289 @@
+# SPDX-License-Identifier: MIT
+"""The command sim-client."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from clients.errors import BadInput, ClientError
+from protocol.channels import DEFAULT_ENDPOINT, SERVER_NAME
+
+app = typer.Typer(
+    name="sim-client",
+    help="Look at a running sim-server, push its bodies about, view and export its logs.",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+
+Triple = tuple[float, float, float]
+Connect = Annotated[
+    list[str] | None,
+    typer.Option(metavar="ENDPOINT", help=f"Where the server listens, {DEFAULT_ENDPOINT} by default; may be repeated."),
+]
+Server = Annotated[str, typer.Option(metavar="NAME", help="Name of the server.")]
+Object = Annotated[str, typer.Option("--object", metavar="NAME", help="Object of the scene.")]
+MOVES_PER_SECOND = 30
+
+
+class Color(StrEnum):
+    displacement = "displacement"
+    von_mises = "von_mises"
+
+
+@app.command()
+def status(
+    as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
+    connect: Connect = None,
+    server: Server = SERVER_NAME,
+) -> None:
+    """Show the server's health once.
+
+    \b
+    Examples:
+      sim-client status
+      sim-client status --json | jq .step_p99
+      sim-client status --connect tcp/192.168.1.5:7447
+    """
+    from clients.client import Client
+    from clients.plain import plain
+
+    with Client(server, connect) as client:
+        found = client.status()
+    if as_json:
+        print(json.dumps(plain(found)))
+        return
+    from rich.console import Console
+
+    from clients.watch import tables
+
+    Console().print(tables(found))
+
+
+@app.command()
+def watch(
+    count: Annotated[int, typer.Option(min=0, help="End after so many looks; 0 = never.")] = 0,
+    connect: Connect = None,
+    server: Server = SERVER_NAME,
+) -> None:
+    """Show the server's health until Ctrl-C.
+
+    \b
+    Examples:
+      sim-client watch
+    """
+    from clients.client import Client
+    from clients.watch import watch as run
+
+    with Client(server, connect) as client:
+        run(client, count)
+
+
+@app.command()
+def push(
+    object: Object,
+    at: Annotated[Triple, typer.Option(metavar="X Y Z", help="Where, m.")],
+    force: Annotated[Triple, typer.Option(metavar="FX FY FZ", help="Force in all, N.")],
+    radius: Annotated[float, typer.Option(help="Nodes so far around are pushed, m; 0 = the nearest free one.")] = 0.0,
+    duration: Annotated[float, typer.Option(help="For how long, s of simulation.")] = 0.1,
+    connect: Connect = None,
+    server: Server = SERVER_NAME,
+) -> None:
+    """Push an object.
+
+    \b
+    Examples:
+      sim-client push --object beam --at 10 1 1 --force 0 -200 0
+      sim-client push --object beam --at 10 1 1 --radius 0.6 --force 0 0 500 --duration 0.5
+    """
+    from clients.client import Client
+
+    with Client(server, connect) as client:
+        taken = client.push(object, at, force, radius, duration)
+    print(f"pushed {taken.nodes} nodes of {object} for {duration:g} s from t = {taken.start:.3f} s")
+
+
+@app.command()
+def grab(
+    object: Object,
+    at: Annotated[Triple, typer.Option(metavar="X Y Z", help="Where to take hold, m.")],
+    to: Annotated[Triple, typer.Option(metavar="X Y Z", help="Where to pull it on a straight line, m.")],
+    radius: Annotated[float, typer.Option(help="Nodes so far around are held, m; 0 = the nearest free one.")] = 0.0,
+    stiffness: Annotated[float, typer.Option(help="Of the spring that pulls, N/m.")] = 1000.0,
+    max_force: Annotated[float, typer.Option(help="That the spring never exceeds, N.")] = 100.0,
+    duration: Annotated[float, typer.Option(help="How long the pull takes, s of wall clock.")] = 1.0,
+    connect: Connect = None,
+    server: Server = SERVER_NAME,
+) -> None:
+    """Take hold of an object, pull it along a straight line, let go (also on Ctrl-C).
+
+    \b
+    Examples:
+      sim-client grab --object beam --at 10 1 1 --to 10 4 1 --duration 2
+      sim-client grab --object beam --at 10 1 1 --to 12 1 1 --stiffness 5000 --max-force 500
+    """
+    from clients.client import Client, number
+
+    number(duration, "duration", positive=True)
+    with Client(server, connect) as client, client.grab(object, at, at, radius, stiffness, max_force) as held:
+        print(f"holding {held.interaction.nodes} nodes of {object}")
+        began = time.monotonic()
+        while (share := (time.monotonic() - began) / duration) < 1:
+            held.move([a + share * (b - a) for a, b in zip(at, to, strict=True)])
+            time.sleep(1 / MOVES_PER_SECOND)
+        held.move(to)
+    print("released")
+
+
+@app.command()
+def pause(connect: Connect = None, server: Server = SERVER_NAME) -> None:
+    """Halt the simulation; the server goes on answering.
+
+    \b
+    Examples:
+      sim-client pause
+    """
+    from clients.client import Client
+
+    with Client(server, connect) as client:
+        client.pause()
+
+
+@app.command()
+def resume(connect: Connect = None, server: Server = SERVER_NAME) -> None:
+    """Go on after a pause.
+
+    \b
+    Examples:
+      sim-client resume
+    """
+    from clients.client import Client
+
+    with Client(server, connect) as client:
+        client.resume()
+
+
+@app.command()
+def stop(connect: Connect = None, server: Server = SERVER_NAME) -> None:
+    """End the server; it closes its log first.
+
+    \b
+    Examples:
+      sim-client stop
+    """
+    from clients.client import Client
+
+    with Client(server, connect) as client:
+        client.stop()
+
+
+@app.command()
+def view(
+    log: Annotated[Path | None, typer.Argument(metavar="[LOG.mcap]", help="A recorded run.")] = None,
+    live: Annotated[bool, typer.Option("--live", help="Show a running server instead.")] = False,
+    save: Annotated[Path | None, typer.Option(metavar="FILE.rrd", help="Write a file for rerun instead.")] = None,
+    screenshot: Annotated[Path | None, typer.Option(metavar="FILE.png", help="Write a picture instead.")] = None,
+    color: Annotated[Color, typer.Option(help="What the surfaces are coloured by.")] = Color.displacement,
+    web: Annotated[bool, typer.Option("--web", help="A page for a browser of this machine, no window.")] = False,
+    connect: Connect = None,
+    server: Server = SERVER_NAME,
+) -> None:
+    """Show a log or a running server in the rerun viewer.
+
+    \b
+    Examples:
+      sim-client view run.mcap
+      sim-client view run.mcap --color von_mises --screenshot run.png
+      sim-client view run.mcap --save run.rrd
+      sim-client view --live
+    """
+    if live == (log is not None):
+        raise BadInput("view: give either a log or --live")
+    from clients import view as viewing
+
+    if live:
+        if save or screenshot:
+            raise BadInput("view: --save and --screenshot need a log, not --live")
+        from clients.client import Client
+
+        with Client(server, connect) as client:
+            viewing.view_live(client, color.value, web)
+        return
+    assert log is not None
+    with _opened(log) as opened:
+        if save:
+            viewing.save_rrd(opened, save, color.value)
+        if screenshot:
+            viewing.save_screenshot(opened, screenshot, color.value)
+        if not save and not screenshot:
+            viewing.view_log(opened, color.value, web)
+
+
+@app.command()
+def export(
+    log: Annotated[Path, typer.Argument(metavar="LOG.mcap", help="A recorded run.")],
+    object: Object,
+    to: Annotated[Path, typer.Option(metavar="FILE", help="FILE.npz, FILE.csv or FILE.vtu.")],
+    frame: Annotated[str, typer.Option(help="Of a .vtu: last, a number (0 first, -1 last), or all.")] = "last",
+    epoch: Annotated[int | None, typer.Option(help="Of an .npz: which mesh, if cuts changed it.")] = None,
+) -> None:
+    """Write a log for other programs: .npz (frames and scalars), .csv (scalars), .vtu (ParaView).
+
+    \b
+    Examples:
+      sim-client export run.mcap --object beam --to beam.npz
+      sim-client export run.mcap --object beam --to beam.csv
+      sim-client export run.mcap --object beam --to beam.vtu --frame all
+    """
+    from clients.export import export as write
+    from clients.progress import progress_bar
+
+    with _opened(log) as opened:
+        with progress_bar("writing", len(opened.object_log(object).frames)) as progress:
+            written = write(opened, object, to, frame, epoch, progress)
+        print(f"wrote {written[-1]}" + (f" and {len(written) - 1} more" if len(written) > 1 else ""))
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator:
+    """A log, with its gaps told on stderr."""
+    from clients.log import Log
+    from clients.progress import progress_bar
+
+    size = path.stat().st_size if path.is_file() else 0
+    with progress_bar("reading", size) as progress:
+        log = Log(path, progress)
+    with log:
+        for note in log.notes:
+            print(f"sim-client: {note}", file=sys.stderr)
+        yield log
+
+
+def main() -> None:
+    """Exit codes: 0 done, 2 bad input, 1 anything else, 130 on Ctrl-C."""
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that viewers and sessions are closed
+    try:
+        app()
+    except BadInput as error:
+        print(f"sim-client: {error}", file=sys.stderr)
+        sys.exit(2)
+    except ClientError as error:
+        print(f"sim-client: {error}", file=sys.stderr)
+        sys.exit(1)
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,203 @@
+# SPDX-License-Identifier: MIT
+"""The library for remote users of a running server: look, push, grab, pause."""
+
+from __future__ import annotations
+
+import math
+import secrets
+from collections.abc import Sequence
+from types import TracebackType
+from typing import Self, TypeVar
+
+import zenoh
+from google.protobuf.message import Message
+
+from clients.errors import BadInput, ClientError
+from clients.frames import Mesh, mesh_of
+from clients.grab import Grab
+from clients.subscriptions import States, Steps
+from protocol import PROTOCOL, Refused
+from protocol import messages_pb2 as pb
+from protocol.channels import CHANNELS, DEFAULT_ENDPOINT, ROOT, SERVER_NAME, check_name, key
+from protocol.check import check_header, parse
+from protocol.endpoints import BadEndpoint
+from protocol.session import ConnectionFailed, open_session
+
+M = TypeVar("M", bound=Message)
+Point = Sequence[float]
+
+
+class Client:
+    """A connection to the server `name`; use it as a context manager, which always closes it.
+
+    connect: endpoints, tcp/127.0.0.1:7447 by default. timeout [s]: for connecting and for every answer.
+    Raises ClientError if there is no such server, BadInput for a bad name or endpoint.
+
+    >>> with Client() as client:
+    ...     client.push("beam", at=(10, 0, 0), force=(0, -50, 0), duration=0.2)
+    """
+
+    def __init__(self, name: str = SERVER_NAME, connect: Sequence[str] | None = None, timeout: float = 3.0) -> None:
+        self.name = name
+        self.id = f"client-{secrets.token_hex(4)}"
+        self._where = ", ".join(connect or [DEFAULT_ENDPOINT])
+        self._timeout = timeout
+        try:
+            check_name(name, "server name")
+            self._session = open_session("client", connect=connect, timeout=timeout, shared_memory=False)
+        except (Refused, BadEndpoint) as error:
+            raise BadInput(str(error)) from None
+        except ConnectionFailed:
+            raise self._no_server() from None
+        try:
+            self._token = self._session.zenoh.liveliness().declare_token(key("alive_client", name, client=self.id))
+            self.status()
+        except BaseException:
+            self.close()
+            raise
+
+    def status(self) -> pb.Status:
+        """The server's health, at most a second old."""
+        found = self._query("status", pb.Status)
+        if not found:
+            raise self._no_server()
+        return found[-1]
+
+    def scene(self) -> pb.Scene:
+        """What is simulated, with the text of the scene file."""
+        found = self._query("scene", pb.Scene)
+        if not found:
+            raise ClientError(f"server {self.name!r} has not announced its scene")
+        return found[-1]
+
+    def meshes(self) -> dict[str, Mesh]:
+        """The present mesh of every object."""
+        try:
+            return {mesh.object: mesh for mesh in map(mesh_of, self._query("topology", pb.Topology))}
+        except Refused as error:
+            raise ClientError(f"server {self.name!r} sent a mesh that cannot be used: {error}") from None
+
+    def push(self, object: str, at: Point, force: Point, radius: float = 0.0, duration: float = 0.1) -> pb.Interaction:
+        """Pushes the nodes of `object` within `radius` [m] of `at` [m] with `force` [N] in all for `duration` [s].
+
+        radius 0 takes the nearest free node. Returns the interaction as the server took it.
+        """
+        wanted = pb.Interaction(
+            object=object,
+            kind="push",
+            point=vector(at, "at"),
+            force=vector(force, "force"),
+            radius=number(radius, "radius"),
+            duration=number(duration, "duration", positive=True),
+        )
+        return self.command("push", wanted).interaction
+
+    def grab(
+        self,
+        object: str,
+        at: Point,
+        target: Point | None = None,
+        radius: float = 0.0,
+        stiffness: float = 1000.0,
+        max_force: float = 100.0,
+    ) -> Grab:
+        """Holds the nodes of `object` around `at` [m] by a spring to `target` (first `at` itself) that can be moved.
+
+        stiffness [N/m] of the spring, max_force [N] that it never exceeds. The handle releases as a context manager.
+        """
+        wanted = pb.Interaction(
+            object=object,
+            kind="grab",
+            point=vector(at, "at"),
+            target=vector(at if target is None else target, "target"),
+            radius=number(radius, "radius"),
+            stiffness=number(stiffness, "stiffness", positive=True),
+            max_force=number(max_force, "max-force", positive=True),
+        )
+        return Grab(self.command, self.command("grab", wanted).interaction)
+
+    def pause(self) -> None:
+        self.command("pause")
+
+    def resume(self) -> None:
+        self.command("resume")
+
+    def stop(self) -> None:
+        """Ends the server, which closes its log first."""
+        self.command("stop")
+
+    def states(self, objects: Sequence[str] | None = None) -> States:
+        """Frames of the named objects (all by default) from now on, the newest of each alone."""
+        return States(self._session.zenoh, self.name, list(objects or self.scene().objects))
+
+    def steps(self) -> Steps:
+        """Per-step scalars of all objects from now on; a reader that falls behind loses the oldest."""
+        return Steps(self._session.zenoh, self.name)
+
+    def command(self, verb: str, interaction: pb.Interaction | None = None) -> pb.Reply:
+        """Sends a command and waits for the answer. Raises BadInput if the server refuses it."""
+        if interaction is not None:
+            interaction.client = self.id
+        message = pb.Command(header=pb.Header(protocol=PROTOCOL), client=self.id, verb=verb, interaction=interaction)
+        found = self._query("command", pb.Reply, message.SerializeToString())
+        if not found:
+            raise self._no_server()
+        if found[-1].error:
+            raise BadInput(f"{verb}: {found[-1].error}")
+        return found[-1]
+
+    def close(self) -> None:
+        self._session.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _query(self, channel: str, kind: type[M], payload: bytes | None = None) -> list[M]:
+        limit = CHANNELS["reply" if channel == "command" else channel].limit
+        found = []
+        try:
+            replies = self._session.zenoh.get(
+                key(channel, self.name), payload=payload, timeout=self._timeout, target=zenoh.QueryTarget.ALL
+            )
+            for reply in replies:
+                if reply.ok is None:
+                    text = reply.err.payload.to_string() if reply.err else "an error"
+                    raise ClientError(f"server {self.name!r} at {self._where} did not answer in time ({text})")
+                message = parse(kind, reply.ok.payload, limit)
+                check_header(message)
+                found.append(message)
+        except Refused as error:
+            raise ClientError(f"server {self.name!r} sent what this client does not understand: {error}") from None
+        except zenoh.ZError as error:
+            raise ClientError(f"lost the server {self.name!r} at {self._where}: {error}") from None
+        return found
+
+    def _no_server(self) -> ClientError:
+        others = self._servers() if hasattr(self, "_session") else []
+        there = f"; there is {', '.join(others)}" if others else "; is it running?"
+        return ClientError(f"no server {self.name!r} at {self._where}{there}")
+
+    def _servers(self) -> list[str]:
+        tokens = self._session.zenoh.liveliness().get(f"{ROOT}/*/alive/server/*", timeout=self._timeout)
+        names = {str(token.ok.key_expr).split("/")[1] for token in tokens if token.ok is not None}
+        return sorted(repr(name) for name in names)
+
+
+def vector(values: Point, what: str) -> pb.Vector:
+    """Three finite numbers as a message. Raises BadInput."""
+    numbers = list(values)
+    if len(numbers) != 3 or not all(math.isfinite(value) for value in numbers):
+        raise BadInput(f"--{what} {' '.join(map(str, numbers))}: allowed are three finite numbers")
+    return pb.Vector(x=numbers[0], y=numbers[1], z=numbers[2])
+
+
+def number(value: float, what: str, positive: bool = False) -> float:
+    """A finite number that is not negative. Raises BadInput."""
+    if not math.isfinite(value) or value < 0 or (positive and value == 0):
+        raise BadInput(f"--{what} {value}: allowed is a finite number {'above 0' if positive else 'of at least 0'}")
+    return value

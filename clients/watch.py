@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: MIT
+"""The server's health as tables on a terminal."""
+
+from __future__ import annotations
+
+import time
+
+from rich.console import Group
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from clients.client import Client
+from clients.scalars import status_name
+from protocol import messages_pb2 as pb
+
+PERIOD = 0.5  # s between two looks
+
+
+def watch(client: Client, count: int = 0) -> None:
+    """Shows the status until Ctrl-C, or `count` times."""
+    shown = 0
+    with Live(tables(client.status()), auto_refresh=False) as live:
+        while not count or shown < count:
+            live.update(tables(client.status()), refresh=True)
+            shown += 1
+            time.sleep(PERIOD)
+
+
+def tables(status: pb.Status) -> Group:
+    """Summary, objects and workers."""
+    return Group(_summary(status), _objects(status), _workers(status))
+
+
+def _summary(status: pb.Status) -> Text:
+    lines = [
+        f"{status.scene or '(no scene)'} on {status.device or '?'}: {status.state}, "
+        f"step {status.step}, t = {status.time:.3f} s, dt = {status.dt * 1e3:g} ms",
+        f"step p50 {_ms(status.step_p50)}, p99 {_ms(status.step_p99)}, max {_ms(status.step_max)}, "
+        f"late {status.late_steps}; frames dropped {status.frames_dropped}",
+        f"messages refused {status.refused}; arrays through shared memory {status.bulk_shared}, "
+        f"as bytes {status.bulk_copied}; clients {len(status.clients)}",
+    ]
+    return Text("\n".join(lines))
+
+
+def _objects(status: pb.Status) -> Table:
+    table = Table("object", "nodes", "iterations", "mean", "residual", "status", "factor age", "preconditioner")
+    for found in status.objects:
+        last = found.last
+        table.add_row(
+            found.object,
+            str(found.nodes),
+            str(last.iterations),
+            f"{found.mean_iterations:.1f}",
+            f"{last.residual:.1e}",
+            status_name(last.status),
+            str(last.factor_age) if last.factor_age >= 0 and last.step else "-",
+            last.preconditioner,
+        )
+    return table
+
+
+def _workers(status: pb.Status) -> Table | Text:
+    if not status.workers:
+        return Text("no workers")
+    table = Table("worker", "host", "pid", "library", "threads", "jobs", "failures", "refused", "shared memory")
+    for worker in status.workers:
+        numbers = (worker.threads, worker.jobs, worker.failures, worker.refused)
+        shared = "yes" if worker.shared_memory else "no"
+        table.add_row(worker.worker, worker.host, str(worker.pid), worker.library, *map(str, numbers), shared)
+    return table
+
+
+def _ms(seconds: float) -> str:
+    return f"{seconds * 1e3:.2f} ms"

@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: MIT
+"""sim-client as a user runs it: output, messages, exit codes."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.clients.fake_server import FakeServer
+from tests.sample_run import record
+
+pytestmark = pytest.mark.system
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture
+def server() -> Iterator[FakeServer]:
+    with FakeServer() as started:
+        yield started
+
+
+def start(*arguments: str | Path) -> subprocess.Popen:
+    command = [sys.executable, "-m", "clients", *map(str, arguments)]
+    environment = os.environ | {"COLUMNS": "160"}
+    return subprocess.Popen(
+        command, cwd=ROOT, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+
+
+def run(*arguments: str | Path) -> tuple[int, str, str]:
+    """Exit code, stdout, stderr; never a traceback."""
+    process = start(*arguments)
+    out, err = process.communicate(timeout=100)
+    assert "Traceback" not in err, err
+    return process.returncode, out, err
+
+
+def test_status(server: FakeServer) -> None:
+    code, out, _ = run("status", "--connect", server.endpoint)
+    assert code == 0
+    assert "made-up.toml" in out and "running, step 50" in out and "p99 6.00 ms" in out
+    assert "liver" in out and "block_jacobi" not in out and "superlu" in out
+
+
+def test_status_as_json(server: FakeServer) -> None:
+    code, out, _ = run("status", "--json", "--connect", server.endpoint)
+    found = json.loads(out)
+    assert code == 0 and found["step"] == 50 and found["step_p99"] == 0.006
+    assert found["objects"][0]["last"]["status"] == "converged" and found["objects"][0]["last"]["factor_step"] == 48
+    assert found["workers"][0]["jobs"] == 3 and found["refused"] == 0
+
+
+def test_watch_a_few_times(server: FakeServer) -> None:
+    code, out, _ = run("watch", "--count", "2", "--connect", server.endpoint)
+    assert code == 0 and "beam" in out
+
+
+def test_push(server: FakeServer) -> None:
+    code, out, err = run(
+        "push", "--object", "beam", "--at", "-1", "0", "0", "--force", "0", "-50", "0", "--connect", server.endpoint
+    )
+    assert (code, err) == (0, "") and "pushed 4 nodes of beam for 0.1 s from t = 1.000 s" in out
+    assert server.commands[-1].interaction.point.x == -1 and server.commands[-1].interaction.force.y == -50
+
+
+def test_grab_moves_on_a_line(server: FakeServer) -> None:
+    code, out, _ = run(
+        *("grab", "--object", "beam", "--at", "1", "0", "0", "--to", "1", "2", "4"),
+        *("--duration", "0.3", "--connect", server.endpoint),
+    )
+    assert code == 0 and "released" in out
+    verbs = [command.verb for command in server.commands]
+    assert verbs[0] == "grab" and verbs[-1] == "release" and set(verbs[1:-1]) == {"move"}
+    targets = [command.interaction.target for command in server.commands[1:-1]]
+    assert all(target.x == 1 and target.z == pytest.approx(2 * target.y) for target in targets)
+    assert [t.y for t in targets] == sorted(t.y for t in targets) and targets[-1].y == 2
+
+
+def test_ctrl_c_releases_and_says_130(server: FakeServer) -> None:
+    process = start(
+        *("grab", "--object", "beam", "--at", "1", "0", "0", "--to", "1", "2", "4"),
+        *("--duration", "60", "--connect", server.endpoint),
+    )
+    deadline = time.monotonic() + 30
+    while len(server.commands) < 2 and time.monotonic() < deadline:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=30)
+    assert process.returncode == 130 and "Traceback" not in err
+    assert server.commands[-1].verb == "release"
+
+
+def test_pause_resume_stop(server: FakeServer) -> None:
+    for verb in ("pause", "resume", "stop"):
+        assert run(verb, "--connect", server.endpoint)[0] == 0
+    assert [command.verb for command in server.commands] == ["pause", "resume", "stop"]
+
+
+def test_refused_command_is_bad_input(server: FakeServer) -> None:
+    code, _, err = run(
+        "push", "--object", "spleen", "--at", "0", "0", "0", "--force", "1", "0", "0", "--connect", server.endpoint
+    )
+    assert code == 2 and err == "sim-client: push: no object 'spleen'; there is beam, liver\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        ((), 2, "Usage"),
+        (("fly",), 2, "No such command 'fly'"),
+        (("push",), 2, "Missing option '--object'"),
+        (("push", "--object", "b", "--at", "1", "2", "x", "--force", "0", "0", "0"), 2, "--at"),
+        (("status", "--connect", "nowhere"), 2, "endpoint 'nowhere' cannot be used"),
+        (("status", "--connect", "tcp/127.0.0.1:9"), 1, "no server 'sim' at tcp/127.0.0.1:9; is it running?"),
+        (("view",), 2, "give either a log or --live"),
+        (("view", "x.mcap", "--live"), 2, "give either a log or --live"),
+        (("view", "--live", "--save", "x.rrd"), 2, "need a log"),
+        (("view", "gone.mcap"), 2, "gone.mcap: cannot be read: No such file or directory"),
+        (("export", "gone.mcap", "--object", "beam", "--to", "x.npz"), 2, "gone.mcap: cannot be read"),
+        (("export", "pyproject.toml", "--object", "beam", "--to", "x.npz"), 2, "not an MCAP file"),
+    ],
+)
+def test_errors(arguments: tuple[str, ...], code: int, said: str) -> None:
+    found, out, err = run(*arguments)
+    assert found == code and said in out + err
+
+
+@pytest.mark.parametrize("command", ["status", "watch", "push", "grab", "pause", "resume", "stop", "view", "export"])
+def test_help_has_examples(command: str) -> None:
+    code, out, _ = run(command, "--help")
+    assert code == 0 and f"Examples:\n    sim-client {command}" in out
+
+
+def test_export(tmp_path: Path) -> None:
+    log = record(tmp_path / "run.mcap", 5)
+    code, out, err = run("export", log, "--object", "beam", "--to", tmp_path / "beam.npz")
+    assert (code, err) == (0, "") and out == f"wrote {tmp_path / 'beam.npz'}\n"
+    with np.load(tmp_path / "beam.npz") as found:
+        assert found["x"].shape == (6, 5, 3)
+    code, out, _ = run("export", log, "--object", "beam", "--to", tmp_path / "beam.vtu", "--frame", "all")
+    assert code == 0 and out == f"wrote {tmp_path / 'beam.pvd'} and 6 more\n"
+
+
+def test_export_of_a_cut_log_says_so(tmp_path: Path) -> None:
+    log = record(tmp_path / "run.mcap", 5)
+    whole = log.read_bytes()
+    log.write_bytes(whole[: whole.index(b"\x0f\x04\x00\x00\x00\x00\x00\x00\x00")])  # without the end mark
+    code, out, err = run("export", log, "--object", "beam", "--to", tmp_path / "beam.csv")
+    assert code == 0 and "wrote" in out
+    assert "without an end mark: the server was killed, or is still recording" in err
+
+
+def test_view_saves(tmp_path: Path) -> None:
+    pytest.importorskip("rerun")
+    log = record(tmp_path / "run.mcap", 5)
+    assert run("view", log, "--save", tmp_path / "run.rrd", "--color", "von_mises")[0] == 0
+    assert (tmp_path / "run.rrd").stat().st_size > 1000
