@@ -114,7 +114,13 @@ class Log:
             self._cached = (offset, self._file.chunk(offset))
         record = self._cached[1][number]
         assert isinstance(record, McapMessage)
-        return frame_of(pb.State.FromString(record.data))
+        frame = frame_of(pb.State.FromString(record.data))
+        mesh = self.object_log(name).meshes.get(frame.epoch)
+        if mesh is not None and len(mesh.rest) != len(frame.x):
+            raise BadInput(
+                f"{self.path}: step {frame.step} of {name!r} has {len(frame.x)} nodes, its mesh has {len(mesh.rest)}"
+            )
+        return frame
 
     def frames(self, name: str) -> Iterator[Frame]:
         """All frames of an object in the order of steps, decoded one by one."""
