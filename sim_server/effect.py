@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
 """What an effect is to the simulation: elements that couple nodes, and launches that add to the system of a step."""
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, Protocol
 
 import numpy as np
@@ -15,11 +17,13 @@ class Effect:
     """Base of all effects. A file under effects/ has `build(world, listed) -> Effect`.
 
     tets (m, 4): node numbers (of the scene) of the elements whose corners the effect couples, or None.
-    rotated: the bodies whose elements have rotations, for the warp.
+    rotated: the bodies whose elements have rotations, for the warp. elastic: by body index, Young's modulus [Pa] and
+    Poisson's ratio of its elements, (m,) each, for viewers.
     """
 
     tets: NDArray[np.int32] | None = None
     rotated: tuple[Body, ...] = ()
+    elastic: Mapping[int, tuple[NDArray[np.float64], NDArray[np.float64]]] = MappingProxyType({})
 
     def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
         """What adds the effect to system.b, .diagonal and .sums. accumulate: another effect wrote sums before."""

@@ -206,6 +206,8 @@ class Engine:
         """Sleeps until the next step is due (real time) and while paused, as `run` does before each step."""
         self._native.wf_wait(c.byref(self.loop))
 
+    records_dtype = RECORD
+
     @property
     def step(self) -> int:
         """Steps completed."""

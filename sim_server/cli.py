@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: MIT
+"""The command line of the server."""
+
+import logging
+import os
+import signal
+import sys
+import time
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, NoReturn
+
+import typer
+
+if TYPE_CHECKING:
+    from sim_server.service import Service
+    from sim_server.supervisor import Supervisor
+
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+
+EPILOG = """Examples:
+
+  sim-server deploy/scenes/beam.toml --workers 1                          real time, one local worker
+
+  sim-server beam.toml --steps 500 --free-run --record beam.mcap          as fast as it goes, with a log
+
+  sim-server beam.toml --listen tcp/0.0.0.0:7447                          workers and clients on other machines
+
+  sim-server beam.toml --set solver.tolerance=1e-8 --set dt=0.01          other values than the scene's
+"""
+
+WORKERS_JOIN = 15.0  # s to wait for the first local worker before the simulation starts
+
+
+class Terminated(BaseException):
+    """SIGTERM: leave in good order."""
+
+
+@app.command(epilog=EPILOG)
+def serve(
+    scene: Annotated[Path, typer.Argument(metavar="SCENE.toml", help="What to simulate")],
+    device: Annotated[str, typer.Option(metavar="auto|cpu|gpu", help="Where; this version has the CPU only")] = "auto",
+    steps: Annotated[int | None, typer.Option(metavar="N", min=1, help="Stop after so many steps")] = None,
+    realtime: Annotated[
+        bool, typer.Option("--realtime/--free-run", help="Keep pace with the clock, or as fast as it goes")
+    ] = True,
+    record: Annotated[Path | None, typer.Option(metavar="FILE.mcap", help="Write a log (replaces the file)")] = None,
+    connect: Annotated[list[str] | None, typer.Option(metavar="EP", help="Link with another server or router")] = None,
+    listen: Annotated[
+        list[str] | None, typer.Option(metavar="EP", help="Where to be reached [default: tcp/127.0.0.1:7447]")
+    ] = None,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Another value than the scene's")
+    ] = None,
+    workers: Annotated[int, typer.Option(metavar="N", min=0, max=64, help="Local workers to start and supervise")] = 0,
+    name: Annotated[str, typer.Option(metavar="NAME", help="Name of this server in all keys")] = "sim",
+    no_shared_memory: Annotated[bool, typer.Option("--no-shared-memory", help="Send arrays as bytes")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing but errors")] = False,
+) -> None:
+    """Simulate the objects of a scene, helped by preconditioner workers, open to clients."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    logging.basicConfig(level=logging.ERROR if quiet else logging.WARNING, format="sim-server: %(message)s")
+    signal.signal(signal.SIGTERM, _terminate)
+    if device not in ("auto", "cpu"):
+        known = "gpu is not available in this version; " if device == "gpu" else ""
+        _bad_input(f"--device {device}: {known}allowed: auto, cpu")
+    say = (lambda text: None) if quiet else (lambda text: print(f"sim-server: {text}", flush=True))
+    try:
+        with ExitStack() as closing:
+            service, supervisor = _set_up(
+                closing, scene, set_ or [], name, listen, connect, not no_shared_memory, record, steps, realtime, workers
+            )
+            _announce(say, service, scene, listen)
+            _wait_for_workers(service, supervisor)
+            try:
+                service.run()
+            finally:
+                say(_summary(service))
+    except KeyboardInterrupt:
+        raise typer.Exit(130) from None
+    except Terminated:
+        raise typer.Exit(0) from None
+
+
+def _set_up(
+    closing: ExitStack, scene: Path, overrides: list[str], name: str, listen: list[str] | None,
+    connect: list[str] | None, shared_memory: bool, record: Path | None, steps: int | None, realtime: bool,
+    workers: int,
+) -> "tuple[Service, Supervisor | None]":  # fmt: skip
+    """Everything that can fail on bad input, before the simulation starts."""
+    from protocol.channels import DEFAULT_ENDPOINT
+    from protocol.endpoints import BadEndpoint
+    from protocol.refused import Refused
+    from protocol.session import ConnectionFailed
+    from sim_server.backend import CompileError
+    from sim_server.errors import InputError
+    from sim_server.link import ServerLink
+    from sim_server.recorder import Recorder
+    from sim_server.service import Service
+    from sim_server.simulation import Simulation
+    from sim_server.supervisor import Supervisor
+
+    try:
+        simulation = Simulation.load(scene, overrides)
+        link = closing.enter_context(ServerLink(name, listen, connect, shared_memory=shared_memory))
+        recorder = None
+        if record is not None:
+            recorder = closing.enter_context(
+                Recorder(record, simulation.scene.record.compression, overwrite=True, report=logging.error)
+            )
+        service = Service(simulation, link, recorder, steps, realtime)
+    except (InputError, BadEndpoint, ConnectionFailed, Refused, CompileError) as error:
+        _bad_input(str(error))
+    except OSError as error:
+        _bad_input(f"--record {record}: {error.strerror or error}")
+    supervisor = None
+    if workers:
+        supervisor = Supervisor(workers, name, _reachable(listen or [DEFAULT_ENDPOINT]))
+        closing.callback(supervisor.close)
+        service.beside = supervisor.look
+    return service, supervisor
+
+
+def _reachable(listen: list[str]) -> list[str]:
+    """How a process of this machine reaches a server that listens there."""
+    return [e.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:") for e in listen[:1]]
+
+
+def _announce(say, service: "Service", scene: Path, listen: list[str] | None) -> None:  # type: ignore[no-untyped-def]
+    from protocol.channels import DEFAULT_ENDPOINT
+
+    world, solver = service.simulation.world, service.simulation.scene.solver
+    tets = sum(len(b.mesh.tets) for b in world.bodies)
+    say(
+        f"{scene.name}: {len(world.bodies)} object{'s' * (len(world.bodies) > 1)}, {world.nodes} nodes, {tets} tets, "
+        f"dt {world.dt:g} s, preconditioner {solver.preconditioner}, update {solver.update}; cpu; "
+        f"listening on {', '.join(listen or [DEFAULT_ENDPOINT])}"
+    )
+
+
+def _wait_for_workers(service: "Service", supervisor: "Supervisor | None") -> None:
+    """A run that was given workers starts when the first is there; it never waits for one afterwards."""
+    end = time.monotonic() + WORKERS_JOIN
+    while supervisor is not None and not service.link.workers() and time.monotonic() < end:
+        supervisor.look()
+        time.sleep(0.02)
+
+
+def _summary(service: "Service") -> str:
+    p50, p99, most = (1e3 * s for s in service.telemetry.percentiles())
+    used = sum(t.used for t in service.driver.tracks)
+    return (
+        f"{service.engine.step} steps; last {len(service.telemetry.seconds)}: p50 {p50:.3f}, p99 {p99:.3f}, "
+        f"max {most:.3f} ms; {used} factors used, {service.engine.loop.late_steps} late steps"
+    )
+
+
+def _terminate(*_: object) -> None:
+    raise Terminated
+
+
+def _bad_input(text: str) -> NoReturn:
+    print(f"sim-server: {text}", file=sys.stderr)
+    raise typer.Exit(2)
+
+
+def main() -> None:
+    """Entry point of the console script."""
+    app(prog_name="sim-server")

@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: MIT
+"""What clients ask of a running simulation: touch it, pause it, stop it."""
+
+import math
+from collections.abc import Callable
+
+from protocol import messages_pb2 as pb
+from sim_server.engine import Engine
+from sim_server.simulation import Simulation
+
+
+class Refusal(ValueError):
+    """A command that is not carried out; the text goes back to the client."""
+
+
+class Commands:
+    """Carries out commands on one simulation. accepted(interaction, time): told of every push and grab taken."""
+
+    def __init__(self, simulation: Simulation, accepted: Callable[[pb.Interaction, float], None]):
+        self.simulation, self.engine = simulation, simulation.engine
+        self.accepted = accepted
+        self.stopping = False
+        if "touch" in simulation.effects:
+            from sim_server.effects.touch import Touch
+
+            touch = simulation.effects["touch"]
+            assert isinstance(touch, Touch)
+            index = next(i for i, launch in enumerate(self.engine.launches) if launch.name == "touch.apply")
+            touch.publish = lambda launch: self.engine.replace(index, launch)
+        self._owners: set[str] = set()
+
+    @property
+    def engine_paused(self) -> bool:
+        """The loop stands still until `resume`."""
+        return bool(self.engine.loop.pause)
+
+    def carry_out(self, command: pb.Command) -> pb.Reply:
+        """Does it and says so; what cannot be done is answered with an error."""
+        try:
+            verb = _VERBS.get(command.verb)
+            if verb is None:
+                raise Refusal(f"unknown verb {command.verb!r}; known: {', '.join(sorted(_VERBS))}")
+            return verb(self, command)
+        except ValueError as error:  # Refusal and TouchError
+            return pb.Reply(error=str(error))
+
+    def gone(self, clients: set[str]) -> int:
+        """Releases what clients that are no longer there still held; returns how many."""
+        lost = self._owners - clients
+        self._owners -= lost
+        return sum(self._touch().release_all(client) for client in lost)
+
+    def applied(self) -> list[pb.Interaction]:
+        """Interactions that are not over, with the time of their first step (negative: not yet)."""
+        return [self._message(a) for a in self._touch().alive()] if "touch" in self.simulation.effects else []
+
+    # --- verbs --------------------------------------------------------------------------------------------------
+
+    def _push(self, command: pb.Command) -> pb.Reply:
+        i = command.interaction
+        _finite(i)
+        point, force = _tuple(i.point), _tuple(i.force)
+        return self._took(command, self._touch(i.object).push(command.client, i.object, point, i.radius, force, i.duration))
+
+    def _grab(self, command: pb.Command) -> pb.Reply:
+        i = command.interaction
+        _finite(i)
+        duration = i.duration if i.duration > 0 else math.inf
+        taken = self._touch(i.object).grab(
+            command.client, i.object, _tuple(i.point), i.radius, _tuple(i.target), i.stiffness, i.max_force, duration
+        )
+        return self._took(command, taken)
+
+    def _move(self, command: pb.Command) -> pb.Reply:
+        _finite(command.interaction)
+        i = command.interaction
+        return self._took(command, self._touch().move(command.client, i.id, _tuple(i.target)))
+
+    def _release(self, command: pb.Command) -> pb.Reply:
+        return pb.Reply(interaction=self._message(self._touch().release(command.client, command.interaction.id)))
+
+    def _pause(self, command: pb.Command) -> pb.Reply:
+        self.engine.loop.pause = 1
+        return pb.Reply()
+
+    def _resume(self, command: pb.Command) -> pb.Reply:
+        self.engine.loop.pause = 0
+        return pb.Reply()
+
+    def _stop(self, command: pb.Command) -> pb.Reply:
+        self.stopping = True
+        return pb.Reply()
+
+    def _took(self, command: pb.Command, taken: object) -> pb.Reply:
+        message = self._message(taken)
+        self._owners.add(command.client)
+        self.accepted(message, float(self.simulation.system.clock[0]))
+        return pb.Reply(interaction=message)
+
+    def _touch(self, name: str = ""):  # type: ignore[no-untyped-def]
+        if "touch" not in self.simulation.effects:
+            raise Refusal(
+                f"object {name!r} does not list the effect touch, so it takes no pushes or grabs; "
+                "add touch = true to its effects"
+                if name
+                else "no object of the scene lists the effect touch"
+            )
+        return self.simulation.effects["touch"]
+
+    @staticmethod
+    def _message(a) -> pb.Interaction:  # type: ignore[no-untyped-def]
+        def vector(v: tuple[float, float, float]) -> pb.Vector:
+            return pb.Vector(x=v[0], y=v[1], z=v[2])
+
+        return pb.Interaction(
+            id=a.id, client=a.client, object=a.object, kind="grab" if a.stiffness else "push", point=vector(a.point),
+            radius=a.radius, force=vector(a.force), duration=a.duration, target=vector(a.target),
+            stiffness=a.stiffness, max_force=a.limit, nodes=len(a.nodes), start=a.start,
+        )  # fmt: skip
+
+
+def _tuple(v: pb.Vector) -> tuple[float, float, float]:
+    return (v.x, v.y, v.z)
+
+
+def _finite(i: pb.Interaction) -> None:
+    numbers = {
+        "point": _tuple(i.point), "force": _tuple(i.force), "target": _tuple(i.target), "radius": (i.radius,),
+        "duration": (i.duration,), "stiffness": (i.stiffness,), "max_force": (i.max_force,),
+    }  # fmt: skip
+    for name, values in numbers.items():
+        if not all(math.isfinite(v) for v in values):
+            raise Refusal(f"{name} = {values}: must be finite")
+
+
+_VERBS: dict[str, Callable[[Commands, pb.Command], pb.Reply]] = {
+    "push": Commands._push, "grab": Commands._grab, "move": Commands._move, "release": Commands._release,
+    "pause": Commands._pause, "resume": Commands._resume, "stop": Commands._stop,
+}  # fmt: skip

@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: MIT
+"""The simulation in the words of the protocol: scene, topologies, states, step records."""
+
+import json
+import platform
+import time
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol import messages_pb2 as pb
+from sim_server.engine import Kind
+from sim_server.mesh import posed
+from sim_server.simulation import Simulation
+from sim_server.surface import surface_triangles
+from sim_server.world import Body
+
+NAMES = {kind: kind.name.lower() for kind in Kind}
+
+
+def scene(simulation: Simulation) -> pb.Scene:
+    """What is simulated, with the text of the scene file and its defaults filled in."""
+    s = simulation.scene
+    return pb.Scene(
+        name=s.path.name or s.name,
+        toml=s.text,
+        resolved=json.dumps(s.resolved()),
+        dt=s.dt,
+        started_ns=time.time_ns(),
+        software=f"warpfactor {_version()}, cpu, Python {platform.python_version()}",
+        objects=[b.name for b in simulation.world.bodies],
+    )
+
+
+def _version() -> str:
+    try:
+        return version("warpfactor")
+    except PackageNotFoundError:
+        return "(not installed)"
+
+
+def topology(simulation: Simulation, body: Body) -> pb.Topology:
+    """Mesh and block pattern of one object, epoch 1."""
+    pose = simulation.scene.objects[body.index].pose
+    row_start, columns = simulation.system.body_pattern(body.first, body.last)
+    fixed = np.flatnonzero(simulation.world.free[body.nodes] == 0)
+    message = pb.Topology(
+        header=pb.Header(object=body.name, epoch=1),
+        nodes=body.last - body.first,
+        rest=_bytes(posed(body.mesh.rest, pose.rotate, pose.translate), "<f8"),
+        tets=_bytes(body.mesh.tets, "<i4"),
+        triangles=_bytes(surface_triangles(body.mesh.tets), "<i4"),
+        row_start=_bytes(row_start, "<i4"),
+        columns=_bytes(columns, "<i4"),
+        fixed=_bytes(fixed, "<i4"),
+    )
+    for e in simulation.effects.values():
+        if body.index in e.elastic:
+            young, poisson = e.elastic[body.index]
+            message.young, message.poisson = _bytes(young, "<f4"), _bytes(poisson, "<f4")
+    return message
+
+
+def state(body: Body, step: int, time: float, x: NDArray[np.float64], v: NDArray[np.float64]) -> pb.State:
+    """One frame of one object; x and v of all nodes of the scene."""
+    return pb.State(
+        header=pb.Header(object=body.name, epoch=1),
+        step=step,
+        time=time,
+        nodes=body.last - body.first,
+        x=_bytes(x[body.nodes], "<f8"),
+        v=_bytes(v[body.nodes], "<f8"),
+    )
+
+
+def steps(simulation: Simulation, records: NDArray[Any]) -> list[pb.ObjectStep]:
+    """Step records (engine.RECORD) as messages."""
+    names = [b.name for b in simulation.world.bodies]
+    columns = [records[name].tolist() for name in records.dtype.names or ()]
+    return [_step(names, dict(zip(records.dtype.names or (), row, strict=True))) for row in zip(*columns, strict=True)]
+
+
+def _step(names: list[str], r: dict[str, Any]) -> pb.ObjectStep:
+    made = r["factor_step"]
+    return pb.ObjectStep(
+        header=pb.Header(object=names[r["body"]], epoch=1),
+        step=r["step"],
+        time=r["time"],
+        iterations=r["iterations"],
+        status=r["status"],
+        residual=r["residual"],
+        factor_step=made,
+        factor_age=r["step"] - 1 - made if made >= 0 else -1,
+        preconditioner=NAMES[Kind(r["kind"])],
+        assemble_seconds=r["assemble"],
+        solve_seconds=r["solve"],
+        integrate_seconds=r["integrate"],
+        step_seconds=r["whole"],
+        late_seconds=r["late"],
+        fallbacks=r["fallbacks"],
+    )
+
+
+def _bytes(values: NDArray[Any], dtype: str) -> bytes:
+    return np.ascontiguousarray(values, dtype).tobytes()

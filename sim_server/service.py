@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: MIT
+"""The server at work: one thread runs the loop, this one serves its mailboxes, the log and the network.
+
+    loop thread      Engine.run, native, without Python's lock (policies that wait by their nature run Driver.advance)
+    service thread   here: factors in, matrices out, commands, records to log and listeners, every millisecond or so
+    recorder, link   threads of their own for the disk and the network
+"""
+
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol import messages_pb2 as pb
+from sim_server.commands import Commands
+from sim_server.driver import Driver
+from sim_server.link import ServerLink
+from sim_server.recorder import Recorder
+from sim_server.simulation import Simulation
+from sim_server.telemetry import Telemetry
+
+log = logging.getLogger(__name__)
+
+NAP = 1e-3  # s between rounds of the service thread
+ENDLESS = 1 << 62
+
+
+class Service:
+    """Runs `simulation` on `link` until `steps` are done (None: until told to stop)."""
+
+    def __init__(
+        self, simulation: Simulation, link: ServerLink, recorder: Recorder | None = None, steps: int | None = None,
+        realtime: bool = True,
+    ):  # fmt: skip
+        self.simulation, self.link, self.recorder, self.steps = simulation, link, recorder, steps
+        self.engine = simulation.engine
+        self.engine.loop.realtime, self.engine.loop.patient = int(realtime), int(not realtime)
+        self.driver = Driver(simulation, link)
+        self.telemetry = Telemetry(self.driver, link, recorder, patient=not realtime)
+        self.commands = Commands(simulation, self._accepted)
+        self.telemetry.commands = self.commands
+        self.engine.loop.frame_every = self.telemetry.wanted_frames()
+        self._waiting: deque[NDArray[Any]] = deque()
+        self._failure: BaseException | None = None
+        self._clients: set[str] = set()
+        self.beside: Callable[[], None] = lambda: None  # called each round: the supervisor of local workers
+        self._alone = not self.driver.wants_factors or self.driver.kind == "async"  # the loop needs no Python
+        self.telemetry.open()
+
+    def run(self) -> None:
+        """Blocks until the run is over; KeyboardInterrupt passes through after a clean end of the loop."""
+        loop = threading.Thread(target=self._loop, name="loop")
+        loop.start()
+        try:
+            while loop.is_alive() and not self.commands.stopping:
+                self.round()
+                time.sleep(NAP)
+        finally:
+            self.engine.loop.stop = 1
+            while loop.is_alive():  # it may wait for room in its rings
+                self._drain()
+                loop.join(0.01)
+            self._drain()
+            self.telemetry.publish_status("stopping")
+        if self._failure is not None:
+            raise self._failure
+
+    def _loop(self) -> None:
+        try:
+            if self._alone:
+                self.engine.run(ENDLESS if self.steps is None else self.steps)
+                return
+            while not self.engine.loop.stop and (self.steps is None or self.engine.step < self.steps):
+                self._waiting.append(self.driver.advance(1))
+        except BaseException as error:
+            self._failure = error
+
+    def round(self) -> None:
+        """One turn of the service thread: everything that is due, nothing that waits."""
+        self._drain()
+        self.beside()
+        for command, reply in self.link.commands():
+            if command.verb == "status":
+                self.telemetry.publish_status(self._state())
+                reply(pb.Reply())
+                continue
+            reply(self.commands.carry_out(command))
+        clients = set(self.link.clients())
+        if clients != self._clients:
+            self.commands.gone(clients) if "touch" in self.simulation.effects else None
+            self._clients = clients
+        self.telemetry.publish_status(self._state(), force=False)
+
+    def _drain(self) -> None:
+        if self._alone:
+            records = self.driver.pump()
+        else:
+            batches = [self._waiting.popleft() for _ in range(len(self._waiting))]
+            records = np.concatenate(batches) if batches else np.zeros(0, self.engine.records_dtype)
+        for line in self.telemetry.bad_steps(records):
+            log.error("%s", line)
+        self.telemetry.records(records)
+        self.telemetry.frames()
+        self.engine.loop.frame_every = self.telemetry.wanted_frames()
+
+    def _state(self) -> str:
+        if self.commands.stopping:
+            return "stopping"
+        return "paused" if self.commands.engine_paused else "running"
+
+    def _accepted(self, interaction: pb.Interaction, time: float) -> None:
+        if self.recorder:
+            self.recorder.interaction(interaction, time)

@@ -1,0 +1,171 @@
+# SPDX-License-Identifier: MIT
+"""What the loop reports, on its way to the log and to whoever listens."""
+
+import os
+import time
+from collections import deque
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol import messages_pb2 as pb
+from sim_server import describe
+from sim_server.commands import Commands
+from sim_server.driver import Driver
+from sim_server.link import ServerLink
+from sim_server.recorder import Recorder
+
+STEPS_PERIOD = 0.05  # s between batches of step records
+STATE_PERIOD = 1 / 30  # s between states for viewers
+STATUS_PERIOD = 1.0  # s
+WINDOW = 1000  # steps that percentiles are taken over
+
+
+class Telemetry:
+    """Turns records and frames of one run into messages. patient: the log may be waited for (no deadline to miss)."""
+
+    def __init__(self, driver: Driver, link: ServerLink, recorder: Recorder | None, patient: bool):
+        self.driver, self.link, self.recorder, self.patient = driver, link, recorder, patient
+        self.simulation, self.engine = driver.simulation, driver.engine
+        self.commands: Commands | None = None
+        self.begun = time.monotonic()
+        self.every = self.simulation.scene.record.every if recorder else 0
+        self._batch: list[pb.ObjectStep] = []
+        self._window: dict[str, deque[int]] = {b.name: deque(maxlen=WINDOW) for b in self.simulation.world.bodies}
+        self.seconds: deque[float] = deque(maxlen=WINDOW)
+        self._last: dict[str, pb.ObjectStep] = {}
+        self._bad: set[str] = set()
+        self._due = {"steps": 0.0, "state": 0.0, "status": 0.0}
+        self._touched: dict[int, pb.Interaction] = {}
+
+    def open(self) -> None:
+        """Scene, topologies and the initial state: first in the log, first on the network."""
+        message = describe.scene(self.simulation)
+        self.link.set_scene(message)
+        if self.recorder:
+            self.recorder.scene(message)
+        for body in self.simulation.world.bodies:
+            topology = describe.topology(self.simulation, body)
+            self.link.announce(topology)
+            if self.recorder:
+                self.recorder.topology(topology)
+        if self.recorder:
+            self._record_frame(0, self.simulation.world.x, self.simulation.world.v)
+        self.publish_status("running")
+
+    def _period(self, what: str, period: float) -> bool:
+        now = time.monotonic()
+        if now < self._due[what]:
+            return False
+        self._due[what] = now + period
+        return True
+
+    def records(self, records: NDArray[Any]) -> None:
+        """Step records: all of them to the log, in batches to listeners."""
+        if len(records):
+            self.seconds.extend(records["whole"][records["body"] == 0].tolist())
+            messages = describe.steps(self.simulation, records)
+            self._touch(messages)
+            for message in messages:
+                self._note(message)
+            self._batch += messages
+        if self._period("steps", STEPS_PERIOD) and self._batch:
+            if self.link.wants_steps():
+                self.link.publish_steps(pb.Steps(steps=self._batch[-4096:]))
+            self._batch = []
+
+    def _note(self, message: pb.ObjectStep) -> None:
+        name = message.header.object
+        message.excess = self.driver.by_name[name].excess
+        self._window[name].append(message.iterations)
+        self._last[name] = message
+        if self.recorder:
+            self.recorder.step(message, block=self.patient)
+
+    def _touch(self, messages: list[pb.ObjectStep]) -> None:
+        """Adds to each step the interactions that acted in it."""
+        if self.commands is None or "touch" not in self.simulation.effects:
+            return
+        alive = {i.id: i for i in self.commands.applied()}
+        clock, dt = float(self.simulation.system.clock[0]), self.simulation.world.dt
+        for id in set(self._touched) - set(alive):  # over or released: it acted up to now at most
+            self._touched[id].duration = min(self._touched[id].duration, max(clock - self._touched[id].start, 0))
+        self._touched.update(alive)
+        for message in messages:
+            begin = message.time - dt
+            message.interactions.extend(
+                i
+                for i in self._touched.values()
+                if i.object == message.header.object and 0 <= i.start <= begin + 0.5 * dt < i.start + i.duration
+            )
+        for id in set(self._touched) - set(alive):
+            del self._touched[id]
+
+    def frames(self) -> None:
+        """States: to the log at the scene's rate, the newest one to viewers."""
+        frames = self.engine.frames()
+        for step, x, v in frames:
+            if self.every and step % self.every == 0:
+                self._record_frame(step, x, v)
+        if frames and self._period("state", STATE_PERIOD):
+            step, x, v = frames[-1]
+            for body in self.simulation.world.bodies:
+                if self.link.wants_state(body.name):
+                    self.link.publish_state(describe.state(body, step, step * self.simulation.world.dt, x, v))
+
+    def wanted_frames(self) -> int:
+        """Steps between frames that the loop should copy out: 0 if nobody looks."""
+        watched = any(self.link.wants_state(b.name) for b in self.simulation.world.bodies)
+        return self.every or (max(1, round(STATE_PERIOD / self.simulation.world.dt)) if watched else 0)
+
+    def _record_frame(self, step: int, x: NDArray[np.float64], v: NDArray[np.float64]) -> None:
+        assert self.recorder is not None
+        for body in self.simulation.world.bodies:
+            message = describe.state(body, step, step * self.simulation.world.dt, x, v)
+            self.recorder.state(message, block=self.patient)
+
+    def publish_status(self, state: str, force: bool = True) -> None:
+        """The health of the whole scene."""
+        if not self._period("status", STATUS_PERIOD) and not force:
+            return
+        loop, world = self.engine.loop, self.simulation.world
+        p50, p99, most = self.percentiles()
+        status = pb.Status(
+            scene=self.simulation.scene.name, state=state, step=self.engine.step, time=self.engine.step * world.dt,
+            dt=world.dt, step_p50=p50, step_p99=p99, step_max=most, late_steps=loop.late_steps, device="cpu",
+            pid=os.getpid(), uptime=time.monotonic() - self.begun,
+        )  # fmt: skip
+        dropped = loop.frames_dropped + (self.recorder.dropped if self.recorder else 0)
+        status.frames_dropped = dropped
+        for track in self.driver.tracks:
+            body, window = track.body, self._window[track.body.name]
+            status.objects.append(
+                pb.ObjectStatus(
+                    object=body.name, nodes=body.last - body.first, tets=len(body.mesh.tets),
+                    last=self._last.get(body.name), mean_iterations=float(np.mean(window)) if window else 0.0,
+                    excess=track.excess, factors_used=track.used, factors_refused=track.refused,
+                    in_flight=track.in_flight,
+                )  # fmt: skip
+            )
+        self.link.publish_status(status)
+
+    def percentiles(self) -> tuple[float, float, float]:
+        """p50, p99 and maximum of the step time over the last steps [s]."""
+        if not self.seconds:
+            return 0.0, 0.0, 0.0
+        seconds = np.array(self.seconds)
+        return float(np.percentile(seconds, 50)), float(np.percentile(seconds, 99)), float(seconds.max())
+
+    def bad_steps(self, records: NDArray[Any]) -> list[str]:
+        """One line for each object whose solve met numbers that are not finite for the first time."""
+        lines = []
+        for r in records[records["bad_node"] >= 0]:
+            name = self.simulation.world.bodies[int(r["body"])].name
+            if name not in self._bad:
+                self._bad.add(name)
+                lines.append(
+                    f"object {name!r}, step {int(r['step'])}: force is not finite at node {int(r['bad_node'])}; "
+                    "its velocity is left as it was"
+                )
+        return lines
