@@ -12,6 +12,7 @@ from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import register_schema
 
 from protocol import PROTOCOL
+from sim_server.errors import InputError
 
 CHUNK_BYTES = 1 << 20
 PROFILE = "warpfactor"
@@ -23,15 +24,13 @@ class McapFile:
 
     def __init__(self, path: Path, compression: str, overwrite: bool) -> None:
         if compression not in COMPRESSIONS:
-            raise ValueError(f"recording: compression = {compression!r}: allowed are {', '.join(COMPRESSIONS)}")
+            raise InputError(f"recording: compression = {compression!r}: allowed are {', '.join(COMPRESSIONS)}")
         try:
             self._stream = path.open("wb" if overwrite else "xb")
         except FileExistsError:
-            raise FileExistsError(
-                f"{path}: the file exists; a log is never overwritten: remove it or choose another name"
-            ) from None
+            raise InputError(f"{path}: the file exists: remove it or choose another name for the log") from None
         except OSError as error:
-            raise type(error)(f"{path}: cannot record there: {error.strerror}") from None
+            raise InputError(f"{path}: a log cannot be written there: {error.strerror}") from None
         self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES, compression=COMPRESSIONS[compression])
         self._schemas: dict[type[Message], int] = {}
         self._channels: dict[str, int] = {}

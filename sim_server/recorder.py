@@ -52,8 +52,8 @@ class Recorder:
     counted in `lost` beyond that. Both numbers are written at the end of the file. A disk error stops the
     recording, is told once through `report` and kept in `failure`; feeding is then a no-op.
 
-    Raises FileExistsError if the file is there and not to be overwritten, OSError if it cannot be created,
-    ValueError for an unknown compression.
+    Raises InputError if the file cannot be created, if it is there already and not to be overwritten, or for an
+    unknown compression.
     """
 
     def __init__(

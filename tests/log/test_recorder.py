@@ -18,6 +18,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from clients.errors import BadInput
 from clients.log import Log
 from protocol import messages_pb2 as pb
+from sim_server.errors import InputError
 from sim_server.recorder import Recorder
 from tests.sample_run import DT, REST, TETS, object_step, positions, push, record, scene, state, topology, velocities
 
@@ -63,7 +64,7 @@ def test_log_is_self_describing(tmp_path: Path) -> None:
 def test_existing_file_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     path.write_text("precious")
-    with pytest.raises(FileExistsError, match=r"run\.mcap: the file exists"):
+    with pytest.raises(InputError, match=r"run\.mcap: the file exists"):
         Recorder(path)
     assert path.read_text() == "precious"
     with Recorder(path, overwrite=True) as recorder:
@@ -74,12 +75,12 @@ def test_existing_file_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("place", ["missing/run.mcap", "."])
 def test_unwritable_place_is_refused(tmp_path: Path, place: str) -> None:
-    with pytest.raises(OSError, match=str(tmp_path)):
+    with pytest.raises(InputError, match=str(tmp_path)):
         Recorder(tmp_path / place)
 
 
 def test_unknown_compression_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="allowed are lz4, zstd, none"):
+    with pytest.raises(InputError, match="allowed are lz4, zstd, none"):
         Recorder(tmp_path / "run.mcap", "gzip")  # type: ignore[arg-type]
     assert not (tmp_path / "run.mcap").exists()
 
