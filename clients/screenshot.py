@@ -31,31 +31,40 @@ def screenshot(rrd: Path, step: int) -> bytes:
     """
     reason = ""
     for _ in range(ATTEMPTS):
-        try:
-            return _attempt(rrd, step)
-        except Exception as error:  # the experimental interface raises many kinds
-            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-    raise ClientError(f"no screenshot from rerun in {ATTEMPTS} attempts: {reason}")
+        with tempfile.TemporaryDirectory() as folder:
+            try:
+                return _attempt(rrd, step, Path(folder))
+            except Exception as error:  # the experimental interface raises many kinds
+                panic = _panic(Path(folder) / "log")
+                reason = panic or (str(error).splitlines() or [type(error).__name__])[0]
+        if panic:
+            break  # the driver will be no better next time
+    raise ClientError(f"no screenshot from rerun: {reason}")
 
 
-def _attempt(rrd: Path, step: int) -> bytes:
+def _attempt(rrd: Path, step: int, folder: Path) -> bytes:
     from rerun.experimental import ViewerClient
 
-    with tempfile.TemporaryDirectory() as folder:
-        wrapper = Path(folder) / "rerun"
-        binary = shlex.quote(str(viewer_binary()))
-        # spawn() has no argument for the address and would listen everywhere; log lines would pop up in the picture.
-        wrapper.write_text(
-            "#!/bin/sh\n"
-            f'export RUST_LOG=off XDG_RUNTIME_DIR="${{XDG_RUNTIME_DIR:-{folder}}}"\n'
-            f'exec {binary} "$@" --bind 127.0.0.1 --window-size {SIZE}\n'
-        )
-        wrapper.chmod(0o700)
-        with ViewerClient.spawn(headless=True, port=free_port(), executable_path=str(wrapper)) as viewer:
-            viewer.open(str(rrd.resolve()))
-            _wait_until_loaded(viewer)
-            viewer.set_time("step", sequence=step, play_state="paused")
-            return _settled(viewer)
+    wrapper = folder / "rerun"
+    binary = shlex.quote(str(viewer_binary()))
+    # spawn() has no argument for the address and would listen everywhere; log lines would pop up in the picture.
+    wrapper.write_text(
+        "#!/bin/sh\n"
+        f'export RUST_LOG=off XDG_RUNTIME_DIR="${{XDG_RUNTIME_DIR:-{folder}}}"\n'
+        f'exec {binary} "$@" --bind 127.0.0.1 --window-size {SIZE} 2> {folder}/log\n'
+    )
+    wrapper.chmod(0o700)
+    with ViewerClient.spawn(headless=True, port=free_port(), executable_path=str(wrapper)) as viewer:
+        viewer.open(str(rrd.resolve()))
+        _wait_until_loaded(viewer)
+        viewer.set_time("step", sequence=step, play_state="paused")
+        return _settled(viewer)
+
+
+def _panic(log: Path) -> str:
+    """What the viewer died of, as when a Vulkan driver is registered but does not work."""
+    text = log.read_text(errors="replace") if log.exists() else ""
+    return next((line for line in text.splitlines() if "panicked at" in line), "")
 
 
 def _wait_until_loaded(viewer) -> None:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import tempfile
 import time
@@ -171,6 +172,7 @@ def _viewer(web: bool) -> Viewer:
 
 
 def _recording() -> rr.RecordingStream:
+    os.environ.setdefault("RUST_LOG", "error")  # rerun reads it when imported, and warns of much that we handle
     try:
         import rerun as rr
     except ImportError:
