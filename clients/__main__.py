@@ -111,7 +111,7 @@ def push(
 
     with Client(server, connect) as client:
         taken = client.push(object, at, force, radius, duration)
-    print(f"pushed {taken.nodes} nodes of {object} for {duration:g} s from t = {taken.start:.3f} s")
+    print(f"pushed {_nodes(taken.nodes)} of {object} for {duration:g} s")
 
 
 @app.command()
@@ -137,7 +137,7 @@ def grab(
 
     number(duration, "duration", positive=True)
     with Client(server, connect) as client, client.grab(object, at, at, radius, stiffness, max_force) as held:
-        print(f"holding {held.interaction.nodes} nodes of {object}")
+        print(f"holding {_nodes(held.interaction.nodes)} of {object}")
         began = time.monotonic()
         while (share := (time.monotonic() - began) / duration) < 1:
             held.move([a + share * (b - a) for a, b in zip(at, to, strict=True)])
@@ -253,6 +253,10 @@ def export(
         with progress_bar("writing", len(opened.object_log(object).frames)) as progress:
             written = write(opened, object, to, frame, epoch, progress)
         print(f"wrote {written[-1]}" + (f" and {len(written) - 1} more" if len(written) > 1 else ""))
+
+
+def _nodes(count: int) -> str:
+    return f"{count} node{'s' if count != 1 else ''}"
 
 
 @contextlib.contextmanager

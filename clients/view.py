@@ -7,6 +7,8 @@ import os
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -117,9 +119,7 @@ def save_screenshot(log: Log, to: Path, coloring: Coloring) -> None:
 
 def view_log(log: Log, coloring: Coloring, web: bool) -> None:
     """Shows the log until the viewer is closed."""
-    with _viewer(web) as viewer:
-        recording = _recording()
-        recording.connect_grpc(viewer.url)
+    with _viewer(web) as viewer, _sent_to(viewer) as recording:
         show_log(log, recording, coloring)
         recording.flush()
         viewer.wait()
@@ -129,11 +129,8 @@ def view_live(client: Client, coloring: Coloring, web: bool) -> None:
     """Shows what the server does now until the viewer is closed."""
     from clients.rerun_scene import RerunScene
 
-    with _viewer(web) as viewer:
-        recording = _recording()
-        recording.connect_grpc(viewer.url)
-        scene = RerunScene(recording, coloring, grow=True)
-        _follow(client, scene, viewer, recording)
+    with _viewer(web) as viewer, _sent_to(viewer) as recording:
+        _follow(client, RerunScene(recording, coloring, grow=True), viewer, recording)
 
 
 def _follow(client: Client, scene: RerunScene, viewer: Viewer, recording: rr.RecordingStream) -> None:
@@ -169,6 +166,17 @@ def _viewer(web: bool) -> Viewer:
     if viewer.page:
         say(f"open {viewer.page} in a browser on this machine; Ctrl-C ends the viewer")
     return viewer
+
+
+@contextmanager
+def _sent_to(viewer: Viewer) -> Iterator[rr.RecordingStream]:
+    """A recording that ends before its viewer does, so that it does not complain of a lost connection."""
+    recording = _recording()
+    recording.connect_grpc(viewer.url)
+    try:
+        yield recording
+    finally:
+        recording.disconnect()
 
 
 def _recording() -> rr.RecordingStream:

@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import time
+from typing import Any
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Group
 from rich.live import Live
 from rich.table import Table
@@ -15,6 +17,7 @@ from clients.scalars import status_name
 from protocol import messages_pb2 as pb
 
 PERIOD = 0.5  # s between two looks
+COMPACT: dict[str, Any] = {"box": SIMPLE_HEAD, "padding": (0, 1), "pad_edge": False}  # fits 80 columns
 
 
 def watch(client: Client, count: int = 0) -> None:
@@ -45,7 +48,7 @@ def _summary(status: pb.Status) -> Text:
 
 
 def _objects(status: pb.Status) -> Table:
-    table = Table("object", "nodes", "iterations", "mean", "residual", "status", "factor age", "preconditioner")
+    table = Table("object", "nodes", "iter.", "mean", "residual", "status", "age", "preconditioner", **COMPACT)
     for found in status.objects:
         last = found.last
         table.add_row(
@@ -64,7 +67,7 @@ def _objects(status: pb.Status) -> Table:
 def _workers(status: pb.Status) -> Table | Text:
     if not status.workers:
         return Text("no workers")
-    table = Table("worker", "host", "pid", "library", "threads", "jobs", "failures", "refused", "shared memory")
+    table = Table("worker", "host", "pid", "library", "threads", "jobs", "failed", "refused", "shm", **COMPACT)
     for worker in status.workers:
         numbers = (worker.threads, worker.jobs, worker.failures, worker.refused)
         shared = "yes" if worker.shared_memory else "no"
