@@ -4,8 +4,9 @@
 //   - a step counts as solved only by its true residual |b - A x| <= tolerance |b|, computed at the end; where the recursive one was
 //     too good the iteration starts again from the true one;
 //   - it starts from the last solution where that is better than zero;
-//   - p'Ap <= 0 and z'r <= 0 are looked for and named; a factor with z'r <= 0 is left for block Jacobi on the spot, so that a
-//     useless factor costs iterations and never the answer.
+//   - p'Ap <= 0 and z'r <= 0 are looked for and named; a factor with z'r <= 0 is left for block Jacobi on the spot, and one that
+//     is not half way (in decades of the residual) after half the iterations allowed is left then: a useless factor costs
+//     iterations and never the answer.
 // An iteration is one application of A after the initial residual.
 #pragma once
 #include <chrono>
@@ -100,23 +101,30 @@ static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor,
 
     Preconditioner P{A, factor, out.kind, inverse, scratch};
     P.prepare();
-    double rz = 0, last_true = INFINITY;
+    double rz = 0, last_true = INFINITY, half_way = std::sqrt(goal * r2);
     bool restart = true, switched = false;
+    auto leave_factor = [&] {
+        P.kind = out.kind = BLOCK_JACOBI;
+        out.fallbacks = 1;
+        P.prepare();
+        r2 = residual(A, b, x, r);
+        restart = true;
+    };
     for (;;) {
         double zr = P.apply(r, std::sqrt(r2), z);                                // 1. 6. z = P^-1 r
-        if (!(zr > 0)) {                                                         // also NaN
+        if (!(zr > 0 && zr < INFINITY)) {                                        // also NaN
             if (P.kind != CHOLESKY) return finish(BREAKDOWN_PRECONDITIONER, residual(A, b, x, r), b2);
-            P.kind = out.kind = BLOCK_JACOBI;
-            out.fallbacks = 1;
-            P.prepare();
-            r2 = residual(A, b, x, r);
-            restart = true;
+            leave_factor();
             continue;
         }
         conjugate(n, restart ? 0 : zr / rz, z, p);                               // 7. 8. p = z + beta p
         rz = zr;
         restart = false;
         if (out.iterations == settings.max_iterations) return finish(MAX_ITERATIONS, residual(A, b, x, r), b2);
+        if (P.kind == CHOLESKY && out.iterations == settings.max_iterations / 2 && !(r2 < half_way) && out.iterations > 0) {
+            leave_factor();
+            continue;
+        }
         if (out.iterations == settings.probe && settings.probe > 0 && factor && P.kind >= BLOCK_JACOBI && !switched) {
             P.kind = out.kind = P.kind == CHOLESKY ? BLOCK_JACOBI : CHOLESKY;
             P.prepare();
