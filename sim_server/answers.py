@@ -50,6 +50,7 @@ class Answers:
         """A pattern that a worker found; raises Refused."""
         message = parse(PatternMessage, data, CHANNELS["pattern"].limit)
         known = self._object(message, key, "pattern")
+        check_header(message, epoch=known.epoch)
         if message.size != known.size:
             raise Refused(f"FactorPattern.size is {message.size}; allowed: {known.size}", "shape")
         pattern = FactorPattern.from_message(message)
@@ -59,7 +60,10 @@ class Answers:
             known.patterns[pattern.id] = pattern
 
     def parse_factor(self, key: object, attachment: Sized | None) -> FactorMessage:
-        """The message beside the values, for this life of the server and an object of it; raises Refused."""
+        """The message beside the values, for this life of the server and an object of it; raises Refused.
+
+        Its epoch is not looked at: also the answer to a job of the last epoch tells that its worker is free again.
+        """
         message = parse(FactorMessage, attachment, CHANNELS["factor"].limit)
         self._object(message, key, "factor")
         check_strings(message)
@@ -94,9 +98,7 @@ class Answers:
         header = check_header(message, incarnation=self._incarnation, object=self.known)
         if header.object != name_in(channel, key, "object"):
             raise Refused(f"{message.DESCRIPTOR.name}.header.object is {header.object!r}, its key is {key}", "object")
-        known = self.known[header.object]
-        check_header(message, epoch=known.epoch)
-        return known
+        return self.known[header.object]
 
 
 def _from_slot(message: FactorMessage, flight: Flight) -> NDArray[Any]:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Compiles the kernel texts for the CPU and binds their arguments.
 
-One `.cu` text serves both compilers (kernels/kernel.h). Here the system C++ compiler builds it into a shared library that
-ctypes loads, cached by source, headers, flags, compiler and processor. A kernel's argument struct is read from the text
-itself, so its layout stands in one place; `Module.bind` fills it from arrays by name and checks types and contiguity.
+One `.cu` text serves both compilers (kernels/kernel.h). Here the system C++ compiler builds it into a shared library
+that ctypes loads, cached by source, headers, flags, compiler and processor. A kernel's argument struct is read from the
+text itself, so its layout stands in one place; `Module.bind` fills it from arrays by name and checks them.
 """
 
 from __future__ import annotations
@@ -26,7 +26,17 @@ import numpy as np
 HERE = Path(__file__).parent
 INCLUDE = HERE / "kernels"
 # No -ffast-math: it deletes NaN checks. Contraction to FMA is the compiler's default on both sides.
-FLAGS = ["-O3", "-march=native", "-std=c++17", "-shared", "-fPIC", "-fopenmp", "-fno-math-errno", "-fno-trapping-math", "-Wall"]
+FLAGS = [
+    "-O3",
+    "-march=native",
+    "-std=c++17",
+    "-shared",
+    "-fPIC",
+    "-fopenmp",
+    "-fno-math-errno",
+    "-fno-trapping-math",
+    "-Wall",
+]
 
 compiled: list[str] = []  # names of the texts this process uses, in order: what a scene costs can be tested
 
@@ -49,7 +59,9 @@ def _machine() -> str:
     """What -march=native depends on: compiler version and processor flags."""
     version = subprocess.run([compiler(), "--version"], capture_output=True, text=True, check=True).stdout
     try:
-        flags = next(line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith(("flags", "Features")))
+        flags = next(
+            line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith(("flags", "Features"))
+        )
     except (OSError, StopIteration):
         flags = platform.processor()
     return version + flags
@@ -69,7 +81,9 @@ def build(source: Path, defines: tuple[str, ...] = ()) -> Path:
     """
     headers = sorted(p for folder in {INCLUDE, source.parent} for p in folder.iterdir() if p.suffix in (".h", ".cuh"))
     flags = [*FLAGS, *(f"-D{d}" for d in defines)]
-    digest = hashlib.sha256("\0".join([_machine(), *flags, *(p.name + p.read_text() for p in [source, *headers])]).encode())
+    digest = hashlib.sha256(
+        "\0".join([_machine(), *flags, *(p.name + p.read_text() for p in [source, *headers])]).encode()
+    )
     library = cache_folder() / f"{source.stem}-{digest.hexdigest()[:24]}.so"
     if not library.exists():
         library.parent.mkdir(parents=True, exist_ok=True)

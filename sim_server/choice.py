@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
 """preconditioner = "auto": block Jacobi or the factor, whichever costs less time per solve.
 
-At small time steps the matrix is easy and block Jacobi beats any factor; at large ones the factor wins many times over.
-Neither is known beforehand, so both are measured. The one not in use is tried again now and then by a *probe*: a solve
-that begins with it and goes over to the other after as many iterations as that one's whole solve costs, so that a probe at
-worst doubles one solve. A pure state machine over (kind, iterations, cost); whoever drives it decides whether cost is
-seconds or, where runs must repeat exactly, bytes moved.
+At small time steps the matrix is easy and block Jacobi beats any factor; at large ones the factor wins many times
+over. Neither is known beforehand, so both are measured. The one not in use is tried again now and then by a *probe*: a
+solve that begins with it and goes over to the other after as many iterations as that one's whole solve costs, so that a
+probe at worst doubles one solve. A pure state machine over (kind, iterations, cost); whoever drives it decides whether
+cost is seconds or, where runs must repeat exactly, bytes moved.
 """
 
 from dataclasses import dataclass

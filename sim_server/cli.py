@@ -68,7 +68,17 @@ def serve(
     try:
         with ExitStack() as closing:
             service, supervisor = _set_up(
-                closing, scene, set_ or [], name, listen, connect, not no_shared_memory, record, steps, realtime, workers
+                closing,
+                scene,
+                set_ or [],
+                name,
+                listen,
+                connect,
+                not no_shared_memory,
+                record,
+                steps,
+                realtime,
+                workers,
             )
             _announce(say, service, scene, listen)
             _wait_for_workers(service, supervisor)

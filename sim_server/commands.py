@@ -5,7 +5,6 @@ import math
 from collections.abc import Callable
 
 from protocol import messages_pb2 as pb
-from sim_server.engine import Engine
 from sim_server.simulation import Simulation
 
 
@@ -60,7 +59,9 @@ class Commands:
         i = command.interaction
         _finite(i)
         point, force = _tuple(i.point), _tuple(i.force)
-        return self._took(command, self._touch(i.object).push(command.client, i.object, point, i.radius, force, i.duration))
+        return self._took(
+            command, self._touch(i.object).push(command.client, i.object, point, i.radius, force, i.duration)
+        )
 
     def _grab(self, command: pb.Command) -> pb.Reply:
         i = command.interaction

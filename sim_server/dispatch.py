@@ -216,7 +216,7 @@ class Dispatch:
 
     def _take_factor(self, sample: zenoh.Sample) -> None:
         message = self._answers.parse_factor(sample.key_expr, sample.attachment)
-        flight = self._jobs.answered(message.job, message.worker)
+        flight = self._jobs.answered(message.job, message.worker, message.header.epoch)
         self._roster.heard(flight.worker, self._clock())
         seconds = None
         try:

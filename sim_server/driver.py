@@ -3,8 +3,8 @@
 
     never       one factor, made in this process from the first matrix (PCG-0)
     every-N     a new one in this process each N-th step, which waits for it (PCG-1, PCG-30)
-    async       matrices to workers, one of an object at a time; a factor is taken up when it comes; nothing waits
-    lockstep-D  as async, but the factor made from step t is taken up exactly at step t + D: the deterministic twin
+    async       matrices to workers, one of an object at a time; a factor is taken up as it comes; nothing waits
+    lockstep-D  async, but the factor made from step t is taken up at step t + D exactly: the deterministic twin
 
 `advance` makes steps and waits where the policy says so. For async the loop runs on its own (Engine.run in a thread that
 has let go of Python's lock) and `pump` is called beside it.
@@ -59,7 +59,9 @@ class Driver:
         self._due: dict[str, int] = {}  # lockstep: step of the matrix whose factor is taken up n steps later
         self._arrived: dict[tuple[str, int], Factor] = {}
         self._warped = {t.body.name: bool(simulation.system.warped[t.body.nodes].any()) for t in self.tracks}
-        bytes_a = {t.body.name: 72.0 * len(simulation.system.body_values(t.body.first, t.body.last)) for t in self.tracks}
+        bytes_a = {
+            t.body.name: 72.0 * len(simulation.system.body_values(t.body.first, t.body.last)) for t in self.tracks
+        }
         self._bytes = bytes_a  # of A: deterministic cost of an iteration
 
     # --- one step after another ---------------------------------------------------------------------------------
@@ -230,7 +232,9 @@ class Driver:
             t.excess += excess(iterations, floor)
             t.refused += fallbacks
             if t.choice is not None:
-                t.choice.observe(Kind(kind), iterations, solve if self.kind == "async" else self._model(t, kind, iterations))
+                t.choice.observe(
+                    Kind(kind), iterations, solve if self.kind == "async" else self._model(t, kind, iterations)
+                )
                 self._settle(t)
 
     def _model(self, t: Track, kind: int, iterations: int) -> float:

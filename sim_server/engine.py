@@ -68,8 +68,8 @@ class _Body(c.Structure):
 RECORD = np.dtype(
     [
         ("step", "i8"), ("factor_step", "i8"), ("time", "f8"), ("residual", "f8"), ("assemble", "f8"), ("solve", "f8"),
-        ("integrate", "f8"), ("whole", "f8"), ("late", "f8"), ("begin", "f8"), ("body", "i4"), ("iterations", "i4"),
-        ("status", "i4"), ("kind", "i4"), ("fallbacks", "i4"), ("bad_node", "i4"),
+        ("integrate", "f8"), ("whole", "f8"), ("late", "f8"), ("begin", "f8"), ("cpu", "f8"), ("body", "i4"),
+        ("iterations", "i4"), ("status", "i4"), ("kind", "i4"), ("fallbacks", "i4"), ("bad_node", "i4"),
     ]
 )  # fmt: skip
 """One body, one step: what the loop reports. Seconds, except step numbers; `step` counts completed steps."""
@@ -87,7 +87,7 @@ class _Loop(c.Structure):
         ("frames_dropped", c.c_int64), ("records_dropped", c.c_int64), ("late_steps", c.c_int64),
         ("realtime", c.c_int32), ("patient", c.c_int32), ("threads", c.c_int32), ("stop", c.c_int32),
         ("pause", c.c_int32), ("deadline", c.c_double), ("assemble_begin", c.c_double),
-        ("assemble_seconds", c.c_double), ("late", c.c_double),
+        ("assemble_seconds", c.c_double), ("late", c.c_double), ("cpu_begin", c.c_double),
     ]  # fmt: skip
 
 
@@ -104,7 +104,9 @@ def _library() -> c.CDLL:
     )  # fmt: skip
     sizes = (c.c_int32 * 6)()
     library.wf_sizes(sizes)
-    ours = [c.sizeof(t) for t in (_Launch, _Body)] + [RECORD.itemsize] + [c.sizeof(t) for t in (_Loop, _Factor, _Pattern)]
+    ours = (
+        [c.sizeof(t) for t in (_Launch, _Body)] + [RECORD.itemsize] + [c.sizeof(t) for t in (_Loop, _Factor, _Pattern)]
+    )
     if list(sizes) != ours:
         raise RuntimeError(f"native/loop.cpp and engine.py disagree on layouts: {list(sizes)} and {ours}")
     return library
@@ -153,8 +155,8 @@ class Mailbox:
 class Engine:
     """The loop over one system.
 
-    assemble, integrate: the launches of a step, in order. ranges: nodes [first, last) of each body. arrays: those of the
-    system by name (row_start, columns, values, b, y, x, v, clock).
+    assemble, integrate: the launches of a step, in order. ranges: nodes [first, last) of each body. arrays: those of
+    the system by name (row_start, columns, values, b, y, x, v, clock).
     """
 
     def __init__(
@@ -186,7 +188,11 @@ class Engine:
             setattr(loop, name, arrays[name].ctypes.data)
         loop.work, loop.threads = self._work.ctypes.data, threads
         loop.records, loop.record_capacity = self._records.ctypes.data, len(self._records)
-        loop.frames, loop.frame_steps, loop.frame_capacity = self._frames.ctypes.data, self._frame_steps.ctypes.data, frames
+        loop.frames, loop.frame_steps, loop.frame_capacity = (
+            self._frames.ctypes.data,
+            self._frame_steps.ctypes.data,
+            frames,
+        )
 
     # --- running ------------------------------------------------------------------------------------------------
 

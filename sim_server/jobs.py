@@ -78,10 +78,12 @@ class Jobs:
         """Late jobs of a worker that it may still be busy with."""
         return len(self._late.get(worker, ()))
 
-    def answered(self, number: int, worker: str) -> Flight:
+    def answered(self, number: int, worker: str, epoch: int) -> Flight:
         """The flight that an answer belongs to, still in flight; raises Refused."""
         flight = self.by_worker.get(worker)
         if flight is not None and flight.number == number:
+            if epoch != flight.epoch:
+                raise Refused(f"Factor.header.epoch is {epoch}; allowed: {flight.epoch}, as in the matrix", "epoch")
             if self.by_object.get(flight.object) is flight:
                 return flight
             self.end(flight)

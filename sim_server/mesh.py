@@ -36,11 +36,13 @@ class Mesh:
     name: str = "mesh"
 
 
-def bar(cells: Sequence[int], size: Sequence[float]) -> Mesh:
+def bar(cells: Sequence[int], size: Sequence[float], split: str = "kuhn") -> Mesh:
     """A box of `size` [m] with a corner at the origin, each of its nx ny nz hexahedra split into 6 tetrahedra.
 
     Kuhn split: one tetrahedron per order of the axes along which a path leads from the lowest corner of the cell to
-    the opposite one, so neighbouring cells match. Nodes are numbered x fastest, then y, then z; so are the cells.
+    the opposite one, so neighbouring cells match. All its diagonals point one way, so that a coarse bar under bending
+    also twists. "mirrored" turns the split over from cell to cell along each axis: the same count, without that bias.
+    Nodes are numbered x fastest, then y, then z; so are the cells.
     Raises InputError unless there are three counts >= 1 and three finite sizes > 0.
     """
     if len(cells) != 3 or min(cells) < 1 or 6 * math.prod(cells) > MOST_TETS:
@@ -53,8 +55,16 @@ def bar(cells: Sequence[int], size: Sequence[float]) -> Mesh:
 
     stride = np.array([1, nx + 1, (nx + 1) * (ny + 1)])
     k, j, i = (axis.ravel() for axis in np.mgrid[:nz, :ny, :nx])
-    corner = np.stack([i, j, k], axis=1) @ stride
-    tets = corner[:, None, None] + _kuhn_paths(stride)
+    cell = np.stack([i, j, k], axis=1)
+    if split == "mirrored":
+        flipped = cell % 2
+        far = (cell + flipped) @ stride  # the corner that the paths of this cell start from
+        paths = np.stack([_kuhn_paths(stride * (1 - 2 * np.array(p))) for p in np.ndindex(2, 2, 2)])
+        tets = far[:, None, None] + paths[flipped @ [4, 2, 1]]
+        turned = flipped.sum(axis=1) % 2 == 1  # a mirror image has its winding the other way round
+        tets[turned] = tets[turned][:, :, [0, 1, 3, 2]]
+    else:
+        tets = (cell @ stride)[:, None, None] + _kuhn_paths(stride)
     name = "bar " + "x".join(str(c) for c in cells)
     return Mesh(rest, tets.reshape(-1, 4).astype(np.int32), name)
 

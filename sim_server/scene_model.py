@@ -48,11 +48,16 @@ class MeshSource(Parameters):
 
     bar: Counts | None = Field(default=None, description="cells along x, y, z; each is split into 6 tetrahedra")
     size: Sizes | None = Field(default=None, description="size of the bar along x, y, z [m]")
+    split: Literal["kuhn", "mirrored"] | None = Field(
+        default=None, description="of the cells of a bar: kuhn (default), or mirrored, which bends without twist"
+    )
     file: Annotated[str, AfterValidator(_found)] | None = Field(default=None, description="a file that meshio reads")
 
     @model_validator(mode="after")
     def _one_source(self) -> "MeshSource":
         given = [name for name in ("bar", "size", "file") if getattr(self, name) is not None]
+        if self.split is not None and self.bar is None:
+            raise complaint("split belongs to a bar")
         if given not in (["bar", "size"], ["file"]):
             raise complaint(f"must be {{ bar = [nx, ny, nz], size = [sx, sy, sz] }} or {{ file = ... }}, not {given}")
         return self
@@ -107,7 +112,7 @@ class SceneObject(Parameters):
             if source.file is not None:
                 return check(read(source.file))
             assert source.bar is not None and source.size is not None
-            return bar(source.bar, source.size)
+            return bar(source.bar, source.size, source.split or "kuhn")
         except InputError as error:
             raise InputError(f"object {self.name!r}: {error}") from error
 

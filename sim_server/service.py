@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """The server at work: one thread runs the loop, this one serves its mailboxes, the log and the network.
 
-    loop thread      Engine.run, native, without Python's lock (policies that wait by their nature run Driver.advance)
-    service thread   here: factors in, matrices out, commands, records to log and listeners, every millisecond or so
-    recorder, link   threads of their own for the disk and the network
+loop thread      Engine.run, native, without Python's lock (policies that wait by their nature run Driver.advance)
+service thread   here: factors in, matrices out, commands, records to log and listeners, every millisecond or so
+recorder, link   threads of their own for the disk and the network
 """
 
 import logging

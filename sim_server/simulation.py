@@ -106,4 +106,3 @@ def build_effects(scene: Scene, world: World) -> dict[str, Effect]:
     for name, params in scene.effects.items():
         built[name] = effect(name).build(world, [(body, params) for body in world.bodies])
     return built
-

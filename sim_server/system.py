@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """The linear system of a step: arrays of A' and b', their pattern, and who adds what where.
 
-A is block CSR with 3x3 blocks over all nodes of the scene, both triangles, columns ascending; bodies do not couple, so a
-body's blocks are one range of it. Rows of fixed nodes hold their diagonal block alone (the identity). Effects add to
+A is block CSR with 3x3 blocks over all nodes of the scene, both triangles, columns ascending; bodies do not couple, so
+a body's blocks are one range of it. Rows of fixed nodes hold their diagonal block alone (the identity). Effects add to
     b (n, 3) [N s], diagonal (n,) [kg] and sums (upper blocks, 3, 3) [kg], all in the world frame;
 `turn` and `assemble` then take b and A into the material frame, where the solve happens (kernels/assemble.cu).
 """
@@ -83,8 +83,8 @@ class System:
         """Everything into the material frame: A' = R^T A R, b' = R^T b, and the start of the solve."""
         w, free = self.world, self.world.free
         turn = module("kernels/nodes.cu").bind(
-            "turn", w.nodes, free=free, warped=self.warped, mean=self.mean, b=self.b, dv=self.dv, rotation=self.rotation,
-            b_material=self.b_material, y=self.y,
+            "turn", w.nodes, free=free, warped=self.warped, mean=self.mean, b=self.b, dv=self.dv,
+            rotation=self.rotation, b_material=self.b_material, y=self.y,
         )  # fmt: skip
         assemble = module("kernels/assemble.cu").bind(
             "assemble", len(self.row), row=self.row, column=self.column, upper=self.upper, lower=self.lower, free=free,

@@ -142,11 +142,16 @@ class Telemetry:
             body, window = track.body, self._window[track.body.name]
             status.objects.append(
                 pb.ObjectStatus(
-                    object=body.name, nodes=body.last - body.first, tets=len(body.mesh.tets),
-                    last=self._last.get(body.name), mean_iterations=float(np.mean(window)) if window else 0.0,
-                    excess=track.excess, factors_used=track.used, factors_refused=track.refused,
+                    object=body.name,
+                    nodes=body.last - body.first,
+                    tets=len(body.mesh.tets),
+                    last=self._last.get(body.name),
+                    mean_iterations=float(np.mean(window)) if window else 0.0,
+                    excess=track.excess,
+                    factors_used=track.used,
+                    factors_refused=track.refused,
                     in_flight=track.in_flight,
-                )  # fmt: skip
+                )
             )
         self.link.publish_status(status)
 

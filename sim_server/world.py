@@ -90,4 +90,4 @@ def _lumped(o: SceneObject, mesh: Mesh) -> Reals:
     if o.masses == "equal":
         return np.full(len(mesh.rest), total / len(mesh.rest))
     share = np.repeat(total * volume / volume.sum() / 4, 4)
-    return np.bincount(mesh.tets.ravel(), weights=share, minlength=len(mesh.rest))
+    return np.bincount(mesh.tets.ravel(), weights=share, minlength=len(mesh.rest)).astype(np.float64)

@@ -47,7 +47,7 @@ class Corotational(Effect):
     def __init__(self, world: World, listed: list[tuple[Body, Any]]):
         self.world = world
         self.rotated = tuple(body for body, _ in listed)
-        self.tets = np.ascontiguousarray(np.concatenate([body.tets for body, _ in listed]))
+        self.tets: NDArray[np.int32] = np.ascontiguousarray(np.concatenate([body.tets for body, _ in listed]))
         self.elastic = {body.index: _constants(body, params) for body, params in listed}  # young, poisson
         young = np.concatenate([self.elastic[body.index][0] for body, _ in listed])
         poisson = np.concatenate([self.elastic[body.index][1] for body, _ in listed])

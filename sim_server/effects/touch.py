@@ -102,7 +102,10 @@ class Touch(Effect):
         self, client: str, name: str, point: Point, radius: float, target: Point, stiffness: float, max_force: float,
         duration: float,
     ) -> Interaction:  # fmt: skip
-        """Ties the free nodes near `point` to `target` by springs [N/m in all] of bounded force [N]. Raises TouchError."""
+        """Ties the free nodes near `point` to `target` by springs [N/m in all] of bounded force [N].
+
+        Raises TouchError.
+        """
         limit = min(max_force, self._params(name).max_force) if max_force > 0 else self._params(name).max_force
         if not stiffness > 0 or not duration > 0:
             raise TouchError(f"grab with stiffness = {stiffness:g} N/m, duration = {duration:g} s: must be above 0")

@@ -39,6 +39,7 @@ struct Record {
     double time;           // s, at the end of the step
     double residual;
     double assemble, solve, integrate, whole, late, begin;  // s; begin: steady clock
+    double cpu;            // s of processor time of the thread, whole step
     int32_t body, iterations, status, kind, fallbacks, bad_node;
 };
 
@@ -77,7 +78,14 @@ struct Loop {
     double assemble_begin;
     double assemble_seconds;
     double late;
+    double cpu_begin;
 };
+
+static double thread_time() {
+    timespec t;
+    clock_gettime(CLOCK_THREAD_CPUTIME_ID, &t);
+    return t.tv_sec + 1e-9 * t.tv_nsec;
+}
 
 static void nap(double seconds) {
     timespec t{(time_t)seconds, (long)((seconds - std::floor(seconds)) * 1e9)};
@@ -136,6 +144,7 @@ extern "C" {
 
 void wf_assemble(Loop* loop) {
     double begin = now();
+    loop->cpu_begin = thread_time();
     loop->clock[0] = loop->start_time + loop->step * loop->dt;
     for (int i = 0; i < loop->before; ++i) run(loop->launch[i], loop->threads);
     for (int i = 0; i < loop->bodies; ++i) copy_matrix(*loop, loop->body[i]);
@@ -159,12 +168,12 @@ void wf_solve(Loop* loop) {
         Record& record = loop->records[(first + i) % loop->record_capacity];
         bool used = r.kind == CHOLESKY || r.fallbacks;
         record = Record{loop->step + 1, used ? body.factor->step : -1, loop->start_time + (loop->step + 1) * loop->dt, r.residual,
-                        loop->assemble_seconds, r.seconds, 0, 0, loop->late, loop->assemble_begin, i, r.iterations, r.status,
+                        loop->assemble_seconds, r.seconds, 0, 0, loop->late, loop->assemble_begin, 0, i, r.iterations, r.status,
                         r.kind, r.fallbacks, r.status == NOT_FINITE ? first_bad_node(*loop, body) : -1};
     }
     double solved = now();
     for (int i = loop->before; i < loop->launches; ++i) run(loop->launch[i], loop->threads);
-    double end = now();
+    double end = now(), cpu = thread_time() - loop->cpu_begin;
     ++loop->step;
     if (!keep) { loop->records_dropped += loop->bodies; }
     else {
@@ -172,6 +181,7 @@ void wf_solve(Loop* loop) {
             Record& record = loop->records[(first + i) % loop->record_capacity];
             record.integrate = end - solved;
             record.whole = loop->assemble_seconds + (end - entered);
+            record.cpu = cpu;
         }
         loop->record_head.store(first + loop->bodies, std::memory_order_release);
     }

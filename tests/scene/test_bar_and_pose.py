@@ -130,3 +130,14 @@ def test_pose_moves_after_turning_and_is_rigid():
     assert np.allclose(moved, [[10, 21, 30], [8, 20, 30]])
     turn = pose_matrix([11, -200, 345])
     assert np.allclose(turn @ turn.T, np.eye(3), atol=1e-15) and np.linalg.det(turn) == pytest.approx(1)
+
+
+def test_the_mirrored_split_conforms_and_fills_the_box():
+    mesh = bar((3, 4, 5), (1, 2, 3), "mirrored")
+    volume = volumes(mesh.rest, mesh.tets)
+    assert len(mesh.tets) == 6 * 60 and volume.min() > 0
+    assert np.isclose(volume.sum(), 6)
+    assert len(surface_triangles(mesh.tets)) == 4 * (3 * 4 + 4 * 5 + 3 * 5)  # no face inside is left open
+    kuhn = bar((3, 4, 5), (1, 2, 3))
+    assert np.array_equal(mesh.rest, kuhn.rest)
+    assert not np.array_equal(mesh.tets, kuhn.tets)
