@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: MIT
+"""The command line of the worker."""
+
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+from link_helpers import ROOT, free_endpoint, process
+
+from sim_server.link import ServerLink
+
+pytestmark = pytest.mark.system
+
+
+def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "precond_worker", *arguments],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+
+
+def test_help_shows_examples() -> None:
+    done = run("--help")
+    assert done.returncode == 0
+    for text in ("--connect", "--threads", "--name", "--server", "--no-shared-memory", "Examples", "tcp/10.0.0.5:7447"):
+        assert text in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["--connect", "nonsense"], "endpoint 'nonsense' cannot be used; allowed: PROTOCOL/HOST:PORT"),
+        (["--connect", "tcp/127.0.0.1:99999"], "PORT 1 to 65535"),
+        (["--name", "a/b"], "--name is 'a/b'; allowed: 1 to 64 characters"),
+        (["--server", ""], "--server is ''; allowed"),
+        (["--threads", "0"], "--threads"),
+        (["--threads", "many"], "--threads"),
+        (["--nonsense"], "--nonsense"),
+    ],
+)
+def test_bad_input_is_one_clear_message(arguments: list[str], text: str) -> None:
+    done = run(*arguments)
+    assert done.returncode == 2
+    assert text in done.stderr and "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
+def test_it_waits_for_the_server_and_says_so_once_and_ends_when_told(number: signal.Signals, code: int) -> None:
+    endpoint = free_endpoint()
+    with process("-m", "precond_worker", "--connect", endpoint, "--name", "early", "--threads", "2") as child:
+        assert child.stderr is not None and child.stdout is not None
+        line = child.stderr.readline()
+        assert f"cannot connect to {endpoint}: no answer; trying until the server is there" in line
+        with ServerLink(listen=[endpoint]):
+            assert "early ready: " in (ready := child.stdout.readline())
+            assert ", 2 threads, " in ready
+        assert "is gone, waiting for it" in child.stderr.readline()
+        child.send_signal(number)
+        out, err = child.communicate(timeout=30)
+        assert child.returncode == code
+        assert out == "" and err == ""
+
+
+def test_it_ends_with_its_parent() -> None:
+    endpoint = free_endpoint()
+    parent = (
+        "import subprocess, sys, time\n"
+        f"command = [sys.executable, '-m', 'precond_worker', '--connect', {endpoint!r}, '--exit-with-parent']\n"
+        "worker = subprocess.Popen(command)\n"
+        "print(worker.pid, flush=True)\n"
+        "time.sleep(1000)\n"
+    )
+    with ServerLink(listen=[endpoint]), process("-c", parent) as child:
+        assert child.stdout is not None
+        assert int(child.stdout.readline()) > 0
+        assert " ready: " in child.stdout.readline()
+        os.kill(child.pid, signal.SIGKILL)
+        # The pipe that both hold is at its end when the worker is gone too.
+        assert child.stdout.read() == ""

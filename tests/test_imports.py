@@ -1,0 +1,34 @@
+# SPDX-License-Identifier: MIT
+"""Imports go one way: everybody imports protocol, and nobody anybody else."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+ALLOWED = {
+    "protocol": {"protocol"},
+    "sim_server": {"sim_server", "protocol"},
+    "precond_worker": {"precond_worker", "protocol"},
+    "clients": {"clients", "protocol"},
+}
+# The server may factorize in its own process: a module of pure functions, imported when it is needed.
+EXCEPTION = ("sim_server", "precond_worker.factorize")
+
+
+@pytest.mark.parametrize("package", ALLOWED)
+def test_directions(package: str) -> None:
+    files = list((ROOT / package).rglob("*.py"))
+    assert files
+    for path in files:
+        tree = ast.parse(path.read_text())
+        for node in ast.walk(tree):
+            modules = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            if isinstance(node, ast.ImportFrom):
+                modules = [node.module or ""]
+                assert node.level == 0, f"{path}: relative import"
+            for module in modules:
+                ours = module.split(".")[0] in ALLOWED
+                exempt = (package, module) == EXCEPTION and node not in tree.body
+                assert not ours or exempt or module.split(".")[0] in ALLOWED[package], f"{path} imports {module}"
