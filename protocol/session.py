@@ -6,7 +6,7 @@ import logging
 import os
 import re
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any, Literal, Self
 
@@ -113,6 +113,7 @@ class Session:
         self.shared_memory = shared_memory
         self._closed = threading.Event()
         self._closing = threading.Lock()
+        self._threads: list[threading.Thread] = []
         threading.Thread(target=self._guard, name="session-guardian", daemon=False).start()
 
     def _guard(self) -> None:
@@ -121,8 +122,17 @@ class Session:
                 return
         self.close()
 
+    def thread(self, name: str, run: Callable[[], None]) -> None:
+        """Start a thread that receives from this session, and so ends (by a ZError) when the session closes.
+
+        close() waits for it: a thread found inside zenoh when the interpreter ends aborts the process.
+        """
+        thread = threading.Thread(target=run, name=name, daemon=True)
+        self._threads.append(thread)
+        thread.start()
+
     def close(self) -> None:
-        """Close the session; a second call does nothing."""
+        """Close the session and wait for its threads; a second call does nothing."""
         with self._closing:
             if self._closed.is_set():
                 return
@@ -130,8 +140,10 @@ class Session:
                 self.zenoh.close()
             except zenoh.ZError as error:
                 log.warning("the session did not close cleanly: %s", _reason(error))
-            finally:
-                self._closed.set()
+            for thread in self._threads:
+                if thread is not threading.current_thread():
+                    thread.join(5.0)
+            self._closed.set()
 
     @property
     def closed(self) -> bool:

@@ -2,7 +2,6 @@
 """Questions that others ask the server: status, scene, topology, shared memory, commands."""
 
 import logging
-import threading
 from collections import deque
 from collections.abc import Callable
 
@@ -14,6 +13,7 @@ from protocol.check import check_header, check_numbers, check_strings, parse
 from protocol.counters import Counters
 from protocol.messages_pb2 import Command, Echo, Header, Reply
 from protocol.refused import Refused
+from protocol.session import Session
 from protocol.slots import Slot
 
 log = logging.getLogger(__name__)
@@ -30,7 +30,7 @@ class Inquiries:
     commands away with an error, so that nothing here grows or blocks.
     """
 
-    def __init__(self, session: zenoh.Session, server: str, incarnation: int, counters: Counters, slot: Slot | None):
+    def __init__(self, session: Session, server: str, incarnation: int, counters: Counters, slot: Slot | None):
         self._server = server
         self._incarnation = incarnation
         self._counters = counters
@@ -39,8 +39,8 @@ class Inquiries:
         self._echo_prefix = key("echo", server, worker="*")[:-1]
         self._answers: dict[str, bytes] = {}
         self._commands: deque[tuple[Command, ReplyFunction]] = deque()
-        self._queryable = session.declare_queryable(everything(server), zenoh.handlers.RingChannel(ASKED))
-        threading.Thread(target=self._run, name="inquiries", daemon=True).start()
+        self._queryable = session.zenoh.declare_queryable(everything(server), zenoh.handlers.RingChannel(ASKED))
+        session.thread("inquiries", self._run)
 
     def offer(self, name: str, answer: bytes) -> None:
         """From now on a query of this key gets this answer."""

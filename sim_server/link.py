@@ -75,7 +75,7 @@ class ServerLink:
         self._dispatch = Dispatch(
             session, self.name, self.incarnation, self._pool, self._jobs_out, self.counters, silence, clock
         )
-        self._inquiries = Inquiries(session, self.name, self.incarnation, self.counters, echo_slot)
+        self._inquiries = Inquiries(self._session, self.name, self.incarnation, self.counters, echo_slot)
         self._publications = Publications(session, self.name, self._telemetry, self.counters)
         self._clients: set[str] = set()
         self._client_tokens = session.liveliness().declare_subscriber(

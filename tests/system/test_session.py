@@ -22,7 +22,7 @@ from sim_server.link import ServerLink
 pytestmark = pytest.mark.system
 
 UNCAUGHT = """
-import sys, threading, time
+import sys, time
 from protocol.session import open_session
 session = open_session("server", listen=[sys.argv[1]])
 subscriber = session.zenoh.declare_subscriber("a/*", lambda sample: None)
@@ -33,7 +33,7 @@ def listen():
         ring.recv()
     except Exception:
         pass
-threading.Thread(target=listen, daemon=True).start()
+session.thread("listener", listen)
 time.sleep(0.1)
 {end}
 """
