@@ -13,7 +13,8 @@ from dataclasses import dataclass
 from sim_server.engine import Kind
 
 MEMORY = 0.2  # weight of the newest solve in the running means
-EVERY = 200  # solves between probes
+EVERY = 200  # solves between probes, doubled after each probe that was no gain ...
+RARELY = 6400  # ... up to so many
 HARDER = 2.0  # probe at once when solves cost so many times what they did at the last one
 MARGIN = 1.1  # switch only for a clear gain
 
@@ -39,6 +40,7 @@ class Choice:
         self.probe = 0
         self._means = {Kind.BLOCK_JACOBI: _Mean(), Kind.CHOLESKY: _Mean()}
         self._since = 0
+        self._every = EVERY
         self._reference = -1.0
         self._has_factor = False
         self._pending: Kind | None = None  # what the next solve goes back to if its probe is no gain
@@ -51,9 +53,10 @@ class Choice:
         elif self.kind is Kind.BLOCK_JACOBI and self._since > EVERY // 4 and self._pending is None:
             self._begin_probe(Kind.CHOLESKY)
 
-    def observe(self, kind: Kind, iterations: int, cost: float) -> None:
-        """A solve was made that ended with `kind`."""
-        if self._pending is not None:
+    def observe(self, kind: Kind, iterations: int, cost: float, asked: Kind | None = None) -> None:
+        """A solve was made that ended with `kind`. asked: the one it began with; what is reported late may be older
+        than the settings made last (None: it is not)."""
+        if self._pending is not None and asked in (None, self.kind):
             self._end_probe(kind, iterations, cost)
             return
         if kind not in self._means:
@@ -63,7 +66,7 @@ class Choice:
         mean = self._means[kind].cost
         if self._reference < 0:
             self._reference = mean
-        if self._has_factor and (self._since >= EVERY or mean > HARDER * self._reference):
+        if self._has_factor and (self._since >= self._every or mean > HARDER * self._reference):
             self._begin_probe(Kind.CHOLESKY if self.kind is Kind.BLOCK_JACOBI else Kind.BLOCK_JACOBI)
 
     def _begin_probe(self, other: Kind) -> None:
@@ -81,4 +84,5 @@ class Choice:
             self._means[tried] = _Mean(cost, cost / max(iterations, 1))
         better = not gave_up and (self._means[before].cost < 0 or cost * MARGIN < self._means[before].cost)
         self.kind = tried if better else before
+        self._every = EVERY if better else min(2 * self._every, RARELY)
         self._reference = self._means[self.kind].cost

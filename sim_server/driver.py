@@ -4,10 +4,10 @@
     never       one factor, made in this process from the first matrix (PCG-0)
     every-N     a new one in this process each N-th step, which waits for it (PCG-1, PCG-30)
     async       matrices to workers, one of an object at a time; a factor is taken up as it comes; nothing waits
-    lockstep-D  async, but the factor made from step t is taken up at step t + D exactly: the deterministic twin
+    lockstep-D  async, but a factor made from step t is taken up at step t + D exactly: the deterministic twin
 
-`advance` makes steps and waits where the policy says so. For async the loop runs on its own (Engine.run in a thread that
-has let go of Python's lock) and `pump` is called beside it.
+`advance` makes steps and waits where the policy says so. For async the loop runs on its own (Engine.run in a thread
+that has let go of Python's lock) and `pump` is called beside it.
 """
 
 import logging
@@ -224,17 +224,14 @@ class Driver:
     def observe(self, records: NDArray[Any]) -> None:
         """Sums up excess iterations and lets `auto` choose."""
         floor = self.solver.update_floor_iterations
-        for body, iterations, kind, solve, fallbacks in zip(
-            records["body"].tolist(), records["iterations"].tolist(), records["kind"].tolist(),
-            records["solve"].tolist(), records["fallbacks"].tolist(), strict=True,
-        ):  # fmt: skip
-            t = self.tracks[body]
+        for r in records:
+            t, iterations = self.tracks[r["body"]], int(r["iterations"])
             t.excess += excess(iterations, floor)
-            t.refused += fallbacks
+            t.refused += int(r["fallbacks"])
             if t.choice is not None:
-                t.choice.observe(
-                    Kind(kind), iterations, solve if self.kind == "async" else self._model(t, kind, iterations)
-                )
+                kind = Kind(r["kind"])
+                cost = float(r["solve"]) if self.kind == "async" else self._model(t, kind, iterations)
+                t.choice.observe(kind, iterations, cost, Kind(r["asked"]))
                 self._settle(t)
 
     def _model(self, t: Track, kind: int, iterations: int) -> float:

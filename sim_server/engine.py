@@ -69,7 +69,8 @@ RECORD = np.dtype(
     [
         ("step", "i8"), ("factor_step", "i8"), ("time", "f8"), ("residual", "f8"), ("assemble", "f8"), ("solve", "f8"),
         ("integrate", "f8"), ("whole", "f8"), ("late", "f8"), ("begin", "f8"), ("cpu", "f8"), ("body", "i4"),
-        ("iterations", "i4"), ("status", "i4"), ("kind", "i4"), ("fallbacks", "i4"), ("bad_node", "i4"),
+        ("iterations", "i4"), ("status", "i4"), ("kind", "i4"), ("asked", "i4"), ("fallbacks", "i4"),
+        ("bad_node", "i4"), ("unused", "i4"),
     ]
 )  # fmt: skip
 """One body, one step: what the loop reports. Seconds, except step numbers; `step` counts completed steps."""

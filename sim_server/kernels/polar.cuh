@@ -4,8 +4,10 @@
 // F, without branches, so that it vectorizes and replays.
 //
 // tr(R(q)^T F) = q^T N q for a unit quaternion q (Horn 1987), so q is the eigenvector of the symmetric traceless 4x4 N of its
-// largest eigenvalue: Newton on the quartic from above, q from the adjugate of (lambda I - N), then Newton steps on SO(3) to
-// rounding. Where the nearest rotation is not unique (s2 + s3 = 0) one of them comes out; F = 0 gives the identity.
+// largest eigenvalue: Laguerre's iteration on the quartic from above, q from the adjugate of (lambda I - N), then steps on
+// SO(3) to rounding. With singular values s1 >= s2 >= |s3| it is exact to rounding while s2 + s3 > 1e-5 s1; below that, on the
+// way to where the nearest rotation is not unique (s2 + s3 = 0: needles, reflections), tr(R^T F) is within 1e-5 s1 of its
+// maximum. F = 0 gives the identity.
 #pragma once
 #include "mat3.cuh"
 
@@ -19,16 +21,17 @@ INLINE mat3 rotation_matrix(quaternion q) {
     return {{1 - yy - zz, xy - wz, xz + wy, xy + wz, 1 - xx - zz, yz - wx, xz - wy, yz + wx, 1 - xx - yy}};
 }
 
-// Largest root of det(lambda I - N) = l^4 - 2 |F|^2 l^2 - 8 det F l + |F|^4 - 4 |cof F|^2; the others lie below, so that
-// Newton from sqrt(3) |F| >= s1 + s2 + s3 falls monotonically.
+// Largest root of det(lambda I - N) = l^4 - 2 |F|^2 l^2 - 8 det F l + |F|^4 - 4 |cof F|^2, |F| = 1. All roots are real, below
+// sqrt(3) |F| >= s1 + s2 + s3, so that Laguerre's iteration falls from there monotonically; it is cubic at a simple root, and
+// where two or three meet an iteration still takes away 3/4 or 2/3 of the distance (Newton's 1/2 or 1/3).
 INLINE number largest_root(number norm2, number det, number cofactor2) {
     number c0 = norm2 * norm2 - 4 * cofactor2;
     number l = sqrt(3 * norm2);
-    number guard = (real)1e-30 + (real)1e-7 * l * l * l;  // a double root has slope 0
-    for (int k = 0; k < 10; ++k) {
-        number f = ((l * l - 2 * norm2) * l - 8 * det) * l + c0;
-        number slope = (4 * l * l - 4 * norm2) * l - 8 * det;
-        l -= larger(f, number{}) / larger(slope, guard);
+    const number flat = constant(sizeof(real) == 4 ? (real)1e-3 : (real)1e-8);  // where roots meet only rounding is left
+    for (int k = 0; k < 8; ++k) {
+        number f = larger(((l * l - 2 * norm2) * l - 8 * det) * l + c0, number{});
+        number slope = (4 * l * l - 4 * norm2) * l - 8 * det, bend = 12 * l * l - 4 * norm2;
+        l -= 4 * f / larger(slope + sqrt(larger(9 * slope * slope - 12 * f * bend, number{})), flat);
     }
     return l;
 }
@@ -63,43 +66,45 @@ INLINE quaternion null_vector(number l, const mat3& F) {
     return better(q3, q3.z, q, best);
 }
 
-// One Newton step on SO(3): (tr S I - sym S) w = axial S with S = R^T F, then R <- R (1, w / 2).
+// The best turn about Newton's axis: with S = R^T F and H = tr S I - sym S, the axis is w = adj(H) axial S (it needs no
+// division, and H may be singular or indefinite), and tr(Rot(w, t)^T S) = const + c cos t + s sin t is largest at
+// tan t = s / c. So a step never loses, from wherever it starts, and near the optimum it is Newton's.
 INLINE quaternion polish(quaternion q, const mat3& F) {
     mat3 S = mul(transposed(rotation_matrix(q)), F);
     const number* s = S.m;
     vec3 g = {s[7] - s[5], s[2] - s[6], s[3] - s[1]};
     number a = s[4] + s[8], b = s[0] + s[8], c = s[0] + s[4];
     number d = (real)-0.5 * (s[1] + s[3]), e = (real)-0.5 * (s[2] + s[6]), f = (real)-0.5 * (s[5] + s[7]);
-    number A = b * c - f * f, B = e * f - d * c, C = d * f - b * e;
-    number det = a * A + d * B + e * C;
-    number scale = a + b + c;
-    auto regular = det > (real)1e-12 * scale * scale * scale + (real)1e-35;  // else not unique: leave it
-    number r = regular ? (real)0.5 / det : number{};
-    number wx = r * (A * g.x + B * g.y + C * g.z);
-    number wy = r * (B * g.x + (a * c - e * e) * g.y + (d * e - a * f) * g.z);
-    number wz = r * (C * g.x + (d * e - a * f) * g.y + (a * b - d * d) * g.z);
-    number w2 = wx * wx + wy * wy + wz * wz;
-    number cut = w2 > 1 ? 1 / sqrt(w2) : constant(1);  // at most 90 degrees
-    wx *= cut; wy *= cut; wz *= cut;
-    quaternion p = {q.w - q.x * wx - q.y * wy - q.z * wz, q.x + q.w * wx + q.y * wz - q.z * wy,
-                    q.y + q.w * wy + q.z * wx - q.x * wz, q.z + q.w * wz + q.x * wy - q.y * wx};
+    number A = b * c - f * f, B = e * f - d * c, C = d * f - b * e, D = d * e - a * f;
+    vec3 w = {A * g.x + B * g.y + C * g.z, B * g.x + (a * c - e * e) * g.y + D * g.z,
+              C * g.x + D * g.y + (a * b - d * d) * g.z};
+    number cosine = dot(w, vec3{a * w.x + d * w.y + e * w.z, d * w.x + b * w.y + f * w.z, e * w.x + f * w.y + c * w.z});
+    number sine = dot(w, g);  // over |w|
+    const real none = sizeof(real) == 4 ? (real)1e-18 : (real)1e-37;  // w = 0: no turn; its square must not be 0
+    number u = cosine + sqrt(cosine * cosine + sine * sine * dot(w, w)) + none;
+    number wx = sine * w.x, wy = sine * w.y, wz = sine * w.z;
+    quaternion p = {u * q.w - q.x * wx - q.y * wy - q.z * wz, u * q.x + q.w * wx + q.y * wz - q.z * wy,
+                    u * q.y + q.w * wy + q.z * wx - q.x * wz, u * q.z + q.w * wz + q.x * wy - q.y * wx};
     number norm = 1 / sqrt(p.w * p.w + p.x * p.x + p.y * p.y + p.z * p.z);
     return {norm * p.w, norm * p.x, norm * p.y, norm * p.z};
 }
 
-INLINE quaternion nearest_quaternion(const mat3& F) {
+INLINE number square(const mat3& a) {
+    return dot(row(a, 0), row(a, 0)) + dot(row(a, 1), row(a, 1)) + dot(row(a, 2), row(a, 2));
+}
+
+INLINE quaternion nearest_quaternion(mat3 F) {
+    number scale = 1 / (sqrt(square(F)) + (real)1e-37);  // what follows has powers of |F| up to the twelfth
+    for (int k = 0; k < 9; ++k) F.m[k] *= scale;
     const number* f = F.m;
     number c00 = f[4] * f[8] - f[5] * f[7], c01 = f[5] * f[6] - f[3] * f[8], c02 = f[3] * f[7] - f[4] * f[6];
     number c10 = f[2] * f[7] - f[1] * f[8], c11 = f[0] * f[8] - f[2] * f[6], c12 = f[1] * f[6] - f[0] * f[7];
     number c20 = f[1] * f[5] - f[2] * f[4], c21 = f[2] * f[3] - f[0] * f[5], c22 = f[0] * f[4] - f[1] * f[3];
-    number norm2 = f[0] * f[0] + f[1] * f[1] + f[2] * f[2] + f[3] * f[3] + f[4] * f[4] + f[5] * f[5] + f[6] * f[6] +
-                 f[7] * f[7] + f[8] * f[8];
     number det = f[0] * c00 + f[1] * c01 + f[2] * c02;
-    number cofactor2 = c00 * c00 + c01 * c01 + c02 * c02 + c10 * c10 + c11 * c11 + c12 * c12 + c20 * c20 + c21 * c21 + c22 * c22;
-    // A shift off the root keeps the adjugate from vanishing where roots meet; the Newton steps take its error out.
-    number l = largest_root(norm2, det, cofactor2);
-    real shift = sizeof(real) == 4 ? (real)1e-3 : (real)1e-6;
-    quaternion q = null_vector(l + shift * sqrt(norm2), F);
+    number cofactor2 = square(mat3{{c00, c01, c02, c10, c11, c12, c20, c21, c22}});
+    // A shift off the root keeps the adjugate from vanishing where roots meet; the steps on SO(3) take its error out.
+    number l = largest_root(square(F), det, cofactor2);
+    quaternion q = null_vector(l + (sizeof(real) == 4 ? (real)1e-3 : (real)1e-6), F);
     q = polish(q, F);
     q = polish(q, F);
     return polish(q, F);

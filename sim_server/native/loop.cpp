@@ -40,7 +40,7 @@ struct Record {
     double residual;
     double assemble, solve, integrate, whole, late, begin;  // s; begin: steady clock
     double cpu;            // s of processor time of the thread, whole step
-    int32_t body, iterations, status, kind, fallbacks, bad_node;
+    int32_t body, iterations, status, kind, asked, fallbacks, bad_node, unused;
 };
 
 struct Loop {
@@ -161,7 +161,8 @@ void wf_solve(Loop* loop) {
         Body& body = loop->body[i];
         if (const Factor* next = body.mail.exchange(nullptr)) body.factor = next;
         BlockCsr A{body.first, body.last, loop->row_start, loop->columns, loop->values};
-        SolveResult r = pcg(A, loop->b + 3 * body.first, body.factor, body.settings, loop->y + 3 * body.first,
+        const SolveSettings settings = body.settings;  // they may change meanwhile
+        SolveResult r = pcg(A, loop->b + 3 * body.first, body.factor, settings, loop->y + 3 * body.first,
                             loop->work + 45 * (int64_t)body.first);
         ++body.steps;
         if (!keep) continue;
@@ -169,7 +170,7 @@ void wf_solve(Loop* loop) {
         bool used = r.kind == CHOLESKY || r.fallbacks;
         record = Record{loop->step + 1, used ? body.factor->step : -1, loop->start_time + (loop->step + 1) * loop->dt, r.residual,
                         loop->assemble_seconds, r.seconds, 0, 0, loop->late, loop->assemble_begin, 0, i, r.iterations, r.status,
-                        r.kind, r.fallbacks, r.status == NOT_FINITE ? first_bad_node(*loop, body) : -1};
+                        r.kind, settings.kind, r.fallbacks, r.status == NOT_FINITE ? first_bad_node(*loop, body) : -1, 0};
     }
     double solved = now();
     for (int i = loop->before; i < loop->launches; ++i) run(loop->launch[i], loop->threads);
