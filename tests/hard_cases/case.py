@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: MIT
+"""What a hard case is: a scene, what is done to it, and what must hold."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from sim_server.simulation import Simulation
+from tests.hard_cases.sources import Source
+from tests.hard_cases.starts import Start, nothing
+
+BAR = Path(__file__).with_name("bar.toml")
+FREE_BAR = Path(__file__).with_name("free_bar.toml")
+GRAVITY = "effects.gravity.g=[0,-9.81,0]"
+
+
+def young(*bands: tuple[str, float]) -> str:
+    """Override for bands of stiffness: (where, Pa), the last one takes the rest."""
+    tables = [f'{{ where = "{where}", young = {value:g} }}' for where, value in bands[:-1]]
+    return f"object.bar.effects.corotational.young=[{', '.join([*tables, f'{{ young = {bands[-1][1]:g} }}'])}]"
+
+
+@dataclass(frozen=True)
+class Hold:
+    """A push or (with a target) a grab of the free nodes within radius of a point, during steps [0, until)."""
+
+    until: int
+    point: tuple[float, float, float]
+    radius: float
+    force: tuple[float, float, float] = (0, 0, 0)
+    target: tuple[float, float, float] | None = None
+    stiffness: float = 0
+    limit: float = 0
+
+
+@dataclass(frozen=True)
+class Case:
+    """One line of the table.
+
+    file, scene: scene file and overrides; build: what makes the simulation from the overrides, instead. done: in words;
+    start, hold and source do it. steps: of the run.
+    rests: where it comes back to: "pose" (no load), "static" (its equilibrium, found by a heavily damped run at another
+    time step), "jacobi" (where the same run ends with block Jacobi instead of a factor) or "spin" (nowhere: free).
+    within: distance to it, largest over the nodes / length of the bar; recovered: step from which it must stay there.
+    energy: largest allowed rise of energy - work of loads over its lowest earlier value, as a part of what the run
+    dissipates. unconverged: how many steps may end with a status other than converged, by status.
+    upright: det F > 0 in every element at the end. iterations: largest allowed mean over the steps with a factor.
+    note: what must be known to read the line; where something does not hold, why.
+    """
+
+    name: str
+    done: str
+    scene: tuple[str, ...] = ()
+    file: Path = BAR
+    start: Start = nothing
+    hold: Hold | None = None
+    source: Source | None = None
+    build: Callable[[list[str], Path], Simulation] | None = None
+    steps: int = 400
+    rests: Literal["pose", "static", "jacobi", "spin"] = "pose"
+    within: float = 1e-3
+    recovered: int = 0
+    energy: float = 1e-9
+    unconverged: dict[str, int] = field(default_factory=dict)
+    upright: bool = True
+    iterations: float = 0
+    note: str = ""
+
+    def must_hold(self) -> str:
+        """In words, from the same numbers that are asserted."""
+        energy = f"energy rises by at most {self.energy:g}" if self.energy > 1e-6 else "energy never rises"
+        parts = ["finite", energy]
+        allowed = [f"{count} × {status}" for status, count in self.unconverged.items()]
+        parts.append("converged" + (f" but for at most {', '.join(allowed)}" if allowed else ""))
+        to = {"pose": "of rest", "static": "of its static state", "jacobi": "of the run without a factor"}
+        if self.rests != "spin":
+            since = f" from step {self.recovered} on" if self.rests != "jacobi" else " at the end"
+            parts.append(f"within {self.within:g} L {to[self.rests]}{since}")
+        if self.upright:
+            parts.append("J > 0 at the end")
+        if self.iterations:
+            parts.append(f"≤ {self.iterations:g} iterations with a factor")
+        return "; ".join(parts)

@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: MIT
+"""Runs a hard case step by step and measures what must hold."""
+
+import math
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_server.driver import Driver
+from sim_server.engine import Kind
+from sim_server.simulation import Simulation
+from tests.hard_cases.case import Case, Hold
+
+Reals = NDArray[np.float64]
+STATUS = ("converged", "max_iterations", "budget", "breakdown_matrix", "breakdown_preconditioner", "not_finite")
+
+
+@dataclass
+class Outcome:
+    """Measured. Lengths are parts of the bar's length, energies parts of what was dissipated; None: never."""
+
+    finite: bool
+    energy: float  # largest rise of energy - work over its lowest earlier value
+    status: Counter[str]
+    fallbacks: int  # solves that left their factor
+    iterations: Reals
+    with_factor: float  # mean iterations of the steps that used one; nan without
+    distance: float  # at the end
+    recovered: int | None  # step from which the distance stays below Case.within
+    lowest: float  # smallest det F of the run
+    upright: int | None  # step from which every det F > 0
+
+    @property
+    def worst(self) -> str:
+        """The status other than converged, with how often, or converged."""
+        bad = {s: n for s, n in self.status.items() if s != "converged"}
+        return ", ".join(f"{n} × {s}" for s, n in bad.items()) or "converged"
+
+
+class Load:
+    """Holds the bar while it lasts and adds up the work done on it."""
+
+    def __init__(self, sim: Simulation, hold: Hold | None):
+        self.sim, self.hold, self.work = sim, hold, 0.0
+        self.held: Any = None
+        if hold is not None:
+            self._take(hold)
+
+    def _take(self, hold: Hold) -> None:
+        self.touch: Any = self.sim.effects["touch"]
+        engine = self.sim.engine
+        index = [launch.name for launch in engine.launches].index("touch.apply")
+        self.touch.publish = lambda launch: engine.replace(index, launch)
+        if hold.target is None:
+            self.held = self.touch.push("test", "bar", hold.point, hold.radius, hold.force, math.inf)
+        else:
+            self.held = self.touch.grab(
+                "test", "bar", hold.point, hold.radius, hold.target, hold.stiffness, hold.limit, math.inf
+            )
+
+    def before(self, step: int) -> None:
+        """Lets go when it is time."""
+        if self.held is not None and self.hold is not None and step >= self.hold.until:
+            self.touch.release("test", self.held.id)
+            self.held = None
+
+    def after(self, x: Reals) -> None:
+        """Adds force times displacement of the step that began at x."""
+        if self.held is None:
+            return
+        h, share = self.held, 1 / len(self.held.nodes)
+        moved = self.sim.world.x[h.nodes] - x[h.nodes]
+        force = np.broadcast_to(share * np.array(h.force), moved.shape)
+        if h.stiffness:
+            goal = np.array(h.target) + h.offset
+            pull = share * h.stiffness * (goal - x[h.nodes])
+            size = np.linalg.norm(pull, axis=1, keepdims=True)
+            implicit = share * h.stiffness * (goal - self.sim.world.x[h.nodes])
+            force = np.where(size > share * h.limit, share * h.limit * pull / np.maximum(size, 1e-300), implicit)
+        self.work += float((force * moved).sum())
+
+
+def built(case: Case, folder: Path, *more: str) -> Simulation:
+    """The case's scene with overrides, before its start."""
+    overrides = [*case.scene, *more]
+    return case.build(overrides, folder) if case.build else Simulation.load(case.file, overrides)
+
+
+def run_case(case: Case, folder: Path) -> Outcome:
+    """folder: for files that the case writes."""
+    sim = built(case, folder)
+    goal = _goal(case, sim, folder)
+    length = float(np.ptp(sim.world.rest, axis=0).max())
+    case.start(sim)
+    driver, load = Driver(sim, case.source(sim) if case.source else None), Load(sim, case.hold)
+    energy, distance, det, records = [_energy(sim)], [], [], []
+    for step in range(case.steps):
+        load.before(step)
+        x = sim.world.x.copy()
+        records.append(driver.advance(1))
+        load.after(x)
+        energy.append(_energy(sim) - load.work)
+        det.append(float(_determinants(sim).min()))
+        distance.append(float(np.abs(sim.world.x - goal).max()) / length)
+        if not np.isfinite(sim.world.x).all():
+            break
+    return _outcome(case, sim, np.concatenate(records), np.array(energy), np.array(distance), np.array(det))
+
+
+def _energy(sim: Simulation) -> float:
+    return sim.potential_energy() + sim.kinetic_energy()
+
+
+def _determinants(sim: Simulation) -> Reals:
+    """det F of each element."""
+    effect: Any = sim.effects["corotational"]
+    corners = sim.world.x[effect.tets]
+    return np.linalg.det(np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2) @ effect.gradients)
+
+
+def _goal(case: Case, sim: Simulation, folder: Path) -> Reals:
+    if case.rests == "static":
+        still = built(case, folder, "dt=0.1", "object.bar.effects.rayleigh.mass=5", "solver.update=every-1")
+        case.start(still)
+        Driver(still).advance(250)
+        assert np.abs(still.world.v).max() < 1e-6, "the reference run did not come to rest"
+        return still.world.x.copy()
+    if case.rests == "jacobi":
+        other = built(case, folder, "solver.preconditioner=block_jacobi")
+        case.start(other)
+        Driver(other).advance(case.steps)
+        return other.world.x.copy()
+    return sim.world.x.copy()
+
+
+def _from_then_on(good: NDArray[np.bool_]) -> int | None:
+    """First step (counted from 1) from which it holds to the end; 0: always."""
+    bad = np.flatnonzero(~good)
+    if len(bad) == 0:
+        return 0
+    return None if bad[-1] == len(good) - 1 else int(bad[-1]) + 2
+
+
+def _outcome(case: Case, sim: Simulation, records: Any, energy: Reals, distance: Reals, det: Reals) -> Outcome:
+    rise = float((energy - np.minimum.accumulate(energy)).max())
+    dissipated = abs(float(energy[0] - energy[-1]))
+    used = records["kind"] == Kind.CHOLESKY
+    return Outcome(
+        finite=bool(np.isfinite(sim.world.x).all() and np.isfinite(energy).all() and len(records) == case.steps),
+        energy=rise / dissipated,
+        status=Counter(STATUS[s] for s in records["status"].tolist()),
+        fallbacks=int(records["fallbacks"].sum()),
+        iterations=records["iterations"].astype(float),
+        with_factor=float(records["iterations"][used].mean()) if used.any() else math.nan,
+        distance=float(distance[-1]),
+        recovered=_from_then_on(distance <= case.within),
+        lowest=float(det.min()),
+        upright=_from_then_on(det > 0),
+    )

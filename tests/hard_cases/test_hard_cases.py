@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: MIT
+"""Every line of the table of hard cases, and what the table itself claims."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sim_server.driver import Driver
+from sim_server.simulation import Simulation
+from tests.hard_cases.case import FREE_BAR, Case
+from tests.hard_cases.running import run_case
+from tests.hard_cases.slivers import THICKNESS, sliver_bar, smallest_dihedral
+from tests.hard_cases.starts import mirrored, spinning
+from tests.hard_cases.table import CASES
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_hard_case(case: Case, tmp_path: Path) -> None:
+    out = run_case(case, tmp_path)
+    assert out.finite
+    assert out.energy <= case.energy, "energy rose without work done"
+    unexpected = {s: n for s, n in out.status.items() if s != "converged" and n > case.unconverged.get(s, 0)}
+    assert not unexpected
+    if case.rests == "jacobi":
+        assert out.distance <= case.within, "the factor changed the answer"
+    elif case.rests != "spin":
+        assert out.recovered is not None and out.recovered <= case.recovered, f"still {out.distance:.3g} L away"
+    if case.upright:
+        assert out.upright is not None, "an element is inverted at the end"
+    if case.iterations:
+        assert out.with_factor <= case.iterations
+
+
+def test_names_of_the_table_differ() -> None:
+    names = [case.name for case in CASES]
+    assert len(set(names)) == len(names)
+
+
+def test_slivers_are_slivers(tmp_path: Path) -> None:
+    sim = sliver_bar([], tmp_path)
+    corners = sim.world.rest[sim.world.bodies[0].tets]
+    edges = [np.linalg.norm(corners[:, a] - corners[:, b], axis=1) for a in range(4) for b in range(a)]
+    heights = np.ptp(corners[:, :, 2], axis=1)
+    assert smallest_dihedral(sim.world.rest, sim.world.bodies[0].tets) < 1
+    assert (np.max(edges, axis=0) / heights).max() >= 1 / THICKNESS
+
+
+def test_mirrored_bar_is_inside_out() -> None:
+    sim = Simulation.load(FREE_BAR)
+    mirrored(0)(sim)
+    corners = sim.world.x[sim.world.bodies[0].tets]
+    assert (np.linalg.det(corners[:, 1:] - corners[:, :1]) < 0).all()
+
+
+def test_warp_helps_while_spinning() -> None:
+    """0.2 rad a step: without the warp a factor of ten steps ago is of another orientation."""
+    mean = {}
+    for warp in ("true", "false"):
+        sim = Simulation.load(FREE_BAR, [f"solver.warp={warp}"])
+        spinning(10)(sim)
+        records = Driver(sim).advance(100)
+        mean[warp] = records["iterations"][10:].mean()
+    assert mean["true"] < 0.25 * mean["false"]
