@@ -40,7 +40,7 @@ class Worker:
         self._counters = uplink.counters
         self._analyse = analyse
         self._on_server = on_server
-        self._analyses: dict[str, tuple[int, Factorization]] = {}  # by object, with its epoch
+        self._analyses: dict[str, tuple[int, int, Factorization]] = {}  # of an object: epoch, blocks
         self._pending: dict[str, Job] = {}
 
     def run(self) -> None:
@@ -127,11 +127,11 @@ class Worker:
             topology = self._uplink.topology(object, epoch)
             row_start = array(topology.row_start, np.int32, (topology.nodes + 1,), "Topology.row_start")
             columns = array(topology.columns, np.int32, (-1,), "Topology.columns")
-            if len(columns) != blocks:
-                raise Refused(f"Matrix.blocks is {blocks}; allowed: {len(columns)}, as in the topology", "shape")
-            known = self._analyses[object] = (epoch, self._analyse(row_start, columns))
-            self._uplink.library = known[1].library
-        return known[1]
+            known = self._analyses[object] = (epoch, len(columns), self._analyse(row_start, columns))
+            self._uplink.library = known[2].library
+        if known[1] != blocks:
+            raise Refused(f"Matrix.blocks is {blocks}; allowed: {known[1]}, as in the topology", "shape")
+        return known[2]
 
     def _answer(
         self,

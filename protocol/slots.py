@@ -92,8 +92,15 @@ def _own_segments() -> Iterator[Path]:
     """zenoh's segments that this process maps, newest first."""
     words = (line.split() for line in Path("/proc/self/maps").read_text().splitlines())
     names = {parts[-1] for parts in words if parts[-1].startswith(f"{memlock.SHM}/") and parts[-1].endswith(".zenoh")}
-    alive = [path for path in map(Path, names) if path.exists()]
-    return iter(sorted(alive, key=lambda path: path.stat().st_mtime_ns, reverse=True))
+    return iter(sorted(map(Path, names), key=_changed, reverse=True))
+
+
+def _changed(path: Path) -> int:
+    """When a file was last written [ns]; 0 if it is gone, as a segment may be that is mapped still."""
+    try:
+        return path.stat().st_mtime_ns
+    except OSError:
+        return 0
 
 
 class SlotPool:

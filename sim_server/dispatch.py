@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import zenoh
-from zenoh.handlers import RingChannel
 
 from protocol import Factor
 from protocol.channels import CHANNELS, key, name_in
@@ -17,6 +16,7 @@ from protocol.messages_pb2 import Topology, WorkerInfo
 from protocol.refused import Refused
 from protocol.slots import Slot, SlotPool
 from sim_server.answers import Answers
+from sim_server.arrivals import Arrivals
 from sim_server.jobs import LATE, Flight, Jobs
 from sim_server.outbox import Outbox
 from sim_server.roster import Roster
@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from sim_server.factors import Job
 
 log = logging.getLogger(__name__)
-
-RINGS = {"pattern": 64, "factor": 64, "worker": 1024}  # messages that may wait; beyond that the oldest is lost
 
 
 class Dispatch:
@@ -52,12 +50,12 @@ class Dispatch:
         self._last_worker: dict[str, str] = {}  # of each object: it knows the pattern already
         self._factors: list[Factor] = []
         self._failures: list[tuple[str, str]] = []
-        self._tokens = session.liveliness().declare_subscriber(
-            key("alive_worker", server), RingChannel(4096), history=True
-        )
-        self._arrivals = {
-            channel: session.declare_subscriber(key(channel, server), RingChannel(depth))
-            for channel, depth in RINGS.items()
+        self._arrivals = Arrivals(session, server)
+        self._take_in: dict[str, Callable[[zenoh.Sample], None]] = {
+            "worker": self._take_hello,
+            "pattern": self._take_pattern,
+            "factor": self._take_factor,
+            "alive_worker": self._take_token,
         }
 
     def announce(self, topology: Topology) -> None:
@@ -170,28 +168,18 @@ class Dispatch:
     # ---- in --------------------------------------------------------------------------------------------------
 
     def _receive(self) -> None:
-        """Take in all that arrived. Factors before tokens: a worker may answer and then leave."""
-        for channel, take_in in (
-            ("worker", self._take_hello),
-            ("pattern", self._take_pattern),
-            ("factor", self._take_factor),
-        ):
-            while (sample := self._arrivals[channel].try_recv()) is not None:
-                try:
-                    take_in(sample)
-                except Refused as refusal:
-                    self._counters.refuse(refusal)
-        while (sample := self._tokens.try_recv()) is not None:
-            self._take_token(sample)
+        """Take in all that arrived; refuse what is wrong; end leases."""
+        for channel, sample in self._arrivals:
+            try:
+                self._take_in[channel](sample)
+            except Refused as refusal:
+                self._counters.refuse(refusal)
         for flight in self._jobs.expire(self._clock()):
             self._counters.add("leases_over")
             self._fail(flight, "was not answered within its lease")
 
     def _take_token(self, sample: zenoh.Sample) -> None:
-        try:
-            name = name_in("alive_worker", sample.key_expr, "worker")
-        except Refused as refusal:
-            return self._counters.refuse(refusal)
+        name = name_in("alive_worker", sample.key_expr, "worker")
         if self._roster.token(name, sample.kind == zenoh.SampleKind.PUT):
             self._leave(name)
 

@@ -1,0 +1,196 @@
+# SPDX-License-Identifier: MIT
+"""The worker's loop without a network: what it keeps, drops and answers."""
+
+import logging
+from typing import Any
+
+import numpy as np
+import pytest
+
+from precond_worker.mailbox import Mailbox
+from precond_worker.uplink import ServerEvent
+from precond_worker.worker import Worker
+from protocol import PROTOCOL, FactorPattern, Refused
+from protocol.channels import key
+from protocol.check import check_header, checksum
+from protocol.counters import Counters
+from protocol.messages_pb2 import Factor, Header, Matrix, Topology
+from protocol.slotmap import SlotMap
+
+
+class Payload(bytes):
+    def as_shm(self) -> None:
+        return None
+
+
+class Sample:
+    def __init__(self, message: Matrix, values: np.ndarray):
+        self.attachment = message.SerializeToString()
+        self.payload = Payload(values.tobytes())
+        self.key_expr = key("matrix", worker="w", object=message.header.object)
+
+
+class Diagonal:
+    """Factorizes diagonal matrices: L is the root of the diagonal."""
+
+    library = "diagonal"
+
+    def __init__(self, row_start: np.ndarray, columns: np.ndarray):
+        self.size = 3 * (len(row_start) - 1)
+        counts = np.arange(self.size + 1)
+        self.pattern = FactorPattern.build(np.arange(self.size), counts, counts, np.arange(self.size))
+
+    def factorize(self, values: np.ndarray, dtype: Any) -> np.ndarray:
+        diagonal = np.einsum("bii->bi", values).reshape(-1)
+        if (diagonal <= 0).any():
+            raise ValueError("not positive definite")
+        return np.sqrt(diagonal).astype(dtype)
+
+
+class FakeUplink:
+    """The network as the worker sees it; answers and patterns pile up here."""
+
+    def __init__(self) -> None:
+        self.name, self.incarnation, self.library = "w", 0, ""
+        self.counters = Counters(logging.getLogger("test"))
+        self.mailbox: Mailbox[Any] = Mailbox(8)
+        self.slots = SlotMap()
+        self.answers: list[tuple[Factor, bytes]] = []
+        self.patterns: list[tuple[str, int]] = []
+        self.asked: list[tuple[str, int]] = []
+
+    def follow(self, incarnation: int) -> None:
+        self.incarnation = incarnation
+
+    def header(self, object: str, epoch: int, channel: str) -> Header:
+        return Header(protocol=PROTOCOL, incarnation=self.incarnation, object=object, epoch=epoch)
+
+    def topology(self, object: str, epoch: int) -> Topology:
+        self.asked.append((object, epoch))
+        if object == "unknown":
+            raise Refused("the server has no topology of unknown", "object")
+        header = self.header(object, epoch, "")
+        row_start = np.arange(3, dtype=np.int32)
+        return Topology(header=header, nodes=2, row_start=row_start.tobytes(), columns=row_start[:2].tobytes())
+
+    def send_pattern(self, pattern: FactorPattern, object: str, epoch: int) -> None:
+        self.patterns.append((object, epoch))
+
+    def send_factor(self, message: Factor, values: bytes = b"") -> None:
+        self.answers.append((message, values))
+
+
+@pytest.fixture
+def uplink() -> FakeUplink:
+    return FakeUplink()
+
+
+@pytest.fixture
+def worker(uplink: FakeUplink) -> Worker:
+    worker = Worker(uplink, Diagonal)  # type: ignore[arg-type]
+    uplink.mailbox.put(ServerEvent(7, True))
+    worker.step(0.0)
+    return worker
+
+
+def matrix(number: int = 1, object: str = "beam", epoch: int = 1, scale: float = 4.0, **changes: Any) -> Sample:
+    values = scale * np.stack([np.eye(3), np.eye(3)])
+    header = Header(protocol=PROTOCOL, incarnation=7, object=object, epoch=epoch, sequence=number)
+    fields = {
+        "header": header,
+        "step": 10 * number,
+        "blocks": 2,
+        "checksum": checksum(values),
+        "factor_dtype": "float32",
+        "method": "cholesky",
+        "worker": "w",
+    }
+    return Sample(Matrix(**(fields | changes)), values)
+
+
+def drain(worker: Worker, uplink: FakeUplink, *samples: Sample) -> None:
+    for sample in samples:
+        uplink.mailbox.put(sample)
+    for _ in range(len(samples) + 1):
+        worker.step(0.0)
+
+
+def test_a_matrix_is_answered_with_its_factor(worker: Worker, uplink: FakeUplink) -> None:
+    drain(worker, uplink, matrix())
+    ((answer, data),) = uplink.answers
+    check_header(answer, incarnation=7, object="beam", epoch=1)
+    assert np.array_equal(np.frombuffer(data, np.float32), np.full(6, 2.0))
+    assert (answer.step, answer.job, answer.worker, answer.dtype, answer.failure) == (10, 1, "w", "float32", "")
+    assert answer.checksum == checksum(data) and answer.nonzeros == 6
+    assert uplink.patterns == [("beam", 1)] and uplink.library == "diagonal"
+
+
+def test_the_newest_matrix_of_an_object_wins(worker: Worker, uplink: FakeUplink) -> None:
+    drain(worker, uplink, matrix(1), matrix(2, "liver"), matrix(3), matrix(4), matrix(2))
+    assert [(answer.header.object, answer.job) for answer, _ in uplink.answers] == [("beam", 4), ("liver", 2)]
+    assert uplink.counters.superseded == 3
+
+
+def test_the_symbolic_phase_is_done_once_per_epoch(worker: Worker, uplink: FakeUplink) -> None:
+    for number, epoch in enumerate((1, 1, 2, 2), start=1):
+        drain(worker, uplink, matrix(number, epoch=epoch))
+    assert uplink.asked == [("beam", 1), ("beam", 2)]
+    assert len(uplink.answers) == 4
+
+
+def test_a_pattern_that_the_server_knows_is_not_sent_again(worker: Worker, uplink: FakeUplink) -> None:
+    drain(worker, uplink, matrix(1))
+    known = uplink.answers[0][0].pattern
+    drain(worker, uplink, matrix(2, known_patterns=[known]), matrix(3))
+    assert len(uplink.patterns) == 1 + 1  # the third job says that the server forgot it
+
+
+def test_what_cannot_be_factorized_is_answered_with_the_reason(worker: Worker, uplink: FakeUplink) -> None:
+    drain(worker, uplink, matrix(1, scale=-1.0))
+    drain(worker, uplink, matrix(2, checksum=5))
+    drain(worker, uplink, matrix(3, "unknown"))
+    drain(worker, uplink, matrix(4, blocks=3))
+    reasons = [answer.failure for answer, data in uplink.answers if data == b""]
+    assert len(reasons) == 4
+    for reason, text in zip(
+        reasons, ("positive definite", "checksum", "no topology", "Matrix.blocks is 3"), strict=True
+    ):
+        assert text in reason
+
+
+@pytest.mark.parametrize(
+    ("changes", "kind"),
+    [
+        ({"header": Header(protocol=2, incarnation=7, object="beam")}, "version"),
+        ({"header": Header(protocol=PROTOCOL, incarnation=6, object="beam")}, "incarnation"),
+        ({"worker": "x"}, "worker"),
+        ({"factor_dtype": "float16"}, "malformed"),
+        ({"method": "lu"}, "malformed"),
+    ],
+)
+def test_what_is_not_for_it_is_dropped_and_counted(
+    worker: Worker, uplink: FakeUplink, changes: dict[str, Any], kind: str
+) -> None:
+    drain(worker, uplink, matrix(1, **changes), matrix(2))
+    assert uplink.counters.refusals == {kind: 1}
+    assert [answer.job for answer, _ in uplink.answers] == [2]
+
+
+def test_a_new_server_means_new_analyses_and_old_work_is_dropped(worker: Worker, uplink: FakeUplink) -> None:
+    drain(worker, uplink, matrix(1))
+    drain(worker, uplink, matrix(2), ServerEvent(8, True), matrix(3))  # type: ignore[arg-type]
+    assert uplink.incarnation == 8
+    assert [answer.job for answer, _ in uplink.answers] == [1]
+    assert uplink.counters.superseded == 1 and uplink.counters.refusals == {"incarnation": 1}
+    drain(worker, uplink, ServerEvent(7, False))  # type: ignore[arg-type]
+    assert uplink.incarnation == 8
+    drain(worker, uplink, ServerEvent(8, False))  # type: ignore[arg-type]
+    assert uplink.incarnation == 0
+
+
+def test_a_full_mailbox_drops_the_oldest_and_counts() -> None:
+    mailbox: Mailbox[int] = Mailbox(3)
+    for number in range(5):
+        mailbox.put(number)
+    assert mailbox.take(0.0) == [2, 3, 4] and mailbox.dropped == 2
+    assert mailbox.take(0.0) == []
