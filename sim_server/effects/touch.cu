@@ -33,7 +33,7 @@ KERNEL(apply, Apply) {
         int k = p.entry[e];
         real now = p.clock[0];
         if (p.start[k] < 0) p.start[k] = now;  // whoever comes first writes the same
-        if (now >= p.start[k] + p.duration[k]) continue;
+        if (now + p.h / 2 >= p.start[k] + p.duration[k]) continue;  // so many whole steps, whatever the rounding
         real share = p.share[k];
         if (p.stiffness[k] == 0) {
             b = b + (p.h * share) * load3(p.force, k);

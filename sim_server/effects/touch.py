@@ -133,9 +133,9 @@ class Touch(Effect):
         return old
 
     def release_all(self, client: str) -> int:
-        """Ends everything of a client that has gone; returns how many."""
+        """Ends the grabs of a client that has gone; its pushes end by themselves. Returns how many."""
         alive = self.alive()
-        kept = [a for a in alive if a.client != client]
+        kept = [a for a in alive if a.client != client or a.stiffness == 0]
         if len(kept) < len(alive):
             self._put(kept)
         return len(alive) - len(kept)
@@ -145,7 +145,7 @@ class Touch(Effect):
         assert self._system is not None
         time = float(self._system.clock[0])
         known = [replace(a, start=float(s)) for a, s in zip(self._now.interactions, self._now.start, strict=True)]
-        return [a for a in known if a.start < 0 or time < a.start + a.duration]
+        return [a for a in known if a.start < 0 or time + self.world.dt / 2 < a.start + a.duration]
 
     def _params(self, name: str) -> Params:
         if name not in self.params:

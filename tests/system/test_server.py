@@ -1,0 +1,211 @@
+# SPDX-License-Identifier: MIT
+"""The whole service with real processes: server, workers, clients, log; and what happens when some of them die."""
+
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+
+from clients.errors import BadInput
+from clients.log import Log
+from tests.system.server_process import Stage, alive, beam, run, until
+
+pytestmark = pytest.mark.system
+
+
+@pytest.fixture
+def stage(tmp_path: Path) -> Iterator[Stage]:
+    stage = Stage(tmp_path)
+    yield stage
+    stage.close()
+
+
+def exported(log: Path, tmp_path: Path, name: str = "beam") -> dict[str, np.ndarray]:
+    """Arrays of `sim-client export`."""
+    out = tmp_path / "out.npz"
+    result = run("clients", "export", str(log), "--object", name, "--to", str(out))
+    assert result.returncode == 0, result.stdout + result.stderr
+    with np.load(out) as data:
+        return {key: data[key] for key in data}
+
+
+def logged(log: Path, topic: str) -> list[Any]:
+    """Messages of a topic, by the schema that the log itself carries."""
+    with log.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        return [message for _, _, _, message in reader.iter_decoded_messages(topics=[topic])]
+
+
+def test_server_worker_client_and_log(stage: Stage, tmp_path: Path) -> None:
+    """A run with a factor from another process, through shared memory, touched by a client, logged completely."""
+    log = tmp_path / "run.mcap"
+    server = stage.server(beam(tmp_path), "--steps", "150", "--record", str(log), "--workers", "1")
+    with stage.client() as client:
+        until(lambda: client.status().step > 10, "the simulation runs")
+        taken = client.push("beam", at=(0.5, 0.5, 4), force=(500, 0, 0), duration=0.2)
+        assert taken.nodes == 1, "radius 0 takes the nearest free node"
+        until(lambda: client.status().objects[0].factors_used > 5, "factors are taken up")
+        status = client.status()
+        assert status.bulk_shared > 0 and status.bulk_copied <= 2, "bulk data goes through shared memory"
+        assert status.refused == 0
+    assert server.wait() == 0, server.output()
+
+    data = exported(log, tmp_path)
+    assert data["x"].shape == (151, 176, 3) and data["step"].tolist() == list(range(151))
+    assert data["scalars/step"].tolist() == list(range(1, 151))
+    assert np.allclose(data["time"], 0.02 * data["step"])
+    assert set(data["scalars/status"]) == {"converged"} and data["scalars/residual"].max() <= 1e-6
+    helped = data["scalars/factor_step"] >= 0
+    iterations = data["scalars/iterations"]
+    assert helped.sum() > 100 and iterations[helped].mean() < iterations[~helped].mean() / 4
+    assert (data["scalars/factor_age"][helped] >= 1).all()
+    pushed = [step.step for step in logged(log, "/step/beam") if step.interactions]
+    assert len(logged(log, "/interaction/beam")) == 1 and len(pushed) == 10, "0.2 s of push are ten steps"
+
+
+def test_a_killed_worker_costs_no_step(stage: Stage, tmp_path: Path) -> None:
+    """kill -9 in the middle of factorizations; the run goes on, another worker is used as soon as it is there."""
+    log = tmp_path / "run.mcap"
+    server = stage.server(beam(tmp_path, (8, 8, 32)), "--steps", "300", "--record", str(log))
+    worker = stage.worker()
+    with stage.client() as client:
+        until(lambda: client.status().objects[0].factors_used > 2, "the worker is used")
+        until(lambda: client.status().objects[0].in_flight, "a matrix is in flight")
+        worker.kill()
+        before = client.status().objects[0].factors_used
+        stage.worker("w2")
+        until(lambda: client.status().objects[0].factors_used > before + 1, "the second worker is used")
+    assert server.wait(60) == 0, server.output()
+    data = exported(log, tmp_path)
+    assert data["scalars/step"].tolist() == list(range(1, 301)), "no step is lost"
+    assert set(data["scalars/status"]) == {"converged"}
+
+
+def test_a_supervised_worker_is_started_again(stage: Stage, tmp_path: Path) -> None:
+    server = stage.server(beam(tmp_path), "--workers", "1")
+    with stage.client() as client:
+        until(lambda: client.status().workers, "the worker has joined")
+        first = client.status().workers[0].pid
+        os.kill(first, signal.SIGKILL)
+        until(lambda: [w.pid for w in client.status().workers] not in ([], [first]), "another worker has joined")
+        second = client.status().workers[0].pid
+        used = client.status().objects[0].factors_used
+        until(lambda: client.status().objects[0].factors_used > used, "and is used")
+    assert server.end() == 0
+    until(lambda: not alive(second), "the worker ends with its server")
+
+
+def test_a_killed_server_leaves_its_log_and_its_worker(stage: Stage, tmp_path: Path) -> None:
+    """The worker serves the next server; the log is readable up to the last flush."""
+    scene, log = beam(tmp_path), tmp_path / "killed.mcap"
+    first, worker = stage.server(scene, "--record", str(log)), stage.worker()
+    with stage.client() as client:
+        until(lambda: client.status().objects[0].factors_used > 2, "the worker is used")
+        until(lambda: client.status().step > 120, "there is something in the log")
+        done = client.status().step
+    first.kill()
+    stage.server(scene)
+    with stage.client() as client:
+        until(lambda: client.status().objects[0].factors_used > 2, "the worker serves the new server")
+    assert worker.process.poll() is None
+    data = exported(log, tmp_path)
+    kept = len(data["scalars/step"])
+    assert data["scalars/step"].tolist() == list(range(1, kept + 1)) and kept > done - 110
+
+
+def test_pause_resume_stop_and_refusals(stage: Stage, tmp_path: Path) -> None:
+    server = stage.server(beam(tmp_path))
+    with stage.client() as client:
+        client.pause()
+        until(lambda: client.status().state == "paused", "it is paused")
+        step = client.status().step
+        with pytest.raises(BadInput, match=r"at most max_force = 10000 N"):
+            client.push("beam", at=(0, 0, 0), force=(1e6, 0, 0))
+        with pytest.raises(BadInput, match=r"no object 'liver'|'liver' does not list"):
+            client.push("liver", at=(0, 0, 0), force=(1, 0, 0))
+        assert client.status().step == step
+        client.resume()
+        until(lambda: client.status().step > step, "it runs again")
+        client.stop()
+    assert server.wait() == 0
+
+
+def test_what_a_dead_client_held_is_released(stage: Stage, tmp_path: Path) -> None:
+    log = tmp_path / "run.mcap"
+    server = stage.server(beam(tmp_path), "--record", str(log))
+    with stage.client() as client:
+        client.grab("beam", at=(0.5, 0.5, 4), target=(0.5, 2, 4), stiffness=1e5, max_force=5e3)
+        until(lambda: client.status().step > 50, "it holds for a while")
+    with stage.client() as client:
+        step = client.status().step
+        until(lambda: client.status().step > step + 60, "it runs on")
+        client.stop()
+    assert server.wait() == 0
+    held = [step.step for step in logged(log, "/step/beam") if step.interactions]
+    assert held and held[-1] < step + 10, "the grab ends with its client"
+
+
+def test_four_beams_share_one_worker(stage: Stage) -> None:
+    """Everybody gets factors; the shaken one is served most."""
+    scene = Path(__file__).parents[2] / "deploy" / "scenes" / "four_beams.toml"
+    server = stage.server(scene, "--workers", "1")
+    with stage.client() as client:
+        until(lambda: min(o.factors_used for o in client.status().objects) >= 1, "each has a factor")
+        client.stop()
+    assert server.wait() == 0
+
+
+@pytest.mark.parametrize(("how", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 0)])
+def test_signals_end_it_in_good_order(stage: Stage, tmp_path: Path, how: signal.Signals, code: int) -> None:
+    log = tmp_path / "run.mcap"
+    server = stage.server(beam(tmp_path), "--record", str(log), "--workers", "1")
+    with stage.client() as client:
+        until(lambda: client.status().step > 20, "it runs")
+    assert server.end(how) == code, server.output()
+    assert "Traceback" not in server.output() and "FATAL" not in server.output()
+    with Log(log) as written:
+        assert not written.notes, "the log is complete"
+
+
+@pytest.mark.parametrize("update", ["never", "every-5", "lockstep-4", "async"])
+def test_every_policy_runs_free_with_a_log(stage: Stage, tmp_path: Path, update: str) -> None:
+    log = tmp_path / "run.mcap"
+    scene = beam(tmp_path, solver=f'update = "{update}"')
+    server = stage.server(scene, "--free-run", "--steps", "60", "--record", str(log), "--workers", "1")
+    assert server.wait() == 0, server.output()
+    data = exported(log, tmp_path)
+    assert len(data["x"]) == 61 and set(data["scalars/status"]) == {"converged"}
+    if update == "lockstep-4":
+        assert data["scalars/factor_step"].tolist()[:12] == [-1] * 4 + [0] * 4 + [4] * 4
+    if update == "every-5":
+        assert data["scalars/factor_step"].tolist()[:12] == [0] * 5 + [5] * 5 + [10] * 2
+
+
+def test_bad_input_gives_one_line_and_code_2(tmp_path: Path) -> None:
+    bad = tmp_path / "bad.toml"
+    bad.write_text("dt = 0\n")
+    cases = [
+        ([str(bad)], "dt = 0"),
+        ([str(tmp_path / "none.toml")], "none.toml"),
+        ([str(beam(tmp_path)), "--device", "gpu"], "--device gpu"),
+        ([str(beam(tmp_path)), "--listen", "nonsense"], "nonsense"),
+        ([str(beam(tmp_path)), "--set", "solver.tolerence=1"], "did you mean 'tolerance'"),
+        ([str(beam(tmp_path)), "--record", "/no/such/folder/a.mcap"], "/no/such/folder"),
+    ]
+    for arguments, words in cases:
+        result = run("sim_server", *arguments, "--steps", "1")
+        assert result.returncode == 2, (arguments, result.stdout, result.stderr)
+        assert words in result.stderr and "Traceback" not in result.stderr, result.stderr
+
+
+def test_a_taken_port_is_told(stage: Stage, tmp_path: Path) -> None:
+    stage.server(beam(tmp_path))
+    with stage.client():
+        result = run("sim_server", str(beam(tmp_path)), "--listen", stage.endpoint, "--steps", "1")
+    assert result.returncode == 2 and stage.endpoint in result.stderr, result.stderr
