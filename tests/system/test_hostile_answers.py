@@ -203,7 +203,8 @@ def test_an_answer_of_the_last_epoch_is_refused(stage: tuple[Driver, HandWorker]
     hand.answer(answer, values)
     driver.until(refused(driver, "epoch", before + 1), "the refusal")
     assert not [f for f in driver.factors if f.object == "cut"]
-    assert driver.link.ready()  # the answer is worth nothing, but the worker is free again
+    driver.until(driver.link.ready, "the worker to be free again")
+    assert driver.link.counters.leases_over == 0  # freed by its answer, though that was worth nothing
     driver.submit(chain(5, "cut", 2), 2)
     hand.answer(*hand.right_answer(hand.receive(), chain(5, "cut", 2)))
     driver.until(lambda: [f for f in driver.factors if f.object == "cut" and f.epoch == 2], "a factor of epoch 2")
