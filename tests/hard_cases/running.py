@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_server.driver import Driver
+from sim_server.effects.touch import Touch
 from sim_server.engine import Kind
 from sim_server.simulation import Simulation
 from tests.hard_cases.case import Case, Hold
@@ -51,7 +52,9 @@ class Load:
             self._take(hold)
 
     def _take(self, hold: Hold) -> None:
-        self.touch: Any = self.sim.effects["touch"]
+        touch = self.sim.effects["touch"]
+        assert isinstance(touch, Touch)
+        self.touch = touch
         engine = self.sim.engine
         index = [launch.name for launch in engine.launches].index("touch.apply")
         self.touch.publish = lambda launch: engine.replace(index, launch)
@@ -161,3 +164,22 @@ def _outcome(case: Case, sim: Simulation, records: Any, energy: Reals, distance:
         lowest=float(det.min()),
         upright=_from_then_on(det > 0),
     )
+
+
+def broken(case: Case, out: Outcome) -> list[str]:
+    """What had to hold and did not; empty if the case passes."""
+    found = [] if out.finite else ["not finite"]
+    if not out.energy <= case.energy:
+        found.append(f"energy rose by {out.energy:.3g} of what was dissipated, more than {case.energy:g}")
+    for status, count in out.status.items():
+        if status != "converged" and count > case.unconverged.get(status, 0):
+            found.append(f"{count} steps ended with {status}")
+    if case.rests == "jacobi" and not out.distance <= case.within:
+        found.append(f"the factor changed the answer: {out.distance:.3g} L")
+    if case.rests in ("pose", "static") and (out.recovered is None or out.recovered > case.recovered):
+        found.append(f"not back by step {case.recovered}; {out.distance:.3g} L away at the end")
+    if case.upright and out.upright is None:
+        found.append("an element is inverted at the end")
+    if case.iterations and not out.with_factor <= case.iterations:
+        found.append(f"{out.with_factor:.3g} iterations with a factor, more than {case.iterations:g}")
+    return found

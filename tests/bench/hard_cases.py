@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: MIT
+"""Runs the table of hard cases (tests/hard_cases/table.py) and writes docs/hard-cases.md with what was measured."""
+
+import tempfile
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+
+from tests.bench.report import ROOT, Report, plots
+from tests.hard_cases.case import Case
+from tests.hard_cases.running import Outcome, broken, run_case
+from tests.hard_cases.table import CASES
+
+ABOUT = """\
+A bar of 1 x 1 x 4 m (648 tetrahedra, E = 1 MPa, Poisson's ratio 0.45, dt = 0.02 s, tolerance 1e-6, factor by
+lockstep-10 with warp) is driven where no run should get by itself. Each line is a test (tests/hard_cases); this page is
+made by the same code.
+
+- *must hold*: what the test asserts. J is det F of an element, L the length of the bar.
+- *energy*: largest rise of kinetic + potential energy - work of the loads over its lowest earlier value, as a part of
+  what the run dissipates. It never rises but where a note says why.
+- *status*: of the solves; *converged* means the true residual, in every step.
+- *back*: step from which every node stays within the distance that must hold; *J > 0*: step from which no element is
+  inverted."""
+
+
+def row(case: Case, out: Outcome) -> dict[str, Any]:
+    """Measured, beside what must hold."""
+    back = "–" if case.rests in ("spin", "jacobi") else "never" if out.recovered is None else str(out.recovered)
+    return {
+        "case": f"**{case.name}**",
+        "what is done": case.done,
+        "must hold": case.must_hold(),
+        "holds": "; ".join(broken(case, out)) or "yes",
+        "energy": f"{max(out.energy, 0):.1e}" if out.energy > 1e-9 else "0",
+        "status": out.worst,
+        "factor left": out.fallbacks,
+        "iterations mean / max": f"{out.iterations.mean():.1f} / {out.iterations.max():.0f}",
+        "back": back,
+        "at the end / L": f"{out.distance:.0e}" if case.rests != "spin" else "–",
+        "smallest J": f"{out.lowest:.2g}",
+        "J > 0": "never" if out.upright is None else "always" if out.upright == 0 else str(out.upright),
+    }
+
+
+def notes(cases: list[Case]) -> str:
+    """Each note once, with the cases that it is about."""
+    about: dict[str, list[str]] = {}
+    for case in cases:
+        if case.note:
+            about.setdefault(case.note, []).append(case.name)
+    return "\n".join(f"- *{', '.join(names)}*: {note}" for note, names in about.items())
+
+
+def picture(results: list[tuple[Case, Outcome]]) -> Any:
+    """Mean and largest iterations of each case."""
+    plt = plots()
+    figure, axis = plt.subplots(figsize=(9, 0.28 * len(results) + 1.2), layout="constrained")
+    place = np.arange(len(results))[::-1]
+    mean = [out.iterations.mean() for _, out in results]
+    most = [out.iterations.max() for _, out in results]
+    axis.hlines(place, mean, most, color="0.7")
+    axis.plot(mean, place, "o", label="mean")
+    axis.plot(most, place, "|", label="largest")
+    axis.set(xscale="log", xlabel="iterations of a step", yticks=place, yticklabels=[case.name for case, _ in results])
+    axis.grid(True, axis="x", which="both", alpha=0.3)
+    axis.legend()
+    return figure
+
+
+def main(
+    quick: Annotated[bool, typer.Option("--quick", help="A smoke run of a few cases; writes no document")] = False,
+    document: Annotated[Path, typer.Option(help="Where the page goes")] = ROOT / "docs" / "hard-cases.md",
+    out: Annotated[Path | None, typer.Option(help="Folder of the results [default: out/bench/hard_cases]")] = None,
+) -> None:
+    """Hard cases: what must hold, and what was measured."""
+    cases = CASES[::6] if quick else CASES
+    report = Report("hard_cases", "Hard cases", {"cases": len(cases)}, out, quick)
+    results = []
+    with tempfile.TemporaryDirectory() as folder:
+        for case in cases:
+            results.append((case, run_case(case, Path(folder))))
+            print(f"{case.name}: {'; '.join(broken(*results[-1])) or 'holds'}")
+    rows = [row(case, outcome) for case, outcome in results]
+    report.say(ABOUT)
+    report.table(rows)
+    report.say("## Notes", notes(cases))
+    report.data["rows"] = rows
+    report.data["iterations"] = {case.name: outcome.iterations for case, outcome in results}
+    if not quick:
+        document.parent.mkdir(parents=True, exist_ok=True)
+        document.write_text(report.markdown(report.header()))
+    report.figure(picture(results), "hard_cases.png", "Iterations of each case.")
+    report.write()
+    if any(broken(case, outcome) for case, outcome in results):
+        raise typer.Exit(1)
+
+
+if __name__ == "__main__":
+    typer.run(main)
