@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: MIT
+"""Each benchmark runs, at a small size, and writes what it says it writes. How long anything took is not looked at."""
+
+import json
+import math
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+BENCHES = {"accuracy": ["--no-processes"], "figure4": ["--no-processes"], "hard_cases": []}
+
+
+def leaves(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
+    """(path, value) of everything in parsed JSON that is no list or table."""
+    if isinstance(value, dict):
+        for name, inner in value.items():
+            yield from leaves(inner, f"{key}.{name}")
+    elif isinstance(value, list):
+        for inner in value:
+            yield from leaves(inner, key)
+    else:
+        yield key, value
+
+
+def bench(name: str, out: Path, *arguments: str) -> dict[str, Any]:
+    command = [sys.executable, f"tests/bench/{name}.py", "--quick", "--out", str(out), *arguments]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    result = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=110)
+    assert result.returncode == 0, result.stdout + result.stderr
+    return json.loads((out / f"{name}.json").read_text())
+
+
+@pytest.mark.parametrize("name", BENCHES)
+def test_bench_writes_its_report(name: str, tmp_path: Path) -> None:
+    content = bench(name, tmp_path, *BENCHES[name])
+    numbers = [v for _, v in leaves(content["data"]) if isinstance(v, int | float)]
+    assert len(numbers) > 20 and all(math.isfinite(v) for v in numbers)
+    missing = {key for key, v in leaves(content["data"]) if v is None}
+    assert all("age" in key for key in missing), "only the age of a factor may be unknown"
+
+    header = content["header"]
+    assert {"date", "commit", "machine", "versions", "calibration"} <= set(header)
+    assert all(v > 0 for _, v in leaves(header["calibration"]))
+    text = (tmp_path / f"{name}.md").read_text()
+    assert header["machine"]["cpu"] in text and f"]({name}.png)" in text
+    assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.system
+def test_figure4_with_a_real_worker(tmp_path: Path) -> None:
+    rows = {row["scheme"]: row for row in bench("figure4", tmp_path)["data"]["rows"]}
+    assert rows["real async+warp"]["unconverged"] == 0
+    assert rows["real async+warp, real time"]["factor age, mean"] >= 0, "no factor ever came"
+
+
+def test_reference_of_accuracy_is_no_competitor(tmp_path: Path) -> None:
+    """PCG-1 against a reference of its own would show an error of exactly 0 at any tolerance."""
+    data = bench("accuracy", tmp_path, "--no-processes")["data"]
+    assert all(error > 0 for point in data["points"] for error in point["worst"])
+    cg = {p["tolerance"]: p["worst"][0] for p in data["points"] if (p["beam"], p["scheme"]) == ("homogeneous", "CG")}
+    assert cg[1e-6] < 1e-2 * cg[1e-2]
