@@ -12,13 +12,14 @@ import typer
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
-EPILOG = """Examples:
-
-  precond-worker                                      a server on this machine
-
+EPILOG = """\b
+Examples:
+  precond-worker
+        for a server on this machine
   precond-worker --connect tcp/10.0.0.5:7447 --threads 4 --name big-box
-
-  precond-worker --no-shared-memory                   arrays as bytes, also on this machine
+        for a server elsewhere, with four threads
+  precond-worker --no-shared-memory
+        arrays as bytes, also on this machine
 """
 
 

@@ -18,15 +18,16 @@ if TYPE_CHECKING:
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
-EPILOG = """Examples:
-
-  sim-server deploy/scenes/beam.toml --workers 1                          real time, one local worker
-
-  sim-server beam.toml --steps 500 --free-run --record beam.mcap          as fast as it goes, with a log
-
-  sim-server beam.toml --listen tcp/0.0.0.0:7447                          workers and clients on other machines
-
-  sim-server beam.toml --set solver.tolerance=1e-8 --set dt=0.01          other values than the scene's
+EPILOG = """\b
+Examples:
+  sim-server deploy/scenes/beam.toml --workers 1
+        in real time, helped by one local worker
+  sim-server beam.toml --steps 500 --free-run --record beam.mcap
+        as fast as it goes, with a log
+  sim-server beam.toml --listen tcp/0.0.0.0:7447
+        open to workers and clients on other machines
+  sim-server beam.toml --set solver.tolerance=1e-8 --set dt=0.01
+        with other values than the scene's
 """
 
 WORKERS_JOIN = 15.0  # s to wait for the first local worker before the simulation starts
