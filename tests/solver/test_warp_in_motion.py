@@ -5,6 +5,8 @@ Numbers found (12 x 3 x 3 cells, tolerance 1e-6, lockstep-10; block Jacobi alone
 without; load turning about the axis by 0.05 rad a step 4.0 and 11.8; beam of 1000:50:10 in stiffness 10 and 26.
 """
 
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -37,7 +39,7 @@ def iterations(
     update: str = "lockstep-10",
 ) -> NDArray:
     """Of each step, (steps,). spin: angle of the load's turn about the beam's axis in a step [rad]."""
-    pose = {"pose": {"rotate": list(POSE)}} if posed else {}
+    pose: dict[str, Any] = {"pose": {"rotate": list(POSE)}} if posed else {}
     sim = simulation(
         bar(poisson=0.4, damping=(0.1, 0.01), **beam, **pose), gravity=(0, -9.81, 0), preconditioner="cholesky",
         warp=warp, update=update, max_iterations=3000,
