@@ -12,7 +12,7 @@ import pytest
 
 from sim_server.driver import Driver
 from sim_server.simulation import Simulation
-from tests.hard_cases.case import FREE_BAR, Case
+from tests.hard_cases.case import BAR, FREE_BAR, Case
 from tests.hard_cases.running import Outcome, broken, run_case
 from tests.hard_cases.slivers import THICKNESS, sliver_bar, smallest_dihedral
 from tests.hard_cases.starts import mirrored, spinning
@@ -59,12 +59,21 @@ def test_warp_helps_while_spinning() -> None:
 def test_what_breaks_the_rules_is_told() -> None:
     """The check is not one that lets everything pass: one complaint for each rule."""
     case = Case("made up", "nothing", iterations=5, recovered=100)
-    good = Outcome(True, 0.0, Counter(converged=10), 0, np.ones(10), 2.0, 1e-6, 50, 1.0, 0)
+    good = Outcome(True, 0.0, Counter(converged=10), 0, np.ones(10), 2.0, 1e-6, 1.0, 50, 1.0, 0)
     assert broken(case, good) == []
     bad: dict[str, Any] = {
         "finite": False, "energy": math.nan, "status": Counter(converged=9, budget=1), "recovered": 101,
-        "upright": None, "with_factor": 6.0,
+        "upright": None, "farthest": 1e-3, "with_factor": 6.0,
     }  # fmt: skip
     for name, value in bad.items():
         assert len(broken(case, replace(good, **{name: value}))) == 1, name
-    assert len(broken(replace(case, rests="jacobi"), replace(good, distance=1.0))) == 1
+    assert len(broken(replace(case, rests="same"), replace(good, distance=1.0))) == 1
+
+
+def test_a_late_factor_is_not_left_for_being_slow_at_first() -> None:
+    """Under a small limit of iterations too: CG speeds up, and block Jacobi would be further away at the end."""
+    heterogeneous = BAR.parents[2] / "deploy" / "scenes" / "heterogeneous.toml"
+    sim = Simulation.load(heterogeneous, ["solver.update=lockstep-30", "solver.max_iterations=20"])
+    records = Driver(sim).advance(120)[30:]
+    assert records["fallbacks"].sum() == 0
+    assert (records["status"] == 0).mean() > 0.8
