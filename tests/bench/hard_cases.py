@@ -22,13 +22,14 @@ made by the same code.
 - *energy*: largest rise of kinetic + potential energy - work of the loads over its lowest earlier value, as a part of
   what the run dissipates. It never rises but where a note says why.
 - *status*: of the solves; *converged* means the true residual, in every step.
+- *at the end / L*: distance there; where every step is compared, the largest. *smallest J*: after the first step.
 - *back*: step from which every node stays within the distance that must hold; *J > 0*: step from which no element is
   inverted."""
 
 
 def row(case: Case, out: Outcome) -> dict[str, Any]:
     """Measured, beside what must hold."""
-    back = "–" if case.rests in ("spin", "jacobi") else "never" if out.recovered is None else str(out.recovered)
+    back = "–" if case.rests in ("spin", "same") else "never" if out.recovered is None else str(out.recovered)
     return {
         "case": f"**{case.name}**",
         "what is done": case.done,

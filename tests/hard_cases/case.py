@@ -41,8 +41,9 @@ class Case:
     file, scene: scene file and overrides; build: what makes the simulation from the overrides, instead. done: in words;
     start, hold and source do it. steps: of the run.
     rests: where it comes back to: "pose" (no load), "static" (its equilibrium, found by a heavily damped run at another
-    time step), "jacobi" (where the same run ends with block Jacobi instead of a factor) or "spin" (nowhere: free).
-    within: distance to it, largest over the nodes / length of the bar; recovered: step from which it must stay there.
+    time step), "same" (at every step where the same run without any preconditioner, solved to 1e-10, is) or "spin"
+    (nowhere: free). within: distance to it, largest over the nodes / length of the bar; recovered: step from which it
+    must stay there.
     energy: largest allowed rise of energy - work of loads over its lowest earlier value, as a part of what the run
     dissipates. unconverged: how many steps may end with a status other than converged, by status.
     upright: det F > 0 in every element at the end. iterations: largest allowed mean over the steps with a factor.
@@ -58,7 +59,7 @@ class Case:
     source: Source | None = None
     build: Callable[[list[str], Path], Simulation] | None = None
     steps: int = 400
-    rests: Literal["pose", "static", "jacobi", "spin"] = "pose"
+    rests: Literal["pose", "static", "same", "spin"] = "pose"
     within: float = 1e-3
     recovered: int = 0
     energy: float = 1e-9
@@ -73,9 +74,9 @@ class Case:
         parts = ["finite", energy]
         allowed = [f"{count} × {status}" for status, count in self.unconverged.items()]
         parts.append("converged" + (f" but for at most {', '.join(allowed)}" if allowed else ""))
-        to = {"pose": "of rest", "static": "of its static state", "jacobi": "of the run without a factor"}
+        to = {"pose": "of rest", "static": "of its static state", "same": "of plain CG solved to 1e-10,"}
         if self.rests != "spin":
-            since = f" from step {self.recovered} on" if self.rests != "jacobi" else " at the end"
+            since = f" from step {self.recovered} on" if self.rests != "same" else " at every step"
             parts.append(f"within {self.within:g} L {to[self.rests]}{since}")
         if self.upright:
             parts.append("J > 0 at the end")
