@@ -38,7 +38,8 @@ def _times(latency: int, processes: bool) -> str:
     return f"""\
 Time: wall time of a step. PCG-1 factorizes in the step (float64) and its time includes that. async+warp has a float32
 factor from a worker: lockstep-{latency} is its deterministic twin, whose factor is {latency} to {2 * latency - 1} steps
-old (made between the steps, not counted; none in the first {latency} steps, block Jacobi until then). *real* {real}."""
+old (made between the steps, not counted; none in the first {latency} steps, block Jacobi until then). *real* {real};
+it has no factor until the worker's first. All steps count; "steps without" are those without a factor."""
 
 
 def schemes(latency: int, processes: bool) -> list[Scheme]:
@@ -68,6 +69,7 @@ class Point:
     p99: list[float] = field(default_factory=list)
     iterations: list[float] = field(default_factory=list)
     age: list[float] = field(default_factory=list)  # mean, steps
+    without: list[float] = field(default_factory=list)  # steps without a factor
     unconverged: int = 0
 
     def add(self, result: Run, reference: Run, length: float) -> None:
@@ -79,6 +81,7 @@ class Point:
         self.iterations.append(float(result.iterations.mean()))
         known = np.isfinite(result.age)
         self.age.append(float(result.age[known].mean()) if known.any() else float("nan"))
+        self.without.append(float((~known).sum()))
         self.unconverged += sum(s != "converged" for s in result.status)
 
     def row(self) -> dict[str, Any]:
@@ -93,6 +96,7 @@ class Point:
             "p99": float(np.median(self.p99)),
             "iterations": float(np.median(self.iterations)),
             "factor age": float(np.median(self.age)),
+            "steps without": float(np.median(self.without)),
             "unconverged": self.unconverged,
         }
 

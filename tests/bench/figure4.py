@@ -86,7 +86,7 @@ def pictures(results: dict[str, list[Run]], start: int) -> Any:
         axis.axvspan(0.5, start + 0.5, color="0.9", zorder=0)
         axis.set(ylabel=label, yscale="log")
         axis.grid(True, which="both", alpha=0.3)
-    axes[0].legend(ncols=2, fontsize="small")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=5, fontsize="small")
     axes[1].set_xlabel(f"step (grey: lockstep-{start} has no factor yet)")
     return figure
 

@@ -142,7 +142,7 @@ class Report:
         self.data: dict[str, Any] = {}
         self._body: list[str] = []
         self._started = datetime.datetime.now().astimezone()
-        self._machine, self._before = machine(), calibration(quick)
+        self._machine, self._commit, self._before = machine(), commit(), calibration(quick)
 
     def say(self, *paragraphs: str) -> None:
         """Adds paragraphs, tables, headings."""
@@ -158,10 +158,10 @@ class Report:
         self._body.append(f"![{caption}]({file})\n\n{caption}")
 
     def header(self) -> dict[str, Any]:
-        """Where, when and with what; the calibration before and now."""
+        """Where, when and with what, as at the start; the calibration before and now."""
         return {
             "date": self._started.isoformat(timespec="seconds"),
-            "commit": commit(),
+            "commit": self._commit,
             "machine": self._machine,
             "versions": versions(),
             "calibration": {"before": self._before, "after": calibration(self.quick)},
