@@ -75,12 +75,8 @@ class Driver:
 
     def _one(self) -> NDArray[Any]:
         if self.wants_factors and self._in_process_now():
-            self.engine.wait()
-            self.engine.assemble()
-            for t in self.tracks:
-                self.inline.submit(self._job(t, self.engine.step, self._values(t.body)))
-            self._take_up(self.inline)
-            self.engine.solve()
+            if self.engine.wait():
+                self._with_factors_of_this_step()
         elif self.wants_factors and self.kind == "lockstep":
             self._lockstep()
         else:
@@ -90,6 +86,13 @@ class Driver:
         records = self.engine.records()
         self.observe(records)
         return records
+
+    def _with_factors_of_this_step(self) -> None:
+        self.engine.assemble()
+        for t in self.tracks:
+            self.inline.submit(self._job(t, self.engine.step, self._values(t.body)))
+        self._take_up(self.inline)
+        self.engine.solve()
 
     def _in_process_now(self) -> bool:
         if self.kind == "never":

@@ -9,6 +9,7 @@ import ctypes as c
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -92,6 +93,7 @@ class _Loop(c.Structure):
     ]  # fmt: skip
 
 
+@cache
 def _library() -> c.CDLL:
     loop, p = c.POINTER(_Loop), c.c_void_p
     library = native(
@@ -209,9 +211,12 @@ class Engine:
         """Second half: solve, integrate, report."""
         self._native.wf_solve(c.byref(self.loop))
 
-    def wait(self) -> None:
-        """Sleeps until the next step is due (real time) and while paused, as `run` does before each step."""
-        self._native.wf_wait(c.byref(self.loop))
+    def wait(self) -> bool:
+        """Sleeps until the next step is due (real time) and while paused, as `run` does before each step.
+
+        False if the loop is to stop.
+        """
+        return bool(self._native.wf_wait(c.byref(self.loop)))
 
     records_dtype = RECORD
 
@@ -273,10 +278,13 @@ class Engine:
     def replace(self, launch: int, new: Launch) -> None:
         """Gives a launch other arguments, from the next step on."""
         binding = _Binding(c.addressof(new.params), new.items, 0)
-        kept = self._posted.setdefault(launch, [])
+        displaced = self._native.wf_post_binding(c.byref(self._launch[launch]), c.addressof(binding))
+        kept = self._posted.setdefault(launch, [])  # in use, waiting
+        if displaced:
+            kept.pop()  # it was never taken up; what is in use must live on
+        else:
+            del kept[:-1]  # the last one was taken up, so those before are done with
         kept.append((binding, new))
-        del kept[:-4]  # the loop may still hold the one before the last
-        self._native.wf_post_binding(c.byref(self._launch[launch]), c.addressof(binding))
 
     # --- reports ------------------------------------------------------------------------------------------------
 
