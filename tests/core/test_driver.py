@@ -1,0 +1,223 @@
+# SPDX-License-Identifier: MIT
+"""Update policies: which step is solved with the factor of which, and that nothing stops the run.
+
+Record k (from 0) is of the step made from state k; factor_step says which state's matrix the factor came from, -1: none.
+"""
+
+import logging
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from protocol.factor import Factor
+from sim_server.driver import Driver
+from sim_server.engine import Kind
+from sim_server.factors import Inline, Job
+from sim_server.simulation import Simulation
+from tests.scenes import bar, simulation
+
+
+def falling(*bodies: dict, **solver) -> Simulation:
+    """A beam (or several) under gravity, with the factor as preconditioner."""
+    beams = bodies or (bar((4, 2, 2), young=1e6, fixed="X < 0.01"),)
+    return simulation(
+        *beams, gravity=(0, -9.81, 0), **({"preconditioner": "cholesky", "max_iterations": 2000} | solver)
+    )
+
+
+def factor_steps(update: str, steps: int, **solver) -> list[int]:
+    return Driver(falling(update=update, **solver)).advance(steps)["factor_step"].tolist()
+
+
+def test_never_is_one_factor_of_the_first_matrix():
+    assert factor_steps("never", 8) == [0] * 8
+
+
+@pytest.mark.parametrize("n", [1, 3, 5])
+def test_every_n_is_a_new_one_each_nth_step_which_waits_for_it(n):
+    assert factor_steps(f"every-{n}", 12) == [n * (k // n) for k in range(12)]
+
+
+@pytest.mark.parametrize("delay", [1, 3, 5])
+def test_lockstep_takes_up_the_factor_of_step_t_at_t_plus_d(delay):
+    """A new matrix goes out when the last factor came in, so a factor serves from t + D to t + 2 D."""
+    expected = [-1] * delay + [delay * (k // delay - 1) for k in range(delay, 4 * delay + 2)]
+    assert factor_steps(f"lockstep-{delay}", len(expected)) == expected
+
+
+def test_async_without_workers_factorizes_in_this_process_between_steps():
+    steps = factor_steps("async", 12)
+    assert steps[:2] == [-1, -1]
+    assert steps[2] == 0
+    ages = [k - made for k, made in enumerate(steps) if made >= 0]
+    assert max(ages) <= 4
+    assert steps == sorted(steps)
+
+
+@pytest.mark.parametrize("preconditioner", ["none", "jacobi", "block_jacobi"])
+@pytest.mark.parametrize("update", ["never", "every-1", "lockstep-2", "async"])
+def test_without_use_for_factors_none_is_made(preconditioner, update, monkeypatch):
+    def refuse(*_):
+        raise AssertionError("factorized")
+
+    monkeypatch.setattr(Inline, "submit", refuse)
+    records = Driver(falling(preconditioner=preconditioner, update=update)).advance(4)
+    assert (records["factor_step"] == -1).all()
+    assert (records["kind"] == Kind[preconditioner.upper()]).all()
+
+
+@pytest.mark.parametrize("update", ["lockstep-3", "every-4", "never"])
+def test_a_run_repeats_bit_for_bit(update):
+    runs = []
+    for _ in range(2):
+        sim = falling(update=update)
+        records = Driver(sim).advance(30)
+        runs.append((sim.world.x.tobytes(), sim.world.v.tobytes(), records["iterations"].tolist()))
+    assert runs[0] == runs[1]
+
+
+def test_advance_in_parts_is_the_same_as_at_once():
+    whole, parts = falling(update="lockstep-3"), falling(update="lockstep-3")
+    Driver(whole).advance(20)
+    driver = Driver(parts)
+    for count in (1, 0, 7, 2, 10):
+        assert len(driver.advance(count)) == count
+    assert np.array_equal(whole.world.x, parts.world.x)
+
+
+def test_several_bodies_have_factors_of_their_own():
+    bodies = [bar((4, 2, 2), name=f"beam{i}", young=1e5 * 4**i, fixed="X < 0.01") for i in range(3)]
+    for update in ("every-4", "lockstep-3"):
+        together = falling(*bodies, update=update)
+        records = Driver(together).advance(20)
+        for body, table in zip(together.world.bodies, bodies, strict=True):
+            alone = falling(table, update=update)
+            own = records[records["body"] == body.index]
+            theirs = Driver(alone).advance(20)
+            for field in ("factor_step", "iterations", "kind", "step"):
+                assert np.array_equal(own[field], theirs[field])
+            assert np.array_equal(together.world.x[body.nodes], alone.world.x)
+
+
+def test_async_serves_every_body_in_turn():
+    bodies = [bar(name=f"beam{i}", young=1e5 * 4**i, fixed="X < 0.01") for i in range(3)]
+    driver = Driver(falling(*bodies, update="async"))
+    driver.advance(60)
+    used = [t.used for t in driver.tracks]
+    assert min(used) >= 3
+    assert all(t.newest > 20 for t in driver.tracks)
+
+
+class Failing(Inline):
+    """Refuses to factorize the matrices of some steps."""
+
+    def __init__(self, patterns, bad):
+        super().__init__(patterns)
+        self.bad = bad
+
+    def submit(self, job: Job) -> bool:
+        if job.step in self.bad:
+            self._failed.append((job.object, "matrix: not positive definite (as the test wants it)"))
+            return True
+        return super().submit(job)
+
+
+def patterns_of(sim: Simulation) -> dict:
+    return {b.name: sim.system.body_pattern(b.first, b.last) for b in sim.world.bodies}
+
+
+def test_a_failed_factorization_does_not_stop_a_run(caplog):
+    """In lockstep the step at which it was due goes on with the factor before, and a new matrix goes out."""
+    sim = falling(update="lockstep-3")
+    driver = Driver(sim, Failing(patterns_of(sim), bad={3}))
+    with caplog.at_level(logging.WARNING):
+        records = driver.advance(13)
+    assert records["factor_step"].tolist() == [-1, -1, -1, 0, 0, 0, 0, 0, 0, 6, 6, 6, 9]
+    assert (records["status"] == 0).all()
+    assert driver.tracks[0].refused == 1
+    assert "object 'bar': no factor: matrix: not positive definite" in caplog.text
+
+
+@pytest.mark.parametrize("update", ["never", "every-1", "lockstep-2", "async"])
+def test_an_indefinite_matrix_leaves_block_jacobi(update, monkeypatch):
+    """Every factorization fails: the run is that of block Jacobi, to the last bit."""
+    plain = falling(preconditioner="block_jacobi")
+    plain.engine.run(8)
+    sim = falling(update=update)
+    driver = Driver(sim)
+    submit = driver.inline.submit
+
+    def negated(job: Job) -> bool:
+        return submit(Job(job.object, job.epoch, job.step, job.warp, -job.values, job.dtype))
+
+    monkeypatch.setattr(driver.inline, "submit", negated)
+    records = driver.advance(8)
+    assert (records["kind"] == Kind.BLOCK_JACOBI).all()
+    assert (records["factor_step"] == -1).all()
+    assert driver.tracks[0].refused >= 1
+    assert np.array_equal(sim.world.x, plain.world.x)
+
+
+def made(driver: Driver, step: int, values: NDArray) -> Factor:
+    """A factor of the first body as a worker would send it."""
+    body = driver.simulation.world.bodies[0].name
+    driver.inline.submit(Job(body, 1, step, True, values, "float64"))
+    return driver.inline.poll()[0]
+
+
+def test_an_older_factor_does_not_replace_a_newer_one():
+    sim = falling(update="async")
+    driver = Driver(sim, Failing(patterns_of(sim), bad=range(1000)))
+    sim.engine.assemble()
+    values = sim.system.values.copy()
+    for step, used in ((5, 5), (3, 5), (5, 5), (7, 7)):
+        driver.adopt(made(driver, step, values))
+        assert driver.advance(1)["factor_step"].tolist() == [used]
+    assert driver.tracks[0].used == 2
+
+
+def test_excess_iterations_are_summed_until_the_next_matrix_goes_out():
+    sim = falling(update="async", update_floor_iterations=3)
+    driver = Driver(sim, Failing(patterns_of(sim), bad=range(1000)))
+    driver.wants_factors = False  # nothing goes out
+    records = driver.advance(10)
+    assert driver.tracks[0].excess == np.maximum(records["iterations"] - 3, 0).sum() > 0
+
+
+def test_a_poisoned_factor_is_counted_as_refused():
+    sim = falling(update="async")
+    driver = Driver(sim, Failing(patterns_of(sim), bad=range(1000)))
+    driver.advance(1)
+    before = driver.tracks[0].refused
+    factor = made(driver, 5, sim.system.values)
+    factor.values[7] = np.nan
+    driver.adopt(factor)
+    record = driver.advance(1)[0]
+    assert (record["status"], record["fallbacks"], record["kind"]) == (0, 1, Kind.BLOCK_JACOBI)
+    assert driver.tracks[0].refused >= before + 1
+
+
+@pytest.mark.parametrize("update", ["every-1", "lockstep-2", "async", "never"])
+def test_stopped_means_no_more_steps(update):
+    sim = falling(update=update)
+    driver = Driver(sim)
+    driver.advance(3)
+    sim.engine.loop.stop = 1
+    x = sim.world.x.copy()
+    assert len(driver.advance(4)) == 0
+    assert sim.engine.step == 3
+    assert np.array_equal(sim.world.x, x)
+
+
+def test_auto_takes_the_factor_where_steps_are_hard_and_leaves_it_where_they_are_easy():
+    """Costs are counted in bytes here (not async), so that the answer is the same on every machine."""
+    hard = bar((10, 3, 3), (10, 2, 2), young=1e7, fixed="X < 0.01")
+    easy = bar((10, 3, 3), (10, 2, 2), young=1e3, fixed="X < 0.01")
+    for body, dt, kind in ((hard, 0.03, Kind.CHOLESKY), (easy, 0.001, Kind.BLOCK_JACOBI)):
+        sim = simulation(
+            body, gravity=(0, -9.81, 0), dt=dt, preconditioner="auto", update="lockstep-5", max_iterations=2000
+        )
+        records = Driver(sim).advance(60)
+        assert (records["status"] == 0).all()
+        assert (records["kind"][20:] == kind).mean() > 0.9
