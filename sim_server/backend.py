@@ -100,12 +100,23 @@ def build(source: Path, defines: tuple[str, ...] = ()) -> Path:
 _SCALARS = {"int": ctypes.c_int32, "double": ctypes.c_double, "float": ctypes.c_float}
 
 
-def _fields(text: str, struct: str, real: str) -> list[tuple[str, Any, np.dtype | None]]:
-    """(name, ctypes type, dtype of the array or None) of each member of a C struct, read from its text."""
+_TYPES = {"int": "i4", "double": "f8", "float": "f4"}
+
+
+@dataclass(frozen=True)
+class Argument:
+    """A member of a kernel's argument struct. dtype: of the array that a pointer points to, None for a number."""
+
+    name: str
+    kind: str  # int, float or double
+    dtype: np.dtype | None
+
+
+def _members(text: str, struct: str, real: str) -> list[Argument]:
     body = re.search(rf"struct {struct} \{{(.*?)\n\}};", text, re.DOTALL)
     if body is None:
         raise CompileError(f"no struct {struct} in the kernel text")
-    fields: list[tuple[str, Any, np.dtype | None]] = []
+    members: list[Argument] = []
     for line in body.group(1).splitlines():
         member = re.fullmatch(r"\s*(?:const )?(\w+)(\*?) (\w+);.*", line)
         if member is None:
@@ -114,11 +125,30 @@ def _fields(text: str, struct: str, real: str) -> list[tuple[str, Any, np.dtype 
             continue
         kind, star, name = member.groups()
         kind = real if kind == "real" else kind
-        if star:
-            fields.append((name, ctypes.c_void_p, np.dtype({"int": "i4", "double": "f8", "float": "f4"}[kind])))
-        else:
-            fields.append((name, _SCALARS[kind], None))
-    return fields
+        members.append(Argument(name, kind, np.dtype(_TYPES[kind]) if star else None))
+    return members
+
+
+def arguments_of(
+    text: str, kernel: str, module: str, real: str, given: dict[str, Any]
+) -> tuple[list[tuple[Argument, Any]], bool]:
+    """The members of a kernel's struct in order, each with its argument, and whether it is a MAILED_KERNEL.
+
+    Raises CompileError for an unknown kernel, TypeError where an argument does not fit the text.
+    """
+    found = re.search(rf"^(MAILED_)?KERNEL\({kernel}, (\w+)\)", text, re.MULTILINE)
+    if found is None:
+        raise CompileError(f"no kernel {kernel} in {module}.cu")
+    members = _members(text, found.group(2), real)
+    if set(given) != {m.name for m in members}:
+        raise TypeError(f"{module}.{kernel} takes {[m.name for m in members]}, not {sorted(given)}")
+    for m in members:
+        value = given[m.name]
+        if m.dtype is not None and not (
+            isinstance(value, np.ndarray) and value.dtype == m.dtype and value.flags.c_contiguous
+        ):
+            raise TypeError(f"{module}.{kernel}: {m.name} must be a contiguous array of {m.dtype}")
+    return [(m, given[m.name]) for m in members], found.group(1) is not None
 
 
 @dataclass
@@ -148,23 +178,16 @@ class Module:
 
     def bind(self, kernel: str, n: int, **arguments: Any) -> Launch:
         """Argument struct of `kernel` over `n` items; raises TypeError where an argument does not fit the text."""
-        found = re.search(rf"KERNEL\({kernel}, (\w+)\)", self._text)
-        if found is None:
-            raise CompileError(f"no kernel {kernel} in {self.name}.cu")
-        fields = _fields(self._text, found.group(1), self.real)
-        arguments = {"n": n, **arguments}
-        if set(arguments) != {name for name, _, _ in fields}:
-            raise TypeError(f"{self.name}.{kernel} takes {[f[0] for f in fields]}, not {sorted(arguments)}")
-        layout = type(found.group(1), (ctypes.Structure,), {"_fields_": [(name, kind) for name, kind, _ in fields]})
-        params, arrays = layout(), {}
-        for name, _, dtype in fields:
-            value = arguments[name]
-            if dtype is not None:
-                if not isinstance(value, np.ndarray) or value.dtype != dtype or not value.flags.c_contiguous:
-                    raise TypeError(f"{self.name}.{kernel}: {name} must be a contiguous array of {dtype}")
-                arrays[name] = value
-                value = value.ctypes.data
-            setattr(params, name, value)
+        fields, _ = arguments_of(self._text, kernel, self.name, self.real, {"n": n, **arguments})
+        layout = type(
+            kernel,
+            (ctypes.Structure,),
+            {"_fields_": [(a.name, ctypes.c_void_p if a.dtype is not None else _SCALARS[a.kind]) for a, _ in fields]},
+        )
+        params = layout()
+        for a, value in fields:
+            setattr(params, a.name, value if a.dtype is None else value.ctypes.data)
+        arrays = {a.name: value for a, value in fields if a.dtype is not None}
         function = ctypes.cast(getattr(self._library, kernel), ctypes.c_void_p).value
         assert function is not None
         return Launch(f"{self.name}.{kernel}", function, params, n, arrays)
@@ -174,6 +197,22 @@ class Module:
 def module(path: str, real: str = "double") -> Module:
     """The compiled text, once per process."""
     return Module(path, real)
+
+
+class Cpu:
+    """The processor as a place for kernels to run."""
+
+    name = "cpu"
+
+    @staticmethod
+    def module(path: str) -> Module:
+        """A kernel text, compiled once."""
+        return module(path)
+
+    @staticmethod
+    def fetch(host: np.ndarray) -> np.ndarray:
+        """The array with what kernels have made of it: here they wrote to it themselves."""
+        return host
 
 
 def native(path: str, signatures: dict[str, tuple[Any, list[Any]]]) -> ctypes.CDLL:

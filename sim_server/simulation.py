@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_server.backend import Launch
+from sim_server.backend import Cpu, Launch
 from sim_server.effect import Effect
 from sim_server.effects import effect
 from sim_server.engine import Engine, Kind
@@ -25,32 +25,43 @@ KINDS = {"none": Kind.NONE, "jacobi": Kind.JACOBI, "block_jacobi": Kind.BLOCK_JA
 
 
 class Simulation:
-    """A scene on the CPU. `engine.run(n)` makes n steps; policies for factors are driver.py's business.
+    """A scene on a device, "cpu" or "gpu". `engine.run(n)` makes n steps; when factors come is driver.py's business.
 
-    Raises InputError for a scene that cannot be built.
+    Raises InputError for a scene that cannot be built or a device that is not there.
     """
 
-    def __init__(self, scene: Scene, record_frames: bool = False):
+    def __init__(self, scene: Scene, device: str = "cpu"):
         self.scene = scene
-        self.world = World(scene)
+        self.world = World(scene, _backend(device))
         self.effects = build_effects(scene, self.world)
         stencilled = [e for e in self.effects.values() if e.tets is not None]
         self.system = System(self.world, [e.tets for e in stencilled if e.tets is not None], self._warped())
         assemble, integrate = self.launches()
         w, s = self.world, self.system
-        self.engine = Engine(
-            assemble, integrate, [(b.first, b.last) for b in w.bodies], w.dt, threads=scene.solver.threads,
-            row_start=s.row_start, columns=s.columns, values=s.values, b=s.b_material, y=s.y, x=w.x, v=w.v,
-            clock=s.clock,
-        )  # fmt: skip
-        self.engine.loop.frame_every = scene.record.every if record_frames else 0
+        arrays: dict[str, Any] = {"row_start": s.row_start, "columns": s.columns, "values": s.values}
+        arrays |= {"b": s.b_material, "y": s.y, "x": w.x, "v": w.v, "clock": s.clock}
+        ranges = [(b.first, b.last) for b in w.bodies]
+        self.engine: Any
+        if device == "gpu":
+            from sim_server.gpu.engine import GpuEngine
+
+            gpu: Any = w.backend
+            self.engine = GpuEngine(gpu, assemble, integrate, ranges, w.dt, **arrays)  # type: ignore[arg-type]
+        else:
+            self.engine = Engine(assemble, integrate, ranges, w.dt, threads=scene.solver.threads, **arrays)
         for body in w.bodies:
             self._settle(body)
 
     @classmethod
-    def load(cls, path: str | Path, overrides: Sequence[str] = ()) -> "Simulation":
+    def load(cls, path: str | Path, overrides: Sequence[str] = (), device: str = "cpu") -> "Simulation":
         """From a scene file."""
-        return cls(load(path, overrides))
+        return cls(load(path, overrides), device)
+
+    def fetch(self) -> World:
+        """The world with positions and velocities as they are on the device now."""
+        for array in (self.world.x, self.world.v):
+            self.world.backend.fetch(array)
+        return self.world
 
     def launches(self) -> tuple[list[Launch], list[Launch]]:
         """What a step runs: before and after the solve."""
@@ -82,10 +93,12 @@ class Simulation:
 
     def potential_energy(self) -> float:
         """Of all effects [J]."""
+        self.fetch()
         return sum(e.energy() for e in self.effects.values())
 
     def kinetic_energy(self) -> float:
         """m v^2 / 2 of all nodes [J]."""
+        self.fetch()
         return 0.5 * float(self.world.mass @ (self.world.v**2).sum(axis=1))
 
     def matrix(self, body: int = 0) -> Any:
@@ -96,6 +109,14 @@ class Simulation:
         row_start, columns = self.system.body_pattern(b.first, b.last)
         n = 3 * (b.last - b.first)
         return bsr_array((self.system.body_values(b.first, b.last).copy(), columns, row_start), shape=(n, n)).tocsc()
+
+
+def _backend(device: str) -> Any:
+    if device == "gpu":
+        from sim_server.gpu.device import Gpu
+
+        return Gpu()
+    return Cpu()
 
 
 def build_effects(scene: Scene, world: World) -> dict[str, Effect]:

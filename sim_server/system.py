@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_server.backend import Launch, module
+from sim_server.backend import Launch
 from sim_server.world import World
 
 Ints = NDArray[np.int32]
@@ -75,18 +75,18 @@ class System:
 
     def start(self) -> Launch:
         """b = 0, diagonal = mass."""
-        return module("kernels/nodes.cu").bind(
+        return self.world.backend.module("kernels/nodes.cu").bind(
             "start", self.world.nodes, mass=self.world.mass, diagonal=self.diagonal, b=self.b, mean=self.mean
         )
 
     def finish(self) -> list[Launch]:
         """Everything into the material frame: A' = R^T A R, b' = R^T b, and the start of the solve."""
         w, free = self.world, self.world.free
-        turn = module("kernels/nodes.cu").bind(
+        turn = self.world.backend.module("kernels/nodes.cu").bind(
             "turn", w.nodes, free=free, warped=self.warped, mean=self.mean, b=self.b, dv=self.dv,
             rotation=self.rotation, b_material=self.b_material, y=self.y,
         )  # fmt: skip
-        assemble = module("kernels/assemble.cu").bind(
+        assemble = self.world.backend.module("kernels/assemble.cu").bind(
             "assemble", len(self.row), row=self.row, column=self.column, upper=self.upper, lower=self.lower, free=free,
             diagonal=self.diagonal, sums=self.sums, rotation=self.rotation, values=self.values,
         )  # fmt: skip
@@ -95,7 +95,7 @@ class System:
     def advance(self) -> Launch:
         """v += R y, x += h v."""
         w = self.world
-        return module("kernels/nodes.cu").bind(
+        return self.world.backend.module("kernels/nodes.cu").bind(
             "advance", w.nodes, rotation=self.rotation, y=self.y, h=w.dt, dv=self.dv, v=w.v, x=w.x
         )
 

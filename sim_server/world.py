@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_server.backend import Cpu
 from sim_server.errors import InputError
 from sim_server.mesh import Mesh, posed
 from sim_server.scene import Scene, SceneObject
@@ -46,10 +47,12 @@ class World:
     """State and node data of a scene.
 
     rest (n, 3): before the pose [m]; x (n, 3): positions [m]; v (n, 3): velocities [m/s]; mass (n,): lumped [kg];
-    free (n,): 1, or 0 at fixed nodes; beta (bodies,): Rayleigh damping of the stiffness [s]; dt: time step [s].
+    free (n,): 1, or 0 at fixed nodes; beta (bodies,): Rayleigh damping of the stiffness [s]; dt: time step [s];
+    backend: where kernels run, Cpu or gpu.device.Gpu.
     """
 
-    def __init__(self, scene: Scene):
+    def __init__(self, scene: Scene, backend: Any = None):
+        self.backend = backend or Cpu()
         self.dt = float(scene.dt)
         self.bodies: list[Body] = []
         meshes = [(o, o.load_mesh()) for o in scene.objects]

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from sim_server.backend import Launch, module
+from sim_server.backend import Launch
 from sim_server.effect import Effect
 from sim_server.errors import InputError
 from sim_server.parameters import Parameters
@@ -65,15 +65,15 @@ class Corotational(Effect):
         assert stencil is not None
         w, m = self.world, len(self.tets)
         stiffening = w.dt * (w.dt + w.beta[self.owner])
-        elements = module("effects/corotational.cu").bind(
+        elements = self.world.backend.module("effects/corotational.cu").bind(
             "elements", m, tets=self.tets, x=w.x, v=w.v, gradients=self.gradients, lame=self.lame,
             stiffening=stiffening, h=w.dt, rotation=self.rotation, spread=self.spread, push=self.push,
         )  # fmt: skip
-        gather = module("kernels/gather.cu").bind(
+        gather = self.world.backend.module("kernels/gather.cu").bind(
             "gather", w.nodes, start=stencil.corner_start, corners=stencil.corners, push=self.push,
             rotation=self.rotation, b=system.b, mean=system.mean,
         )  # fmt: skip
-        blocks = module("effects/corotational_blocks.cu").bind(
+        blocks = self.world.backend.module("effects/corotational_blocks.cu").bind(
             "blocks", len(system.row), accumulate=int(accumulate), start=stencil.pair_start, pairs=stencil.pairs,
             ratio=self.ratio, spread=self.spread, sums=system.sums,
         )  # fmt: skip
@@ -82,11 +82,11 @@ class Corotational(Effect):
     def energy(self) -> float:
         """sum V (mu |S - I|^2 + lambda / 2 tr(S - I)^2) with S = R^T F [J]."""
         energy = np.zeros(len(self.tets))
-        module("effects/corotational.cu").bind(
+        self.world.backend.module("effects/corotational.cu").bind(
             "energy", len(self.tets), tets=self.tets, x=self.world.x, gradients=self.gradients, lame=self.lame,
             energy=energy,
         )()  # fmt: skip
-        return float(energy.sum())
+        return float(self.world.backend.fetch(energy).sum())
 
 
 def _constants(body: Body, params: Params) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

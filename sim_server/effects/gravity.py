@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from sim_server.backend import Launch, module
+from sim_server.backend import Launch
 from sim_server.effect import Effect
 from sim_server.parameters import Parameters, Vector
 from sim_server.system import Stencil, System
@@ -38,7 +38,11 @@ class Gravity(Effect):
 
     def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
         w = self.world
-        return [module("effects/gravity.cu").bind("gravity", w.nodes, mass=w.mass, g=self.g, h=w.dt, b=system.b)]
+        return [
+            self.world.backend.module("effects/gravity.cu").bind(
+                "gravity", w.nodes, mass=w.mass, g=self.g, h=w.dt, b=system.b
+            )
+        ]
 
     def energy(self) -> float:
         """-sum m g . x, zero at the origin [J]."""

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from sim_server.backend import Launch, module
+from sim_server.backend import Launch
 from sim_server.effect import Effect, per_node
 from sim_server.parameters import Parameters
 from sim_server.system import Stencil, System
@@ -45,7 +45,7 @@ class Drag(Effect):
         if not self.alpha.any():
             return []
         w = self.world
-        drag = module("effects/rayleigh.cu").bind(
+        drag = self.world.backend.module("effects/rayleigh.cu").bind(
             "drag", w.nodes, mass=w.mass, alpha=self.alpha, v=w.v, h=w.dt, diagonal=system.diagonal, b=system.b
         )
         return [drag]

@@ -25,7 +25,7 @@ struct Apply {
 };
 
 // A grab is a spring, implicit while it is below its limit and a constant force above: stable at any stiffness.
-KERNEL(apply, Apply) {
+MAILED_KERNEL(apply, Apply) {
     int node = p.node[i];
     vec3 x = load3(p.x, node), v = load3(p.v, node), b = load3(p.b, node);
     real diagonal = p.diagonal[node];

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from sim_server.backend import Launch, module
+from sim_server.backend import Launch
 from sim_server.effect import Effect
 from sim_server.parameters import Parameters
 from sim_server.system import Stencil, System
@@ -201,7 +201,7 @@ class Touch(Effect):
         def per(value: str) -> NDArray[np.float64]:
             return np.array([getattr(a, value) for a in interactions], dtype=float)
 
-        return module("effects/touch.cu").bind(
+        return self.world.backend.module("effects/touch.cu").bind(
             "apply", len(touched), node=touched.astype(np.int32), first=np.append(first, len(nodes)).astype(np.int32),
             entry=entry, offset=np.ascontiguousarray(offset), share=1.0 / np.array(count, dtype=float), start=start,
             duration=per("duration"), force=per("force"), target=per("target"), stiffness=per("stiffness"),

@@ -7,6 +7,8 @@
 // NVRTC turns it into a __global__ function, one thread per item; a C++ compiler into a loop over a range of items.
 // A text that defines WIDE first is written on `number` and `index`: scalars on a GPU, as many items at once as a vector
 // register holds on a CPU (past the end the last item is repeated; an item loads before it stores, so that does no harm).
+// MAILED_KERNEL is the same for a launch whose arguments are replaced while the simulation runs: on a GPU it reads them from
+// device memory and takes any number of items.
 // Structs hold 4-byte ints, reals and pointers; the Python side reads their layout from this very text (backend.py), so that
 // names and order stand nowhere else.
 #pragma once
@@ -27,6 +29,13 @@ typedef int index;
         if (i < p.n) name##_item(p, i);                                     \
     }                                                                       \
     __device__ __forceinline__ void name##_item(const Params& p, index i)
+#define MAILED_KERNEL(name, Params)                                         \
+    __device__ __forceinline__ void name##_item(const Params& p, index i);  \
+    extern "C" __global__ void name(const Params* mail) {                   \
+        const Params p = *mail;                                             \
+        for (int i = blockIdx.x * blockDim.x + threadIdx.x; i < p.n; i += gridDim.x * blockDim.x) name##_item(p, i); \
+    }                                                                       \
+    __device__ __forceinline__ void name##_item(const Params& p, index i)
 
 #else
 
@@ -40,6 +49,7 @@ typedef int index;
         for (int i = begin; i < end; i += LANES) name##_item(p, items(i, end - 1));   \
     }                                                                                 \
     INLINE void name##_item(const Params& p, index i)
+#define MAILED_KERNEL(name, Params) KERNEL(name, Params)
 
 #ifdef WIDE
 

@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: MIT
+"""An NVIDIA GPU: its arrays, and the kernel texts compiled for it by NVRTC.
+
+Host arrays keep their names: `twin` gives the device array that stands for one, made and filled at the first call. So
+the code that lists the launches of a step is the same on both devices.
+"""
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_server.backend import HERE, INCLUDE, Argument, arguments_of
+from sim_server.errors import InputError
+
+BLOCK = 128  # threads of an ordinary launch
+
+
+class DeviceError(InputError):
+    """No usable GPU; the message says what to do."""
+
+
+@cache
+def cupy() -> Any:
+    """The cupy package, imported when a GPU is asked for; raises DeviceError."""
+    try:
+        import cupy as cp
+    except ImportError as error:
+        raise DeviceError(f"--device gpu needs CuPy: pip install 'warpfactor[gpu]' ({error})") from error
+    try:
+        count = cp.cuda.runtime.getDeviceCount()
+    except cp.cuda.runtime.CUDARuntimeError as error:
+        raise DeviceError(f"--device gpu: no usable NVIDIA driver, see nvidia-smi ({error})") from error
+    if count == 0:
+        raise DeviceError("--device gpu: no NVIDIA GPU is visible (CUDA_VISIBLE_DEVICES?)")
+    return cp
+
+
+class DeviceLaunch:
+    """One kernel with its arguments on the device. mailed: they lie in device memory and may be replaced."""
+
+    def __init__(self, name: str, function: Any, params: NDArray[Any], items: int, mailed: bool, arrays: list[Any]):
+        self.name, self.items, self.mailed, self._arrays = name, items, mailed, arrays
+        self._function, self.params = function, params
+        self._mail = cupy().asarray(params.reshape(1).view(np.uint8)) if mailed else None
+
+    def __call__(self) -> None:
+        """Puts it onto the current stream."""
+        argument = self._mail if self.mailed else self.params
+        blocks = 64 if self.mailed else max(1, -(-self.items // BLOCK))
+        if self.items or self.mailed:
+            self._function((blocks,), (BLOCK,), (argument,))
+
+    def take(self, other: "DeviceLaunch") -> None:
+        """From the next launch on, the arguments of `other`."""
+        assert self._mail is not None
+        self._mail.set(other.params.reshape(1).view(np.uint8))
+        self._arrays = other._arrays
+
+
+class DeviceModule:
+    """A kernel text compiled by NVRTC; raises CompileError through CuPy's compiler."""
+
+    def __init__(self, path: str, gpu: "Gpu", real: str = "double", cooperative: bool = False):
+        source = HERE / path
+        self.name, self.real, self._gpu, self._text = source.stem, real, gpu, source.read_text()
+        self._module = cupy().RawModule(
+            code=self._text,
+            options=("-std=c++17", f"-I{INCLUDE}", f"-Dreal={real}"),
+            backend="nvrtc",
+            enable_cooperative_groups=cooperative,
+        )
+
+    def function(self, kernel: str) -> Any:
+        """A kernel by name."""
+        return self._module.get_function(kernel)
+
+    def bind(self, kernel: str, n: int, **arguments: Any) -> DeviceLaunch:
+        """As backend.Module.bind, with the twins of the arrays."""
+        fields, mailed = arguments_of(self._text, kernel, self.name, self.real, {"n": n, **arguments})
+        params = np.zeros((), dtype=_layout(fields))
+        twins = []
+        for field, value in fields:
+            if field.dtype is not None:
+                twin = self._gpu.twin(value)
+                twins.append(twin)
+                value = twin.data.ptr
+            params[field.name] = value
+        return DeviceLaunch(f"{self.name}.{kernel}", self.function(kernel), params, n, mailed, twins)
+
+
+def _layout(fields: list[tuple[Argument, Any]]) -> np.dtype:
+    types = {"int": "i4", "double": "f8", "float": "f4"}
+    return np.dtype([(f.name, "u8" if f.dtype is not None else types[f.kind]) for f, _ in fields], align=True)
+
+
+class Gpu:
+    """The current CUDA device."""
+
+    name = "gpu"
+
+    def __init__(self) -> None:
+        self.cp = cupy()
+        self._twins: dict[int, tuple[NDArray[Any], Any]] = {}
+        self._modules: dict[str, DeviceModule] = {}
+        self.properties = self.cp.cuda.runtime.getDeviceProperties(self.cp.cuda.Device().id)
+
+    def twin(self, host: NDArray[Any]) -> Any:
+        """The device array of a host array."""
+        kept = self._twins.get(id(host))
+        if kept is None:
+            kept = (host, self.cp.asarray(host))  # keeping the host array keeps its id its own
+            self._twins[id(host)] = kept
+        return kept[1]
+
+    def fetch(self, host: NDArray[Any]) -> NDArray[Any]:
+        """The array with what kernels have made of its twin."""
+        if id(host) in self._twins:
+            host[...] = self.twin(host).get()
+        return host
+
+    def module(self, path: str) -> DeviceModule:
+        """A kernel text, compiled once."""
+        if path not in self._modules:
+            self._modules[path] = DeviceModule(path, self)
+        return self._modules[path]
+

@@ -1,0 +1,389 @@
+// SPDX-License-Identifier: MIT
+// Preconditioned conjugate gradients of all bodies in one persistent launch, numbered as native/pcg.h, which it mirrors.
+//
+// A body is solved by a group of thread blocks with a barrier of its own; blocks beyond what the bodies need do nothing,
+// bodies beyond the blocks queue. Two barriers an iteration: the search direction p = z + beta p is formed while A p is
+// computed (every block forms what it reads), and x, r are updated while the preconditioner is applied. All sums have a
+// fixed order: no float atomics, the same bits every time.
+//
+// The factor is applied as the dense inverse in float16, made on the device from L (expand.py): data without dependency
+// chains. Vectors and A are float64, so that the residual is, whatever the preconditioner's precision.
+#define THREADS 512
+#define WARPS (THREADS / 32)
+#define LANES_PER_NODE 16
+
+enum Kind { NONE = 0, JACOBI = 1, BLOCK_JACOBI = 2, CHOLESKY = 3 };
+enum Status { CONVERGED = 0, MAX_ITERATIONS = 1, BUDGET = 2, BREAKDOWN_MATRIX = 3, BREAKDOWN_PRECONDITIONER = 4, NOT_FINITE = 5 };
+
+struct Body {
+    int first, nodes;                // of the scene's nodes
+    int block, blocks;               // thread blocks [block, block + blocks) solve it
+    int kind, max_iterations, warm_start, probe;
+    double tolerance;
+    const unsigned short* inverse;   // (3 nodes, stride) float16, or null
+    long long factor_step;           // of the matrix it was made from
+    const float* scale;              // (3 nodes,) d: the inverse is d_i stored_ij d_j, entries of at most 1
+    int stride, unused;              // entries per row, a multiple of 8, zeros beyond 3 nodes
+};
+
+struct Result {
+    double residual;                 // true, relative
+    double seconds;
+    long long factor_step;           // -1: no factor used
+    int iterations, status, kind, asked, fallbacks, bad_node;
+};
+
+struct Solve {
+    const Body* bodies;
+    int count, capacity;             // bodies; results kept per body
+    const int* row_start;
+    const int* columns;
+    const double* values;            // (blocks, 3, 3)
+    const double* b;                 // (nodes, 3)
+    double* y;                       // (nodes, 3) start in, solution out
+    double* r;                       // (2, nodes, 3)
+    double* p;                       // (2, nodes, 3)
+    double* z;                       // (nodes, 3)
+    double* q;                       // (nodes, 3)
+    double* diagonal;                // (nodes, 9) inverses of the diagonal blocks
+    double* partial;                 // (bodies, 2, grid, 2) sums of the thread blocks
+    unsigned* arrived;               // (bodies,) zero at launch
+    const long long* step;           // completed steps: where the result goes
+    Result* results;                 // (capacity, bodies)
+    int nodes;
+};
+
+extern __shared__ float shared_r[];
+
+struct Group {
+    const Solve& s;
+    const Body& body;
+    int index, lane, warp;           // of this block in the group, of this thread
+    int begin, end;                  // own nodes, from 0 in the body
+    unsigned target;
+    int parity;                      // of the partial sums
+    unsigned* arrived;
+    double* partial;                 // of this body
+    double* scratch;                 // shared, 2 WARPS + 2
+
+    __device__ void barrier() {
+        __syncthreads();
+        if (body.blocks == 1) return;
+        if (threadIdx.x == 0) {
+            target += body.blocks;
+            unsigned seen;
+            asm volatile("fence.acq_rel.gpu;" ::: "memory");
+            atomicAdd(arrived, 1u);
+            do asm volatile("ld.acquire.gpu.u32 %0, [%1];" : "=r"(seen) : "l"(arrived) : "memory");
+            while ((int)(seen - target) < 0);
+        }
+        __syncthreads();
+    }
+
+    // Sums over the threads of this block, in every thread.
+    __device__ void block_sum(double& a, double& c) {
+        for (int k = 16; k; k >>= 1) {
+            a += __shfl_down_sync(~0u, a, k);
+            c += __shfl_down_sync(~0u, c, k);
+        }
+        __syncthreads();
+        if (lane == 0) { scratch[warp] = a; scratch[WARPS + warp] = c; }
+        __syncthreads();
+        a = 0; c = 0;
+        for (int k = 0; k < WARPS; ++k) { a += scratch[k]; c += scratch[WARPS + k]; }
+    }
+
+    // Sums over the group, in every thread; a barrier.
+    __device__ void group_sum(double& a, double& c) {
+        block_sum(a, c);
+        if (body.blocks == 1) { __syncthreads(); return; }
+        double* mine = partial + 2 * parity * gridDim.x;
+        if (threadIdx.x == 0) { mine[2 * index] = a; mine[2 * index + 1] = c; }
+        barrier();
+        double u = 0, v = 0;
+        if (warp == 0) {
+            for (int k = lane; k < body.blocks; k += 32) { u += __ldcg(mine + 2 * k); v += __ldcg(mine + 2 * k + 1); }
+            for (int k = 16; k; k >>= 1) { u += __shfl_down_sync(~0u, u, k); v += __shfl_down_sync(~0u, v, k); }
+            if (lane == 0) { scratch[2 * WARPS] = u; scratch[2 * WARPS + 1] = v; }
+        }
+        __syncthreads();
+        a = scratch[2 * WARPS]; c = scratch[2 * WARPS + 1];
+        parity ^= 1;
+    }
+
+    // One row of blocks times a vector that is formed on the way: u + beta w. 16 lanes a node; the sum ends in lane 0 of them.
+    __device__ void row_product(int node, int sub, const double* u, const double* w, double beta, double sum[3]) {
+        sum[0] = sum[1] = sum[2] = 0;
+        if (node < end) {
+            int row = body.first + node;
+            for (int k = s.row_start[row] + sub; k < s.row_start[row + 1]; k += LANES_PER_NODE) {
+                const double* a = s.values + 9ll * k;
+                const double* uj = u + 3ll * s.columns[k];
+                double v0 = __ldcg(uj), v1 = __ldcg(uj + 1), v2 = __ldcg(uj + 2);
+                if (w) {
+                    const double* wj = w + 3ll * s.columns[k];
+                    v0 += beta * __ldcg(wj); v1 += beta * __ldcg(wj + 1); v2 += beta * __ldcg(wj + 2);
+                }
+                sum[0] += a[0] * v0 + a[1] * v1 + a[2] * v2;
+                sum[1] += a[3] * v0 + a[4] * v1 + a[5] * v2;
+                sum[2] += a[6] * v0 + a[7] * v1 + a[8] * v2;
+            }
+        }
+        for (int k = LANES_PER_NODE / 2; k; k >>= 1)
+            for (int m = 0; m < 3; ++m) sum[m] += __shfl_down_sync(~0u, sum[m], k, LANES_PER_NODE);
+    }
+
+    // r = b - A y; returns |r|^2, and |b|^2 in `bb`.
+    __device__ double residual(double* r, double& bb) {
+        double rr = 0, sum[3];
+        bb = 0;
+        int sub = threadIdx.x % LANES_PER_NODE, each = THREADS / LANES_PER_NODE;
+        for (int base = begin; base < end; base += each) {
+            int node = base + threadIdx.x / LANES_PER_NODE;
+            row_product(node, sub, s.y, nullptr, 0, sum);
+            if (node < end && sub == 0)
+                for (int m = 0; m < 3; ++m) {
+                    long long i = 3ll * (body.first + node) + m;
+                    double d = s.b[i] - sum[m];
+                    r[i] = d;
+                    rr += d * d;
+                    bb += s.b[i] * s.b[i];
+                }
+        }
+        group_sum(rr, bb);
+        return rr;
+    }
+
+    // q = A p with p = z + beta p_old, kept; returns p . q.
+    __device__ double direction(double beta, const double* old, double* p) {
+        double pq = 0, none = 0, sum[3];
+        int sub = threadIdx.x % LANES_PER_NODE, each = THREADS / LANES_PER_NODE;
+        for (int base = begin; base < end; base += each) {
+            int node = base + threadIdx.x / LANES_PER_NODE;
+            row_product(node, sub, s.z, beta != 0 ? old : nullptr, beta, sum);
+            if (node < end && sub == 0)
+                for (int m = 0; m < 3; ++m) {
+                    long long i = 3ll * (body.first + node) + m;
+                    double v = __ldcg(s.z + i) + (beta != 0 ? beta * __ldcg(old + i) : 0);
+                    p[i] = v;
+                    s.q[i] = sum[m];
+                    pq += v * sum[m];
+                }
+        }
+        group_sum(pq, none);
+        return pq;
+    }
+
+    // x += alpha p and r -= alpha q for the own nodes; alpha 0: nothing to add yet (p and q hold nothing).
+    __device__ double update(long long i, double alpha, const double* p, const double* r_old, double* r_new) {
+        double d = __ldcg(r_old + i);
+        if (alpha != 0) {
+            d -= alpha * __ldcg(s.q + i);
+            s.y[i] += alpha * p[i];
+        }
+        r_new[i] = d;
+        return d;
+    }
+
+    // z = P^-1 r by diagonal blocks, r updated on the way; returns z . r, and |r|^2 in `rr`.
+    __device__ double by_blocks(int kind, double alpha, const double* p, const double* r_old, double* r_new, double& rr) {
+        double rz = 0;
+        rr = 0;
+        for (int node = begin + threadIdx.x; node < end; node += THREADS) {
+            long long i = 3ll * (body.first + node);
+            double d[3];
+            for (int m = 0; m < 3; ++m) d[m] = update(i + m, alpha, p, r_old, r_new);
+            const double* v = s.diagonal + 3 * i;
+            for (int m = 0; m < 3; ++m) {
+                double zi = kind == NONE ? d[m] : v[3 * m] * d[0] + v[3 * m + 1] * d[1] + v[3 * m + 2] * d[2];
+                s.z[i + m] = zi;
+                rz += zi * d[m];
+                rr += d[m] * d[m];
+            }
+        }
+        group_sum(rz, rr);
+        return rz;
+    }
+
+    // z = P^-1 r by the dense inverse. Every block forms all of r (a barrier less), then the rows of z that are its warps'.
+    __device__ double by_inverse(double alpha, const double* p, const double* r_old, double* r_new, double goal, double& rr) {
+        int n = 3 * body.nodes;
+        long long base = 3ll * body.first;
+        double rz = 0, none = 0;
+        rr = 0;
+        for (int k = threadIdx.x; k < body.stride; k += THREADS) {
+            double d = 0;
+            if (k < n) {
+                d = __ldcg(r_old + base + k);
+                if (alpha != 0) d -= alpha * __ldcg(s.q + base + k);
+            }
+            shared_r[k] = k < n ? body.scale[k] * (float)d : 0;
+            rr += d * d;
+        }
+        for (int k = 3 * begin + threadIdx.x; k < 3 * end; k += THREADS) update(base + k, alpha, p, r_old, r_new);
+        block_sum(rr, none);  // the same in every block, to the bit
+        if (rr <= goal) {
+            barrier();
+            return 1;
+        }
+        int warps = WARPS * body.blocks;
+        for (int row = WARPS * index + warp; row < n; row += warps) {
+            const uint4* a = (const uint4*)(body.inverse + (long long)row * body.stride);
+            float sum = 0;
+            for (int k = lane; k < body.stride / 8; k += 32) {
+                uint4 v = a[k];
+                const float* x = shared_r + 8 * k;
+                unsigned words[4] = {v.x, v.y, v.z, v.w};
+                for (int m = 0; m < 4; ++m) {
+                    float lo, hi;
+                    asm("{.reg .b16 a, b; mov.b32 {a, b}, %2; cvt.f32.f16 %0, a; cvt.f32.f16 %1, b;}"
+                        : "=f"(lo), "=f"(hi) : "r"(words[m]));
+                    sum += lo * x[2 * m] + hi * x[2 * m + 1];
+                }
+            }
+            for (int k = 16; k; k >>= 1) sum += __shfl_down_sync(~0u, sum, k);
+            if (lane == 0) {
+                s.z[base + row] = (double)body.scale[row] * sum;
+                rz += (double)sum * shared_r[row];
+            }
+        }
+        none = 0;
+        group_sum(rz, none);
+        return rz;
+    }
+
+    __device__ void invert_diagonal(bool whole) {
+        for (int node = begin + threadIdx.x; node < end; node += THREADS) {
+            int row = body.first + node, k = s.row_start[row];
+            while (s.columns[k] != row) ++k;
+            const double* a = s.values + 9ll * k;
+            double* v = s.diagonal + 9ll * row;
+            if (!whole) {
+                for (int m = 0; m < 9; ++m) v[m] = 0;
+                v[0] = 1 / a[0]; v[4] = 1 / a[4]; v[8] = 1 / a[8];
+                continue;
+            }
+            double c0 = a[4] * a[8] - a[5] * a[7], c1 = a[5] * a[6] - a[3] * a[8], c2 = a[3] * a[7] - a[4] * a[6];
+            double d = 1 / (a[0] * c0 + a[1] * c1 + a[2] * c2);
+            v[0] = d * c0; v[4] = d * (a[0] * a[8] - a[2] * a[6]); v[8] = d * (a[0] * a[4] - a[1] * a[3]);
+            v[1] = v[3] = d * c1; v[2] = v[6] = d * c2; v[5] = v[7] = d * (a[1] * a[6] - a[0] * a[7]);
+        }
+    }
+
+    __device__ void set(double* to, const double* from) {
+        for (int k = 3 * begin + threadIdx.x; k < 3 * end; k += THREADS)
+            to[3ll * body.first + k] = from ? from[3ll * body.first + k] : 0;
+    }
+};
+
+__device__ long long nanoseconds() {
+    long long t;
+    asm volatile("mov.u64 %0, %globaltimer;" : "=l"(t));
+    return t;
+}
+
+__device__ Result solve(Group& g) {
+    const Solve& s = g.s;
+    const Body& body = g.body;
+    long long all = 3ll * s.nodes;
+    int kind = body.kind == CHOLESKY && !body.inverse ? BLOCK_JACOBI : body.kind;
+    Result out = {0, 0, -1, 0, CONVERGED, kind, body.kind, 0, -1};
+    int turn = 0;  // which half of r holds the residual
+    double b2, r2 = g.residual(s.r, b2), none;
+    double goal = body.tolerance * body.tolerance * b2;
+    if (!isfinite(b2)) {
+        g.set(s.y, nullptr);
+        out.status = NOT_FINITE;
+        out.residual = b2;
+        return out;
+    }
+    if (!body.warm_start || !(r2 < b2)) {
+        g.set(s.y, nullptr);
+        g.set(s.r, s.b);
+        r2 = b2;
+    }
+    if (r2 <= goal) {
+        out.residual = b2 > 0 ? sqrt(r2 / b2) : 0;
+        return out;
+    }
+    if (kind == JACOBI || kind == BLOCK_JACOBI) g.invert_diagonal(kind == BLOCK_JACOBI);
+    g.barrier();
+
+    double alpha = 0, rz = 0, last = 1e300;
+    bool restart = true, switched = false;
+    for (int way = 0;; ) {
+        double *r_old = s.r + turn * all, *r_new = s.r + (1 - turn) * all, *p = s.p + way * all;
+        double zr = kind == CHOLESKY ? g.by_inverse(alpha, p, r_old, r_new, goal, r2)
+                                     : g.by_blocks(kind, alpha, p, r_old, r_new, r2);
+        turn = 1 - turn;
+        int stop = -1;
+        if (r2 <= goal) stop = CONVERGED;
+        else if (!(zr > 0)) stop = BREAKDOWN_PRECONDITIONER;
+        else if (out.iterations == body.max_iterations) stop = MAX_ITERATIONS;
+        if (stop == BREAKDOWN_PRECONDITIONER && kind == CHOLESKY) {  // a useless factor: on with block Jacobi
+            kind = out.kind = BLOCK_JACOBI;
+            out.fallbacks = 1;
+            g.invert_diagonal(true);
+            alpha = 0;
+            restart = true;
+            g.barrier();
+            continue;
+        }
+        if (stop < 0 && body.probe > 0 && out.iterations == body.probe && body.inverse && kind >= BLOCK_JACOBI && !switched) {
+            kind = out.kind = kind == CHOLESKY ? BLOCK_JACOBI : CHOLESKY;
+            if (kind == BLOCK_JACOBI) g.invert_diagonal(true);
+            alpha = 0;
+            switched = restart = true;
+            g.barrier();
+            continue;
+        }
+        if (stop < 0) {
+            double pq = g.direction(restart ? 0 : zr / rz, p, s.p + (1 - way) * all);
+            way = 1 - way;
+            rz = zr;
+            restart = false;
+            ++out.iterations;
+            if (pq > 0) { alpha = rz / pq; continue; }
+            stop = BREAKDOWN_MATRIX;
+        }
+        g.barrier();
+        r2 = g.residual(s.r + turn * all, none);
+        if (stop == CONVERGED && r2 > goal) {  // the recursive residual was too good
+            if (r2 < 0.25 * last) {
+                last = r2;
+                alpha = 0;
+                restart = true;
+                continue;
+            }
+            stop = MAX_ITERATIONS;
+        }
+        out.status = stop;
+        out.residual = sqrt(r2 / b2);
+        return out;
+    }
+}
+
+extern "C" __global__ void __launch_bounds__(THREADS, 1) pcg(const Solve s) {
+    __shared__ Body body;
+    __shared__ double scratch[2 * WARPS + 2];
+    for (int k = 0; k < s.count; ++k) {
+        const Body* next = s.bodies + k;
+        bool mine = (int)blockIdx.x >= next->block && (int)blockIdx.x < next->block + next->blocks;
+        if (!mine) continue;
+        __syncthreads();
+        if (threadIdx.x == 0) body = *next;
+        __syncthreads();
+        int index = blockIdx.x - body.block;
+        Group g = {s, body, index, (int)threadIdx.x % 32, (int)threadIdx.x / 32,
+                   (int)((long long)body.nodes * index / body.blocks), (int)((long long)body.nodes * (index + 1) / body.blocks),
+                   0, 0, s.arrived + k, s.partial + 4ll * gridDim.x * k, scratch};
+        long long begin = nanoseconds();
+        Result out = solve(g);
+        if (index == 0 && threadIdx.x == 0) {
+            out.seconds = 1e-9 * (nanoseconds() - begin);
+            if (out.kind == CHOLESKY || out.fallbacks) out.factor_step = body.factor_step;
+            s.results[(s.step[0] % s.capacity) * s.count + k] = out;
+        }
+        __syncthreads();
+    }
+}
