@@ -3,7 +3,7 @@
 
 import math
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,9 @@ class Outcome:
     """Measured. Lengths are parts of the bar's length, energies parts of what was dissipated; None: never."""
 
     finite: bool
-    energy: float  # largest rise of energy - work over its lowest earlier value
+    energy: float  # rise / dissipated
+    rise: float  # largest, of energy - work over its lowest earlier value [J]
+    dissipated: float  # from start to end [J]
     status: Counter[str]
     fallbacks: int  # solves that left their factor
     iterations: Reals
@@ -86,6 +88,14 @@ class Load:
             implicit = share * h.stiffness * (goal - self.sim.world.x[h.nodes])
             force = np.where(size > share * h.limit, share * h.limit * pull / np.maximum(size, 1e-300), implicit)
         self.work += float((force * moved).sum())
+
+
+def finer(case: Case, times: int = 10, steps: int = 150) -> Case:
+    """The first steps of a case with so many times smaller ones: is what happens there an error of the time step?"""
+    dt = next((float(s.removeprefix("dt=")) for s in case.scene if s.startswith("dt=")), 0.02)
+    scene = (*(s for s in case.scene if not s.startswith("dt=")), f"dt={dt / times}")
+    hold = replace(case.hold, until=times * case.hold.until) if case.hold else None
+    return replace(case, scene=scene, hold=hold, steps=times * min(steps, case.steps), rests="spin")
 
 
 def built(case: Case, folder: Path, *more: str) -> Simulation:
@@ -161,6 +171,8 @@ def _outcome(case: Case, sim: Simulation, records: Any, energy: Reals, distance:
     return Outcome(
         finite=bool(np.isfinite(sim.world.x).all() and np.isfinite(energy).all() and len(records) == case.steps),
         energy=rise / dissipated,
+        rise=rise,
+        dissipated=dissipated,
         status=Counter(STATUS[s] for s in records["status"].tolist()),
         fallbacks=int(records["fallbacks"].sum()),
         iterations=records["iterations"].astype(float),

@@ -13,7 +13,7 @@ import pytest
 from sim_server.driver import Driver
 from sim_server.simulation import Simulation
 from tests.hard_cases.case import BAR, FREE_BAR, Case
-from tests.hard_cases.running import Outcome, broken, run_case
+from tests.hard_cases.running import Outcome, broken, finer, run_case
 from tests.hard_cases.slivers import THICKNESS, sliver_bar, smallest_dihedral
 from tests.hard_cases.starts import mirrored, spinning
 from tests.hard_cases.table import CASES
@@ -22,6 +22,12 @@ from tests.hard_cases.table import CASES
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 def test_hard_case(case: Case, tmp_path: Path) -> None:
     assert broken(case, run_case(case, tmp_path)) == []
+
+
+@pytest.mark.parametrize("case", [c for c in CASES if c.energy > 1e-6], ids=lambda case: case.name)
+def test_energy_that_rises_is_an_error_of_the_time_step(case: Case, tmp_path: Path) -> None:
+    """What the notes of the table say of every case that is allowed to gain energy."""
+    assert run_case(finer(case), tmp_path).rise < 0.5 * run_case(finer(case, times=1), tmp_path).rise
 
 
 def test_names_of_the_table_differ() -> None:
@@ -59,7 +65,7 @@ def test_warp_helps_while_spinning() -> None:
 def test_what_breaks_the_rules_is_told() -> None:
     """The check is not one that lets everything pass: one complaint for each rule."""
     case = Case("made up", "nothing", iterations=5, recovered=100)
-    good = Outcome(True, 0.0, Counter(converged=10), 0, np.ones(10), 2.0, 1e-6, 1.0, 50, 1.0, 0)
+    good = Outcome(True, 0.0, 0.0, 1.0, Counter(converged=10), 0, np.ones(10), 2.0, 1e-6, 1.0, 50, 1.0, 0)
     assert broken(case, good) == []
     bad: dict[str, Any] = {
         "finite": False, "energy": math.nan, "status": Counter(converged=9, budget=1), "recovered": 101,
