@@ -51,6 +51,7 @@ class System:
         self.sums = np.zeros((len(upper), 3, 3))
         self.values = np.zeros((len(self.columns), 3, 3))
         self.diagonal = np.zeros(n)
+        self.diagonal_block = np.flatnonzero(self.row == self.column).astype(np.int32)  # of each node, among the sums
         self.b = np.zeros((n, 3))
         self.mean = np.zeros((n, 3, 3))
         self.rotation = np.tile(np.eye(3), (n, 1, 1))

@@ -19,16 +19,22 @@ struct Apply {
     const real* x;          // (nodes, 3) [m]
     const real* v;          // (nodes, 3) [m/s]
     const real* free;       // (nodes,) 1, or 0 at fixed nodes
+    const int* block;       // (nodes,) place of a node's own block among the sums
+    const real* sums;       // (blocks, 3, 3) what elements have put into A, world frame [kg]
     real h;                 // [s]
     real* diagonal;         // (nodes,) in, out: += h2 k [kg]
     real* b;                // (nodes, 3) in, out: += h f - h2 k v [N s]
 };
 
-// A grab is a spring, implicit while it is below its limit and a constant force above: stable at any stiffness.
+// A grab is a spring, implicit while it is below its limit and a constant force above. What it will be is reckoned at the end
+// of the step, with the node's own part of A for inertia; reckoned at the beginning, a stiff spring would throw the node from
+// one side of its target to the other for ever.
 MAILED_KERNEL(apply, Apply) {
     int node = p.node[i];
     vec3 x = load3(p.x, node), v = load3(p.v, node), b = load3(p.b, node);
     real diagonal = p.diagonal[node];
+    const real* K = p.sums + 9 * p.block[node];
+    real inertia = diagonal + (K[0] + K[4] + K[8]) / 3;
     for (int e = p.first[i]; e < p.first[i + 1]; ++e) {
         int k = p.entry[e];
         real now = p.clock[0];
@@ -40,12 +46,12 @@ MAILED_KERNEL(apply, Apply) {
             continue;
         }
         real spring = share * p.stiffness[k], limit = share * p.limit[k];
-        vec3 pull = spring * (load3(p.target, k) + load3(p.offset, e) - x);
+        vec3 pull = spring * (load3(p.target, k) + load3(p.offset, e) - x - p.h * v);
         real size = sqrt(dot(pull, pull));
-        if (size > limit) {
+        if (size > limit * (1 + p.h * p.h * spring / inertia)) {
             b = b + (p.h * limit / size) * pull;
         } else {
-            b = b + p.h * pull - (p.h * p.h * spring) * v;
+            b = b + p.h * pull;
             diagonal += p.h * p.h * spring;
         }
     }

@@ -3,8 +3,8 @@
 
 A push is a force F [N] on the nodes within a radius of a point, for a while. A grab ties such nodes to a target point
 by springs of stiffness k [N/m] in total, f = k (target - x), with a bounded force: once |f| would pass the limit, it
-stays at the limit. The spring enters the system matrix (h^2 k on the diagonal), so a stiff grab is as stable as the
-rest; a push is a plain force.
+stays at the limit (by what f will be at the end of the step). The spring enters the system matrix (h^2 k on the
+diagonal), so a stiff grab is as stable as the rest; a push is a plain force.
 
 Clients are not trusted: a push beyond `max_force` is refused, a grab is bounded by it, and at most `max_interactions`
 are alive at once on one object. An object that does not list this effect cannot be touched at all.
@@ -205,8 +205,8 @@ class Touch(Effect):
             "apply", len(touched), node=touched.astype(np.int32), first=np.append(first, len(nodes)).astype(np.int32),
             entry=entry, offset=np.ascontiguousarray(offset), share=1.0 / np.array(count, dtype=float), start=start,
             duration=per("duration"), force=per("force"), target=per("target"), stiffness=per("stiffness"),
-            limit=per("limit"), clock=system.clock, x=w.x, v=w.v, free=w.free, h=w.dt, diagonal=system.diagonal,
-            b=system.b,
+            limit=per("limit"), clock=system.clock, x=w.x, v=w.v, free=w.free, block=system.diagonal_block,
+            sums=system.sums, h=w.dt, diagonal=system.diagonal, b=system.b,
         )  # fmt: skip
 
 
