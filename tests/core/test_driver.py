@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Update policies: which step is solved with the factor of which, and that nothing stops the run.
 
-Record k (from 0) is of the step made from state k; factor_step says which state's matrix the factor came from, -1: none.
+Record k (from 0) is of the step made from state k; factor_step says which state's matrix the factor came from (-1: no
+factor).
 """
 
 import logging

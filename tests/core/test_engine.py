@@ -49,8 +49,8 @@ def small_ring(sim: Simulation, records: int) -> Engine:
     assemble, integrate = sim.launches()
     s, w = sim.system, sim.world
     return Engine(
-        assemble, integrate, [(b.first, b.last) for b in w.bodies], w.dt, records=records, frames=4, row_start=s.row_start,
-        columns=s.columns, values=s.values, b=s.b_material, y=s.y, x=w.x, v=w.v, clock=s.clock,
+        assemble, integrate, [(b.first, b.last) for b in w.bodies], w.dt, records=records, frames=4,
+        row_start=s.row_start, columns=s.columns, values=s.values, b=s.b_material, y=s.y, x=w.x, v=w.v, clock=s.clock,
     )  # fmt: skip
 
 
@@ -74,7 +74,8 @@ def test_a_patient_loop_waits_for_its_reader():
     engine.settings(0).max_iterations, engine.settings(0).tolerance = 500, 1e-6
     thread = threading.Thread(target=engine.run, args=(200,))
     thread.start()
-    steps, frames = [], []
+    steps: list[int] = []
+    frames: list[int] = []
     while thread.is_alive() or len(steps) < 200:
         steps += engine.records()["step"].tolist()
         frames += [step for step, _, _ in engine.frames()]

@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: MIT
+"""Kernel texts: compiled with a cache, their errors shown, their arguments checked."""
+
+import ctypes
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sim_server import backend
+
+PUSH = """#include "kernel.h"
+struct Push {
+    int n;            // items
+    const real* v;    // (n,)
+    real* x;          // (n,) in, out
+    const int* twist; // (n,)
+    real h;
+};
+KERNEL(push, Push) { p.x[i] += p.h * p.v[i] * p.twist[i]; }
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch) -> Path:
+    """Kernel texts of a test's own, with the package's headers and an empty cache."""
+    texts = tmp_path / "texts"
+    texts.mkdir()
+    (texts / "push.cu").write_text(PUSH)
+    monkeypatch.setattr(backend, "HERE", texts)
+    monkeypatch.setenv("WARPFACTOR_CACHE", str(tmp_path / "cache"))
+    return texts
+
+
+def arguments(n: int = 5, real: str = "f8") -> dict:
+    return {"v": np.ones(n, real), "x": np.zeros(n, real), "twist": np.arange(n, dtype=np.int32), "h": 0.5}
+
+
+def libraries(folder: Path) -> set[str]:
+    return {p.name for p in (folder.parent / "cache").iterdir()}
+
+
+@pytest.mark.parametrize(("real", "dtype"), [("double", "f8"), ("float", "f4")])
+def test_a_text_is_compiled_bound_and_run(folder, real, dtype):
+    given = arguments(real=dtype)
+    launch = backend.Module("push.cu", real).bind("push", 5, **given)
+    launch()
+    launch()
+    np.testing.assert_array_equal(given["x"], [0, 1, 2, 3, 4])
+    assert given["x"].dtype == dtype
+    assert (launch.name, launch.items) == ("push.push", 5)
+
+
+def test_nothing_is_compiled_twice(folder):
+    backend.Module("push.cu")
+    first = libraries(folder)
+    assert len(first) == 1
+    assert next(iter(first)).startswith("push-")
+    stamp = next((folder.parent / "cache").iterdir()).stat().st_mtime_ns
+    backend.Module("push.cu")
+    assert libraries(folder) == first
+    assert next((folder.parent / "cache").iterdir()).stat().st_mtime_ns == stamp
+
+
+def test_the_cache_knows_text_headers_flags_and_precision(folder, monkeypatch):
+    source = folder / "push.cu"
+    (folder / "mine.cuh").write_text("#define FACTOR 2\n")
+    source.write_text(PUSH.replace('"kernel.h"', '"kernel.h"\n#include "mine.cuh"').replace("p.h *", "FACTOR * p.h *"))
+
+    def result() -> float:
+        given = arguments()
+        backend.Module("push.cu").bind("push", 5, **given)()
+        return given["x"][1]
+
+    assert result() == 1.0
+    (folder / "mine.cuh").write_text("#define FACTOR 6\n")
+    assert result() == 3.0  # a header alone was edited
+    assert len(libraries(folder)) == 2
+    source.write_text(source.read_text().replace("* p.twist", "* 10 * p.twist"))
+    assert result() == 30.0
+    assert len(libraries(folder)) == 3
+    monkeypatch.setattr(backend, "FLAGS", [*backend.FLAGS, "-DUNUSED"])
+    assert result() == 30.0
+    assert len(libraries(folder)) == 4
+    backend.Module("push.cu", "float")
+    assert len(libraries(folder)) == 5
+    (folder / "mine.cuh").write_text("#define FACTOR 2\n")
+    source.write_text(PUSH)
+    assert result() == 0.5
+
+
+def test_a_text_that_does_not_compile_says_why_and_leaves_nothing(folder):
+    (folder / "push.cu").write_text(PUSH.replace("p.h", "p.nonsense"))
+    with pytest.raises(backend.CompileError, match=r"push\.cu did not compile:[\s\S]*nonsense"):
+        backend.Module("push.cu")
+    assert not any(name.endswith(".so") for name in libraries(folder))
+
+
+def test_without_a_compiler_the_message_says_what_to_do(folder, monkeypatch):
+    backend.compiler.cache_clear()
+    monkeypatch.setenv("PATH", str(folder))
+    monkeypatch.delenv("CXX", raising=False)
+    try:
+        with pytest.raises(backend.CompileError, match=r"no C\+\+ compiler found .*apt-get install g\+\+"):
+            backend.compiler()
+    finally:
+        backend.compiler.cache_clear()
+
+
+WRONG = {
+    "missing": ({"h": None}, "takes"),
+    "unknown": ({"extra": 1.0}, "takes"),
+    "single precision": ({"x": np.zeros(5, np.float32)}, "x must be a contiguous array of float64"),
+    "wide integers": ({"twist": np.arange(5)}, "twist must be a contiguous array of int32"),
+    "not contiguous": ({"v": np.ones(10)[::2]}, "v must be a contiguous array of float64"),
+    "column major": ({"v": np.asfortranarray(np.ones((5, 2)))}, "v must be a contiguous array of float64"),
+    "a list": ({"v": [1.0] * 5}, "v must be a contiguous array of float64"),
+    "a number": ({"x": 3.0}, "x must be a contiguous array of float64"),
+    "an array for a number": ({"h": np.ones(5)}, "array"),
+    "a word for a number": ({"h": "fast"}, "real number|float"),
+}
+
+
+@pytest.mark.parametrize(("change", "message"), WRONG.values(), ids=WRONG.keys())
+def test_arguments_that_do_not_fit_are_refused(folder, change, message):
+    given = {k: v for k, v in (arguments() | change).items() if v is not None}
+    with pytest.raises(TypeError, match=message):
+        backend.Module("push.cu").bind("push", 5, **given)
+
+
+def test_kernels_and_members_that_cannot_be_found_are_named(folder):
+    module = backend.Module("push.cu")
+    with pytest.raises(backend.CompileError, match=r"no kernel pull in push\.cu"):
+        module.bind("pull", 5, **arguments())
+    (folder / "odd.cu").write_text(PUSH.replace("real h;", "real h[3];"))
+    (folder / "odd.cu").write_text((folder / "odd.cu").read_text().replace("p.h *", "p.h[0] *"))
+    with pytest.raises(backend.CompileError, match=r"struct Push: cannot read the member 'real h\[3\];'"):
+        backend.Module("odd.cu").bind("push", 5, **arguments())
+
+
+def test_layouts_are_those_of_the_compiler(folder):
+    """Ints, reals and pointers in any order: the compiler pads as ctypes does."""
+    body = "int n; real a; int k; const real* v; int m; real b; real* out;".replace("; ", ";\n    ")
+    text = f'#include "kernel.h"\nstruct Odd {{\n    {body}\n}};\n'
+    text += "KERNEL(odd, Odd) { p.out[i] = p.a + 10 * p.k + 100 * p.v[i] + 1000 * p.m + 10000 * p.b; }\n"
+    (folder / "odd.cu").write_text(text)
+    for real, dtype in (("double", "f8"), ("float", "f4")):
+        out = np.zeros(3, dtype)
+        launch = backend.Module("odd.cu", real).bind("odd", 3, a=1.0, k=2, v=np.full(3, 3, dtype), m=4, b=5.0, out=out)
+        launch()
+        assert (out == 54321).all()
+        assert ctypes.sizeof(launch.params) in (40, 48, 56)
+
+
+PACKAGE = backend.HERE
+GPU_TEXTS = sorted(p.relative_to(PACKAGE).as_posix() for p in PACKAGE.rglob("*.cu"))
+TEXTS = [path for path in GPU_TEXTS if not path.startswith("gpu/")]
+
+
+@pytest.mark.parametrize("path", TEXTS)
+def test_every_text_of_the_package_compiles_without_warnings(path, tmp_path):
+    """In both precisions; -Wall is on, and a warning is an error here."""
+    for real in ("double", "float"):
+        command = [backend.compiler(), *backend.FLAGS, "-Werror", "-fsyntax-only", f"-Dreal={real}", "-x", "c++"]
+        command += [f"-I{backend.INCLUDE}", str(PACKAGE / path)]
+        result = subprocess.run(command, capture_output=True, text=True)
+        assert result.returncode == 0, result.stderr
+
+
+@pytest.mark.parametrize("arch", ["sm_80", "sm_90"])
+@pytest.mark.parametrize("path", GPU_TEXTS)
+def test_every_text_of_the_package_compiles_for_gpus(path, arch):
+    """By NVRTC, which needs no GPU and no driver."""
+    nvrtc = pytest.importorskip("cupy_backends.cuda.libs.nvrtc", reason="needs CuPy (pip install 'warpfactor[gpu]')")
+    try:
+        program = nvrtc.createProgram((PACKAGE / path).read_text(), path, (), ())
+    except (RuntimeError, ImportError, OSError) as error:
+        pytest.skip(f"NVRTC cannot be loaded: {error}")
+    options = (f"-arch={arch}", "-std=c++17", "-Dreal=double", f"-I{backend.INCLUDE}")
+    try:
+        nvrtc.compileProgram(program, options)
+    except nvrtc.NVRTCError:
+        pytest.fail(nvrtc.getProgramLog(program))
+    assert len(nvrtc.getCUBIN(program)) > 100
+
+
+def test_a_process_without_kernels_compiles_none(tmp_path):
+    code = "import sim_server.scene, sim_server.simulation, sim_server.backend as b; print(b.compiled)"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=PACKAGE.parent)
+    assert run.stdout.strip() == "[]"
