@@ -41,7 +41,14 @@ _POINTERS = (
     "row_start", "columns", "values", "b", "y", "r", "p", "z", "q", "diagonal", "partial", "arrived", "step", "results",
 )  # fmt: skip
 SOLVE = np.dtype(
-    [("bodies", "u8"), ("count", "i4"), ("capacity", "i4"), *((name, "u8") for name in _POINTERS), ("nodes", "i4")],
+    [
+        ("bodies", "u8"),
+        ("count", "i4"),
+        ("capacity", "i4"),
+        *((name, "u8") for name in _POINTERS),
+        ("nodes", "i4"),
+        ("shared", "i4"),
+    ],
     align=True,
 )
 
@@ -128,10 +135,22 @@ class GpuEngine:
         params["arrived"], params["step"] = self._arrived.data.ptr, self._counter.data.ptr
         params["results"], params["nodes"] = self._results.data.ptr, nodes
         function = DeviceModule("gpu/pcg.cu", self.gpu, cooperative=True).function("pcg")
-        shared = 4 * (-(-3 * int(self._bodies["nodes"].max()) // 8) * 8)
-        shared = shared if shared <= 220_000 else 0  # larger bodies have no dense inverse
-        function.max_dynamic_shared_size_bytes = max(shared, 1024)
+        shared = self._shared_memory()
+        params["shared"] = shared
+        function.max_dynamic_shared_size_bytes = shared
         return lambda: function((self._grid,), (THREADS,), (params,), shared_mem=shared)
+
+    def _shared_memory(self) -> int:
+        """Bytes per thread block for the residual and the rows of A of the body that needs most, if they fit."""
+        start = self._arrays["row_start"].astype(np.int64)
+        most = 0
+        for row in self._bodies:
+            first, nodes, parts = int(row["first"]), int(row["nodes"]), int(row["blocks"])
+            cut = first + nodes * np.arange(parts + 1) // parts
+            blocks, rows = int(np.diff(start[cut]).max()), int(np.diff(cut).max())
+            most = max(most, 4 * (-(-3 * nodes // 8) * 8) + 76 * blocks + 4 * rows + 32)
+        available = int(self.gpu.properties["sharedMemPerBlockOptin"]) - 1024
+        return min(most, available)
 
     # --- running ------------------------------------------------------------------------------------------------
 
@@ -236,7 +255,12 @@ class GpuEngine:
         records["body"] = np.arange(count)
         for name in ("factor_step", "residual", "iterations", "status", "kind", "asked", "fallbacks", "bad_node"):
             records[name] = found[name]
-        records["solve"], records["whole"], records["late"], records["begin"] = found["seconds"], seconds, self.loop.late, begin
+        records["solve"], records["whole"], records["late"], records["begin"] = (
+            found["seconds"],
+            seconds,
+            self.loop.late,
+            begin,
+        )
         with self._lock:
             self._found.append(records.ravel())
         self.step += size

@@ -11,6 +11,7 @@
 #define THREADS 512
 #define WARPS (THREADS / 32)
 #define LANES_PER_NODE 16
+#define ALL 0xffffffffu
 
 enum Kind { NONE = 0, JACOBI = 1, BLOCK_JACOBI = 2, CHOLESKY = 3 };
 enum Status { CONVERGED = 0, MAX_ITERATIONS = 1, BUDGET = 2, BREAKDOWN_MATRIX = 3, BREAKDOWN_PRECONDITIONER = 4, NOT_FINITE = 5 };
@@ -50,78 +51,111 @@ struct Solve {
     unsigned* arrived;               // (bodies,) zero at launch
     const long long* step;           // completed steps: where the result goes
     Result* results;                 // (capacity, bodies)
-    int nodes;
+    int nodes, shared;               // of the scene; bytes of dynamic shared memory
 };
 
-extern __shared__ float shared_r[];
+extern __shared__ float4 dynamic[];   // the residual in float32 (dense inverse), then the own rows of A where they fit
 
 struct Group {
     const Solve& s;
-    const Body& body;
-    int index, lane, warp;           // of this block in the group, of this thread
-    int begin, end;                  // own nodes, from 0 in the body
+    const Body body;
+    const int index, lane, warp;     // of this block in the group, of this thread
+    const int begin, end;            // own nodes, from 0 in the body
     unsigned target;
     int parity;                      // of the partial sums
-    unsigned* arrived;
-    double* partial;                 // of this body
-    double* scratch;                 // shared, 2 WARPS + 2
+    unsigned* const arrived;
+    double* const partial;           // of this body
+    double* const scratch;           // shared, 2 WARPS + 2
+    const int* row_start;            // of the own rows: here or in global memory, from row `row_base`
+    const int* columns;
+    const double* values;
+    int row_base, block_base;
 
-    __device__ void barrier() {
+    __device__ __forceinline__ float* residual32() { return (float*)dynamic; }
+
+    // Copies the own rows of A into shared memory if they fit: loads after a barrier miss L1.
+    __device__ __forceinline__ void bring_rows(int bytes, int capacity) {
+        int first = body.first + begin, count = end - begin;
+        int low = s.row_start[first], blocks = s.row_start[body.first + end] - low;
+        row_start = s.row_start; columns = s.columns; values = s.values;
+        row_base = body.first; block_base = 0;
+        if (bytes + 72 * blocks + 4 * (blocks + count + 1) + 16 > capacity) return;
+        double* v = (double*)((char*)dynamic + bytes);
+        int *c = (int*)(v + 9 * blocks), *r = c + blocks;
+        for (int k = threadIdx.x; k < 9 * blocks; k += THREADS) v[k] = s.values[9ll * low + k];
+        for (int k = threadIdx.x; k < blocks; k += THREADS) c[k] = s.columns[low + k];
+        for (int k = threadIdx.x; k <= count; k += THREADS) r[k] = s.row_start[first + k];
+        row_start = r; columns = c; values = v;
+        row_base = -begin; block_base = low;
+        __syncthreads();
+    }
+
+    __device__ __forceinline__ void barrier() {
         __syncthreads();
         if (body.blocks == 1) return;
+        target += body.blocks;
         if (threadIdx.x == 0) {
-            target += body.blocks;
             unsigned seen;
-            asm volatile("fence.acq_rel.gpu;" ::: "memory");
-            atomicAdd(arrived, 1u);
-            do asm volatile("ld.acquire.gpu.u32 %0, [%1];" : "=r"(seen) : "l"(arrived) : "memory");
+            asm volatile("red.release.gpu.global.add.u32 [%0], 1;" ::"l"(arrived) : "memory");
+            do asm volatile("ld.relaxed.gpu.global.u32 %0, [%1];" : "=r"(seen) : "l"(arrived) : "memory");
             while ((int)(seen - target) < 0);
+            asm volatile("fence.acq_rel.gpu;" ::: "memory");  // once: an acquiring load would flush L1 at every turn
         }
         __syncthreads();
+    }
+
+    static __device__ __forceinline__ void warp_sum(double& a, double& c, int from) {
+        for (int k = from; k; k >>= 1) {
+            a += __shfl_xor_sync(ALL, a, k);
+            c += __shfl_xor_sync(ALL, c, k);
+        }
     }
 
     // Sums over the threads of this block, in every thread.
-    __device__ void block_sum(double& a, double& c) {
-        for (int k = 16; k; k >>= 1) {
-            a += __shfl_down_sync(~0u, a, k);
-            c += __shfl_down_sync(~0u, c, k);
-        }
+    __device__ __forceinline__ void block_sum(double& a, double& c) {
+        warp_sum(a, c, 16);
         __syncthreads();
         if (lane == 0) { scratch[warp] = a; scratch[WARPS + warp] = c; }
         __syncthreads();
-        a = 0; c = 0;
-        for (int k = 0; k < WARPS; ++k) { a += scratch[k]; c += scratch[WARPS + k]; }
+        a = scratch[lane % WARPS];
+        c = scratch[WARPS + lane % WARPS];
+        warp_sum(a, c, WARPS / 2);
     }
 
     // Sums over the group, in every thread; a barrier.
-    __device__ void group_sum(double& a, double& c) {
+    __device__ __forceinline__ void group_sum(double& a, double& c) {
         block_sum(a, c);
         if (body.blocks == 1) { __syncthreads(); return; }
-        double* mine = partial + 2 * parity * gridDim.x;
-        if (threadIdx.x == 0) { mine[2 * index] = a; mine[2 * index + 1] = c; }
+        double2* mine = (double2*)partial + parity * gridDim.x;
+        if (threadIdx.x == 0) __stcg(mine + index, make_double2(a, c));
         barrier();
-        double u = 0, v = 0;
-        if (warp == 0) {
-            for (int k = lane; k < body.blocks; k += 32) { u += __ldcg(mine + 2 * k); v += __ldcg(mine + 2 * k + 1); }
-            for (int k = 16; k; k >>= 1) { u += __shfl_down_sync(~0u, u, k); v += __shfl_down_sync(~0u, v, k); }
-            if (lane == 0) { scratch[2 * WARPS] = u; scratch[2 * WARPS + 1] = v; }
+        if (warp == 0) {  // one warp a block: all of them would queue for the same few lines of L2
+            a = 0; c = 0;
+            for (int k = lane; k < body.blocks; k += 32) {
+                double2 sums = __ldcg(mine + k);
+                a += sums.x;
+                c += sums.y;
+            }
+            warp_sum(a, c, 16);
+            if (lane == 0) { scratch[2 * WARPS] = a; scratch[2 * WARPS + 1] = c; }
         }
         __syncthreads();
-        a = scratch[2 * WARPS]; c = scratch[2 * WARPS + 1];
+        a = scratch[2 * WARPS];
+        c = scratch[2 * WARPS + 1];
         parity ^= 1;
     }
 
     // One row of blocks times a vector that is formed on the way: u + beta w. 16 lanes a node; the sum ends in lane 0 of them.
-    __device__ void row_product(int node, int sub, const double* u, const double* w, double beta, double sum[3]) {
+    __device__ __forceinline__ void row_product(int node, int sub, const double* u, const double* w, double beta, double sum[3]) {
         sum[0] = sum[1] = sum[2] = 0;
         if (node < end) {
-            int row = body.first + node;
-            for (int k = s.row_start[row] + sub; k < s.row_start[row + 1]; k += LANES_PER_NODE) {
-                const double* a = s.values + 9ll * k;
-                const double* uj = u + 3ll * s.columns[k];
+            int row = row_base + node;
+            for (int k = row_start[row] - block_base + sub; k < row_start[row + 1] - block_base; k += LANES_PER_NODE) {
+                const double* a = values + 9ll * k;
+                const double* uj = u + 3ll * columns[k];
                 double v0 = __ldcg(uj), v1 = __ldcg(uj + 1), v2 = __ldcg(uj + 2);
                 if (w) {
-                    const double* wj = w + 3ll * s.columns[k];
+                    const double* wj = w + 3ll * columns[k];
                     v0 += beta * __ldcg(wj); v1 += beta * __ldcg(wj + 1); v2 += beta * __ldcg(wj + 2);
                 }
                 sum[0] += a[0] * v0 + a[1] * v1 + a[2] * v2;
@@ -130,11 +164,11 @@ struct Group {
             }
         }
         for (int k = LANES_PER_NODE / 2; k; k >>= 1)
-            for (int m = 0; m < 3; ++m) sum[m] += __shfl_down_sync(~0u, sum[m], k, LANES_PER_NODE);
+            for (int m = 0; m < 3; ++m) sum[m] += __shfl_down_sync(ALL, sum[m], k, LANES_PER_NODE);
     }
 
     // r = b - A y; returns |r|^2, and |b|^2 in `bb`.
-    __device__ double residual(double* r, double& bb) {
+    __device__ __forceinline__ double residual(double* r, double& bb) {
         double rr = 0, sum[3];
         bb = 0;
         int sub = threadIdx.x % LANES_PER_NODE, each = THREADS / LANES_PER_NODE;
@@ -155,7 +189,7 @@ struct Group {
     }
 
     // q = A p with p = z + beta p_old, kept; returns p . q.
-    __device__ double direction(double beta, const double* old, double* p) {
+    __device__ __forceinline__ double direction(double beta, const double* old, double* p) {
         double pq = 0, none = 0, sum[3];
         int sub = threadIdx.x % LANES_PER_NODE, each = THREADS / LANES_PER_NODE;
         for (int base = begin; base < end; base += each) {
@@ -175,7 +209,7 @@ struct Group {
     }
 
     // x += alpha p and r -= alpha q for the own nodes; alpha 0: nothing to add yet (p and q hold nothing).
-    __device__ double update(long long i, double alpha, const double* p, const double* r_old, double* r_new) {
+    __device__ __forceinline__ double update(long long i, double alpha, const double* p, const double* r_old, double* r_new) {
         double d = __ldcg(r_old + i);
         if (alpha != 0) {
             d -= alpha * __ldcg(s.q + i);
@@ -186,7 +220,7 @@ struct Group {
     }
 
     // z = P^-1 r by diagonal blocks, r updated on the way; returns z . r, and |r|^2 in `rr`.
-    __device__ double by_blocks(int kind, double alpha, const double* p, const double* r_old, double* r_new, double& rr) {
+    __device__ __forceinline__ double by_blocks(int kind, double alpha, const double* p, const double* r_old, double* r_new, double& rr) {
         double rz = 0;
         rr = 0;
         for (int node = begin + threadIdx.x; node < end; node += THREADS) {
@@ -205,12 +239,21 @@ struct Group {
         return rz;
     }
 
+    // Two float16 times two float32.
+    static __device__ __forceinline__ float two(unsigned halves, float x, float y) {
+        float lo, hi;
+        asm("{.reg .b16 a, b; mov.b32 {a, b}, %2; cvt.f32.f16 %0, a; cvt.f32.f16 %1, b;}"
+            : "=f"(lo), "=f"(hi) : "r"(halves));
+        return lo * x + hi * y;
+    }
+
     // z = P^-1 r by the dense inverse. Every block forms all of r (a barrier less), then the rows of z that are its warps'.
-    __device__ double by_inverse(double alpha, const double* p, const double* r_old, double* r_new, double goal, double& rr) {
+    __device__ __forceinline__ double by_inverse(double alpha, const double* p, const double* r_old, double* r_new, double goal, double& rr) {
         int n = 3 * body.nodes;
         long long base = 3ll * body.first;
         double rz = 0, none = 0;
         rr = 0;
+        float* shared_r = residual32();
         for (int k = threadIdx.x; k < body.stride; k += THREADS) {
             double d = 0;
             if (k < n) {
@@ -232,16 +275,10 @@ struct Group {
             float sum = 0;
             for (int k = lane; k < body.stride / 8; k += 32) {
                 uint4 v = a[k];
-                const float* x = shared_r + 8 * k;
-                unsigned words[4] = {v.x, v.y, v.z, v.w};
-                for (int m = 0; m < 4; ++m) {
-                    float lo, hi;
-                    asm("{.reg .b16 a, b; mov.b32 {a, b}, %2; cvt.f32.f16 %0, a; cvt.f32.f16 %1, b;}"
-                        : "=f"(lo), "=f"(hi) : "r"(words[m]));
-                    sum += lo * x[2 * m] + hi * x[2 * m + 1];
-                }
+                float4 x = dynamic[2 * k], y = dynamic[2 * k + 1];
+                sum += two(v.x, x.x, x.y) + two(v.y, x.z, x.w) + two(v.z, y.x, y.y) + two(v.w, y.z, y.w);
             }
-            for (int k = 16; k; k >>= 1) sum += __shfl_down_sync(~0u, sum, k);
+            for (int k = 16; k; k >>= 1) sum += __shfl_down_sync(ALL, sum, k);
             if (lane == 0) {
                 s.z[base + row] = (double)body.scale[row] * sum;
                 rz += (double)sum * shared_r[row];
@@ -252,7 +289,7 @@ struct Group {
         return rz;
     }
 
-    __device__ void invert_diagonal(bool whole) {
+    __device__ __forceinline__ void invert_diagonal(bool whole) {
         for (int node = begin + threadIdx.x; node < end; node += THREADS) {
             int row = body.first + node, k = s.row_start[row];
             while (s.columns[k] != row) ++k;
@@ -270,7 +307,7 @@ struct Group {
         }
     }
 
-    __device__ void set(double* to, const double* from) {
+    __device__ __forceinline__ void set(double* to, const double* from) {
         for (int k = 3 * begin + threadIdx.x; k < 3 * end; k += THREADS)
             to[3ll * body.first + k] = from ? from[3ll * body.first + k] : 0;
     }
@@ -364,20 +401,17 @@ __device__ Result solve(Group& g) {
 }
 
 extern "C" __global__ void __launch_bounds__(THREADS, 1) pcg(const Solve s) {
-    __shared__ Body body;
     __shared__ double scratch[2 * WARPS + 2];
     for (int k = 0; k < s.count; ++k) {
-        const Body* next = s.bodies + k;
-        bool mine = (int)blockIdx.x >= next->block && (int)blockIdx.x < next->block + next->blocks;
-        if (!mine) continue;
-        __syncthreads();
-        if (threadIdx.x == 0) body = *next;
-        __syncthreads();
+        int block = s.bodies[k].block;
+        if ((int)blockIdx.x < block || (int)blockIdx.x >= block + s.bodies[k].blocks) continue;
+        const Body body = s.bodies[k];
         int index = blockIdx.x - body.block;
         Group g = {s, body, index, (int)threadIdx.x % 32, (int)threadIdx.x / 32,
                    (int)((long long)body.nodes * index / body.blocks), (int)((long long)body.nodes * (index + 1) / body.blocks),
                    0, 0, s.arrived + k, s.partial + 4ll * gridDim.x * k, scratch};
         long long begin = nanoseconds();
+        g.bring_rows(4 * body.stride, s.shared);
         Result out = solve(g);
         if (index == 0 && threadIdx.x == 0) {
             out.seconds = 1e-9 * (nanoseconds() - begin);
