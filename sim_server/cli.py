@@ -105,7 +105,7 @@ def _set_up(
     from protocol.session import ConnectionFailed
     from sim_server.backend import CompileError
     from sim_server.errors import InputError
-    from sim_server.link import ServerLink
+    from sim_server.network.link import ServerLink
     from sim_server.recorder import Recorder
     from sim_server.service import Service
     from sim_server.simulation import Simulation

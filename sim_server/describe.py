@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from protocol import messages_pb2 as pb
 from sim_server.engine import Kind
 from sim_server.mesh import posed
+from sim_server.mesh.surface import surface_triangles
 from sim_server.simulation import Simulation
-from sim_server.surface import surface_triangles
 from sim_server.world import Body
 
 NAMES = {kind: kind.name.lower() for kind in Kind}

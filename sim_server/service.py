@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from protocol import messages_pb2 as pb
 from sim_server.commands import Commands
 from sim_server.driver import Driver
-from sim_server.link import ServerLink
+from sim_server.network.link import ServerLink
 from sim_server.recorder import Recorder
 from sim_server.simulation import Simulation
 from sim_server.telemetry import Telemetry

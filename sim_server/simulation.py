@@ -69,7 +69,7 @@ class Simulation:
         assemble = [system.start()]
         stencils = iter(system.stencils)
         accumulate = False
-        for e in self.effects.values():
+        for e in sorted(self.effects.values(), key=lambda e: e.tets is None):  # touch asks what the elements added
             stencil = next(stencils) if e.tets is not None else None
             assemble += e.launches(system, stencil, accumulate)  # f and K, M, B of each effect
             accumulate = accumulate or stencil is not None

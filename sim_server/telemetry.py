@@ -13,7 +13,7 @@ from protocol import messages_pb2 as pb
 from sim_server import describe
 from sim_server.commands import Commands
 from sim_server.driver import Driver
-from sim_server.link import ServerLink
+from sim_server.network.link import ServerLink
 from sim_server.recorder import Recorder
 
 STEPS_PERIOD = 0.05  # s between batches of step records

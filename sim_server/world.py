@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from sim_server.backend import Cpu
 from sim_server.errors import InputError
 from sim_server.mesh import Mesh, posed
+from sim_server.mesh.surface import volumes
 from sim_server.scene import Scene, SceneObject
-from sim_server.surface import volumes
 
 Reals = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ from precond_worker.factorize import Analysis
 from protocol.factor import FactorPattern
 from sim_server.effects.corotational import Corotational
 from sim_server.mesh import bar as bar_mesh
-from sim_server.scene_model import Scene
+from sim_server.scene.model import Scene
 from sim_server.simulation import Simulation
 from tests.reference.corotational import Solid
 

@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from sim_server import where
 from sim_server.effect import Effect
 from sim_server.errors import InputError
-from sim_server.parameters import Parameters, Where
+from sim_server.scene import where
+from sim_server.scene.parameters import Parameters, Where
 from sim_server.world import Body, World
 
 SCOPE = "object"

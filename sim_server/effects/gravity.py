@@ -19,7 +19,7 @@ from pydantic import Field
 
 from sim_server.backend import Launch
 from sim_server.effect import Effect
-from sim_server.parameters import Parameters, Vector
+from sim_server.scene.parameters import Parameters, Vector
 from sim_server.system import Stencil, System
 from sim_server.world import Body, World
 

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from sim_server import describe
 from sim_server.driver import Driver
-from sim_server.link import ServerLink
+from sim_server.network.link import ServerLink
 from sim_server.simulation import Simulation
 from sim_server.supervisor import Supervisor
 from tests.bench._scipy_step import ScipyStep

@@ -4,7 +4,7 @@
 import pytest
 
 from protocol import Refused
-from sim_server.jobs import LONGEST, SHORTEST, Flight, Jobs
+from sim_server.network.jobs import LONGEST, SHORTEST, Flight, Jobs
 
 
 class Lender:

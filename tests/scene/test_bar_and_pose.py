@@ -9,7 +9,7 @@ import pytest
 
 from sim_server.errors import InputError
 from sim_server.mesh import bar, check, pose_matrix, posed
-from sim_server.surface import centroids, surface_triangles, volumes
+from sim_server.mesh.surface import centroids, surface_triangles, volumes
 
 
 def bar_by_loops(cells, size):

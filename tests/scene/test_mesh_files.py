@@ -10,7 +10,7 @@ import pytest
 
 from sim_server.errors import InputError
 from sim_server.mesh import Mesh, bar, check, read
-from sim_server.surface import volumes
+from sim_server.mesh.surface import volumes
 
 CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]])
 TETS = np.array([[0, 1, 2, 3], [4, 2, 1, 3]])

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from sim_server.errors import InputError
-from sim_server.regions import Region, region_values
+from sim_server.mesh.surface import centroids
 from sim_server.scene import load
-from sim_server.surface import centroids
+from sim_server.scene.regions import Region, region_values
 
 POINTS = np.array([[0.5, 0, 0], [1.5, 0, 0], [2.5, 0, 0]])
 

@@ -11,7 +11,7 @@ import pytest
 from sim_server.effects import known_effects
 from sim_server.errors import InputError
 from sim_server.scene import load
-from sim_server.solver_options import Update
+from sim_server.scene.solver_options import Update
 
 SCENES = Path(__file__).parents[2] / "deploy" / "scenes"
 

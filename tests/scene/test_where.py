@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from sim_server.errors import InputError
-from sim_server.where import mask
+from sim_server.scene.where import mask
 
 POINTS = np.array([[0.0, 0.0, 0.0], [1.0, 0.5, 0.0], [2.0, 1.0, -1.0], [3.0, 1.5, 4.0]])
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from protocol import Factor, FactorPattern
 from protocol.messages_pb2 import Header, Topology
 from sim_server.factors import Job
-from sim_server.link import ServerLink
+from sim_server.network.link import ServerLink
 
 ROOT = Path(__file__).parents[2]
 PATIENCE = 30.0  # s until a test gives up

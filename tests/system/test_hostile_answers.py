@@ -12,7 +12,7 @@ from link_helpers import DenseAnalysis, Driver, chain, dense, free_endpoint, mat
 
 from protocol.messages_pb2 import Factor, FactorPattern, Matrix
 from sim_server.factors import Job
-from sim_server.link import ServerLink
+from sim_server.network.link import ServerLink
 
 pytestmark = pytest.mark.system
 

@@ -17,7 +17,7 @@ from protocol.channels import DEFAULT_ENDPOINT, key
 from protocol.endpoints import BadEndpoint
 from protocol.messages_pb2 import Status
 from protocol.session import EXTRA_CONFIG, ConnectionFailed, open_session
-from sim_server.link import ServerLink
+from sim_server.network.link import ServerLink
 
 pytestmark = pytest.mark.system
 
@@ -39,7 +39,7 @@ time.sleep(0.1)
 """
 LINK = """
 import sys
-from sim_server.link import ServerLink
+from sim_server.network.link import ServerLink
 link = ServerLink(listen=[sys.argv[1]])
 {end}
 """

@@ -9,7 +9,7 @@ import sys
 import pytest
 from link_helpers import ROOT, free_endpoint, process
 
-from sim_server.link import ServerLink
+from sim_server.network.link import ServerLink
 
 pytestmark = pytest.mark.system
 

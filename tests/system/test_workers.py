@@ -14,7 +14,7 @@ from hand_worker import HandWorker
 from link_helpers import Driver, chain, dense, free_endpoint, light_worker, matrix, process, product
 
 from protocol import memlock
-from sim_server.link import ServerLink
+from sim_server.network.link import ServerLink
 
 pytestmark = pytest.mark.system
 shared = pytest.mark.skipif(bool(memlock.obstacle()), reason=f"no shared memory here: {memlock.obstacle()}")

@@ -11,8 +11,8 @@ from protocol.channels import PROTOCOL
 from protocol.check import checksum
 from protocol.messages_pb2 import Header, Matrix
 from protocol.slots import Slot
-from sim_server.answers import Known
-from sim_server.jobs import Flight
+from sim_server.network.answers import Known
+from sim_server.network.jobs import Flight
 
 
 def matrix_message(flight: Flight, known: Known, incarnation: int, lease: float) -> Matrix:

@@ -12,8 +12,8 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 from pydantic_core import InitErrorDetails, PydanticCustomError
 from pydantic_core.core_schema import ValidatorFunctionWrapHandler
 
-from sim_server import where
 from sim_server.errors import InputError
+from sim_server.scene import where
 
 
 class Parameters(BaseModel):

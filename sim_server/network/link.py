@@ -23,10 +23,10 @@ from protocol.messages_pb2 import Command, Header, Reply, Scene, State, Status, 
 from protocol.refused import Refused
 from protocol.session import open_session
 from protocol.slots import Slot, SlotPool, SlotsUnusable
-from sim_server.dispatch import Dispatch
-from sim_server.inquiries import Inquiries
-from sim_server.outbox import Outbox
-from sim_server.publish import Publications
+from sim_server.network.dispatch import Dispatch
+from sim_server.network.inquiries import Inquiries
+from sim_server.network.outbox import Outbox
+from sim_server.network.publish import Publications
 
 if TYPE_CHECKING:
     from sim_server.factors import Job

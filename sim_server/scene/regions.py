@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Discriminator, Field, Tag
 
-from sim_server import where
 from sim_server.errors import InputError
-from sim_server.parameters import Parameters, Positive, Where, complaint
+from sim_server.scene import where
+from sim_server.scene.parameters import Parameters, Positive, Where, complaint
 
 log = logging.getLogger(__name__)
 

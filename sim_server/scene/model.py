@@ -19,12 +19,12 @@ from pydantic import (
 
 from protocol.channels import check_name
 from protocol.refused import Refused
-from sim_server import where
 from sim_server.errors import InputError
 from sim_server.mesh import Mesh, bar, check, read
-from sim_server.parameters import Count, Counts, Parameters, Positive, Sizes, Vector, complaint
-from sim_server.scene_effects import checked_effects
-from sim_server.solver_options import Solver
+from sim_server.scene import where
+from sim_server.scene.effect_tables import checked_effects
+from sim_server.scene.parameters import Count, Counts, Parameters, Positive, Sizes, Vector, complaint
+from sim_server.scene.solver_options import Solver
 
 
 class Pose(Parameters):

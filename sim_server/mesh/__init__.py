@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sim_server.errors import InputError
-from sim_server.mesh_check import complaints, indices
-from sim_server.surface import volumes
+from sim_server.mesh.check import complaints, indices
+from sim_server.mesh.surface import volumes
 
 log = logging.getLogger(__name__)
 

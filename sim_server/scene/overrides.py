@@ -6,7 +6,7 @@ import tomllib
 from typing import Any
 
 from sim_server.errors import InputError
-from sim_server.parameters import nearest
+from sim_server.scene.parameters import nearest
 
 
 def apply(override: str, table: dict[str, Any]) -> None:

@@ -7,7 +7,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import InitErrorDetails
 
 from sim_server import effects
-from sim_server.parameters import complaint, nearest
+from sim_server.scene.parameters import complaint, nearest
 
 BELONGS = {
     "scene": "it acts on the whole scene: list it under [effects] at the top of the file",

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import Field, PlainSerializer, PlainValidator
 
-from sim_server.parameters import Parameters, complaint
+from sim_server.scene.parameters import Parameters, complaint
 
 PRECONDITIONERS = ("auto", "none", "jacobi", "block_jacobi", "cholesky")
 NOT_YET = ("ssor", "incomplete_cholesky")

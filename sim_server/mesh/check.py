@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_server.surface import volumes
+from sim_server.mesh.surface import volumes
 
 FLAT = 1e-12  # |volume| / (longest edge)^3 below which a tetrahedron is flat; rounding alone gives about 1e-15
 COINCIDENT = 1e-9  # distance / diagonal of the bounding box below which two nodes are one

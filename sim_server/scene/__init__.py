@@ -13,9 +13,9 @@ from typing import Any
 from pydantic import ValidationError
 
 from sim_server.errors import InputError
-from sim_server.overrides import apply
-from sim_server.scene_errors import readable
-from sim_server.scene_model import Scene, SceneObject
+from sim_server.scene.messages import readable
+from sim_server.scene.model import Scene, SceneObject
+from sim_server.scene.overrides import apply
 
 __all__ = ["Scene", "SceneObject", "load"]
 

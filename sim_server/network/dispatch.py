@@ -15,12 +15,12 @@ from protocol.counters import Counters
 from protocol.messages_pb2 import Topology, WorkerInfo
 from protocol.refused import Refused
 from protocol.slots import Slot, SlotPool
-from sim_server.answers import Answers
-from sim_server.arrivals import Arrivals
-from sim_server.jobs import LATE, Flight, Jobs
-from sim_server.outbox import Outbox
-from sim_server.roster import Roster
-from sim_server.shipment import load, matrix_message
+from sim_server.network.answers import Answers
+from sim_server.network.arrivals import Arrivals
+from sim_server.network.jobs import LATE, Flight, Jobs
+from sim_server.network.outbox import Outbox
+from sim_server.network.roster import Roster
+from sim_server.network.shipment import load, matrix_message
 
 if TYPE_CHECKING:
     from sim_server.factors import Job
