@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from sim_server import backend
+from tests.core import nvrtc
 
 PUSH = """#include "kernel.h"
 struct Push {
@@ -172,18 +173,22 @@ def test_every_text_of_the_package_compiles_without_warnings(path, tmp_path):
 @pytest.mark.parametrize("arch", ["sm_80", "sm_90"])
 @pytest.mark.parametrize("path", GPU_TEXTS)
 def test_every_text_of_the_package_compiles_for_gpus(path, arch):
-    """By NVRTC, which needs no GPU and no driver."""
-    nvrtc = pytest.importorskip("cupy_backends.cuda.libs.nvrtc", reason="needs CuPy (pip install 'warpfactor[gpu]')")
-    try:
-        program = nvrtc.createProgram((PACKAGE / path).read_text(), path, (), ())
-    except (RuntimeError, ImportError, OSError) as error:
-        pytest.skip(f"NVRTC cannot be loaded: {error}")
-    options = (f"-arch={arch}", "-std=c++17", "-Dreal=double", f"-I{backend.INCLUDE}")
-    try:
-        nvrtc.compileProgram(program, options)
-    except nvrtc.NVRTCError:
-        pytest.fail(nvrtc.getProgramLog(program))
-    assert len(nvrtc.getCUBIN(program)) > 100
+    """By NVRTC, which needs no GPU and no driver; what it says counts as a failure too."""
+    if (library := nvrtc.library()) is None:
+        pytest.skip("needs the package nvidia-cuda-nvrtc")
+    for real in ("double", "float"):
+        options = [f"-arch={arch}", "-std=c++17", f"-Dreal={real}", f"-I{backend.INCLUDE}"]
+        code, said = nvrtc.compiled(library, PACKAGE / path, options)
+        assert len(code) > 1000 and not said, said
+
+
+def test_the_gpu_compiler_names_an_error(tmp_path):
+    if (library := nvrtc.library()) is None:
+        pytest.skip("needs the package nvidia-cuda-nvrtc")
+    text = tmp_path / "wrong.cu"
+    text.write_text('#include "kernel.h"\nINLINE number f() { return missing; }\n')
+    code, said = nvrtc.compiled(library, text, ["-arch=sm_90", f"-I{backend.INCLUDE}"])
+    assert not code and "missing" in said
 
 
 def test_a_process_without_kernels_compiles_none(tmp_path):

@@ -1,0 +1,37 @@
+# SPDX-License-Identifier: MIT
+"""NVIDIA's run-time compiler by itself (package nvidia-cuda-nvrtc): it needs no GPU and no driver."""
+
+import ctypes
+from importlib import metadata
+from pathlib import Path
+
+
+def library() -> ctypes.CDLL | None:
+    """libnvrtc as installed by pip, or None."""
+    try:
+        files = metadata.files("nvidia-cuda-nvrtc") or []
+    except metadata.PackageNotFoundError:
+        return None
+    found = [f for f in files if f.name.startswith("libnvrtc.so")]
+    return ctypes.CDLL(str(found[0].locate())) if found else None
+
+
+def compiled(nvrtc: ctypes.CDLL, source: Path, options: list[str]) -> tuple[bytes, str]:
+    """Machine code of a text (empty if it was refused), and what the compiler said."""
+    program = ctypes.c_void_p()
+    words = (ctypes.c_char_p * len(options))(*[o.encode() for o in options])
+    text = source.read_bytes()
+    assert nvrtc.nvrtcCreateProgram(ctypes.byref(program), text, source.name.encode(), 0, None, None) == 0
+    refused = nvrtc.nvrtcCompileProgram(program, len(options), words)
+    said = _text(nvrtc.nvrtcGetProgramLogSize, nvrtc.nvrtcGetProgramLog, program)
+    code = b"" if refused else _text(nvrtc.nvrtcGetCUBINSize, nvrtc.nvrtcGetCUBIN, program)
+    nvrtc.nvrtcDestroyProgram(ctypes.byref(program))
+    return code, said.rstrip(b"\0").decode()
+
+
+def _text(size_of, get, program) -> bytes:
+    size = ctypes.c_size_t()
+    assert size_of(program, ctypes.byref(size)) == 0
+    buffer = ctypes.create_string_buffer(size.value)
+    assert get(program, buffer) == 0
+    return buffer.raw
