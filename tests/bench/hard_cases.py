@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Runs the table of hard cases (tests/hard_cases/table.py) and writes docs/hard-cases.md with what was measured."""
+"""Runs the table of hard cases (tests/hard_cases/table.py) and writes what was measured."""
 
 import tempfile
 from pathlib import Path
@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from tests.bench.report import ROOT, Report, plots
+from tests.bench.report import Report, plots
 from tests.hard_cases.case import Case
 from tests.hard_cases.running import Outcome, broken, finer, run_case
 from tests.hard_cases.table import CASES
@@ -74,8 +74,7 @@ def picture(results: list[tuple[Case, Outcome]]) -> Any:
 
 
 def main(
-    quick: Annotated[bool, typer.Option("--quick", help="A smoke run of a few cases; writes no document")] = False,
-    document: Annotated[Path, typer.Option(help="Where the page goes")] = ROOT / "docs" / "hard-cases.md",
+    quick: Annotated[bool, typer.Option("--quick", help="A smoke run of a few cases")] = False,
     out: Annotated[Path | None, typer.Option(help="Folder of the results [default: out/bench/hard_cases]")] = None,
 ) -> None:
     """Hard cases: what must hold, and what was measured."""
@@ -93,9 +92,6 @@ def main(
     report.say("## Notes", notes(cases))
     report.data["rows"] = rows
     report.data["iterations"] = {case.name: outcome.iterations for case, outcome in results}
-    if not quick:
-        document.parent.mkdir(parents=True, exist_ok=True)
-        document.write_text(report.markdown(report.header()))
     report.figure(picture(results), "hard_cases.png", "Iterations of each case.")
     report.write()
     if any(broken(case, outcome) for case, outcome in results):

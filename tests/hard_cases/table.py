@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""THE TABLE of hard cases: name, scene, what is done, what must hold (measured numbers: docs/hard-cases.md)."""
+"""THE TABLE of hard cases: name, scene, what is done, what must hold (measured numbers: docs/bench/hard_cases.md)."""
 
 from tests.hard_cases import sources, starts
 from tests.hard_cases.case import FREE_BAR, GRAVITY, Case, Hold, young

@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: MIT
+"""Brings what the benchmarks found into the documents: pages under docs/bench, and the table of the README.
+
+Run it after the benchmarks whose results shall be shown; it copies their Markdown and pictures as they are, and fills
+the README between the marks. So no figure in a document is typed by hand.
+"""
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+from tests.bench.report import ROOT, table
+
+PAGES = ("cpu", "figure4", "accuracy", "hard_cases")
+README = ROOT / "README.md"
+
+
+def copied(name: str, out: Path, docs: Path) -> bool:
+    """Copies one benchmark's page and pictures; False if it has not been run."""
+    page = out / name / f"{name}.md"
+    if not page.exists():
+        return False
+    docs.mkdir(parents=True, exist_ok=True)
+    for file in [page, *sorted((out / name).glob("*.png"))]:
+        shutil.copyfile(file, docs / file.name)
+    return True
+
+
+def cpu_table(found: dict[str, Any]) -> str:
+    """Of the README: a step's CPU time at the paper's sizes, ours and others'."""
+    rows = found["data"]["rows"]
+    by = {(row["tets"], row["scheme"]): row for row in rows}
+    lines = []
+    for tets in sorted({row["tets"] for row in rows}):
+        ours = by[tets, "async + warp"]
+        lines.append(
+            {
+                "tetrahedra": f"{tets:,}",
+                "**Warpfactor**": f"**{ours['CPU ms']:.2g} ms**",
+                "iterations": ours["iterations"],
+                "step p50 / p99": f"{ours['wall p50']:.2g} / {ours['wall p99']:.2g} ms",
+                "plain CG, ours": f"{by[tets, 'CG']['CPU ms']:.2g} ms",
+                "SciPy + CHOLMOD each step": f"{by[tets, 'SciPy + CHOLMOD each step']['CPU ms']:.2g} ms",
+            }
+        )
+    machine = found["header"]["machine"]
+    dgemm = found["header"]["calibration"]["before"]["dgemm_ms"]
+    return (
+        "CPU time of the simulation thread per step, SOFA's bending beam (E 3 MPa, dt 20 ms), tolerance 1e-6 of the "
+        f"true residual, one thread, one worker process beside it, as fast as it goes; {machine['cpu']}, "
+        f"{machine['cores']} cores, dgemm 1000 in {dgemm:.0f} ms ([all of it](docs/bench/cpu.md)):\n\n{table(lines)}"
+    )
+
+
+def filled(text: str, mark: str, content: str) -> str:
+    """The text with what stands between <!-- mark --> and <!-- /mark --> replaced."""
+    begin, end = f"<!-- {mark} -->", f"<!-- /{mark} -->"
+    head, _, rest = text.partition(begin)
+    _, _, tail = rest.partition(end)
+    if not tail:
+        raise SystemExit(f"README.md has no marks {begin} {end}")
+    return f"{head}{begin}\n{content}\n{end}{tail}"
+
+
+def main() -> None:
+    out, docs = ROOT / "out" / "bench", ROOT / "docs" / "bench"
+    for name in PAGES:
+        print(f"{name}: {'docs/bench' if copied(name, out, docs) else 'not run, page left as it is'}")
+    if (out / "cpu" / "cpu.json").exists():
+        found = json.loads((out / "cpu" / "cpu.json").read_text())
+        README.write_text(filled(README.read_text(), "cpu", cpu_table(found)))
+        print("README.md: table of steps on a CPU")
+
+
+if __name__ == "__main__":
+    main()
