@@ -21,7 +21,7 @@ from clients.errors import ClientError
 ROOT = Path(__file__).resolve().parent.parent
 OUT = ROOT / "out" / "demo"
 SCENE = ROOT / "deploy" / "scenes" / "beam.toml"
-STEPS = 500  # 20 ms each
+STEPS = 430  # of 20 ms each; it ends while the beam hangs low
 ENDPOINT = "tcp/127.0.0.1:7451"  # not the default one: a server of the user's may be running there
 PUSH_AT, GRAB_AT, RELEASE_AT = 200, 320, 400  # steps
 
