@@ -161,6 +161,10 @@ class Launch:
     items: int
     arrays: dict[str, np.ndarray]  # kept alive
 
+    def fetch(self, name: str) -> np.ndarray:
+        """One of its arrays as kernels have left it."""
+        return self.arrays[name]
+
     def __call__(self) -> None:
         """Runs it here and now (tests, set-up); a step runs launches natively."""
         call = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int, ctypes.c_int)(self.function)

@@ -14,7 +14,7 @@ of a grab near young times the size of the grabbed patch moves that patch withou
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -61,14 +61,6 @@ class TouchError(ValueError):
     """An interaction that is refused; the text is for the client."""
 
 
-@dataclass
-class _Arrays:
-    """What the launch in use reads; `start` is written by it."""
-
-    interactions: list[Interaction]
-    start: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
-
-
 class Touch(Effect):
     """All interactions of a scene. Changes go to the loop as a new launch, through `publish`."""
 
@@ -77,7 +69,8 @@ class Touch(Effect):
         self.params: dict[str, Params] = {body.name: params for body, params in listed}
         self.publish: Callable[[Launch], None] = lambda launch: None  # set by the server
         self._system: System | None = None
-        self._now = _Arrays([])
+        self._applied: list[Interaction] = []
+        self._launch: Launch | None = None  # in use, or about to be; it writes when each interaction began
         self._last_id = 0
 
     def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
@@ -91,7 +84,7 @@ class Touch(Effect):
         """
         limit = self._params(name).max_force
         size = float(np.linalg.norm(force))
-        if size > limit:
+        if not size <= limit:
             raise TouchError(f"push of {size:g} N on {name!r}: at most max_force = {limit:g} N")
         if not duration > 0:
             raise TouchError(f"push with duration = {duration:g} s: must be above 0")
@@ -144,7 +137,10 @@ class Touch(Effect):
         """Interactions that are not over, with the time at which they began."""
         assert self._system is not None
         time = float(self._system.clock[0])
-        known = [replace(a, start=float(s)) for a, s in zip(self._now.interactions, self._now.start, strict=True)]
+        if not self._applied or self._launch is None:
+            return []
+        begun = self._launch.fetch("start")
+        known = [replace(a, start=float(s)) for a, s in zip(self._applied, begun, strict=True)]
         return [a for a in known if a.start < 0 or time + self.world.dt / 2 < a.start + a.duration]
 
     def _params(self, name: str) -> Params:
@@ -163,7 +159,8 @@ class Touch(Effect):
         body = self.world.body(name)
         if radius < 0:
             raise TouchError(f"radius = {radius:g} m: must not be negative (0 = the nearest node)")
-        x, free = self.world.x[body.nodes].copy(), self.world.free[body.nodes] > 0
+        x = self.world.backend.fetch(self.world.x)[body.nodes].copy()
+        free = self.world.free[body.nodes] > 0
         distance = np.where(free, np.linalg.norm(x - point, axis=1), np.inf)
         near = np.flatnonzero(distance <= radius) if radius > 0 else np.array([int(distance.argmin())])
         if len(near) == 0:
@@ -173,6 +170,8 @@ class Touch(Effect):
         return (near + body.first).astype(np.int32), x[near] - point
 
     def _add(self, new: Interaction) -> Interaction:
+        if not np.isfinite([*new.point, *new.force, *new.target, new.radius, new.stiffness, new.limit]).all():
+            raise TouchError("point, radius, force, target, stiffness and max_force must be finite numbers")
         alive = self.alive()
         most = self._params(new.object).max_interactions
         if sum(a.object == new.object for a in alive) >= most:
@@ -196,18 +195,19 @@ class Touch(Effect):
         entry = np.repeat(np.arange(n, dtype=np.int32), count)[order]
         offset = np.concatenate([a.offset for a in interactions])[order] if n else np.zeros((0, 3))
         start = np.array([a.start for a in interactions], dtype=float)
-        self._now = _Arrays(interactions, start)
 
         def per(value: str) -> NDArray[np.float64]:
             return np.array([getattr(a, value) for a in interactions], dtype=float)
 
-        return self.world.backend.module("effects/touch.cu").bind(
+        self._launch = self.world.backend.module("effects/touch.cu").bind(
             "apply", len(touched), node=touched.astype(np.int32), first=np.append(first, len(nodes)).astype(np.int32),
             entry=entry, offset=np.ascontiguousarray(offset), share=1.0 / np.array(count, dtype=float), start=start,
             duration=per("duration"), force=per("force"), target=per("target"), stiffness=per("stiffness"),
             limit=per("limit"), clock=system.clock, x=w.x, v=w.v, free=w.free, block=system.diagonal_block,
             sums=system.sums, h=w.dt, diagonal=system.diagonal, b=system.b,
         )  # fmt: skip
+        self._applied = interactions
+        return self._launch
 
 
 def build(world: World, listed: list[tuple[Body, Any]]) -> Touch:

@@ -40,7 +40,9 @@ def cupy() -> Any:
 class DeviceLaunch:
     """One kernel with its arguments on the device. mailed: they lie in device memory and may be replaced."""
 
-    def __init__(self, name: str, function: Any, params: NDArray[Any], items: int, mailed: bool, arrays: list[Any]):
+    def __init__(
+        self, name: str, function: Any, params: NDArray[Any], items: int, mailed: bool, arrays: dict[str, Any]
+    ):  # fmt: skip
         self.name, self.items, self.mailed, self._arrays = name, items, mailed, arrays
         self._function, self.params = function, params
         self._mail = cupy().asarray(params.reshape(1).view(np.uint8)) if mailed else None
@@ -51,6 +53,10 @@ class DeviceLaunch:
         blocks = 64 if self.mailed else max(1, -(-self.items // BLOCK))
         if self.items or self.mailed:
             self._function((blocks,), (BLOCK,), (argument,))
+
+    def fetch(self, name: str) -> NDArray[Any]:
+        """One of its arrays as kernels have left it, copied."""
+        return self._arrays[name].get()
 
     def take(self, other: "DeviceLaunch") -> None:
         """From the next launch on, the arguments of `other`."""
@@ -80,12 +86,11 @@ class DeviceModule:
         """As backend.Module.bind, with the twins of the arrays."""
         fields, mailed = arguments_of(self._text, kernel, self.name, self.real, {"n": n, **arguments})
         params = np.zeros((), dtype=_layout(fields))
-        twins = []
+        twins = {}
         for field, value in fields:
             if field.dtype is not None:
-                twin = self._gpu.twin(value)
-                twins.append(twin)
-                value = twin.data.ptr
+                twins[field.name] = self._gpu.twin(value, keep=not mailed)
+                value = twins[field.name].data.ptr
             params[field.name] = value
         return DeviceLaunch(f"{self.name}.{kernel}", self.function(kernel), params, n, mailed, twins)
 
@@ -106,13 +111,15 @@ class Gpu:
         self._modules: dict[str, DeviceModule] = {}
         self.properties = self.cp.cuda.runtime.getDeviceProperties(self.cp.cuda.Device().id)
 
-    def twin(self, host: NDArray[Any]) -> Any:
-        """The device array of a host array."""
-        kept = self._twins.get(id(host))
-        if kept is None:
-            kept = (host, self.cp.asarray(host))  # keeping the host array keeps its id its own
-            self._twins[id(host)] = kept
-        return kept[1]
+    def twin(self, host: NDArray[Any], keep: bool = True) -> Any:
+        """The device array of a host array. keep: the same one from now on; else of a new one just a copy."""
+        known = self._twins.get(id(host))
+        if known is not None:
+            return known[1]
+        copy = self.cp.asarray(host)
+        if keep:
+            self._twins[id(host)] = (host, copy)  # keeping the host array keeps its id its own
+        return copy
 
     def fetch(self, host: NDArray[Any]) -> NDArray[Any]:
         """The array with what kernels have made of its twin."""

@@ -264,6 +264,7 @@ class GpuEngine:
         with self._lock:
             self._found.append(records.ravel())
         self.step += size
+        self._arrays["clock"][0] = self.step * self.dt  # for those who ask the host
 
     # --- mailboxes ----------------------------------------------------------------------------------------------
 
