@@ -131,12 +131,12 @@ def _members(text: str, struct: str, real: str) -> list[Argument]:
 
 def arguments_of(
     text: str, kernel: str, module: str, real: str, given: dict[str, Any]
-) -> tuple[list[tuple[Argument, Any]], bool]:
-    """The members of a kernel's struct in order, each with its argument, and whether it is a MAILED_KERNEL.
+) -> tuple[list[tuple[Argument, Any]], str, str]:
+    """The members of a kernel's struct in order, each with its argument; the struct's name; "", "MAILED_" or "SUM_".
 
     Raises CompileError for an unknown kernel, TypeError where an argument does not fit the text.
     """
-    found = re.search(rf"^(MAILED_)?KERNEL\({kernel}, (\w+)\)", text, re.MULTILINE)
+    found = re.search(rf"^(MAILED_|SUM_)?KERNEL\({kernel}, (\w+)[,)]", text, re.MULTILINE)
     if found is None:
         raise CompileError(f"no kernel {kernel} in {module}.cu")
     members = _members(text, found.group(2), real)
@@ -148,7 +148,7 @@ def arguments_of(
             isinstance(value, np.ndarray) and value.dtype == m.dtype and value.flags.c_contiguous
         ):
             raise TypeError(f"{module}.{kernel}: {m.name} must be a contiguous array of {m.dtype}")
-    return [(m, given[m.name]) for m in members], found.group(1) is not None
+    return [(m, given[m.name]) for m in members], found.group(2), found.group(1) or ""
 
 
 @dataclass
@@ -182,7 +182,7 @@ class Module:
 
     def bind(self, kernel: str, n: int, **arguments: Any) -> Launch:
         """Argument struct of `kernel` over `n` items; raises TypeError where an argument does not fit the text."""
-        fields, _ = arguments_of(self._text, kernel, self.name, self.real, {"n": n, **arguments})
+        fields, _, _ = arguments_of(self._text, kernel, self.name, self.real, {"n": n, **arguments})
         layout = type(
             kernel,
             (ctypes.Structure,),
@@ -212,6 +212,10 @@ class Cpu:
     def module(path: str) -> Module:
         """A kernel text, compiled once."""
         return module(path)
+
+    @staticmethod
+    def keep(*hosts: np.ndarray) -> None:
+        """Arrays that stay for the whole run: nothing to do here."""
 
     @staticmethod
     def fetch(host: np.ndarray) -> np.ndarray:

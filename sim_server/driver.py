@@ -163,6 +163,7 @@ class Driver:
             time.sleep(2e-4)
         if factor := self._arrived.pop((name, made), None):
             self.adopt(factor)
+            self.engine.settle_factors()
         for late in [key for key in self._arrived if key[0] == name]:  # of a job that was given up
             del self._arrived[late]
         self._due.pop(name)

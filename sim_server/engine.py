@@ -237,6 +237,9 @@ class Engine:
         buffer.fill(values, step)
         self._native.wf_post_factor(c.byref(self._body[body]), buffer.address)
 
+    def settle_factors(self) -> None:
+        """Sees to it that the next solve uses what was posted; here it does so anyway."""
+
     def _free_buffer(self, body: int, pattern: FactorPattern, dtype: np.dtype) -> NativeFactor:
         """Not the one in use and not the one waiting (which is taken back: a newer one is coming)."""
         entry, mail = self._body[body], self._mail[body]

@@ -59,6 +59,7 @@ class System:
         self.y = np.zeros((n, 3))
         self.dv = np.zeros((n, 3))
         self.clock = np.zeros(1)
+        world.backend.keep(*(a for o in (world, self) for a in vars(o).values() if isinstance(a, np.ndarray)))
 
     def _number(self, n: int) -> None:
         """Places of the upper blocks and of their transposes in block CSR."""

@@ -45,6 +45,8 @@ class DeviceLaunch:
     ):  # fmt: skip
         self.name, self.items, self.mailed, self._arrays = name, items, mailed, arrays
         self._function, self.params = function, params
+        self.text = self.struct = ""  # where it comes from
+        self.sums = False  # its items sum over lists
         self._mail = cupy().asarray(params.reshape(1).view(np.uint8)) if mailed else None
 
     def __call__(self) -> None:
@@ -84,7 +86,8 @@ class DeviceModule:
 
     def bind(self, kernel: str, n: int, **arguments: Any) -> DeviceLaunch:
         """As backend.Module.bind, with the twins of the arrays."""
-        fields, mailed = arguments_of(self._text, kernel, self.name, self.real, {"n": n, **arguments})
+        fields, struct, form = arguments_of(self._text, kernel, self.name, self.real, {"n": n, **arguments})
+        mailed = form == "MAILED_"
         params = np.zeros((), dtype=_layout(fields))
         twins = {}
         for field, value in fields:
@@ -92,7 +95,9 @@ class DeviceModule:
                 twins[field.name] = self._gpu.twin(value, keep=not mailed)
                 value = twins[field.name].data.ptr
             params[field.name] = value
-        return DeviceLaunch(f"{self.name}.{kernel}", self.function(kernel), params, n, mailed, twins)
+        launch = DeviceLaunch(f"{self.name}.{kernel}", self.function(kernel), params, n, mailed, twins)
+        launch.text, launch.struct, launch.sums = self._text, struct, form == "SUM_"
+        return launch
 
 
 def _layout(fields: list[tuple[Argument, Any]]) -> np.dtype:
@@ -120,6 +125,11 @@ class Gpu:
         if keep:
             self._twins[id(host)] = (host, copy)  # keeping the host array keeps its id its own
         return copy
+
+    def keep(self, *hosts: NDArray[Any]) -> None:
+        """Arrays that stay for the whole run have one twin each from now on."""
+        for host in hosts:
+            self.twin(host)
 
     def fetch(self, host: NDArray[Any]) -> NDArray[Any]:
         """The array with what kernels have made of its twin."""

@@ -19,6 +19,7 @@ from protocol.factor import FactorPattern
 from sim_server.engine import RECORD
 from sim_server.gpu.device import DeviceLaunch, DeviceModule, Gpu
 from sim_server.gpu.expand import Expanded, Expansion
+from sim_server.gpu.fuse import fused
 
 Reals = NDArray[np.float64]
 THREADS = 512
@@ -95,6 +96,7 @@ class GpuEngine:
         self._solve = self._solver(nodes)
         self._tick = DeviceModule("gpu/tick.cu", gpu).function("tick")
         self._graphs: dict[int, Any] = {}
+        self._fused = fused(gpu, self.launches[: self._before])
         self._lock = threading.Lock()
         self._factors: dict[int, tuple[int, Expanded]] = {}  # by body: step, and what is being made
         self._expansions: dict[tuple[int, int], Expansion] = {}
@@ -156,14 +158,17 @@ class GpuEngine:
 
     def _one_step(self) -> None:
         """Everything a step puts onto the stream."""
-        self._arrived.fill(0)
-        for launch in self.launches[: self._before]:
+        for launch in self._fused:
             launch()
+        self._finish_step()
+
+    def _finish_step(self) -> None:
+        """Solve, integrate, count."""
         self._solve()
         for launch in self.launches[self._before :]:
             launch()
-        clock = self.gpu.twin(self._arrays["clock"])
-        self._tick((1,), (1,), (clock, self._counter, np.float64(self.dt)))
+        clock, bodies = self.gpu.twin(self._arrays["clock"]), len(self._bodies)
+        self._tick((1,), (256,), (clock, self._counter, np.float64(self.dt), self._arrived, np.int32(bodies)))
 
     def _graph(self) -> Any:
         if 1 not in self._graphs:
@@ -236,11 +241,7 @@ class GpuEngine:
         begin = time.perf_counter()
         with self.stream:
             self._look_into_mail(patient=True)
-            self._arrived.fill(0)
-            self._solve()
-            for launch in self.launches[self._before :]:
-                launch()
-            self._tick((1,), (1,), (self.gpu.twin(self._arrays["clock"]), self._counter, np.float64(self.dt)))
+            self._finish_step()
             self.stream.synchronize()
             self._report(1, begin, time.perf_counter() - begin)
             self._copy_frame()
@@ -308,6 +309,10 @@ class GpuEngine:
         made = self._expansions[key].expand(values, occupied)
         with self._lock:
             self._factors[body] = (step, made)
+
+    def settle_factors(self) -> None:
+        """Sees to it that the next solve uses what was posted: waits until it is expanded (deterministic policies)."""
+        self._look_into_mail(patient=True)
 
     def factor_step(self, body: int) -> int:
         """Step of the factor in use, -1 without one."""

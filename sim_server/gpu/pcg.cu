@@ -346,7 +346,7 @@ __device__ Result solve(Group& g) {
     if (kind == JACOBI || kind == BLOCK_JACOBI) g.invert_diagonal(kind == BLOCK_JACOBI);
     g.barrier();
 
-    double alpha = 0, rz = 0, last = 1e300;
+    double alpha = 0, rz = 0, last = 1e300, quarter = r2 * pow(goal / r2, 0.25);
     bool restart = true, switched = false;
     for (int way = 0;; ) {
         double *r_old = s.r + turn * all, *r_new = s.r + (1 - turn) * all, *p = s.p + way * all;
@@ -355,8 +355,10 @@ __device__ Result solve(Group& g) {
         turn = 1 - turn;
         int stop = -1;
         if (r2 <= goal) stop = CONVERGED;
-        else if (!(zr > 0)) stop = BREAKDOWN_PRECONDITIONER;
+        else if (!(zr > 0 && zr < 1e300)) stop = BREAKDOWN_PRECONDITIONER;
         else if (out.iterations == body.max_iterations) stop = MAX_ITERATIONS;
+        else if (kind == CHOLESKY && out.iterations > 0 && out.iterations == body.max_iterations / 2 && !(r2 < quarter))
+            stop = BREAKDOWN_PRECONDITIONER;  // not a quarter of the way: pcg.h says why
         if (stop == BREAKDOWN_PRECONDITIONER && kind == CHOLESKY) {  // a useless factor: on with block Jacobi
             kind = out.kind = BLOCK_JACOBI;
             out.fallbacks = 1;

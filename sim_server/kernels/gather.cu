@@ -12,15 +12,16 @@ struct Gather {
     real* mean;            // (n, 3, 3) in, out: sum of the elements' rotations
 };
 
-KERNEL(gather, Gather) {
-    vec3 b = load3(p.b, i);
-    mat3 sum = load9(p.mean, i);
-    for (int k = p.start[i]; k < p.start[i + 1]; ++k) {
-        int corner = p.corners[k];
-        b = b + load3(p.push, corner);
-        const real* r = p.rotation + 9 * (corner >> 2);
-        for (int m = 0; m < 9; ++m) sum.m[m] += r[m];
-    }
-    store3(p.b, i, b);
-    store9(p.mean, i, sum);
+INLINE void gather_add(const Gather& p, int, int k, real* sum) {
+    int corner = p.corners[k];
+    const real *f = p.push + 3 * corner, *r = p.rotation + 9 * (corner >> 2);
+    for (int m = 0; m < 3; ++m) sum[m] += f[m];
+    for (int m = 0; m < 9; ++m) sum[3 + m] += r[m];
 }
+
+INLINE void gather_put(const Gather& p, int i, const real* sum) {
+    for (int m = 0; m < 3; ++m) p.b[3 * i + m] += sum[m];
+    for (int m = 0; m < 9; ++m) p.mean[9 * i + m] += sum[3 + m];
+}
+
+SUM_KERNEL(gather, Gather, 12)

@@ -7,6 +7,9 @@
 // NVRTC turns it into a __global__ function, one thread per item; a C++ compiler into a loop over a range of items.
 // A text that defines WIDE first is written on `number` and `index`: scalars on a GPU, as many items at once as a vector
 // register holds on a CPU (past the end the last item is repeated; an item loads before it stores, so that does no harm).
+// SUM_KERNEL(name, Params, N) is for items that sum N reals over a list of entries p.start[i] .. p.start[i + 1]: the text has
+// name_add(p, i, k, sum) for entry k and name_put(p, i, sum) for what becomes of the sum; a GPU may share the entries of an
+// item between threads (gpu/fuse.py).
 // MAILED_KERNEL is the same for a launch whose arguments are replaced while the simulation runs: on a GPU it reads them from
 // device memory and takes any number of items.
 // Structs hold 4-byte ints, reals and pointers; the Python side reads their layout from this very text (backend.py), so that
@@ -22,6 +25,10 @@
 #define INLINE __device__ __forceinline__
 typedef real number;
 typedef int index;
+#ifdef ITEMS_ONLY  // the texts of several kernels are put together into one
+#define KERNEL(name, Params) INLINE void name##_item(const Params& p, index i)
+#define SUM_KERNEL(name, Params, N) static constexpr int name##_reals = N;
+#else
 #define KERNEL(name, Params)                                                \
     __device__ __forceinline__ void name##_item(const Params& p, index i);  \
     extern "C" __global__ void name(const Params p) {                       \
@@ -29,6 +36,8 @@ typedef int index;
         if (i < p.n) name##_item(p, i);                                     \
     }                                                                       \
     __device__ __forceinline__ void name##_item(const Params& p, index i)
+#define SUM_KERNEL(name, Params, N) KERNEL(name, Params) { SUM_OF_ENTRIES(name, N) }
+#endif
 #define MAILED_KERNEL(name, Params)                                         \
     __device__ __forceinline__ void name##_item(const Params& p, index i);  \
     extern "C" __global__ void name(const Params* mail) {                   \
@@ -50,6 +59,7 @@ typedef int index;
     }                                                                                 \
     INLINE void name##_item(const Params& p, index i)
 #define MAILED_KERNEL(name, Params) KERNEL(name, Params)
+#define SUM_KERNEL(name, Params, N) KERNEL(name, Params) { SUM_OF_ENTRIES(name, N) }
 
 #ifdef WIDE
 
@@ -103,6 +113,12 @@ INLINE number at(const real* a, index i) { return a[i]; }
 INLINE index at(const int* a, index i) { return a[i]; }
 INLINE void put(real* a, index i, number v) { a[i] = v; }
 #endif
+
+#define SUM_OF_ENTRIES(name, N)                                                   \
+    real sum[N];                                                                  \
+    for (int m = 0; m < N; ++m) sum[m] = 0;                                       \
+    for (int k = p.start[i]; k < p.start[i + 1]; ++k) name##_add(p, i, k, sum);   \
+    name##_put(p, i, sum);
 
 INLINE number constant(real c) { return number{} + c; }
 INLINE number larger(number a, number b) { return a > b ? a : b; }

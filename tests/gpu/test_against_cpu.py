@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: MIT
+"""The GPU's steps beside the CPU's, on the same scenes. Runs where there is a GPU: pytest -m gpu."""
+
+import numpy as np
+import pytest
+
+from protocol.messages_pb2 import SolveStatus
+from sim_server.driver import Driver
+from sim_server.simulation import Simulation
+
+pytestmark = pytest.mark.gpu
+
+
+@pytest.fixture(autouse=True)
+def gpu():
+    from sim_server.gpu.device import DeviceError, cupy
+
+    try:
+        cupy()
+    except DeviceError as error:
+        pytest.skip(str(error))
+
+
+def both(overrides: list[str], steps: int, scene: str = "beam") -> list[tuple[Simulation, np.ndarray]]:
+    """Simulation and records on either device."""
+    path = f"deploy/scenes/{scene}.toml"
+    runs = []
+    for device in ("gpu", "cpu"):
+        sim = Simulation.load(path, overrides, device)
+        runs.append((sim, Driver(sim).advance(steps)))
+        sim.fetch()
+    return runs
+
+
+@pytest.mark.parametrize("preconditioner", ["none", "jacobi", "block_jacobi"])
+def test_simple_preconditioners_take_the_same_iterations(preconditioner):
+    (on_gpu, g), (on_cpu, c) = both([f"solver.preconditioner={preconditioner}"], 30)
+    assert np.abs(g["iterations"] - c["iterations"]).max() <= 1
+    assert (g["status"] == SolveStatus.CONVERGED).all() and g["residual"].max() <= 1e-6
+    assert np.abs(on_gpu.world.x - on_cpu.world.x).max() < 1e-6
+
+
+@pytest.mark.parametrize("update", ["never", "every-5", "lockstep-4"])
+def test_factors_are_taken_up_at_the_same_steps(update):
+    """float16 costs at most two iterations; the answer is the same to the tolerance."""
+    (on_gpu, g), (on_cpu, c) = both(["solver.preconditioner=cholesky", f"solver.update={update}"], 30)
+    assert g["factor_step"].tolist() == c["factor_step"].tolist()
+    assert (g["iterations"] <= c["iterations"] + 2).all() and g["residual"].max() <= 1e-6
+    assert np.abs(on_gpu.world.x - on_cpu.world.x).max() < 1e-5
+
+
+def test_tight_tolerances_are_reached_in_spite_of_float16():
+    solver = ["solver.preconditioner=cholesky", "solver.update=every-10", "solver.tolerance=1e-11"]
+    (_, g), _ = both(solver, 20)
+    assert (g["status"] == SolveStatus.CONVERGED).all() and g["residual"].max() <= 1e-11
+
+
+def test_bodies_of_one_scene_are_solved_together():
+    (on_gpu, g), (on_cpu, c) = both(["solver.preconditioner=cholesky", "solver.update=lockstep-3"], 15, "four_beams")
+    assert g["body"].tolist() == c["body"].tolist()
+    assert (g["status"] == SolveStatus.CONVERGED).all()
+    assert np.abs(on_gpu.world.x - on_cpu.world.x).max() < 1e-5
+
+
+def test_graphs_of_many_steps_are_the_same_steps():
+    solver = ["solver.preconditioner=block_jacobi"]
+    one, many = (Simulation.load("deploy/scenes/beam.toml", solver, "gpu") for _ in range(2))
+    for _ in range(24):
+        one.engine.run(1)
+    many.engine.run(24)
+    assert one.engine.records()["iterations"].tolist() == many.engine.records()["iterations"].tolist()
+    assert np.array_equal(one.fetch().x, many.fetch().x), "the same bits: no sum depends on the order of threads"
+
+
+def test_a_push_moves_it_as_on_the_cpu():
+    results = []
+    for device in ("gpu", "cpu"):
+        sim = Simulation.load("deploy/scenes/beam.toml", ["solver.preconditioner=block_jacobi"], device)
+        touch = sim.effects["touch"]
+        index = next(i for i, launch in enumerate(sim.engine.launches) if launch.name == "touch.apply")
+        touch.publish = lambda launch, engine=sim.engine, index=index: engine.replace(index, launch)
+        sim.engine.run(5)
+        touch.push("me", "beam", (0.5, 0.4, 4.0), 0.0, (800.0, 0.0, 0.0), 0.1)
+        sim.engine.run(10)
+        results.append((sim.fetch().x.copy(), touch.alive()))
+    (x_gpu, alive_gpu), (x_cpu, alive_cpu) = results
+    assert np.abs(x_gpu - x_cpu).max() < 1e-6 and alive_gpu == alive_cpu == []
+    assert x_gpu[:, 0].max() > 1.01
+
+
+def test_matrices_and_frames_come_back():
+    solver = ["solver.preconditioner=block_jacobi"]
+    sim = Simulation.load("deploy/scenes/beam.toml", solver, "gpu")
+    reference = Simulation.load("deploy/scenes/beam.toml", solver)
+    target = np.zeros_like(reference.system.values)
+    sim.engine.loop.frame_every = 2
+    sim.engine.request_matrix(0, target)
+    sim.engine.run(4)
+    reference.engine.run(1)
+    assert sim.engine.matrix_step(0) == 0
+    assert np.abs(target - reference.system.values).max() < 1e-9 * np.abs(target).max()
+    assert [step for step, _, _ in sim.engine.frames()] == [2, 4]
+
+
+def test_a_useless_factor_is_left_for_block_jacobi():
+    sim = Simulation.load("deploy/scenes/beam.toml", ["solver.preconditioner=cholesky", "solver.update=never"], "gpu")
+    Driver(sim).advance(1)
+    factor = next(iter(sim.engine._expansions.values()))
+    for scale in factor.scales:
+        sim.world.backend.twin(scale).fill(np.nan)
+    sim.engine.run(3)
+    records = sim.engine.records()
+    assert (records["fallbacks"] == 1).all() and (records["status"] == SolveStatus.CONVERGED).all()
