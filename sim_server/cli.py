@@ -7,6 +7,7 @@ import signal
 import sys
 import time
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
 
@@ -40,7 +41,9 @@ class Terminated(BaseException):
 @app.command(epilog=EPILOG)
 def serve(
     scene: Annotated[Path, typer.Argument(metavar="SCENE.toml", help="What to simulate")],
-    device: Annotated[str, typer.Option(metavar="auto|cpu|gpu", help="Where; this version has the CPU only")] = "auto",
+    device: Annotated[
+        str, typer.Option(metavar="auto|cpu|gpu", help="Where; auto: the CPU, while the GPU is a preview")
+    ] = "auto",
     steps: Annotated[int | None, typer.Option(metavar="N", min=1, help="Stop after so many steps")] = None,
     realtime: Annotated[
         bool, typer.Option("--realtime/--free-run", help="Keep pace with the clock, or as fast as it goes")
@@ -62,25 +65,15 @@ def serve(
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     logging.basicConfig(level=logging.ERROR if quiet else logging.WARNING, format="sim-server: %(message)s")
     signal.signal(signal.SIGTERM, _terminate)
-    if device not in ("auto", "cpu"):
-        known = "gpu is not available in this version; " if device == "gpu" else ""
-        _bad_input(f"--device {device}: {known}allowed: auto, cpu")
+    if device not in ("auto", "cpu", "gpu"):
+        _bad_input(f"--device {device}: allowed are auto, cpu, gpu")
+    options = Options(
+        scene, set_ or [], device, name, listen, connect, not no_shared_memory, record, steps, realtime, workers
+    )  # fmt: skip
     say = (lambda text: None) if quiet else (lambda text: print(f"sim-server: {text}", flush=True))
     try:
         with ExitStack() as closing:
-            service, supervisor = _set_up(
-                closing,
-                scene,
-                set_ or [],
-                name,
-                listen,
-                connect,
-                not no_shared_memory,
-                record,
-                steps,
-                realtime,
-                workers,
-            )
+            service, supervisor = _set_up(closing, options)
             _announce(say, service, scene, listen)
             _wait_for_workers(service, supervisor)
             try:
@@ -93,11 +86,24 @@ def serve(
         raise typer.Exit(0) from None
 
 
-def _set_up(
-    closing: ExitStack, scene: Path, overrides: list[str], name: str, listen: list[str] | None,
-    connect: list[str] | None, shared_memory: bool, record: Path | None, steps: int | None, realtime: bool,
-    workers: int,
-) -> "tuple[Service, Supervisor | None]":  # fmt: skip
+@dataclass(frozen=True)
+class Options:
+    """The command line, read."""
+
+    scene: Path
+    overrides: list[str]
+    device: str
+    name: str
+    listen: list[str] | None
+    connect: list[str] | None
+    shared_memory: bool
+    record: Path | None
+    steps: int | None
+    realtime: bool
+    workers: int
+
+
+def _set_up(closing: ExitStack, o: Options) -> "tuple[Service, Supervisor | None]":
     """Everything that can fail on bad input, before the simulation starts."""
     from protocol.channels import DEFAULT_ENDPOINT
     from protocol.endpoints import BadEndpoint
@@ -112,21 +118,20 @@ def _set_up(
     from sim_server.supervisor import Supervisor
 
     try:
-        simulation = Simulation.load(scene, overrides)
-        link = closing.enter_context(ServerLink(name, listen, connect, shared_memory=shared_memory))
+        simulation = Simulation.load(o.scene, o.overrides, "gpu" if o.device == "gpu" else "cpu")
+        link = closing.enter_context(ServerLink(o.name, o.listen, o.connect, shared_memory=o.shared_memory))
         recorder = None
-        if record is not None:
-            recorder = closing.enter_context(
-                Recorder(record, simulation.scene.record.compression, overwrite=True, report=logging.error)
-            )
-        service = Service(simulation, link, recorder, steps, realtime)
+        if o.record is not None:
+            compression = simulation.scene.record.compression
+            recorder = closing.enter_context(Recorder(o.record, compression, overwrite=True, report=logging.error))
+        service = Service(simulation, link, recorder, o.steps, o.realtime)
     except (InputError, BadEndpoint, ConnectionFailed, Refused, CompileError) as error:
         _bad_input(str(error))
     except OSError as error:
-        _bad_input(f"--record {record}: {error.strerror or error}")
+        _bad_input(f"--record {o.record}: {error.strerror or error}")
     supervisor = None
-    if workers:
-        supervisor = Supervisor(workers, name, _reachable(listen or [DEFAULT_ENDPOINT]))
+    if o.workers:
+        supervisor = Supervisor(o.workers, o.name, _reachable(o.listen or [DEFAULT_ENDPOINT]))
         closing.callback(supervisor.close)
         service.beside = supervisor.look
     return service, supervisor
@@ -144,7 +149,7 @@ def _announce(say, service: "Service", scene: Path, listen: list[str] | None) ->
     tets = sum(len(b.mesh.tets) for b in world.bodies)
     say(
         f"{scene.name}: {len(world.bodies)} object{'s' * (len(world.bodies) > 1)}, {world.nodes} nodes, {tets} tets, "
-        f"dt {world.dt:g} s, preconditioner {solver.preconditioner}, update {solver.update}; cpu; "
+        f"dt {world.dt:g} s, preconditioner {solver.preconditioner}, update {solver.update}; {world.backend.name}; "
         f"listening on {', '.join(listen or [DEFAULT_ENDPOINT])}"
     )
 

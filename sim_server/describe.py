@@ -29,7 +29,7 @@ def scene(simulation: Simulation) -> pb.Scene:
         resolved=json.dumps(s.resolved()),
         dt=s.dt,
         started_ns=time.time_ns(),
-        software=f"warpfactor {_version()}, cpu, Python {platform.python_version()}",
+        software=f"warpfactor {_version()}, {simulation.world.backend.name}, Python {platform.python_version()}",
         objects=[b.name for b in simulation.world.bodies],
     )
 

@@ -133,7 +133,8 @@ class Telemetry:
         p50, p99, most = self.percentiles()
         status = pb.Status(
             scene=self.simulation.scene.name, state=state, step=self.engine.step, time=self.engine.step * world.dt,
-            dt=world.dt, step_p50=p50, step_p99=p99, step_max=most, late_steps=loop.late_steps, device="cpu",
+            dt=world.dt, step_p50=p50, step_p99=p99, step_max=most, late_steps=loop.late_steps,
+            device=self.simulation.world.backend.name,
             pid=os.getpid(), uptime=time.monotonic() - self.begun,
         )  # fmt: skip
         dropped = loop.frames_dropped + (self.recorder.dropped if self.recorder else 0)

@@ -6,6 +6,7 @@ stop test of the iteration is on the device, so the host only launches graphs. B
 mailboxes (factors, arguments, requests for matrices) and passes on what it finds by copies on the step's stream.
 """
 
+import logging
 import threading
 import time
 from collections.abc import Sequence
@@ -18,8 +19,10 @@ from numpy.typing import NDArray
 from protocol.factor import FactorPattern
 from sim_server.engine import RECORD
 from sim_server.gpu.device import DeviceLaunch, DeviceModule, Gpu
-from sim_server.gpu.expand import Expanded, Expansion
+from sim_server.gpu.expand import LIMIT, Expanded, Expansion
 from sim_server.gpu.fuse import fused
+
+log = logging.getLogger(__name__)
 
 Reals = NDArray[np.float64]
 THREADS = 512
@@ -100,6 +103,7 @@ class GpuEngine:
         self._lock = threading.Lock()
         self._factors: dict[int, tuple[int, Expanded]] = {}  # by body: step, and what is being made
         self._expansions: dict[tuple[int, int], Expansion] = {}
+        self._too_large: set[int] = set()
         self._snapshots: dict[int, Reals] = {}
         self._copied: dict[int, int] = {}
         self._changed = True
@@ -304,6 +308,14 @@ class GpuEngine:
                 self._factors[body][1].event.synchronize()  # they share what they are made from
                 occupied.add(self._factors[body][1].inverse)
         key = (body, pattern.id)
+        if pattern.size > LIMIT:
+            if body not in self._too_large:
+                self._too_large.add(body)
+                log.warning(
+                    "body %d has %d degrees of freedom: beyond %d the GPU has no factors yet, it goes on with block "
+                    "Jacobi", body, pattern.size, LIMIT,
+                )  # fmt: skip
+            return
         if key not in self._expansions:
             self._expansions[key] = Expansion(self.gpu, pattern)
         made = self._expansions[key].expand(values, occupied)

@@ -193,7 +193,7 @@ def test_bad_input_gives_one_line_and_code_2(tmp_path: Path) -> None:
     cases = [
         ([str(bad)], "dt = 0"),
         ([str(tmp_path / "none.toml")], "none.toml"),
-        ([str(beam(tmp_path)), "--device", "gpu"], "--device gpu"),
+        ([str(beam(tmp_path)), "--device", "tpu"], "allowed are auto, cpu, gpu"),
         ([str(beam(tmp_path)), "--listen", "nonsense"], "nonsense"),
         ([str(beam(tmp_path)), "--set", "solver.tolerence=1"], "did you mean 'tolerance'"),
         ([str(beam(tmp_path)), "--record", "/no/such/folder/a.mcap"], "/no/such/folder"),
