@@ -8,6 +8,8 @@
 //
 // The factor is applied as the dense inverse in float16, made on the device from L (expand.py): data without dependency
 // chains. Vectors and A are float64, so that the residual is, whatever the preconditioner's precision.
+#include "invert3.cuh"
+
 #define THREADS 512
 #define WARPS (THREADS / 32)
 #define LANES_PER_NODE 16
@@ -293,17 +295,7 @@ struct Group {
         for (int node = begin + threadIdx.x; node < end; node += THREADS) {
             int row = body.first + node, k = s.row_start[row];
             while (s.columns[k] != row) ++k;
-            const double* a = s.values + 9ll * k;
-            double* v = s.diagonal + 9ll * row;
-            if (!whole) {
-                for (int m = 0; m < 9; ++m) v[m] = 0;
-                v[0] = 1 / a[0]; v[4] = 1 / a[4]; v[8] = 1 / a[8];
-                continue;
-            }
-            double c0 = a[4] * a[8] - a[5] * a[7], c1 = a[5] * a[6] - a[3] * a[8], c2 = a[3] * a[7] - a[4] * a[6];
-            double d = 1 / (a[0] * c0 + a[1] * c1 + a[2] * c2);
-            v[0] = d * c0; v[4] = d * (a[0] * a[8] - a[2] * a[6]); v[8] = d * (a[0] * a[4] - a[1] * a[3]);
-            v[1] = v[3] = d * c1; v[2] = v[6] = d * c2; v[5] = v[7] = d * (a[1] * a[6] - a[0] * a[7]);
+            invert3(s.values + 9ll * k, whole, s.diagonal + 9ll * row);
         }
     }
 

@@ -4,6 +4,8 @@
 #include <cmath>
 #include <cstdint>
 
+#include "invert3.cuh"
+
 struct BlockCsr {
     int32_t first, last;        // nodes [first, last) of a body; vectors below start at its first node
     const int32_t* row_start;   // (nodes + 1,) of the scene, into columns and values
@@ -77,17 +79,7 @@ static void invert_diagonal(const BlockCsr& A, bool whole, double* inverse) {
     for (int i = A.first; i < A.last; ++i) {
         int k = A.row_start[i];
         while (A.columns[k] != i) ++k;
-        const double* a = A.values + 9 * (int64_t)k;
-        double* v = inverse + 9 * (i - A.first);
-        if (!whole) {
-            for (int m = 0; m < 9; ++m) v[m] = 0;
-            v[0] = 1 / a[0]; v[4] = 1 / a[4]; v[8] = 1 / a[8];
-            continue;
-        }
-        double c0 = a[4] * a[8] - a[5] * a[7], c1 = a[5] * a[6] - a[3] * a[8], c2 = a[3] * a[7] - a[4] * a[6];
-        double d = 1 / (a[0] * c0 + a[1] * c1 + a[2] * c2);
-        v[0] = d * c0; v[4] = d * (a[0] * a[8] - a[2] * a[6]); v[8] = d * (a[0] * a[4] - a[1] * a[3]);
-        v[1] = v[3] = d * c1; v[2] = v[6] = d * c2; v[5] = v[7] = d * (a[1] * a[6] - a[0] * a[7]);
+        invert3(A.values + 9 * (int64_t)k, whole, inverse + 9 * (i - A.first));
     }
 }
 
