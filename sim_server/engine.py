@@ -150,9 +150,11 @@ class NativeFactor:
 
 @dataclass
 class Mailbox:
-    """Factor buffers of a body: one in use, one perhaps waiting, one to fill."""
+    """Factor buffers of a body, two of them: one in use, the other waiting or to be filled."""
 
     buffers: list[NativeFactor]
+    waiting: NativeFactor | None = None  # as posted last
+    in_use: NativeFactor | None = None  # as far as the mailbox has told
 
 
 class Engine:
@@ -235,18 +237,25 @@ class Engine:
         """Copies a factor into a free buffer; the loop takes it up before its next solve of the body."""
         buffer = self._free_buffer(body, pattern, values.dtype)
         buffer.fill(values, step)
+        self._mail[body].waiting = buffer
         self._native.wf_post_factor(c.byref(self._body[body]), buffer.address)
 
     def settle_factors(self) -> None:
         """Sees to it that the next solve uses what was posted; here it does so anyway."""
 
     def _free_buffer(self, body: int, pattern: FactorPattern, dtype: np.dtype) -> NativeFactor:
-        """Not the one in use and not the one waiting (which is taken back: a newer one is coming)."""
-        entry, mail = self._body[body], self._mail[body]
-        self._native.wf_post_factor(c.byref(entry), None)
-        in_use = entry.factor
+        """One that the loop does not have. What still waits is taken back, since a newer one is coming.
+
+        Which one the loop has follows from what the mailbox gives back. Its own pointer would not do: between taking
+        a factor out of the mailbox and noting it there the loop has both.
+        """
+        mail = self._mail[body]
+        taken_back = self._native.wf_post_factor(c.byref(self._body[body]), None)
+        if not taken_back and mail.waiting is not None:
+            mail.in_use = mail.waiting
+        mail.waiting = None
         for i, buffer in enumerate(mail.buffers):
-            if buffer.address == in_use:
+            if buffer is mail.in_use:
                 continue
             if buffer.pattern is not pattern or buffer.values.dtype != dtype:
                 mail.buffers[i] = NativeFactor(pattern, dtype)
