@@ -66,7 +66,8 @@ struct Loop {
     std::atomic<int64_t> record_head, record_tail;
     double* frames;                    // ring of (2, nodes, 3): x, v
     int64_t* frame_steps;
-    int64_t frame_capacity, frame_every;   // every 0: none
+    int64_t frame_capacity;
+    std::atomic<int64_t> frame_every;      // 0: none; set from outside as viewers come and go
     std::atomic<int64_t> frame_head, frame_tail;
     std::atomic<int64_t> frames_dropped, records_dropped, late_steps;
 
@@ -123,7 +124,8 @@ static bool room(Loop& loop, std::atomic<int64_t>& head, std::atomic<int64_t>& t
 }
 
 static void write_frame(Loop& loop) {
-    if (loop.frame_every <= 0 || loop.step % loop.frame_every) return;
+    const int64_t every = loop.frame_every.load();  // once: it may become 0 meanwhile
+    if (every <= 0 || loop.step % every) return;
     if (!room(loop, loop.frame_head, loop.frame_tail, loop.frame_capacity)) { ++loop.frames_dropped; return; }
     int64_t slot = loop.frame_head.load() % loop.frame_capacity, size = 3 * (int64_t)loop.nodes;
     double* frame = loop.frames + 2 * size * slot;
