@@ -58,6 +58,7 @@ class Driver:
         self.wants_factors = self.solver.preconditioner in ("auto", "cholesky")
         self._due: dict[str, int] = {}  # lockstep: step of the matrix whose factor is taken up n steps later
         self._arrived: dict[tuple[str, int], Factor] = {}
+        self._alone = False  # there was no worker for a matrix of lockstep
         self._warped = {t.body.name: bool(simulation.system.warped[t.body.nodes].any()) for t in self.tracks}
         bytes_a = {
             t.body.name: 72.0 * len(simulation.system.body_values(t.body.first, t.body.last)) for t in self.tracks
@@ -147,8 +148,8 @@ class Driver:
         if self.engine.step == now:
             return  # stopped
         for t in fresh:
-            self._send_patiently(t)
-            self._due[t.body.name] = now
+            if self._send_patiently(t):
+                self._due[t.body.name] = now
 
     def _await(self, name: str, made: int) -> None:
         """The factor of step `made`, waited for; without one (a failure) the body goes on as it is."""
@@ -175,19 +176,26 @@ class Driver:
             for name, reason in source.failures():
                 self.failed(name, reason)
 
-    def _send_patiently(self, t: Track) -> None:
-        """To a worker, waiting for an idle one; into this process where there is no worker at all."""
+    def _send_patiently(self, t: Track) -> bool:
+        """To a worker, waiting for an idle one; into this process where there is no worker at all. False: stopped."""
         step = self.engine.matrix_step(t.body.index)
         assert t.wanted is not None
         job = self._job(t, step, t.wanted)
         asked = time.monotonic()
         while not (self.source.ready() and self.source.submit(job)):
+            if self.engine.loop.stop:
+                t.wanted = None
+                return False
             self._collect()
             if time.monotonic() - asked > 1 and not getattr(self.source, "workers", lambda: [1])():
+                if not self._alone:
+                    log.warning("lockstep without a worker: factors are made in this process")
+                self._alone = True
                 self.inline.submit(job)
                 break
             time.sleep(2e-4)
         t.in_flight, t.sent, t.wanted, t.excess = True, step, None, 0.0
+        return True
 
     # --- async --------------------------------------------------------------------------------------------------
 

@@ -211,6 +211,37 @@ def test_stopped_means_no_more_steps(update):
     assert np.array_equal(sim.world.x, x)
 
 
+class Unready(Inline):
+    """Workers that are there and never idle; after a while somebody stops the run. workers: their names."""
+
+    def __init__(self, sim: Simulation, workers: list[str]):
+        super().__init__(patterns_of(sim))
+        self._engine, self._workers, self._asked = sim.engine, workers, 0
+
+    def workers(self) -> list[str]:
+        return self._workers
+
+    def ready(self) -> bool:
+        self._asked += 1
+        if self._workers and self._asked > 10:
+            self._engine.loop.stop = 1
+        return False
+
+
+def test_lockstep_that_waits_for_a_busy_worker_can_be_stopped():
+    sim = falling(update="lockstep-2")
+    assert len(Driver(sim, Unready(sim, ["busy"])).advance(5)) == 1
+    assert sim.engine.step == 1
+
+
+def test_lockstep_without_workers_says_once_that_it_makes_the_factors_itself(caplog):
+    sim = falling(update="lockstep-2")
+    with caplog.at_level(logging.WARNING):
+        records = Driver(sim, Unready(sim, [])).advance(4)
+    assert records["factor_step"].tolist() == [-1, -1, 0, 0]
+    assert caplog.text.count("without a worker") == 1
+
+
 def test_auto_takes_the_factor_where_steps_are_hard_and_leaves_it_where_they_are_easy():
     """Costs are counted in bytes here (not async), so that the answer is the same on every machine."""
     hard = bar((10, 3, 3), (10, 2, 2), young=1e7, fixed="X < 0.01")
