@@ -2,6 +2,7 @@
 """Matrices out to workers, factors back: who gets a job, and what becomes of it."""
 
 import logging
+import threading
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
@@ -29,7 +30,7 @@ log = logging.getLogger(__name__)
 
 
 class Dispatch:
-    """Jobs, workers and answers of one server. For one thread."""
+    """Jobs, workers and answers of one server. Methods may be called from any thread; none waits for the network."""
 
     def __init__(
         self,
@@ -47,6 +48,7 @@ class Dispatch:
         self._answers = Answers(incarnation)
         self._roster = Roster(incarnation, silence)
         self._jobs = Jobs(pool)
+        self._busy = threading.RLock()  # a status asks for the workers while the loop thread takes in a factor
         self._last_worker: dict[str, str] = {}  # of each object: it knows the pattern already
         self._factors: list[Factor] = []
         self._failures: list[tuple[str, str]] = []
@@ -60,40 +62,44 @@ class Dispatch:
 
     def announce(self, topology: Topology) -> None:
         """A new epoch of an object."""
-        self._answers.announce(topology)
-        self._jobs.forget(topology.header.object)
+        with self._busy:
+            self._answers.announce(topology)
+            self._jobs.forget(topology.header.object)
 
     def ready(self) -> bool:
         """Somebody idle can take a job."""
-        self._receive()
-        return bool(self._idle())
+        with self._busy:
+            self._receive()
+            return bool(self._idle())
 
     def workers(self) -> list[WorkerInfo]:
         """Workers that may be given work."""
-        self._receive()
-        infos = (self._roster.info(name) for name in self._roster.fit(self._clock(), self._jobs.deadlines()))
-        return [info for info in infos if info is not None]
+        with self._busy:
+            self._receive()
+            infos = (self._roster.info(name) for name in self._roster.fit(self._clock(), self._jobs.deadlines()))
+            return [info for info in infos if info is not None]
 
     def poll(self) -> list[Factor]:
         """Good factors since the last call."""
-        self._receive()
-        factors, self._factors = self._factors, []
-        return factors
+        with self._busy:
+            self._receive()
+            factors, self._factors = self._factors, []
+            return factors
 
     def failures(self) -> list[tuple[str, str]]:
         """(object, reason) of jobs that ended without a factor since the last call."""
-        failures, self._failures = self._failures, []
-        return failures
-
-    def close(self) -> None:
-        """Forget all jobs."""
-        self._factors.clear()
-        self._failures.clear()
+        with self._busy:
+            failures, self._failures = self._failures, []
+            return failures
 
     # ---- out -------------------------------------------------------------------------------------------------
 
     def submit(self, job: "Job") -> bool:
         """Send a job to an idle worker; False if there is none or the object is in flight."""
+        with self._busy:
+            return self._submit(job)
+
+    def _submit(self, job: "Job") -> bool:
         known = self._answers.known.get(job.object)
         if known is None or known.epoch != job.epoch:
             raise ValueError(f"job for {job.object} epoch {job.epoch}, which was not announced")
