@@ -2,7 +2,8 @@
 """The network side of the server: jobs for remote workers, what is published, what clients ask.
 
 Nothing here waits for the network: sending has its own threads, what arrives lies in bounded rings until the service
-thread takes it. Methods are for that one thread, except close().
+thread takes it. Methods are for that one thread, except close() and those of a source of factors (ready, submit, poll,
+failures, workers), which a loop that waits for its factors calls from its own.
 """
 
 import logging
@@ -182,7 +183,7 @@ class ServerLink:
         status.clients.extend(self.clients())
         status.bulk_shared, status.bulk_copied = self.counters.bulk_shared, self.counters.bulk_copied
         status.refused = self.counters.refused
-        status.frames_dropped = self.counters.frames_dropped
+        status.frames_dropped += self.counters.frames_dropped
         self._inquiries.offer(key("status", self.name), self._stamped(status).SerializeToString())
         self._publications.put("status", status, self._stamp)
 

@@ -56,12 +56,13 @@ def test_late_joiners_get_scene_status_and_topology(stage: tuple[Driver, zenoh.S
     driver.link.set_scene(Scene(name="beam.toml", objects=["a", "b"]))
     driver.link.announce(chain(4, "a"))
     driver.link.announce(chain(5, "b", epoch=3))
-    driver.link.publish_status(Status(scene="beam.toml", step=7))
+    driver.link.publish_status(Status(scene="beam.toml", step=7, frames_dropped=3))
     scene = Scene.FromString(*answers(ask(session, key("scene"))))
     assert scene.name == "beam.toml" and scene.header.incarnation == driver.link.incarnation
     assert scene.header.protocol == PROTOCOL
     status = Status.FromString(*answers(ask(session, key("status"))))
     assert status.step == 7
+    assert status.frames_dropped == 3, "what the log lost is not forgotten for what the network lost"
     topologies = [Topology.FromString(data) for data in answers(ask(session, key("topology")))]
     assert sorted((t.header.object, t.header.epoch, t.nodes) for t in topologies) == [("a", 1, 4), ("b", 3, 5)]
     only = [Topology.FromString(data).nodes for data in answers(ask(session, key("topology", object="b")))]
