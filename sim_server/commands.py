@@ -50,8 +50,8 @@ class Commands:
         return sum(self._touch().release_all(client) for client in lost)
 
     def applied(self) -> list[pb.Interaction]:
-        """Interactions that are not over, with the time of their first step (negative: not yet)."""
-        return [self._message(a) for a in self._touch().alive()] if "touch" in self.simulation.effects else []
+        """Interactions that the loop knows, with the time of their first step (negative: not yet); some may be over."""
+        return [self._message(a) for a in self._touch().known()] if "touch" in self.simulation.effects else []
 
     # --- verbs --------------------------------------------------------------------------------------------------
 

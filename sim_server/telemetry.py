@@ -3,7 +3,7 @@
 
 import os
 import time
-from collections import deque
+from collections import Counter, deque
 from typing import Any
 
 import numpy as np
@@ -36,6 +36,8 @@ class Telemetry:
         self.seconds: deque[float] = deque(maxlen=WINDOW)
         self._last: dict[str, pb.ObjectStep] = {}
         self._bad: set[str] = set()
+        self.solves = 0
+        self.unconverged: Counter[str] = Counter()  # solves by status, of those that did not converge
         self._due = {"steps": 0.0, "state": 0.0, "status": 0.0}
         self._touched: dict[int, pb.Interaction] = {}
 
@@ -87,11 +89,11 @@ class Telemetry:
         """Adds to each step the interactions that acted in it."""
         if self.commands is None or "touch" not in self.simulation.effects:
             return
-        alive = {i.id: i for i in self.commands.applied()}
+        known = {i.id: i for i in self.commands.applied()}
         clock, dt = float(self.simulation.system.clock[0]), self.simulation.world.dt
-        for id in set(self._touched) - set(alive):  # over or released: it acted up to now at most
-            self._touched[id].duration = min(self._touched[id].duration, max(clock - self._touched[id].start, 0))
-        self._touched.update(alive)
+        for id in set(self._touched) - set(known):  # over or released: it acted up to the step under way at most
+            self._touched[id].duration = min(self._touched[id].duration, max(clock + dt - self._touched[id].start, 0))
+        self._touched.update(known)
         for message in messages:
             begin = message.time - dt
             message.interactions.extend(
@@ -99,7 +101,7 @@ class Telemetry:
                 for i in self._touched.values()
                 if i.object == message.header.object and 0 <= i.start <= begin + 0.5 * dt < i.start + i.duration
             )
-        for id in set(self._touched) - set(alive):
+        for id in set(self._touched) - set(known):
             del self._touched[id]
 
     def frames(self) -> None:
@@ -162,6 +164,23 @@ class Telemetry:
             return 0.0, 0.0, 0.0
         seconds = np.array(self.seconds)
         return float(np.percentile(seconds, 50)), float(np.percentile(seconds, 99)), float(seconds.max())
+
+    def count(self, records: NDArray[Any]) -> list[str]:
+        """Counts statuses; one line for the first solve that did not converge."""
+        self.solves += len(records)
+        failed = records[records["status"] != pb.CONVERGED]
+        if not len(failed):
+            return []
+        first = not self.unconverged
+        self.unconverged.update(pb.SolveStatus.Name(int(s)).lower() for s in failed["status"])
+        if not first:
+            return []
+        r, status = failed[0], next(iter(self.unconverged))
+        name = self.simulation.world.bodies[int(r["body"])].name
+        return [
+            f"object {name!r}, step {int(r['step'])}: not converged ({status}, residual {float(r['residual']):.1e}); "
+            "further ones are counted"
+        ]
 
     def bad_steps(self, records: NDArray[Any]) -> list[str]:
         """One line for each object whose solve met numbers that are not finite for the first time."""

@@ -133,18 +133,24 @@ class Touch(Effect):
             self._put(kept)
         return len(alive) - len(kept)
 
+    def known(self) -> list[Interaction]:
+        """All that the loop was given last, also those that are over, with the time at which they began."""
+        if not self._applied or self._launch is None:
+            return []
+        begun = self._launch.fetch("start")
+        return [replace(a, start=float(s)) for a, s in zip(self._applied, begun, strict=True)]
+
     def alive(self) -> list[Interaction]:
         """Interactions that are not over, with the time at which they began."""
         assert self._system is not None
         time = float(self._system.clock[0])
-        if not self._applied or self._launch is None:
-            return []
-        begun = self._launch.fetch("start")
-        known = [replace(a, start=float(s)) for a, s in zip(self._applied, begun, strict=True)]
-        return [a for a in known if a.start < 0 or time + self.world.dt / 2 < a.start + a.duration]
+        return [a for a in self.known() if a.start < 0 or time + self.world.dt / 2 < a.start + a.duration]
 
     def _params(self, name: str) -> Params:
         if name not in self.params:
+            names = [body.name for body in self.world.bodies]
+            if name not in names:
+                raise TouchError(f"no object {name!r}; objects of the scene: {', '.join(names)}")
             listed = ", ".join(sorted(self.params))
             raise TouchError(f"object {name!r} does not list the effect touch; these do: {listed}")
         return self.params[name]

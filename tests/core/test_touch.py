@@ -107,6 +107,15 @@ def test_a_push_is_alive_from_when_it_is_asked_for_until_it_is_over():
     assert touch.alive() == []
 
 
+def test_what_is_over_before_anybody_looked_is_still_known():
+    """The log asks afterwards which pushes acted in which steps."""
+    sim, touch = held_bar()
+    push = touch.push("anna", "bar", END, 0.0, (0, 1, 0), 2 * H)
+    sim.engine.run(20)
+    assert touch.alive() == []
+    assert [(a.id, a.start) for a in touch.known()] == [(push.id, 0.0)]
+
+
 def test_several_interactions_add_up_at_a_node():
     sim, touch = held_bar()
     for _ in range(3):
