@@ -74,10 +74,19 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "warpfactor"
 
 
+def _make(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise CompileError(
+            f"compiled kernels cannot be kept in {folder}: {error.strerror}; WARPFACTOR_CACHE may name another folder"
+        ) from error
+
+
 def build(source: Path, defines: tuple[str, ...] = ()) -> Path:
     """Shared library of one text; compiles only what the cache lacks.
 
-    Raises CompileError with the compiler's output.
+    Raises CompileError with the compiler's output, or if there is no folder for it.
     """
     headers = sorted(p for folder in {INCLUDE, source.parent} for p in folder.iterdir() if p.suffix in (".h", ".cuh"))
     flags = [*FLAGS, *(f"-D{d}" for d in defines)]
@@ -86,7 +95,7 @@ def build(source: Path, defines: tuple[str, ...] = ()) -> Path:
     )
     library = cache_folder() / f"{source.stem}-{digest.hexdigest()[:24]}.so"
     if not library.exists():
-        library.parent.mkdir(parents=True, exist_ok=True)
+        _make(library.parent)
         scratch = library.with_suffix(f".{os.getpid()}.tmp")  # another process may build the same
         command = [compiler(), *flags, "-x", "c++", f"-I{INCLUDE}", str(source), "-o", str(scratch)]
         result = subprocess.run(command, capture_output=True, text=True)

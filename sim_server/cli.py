@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
+from sim_server.errors import InputError
+
 if TYPE_CHECKING:
     from sim_server.service import Service
     from sim_server.supervisor import Supervisor
@@ -76,6 +78,7 @@ def serve(
             service, supervisor = _set_up(closing, options)
             _announce(say, service, scene, listen)
             _wait_for_workers(service, supervisor)
+            _describe_objects(say, service)
             try:
                 service.run()
             finally:
@@ -110,7 +113,6 @@ def _set_up(closing: ExitStack, o: Options) -> "tuple[Service, Supervisor | None
     from protocol.refused import Refused
     from protocol.session import ConnectionFailed
     from sim_server.backend import CompileError
-    from sim_server.errors import InputError
     from sim_server.network.link import ServerLink
     from sim_server.recorder import Recorder
     from sim_server.service import Service
@@ -122,19 +124,28 @@ def _set_up(closing: ExitStack, o: Options) -> "tuple[Service, Supervisor | None
         link = closing.enter_context(ServerLink(o.name, o.listen, o.connect, shared_memory=o.shared_memory))
         recorder = None
         if o.record is not None:
+            _only_over_logs(o.record)
             compression = simulation.scene.record.compression
             recorder = closing.enter_context(Recorder(o.record, compression, overwrite=True, report=logging.error))
         service = Service(simulation, link, recorder, o.steps, o.realtime)
-    except (InputError, BadEndpoint, ConnectionFailed, Refused, CompileError) as error:
+    except ConnectionFailed as error:
+        _bad_input(f"{error}; is another sim-server there? --listen tcp/127.0.0.1:7448 takes another port")
+    except (InputError, BadEndpoint, Refused, CompileError) as error:
         _bad_input(str(error))
-    except OSError as error:
-        _bad_input(f"--record {o.record}: {error.strerror or error}")
     supervisor = None
     if o.workers:
         supervisor = Supervisor(o.workers, o.name, _reachable(o.listen or [DEFAULT_ENDPOINT]))
         closing.callback(supervisor.close)
         service.beside = supervisor.look
     return service, supervisor
+
+
+def _only_over_logs(path: Path) -> None:
+    """Raises InputError if something other than a log would be replaced."""
+    if path.is_file() and path.stat().st_size:
+        with path.open("rb") as file:
+            if file.read(8) != b"\x89MCAP0\r\n":
+                raise InputError(f"--record {path}: this file exists and is no MCAP log; it is left as it is")
 
 
 def _reachable(listen: list[str]) -> list[str]:
@@ -154,6 +165,16 @@ def _announce(say, service: "Service", scene: Path, listen: list[str] | None) ->
     )
 
 
+def _describe_objects(say, service: "Service") -> None:  # type: ignore[no-untyped-def]
+    """Size and mass of each object: where a mesh in millimetres or a density in g/cm3 shows."""
+    world = service.simulation.world
+    for body in world.bodies[:20]:
+        size = " x ".join(f"{s:.3g}" for s in body.mesh.rest.max(axis=0) - body.mesh.rest.min(axis=0))
+        say(f"  {body.name}: {body.last - body.first} nodes, {size} m, {world.mass[body.nodes].sum():.3g} kg")
+    if service.driver.wants_factors and service.driver.kind == "async" and not service.link.workers():
+        say("no worker yet: block Jacobi until one joins (precond-worker, or --workers 1)")
+
+
 def _wait_for_workers(service: "Service", supervisor: "Supervisor | None") -> None:
     """A run that was given workers starts when the first is there; it never waits for one afterwards."""
     end = time.monotonic() + WORKERS_JOIN
@@ -167,8 +188,17 @@ def _summary(service: "Service") -> str:
     used = sum(t.used for t in service.driver.tracks)
     return (
         f"{service.engine.step} steps; last {len(service.telemetry.seconds)}: p50 {p50:.3f}, p99 {p99:.3f}, "
-        f"max {most:.3f} ms; {used} factors used, {service.engine.loop.late_steps} late steps"
+        f"max {most:.3f} ms; {used} factors used, {service.engine.loop.late_steps} late steps; {_unconverged(service)}"
     )
+
+
+def _unconverged(service: "Service") -> str:
+    """How many solves did not reach the tolerance, and why."""
+    counts = service.telemetry.unconverged
+    if not counts:
+        return "all solves converged"
+    why = ", ".join(f"{n} {status}" for status, n in counts.most_common())
+    return f"{sum(counts.values())} of {service.telemetry.solves} solves not converged ({why})"
 
 
 def _terminate(*_: object) -> None:

@@ -54,6 +54,13 @@ def test_a_text_is_compiled_bound_and_run(folder, real, dtype):
     assert (launch.name, launch.items) == ("push.push", 5)
 
 
+def test_a_cache_that_cannot_be_made_is_named(folder, monkeypatch, tmp_path):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("WARPFACTOR_CACHE", str(tmp_path / "file" / "cache"))
+    with pytest.raises(backend.CompileError, match=r"kept in .*file/cache: Not a directory; WARPFACTOR"):
+        backend.Module("push.cu")
+
+
 def test_nothing_is_compiled_twice(folder):
     backend.Module("push.cu")
     first = libraries(folder)
