@@ -93,7 +93,7 @@ def watch(
 @app.command()
 def push(
     object: Object,
-    at: Annotated[Triple, typer.Option(metavar="X Y Z", help="Where, m.")],
+    at: Annotated[Triple, typer.Option(metavar="X Y Z", help="Where, in the world as it is now, m.")],
     force: Annotated[Triple, typer.Option(metavar="FX FY FZ", help="Force in all, N.")],
     radius: Annotated[float, typer.Option(help="Nodes so far around are pushed, m; 0 = the nearest free one.")] = 0.0,
     duration: Annotated[float, typer.Option(help="For how long, s of simulation.")] = 0.1,

@@ -8,3 +8,7 @@ class InputError(Exception):
     The text names the file, the field, the value and what is allowed. Commands print it without a traceback
     and exit with code 2.
     """
+
+
+class DeviceError(InputError):
+    """The device asked for is not there or not usable; the message says what to do."""

@@ -102,6 +102,8 @@ class Service:
         else:
             batches = [self._waiting.popleft() for _ in range(len(self._waiting))]
             records = np.concatenate(batches) if batches else np.zeros(0, self.engine.records_dtype)
+        for line in self.telemetry.count(records):
+            log.warning("%s", line)
         for line in self.telemetry.bad_steps(records):
             log.error("%s", line)
         self.telemetry.records(records)

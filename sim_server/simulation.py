@@ -17,6 +17,7 @@ from sim_server.backend import Cpu, Launch
 from sim_server.effect import Effect
 from sim_server.effects import effect
 from sim_server.engine import Engine, Kind
+from sim_server.errors import DeviceError, InputError
 from sim_server.scene import Scene, load
 from sim_server.system import System
 from sim_server.world import Body, World
@@ -55,7 +56,13 @@ class Simulation:
     @classmethod
     def load(cls, path: str | Path, overrides: Sequence[str] = (), device: str = "cpu") -> "Simulation":
         """From a scene file."""
-        return cls(load(path, overrides), device)
+        scene = load(path, overrides)
+        try:
+            return cls(scene, device)
+        except DeviceError:
+            raise
+        except InputError as error:
+            raise InputError(f"scene {scene.path.name}, {error}") from error
 
     def fetch(self) -> World:
         """The world with positions and velocities as they are on the device now."""

@@ -12,13 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_server.backend import HERE, INCLUDE, Argument, arguments_of
-from sim_server.errors import InputError
+from sim_server.errors import DeviceError
 
 BLOCK = 128  # threads of an ordinary launch
-
-
-class DeviceError(InputError):
-    """No usable GPU; the message says what to do."""
 
 
 @cache

@@ -86,7 +86,8 @@ def duplicate_nodes(rest: Rest, tets: Tets) -> str | None:
 
 def unused_nodes(rest: Rest, tets: Tets) -> str | None:
     bad = np.flatnonzero(np.bincount(tets.ravel(), minlength=len(rest)) == 0)
-    return _named("node", bad, "belongs to no tetrahedron", lambda i: f"at {_point(rest[i])}")
+    reason = "belongs to no tetrahedron (meshio: mesh.remove_orphaned_nodes())"
+    return _named("node", bad, reason, lambda i: f"at {_point(rest[i])}")
 
 
 def _point(x: NDArray[np.float64]) -> str:

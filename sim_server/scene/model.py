@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The tables of a scene file, checked, with defaults filled in. How a file becomes one: scene.py."""
 
+from dataclasses import replace
 from functools import partial
 from os.path import isfile
 from pathlib import Path
@@ -51,6 +52,7 @@ class MeshSource(Parameters):
     split: Literal["kuhn", "mirrored"] | None = Field(
         default=None, description="of the cells of a bar: kuhn (default), or mirrored, which bends without twist"
     )
+    scale: Positive | None = Field(default=None, description="of a file's coordinates: 0.001 for a mesh in mm")
     file: Annotated[str, AfterValidator(_found)] | None = Field(default=None, description="a file that meshio reads")
 
     @model_validator(mode="after")
@@ -58,6 +60,8 @@ class MeshSource(Parameters):
         given = [name for name in ("bar", "size", "file") if getattr(self, name) is not None]
         if self.split is not None and self.bar is None:
             raise complaint("split belongs to a bar")
+        if self.scale is not None and self.file is None:
+            raise complaint("scale belongs to a file; a bar has its size in m")
         if given not in (["bar", "size"], ["file"]):
             raise complaint(f"must be {{ bar = [nx, ny, nz], size = [sx, sy, sz] }} or {{ file = ... }}, not {given}")
         return self
@@ -110,7 +114,8 @@ class SceneObject(Parameters):
         source = self.mesh
         try:
             if source.file is not None:
-                return check(read(source.file))
+                mesh = read(source.file)
+                return check(replace(mesh, rest=mesh.rest * (source.scale or 1.0)))
             assert source.bar is not None and source.size is not None
             return bar(source.bar, source.size, source.split or "kuhn")
         except InputError as error:

@@ -153,8 +153,9 @@ def _row(tets: int, name: str, runs: list[dict[str, Any]]) -> dict[str, Any]:
         row[what] = float(np.median(every(what)))
     row["iterations"] = float(every("iterations").mean()) if len(every("iterations")) else None
     row["factor age"] = float(age.mean()) if len(age) and name == "async + warp" else None
-    for q in (50, 99, 100):
-        row[f"wall p{q}" if q < 100 else "wall max"] = float(np.percentile(wall, q)) if len(wall) else None
+    for q in (50, 99, 100):  # of PCG-1 the recorded wall time lacks the factorization
+        known = len(wall) and name != "PCG-1"
+        row[f"wall p{q}" if q < 100 else "wall max"] = float(np.percentile(wall, q)) if known else None
     row["residual"] = float(every("residual").max()) if len(every("residual")) else None
     return row
 
@@ -200,7 +201,11 @@ def main() -> None:
     report.table(rows)
     against = [r for r in rows if r["scheme"] == "async + warp"]
     yardstick = {r["tets"]: r["CPU ms"] for r in rows if r["scheme"] == "SciPy + CHOLMOD each step"}
-    report.say("## Against others")
+    report.say(
+        "## Against others",
+        "Aim: what we set out to reach. SOFA: v17.06 with the logic of its asynchronous LDL solver, the same mesh, "
+        "matrix and stop rule, measured on a 2.5 GHz Cascade Lake virtual machine (dgemm 1000 in 35 ms on one thread).",
+    )
     report.table(
         [
             {

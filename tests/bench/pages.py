@@ -37,11 +37,11 @@ def cpu_table(found: dict[str, Any]) -> str:
         lines.append(
             {
                 "tetrahedra": f"{tets:,}",
-                "**Warpfactor**": f"**{ours['CPU ms']:.2g} ms**",
+                "**Warpfactor**": f"**{ours['CPU ms']:.3g} ms**",
                 "iterations": ours["iterations"],
-                "step p50 / p99": f"{ours['wall p50']:.2g} / {ours['wall p99']:.2g} ms",
-                "plain CG, ours": f"{by[tets, 'CG']['CPU ms']:.2g} ms",
-                "SciPy + CHOLMOD each step": f"{by[tets, 'SciPy + CHOLMOD each step']['CPU ms']:.2g} ms",
+                "step p50 / p99": f"{ours['wall p50']:.3g} / {ours['wall p99']:.3g} ms",
+                "plain CG, ours": f"{by[tets, 'CG']['CPU ms']:.3g} ms",
+                "SciPy + CHOLMOD each step": f"{by[tets, 'SciPy + CHOLMOD each step']['CPU ms']:.3g} ms",
             }
         )
     machine = found["header"]["machine"]

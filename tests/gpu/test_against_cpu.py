@@ -13,7 +13,8 @@ pytestmark = pytest.mark.gpu
 
 @pytest.fixture(autouse=True)
 def gpu():
-    from sim_server.gpu.device import DeviceError, cupy
+    from sim_server.errors import DeviceError
+    from sim_server.gpu.device import cupy
 
     try:
         cupy()

@@ -11,6 +11,7 @@ import pytest
 from sim_server.errors import InputError
 from sim_server.mesh import Mesh, bar, check, read
 from sim_server.mesh.surface import volumes
+from sim_server.scene import load
 
 CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]])
 TETS = np.array([[0, 1, 2, 3], [4, 2, 1, 3]])
@@ -131,3 +132,17 @@ def test_check_lets_slivers_and_small_units_through():
     assert check(box) is box
     far = Mesh(box.rest * 1e6 + 1000.0, box.tets)
     assert check(far) is far
+
+
+def test_a_file_in_millimetres_is_scaled(tmp_path):
+    import meshio
+
+    mesh = bar((2, 1, 1), (20.0, 10.0, 10.0))
+    meshio.Mesh(mesh.rest, [("tetra", mesh.tets)]).write(tmp_path / "mm.vtk")
+    scene = tmp_path / "scene.toml"
+    scene.write_text('dt = 0.01\n[[object]]\nname = "a"\nmesh = { file = "mm.vtk", scale = 0.001 }\n')
+    loaded = load(scene).objects[0].load_mesh()
+    assert np.allclose(loaded.rest.max(axis=0), [0.02, 0.01, 0.01])
+    scene.write_text('dt = 0.01\n[[object]]\nname = "a"\nmesh = { bar = [1, 1, 1], size = [1, 1, 1], scale = 2 }\n')
+    with pytest.raises(InputError, match="scale belongs to a file"):
+        load(scene)

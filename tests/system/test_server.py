@@ -14,6 +14,7 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from clients.errors import BadInput
 from clients.log import Log
+from tests.system.link_helpers import free_endpoint
 from tests.system.server_process import Stage, alive, beam, run, until
 
 pytestmark = pytest.mark.system
@@ -209,3 +210,15 @@ def test_a_taken_port_is_told(stage: Stage, tmp_path: Path) -> None:
     with stage.client():
         result = run("sim_server", str(beam(tmp_path)), "--listen", stage.endpoint, "--steps", "1")
     assert result.returncode == 2 and stage.endpoint in result.stderr, result.stderr
+
+
+def test_it_says_what_did_not_converge_and_writes_over_nothing_but_logs(tmp_path: Path) -> None:
+    scene = beam(tmp_path)
+    arguments = ["--steps", "3", "--free-run", "--listen", free_endpoint()]
+    result = run("sim_server", str(scene), *arguments, "--set", "solver.max_iterations=2")
+    assert result.returncode == 0 and "3 of 3 solves not converged (3 max_iterations)" in result.stdout
+    assert "step 1: not converged (max_iterations, residual" in result.stderr
+    before = scene.read_text()
+    result = run("sim_server", str(scene), *arguments, "--record", str(scene))
+    assert result.returncode == 2 and "is no MCAP log" in result.stderr
+    assert scene.read_text() == before
