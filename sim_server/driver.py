@@ -187,13 +187,16 @@ class Driver:
                 t.wanted = None
                 return False
             self._collect()
-            if time.monotonic() - asked > 1 and not getattr(self.source, "workers", lambda: [1])():
+            patient = not self._alone and time.monotonic() - asked < 1  # a worker may be about to join
+            if not patient and not getattr(self.source, "workers", lambda: [1])():
                 if not self._alone:
                     log.warning("lockstep without a worker: factors are made in this process")
                 self._alone = True
                 self.inline.submit(job)
                 break
             time.sleep(2e-4)
+        else:
+            self._alone = False
         t.in_flight, t.sent, t.wanted, t.excess = True, step, None, 0.0
         return True
 
