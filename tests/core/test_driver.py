@@ -128,6 +128,19 @@ def patterns_of(sim: Simulation) -> dict:
     return {b.name: sim.system.body_pattern(b.first, b.last) for b in sim.world.bodies}
 
 
+def test_the_shaken_one_of_four_is_served_most():
+    """Each gets its first factor; from then on the sum of excess iterations decides."""
+    sim = falling(*(bar((4, 2, 2), name=f"beam{k}", young=1e6, fixed="X < 0.01") for k in range(4)), update="async")
+    driver, shaken, rng = Driver(sim), sim.world.bodies[2], np.random.default_rng(0)
+    for _ in range(60):
+        sim.world.v[shaken.nodes] += rng.normal(size=(shaken.last - shaken.first, 3))
+        driver.advance(1)
+    used = [t.used for t in driver.tracks]
+    calm = used[:2] + used[3:]
+    assert min(calm) >= 1
+    assert used[2] > 2 * max(calm)
+
+
 def test_a_failed_factorization_does_not_stop_a_run(caplog):
     """In lockstep the step at which it was due goes on with the factor before, and a new matrix goes out."""
     sim = falling(update="lockstep-3")
