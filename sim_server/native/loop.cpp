@@ -155,9 +155,9 @@ void wf_assemble(Loop* loop) {
 }
 
 void wf_solve(Loop* loop) {
-    double entered = now();
     int64_t first = loop->record_head.load();
     bool keep = room(*loop, loop->record_head, loop->record_tail, loop->record_capacity - loop->bodies);
+    double entered = now();  // waiting for room is no part of the step
 #pragma omp parallel for num_threads(loop->threads) schedule(dynamic, 1) if (loop->threads > 1 && loop->bodies > 1)
     for (int i = 0; i < loop->bodies; ++i) {
         Body& body = loop->body[i];
