@@ -202,7 +202,7 @@ REFUSED = {
     "a push of duration NaN": ("push", {"duration": float("nan")}, "must be above 0"),
     "a negative radius": ("push", {"radius": -1.0}, "radius = -1 m: must not be negative"),
     "nothing within reach": ("push", {"point": (50.0, 0.0, 0.0)}, r"'bar' within 0.6 m .*nearest is 48"),
-    "an unknown object": ("push", {"name": "beam"}, "object 'beam' does not list the effect touch; these do: bar"),
+    "an unknown object": ("push", {"name": "beam"}, "no object 'beam'; objects of the scene: bar"),
     "a grab without stiffness": ("grab", {"stiffness": 0.0}, "stiffness = 0 N/m"),
     "a grab with stiffness NaN": ("grab", {"stiffness": float("nan")}, "must be above 0"),
     "a grab of negative duration": ("grab", {"duration": -1.0}, "must be above 0"),
@@ -252,3 +252,9 @@ def test_what_a_lost_client_held_is_let_go_and_others_are_left_alone():
     assert touch.release_all("anna") == 2
     assert [a.id for a in touch.alive()] == [push.id, other.id]  # a push ends by itself
     assert touch.release_all("nobody") == 0
+
+
+def test_an_object_that_does_not_list_touch_is_not_touched():
+    sim = Simulation.load("deploy/scenes/four_beams.toml")
+    with pytest.raises(TouchError, match="object 'beam2' does not list the effect touch; these do: beam1"):
+        sim.effects["touch"].push("anna", "beam2", (2.0, 0.5, 4.0), 0.5, (0.0, 1.0, 0.0), 1.0)
