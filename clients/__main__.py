@@ -146,6 +146,14 @@ def grab(
     print("released")
 
 
+def _command(verb: str, connect: Connect, server: str) -> None:
+    """Sends a command that needs nothing but its verb."""
+    from clients.client import Client
+
+    with Client(server, connect) as client:
+        client.command(verb)
+
+
 @app.command()
 def pause(connect: Connect = None, server: Server = SERVER_NAME) -> None:
     """Halt the simulation; the server goes on answering.
@@ -154,10 +162,7 @@ def pause(connect: Connect = None, server: Server = SERVER_NAME) -> None:
     Examples:
       sim-client pause
     """
-    from clients.client import Client
-
-    with Client(server, connect) as client:
-        client.pause()
+    _command("pause", connect, server)
 
 
 @app.command()
@@ -168,10 +173,7 @@ def resume(connect: Connect = None, server: Server = SERVER_NAME) -> None:
     Examples:
       sim-client resume
     """
-    from clients.client import Client
-
-    with Client(server, connect) as client:
-        client.resume()
+    _command("resume", connect, server)
 
 
 @app.command()
@@ -182,10 +184,7 @@ def stop(connect: Connect = None, server: Server = SERVER_NAME) -> None:
     Examples:
       sim-client stop
     """
-    from clients.client import Client
-
-    with Client(server, connect) as client:
-        client.stop()
+    _command("stop", connect, server)
 
 
 @app.command()

@@ -92,7 +92,8 @@ class Service:
             reply(self.commands.carry_out(command))
         clients = set(self.link.clients())
         if clients != self._clients:
-            self.commands.gone(clients) if "touch" in self.simulation.effects else None
+            if "touch" in self.simulation.effects:
+                self.commands.gone(clients)
             self._clients = clients
         self.telemetry.publish_status(self._state(), force=False)
 

@@ -74,9 +74,9 @@ class World:
 
     def body(self, name: str) -> Body:
         """By name; raises KeyError."""
-        return next((b for b in self.bodies if b.name == name), None) or self._unknown(name)
-
-    def _unknown(self, name: str) -> Body:
+        for body in self.bodies:
+            if body.name == name:
+                return body
         raise KeyError(f"no object {name!r}; there are {', '.join(b.name for b in self.bodies)}")
 
     def with_effect(self, name: str) -> list[tuple[Body, Any]]:
