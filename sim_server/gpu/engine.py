@@ -21,40 +21,12 @@ from sim_server.engine import RECORD
 from sim_server.gpu.device import DeviceLaunch, DeviceModule, Gpu
 from sim_server.gpu.expand import LIMIT, Expanded, Expansion
 from sim_server.gpu.fuse import fused
+from sim_server.gpu.solver import RESULT, Solver
 
 log = logging.getLogger(__name__)
 
 Reals = NDArray[np.float64]
-THREADS = 512
 CAPACITY = 256  # results kept on the device: steps per batch at most
-
-BODY = np.dtype(
-    [
-        ("first", "i4"), ("nodes", "i4"), ("block", "i4"), ("blocks", "i4"), ("kind", "i4"), ("max_iterations", "i4"),
-        ("warm_start", "i4"), ("probe", "i4"), ("tolerance", "f8"), ("inverse", "u8"), ("factor_step", "i8"),
-        ("scale", "u8"), ("stride", "i4"), ("unused", "i4"),
-    ]
-)  # fmt: skip
-RESULT = np.dtype(
-    [
-        ("residual", "f8"), ("seconds", "f8"), ("factor_step", "i8"), ("iterations", "i4"), ("status", "i4"),
-        ("kind", "i4"), ("asked", "i4"), ("fallbacks", "i4"), ("bad_node", "i4"),
-    ]
-)  # fmt: skip
-_POINTERS = (
-    "row_start", "columns", "values", "b", "y", "r", "p", "z", "q", "diagonal", "partial", "arrived", "step", "results",
-)  # fmt: skip
-SOLVE = np.dtype(
-    [
-        ("bodies", "u8"),
-        ("count", "i4"),
-        ("capacity", "i4"),
-        *((name, "u8") for name in _POINTERS),
-        ("nodes", "i4"),
-        ("shared", "i4"),
-    ],
-    align=True,
-)
 
 
 class _Settings:
@@ -82,21 +54,11 @@ class GpuEngine:
     ):  # fmt: skip
         self.gpu, self.launches, self._before = gpu, [*assemble, *integrate], len(assemble)
         self._arrays, self.batch, self.dt = arrays, min(batch, CAPACITY), dt
-        cp, nodes = gpu.cp, len(arrays["x"])
-        self._bodies = np.zeros(len(ranges), BODY)
-        self._bodies["first"] = [first for first, _ in ranges]
-        self._bodies["nodes"] = [last - first for first, last in ranges]
-        self._share_blocks(gpu.properties["multiProcessorCount"])
+        cp = gpu.cp
         self.stream = cp.cuda.Stream(non_blocking=True, priority=-5)
-        self._device_bodies = cp.zeros(self._bodies.nbytes, np.uint8)
-        self._results = cp.zeros(CAPACITY * len(ranges) * RESULT.itemsize, np.uint8)
         self._counter = cp.zeros(1, np.int64)
-        self._arrived = cp.zeros(len(ranges), np.uint32)
-        self._work = {
-            "r": cp.zeros(6 * nodes), "p": cp.zeros(6 * nodes), "z": cp.zeros(3 * nodes), "q": cp.zeros(3 * nodes),
-            "diagonal": cp.zeros(9 * nodes), "partial": cp.zeros(4 * self._grid * len(ranges)),
-        }  # fmt: skip
-        self._solve = self._solver(nodes)
+        self.solver = Solver(gpu, ranges, arrays, self._counter, CAPACITY)
+        self._bodies = self.solver.bodies
         self._tick = DeviceModule("gpu/tick.cu", gpu).function("tick")
         self._graphs: dict[int, Any] = {}
         self._fused = fused(gpu, self.launches[: self._before])
@@ -116,48 +78,6 @@ class GpuEngine:
         self.step = 0
         self._upload()
 
-    def _share_blocks(self, processors: int) -> None:
-        """Thread blocks by size of body, at least one each; bodies beyond the processors queue."""
-        nodes = self._bodies["nodes"].astype(float)
-        count = len(nodes)
-        self._grid = processors
-        if count >= processors:
-            self._bodies["block"] = np.arange(count) % processors
-            self._bodies["blocks"] = 1
-            return
-        share = np.maximum(1, np.floor(nodes / nodes.sum() * (processors - count)).astype(int))
-        self._bodies["blocks"] = share
-        self._bodies["block"] = np.concatenate([[0], np.cumsum(share)[:-1]])
-
-    def _solver(self, nodes: int) -> Any:
-        a, twin = self._arrays, self.gpu.twin
-        params = np.zeros((), SOLVE)
-        params["bodies"], params["count"] = self._device_bodies.data.ptr, len(self._bodies)
-        params["capacity"] = CAPACITY
-        for name in ("row_start", "columns", "values", "b", "y"):
-            params[name] = twin(a[name]).data.ptr
-        for name, array in self._work.items():
-            params[name] = array.data.ptr
-        params["arrived"], params["step"] = self._arrived.data.ptr, self._counter.data.ptr
-        params["results"], params["nodes"] = self._results.data.ptr, nodes
-        function = DeviceModule("gpu/pcg.cu", self.gpu, cooperative=True).function("pcg")
-        shared = self._shared_memory()
-        params["shared"] = shared
-        function.max_dynamic_shared_size_bytes = shared
-        return lambda: function((self._grid,), (THREADS,), (params,), shared_mem=shared)
-
-    def _shared_memory(self) -> int:
-        """Bytes per thread block for the residual and the rows of A of the body that needs most, if they fit."""
-        start = self._arrays["row_start"].astype(np.int64)
-        most = 0
-        for row in self._bodies:
-            first, nodes, parts = int(row["first"]), int(row["nodes"]), int(row["blocks"])
-            cut = first + nodes * np.arange(parts + 1) // parts
-            blocks, rows = int(np.diff(start[cut]).max()), int(np.diff(cut).max())
-            most = max(most, 4 * (-(-3 * nodes // 8) * 8) + 76 * blocks + 4 * rows + 32)
-        available = int(self.gpu.properties["sharedMemPerBlockOptin"]) - 1024
-        return min(most, available)
-
     # --- running ------------------------------------------------------------------------------------------------
 
     def _one_step(self) -> None:
@@ -168,11 +88,11 @@ class GpuEngine:
 
     def _finish_step(self) -> None:
         """Solve, integrate, count."""
-        self._solve()
+        self.solver.launch()
         for launch in self.launches[self._before :]:
             launch()
         clock, bodies = self.gpu.twin(self._arrays["clock"]), len(self._bodies)
-        self._tick((1,), (256,), (clock, self._counter, np.float64(self.dt), self._arrived, np.int32(bodies)))
+        self._tick((1,), (256,), (clock, self._counter, np.float64(self.dt), self.solver.arrived, np.int32(bodies)))
 
     def _graph(self) -> Any:
         if 1 not in self._graphs:
@@ -252,7 +172,7 @@ class GpuEngine:
 
     def _report(self, size: int, begin: float, seconds: float) -> None:
         count = len(self._bodies)
-        all_results = self._results.get(stream=self.stream).view(RESULT).reshape(CAPACITY, count)
+        all_results = self.solver.results.get(stream=self.stream).view(RESULT).reshape(CAPACITY, count)
         found = all_results[np.arange(self.step, self.step + size) % CAPACITY]
         records = np.zeros((size, count), RECORD)
         records["step"] = np.arange(self.step + 1, self.step + size + 1)[:, None]
@@ -279,7 +199,7 @@ class GpuEngine:
         return _Settings(self._bodies[body : body + 1].reshape(()))
 
     def _upload(self) -> None:
-        self._device_bodies.set(self._bodies.view(np.uint8), stream=self.stream)
+        self.solver._rows.set(self._bodies.view(np.uint8), stream=self.stream)
         self._changed = False
 
     def _look_into_mail(self, patient: bool = False) -> None:
@@ -291,8 +211,7 @@ class GpuEngine:
                 made.event.synchronize()
             if not made.event.done:
                 continue
-            row = self._bodies[body]
-            row["inverse"], row["scale"], row["stride"], row["factor_step"] = *made[:3], step
+            self.solver.use(body, made, step)
             self._changed = True
             with self._lock:
                 if self._factors[body][1] is made:
@@ -333,8 +252,7 @@ class GpuEngine:
 
     def factor_bytes(self, body: int) -> int:
         """Of the inverse that an application reads."""
-        row = self._bodies[body]
-        return int(row["stride"]) * 6 * int(row["nodes"]) if row["inverse"] else 0
+        return self.solver.factor_bytes(body)
 
     def request_matrix(self, body: int, target: Reals) -> None:
         """The values of A are copied into `target` after the next step."""
