@@ -2,7 +2,7 @@
 """The native simulation loop as seen from Python: its memory, its mailboxes and what it reports.
 
 `Engine.run` lets go of Python's lock for as long as it runs. Everything else here only puts things into mailboxes or
-reads what the loop has left in its rings, and may be called from another thread meanwhile. Layouts: native/loop.cpp.
+reads what the loop has left in its rings, and may be called from another thread meanwhile. Layouts: layouts.py.
 """
 
 import ctypes as c
@@ -16,7 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import FactorPattern
+from sim_server import layouts
 from sim_server.backend import Launch, native
+from sim_server.layouts import RECORD
+from sim_server.rings import Reports
 
 Reals = NDArray[np.float64]
 
@@ -30,88 +33,22 @@ class Kind(IntEnum):
     CHOLESKY = 3
 
 
-class _Pattern(c.Structure):
-    _fields_ = [
-        ("size", c.c_int32), ("supernodes", c.c_int32), ("permutation", c.c_void_p), ("super_start", c.c_void_p),
-        ("row_start", c.c_void_p), ("rows", c.c_void_p), ("value_start", c.c_void_p),
-    ]  # fmt: skip
-
-
-class _Factor(c.Structure):
-    _fields_ = [
-        ("pattern", c.POINTER(_Pattern)), ("values", c.c_void_p), ("step", c.c_int64), ("bytes", c.c_int32),
-        ("unused", c.c_int32),
-    ]  # fmt: skip
-
-
-class _Settings(c.Structure):
-    _fields_ = [
-        ("tolerance", c.c_double), ("budget", c.c_double), ("max_iterations", c.c_int32), ("kind", c.c_int32),
-        ("warm_start", c.c_int32), ("probe", c.c_int32),
-    ]  # fmt: skip
-
-
-class _Binding(c.Structure):
-    _fields_ = [("params", c.c_void_p), ("items", c.c_int32), ("unused", c.c_int32)]
-
-
-class _Launch(c.Structure):
-    _fields_ = [("kernel", c.c_void_p), ("binding", c.c_void_p), ("mail", c.c_void_p)]
-
-
-class _Body(c.Structure):
-    _fields_ = [
-        ("first", c.c_int32), ("last", c.c_int32), ("settings", _Settings), ("factor", c.c_void_p),
-        ("mail", c.c_void_p), ("snapshot", c.c_void_p), ("snapshot_step", c.c_int64), ("steps", c.c_int64),
-    ]  # fmt: skip
-
-
-RECORD = np.dtype(
-    [
-        ("step", "i8"), ("factor_step", "i8"), ("time", "f8"), ("residual", "f8"), ("assemble", "f8"), ("solve", "f8"),
-        ("integrate", "f8"), ("whole", "f8"), ("late", "f8"), ("begin", "f8"), ("cpu", "f8"), ("body", "i4"),
-        ("iterations", "i4"), ("status", "i4"), ("kind", "i4"), ("asked", "i4"), ("fallbacks", "i4"),
-        ("bad_node", "i4"), ("unused", "i4"),
-    ]
-)  # fmt: skip
-"""One body, one step: what the loop reports. Seconds, except step numbers; `step` counts completed steps."""
-
-
-class _Loop(c.Structure):
-    _fields_ = [
-        ("launches", c.c_int32), ("before", c.c_int32), ("launch", c.POINTER(_Launch)), ("bodies", c.c_int32),
-        ("nodes", c.c_int32), ("body", c.POINTER(_Body)), ("row_start", c.c_void_p), ("columns", c.c_void_p),
-        ("values", c.c_void_p), ("b", c.c_void_p), ("y", c.c_void_p), ("x", c.c_void_p), ("v", c.c_void_p),
-        ("work", c.c_void_p), ("clock", c.c_void_p), ("dt", c.c_double), ("start_time", c.c_double),
-        ("step", c.c_int64), ("records", c.c_void_p), ("record_capacity", c.c_int64), ("record_head", c.c_int64),
-        ("record_tail", c.c_int64), ("frames", c.c_void_p), ("frame_steps", c.c_void_p), ("frame_capacity", c.c_int64),
-        ("frame_every", c.c_int64), ("frame_head", c.c_int64), ("frame_tail", c.c_int64),
-        ("frames_dropped", c.c_int64), ("records_dropped", c.c_int64), ("late_steps", c.c_int64),
-        ("realtime", c.c_int32), ("patient", c.c_int32), ("threads", c.c_int32), ("stop", c.c_int32),
-        ("pause", c.c_int32), ("deadline", c.c_double), ("assemble_begin", c.c_double),
-        ("assemble_seconds", c.c_double), ("late", c.c_double), ("cpu_begin", c.c_double),
-    ]  # fmt: skip
-
-
 @cache
 def _library() -> c.CDLL:
-    loop, p = c.POINTER(_Loop), c.c_void_p
+    loop, p = c.POINTER(layouts.Loop), c.c_void_p
     library = native(
         "native/loop.cpp",
         {
             "wf_assemble": (None, [loop]), "wf_solve": (None, [loop]), "wf_run": (c.c_int64, [loop, c.c_int64]),
             "wf_wait": (c.c_int32, [loop]),
-            "wf_post_factor": (p, [c.POINTER(_Body), p]), "wf_post_binding": (p, [c.POINTER(_Launch), p]),
-            "wf_apply_factor": (None, [c.POINTER(_Factor), p, p, p]), "wf_sizes": (c.c_int32, [p]),
+            "wf_post_factor": (p, [c.POINTER(layouts.Body), p]), "wf_post_binding": (p, [c.POINTER(layouts.Launch), p]),
+            "wf_apply_factor": (None, [c.POINTER(layouts.Factor), p, p, p]), "wf_sizes": (c.c_int32, [p]),
         },
     )  # fmt: skip
     sizes = (c.c_int32 * 6)()
     library.wf_sizes(sizes)
-    ours = (
-        [c.sizeof(t) for t in (_Launch, _Body)] + [RECORD.itemsize] + [c.sizeof(t) for t in (_Loop, _Factor, _Pattern)]
-    )
-    if list(sizes) != ours:
-        raise RuntimeError(f"native/loop.cpp and engine.py disagree on layouts: {list(sizes)} and {ours}")
+    shared = (layouts.Launch, layouts.Body, layouts.Loop, layouts.Factor, layouts.Pattern)
+    layouts.check_sizes("native/loop.cpp", list(sizes), [*(c.sizeof(t) for t in shared), RECORD.itemsize])
     return library
 
 
@@ -124,11 +61,11 @@ class NativeFactor:
         width, height = np.diff(pattern.super_start).astype(np.int64), np.diff(pattern.row_start)
         sizes = width * height - width * (width - 1) // 2
         self._value_start = np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64)
-        self._pattern = _Pattern(
+        self._pattern = layouts.Pattern(
             pattern.size, len(width), pattern.permutation.ctypes.data, pattern.super_start.ctypes.data,
             pattern.row_start.ctypes.data, pattern.rows.ctypes.data, self._value_start.ctypes.data,
         )  # fmt: skip
-        self.native = _Factor(c.pointer(self._pattern), self.values.ctypes.data, -1, self.values.itemsize, 0)
+        self.native = layouts.Factor(c.pointer(self._pattern), self.values.ctypes.data, -1, self.values.itemsize, 0)
 
     @property
     def address(self) -> int:
@@ -157,7 +94,7 @@ class Mailbox:
     in_use: NativeFactor | None = None  # as far as the mailbox has told
 
 
-class Engine:
+class Engine(Reports):
     """The loop over one system.
 
     assemble, integrate: the launches of a step, in order. ranges: nodes [first, last) of each body. arrays: those of
@@ -171,33 +108,25 @@ class Engine:
         self._native = _library()
         launches = [*assemble, *integrate]
         nodes, bodies = len(arrays["x"]), len(ranges)
-        self.launches, self._bindings = launches, [_Binding(c.addressof(x.params), x.items, 0) for x in launches]
-        self._launch = (_Launch * max(len(launches), 1))()
+        self.launches, self._bindings = launches, [layouts.Binding(c.addressof(x.params), x.items, 0) for x in launches]
+        self._launch = (layouts.Launch * max(len(launches), 1))()
         for entry, launch, binding in zip(self._launch, launches, self._bindings, strict=False):
             entry.kernel, entry.binding = launch.function, c.addressof(binding)
-        self._body = (_Body * bodies)()
+        self._body = (layouts.Body * bodies)()
         for entry_body, (first, last) in zip(self._body, ranges, strict=True):
             entry_body.first, entry_body.last, entry_body.snapshot_step = first, last, -1
-        self._records = np.zeros(max(records, 4 * bodies), RECORD)
-        self._frames = np.zeros((frames, 2, nodes, 3))
-        self._frame_steps = np.zeros(frames, np.int64)
         self._work = np.zeros(45 * nodes)
         self._arrays = arrays
         self._mail: list[Mailbox] = [Mailbox([]) for _ in ranges]
         self._copies: list[Reals | None] = [None] * bodies
         self._posted: dict[int, Any] = {}
-        loop = self.loop = _Loop()
+        loop = layouts.Loop()
+        super().__init__(loop, bodies, dt, records, np.zeros((frames, 2, nodes, 3)))
         loop.launches, loop.before, loop.launch = len(launches), len(assemble), self._launch
-        loop.bodies, loop.nodes, loop.body, loop.dt = bodies, nodes, self._body, dt
+        loop.bodies, loop.nodes, loop.body = bodies, nodes, self._body
         for name in ("row_start", "columns", "values", "b", "y", "x", "v", "clock"):
             setattr(loop, name, arrays[name].ctypes.data)
         loop.work, loop.threads = self._work.ctypes.data, threads
-        loop.records, loop.record_capacity = self._records.ctypes.data, len(self._records)
-        loop.frames, loop.frame_steps, loop.frame_capacity = (
-            self._frames.ctypes.data,
-            self._frame_steps.ctypes.data,
-            frames,
-        )
 
     # --- running ------------------------------------------------------------------------------------------------
 
@@ -220,14 +149,7 @@ class Engine:
         """
         return bool(self._native.wf_wait(c.byref(self.loop)))
 
-    records_dtype = RECORD
-
-    @property
-    def step(self) -> int:
-        """Steps completed."""
-        return int(self.loop.step)
-
-    def settings(self, body: int) -> _Settings:
+    def settings(self, body: int) -> layouts.Settings:
         """Solver settings of a body; what is set holds from its next solve on."""
         return self._body[body].settings
 
@@ -266,7 +188,7 @@ class Engine:
     def factor_step(self, body: int) -> int:
         """Step of the factor in use, -1 without one."""
         address = self._body[body].factor
-        return int(c.cast(address, c.POINTER(_Factor)).contents.step) if address else -1
+        return int(c.cast(address, c.POINTER(layouts.Factor)).contents.step) if address else -1
 
     def factor_bytes(self, body: int) -> int:
         """Size of the values of the factor buffers of a body, 0 while there are none."""
@@ -289,7 +211,7 @@ class Engine:
 
     def replace(self, launch: int, new: Launch) -> None:
         """Gives a launch other arguments, from the next step on."""
-        binding = _Binding(c.addressof(new.params), new.items, 0)
+        binding = layouts.Binding(c.addressof(new.params), new.items, 0)
         displaced = self._native.wf_post_binding(c.byref(self._launch[launch]), c.addressof(binding))
         kept = self._posted.setdefault(launch, [])  # in use, waiting
         if displaced:
@@ -297,22 +219,3 @@ class Engine:
         else:
             del kept[:-1]  # the last one was taken up, so those before are done with
         kept.append((binding, new))
-
-    # --- reports ------------------------------------------------------------------------------------------------
-
-    def records(self) -> NDArray[Any]:
-        """New records since the last call, oldest first, (k,) of RECORD."""
-        head, tail, size = int(self.loop.record_head), int(self.loop.record_tail), len(self._records)
-        out = self._records[np.arange(tail, head) % size]
-        self.loop.record_tail = head
-        return out
-
-    def frames(self) -> list[tuple[int, Reals, Reals]]:
-        """New frames since the last call: (step, x (n, 3), v (n, 3)), copied."""
-        head, tail = int(self.loop.frame_head), int(self.loop.frame_tail)
-        out = []
-        for k in range(tail, head):
-            slot = k % len(self._frame_steps)
-            out.append((int(self._frame_steps[slot]), self._frames[slot, 0].copy(), self._frames[slot, 1].copy()))
-            self.loop.frame_tail = k + 1
-        return out

@@ -2,10 +2,7 @@
 // The simulation loop. It runs the launches of a step, solves each body, and exchanges data with the rest of the server only
 // through mailboxes: an atomic pointer or flag each, looked at between solves, never waited for. The caller (ctypes) has let
 // go of Python's lock, so no Python code, network, worker or disk can delay a step.
-#include <atomic>
-#include <cmath>
 #include <cstring>
-#include <ctime>
 
 #include "pcg.h"
 
@@ -33,16 +30,6 @@ struct Body {
     int64_t steps;                      // solved so far
 };
 
-struct Record {
-    int64_t step;          // steps completed
-    int64_t factor_step;   // -1: no factor used
-    double time;           // s, at the end of the step
-    double residual;
-    double assemble, solve, integrate, whole, late, begin;  // s; begin: steady clock
-    double cpu;            // s of processor time of the thread, whole step
-    int32_t body, iterations, status, kind, asked, fallbacks, bad_node, unused;
-};
-
 struct Loop {
     int32_t launches, before;          // launches; how many of them assemble (the others integrate)
     Launch* launch;
@@ -57,41 +44,13 @@ struct Loop {
     double* v;
     double* work;                      // 45 doubles a node
     double* clock;                     // (1,) s, read by kernels
-    double dt;
-    double start_time;
-    int64_t step;                      // completed
-
-    Record* records;                   // ring
-    int64_t record_capacity;
-    std::atomic<int64_t> record_head, record_tail;
-    double* frames;                    // ring of (2, nodes, 3): x, v
-    int64_t* frame_steps;
-    int64_t frame_capacity;
-    std::atomic<int64_t> frame_every;      // 0: none; set from outside as viewers come and go
-    std::atomic<int64_t> frame_head, frame_tail;
-    std::atomic<int64_t> frames_dropped, records_dropped, late_steps;
-
-    int32_t realtime;                  // keep pace with the wall clock
-    int32_t patient;                   // wait for room in the rings instead of dropping (no deadline to miss)
     int32_t threads;                   // of this process, for launches and bodies
-    std::atomic<int32_t> stop, pause;
-    double deadline;                   // steady clock, of the next step; 0: now
+    int32_t unused;
     double assemble_begin;
     double assemble_seconds;
-    double late;
     double cpu_begin;
+    Rings rings;
 };
-
-static double thread_time() {
-    timespec t;
-    clock_gettime(CLOCK_THREAD_CPUTIME_ID, &t);
-    return t.tv_sec + 1e-9 * t.tv_nsec;
-}
-
-static void nap(double seconds) {
-    timespec t{(time_t)seconds, (long)((seconds - std::floor(seconds)) * 1e9)};
-    nanosleep(&t, nullptr);
-}
 
 static void run(Launch& l, int threads) {
     if (const Binding* next = l.mail.exchange(nullptr)) l.binding = next;
@@ -111,28 +70,28 @@ static void copy_matrix(Loop& loop, Body& body) {
     int64_t begin = loop.row_start[body.first], end = loop.row_start[body.last];
     std::memcpy(target, loop.values + 9 * begin, 9 * sizeof(double) * (end - begin));
     body.snapshot.store(nullptr, std::memory_order_relaxed);
-    body.snapshot_step.store(loop.step, std::memory_order_release);
+    body.snapshot_step.store(loop.rings.step, std::memory_order_release);
 }
 
-// A full ring: wait if nobody minds, else say no.
-static bool room(Loop& loop, std::atomic<int64_t>& head, std::atomic<int64_t>& tail, int64_t capacity) {
-    while (head.load() - tail.load(std::memory_order_acquire) >= capacity) {
-        if (!loop.patient || loop.stop.load()) return false;
+static bool room_for_frame(Rings& rings) {
+    while (rings.frame_head.load() - rings.frame_tail.load(std::memory_order_acquire) >= rings.frame_capacity) {
+        if (!rings.patient || rings.stop.load()) return false;
         nap(2e-4);
     }
     return true;
 }
 
 static void write_frame(Loop& loop) {
-    const int64_t every = loop.frame_every.load();  // once: it may become 0 meanwhile
-    if (every <= 0 || loop.step % every) return;
-    if (!room(loop, loop.frame_head, loop.frame_tail, loop.frame_capacity)) { ++loop.frames_dropped; return; }
-    int64_t slot = loop.frame_head.load() % loop.frame_capacity, size = 3 * (int64_t)loop.nodes;
-    double* frame = loop.frames + 2 * size * slot;
+    Rings& rings = loop.rings;
+    const int64_t every = rings.frame_every.load();  // once: it may become 0 meanwhile
+    if (every <= 0 || rings.step % every) return;
+    if (!room_for_frame(rings)) { ++rings.frames_dropped; return; }
+    int64_t slot = rings.frame_head.load() % rings.frame_capacity, size = 3 * (int64_t)loop.nodes;
+    double* frame = rings.frames + 2 * size * slot;
     std::memcpy(frame, loop.x, sizeof(double) * size);
     std::memcpy(frame + size, loop.v, sizeof(double) * size);
-    loop.frame_steps[slot] = loop.step;
-    loop.frame_head.fetch_add(1, std::memory_order_release);
+    rings.frame_steps[slot] = rings.step;
+    rings.frame_head.fetch_add(1, std::memory_order_release);
 }
 
 static int first_bad_node(const Loop& loop, const Body& body) {
@@ -146,8 +105,9 @@ extern "C" {
 
 void wf_assemble(Loop* loop) {
     double begin = now();
+    Rings& rings = loop->rings;
     loop->cpu_begin = thread_time();
-    loop->clock[0] = loop->start_time + loop->step * loop->dt;
+    loop->clock[0] = rings.start_time + rings.step * rings.dt;
     for (int i = 0; i < loop->before; ++i) run(loop->launch[i], loop->threads);
     for (int i = 0; i < loop->bodies; ++i) copy_matrix(*loop, loop->body[i]);
     loop->assemble_begin = begin;
@@ -155,9 +115,11 @@ void wf_assemble(Loop* loop) {
 }
 
 void wf_solve(Loop* loop) {
-    int64_t first = loop->record_head.load();
-    bool keep = room(*loop, loop->record_head, loop->record_tail, loop->record_capacity - loop->bodies);
-    double entered = now();  // waiting for room is no part of the step
+    Rings& rings = loop->rings;
+    int64_t first = rings.record_head.load(), step = rings.step + 1;
+    double entered = now();
+    bool keep = room_for_records(rings, loop->bodies, [] {});
+    double waited = now() - entered;  // no part of the step
 #pragma omp parallel for num_threads(loop->threads) schedule(dynamic, 1) if (loop->threads > 1 && loop->bodies > 1)
     for (int i = 0; i < loop->bodies; ++i) {
         Body& body = loop->body[i];
@@ -168,46 +130,30 @@ void wf_solve(Loop* loop) {
                             loop->work + 45 * (int64_t)body.first);
         ++body.steps;
         if (!keep) continue;
-        Record& record = loop->records[(first + i) % loop->record_capacity];
+        Record& record = rings.records[(first + i) % rings.record_capacity];
         bool used = r.kind == CHOLESKY || r.fallbacks;
-        record = Record{loop->step + 1, used ? body.factor->step : -1, loop->start_time + (loop->step + 1) * loop->dt, r.residual,
-                        loop->assemble_seconds, r.seconds, 0, 0, loop->late, loop->assemble_begin, 0, i, r.iterations, r.status,
+        record = Record{step, used ? body.factor->step : -1, rings.start_time + step * rings.dt, r.residual,
+                        loop->assemble_seconds, r.seconds, 0, 0, rings.late, loop->assemble_begin, 0, i, r.iterations, r.status,
                         r.kind, settings.kind, r.fallbacks, r.status == NOT_FINITE ? first_bad_node(*loop, body) : -1, 0};
     }
     double solved = now();
     for (int i = loop->before; i < loop->launches; ++i) run(loop->launch[i], loop->threads);
     double end = now(), cpu = thread_time() - loop->cpu_begin;
-    ++loop->step;
-    if (!keep) { loop->records_dropped += loop->bodies; }
+    ++rings.step;
+    if (!keep) { rings.records_dropped += loop->bodies; }
     else {
         for (int i = 0; i < loop->bodies; ++i) {
-            Record& record = loop->records[(first + i) % loop->record_capacity];
+            Record& record = rings.records[(first + i) % rings.record_capacity];
             record.integrate = end - solved;
-            record.whole = loop->assemble_seconds + (end - entered);
+            record.whole = end - loop->assemble_begin - waited;  // with a factorization that the step waited for
             record.cpu = cpu;
         }
-        loop->record_head.store(first + loop->bodies, std::memory_order_release);
+        rings.record_head.store(first + loop->bodies, std::memory_order_release);
     }
     write_frame(*loop);
 }
 
-// Before a step: sleep while paused and until it is due. 0 if the loop is to stop.
-int32_t wf_wait(Loop* loop) {
-    while (loop->pause.load(std::memory_order_relaxed) && !loop->stop.load()) {
-        nap(1e-3);
-        loop->deadline = 0;
-    }
-    loop->late = 0;
-    if (loop->realtime && !loop->stop.load()) {
-        double t = now();
-        if (loop->deadline == 0) loop->deadline = t;
-        if (t < loop->deadline) nap(loop->deadline - t);
-        else loop->late = t - loop->deadline;
-        if (loop->late > loop->dt) { ++loop->late_steps; loop->deadline = t; }  // do not chase lost time
-        loop->deadline += loop->dt;
-    }
-    return !loop->stop.load();
-}
+int32_t wf_wait(Loop* loop) { return wait_until_due(loop->rings); }
 
 // Runs until `steps` are done or `stop` is set; returns the steps done.
 int64_t wf_run(Loop* loop, int64_t steps) {
@@ -229,8 +175,8 @@ void wf_apply_factor(const Factor* factor, const double* r, double* z, double* w
 }
 
 int32_t wf_sizes(int32_t* sizes) {  // layouts, checked against the Python side
-    sizes[0] = sizeof(Launch); sizes[1] = sizeof(Body); sizes[2] = sizeof(Record); sizes[3] = sizeof(Loop);
-    sizes[4] = sizeof(Factor); sizes[5] = sizeof(Pattern);
+    sizes[0] = sizeof(Launch); sizes[1] = sizeof(Body); sizes[2] = sizeof(Loop); sizes[3] = sizeof(Factor);
+    sizes[4] = sizeof(Pattern); sizes[5] = sizeof(Record);
     return 6;
 }
 }

@@ -10,9 +10,8 @@
 //     still gets there;
 // An iteration is one application of A after the initial residual.
 #pragma once
-#include <chrono>
-
 #include "block_csr.h"
+#include "rings.h"
 #include "supernodal.h"
 
 enum Kind { NONE = 0, JACOBI = 1, BLOCK_JACOBI = 2, CHOLESKY = 3 };
@@ -42,10 +41,6 @@ struct SolveResult {
     int32_t kind;           // used at the end
     int32_t fallbacks;      // 1: the factor was left in this solve
 };
-
-static double now() {
-    return std::chrono::duration<double>(std::chrono::steady_clock::now().time_since_epoch()).count();
-}
 
 struct Preconditioner {
     const BlockCsr& A;

@@ -4,10 +4,8 @@
 import socket
 import subprocess
 import sys
-import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,22 +46,6 @@ class Run:
     x: Reals  # (k + 1, nodes, 3) [m]; the first frame is the start
 
 
-class _Waited:
-    """Adds up the time spent in Inline.submit."""
-
-    def __init__(self, driver: Driver):
-        self.seconds = 0.0
-        self._submit = driver.inline.submit
-        driver.inline.submit = self  # type: ignore[method-assign]
-
-    def __call__(self, job: Any) -> bool:
-        start = time.perf_counter()
-        try:
-            return self._submit(job)
-        finally:
-            self.seconds += time.perf_counter() - start
-
-
 def run(scene: Path, scheme: Scheme, steps: int, more: tuple[str, ...] = (), folder: Path | None = None) -> Run:
     """folder: for the log where there are processes."""
     if scheme.processes:
@@ -71,17 +53,14 @@ def run(scene: Path, scheme: Scheme, steps: int, more: tuple[str, ...] = (), fol
         return _in_processes(scene, scheme, steps, more, folder)
     sim = Simulation.load(scene, scheme.overrides(*more))
     driver = Driver(sim)
-    waited, waits = _Waited(driver), driver.kind in ("never", "every")
-    x, records, seconds = [sim.world.x.copy()], [], []
+    x, records = [sim.world.x.copy()], []
     for _ in range(steps):
-        before = waited.seconds
         records.append(driver.advance(1))
-        seconds.append(float(records[-1]["whole"][0]) + (waited.seconds - before if waits else 0.0))
         x.append(sim.world.x.copy())
     r = np.concatenate(records)
     age = np.where(r["factor_step"] >= 0, r["step"] - 1 - r["factor_step"], np.nan)
     status = [pb.SolveStatus.Name(s).lower() for s in r["status"].tolist()]  # type: ignore[arg-type]
-    return Run(r["iterations"].astype(float), np.array(seconds), r["residual"], age, status, np.array(x))
+    return Run(r["iterations"].astype(float), r["whole"], r["residual"], age, status, np.array(x))
 
 
 def _free_endpoint() -> str:

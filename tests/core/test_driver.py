@@ -6,6 +6,7 @@ factor).
 """
 
 import logging
+import time
 
 import numpy as np
 import pytest
@@ -38,6 +39,25 @@ def test_never_is_one_factor_of_the_first_matrix():
 @pytest.mark.parametrize("n", [1, 3, 5])
 def test_every_n_is_a_new_one_each_nth_step_which_waits_for_it(n):
     assert factor_steps(f"every-{n}", 12) == [n * (k // n) for k in range(12)]
+
+
+@pytest.mark.parametrize(("update", "made_at"), [("never", [0]), ("every-3", [0, 3])])
+def test_the_step_time_holds_the_factorization_that_the_step_waited_for(update, made_at, monkeypatch):
+    driver, clocks = Driver(falling(update=update)), []
+    submit = driver.inline.submit
+
+    def timed(job: Job) -> bool:
+        begin = time.perf_counter()
+        done = submit(job)
+        clocks.append(time.perf_counter() - begin)
+        return done
+
+    monkeypatch.setattr(driver.inline, "submit", timed)
+    records = driver.advance(5)
+    assert len(clocks) == len(made_at)
+    for step, spent in zip(made_at, clocks, strict=True):
+        r = records[step]
+        assert r["whole"] >= spent + r["assemble"] + r["solve"] + r["integrate"]
 
 
 @pytest.mark.parametrize("delay", [1, 3, 5])

@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: MIT
+"""Memory that the native loop and Python share, as ctypes and NumPy see it.
+
+The C++ side is native/rings.h and native/loop.cpp; sizes are compared when a library is loaded.
+"""
+
+import ctypes as c
+
+import numpy as np
+
+RECORD = np.dtype(
+    [
+        ("step", "i8"), ("factor_step", "i8"), ("time", "f8"), ("residual", "f8"), ("assemble", "f8"), ("solve", "f8"),
+        ("integrate", "f8"), ("whole", "f8"), ("late", "f8"), ("begin", "f8"), ("cpu", "f8"), ("body", "i4"),
+        ("iterations", "i4"), ("status", "i4"), ("kind", "i4"), ("asked", "i4"), ("fallbacks", "i4"),
+        ("bad_node", "i4"), ("unused", "i4"),
+    ]
+)  # fmt: skip
+"""One body, one step: what a loop reports. Seconds, except step numbers; `step` counts completed steps."""
+
+
+class Rings(c.Structure):
+    """Records, frames, pace, stop and pause: the same for both devices."""
+
+    _fields_ = [
+        ("dt", c.c_double), ("start_time", c.c_double), ("step", c.c_int64), ("records", c.c_void_p),
+        ("record_capacity", c.c_int64), ("record_head", c.c_int64), ("record_tail", c.c_int64), ("frames", c.c_void_p),
+        ("frame_steps", c.c_void_p), ("frame_capacity", c.c_int64), ("frame_every", c.c_int64),
+        ("frame_head", c.c_int64), ("frame_tail", c.c_int64), ("frames_dropped", c.c_int64),
+        ("records_dropped", c.c_int64), ("late_steps", c.c_int64), ("realtime", c.c_int32), ("patient", c.c_int32),
+        ("stop", c.c_int32), ("pause", c.c_int32), ("deadline", c.c_double), ("late", c.c_double),
+    ]  # fmt: skip
+
+
+class Pattern(c.Structure):
+    _fields_ = [
+        ("size", c.c_int32), ("supernodes", c.c_int32), ("permutation", c.c_void_p), ("super_start", c.c_void_p),
+        ("row_start", c.c_void_p), ("rows", c.c_void_p), ("value_start", c.c_void_p),
+    ]  # fmt: skip
+
+
+class Factor(c.Structure):
+    _fields_ = [
+        ("pattern", c.POINTER(Pattern)), ("values", c.c_void_p), ("step", c.c_int64), ("bytes", c.c_int32),
+        ("unused", c.c_int32),
+    ]  # fmt: skip
+
+
+class Settings(c.Structure):
+    _fields_ = [
+        ("tolerance", c.c_double), ("budget", c.c_double), ("max_iterations", c.c_int32), ("kind", c.c_int32),
+        ("warm_start", c.c_int32), ("probe", c.c_int32),
+    ]  # fmt: skip
+
+
+class Binding(c.Structure):
+    _fields_ = [("params", c.c_void_p), ("items", c.c_int32), ("unused", c.c_int32)]
+
+
+class Launch(c.Structure):
+    _fields_ = [("kernel", c.c_void_p), ("binding", c.c_void_p), ("mail", c.c_void_p)]
+
+
+class Body(c.Structure):
+    _fields_ = [
+        ("first", c.c_int32), ("last", c.c_int32), ("settings", Settings), ("factor", c.c_void_p),
+        ("mail", c.c_void_p), ("snapshot", c.c_void_p), ("snapshot_step", c.c_int64), ("steps", c.c_int64),
+    ]  # fmt: skip
+
+
+class Loop(c.Structure):
+    _anonymous_ = ("rings",)
+    _fields_ = [
+        ("launches", c.c_int32), ("before", c.c_int32), ("launch", c.POINTER(Launch)), ("bodies", c.c_int32),
+        ("nodes", c.c_int32), ("body", c.POINTER(Body)), ("row_start", c.c_void_p), ("columns", c.c_void_p),
+        ("values", c.c_void_p), ("b", c.c_void_p), ("y", c.c_void_p), ("x", c.c_void_p), ("v", c.c_void_p),
+        ("work", c.c_void_p), ("clock", c.c_void_p), ("threads", c.c_int32), ("unused", c.c_int32),
+        ("assemble_begin", c.c_double), ("assemble_seconds", c.c_double), ("cpu_begin", c.c_double), ("rings", Rings),
+    ]  # fmt: skip
+
+
+def check_sizes(name: str, theirs: list[int], ours: list[int]) -> None:
+    """Raises RuntimeError if the C++ text `name` and this package disagree on a layout."""
+    if theirs != ours:
+        raise RuntimeError(f"{name} and Python disagree on layouts: {theirs} and {ours}")

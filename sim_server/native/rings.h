@@ -1,0 +1,82 @@
+// SPDX-License-Identifier: MIT
+// What the loops of both devices share: records and frames in rings that another thread empties, pace, stop and pause.
+#pragma once
+#include <atomic>
+#include <chrono>
+#include <cmath>
+#include <cstdint>
+#include <ctime>
+
+struct Record {
+    int64_t step;          // steps completed
+    int64_t factor_step;   // -1: no factor used
+    double time;           // s, at the end of the step
+    double residual;
+    double assemble, solve, integrate, whole, late, begin;  // s; begin: steady clock
+    double cpu;            // s of processor time of the thread, whole step
+    int32_t body, iterations, status, kind, asked, fallbacks, bad_node, unused;
+};
+
+struct Rings {
+    double dt;
+    double start_time;
+    std::atomic<int64_t> step;             // completed
+    Record* records;
+    int64_t record_capacity;
+    std::atomic<int64_t> record_head, record_tail;
+    double* frames;                        // (capacity, 2, nodes, 3): x, v
+    int64_t* frame_steps;
+    int64_t frame_capacity;
+    std::atomic<int64_t> frame_every;      // 0: none; set from outside as viewers come and go
+    std::atomic<int64_t> frame_head, frame_tail;
+    std::atomic<int64_t> frames_dropped, records_dropped, late_steps;
+    int32_t realtime;                      // keep pace with the wall clock
+    int32_t patient;                       // wait for room in the rings instead of dropping (no deadline to miss)
+    std::atomic<int32_t> stop, pause;
+    double deadline;                       // steady clock, of the next step; 0: now
+    double late;
+};
+
+static inline double now() {
+    return std::chrono::duration<double>(std::chrono::steady_clock::now().time_since_epoch()).count();
+}
+
+static inline double thread_time() {
+    timespec t;
+    clock_gettime(CLOCK_THREAD_CPUTIME_ID, &t);
+    return t.tv_sec + 1e-9 * t.tv_nsec;
+}
+
+static inline void nap(double seconds) {
+    timespec t{(time_t)seconds, (long)((seconds - std::floor(seconds)) * 1e9)};
+    nanosleep(&t, nullptr);
+}
+
+// Room for the records of one step. A full ring: wait if nobody minds, doing `meanwhile`, else say no.
+template <class Meanwhile>
+static bool room_for_records(Rings& rings, int64_t count, Meanwhile meanwhile) {
+    while (rings.record_head.load() - rings.record_tail.load(std::memory_order_acquire) > rings.record_capacity - count) {
+        if (!rings.patient || rings.stop.load()) return false;
+        meanwhile();
+        nap(2e-4);
+    }
+    return true;
+}
+
+// Before a step: sleep while paused and until it is due. False if the loop is to stop.
+static bool wait_until_due(Rings& rings) {
+    while (rings.pause.load(std::memory_order_relaxed) && !rings.stop.load()) {
+        nap(1e-3);
+        rings.deadline = 0;
+    }
+    rings.late = 0;
+    if (rings.realtime && !rings.stop.load()) {
+        double t = now();
+        if (rings.deadline == 0) rings.deadline = t;
+        if (t < rings.deadline) nap(rings.deadline - t);
+        else rings.late = t - rings.deadline;
+        if (rings.late > rings.dt) { ++rings.late_steps; rings.deadline = t; }  // do not chase lost time
+        rings.deadline += rings.dt;
+    }
+    return !rings.stop.load();
+}
