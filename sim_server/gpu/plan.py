@@ -1,0 +1,253 @@
+# SPDX-License-Identifier: MIT
+"""How a factor is laid out and applied on a GPU: matrices in tiles, phases, and who does what.
+
+With parts (partition.py) V, their boundaries B and A_VV as it is once everything below has been eliminated, the factor
+is applied as, S~ = D^-1 A_VV^-1 D^-1 and W~ = D^-1 A_VV^-1 A_VB D with D the square root of the diagonal of A_VV^-1,
+
+    s~ = D r;  forward, groups 1 .. P-1: s~_B -= W~^T s~_V;  top: y_V = S~ s~_V;
+    backward, P-1 .. 1: y_V = S~ s~_V - W~ y_B;  z = D y
+
+in 2 P - 1 phases, each a set of independent dense products. |S~| <= 1, so float16 neither overflows nor loses the stiff
+regions. P = 1 is the dense inverse.
+
+Vectors are in packed order: part after part, in a part the order of elimination, each part padded to a multiple of 32
+with zeros; N in all, then 32 more zeros. Matrices are kept in chunks of 8 rows x 32 columns, row-major, float16; a tile
+is 8 rows by all columns, its chunks one after another; with planes = 2 as many more follow, of the remainders
+(value - float16(value)) * 2048. Columns of a part and of its boundary are padded to 32 each, rows to 8, with zeros.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol.factor import FactorPattern
+from sim_server.gpu.partition import COLUMNS, NODE, ROWS, Partition, Tree, padded, partition, tree_of
+from sim_server.gpu.sharing import Pieces, share
+from sim_server.gpu.thresholds import choose, works
+
+Int32 = NDArray[np.int32]
+Ints = NDArray[np.int64]
+FORM, READ, GATHER, WRITE = 0, 1, 2, 4  # kinds of segments
+CHUNK = 2 * ROWS * COLUMNS  # bytes
+_KEPT = 64  # plans
+
+
+class Parts(NamedTuple):
+    """Of each part, (parts,): group; start: packed position; v, b: degrees of freedom inside and in the boundary;
+    boundary: where it begins in Plan.boundary; out: its first entry of the contributions."""
+
+    group: Int32
+    start: Int32
+    v: Int32
+    b: Int32
+    boundary: Int32
+    out: Int32
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """For one pattern and one number of thread blocks. Arrays are int32; [phase, block] means phase * blocks + block.
+
+    segments (k, 4): kind, from, count, to: what a block brings into its x area before a phase, `to` entries from its
+        beginning; count and to are multiples of 32. kind FORM: s~ at packed positions from.. out of residual and
+        contributions (| WRITE: and stores it for the others, exactly one block does); READ: s~ formed earlier;
+        GATHER: y at boundary[from..].
+    tiles (m, 4): chunk (the first one), x (offset in the x area, a multiple of 32), chunks (columns / 32), out (the
+        first of 8 packed positions; forward: of 8 contributions). Sorted by [phase, block].
+    segment_start, tile_start (phases * blocks + 1,): of each [phase, block].
+    boundary: packed positions, N for padding; 32 k per part.
+    slot_start (N + 1,), slots: the contributions that each packed position subtracts, in this order.
+    chunk_start (blocks + 1,): of each block in the storage, which is sorted by block, phase, tile.
+    place (nodes,): packed position of a node's first degree of freedom. column (N,): column of L, -1 for padding.
+    part (supernodes,): of each supernode. parts: of each part. thresholds: those that cut the tree.
+    size N, phases, blocks, groups P, contributions, chunks; x_area: entries of the largest; bytes of the matrices;
+    predicted: time of one application [us].
+    """
+
+    segments: Int32
+    tiles: Int32
+    segment_start: Int32
+    tile_start: Int32
+    boundary: Int32
+    slot_start: Int32
+    slots: Int32
+    chunk_start: Int32
+    place: Int32
+    column: Int32
+    part: Int32
+    parts: Parts
+    thresholds: tuple[int, ...]
+    size: int
+    phases: int
+    blocks: int
+    groups: int
+    planes: int
+    contributions: int
+    chunks: int
+    x_area: int
+    predicted: float
+
+    @property
+    def bytes(self) -> int:
+        """Of the stored matrices."""
+        return CHUNK * self.chunks
+
+    @property
+    def nbytes(self) -> int:
+        """Of the plan's own arrays."""
+        return sum(v.nbytes for v in vars(self).values() if isinstance(v, np.ndarray))
+
+
+_plans: dict[tuple[int, int, int | None, int], Plan] = {}
+
+
+def plan(pattern: FactorPattern, blocks: int, groups: int | None = None, planes: int = 1) -> Plan:
+    """The plan of least predicted time, with `groups` groups if given. planes: 1 or 2 float16 numbers per entry.
+
+    Cached by pattern.id. Raises ValueError for a pattern that is not one of whole nodes of a Cholesky factor.
+    """
+    key = (pattern.id, blocks, groups, planes)
+    if key not in _plans:
+        if len(_plans) >= _KEPT:
+            _plans.clear()
+        tree = _tree(pattern)
+        thresholds, predicted = choose(tree, blocks, groups, planes)
+        _plans[key] = lay_out(tree, thresholds, blocks, planes, predicted)
+    return _plans[key]
+
+
+@lru_cache(4)
+def _tree(pattern: FactorPattern) -> Tree:
+    return tree_of(pattern)
+
+
+def lay_out(tree: Tree, thresholds: tuple[int, ...], blocks: int, planes: int = 1, predicted: float = 0.0) -> Plan:
+    """The plan for given thresholds (partition.partition)."""
+    cut = partition(tree, thresholds)
+    parts, column, contributions = _packed(tree, cut)
+    size = len(column)
+    position = np.empty(tree.pattern.size, np.int64)  # packed, of each column of L
+    position[column[column >= 0]] = np.flatnonzero(column >= 0)
+    boundary = _boundaries(tree, cut, parts, position, size)
+    slot_start, slots = _slots(parts, boundary, size)
+    work = _shared_out(cut, parts, blocks, planes)
+    return Plan(
+        boundary=boundary, slot_start=slot_start, slots=slots, place=_places(tree.pattern, position), column=column,
+        part=cut.part.astype(np.int32), parts=parts, thresholds=thresholds, size=size, phases=2 * cut.groups - 1,
+        blocks=blocks, groups=cut.groups, planes=planes, contributions=contributions, predicted=predicted, **work,
+    )  # fmt: skip
+
+
+def _packed(tree: Tree, cut: Partition) -> tuple[Parts, Int32, int]:
+    """Parts, column of L at each packed position, entries of the contributions."""
+    span, edge, out = padded(cut.v, COLUMNS), padded(cut.b, COLUMNS), padded(cut.b, ROWS)
+    start = np.cumsum(span) - span
+    of = np.repeat(cut.part, tree.width)  # part of each column
+    order = np.argsort(of, kind="stable")  # columns by part, ascending in each
+    within = np.arange(len(of)) - np.repeat(np.cumsum(cut.v) - cut.v, cut.v)
+    column = np.full(int(span.sum()), -1, np.int32)
+    column[np.repeat(start, cut.v) + within] = order
+    fields = (cut.group, start, cut.v, cut.b, np.cumsum(edge) - edge, np.cumsum(out) - out)
+    return Parts(*(np.asarray(f, np.int32) for f in fields)), column, int(out.sum())
+
+
+def _places(pattern: FactorPattern, position: Ints) -> Int32:
+    place = np.empty(pattern.size // NODE, np.int32)
+    place[pattern.permutation[::NODE] // NODE] = position[::NODE]
+    return place
+
+
+def _ranges(first: Ints, count: Ints) -> Ints:
+    """first[i] .. first[i] + count[i] for all i, one after another."""
+    return np.repeat(first - np.cumsum(count) + count, count) + np.arange(int(count.sum()))
+
+
+def _boundaries(tree: Tree, cut: Partition, parts: Parts, position: Ints, size: int) -> Int32:
+    rows = _ranges(tree.pattern.row_start[cut.root] + tree.width[cut.root], cut.b)
+    boundary = np.full(int(padded(cut.b, COLUMNS).sum()), size, np.int32)
+    boundary[_ranges(parts.boundary.astype(np.int64), cut.b)] = position[tree.pattern.rows[rows]]
+    return boundary
+
+
+def _slots(parts: Parts, boundary: Int32, size: int) -> tuple[Int32, Int32]:
+    b = parts.b.astype(np.int64)
+    target = boundary[_ranges(parts.boundary.astype(np.int64), b)]
+    source = _ranges(parts.out.astype(np.int64), b)
+    order = np.argsort(target, kind="stable")
+    start = np.concatenate([[0], np.cumsum(np.bincount(target, minlength=size))])
+    return start.astype(np.int32), source[order].astype(np.int32)
+
+
+def _shared_out(cut: Partition, parts: Parts, blocks: int, planes: int) -> dict:
+    """Segments and tiles of all phases, and where each block's storage begins."""
+    segments, tiles, keys, areas = [], [], [], [0]
+    for phase, (which, work) in enumerate(works(cut, blocks, planes)):
+        pieces = share(work, blocks)
+        found = _Phase(phase, cut.groups, parts, which, pieces, planes)
+        segments.append(found.segments())
+        tiles.append(found.tiles())
+        keys.append((phase * blocks + segments[-1][:, 0], phase * blocks + tiles[-1][:, 0]))
+        areas.append(found.area)
+    segment, tile = np.concatenate(segments), np.concatenate(tiles)
+    storage = np.argsort(tile[:, 0], kind="stable")  # by block, phase, tile
+    length = tile[storage, 3] * planes
+    tile[storage, 1] = np.cumsum(length) - length
+    per_block = np.bincount(tile[:, 0], tile[:, 3] * planes, blocks).astype(np.int64)
+    total = (2 * cut.groups - 1) * blocks
+    return {
+        "segments": np.ascontiguousarray(segment[:, 1:], np.int32),
+        "tiles": np.ascontiguousarray(tile[:, 1:], np.int32),
+        "segment_start": _starts(np.concatenate([k[0] for k in keys]), total),
+        "tile_start": _starts(np.concatenate([k[1] for k in keys]), total),
+        "chunk_start": np.concatenate([[0], np.cumsum(per_block)]).astype(np.int32),
+        "chunks": int(per_block.sum()),
+        "x_area": int(max(areas)),
+    }
+
+
+def _starts(keys: Ints, count: int) -> Int32:
+    return np.concatenate([[0], np.cumsum(np.bincount(keys, minlength=count))]).astype(np.int32)
+
+
+class _Phase:
+    """Segments and tiles of one phase, each with its block in front."""
+
+    def __init__(self, phase: int, groups: int, parts: Parts, which: Ints, pieces: Pieces, planes: int):
+        self.forward, self.backward = phase < groups - 1, phase >= groups
+        self.pieces = pieces
+        part = which[pieces.matrix]
+        self.start, self.boundary = parts.start[part].astype(np.int64), parts.boundary[part].astype(np.int64)
+        self.out = (parts.out if self.forward else parts.start)[part].astype(np.int64)
+        self.inside = padded(parts.v[part].astype(np.int64), COLUMNS)
+        self.outside = padded(parts.b[part].astype(np.int64), COLUMNS) * self.backward
+        length = self.inside + self.outside
+        total, opens = np.cumsum(length) - length, np.searchsorted(pieces.block, pieces.block)
+        self.x = total - total[opens]
+        self.area = int((self.x + length).max(initial=0))
+
+    def segments(self) -> Ints:
+        """(k, 5): block, kind, from, count, to."""
+        kind = np.full(len(self.x), READ if self.backward else FORM)
+        if self.forward:
+            kind[self.pieces.first == 0] |= WRITE
+        own = np.stack([self.pieces.block, kind, self.start, self.inside, self.x], axis=1)
+        if not self.backward:
+            return own
+        gather = np.full(len(self.x), GATHER)
+        edge = np.stack([self.pieces.block, gather, self.boundary, self.outside, self.x + self.inside], axis=1)
+        both = np.stack([own, edge], axis=1).reshape(-1, 5)
+        return both[both[:, 3] > 0]
+
+    def tiles(self) -> Ints:
+        """(m, 5): block, 0 (the chunk comes later), x, chunks, out."""
+        count = self.pieces.tiles
+        tile = _ranges(self.pieces.first, count)
+        found = np.zeros((len(tile), 5), np.int64)
+        found[:, 0] = np.repeat(self.pieces.block, count)
+        found[:, 2] = np.repeat(self.x, count)
+        found[:, 3] = np.repeat((self.inside + self.outside) // COLUMNS, count)
+        found[:, 4] = np.repeat(self.out, count) + ROWS * tile
+        return found

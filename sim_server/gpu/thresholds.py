@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: MIT
+"""Which thresholds cut the elimination tree: those with the least predicted time of one application.
+
+Few groups mean few phases, each with a latency, and many bytes; many groups the reverse. The constants were measured on
+an H200; what matters of them is the ratio of latency to bandwidth, which is much the same on other large GPUs.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_server.gpu.partition import COLUMNS, ROWS, Partition, Tree, padded, partition
+from sim_server.gpu.sharing import Work
+
+Ints = NDArray[np.int64]
+LATENCY, LATENCY_ALONE = 1700.0, 400.0  # of a phase [ns]: with a barrier between many blocks, in one block
+MEMORY, CACHE, SHARED = 4400 / 132, 7000 / 132, 25000 / 132  # bandwidths of one block [bytes/ns]
+CACHED = 50e6  # bytes that stay in the second-level cache
+KEPT, X_AREA = 190e3, 160e3  # bytes of a block's shared memory: for matrices and vectors, at most for vectors
+BRING, ENTRY = 250.0, 0.4  # of a part's vector [ns]: at all, per entry
+FLOPS, USES = 15e3, 3000  # making the matrices: float32 operations per ns; applications that share the cost
+MOST = 7  # groups
+
+
+def works(cut: Partition, blocks: int, planes: int) -> Iterator[tuple[Ints, Work]]:
+    """Parts and what is to be done for each, phase by phase."""
+    inside, outside = padded(cut.v, COLUMNS), padded(cut.b, COLUMNS)
+    rate = _rate(cut, planes)
+    for phase in range(2 * cut.groups - 1):
+        group = min(phase, 2 * cut.groups - 2 - phase)
+        which = np.flatnonzero(cut.group == group)
+        forward, backward = phase < cut.groups - 1, phase >= cut.groups
+        rows = padded(cut.b[which] if forward else cut.v[which], ROWS) // ROWS
+        columns = inside[which] + outside[which] * backward
+        tile = columns * (2.0 * ROWS * planes) / rate
+        yield which, Work(rows, tile, BRING + ENTRY * columns)
+
+
+def _rate(cut: Partition, planes: int) -> float:
+    return CACHE if _bytes(cut, planes) < CACHED else MEMORY
+
+
+def _bytes(cut: Partition, planes: int) -> float:
+    v, b = padded(cut.v, COLUMNS).astype(float), padded(cut.b, COLUMNS).astype(float)
+    return float((v * v + 2 * v * b).sum()) * 2 * planes
+
+
+def predict(cut: Partition, blocks: int, planes: int) -> float:
+    """Time of one application [ns], the cost of making the matrices shared among its uses included."""
+    rate, kept, time = _rate(cut, planes), KEPT, 0.0
+    for which, work in works(cut, blocks, planes):
+        if len(which) == 0:
+            continue
+        stream = work.tiles * work.tile
+        busiest = max(float(stream.sum()) / blocks, float(work.tile.max()))
+        shares = np.maximum(1, np.minimum(work.tiles, stream / busiest))  # blocks of each part
+        bring = float((work.bring * shares).sum()) / min(blocks, float(np.ceil(shares).sum()))
+        bytes_kept = min(kept, busiest * rate)
+        kept -= bytes_kept
+        time += bytes_kept / SHARED + (busiest - bytes_kept / rate) + bring
+        time += LATENCY_ALONE if blocks == 1 else LATENCY
+    return time + _flops(cut) / FLOPS / USES
+
+
+def _flops(cut: Partition) -> float:
+    v, b = cut.v.astype(float), cut.b.astype(float)
+    return float((2 / 3 * v**3 + v * v * b).sum())
+
+
+def largest_area(cut: Partition, blocks: int) -> float:
+    """Entries that one block brings in a phase, about."""
+    return max(
+        float(((padded(cut.v, COLUMNS) + padded(cut.b, COLUMNS))[cut.group == g]).sum()) / blocks
+        for g in range(cut.groups)
+    )
+
+
+def candidates(tree: Tree, groups: int) -> Iterator[tuple[int, ...]]:
+    """Thresholds that leave about as much to each group, geometrically spaced."""
+    if groups == 1:
+        yield ()
+        return
+    largest = int(tree.size.max(initial=1))
+    tops = np.unique(np.geomspace(30, max(31, largest - 1), 14).astype(int))
+    ratios = (1.0,) if groups == 2 else (2.0, 3.0, 4.5, 7.0, 11.0)
+    for top in tops.tolist():
+        for ratio in ratios:
+            cut = tuple(int(top / ratio**k) for k in range(groups - 2, -1, -1))
+            if cut[0] >= 6:
+                yield cut
+
+
+def choose(tree: Tree, blocks: int, groups: int | None, planes: int) -> tuple[tuple[int, ...], float]:
+    """Thresholds and predicted time [us]."""
+    best: tuple[int, ...] = ()
+    least = np.inf
+    for count in [groups] if groups else range(1, MOST + 1):
+        found = np.inf
+        for thresholds in candidates(tree, count):
+            cut = partition(tree, thresholds)
+            if count > 1 and len(np.unique(cut.group)) < count:
+                continue
+            time = predict(cut, blocks, planes)
+            if 4 * largest_area(cut, blocks) > X_AREA:
+                time *= 10
+            found = min(found, time)
+            if time < least:
+                best, least = thresholds, time
+        if found > 1.5 * least and count > 1:
+            break  # more phases do not help any more
+    return best, least / 1000
