@@ -160,22 +160,22 @@ def _places(pattern: FactorPattern, position: Ints) -> Int32:
     return place
 
 
-def _ranges(first: Ints, count: Ints) -> Ints:
+def ranges(first: Ints, count: Ints) -> Ints:
     """first[i] .. first[i] + count[i] for all i, one after another."""
     return np.repeat(first - np.cumsum(count) + count, count) + np.arange(int(count.sum()))
 
 
 def _boundaries(tree: Tree, cut: Partition, parts: Parts, position: Ints, size: int) -> Int32:
-    rows = _ranges(tree.pattern.row_start[cut.root] + tree.width[cut.root], cut.b)
+    rows = ranges(tree.pattern.row_start[cut.root] + tree.width[cut.root], cut.b)
     boundary = np.full(int(padded(cut.b, COLUMNS).sum()), size, np.int32)
-    boundary[_ranges(parts.boundary.astype(np.int64), cut.b)] = position[tree.pattern.rows[rows]]
+    boundary[ranges(parts.boundary.astype(np.int64), cut.b)] = position[tree.pattern.rows[rows]]
     return boundary
 
 
 def _slots(parts: Parts, boundary: Int32, size: int) -> tuple[Int32, Int32]:
     b = parts.b.astype(np.int64)
-    target = boundary[_ranges(parts.boundary.astype(np.int64), b)]
-    source = _ranges(parts.out.astype(np.int64), b)
+    target = boundary[ranges(parts.boundary.astype(np.int64), b)]
+    source = ranges(parts.out.astype(np.int64), b)
     order = np.argsort(target, kind="stable")
     start = np.concatenate([[0], np.cumsum(np.bincount(target, minlength=size))])
     return start.astype(np.int32), source[order].astype(np.int32)
@@ -244,7 +244,7 @@ class _Phase:
     def tiles(self) -> Ints:
         """(m, 5): block, 0 (the chunk comes later), x, chunks, out."""
         count = self.pieces.tiles
-        tile = _ranges(self.pieces.first, count)
+        tile = ranges(self.pieces.first, count)
         found = np.zeros((len(tile), 5), np.int64)
         found[:, 0] = np.repeat(self.pieces.block, count)
         found[:, 2] = np.repeat(self.x, count)

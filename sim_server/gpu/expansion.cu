@@ -1,0 +1,301 @@
+// SPDX-License-Identifier: MIT
+// From the values of L to the matrices of a plan (plan.py), all parts of a batch at once. GPU only.
+//
+// Of a part with v degrees of freedom inside and b in its boundary, both padded to 64, there is a matrix G of v rows and
+// v + b columns: at first [L_VV^T | L_BV^T], just as the values stand in L's columns. The diagonal blocks of 64 are inverted
+// in place, then neighbouring ones are merged, 64 -> 128 -> ..: inverse of [L1 0; C L2] = [Y1 0; X Y2], X = -Y2 (C Y1).
+// X goes below the diagonal, C = L21 is above it as its transpose, C Y1 lies in a matrix T of its own. So in the end G is
+// Y = L_VV^-1 on and below its diagonal blocks, and [Y^T Y | Y^T L_BV^T] are the matrices wanted, tile by tile of 64 x 64.
+//
+// A kernel takes tasks one after another from a list, so any number of thread blocks will do.
+// Float32 throughout: Y's columns are summed in a fixed order, results do not depend on the number of blocks.
+#define EDGE 64          // of a tile
+#define DEPTH 16         // rows of G that are in shared memory at a time
+#define PITCH 68         // of the rows there
+#define THREADS 256
+#define TILE_PITCH 65
+#define KERNEL_OF(threads) extern "C" __global__ void __launch_bounds__(threads)
+
+struct Part {
+    long long g, t;                  // where G and T begin in the workspace
+    int v, b;                        // degrees of freedom
+    int pitch_g, pitch_t;            // entries per row
+    int start, boundary, out, unused; // as in plan.Parts
+};
+
+struct Column {                      // of L
+    long long value, row;            // its first value, and that value's place among the rows
+    int length, part, local, unused; // local: in the part
+};
+
+struct Task { int part, i, j, end; }; // tile in units of 64; end: of the first of two merged runs
+
+struct Target {                      // set before each run
+    unsigned short* matrix;          // (chunks, 8, 32)
+    float* scale;                    // (N + 1,)
+};
+
+__device__ __forceinline__ int padded(int n, int step) { return (n + step - 1) / step * step; }
+
+// Values into G, a warp per column. place: column in its part's G of each entry of L's row lists. begin: the first batch.
+KERNEL_OF(THREADS) scatter(const Part* parts, const Column* columns, int first, int last, const int* place,
+                           const float* values, float* workspace, int begin, int scale_end, const Target* target) {
+    if (begin && blockIdx.x == 0 && threadIdx.x == 0) target->scale[scale_end] = 0;
+    int warps = gridDim.x * (THREADS / 32), lane = threadIdx.x % 32;
+    for (int c = first + blockIdx.x * (THREADS / 32) + threadIdx.x / 32; c < last; c += warps) {
+        const Column column = columns[c];
+        const Part part = parts[column.part];
+        float* row = workspace + part.g + (long long)column.local * part.pitch_g;
+        const float* value = values + column.value;
+        const int* to = place + column.row;
+#pragma unroll 4
+        for (int k = lane; k < column.length; k += 32) row[to[k]] = value[k];
+    }
+}
+
+// Diagonal blocks: L^T in, L^-1 out. A thread has a column of the inverse in registers.
+KERNEL_OF(EDGE) invert(const Part* parts, const Task* tasks, int count, float* workspace) {
+    __shared__ float4 rows[EDGE][EDGE / 4];   // of L^T
+    __shared__ float pivots[EDGE];
+    for (int t = blockIdx.x; t < count; t += gridDim.x) {
+        const Task task = tasks[t];
+        const Part part = parts[task.part];
+        float* block = workspace + part.g + (long long)task.i * EDGE * part.pitch_g + task.i * EDGE;
+        int j = threadIdx.x, inside = part.v - task.i * EDGE;
+        for (int i = 0; i < EDGE; i++) ((float*)rows[i])[j] = block[(long long)i * part.pitch_g + j];
+        __syncthreads();
+        pivots[j] = j < inside ? 1 / ((float*)rows[j])[j] : 0;
+        __syncthreads();
+        float x[EDGE];
+#pragma unroll
+        for (int i = 0; i < EDGE; i++) x[i] = i == j ? 1.f : 0.f;
+#pragma unroll
+        for (int i = 0; i < EDGE; i++) {
+            x[i] *= pivots[i];
+#pragma unroll
+            for (int k = i / 4 * 4; k < EDGE; k += 4) {
+                float4 u = rows[i][k / 4];
+                if (k > i) x[k] -= u.x * x[i];
+                if (k + 1 > i) x[k + 1] -= u.y * x[i];
+                if (k + 2 > i) x[k + 2] -= u.z * x[i];
+                if (k + 3 > i) x[k + 3] -= u.w * x[i];
+            }
+        }
+#pragma unroll
+        for (int i = 0; i < EDGE; i++) block[(long long)i * part.pitch_g + j] = x[i];
+        __syncthreads();
+    }
+}
+
+struct Operand { const float* from; int pitch; };
+
+// 4 x 4 entries of a 64 x 64 tile of A^T B per thread: A, B (depth, 64), row by row; or of A B with A (64, depth).
+template <bool ACROSS>
+struct Product {
+    float (*a)[DEPTH][PITCH], (*b)[DEPTH][PITCH];
+    float sum[4][4];
+    int row, column;     // of this thread's entries in the tile
+
+    __device__ __forceinline__ Product(float (*shared)[2][DEPTH][PITCH]) : a(shared[0]), b(shared[1]) {
+        int lane = threadIdx.x % 32, warp = threadIdx.x / 32;   // a warp has 32 x 16 entries
+        row = warp / 4 * 32 + lane / 4 * 4;
+        column = warp % 4 * 16 + lane % 4 * 4;
+    }
+
+    __device__ __forceinline__ float4 fetch_a(Operand o, int k) const {
+        if (ACROSS) return *(const float4*)(o.from + (long long)(threadIdx.x / 4) * o.pitch + k + threadIdx.x % 4 * 4);
+        return *(const float4*)(o.from + (long long)(k + threadIdx.x / 16) * o.pitch + threadIdx.x % 16 * 4);
+    }
+    __device__ __forceinline__ float4 fetch_b(Operand o, int k) const {
+        return *(const float4*)(o.from + (long long)(k + threadIdx.x / 16) * o.pitch + threadIdx.x % 16 * 4);
+    }
+    __device__ __forceinline__ void put(int buffer, float4 x, float4 y) {
+        if (ACROSS) {
+            int k = threadIdx.x % 4 * 4, i = threadIdx.x / 4;
+            a[buffer][k][i] = x.x; a[buffer][k + 1][i] = x.y; a[buffer][k + 2][i] = x.z; a[buffer][k + 3][i] = x.w;
+        } else {
+            *(float4*)&a[buffer][threadIdx.x / 16][threadIdx.x % 16 * 4] = x;
+        }
+        *(float4*)&b[buffer][threadIdx.x / 16][threadIdx.x % 16 * 4] = y;
+    }
+    __device__ __forceinline__ void multiply(int buffer) {
+#pragma unroll
+        for (int k = 0; k < DEPTH; k++) {
+            float4 x = *(float4*)&a[buffer][k][row], y = *(float4*)&b[buffer][k][column];
+            float p[4] = {x.x, x.y, x.z, x.w}, q[4] = {y.x, y.y, y.z, y.w};
+#pragma unroll
+            for (int i = 0; i < 4; i++)
+#pragma unroll
+                for (int j = 0; j < 4; j++) sum[i][j] += p[i] * q[j];
+        }
+    }
+
+    // depth: a multiple of 64. While one slice is multiplied the next one is on its way.
+    __device__ __forceinline__ void run(Operand oa, Operand ob, int depth) {
+#pragma unroll
+        for (int i = 0; i < 4; i++)
+#pragma unroll
+            for (int j = 0; j < 4; j++) sum[i][j] = 0;
+        __syncthreads();
+        put(0, fetch_a(oa, 0), fetch_b(ob, 0));
+        __syncthreads();
+        for (int k = 0; k < depth; k += DEPTH) {
+            int buffer = k / DEPTH % 2;
+            bool more = k + DEPTH < depth;
+            float4 x, y;
+            if (more) { x = fetch_a(oa, k + DEPTH); y = fetch_b(ob, k + DEPTH); }
+            multiply(buffer);
+            if (more) put(1 - buffer, x, y);
+            __syncthreads();
+        }
+    }
+
+    __device__ __forceinline__ void store(float* to, int pitch, float sign) const {
+#pragma unroll
+        for (int i = 0; i < 4; i++)
+            *(float4*)(to + (long long)(row + i) * pitch + column) =
+                make_float4(sign * sum[i][0], sign * sum[i][1], sign * sum[i][2], sign * sum[i][3]);
+    }
+};
+
+// T = C Y1: tile (i, j) of a pair of runs j .. end, end .. i ..
+KERNEL_OF(THREADS) couple(const Part* parts, const Task* tasks, int count, float* workspace) {
+    __shared__ __align__(16) float shared[2][2][DEPTH][PITCH];
+    for (int t = blockIdx.x; t < count; t += gridDim.x) {
+        const Task task = tasks[t];
+        const Part part = parts[task.part];
+        const float* rows = workspace + part.g + (long long)task.j * EDGE * part.pitch_g;
+        Product<false> product(shared);
+        product.run({rows + task.i * EDGE, part.pitch_g}, {rows + task.j * EDGE, part.pitch_g}, (task.end - task.j) * EDGE);
+        product.store(workspace + part.t + (long long)task.i * EDGE * part.pitch_t + task.j * EDGE, part.pitch_t, 1);
+    }
+}
+
+// X = -Y2 T.
+KERNEL_OF(THREADS) merge(const Part* parts, const Task* tasks, int count, float* workspace) {
+    __shared__ __align__(16) float shared[2][2][DEPTH][PITCH];
+    for (int t = blockIdx.x; t < count; t += gridDim.x) {
+        const Task task = tasks[t];
+        const Part part = parts[task.part];
+        float* row = workspace + part.g + (long long)task.i * EDGE * part.pitch_g;
+        const float* coupled = workspace + part.t + (long long)task.end * EDGE * part.pitch_t + task.j * EDGE;
+        Product<true> product(shared);
+        product.run({row + task.end * EDGE, part.pitch_g}, {coupled, part.pitch_t}, (task.i + 1 - task.end) * EDGE);
+        product.store(row + task.j * EDGE, part.pitch_g, -1);
+    }
+}
+
+// Scale: length of the columns of Y, 32 columns of a block of 64 at a time; the largest one goes to scale[scale_end].
+KERNEL_OF(THREADS) lengths(const Part* parts, const Task* tasks, int count, const float* workspace, int scale_end,
+                           const Target* target) {
+    __shared__ float sums[THREADS / 32][32];
+    float* scale = target->scale;
+    int lane = threadIdx.x % 32, warp = threadIdx.x / 32;
+    for (int t = blockIdx.x; t < 2 * count; t += gridDim.x) {
+        const Task task = tasks[t / 2];
+        const Part part = parts[task.part];
+        int j = task.i * EDGE + t % 2 * 32 + lane;
+        float sum = 0;
+#pragma unroll 4
+        for (int k = task.i * EDGE + warp; k < part.v; k += THREADS / 32) {
+            float y = workspace[part.g + (long long)k * part.pitch_g + j];
+            sum += y * y;
+        }
+        sums[warp][lane] = sum;
+        __syncthreads();
+        if (warp == 0 && j < part.v) {
+            for (int k = 1; k < THREADS / 32; k++) sum += sums[k][lane];
+            sum = sqrtf(sum);
+            scale[part.start + j] = sum;
+            atomicMax((int*)(scale + scale_end), __float_as_int(sum));   // positive numbers are ordered as their bits are
+        }
+        __syncthreads();
+    }
+}
+
+// Two float16 numbers, as large as they can be rather than infinite.
+__device__ __forceinline__ unsigned halves(float lo, float hi) {
+    unsigned word;
+    lo = lo > 65504.f ? 65504.f : lo < -65504.f ? -65504.f : lo;
+    hi = hi > 65504.f ? 65504.f : hi < -65504.f ? -65504.f : hi;
+    asm("{.reg .b16 a, b; cvt.rn.f16.f32 a, %1; cvt.rn.f16.f32 b, %2; mov.b32 %0, {a, b};}" : "=r"(word) : "f"(lo), "f"(hi));
+    return word;
+}
+
+__device__ __forceinline__ float number(unsigned word, int upper) {
+    float x;
+    unsigned short h = upper ? word >> 16 : word & 0xffff;
+    asm("cvt.f32.f16 %0, %1;" : "=f"(x) : "h"(h));
+    return x;
+}
+
+// A tile of 64 x 64 (rows of `tile`, or its columns if ACROSS) as chunks. chunk_of: first chunk of 8 rows, from the tile's
+// first row on; rows, columns: how many there are from there on, padded; column: the tile's first in the matrix; width: of
+// the whole matrix in chunks.
+template <bool ACROSS>
+__device__ __forceinline__ void store(float (*tile)[TILE_PITCH], float sign, const int* chunk_of, int rows, int columns,
+                                      int column, int width, int planes, unsigned short* matrix) {
+    for (int k = threadIdx.x; k < EDGE * EDGE / 8; k += THREADS) {
+        int piece = k % 4, row = k / 4 % 8, chunk = k / 32;
+        int r = chunk / 2 * 8 + row, c = chunk % 2 * 32 + piece * 8;
+        if (r >= rows || c >= columns) continue;
+        float x[8];
+#pragma unroll
+        for (int e = 0; e < 8; e++) x[e] = sign * (ACROSS ? tile[c + e][r] : tile[r][c + e]);
+        unsigned w[4];
+#pragma unroll
+        for (int e = 0; e < 4; e++) w[e] = halves(x[2 * e], x[2 * e + 1]);
+        long long at = chunk_of[r / 8] + (column + c) / 32;
+        uint4* to = (uint4*)(matrix + at * 256) + row * 4 + piece;
+        *to = make_uint4(w[0], w[1], w[2], w[3]);
+        if (planes == 1) continue;
+#pragma unroll
+        for (int e = 0; e < 8; e++) x[e] = (x[e] - number(w[e / 2], e % 2)) * 2048.f;
+        to[(long long)width * 32] = make_uint4(halves(x[0], x[1]), halves(x[2], x[3]), halves(x[4], x[5]), halves(x[6], x[7]));
+    }
+}
+
+// Tile (i, j) of [Y^T Y | Y^T L_BV^T] into the storage: twice, since the inverse is symmetric and the coupling is applied
+// both ways. row_chunk (N / 8,), out_chunk (contributions / 8,): first chunk of each 8 rows.
+KERNEL_OF(THREADS) finish(const Part* parts, const Task* tasks, int count, const float* workspace, const int* boundary,
+                          const int* row_chunk, const int* out_chunk, int planes, const Target* target) {
+    __shared__ __align__(16) float shared[2][2][DEPTH][PITCH];
+    __shared__ float tile[EDGE][TILE_PITCH], across[EDGE], down[EDGE];
+    const Target to = *target;
+    for (int t = blockIdx.x; t < count; t += gridDim.x) {
+        const Task task = tasks[t];
+        const Part part = parts[task.part];
+        int i = task.i * EDGE, j = task.j * EDGE, inside = padded(part.v, EDGE), edge = j - inside;
+        const float* rows = workspace + part.g + (long long)i * part.pitch_g;
+        Product<false> product(shared);
+        product.run({rows + i, part.pitch_g}, {rows + j, part.pitch_g}, inside - i);
+        if (threadIdx.x < EDGE) {
+            int k = i + threadIdx.x;
+            down[threadIdx.x] = k < part.v ? 1 / to.scale[part.start + k] : 0;
+        } else if (threadIdx.x < 2 * EDGE) {
+            int k = threadIdx.x - EDGE;
+            float d = 0;
+            if (edge >= 0) { if (edge + k < part.b) d = to.scale[boundary[part.boundary + edge + k]]; }
+            else if (j + k < part.v) d = 1 / to.scale[part.start + j + k];
+            across[k] = d;
+        }
+        __syncthreads();
+#pragma unroll
+        for (int r = 0; r < 4; r++)
+#pragma unroll
+            for (int c = 0; c < 4; c++)
+                tile[product.row + r][product.column + c] =
+                    product.sum[r][c] * (down[product.row + r] * across[product.column + c]);
+        __syncthreads();
+        int rows_v = padded(part.v, 8), columns_v = padded(part.v, 32), width = (columns_v + padded(part.b, 32)) / 32;
+        const int* own = row_chunk + part.start / 8;
+        if (edge < 0) {
+            store<false>(tile, 1, own + i / 8, rows_v - i, columns_v - j, j, width, planes, to.matrix);
+            if (i != j) store<true>(tile, 1, own + j / 8, rows_v - j, columns_v - i, i, width, planes, to.matrix);
+        } else {
+            store<false>(tile, -1, own + i / 8, rows_v - i, padded(part.b, 32) - edge, columns_v + edge, width, planes, to.matrix);
+            store<true>(tile, 1, out_chunk + (part.out + edge) / 8, padded(part.b, 8) - edge, columns_v - i, i,
+                        columns_v / 32, planes, to.matrix);
+        }
+    }
+}
