@@ -18,6 +18,8 @@ Examples:
         for a server on this machine
   precond-worker --connect tcp/10.0.0.5:7447 --threads 4 --name big-box
         for a server elsewhere, with four threads
+  precond-worker --device auto
+        on the GPU of this machine if it has a usable one
   precond-worker --no-shared-memory
         arrays as bytes, also on this machine
 """
@@ -33,6 +35,13 @@ def work(
         list[str] | None,
         typer.Option(metavar="EP", help="Endpoint of the server, may be repeated [default: tcp/127.0.0.1:7447]"),
     ] = None,
+    device: Annotated[
+        str, typer.Option(metavar="auto|cpu|gpu", help="What factorizes; auto: an NVIDIA GPU if it is usable")
+    ] = "cpu",
+    arithmetic: Annotated[
+        str,
+        typer.Option(metavar="auto|float32|float64", help="On the GPU; auto: float32 where float64 is slow"),
+    ] = "auto",
     threads: Annotated[int, typer.Option(metavar="N", min=1, max=1024, help="Threads of the linear algebra")] = 1,
     name: Annotated[str, typer.Option(metavar="NAME", help="Name, unique on its server [default: HOST-PID]")] = "",
     server: Annotated[str, typer.Option(metavar="NAME", help="Name of the server")] = "sim",
@@ -52,7 +61,8 @@ def work(
             from precond_worker.parent import end_with_parent
 
             end_with_parent()
-        _serve(connect or [], threads, name or _default_name(), server, not no_shared_memory)
+        library = _library(device, arithmetic)
+        _serve(connect or [], threads, name or _default_name(), server, not no_shared_memory, library)
     except KeyboardInterrupt:
         raise typer.Exit(130) from None
     except Terminated:
@@ -68,8 +78,31 @@ def _default_name() -> str:
     return f"{host[:50]}-{os.getpid()}"
 
 
-def _serve(connect: list[str], threads: int, name: str, server: str, shared_memory: bool) -> None:
-    from precond_worker.factorize import Analysis, default_library
+def _library(device: str, arithmetic: str) -> str:
+    """What Analysis is to use; ends the program if that cannot work here."""
+    if device not in ("auto", "cpu", "gpu"):
+        _bad_input(f"--device {device}: allowed are auto, cpu, gpu")
+    if arithmetic not in ("auto", "float32", "float64"):
+        _bad_input(f"--arithmetic {arithmetic}: allowed are auto, float32, float64")
+    if device == "cpu":
+        return "auto"
+    from precond_worker.errors import DeviceUnusable
+    from precond_worker.gpu.device import try_out
+
+    try:
+        try_out(arithmetic)
+    except DeviceUnusable as error:
+        if device == "gpu":
+            _bad_input(f"--device gpu: {error}")
+        print(f"precond-worker: --device auto takes the CPU: {error}", file=sys.stderr, flush=True)
+        return "auto"
+    return "gpu" if arithmetic == "auto" else f"gpu-{arithmetic}"
+
+
+def _serve(connect: list[str], threads: int, name: str, server: str, shared_memory: bool, library: str) -> None:
+    from functools import partial
+
+    from precond_worker.factorize import Analysis
     from precond_worker.joining import join
     from precond_worker.uplink import Uplink
     from precond_worker.worker import Worker
@@ -80,24 +113,36 @@ def _serve(connect: list[str], threads: int, name: str, server: str, shared_memo
     try:
         check_name(server, "--server")
         check_name(name, "--name")
-        library, remark = default_library()
-        if remark:
-            print(f"precond-worker: {remark}", file=sys.stderr)
+        shown = _shown(library)
         session = join(connect, shared_memory)
     except (BadEndpoint, ValueError) as error:
         _bad_input(str(error))
-    with session, Uplink(session, server, name, threads, library, Counters(logging.getLogger("precond_worker"))) as up:
+    with session, Uplink(session, server, name, threads, shown, Counters(logging.getLogger("precond_worker"))) as up:
 
         def on_server(found: bool) -> None:
             where = f"server {server} at {', '.join(connect or [DEFAULT_ENDPOINT])}"
             if found:
                 count = f"{threads} thread{'s' if threads > 1 else ''}"
                 memory = "shared memory" if up.shared_memory else "no shared memory"
-                print(f"precond-worker {name} ready: {library}, {count}, {memory}, {where}", flush=True)
+                print(f"precond-worker {name} ready: {shown}, {count}, {memory}, {where}", flush=True)
             else:
                 print(f"precond-worker {name}: {where} is gone, waiting for it", file=sys.stderr)
 
-        Worker(up, Analysis, on_server).run()
+        Worker(up, partial(Analysis, library=library), on_server).run()
+
+
+def _shown(library: str) -> str:
+    """What the worker says that it works with. On the CPU without CHOLMOD it also says what that costs."""
+    if library.startswith("gpu"):
+        from precond_worker.gpu.library import title
+
+        return title(library.removeprefix("gpu").removeprefix("-") or "auto")
+    from precond_worker.factorize import default_library
+
+    name, remark = default_library()
+    if remark:
+        print(f"precond-worker: {remark}", file=sys.stderr)
+    return name
 
 
 def _bad_input(text: str) -> NoReturn:

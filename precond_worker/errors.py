@@ -11,3 +11,7 @@ class NotPositiveDefinite(ValueError):
     def __init__(self, text: str, column: int = -1):
         super().__init__(text)
         self.column = column
+
+
+class DeviceUnusable(RuntimeError):
+    """There is no GPU to work on, and why."""

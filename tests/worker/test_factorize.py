@@ -106,7 +106,7 @@ def test_both_libraries_give_the_same_factor_in_the_same_pattern(graph):
 def test_cholmod_merges_columns_as_the_pattern_says(graph):
     """Otherwise its values would have to be looked up one by one: right, but slower."""
     analysis = Analysis(*graph, "cholmod")
-    assert analysis._packer._is_packed(analysis._numeric.factorize(spd(*graph)))
+    assert analysis._library.packer._is_packed(analysis._library.numeric.factorize(spd(*graph)))
 
 
 @both
@@ -116,7 +116,7 @@ def test_cholmod_merges_columns_of_a_large_bar_as_the_pattern_says():
     assert np.diff(analysis.pattern.super_start).max() > 48  # panels of all widths that the rule tells apart
     identity = np.zeros((len(graph[1]), 3, 3))
     identity[diagonal_blocks(*graph)] = np.eye(3)
-    assert analysis._packer._is_packed(analysis._numeric.factorize(identity))
+    assert analysis._library.packer._is_packed(analysis._library.numeric.factorize(identity))
     assert np.count_nonzero(analysis.factorize(identity)) == analysis.pattern.size
 
 
@@ -209,7 +209,7 @@ def test_wrong_shapes_and_types_are_named():
         analysis.factorize(spd(*graph), np.float16)
     with pytest.raises(ValueError, match=r"out of shape \(3,\), allowed: \(21,\)"):
         analysis.factorize(spd(*graph), out=np.empty(3))
-    with pytest.raises(ValueError, match="'umfpack', allowed: auto, cholmod, superlu"):
+    with pytest.raises(ValueError, match="'umfpack', allowed: auto, cholmod, superlu, gpu"):
         Analysis(*graph, "umfpack")
 
 

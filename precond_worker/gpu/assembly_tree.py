@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: MIT
+"""The tree of fronts for a GPU: larger and fewer than the supernodes of the CPU.
+
+A launch costs a GPU more than the arithmetic on many explicit zeros, so small neighbours become one front, also where
+a parent has several children (on the CPU only the last child may join its parent, since the order of elimination stays
+as it is). The order is then a postorder of the merged tree; the fill without those zeros is the same. Duff and Reid,
+The multifrontal solution of indefinite sparse symmetric linear equations, 1983.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from precond_worker.blocks import BLOCK, degrees_of_freedom, inverse_permutation
+from precond_worker.elimination import Elimination, postorder
+from precond_worker.supernodes import Panel, fundamental
+
+Int = NDArray[np.int64]
+
+WIDTH = 64  # degrees of freedom that the kernels eliminate in one step (multifrontal.cu)
+ZEROS = 0.05  # fronts join if the joint one holds at most this share of explicit zeros ...
+ZEROS_IN_ONE_STEP = 0.5  # ... or this one while it is eliminated in a single step
+
+
+@dataclass(frozen=True)
+class AssemblyTree:
+    """Fronts in postorder, in nodes (not degrees of freedom).
+
+    order        (n,): node eliminated k-th
+    first        (f + 1,): first column of each front
+    parent       (f,): front that takes the update matrix, -1 at a root
+    below_start  (f + 1,), below: rows under each front's own columns, ascending
+    """
+
+    order: Int
+    first: Int
+    parent: Int
+    below_start: Int
+    below: Int
+
+    @property
+    def own(self) -> Int:
+        """Columns that each front eliminates, (f,)."""
+        return np.diff(self.first)
+
+    def pattern_arrays(self) -> dict[str, NDArray[np.integer]]:
+        """Arrays of protocol.factor.FactorPattern, in degrees of freedom."""
+        height = self.own + np.diff(self.below_start)
+        start = np.concatenate([[0], np.cumsum(height)])
+        rows = np.empty(start[-1], np.int64)
+        own = np.repeat(start[:-1] - self.first[:-1], self.own) + np.arange(self.first[-1])
+        rows[own] = np.arange(self.first[-1])
+        under = np.repeat(start[:-1] + self.own - self.below_start[:-1], np.diff(self.below_start))
+        rows[under + np.arange(len(self.below))] = self.below
+        return {
+            "permutation": degrees_of_freedom(self.order).astype(np.int32),
+            "super_start": (BLOCK * self.first).astype(np.int32),
+            "row_start": (BLOCK * start).astype(np.int64),
+            "rows": degrees_of_freedom(rows).astype(np.int32),
+        }
+
+
+def assembly_tree(tree: Elimination) -> AssemblyTree:
+    """Fronts for an elimination tree of nodes."""
+    panels = fundamental(tree)
+    owner, parent = merged(panels, parents(panels, tree))
+    heads = np.flatnonzero(owner == np.arange(len(panels)))  # the topmost panel of each front: its rows are the front's
+    width = np.array([panel.width for panel in panels]) // BLOCK
+    columns = np.bincount(owner, width, len(panels)).astype(np.int64)[heads]
+    up = np.where(parent[heads] >= 0, owner[parent[heads]], -1)
+    number = np.full(len(panels), -1)
+    number[heads] = np.arange(len(heads))
+    up = np.where(up >= 0, number[up], -1)
+    below_top = np.array([(panels[head].height - panels[head].width) // BLOCK for head in heads])
+    weight = columns + below_top
+    after = postorder(up, weight)  # fronts, children first
+    rank = inverse_permutation(after)
+    front_of = rank[number[owner]].repeat(width)  # of each column in the old order
+    place = inverse_permutation(order := np.argsort(front_of, kind="stable"))
+    below = [place[tree.rows_below(panels[heads[front]].last)] for front in after]
+    below_start = np.concatenate([[0], np.cumsum([len(rows) for rows in below])]).astype(np.int64)
+    parent_of = np.where(up[after] >= 0, rank[up[after]], -1)
+    first = np.concatenate([[0], np.cumsum(columns[after])])
+    return AssemblyTree(tree.order[order], first, parent_of, below_start, _sorted(below, len(place)))
+
+
+def _sorted(lists: list[Int], nodes: int) -> Int:
+    """Concatenation of the lists, each ascending."""
+    flat = np.concatenate(lists).astype(np.int64)
+    which = np.repeat(np.arange(len(lists)), [len(rows) for rows in lists])
+    return np.sort(which * nodes + flat) - which * nodes
+
+
+def parents(panels: list[Panel], tree: Elimination) -> Int:
+    """Parent panel of each panel, -1 at a root."""
+    panel_of = np.repeat(np.arange(len(panels)), [panel.last - panel.first + 1 for panel in panels])
+    column = tree.parent[[panel.last for panel in panels]]
+    return np.where(column >= 0, panel_of[column], -1)
+
+
+def merged(panels: list[Panel], parent: Int) -> tuple[Int, Int]:
+    """For each panel the topmost panel of the front that it is in, and its parent in the tree.
+
+    From the leaves up, each front takes in those of its children that cost few zeros, those with the most rows first.
+    """
+    width, height = [p.width for p in panels], [p.height for p in panels]
+    zeros = [p.zeros for p in panels]
+    owner = np.arange(len(panels))
+    children: list[list[int]] = [[] for _ in panels]
+    for top in range(len(panels)):
+        kept: list[int] = []
+        for child in sorted(children[top], key=lambda c: height[c] - width[c], reverse=True):
+            joint = _joint(width, height, zeros, child, top)
+            if joint is None:
+                kept.append(child)
+                continue
+            width[top], height[top], zeros[top] = joint
+            owner[child] = top
+            kept += children[child]
+        children[top] = kept
+        if parent[top] >= 0:
+            children[parent[top]].append(top)
+    for panel in range(len(panels) - 1, -1, -1):  # owners of owners
+        owner[panel] = owner[owner[panel]]
+    return owner, parent
+
+
+def _joint(
+    width: list[int], height: list[int], zeros: list[int], child: int, top: int
+) -> tuple[int, int, int] | None:  # fmt: skip
+    """Width, height and explicit zeros of two fronts as one; None if that holds too many zeros."""
+    added = width[child] * (height[top] + width[child] - height[child])
+    joint = Panel(0, 0, width[child] + width[top], width[child] + height[top], zeros[child] + zeros[top] + added)
+    share = joint.zeros / joint.size
+    if share <= ZEROS or (joint.width <= WIDTH and share <= ZEROS_IN_ONE_STEP):
+        return joint.width, joint.height, joint.zeros
+    return None

@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: MIT
+"""A plan on the device: its tables and its memory, made once, and all launches of a factorization as one CUDA graph."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from precond_worker.gpu.device import cupy, kernels
+from precond_worker.gpu.plan import Plan
+from precond_worker.gpu.tables import Launch, front_table, launches
+
+THREADS = {"assemble": 192, "store": 192}  # of a block; 128 in the others (multifrontal.cu)
+NONE = np.iinfo(np.int32).max
+GIB = 2**30
+
+
+class Outcome(NamedTuple):
+    """Columns of L where it failed (-1: nowhere), and whether the matrix held something other than numbers."""
+
+    pivot: int
+    range: int
+    infinite: bool
+
+
+class Executor:
+    """Factorizes matrices of one plan in memory of its own.
+
+    arithmetic, stored: "float32" or "float64", of the fronts and of L. Raises MemoryError if the device has not enough
+    left, saying how much that is.
+    """
+
+    def __init__(self, plan: Plan, arithmetic: str, stored: str):
+        self._cp, self._plan, self.arithmetic = cupy(), plan, arithmetic
+        self._kernels = kernels(arithmetic, stored)
+        self._stored = np.dtype(stored)
+        self._list, starts = launches(plan)
+        self._reserve(starts)
+        self.stream = self._cp.cuda.Stream(non_blocking=True)
+        with self.stream:
+            self.stream.begin_capture()
+            try:
+                self._launch_all()
+            finally:
+                self._graph = self.stream.end_capture()
+        self.stream.synchronize()
+
+    @property
+    def bytes(self) -> int:
+        """Device memory of the large arrays."""
+        fronts = sum(self._plan.half) * np.dtype(self.arithmetic).itemsize
+        return fronts + self._plan.nonzeros * self._stored.itemsize + 72 * self._plan.blocks
+
+    def _reserve(self, starts: NDArray[np.int32]) -> None:
+        cp, plan = self._cp, self._plan
+        memory = cp.get_default_memory_pool()
+        free, total = cp.cuda.runtime.memGetInfo()
+        free += memory.free_bytes()
+        sizes = f"this object needs {self.bytes / GIB:.2f} GiB, {free / GIB:.2f} of {total / GIB:.1f} GiB are free"
+        if self.bytes > free:
+            raise MemoryError(f"GPU memory: {sizes}")
+        try:
+            self._halves = [cp.empty(max(size, 1), self.arithmetic) for size in plan.half]
+            self._values = cp.empty(plan.nonzeros, self._stored)
+            self._blocks = cp.empty(9 * plan.blocks, np.float64)
+            self._status = cp.zeros(3, np.int32)
+            self._tables = {
+                "fronts": cp.asarray(front_table(plan).view(np.uint8)),
+                "starts": cp.asarray(starts),
+                "child": cp.asarray(plan.child.astype(np.int32)),
+                "map": cp.asarray(plan.map),
+                "split": cp.asarray(plan.split),
+                "entry_start": cp.asarray(plan.entry_start),
+                "entry_block": cp.asarray(plan.entry_block),
+                "entry_row": cp.asarray(plan.entry_row),
+            }
+            self._sent = self._pinned(9 * plan.blocks, np.dtype(np.float64))
+            self._outcome = self._pinned(3, np.dtype(np.int32))
+        except (cp.cuda.memory.OutOfMemoryError, cp.cuda.runtime.CUDARuntimeError) as error:
+            self.__dict__.clear()
+            memory.free_all_blocks()
+            raise MemoryError(f"GPU memory: {sizes} ({error})") from error
+
+    def _pinned(self, count: int, dtype: np.dtype[Any]) -> NDArray[Any]:
+        """An array in memory that the device reaches by itself; from CuPy's pool, to which it returns when dropped."""
+        memory = self._cp.cuda.alloc_pinned_memory(max(count * dtype.itemsize, 1))
+        return np.frombuffer(memory, dtype, count)
+
+    def _launch_all(self) -> None:
+        status = self._status
+        count = np.int64(self._blocks.size)
+        self._kernels["reset"]((1,), (1,), (status,))
+        blocks = max(1, min(1024, self._blocks.size // 1024))
+        self._kernels["look"]((blocks,), (256,), (self._blocks, count, status))
+        for launch in self._list:
+            threads = THREADS.get(launch.kernel, 128)
+            self._kernels[launch.kernel]((launch.blocks,), (threads,), self._arguments(launch))
+
+    def _arguments(self, launch: Launch) -> tuple[Any, ...]:
+        tables, status = self._tables, self._status
+        here, there = self._halves[launch.level % 2], self._halves[1 - launch.level % 2]
+        fronts = np.uint64(tables["fronts"].data.ptr + 64 * int(self._plan.level_start[launch.level]))
+        start = np.uint64(tables["starts"].data.ptr + 4 * launch.table)
+        step, count = np.int32(launch.step), np.int32(launch.fronts)
+        if launch.kernel == "assemble":
+            lists = [tables[name] for name in ("fronts", "child", "map", "split")]
+            entries = [tables[name] for name in ("entry_start", "entry_block", "entry_row")]
+            return (fronts, start, count, *lists, *entries, self._blocks, here, there)
+        return {
+            "factor": (fronts, here, status),
+            "panel": (fronts, start, count, step, here),
+            "update": (fronts, start, count, step, here, status),
+            "store": (fronts, start, count, here, self._values, status),
+        }[launch.kernel]
+
+    def run(self, matrix: NDArray[np.float64]) -> tuple[NDArray[Any], Outcome]:
+        """Values of L, (nonzeros,), of block values (blocks, 3, 3). The array is the caller's to keep."""
+        np.copyto(self._sent, matrix.reshape(-1))
+        values = self._pinned(self._plan.nonzeros, self._stored)
+        self._copy(self._blocks.data.ptr, self._sent.ctypes.data, self._sent.nbytes)
+        self._graph.launch(self.stream)
+        self._copy(self._outcome.ctypes.data, self._status.data.ptr, self._outcome.nbytes)
+        self._copy(values.ctypes.data, self._values.data.ptr, values.nbytes)
+        self.stream.synchronize()
+        pivot, range_, infinite = (-1 if c == NONE else int(c) for c in self._outcome)
+        return values, Outcome(pivot, range_, bool(infinite))
+
+    def _copy(self, to: int, source: int, size: int) -> None:
+        self._cp.cuda.runtime.memcpyAsync(to, source, size, self._cp.cuda.runtime.memcpyDefault, self.stream.ptr)

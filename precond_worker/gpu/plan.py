@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: MIT
+"""Everything the numeric phase needs to know, made once per topology: where fronts lie, what is added where, and when.
+
+A front is a dense symmetric matrix, of which the lower triangle counts, stored column by column with a stride: the
+columns that it eliminates first, then those of its rows below. It begins as the sum of its entries of A and of the
+update matrices (the rows and columns below) of its children; eliminating its own columns leaves columns of L and its
+own update matrix. Fronts of one level need nothing of each other; each lies one level under its parent, so two halves
+of memory, used in turn, hold all that is needed at a time.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from precond_worker.blocks import BLOCK, Index, inverse_permutation, rows_of
+from precond_worker.gpu.assembly_tree import WIDTH, AssemblyTree
+
+Int32 = NDArray[np.int32]
+Int64 = NDArray[np.int64]
+
+CHUNK = 2  # nodes whose columns one thread block assembles (multifrontal.cu)
+ALIGN = 8  # entries: columns of a front begin at multiples
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Fronts are numbered by level, leaves first, those with many own columns first in each.
+
+    level_start  (levels + 1,): first front of each level
+    own, rows    (f,): columns that a front eliminates, and all its rows, in degrees of freedom
+    stride, at   (f,): entries from column to column, and its first entry in its half of memory (level modulo 2)
+    column       (f,): its first column of L
+    value        (f,): where that column begins among the values of L (FactorPattern)
+    child_start  (f + 1,), child: fronts whose update matrices it takes in, in a fixed order
+    map_start    (f + 1,), map: for each node below its own, the node of its parent's front (counted from 0)
+    split_start  (f,), split: of its map, where each chunk of CHUNK nodes of its parent begins, and the end
+    entry_start  (nodes + 1,), entry_block, entry_row: blocks of A in each node's column: number, node in the front
+    half         the two halves of memory, in entries
+    """
+
+    level_start: Int64
+    own: Int64
+    rows: Int64
+    stride: Int64
+    at: Int64
+    column: Int64
+    value: Int64
+    child_start: Int64
+    child: Int64
+    map_start: Int64
+    map: Int32
+    split_start: Int64
+    split: Int32
+    entry_start: Int64
+    entry_block: Int32
+    entry_row: Int32
+    half: tuple[int, int]
+    blocks: int
+    nonzeros: int
+
+    @property
+    def levels(self) -> int:
+        """How many levels."""
+        return len(self.level_start) - 1
+
+    def fronts(self, level: int) -> slice:
+        """The fronts of a level."""
+        return slice(int(self.level_start[level]), int(self.level_start[level + 1]))
+
+    def steps(self, level: int) -> int:
+        """Steps of WIDTH columns in which the widest front of a level is eliminated."""
+        return -(-int(self.own[self.fronts(level)].max()) // WIDTH)
+
+    @cached_property
+    def flops(self) -> float:
+        """Multiplications and additions of one factorization."""
+        k, m = self.own.astype(float), self.rows.astype(float)
+        return float((k * m**2 - k**2 * m + k**3 / 3).sum())
+
+
+def make_plan(tree: AssemblyTree, row_start: Index, columns: Index) -> Plan:
+    """Plan for matrices of a block pattern (blocks.py) whose fronts these are."""
+    level = levels(tree)
+    own = tree.own
+    height = own + np.diff(tree.below_start)
+    order = np.lexsort((np.arange(len(own)), -height, -own, level))  # the last key counts first
+    number = inverse_permutation(order)
+    level_start = np.searchsorted(level[order], np.arange(level.max() + 2))
+    k, m = BLOCK * own, BLOCK * height
+    value = np.concatenate([[0], np.cumsum(k * m - k * (k - 1) // 2)])
+    stride = -(-m[order] // ALIGN) * ALIGN
+    at, half = _places(stride * m[order], level_start)
+    child_start, child = _children(tree.parent, order, number)
+    maps = _maps(tree)
+    map_start, map_ = _regrouped(tree.below_start, maps, order)
+    split_start, split = _splits(tree, height, maps, order)
+    entry_start, block, row = _entries(tree, row_start, columns)
+    return Plan(
+        level_start, k[order], m[order], stride, at, BLOCK * tree.first[order], value[order], child_start, child,
+        map_start, map_.astype(np.int32), split_start, split, entry_start, block, row, half, len(columns),
+        int(value[-1]),
+    )  # fmt: skip
+
+
+def levels(tree: AssemblyTree) -> Int64:
+    """Level of each front, (f,): its parent's less one; of a root the length of the longest path down."""
+    parent = tree.parent.tolist()
+    level = [0] * len(parent)
+    for front, up in enumerate(parent):  # heights
+        if up >= 0:
+            level[up] = max(level[up], level[front] + 1)
+    for front in range(len(parent) - 1, -1, -1):
+        if parent[front] >= 0:
+            level[front] = level[parent[front]] - 1
+    return np.array(level)
+
+
+def _places(sizes: Int64, level_start: Int64) -> tuple[Int64, tuple[int, int]]:
+    """First entry of each front in its half, and what either half has to hold."""
+    end = np.cumsum(sizes)
+    at = end - sizes
+    before = at[level_start[:-1]]
+    held = np.append(before[1:], end[-1]) - before
+    return at - np.repeat(before, np.diff(level_start)), (int(held[::2].max()), int(held[1::2].max(initial=0)))
+
+
+def _children(parent: Int64, order: Int64, number: Int64) -> tuple[Int64, Int64]:
+    """Children of each front in the order of their columns, fronts numbered anew."""
+    has = np.flatnonzero(parent >= 0)
+    by_parent = has[np.argsort(number[parent[has]], kind="stable")]
+    counts = np.bincount(number[parent[has]], minlength=len(order))
+    return np.concatenate([[0], np.cumsum(counts)]), number[by_parent]
+
+
+def _maps(tree: AssemblyTree) -> Int64:
+    """For each row below a front its place in the parent's front, in the order of tree.below."""
+    fronts = np.repeat(np.arange(len(tree.parent)), np.diff(tree.below_start))
+    return _place(tree, tree.parent[fronts], tree.below)
+
+
+def _place(tree: AssemblyTree, front: Int64, row: Int64) -> Int64:
+    """Where a row stands in a front's list of rows: own columns first, then those below."""
+    nodes = len(tree.order)
+    keys = np.repeat(np.arange(len(tree.parent)), np.diff(tree.below_start)) * nodes + tree.below
+    below = np.searchsorted(keys, front * nodes + row) - tree.below_start[front] + tree.own[front]
+    return np.where(row < tree.first[front + 1], row - tree.first[front], below)
+
+
+def _regrouped(start: Int64, values: Int64, order: Int64) -> tuple[Int64, Int64]:
+    """Lists of fronts in another order of the fronts: where each begins, and all of them."""
+    length = np.diff(start)[order]
+    new = np.concatenate([[0], np.cumsum(length)])
+    source = np.repeat(start[order] - new[:-1], length) + np.arange(new[-1])
+    return new, values[source]
+
+
+def _splits(tree: AssemblyTree, height: Int64, maps: Int64, order: Int64) -> tuple[Int64, Int32]:
+    """Where in each front's map the chunks of its parent begin; a root has none."""
+    chunks = np.where(tree.parent >= 0, -(-height[tree.parent] // CHUNK) + 1, 0)
+    start = np.concatenate([[0], np.cumsum(chunks)])
+    front = np.repeat(np.arange(len(chunks)), chunks)
+    first_node = (np.arange(start[-1]) - start[front]) * CHUNK
+    wide = int(height.max()) + CHUNK + 1
+    keys = np.repeat(np.arange(len(chunks)), np.diff(tree.below_start)) * wide + maps
+    found = np.searchsorted(keys, front * wide + np.minimum(first_node, wide - 1)) - tree.below_start[front]
+    return start[:-1][order], found.astype(np.int32)
+
+
+def _entries(tree: AssemblyTree, row_start: Index, columns: Index) -> tuple[Int64, Int32, Int32]:
+    """Blocks of A by column. Of two mirrored ones that in the row of the node eliminated later, as on the CPU."""
+    rank = inverse_permutation(tree.order)
+    row, column = rank[rows_of(row_start)], rank[columns]
+    block = np.flatnonzero(row >= column)
+    block = block[np.lexsort((row[block], column[block]))]
+    front = np.repeat(np.arange(len(tree.parent)), tree.own)
+    place = _place(tree, front[column[block]], row[block])
+    start = np.searchsorted(column[block], np.arange(len(tree.order) + 1))
+    return start, block.astype(np.int32), place.astype(np.int32)
