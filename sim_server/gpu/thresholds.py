@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_server.gpu.partition import COLUMNS, ROWS, Partition, Tree, padded, partition
-from sim_server.gpu.sharing import Work
+from sim_server.gpu.sharing import Work, share
 
 Ints = NDArray[np.int64]
 LATENCY, LATENCY_ALONE = 1700.0, 400.0  # of a phase [ns]: with a barrier between many blocks, in one block
@@ -19,7 +19,7 @@ MEMORY, CACHE, SHARED = 4400 / 132, 7000 / 132, 25000 / 132  # bandwidths of one
 CACHED = 50e6  # bytes that stay in the second-level cache
 KEPT, X_AREA = 190e3, 160e3  # bytes of a block's shared memory: for matrices and vectors, at most for vectors
 BRING, ENTRY = 250.0, 0.4  # of a part's vector [ns]: at all, per entry
-FLOPS, USES = 15e3, 3000  # making the matrices: float32 operations per ns; applications that share the cost
+FLOPS, USES = 10e3, 3000  # making the matrices: float32 operations per ns; applications that share the cost
 MOST = 7  # groups
 
 
@@ -46,8 +46,8 @@ def _bytes(cut: Partition, planes: int) -> float:
     return float((v * v + 2 * v * b).sum()) * 2 * planes
 
 
-def predict(cut: Partition, blocks: int, planes: int) -> float:
-    """Time of one application [ns], the cost of making the matrices shared among its uses included."""
+def estimate(cut: Partition, blocks: int, planes: int) -> float:
+    """Time of one application [ns] if all blocks had the same to do, and a share in the cost of making the matrices."""
     rate, kept, time = _rate(cut, planes), KEPT, 0.0
     for which, work in works(cut, blocks, planes):
         if len(which) == 0:
@@ -58,14 +58,31 @@ def predict(cut: Partition, blocks: int, planes: int) -> float:
         bring = float((work.bring * shares).sum()) / min(blocks, float(np.ceil(shares).sum()))
         bytes_kept = min(kept, busiest * rate)
         kept -= bytes_kept
-        time += bytes_kept / SHARED + (busiest - bytes_kept / rate) + bring
-        time += LATENCY_ALONE if blocks == 1 else LATENCY
-    return time + _flops(cut) / FLOPS / USES
+        time += bytes_kept / SHARED + (busiest - bytes_kept / rate) + bring + _latency(blocks)
+    return time + _making(cut)
 
 
-def _flops(cut: Partition) -> float:
+def predict(cut: Partition, blocks: int, planes: int) -> float:
+    """As estimate, with the work shared out as it will be."""
+    rate, kept, time = _rate(cut, planes), np.full(blocks, KEPT), 0.0
+    for _, work in works(cut, blocks, planes):
+        pieces = share(work, blocks)
+        stream = np.bincount(pieces.block, pieces.tiles * work.tile[pieces.matrix], blocks)
+        bring = np.bincount(pieces.block, work.bring[pieces.matrix], blocks)
+        bytes_kept = np.minimum(kept, stream * rate)
+        kept -= bytes_kept
+        time += float((bytes_kept / SHARED + stream - bytes_kept / rate + bring).max()) + _latency(blocks)
+    return time + _making(cut)
+
+
+def _latency(blocks: int) -> float:
+    return LATENCY_ALONE if blocks == 1 else LATENCY
+
+
+def _making(cut: Partition) -> float:
+    """Time of making the matrices [ns] by the applications that share it."""
     v, b = cut.v.astype(float), cut.b.astype(float)
-    return float((2 / 3 * v**3 + v * v * b).sum())
+    return float((2 / 3 * v**3 + v * v * b).sum()) / FLOPS / USES
 
 
 def largest_area(cut: Partition, blocks: int) -> float:
@@ -92,21 +109,23 @@ def candidates(tree: Tree, groups: int) -> Iterator[tuple[int, ...]]:
 
 
 def choose(tree: Tree, blocks: int, groups: int | None, planes: int) -> tuple[tuple[int, ...], float]:
-    """Thresholds and predicted time [us]."""
-    best: tuple[int, ...] = ()
-    least = np.inf
+    """Thresholds and predicted time [us]: of each number of groups the best by estimate, of these the best by
+    prediction."""
+    found: list[tuple[float, tuple[int, ...]]] = []
     for count in [groups] if groups else range(1, MOST + 1):
-        found = np.inf
-        for thresholds in candidates(tree, count):
-            cut = partition(tree, thresholds)
-            if count > 1 and len(np.unique(cut.group)) < count:
-                continue
-            time = predict(cut, blocks, planes)
-            if 4 * largest_area(cut, blocks) > X_AREA:
-                time *= 10
-            found = min(found, time)
-            if time < least:
-                best, least = thresholds, time
-        if found > 1.5 * least and count > 1:
+        estimated = [(_estimate(tree, t, blocks, planes), t) for t in candidates(tree, count)]
+        found.append(min(estimated, default=(np.inf, ())))
+        if found[-1][0] > 1.5 * min(found)[0] and count > 1:
             break  # more phases do not help any more
-    return best, least / 1000
+    near = [t for time, t in found if time < 1.5 * min(found)[0]] or [()]
+    predicted = [(predict(partition(tree, t), blocks, planes), t) for t in near]
+    time, thresholds = min(predicted)
+    return thresholds, time / 1000
+
+
+def _estimate(tree: Tree, thresholds: tuple[int, ...], blocks: int, planes: int) -> float:
+    cut = partition(tree, thresholds)
+    if len(np.unique(cut.group)) < cut.groups:
+        return np.inf
+    time = estimate(cut, blocks, planes)
+    return time * 10 if 4 * largest_area(cut, blocks) > X_AREA else time
