@@ -40,7 +40,8 @@ def _summary(status: pb.Status) -> Text:
         f"{status.scene or '(no scene)'} on {status.device or '?'}: {status.state}, "
         f"step {status.step}, t = {status.time:.3f} s, dt = {status.dt * 1e3:g} ms",
         f"step p50 {_ms(status.step_p50)}, p99 {_ms(status.step_p99)}, max {_ms(status.step_max)}, "
-        f"late {status.late_steps}; frames dropped {status.frames_dropped}",
+        f"late {status.late_steps}; dropped: frames {status.frames_dropped}, step records {status.records_dropped}; "
+        f"lost to the log {status.records_lost}",
         f"messages refused {status.refused}; arrays through shared memory {status.bulk_shared}, "
         f"as bytes {status.bulk_copied}; clients {len(status.clients)}",
     ]

@@ -88,7 +88,8 @@ def build(source: Path, defines: tuple[str, ...] = ()) -> Path:
 
     Raises CompileError with the compiler's output, or if there is no folder for it.
     """
-    headers = sorted(p for folder in {INCLUDE, source.parent} for p in folder.iterdir() if p.suffix in (".h", ".cuh"))
+    folders = [f for f in {INCLUDE, source.parent, HERE / "native"} if f.is_dir()]
+    headers = sorted(p for folder in folders for p in folder.iterdir() if p.suffix in (".h", ".cuh"))
     flags = [*FLAGS, *(f"-D{d}" for d in defines)]
     digest = hashlib.sha256(
         "\0".join([_machine(), *flags, *(p.name + p.read_text() for p in [source, *headers])]).encode()

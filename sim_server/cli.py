@@ -6,6 +6,7 @@ import os
 import signal
 import sys
 import time
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
-from sim_server.errors import InputError
+from sim_server.errors import DeviceError, DeviceLost, InputError
 
 if TYPE_CHECKING:
     from sim_server.service import Service
@@ -44,7 +45,7 @@ class Terminated(BaseException):
 def serve(
     scene: Annotated[Path, typer.Argument(metavar="SCENE.toml", help="What to simulate")],
     device: Annotated[
-        str, typer.Option(metavar="auto|cpu|gpu", help="Where; auto: the CPU, while the GPU is a preview")
+        str, typer.Option(metavar="auto|cpu|gpu", help="Where; auto: the GPU if there is a usable one, else the CPU")
     ] = "auto",
     steps: Annotated[int | None, typer.Option(metavar="N", min=1, help="Stop after so many steps")] = None,
     realtime: Annotated[
@@ -69,10 +70,11 @@ def serve(
     signal.signal(signal.SIGTERM, _terminate)
     if device not in ("auto", "cpu", "gpu"):
         _bad_input(f"--device {device}: allowed are auto, cpu, gpu")
-    options = Options(
-        scene, set_ or [], device, name, listen, connect, not no_shared_memory, record, steps, realtime, workers
-    )  # fmt: skip
     say = (lambda text: None) if quiet else (lambda text: print(f"sim-server: {text}", flush=True))
+    options = Options(
+        scene, set_ or [], chosen(device, say), name, listen, connect, not no_shared_memory, record, steps, realtime,
+        workers,
+    )  # fmt: skip
     try:
         with ExitStack() as closing:
             service, supervisor = _set_up(closing, options)
@@ -87,6 +89,23 @@ def serve(
         raise typer.Exit(130) from None
     except Terminated:
         raise typer.Exit(0) from None
+    except DeviceLost as error:
+        print(f"sim-server: {error}", file=sys.stderr)
+        raise typer.Exit(1) from None
+
+
+def chosen(device: str, say: Callable[[str], None]) -> str:
+    """The device to run on: auto is the GPU if there is a usable one. Says why if there is none."""
+    if device != "auto":
+        return device
+    from sim_server.gpu.device import cupy
+
+    try:
+        cupy()
+    except DeviceError as error:
+        say(f"on the CPU; {error}")
+        return "cpu"
+    return "gpu"
 
 
 @dataclass(frozen=True)
@@ -120,7 +139,7 @@ def _set_up(closing: ExitStack, o: Options) -> "tuple[Service, Supervisor | None
     from sim_server.supervisor import Supervisor
 
     try:
-        simulation = Simulation.load(o.scene, o.overrides, "gpu" if o.device == "gpu" else "cpu")
+        simulation = Simulation.load(o.scene, o.overrides, o.device)
         link = closing.enter_context(ServerLink(o.name, o.listen, o.connect, shared_memory=o.shared_memory))
         recorder = None
         if o.record is not None:

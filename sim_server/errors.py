@@ -12,3 +12,7 @@ class InputError(Exception):
 
 class DeviceError(InputError):
     """The device asked for is not there or not usable; the message says what to do."""
+
+
+class DeviceLost(RuntimeError):
+    """The GPU failed while the simulation ran; nothing on it can be used any more."""

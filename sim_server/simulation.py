@@ -7,6 +7,7 @@ Start reading there.
 """
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +34,10 @@ class Simulation:
 
     def __init__(self, scene: Scene, device: str = "cpu"):
         self.scene = scene
+        with _building(device):
+            self._build(scene, device)
+
+    def _build(self, scene: Scene, device: str) -> None:
         self.world = World(scene, _backend(device))
         self.effects = build_effects(scene, self.world)
         stencilled = [e for e in self.effects.values() if e.tets is not None]
@@ -47,7 +52,8 @@ class Simulation:
             from sim_server.gpu.engine import GpuEngine
 
             gpu: Any = w.backend
-            self.engine = GpuEngine(gpu, assemble, integrate, ranges, w.dt, **arrays)  # type: ignore[arg-type]
+            names = [b.name for b in w.bodies]
+            self.engine = GpuEngine(gpu, assemble, integrate, ranges, w.dt, names, **arrays)  # type: ignore[arg-type]
         else:
             self.engine = Engine(assemble, integrate, ranges, w.dt, threads=scene.solver.threads, **arrays)
         for body in w.bodies:
@@ -116,6 +122,14 @@ class Simulation:
         row_start, columns = self.system.body_pattern(b.first, b.last)
         n = 3 * (b.last - b.first)
         return bsr_array((self.system.body_values(b.first, b.last).copy(), columns, row_start), shape=(n, n)).tocsc()
+
+
+def _building(device: str) -> AbstractContextManager[None]:
+    if device == "gpu":
+        from sim_server.gpu.device import building
+
+        return building()
+    return nullcontext()
 
 
 def _backend(device: str) -> Any:

@@ -140,7 +140,8 @@ class Telemetry:
             pid=os.getpid(), uptime=time.monotonic() - self.begun,
         )  # fmt: skip
         dropped = loop.frames_dropped + (self.recorder.dropped if self.recorder else 0)
-        status.frames_dropped = dropped
+        status.frames_dropped, status.records_dropped = dropped, loop.records_dropped
+        status.records_lost = self.recorder.lost if self.recorder else 0
         for track in self.driver.tracks:
             body, window = track.body, self._window[track.body.name]
             status.objects.append(

@@ -5,13 +5,15 @@ Host arrays keep their names: `twin` gives the device array that stands for one,
 the code that lists the launches of a step is the same on both devices.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_server.backend import HERE, INCLUDE, Argument, arguments_of
+from sim_server.backend import HERE, INCLUDE, Argument, CompileError, arguments_of
 from sim_server.errors import DeviceError
 
 BLOCK = 128  # threads of an ordinary launch
@@ -23,14 +25,58 @@ def cupy() -> Any:
     try:
         import cupy as cp
     except ImportError as error:
-        raise DeviceError(f"--device gpu needs CuPy: pip install 'warpfactor[gpu]' ({error})") from error
+        raise DeviceError(f"no GPU: CuPy is not usable ({error}); pip install 'warpfactor[gpu]'") from error
     try:
         count = cp.cuda.runtime.getDeviceCount()
     except cp.cuda.runtime.CUDARuntimeError as error:
-        raise DeviceError(f"--device gpu: no usable NVIDIA driver, see nvidia-smi ({error})") from error
+        raise DeviceError(_no_device(error)) from error
     if count == 0:
-        raise DeviceError("--device gpu: no NVIDIA GPU is visible (CUDA_VISIBLE_DEVICES?)")
+        raise DeviceError("no GPU: CuPy sees no NVIDIA device (is CUDA_VISIBLE_DEVICES empty?)")
     return cp
+
+
+def _no_device(error: Exception) -> str:
+    text = str(error)
+    if "InsufficientDriver" in text:
+        return (
+            f"no GPU: there is no NVIDIA driver, or it is too old for this CuPy ({text}); nvidia-smi shows it. "
+            "Update the driver, or install the CuPy of its CUDA version (for 12: pip install 'cupy-cuda12x[ctk]')"
+        )
+    if "NoDevice" in text:
+        return f"no GPU: CuPy sees no NVIDIA device ({text}); see nvidia-smi and CUDA_VISIBLE_DEVICES"
+    return f"no GPU: the NVIDIA driver does not answer ({text}); see nvidia-smi"
+
+
+def no_memory_left(error: Exception) -> bool:
+    """The GPU (or page-locked host memory) has no room for what was asked for."""
+    cp = cupy()
+    out = isinstance(error, cp.cuda.memory.OutOfMemoryError)
+    return out or (isinstance(error, cp.cuda.runtime.CUDARuntimeError) and "MemoryAllocation" in str(error))
+
+
+@contextmanager
+def building() -> Iterator[None]:
+    """While a scene is put onto the GPU: too little memory becomes a DeviceError that says what to do."""
+    try:
+        yield
+    except Exception as error:
+        if not no_memory_left(error):
+            raise
+        free, total = cupy().cuda.runtime.memGetInfo()
+        raise DeviceError(
+            f"the scene does not fit into the memory of the GPU: {error}; {free / 1e9:.2f} of {total / 1e9:.2f} GB are "
+            "free. Fewer or smaller objects need less, or --device cpu"
+        ) from error
+
+
+def compiled(name: str, module: Any, kernel: str) -> Any:
+    """A kernel of a text; raises CompileError with the first error of the compiler."""
+    try:
+        return module.get_function(kernel)
+    except cupy().cuda.compiler.CompileException as error:
+        lines = str(error).splitlines()
+        first = next((line for line in lines if "error" in line), lines[0] if lines else "no message")
+        raise CompileError(f"{name} does not compile for this GPU: {first.strip()}") from error
 
 
 class DeviceLaunch:
@@ -56,15 +102,15 @@ class DeviceLaunch:
         """One of its arrays as kernels have left it, copied."""
         return self._arrays[name].get()
 
-    def take(self, other: "DeviceLaunch") -> None:
-        """From the next launch on, the arguments of `other`."""
+    @property
+    def mail_address(self) -> int:
+        """Where the arguments of a mailed launch lie."""
         assert self._mail is not None
-        self._mail.set(other.params.reshape(1).view(np.uint8))
-        self._arrays = other._arrays
+        return int(self._mail.data.ptr)
 
 
 class DeviceModule:
-    """A kernel text compiled by NVRTC; raises CompileError through CuPy's compiler."""
+    """A kernel text compiled by NVRTC; raises CompileError."""
 
     def __init__(self, path: str, gpu: "Gpu", real: str = "double", cooperative: bool = False):
         source = HERE / path
@@ -78,7 +124,7 @@ class DeviceModule:
 
     def function(self, kernel: str) -> Any:
         """A kernel by name."""
-        return self._module.get_function(kernel)
+        return compiled(f"{self.name}.cu", self._module, kernel)
 
     def bind(self, kernel: str, n: int, **arguments: Any) -> DeviceLaunch:
         """As backend.Module.bind, with the twins of the arrays."""
@@ -138,4 +184,3 @@ class Gpu:
         if path not in self._modules:
             self._modules[path] = DeviceModule(path, self)
         return self._modules[path]
-

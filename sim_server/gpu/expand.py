@@ -29,7 +29,7 @@ def entries(pattern: FactorPattern) -> tuple[NDArray[np.int32], NDArray[np.int32
     return np.concatenate(rows).astype(np.int32), np.concatenate(columns)
 
 
-BUFFERS = 3  # in use, waiting to be taken up, being made
+BUFFERS = 2  # in use, being made
 
 
 class Expanded(NamedTuple):
@@ -47,8 +47,9 @@ class Expansion:
     def __init__(self, gpu: Gpu, pattern: FactorPattern):
         cp, n = gpu.cp, pattern.size
         if n > LIMIT:
-            raise ValueError(f"{n} degrees of freedom: a dense inverse is kept up to {LIMIT}")
+            raise ValueError(f"{n} degrees of freedom, beyond {LIMIT}")
         self.gpu, self.pattern = gpu, pattern
+        self._given = 0
         self.stride = -(-n // 8) * 8
         self.stream = cp.cuda.Stream(non_blocking=True, priority=0)
         row, column = entries(pattern)
@@ -75,13 +76,17 @@ class Expansion:
         self._pinned = cp.cuda.alloc_pinned_memory(self._values.nbytes)
         self._staged = np.frombuffer(self._pinned, np.float32, pattern.nonzeros)
 
-    def expand(self, values: NDArray[Any], occupied: set[int]) -> "Expanded":
-        """Starts making the inverse in a buffer whose address is not among the (at most two) occupied ones."""
+    def target(self) -> int:
+        """One of the buffers, each once."""
+        self._given += 1
+        return self._given - 1
+
+    def expand(self, values: NDArray[Any], back: int) -> "Expanded":
+        """Starts making the inverse in a buffer."""
         cp = self.gpu.cp
         from cupyx.scipy.linalg import solve_triangular
 
         self._staged[:] = values
-        back = next(i for i, s in enumerate(self.stored) if self.gpu.twin(s).data.ptr not in occupied)
         dense, inverse = self.gpu.twin(self._dense), self.gpu.twin(self._inverse)
         with self.stream:
             self.gpu.twin(self._values).set(self._staged, stream=self.stream)

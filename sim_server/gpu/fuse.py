@@ -13,7 +13,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from sim_server.backend import INCLUDE
-from sim_server.gpu.device import DeviceLaunch, Gpu, cupy
+from sim_server.gpu.device import DeviceLaunch, Gpu, compiled, cupy
 
 DOMAINS = ("elements", "nodes", "blocks")
 LANES = {"elements": 1, "nodes": 8, "blocks": 4}
@@ -38,7 +38,7 @@ class Fused:
         module = cupy().RawModule(
             code=source(launches, self._lanes), options=("-std=c++17", f"-I{INCLUDE}", "-Dreal=double"), backend="nvrtc"
         )
-        self._function = module.get_function("fused")
+        self._function = compiled(self.name, module, "fused")
 
     def __call__(self) -> None:
         """Puts it onto the current stream."""
@@ -89,4 +89,3 @@ def fused(gpu: Gpu, launches: Sequence[DeviceLaunch]) -> list[Any]:
         return list(launches)
     together = [[x for x in launches if domain(x) == d] for d in DOMAINS]
     return [Fused(gpu, group) if len(group) > 1 or group[0].sums else group[0] for group in together if group]
-

@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from protocol.factor import FactorPattern
 from sim_server.gpu.device import DeviceModule, Gpu
-from sim_server.gpu.expand import Expanded
+from sim_server.gpu.expand import Expanded, Expansion
 
 THREADS = 512
 
@@ -70,6 +71,7 @@ class Solver:
             "diagonal": cp.zeros(9 * nodes), "partial": cp.zeros(4 * self._grid * len(ranges)),
             "arrived": self.arrived, "results": self.results, "step": counter,
         }  # fmt: skip
+        self._expansions: dict[tuple[int, int], Expansion] = {}
         self._shared = self._shared_memory()
         self._params = self._arguments(nodes)
         self._function = DeviceModule("gpu/pcg.cu", gpu, cooperative=True).function("pcg")
@@ -84,7 +86,14 @@ class Solver:
         """Puts a solve onto the current stream."""
         self._function((self._grid,), (THREADS,), (self._params,), shared_mem=self._shared)
 
-    def use(self, body: int, expanded: Expanded, step: int) -> None:
+    def expansion(self, body: int, pattern: FactorPattern) -> Expansion:
+        """What makes factors of this pattern usable for a body. Raises ValueError if nothing does."""
+        key = (body, pattern.id)
+        if key not in self._expansions:
+            self._expansions[key] = Expansion(self.gpu, pattern)
+        return self._expansions[key]
+
+    def use(self, body: int, pattern: FactorPattern, expanded: Expanded, step: int) -> None:
         """Writes a factor into the host row of a body; it holds once the row is uploaded."""
         row = self.bodies[body]
         row["inverse"], row["scale"], row["stride"] = expanded.inverse, expanded.scale, expanded.stride

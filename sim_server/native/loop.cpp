@@ -153,7 +153,7 @@ void wf_solve(Loop* loop) {
     write_frame(*loop);
 }
 
-int32_t wf_wait(Loop* loop) { return wait_until_due(loop->rings); }
+int32_t wf_wait(Loop* loop) { return wait_until_due(loop->rings, [] { return false; }); }
 
 // Runs until `steps` are done or `stop` is set; returns the steps done.
 int64_t wf_run(Loop* loop, int64_t steps) {

@@ -63,19 +63,25 @@ static bool room_for_records(Rings& rings, int64_t count, Meanwhile meanwhile) {
     return true;
 }
 
-// Before a step: sleep while paused and until it is due. False if the loop is to stop.
-static bool wait_until_due(Rings& rings) {
+// Before a step: sleep while paused and until it is due. False if the loop is to stop. `meanwhile` is called before each nap and
+// says whether it wants to be called again soon.
+template <class Meanwhile>
+static bool wait_until_due(Rings& rings, Meanwhile meanwhile) {
     while (rings.pause.load(std::memory_order_relaxed) && !rings.stop.load()) {
+        meanwhile();
         nap(1e-3);
         rings.deadline = 0;
     }
     rings.late = 0;
     if (rings.realtime && !rings.stop.load()) {
-        double t = now();
+        double t = now(), entered = t;
         if (rings.deadline == 0) rings.deadline = t;
-        if (t < rings.deadline) nap(rings.deadline - t);
-        else rings.late = t - rings.deadline;
-        if (rings.late > rings.dt) { ++rings.late_steps; rings.deadline = t; }  // do not chase lost time
+        for (; t < rings.deadline; t = now()) {
+            double left = rings.deadline - t;
+            nap(meanwhile() && left > 2e-4 ? 2e-4 : left);
+        }
+        if (entered > rings.deadline) rings.late = entered - rings.deadline;
+        if (rings.late > rings.dt) { ++rings.late_steps; rings.deadline = entered; }  // do not chase lost time
         rings.deadline += rings.dt;
     }
     return !rings.stop.load();

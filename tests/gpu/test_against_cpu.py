@@ -6,6 +6,7 @@ import pytest
 
 from protocol.messages_pb2 import SolveStatus
 from sim_server.driver import Driver
+from sim_server.factors import Job
 from sim_server.simulation import Simulation
 
 pytestmark = pytest.mark.gpu
@@ -105,10 +106,12 @@ def test_matrices_and_frames_come_back():
 
 def test_a_useless_factor_is_left_for_block_jacobi():
     sim = Simulation.load("deploy/scenes/beam.toml", ["solver.preconditioner=cholesky", "solver.update=never"], "gpu")
-    Driver(sim).advance(1)
-    factor = next(iter(sim.engine._expansions.values()))
-    for scale in factor.scales:
-        sim.world.backend.twin(scale).fill(np.nan)
+    driver = Driver(sim)
+    driver.advance(1)
+    driver.inline.submit(Job("beam", 1, 0, True, sim.system.values, "float32"))
+    factor = driver.inline.poll()[0]
+    sim.engine.post_factor(0, factor.pattern, np.full_like(factor.values, np.nan), 1)
+    sim.engine.settle_factors()
     sim.engine.run(3)
     records = sim.engine.records()
     assert (records["fallbacks"] == 1).all() and (records["status"] == SolveStatus.CONVERGED).all()

@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: MIT
+"""Memory that the native GPU loop and Python share. The C++ side is loop.h; sizes are compared when it is loaded."""
+
+import ctypes as c
+
+import numpy as np
+
+from sim_server.layouts import Rings
+
+p, i64 = c.c_void_p, c.c_int64
+DEPTH, PICTURES = 2, 4  # batches and frames under way at most
+STAMP = np.dtype([("begin", "i8"), ("end", "i8")])
+
+
+class Cuda(c.Structure):
+    """Addresses of functions of the driver API."""
+
+    _fields_ = [
+        (name, p)
+        for name in (
+            "context_set", "graph_launch", "to_device", "to_host", "on_device", "event_record", "event_query",
+            "event_wait", "stream_wait",
+        )
+    ]  # fmt: skip
+
+
+class Mail(c.Structure):
+    _fields_ = [("bytes", p), ("event", p), ("number", i64)]
+
+
+class Mailbox(c.Structure):
+    _fields_ = [("target", c.c_uint64), ("size", i64), ("mail", p), ("held", p), ("taken", i64)]
+
+
+class Body(c.Structure):
+    _fields_ = [("begin", i64), ("bytes", i64), ("wanted", c.c_int32), ("coming", c.c_int32), ("copied", i64)]
+
+
+class Batch(c.Structure):
+    _fields_ = [
+        ("results", p), ("stamps", p), ("upload", p), ("done", p), ("first", i64), ("steps", i64), ("late", c.c_double),
+    ]  # fmt: skip
+
+
+class Picture(c.Structure):
+    _fields_ = [("taken", p), ("arrived", p)]
+
+
+class Loop(c.Structure):
+    _anonymous_ = ("rings",)
+    _fields_ = [
+        ("cuda", c.POINTER(Cuda)), ("context", p), ("stream", p), ("copies", p), ("stamp_graph", p), ("step_graph", p),
+        ("steps_graph", p), ("many", i64), ("mailbox", c.POINTER(Mailbox)), ("body", c.POINTER(Body)),
+        ("mailboxes", c.c_int32), ("bodies", c.c_int32), ("results", c.c_uint64), ("stamps", c.c_uint64),
+        ("capacity", i64), ("batch", i64), ("values", c.c_uint64), ("staged", c.c_uint64), ("matrices", p),
+        ("snapped", p), ("home", p), ("x", c.c_uint64), ("v", c.c_uint64), ("pictures", c.c_uint64),
+        ("frame_bytes", i64), ("clock", p), ("span", c.c_double), ("spin", c.c_double), ("step_seconds", c.c_double),
+        ("cpu", c.c_double), ("begun", i64), ("finished", i64), ("launched", i64), ("drawn", i64),
+        ("matrix_step", i64), ("asked", c.c_int32), ("error", c.c_int32), ("where", c.c_char * 24),
+        ("batches", Batch * DEPTH), ("picture", Picture * PICTURES), ("rings", Rings),
+    ]  # fmt: skip

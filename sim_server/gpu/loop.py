@@ -1,0 +1,234 @@
+# SPDX-License-Identifier: MIT
+"""The native GPU loop (loop.cpp) as seen from Python: its memory, its mailboxes and what comes home.
+
+Nothing here knows CuPy: memory, events and the driver's functions come from a `Device`, which a test may play.
+"""
+
+import ctypes as c
+from collections.abc import Sequence
+from functools import cache
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_server.backend import native
+from sim_server.errors import DeviceLost
+from sim_server.gpu import layouts
+from sim_server.gpu.layouts import PICTURES, STAMP
+from sim_server.layouts import RECORD, check_sizes
+from sim_server.rings import Reals, Reports
+
+BATCH = 16  # steps read back together at most
+MANY = 8  # steps of the larger graph
+CAPACITY = 64  # steps whose results the device keeps: more than can be under way
+FRAMES = 8
+SPAN = 2e-3  # s that a batch lasts about: what asks for something waits two of them at most
+SPIN = 0.0  # s
+
+
+class Device(Protocol):
+    """What the loop needs of a GPU: handles are integers."""
+
+    functions: layouts.Cuda
+    context: int
+    stream: int
+    copies: int
+
+    def pinned(self, size: int) -> NDArray[np.uint8]:
+        """Host memory that the device can copy from and to beside other work, zero."""
+        ...
+
+    def memory(self, size: int) -> int:
+        """Device memory, zero; it stays."""
+        ...
+
+    def event(self) -> int:
+        """An event that a thread may sleep on; it stays."""
+        ...
+
+    def error(self, code: int) -> str:
+        """What an error code of the driver means."""
+        ...
+
+
+@cache
+def library() -> c.CDLL:
+    """The compiled loop."""
+    loop, p = c.POINTER(layouts.Loop), c.c_void_p
+    compiled = native(
+        "gpu/loop.cpp",
+        {
+            "wf_gpu_run": (c.c_int64, [loop, c.c_int64]), "wf_gpu_wait": (c.c_int32, [loop]),
+            "wf_gpu_open": (c.c_int32, [loop]), "wf_gpu_renew": (c.c_int32, [loop]),
+            "wf_gpu_close": (c.c_int32, [loop]), "wf_gpu_post": (p, [c.POINTER(layouts.Mailbox), p]),
+            "wf_gpu_sizes": (c.c_int32, [p]),
+        },
+    )  # fmt: skip
+    sizes = (c.c_int32 * 8)()
+    compiled.wf_gpu_sizes(sizes)
+    from sim_server.gpu.solver import RESULT
+
+    structures = (layouts.Cuda, layouts.Mail, layouts.Mailbox)
+    ours = [*map(c.sizeof, structures), RESULT.itemsize, STAMP.itemsize, c.sizeof(layouts.Body)]
+    check_sizes("gpu/loop.cpp", list(sizes), [*ours, c.sizeof(layouts.Loop), RECORD.itemsize])
+    return compiled
+
+
+class Mailbox:
+    """Bytes on the device that are replaced between batches. Old mail and what it leads to is kept until it is out of
+    use."""
+
+    def __init__(self, loop: Any, box: layouts.Mailbox):
+        self._loop, self._box, self.number = loop, box, 0
+        self._kept: list[Any] = []  # in use, waiting
+        self._leaving: list[tuple[int, Any]] = []  # (free once so many steps are completed, what)
+
+    def post(self, data: bytes, keep: Any = None, event: int | None = None) -> None:
+        """Replaces the bytes from the next batch on (once the event is done). keep: what the bytes point to."""
+        assert len(data) == self._box.size
+        self.number += 1
+        memory = c.create_string_buffer(data, len(data))
+        mail = layouts.Mail(c.addressof(memory), event, self.number)
+        displaced = library().wf_gpu_post(c.byref(self._box), c.addressof(mail))
+        self._leaving = [(step, what) for step, what in self._leaving if step > self._loop.step]
+        if displaced:
+            self._kept.pop()  # it was never taken up; what is in use must live on
+        elif len(self._kept) > 1:  # the last one was taken up: those before are done with after what is under way
+            self._leaving.append((int(self._loop.launched), self._kept[:-1]))
+            del self._kept[:-1]
+        self._kept.append((memory, mail, keep))
+
+    def withdraw(self) -> bool:
+        """Takes back what the loop has not looked at; only while it stands still. True if something came back."""
+        back = bool(library().wf_gpu_post(c.byref(self._box), None)) or bool(self._box.held)
+        self._box.held = None
+        if back:
+            self._kept.pop()
+        return back
+
+    @property
+    def taken(self) -> bool:
+        """What was posted last is on its way to the device."""
+        return bool(self._box.taken == self.number)
+
+
+class DeviceLoop(Reports):
+    """The loop over graphs that were captured elsewhere.
+
+    row_start: of A. ranges: nodes [first, last) of each body. mailboxes: (device address, bytes) of each.
+    real: type of the values of A. results, stamps, values, x, v: device addresses. clock: host array (1,).
+    """
+
+    def __init__(
+        self, device: Device, ranges: Sequence[tuple[int, int]], row_start: NDArray[Any], dt: float,
+        mailboxes: Sequence[tuple[int, int]], clock: Reals, records: int = 8192, real: Any = np.float64,
+        **addresses: int,
+    ):  # fmt: skip
+        self._device, self._ranges, bodies, nodes = device, ranges, len(ranges), len(row_start) - 1
+        self._native = library()
+        loop = layouts.Loop()
+        frames = device.pinned(FRAMES * 48 * nodes).view(np.float64).reshape(FRAMES, 2, nodes, 3)
+        super().__init__(loop, bodies, dt, records, frames)
+        self._box = (layouts.Mailbox * max(len(mailboxes), 1))()
+        for box, (target, size) in zip(self._box, mailboxes, strict=False):
+            box.target, box.size = target, size
+        self.mailboxes = [Mailbox(loop, box) for box in self._box]
+        self._body, block = (layouts.Body * bodies)(), 9 * np.dtype(real).itemsize
+        for entry, (first, last) in zip(self._body, ranges, strict=True):
+            begin, end = block * int(row_start[first]), block * int(row_start[last])
+            entry.begin, entry.bytes, entry.copied = begin, end - begin, -1
+        self._real, self._value_bytes = np.dtype(real), block * int(row_start[-1])
+        self._targets: dict[int, Reals] = {}
+        loop.cuda = c.pointer(device.functions)
+        loop.context, loop.stream, loop.copies = device.context, device.stream, device.copies
+        loop.mailbox, loop.mailboxes, loop.body, loop.bodies = self._box, len(mailboxes), self._body, bodies
+        for name, address in addresses.items():
+            setattr(loop, name, address)
+        loop.capacity, loop.batch, loop.many, loop.span, loop.spin = CAPACITY, BATCH, MANY, SPAN, SPIN
+        loop.frame_bytes, loop.clock, loop.matrix_step = 24 * nodes, clock.ctypes.data, -1
+        loop.pictures = device.memory(PICTURES * 48 * nodes)
+        self._clock = clock
+        self._pinned = self._events_and_memory(loop, sum(-(-size // 16) * 16 for _, size in mailboxes))
+
+    def _events_and_memory(self, loop: layouts.Loop, upload: int) -> list[NDArray[np.uint8]]:
+        from sim_server.gpu.solver import RESULT
+
+        pinned, event = self._device.pinned, self._device.event
+        memory = []
+        for batch in loop.batches:
+            parts = [pinned(max(size, 16)) for size in (BATCH * loop.bodies * RESULT.itemsize, 16 * BATCH, upload)]
+            batch.results, batch.stamps, batch.upload = (part.ctypes.data for part in parts)
+            batch.done = event()
+            memory += parts
+        for picture in loop.picture:
+            picture.taken, picture.arrived = event(), event()
+        loop.snapped, loop.home = event(), event()
+        return memory
+
+    # --- running ------------------------------------------------------------------------------------------------
+
+    def use_graphs(self, stamp: int, step: int, steps: int | None) -> None:
+        """Handles of the graphs: the time when a batch begins, one step, MANY steps."""
+        self.loop.stamp_graph, self.loop.step_graph, self.loop.steps_graph = stamp, step, steps
+
+    def run(self, steps: int) -> int:
+        """Runs up to `steps` steps without Python; returns those done (fewer only after `stop`).
+
+        Raises DeviceLost.
+        """
+        done = int(self._native.wf_gpu_run(c.byref(self.loop), steps))
+        self._check()
+        return done
+
+    def wait(self) -> bool:
+        """Sleeps until the next step is due (real time) and while paused; False if the loop is to stop."""
+        return bool(self._native.wf_gpu_wait(c.byref(self.loop)))
+
+    def _open(self) -> None:
+        """Begins a step whose kernels the caller puts onto the stream."""
+        self._native.wf_gpu_open(c.byref(self.loop))
+        self._check()
+
+    def _renew(self) -> None:
+        """Looks into the mailboxes within a step; the stream must be empty."""
+        self._native.wf_gpu_renew(c.byref(self.loop))
+        self._check()
+
+    def _close(self) -> None:
+        """Ends such a step: waits for it and reports."""
+        self._native.wf_gpu_close(c.byref(self.loop))
+        self._check()
+
+    def _check(self) -> None:
+        if self.loop.error:
+            call = self.loop.where.decode()
+            raise DeviceLost(f"the GPU failed at step {self.step}: {call}: {self._device.error(self.loop.error)}")
+
+    # --- matrices -----------------------------------------------------------------------------------------------
+
+    def request_matrix(self, body: int, target: Reals) -> None:
+        """The values of A of the next step are copied into `target`; it is filled once `matrix_step` says so."""
+        if not self.loop.staged:  # made once, when the first one is asked for
+            self.loop.staged = self._device.memory(self._value_bytes)
+            self._pinned_values = self._device.pinned(self._value_bytes)
+            self.loop.matrices = self._pinned_values.ctypes.data
+        self._targets[body] = target
+        entry = self._body[body]
+        entry.copied, entry.wanted = -1, 1
+        self.loop.asked = 1
+
+    def matrix_step(self, body: int) -> int:
+        """Step of the copy asked for last, -1 while it is not there. `step` counts the steps completed before it."""
+        entry = self._body[body]
+        step = int(entry.copied)
+        if step >= 0 and body in self._targets:
+            data = self._pinned_values[entry.begin : entry.begin + entry.bytes]
+            target = self._targets.pop(body)
+            target[...] = data.view(self._real).reshape(target.shape)
+        return step
+
+    def cancel_matrix(self, body: int) -> None:
+        """Forget the copy asked for (only while the loop stands still)."""
+        self._body[body].wanted = 0
+        self._targets.pop(body, None)

@@ -1,0 +1,177 @@
+# SPDX-License-Identifier: MIT
+"""A GPU made of NumPy for the native GPU loop: work is put off as a real one does it, so that order mistakes show."""
+
+import ctypes as c
+from collections import deque
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_server.gpu import layouts
+from sim_server.gpu.layouts import STAMP
+from sim_server.gpu.loop import CAPACITY, MANY, DeviceLoop
+from sim_server.gpu.solver import RESULT
+
+NOT_READY = 600
+p, size, u64 = c.c_void_p, c.c_size_t, c.c_uint64
+SIGNATURES = {
+    "context_set": [p], "graph_launch": [p, p], "to_device": [u64, p, size, p], "to_host": [p, u64, size, p],
+    "on_device": [u64, u64, size, p], "event_record": [p, p], "event_query": [p], "event_wait": [p],
+    "stream_wait": [p, p, c.c_uint32],
+}  # fmt: skip
+Work = Callable[[], None]
+
+
+class FakeDevice:
+    """loop.Device. Nothing is done before somebody waits for it or asks often enough: a query does one piece of work.
+
+    calls: names of the functions in the order of the calls. fail: a function that answers with an error.
+    """
+
+    context, stream, copies = 1, 2, 3
+
+    def __init__(self) -> None:
+        self.calls: list[str] = []
+        self.fail = ""
+        self.graphs: dict[int, Work] = {}
+        self._queues: dict[int, deque[tuple[str, int | Work]]] = {self.stream: deque(), self.copies: deque()}
+        self._recorded: dict[int, int] = {}  # by event: records asked for, of which so many are
+        self._done: dict[int, int] = {}
+        self._events, self._kept = 100, []
+        self._functions = {
+            name: c.CFUNCTYPE(c.c_int32, *types)(getattr(self, "_" + name)) for name, types in SIGNATURES.items()
+        }
+        self.functions = layouts.Cuda(**{name: c.cast(f, p) for name, f in self._functions.items()})
+
+    def pinned(self, size: int) -> NDArray[np.uint8]:
+        return np.zeros(size, np.uint8)
+
+    def memory(self, size: int) -> int:
+        self._kept.append(np.zeros(size, np.uint8))
+        return int(self._kept[-1].ctypes.data)
+
+    def event(self) -> int:
+        self._events += 1
+        return self._events
+
+    def error(self, code: int) -> str:
+        return f"fake error {code}"
+
+    def _put(self, name: str, stream: int, work: Work) -> int:
+        self.calls.append(name)
+        if name == self.fail:
+            return 700
+        self._queues[stream].append(("work", work))
+        return 0
+
+    def _context_set(self, context: int) -> int:
+        assert context == self.context
+        return 0
+
+    def _graph_launch(self, graph: int, stream: int) -> int:
+        return self._put("graph_launch", stream, self.graphs[graph])
+
+    def _to_device(self, to: int, source: int, count: int, stream: int) -> int:
+        return self._put("to_device", stream, lambda: c.memmove(to, source, count))  # type: ignore[arg-type,return-value]
+
+    def _to_host(self, to: int, source: int, count: int, stream: int) -> int:
+        return self._put("to_host", stream, lambda: c.memmove(to, source, count))  # type: ignore[arg-type,return-value]
+
+    def _on_device(self, to: int, source: int, count: int, stream: int) -> int:
+        return self._put("on_device", stream, lambda: c.memmove(to, source, count))  # type: ignore[arg-type,return-value]
+
+    def _event_record(self, event: int, stream: int) -> int:
+        self._recorded[event] = self._recorded.get(event, 0) + 1
+        count = self._recorded[event]
+        return self._put("event_record", stream, lambda: self._done.__setitem__(event, count))
+
+    def _stream_wait(self, stream: int, event: int, flags: int) -> int:
+        self.calls.append("stream_wait")
+        self._queues[stream].append(("wait", event))
+        return 0
+
+    def is_done(self, event: int) -> bool:
+        """Everything before its last record has been done."""
+        return self._done.get(event, 0) >= self._recorded.get(event, 1 << 30)
+
+    def record(self, event: int) -> None:
+        """As if a stream of somebody else had come so far."""
+        self._recorded[event] = self._done[event] = 1
+
+    def _event_query(self, event: int) -> int:
+        self.calls.append("event_query")
+        if not self.is_done(event):
+            self._one(self.stream) or self._one(self.copies)
+        return 0 if self.is_done(event) else NOT_READY
+
+    def _event_wait(self, event: int) -> int:
+        self.calls.append("event_wait")
+        if self.fail == "event_wait":
+            return 700
+        while not self.is_done(event):
+            assert self._one(self.stream) or self._one(self.copies), "nothing would ever end this wait"
+        return 0
+
+    def _one(self, stream: int) -> bool:
+        """Does one piece of work of a stream, if it may."""
+        queue = self._queues[stream]
+        while queue:
+            kind, what = queue[0]
+            if kind == "wait" and not self.is_done(what):  # type: ignore[arg-type]
+                return False
+            queue.popleft()
+            if kind == "work":
+                what()  # type: ignore[operator]
+                return True
+        return False
+
+
+class FakeScene:
+    """A loop over `bodies` bodies of two nodes with one block of A a node. Step k (from 0) leaves x = k + 1, v = -k,
+    A = k; the settings of a body (one int64) come back as its iterations, its factor (one int64) as its factor_step."""
+
+    def __init__(self, bodies: int = 1, records: int = 8192):
+        nodes = 2 * bodies
+        self.device = device = FakeDevice()
+        self.x, self.v, self.values = np.zeros((nodes, 3)), np.zeros((nodes, 3)), np.zeros((nodes, 3, 3))
+        self.settings, self.factor = np.zeros(bodies, np.int64), np.zeros(bodies, np.int64)
+        self.argument = np.zeros(1, np.int64)
+        self.results, self.stamps = np.zeros((CAPACITY, bodies), RESULT), np.zeros(CAPACITY, STAMP)
+        self.clock, self.time, self.done = np.zeros(1), 0, 0
+        self.seen: list[int] = []  # the argument in each step
+        boxes = [(a.ctypes.data + 8 * k, 8) for a in (self.settings, self.factor) for k in range(bodies)]
+        addresses = {n: getattr(self, n).ctypes.data for n in ("x", "v", "values", "results", "stamps")}
+        self.loop = DeviceLoop(
+            device, [(2 * k, 2 * k + 2) for k in range(bodies)], np.arange(nodes + 1, dtype=np.int32), 0.5,
+            [*boxes, (self.argument.ctypes.data, 8)], self.clock, records, **addresses,
+        )  # fmt: skip
+        device.graphs = {7: self._stamp, 8: self._step, 9: lambda: [self._step() for _ in range(MANY)] and None}  # type: ignore[dict-item]
+        self.loop.use_graphs(7, 8, 9)
+
+    def _stamp(self) -> None:
+        self.time += 1_000_000  # the device had nothing to do for a while
+        self.stamps[self.done % CAPACITY]["begin"] = self.time
+
+    def _step(self) -> None:
+        k, slot = self.done, self.done % CAPACITY
+        self.seen.append(int(self.argument[0]))
+        self.values[:] = k
+        row = self.results[slot]
+        row["iterations"], row["factor_step"] = self.settings, self.factor
+        row["residual"], row["seconds"], row["bad_node"] = 1e-7 * k, 1e-6, -1
+        self.x[:], self.v[:] = k + 1, -k
+        self.time += 10 * (k + 1)
+        self.stamps[slot]["end"] = self.time
+        self.stamps[(slot + 1) % CAPACITY]["begin"] = self.time
+        self.done += 1
+
+
+def number(value: int) -> bytes:
+    """As a mailbox of FakeScene takes it."""
+    return np.int64(value).tobytes()
+
+
+def runs(words: Sequence[str], word: str) -> list[int]:
+    """Lengths of the runs of `word`."""
+    return [len(part.split()) for part in " ".join(w if w == word else "|" for w in words).split("|") if part.split()]

@@ -1,0 +1,264 @@
+# SPDX-License-Identifier: MIT
+"""The native GPU loop on a GPU made of NumPy: batches, mailboxes, frames, matrices, errors."""
+
+import gc
+import threading
+import weakref
+
+import numpy as np
+import pytest
+
+from sim_server.errors import DeviceLost
+from sim_server.gpu.loop import BATCH, FRAMES
+from tests.core.fake_cuda import FakeScene, number
+
+
+def launches_before_each_wait(calls: list[str]) -> list[int]:
+    """Graph launches that had been made when each batch was waited for."""
+    made, out = 0, []
+    for call in calls:
+        made += call == "graph_launch"
+        if call == "event_wait":
+            out.append(made)
+    return out
+
+
+def test_every_step_is_reported_once_and_in_order():
+    scene = FakeScene(bodies=2)
+    assert scene.loop.run(300) == 300  # the device's rings go round several times
+    records = scene.loop.records()
+    assert records["step"].tolist() == np.repeat(np.arange(1, 301), 2).tolist()
+    assert records["body"].tolist() == [0, 1] * 300
+    np.testing.assert_allclose(records["residual"], 1e-7 * (records["step"] - 1))
+    np.testing.assert_allclose(records["time"], 0.5 * records["step"])
+    assert (records["solve"] == 1e-6).all()
+    assert scene.done == scene.loop.step == 300
+    assert scene.clock[0] == 150.0
+
+
+def test_the_time_of_a_step_is_its_own_and_not_a_share_of_its_batch():
+    scene = FakeScene()
+    scene.loop.run(100)
+    records = scene.loop.records()
+    np.testing.assert_allclose(records["whole"], 1e-8 * records["step"], rtol=1e-9)
+    assert (records["cpu"] > 0).all()
+
+
+def test_the_next_batch_is_under_way_before_the_last_one_is_waited_for():
+    scene = FakeScene()
+    scene.loop.run(BATCH)
+    scene.loop.loop.steps_graph = None  # one launch a step
+    scene.device.calls.clear()
+    scene.loop.run(5 * BATCH)
+    steps = np.diff([0, *launches_before_each_wait(scene.device.calls)])
+    assert steps[0] == 2 * (BATCH + 1)  # with the stamps
+    assert max(steps[1:]) <= BATCH + 1
+
+
+def test_in_real_time_each_step_is_waited_for():
+    scene = FakeScene()
+    scene.loop.loop.realtime, scene.loop.loop.dt = 1, 1e-4
+    scene.loop.run(6)
+    assert launches_before_each_wait(scene.device.calls) == [2, 4, 6, 8, 10, 12]
+
+
+def test_few_launches_do_for_many_steps():
+    scene = FakeScene()
+    scene.loop.run(BATCH)
+    scene.device.calls.clear()
+    scene.loop.run(10 * BATCH)
+    assert scene.device.calls.count("graph_launch") == 10 * 3  # a stamp and two graphs of eight steps
+
+
+def test_mail_holds_from_the_next_batch_on_and_the_last_one_wins():
+    scene = FakeScene()
+    box = scene.loop.mailboxes[0]
+    for value in (3, 4, 5):
+        box.post(number(value))
+    assert not box.taken
+    scene.loop.run(2)
+    assert box.taken
+    box.post(number(6))
+    scene.loop.run(1)
+    assert scene.loop.records()["iterations"].tolist() == [5, 5, 6]
+
+
+def test_a_factor_is_used_once_its_event_is_done():
+    scene = FakeScene()
+    event, box = scene.device.event(), scene.loop.mailboxes[1]
+    scene.device._recorded[event] = 1  # under way
+    box.post(number(9), event=event)
+    scene.loop.run(2)
+    assert not box.taken
+    scene.device.record(event)
+    scene.loop.run(1)
+    assert box.taken
+    assert scene.loop.records()["factor_step"].tolist() == [0, 0, 9]
+
+
+def test_what_was_not_taken_can_be_withdrawn():
+    scene = FakeScene()
+    event, box = scene.device.event(), scene.loop.mailboxes[1]
+    scene.device._recorded[event] = 1
+    box.post(number(9), event=event)
+    scene.loop.run(1)  # the loop holds it, but does not use it
+    assert box.withdraw()
+    scene.device.record(event)
+    box.post(number(10))
+    scene.loop.run(1)
+    assert not box.withdraw()
+    assert scene.loop.records()["factor_step"].tolist() == [0, 10]
+
+
+class Held:
+    """What mail points to."""
+
+
+def test_what_mail_points_to_lives_until_the_device_is_done_with_it():
+    scene = FakeScene()
+    box = scene.loop.mailboxes[-1]
+
+    def post(value: int) -> weakref.ref:
+        what = Held()
+        box.post(number(value), keep=what)
+        return weakref.ref(what)
+
+    in_use = post(1)
+    scene.loop.run(1)
+    waiting = [post(k) for k in range(2, 22)]
+    gc.collect()
+    assert in_use() is not None
+    assert sum(w() is not None for w in waiting) == 1
+    scene.loop.run(3)
+    post(50)
+    scene.loop.run(1)
+    post(51)
+    gc.collect()
+    assert in_use() is None
+    assert scene.seen == [1, 21, 21, 21, 50]
+
+
+def test_frames_are_the_states_of_their_steps():
+    scene = FakeScene()
+    scene.loop.loop.frame_every = 3
+    scene.loop.run(14)
+    frames = scene.loop.frames()
+    assert [step for step, _, _ in frames] == [3, 6, 9, 12]
+    for step, x, v in frames:
+        assert (x == step).all()
+        assert (v == 1 - step).all()
+    assert scene.loop.frames() == []
+
+
+def test_frames_that_nobody_fetches_are_dropped_and_counted():
+    scene = FakeScene()
+    scene.loop.loop.frame_every = 1
+    assert scene.loop.run(50) == 50
+    assert [step for step, _, _ in scene.loop.frames()] == list(range(1, FRAMES + 1))
+    assert scene.loop.loop.frames_dropped == 50 - FRAMES
+
+
+def test_a_patient_loop_waits_for_its_reader():
+    scene = FakeScene(records=10)
+    scene.loop.loop.patient = scene.loop.loop.frame_every = 1
+    thread = threading.Thread(target=scene.loop.run, args=(200,))
+    thread.start()
+    steps: list[int] = []
+    frames: list[tuple[int, float]] = []
+    alive = True
+    while alive:
+        alive = thread.is_alive()  # once more after its end
+        steps += scene.loop.records()["step"].tolist()
+        frames += [(step, float(x[0, 0])) for step, x, _ in scene.loop.frames()]
+    assert steps == list(range(1, 201))
+    assert frames == [(k, k) for k in range(1, 201)]
+    assert scene.loop.loop.records_dropped == scene.loop.loop.frames_dropped == 0
+
+
+def test_records_that_nobody_fetches_are_dropped_by_whole_steps_and_counted():
+    scene = FakeScene(bodies=3, records=13)
+    scene.loop.run(40)
+    kept = scene.loop.records()
+    assert kept["step"].tolist() == np.repeat(np.arange(1, 5), 3).tolist()
+    assert len(kept) + scene.loop.loop.records_dropped == 120
+
+
+def test_matrices_are_those_of_the_step_after_the_request_in_all_bodies():
+    scene = FakeScene(bodies=3)
+    scene.loop.run(20)
+    targets = [np.full((2, 3, 3), np.nan) for _ in range(2)]
+    scene.loop.request_matrix(0, targets[0])
+    scene.loop.request_matrix(2, targets[1])
+    assert scene.loop.matrix_step(0) == scene.loop.matrix_step(2) == -1
+    scene.loop.run(40)
+    assert [scene.loop.matrix_step(k) for k in range(3)] == [20, -1, 20]
+    assert all((t == 20).all() for t in targets)
+    scene.loop.request_matrix(0, targets[0])
+    scene.loop.cancel_matrix(0)
+    scene.loop.run(1)
+    assert (targets[0] == 20).all()
+
+
+def test_a_matrix_asked_for_while_it_runs_is_whole():
+    """Its copy is made aside: the steps that follow do not reach it."""
+    scene = FakeScene()
+    scene.loop.run(1)
+    thread = threading.Thread(target=scene.loop.run, args=(4000,))
+    thread.start()
+    found = []
+    target = np.zeros((2, 3, 3))
+    while thread.is_alive():
+        scene.loop.request_matrix(0, target)
+        while scene.loop.matrix_step(0) < 0 and thread.is_alive():
+            scene.loop.records()
+        if (step := scene.loop.matrix_step(0)) >= 0:
+            found.append((step, target.min(), target.max()))
+    assert found
+    assert all(step == low == high for step, low, high in found)
+    assert [step for step, _, _ in found] == sorted({step for step, _, _ in found})
+
+
+def test_a_pause_ends_what_is_under_way_and_resumes():
+    scene = FakeScene()
+    done: list[int] = []
+    scene.loop.loop.pause = 1
+    thread = threading.Thread(target=lambda: done.append(scene.loop.run(30)))
+    thread.start()
+    thread.join(0.05)
+    assert thread.is_alive()
+    assert scene.loop.step == scene.loop.loop.launched == 0
+    scene.loop.loop.pause = 0
+    thread.join(20)
+    assert done == [30]
+    scene.loop.loop.stop = 1
+    assert scene.loop.run(5) == 0
+
+
+@pytest.mark.parametrize("call", ["graph_launch", "event_wait", "to_host"])
+def test_a_device_that_fails_is_told_with_the_call_that_failed(call):
+    scene = FakeScene()
+    scene.loop.run(3)
+    scene.device.fail = call
+    with pytest.raises(DeviceLost, match=rf"the GPU failed at step 3: {call}: fake error 700"):
+        scene.loop.run(3)
+
+
+def test_half_a_step_by_hand_is_a_step():
+    scene = FakeScene()
+    target = np.zeros((2, 3, 3))
+    scene.loop.request_matrix(0, target)
+    scene.loop._open()
+    scene.loop.mailboxes[0].post(number(4))
+    scene.device._event_wait(_recorded(scene))  # the caller waits for the first half
+    scene.loop._renew()
+    scene.device._graph_launch(8, scene.device.stream)
+    scene.loop._close()
+    assert scene.loop.records()[["step", "iterations"]].tolist() == [(1, 4)]
+    assert scene.loop.matrix_step(0) == 0
+    assert scene.loop.run(2) == 2
+
+
+def _recorded(scene: FakeScene) -> int:
+    event = scene.device.event()
+    scene.device._event_record(event, scene.device.stream)
+    return event
