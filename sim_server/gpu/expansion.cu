@@ -7,14 +7,18 @@
 // X goes below the diagonal, C = L21 is above it as its transpose, C Y1 lies in a matrix T of its own. So in the end G is
 // Y = L_VV^-1 on and below its diagonal blocks, and [Y^T Y | Y^T L_BV^T] are the matrices wanted, tile by tile of 64 x 64.
 //
-// A kernel takes tasks one after another from a list, so any number of thread blocks will do.
-// Float32 throughout: Y's columns are summed in a fixed order, results do not depend on the number of blocks.
+// A group of threads takes tasks one after another from a list, and a thread block may have any number of groups: few large
+// blocks keep to few multiprocessors, many small ones are over soon and leave room for more urgent work.
+// Float32 throughout: every sum has a fixed order, so results depend on neither number.
 #define EDGE 64          // of a tile
 #define DEPTH 16         // rows of G that are in shared memory at a time
 #define PITCH 68         // of the rows there
-#define THREADS 256
+#define THREADS 256      // of a group
 #define TILE_PITCH 65
+#define SHARED (4 * DEPTH * PITCH + 2 * EDGE)   // floats of a group
 #define KERNEL_OF(threads) extern "C" __global__ void __launch_bounds__(threads)
+
+extern __shared__ float4 dynamic[];   // SHARED floats per group
 
 struct Part {
     long long g, t;                  // where G and T begin in the workspace
@@ -35,37 +39,49 @@ struct Target {                      // set before each run
     float* scale;                    // (N + 1,)
 };
 
+// Threads of a block that work together; first, step: of the tasks they take.
+template <int SIZE>
+struct Group {
+    int thread, index, first, step;
+    __device__ __forceinline__ Group()
+        : thread(threadIdx.x % SIZE), index(threadIdx.x / SIZE), first(blockIdx.x * (blockDim.x / SIZE) + index),
+          step(gridDim.x * (blockDim.x / SIZE)) {}
+    __device__ __forceinline__ void barrier() const { asm volatile("bar.sync %0, %1;" ::"r"(index + 1), "n"(SIZE) : "memory"); }
+};
+
 __device__ __forceinline__ int padded(int n, int step) { return (n + step - 1) / step * step; }
 
 // Values into G, a warp per column. place: column in its part's G of each entry of L's row lists. begin: the first batch.
-KERNEL_OF(THREADS) scatter(const Part* parts, const Column* columns, int first, int last, const int* place,
+KERNEL_OF(4 * THREADS) scatter(const Part* parts, const Column* columns, int first, int last, const int* place,
                            const float* values, float* workspace, int begin, int scale_end, const Target* target) {
     if (begin && blockIdx.x == 0 && threadIdx.x == 0) target->scale[scale_end] = 0;
-    int warps = gridDim.x * (THREADS / 32), lane = threadIdx.x % 32;
-    for (int c = first + blockIdx.x * (THREADS / 32) + threadIdx.x / 32; c < last; c += warps) {
+    Group<32> warp;
+    for (int c = first + warp.first; c < last; c += warp.step) {
         const Column column = columns[c];
         const Part part = parts[column.part];
         float* row = workspace + part.g + (long long)column.local * part.pitch_g;
         const float* value = values + column.value;
         const int* to = place + column.row;
 #pragma unroll 4
-        for (int k = lane; k < column.length; k += 32) row[to[k]] = value[k];
+        for (int k = warp.thread; k < column.length; k += 32) row[to[k]] = value[k];
     }
 }
 
 // Diagonal blocks: L^T in, L^-1 out. A thread has a column of the inverse in registers.
-KERNEL_OF(EDGE) invert(const Part* parts, const Task* tasks, int count, float* workspace) {
-    __shared__ float4 rows[EDGE][EDGE / 4];   // of L^T
-    __shared__ float pivots[EDGE];
-    for (int t = blockIdx.x; t < count; t += gridDim.x) {
+KERNEL_OF(4 * EDGE) invert(const Part* parts, const Task* tasks, int count, float* workspace) {
+    Group<EDGE> group;
+    int j = group.thread;
+    float(*rows)[EDGE] = (float(*)[EDGE])((float*)dynamic + group.index * EDGE * (EDGE + 1));   // of L^T
+    float* pivots = rows[EDGE];
+    for (int t = group.first; t < count; t += group.step) {
         const Task task = tasks[t];
         const Part part = parts[task.part];
-        float* block = workspace + part.g + (long long)task.i * EDGE * part.pitch_g + task.i * EDGE;
-        int j = threadIdx.x, inside = part.v - task.i * EDGE;
-        for (int i = 0; i < EDGE; i++) ((float*)rows[i])[j] = block[(long long)i * part.pitch_g + j];
-        __syncthreads();
-        pivots[j] = j < inside ? 1 / ((float*)rows[j])[j] : 0;
-        __syncthreads();
+        float* block = workspace + part.g + (long long)task.i * EDGE * part.pitch_g + task.i * EDGE + j;
+        int inside = part.v - task.i * EDGE;
+        for (int i = 0; i < EDGE; i++) rows[i][j] = block[(long long)i * part.pitch_g];
+        group.barrier();
+        pivots[j] = j < inside ? 1 / rows[j][j] : 0;
+        group.barrier();
         float x[EDGE];
 #pragma unroll
         for (int i = 0; i < EDGE; i++) x[i] = i == j ? 1.f : 0.f;
@@ -74,7 +90,7 @@ KERNEL_OF(EDGE) invert(const Part* parts, const Task* tasks, int count, float* w
             x[i] *= pivots[i];
 #pragma unroll
             for (int k = i / 4 * 4; k < EDGE; k += 4) {
-                float4 u = rows[i][k / 4];
+                float4 u = *(float4*)&rows[i][k];
                 if (k > i) x[k] -= u.x * x[i];
                 if (k + 1 > i) x[k + 1] -= u.y * x[i];
                 if (k + 2 > i) x[k + 2] -= u.z * x[i];
@@ -82,8 +98,8 @@ KERNEL_OF(EDGE) invert(const Part* parts, const Task* tasks, int count, float* w
             }
         }
 #pragma unroll
-        for (int i = 0; i < EDGE; i++) block[(long long)i * part.pitch_g + j] = x[i];
-        __syncthreads();
+        for (int i = 0; i < EDGE; i++) block[(long long)i * part.pitch_g] = x[i];
+        group.barrier();
     }
 }
 
@@ -92,31 +108,34 @@ struct Operand { const float* from; int pitch; };
 // 4 x 4 entries of a 64 x 64 tile of A^T B per thread: A, B (depth, 64), row by row; or of A B with A (64, depth).
 template <bool ACROSS>
 struct Product {
-    float (*a)[DEPTH][PITCH], (*b)[DEPTH][PITCH];
+    const Group<THREADS>& group;
+    float (*const a)[DEPTH][PITCH];
+    float (*const b)[DEPTH][PITCH];
     float sum[4][4];
     int row, column;     // of this thread's entries in the tile
 
-    __device__ __forceinline__ Product(float (*shared)[2][DEPTH][PITCH]) : a(shared[0]), b(shared[1]) {
-        int lane = threadIdx.x % 32, warp = threadIdx.x / 32;   // a warp has 32 x 16 entries
+    __device__ __forceinline__ Product(const Group<THREADS>& g, float* shared)
+        : group(g), a((float(*)[DEPTH][PITCH])shared), b(a + 2) {
+        int lane = g.thread % 32, warp = g.thread / 32;   // a warp has 32 x 16 entries
         row = warp / 4 * 32 + lane / 4 * 4;
         column = warp % 4 * 16 + lane % 4 * 4;
     }
 
     __device__ __forceinline__ float4 fetch_a(Operand o, int k) const {
-        if (ACROSS) return *(const float4*)(o.from + (long long)(threadIdx.x / 4) * o.pitch + k + threadIdx.x % 4 * 4);
-        return *(const float4*)(o.from + (long long)(k + threadIdx.x / 16) * o.pitch + threadIdx.x % 16 * 4);
+        if (ACROSS) return *(const float4*)(o.from + (long long)(group.thread / 4) * o.pitch + k + group.thread % 4 * 4);
+        return *(const float4*)(o.from + (long long)(k + group.thread / 16) * o.pitch + group.thread % 16 * 4);
     }
     __device__ __forceinline__ float4 fetch_b(Operand o, int k) const {
-        return *(const float4*)(o.from + (long long)(k + threadIdx.x / 16) * o.pitch + threadIdx.x % 16 * 4);
+        return *(const float4*)(o.from + (long long)(k + group.thread / 16) * o.pitch + group.thread % 16 * 4);
     }
     __device__ __forceinline__ void put(int buffer, float4 x, float4 y) {
         if (ACROSS) {
-            int k = threadIdx.x % 4 * 4, i = threadIdx.x / 4;
+            int k = group.thread % 4 * 4, i = group.thread / 4;
             a[buffer][k][i] = x.x; a[buffer][k + 1][i] = x.y; a[buffer][k + 2][i] = x.z; a[buffer][k + 3][i] = x.w;
         } else {
-            *(float4*)&a[buffer][threadIdx.x / 16][threadIdx.x % 16 * 4] = x;
+            *(float4*)&a[buffer][group.thread / 16][group.thread % 16 * 4] = x;
         }
-        *(float4*)&b[buffer][threadIdx.x / 16][threadIdx.x % 16 * 4] = y;
+        *(float4*)&b[buffer][group.thread / 16][group.thread % 16 * 4] = y;
     }
     __device__ __forceinline__ void multiply(int buffer) {
 #pragma unroll
@@ -136,9 +155,9 @@ struct Product {
         for (int i = 0; i < 4; i++)
 #pragma unroll
             for (int j = 0; j < 4; j++) sum[i][j] = 0;
-        __syncthreads();
+        group.barrier();
         put(0, fetch_a(oa, 0), fetch_b(ob, 0));
-        __syncthreads();
+        group.barrier();
         for (int k = 0; k < depth; k += DEPTH) {
             int buffer = k / DEPTH % 2;
             bool more = k + DEPTH < depth;
@@ -146,7 +165,7 @@ struct Product {
             if (more) { x = fetch_a(oa, k + DEPTH); y = fetch_b(ob, k + DEPTH); }
             multiply(buffer);
             if (more) put(1 - buffer, x, y);
-            __syncthreads();
+            group.barrier();
         }
     }
 
@@ -159,39 +178,42 @@ struct Product {
 };
 
 // T = C Y1: tile (i, j) of a pair of runs j .. end, end .. i ..
-KERNEL_OF(THREADS) couple(const Part* parts, const Task* tasks, int count, float* workspace) {
-    __shared__ __align__(16) float shared[2][2][DEPTH][PITCH];
-    for (int t = blockIdx.x; t < count; t += gridDim.x) {
+KERNEL_OF(4 * THREADS) couple(const Part* parts, const Task* tasks, int count, float* workspace) {
+    Group<THREADS> group;
+    float* shared = (float*)dynamic + group.index * SHARED;
+    for (int t = group.first; t < count; t += group.step) {
         const Task task = tasks[t];
         const Part part = parts[task.part];
         const float* rows = workspace + part.g + (long long)task.j * EDGE * part.pitch_g;
-        Product<false> product(shared);
+        Product<false> product(group, shared);
         product.run({rows + task.i * EDGE, part.pitch_g}, {rows + task.j * EDGE, part.pitch_g}, (task.end - task.j) * EDGE);
         product.store(workspace + part.t + (long long)task.i * EDGE * part.pitch_t + task.j * EDGE, part.pitch_t, 1);
     }
 }
 
 // X = -Y2 T.
-KERNEL_OF(THREADS) merge(const Part* parts, const Task* tasks, int count, float* workspace) {
-    __shared__ __align__(16) float shared[2][2][DEPTH][PITCH];
-    for (int t = blockIdx.x; t < count; t += gridDim.x) {
+KERNEL_OF(4 * THREADS) merge(const Part* parts, const Task* tasks, int count, float* workspace) {
+    Group<THREADS> group;
+    float* shared = (float*)dynamic + group.index * SHARED;
+    for (int t = group.first; t < count; t += group.step) {
         const Task task = tasks[t];
         const Part part = parts[task.part];
         float* row = workspace + part.g + (long long)task.i * EDGE * part.pitch_g;
         const float* coupled = workspace + part.t + (long long)task.end * EDGE * part.pitch_t + task.j * EDGE;
-        Product<true> product(shared);
+        Product<true> product(group, shared);
         product.run({row + task.end * EDGE, part.pitch_g}, {coupled, part.pitch_t}, (task.i + 1 - task.end) * EDGE);
         product.store(row + task.j * EDGE, part.pitch_g, -1);
     }
 }
 
 // Scale: length of the columns of Y, 32 columns of a block of 64 at a time; the largest one goes to scale[scale_end].
-KERNEL_OF(THREADS) lengths(const Part* parts, const Task* tasks, int count, const float* workspace, int scale_end,
+KERNEL_OF(4 * THREADS) lengths(const Part* parts, const Task* tasks, int count, const float* workspace, int scale_end,
                            const Target* target) {
-    __shared__ float sums[THREADS / 32][32];
+    Group<THREADS> group;
+    float(*sums)[32] = (float(*)[32])((float*)dynamic + group.index * SHARED);
     float* scale = target->scale;
-    int lane = threadIdx.x % 32, warp = threadIdx.x / 32;
-    for (int t = blockIdx.x; t < 2 * count; t += gridDim.x) {
+    int lane = group.thread % 32, warp = group.thread / 32;
+    for (int t = group.first; t < 2 * count; t += group.step) {
         const Task task = tasks[t / 2];
         const Part part = parts[task.part];
         int j = task.i * EDGE + t % 2 * 32 + lane;
@@ -202,14 +224,14 @@ KERNEL_OF(THREADS) lengths(const Part* parts, const Task* tasks, int count, cons
             sum += y * y;
         }
         sums[warp][lane] = sum;
-        __syncthreads();
+        group.barrier();
         if (warp == 0 && j < part.v) {
             for (int k = 1; k < THREADS / 32; k++) sum += sums[k][lane];
             sum = sqrtf(sum);
             scale[part.start + j] = sum;
             atomicMax((int*)(scale + scale_end), __float_as_int(sum));   // positive numbers are ordered as their bits are
         }
-        __syncthreads();
+        group.barrier();
     }
 }
 
@@ -233,9 +255,9 @@ __device__ __forceinline__ float number(unsigned word, int upper) {
 // first row on; rows, columns: how many there are from there on, padded; column: the tile's first in the matrix; width: of
 // the whole matrix in chunks.
 template <bool ACROSS>
-__device__ __forceinline__ void store(float (*tile)[TILE_PITCH], float sign, const int* chunk_of, int rows, int columns,
+__device__ __forceinline__ void store(int thread, float (*tile)[TILE_PITCH], float sign, const int* chunk_of, int rows, int columns,
                                       int column, int width, int planes, unsigned short* matrix) {
-    for (int k = threadIdx.x; k < EDGE * EDGE / 8; k += THREADS) {
+    for (int k = thread; k < EDGE * EDGE / 8; k += THREADS) {
         int piece = k % 4, row = k / 4 % 8, chunk = k / 32;
         int r = chunk / 2 * 8 + row, c = chunk % 2 * 32 + piece * 8;
         if (r >= rows || c >= columns) continue;
@@ -257,44 +279,46 @@ __device__ __forceinline__ void store(float (*tile)[TILE_PITCH], float sign, con
 
 // Tile (i, j) of [Y^T Y | Y^T L_BV^T] into the storage: twice, since the inverse is symmetric and the coupling is applied
 // both ways. row_chunk (N / 8,), out_chunk (contributions / 8,): first chunk of each 8 rows.
-KERNEL_OF(THREADS) finish(const Part* parts, const Task* tasks, int count, const float* workspace, const int* boundary,
+KERNEL_OF(4 * THREADS) finish(const Part* parts, const Task* tasks, int count, const float* workspace, const int* boundary,
                           const int* row_chunk, const int* out_chunk, int planes, const Target* target) {
-    __shared__ __align__(16) float shared[2][2][DEPTH][PITCH];
-    __shared__ float tile[EDGE][TILE_PITCH], across[EDGE], down[EDGE];
+    Group<THREADS> group;
+    float* shared = (float*)dynamic + group.index * SHARED;
+    float(*tile)[TILE_PITCH] = (float(*)[TILE_PITCH])shared;   // after the product
+    float *down = shared + SHARED - 2 * EDGE, *across = down + EDGE;
     const Target to = *target;
-    for (int t = blockIdx.x; t < count; t += gridDim.x) {
+    for (int t = group.first; t < count; t += group.step) {
         const Task task = tasks[t];
         const Part part = parts[task.part];
         int i = task.i * EDGE, j = task.j * EDGE, inside = padded(part.v, EDGE), edge = j - inside;
         const float* rows = workspace + part.g + (long long)i * part.pitch_g;
-        Product<false> product(shared);
+        Product<false> product(group, shared);
         product.run({rows + i, part.pitch_g}, {rows + j, part.pitch_g}, inside - i);
-        if (threadIdx.x < EDGE) {
-            int k = i + threadIdx.x;
-            down[threadIdx.x] = k < part.v ? 1 / to.scale[part.start + k] : 0;
-        } else if (threadIdx.x < 2 * EDGE) {
-            int k = threadIdx.x - EDGE;
+        if (group.thread < EDGE) {
+            int k = i + group.thread;
+            down[group.thread] = k < part.v ? 1 / to.scale[part.start + k] : 0;
+        } else if (group.thread < 2 * EDGE) {
+            int k = group.thread - EDGE;
             float d = 0;
             if (edge >= 0) { if (edge + k < part.b) d = to.scale[boundary[part.boundary + edge + k]]; }
             else if (j + k < part.v) d = 1 / to.scale[part.start + j + k];
             across[k] = d;
         }
-        __syncthreads();
+        group.barrier();
 #pragma unroll
         for (int r = 0; r < 4; r++)
 #pragma unroll
             for (int c = 0; c < 4; c++)
                 tile[product.row + r][product.column + c] =
                     product.sum[r][c] * (down[product.row + r] * across[product.column + c]);
-        __syncthreads();
+        group.barrier();
         int rows_v = padded(part.v, 8), columns_v = padded(part.v, 32), width = (columns_v + padded(part.b, 32)) / 32;
         const int* own = row_chunk + part.start / 8;
         if (edge < 0) {
-            store<false>(tile, 1, own + i / 8, rows_v - i, columns_v - j, j, width, planes, to.matrix);
-            if (i != j) store<true>(tile, 1, own + j / 8, rows_v - j, columns_v - i, i, width, planes, to.matrix);
+            store<false>(group.thread, tile, 1, own + i / 8, rows_v - i, columns_v - j, j, width, planes, to.matrix);
+            if (i != j) store<true>(group.thread, tile, 1, own + j / 8, rows_v - j, columns_v - i, i, width, planes, to.matrix);
         } else {
-            store<false>(tile, -1, own + i / 8, rows_v - i, padded(part.b, 32) - edge, columns_v + edge, width, planes, to.matrix);
-            store<true>(tile, 1, out_chunk + (part.out + edge) / 8, padded(part.b, 8) - edge, columns_v - i, i,
+            store<false>(group.thread, tile, -1, own + i / 8, rows_v - i, padded(part.b, 32) - edge, columns_v + edge, width, planes, to.matrix);
+            store<true>(group.thread, tile, 1, out_chunk + (part.out + edge) / 8, padded(part.b, 8) - edge, columns_v - i, i,
                         columns_v / 32, planes, to.matrix);
         }
     }

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import FactorPattern
-from sim_server.gpu.batches import Batch, layout
+from sim_server.gpu.batches import EDGE, Batch, layout
 from sim_server.gpu.device import Gpu
 from sim_server.gpu.partition import COLUMNS, ROWS
 from sim_server.gpu.plan import Plan
@@ -19,7 +19,12 @@ from sim_server.gpu.workspace import workspace
 
 BUFFERS = 3  # per body: in use, waiting to be taken up, being made
 HEAD = 16  # bytes in front of the values: the two addresses of a target
-THREADS, EDGE = 256, 64
+# Of a kernel of expansion.cu: threads and bytes of shared memory of a group, groups in a small and in a large block.
+Groups = tuple[int, int, int, int]
+TILES: Groups = (256, 4 * (4 * 16 * 68 + 2 * EDGE), 1, 4)
+KERNELS: dict[str, Groups] = {"scatter": (32, 0, 8, 32), "invert": (EDGE, 4 * EDGE * (EDGE + 1), 1, 4)} | dict.fromkeys(
+    ("couple", "merge", "lengths", "finish"), TILES
+)
 
 
 class Expanded(NamedTuple):
@@ -39,15 +44,11 @@ class Target(NamedTuple):
 
 
 class Expansion:
-    """Of factors with one pattern by one plan, for any number of bodies.
+    """Of factors with one pattern by one plan, for any number of bodies."""
 
-    multiprocessors: how many may be busy with it at a time; None: all of them, with short thread blocks.
-    """
-
-    def __init__(self, gpu: Gpu, pattern: FactorPattern, plan: Plan, multiprocessors: int | None = None):
+    def __init__(self, gpu: Gpu, pattern: FactorPattern, plan: Plan):
         cp = gpu.cp
-        self.plan, self._gpu, self._limit = plan, gpu, multiprocessors
-        self._nonzeros = pattern.nonzeros
+        self.plan, self._gpu, self._nonzeros = plan, gpu, pattern.nonzeros
         self._layout = made = layout(pattern, plan)
         tables = (made.parts, made.columns)
         self._parts, self._columns = (cp.asarray(t.view(np.uint8)) for t in tables)
@@ -56,7 +57,7 @@ class Expansion:
         self._tasks = [[cp.asarray(t) for t in (b.diagonal, b.finish, *b.merges)] for b in made.batches]
         self._workspace = workspace(cp.cuda.Device().id)
         self._workspace.reserve(made.room, HEAD + 4 * self._nonzeros)
-        self._graph: Any = None
+        self._graphs: dict[int | None, Any] = {}
         self._generation = -1
 
     def target(self) -> Target:
@@ -64,9 +65,13 @@ class Expansion:
         cp, p = self._gpu.cp, self.plan
         return Target(cp.zeros((p.chunks, ROWS, COLUMNS), np.float16), cp.zeros(p.size + 1, np.float32))
 
-    def expand(self, values: NDArray[Any], target: Target) -> Expanded:
+    def expand(self, values: NDArray[Any], target: Target, multiprocessors: int | None = None) -> Expanded:
         """Starts making what `values` (nonzeros,) stand for. Nobody may be using the target; returns at once, but
-        waits for the values of an expansion before it to have been copied to the device."""
+        waits for the values of an expansion before it to have been copied to the device.
+
+        multiprocessors: at most so many are kept busy, for whole milliseconds; a launch that needs all the others
+        runs beside. None: all of them, and a launch that needs all waits some 100 us now and then.
+        """
         space, cp = self._workspace, self._gpu.cp
         if space.copied is not None:
             space.copied.synchronize()
@@ -74,50 +79,54 @@ class Expansion:
         addresses = target.matrix.data.ptr, target.scale.data.ptr
         space.staging[:HEAD].view(np.uint64)[:] = addresses
         space.staging[HEAD:size].view(np.float32)[:] = values
-        if self._generation != space.generation:
-            self._graph, self._generation = self._capture(), space.generation
-        stream = space.stream
+        graph, stream = self._graph(multiprocessors), space.stream
         cp.cuda.runtime.memcpyAsync(
             space.incoming.data.ptr, space.staging.ctypes.data, size, cp.cuda.runtime.memcpyHostToDevice, stream.ptr
         )
         space.copied = stream.record()
-        self._graph.launch(stream)
+        graph.launch(stream)
         return Expanded(*addresses, stream.record())
 
-    def _capture(self) -> Any:
-        stream = self._workspace.stream
-        with stream:
-            stream.begin_capture()
-            for batch, tasks in zip(self._layout.batches, self._tasks, strict=True):
-                self._batch(batch, batch is self._layout.batches[0], *tasks)
-            return stream.end_capture()
+    def _graph(self, limit: int | None) -> Any:
+        if self._generation != self._workspace.generation:  # they hold its addresses
+            self._graphs, self._generation = {}, self._workspace.generation
+        if limit not in self._graphs:
+            stream = self._workspace.stream
+            with stream:
+                stream.begin_capture()
+                for number, batch in enumerate(self._layout.batches):
+                    self._batch(number, batch, limit)
+                self._graphs[limit] = stream.end_capture()
+        return self._graphs[limit]
 
-    def _batch(self, batch: Batch, begin: bool, diagonal: Any, finish: Any, *merges: Any) -> None:
-        space, runtime, parts = self._workspace, self._gpu.cp.cuda.runtime, self._parts
-        memory, target = np.uint64(space.memory.data.ptr), np.uint64(space.incoming.data.ptr)
-        last = np.int32(self.plan.size)
-        runtime.memsetAsync(space.memory.data.ptr, 0, batch.cleared, space.stream.ptr)
-        first, end, columns = np.int32(batch.first), np.int32(batch.last), self._columns
+    def _batch(self, number: int, batch: Batch, limit: int | None) -> None:
+        space, parts, last = self._workspace, self._parts, np.int32(self.plan.size)
+        memory, target = (np.uint64(a.data.ptr) for a in (space.memory, space.incoming))
+        diagonal, finish, *merges = self._tasks[number]
+
+        def launch(name: str, tasks: Any, *more: Any) -> None:
+            self._launch(name, limit, len(tasks), parts, tasks, np.int32(len(tasks)), memory, *more)
+
+        self._gpu.cp.cuda.runtime.memsetAsync(int(memory), 0, batch.cleared, space.stream.ptr)
         self._launch(
-            "scatter", -(-(batch.last - batch.first) // (THREADS // 32)), THREADS,
-            parts, columns, first, end, self._place, np.uint64(target + HEAD), memory, np.int32(begin), last, target,
+            "scatter", limit, batch.last - batch.first, parts, self._columns, np.int32(batch.first),
+            np.int32(batch.last), self._place, np.uint64(target + HEAD), memory, np.int32(number == 0), last, target,
         )  # fmt: skip
-        self._launch("invert", len(diagonal), EDGE, parts, diagonal, np.int32(len(diagonal)), memory)
+        launch("invert", diagonal)
         for tasks in merges:
-            self._launch("couple", len(tasks), THREADS, parts, tasks, np.int32(len(tasks)), memory)
-            self._launch("merge", len(tasks), THREADS, parts, tasks, np.int32(len(tasks)), memory)
-        count = np.int32(len(diagonal))
-        self._launch("lengths", 2 * len(diagonal), THREADS, parts, diagonal, count, memory, last, target)
-        self._launch(
-            "finish", len(finish), THREADS, parts, finish, np.int32(len(finish)), memory, self._boundary,
-            self._row_chunk, self._out_chunk, np.int32(self.plan.planes), target,
-        )  # fmt: skip
+            launch("couple", tasks)
+            launch("merge", tasks)
+        launch("lengths", diagonal, last, target)
+        tables = (self._boundary, self._row_chunk, self._out_chunk)
+        launch("finish", finish, *tables, np.int32(self.plan.planes), target)
 
-    def _launch(self, name: str, blocks: int, threads: int, *arguments: Any) -> None:
+    def _launch(self, name: str, limit: int | None, tasks: int, *arguments: Any) -> None:
+        if tasks == 0:
+            return
+        threads, shared, small, large = KERNELS[name]
+        groups = large if limit else small
+        blocks = min(-(-tasks // groups), limit or tasks)
         function = self._gpu.module("gpu/expansion.cu").function(name)
-        shared = 0
-        if self._limit:  # so much shared memory that a multiprocessor takes one thread block only
-            blocks, shared = min(blocks, self._limit), self._gpu.properties["sharedMemPerMultiprocessor"] // 2
-            function.max_dynamic_shared_size_bytes = shared
-        if blocks:
-            function((blocks,), (threads,), arguments, shared_mem=shared)
+        if large * shared > 48 << 10:
+            function.max_dynamic_shared_size_bytes = large * shared
+        function((blocks,), (groups * threads,), arguments, shared_mem=groups * shared)

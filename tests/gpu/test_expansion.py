@@ -37,9 +37,9 @@ def expanded(gpu, shape, values, p, multiprocessors=None):
     """Chunks and scale, on the host."""
     from sim_server.gpu.expansion import Expansion
 
-    expansion = Expansion(gpu, shape, p, multiprocessors)
+    expansion = Expansion(gpu, shape, p)
     target = expansion.target()
-    made = expansion.expand(values, target)
+    made = expansion.expand(values, target, multiprocessors)
     made.event.synchronize()
     assert (made.matrix, made.scale) == (target.matrix.data.ptr, target.scale.data.ptr)
     return target.matrix.get(), target.scale.get()
