@@ -98,8 +98,8 @@ def versions() -> dict[str, str]:
 
 
 def commit() -> str:
-    """Of the working tree; "-dirty" where files differ from it."""
-    return _first_line(["git", "describe", "--always", "--dirty"]) or "unknown"
+    """Of the working tree; "-dirty" where files differ from it. WARPFACTOR_COMMIT says it where there is no git."""
+    return os.environ.get("WARPFACTOR_COMMIT") or _first_line(["git", "describe", "--always", "--dirty"]) or "unknown"
 
 
 def _cell(value: Any) -> str:

@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: MIT
+"""The page of the GPU benchmark: tables out of the rows of one run or of several."""
+
+from typing import Any
+
+from tests.bench._gpu_figure import figure
+from tests.bench._gpu_problem import AIMS, MATERIALS
+from tests.bench.report import Report
+
+Row = dict[str, Any]
+Data = dict[str, Any]
+KEYS = {  # what tells rows of a section apart
+    "steps": ("tets", "material", "beams"),
+    "others": ("tets", "material", "what"),
+    "served": ("tets", "material", "worker"),
+    "publishing": ("tets", "material", "matrices"),
+}
+
+PROBLEM = (
+    "Beams of 4 x 1 x 1 m, clamped at one end and let go from horizontal; linear corotational tetrahedra, Poisson "
+    "0.45, 1000 kg/m3, Rayleigh damping of the mass 0.1, dt 30 ms. Homogeneous: E 1 MPa. Heterogeneous: 5 MPa times "
+    "1 : 0.05 : 0.01 in three segments. Tolerance 1e-6, warp on. Rounds of 16 steps with a factor 1 to 16 steps old, "
+    "of the last matrix of the round before; it is made between the rounds and no step waits for it (what that takes "
+    "is told apart). Step times are those of single steps on the device; host us: wall time of a round over its steps. "
+    "Residual: |b - A y| / |b| of the last step of each round in float64 on the host, the largest; A, b and y as "
+    "copied from the device."
+)
+AIMED = (
+    "CG and block Jacobi: the whole step of ours without a factor, a few steps of every round. Direct: cuDSS, "
+    "refactorization and solution in float64 alone, without assembly. The paper: Courtecuisse et al. 2010, GTX 480."
+)
+BATCHED = (
+    "Eight kinds whose stiffness differs by a factor 2 in all; each beam has a matrix, a factor and a stop test of its "
+    "own. Others: one step of each round."
+)
+BYTES = (
+    "MB of a step counted from sizes and iterations, each array once per pass over it, over the bandwidth measured: a "
+    "floor for what does not stay in caches (smaller bodies do, and may be faster). Latency: two barriers and one a "
+    "phase of the factor's application in each iteration, times the barrier measured."
+)
+OTHERS = (
+    "Of the last matrix of a run. The first two are one application of the factor that ours applies once an "
+    "iteration, made of the same matrix (their residual is that of one application); the others are whole solves "
+    "without assembly. Prepared: analysis, or the inverse."
+)
+SERVED = (
+    "Matrices and factors over shared memory, one worker, as fast as it goes; the beam is put back to its start every "
+    "100 steps so that it keeps swinging. Residual: as the solver reports it."
+)
+PUBLISHED = "In turns; the factor stays the same, what the worker (on the CPU) sends back is thrown away."
+
+
+def merged(parts: list[Data]) -> Data:
+    """One set of rows of several runs; where two have the same row, that of the later one. device: of the last."""
+    out: Data = {"device": parts[-1]["device"]}
+    for section, names in KEYS.items():
+        rows = {tuple(row[n] for n in names): row for part in parts for row in part.get(section, [])}
+        out[section] = [rows[key] for key in sorted(rows, key=_order)]
+    return out
+
+
+def _order(key: tuple[Any, ...]) -> tuple[Any, ...]:
+    """Homogeneous before heterogeneous, then as numbers and names go."""
+    return tuple(MATERIALS.index(part) if part in MATERIALS else part for part in key)
+
+
+def write(report: Report, data: Data) -> None:
+    """Everything, in the order of interest."""
+    report.data |= data
+    report.say(_device(data["device"]), PROBLEM)
+    if data["steps"]:
+        _steps(report, data)
+    for section, title, words in (
+        ("others", "Others on the same matrices", OTHERS), ("served", "With a worker process", SERVED),
+        ("publishing", "Steps with and without matrices leaving the device", PUBLISHED),
+    ):  # fmt: skip
+        if data[section]:
+            report.say(f"## {title}", words)
+            report.table(data[section], _columns(data[section]))
+    report.write()
+
+
+def _columns(rows: list[Row]) -> list[str]:
+    """Every key, in the order of their first appearance."""
+    return list(dict.fromkeys(key for row in rows for key in row))
+
+
+def _device(device: Row) -> str:
+    return (
+        f"{device['gpu']}, {device['processors']} multiprocessors, driver {device['driver']}, CUDA {device['CUDA']}, "
+        f"CuPy {device['cupy']}, cuDSS {device['cuDSS']}. Measured in this run: copy within its memory "
+        f"{device['copy TB/s']:.3g} TB/s (read and written), barrier of all multiprocessors with a store before and a "
+        f"dependent load after it {device['barrier us']:.3g} us."
+    )
+
+
+def _steps(report: Report, data: Data) -> None:
+    rows = data["steps"]
+    aims = [_against(r, data) for r in rows if (r["beams"], r["tets"]) in AIMS and r["material"] == MATERIALS[0]]
+    if aims:
+        report.say("## Aims, homogeneous, us per step of all beams", AIMED)
+        report.table(aims)
+    columns = (
+        "us p50", "us p99", "us max", "host us", "solve us", "iterations", "most", "residual", "factor age", "oldest",
+        "factor ms", "expansion ms", "library", "CG us", "CG iterations", "block Jacobi us", "block Jacobi iterations",
+        "unconverged",
+    )  # fmt: skip
+    if single := [r for r in rows if r["beams"] == 1]:
+        report.say("## One beam")
+        report.table(single, ["tets", "material", *columns])
+        figure(report, single, data["others"])
+    if batches := [{**r, "beam steps/s": 1e6 * r["beams"] / r["us p50"]} for r in rows if r["beams"] > 1]:
+        report.say("## Many beams in the same launches", BATCHED)
+        report.table(batches, ["beams", "tets", "beam steps/s", *columns])
+    report.say("## Bytes and latencies", BYTES)
+    report.table([_floors(r, data["device"]) for r in rows])
+
+
+def _against(row: Row, data: Data) -> Row:
+    aim = AIMS[row["beams"], row["tets"]]
+    name = f"{row['beams']} beams of {row['tets']:,}" if row["beams"] > 1 else f"{row['tets']:,} tets"
+    direct = [
+        r.get("us") for r in data["others"]
+        if row["beams"] == 1 and (r["tets"], r["material"], r["what"]) == (row["tets"], row["material"], DIRECT)
+    ]  # fmt: skip
+    return {
+        "scene": name, "aim": aim.aim, "**ours, p50**": row["us p50"], "ours / aim": row["us p50"] / aim.aim,
+        "p99": row["us p99"], "iterations": row["iterations"], "residual": row["residual"],
+        "oldest factor": row["oldest"], "prototype": aim.prototype, "CG, same GPU": row.get("CG us"),
+        "block Jacobi, same GPU": row.get("block Jacobi us"),
+        "direct each step, same GPU": direct[0] if direct else None, "the paper": aim.paper,
+    }  # fmt: skip
+
+
+DIRECT = "cuDSS, float64"
+
+
+def _floors(row: Row, device: Row) -> Row:
+    floor, phases = row["MB all"] / device["copy TB/s"], row.get("phases")
+    latency = row["iterations"] * (phases + 2) * device["barrier us"] if phases else None
+    return {
+        **{k: row[k] for k in ("tets", "material", "beams", "iterations")},
+        **{f"MB {k}": row[f"MB {k}"] for k in ("matrix", "vectors", "factor", "assembly")},
+        "all / bandwidth, us": floor, "phases": phases, "latency, us": latency, "us p50": row["us p50"],
+        "p50 / bytes floor": row["us p50"] / floor,
+        "p50 / sum of both": row["us p50"] / (floor + latency) if latency else None,
+    }  # fmt: skip

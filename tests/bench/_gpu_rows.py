@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: MIT
+"""What one scene of the GPU benchmark comes to: one row."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tests.bench import _gpu_bytes as moved
+from tests.bench._gpu_steps import WITHOUT, Beams, Found
+
+Row = dict[str, Any]
+
+
+def row(beams: Beams, found: Found) -> Row:
+    """us are of a step of all beams together; iterations, residual and age of one beam."""
+    from protocol import messages_pb2 as pb
+
+    records = np.concatenate(found.records)
+    age = (records["step"] - 1 - records["factor_step"])[records["factor_step"] >= 0]
+    problem, iterations = beams.problem, float(records["iterations"].mean())
+    size = beams.size()
+    return {
+        "tets": problem.tets, "material": problem.material, "beams": problem.beams,
+        **_times(records, "us"), "host us": 1e6 * float(np.median(found.wall)),
+        "solve us": 1e6 * float(np.median(_first(records)["solve"])),
+        "iterations": iterations, "most": int(records["iterations"].max()),
+        "residual": max(found.residuals), "reported residual": float(records["residual"].max()),
+        "unconverged": int((records["status"] != pb.CONVERGED).sum()),
+        "factor age": float(age.mean()) if len(age) else None, "oldest": int(age.max()) if len(age) else None,
+        "factor ms": float(np.median(found.made)) if found.made else None,
+        "expansion ms": float(np.median(found.taken)) if found.taken else None,
+        "library": beams.analysis.library if beams.analysis else "none",
+        "phases": phases(beams) if problem.beams == 1 and size.factor else None,
+        **{f"MB {what}": mb for what, mb in moved.step(size, iterations).items()},
+        **_without(found),
+    }  # fmt: skip
+
+
+def phases(beams: Beams) -> int | None:
+    """Of an application of the factor on this GPU, a barrier each; None where there is none such."""
+    if beams.sim.world.backend.name != "gpu" or beams.analysis is None:
+        return None
+    from sim_server.gpu.plan import plan
+
+    return plan(beams.analysis.pattern, beams.sim.world.backend.properties["multiProcessorCount"]).phases
+
+
+def _first(records: NDArray[Any]) -> NDArray[Any]:
+    """One record a step: a step of all bodies is one step."""
+    return records[records["body"] == 0]
+
+
+def _times(records: NDArray[Any], name: str) -> Row:
+    us = 1e6 * _first(records)["whole"]
+    return {f"{name} p50": float(np.median(us)), f"{name} p99": float(np.percentile(us, 99)), f"{name} max": us.max()}
+
+
+def _without(found: Found) -> Row:
+    out: Row = {}
+    for name in WITHOUT.values():
+        parts = [records for records in found.without[name] if len(records)]
+        if not parts:
+            continue
+        records = np.concatenate(parts)
+        out[f"{name} us"] = 1e6 * float(np.median(_first(records)["whole"]))
+        out[f"{name} solve us"] = 1e6 * float(np.median(_first(records)["solve"]))
+        out[f"{name} iterations"] = float(records["iterations"].mean())
+    return out

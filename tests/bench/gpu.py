@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: MIT
+"""What a step costs on a GPU: bending beams of 540 to 1,029,000 tetrahedra, alone and many at once, beside others.
+
+Beside ours with a factor at most 16 steps old: ours with plain CG and block Jacobi, cuSPARSE's triangular solves, a
+sparse explicit inverse, CuPy's cg and cuDSS on the same matrices; and ours with a real worker process. A run may be cut
+into pieces (--only, --sizes, --materials) whose results --merge makes into one page, where there need be no GPU.
+"""
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import argparse
+import json
+import sys
+import time
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from sim_server.errors import DeviceError
+from tests.bench import _gpu_page as page
+from tests.bench._gpu_problem import BARS, BATCHES, MATERIALS, Problem
+from tests.bench.report import Report
+
+SECTIONS = ("steps", "batches", "others", "served")
+ROUNDS = {540: 20, 3000: 20, 7350: 20, 24_000: 12, 98_304: 6, 405_600: 3, 1_029_000: 2}
+WITHOUT = {540: 4, 3000: 4, 7350: 2, 24_000: 2, 98_304: 2, 405_600: 1, 1_029_000: 1}  # steps of CG in each round
+
+Rows = list[dict[str, Any]]
+
+
+class Page(Report):
+    """A report whose head is that of the run that made its figures."""
+
+    def __init__(self, header: dict[str, Any], arguments: dict[str, Any], out: Path | None):
+        super().__init__("gpu", TITLE, arguments, out, quick=True)
+        self.quick, self._given = bool(arguments.get("quick")), header
+
+    def header(self) -> dict[str, Any]:
+        """As given."""
+        return self._given
+
+
+TITLE = "A step on a GPU"
+
+
+def beams(problem: Problem, o: argparse.Namespace, external: bool) -> tuple[Rows, Rows]:
+    """Row of one scene, rows of others on its last matrix."""
+    from tests.bench._gpu_others import compared
+    from tests.bench._gpu_rows import row
+    from tests.bench._gpu_steps import Beams, rounds
+
+    begin = time.perf_counter()
+    scene = Beams(problem, o.library, overrides=tuple(o.set))
+    ready = time.perf_counter()
+    count = ROUNDS[problem.tets] if problem.beams == 1 else 4 if problem.beams < 256 else 2
+    found = rounds(scene, 2 if o.quick else count, WITHOUT[problem.tets] if problem.beams == 1 else 1)
+    rows = [row(scene, found)]
+    print(rows[0], flush=True)
+    others: Rows = []
+    if external and found.sample is not None:
+        sample = found.sample
+        del scene, found  # their memory
+        others = compared(sample, problem.tets, problem.material, 10 if o.quick else 50)
+    print(f"{problem.name}: {ready - begin:.1f} s to load, {time.perf_counter() - ready:.1f} s", flush=True)
+    return rows, others
+
+
+def measure(o: argparse.Namespace) -> dict[str, Rows]:
+    """All sections asked for, and what the device is."""
+    from tests.bench._gpu_device import described
+    from tests.bench._gpu_served import SIZES
+    from tests.bench._gpu_served import measure as served
+
+    data: dict[str, Any] = {name: [] for name in page.KEYS}
+    data["device"] = described() | {"cuDSS": _cudss()}
+    print(data["device"], flush=True)
+    problems = [Problem(tets, m) for tets in o.sizes for m in o.materials] if {"steps", "others"} & {*o.only} else []
+    if "batches" in o.only:
+        problems += [Problem(tets, MATERIALS[0], n) for n, tets in BATCHES if 1 < n <= o.beams]
+    for problem in problems:
+        external = problem.beams == 1 and problem.material == MATERIALS[0] and "others" in o.only
+        steps, others = guarded(problem.name, lambda: beams(problem, o, external))  # noqa: B023
+        data["steps"] += steps
+        data["others"] += others
+    if "served" in o.only:
+        for tets in (t for t in o.sizes if t in SIZES):
+            for material in o.materials:
+                problem = Problem(tets, material)
+                rows, publishing = guarded(problem.name, lambda: served(problem, 1.0, overrides=tuple(o.set)))  # noqa: B023
+                data["served"] += rows
+                data["publishing"] += publishing
+    return data
+
+
+def guarded(name: str, run: Any) -> tuple[Rows, Rows]:
+    """What `run` returns; where it fails, a line that says so, and nothing, so that the rest goes on."""
+    try:
+        return run()
+    except Exception as error:
+        print(f"FAILED {name}: {type(error).__name__}: {error}", file=sys.stderr, flush=True)
+        return [], []
+
+
+def _cudss() -> str:
+    try:
+        return f"0.8 line, nvmath-python {metadata.version('nvmath-python')}"
+    except metadata.PackageNotFoundError:
+        return "absent"
+
+
+def merge(files: list[Path], out: Path | None) -> None:
+    """One page of the results of several runs; the head is that of the last."""
+    parts = [json.loads(file.read_text()) for file in files]
+    last = parts[-1]
+    dates = ", ".join(f"{part['header']['date']} ({part['header']['commit']})" for part in parts)
+    report = Page(last["header"], {"pieces": len(parts), **last["arguments"]}, out)
+    if len(parts) > 1:
+        report.say(f"Put together of {len(parts)} runs: {dates}.")
+    page.write(report, page.merged([part["data"] for part in parts]))
+
+
+def options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
+    parser.add_argument("--only", nargs="+", choices=SECTIONS, default=list(SECTIONS))
+    parser.add_argument("--sizes", type=int, nargs="+", choices=list(BARS), default=list(BARS))
+    parser.add_argument("--materials", nargs="+", choices=MATERIALS, default=list(MATERIALS))
+    parser.add_argument("--beams", type=int, default=1024, help="largest batch")
+    parser.add_argument("--library", default="auto", help="that factorizes: auto, gpu, cholmod, superlu")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="of every scene")
+    parser.add_argument("--quick", action="store_true", help="540 and 3000 tets, two rounds, batches up to 16")
+    parser.add_argument("--merge", type=Path, nargs="+", metavar="JSON", help="only make one page of these results")
+    parser.add_argument("--out", type=Path)
+    o = parser.parse_args()
+    if o.quick:
+        o.sizes, o.beams = [t for t in o.sizes if t <= 3000], min(o.beams, 16)
+    return o
+
+
+def main() -> None:
+    o = options()
+    if o.merge:
+        merge(o.merge, o.out)
+        return
+    try:
+        from sim_server.gpu.device import cupy
+
+        cupy()
+    except DeviceError as error:
+        print(f"bench gpu: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+    words = {k: v for k, v in vars(o).items() if k in ("only", "sizes", "materials", "library") or (k == "set" and v)}
+    report = Report("gpu", TITLE, words, o.out, o.quick)
+    page.write(report, page.merged([measure(o)]))
+
+
+if __name__ == "__main__":
+    main()

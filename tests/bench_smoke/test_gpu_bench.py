@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: MIT
+"""The parts of the GPU benchmark that need no GPU: scenes, rounds (on a CPU), counts of bytes, tables, merging."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sim_server.scene import load
+from sim_server.simulation import Simulation
+from tests.bench import _gpu_bytes as moved
+from tests.bench import _gpu_page as page
+from tests.bench import gpu
+from tests.bench._gpu_others import lower
+from tests.bench._gpu_problem import BARS, MATERIALS, Problem
+from tests.bench._gpu_rows import row
+from tests.bench._gpu_served import row as served_row
+from tests.bench._gpu_steps import STEPS, Beams, rounds
+
+ROOT = Path(__file__).resolve().parents[2]
+DEVICE = {
+    "gpu": "none", "processors": 1, "driver": "0", "CUDA": "0", "cupy": "0", "cuDSS": "absent", "copy TB/s": 2.0,
+    "barrier us": 1.0,
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def found() -> tuple[Beams, Any]:
+    beams = Beams(Problem(540, MATERIALS[1]), device="cpu")
+    return beams, rounds(beams, 2, 1)
+
+
+def test_sizes_are_those_of_their_bars() -> None:
+    assert all(tets == 6 * np.prod(cells) for tets, cells in BARS.items())
+
+
+@pytest.mark.parametrize("problem", [Problem(540), Problem(540, MATERIALS[1]), Problem(3000, MATERIALS[0], 9)])
+def test_scene_is_what_the_page_says(problem: Problem, tmp_path: Path) -> None:
+    sim = Simulation(load(problem.write(tmp_path)))
+    assert [len(b.mesh.tets) for b in sim.world.bodies] == [problem.tets] * problem.beams
+    assert sim.world.free.sum() < sim.world.nodes and np.isclose(sim.world.mass.sum(), 4000 * problem.beams)
+    young = [np.unique(sim.effects["corotational"].elastic[k][0]).round(3) for k in range(problem.beams)]
+    if problem.material == MATERIALS[1]:
+        np.testing.assert_allclose(young[0], [5e4, 2.5e5, 5e6])
+    elif problem.beams == 1:
+        np.testing.assert_allclose(young[0], [1e6])
+    else:
+        assert len({y[0] for y in young}) == 8 and young[8] == young[0] and np.isclose(max(young)[0], 2 * min(young)[0])
+
+
+def test_rounds_use_factors_of_the_age_they_claim(found: tuple[Beams, Any]) -> None:
+    beams, rounds_found = found
+    records = np.concatenate(rounds_found.records)
+    assert len(records) == 2 * STEPS
+    np.testing.assert_array_equal(records["step"] - 1 - records["factor_step"], [*range(1, STEPS + 1)] * 2)
+    one = row(beams, rounds_found)
+    assert one["factor age"] == (STEPS + 1) / 2 and one["oldest"] == STEPS and one["unconverged"] == 0
+    assert one["CG iterations"] > 3 * one["iterations"] > 0
+    assert 0 < one["residual"] <= 1.001e-6
+    json.dumps(one)
+
+
+def test_factor_of_the_sample_is_that_of_its_matrix(found: tuple[Beams, Any]) -> None:
+    sample = found[1].sample
+    factor, order = lower(sample.pattern, sample.factor.astype(float)), sample.pattern.permutation
+    matrix = sample.matrix().tocsc()[order][:, order]
+    assert abs(factor @ factor.T - matrix).max() < 1e-6 * abs(matrix).max()
+    assert sample.residual(np.zeros(sample.b.size)) == 1.0
+
+
+def test_bytes_of_a_step() -> None:
+    size = moved.Size(nodes=2, tets=1, blocks=4, upper=3, factor=1000)
+    assert moved.matrix(size, 0) == 2 * 4 * 72 + 4 * (4 + 3)  # written, read once
+    assert moved.matrix(size, 3) - moved.matrix(size, 2) == 4 * 72 + 4 * 7
+    assert moved.vectors(size, 2) - moved.vectors(size, 1) == 13 * 2 * 3 * 8
+    assert moved.factor(size, 5) == 5000
+    parts = moved.step(size, 5)
+    assert parts["all"] == pytest.approx(sum(v for k, v in parts.items() if k != "all"))
+
+
+def test_percentiles_leave_out_steps_without_a_factor() -> None:
+    from sim_server.engine import RECORD
+
+    records = np.zeros(4, RECORD)
+    records["factor_step"], records["step"], records["whole"] = [-1, 0, 0, 0], [1, 2, 3, 4], [9, 1e-6, 2e-6, 3e-6]
+    one = served_row(records)
+    assert one["steps"] == 3 and one["us p50"] == pytest.approx(2) and one["factor age"] == 2 and one["oldest"] == 3
+
+
+def piece(path: Path, rows: list[dict[str, Any]], **sections: Any) -> Path:
+    header = {
+        "date": "2026-01-01", "commit": path.stem, "machine": {"cpu": "fast", "cores": 1, "governor": "-", "load": 0.0,
+        "system": "Linux"}, "versions": {"python": "3"},
+        "calibration": {k: {"dgemm_ms": 1.0, "spmv_ms": 1.0} for k in ("before", "after")},
+    }  # fmt: skip
+    data = {"device": DEVICE, "steps": rows, "others": [], "served": [], "publishing": [], **sections}
+    path.write_text(json.dumps({"header": header, "arguments": {"only": ["steps"]}, "data": data}))
+    return path
+
+
+def test_pieces_become_one_page(found: tuple[Beams, Any], tmp_path: Path) -> None:
+    one = row(*found) | {"material": MATERIALS[0]}
+    batch = one | {"beams": 512, "us p50": 1000.0}
+    others = [{"tets": 540, "material": MATERIALS[0], "what": "cuDSS, float64", "us": 321.0, "residual": 1e-14}]
+    served = [{"tets": 540, "material": MATERIALS[0], "worker": "cpu", "us p50": 77.0, "factor age": 12.0}]
+    first = piece(tmp_path / "a.json", [one | {"us p50": 90.0}, batch], others=others, served=served)
+    second = piece(tmp_path / "b.json", [one | {"us p50": 22.5}])
+    gpu.merge([first, second], tmp_path / "out")
+    text = (tmp_path / "out" / "gpu.md").read_text()
+    lines = [line.split(" | ") for line in text.splitlines() if line.startswith("| 540 tets")]
+    assert lines and lines[0][2:4] == ["22.5", "0.5"] and "321" in lines[0]  # ours, over the aim of 45; direct
+    assert "| 512 beams of 540 | 500 | 1000 | 2 |" in text and "5.12e+05" not in text and "| 512000 |" in text
+    assert "2 runs" in text and "commit b" in text and "| cpu | 77 | 12 |" in text
+    assert (tmp_path / "out" / "gpu.png").read_bytes().startswith(b"\x89PNG")
+    again = json.loads((tmp_path / "out" / "gpu.json").read_text())
+    assert page.merged([again["data"]]) == again["data"]
+
+
+def test_without_a_gpu_one_line_and_code_2(tmp_path: Path) -> None:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "CUDA_VISIBLE_DEVICES": ""}
+    command = [sys.executable, "tests/bench/gpu.py", "--out", str(tmp_path)]
+    result = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=60)
+    assert result.returncode == 2 and result.stdout == ""
+    assert result.stderr.startswith("bench gpu: ") and result.stderr.count("\n") == 1
