@@ -11,14 +11,14 @@
 // blocks keep to few multiprocessors, many small ones are over soon and leave room for more urgent work.
 // Float32 throughout: every sum has a fixed order, so results depend on neither number.
 #define EDGE 64          // of a tile
-#define DEPTH 16         // rows of G that are in shared memory at a time
-#define PITCH 68         // of the rows there
-#define THREADS 256      // of a group
-#define TILE_PITCH 65
-#define SHARED (4 * DEPTH * PITCH + 2 * EDGE)   // floats of a group
+#define DEPTH 8          // rows of G that are in shared memory at a time
+#define THREADS 128      // of a group
+#define PITCH 65         // of a finished tile in shared memory
+#define SHARED (EDGE * PITCH + 2 * EDGE)   // floats of a group
+#define LENGTHS 256      // threads of a group that sums columns
 #define KERNEL_OF(threads) extern "C" __global__ void __launch_bounds__(threads)
 
-extern __shared__ float4 dynamic[];   // SHARED floats per group
+extern __shared__ float4 dynamic[];   // of all groups
 
 struct Part {
     long long g, t;                  // where G and T begin in the workspace
@@ -52,7 +52,7 @@ struct Group {
 __device__ __forceinline__ int padded(int n, int step) { return (n + step - 1) / step * step; }
 
 // Values into G, a warp per column. place: column in its part's G of each entry of L's row lists. begin: the first batch.
-KERNEL_OF(4 * THREADS) scatter(const Part* parts, const Column* columns, int first, int last, const int* place,
+KERNEL_OF(1024) scatter(const Part* parts, const Column* columns, int first, int last, const int* place,
                            const float* values, float* workspace, int begin, int scale_end, const Target* target) {
     if (begin && blockIdx.x == 0 && threadIdx.x == 0) target->scale[scale_end] = 0;
     Group<32> warp;
@@ -105,45 +105,47 @@ KERNEL_OF(4 * EDGE) invert(const Part* parts, const Task* tasks, int count, floa
 
 struct Operand { const float* from; int pitch; };
 
-// 4 x 4 entries of a 64 x 64 tile of A^T B per thread: A, B (depth, 64), row by row; or of A B with A (64, depth).
+// 8 x 4 entries of a 64 x 64 tile of A^T B per thread: A, B (depth, 64), row by row; or of A B with A (64, depth). With
+// fewer a multiprocessor waits for shared memory, with more a tile takes too long.
 template <bool ACROSS>
 struct Product {
     const Group<THREADS>& group;
-    float (*const a)[DEPTH][PITCH];
-    float (*const b)[DEPTH][PITCH];
-    float sum[4][4];
-    int row, column;     // of this thread's entries in the tile
+    float (*const a)[DEPTH][EDGE];
+    float (*const b)[DEPTH][EDGE];
+    float sum[8][4];
+    int row, column;     // of this thread's entries in the tile: rows row .. row + 3 and row + 32 .. row + 35
 
     __device__ __forceinline__ Product(const Group<THREADS>& g, float* shared)
-        : group(g), a((float(*)[DEPTH][PITCH])shared), b(a + 2) {
-        int lane = g.thread % 32, warp = g.thread / 32;   // a warp has 32 x 16 entries
-        row = warp / 4 * 32 + lane / 4 * 4;
-        column = warp % 4 * 16 + lane % 4 * 4;
+        : group(g), a((float(*)[DEPTH][EDGE])shared), b(a + 2) {
+        int lane = g.thread % 32, warp = g.thread / 32;
+        row = warp / 2 * 16 + lane / 8 * 4;
+        column = warp % 2 * 32 + lane % 8 * 4;
     }
 
+    __device__ __forceinline__ float4 fetch(Operand o, int k) const {
+        return *(const float4*)(o.from + (long long)(k + group.thread / 16) * o.pitch + group.thread % 16 * 4);
+    }
+    __device__ __forceinline__ void put(float (*to)[EDGE], float4 x) const {
+        *(float4*)&to[group.thread / 16][group.thread % 16 * 4] = x;
+    }
     __device__ __forceinline__ float4 fetch_a(Operand o, int k) const {
-        if (ACROSS) return *(const float4*)(o.from + (long long)(group.thread / 4) * o.pitch + k + group.thread % 4 * 4);
-        return *(const float4*)(o.from + (long long)(k + group.thread / 16) * o.pitch + group.thread % 16 * 4);
+        if constexpr (!ACROSS) return fetch(o, k);
+        else return *(const float4*)(o.from + (long long)(group.thread / 2) * o.pitch + k + group.thread % 2 * 4);
     }
-    __device__ __forceinline__ float4 fetch_b(Operand o, int k) const {
-        return *(const float4*)(o.from + (long long)(k + group.thread / 16) * o.pitch + group.thread % 16 * 4);
-    }
-    __device__ __forceinline__ void put(int buffer, float4 x, float4 y) {
-        if (ACROSS) {
-            int k = group.thread % 4 * 4, i = group.thread / 4;
-            a[buffer][k][i] = x.x; a[buffer][k + 1][i] = x.y; a[buffer][k + 2][i] = x.z; a[buffer][k + 3][i] = x.w;
-        } else {
-            *(float4*)&a[buffer][group.thread / 16][group.thread % 16 * 4] = x;
-        }
-        *(float4*)&b[buffer][group.thread / 16][group.thread % 16 * 4] = y;
+    __device__ __forceinline__ void put_a(float (*to)[EDGE], float4 x) const {
+        if constexpr (!ACROSS) return put(to, x);
+        int k = group.thread % 2 * 4, i = group.thread / 2;
+        to[k][i] = x.x; to[k + 1][i] = x.y; to[k + 2][i] = x.z; to[k + 3][i] = x.w;
     }
     __device__ __forceinline__ void multiply(int buffer) {
 #pragma unroll
         for (int k = 0; k < DEPTH; k++) {
-            float4 x = *(float4*)&a[buffer][k][row], y = *(float4*)&b[buffer][k][column];
-            float p[4] = {x.x, x.y, x.z, x.w}, q[4] = {y.x, y.y, y.z, y.w};
+            float p[8], q[4];
+            *(float4*)p = *(float4*)&a[buffer][k][row];
+            *(float4*)(p + 4) = *(float4*)&a[buffer][k][row + 32];
+            *(float4*)q = *(float4*)&b[buffer][k][column];
 #pragma unroll
-            for (int i = 0; i < 4; i++)
+            for (int i = 0; i < 8; i++)
 #pragma unroll
                 for (int j = 0; j < 4; j++) sum[i][j] += p[i] * q[j];
         }
@@ -152,33 +154,43 @@ struct Product {
     // depth: a multiple of 64. While one slice is multiplied the next one is on its way.
     __device__ __forceinline__ void run(Operand oa, Operand ob, int depth) {
 #pragma unroll
-        for (int i = 0; i < 4; i++)
+        for (int i = 0; i < 8; i++)
 #pragma unroll
             for (int j = 0; j < 4; j++) sum[i][j] = 0;
+        float4 x = fetch_a(oa, 0), y = fetch(ob, 0);
         group.barrier();
-        put(0, fetch_a(oa, 0), fetch_b(ob, 0));
+        put_a(a[0], x);
+        put(b[0], y);
         group.barrier();
         for (int k = 0; k < depth; k += DEPTH) {
             int buffer = k / DEPTH % 2;
             bool more = k + DEPTH < depth;
-            float4 x, y;
-            if (more) { x = fetch_a(oa, k + DEPTH); y = fetch_b(ob, k + DEPTH); }
+            if (more) {
+                x = fetch_a(oa, k + DEPTH);
+                y = fetch(ob, k + DEPTH);
+            }
             multiply(buffer);
-            if (more) put(1 - buffer, x, y);
+            if (more) {
+                put_a(a[1 - buffer], x);
+                put(b[1 - buffer], y);
+            }
             group.barrier();
         }
     }
 
+    // Row of the i-th of this thread's rows.
+    __device__ __forceinline__ int row_of(int i) const { return row + i % 4 + i / 4 * 32; }
+
     __device__ __forceinline__ void store(float* to, int pitch, float sign) const {
 #pragma unroll
-        for (int i = 0; i < 4; i++)
-            *(float4*)(to + (long long)(row + i) * pitch + column) =
+        for (int i = 0; i < 8; i++)
+            *(float4*)(to + (long long)row_of(i) * pitch + column) =
                 make_float4(sign * sum[i][0], sign * sum[i][1], sign * sum[i][2], sign * sum[i][3]);
     }
 };
 
 // T = C Y1: tile (i, j) of a pair of runs j .. end, end .. i ..
-KERNEL_OF(4 * THREADS) couple(const Part* parts, const Task* tasks, int count, float* workspace) {
+KERNEL_OF(5 * THREADS) couple(const Part* parts, const Task* tasks, int count, float* workspace) {
     Group<THREADS> group;
     float* shared = (float*)dynamic + group.index * SHARED;
     for (int t = group.first; t < count; t += group.step) {
@@ -192,7 +204,7 @@ KERNEL_OF(4 * THREADS) couple(const Part* parts, const Task* tasks, int count, f
 }
 
 // X = -Y2 T.
-KERNEL_OF(4 * THREADS) merge(const Part* parts, const Task* tasks, int count, float* workspace) {
+KERNEL_OF(5 * THREADS) merge(const Part* parts, const Task* tasks, int count, float* workspace) {
     Group<THREADS> group;
     float* shared = (float*)dynamic + group.index * SHARED;
     for (int t = group.first; t < count; t += group.step) {
@@ -207,10 +219,10 @@ KERNEL_OF(4 * THREADS) merge(const Part* parts, const Task* tasks, int count, fl
 }
 
 // Scale: length of the columns of Y, 32 columns of a block of 64 at a time; the largest one goes to scale[scale_end].
-KERNEL_OF(4 * THREADS) lengths(const Part* parts, const Task* tasks, int count, const float* workspace, int scale_end,
+KERNEL_OF(4 * LENGTHS) lengths(const Part* parts, const Task* tasks, int count, const float* workspace, int scale_end,
                            const Target* target) {
-    Group<THREADS> group;
-    float(*sums)[32] = (float(*)[32])((float*)dynamic + group.index * SHARED);
+    Group<LENGTHS> group;
+    float(*sums)[32] = (float(*)[32])((float*)dynamic + group.index * LENGTHS);
     float* scale = target->scale;
     int lane = group.thread % 32, warp = group.thread / 32;
     for (int t = group.first; t < 2 * count; t += group.step) {
@@ -219,14 +231,14 @@ KERNEL_OF(4 * THREADS) lengths(const Part* parts, const Task* tasks, int count, 
         int j = task.i * EDGE + t % 2 * 32 + lane;
         float sum = 0;
 #pragma unroll 4
-        for (int k = task.i * EDGE + warp; k < part.v; k += THREADS / 32) {
+        for (int k = task.i * EDGE + warp; k < part.v; k += LENGTHS / 32) {
             float y = workspace[part.g + (long long)k * part.pitch_g + j];
             sum += y * y;
         }
         sums[warp][lane] = sum;
         group.barrier();
         if (warp == 0 && j < part.v) {
-            for (int k = 1; k < THREADS / 32; k++) sum += sums[k][lane];
+            for (int k = 1; k < LENGTHS / 32; k++) sum += sums[k][lane];
             sum = sqrtf(sum);
             scale[part.start + j] = sum;
             atomicMax((int*)(scale + scale_end), __float_as_int(sum));   // positive numbers are ordered as their bits are
@@ -255,7 +267,7 @@ __device__ __forceinline__ float number(unsigned word, int upper) {
 // first row on; rows, columns: how many there are from there on, padded; column: the tile's first in the matrix; width: of
 // the whole matrix in chunks.
 template <bool ACROSS>
-__device__ __forceinline__ void store(int thread, float (*tile)[TILE_PITCH], float sign, const int* chunk_of, int rows, int columns,
+__device__ __forceinline__ void store(int thread, float (*tile)[PITCH], float sign, const int* chunk_of, int rows, int columns,
                                       int column, int width, int planes, unsigned short* matrix) {
     for (int k = thread; k < EDGE * EDGE / 8; k += THREADS) {
         int piece = k % 4, row = k / 4 % 8, chunk = k / 32;
@@ -279,11 +291,11 @@ __device__ __forceinline__ void store(int thread, float (*tile)[TILE_PITCH], flo
 
 // Tile (i, j) of [Y^T Y | Y^T L_BV^T] into the storage: twice, since the inverse is symmetric and the coupling is applied
 // both ways. row_chunk (N / 8,), out_chunk (contributions / 8,): first chunk of each 8 rows.
-KERNEL_OF(4 * THREADS) finish(const Part* parts, const Task* tasks, int count, const float* workspace, const int* boundary,
+KERNEL_OF(5 * THREADS) finish(const Part* parts, const Task* tasks, int count, const float* workspace, const int* boundary,
                           const int* row_chunk, const int* out_chunk, int planes, const Target* target) {
     Group<THREADS> group;
     float* shared = (float*)dynamic + group.index * SHARED;
-    float(*tile)[TILE_PITCH] = (float(*)[TILE_PITCH])shared;   // after the product
+    float(*tile)[PITCH] = (float(*)[PITCH])shared;   // after the product
     float *down = shared + SHARED - 2 * EDGE, *across = down + EDGE;
     const Target to = *target;
     for (int t = group.first; t < count; t += group.step) {
@@ -293,11 +305,8 @@ KERNEL_OF(4 * THREADS) finish(const Part* parts, const Task* tasks, int count, c
         const float* rows = workspace + part.g + (long long)i * part.pitch_g;
         Product<false> product(group, shared);
         product.run({rows + i, part.pitch_g}, {rows + j, part.pitch_g}, inside - i);
-        if (group.thread < EDGE) {
-            int k = i + group.thread;
-            down[group.thread] = k < part.v ? 1 / to.scale[part.start + k] : 0;
-        } else if (group.thread < 2 * EDGE) {
-            int k = group.thread - EDGE;
+        for (int k = group.thread; k < EDGE; k += THREADS) {
+            down[k] = i + k < part.v ? 1 / to.scale[part.start + i + k] : 0;
             float d = 0;
             if (edge >= 0) { if (edge + k < part.b) d = to.scale[boundary[part.boundary + edge + k]]; }
             else if (j + k < part.v) d = 1 / to.scale[part.start + j + k];
@@ -305,11 +314,12 @@ KERNEL_OF(4 * THREADS) finish(const Part* parts, const Task* tasks, int count, c
         }
         group.barrier();
 #pragma unroll
-        for (int r = 0; r < 4; r++)
+        for (int r = 0; r < 8; r++)
 #pragma unroll
-            for (int c = 0; c < 4; c++)
-                tile[product.row + r][product.column + c] =
-                    product.sum[r][c] * (down[product.row + r] * across[product.column + c]);
+            for (int c = 0; c < 4; c++) {
+                int row = product.row_of(r), column = product.column + c;
+                tile[row][column] = product.sum[r][c] * (down[row] * across[column]);
+            }
         group.barrier();
         int rows_v = padded(part.v, 8), columns_v = padded(part.v, 32), width = (columns_v + padded(part.b, 32)) / 32;
         const int* own = row_chunk + part.start / 8;

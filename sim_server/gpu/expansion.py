@@ -21,10 +21,15 @@ BUFFERS = 3  # per body: in use, waiting to be taken up, being made
 HEAD = 16  # bytes in front of the values: the two addresses of a target
 # Of a kernel of expansion.cu: threads and bytes of shared memory of a group, groups in a small and in a large block.
 Groups = tuple[int, int, int, int]
-TILES: Groups = (256, 4 * (4 * 16 * 68 + 2 * EDGE), 1, 4)
-KERNELS: dict[str, Groups] = {"scatter": (32, 0, 8, 32), "invert": (EDGE, 4 * EDGE * (EDGE + 1), 1, 4)} | dict.fromkeys(
-    ("couple", "merge", "lengths", "finish"), TILES
-)
+TILES: Groups = (128, 4 * (EDGE * (EDGE + 1) + 2 * EDGE), 1, 5)
+KERNELS: dict[str, Groups] = {
+    "scatter": (32, 0, 8, 32),
+    "invert": (64, 4 * EDGE * (EDGE + 1), 1, 4),
+    "couple": TILES,
+    "merge": TILES,
+    "lengths": (256, 4 * 256, 1, 4),
+    "finish": TILES,
+}
 
 
 class Expanded(NamedTuple):
@@ -124,9 +129,10 @@ class Expansion:
         if tasks == 0:
             return
         threads, shared, small, large = KERNELS[name]
-        groups = large if limit else small
+        room = self._gpu.properties["sharedMemPerBlockOptin"] // max(1, shared)
+        groups = min(large, room) if limit else small
         blocks = min(-(-tasks // groups), limit or tasks)
         function = self._gpu.module("gpu/expansion.cu").function(name)
-        if large * shared > 48 << 10:
-            function.max_dynamic_shared_size_bytes = large * shared
+        if groups * shared > 48 << 10:
+            function.max_dynamic_shared_size_bytes = groups * shared
         function((blocks,), (groups * threads,), arguments, shared_mem=groups * shared)
