@@ -103,8 +103,8 @@ def _steps(report: Report, data: Data) -> None:
         report.table(aims)
     columns = (
         "us p50", "us p99", "us max", "between us", "host CPU us", "solve us", "iterations", "most", "residual",
-        "factor age", "oldest", "factor ms", "expansion ms", "library", "CG us", "CG iterations", "block Jacobi us", "block Jacobi iterations",
-        "unconverged",
+        "factor age", "oldest", "factor ms", "expansion ms", "library", "CG us", "CG iterations", "block Jacobi us",
+        "block Jacobi iterations", "unconverged",
     )  # fmt: skip
     if single := [r for r in rows if r["beams"] == 1]:
         report.say("## One beam")
