@@ -105,9 +105,10 @@ _plans: dict[tuple[int, int, int | None, int], Plan] = {}
 
 
 def plan(pattern: FactorPattern, blocks: int, groups: int | None = None, planes: int = 1) -> Plan:
-    """The plan of least predicted time, with `groups` groups if given. planes: 1 or 2 float16 numbers per entry.
+    """The plan of least predicted time, with `groups` groups (or as many as the tree has) if given. planes: 1 or 2
+    float16 numbers per entry. Cached by pattern.id.
 
-    Cached by pattern.id. Raises ValueError for a pattern that is not one of whole nodes of a Cholesky factor.
+    Raises ValueError for a pattern that is not one of whole nodes of a Cholesky factor.
     """
     key = (pattern.id, blocks, groups, planes)
     if key not in _plans:

@@ -20,7 +20,7 @@ CACHED = 50e6  # bytes that stay in the second-level cache
 KEPT, X_AREA = 190e3, 160e3  # bytes of a block's shared memory: for matrices and vectors, at most for vectors
 BRING, ENTRY = 250.0, 0.4  # of a part's vector [ns]: at all, per entry
 FLOPS, USES = 10e3, 3000  # making the matrices: float32 operations per ns; applications that share the cost
-MOST = 7  # groups
+MOST = 9  # groups
 
 
 def works(cut: Partition, blocks: int, planes: int) -> Iterator[tuple[Ints, Work]]:
@@ -109,23 +109,39 @@ def candidates(tree: Tree, groups: int) -> Iterator[tuple[int, ...]]:
 
 
 def choose(tree: Tree, blocks: int, groups: int | None, planes: int) -> tuple[tuple[int, ...], float]:
-    """Thresholds and predicted time [us]: of each number of groups the best by estimate, of these the best by
-    prediction."""
+    """Thresholds and predicted time [us]: of each number of groups the best by estimate, improved one by one, of these
+    the best by prediction. groups: so many, or as many as the tree has."""
     found: list[tuple[float, tuple[int, ...]]] = []
-    for count in [groups] if groups else range(1, MOST + 1):
+    for count in range(groups, 0, -1) if groups else range(1, MOST + 1):
         estimated = [(_estimate(tree, t, blocks, planes), t) for t in candidates(tree, count)]
-        found.append(min(estimated, default=(np.inf, ())))
-        if found[-1][0] > 1.5 * min(found)[0] and count > 1:
+        best = min(estimated, default=(np.inf, ()))
+        if best[0] < np.inf:
+            found.append(best)
+            if groups:
+                break
+        if not groups and best[0] > 1.5 * min(found)[0]:
             break  # more phases do not help any more
-    near = [t for time, t in found if time < 1.5 * min(found)[0]] or [()]
-    predicted = [(predict(partition(tree, t), blocks, planes), t) for t in near]
-    time, thresholds = min(predicted)
+    near = [_improved(tree, pair, blocks, planes) for pair in found if pair[0] < 1.3 * min(found)[0]]
+    time, thresholds = min((predict(partition(tree, t), blocks, planes), t) for _, t in near)
     return thresholds, time / 1000
+
+
+def _improved(
+    tree: Tree, best: tuple[float, tuple[int, ...]], blocks: int, planes: int
+) -> tuple[float, tuple[int, ...]]:
+    """One threshold after another a third up or down, twice."""
+    for k in [*range(len(best[1]))] * 2:
+        for factor in (0.75, 1.33):
+            moved = list(best[1])
+            moved[k] = int(moved[k] * factor)
+            if moved == sorted(set(moved)):
+                best = min(best, (_estimate(tree, tuple(moved), blocks, planes), tuple(moved)))
+    return best
 
 
 def _estimate(tree: Tree, thresholds: tuple[int, ...], blocks: int, planes: int) -> float:
     cut = partition(tree, thresholds)
-    if len(np.unique(cut.group)) < cut.groups:
+    if cut.groups > 1 and len(np.unique(cut.group)) < cut.groups:
         return np.inf
     time = estimate(cut, blocks, planes)
     return time * 10 if 4 * largest_area(cut, blocks) > X_AREA else time

@@ -165,6 +165,12 @@ def test_fixed_nodes_share_parts():
     assert p.groups == 1 and p.parts.v.tolist() == [30, 30, 15] and p.size == 96
 
 
+def test_more_groups_than_the_tree_has_are_as_many_as_it_has():
+    assert plan(system(GRAPHS["one node"]).pattern, 3, 4).groups == 1
+    s = system(GRAPHS["long bar with a fixed end"])
+    assert plan(s.pattern, 3, 3).groups == 3 and plan(s.pattern, 3, 2).groups == 2
+
+
 def test_plans_are_kept():
     s = system(GRAPHS["chain"])
     assert plan(s.pattern, 3) is plan(s.pattern, 3) is not plan(s.pattern, 4)
