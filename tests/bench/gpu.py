@@ -124,17 +124,19 @@ def merge(files: list[Path], out: Path | None) -> None:
 def options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
     parser.add_argument("--only", nargs="+", choices=SECTIONS, default=list(SECTIONS))
-    parser.add_argument("--sizes", type=int, nargs="+", choices=list(BARS), default=list(BARS))
+    parser.add_argument("--sizes", type=int, nargs="+", choices=list(BARS), help="of one beam [default: all]")
     parser.add_argument("--materials", nargs="+", choices=MATERIALS, default=list(MATERIALS))
     parser.add_argument("--beams", type=int, default=1024, help="largest batch")
     parser.add_argument("--library", default="auto", help="that factorizes: auto, gpu, cholmod, superlu")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="of every scene")
-    parser.add_argument("--quick", action="store_true", help="540 and 3000 tets, two rounds, batches up to 16")
+    parser.add_argument(
+        "--quick", action="store_true", help="two rounds; 540 and 3000 tets unless --sizes; batches up to 16"
+    )
     parser.add_argument("--merge", type=Path, nargs="+", metavar="JSON", help="only make one page of these results")
     parser.add_argument("--out", type=Path)
     o = parser.parse_args()
-    if o.quick:
-        o.sizes, o.beams = [t for t in o.sizes if t <= 3000], min(o.beams, 16)
+    o.sizes = o.sizes or ([540, 3000] if o.quick else list(BARS))
+    o.beams = min(o.beams, 16) if o.quick else o.beams
     return o
 
 
