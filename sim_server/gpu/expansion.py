@@ -72,7 +72,7 @@ class Expansion:
 
     def expand(self, values: NDArray[Any], target: Target, multiprocessors: int | None = None) -> Expanded:
         """Starts making what `values` (nonzeros,) stand for. Nobody may be using the target; returns at once, but
-        waits for the values of an expansion before it to have been copied to the device.
+        waits for the values of an expansion before it to have been copied to the device. For one thread at a time.
 
         multiprocessors: at most so many are kept busy, for whole milliseconds; a launch that needs all the others
         runs beside. None: all of them, and a launch that needs all waits some 100 us now and then.

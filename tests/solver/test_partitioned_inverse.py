@@ -16,6 +16,7 @@ from sim_server.gpu.batches import layout
 from sim_server.gpu.partition import tree_of
 from sim_server.gpu.plan import FORM, GATHER, READ, WRITE, Plan, lay_out, plan
 from tests.reference.partitioned import Application, by_tasks, stored
+from tests.reference.supernodal import columns
 from tests.scenes import bar, factor_of, simulation
 from tests.worker.block_matrices import bar_edges, dense_matrix, pattern, spd
 
@@ -101,6 +102,19 @@ def test_the_operator_is_symmetric_and_positive_also_in_float16():
             a, b = random.normal(size=(2, len(s.r)))
             assert abs(a @ apply(b) - b @ apply(a)) < 1e-12 * np.sqrt((a @ apply(a)) * (b @ apply(b)))
             assert a @ apply(a) > 0
+
+
+def test_what_is_stored_does_not_depend_on_units_or_stiffness_ratios():
+    """C A C with any diagonal C has the factor C L: the scale takes it up, so float16 loses nothing to it."""
+    s = system(GRAPHS["long bar with a fixed end"])
+    c = np.exp(3 * np.random.default_rng(2).normal(size=len(s.r)))  # entries of the matrix over ten decades
+    scaled = np.concatenate([v * c[rows] for rows, v in columns(s.pattern, s.factor)])
+    for groups in (1, 2, 3):
+        p = plan(s.pattern, 3, groups)
+        (chunks, scale), (other, lengths) = stored(s.pattern, s.factor, p), stored(s.pattern, scaled, p)
+        assert np.abs(other - chunks).max() < 1e-12 and np.abs(chunks).max() < 2
+        own = p.column >= 0
+        np.testing.assert_allclose(lengths[:-1][own] * c[p.column[own]], scale[:-1][own], rtol=1e-12)
 
 
 @graphs
