@@ -19,7 +19,7 @@ from sim_server.gpu.fuse import fused
 from sim_server.gpu.intake import Intake
 from sim_server.gpu.layouts import STAMP
 from sim_server.gpu.loop import CAPACITY, MANY, DeviceLoop, Mailbox
-from sim_server.gpu.solver import BODY, SETTINGS, Solver
+from sim_server.gpu.solver import BODY, RESULT, SETTINGS, Solver
 
 
 class Settings:
@@ -57,7 +57,8 @@ class GpuEngine(DeviceLoop):
         device = CudaDevice(cp)
         self._steps = device.steps
         self._counter = cp.zeros(1, np.int64)
-        self._stamps = cp.zeros(CAPACITY * STAMP.itemsize, np.uint8)
+        self._stamps = device.pinned(CAPACITY * STAMP.itemsize)
+        self._results = device.pinned(CAPACITY * RESULT.itemsize * bodies)
         self.solver = Solver(gpu, ranges, arrays, self._counter, CAPACITY)
         row, first = BODY.itemsize, self.solver.bodies_device
         boxes = [(first + row * k, SETTINGS) for k in range(bodies)]
@@ -66,10 +67,9 @@ class GpuEngine(DeviceLoop):
         boxes += [(self.launches[k].mail_address, self.launches[k].params.nbytes) for k in self._mailed]
         twins = {name: gpu.twin(arrays[name]) for name in ("values", "x", "v")}
         addresses = {name: int(twin.data.ptr) for name, twin in twins.items()}
-        addresses |= {"results": int(self.solver.results.data.ptr), "stamps": int(self._stamps.data.ptr)}
         super().__init__(
-            device, ranges, arrays["row_start"], dt, boxes, arrays["clock"], records,
-            twins["values"].dtype, **addresses,
+            device, ranges, arrays["row_start"], dt, boxes, self._results, self._stamps, arrays["clock"],
+            records, twins["values"].dtype, **addresses,
         )  # fmt: skip
         names = names or [f"body {k}" for k in range(bodies)]
         self._intake = Intake(gpu, self.solver, self, names, self.mailboxes[bodies : 2 * bodies])
@@ -92,16 +92,20 @@ class GpuEngine(DeviceLoop):
     def _capture(self) -> None:
         if self._graphs:
             return
-        for put, times in ((self._begin, 1), (self._one_step, 1), (self._one_step, MANY)):
-            with self._steps:
-                self._steps.begin_capture()
-                for _ in range(times):
-                    put()
-                self._graphs.append(self._steps.end_capture())
-        self.use_graphs(*(int(graph.graphExec) for graph in self._graphs))
+        for begin in (False, True):
+            for steps in (1, MANY):
+                with self._steps:
+                    self._steps.begin_capture()
+                    if begin:
+                        self._begin()
+                    for _ in range(steps):
+                        self._one_step()
+                    self._graphs.append(self._steps.end_capture())
+        self.use_graphs([int(graph.graphExec) for graph in self._graphs])
 
     def _begin(self) -> None:
-        self._stamp((1,), (1,), (self._counter, self._stamps, np.int32(CAPACITY)))
+        """Notes the time: the device has had nothing to do until now."""
+        self._stamp((1,), (1,), (self._counter, np.uint64(self._stamps.ctypes.data), np.int32(CAPACITY)))
 
     def _one_step(self) -> None:
         """Everything a step puts onto the stream."""
@@ -115,14 +119,21 @@ class GpuEngine(DeviceLoop):
         for launch in self._integrate:
             launch()
         arrived, clock = self.solver.arrived, self.gpu.twin(self._arrays["clock"])
-        dt, count = np.float64(self.loop.dt), np.int32(len(arrived))
-        self._tick((1,), (256,), (clock, self._counter, dt, arrived, count, self._stamps, np.int32(CAPACITY)))
+        words = np.int32(len(self._ranges) * RESULT.itemsize // 8)
+        self._tick(
+            (1,), (256,),
+            (
+                clock, self._counter, np.float64(self.loop.dt), arrived, np.int32(len(arrived)), np.int32(CAPACITY),
+                np.uint64(self._stamps.ctypes.data), self.solver.results, np.uint64(self._results.ctypes.data), words,
+            ),
+        )  # fmt: skip
 
     def assemble(self) -> None:
         """First half of one step: the system matrix, which the host has then too."""
         self._capture()
         self._open()
         with self._steps:
+            self._begin()
             for launch in self._fused:
                 launch()
             values = self._arrays["values"]

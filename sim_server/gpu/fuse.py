@@ -84,8 +84,19 @@ SUM_BY_LANES = """
 
 
 def fused(gpu: Gpu, launches: Sequence[DeviceLaunch]) -> list[Any]:
-    """The launches in as few kernels as their domains allow; as they are where one may be replaced at any time."""
-    if any(launch.mailed or domain(launch) not in DOMAINS for launch in launches):
-        return list(launches)
+    """The launches in as few kernels as their domains allow; one that may be replaced at any time stays as it is, and
+    those before it before it."""
+    out: list[Any] = []
+    run: list[DeviceLaunch] = []
+    for launch in launches:
+        if launch.mailed or domain(launch) not in DOMAINS:
+            out += [*_by_domain(gpu, run), launch]
+            run = []
+        else:
+            run.append(launch)
+    return out + _by_domain(gpu, run)
+
+
+def _by_domain(gpu: Gpu, launches: Sequence[DeviceLaunch]) -> list[Any]:
     together = [[x for x in launches if domain(x) == d] for d in DOMAINS]
     return [Fused(gpu, group) if len(group) > 1 or group[0].sums else group[0] for group in together if group]

@@ -51,6 +51,7 @@ static bool room_for_frame(Loop& l) {
         if (!oldest_frame_home(l)) return false;
     while (l.drawn - rings.frame_tail.load(std::memory_order_acquire) >= rings.frame_capacity) {
         if (!rings.patient || rings.stop.load() || l.error) return false;
+        l.stalled = 1;
         publish(l);
         nap(1e-4);
     }

@@ -38,7 +38,7 @@ class Body(c.Structure):
 
 class Batch(c.Structure):
     _fields_ = [
-        ("results", p), ("stamps", p), ("upload", p), ("done", p), ("first", i64), ("steps", i64), ("late", c.c_double),
+        ("upload", p), ("done", p), ("first", i64), ("steps", i64), ("late", c.c_double),
     ]  # fmt: skip
 
 
@@ -49,13 +49,14 @@ class Picture(c.Structure):
 class Loop(c.Structure):
     _anonymous_ = ("rings",)
     _fields_ = [
-        ("cuda", c.POINTER(Cuda)), ("context", p), ("stream", p), ("copies", p), ("stamp_graph", p), ("step_graph", p),
-        ("steps_graph", p), ("many", i64), ("mailbox", c.POINTER(Mailbox)), ("body", c.POINTER(Body)),
-        ("mailboxes", c.c_int32), ("bodies", c.c_int32), ("results", c.c_uint64), ("stamps", c.c_uint64),
+        ("cuda", c.POINTER(Cuda)), ("context", p), ("stream", p), ("copies", p), ("graphs", p * 4), ("many", i64),
+         ("mailbox", c.POINTER(Mailbox)), ("body", c.POINTER(Body)),
+        ("mailboxes", c.c_int32), ("bodies", c.c_int32), ("results", p), ("stamps", p),
         ("capacity", i64), ("batch", i64), ("values", c.c_uint64), ("staged", c.c_uint64), ("matrices", p),
         ("snapped", p), ("home", p), ("x", c.c_uint64), ("v", c.c_uint64), ("pictures", c.c_uint64),
-        ("frame_bytes", i64), ("clock", p), ("span", c.c_double), ("spin", c.c_double), ("step_seconds", c.c_double),
-        ("cpu", c.c_double), ("begun", i64), ("finished", i64), ("launched", i64), ("drawn", i64),
-        ("matrix_step", i64), ("asked", c.c_int32), ("error", c.c_int32), ("where", c.c_char * 24),
+        ("frame_bytes", i64), ("clock", p), ("span", c.c_double), ("poll", c.c_double), ("step_seconds", c.c_double),
+        ("idle", c.c_double), ("cpu", c.c_double), ("begun", i64), ("finished", i64), ("launched", i64),
+        ("drawn", i64), ("matrix_step", i64), ("asked", c.c_int32), ("stalled", c.c_int32), ("error", c.c_int32),
+        ("where", c.c_char * 28),
         ("batches", Batch * DEPTH), ("picture", Picture * PICTURES), ("rings", Rings),
     ]  # fmt: skip

@@ -1,8 +1,10 @@
 // SPDX-License-Identifier: MIT
-// The simulation loop on a GPU. It launches the graph of a step, again and again, and reads results back once per batch; the
+// The simulation loop on a GPU. It launches the graph of a step, again and again, and looks at results once per batch; the
 // next batch is under way before the results of the last one are looked at, so that the device never waits for this thread.
 // Data is exchanged with the rest of the server through mailboxes, looked at before each batch. No Python: the caller (ctypes)
 // has let go of its lock. The driver's functions come as a table, so that all of this can be tested without a GPU.
+#include <sys/prctl.h>
+
 #include <algorithm>
 
 #include "home.h"
@@ -29,9 +31,7 @@ static bool open_batch(Loop& l) {
     batch.first = l.launched;
     batch.steps = 0;
     batch.late = l.rings.late;
-    if (!deliver(l, batch)) return false;
-    CALL(graph_launch, l.stamp, l.stream);
-    return true;
+    return deliver(l, batch);
 }
 
 // So many steps were put onto the stream.
@@ -42,12 +42,7 @@ static bool count(Loop& l, int64_t steps) {
 }
 
 static bool close_batch(Loop& l) {
-    Batch& batch = l.batches[l.begun % DEPTH];
-    const size_t row = sizeof(Result) * l.bodies;
-    int64_t slot = batch.first % l.capacity;
-    CALL(to_host, batch.results, l.results + row * slot, row * batch.steps, l.stream);
-    CALL(to_host, batch.stamps, l.stamps + sizeof(Stamp) * slot, sizeof(Stamp) * batch.steps, l.stream);
-    CALL(event_record, batch.done, l.stream);
+    CALL(event_record, l.batches[l.begun % DEPTH].done, l.stream);
     ++l.begun;
     return true;
 }
@@ -59,12 +54,17 @@ static int64_t batch_size(Loop& l, int64_t left) {
 
 static bool launch_batch(Loop& l, int64_t steps) {
     if (!open_batch(l)) return false;
+    if (l.begun == l.finished || done(l, l.batches[(l.begun - 1) % DEPTH].done)) {
+        l.stalled = 1;
+        l.idle = now();
+    }
     for (int64_t left = steps; left;) {
         int64_t every = l.rings.frame_every.load(), n = l.many;
         bool undisturbed = every <= 0 || every - l.launched % every >= n;
         bool wanted = l.asked.load(std::memory_order_relaxed) && l.matrix_step < 0;
-        if (!l.steps || left < n || !undisturbed || wanted) n = 1;
-        CALL(graph_launch, n == 1 ? l.step : l.steps, l.stream);
+        if (!l.graphs[0][1] || left < n || !undisturbed || wanted) n = 1;
+        CALL(graph_launch, l.graphs[l.stalled][n > 1], l.stream);
+        l.stalled = 0;
         if (!count(l, n)) return false;
         left -= n;
     }
@@ -73,11 +73,13 @@ static bool launch_batch(Loop& l, int64_t steps) {
 
 static void report(Loop& l, const Batch& batch, int64_t k, double end, double cpu) {
     Rings& rings = l.rings;
-    const Stamp &stamp = batch.stamps[k], &last = batch.stamps[batch.steps - 1];
+    const Stamp &stamp = l.stamps[(batch.first + k) % l.capacity];
+    const Stamp &last = l.stamps[(batch.first + batch.steps - 1) % l.capacity];
+    const Result* results = l.results + (batch.first + k) % l.capacity * l.bodies;
     int64_t step = batch.first + k + 1, head = rings.record_head.load();
     bool keep = room_for_records(rings, l.bodies, [&] { publish(l); });
     for (int i = 0; keep && i < l.bodies; ++i) {
-        const Result& r = batch.results[k * l.bodies + i];
+        const Result& r = results[i];
         rings.records[(head + i) % rings.record_capacity] =
             Record{step, r.factor_step, rings.start_time + step * rings.dt, r.residual, 0, r.seconds, 0,
                    1e-9 * (stamp.end - stamp.begin), k ? 0 : batch.late, end - 1e-9 * (last.end - stamp.begin), cpu, i,
@@ -91,11 +93,12 @@ static void report(Loop& l, const Batch& batch, int64_t k, double end, double cp
 
 static bool finish_batch(Loop& l) {
     Batch& batch = l.batches[l.finished % DEPTH];
-    if (!await(l, batch.done)) return false;
-    double end = now(), cpu = thread_time();
+    if (!await(l, batch.done, l.idle + l.step_seconds * batch.steps)) return false;
+    double end = l.idle = now(), cpu = thread_time();
+    const Stamp &first = l.stamps[batch.first % l.capacity], &last = l.stamps[(batch.first + batch.steps - 1) % l.capacity];
+    l.step_seconds = 1e-9 * (last.end - first.begin) / batch.steps;
     for (int64_t k = 0; k < batch.steps; ++k) report(l, batch, k, end, (cpu - l.cpu) / batch.steps);
     l.cpu = cpu;
-    l.step_seconds = 1e-9 * (batch.stamps[batch.steps - 1].end - batch.stamps[0].begin) / batch.steps;
     ++l.finished;
     publish(l);
     return !l.error;
@@ -116,6 +119,7 @@ static bool wait(Loop& l) {
 }
 
 static bool begin(Loop& l) {
+    prctl(PR_SET_TIMERSLACK, 1000);  // ns: naps end when they should
     l.cpu = thread_time();
     CALL(context_set, l.context);
     return true;

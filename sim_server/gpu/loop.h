@@ -50,9 +50,7 @@ struct Body {
     std::atomic<int64_t> copied;   // step of the last copy made, -1: none
 };
 
-struct Batch {                     // steps that are read back together
-    Result* results;               // (batch, bodies), pinned
-    Stamp* stamps;                 // (batch,), pinned
+struct Batch {                     // steps that are looked at together
     char* upload;                  // pinned room for all that mailboxes may hold
     void* done;                    // event
     int64_t first, steps;          // steps completed before it; in it
@@ -66,12 +64,13 @@ enum { DEPTH = 2, PICTURES = 4 };
 struct Loop {
     const Cuda* cuda;
     void *context, *stream, *copies;   // copies: the stream that brings frames and matrices home
-    void *stamp, *step, *steps;        // graphs: the time when a batch begins; one step; `many` steps, or null
+    void* graphs[2][2];                // [the device was idle: its clock is noted first][0: one step, 1: `many` steps or null]
     int64_t many;
     Mailbox* mailbox;
     Body* body;
     int32_t mailboxes, bodies;
-    Address results, stamps;           // rings of `capacity` steps
+    const Result* results;             // (capacity, bodies) pinned; the steps write there themselves
+    const Stamp* stamps;               // (capacity,) likewise
     int64_t capacity, batch;           // batch: most steps in one; divides the capacity
     Address values, staged;            // A of all bodies, and as much room beside
     char* matrices;                    // ... and on the host, pinned
@@ -80,16 +79,18 @@ struct Loop {
     int64_t frame_bytes;               // of x
     double* clock;                     // (1,) s, for those who ask the host
     double span;                       // s that a batch lasts about, at most
-    double spin;                       // s to look at an event before sleeping until it is done
+    double poll;                       // s between looks at an event that is nearly due
     double step_seconds;               // of the last batch, 0: not known
+    double idle;                       // when the device had nothing to do, or the last batch was seen done
     double cpu;                        // time of this thread when the last batch was finished
     int64_t begun, finished;           // batches
     std::atomic<int64_t> launched;     // steps
     int64_t drawn;                     // frames begun
     int64_t matrix_step;               // of the matrices on their way, -1: none are
     std::atomic<int32_t> asked;        // some body's matrix is wanted
+    int32_t stalled;                   // the device has run dry meanwhile
     int32_t error;
-    char where[24];                    // the call that failed
+    char where[28];                    // the call that failed
     Batch batches[DEPTH];
     Picture picture[PICTURES];
     Rings rings;
@@ -110,9 +111,13 @@ static bool done(Loop& l, void* event) {
     return !failed(l, answer, "event_query");
 }
 
-static bool await(Loop& l, void* event) {
-    for (double end = now() + l.spin; l.spin > 0 && now() < end;)
-        if (done(l, event) || l.error) return !l.error;
-    CALL(event_wait, event);
-    return true;
+// Waits without burning the processor: sleeps until about when it is due, then looks again and again.
+static bool await(Loop& l, void* event, double due = 0) {
+    for (double begin = now(), t = begin; !done(l, event); t = now()) {
+        if (l.error) return false;
+        double over = t - (due > begin ? due : begin);
+        if (over > 1) { CALL(event_wait, event); return true; }
+        nap(over < 0 ? -over : l.poll + over / 8);
+    }
+    return !l.error;
 }

@@ -24,7 +24,7 @@ MANY = 8  # steps of the larger graph
 CAPACITY = 64  # steps whose results the device keeps: more than can be under way
 FRAMES = 8
 SPAN = 2e-3  # s that a batch lasts about: what asks for something waits two of them at most
-SPIN = 0.0  # s
+POLL = 1e-5  # s
 
 
 class Device(Protocol):
@@ -117,13 +117,14 @@ class DeviceLoop(Reports):
     """The loop over graphs that were captured elsewhere.
 
     row_start: of A. ranges: nodes [first, last) of each body. mailboxes: (device address, bytes) of each.
-    real: type of the values of A. results, stamps, values, x, v: device addresses. clock: host array (1,).
+    results, stamps: host memory (CAPACITY, bodies) of RESULT and (CAPACITY,) of STAMP that the steps write to. clock:
+    host array (1,). real: type of the values of A. values, x, v: device addresses.
     """
 
     def __init__(
         self, device: Device, ranges: Sequence[tuple[int, int]], row_start: NDArray[Any], dt: float,
-        mailboxes: Sequence[tuple[int, int]], clock: Reals, records: int = 8192, real: Any = np.float64,
-        **addresses: int,
+        mailboxes: Sequence[tuple[int, int]], results: NDArray[Any], stamps: NDArray[Any], clock: Reals,
+        records: int = 8192, real: Any = np.float64, **addresses: int,
     ):  # fmt: skip
         self._device, self._ranges, bodies, nodes = device, ranges, len(ranges), len(row_start) - 1
         self._native = library()
@@ -145,32 +146,27 @@ class DeviceLoop(Reports):
         loop.mailbox, loop.mailboxes, loop.body, loop.bodies = self._box, len(mailboxes), self._body, bodies
         for name, address in addresses.items():
             setattr(loop, name, address)
-        loop.capacity, loop.batch, loop.many, loop.span, loop.spin = CAPACITY, BATCH, MANY, SPAN, SPIN
+        loop.capacity, loop.batch, loop.many, loop.span, loop.poll = CAPACITY, BATCH, MANY, SPAN, POLL
         loop.frame_bytes, loop.clock, loop.matrix_step = 24 * nodes, clock.ctypes.data, -1
         loop.pictures = device.memory(PICTURES * 48 * nodes)
-        self._clock = clock
+        loop.results, loop.stamps = results.ctypes.data, stamps.ctypes.data
+        self._written = (results, stamps, clock)
         self._pinned = self._events_and_memory(loop, sum(-(-size // 16) * 16 for _, size in mailboxes))
 
     def _events_and_memory(self, loop: layouts.Loop, upload: int) -> list[NDArray[np.uint8]]:
-        from sim_server.gpu.solver import RESULT
-
-        pinned, event = self._device.pinned, self._device.event
-        memory = []
-        for batch in loop.batches:
-            parts = [pinned(max(size, 16)) for size in (BATCH * loop.bodies * RESULT.itemsize, 16 * BATCH, upload)]
-            batch.results, batch.stamps, batch.upload = (part.ctypes.data for part in parts)
-            batch.done = event()
-            memory += parts
+        memory = [self._device.pinned(max(upload, 16)) for _ in loop.batches]
+        for batch, room in zip(loop.batches, memory, strict=True):
+            batch.upload, batch.done = room.ctypes.data, self._device.event()
         for picture in loop.picture:
-            picture.taken, picture.arrived = event(), event()
-        loop.snapped, loop.home = event(), event()
+            picture.taken, picture.arrived = self._device.event(), self._device.event()
+        loop.snapped, loop.home = self._device.event(), self._device.event()
         return memory
 
     # --- running ------------------------------------------------------------------------------------------------
 
-    def use_graphs(self, stamp: int, step: int, steps: int | None) -> None:
-        """Handles of the graphs: the time when a batch begins, one step, MANY steps."""
-        self.loop.stamp_graph, self.loop.step_graph, self.loop.steps_graph = stamp, step, steps
+    def use_graphs(self, graphs: Sequence[int]) -> None:
+        """Handles of the graphs of one step and of MANY steps, then of the same with the time noted first."""
+        self.loop.graphs[:] = graphs
 
     def run(self, steps: int) -> int:
         """Runs up to `steps` steps without Python; returns those done (fewer only after `stop`).

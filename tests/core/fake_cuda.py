@@ -3,7 +3,7 @@
 
 import ctypes as c
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,25 +24,31 @@ Work = Callable[[], None]
 
 
 class FakeDevice:
-    """loop.Device. Nothing is done before somebody waits for it or asks often enough: a query does one piece of work.
+    """loop.Device. Nothing is done before somebody waits for it or asks often enough.
 
-    calls: names of the functions in the order of the calls. fail: a function that answers with an error.
+    calls: names of the functions in the order of the calls. fail: a function that answers with an error. pieces: of
+    work that are done when somebody asks.
     """
 
     context, stream, copies = 1, 2, 3
 
     def __init__(self) -> None:
         self.calls: list[str] = []
-        self.fail = ""
+        self.fail, self.pieces = "", 4
         self.graphs: dict[int, Work] = {}
         self._queues: dict[int, deque[tuple[str, int | Work]]] = {self.stream: deque(), self.copies: deque()}
         self._recorded: dict[int, int] = {}  # by event: records asked for, of which so many are
         self._done: dict[int, int] = {}
         self._events, self._kept = 100, []
-        self._functions = {
-            name: c.CFUNCTYPE(c.c_int32, *types)(getattr(self, "_" + name)) for name, types in SIGNATURES.items()
-        }
-        self.functions = layouts.Cuda(**{name: c.cast(f, p) for name, f in self._functions.items()})
+        self._functions: dict[str, object] = {}
+        self.functions = layouts.Cuda()
+        for name in SIGNATURES:
+            self.set(name, getattr(self, "_" + name))
+
+    def set(self, name: str, function: Callable[..., int]) -> None:
+        """Another function of the driver in place of what stands here."""
+        self._functions[name] = made = c.CFUNCTYPE(c.c_int32, *SIGNATURES[name])(function)
+        setattr(self.functions, name, c.cast(made, p).value)
 
     def pinned(self, size: int) -> NDArray[np.uint8]:
         return np.zeros(size, np.uint8)
@@ -101,8 +107,11 @@ class FakeDevice:
 
     def _event_query(self, event: int) -> int:
         self.calls.append("event_query")
-        if not self.is_done(event):
-            self._one(self.stream) or self._one(self.copies)
+        if self.fail == "event_query":
+            return 700
+        for _ in range(self.pieces):
+            if not self.is_done(event):
+                self._one(self.stream) or self._one(self.copies)
         return 0 if self.is_done(event) else NOT_READY
 
     def _event_wait(self, event: int) -> int:
@@ -141,13 +150,20 @@ class FakeScene:
         self.clock, self.time, self.done = np.zeros(1), 0, 0
         self.seen: list[int] = []  # the argument in each step
         boxes = [(a.ctypes.data + 8 * k, 8) for a in (self.settings, self.factor) for k in range(bodies)]
-        addresses = {n: getattr(self, n).ctypes.data for n in ("x", "v", "values", "results", "stamps")}
+        addresses = {n: getattr(self, n).ctypes.data for n in ("x", "v", "values")}
         self.loop = DeviceLoop(
             device, [(2 * k, 2 * k + 2) for k in range(bodies)], np.arange(nodes + 1, dtype=np.int32), 0.5,
-            [*boxes, (self.argument.ctypes.data, 8)], self.clock, records, **addresses,
+            [*boxes, (self.argument.ctypes.data, 8)], self.results, self.stamps, self.clock, records, **addresses,
         )  # fmt: skip
-        device.graphs = {7: self._stamp, 8: self._step, 9: lambda: [self._step() for _ in range(MANY)] and None}  # type: ignore[dict-item]
-        self.loop.use_graphs(7, 8, 9)
+        device.graphs = {7: lambda: self._steps(1), 8: lambda: self._steps(MANY)}
+        device.graphs |= {9: lambda: self._steps(1, True), 10: lambda: self._steps(MANY, True)}
+        self.loop.use_graphs([7, 8, 9, 10])
+
+    def _steps(self, steps: int, stamp: bool = False) -> None:
+        if stamp:
+            self._stamp()
+        for _ in range(steps):
+            self._step()
 
     def _stamp(self) -> None:
         self.time += 1_000_000  # the device had nothing to do for a while
@@ -170,8 +186,3 @@ class FakeScene:
 def number(value: int) -> bytes:
     """As a mailbox of FakeScene takes it."""
     return np.int64(value).tobytes()
-
-
-def runs(words: Sequence[str], word: str) -> list[int]:
-    """Lengths of the runs of `word`."""
-    return [len(part.split()) for part in " ".join(w if w == word else "|" for w in words).split("|") if part.split()]

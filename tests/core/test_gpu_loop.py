@@ -13,14 +13,17 @@ from sim_server.gpu.loop import BATCH, FRAMES
 from tests.core.fake_cuda import FakeScene, number
 
 
-def launches_before_each_wait(calls: list[str]) -> list[int]:
-    """Graph launches that had been made when each batch was waited for."""
-    made, out = 0, []
-    for call in calls:
-        made += call == "graph_launch"
-        if call == "event_wait":
-            out.append(made)
-    return out
+def steps_ahead(scene: FakeScene) -> list[int]:
+    """Steps launched before each of its batches was reported, beyond those reported by then."""
+    ahead: list[int] = []
+    launch = scene.device._graph_launch
+
+    def counted(graph: int, stream: int) -> int:
+        ahead.append(int(scene.loop.loop.launched) - scene.loop.step)
+        return launch(graph, stream)
+
+    scene.device.set("graph_launch", counted)
+    return ahead
 
 
 def test_every_step_is_reported_once_and_in_order():
@@ -44,22 +47,33 @@ def test_the_time_of_a_step_is_its_own_and_not_a_share_of_its_batch():
     assert (records["cpu"] > 0).all()
 
 
-def test_the_next_batch_is_under_way_before_the_last_one_is_waited_for():
+def test_the_next_batch_is_under_way_before_the_last_one_is_reported():
     scene = FakeScene()
     scene.loop.run(BATCH)
-    scene.loop.loop.steps_graph = None  # one launch a step
-    scene.device.calls.clear()
-    scene.loop.run(5 * BATCH)
-    steps = np.diff([0, *launches_before_each_wait(scene.device.calls)])
-    assert steps[0] == 2 * (BATCH + 1)  # with the stamps
-    assert max(steps[1:]) <= BATCH + 1
+    ahead = steps_ahead(scene)
+    scene.loop.run(8 * BATCH)
+    assert max(ahead[:2]) < BATCH  # nothing to be ahead of
+    assert min(ahead[2:]) >= BATCH
+    assert max(ahead) < 2 * BATCH
 
 
-def test_in_real_time_each_step_is_waited_for():
+def test_in_real_time_no_step_is_begun_before_the_last_one_is_reported():
     scene = FakeScene()
     scene.loop.loop.realtime, scene.loop.loop.dt = 1, 1e-4
+    ahead = steps_ahead(scene)
     scene.loop.run(6)
-    assert launches_before_each_wait(scene.device.calls) == [2, 4, 6, 8, 10, 12]
+    assert ahead == [0] * 6
+
+
+def test_the_clock_is_noted_first_where_the_device_had_nothing_to_do():
+    scene = FakeScene()
+    scene.loop.run(BATCH)
+    scene.device.pieces = 1  # slow enough to be busy
+    graphs: list[int] = []
+    launch = scene.device._graph_launch
+    scene.device.set("graph_launch", lambda graph, stream: graphs.append(graph) or launch(graph, stream))
+    scene.loop.run(3 * BATCH)
+    assert graphs == [10, 8, 8, 8, 8, 8]
 
 
 def test_few_launches_do_for_many_steps():
@@ -67,7 +81,7 @@ def test_few_launches_do_for_many_steps():
     scene.loop.run(BATCH)
     scene.device.calls.clear()
     scene.loop.run(10 * BATCH)
-    assert scene.device.calls.count("graph_launch") == 10 * 3  # a stamp and two graphs of eight steps
+    assert scene.device.calls.count("graph_launch") == 10 * 2  # of eight steps
 
 
 def test_mail_holds_from_the_next_batch_on_and_the_last_one_wins():
@@ -234,7 +248,7 @@ def test_a_pause_ends_what_is_under_way_and_resumes():
     assert scene.loop.run(5) == 0
 
 
-@pytest.mark.parametrize("call", ["graph_launch", "event_wait", "to_host"])
+@pytest.mark.parametrize("call", ["graph_launch", "event_query", "event_record"])
 def test_a_device_that_fails_is_told_with_the_call_that_failed(call):
     scene = FakeScene()
     scene.loop.run(3)
@@ -251,7 +265,7 @@ def test_half_a_step_by_hand_is_a_step():
     scene.loop.mailboxes[0].post(number(4))
     scene.device._event_wait(_recorded(scene))  # the caller waits for the first half
     scene.loop._renew()
-    scene.device._graph_launch(8, scene.device.stream)
+    scene.device._graph_launch(7, scene.device.stream)
     scene.loop._close()
     assert scene.loop.records()[["step", "iterations"]].tolist() == [(1, 4)]
     assert scene.loop.matrix_step(0) == 0

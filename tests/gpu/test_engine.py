@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: MIT
+"""The native loop on a GPU that is there: what comes home while it runs, what goes in, what it cannot take."""
+
+import logging
+import threading
+
+import numpy as np
+import pytest
+
+from protocol.messages_pb2 import SolveStatus
+from sim_server.driver import Driver
+from sim_server.errors import DeviceError
+from sim_server.factors import Job
+from sim_server.simulation import Simulation
+
+pytestmark = pytest.mark.gpu
+SCENE = "deploy/scenes/beam.toml"
+JACOBI = "solver.preconditioner=block_jacobi"
+
+
+@pytest.fixture(autouse=True)
+def cp():
+    from sim_server.gpu.device import cupy
+
+    try:
+        package = cupy()
+    except DeviceError as error:
+        pytest.skip(str(error))
+    yield package
+    package.get_default_memory_pool().set_limit(size=0)
+
+
+def on_gpu(*overrides: str) -> Simulation:
+    return Simulation.load(SCENE, [JACOBI, *overrides], "gpu")
+
+
+def factor_of(sim: Simulation):
+    """One that is fresh."""
+    driver = Driver(sim)
+    sim.engine.assemble()
+    driver.inline.submit(Job("beam", 1, sim.engine.step, True, sim.system.values, "float32"))
+    sim.engine.solve()
+    return driver.inline.poll()[0]
+
+
+def test_steps_are_reported_with_their_own_times():
+    sim = on_gpu()
+    assert sim.engine.run(300) == 300
+    records = sim.engine.records()
+    assert records["step"].tolist() == list(range(1, 301))
+    assert (records["solve"] > 0).all()
+    assert (records["whole"] > records["solve"]).all()
+    assert len(set(records["whole"].tolist())) > 20
+    assert (records["status"] == SolveStatus.CONVERGED).all()
+
+
+def test_matrices_and_frames_that_come_home_beside_the_steps_are_of_their_step():
+    sim, frames, matrices = on_gpu(), [], []
+    sim.engine.loop.frame_every = 7
+    thread = threading.Thread(target=sim.engine.run, args=(600,))
+    thread.start()
+    target = None
+    alive = True
+    while alive:
+        alive = thread.is_alive()
+        frames += sim.engine.frames()
+        if target is None and alive:
+            target = np.zeros_like(sim.system.values)
+            sim.engine.request_matrix(0, target)
+        if target is not None and (step := sim.engine.matrix_step(0)) >= 0:
+            matrices.append((step, target))
+            target = None
+    assert len(frames) >= 5
+    assert len(matrices) >= 2
+    again = on_gpu()
+    for step, values in [matrices[0], matrices[-1]]:
+        again.engine.run(step - again.engine.step)
+        again.engine.assemble()
+        assert np.array_equal(values, again.system.values), "the same bits"
+        again.engine.solve()
+    again = on_gpu()
+    for step, x, v in frames[:5]:
+        again.engine.run(step - again.engine.step)
+        world = again.fetch()
+        assert np.array_equal(x, world.x)
+        assert np.array_equal(v, world.v)
+
+
+def test_settings_and_factors_are_taken_up_while_it_runs():
+    sim = on_gpu()
+    factor = factor_of(sim)
+    sim.engine.records()
+    sim.engine.loop.patient = 1
+    thread = threading.Thread(target=sim.engine.run, args=(20000,))
+    thread.start()
+    records = []
+    sim.engine.settings(0).kind = 3
+    for step in (11, 12, 13):
+        sim.engine.post_factor(0, factor.pattern, factor.values, step)
+    while thread.is_alive():
+        records.append(sim.engine.records())
+        if len(records[-1]) and records[-1]["factor_step"][-1] == 13:
+            sim.engine.loop.stop = 1
+    thread.join()
+    records.append(sim.engine.records())
+    r = np.concatenate(records)
+    assert sorted(set(r["factor_step"].tolist())) == [-1, 11, 13]
+    assert (r["status"] == SolveStatus.CONVERGED).all()
+    assert sim.engine.factor_step(0) == 13
+    used = r["factor_step"] >= 0
+    assert r["iterations"][used].mean() < r["iterations"][~used].mean()
+
+
+def test_a_scene_that_does_not_fit_is_refused_with_what_is_free(cp):
+    pool = cp.get_default_memory_pool()
+    pool.free_all_blocks()
+    pool.set_limit(size=pool.used_bytes() + (1 << 20))
+    with pytest.raises(
+        DeviceError, match=r"beam\.toml|does not fit into the memory of the GPU: Out of memory allocating"
+    ):
+        Simulation.load(SCENE, ["object.beam.mesh.bar=[10,10,40]"], "gpu")
+
+
+def test_a_factor_that_does_not_fit_leaves_block_jacobi(cp, caplog):
+    sim = on_gpu()
+    factor = factor_of(sim)
+    sim.engine.settings(0).kind = 3
+    pool = cp.get_default_memory_pool()
+    pool.free_all_blocks()
+    pool.set_limit(size=pool.used_bytes() + 1024)
+    with caplog.at_level(logging.WARNING):
+        for step in (1, 2):
+            sim.engine.post_factor(0, factor.pattern, factor.values, step)
+            sim.engine.settle_factors()
+            sim.engine.run(2)
+    pool.set_limit(size=0)
+    assert caplog.text.count("not enough GPU memory") == 1
+    records = sim.engine.records()
+    assert (records["factor_step"] == -1).all() and (records["status"] == SolveStatus.CONVERGED).all()
+    sim.engine.post_factor(0, factor.pattern, factor.values, 3)
+    sim.engine.settle_factors()
+    sim.engine.run(1)
+    assert sim.engine.records()["factor_step"].tolist() == [3]
+
+
+def test_numbers_that_are_not_finite_are_told_with_their_node():
+    sim = on_gpu()
+    sim.engine.run(2)
+    sim.world.backend.twin(sim.world.v)[40] = np.nan
+    sim.engine.run(1)
+    record = sim.engine.records()[-1]
+    assert record["status"] == SolveStatus.NOT_FINITE
+    touching = {int(n) for tet in sim.world.bodies[0].mesh.tets for n in tet if 40 in tet}
+    assert record["bad_node"] == min(touching)
