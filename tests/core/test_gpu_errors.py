@@ -111,7 +111,7 @@ def test_auto_takes_a_gpu_that_is_there_and_says_nothing(cupy):
 def test_a_scene_that_does_not_fit_names_what_it_needs_and_what_is_free(cupy, error):
     cupy(fake())
     with (
-        pytest.raises(DeviceError, match="2.00 of 8.00 GB are free. Fewer or smaller objects") as raised,
+        pytest.raises(DeviceError, match=r"2\.00 of 8\.00 GB are free\. Fewer or smaller objects") as raised,
         device.building(),
     ):
         raise error
