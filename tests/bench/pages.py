@@ -53,6 +53,38 @@ def cpu_table(found: dict[str, Any]) -> str:
     )
 
 
+def gpu_table(found: dict[str, Any]) -> str:
+    """Of the README: a step's time on a GPU, ours beside a direct solver and plain CG on the same one."""
+    data = found["data"]
+    direct = {row["tets"]: row.get("us") for row in data["others"] if row["what"] == "cuDSS, float64"}
+    lines = []
+    for row in (r for r in data["steps"] if r["material"] == "homogeneous"):
+        alone, beams = row["beams"] == 1, row["beams"]
+        lines.append(
+            {
+                "scene": f"{row['tets']:,} tetrahedra" if alone else f"{beams} beams of {row['tets']:,}",
+                "**Warpfactor**": f"**{_time(row['us p50'])}**",
+                "p99": _time(row["us p99"]),
+                "iterations": row["iterations"],
+                "true residual": row["residual"],
+                "plain CG, ours": _time(row.get("CG us")),
+                "cuDSS each step, without assembly": _time(direct.get(row["tets"]) if alone else None),
+            }
+        )
+    device = data["device"]
+    return (
+        "Time of a whole step on the device, homogeneous beam let go from horizontal (E 1 MPa, dt 30 ms), tolerance "
+        f"1e-6, factor at most 16 steps old; {device['gpu']}, driver {device['driver']}, copy "
+        f"{device['copy TB/s']:.3g} TB/s ([all of it](docs/bench/gpu.md)):\n\n{table(lines)}"
+    )
+
+
+def _time(us: float | None) -> str | None:
+    if us is None:
+        return None
+    return f"{us:.0f} µs" if us < 1000 else f"{us / 1000:.3g} ms"
+
+
 def filled(text: str, mark: str, content: str) -> str:
     """The text with what stands between <!-- mark --> and <!-- /mark --> replaced."""
     begin, end = f"<!-- {mark} -->", f"<!-- /{mark} -->"
@@ -67,10 +99,11 @@ def main() -> None:
     out, docs = ROOT / "out" / "bench", ROOT / "docs" / "bench"
     for name in PAGES:
         print(f"{name}: {'docs/bench' if copied(name, out, docs) else 'not run, page left as it is'}")
-    if (out / "cpu" / "cpu.json").exists():
-        found = json.loads((out / "cpu" / "cpu.json").read_text())
-        README.write_text(filled(README.read_text(), "cpu", cpu_table(found)))
-        print("README.md: table of steps on a CPU")
+    for name, made in (("cpu", cpu_table), ("gpu", gpu_table)):
+        results = out / name / f"{name}.json"
+        if results.exists() and f"<!-- {name} -->" in README.read_text():
+            README.write_text(filled(README.read_text(), name, made(json.loads(results.read_text()))))
+            print(f"README.md: table of steps on a {name.upper()}")
 
 
 if __name__ == "__main__":

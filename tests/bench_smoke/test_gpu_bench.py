@@ -15,7 +15,7 @@ from sim_server.scene import load
 from sim_server.simulation import Simulation
 from tests.bench import _gpu_bytes as moved
 from tests.bench import _gpu_page as page
-from tests.bench import gpu
+from tests.bench import gpu, pages
 from tests.bench._gpu_others import lower
 from tests.bench._gpu_problem import BARS, MATERIALS, Problem
 from tests.bench._gpu_rows import row
@@ -119,6 +119,9 @@ def test_pieces_become_one_page(found: tuple[Beams, Any], tmp_path: Path) -> Non
     assert (tmp_path / "out" / "gpu.png").read_bytes().startswith(b"\x89PNG")
     again = json.loads((tmp_path / "out" / "gpu.json").read_text())
     assert page.merged([again["data"]]) == again["data"]
+    readme = pages.gpu_table(again)
+    assert "| 540 tetrahedra | **22 µs** |" in readme and "| 321 µs |" in readme
+    assert "| 512 beams of 540 | **1 ms** |" in readme
 
 
 def test_without_a_gpu_one_line_and_code_2(tmp_path: Path) -> None:
