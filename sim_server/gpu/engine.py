@@ -80,18 +80,16 @@ class GpuEngine(DeviceLoop):
         self._graphs: list[Any] = []
         module = DeviceModule("gpu/tick.cu", gpu)
         self._tick, self._stamp = module.function("tick"), module.function("stamp")
+        self._capture()
         cp.cuda.get_current_stream().synchronize()  # what was made until now is there for the loop's streams
 
     # --- running ------------------------------------------------------------------------------------------------
 
     def run(self, steps: int) -> int:
-        self._capture()
         self._intake.advance()
         return super().run(steps)
 
     def _capture(self) -> None:
-        if self._graphs:
-            return
         for begin in (False, True):
             for steps in (1, MANY):
                 with self._steps:
@@ -130,7 +128,6 @@ class GpuEngine(DeviceLoop):
 
     def assemble(self) -> None:
         """First half of one step: the system matrix, which the host has then too."""
-        self._capture()
         self._open()
         with self._steps:
             self._begin()
