@@ -7,19 +7,20 @@ faster than this floor says (an H200 keeps about 25 MB close by).
 
 from dataclasses import dataclass
 
-REAL = 8  # bytes of a number of the state, the matrix and the vectors
-INDEX = 4
+INDEX = 4  # bytes
 
 
 @dataclass(frozen=True)
 class Size:
-    """Of a scene. blocks: 3x3 of A; upper: those on and above its diagonal; factor: bytes an application reads."""
+    """Of a scene. blocks: 3x3 of A; upper: those on and above its diagonal; factor: bytes an application reads; real:
+    bytes of a number of the matrix and the vectors."""
 
     nodes: int
     tets: int
     blocks: int
     upper: int
     factor: int
+    real: int = 8
 
 
 # Passes over vectors of 3 numbers a node in an iteration: product reads p, writes q; y += a p reads y and p, writes y;
@@ -29,13 +30,13 @@ PASSES = 13
 
 def matrix(size: Size, iterations: float) -> float:
     """A is written once, read by each product and by that for the residual of the start."""
-    values = 9 * REAL * size.blocks
+    values = 9 * size.real * size.blocks
     return values + (iterations + 1) * (values + INDEX * (size.blocks + size.nodes + 1))
 
 
 def vectors(size: Size, iterations: float) -> float:
     """Of the iteration, and of the start: b, y, q read, r and p written."""
-    return (PASSES * iterations + 5) * 3 * REAL * size.nodes
+    return (PASSES * iterations + 5) * 3 * size.real * size.nodes
 
 
 def factor(size: Size, iterations: float) -> float:
@@ -50,8 +51,8 @@ def assembly(size: Size) -> float:
     nodes' and blocks' lists (4 and 10 pairs) read again; a node reads and writes about 50 numbers, a block on or above
     the diagonal reads four indices.
     """
-    element = INDEX * (4 + 4 + 2 * 10) + REAL * (12 + 2 * 33 + 1)
-    return element * size.tets + 50 * REAL * size.nodes + 4 * INDEX * size.upper
+    element = INDEX * (4 + 4 + 2 * 10) + size.real * (12 + 2 * 33 + 1)
+    return element * size.tets + 50 * size.real * size.nodes + 4 * INDEX * size.upper
 
 
 def step(size: Size, iterations: float) -> dict[str, float]:

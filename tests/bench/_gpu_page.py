@@ -10,10 +10,10 @@ from tests.bench.report import Report
 Row = dict[str, Any]
 Data = dict[str, Any]
 KEYS = {  # what tells rows of a section apart
-    "steps": ("tets", "material", "beams"),
-    "others": ("tets", "material", "what"),
-    "served": ("tets", "material", "worker"),
-    "publishing": ("tets", "material", "matrices"),
+    "steps": ("tets", "material", "beams", "settings"),
+    "others": ("tets", "material", "what", "settings"),
+    "served": ("tets", "material", "worker", "settings"),
+    "publishing": ("tets", "material", "matrices", "settings"),
 }
 
 PROBLEM = (
@@ -53,7 +53,8 @@ PUBLISHED = "In turns; the factor stays the same, what the worker (on the CPU) s
 
 def merged(parts: list[Data]) -> Data:
     """One set of rows of several runs; where two have the same row, that of the later one. device: of the last."""
-    out: Data = {"device": parts[-1]["device"]}
+    direct = [part["device"]["cuDSS"] for part in parts if part["device"]["cuDSS"] != "absent"]
+    out: Data = {"device": parts[-1]["device"] | {"cuDSS": direct[-1] if direct else "absent"}}
     for section, names in KEYS.items():
         rows = {tuple(row[n] for n in names): row for part in parts for row in part.get(section, [])}
         out[section] = [rows[key] for key in sorted(rows, key=_order)]
@@ -82,8 +83,9 @@ def write(report: Report, data: Data) -> None:
 
 
 def _columns(rows: list[Row]) -> list[str]:
-    """Every key, in the order of their first appearance."""
-    return list(dict.fromkeys(key for row in rows for key in row))
+    """Every key, in the order of their first appearance; the settings only where there are several."""
+    names = list(dict.fromkeys(key for row in rows for key in row))
+    return [n for n in names if n != "settings" or any(row.get(n) for row in rows)]
 
 
 def _device(device: Row) -> str:
@@ -96,8 +98,9 @@ def _device(device: Row) -> str:
 
 
 def _steps(report: Report, data: Data) -> None:
-    rows = data["steps"]
-    aims = [_against(r, data) for r in rows if (r["beams"], r["tets"]) in AIMS and r["material"] == MATERIALS[0]]
+    rows, usual = data["steps"], [row for row in data["steps"] if not row["settings"]]
+    more = ["settings"] if len(usual) < len(rows) else []
+    aims = [_against(r, data) for r in usual if (r["beams"], r["tets"]) in AIMS and r["material"] == MATERIALS[0]]
     if aims:
         report.say("## Aims, homogeneous, us per step of all beams", AIMED)
         report.table(aims)
@@ -108,13 +111,14 @@ def _steps(report: Report, data: Data) -> None:
     )  # fmt: skip
     if single := [r for r in rows if r["beams"] == 1]:
         report.say("## One beam")
-        report.table(single, ["tets", "material", *columns])
-        figure(report, single, data["others"])
+        report.table(single, ["tets", "material", *more, *columns])
+        figure(report, [r for r in single if not r["settings"]], data["others"])
     if batches := [{**r, "beam steps/s": 1e6 * r["beams"] / r["us p50"]} for r in rows if r["beams"] > 1]:
         report.say("## Many beams in the same launches", BATCHED)
-        report.table(batches, ["beams", "tets", "beam steps/s", *columns])
+        report.table(batches, ["beams", "tets", *more, "beam steps/s", *columns])
     report.say("## Bytes and latencies", BYTES)
-    report.table([_floors(r, data["device"]) for r in rows])
+    floors = [_floors(r, data["device"]) for r in rows]
+    report.table(floors, _columns(floors))
 
 
 def _against(row: Row, data: Data) -> Row:
@@ -140,7 +144,7 @@ def _floors(row: Row, device: Row) -> Row:
     floor, phases = row["MB all"] / device["copy TB/s"], row.get("phases")
     latency = row["iterations"] * (phases + 2) * device["barrier us"] if phases else None
     return {
-        **{k: row[k] for k in ("tets", "material", "beams", "iterations")},
+        **{k: row[k] for k in ("tets", "material", "beams", "settings", "iterations")},
         **{f"MB {k}": row[f"MB {k}"] for k in ("matrix", "vectors", "factor", "assembly")},
         "all / bandwidth, us": floor, "phases": phases, "latency, us": latency, "us p50": row["us p50"],
         "p50 / bytes floor": row["us p50"] / floor,

@@ -38,12 +38,11 @@ def row(beams: Beams, found: Found) -> Row:
 
 
 def phases(beams: Beams) -> int | None:
-    """Of an application of the factor on this GPU, a barrier each; None where there is none such."""
-    if beams.sim.world.backend.name != "gpu" or beams.analysis is None:
+    """Of an application of the factor that the first beam has on a GPU, a barrier each; None where there is none."""
+    planned = getattr(getattr(beams.engine, "solver", None), "planned", None)
+    if planned is None or beams.analysis is None:
         return None
-    from sim_server.gpu.plan import plan
-
-    return plan(beams.analysis.pattern, beams.sim.world.backend.properties["multiProcessorCount"]).phases
+    return int(planned(0, beams.analysis.pattern).plan.phases)
 
 
 def _first(records: NDArray[Any]) -> NDArray[Any]:

@@ -100,7 +100,8 @@ class Beams:
         """For the count of bytes."""
         system, factor = self.sim.system, sum(self.engine.factor_bytes(b.index) for b in self.bodies)
         tets = sum(len(b.mesh.tets) for b in self.bodies)
-        return moved.Size(self.sim.world.nodes, tets, len(system.columns), len(system.row), factor)
+        real = getattr(getattr(self.engine, "solver", None), "real", np.dtype(np.float64)).itemsize  # of a GPU's solver
+        return moved.Size(self.sim.world.nodes, tets, len(system.columns), len(system.row), factor, real)
 
     def use(self, kind: Kind) -> None:
         """The preconditioner of all beams from now on."""

@@ -91,6 +91,8 @@ def measure(o: argparse.Namespace) -> dict[str, Rows]:
                 rows, publishing = guarded(problem.name, lambda: served(problem, 1.0, overrides=tuple(o.set)))  # noqa: B023
                 data["served"] += rows
                 data["publishing"] += publishing
+    for section in page.KEYS:
+        data[section] = [{"settings": " ".join(o.set), **row} for row in data[section]]
     return data
 
 

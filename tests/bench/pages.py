@@ -58,7 +58,7 @@ def gpu_table(found: dict[str, Any]) -> str:
     data = found["data"]
     direct = {row["tets"]: row.get("us") for row in data["others"] if row["what"] == "cuDSS, float64"}
     lines = []
-    for row in (r for r in data["steps"] if r["material"] == "homogeneous"):
+    for row in (r for r in data["steps"] if r["material"] == "homogeneous" and not r["settings"]):
         alone, beams = row["beams"] == 1, row["beams"]
         lines.append(
             {

@@ -104,17 +104,21 @@ def piece(path: Path, rows: list[dict[str, Any]], **sections: Any) -> Path:
 
 
 def test_pieces_become_one_page(found: tuple[Beams, Any], tmp_path: Path) -> None:
-    one = row(*found) | {"material": MATERIALS[0]}
+    one = row(*found) | {"material": MATERIALS[0], "settings": ""}
     batch = one | {"beams": 512, "us p50": 1000.0}
-    others = [{"tets": 540, "material": MATERIALS[0], "what": "cuDSS, float64", "us": 321.0, "residual": 1e-14}]
-    served = [{"tets": 540, "material": MATERIALS[0], "worker": "cpu", "us p50": 77.0, "factor age": 12.0}]
+    others = [{"tets": 540, "material": MATERIALS[0], "what": "cuDSS, float64", "settings": "", "us": 321.0}]
+    served = [
+        {"tets": 540, "material": MATERIALS[0], "worker": "cpu", "settings": "", "us p50": 77.0, "factor age": 12.0}
+    ]
     first = piece(tmp_path / "a.json", [one | {"us p50": 90.0}, batch], others=others, served=served)
-    second = piece(tmp_path / "b.json", [one | {"us p50": 22.5}])
+    other = one | {"us p50": 11.5, "settings": "solver.threads=2"}
+    second = piece(tmp_path / "b.json", [one | {"us p50": 22.5}, other])
     gpu.merge([first, second], tmp_path / "out")
     text = (tmp_path / "out" / "gpu.md").read_text()
     lines = [line.split(" | ") for line in text.splitlines() if line.startswith("| 540 tets")]
     assert lines and lines[0][2:4] == ["22.5", "0.5"] and "321" in lines[0]  # ours, over the aim of 45; direct
     assert "| 512 beams of 540 | 500 | 1000 | 2 |" in text and "5.12e+05" not in text and "| 512000 |" in text
+    assert text.count("| 540 tets |") == 1 and "| solver.threads=2 | 11.5 |" in text
     assert "2 runs" in text and "commit b" in text and "| cpu | 77 | 12 |" in text
     assert (tmp_path / "out" / "gpu.png").read_bytes().startswith(b"\x89PNG")
     again = json.loads((tmp_path / "out" / "gpu.json").read_text())
