@@ -115,12 +115,18 @@ def _cudss() -> str:
 def merge(files: list[Path], out: Path | None) -> None:
     """One page of the results of several runs; the head is that of the last."""
     parts = [json.loads(file.read_text()) for file in files]
-    last = parts[-1]
-    dates = ", ".join(f"{part['header']['date']} ({part['header']['commit']})" for part in parts)
-    report = Page(last["header"], {"pieces": len(parts), **last["arguments"]}, out)
-    if len(parts) > 1:
-        report.say(f"Put together of {len(parts)} runs: {dates}.")
+    last, several = parts[-1], len(parts) > 1
+    report = Page(last["header"], {"pieces": len(parts)} if several else last["arguments"], out)
+    if several:
+        report.say("Put together of several runs, the last one described above:")
+        report.table(
+            [{**{k: part["header"][k] for k in ("date", "commit")}, **_words(part["arguments"])} for part in parts]
+        )
     page.write(report, page.merged([part["data"] for part in parts]))
+
+
+def _words(arguments: dict[str, Any]) -> dict[str, str]:
+    return {k: " ".join(map(str, v)) if isinstance(v, list) else str(v) for k, v in arguments.items()}
 
 
 def options() -> argparse.Namespace:
@@ -154,7 +160,8 @@ def main() -> None:
     except DeviceError as error:
         print(f"bench gpu: {error}", file=sys.stderr)
         raise SystemExit(2) from None
-    words = {k: v for k, v in vars(o).items() if k in ("only", "sizes", "materials", "library") or (k == "set" and v)}
+    words = {k: getattr(o, k) for k in ("only", "sizes", "materials", "beams", "library")}
+    words |= {k: getattr(o, k) for k in ("set", "quick") if getattr(o, k)}
     report = Report("gpu", TITLE, words, o.out, o.quick)
     page.write(report, page.merged([measure(o)]))
 
