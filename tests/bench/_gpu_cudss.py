@@ -2,6 +2,7 @@
 """NVIDIA's direct solver cuDSS through nvmath-python, where that is installed."""
 
 import time
+from importlib import metadata
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,18 @@ from tests.bench._gpu_device import timed
 from tests.bench._gpu_steps import Sample
 
 ABSENT = "cuDSS: not installed (pip install 'nvmath-python[cu13]')"
+
+
+def version() -> str:
+    """Of cuDSS and nvmath-python; "absent"."""
+    try:
+        from nvmath.bindings import cudss
+
+        number = ".".join(str(cudss.get_property(part)) for part in range(3))
+        return f"{number} through nvmath-python {metadata.version('nvmath-python')}"
+    except (ImportError, RuntimeError) as error:
+        print(f"cuDSS: {error}", flush=True)
+        return "absent"
 
 
 class Direct:

@@ -14,7 +14,6 @@ import argparse
 import json
 import sys
 import time
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -69,12 +68,13 @@ def beams(problem: Problem, o: argparse.Namespace, external: bool) -> tuple[Rows
 
 def measure(o: argparse.Namespace) -> dict[str, Rows]:
     """All sections asked for, and what the device is."""
+    from tests.bench._gpu_cudss import version
     from tests.bench._gpu_device import described
     from tests.bench._gpu_served import SIZES
     from tests.bench._gpu_served import measure as served
 
     data: dict[str, Any] = {name: [] for name in page.KEYS}
-    data["device"] = described() | {"cuDSS": _cudss()}
+    data["device"] = described() | {"cuDSS": version()}
     print(data["device"], flush=True)
     problems = [Problem(tets, m) for tets in o.sizes for m in o.materials] if {"steps", "others"} & {*o.only} else []
     if "batches" in o.only:
@@ -103,13 +103,6 @@ def guarded(name: str, run: Any) -> tuple[Rows, Rows]:
     except Exception as error:
         print(f"FAILED {name}: {type(error).__name__}: {error}", file=sys.stderr, flush=True)
         return [], []
-
-
-def _cudss() -> str:
-    try:
-        return f"0.8 line, nvmath-python {metadata.version('nvmath-python')}"
-    except metadata.PackageNotFoundError:
-        return "absent"
 
 
 def merge(files: list[Path], out: Path | None) -> None:
