@@ -29,18 +29,24 @@ class Workspace:
         self.copied: Any = None  # event after which the staging may be written again
 
     def reserve(self, memory: int, incoming: int) -> None:
-        """At least that many bytes, from now on."""
+        """At least that many bytes, from now on. Without room for them it stays as large as it is, and CuPy's error is
+        raised."""
         cp = cupy()
         if memory <= self.memory.nbytes and incoming <= self.incoming.nbytes:
             return
         self.stream.synchronize()
         self.generation += 1
         if memory > self.memory.nbytes:
+            before = self.memory.nbytes
             self.memory = None  # freed before the new one is made
-            self.memory = cp.zeros(memory, np.uint8)
+            try:
+                self.memory = cp.zeros(memory, np.uint8)
+            except Exception:
+                self.memory = cp.zeros(before, np.uint8)
+                raise
         if incoming > self.incoming.nbytes:
-            self.incoming = cp.zeros(incoming, np.uint8)
-            self._pinned = cp.cuda.alloc_pinned_memory(incoming)
+            device, pinned = cp.zeros(incoming, np.uint8), cp.cuda.alloc_pinned_memory(incoming)
+            self.incoming, self._pinned = device, pinned
             self.staging = np.frombuffer(self._pinned, np.uint8, incoming)
         cp.cuda.get_current_stream().synchronize()
 
