@@ -1,309 +1,344 @@
 // SPDX-License-Identifier: MIT
 // Preconditioned conjugate gradients of all bodies in one persistent launch, numbered as native/pcg.h, which it mirrors.
 //
-// A body is solved by a group of thread blocks with a barrier of its own; blocks beyond what the bodies need do nothing,
-// bodies beyond the blocks queue. Two barriers an iteration: the search direction p = z + beta p is formed while A p is
-// computed (every block forms what it reads), and x, r are updated while the preconditioner is applied. All sums have a
-// fixed order: no float atomics, the same bits every time.
+// A body is solved by a team of thread blocks with a barrier of its own; small bodies of a large scene are taken one by one
+// by whichever block is free. An iteration has one barrier for A p and 2 P - 1 for the inverse in parts (one for a diagonal
+// preconditioner): x and r are updated in the preconditioner's first phase, and |r| after the update is known before it from
+// |r|^2 - 2 alpha r.q + alpha^2 q.q, so that nothing is applied in vain at the end.
 //
-// The factor is applied as the dense inverse in float16, made on the device from L (expand.py): data without dependency
-// chains. Vectors and A are float64, so that the residual is, whatever the preconditioner's precision.
-#include "invert3.cuh"
+// Vectors and A are `real`, so that the residual is, whatever the preconditioner's precision. No float atomics.
+#include "apply.cuh"
+#include "rows.cuh"
 
-#define THREADS 512
-#define WARPS (THREADS / 32)
-#define LANES_PER_NODE 16
-#define ALL 0xffffffffu
-
-enum Kind { NONE = 0, JACOBI = 1, BLOCK_JACOBI = 2, CHOLESKY = 3 };
-enum Status { CONVERGED = 0, MAX_ITERATIONS = 1, BUDGET = 2, BREAKDOWN_MATRIX = 3, BREAKDOWN_PRECONDITIONER = 4, NOT_FINITE = 5 };
-
-struct Body {
-    int first, nodes;                // of the scene's nodes
-    int block, blocks;               // thread blocks [block, block + blocks) solve it
-    int kind, max_iterations, warm_start, probe;
-    double tolerance;
-    const unsigned short* inverse;   // (3 nodes, stride) float16, or null
-    long long factor_step;           // of the matrix it was made from
-    const float* scale;              // (3 nodes,) d: the inverse is d_i stored_ij d_j, entries of at most 1
-    int stride, unused;              // entries per row, a multiple of 8, zeros beyond 3 nodes
+struct Memory {  // fixed shared memory of a thread block: what is the same in all threads costs no registers
+    double scratch[3 * WARPS][4], totals[4];
+    Body body;
+    Plan plan;
+    Rows rows;
+    Inverse inverse;
+    real* d;         // (own, 3) scale of the own degrees of freedom, or null
+    real* diagonal;  // (own, 9) inverses of the diagonal blocks
+    float peak;      // largest scale
+    int next, bad;
+    double b2, goal, quarter, rz;  // of the iteration: all threads write the same
+    Result out;
 };
+extern __shared__ __align__(16) char dynamic[];
+__shared__ Memory memory;
 
-struct Result {
-    double residual;                 // true, relative
-    double seconds;
-    long long factor_step;           // -1: no factor used
-    int iterations, status, kind, asked, fallbacks, bad_node;
-};
+__device__ __forceinline__ bool usable(double a) { return a > 0 && a < 1e300; }
 
-struct Solve {
-    const Body* bodies;
-    int count, capacity;             // bodies; results kept per body
-    const int* row_start;
-    const int* columns;
-    const double* values;            // (blocks, 3, 3)
-    const double* b;                 // (nodes, 3)
-    double* y;                       // (nodes, 3) start in, solution out
-    double* r;                       // (2, nodes, 3)
-    double* p;                       // (2, nodes, 3)
-    double* z;                       // (nodes, 3)
-    double* q;                       // (nodes, 3)
-    double* diagonal;                // (nodes, 9) inverses of the diagonal blocks
-    double* partial;                 // (bodies, 2, grid, 2) sums of the thread blocks
-    unsigned* arrived;               // (bodies,) zero at launch
-    const long long* step;           // completed steps: where the result goes
-    Result* results;                 // (capacity, bodies)
-    int nodes, shared;               // of the scene; bytes of dynamic shared memory
-};
+// 1 / a to 40 bits, in a tenth of the time of a division: step lengths and directions need no more.
+__device__ __forceinline__ double inverse_of(double a) {
+    double y;
+    asm("rcp.approx.ftz.f64 %0, %1;" : "=d"(y) : "d"(a));
+    return y * (2 - a * y);
+}
 
-extern __shared__ float4 dynamic[];   // the residual in float32 (dense inverse), then the own rows of A where they fit
+// 2^-k, the largest with `a` 2^-k < 1.
+__device__ __forceinline__ float unit_for(double a) {
+    const int k = ((__double2hiint(a) >> 20) & 0x7ff) - 1022;
+    return __int_as_float((127 - max(-120, min(120, k))) << 23);
+}
 
-struct Group {
+struct Solver {
     const Solve& s;
-    const Body body;
-    const int index, lane, warp;     // of this block in the group, of this thread
-    const int begin, end;            // own nodes, from 0 in the body
-    unsigned target;
-    int parity;                      // of the partial sums
-    unsigned* const arrived;
-    double* const partial;           // of this body
-    double* const scratch;           // shared, 2 WARPS + 2
-    const int* row_start;            // of the own rows: here or in global memory, from row `row_base`
-    const int* columns;
-    const double* values;
-    int row_base, block_base;
+    Team team;
+    int turn = 0;                   // half of inverse.residual that holds d r before the update
+    unsigned r_number = 0, q_number = 0, z_number = 0;  // exchanges in which d r, d q and z were put
+    bool packed = false;            // places are those of the inverse
 
-    __device__ __forceinline__ float* residual32() { return (float*)dynamic; }
-
-    // Copies the own rows of A into shared memory if they fit: loads after a barrier miss L1.
-    __device__ __forceinline__ void bring_rows(int bytes, int capacity) {
-        int first = body.first + begin, count = end - begin;
-        int low = s.row_start[first], blocks = s.row_start[body.first + end] - low;
-        row_start = s.row_start; columns = s.columns; values = s.values;
-        row_base = body.first; block_base = 0;
-        if (bytes + 72 * blocks + 4 * (blocks + count + 1) + 16 > capacity) return;
-        double* v = (double*)((char*)dynamic + bytes);
-        int *c = (int*)(v + 9 * blocks), *r = c + blocks;
-        for (int k = threadIdx.x; k < 9 * blocks; k += THREADS) v[k] = s.values[9ll * low + k];
-        for (int k = threadIdx.x; k < blocks; k += THREADS) c[k] = s.columns[low + k];
-        for (int k = threadIdx.x; k <= count; k += THREADS) r[k] = s.row_start[first + k];
-        row_start = r; columns = c; values = v;
-        row_base = -begin; block_base = low;
-        __syncthreads();
-    }
-
-    __device__ __forceinline__ void barrier() {
-        __syncthreads();
-        if (body.blocks == 1) return;
-        target += body.blocks;
+    __device__ __forceinline__ void set_up(const Share& share) {
+        const Body& body = memory.body;
+        Arena arena = {dynamic, dynamic + s.shared};
+        Rows rows;
+        rows.set_up(s, body, share, arena);
+        real* diagonal = arena.take<real>(9 * rows.own);
+        if (!diagonal) diagonal = s.diagonal + 9ll * (body.first + rows.begin);
+        real* d = body.plan ? arena.take<real>(3 * rows.own) : nullptr;
+        Inverse inverse;
+        if (body.plan) inverse.set_up(body, &memory.plan, team.index, arena);
+        else copies_begin();
         if (threadIdx.x == 0) {
-            unsigned seen;
-            asm volatile("red.release.gpu.global.add.u32 [%0], 1;" ::"l"(arrived) : "memory");
-            do asm volatile("ld.relaxed.gpu.global.u32 %0, [%1];" : "=r"(seen) : "l"(arrived) : "memory");
-            while ((int)(seen - target) < 0);
-            asm volatile("fence.acq_rel.gpu;" ::: "memory");  // once: an acquiring load would flush L1 at every turn
+            memory.rows = rows;
+            memory.inverse = inverse;
+            memory.diagonal = diagonal;
+            memory.d = d;
+            if (body.plan) memory.peak = inverse.scale[inverse.size];
         }
+        packed = body.kind == CHOLESKY && body.plan;
+        copies_end<1>();  // all but the chunks
+        __syncthreads();
+        find_places();
         __syncthreads();
     }
 
-    static __device__ __forceinline__ void warp_sum(double& a, double& c, int from) {
-        for (int k = from; k; k >>= 1) {
-            a += __shfl_xor_sync(ALL, a, k);
-            c += __shfl_xor_sync(ALL, c, k);
-        }
-    }
-
-    // Sums over the threads of this block, in every thread.
-    __device__ __forceinline__ void block_sum(double& a, double& c) {
-        warp_sum(a, c, 16);
-        __syncthreads();
-        if (lane == 0) { scratch[warp] = a; scratch[WARPS + warp] = c; }
-        __syncthreads();
-        a = scratch[lane % WARPS];
-        c = scratch[WARPS + lane % WARPS];
-        warp_sum(a, c, WARPS / 2);
-    }
-
-    // Sums over the group, in every thread; a barrier.
-    __device__ __forceinline__ void group_sum(double& a, double& c) {
-        block_sum(a, c);
-        if (body.blocks == 1) { __syncthreads(); return; }
-        double2* mine = (double2*)partial + parity * gridDim.x;
-        if (threadIdx.x == 0) __stcg(mine + index, make_double2(a, c));
-        barrier();
-        if (warp == 0) {  // one warp a block: all of them would queue for the same few lines of L2
-            a = 0; c = 0;
-            for (int k = lane; k < body.blocks; k += 32) {
-                double2 sums = __ldcg(mine + k);
-                a += sums.x;
-                c += sums.y;
-            }
-            warp_sum(a, c, 16);
-            if (lane == 0) { scratch[2 * WARPS] = a; scratch[2 * WARPS + 1] = c; }
+    // Where the values that this block reads stand: with the inverse in its order, else in that of the nodes.
+    __device__ __forceinline__ void find_places() {
+        const Rows& rows = memory.rows;
+        for (int k = threadIdx.x; k < rows.halo; k += THREADS) {
+            int node = rows.nodes[k];
+            rows.place[k] = packed ? memory.plan.place[node] : 3 * (memory.body.first + node);
         }
         __syncthreads();
-        a = scratch[2 * WARPS];
-        c = scratch[2 * WARPS + 1];
-        parity ^= 1;
+        if (!packed || !memory.d) return;
+        for (int k = threadIdx.x; k < 3 * rows.own; k += THREADS) memory.d[k] = memory.inverse.scale[rows.place[k / 3] + k % 3];
     }
 
-    // One row of blocks times a vector that is formed on the way: u + beta w. 16 lanes a node; the sum ends in lane 0 of them.
-    __device__ __forceinline__ void row_product(int node, int sub, const double* u, const double* w, double beta, double sum[3]) {
-        sum[0] = sum[1] = sum[2] = 0;
-        if (node < end) {
-            int row = row_base + node;
-            for (int k = row_start[row] - block_base + sub; k < row_start[row + 1] - block_base; k += LANES_PER_NODE) {
-                const double* a = values + 9ll * k;
-                const double* uj = u + 3ll * columns[k];
-                double v0 = __ldcg(uj), v1 = __ldcg(uj + 1), v2 = __ldcg(uj + 2);
-                if (w) {
-                    const double* wj = w + 3ll * columns[k];
-                    v0 += beta * __ldcg(wj); v1 += beta * __ldcg(wj + 1); v2 += beta * __ldcg(wj + 2);
-                }
-                sum[0] += a[0] * v0 + a[1] * v1 + a[2] * v2;
-                sum[1] += a[3] * v0 + a[4] * v1 + a[5] * v2;
-                sum[2] += a[6] * v0 + a[7] * v1 + a[8] * v2;
+    static __device__ __forceinline__ real scale_of(int k) {
+        return memory.d ? memory.d[k] : (real)memory.inverse.scale[memory.rows.place[k / 3] + k % 3];
+    }
+
+    // d r of an own degree of freedom for all to see.
+    __device__ __forceinline__ void publish(int half, int k, real r) const {
+        residuals(half)[memory.rows.place[k / 3] + k % 3].put((float)(scale_of(k) * r), team.number);
+    }
+    __device__ __forceinline__ void publish_product(int k, real q) const {
+        memory.inverse.product[memory.rows.place[k / 3] + k % 3].put((float)(scale_of(k) * q), team.number);
+    }
+    static __device__ __forceinline__ Word<float>* residuals(int half) {
+        return memory.inverse.residual + (long long)half * (memory.inverse.size + 32);
+    }
+
+    // 1. r = b - A x for the x of the scene, left as the update by alpha = 1 that is still to be made: x = 0 + 1 x,
+    // r = b - 1 (A x). So alpha = 0 starts from zero instead. Returns |r|^2; |b|^2 in `b2`.
+    __device__ __forceinline__ double residual(double& b2) {
+        const Rows& rows = memory.rows;
+        const long long first = memory.body.first, begin = 3 * (first + rows.begin);
+#pragma unroll 4
+        for (int k = threadIdx.x; k < 3 * rows.halo; k += THREADS)
+            rows.values[k] = __ldcg(s.y + 3 * (first + rows.nodes[k / 3]) + k % 3);
+        __syncthreads();
+        double mine[2] = {0, 0}, out[2];
+        rows.multiply([&](int node, real qk) {
+            const int k = 3 * node + team.lane;
+            const real bk = s.b[begin + k];
+            const double rk = (double)bk - (double)qk;
+            mine[0] += rk * rk;
+            mine[1] += (double)bk * (double)bk;
+            rows.x[k] = 0;
+            rows.r[k] = bk;
+            rows.q[k] = qk;
+            if (!packed) return;
+            publish(turn, k, bk);
+            publish_product(k, qk);
+        });
+        r_number = q_number = team.number;
+        team.sums<2, 3>(mine, out);
+        b2 = out[1];
+        return out[0];
+    }
+
+    // 7. 8. 2. p = z + beta p, q = A p; sums p.q, r.q, q.q, r.r
+    __device__ __forceinline__ void direction(real beta, double out[4]) {
+        const Rows rows = memory.rows;
+        if (packed) rows.form(memory.inverse.z, z_number, beta);
+        else rows.form(s.z, z_number, beta);
+        double mine[4] = {0, 0, 0, 0};
+        rows.multiply([&](int node, real q) {
+            const int k = 3 * node + team.lane;
+            const double p = rows.values[k], r = rows.r[k], qk = q;
+            mine[0] += p * qk;
+            mine[1] += r * qk;
+            mine[2] += qk * qk;
+            mine[3] += r * r;
+            rows.q[k] = q;
+            if (packed) publish_product(k, q);
+        });
+        q_number = team.number;
+        team.sums<4, 3>(mine, out);
+    }
+
+    // 3. 4. 5. 6. x += alpha p, r -= alpha q, z = P^-1 r; returns z . r. r2: |r|^2 after the update.
+    __device__ __forceinline__ double precondition(int kind, real alpha, double r2) {
+        const Rows rows = memory.rows;
+        for (int k = threadIdx.x; k < 3 * rows.own; k += THREADS) {
+            real r = rows.r[k];
+            if (alpha != 0) {
+                const real x = rows.x[k] + alpha * rows.values[k];
+                r -= alpha * rows.q[k];
+                rows.r[k] = r;
+                rows.x[k] = x;
             }
+            if (packed) publish(1 - turn, k, r);
         }
-        for (int k = LANES_PER_NODE / 2; k; k >>= 1)
-            for (int m = 0; m < 3; ++m) sum[m] += __shfl_down_sync(ALL, sum[m], k, LANES_PER_NODE);
+        double mine[1], zr[1];
+        z_number = team.number;
+        if (kind == CHOLESKY) {
+            mine[0] = by_inverse(alpha, r2);
+        } else {
+            __syncthreads();
+            mine[0] = by_diagonal(kind);
+        }
+        for (int k = 16; k; k >>= 1) mine[0] += __shfl_xor_sync(ALL, mine[0], k);
+        team.sums<1, 1>(mine, zr);
+        return zr[0];
     }
 
-    // r = b - A y; returns |r|^2, and |b|^2 in `bb`.
-    __device__ __forceinline__ double residual(double* r, double& bb) {
-        double rr = 0, sum[3];
-        bb = 0;
-        int sub = threadIdx.x % LANES_PER_NODE, each = THREADS / LANES_PER_NODE;
-        for (int base = begin; base < end; base += each) {
-            int node = base + threadIdx.x / LANES_PER_NODE;
-            row_product(node, sub, s.y, nullptr, 0, sum);
-            if (node < end && sub == 0)
-                for (int m = 0; m < 3; ++m) {
-                    long long i = 3ll * (body.first + node) + m;
-                    double d = s.b[i] - sum[m];
-                    r[i] = d;
-                    rr += d * d;
-                    bb += s.b[i] * s.b[i];
-                }
+    __device__ __forceinline__ double by_diagonal(int kind) const {
+        const Rows rows = memory.rows;
+        double mine = 0;
+        for (int k = threadIdx.x; k < 3 * rows.own; k += THREADS) {
+            const real *r = rows.r + k / 3 * 3, *v = memory.diagonal + 3 * k;
+            const real z = kind == NONE ? rows.r[k] : v[0] * r[0] + v[1] * r[1] + v[2] * r[2];
+            s.z[3ll * (memory.body.first + rows.begin) + k].put(z, team.number);
+            mine += (double)z * (double)rows.r[k];
         }
-        group_sum(rr, bb);
-        return rr;
+        return mine;
     }
 
-    // q = A p with p = z + beta p_old, kept; returns p . q.
-    __device__ __forceinline__ double direction(double beta, const double* old, double* p) {
-        double pq = 0, none = 0, sum[3];
-        int sub = threadIdx.x % LANES_PER_NODE, each = THREADS / LANES_PER_NODE;
-        for (int base = begin; base < end; base += each) {
-            int node = base + threadIdx.x / LANES_PER_NODE;
-            row_product(node, sub, s.z, beta != 0 ? old : nullptr, beta, sum);
-            if (node < end && sub == 0)
-                for (int m = 0; m < 3; ++m) {
-                    long long i = 3ll * (body.first + node) + m;
-                    double v = __ldcg(s.z + i) + (beta != 0 ? beta * __ldcg(old + i) : 0);
-                    p[i] = v;
-                    s.q[i] = sum[m];
-                    pq += v * sum[m];
-                }
+    __device__ __forceinline__ double by_inverse(real alpha, double r2) {
+        const Inverse inverse = memory.inverse;
+        // a power of two that brings d r below 1: float16 has few of them
+        const float unit = unit_for((double)sqrtf((float)r2) * memory.peak);
+        Residual from = {residuals(turn), r_number, q_number, (float)alpha};  // the update is being made
+        double mine = 0;
+        copies_end<0>();
+        for (int phase = 0; phase < inverse.phases; ++phase) {
+            inverse.gather(phase, from, team.number, unit);
+            __syncthreads();
+            mine += inverse.multiply(phase, from, team.number, unit);
+            from = {residuals(1 - turn), team.number, 0, 0};
+            if (phase + 1 < inverse.phases) __syncthreads();  // the vector has been read
         }
-        group_sum(pq, none);
-        return pq;
+        turn = 1 - turn;
+        r_number = team.number;
+        return mine;
     }
 
-    // x += alpha p and r -= alpha q for the own nodes; alpha 0: nothing to add yet (p and q hold nothing).
-    __device__ __forceinline__ double update(long long i, double alpha, const double* p, const double* r_old, double* r_new) {
-        double d = __ldcg(r_old + i);
-        if (alpha != 0) {
-            d -= alpha * __ldcg(s.q + i);
-            s.y[i] += alpha * p[i];
-        }
-        r_new[i] = d;
-        return d;
-    }
-
-    // z = P^-1 r by diagonal blocks, r updated on the way; returns z . r, and |r|^2 in `rr`.
-    __device__ __forceinline__ double by_blocks(int kind, double alpha, const double* p, const double* r_old, double* r_new, double& rr) {
-        double rz = 0;
-        rr = 0;
-        for (int node = begin + threadIdx.x; node < end; node += THREADS) {
-            long long i = 3ll * (body.first + node);
-            double d[3];
-            for (int m = 0; m < 3; ++m) d[m] = update(i + m, alpha, p, r_old, r_new);
-            const double* v = s.diagonal + 3 * i;
-            for (int m = 0; m < 3; ++m) {
-                double zi = kind == NONE ? d[m] : v[3 * m] * d[0] + v[3 * m + 1] * d[1] + v[3 * m + 2] * d[2];
-                s.z[i + m] = zi;
-                rz += zi * d[m];
-                rr += d[m] * d[m];
-            }
-        }
-        group_sum(rz, rr);
-        return rz;
-    }
-
-    // Two float16 times two float32.
-    static __device__ __forceinline__ float two(unsigned halves, float x, float y) {
-        float lo, hi;
-        asm("{.reg .b16 a, b; mov.b32 {a, b}, %2; cvt.f32.f16 %0, a; cvt.f32.f16 %1, b;}"
-            : "=f"(lo), "=f"(hi) : "r"(halves));
-        return lo * x + hi * y;
-    }
-
-    // z = P^-1 r by the dense inverse. Every block forms all of r (a barrier less), then the rows of z that are its warps'.
-    __device__ __forceinline__ double by_inverse(double alpha, const double* p, const double* r_old, double* r_new, double goal, double& rr) {
-        int n = 3 * body.nodes;
-        long long base = 3ll * body.first;
-        double rz = 0, none = 0;
-        rr = 0;
-        float* shared_r = residual32();
-        for (int k = threadIdx.x; k < body.stride; k += THREADS) {
-            double d = 0;
-            if (k < n) {
-                d = __ldcg(r_old + base + k);
-                if (alpha != 0) d -= alpha * __ldcg(s.q + base + k);
-            }
-            shared_r[k] = k < n ? body.scale[k] * (float)d : 0;
-            rr += d * d;
-        }
-        for (int k = 3 * begin + threadIdx.x; k < 3 * end; k += THREADS) update(base + k, alpha, p, r_old, r_new);
-        block_sum(rr, none);  // the same in every block, to the bit
-        if (rr <= goal) {
-            barrier();
-            return 1;
-        }
-        int warps = WARPS * body.blocks;
-        for (int row = WARPS * index + warp; row < n; row += warps) {
-            const uint4* a = (const uint4*)(body.inverse + (long long)row * body.stride);
-            float sum = 0;
-            for (int k = lane; k < body.stride / 8; k += 32) {
-                uint4 v = a[k];
-                float4 x = dynamic[2 * k], y = dynamic[2 * k + 1];
-                sum += two(v.x, x.x, x.y) + two(v.y, x.z, x.w) + two(v.z, y.x, y.y) + two(v.w, y.z, y.w);
-            }
-            for (int k = 16; k; k >>= 1) sum += __shfl_down_sync(ALL, sum, k);
-            if (lane == 0) {
-                s.z[base + row] = (double)body.scale[row] * sum;
-                rz += (double)sum * shared_r[row];
-            }
-        }
-        none = 0;
-        group_sum(rz, none);
-        return rz;
-    }
-
-    __device__ __forceinline__ void invert_diagonal(bool whole) {
-        for (int node = begin + threadIdx.x; node < end; node += THREADS) {
-            int row = body.first + node, k = s.row_start[row];
-            while (s.columns[k] != row) ++k;
-            invert3(s.values + 9ll * k, whole, s.diagonal + 9ll * row);
+    __device__ __forceinline__ void invert_diagonal(bool whole) const {
+        const Rows& rows = memory.rows;
+        for (int node = threadIdx.x; node < rows.own; node += THREADS) {
+            int k = rows.row_start[node] - rows.base;
+            while (rows.columns[k] != node) ++k;
+            invert3(rows.blocks + 9ll * k, whole, memory.diagonal + 9 * node);
         }
     }
 
-    __device__ __forceinline__ void set(double* to, const double* from) {
-        for (int k = 3 * begin + threadIdx.x; k < 3 * end; k += THREADS)
-            to[3ll * body.first + k] = from ? from[3ll * body.first + k] : 0;
+    // x + alpha p to the scene (keep = 0: zero); a barrier.
+    __device__ __forceinline__ void give(real keep, real alpha) {
+        const Rows& rows = memory.rows;
+        for (int k = threadIdx.x; k < 3 * rows.own; k += THREADS) {
+            const real x = keep != 0 ? rows.x[k] + (alpha != 0 ? alpha * rows.values[k] : 0) : 0;
+            __stcg(s.y + 3ll * (memory.body.first + rows.begin) + k, x);
+        }
+        team.barrier();
     }
+
+    // On with another preconditioner from the residual as it is.
+    __device__ __forceinline__ void change(int kind) {
+        team.barrier();
+        packed = kind == CHOLESKY;
+        find_places();
+        __syncthreads();
+        if (packed) {
+            for (int k = threadIdx.x; k < 3 * memory.rows.own; k += THREADS) publish(turn, k, memory.rows.r[k]);
+            r_number = team.number;
+            team.barrier();
+        } else {
+            invert_diagonal(true);
+        }
+    }
+
+    __device__ __forceinline__ int first_bad_node() const {
+        const Rows& rows = memory.rows;
+        if (threadIdx.x == 0) memory.bad = 0x7fffffff;
+        __syncthreads();
+        for (int k = threadIdx.x; k < 3 * rows.own; k += THREADS)
+            if (!isfinite(rows.r[k])) atomicMin(&memory.bad, rows.begin + k / 3);
+        __syncthreads();
+        return memory.bad;
+    }
+
+    __device__ __forceinline__ void solve();
 };
+
+// One loop with one place for each of its parts: written out twice they would not fit the instruction cache.
+__device__ __forceinline__ void Solver::solve() {
+    const Body& body = memory.body;
+    Result& out = memory.out;
+    int kind = body.kind == CHOLESKY && !body.plan ? BLOCK_JACOBI : body.kind;
+    out = {0, 0, -1, 0, CONVERGED, kind, body.kind, 0, -1};
+    double r2 = 0, alpha = 0, last = 1e300;
+    int stop = CONVERGED, iterations = 0;
+    bool begun = false, measure = true, restart = true, switched = false;
+    if (kind == JACOBI || kind == BLOCK_JACOBI) invert_diagonal(kind == BLOCK_JACOBI);
+    for (;;) {
+        if (measure) {  // the true residual
+            double bb;
+            r2 = residual(bb);
+            measure = false;
+            alpha = 1;
+            restart = true;
+            if (!begun) {
+                begun = true;
+                memory.b2 = bb;
+                if (!isfinite(bb)) {
+                    out.status = NOT_FINITE;
+                    out.residual = bb;
+                    out.bad_node = first_bad_node();
+                    give(0, 0);
+                    return;
+                }
+                memory.goal = body.tolerance * body.tolerance * bb;
+                if (!body.warm_start || !(r2 < bb)) { alpha = 0; r2 = bb; }
+                memory.quarter = r2 * sqrt(sqrt(memory.goal / r2));
+                if (r2 <= memory.goal) {
+                    if (alpha == 0) give(0, 0);  // else the scene has it already
+                    out.residual = bb > 0 ? sqrt(r2 / bb) : 0;
+                    return;
+                }
+            } else {
+                if (stop == CONVERGED && r2 > memory.goal && !(r2 < 0.25 * last)) stop = MAX_ITERATIONS;  // rounding is reached
+                if (stop != CONVERGED || r2 <= memory.goal) {
+                    out.status = stop;
+                    out.residual = sqrt(r2 / memory.b2);
+                    return;
+                }
+                last = r2;  // the recursive residual was too good
+            }
+        }
+        stop = r2 <= memory.goal ? CONVERGED : -1;
+        if (stop < 0) {
+            const double zr = precondition(kind, (real)alpha, r2);
+            alpha = 0;
+            int other = -1;
+            if (!usable(zr)) stop = BREAKDOWN_PRECONDITIONER;
+            else if (iterations == body.max_iterations) stop = MAX_ITERATIONS;
+            else if (kind == CHOLESKY && iterations > 0 && iterations == body.max_iterations / 2 && !(r2 < memory.quarter))
+                stop = BREAKDOWN_PRECONDITIONER;  // not a quarter of the way: pcg.h says why
+            if (stop == BREAKDOWN_PRECONDITIONER && kind == CHOLESKY) {  // a useless factor: on with block Jacobi
+                other = BLOCK_JACOBI;
+                out.fallbacks = 1;
+            } else if (stop < 0 && body.probe > 0 && iterations == body.probe && body.plan && kind >= BLOCK_JACOBI && !switched) {
+                other = kind == CHOLESKY ? BLOCK_JACOBI : CHOLESKY;
+                switched = true;
+            }
+            if (other >= 0) {
+                kind = out.kind = other;
+                change(kind);
+                restart = true;
+                continue;
+            }
+            if (stop < 0) {
+                double sums[4];
+                direction(restart ? 0 : (real)(zr * inverse_of(memory.rz)), sums);
+                memory.rz = zr;
+                restart = false;
+                out.iterations = ++iterations;
+                stop = BREAKDOWN_MATRIX;
+                if (sums[0] > 0) {
+                    alpha = (real)(zr * inverse_of(sums[0]));
+                    r2 = fmax(0.0, sums[3] - 2 * alpha * sums[1] + alpha * alpha * sums[2]);
+                    if (usable(alpha) && isfinite(r2)) continue;
+                    alpha = 0;
+                }
+            }
+        }
+        give(1, (real)alpha);
+        measure = true;
+    }
+}
 
 __device__ long long nanoseconds() {
     long long t;
@@ -311,107 +346,36 @@ __device__ long long nanoseconds() {
     return t;
 }
 
-__device__ Result solve(Group& g) {
-    const Solve& s = g.s;
-    const Body& body = g.body;
-    long long all = 3ll * s.nodes;
-    int kind = body.kind == CHOLESKY && !body.inverse ? BLOCK_JACOBI : body.kind;
-    Result out = {0, 0, -1, 0, CONVERGED, kind, body.kind, 0, -1};
-    int turn = 0;  // which half of r holds the residual
-    double b2, r2 = g.residual(s.r, b2), none;
-    double goal = body.tolerance * body.tolerance * b2;
-    if (!isfinite(b2)) {
-        g.set(s.y, nullptr);
-        out.status = NOT_FINITE;
-        out.residual = b2;
-        return out;
+__device__ __forceinline__ void solve_body(const Solve& s, const Share& share) {
+    const int k = share.body;
+    for (int i = threadIdx.x; i < (int)(sizeof(Body) / 4); i += THREADS) ((int*)&memory.body)[i] = ((const int*)(s.bodies + k))[i];
+    __syncthreads();
+    if (memory.body.plan)
+        for (int i = threadIdx.x; i < (int)(sizeof(Plan) / 4); i += THREADS) ((int*)&memory.plan)[i] = ((const int*)memory.body.plan)[i];
+    __syncthreads();
+    const long long begin = nanoseconds();
+    Solver solver = {s, {share.index, memory.body.blocks, s.exchanges[k], s.board + 8ll * s.grid * k, s.grid, memory.scratch, memory.totals,
+                         (int)threadIdx.x % 32, (int)threadIdx.x / 32}};
+    solver.set_up(share);
+    solver.solve();
+    if (share.index == 0 && threadIdx.x == 0) {
+        Result out = memory.out;
+        out.seconds = 1e-9 * (nanoseconds() - begin);
+        if (out.kind == CHOLESKY || out.fallbacks) out.factor_step = memory.body.factor_step;
+        s.results[(s.step[0] % s.capacity) * s.count + k] = out;
+        s.exchanges[k] = solver.team.number;  // all have read it before the first exchange
     }
-    if (!body.warm_start || !(r2 < b2)) {
-        g.set(s.y, nullptr);
-        g.set(s.r, s.b);
-        r2 = b2;
-    }
-    if (r2 <= goal) {
-        out.residual = b2 > 0 ? sqrt(r2 / b2) : 0;
-        return out;
-    }
-    if (kind == JACOBI || kind == BLOCK_JACOBI) g.invert_diagonal(kind == BLOCK_JACOBI);
-    g.barrier();
-
-    double alpha = 0, rz = 0, last = 1e300, quarter = r2 * pow(goal / r2, 0.25);
-    bool restart = true, switched = false;
-    for (int way = 0;; ) {
-        double *r_old = s.r + turn * all, *r_new = s.r + (1 - turn) * all, *p = s.p + way * all;
-        double zr = kind == CHOLESKY ? g.by_inverse(alpha, p, r_old, r_new, goal, r2)
-                                     : g.by_blocks(kind, alpha, p, r_old, r_new, r2);
-        turn = 1 - turn;
-        int stop = -1;
-        if (r2 <= goal) stop = CONVERGED;
-        else if (!(zr > 0 && zr < 1e300)) stop = BREAKDOWN_PRECONDITIONER;
-        else if (out.iterations == body.max_iterations) stop = MAX_ITERATIONS;
-        else if (kind == CHOLESKY && out.iterations > 0 && out.iterations == body.max_iterations / 2 && !(r2 < quarter))
-            stop = BREAKDOWN_PRECONDITIONER;  // not a quarter of the way: pcg.h says why
-        if (stop == BREAKDOWN_PRECONDITIONER && kind == CHOLESKY) {  // a useless factor: on with block Jacobi
-            kind = out.kind = BLOCK_JACOBI;
-            out.fallbacks = 1;
-            g.invert_diagonal(true);
-            alpha = 0;
-            restart = true;
-            g.barrier();
-            continue;
-        }
-        if (stop < 0 && body.probe > 0 && out.iterations == body.probe && body.inverse && kind >= BLOCK_JACOBI && !switched) {
-            kind = out.kind = kind == CHOLESKY ? BLOCK_JACOBI : CHOLESKY;
-            if (kind == BLOCK_JACOBI) g.invert_diagonal(true);
-            alpha = 0;
-            switched = restart = true;
-            g.barrier();
-            continue;
-        }
-        if (stop < 0) {
-            double pq = g.direction(restart ? 0 : zr / rz, p, s.p + (1 - way) * all);
-            way = 1 - way;
-            rz = zr;
-            restart = false;
-            ++out.iterations;
-            if (pq > 0) { alpha = rz / pq; continue; }
-            stop = BREAKDOWN_MATRIX;
-        }
-        g.barrier();
-        r2 = g.residual(s.r + turn * all, none);
-        if (stop == CONVERGED && r2 > goal) {  // the recursive residual was too good
-            if (r2 < 0.25 * last) {
-                last = r2;
-                alpha = 0;
-                restart = true;
-                continue;
-            }
-            stop = MAX_ITERATIONS;
-        }
-        out.status = stop;
-        out.residual = sqrt(r2 / b2);
-        return out;
-    }
+    __syncthreads();
 }
 
-extern "C" __global__ void __launch_bounds__(THREADS, 1) pcg(const Solve s) {
-    __shared__ double scratch[2 * WARPS + 2];
-    for (int k = 0; k < s.count; ++k) {
-        int block = s.bodies[k].block;
-        if ((int)blockIdx.x < block || (int)blockIdx.x >= block + s.bodies[k].blocks) continue;
-        const Body body = s.bodies[k];
-        int index = blockIdx.x - body.block;
-        Group g = {s, body, index, (int)threadIdx.x % 32, (int)threadIdx.x / 32,
-                   (int)((long long)body.nodes * index / body.blocks), (int)((long long)body.nodes * (index + 1) / body.blocks),
-                   0, 0, s.arrived + k, s.partial + 4ll * gridDim.x * k, scratch};
-        long long begin = nanoseconds();
-        g.bring_rows(4 * body.stride, s.shared);
-        Result out = solve(g);
-        if (index == 0 && threadIdx.x == 0) {
-            out.seconds = 1e-9 * (nanoseconds() - begin);
-            if (out.kind == CHOLESKY || out.fallbacks) out.factor_step = body.factor_step;
-            s.results[(s.step[0] % s.capacity) * s.count + k] = out;
+extern "C" __global__ void __launch_bounds__(THREADS, PER_PROCESSOR) pcg(const Solve s) {
+    for (int next = s.own_share[blockIdx.x];; next = -1) {
+        if (next < 0) {  // the next one of those that any block may take
+            if (threadIdx.x == 0) memory.next = s.pooled > 0 ? atomicAdd(s.arrived, 1) : s.pooled;
+            __syncthreads();
+            if (memory.next >= s.pooled) return;
+            next = s.bodies[s.order[s.count - s.pooled + memory.next]].share;
         }
-        __syncthreads();
+        solve_body(s, s.shares[next]);
     }
 }

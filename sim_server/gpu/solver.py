@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Memory and launch of the persistent solver (pcg.cu): rows of the bodies in, rows of results out."""
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -8,46 +9,59 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import FactorPattern
-from sim_server.gpu.device import DeviceModule, Gpu
-from sim_server.gpu.expand import Expanded, Expansion
-
-THREADS = 512
+from sim_server.backend import HERE, INCLUDE
+from sim_server.gpu.device import Gpu
+from sim_server.gpu.expansion import Expanded, Expansion
+from sim_server.gpu.plan import plan
+from sim_server.gpu.planned import PLAN, Planned
+from sim_server.gpu.shares import first_shares, halo, shares
 
 BODY = np.dtype(
     [
         ("first", "i4"), ("nodes", "i4"), ("block", "i4"), ("blocks", "i4"), ("kind", "i4"), ("max_iterations", "i4"),
-        ("warm_start", "i4"), ("probe", "i4"), ("tolerance", "f8"), ("inverse", "u8"), ("factor_step", "i8"),
-        ("scale", "u8"), ("stride", "i4"), ("unused", "i4"),
+        ("warm_start", "i4"), ("probe", "i4"), ("tolerance", "f8"), ("share", "i4"), ("unused", "i4"),
+        ("factor_step", "i8"), ("plan", "u8"), ("matrix", "u8"), ("scale", "u8"), ("residual", "u8"),
+        ("product", "u8"), ("z", "u8"), ("formed", "u8"), ("solved", "u8"), ("given", "u8"), ("planes", "i4"),
+        ("unused_too", "i4"),
     ]
 )  # fmt: skip
-SETTINGS = BODY.fields["inverse"][1]  # type: ignore[index]  # bytes of a row before the factor: they change apart
+SETTINGS = BODY.fields["factor_step"][1]  # type: ignore[index]  # bytes of a row before the factor: they change apart
 RESULT = np.dtype(
     [
         ("residual", "f8"), ("seconds", "f8"), ("factor_step", "i8"), ("iterations", "i4"), ("status", "i4"),
         ("kind", "i4"), ("asked", "i4"), ("fallbacks", "i4"), ("bad_node", "i4"),
     ]
 )  # fmt: skip
-_POINTERS = (
-    "row_start", "columns", "values", "b", "y", "r", "p", "z", "q", "diagonal", "partial", "arrived", "step", "results",
-)  # fmt: skip
 SOLVE = np.dtype(
     [
-        ("bodies", "u8"),
-        ("count", "i4"),
-        ("capacity", "i4"),
-        *((name, "u8") for name in _POINTERS),
-        ("nodes", "i4"),
-        ("shared", "i4"),
-    ],
-    align=True,
-)
+        ("bodies", "u8"), ("count", "i4"), ("capacity", "i4"), ("row_start", "u8"), ("columns", "u8"),
+        ("values", "u8"), ("b", "u8"), ("y", "u8"), ("order", "u8"), ("pooled", "i4"), ("grid", "i4"),
+        ("shares", "u8"), ("own_share", "u8"), ("halo", "u8"), ("local", "u8"), ("halo_values", "u8"),
+        ("halo_place", "u8"), ("own", "u8"), ("z", "u8"), ("diagonal", "u8"), ("board", "u8"), ("exchanges", "u8"),
+        ("arrived", "u8"), ("step", "u8"), ("results", "u8"), ("nodes", "i4"), ("shared", "i4"),
+    ]
+)  # fmt: skip
+
+
+def texts() -> str:
+    """Of all that kernel texts may include: CuPy keeps compiled kernels by their own text and options alone."""
+    found = sorted([*HERE.glob("**/*.cuh"), *HERE.glob("kernels/*.h")])
+    return "x" + hashlib.sha256(b"".join(path.read_bytes() for path in found)).hexdigest()[:16]
+
+
+def threads_and_blocks(nodes: NDArray[np.int64], processors: int) -> tuple[int, int]:
+    """Threads of a thread block, and thread blocks a processor: many small bodies are solved side by side."""
+    if len(nodes) < 2 * processors:
+        return 256, 1  # 255 registers a thread: what is spilled to local memory costs a trip to L2
+    return (64, 4) if np.median(nodes) < 300 else (128, 2)
 
 
 class Solver:
     """Solves the system of every body in one launch.
 
     ranges: nodes [first, last) of each body. arrays: host arrays by name (row_start, columns, values, b, y), solved for
-    their twins. counter: device array (1,) of completed steps. capacity: steps whose results are kept.
+    their twins. counter: device array (1,) of completed steps. capacity: steps whose results are kept. planes: 1 for a
+    preconditioner in float16, 2 for one of 22 bits.
 
     bodies: host rows (BODY), one per body; whoever runs the loop uploads them, settings (the first SETTINGS bytes) and
     factor (the rest) apart. results: device ring (capacity, bodies) of RESULT. arrived: zero at launch.
@@ -55,86 +69,111 @@ class Solver:
 
     def __init__(
         self, gpu: Gpu, ranges: Sequence[tuple[int, int]], arrays: Mapping[str, NDArray[Any]], counter: Any,
-        capacity: int,
+        capacity: int, planes: int = 1,
     ):  # fmt: skip
-        cp, nodes = gpu.cp, len(arrays["x"])
-        self.gpu, self._arrays, self._capacity = gpu, arrays, capacity
+        cp, processors = gpu.cp, gpu.properties["multiProcessorCount"]
+        self.gpu, self._capacity, self.planes = gpu, capacity, planes
+        self._twins = {name: gpu.twin(arrays[name]) for name in ("row_start", "columns", "values", "b", "y")}
+        self.real = np.dtype(self._twins["values"].dtype)
+        spans = np.array(ranges, np.int64)
+        nodes = spans[:, 1] - spans[:, 0]
+        self.threads, blocks = threads_and_blocks(nodes, processors)
+        self.grid = blocks * processors
+        share = shares(nodes, self.grid)
         self.bodies = np.zeros(len(ranges), BODY)
-        self.bodies["first"] = [first for first, _ in ranges]
-        self.bodies["nodes"] = [last - first for first, last in ranges]
-        self._share_blocks(gpu.properties["multiProcessorCount"])
+        self.bodies["first"], self.bodies["nodes"] = spans[:, 0], nodes
+        self.bodies["block"], self.bodies["blocks"] = share.first, share.blocks
+        seen = halo(spans, share.blocks, arrays["row_start"], arrays["columns"])
+        self.bodies["share"] = seen.first
         self._rows = cp.zeros(self.bodies.nbytes, np.uint8)
         self.results = cp.zeros(capacity * len(ranges) * RESULT.itemsize, np.uint8)
-        self.arrived = cp.zeros(len(ranges), np.uint32)
+        self.arrived = cp.zeros(1, np.uint32)
+        total, ints = len(arrays["row_start"]) - 1, np.int32
         self._work = {
-            "r": cp.zeros(6 * nodes), "p": cp.zeros(6 * nodes), "z": cp.zeros(3 * nodes), "q": cp.zeros(3 * nodes),
-            "diagonal": cp.zeros(9 * nodes), "partial": cp.zeros(4 * self._grid * len(ranges)),
+            "order": cp.asarray(share.order.astype(ints)), "shares": cp.asarray(seen.shares.view(ints)),
+            "own_share": cp.asarray(first_shares(share, seen, self.grid)),
+            "halo": cp.asarray(seen.nodes.astype(ints)), "local": cp.asarray(seen.local.astype(ints)),
+            "halo_values": cp.zeros(3 * len(seen.nodes), self.real), "halo_place": cp.zeros(len(seen.nodes), ints),
+            "own": cp.zeros(9 * total, self.real), "z": cp.zeros(6 * total),
+            "diagonal": cp.zeros(9 * total, self.real), "board": cp.zeros(16 * self.grid * len(ranges)),
+            "exchanges": cp.zeros(len(ranges), np.uint32),
             "arrived": self.arrived, "results": self.results, "step": counter,
         }  # fmt: skip
-        self._expansions: dict[tuple[int, int], Expansion] = {}
-        self._shared = self._shared_memory()
-        self._params = self._arguments(nodes)
-        self._function = DeviceModule("gpu/pcg.cu", gpu, cooperative=True).function("pcg")
+        fixed = 2048  # bytes of its own that a thread block needs, and the driver's
+        self._shared = (gpu.properties["sharedMemPerMultiprocessor"] // blocks - fixed - 1024) // 16 * 16
+        self._params = self._arguments(total, share.pooled)
+        self._function = self._compiled(blocks)
         self._function.max_dynamic_shared_size_bytes = self._shared
+        self._planned: dict[tuple[int, int], Planned] = {}
+        self._expansions: dict[tuple[int, int], Expansion] = {}  # likewise by pattern and thread blocks
+        self._vectors: dict[tuple[int, int], dict[str, Any]] = {}  # by body and plan
+        self._applied = [0] * len(ranges)
+
+    @property
+    def real_name(self) -> str:
+        """As kernel texts call the type of A and the vectors."""
+        return "float" if self.real == np.float32 else "double"
 
     @property
     def bodies_device(self) -> int:
         """Address of the rows that the solver reads."""
         return int(self._rows.data.ptr)
 
+    def _compiled(self, blocks: int) -> Any:
+        layouts = {"BODY": BODY, "RESULT": RESULT, "SOLVE": SOLVE, "PLAN": PLAN}
+        numbers = {"THREADS": self.threads, "PER_PROCESSOR": blocks} | {
+            f"{name}_BYTES": layout.itemsize for name, layout in layouts.items()
+        }
+        module = self.gpu.cp.RawModule(
+            code=(HERE / "gpu/pcg.cu").read_text(),
+            options=(
+                "-std=c++17", f"-I{INCLUDE}", f"-I{HERE / 'gpu'}", f"-Dreal={self.real_name}", f"-DTEXTS={texts()}",
+                *(f"-D{name}={number}" for name, number in numbers.items()),
+            ),
+            backend="nvrtc",
+            enable_cooperative_groups=True,
+        )  # fmt: skip
+        return module.get_function("pcg")
+
     def launch(self) -> None:
         """Puts a solve onto the current stream."""
-        self._function((self._grid,), (THREADS,), (self._params,), shared_mem=self._shared)
+        self._function((self.grid,), (self.threads,), (self._params,), shared_mem=self._shared)
+
+    def planned(self, body: int, pattern: FactorPattern) -> Planned:
+        """How the inverse of factors of this pattern is shared out for a body. Raises ValueError if it cannot be."""
+        blocks = int(self.bodies[body]["blocks"])
+        key = (pattern.id, blocks)
+        if key not in self._planned:
+            found = plan(pattern, blocks, planes=self.planes)
+            self._planned[key] = Planned(self.gpu, found, self.threads // 32)
+            self._expansions[key] = Expansion(self.gpu, pattern, found)
+        return self._planned[key]
 
     def expansion(self, body: int, pattern: FactorPattern) -> Expansion:
-        """What makes factors of this pattern usable for a body. Raises ValueError if nothing does."""
-        key = (body, pattern.id)
-        if key not in self._expansions:
-            self._expansions[key] = Expansion(self.gpu, pattern)
-        return self._expansions[key]
+        """What makes factors of this pattern usable for a body, the same for all alike. Raises ValueError."""
+        self.planned(body, pattern)
+        return self._expansions[pattern.id, int(self.bodies[body]["blocks"])]
 
     def use(self, body: int, pattern: FactorPattern, expanded: Expanded, step: int) -> None:
         """Writes a factor into the host row of a body; it holds once the row is uploaded."""
-        row = self.bodies[body]
-        row["inverse"], row["scale"], row["stride"] = expanded.inverse, expanded.scale, expanded.stride
-        row["factor_step"] = step
+        planned, row = self.planned(body, pattern), self.bodies[body]
+        row["plan"], row["matrix"], row["scale"] = planned.address, expanded.matrix, expanded.scale
+        row["planes"], row["factor_step"] = self.planes, step
+        key = (body, planned.address)
+        if key not in self._vectors:
+            self._vectors[key] = planned.vectors()
+        for name, array in self._vectors[key].items():
+            row[name] = array.data.ptr
+        self._applied[body] = planned.bytes
 
     def factor_bytes(self, body: int) -> int:
         """What an application of the factor of a body's host row reads, 0 without one."""
-        row = self.bodies[body]
-        return int(row["stride"]) * 6 * int(row["nodes"]) if row["inverse"] else 0
+        return self._applied[body]
 
-    def _share_blocks(self, processors: int) -> None:
-        """Thread blocks by size of body, at least one each; bodies beyond the processors queue."""
-        nodes = self.bodies["nodes"].astype(float)
-        count = len(nodes)
-        self._grid = processors
-        if count >= processors:
-            self.bodies["block"] = np.arange(count) % processors
-            self.bodies["blocks"] = 1
-            return
-        share = np.maximum(1, np.floor(nodes / nodes.sum() * (processors - count)).astype(int))
-        self.bodies["blocks"] = share
-        self.bodies["block"] = np.concatenate([[0], np.cumsum(share)[:-1]])
-
-    def _arguments(self, nodes: int) -> NDArray[Any]:
+    def _arguments(self, nodes: int, pooled: int) -> NDArray[Any]:
         params = np.zeros((), SOLVE)
         params["bodies"], params["count"], params["capacity"] = self.bodies_device, len(self.bodies), self._capacity
-        for name in ("row_start", "columns", "values", "b", "y"):
-            params[name] = self.gpu.twin(self._arrays[name]).data.ptr
-        for name, array in self._work.items():
+        for name, array in (self._twins | self._work).items():
             params[name] = array.data.ptr
-        params["nodes"], params["shared"] = nodes, self._shared
+        params["pooled"], params["grid"], params["nodes"], params["shared"] = pooled, self.grid, nodes, self._shared
         return params
-
-    def _shared_memory(self) -> int:
-        """Bytes per thread block for the residual and the rows of A of the body that needs most, if they fit."""
-        start = self._arrays["row_start"].astype(np.int64)
-        most = 0
-        for row in self.bodies:
-            first, nodes, parts = int(row["first"]), int(row["nodes"]), int(row["blocks"])
-            cut = first + nodes * np.arange(parts + 1) // parts
-            blocks, rows = int(np.diff(start[cut]).max()), int(np.diff(cut).max())
-            most = max(most, 4 * (-(-3 * nodes // 8) * 8) + 76 * blocks + 4 * rows + 32)
-        available = int(self.gpu.properties["sharedMemPerBlockOptin"]) - 1024
-        return min(most, available)

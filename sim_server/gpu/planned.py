@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: MIT
+"""A plan (plan.py) as the kernel reads it, on the device. Layouts: solve.cuh."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_server.gpu.device import Gpu
+from sim_server.gpu.plan import Plan
+
+DUMMY = 32  # entries behind the packed vectors, where padding points
+TILE_SUMS = 64  # apply.cuh
+ROUND = 12  # what a product costs besides its chunks, in chunks
+
+PLAN = np.dtype(
+    [
+        ("phases", "i4"), ("blocks", "i4"), ("groups", "i4"), ("size", "i4"), ("parts", "u8"), ("lists", "u8"),
+        ("pieces", "u8"), ("tiles", "u8"), ("boundary", "u8"), ("slot_start", "u8"), ("target", "u8"), ("place", "u8"),
+        ("entries", "i4"), ("unused", "i4"),
+    ]
+)  # fmt: skip
+
+
+def by_block(start: NDArray[Any], phases: int, blocks: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Lists kept by phase and block, wanted by block and phase: where each begins then, and which items follow."""
+    order = np.arange(phases * blocks).reshape(phases, blocks).T.ravel()
+    start = start.astype(np.int64)
+    length = np.diff(start)[order]
+    new = np.concatenate([[0], np.cumsum(length)])
+    items = np.arange(new[-1]) - np.repeat(new[:-1] - start[:-1][order], length)
+    return new, items
+
+
+def pieces(plan: Plan) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+    """Segments cut into 32 entries each: where those of each list begin, and (kind, from, to, 2 valid + keep)."""
+    segments = plan.segments.astype(np.int64)
+    count = segments[:, 2] // 32
+    ends = np.concatenate([[0], np.cumsum(count)])
+    which = np.repeat(np.arange(len(segments)), count)
+    step = 32 * (np.arange(ends[-1]) - ends[:-1][which])
+    kind, begin, to = segments[which, 0], segments[which, 1] + step, segments[which, 3] + step
+    used = np.zeros((2, max(len(plan.boundary), plan.size) // 32), np.int64)  # entries that are not padding, of 32
+    used[0, : plan.size // 32] = (plan.column.reshape(-1, 32) >= 0).sum(axis=1)
+    used[1, : len(plan.boundary) // 32] = (plan.boundary.reshape(-1, 32) < plan.size).sum(axis=1)
+    valid = used[(kind & 3) // 2, begin // 32]
+    return ends[plan.segment_start], np.stack([kind & 3, begin, to, 2 * valid + (kind >> 2 & 1)], 1).astype(np.int32)
+
+
+def splits(tiles: NDArray[Any], start: NDArray[Any], warps: int) -> NDArray[np.int32]:
+    """Warps that share each tile of a list, (lists,): few tiles would leave most warps idle."""
+    count = np.diff(start)
+    total = np.concatenate([[0], np.cumsum(tiles[:, 2].astype(np.int64))])
+    mean = (total[start[1:]] - total[start[:-1]]) / np.maximum(count, 1)
+    best, least = np.ones(len(count), np.int32), np.full(len(count), np.inf)
+    for parts in range(1, warps + 1):
+        rounds = -(-count * parts // warps)
+        cost = rounds * (np.ceil(mean / parts) + ROUND)
+        fits = (count * parts <= TILE_SUMS) & (8 * count <= 32 * warps) if parts > 1 else np.ones(len(count), bool)
+        better = fits & (cost < least)
+        best[better], least[better] = parts, cost[better]
+    return best
+
+
+def parts(piece_start: NDArray[Any], tile_start: NDArray[Any], plan: Plan) -> NDArray[np.int64]:
+    """(blocks, 8) what each thread block has: first and count of pieces, tiles, chunks."""
+    found = np.zeros((plan.blocks, 8), np.int64)
+    for k, start in enumerate((piece_start[:: plan.phases], tile_start[:: plan.phases], plan.chunk_start)):
+        found[:, 2 * k], found[:, 2 * k + 1] = start[:-1], np.diff(start)
+    return found
+
+
+def lists(piece_start: NDArray[Any], tile_start: NDArray[Any], split: NDArray[Any]) -> NDArray[np.int64]:
+    """(blocks, 3 phases + 2): where the pieces of each phase begin, and its tiles, in a block's own; and the splits."""
+    blocks, phases = split.shape
+    at = phases * np.arange(blocks)[:, None] + np.arange(phases + 1)
+    own = [start[at] - start[at[:, :1]] for start in (piece_start, tile_start)]
+    return np.hstack([*own, split])
+
+
+class Planned:
+    """A plan on the device, with the vectors that an application of it needs made by `vectors`."""
+
+    def __init__(self, gpu: Gpu, plan: Plan, warps: int):
+        self.gpu, self.plan = gpu, plan
+        self.bytes = int(plan.chunks) * 512
+        piece_start, cut = pieces(plan)
+        piece_start, piece_order = by_block(piece_start, plan.phases, plan.blocks)
+        tile_start, tile_order = by_block(plan.tile_start, plan.phases, plan.blocks)
+        tiles = plan.tiles[tile_order]
+        split = splits(tiles, tile_start, warps).reshape(plan.blocks, plan.phases)
+        target = np.full(plan.contributions + DUMMY, len(plan.slots), np.int32)
+        target[plan.slots] = np.arange(len(plan.slots), dtype=np.int32)
+        self._given = len(plan.slots) + DUMMY
+        arrays: dict[str, NDArray[Any]] = {
+            "parts": parts(piece_start, tile_start, plan), "lists": lists(piece_start, tile_start, split),
+            "pieces": cut[piece_order], "tiles": tiles, "boundary": plan.boundary, "slot_start": plan.slot_start,
+            "target": target, "place": plan.place,
+        }  # fmt: skip
+        self._arrays = {name: gpu.cp.asarray(array.astype(np.int32)) for name, array in arrays.items()}
+        params = np.zeros((), PLAN)
+        params["phases"], params["blocks"], params["groups"] = plan.phases, plan.blocks, plan.groups
+        params["size"], params["entries"] = plan.size, plan.x_area
+        for name, array in self._arrays.items():
+            params[name] = array.data.ptr
+        self._params = gpu.cp.asarray(params.reshape(1).view(np.uint8))
+        self.address = int(self._params.data.ptr)
+
+    def vectors(self) -> dict[str, Any]:
+        """Those of one body, in words (team.cuh) of no exchange."""
+        zeros, n = self.gpu.cp.zeros, self.plan.size + DUMMY
+        return {
+            "residual": zeros(2 * n), "product": zeros(n), "z": zeros(n), "formed": zeros(n), "solved": zeros(n),
+            "given": zeros(self._given),
+        }  # fmt: skip

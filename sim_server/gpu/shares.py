@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: MIT
+"""Who does what on the device: thread blocks of each body, the rows of A of each, the nodes that their rows read."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Ints = NDArray[np.int64]
+NODES_A_BLOCK = 4  # a body of few nodes is not spread over more thread blocks than this gives
+
+
+class Shares(NamedTuple):
+    """Thread blocks [first, first + blocks) of each body, first -1 where any free one takes it; `order`: those with
+    blocks of their own, then the `pooled` others, largest first."""
+
+    first: Ints
+    blocks: Ints
+    order: Ints
+    pooled: int
+
+
+def shares(nodes: Ints, grid: int) -> Shares:
+    """nodes (bodies,): by size while there are enough thread blocks; of many bodies the small share what is left."""
+    bodies = len(nodes)
+    wanted = nodes / nodes.sum() * grid
+    own = np.ones(bodies, bool) if bodies <= grid else wanted >= 2
+    pooled = int((~own).sum())
+    free = grid - max(1, round(wanted[~own].sum())) if pooled else grid
+    count = np.ones(bodies, np.int64)
+    if own.any():
+        spread = np.floor(nodes[own] / nodes[own].sum() * (free - own.sum())).astype(np.int64)
+        most = -(-nodes[own] // NODES_A_BLOCK)
+        count[own] = np.clip(spread, 1, most)
+    first = np.full(bodies, -1)
+    first[own] = np.cumsum(count[own]) - count[own]
+    rest = np.flatnonzero(~own)
+    order = np.concatenate([np.flatnonzero(own), rest[np.argsort(-nodes[rest], kind="stable")]])
+    return Shares(first, count, order, pooled)
+
+
+SHARE = np.dtype([(n, "i4") for n in ("body", "index", "begin", "own", "halo_first", "halo", "block_first", "blocks")])
+"""What a thread block has of a body: own nodes [begin, begin + own) of the body, places in Halo.nodes, blocks of A."""
+
+
+class Halo(NamedTuple):
+    """What each thread block of each body reads.
+
+    shares (thread blocks,): SHARE; nodes: of the body, lists of the thread blocks one after another, its own first;
+    local (blocks of A,): the column as a place in its thread block's list; first (bodies,): first share of a body.
+    """
+
+    shares: NDArray[Any]
+    nodes: Ints
+    local: Ints
+    first: Ints
+
+
+def halo(ranges: Ints, count: Ints, row_start: NDArray[Any], columns: NDArray[Any]) -> Halo:
+    """ranges (bodies, 2): nodes [first, last) of each; count (bodies,): thread blocks. Rows are cut evenly by nodes."""
+    total = int(row_start.shape[0]) - 1
+    first = np.cumsum(count) - count
+    begin, end = [], []
+    for (low, high), parts in zip(ranges.tolist(), count.tolist(), strict=True):
+        cut = low + (high - low) * np.arange(parts + 1) // parts
+        begin.append(cut[:-1])
+        end.append(cut[1:])
+    low, high = np.concatenate(begin), np.concatenate(end)
+    own = high - low
+    owner = np.repeat(np.arange(len(own)), own)  # of each node
+    reader = np.repeat(owner, np.diff(row_start))  # of each block of A
+    columns = columns.astype(np.int64)
+    foreign = owner[columns] != reader
+    keys, rank = np.unique(reader[foreign] * total + columns[foreign], return_inverse=True)
+    of = keys // total
+    extra = np.bincount(of, minlength=len(own))
+    local = columns - low[reader]
+    local[foreign] = own[reader[foreign]] + rank - (np.cumsum(extra) - extra)[reader[foreign]]
+    start = np.concatenate([[0], np.cumsum(own + extra)])
+    nodes = np.empty(start[-1], np.int64)
+    mine = np.arange(total)
+    nodes[start[owner] + mine - low[owner]] = mine
+    nodes[start[of] + own[of] + np.arange(len(keys)) - (np.cumsum(extra) - extra)[of]] = keys % total
+    origin = np.repeat(ranges[:, 0], count)  # of each thread block
+    table = np.zeros(len(own), SHARE)
+    table["body"] = np.repeat(np.arange(len(count)), count)
+    table["index"] = np.arange(len(own)) - np.repeat(first, count)
+    table["begin"], table["own"] = low - origin, own
+    table["halo_first"], table["halo"] = start[:-1], np.diff(start)
+    table["block_first"], table["blocks"] = row_start[low], row_start[high] - row_start[low]
+    return Halo(table, nodes - np.repeat(origin, np.diff(start)), local, first)
+
+
+def first_shares(given: Shares, seen: Halo, grid: int) -> NDArray[np.int32]:
+    """The share that each thread block of the grid begins with, -1 where it takes one of the pool."""
+    found = np.full(grid, -1, np.int32)
+    for body in given.order[: len(given.order) - given.pooled]:
+        k = np.arange(given.blocks[body])
+        found[given.first[body] + k] = seen.first[body] + k
+    return found
