@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from protocol.factor import FactorPattern
 from sim_server.backend import HERE, INCLUDE
-from sim_server.gpu.device import Gpu
+from sim_server.gpu.device import Gpu, compiled
 from sim_server.gpu.expansion import Expanded, Expansion
 from sim_server.gpu.plan import plan
 from sim_server.gpu.planned import PLAN, Planned
@@ -133,7 +133,7 @@ class Solver:
             backend="nvrtc",
             enable_cooperative_groups=True,
         )  # fmt: skip
-        return module.get_function("pcg")
+        return compiled("pcg.cu", module, "pcg")
 
     def launch(self) -> None:
         """Puts a solve onto the current stream."""
@@ -145,8 +145,9 @@ class Solver:
         key = (pattern.id, blocks)
         if key not in self._planned:
             found = plan(pattern, blocks, planes=self.planes)
-            self._planned[key] = Planned(self.gpu, found, self.threads // 32)
+            planned = Planned(self.gpu, found, self.threads // 32)
             self._expansions[key] = Expansion(self.gpu, pattern, found)
+            self._planned[key] = planned  # once there was memory for both
         return self._planned[key]
 
     def expansion(self, body: int, pattern: FactorPattern) -> Expansion:
