@@ -60,6 +60,9 @@ def serve(
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Another value than the scene's")
     ] = None,
     workers: Annotated[int, typer.Option(metavar="N", min=0, max=64, help="Local workers to start and supervise")] = 0,
+    worker_device: Annotated[
+        str, typer.Option(metavar="auto|cpu|gpu", help="What local workers factorize on (precond-worker --device)")
+    ] = "cpu",
     name: Annotated[str, typer.Option(metavar="NAME", help="Name of this server in all keys")] = "sim",
     no_shared_memory: Annotated[bool, typer.Option("--no-shared-memory", help="Send arrays as bytes")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing but errors")] = False,
@@ -70,10 +73,12 @@ def serve(
     signal.signal(signal.SIGTERM, _terminate)
     if device not in ("auto", "cpu", "gpu"):
         _bad_input(f"--device {device}: allowed are auto, cpu, gpu")
+    if worker_device not in ("auto", "cpu", "gpu"):
+        _bad_input(f"--worker-device {worker_device}: allowed are auto, cpu, gpu")
     say = (lambda text: None) if quiet else (lambda text: print(f"sim-server: {text}", flush=True))
     options = Options(
         scene, set_ or [], chosen(device, say), name, listen, connect, not no_shared_memory, record, steps, realtime,
-        workers,
+        workers, worker_device,
     )  # fmt: skip
     try:
         with ExitStack() as closing:
@@ -123,6 +128,7 @@ class Options:
     steps: int | None
     realtime: bool
     workers: int
+    worker_device: str
 
 
 def _set_up(closing: ExitStack, o: Options) -> "tuple[Service, Supervisor | None]":
@@ -153,7 +159,8 @@ def _set_up(closing: ExitStack, o: Options) -> "tuple[Service, Supervisor | None
         _bad_input(str(error))
     supervisor = None
     if o.workers:
-        supervisor = Supervisor(o.workers, o.name, _reachable(o.listen or [DEFAULT_ENDPOINT]))
+        reachable = _reachable(o.listen or [DEFAULT_ENDPOINT])
+        supervisor = Supervisor(o.workers, o.name, reachable, ["--device", o.worker_device])
         closing.callback(supervisor.close)
         service.beside = supervisor.look
     return service, supervisor
