@@ -5,6 +5,7 @@ Host arrays keep their names: `twin` gives the device array that stands for one,
 the code that lists the launches of a step is the same on both devices.
 """
 
+import hashlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from sim_server.backend import HERE, INCLUDE, Argument, CompileError, arguments_of
 from sim_server.errors import DeviceError
 
-BLOCK = 128  # threads of an ordinary launch
+MAILED = 4096  # threads of a launch whose number of items may change
 
 
 @cache
@@ -79,6 +80,24 @@ def compiled(name: str, module: Any, kernel: str) -> Any:
         raise CompileError(f"{name} does not compile for this GPU: {first.strip()}") from error
 
 
+@cache
+def _processors() -> int:
+    return int(cupy().cuda.Device().attributes["MultiProcessorCount"])
+
+
+@cache
+def texts() -> str:
+    """Of all headers, in an option: CuPy keeps compiled kernels by their own text and options alone."""
+    found = sorted(p for p in HERE.rglob("*") if p.suffix in (".h", ".cuh"))
+    return "-DTEXTS=x" + hashlib.sha256(b"".join(path.read_bytes() for path in found)).hexdigest()[:16]
+
+
+def shape(threads: int) -> tuple[tuple[int], tuple[int]]:
+    """Grid and thread blocks for so many threads: small blocks spread a small launch over more processors."""
+    block = next((b for b in (32, 64) if threads <= 16 * b * _processors()), 128)
+    return (max(1, -(-threads // block)),), (block,)
+
+
 class DeviceLaunch:
     """One kernel with its arguments on the device. mailed: they lie in device memory and may be replaced."""
 
@@ -94,9 +113,8 @@ class DeviceLaunch:
     def __call__(self) -> None:
         """Puts it onto the current stream."""
         argument = self._mail if self.mailed else self.params
-        blocks = 64 if self.mailed else max(1, -(-self.items // BLOCK))
         if self.items or self.mailed:
-            self._function((blocks,), (BLOCK,), (argument,))
+            self._function(*shape(MAILED if self.mailed else self.items), (argument,))
 
     def fetch(self, name: str) -> NDArray[Any]:
         """One of its arrays as kernels have left it, copied."""
@@ -117,7 +135,7 @@ class DeviceModule:
         self.name, self.real, self._gpu, self._text = source.stem, real, gpu, source.read_text()
         self._module = cupy().RawModule(
             code=self._text,
-            options=("-std=c++17", f"-I{INCLUDE}", f"-Dreal={real}"),
+            options=("-std=c++17", f"-I{INCLUDE}", f"-Dreal={real}", texts()),
             backend="nvrtc",
             enable_cooperative_groups=cooperative,
         )

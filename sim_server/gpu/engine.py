@@ -13,13 +13,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import FactorPattern
+from sim_server.backend import HERE
 from sim_server.gpu.cuda import CudaDevice
-from sim_server.gpu.device import DeviceLaunch, DeviceModule, Gpu
-from sim_server.gpu.fuse import fused
+from sim_server.gpu.device import DeviceLaunch, Gpu
+from sim_server.gpu.fuse import End, Fused, fused
 from sim_server.gpu.intake import Intake
 from sim_server.gpu.layouts import STAMP
 from sim_server.gpu.loop import CAPACITY, MANY, DeviceLoop, Mailbox
 from sim_server.gpu.solver import BODY, RESULT, SETTINGS, Solver
+
+TICK = np.dtype(
+    [
+        ("clock", "u8"), ("step", "u8"), ("dt", "f8"), ("arrived", "u8"), ("finished", "u8"), ("stamps", "u8"),
+        ("results", "u8"), ("reports", "u8"), ("barriers", "i4"), ("capacity", "i4"), ("words", "i4"), ("unused", "i4"),
+    ]
+)  # fmt: skip
 
 
 class Settings:
@@ -51,8 +59,7 @@ class GpuEngine(DeviceLoop):
         **arrays: NDArray[Any],
     ):  # fmt: skip
         self.gpu, self.launches, self._arrays = gpu, [*assemble, *integrate], arrays
-        self._integrate = list(integrate)
-        self._fused = fused(gpu, assemble)
+        self._fused = fused(assemble)
         cp, bodies = gpu.cp, len(ranges)
         device = CudaDevice(cp)
         self._steps = device.steps
@@ -78,10 +85,25 @@ class GpuEngine(DeviceLoop):
             self.mailboxes[k].post(whole[:SETTINGS])
             self.mailboxes[bodies + k].post(whole[SETTINGS:])
         self._graphs: list[Any] = []
-        module = DeviceModule("gpu/tick.cu", gpu)
-        self._tick, self._stamp = module.function("tick"), module.function("stamp")
+        self._tick = self._end_of_step(dt)
+        self._last = Fused(integrate, End((HERE / "gpu/tick.cu").read_text(), "Tick", self._tick))
+        self._stamp = self._last.function("stamp")
         self._capture()
         cp.cuda.get_current_stream().synchronize()  # what was made until now is there for the loop's streams
+
+    def _end_of_step(self, dt: float) -> NDArray[Any]:
+        self._finished = self.gpu.cp.zeros(1, np.uint32)
+        tick = np.zeros((), TICK)
+        arrays = {
+            "clock": self.gpu.twin(self._arrays["clock"]), "step": self._counter, "arrived": self.solver.arrived,
+            "finished": self._finished, "results": self.solver.results,
+        }  # fmt: skip
+        for name, array in arrays.items():
+            tick[name] = array.data.ptr
+        tick["stamps"], tick["reports"] = self._stamps.ctypes.data, self._results.ctypes.data
+        tick["dt"], tick["barriers"], tick["capacity"] = dt, len(self.solver.arrived), CAPACITY
+        tick["words"] = len(self._ranges) * RESULT.itemsize // 8
+        return tick
 
     # --- running ------------------------------------------------------------------------------------------------
 
@@ -103,7 +125,7 @@ class GpuEngine(DeviceLoop):
 
     def _begin(self) -> None:
         """Notes the time: the device has had nothing to do until now."""
-        self._stamp((1,), (1,), (self._counter, np.uint64(self._stamps.ctypes.data), np.int32(CAPACITY)))
+        self._stamp((1,), (1,), (self._tick,))
 
     def _one_step(self) -> None:
         """Everything a step puts onto the stream."""
@@ -114,17 +136,7 @@ class GpuEngine(DeviceLoop):
     def _finish_step(self) -> None:
         """Solve, integrate, count."""
         self.solver.launch()
-        for launch in self._integrate:
-            launch()
-        arrived, clock = self.solver.arrived, self.gpu.twin(self._arrays["clock"])
-        words = np.int32(len(self._ranges) * RESULT.itemsize // 8)
-        self._tick(
-            (1,), (256,),
-            (
-                clock, self._counter, np.float64(self.loop.dt), arrived, np.int32(len(arrived)), np.int32(CAPACITY),
-                np.uint64(self._stamps.ctypes.data), self.solver.results, np.uint64(self._results.ctypes.data), words,
-            ),
-        )  # fmt: skip
+        self._last()
 
     def assemble(self) -> None:
         """First half of one step: the system matrix, which the host has then too."""

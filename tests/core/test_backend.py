@@ -5,11 +5,13 @@ import ctypes
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from sim_server import backend
+from sim_server.gpu import fuse
 from tests.core import nvrtc
 
 PUSH = """#include "kernel.h"
@@ -184,7 +186,7 @@ def test_every_text_of_the_package_compiles_for_gpus(path, arch):
     if (library := nvrtc.library()) is None:
         pytest.skip("needs the package nvidia-cuda-nvrtc")
     for real in ("double", "float"):
-        options = [f"-arch={arch}", "-std=c++17", f"-Dreal={real}", f"-I{backend.INCLUDE}"]
+        options = [f"-arch={arch}", "-std=c++17", f"-Dreal={real}", f"-I{backend.INCLUDE}", f"-I{PACKAGE / 'gpu'}"]
         code, said = nvrtc.compiled(library, PACKAGE / path, options)
         assert len(code) > 1000 and not said, said
 
@@ -202,3 +204,17 @@ def test_a_process_without_kernels_compiles_none(tmp_path):
     code = "import sim_server.scene, sim_server.simulation, sim_server.backend as b; print(b.compiled)"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=PACKAGE.parent)
     assert run.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("arch", ["sm_80", "sm_90"])
+def test_the_last_kernel_of_a_step_compiles_with_the_end_of_the_step(arch, tmp_path):
+    if (library := nvrtc.library()) is None:
+        pytest.skip("needs the package nvidia-cuda-nvrtc")
+    advance = SimpleNamespace(
+        text=(PACKAGE / "kernels/nodes.cu").read_text(), struct="Advance", name="nodes.advance", sums=False
+    )
+    end = fuse.End((PACKAGE / "gpu/tick.cu").read_text(), "Tick", np.zeros(()))
+    text = tmp_path / "last.cu"
+    text.write_text(fuse.source([advance], 1, end))  # type: ignore[list-item]
+    code, said = nvrtc.compiled(library, text, [f"-arch={arch}", "-std=c++17", f"-I{backend.INCLUDE}"])
+    assert len(code) > 1000 and not said, said
