@@ -52,7 +52,9 @@ class Maker:
         self.targets.append([])
         return self.targets[-1]
 
-    def expand(self, values: np.ndarray, target: list[int]) -> Expanded:
+    spared = None
+
+    def expand(self, values: np.ndarray, target: list[int], multiprocessors: int | None = None) -> Expanded:
         if self.fail:
             raise self.fail
         target[:] = [int(values[0])]
