@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: MIT
 // z = P^-1 r by an inverse in parts (plan.py): 2 P - 1 phases of dense products in float16 with float32 sums.
 //
-// A product of 8 rows x 32 columns is two matrix instructions. The vector is their left factor, split into two float16
-// (value = high + low / 2048): 22 bits of it count, nearly as many as float32 has. So a warp needs four instructions for 512
-// bytes of matrix, and memory is the only limit.
+// A product of 16 rows x 32 columns is two matrix instructions. The vector is their right factor, split into two columns of
+// float16 (value = high + low / 2048): 22 bits of it count, nearly as many as float32 has. So a warp needs five instructions
+// for 1024 bytes of matrix, and memory is the only limit.
 #pragma once
 #include "team.cuh"
 
@@ -12,6 +12,9 @@
 #define CHUNKS_AT_ONCE 4
 #endif
 #define TILE_SUMS 64  // jobs of a phase that share tiles, at most
+#define LISTS 32768   // bytes of a list that is worth its place in shared memory
+#define FEW 3         // pieces that a warp brings together at a time
+#define MANY 8        // 2304 entries in one trip through L2 with 8 warps
 
 struct Vector { unsigned short *high, *low; };  // of a phase, in shared memory
 
@@ -33,11 +36,24 @@ __device__ __forceinline__ void put_halves(const Vector& to, int i, float v) {
     to.low[i] = half_of((v - of_half(high)) * LOW);
 }
 
-__device__ __forceinline__ void multiply_add(float sum[4], unsigned a0, unsigned a2, unsigned b0, unsigned b1) {
+__device__ __forceinline__ unsigned shared_address(const void* p) { return (unsigned)__cvta_generic_to_shared(p); }
+
+// 16 bytes of shared memory if they are wanted, else zeros, without a branch.
+__device__ __forceinline__ uint4 shared_load(unsigned from, bool wanted) {
+    uint4 v;
+    asm volatile(
+        "{.reg .pred p; setp.ne.s32 p, %5, 0; mov.b32 %0, 0; mov.b32 %1, 0; mov.b32 %2, 0; mov.b32 %3, 0;\n"
+        "@p ld.shared.v4.u32 {%0, %1, %2, %3}, [%4];}"
+        : "=r"(v.x), "=r"(v.y), "=r"(v.z), "=r"(v.w) : "r"(from), "r"((int)wanted));
+    return v;
+}
+
+// sum += a b: a of 16 rows x 16 columns, b of 16 x 8, of which two columns are meant.
+__device__ __forceinline__ void multiply_add(float sum[4], unsigned a0, unsigned a1, unsigned a2, unsigned a3, unsigned b0, unsigned b1) {
 #if __CUDA_ARCH__ >= 800
     asm("mma.sync.aligned.m16n8k16.row.col.f32.f16.f16.f32 {%0, %1, %2, %3}, {%4, %5, %6, %7}, {%8, %9}, {%0, %1, %2, %3};"
         : "+f"(sum[0]), "+f"(sum[1]), "+f"(sum[2]), "+f"(sum[3])
-        : "r"(a0), "r"(0), "r"(a2), "r"(0), "r"(b0), "r"(b1));
+        : "r"(a0), "r"(a1), "r"(a2), "r"(a3), "r"(b0), "r"(b1));
 #endif
 }
 
@@ -56,16 +72,17 @@ struct Inverse {
     const float* scale;
     Word<float> *residual, *product, *z, *formed, *solved, *given;
     Vector vector;
-    float* tile_sums;             // (TILE_SUMS, 8)
+    float* tile_sums;             // (TILE_SUMS, 16)
     const int* lists;             // of the phases: first piece (phases + 1), first tile (phases + 1), warps that share a tile
     const Piece* pieces;
+    const int* where;             // (pieces, 32) Plan.index
     const Tile* tiles;
     int size, phases, groups;
 
     // A list into shared memory if it is short: loads after a barrier miss L1.
     template <class T>
     static __device__ __forceinline__ const T* brought(const T* list, int count, Arena& arena) {
-        T* to = count * sizeof(T) <= 16384 ? arena.take<T>(count) : nullptr;
+        T* to = count * sizeof(T) <= LISTS ? arena.take<T>(count) : nullptr;
         if (!to) return list;
         for (int k = threadIdx.x; k < count * (int)sizeof(T) / 4; k += THREADS) copy_async((int*)to + k, (const int*)list + k, 4);
         return to;
@@ -80,9 +97,10 @@ struct Inverse {
         const Part part = plan->parts[index];
         vector.high = arena.take<unsigned short>(plan->entries);
         vector.low = arena.take<unsigned short>(plan->entries);
-        tile_sums = arena.take<float>(8 * TILE_SUMS);
+        tile_sums = arena.take<float>(16 * TILE_SUMS);
         lists = brought(plan->lists + index * (3 * phases + 2), 3 * phases + 2, arena);
         pieces = brought(plan->pieces + part.piece, part.pieces, arena);
+        where = brought(plan->index + 32ll * part.piece, 32 * part.pieces, arena);
         tiles = brought(plan->tiles + part.tile, part.tiles, arena);
         begin = part.chunk;
         matrix = body.matrix + 32ll * begin;
@@ -97,29 +115,38 @@ struct Inverse {
     // Brings together the vector of a phase. No branches between loads: they travel together.
     __device__ __forceinline__ void gather(int phase, const Residual& from, unsigned number, float unit) const {
         const int first = lists[phase] + (int)threadIdx.x / 32, last = lists[phase + 1];
-        for (int at = first; at < last; at += AT_ONCE * WARPS) {
-            if (phase == 0) residual_pieces(at, last, from, number, unit);
-            else if (phase >= groups) solved_pieces(at, last, number, unit);
-            else for (int k = at; k < min(at + AT_ONCE * WARPS, last); k += WARPS) reduced_piece(k, from, number, unit);
+        const bool few = last - lists[phase] <= FEW * WARPS;
+        for (int at = first; at < last; at += (few ? FEW : MANY) * WARPS) {
+            if (phase == 0) {
+                if (few) residual_pieces<FEW>(at, last, from, number, unit);
+                else residual_pieces<MANY>(at, last, from, number, unit);
+            } else if (phase < groups) {
+                if (few) reduced_pieces<FEW, 5>(at, last, from, number, unit);
+                else for (int k = at; k < min(at + MANY * WARPS, last); k += 2 * WARPS) reduced_pieces<2, 6>(k, last, from, number, unit);
+            } else {
+                if (few) solved_pieces<FEW>(at, last, number, unit);
+                else solved_pieces<MANY>(at, last, number, unit);
+            }
         }
     }
 
     // Of the first phase: nothing has contributed yet.
+    template <int N>
     __device__ __forceinline__ void residual_pieces(int at, int last, const Residual& from, unsigned number, float unit) const {
         const int lane = threadIdx.x % 32;
-        Word<float> r[AT_ONCE], q[AT_ONCE];
-        float rk[AT_ONCE], qk[AT_ONCE];
+        Word<float> r[N], q[N];
+        float rk[N], qk[N];
         bool all;
         do {
 #pragma unroll
-            for (int k = 0; k < AT_ONCE; ++k) {
+            for (int k = 0; k < N; ++k) {
                 const int i = pieces[min(at + k * WARPS, last - 1)].from + lane;
                 r[k] = from.r[i].seen();
                 q[k] = product[i].seen();
             }
             all = true;
 #pragma unroll
-            for (int k = 0; k < AT_ONCE; ++k) {
+            for (int k = 0; k < N; ++k) {
                 const bool valid = lane < pieces[min(at + k * WARPS, last - 1)].keep >> 1;
                 all &= (r[k].is(rk[k], from.r_number) & (q[k].is(qk[k], from.q_number) | from.alpha == 0)) | !valid;
                 rk[k] = valid ? rk[k] : 0;
@@ -127,7 +154,7 @@ struct Inverse {
             }
         } while (!all);
 #pragma unroll
-        for (int k = 0; k < AT_ONCE; ++k)
+        for (int k = 0; k < N; ++k)
             if (at + k * WARPS < last) put(pieces[at + k * WARPS], rk[k] - from.alpha * qk[k], number, unit);
     }
 
@@ -138,99 +165,121 @@ struct Inverse {
     }
 
     // Of the phases up to the top: what has been contributed comes off.
-    __device__ __forceinline__ void reduced_piece(int at, const Residual& from, unsigned number, float unit) const {
+    template <int N, int M>
+    __device__ __forceinline__ void reduced_pieces(int at, int last, const Residual& from, unsigned number, float unit) const {
         const int lane = threadIdx.x % 32;
-        const Piece piece = pieces[at];
-        const bool valid = lane < piece.keep >> 1;
-        const int i = piece.from + lane, low = plan->slot_start[i], high = plan->slot_start[i + 1];
-        Word<float> r = from.r[i].seen();
-        float v = 0, sum = 0;
-        for (int k = low; k < high; k += AT_ONCE) {
-            Word<float> c[AT_ONCE];
-            float ck[AT_ONCE];
+        int low[N], high[N], most = 0;
+        Word<float> r[N];
+        float v[N];
+#pragma unroll
+        for (int k = 0; k < N; ++k) {
+            const int p = min(at + k * WARPS, last - 1);
+            const unsigned slots = where[32 * p + lane];
+            low[k] = slots & 0xffffff;
+            high[k] = low[k] + (slots >> 24);
+            r[k] = from.r[pieces[p].from + lane].seen();
+            v[k] = 0;
+        }
+#pragma unroll
+        for (int k = 0; k < N; ++k) most = max(most, high[k] - low[k]);
+        for (int m = 0; m < most; m += M) {
+            Word<float> c[N][M];
+            float ck[N][M];
             bool all;
             do {
 #pragma unroll
-                for (int m = 0; m < AT_ONCE; ++m) c[m] = given[min(k + m, high - 1)].seen();
+                for (int k = 0; k < N; ++k)
+#pragma unroll
+                    for (int j = 0; j < M; ++j) c[k][j] = given[min(low[k] + m + j, max(high[k] - 1, 0))].seen();
                 all = true;
 #pragma unroll
-                for (int m = 0; m < AT_ONCE; ++m) all &= c[m].is(ck[m], number);
+                for (int k = 0; k < N; ++k)
+#pragma unroll
+                    for (int j = 0; j < M; ++j) all &= c[k][j].is(ck[k][j], number) | (low[k] + m + j >= high[k]);
             } while (!all);
 #pragma unroll
-            for (int m = 0; m < AT_ONCE; ++m) sum += k + m < high ? ck[m] : 0;
+            for (int k = 0; k < N; ++k)
+#pragma unroll
+                for (int j = 0; j < M; ++j) v[k] -= low[k] + m + j < high[k] ? ck[k][j] : 0;
         }
-        while (valid && !r.is(v, from.r_number)) r = from.r[i].seen();
-        put(piece, valid ? v - sum : 0, number, unit);
+#pragma unroll
+        for (int k = 0; k < N; ++k) {
+            if (at + k * WARPS >= last) continue;
+            const Piece& piece = pieces[at + k * WARPS];
+            const bool valid = lane < piece.keep >> 1;
+            float rk = 0;
+            while (valid && !r[k].is(rk, from.r_number)) r[k] = from.r[piece.from + lane].seen();
+            put(piece, valid ? rk + v[k] : 0, number, unit);
+        }
     }
 
     // Of the phases after the top: what was formed on the way there, and what is solved.
+    template <int N>
     __device__ __forceinline__ void solved_pieces(int at, int last, unsigned number, float unit) const {
         const int lane = threadIdx.x % 32;
-        const Word<float>* word[AT_ONCE];
-        Word<float> w[AT_ONCE];
-        float v[AT_ONCE];
+        const Word<float>* word[N];
+        Word<float> w[N];
+        float v[N];
         bool all;
 #pragma unroll
-        for (int k = 0; k < AT_ONCE; ++k) {
-            const Piece piece = pieces[min(at + k * WARPS, last - 1)];
-            const int i = piece.from + lane, j = plan->boundary[piece.kind == 1 ? 0 : i];
-            word[k] = piece.kind == 1 ? formed + i : solved + j;
+        for (int k = 0; k < N; ++k) {
+            const int p = min(at + k * WARPS, last - 1);
+            word[k] = (pieces[p].kind == 1 ? formed : solved) + where[32 * p + lane];
         }
         do {
 #pragma unroll
-            for (int k = 0; k < AT_ONCE; ++k) w[k] = word[k]->seen();
+            for (int k = 0; k < N; ++k) w[k] = word[k]->seen();
             all = true;
 #pragma unroll
-            for (int k = 0; k < AT_ONCE; ++k) {
+            for (int k = 0; k < N; ++k) {
                 const bool valid = lane < pieces[min(at + k * WARPS, last - 1)].keep >> 1;
                 all &= w[k].is(v[k], number) | !valid;
                 v[k] = valid ? v[k] : 0;
             }
         } while (!all);
 #pragma unroll
-        for (int k = 0; k < AT_ONCE; ++k)
+        for (int k = 0; k < N; ++k)
             if (at + k * WARPS < last) put_halves(vector, pieces[at + k * WARPS].to + lane, unit * v[k]);
     }
 
-    // Sums over chunks [from, to) of this block's storage; the vector begins at `x`. Four chains of matrix instructions.
+    // Sums over chunks [from, to) of this block's storage, and over those `second` further on, of the next eight rows; the
+    // vector begins at `x`.
     template <bool NEAR>
-    __device__ __forceinline__ void accumulate(int from, int to, int x, float sum[4][4]) const {
+    __device__ __forceinline__ void accumulate(int from, int to, int second, int x, float sum[2][4]) const {
         const int lane = threadIdx.x % 32;
-        const unsigned short* half = (lane & 4 ? vector.low : vector.high) + x + 8 * (lane % 4);
-        const uint4* a = (NEAR ? kept : matrix) + lane;
+        const unsigned half = shared_address((lane & 4 ? vector.low : vector.high) + x + 8 * (lane % 4)), a = shared_address(kept + lane);
+        const uint4* far = matrix + lane;
         for (int at = from; at < to; at += CHUNKS_AT_ONCE) {
-            uint4 m[CHUNKS_AT_ONCE], v[CHUNKS_AT_ONCE];
+            uint4 m[CHUNKS_AT_ONCE], n[CHUNKS_AT_ONCE], v[CHUNKS_AT_ONCE];
 #pragma unroll
             for (int k = 0; k < CHUNKS_AT_ONCE; ++k) {
                 const int c = min(at + k, to - 1);
-                m[k] = NEAR ? a[32 * c] : __ldg(a + 32ll * c);
-                v[k] = *(const uint4*)(half + 32 * (c - from));
+                m[k] = NEAR ? shared_load(a + 512 * c, true) : __ldg(far + 32ll * c);
+                n[k] = NEAR ? shared_load(a + 512 * (c + second), second > 0) : second ? __ldg(far + 32ll * (c + second)) : make_uint4(0, 0, 0, 0);
+                v[k] = shared_load(half + 64 * (c - from), lane < 8 && at + k < to);
             }
 #pragma unroll
             for (int k = 0; k < CHUNKS_AT_ONCE; ++k) {
-                const bool here = lane < 8 && at + k < to;  // the other rows of the left factor are zero
-                multiply_add(sum[2 * k % 4], here ? v[k].x : 0, here ? v[k].y : 0, m[k].x, m[k].y);
-                multiply_add(sum[2 * k % 4 + 1], here ? v[k].z : 0, here ? v[k].w : 0, m[k].z, m[k].w);
+                multiply_add(sum[0], m[k].x, n[k].x, m[k].y, n[k].y, v[k].x, v[k].y);
+                multiply_add(sum[1], m[k].z, n[k].z, m[k].w, n[k].w, v[k].z, v[k].w);
             }
         }
     }
 
-    // Row `lane` (of eight) of a tile's product over its chunks [low, high), in lanes 0 to 7.
+    // Row `lane` (of sixteen) of a tile's product over its chunks [low, high), in lanes 0 to 15.
     __device__ __forceinline__ float product_of(const Tile& tile, int low, int high) const {
-        const int lane = threadIdx.x % 32;
+        const int lane = threadIdx.x % 32, second = tile.rows > 8 ? tile.chunks * planes : 0, x = tile.x;
         float total = 0, weight = 1;
         for (int plane = 0; plane < planes; ++plane, weight /= LOW) {
-            float sum[4][4] = {};
-            int from = tile.chunk - begin + plane * tile.chunks + low, to = from + high - low;
-            int middle = to < near ? to : from > near ? from : near;
-            accumulate<true>(from, middle, tile.x + 32 * low, sum);
-            accumulate<false>(middle, to, tile.x + 32 * (low + middle - from), sum);
-            for (int k = 0; k < 2; ++k) {
-                sum[0][k] = (sum[0][k] + sum[1][k]) + (sum[2][k] + sum[3][k]);
-                sum[0][k] += __shfl_down_sync(ALL, sum[0][k], 4) / LOW;  // lane t: rows 2 t, 2 t + 1
-            }
-            float even = __shfl_sync(ALL, sum[0][0], lane / 2), odd = __shfl_sync(ALL, sum[0][1], lane / 2);
-            total += weight * (lane % 2 ? odd : even);
+            float sum[2][4] = {};
+            const int from = tile.chunk - begin + plane * tile.chunks + low, to = from + high - low;
+            const int kept_to = near - second, middle = to < kept_to ? to : from > kept_to ? from : kept_to;
+            accumulate<true>(from, middle, second, x + 32 * low, sum);
+            accumulate<false>(middle, to, second, x + 32 * (low + middle - from), sum);
+            const float upper = sum[0][0] + sum[1][0] + (sum[0][1] + sum[1][1]) / LOW;  // lane 4 r: row r
+            const float lower = sum[0][2] + sum[1][2] + (sum[0][3] + sum[1][3]) / LOW;  // and row r + 8
+            const float one = __shfl_sync(ALL, upper, 4 * (lane % 8)), two = __shfl_sync(ALL, lower, 4 * (lane % 8));
+            total += weight * (lane & 8 ? two : one);
         }
         return total;
     }
@@ -271,21 +320,25 @@ struct Inverse {
             zr += (double)value * (ri - from.alpha * qi);
         };
         const int row = threadIdx.x;
-        if (parts > 1 && row < 8 * count) look_up(tiles[first + row / 8], row % 8);
+        bool here = row < 16 * count;
+        if (parts > 1 && here) {
+            here = row % 16 < tiles[first + row / 16].rows;
+            if (here) look_up(tiles[first + row / 16], row % 16);
+        }
         for (int job = warp; job < count * parts; job += WARPS) {
             const int at = parts > 1 ? job / parts : job, part = job - at * parts;
             const Tile tile = tiles[first + at];
-            if (parts == 1 && lane < 8) look_up(tile, lane);
+            if (parts == 1 && lane < tile.rows) look_up(tile, lane);
             const float value = product_of(tile, tile.chunks * part / parts, tile.chunks * (part + 1) / parts);
-            if (lane >= 8) continue;
-            if (parts > 1) tile_sums[8 * job + lane] = value;
+            if (lane >= tile.rows) continue;
+            if (parts > 1) tile_sums[16 * job + lane] = value;
             else finish(back * value);
         }
         if (parts > 1) {
             __syncthreads();
-            if (row < 8 * count) {
+            if (here) {
                 float value = 0;
-                for (int k = 0; k < parts; ++k) value += tile_sums[8 * (row / 8 * parts + k) + row % 8];
+                for (int k = 0; k < parts; ++k) value += tile_sums[16 * (row / 16 * parts + k) + row % 16];
                 finish(back * value);
             }
         }

@@ -141,7 +141,7 @@ class Intake:
             target = expansion.target()
             targets.append(target)
         self._gpu.cp.cuda.get_current_stream().synchronize()  # what was made for it is there for other streams
-        expanded = expansion.expand(values, target)
+        expanded = expansion.expand(values, target, self._solver.spared)  # beside the steps
         self._solver.use(body, pattern, expanded, step)
         return Made(expanded, target, step, pattern)
 

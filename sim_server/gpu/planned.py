@@ -11,12 +11,12 @@ from sim_server.gpu.plan import Plan
 
 DUMMY = 32  # entries behind the packed vectors, where padding points
 TILE_SUMS = 64  # apply.cuh
-ROUND = 12  # what a product costs besides its chunks, in chunks
+ROUND = 6  # what a product costs besides its chunks, in chunks
 
 PLAN = np.dtype(
     [
         ("phases", "i4"), ("blocks", "i4"), ("groups", "i4"), ("size", "i4"), ("parts", "u8"), ("lists", "u8"),
-        ("pieces", "u8"), ("tiles", "u8"), ("boundary", "u8"), ("slot_start", "u8"), ("target", "u8"), ("place", "u8"),
+        ("pieces", "u8"), ("tiles", "u8"), ("index", "u8"), ("target", "u8"), ("place", "u8"),
         ("entries", "i4"), ("unused", "i4"),
     ]
 )  # fmt: skip
@@ -47,6 +47,37 @@ def pieces(plan: Plan) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
     return ends[plan.segment_start], np.stack([kind & 3, begin, to, 2 * valid + (kind >> 2 & 1)], 1).astype(np.int32)
 
 
+def index(plan: Plan, cut: NDArray[np.int32]) -> NDArray[np.int64]:
+    """(pieces, 32): where each entry stands, or its contributions. Raises ValueError if there are too many."""
+    entry = cut[:, 1, None].astype(np.int64) + np.arange(32)
+    formed = (cut[:, 0] == 0)[:, None]
+    start = plan.slot_start.astype(np.int64)
+    many = np.diff(start)
+    if len(many) and (many.max() > 255 or start[-1] >= 1 << 24):
+        raise ValueError(f"FactorPattern: up to {many.max()} couplings of parts to a row, allowed on a GPU: 255")
+    position = np.where(formed, entry, 0)
+    slots = start[position] | many[position] << 24
+    boundary = np.append(plan.boundary, 0)
+    return np.where(
+        formed, slots, np.where((cut[:, 0] == 2)[:, None], boundary[np.where(formed, 0, entry) % len(boundary)], entry)
+    )
+
+
+def doubled(tiles: NDArray[Any], start: NDArray[Any], planes: int) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+    """Tiles of 8 rows taken together where the next eight rows follow, (k, 8): chunk, x, chunks, out, rows, 0, 0, 0."""
+    chunk, x, chunks, out = tiles.T.astype(np.int64)
+    follows = np.zeros(len(tiles), bool)  # the one before, in the same list
+    follows[1:] = (x[1:] == x[:-1]) & (out[1:] == out[:-1] + 8) & (chunk[1:] == chunk[:-1] + planes * chunks[:-1])
+    follows[start[:-1][start[:-1] < len(tiles)]] = False
+    run = np.maximum.accumulate(np.where(follows, 0, np.arange(len(tiles))))
+    second = (np.arange(len(tiles)) - run) % 2 == 1
+    found = np.zeros((len(tiles), 8), np.int32)
+    found[:, :4] = tiles
+    found[:, 4] = 8 + 8 * np.append(second[1:], False)
+    kept = np.concatenate([[0], np.cumsum(~second)])
+    return found[~second], kept[start]
+
+
 def splits(tiles: NDArray[Any], start: NDArray[Any], warps: int) -> NDArray[np.int32]:
     """Warps that share each tile of a list, (lists,): few tiles would leave most warps idle."""
     count = np.diff(start)
@@ -56,7 +87,7 @@ def splits(tiles: NDArray[Any], start: NDArray[Any], warps: int) -> NDArray[np.i
     for parts in range(1, warps + 1):
         rounds = -(-count * parts // warps)
         cost = rounds * (np.ceil(mean / parts) + ROUND)
-        fits = (count * parts <= TILE_SUMS) & (8 * count <= 32 * warps) if parts > 1 else np.ones(len(count), bool)
+        fits = (count * parts <= TILE_SUMS) & (16 * count <= 32 * warps) if parts > 1 else np.ones(len(count), bool)
         better = fits & (cost < least)
         best[better], least[better] = parts, cost[better]
     return best
@@ -87,17 +118,20 @@ class Planned:
         piece_start, cut = pieces(plan)
         piece_start, piece_order = by_block(piece_start, plan.phases, plan.blocks)
         tile_start, tile_order = by_block(plan.tile_start, plan.phases, plan.blocks)
-        tiles = plan.tiles[tile_order]
+        tiles, tile_start = doubled(plan.tiles[tile_order], tile_start, plan.planes)
         split = splits(tiles, tile_start, warps).reshape(plan.blocks, plan.phases)
         target = np.full(plan.contributions + DUMMY, len(plan.slots), np.int32)
         target[plan.slots] = np.arange(len(plan.slots), dtype=np.int32)
         self._given = len(plan.slots) + DUMMY
         arrays: dict[str, NDArray[Any]] = {
             "parts": parts(piece_start, tile_start, plan), "lists": lists(piece_start, tile_start, split),
-            "pieces": cut[piece_order], "tiles": tiles, "boundary": plan.boundary, "slot_start": plan.slot_start,
+            "pieces": cut[piece_order], "index": index(plan, cut[piece_order]), "tiles": tiles,
             "target": target, "place": plan.place,
         }  # fmt: skip
-        self._arrays = {name: gpu.cp.asarray(array.astype(np.int32)) for name, array in arrays.items()}
+        self._arrays = {
+            name: gpu.cp.asarray(array.astype(np.int64).astype(np.uint32).view(np.int32))
+            for name, array in arrays.items()
+        }
         params = np.zeros((), PLAN)
         params["phases"], params["blocks"], params["groups"] = plan.phases, plan.blocks, plan.groups
         params["size"], params["entries"] = plan.size, plan.x_area

@@ -5,6 +5,8 @@
 #include "team.cuh"
 #include "invert3.cuh"
 
+#define TOGETHER 3  // rows of a warp at a time
+
 struct Rows {
     int begin, own, halo;           // own nodes [begin, begin + own) of the body; nodes read
     const int* nodes;               // (halo,) of the body
@@ -60,39 +62,75 @@ struct Rows {
         copies_begin();
     }
 
-    // q = A values for the own nodes, a warp a node. done(node, q): called by lanes 0, 1, 2 with entry `lane` of q.
+    // q = A values for the own nodes. done(node, q): called by lanes 0, 1, 2 with entry `lane` of q.
     template <class Done>
     __device__ __forceinline__ void multiply(Done done) const {
+        if (own <= WARPS) some_rows<1>(done);
+        else some_rows<TOGETHER>(done);
+    }
+
+    template <int N, class Done>
+    __device__ __forceinline__ void some_rows(Done done) const {
         const int lane = threadIdx.x % 32;
-        for (int node = threadIdx.x / 32; node < own; node += WARPS) {
-            const int low = row_start[node] - base, high = row_start[node + 1] - base;
-            real sum = near ? of_near(low, high) : of_far(low, high);
-            if (lane < 3) done(node, sum);
+        for (int first = threadIdx.x / 32; first < own; first += N * WARPS) {
+            real sum[N];
+            if (near) of_near<N>(first, sum);
+            else of_far<N>(first, sum);
+#pragma unroll
+            for (int n = 0; n < N; ++n)
+                if (lane < 3 && first + n * WARPS < own) done(first + n * WARPS, sum[n]);
         }
     }
 
-    // Eight blocks of a row at a time: lane 3 e + r has row r of block e. The sums end in lanes 0, 1, 2.
-    __device__ __forceinline__ real of_near(int low, int high) const {
+    // Eight blocks of a row at a time: lane 3 e + r has row r of block e. The sums end in lanes 0, 1, 2. Rows of up to 16 blocks
+    // go without a branch, so that the warp's rows overlap.
+    template <int N>
+    __device__ __forceinline__ void of_near(int first, real sum[N]) const {
         const int lane = threadIdx.x % 32, entry = lane / 3, r = lane - 3 * entry;
-        real sum = 0;
-        for (int k = low + entry; k < high && lane < 24; k += 8) {
-            const real *a = blocks + 9 * k + 3 * r, *v = values + 3 * columns[k];
-            sum += a[0] * v[0] + a[1] * v[1] + a[2] * v[2];
+#pragma unroll
+        for (int n = 0; n < N; ++n) {
+            const int node = min(first + n * WARPS, own - 1), low = row_start[node] - base, high = row_start[node + 1] - base;
+            sum[n] = 0;
+#pragma unroll
+            for (int e = 0; e < 16; e += 8) {
+                const int k = low + e + entry, there = min(k, high - 1);
+                const real *a = blocks + 9 * there + 3 * r, *v = values + 3 * columns[there];
+                const real product = a[0] * v[0] + a[1] * v[1] + a[2] * v[2];
+                sum[n] += lane < 24 && k < high ? product : 0;
+            }
+            for (int k = low + 16 + entry; k < high && lane < 24; k += 8) {
+                const real *a = blocks + 9 * k + 3 * r, *v = values + 3 * columns[k];
+                sum[n] += a[0] * v[0] + a[1] * v[1] + a[2] * v[2];
+            }
         }
-        for (int k = 12; k >= 3; k >>= 1) sum += __shfl_down_sync(ALL, sum, k);
-        return sum;
+        for (int k = 12; k >= 3; k >>= 1)
+#pragma unroll
+            for (int n = 0; n < N; ++n) sum[n] += __shfl_down_sync(ALL, sum[n], k);
     }
 
     // Three at a time: lane 9 e + 3 r + c has entry (r, c) of block e, so that A is read in order.
-    __device__ __forceinline__ real of_far(int low, int high) const {
+    template <int N>
+    __device__ __forceinline__ void of_far(int first, real sum[N]) const {
         const int lane = threadIdx.x % 32, entry = lane / 9, c = lane % 3;
-        real sum = 0;
-#pragma unroll 4
-        for (int k = low; k < high; k += 3)
-            if (lane < 27 && k + entry < high) sum += __ldcs(blocks + 9ll * k + lane) * values[3 * __ldg(columns + k + entry) + c];
-        sum += __shfl_down_sync(ALL, sum, 9) + __shfl_down_sync(ALL, sum, 18);   // lanes 0 to 8: entry (r, c)
-        sum += __shfl_down_sync(ALL, sum, 1) + __shfl_down_sync(ALL, sum, 2);    // lanes 0, 3, 6: row r
-        return __shfl_sync(ALL, sum, lane < 3 ? 3 * lane : 0);
+#pragma unroll
+        for (int n = 0; n < N; ++n) {
+            const int node = min(first + n * WARPS, own - 1), low = row_start[node] - base, high = row_start[node + 1] - base;
+            sum[n] = 0;
+#pragma unroll
+            for (int e = 0; e < 15; e += 3) {
+                const int k = low + e + entry, there = min(k, high - 1);
+                const real product = blocks[9ll * there + lane % 9] * values[3 * __ldg(columns + there) + c];
+                sum[n] += lane < 27 && k < high ? product : 0;
+            }
+            for (int k = low + 15 + entry; k < high && lane < 27; k += 3)
+                sum[n] += blocks[9ll * k + lane % 9] * values[3 * __ldg(columns + k) + c];
+        }
+#pragma unroll
+        for (int n = 0; n < N; ++n) {
+            sum[n] += __shfl_down_sync(ALL, sum[n], 9) + __shfl_down_sync(ALL, sum[n], 18);  // lanes 0 to 8: entry (r, c)
+            sum[n] += __shfl_down_sync(ALL, sum[n], 1) + __shfl_down_sync(ALL, sum[n], 2);   // lanes 0, 3, 6: row r
+            sum[n] = __shfl_sync(ALL, sum[n], lane < 3 ? 3 * lane : 0);
+        }
     }
 
     // The values that A multiplies: those of exchange `number` + beta what they are.

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Ints = NDArray[np.int64]
-NODES_A_BLOCK = 4  # a body of few nodes is not spread over more thread blocks than this gives
+NODES_A_BLOCK = 8  # a body of few nodes is not spread over more thread blocks than this gives
 
 
 class Shares(NamedTuple):

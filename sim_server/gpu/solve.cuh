@@ -17,8 +17,9 @@ struct __align__(16) Piece {
     int keep;  // 2 valid + 1 where this block also leaves it for others (kind 0); entries from `valid` on are zero
 };
 
-// Eight rows of a part's matrix: `chunks` chunks of 8 rows x 32 columns.
-struct __align__(16) Tile { int chunk, x, chunks, out; };
+// Eight or sixteen rows of a part's matrix: `chunks` chunks of 8 rows x 32 columns from `chunk` on, then those of the other
+// eight rows. x: where the vector begins; out: where the rows go.
+struct __align__(16) Tile { int chunk, x, chunks, out, rows, unused[3]; };
 
 // What a thread block has of a plan: ranges of its lists.
 struct Part { int piece, pieces, tile, tiles, chunk, chunks, unused[2]; };
@@ -31,8 +32,8 @@ struct Plan {
                             // within the part; warps that share a tile
     const Piece* pieces;
     const Tile* tiles;
-    const int* boundary;
-    const int* slot_start;  // (size + 1,) contributions to each packed position
+    const int* index;       // (pieces, 32) of each entry: where it stands (kinds 1 and 2), or the first of the contributions
+                            // that come off it and, in the upper 8 bits, how many there are (kind 0)
     const int* target;      // where a contribution goes
     const int* place;       // (nodes,) packed position of a node
     int entries, unused;    // of the longest vector of a phase

@@ -43,6 +43,9 @@ SOLVE = np.dtype(
 )  # fmt: skip
 
 
+SPARED = 8  # multiprocessors that a step leaves to expansions beside it: one that needs all would wait for them to end
+
+
 def texts() -> str:
     """Of all that kernel texts may include: CuPy keeps compiled kernels by their own text and options alone."""
     found = sorted([*HERE.glob("**/*.cuh"), *HERE.glob("kernels/*.h")])
@@ -65,6 +68,7 @@ class Solver:
 
     bodies: host rows (BODY), one per body; whoever runs the loop uploads them, settings (the first SETTINGS bytes) and
     factor (the rest) apart. results: device ring (capacity, bodies) of RESULT. arrived: zero at launch.
+    spared: multiprocessors that a launch does not need.
     """
 
     def __init__(
@@ -78,8 +82,9 @@ class Solver:
         spans = np.array(ranges, np.int64)
         nodes = spans[:, 1] - spans[:, 0]
         self.threads, blocks = threads_and_blocks(nodes, processors)
-        self.grid = blocks * processors
-        share = shares(nodes, self.grid)
+        share = shares(nodes, blocks * (processors - SPARED))
+        self.grid = blocks * (processors - SPARED) if share.pooled else int(share.blocks.sum())
+        self.spared = processors - -(-self.grid // blocks)
         self.bodies = np.zeros(len(ranges), BODY)
         self.bodies["first"], self.bodies["nodes"] = spans[:, 0], nodes
         self.bodies["block"], self.bodies["blocks"] = share.first, share.blocks
