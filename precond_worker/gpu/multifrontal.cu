@@ -17,6 +17,9 @@ const int WIDTH = 64, CHUNK = 2, THREADS = 128;
 const int DEEP = 32;      // columns of two operands that are in shared memory at a time
 const int PITCH = 64 + 4;  // reals from one such column to the next: a warp's reads fall on different banks
 
+#define LANE (int(threadIdx.x) % 32)
+#define WARP (int(threadIdx.x) / 32)
+
 struct Front {
     Long at, value, child, map, split;  // see Plan
     int own, rows, stride, column;
@@ -87,18 +90,18 @@ assemble(const Front* fronts, const int* start, int count, const Front* all, con
         int below = c.rows - c.own;
         const real* from = there + c.at + (Long)(c.own + u) * c.stride + c.own;
         real* column = front + (Long)(3 * to[u / 3] + u % 3) * f.stride;
-        for (int r = u + lane; r < below; r += 128) {
-            real* entry[4];
-            real sum[4];
+        for (int r = u + lane; r < below; r += 256) {
+            real* entry[8];
+            real sum[8];
 #pragma unroll
-            for (int a = 0; a < 4; a++) {
+            for (int a = 0; a < 8; a++) {
                 int row = r + 32 * a;
                 bool in = row < below;
                 entry[a] = in ? column + 3 * to[row / 3] + row % 3 : 0;
                 sum[a] = in ? *entry[a] + from[row] : 0;
             }
 #pragma unroll
-            for (int a = 0; a < 4; a++)
+            for (int a = 0; a < 8; a++)
                 if (entry[a]) *entry[a] = sum[a];
         }
     }
@@ -107,78 +110,145 @@ assemble(const Front* fronts, const int* start, int count, const Front* all, con
 __device__ double rsqrt_of(double v) { return rsqrt(v); }
 __device__ float rsqrt_of(float v) { return 1 / sqrtf(v); }
 
+// Cholesky factor and inverse of 32 x 32 entries in shared memory by one warp, a row in each lane: column by column,
+// s holds what remains of A right of the current column and the inverse, its rows not yet divided by their pivots, left
+// of it. The result: L below the diagonal, the inverse transposed above it, 1 / diagonal in `reciprocal`.
+__device__ void eliminate(real* m, real* reciprocal, int active, int column, Status* status) {
+    int i = LANE;
+    real s[32], own = 1;
+#pragma unroll
+    for (int c = 0; c < 32; c++) s[c] = c <= i ? m[c * PITCH + i] : 0;
+#pragma unroll
+    for (int j = 0; j < 32; j++) {
+        if (j >= active) break;
+        if (i == j)
+#pragma unroll
+            for (int c = 0; c < j; c++) m[j * PITCH + c] = s[c];
+        real pivot = __shfl_sync(~0u, s[j], j);
+        if (!(pivot > 0)) {
+            if (i == 0) atomicMin(&status->pivot, column + j);
+            pivot = 1;
+        }
+        real r = rsqrt_of(pivot), l = i > j ? s[j] * r : 0;
+        if (i == j) own = r;
+        if (i >= j) m[j * PITCH + i] = i == j ? pivot * r : l;
+        __syncwarp();
+        real lr = l * r;
+        s[j] = i == j ? 1 : -lr;
+#pragma unroll
+        for (int c = j + 1; c < 32; c++) s[c] -= l * m[j * PITCH + c];
+#pragma unroll
+        for (int c = 0; c < j; c++) s[c] -= lr * m[j * PITCH + c];
+    }
+    __syncwarp();
+    reciprocal[i] = own;
+#pragma unroll
+    for (int c = 0; c < 32; c++)
+        if (c < i) m[i * PITCH + c] = s[c] * own;
+}
+
+// Entry [i][q] of the inverse of a factor that `eliminate` has left in m.
+__device__ real inverse_entry(const real* m, const real* reciprocal, int i, int q) {
+    return q < i ? m[i * PITCH + q] : q == i ? reciprocal[i] : 0;
+}
+
+// Of the factor and inverse in two halves of 32: [m .; under corner], 8 rows or columns for each warp.
+struct Halves {
+    real *m, *under, *corner, *reciprocal;
+    int first;
+
+    // under becomes the lower left quarter of the factor, and corner loses its product with itself.
+    __device__ void divide() {
+        real x[8] = {};
+        for (int q = 0; q < first + 8; q++) {
+            real v = under[q * PITCH + LANE];
+#pragma unroll
+            for (int a = 0; a < 8; a++) x[a] += v * inverse_entry(m, reciprocal, first + a, q);
+        }
+        __syncthreads();
+#pragma unroll
+        for (int a = 0; a < 8; a++) under[(first + a) * PITCH + LANE] = x[a], x[a] = 0;
+        __syncthreads();
+#pragma unroll 4
+        for (int q = 0; q < 32; q++) {
+            real v = under[q * PITCH + LANE];
+#pragma unroll
+            for (int a = 0; a < 8; a++) x[a] += v * under[q * PITCH + first + a];
+        }
+#pragma unroll
+        for (int a = 0; a < 8; a++)
+            if (first + a <= LANE) corner[(first + a) * PITCH + LANE] -= x[a];
+    }
+
+    // By warps 1 to 3: under times the inverse, into the place of the inverse's lower left quarter (transposed).
+    __device__ void multiply() {
+        real y[11] = {};
+        int top = 11 * (WARP - 1);
+#pragma unroll 2
+        for (int q = 0; q < 32; q++) {
+            real v = inverse_entry(m, reciprocal, q, LANE);
+#pragma unroll
+            for (int a = 0; a < 11; a++) y[a] += under[q * PITCH + min(top + a, 31)] * v;
+        }
+#pragma unroll
+        for (int a = 0; a < 11; a++)
+            if (top + a < 32) m[(32 + top + a) * PITCH + LANE] = y[a];
+    }
+
+    // ... and that times the inverse of the corner.
+    __device__ void finish() {
+        real x[8] = {};
+        for (int q = 0; q < first + 8; q++) {
+            real v = m[(32 + q) * PITCH + LANE];
+#pragma unroll
+            for (int a = 0; a < 8; a++) x[a] -= inverse_entry(corner, reciprocal + 32, first + a, q) * v;
+        }
+        __syncthreads();
+#pragma unroll
+        for (int a = 0; a < 8; a++) m[(32 + first + a) * PITCH + LANE] = x[a];
+    }
+};
+
 // Factorizes the leading w x w entries (w <= 64) of `block` in place, its inverse transposed above the diagonal.
-// Column by column; each thread keeps 4 x 8 entries of a matrix in registers that is what remains of A right of the
-// current column and the inverse left of it, and all share what the current column needs.
-__device__ void diagonal(real* block, int stride, int w, int column, Status* status) {
-    __shared__ real shared_column[2][WIDTH], shared_row[2][WIDTH];
-    int ti = threadIdx.x % 16, tc = threadIdx.x / 16;  // rows ti + 16 a, columns tc + 8 b
-    real s[4][8];
+// m: 64 columns of shared memory.
+__device__ void diagonal(real* m, real* block, int stride, int w, int column, Status* status) {
+    __shared__ real reciprocal[WIDTH];
+    Halves halves = {m, m + 32, m + 32 * PITCH + 32, reciprocal, 8 * WARP};
+    int r = threadIdx.x % 64, c0 = threadIdx.x / 64;
+    real v[WIDTH / 2];
 #pragma unroll
-    for (int a = 0; a < 4; a++)
+    for (int i = 0; i < WIDTH / 2; i++) {
+        int c = c0 + 2 * i;
+        v[i] = r < w && c <= r ? block[r + (Long)c * stride] : real(r == c);
+    }
 #pragma unroll
-        for (int b = 0; b < 8; b++) {
-            int i = ti + 16 * a, c = tc + 8 * b;
-            s[a][b] = i < w && c <= i ? block[i + (Long)c * stride] : real(i == c);
-        }
-#pragma unroll
-    for (int jb = 0; jb < 8; jb++)
+    for (int i = 0; i < WIDTH / 2; i++) m[(c0 + 2 * i) * PITCH + r] = v[i];
+    __syncthreads();
 #pragma unroll 1
-        for (int jc = 0; jc < 8; jc++) {
-            int j = 8 * jb + jc;
-            if (j >= w) break;
-            real *col = shared_column[j % 2], *row = shared_row[j % 2];
-            if (tc == jc)
-#pragma unroll
-                for (int a = 0; a < 4; a++) col[ti + 16 * a] = s[a][jb];
-            if (ti == j % 16)
-#pragma unroll
-                for (int b = 0; b < 8; b++) row[tc + 8 * b] = s[jb / 2][b];
-            __syncthreads();  // once a column: the two buffers are used in turn
-            real pivot = col[j];
-            if (!(pivot > 0)) {
-                if (threadIdx.x == 0) atomicMin(&status->pivot, column + j);
-                pivot = 1;
-            }
-            real r = rsqrt_of(pivot), l[4];
-#pragma unroll
-            for (int a = 0; a < 4; a++) l[a] = ti + 16 * a >= j ? col[ti + 16 * a] * r : 0;
-            if (tc == jc)
-#pragma unroll
-                for (int a = 0; a < 4; a++) {
-                    int i = ti + 16 * a;
-                    if (i >= j && i < w) block[i + (Long)j * stride] = i == j ? pivot * r : l[a];
-                }
-#pragma unroll
-            for (int b = 0; b < 8; b++) {
-                int c = tc + 8 * b;
-                real v = c > j ? col[c] * r : c < j ? row[c] * r : r;  // scaled row j of what is kept
-#pragma unroll
-                for (int a = 0; a < 4; a++) {
-                    int i = ti + 16 * a;
-                    if (i > j) s[a][b] = (c == j ? 0 : s[a][b]) - l[a] * v;
-                    if (i == j && c <= j) s[a][b] = v;
-                }
-            }
-        }
-#pragma unroll
-    for (int a = 0; a < 4; a++)
-#pragma unroll
-        for (int b = 0; b < 8; b++) {
-            int i = ti + 16 * a, c = tc + 8 * b;
-            if (c < i && i < w) block[c + (Long)i * stride] = s[a][b];
-        }
+    for (int half = 0; 32 * half < w; half++) {
+        if (WARP == 0)
+            eliminate(m + 32 * half * (PITCH + 1), reciprocal + 32 * half, w - 32 * half, column + 32 * half, status);
+        else if (half)
+            halves.multiply();
+        __syncthreads();
+        if (half)
+            halves.finish();
+        else if (w > 32)
+            halves.divide();
+        __syncthreads();
+    }
+#pragma unroll 8
+    for (int c = c0; c < w; c += 2)
+        if (r < w) block[r + (Long)c * stride] = m[c * PITCH + r];
 }
 
 extern "C" __global__ void __launch_bounds__(THREADS) factor(const Front* fronts, real* here, Status* status) {
+    __shared__ __align__(16) real work[2 * DEEP * PITCH];
     Front f = fronts[blockIdx.x];
-    diagonal(here + f.at, f.stride, min(WIDTH, f.own), f.column, status);
+    diagonal(work, here + f.at, f.stride, min(WIDTH, f.own), f.column, status);
 }
 
 // Tiles of 64 x 64 sums, 32 of them in each thread: where they stand, and adding a b^T of DEEP columns of a and b.
-#define LANE (int(threadIdx.x) % 32)
-#define WARP (int(threadIdx.x) / 32)
-
 template <class T> struct Product;
 
 template <> struct Product<double> {  // a warp has 32 x 32 sums, 4 x 4 squares of 8 x 8
@@ -235,28 +305,39 @@ template <> struct Product<float> {
 
 typedef Product<real> Tiles;
 
-// 64 rows of DEEP columns into shared memory; zeros outside of rows x columns.
+// 64 rows of DEEP columns into shared memory; zeros outside of rows x columns. Here and below reads come first, all of
+// them, then writes: a read that might follow a write to the same place would wait for it.
 __device__ void load(real* to, const real* from, int stride, int rows, int columns) {
     int r = threadIdx.x % 64, k = threadIdx.x / 64;
-#pragma unroll 16
-    for (int i = 0; i < DEEP; i += 2)
-        to[(i + k) * PITCH + r] = r < rows && i + k < columns ? from[r + (Long)(i + k) * stride] : 0;
+    real v[DEEP / 2];
+#pragma unroll
+    for (int i = 0; i < DEEP / 2; i++)
+        v[i] = r < rows && 2 * i + k < columns ? from[r + (Long)(2 * i + k) * stride] : 0;
+#pragma unroll
+    for (int i = 0; i < DEEP / 2; i++) to[(2 * i + k) * PITCH + r] = v[i];
 }
 
 // DEEP columns, from q0 on, of the inverse of a factorized diagonal block.
 __device__ void load_inverse(real* to, const real* block, int stride, int w, int q0) {
-    int k = threadIdx.x % DEEP, q = q0 + k;
-#pragma unroll 16
-    for (int c = threadIdx.x / DEEP; c < WIDTH; c += THREADS / DEEP) {
-        real v = 0;
-        if (c < w && q <= c) v = block[q + (Long)c * stride];
-        to[k * PITCH + c] = q == c && c < w ? 1 / v : v;
+    const int APART = THREADS / DEEP;
+    int k = threadIdx.x % DEEP, q = q0 + k, c0 = threadIdx.x / DEEP;
+    real v[WIDTH / APART];
+#pragma unroll
+    for (int i = 0; i < WIDTH / APART; i++) {
+        int c = c0 + APART * i;
+        v[i] = c < w && q < c ? block[q + (Long)c * stride] : 0;
     }
+    real pivot = c0 == 0 && q < w ? block[q + (Long)q * stride] : 1;
+#pragma unroll
+    for (int i = 0; i < WIDTH / APART; i++)
+        if (c0 + APART * i != q) to[k * PITCH + c0 + APART * i] = v[i];
+    if (c0 == 0) to[k * PITCH + q] = 1 / pivot;
 }
 
-extern "C" __global__ void __launch_bounds__(THREADS)
+extern "C" __global__ void __launch_bounds__(THREADS, 3)
 panel(const Front* fronts, const int* start, int count, int step, real* here) {
-    __shared__ __align__(16) real a[DEEP * PITCH], b[DEEP * PITCH];
+    __shared__ __align__(16) real work[2 * DEEP * PITCH];
+    real *a = work, *b = work + DEEP * PITCH;
     int index = locate(start, count, blockIdx.x);
     Front f = fronts[index];
     int d = WIDTH * step, w = min(WIDTH, f.own - d), top = d + w + 64 * (blockIdx.x - start[index]);
@@ -278,9 +359,10 @@ panel(const Front* fronts, const int* start, int count, int step, real* here) {
     }
 }
 
-extern "C" __global__ void __launch_bounds__(THREADS)
+extern "C" __global__ void __launch_bounds__(THREADS, 3)
 update(const Front* fronts, const int* start, int count, int step, real* here, Status* status) {
-    __shared__ __align__(16) real a[DEEP * PITCH], b[DEEP * PITCH];
+    __shared__ __align__(16) real work[2 * DEEP * PITCH];
+    real *a = work, *b = work + DEEP * PITCH;
     int index = locate(start, count, blockIdx.x);
     Front f = fronts[index];
     int number = blockIdx.x - start[index];  // tiles of a lower triangle, row by row
@@ -301,19 +383,29 @@ update(const Front* fronts, const int* start, int count, int step, real* here, S
     }
     real* tile = here + f.at + top + (Long)left * f.stride;
 #pragma unroll
-    for (int e = 0; e < 32; e++) {
-        int r = Tiles::row(e), c = Tiles::column(e);
-        if (r < rows && c < columns) tile[r + (Long)c * f.stride] -= sum[e];
+    for (int half = 0; half < 2; half++) {
+        real v[16];
+#pragma unroll
+        for (int e = 0; e < 16; e++) {
+            int r = Tiles::row(16 * half + e), c = Tiles::column(16 * half + e);
+            v[e] = r < rows && c < columns ? tile[r + (Long)c * f.stride] : 0;
+        }
+#pragma unroll
+        for (int e = 0; e < 16; e++) {
+            int r = Tiles::row(16 * half + e), c = Tiles::column(16 * half + e);
+            if (r < rows && c < columns) tile[r + (Long)c * f.stride] = v[e] - sum[16 * half + e];
+        }
     }
     if (number == 0 && base < f.own) {
         __syncthreads();
-        diagonal(tile, f.stride, min(WIDTH, f.own - base), f.column + base, status);
+        diagonal(work, tile, f.stride, min(WIDTH, f.own - base), f.column + base, status);
     }
 }
 
 // Columns of L, one warp each, to where the pattern has them.
 extern "C" __global__ void __launch_bounds__(192)
-store(const Front* fronts, const int* start, int count, const real* here, Value* values, Status* status) {
+store(const Front* fronts, const int* start, int count, const real* __restrict__ here, Value* __restrict__ values,
+      Status* status) {
     const Value tiny = sizeof(Value) == 4 ? Value(1.17549435e-38f) : Value(2.2250738585072014e-308);
     int index = locate(start, count, blockIdx.x);
     Front f = fronts[index];
@@ -322,6 +414,7 @@ store(const Front* fronts, const int* start, int count, const real* here, Value*
     const real* column = here + f.at + (Long)j * f.stride;
     Value* out = values + f.value + (Long)j * f.rows - (Long)j * (j - 1) / 2 - j;
     bool fine = true;
+#pragma unroll 8
     for (int i = j + threadIdx.x % 32; i < f.rows; i += 32) {
         Value v = column[i];
         out[i] = v;
