@@ -115,48 +115,56 @@ _TYPES = {"int": "i4", "double": "f8", "float": "f4"}
 
 @dataclass(frozen=True)
 class Argument:
-    """A member of a kernel's argument struct. dtype: of the array that a pointer points to, None for a number."""
+    """A member of a kernel's argument struct. dtype: of the array that a pointer points to, None for a number.
+
+    own: only the items of the kernel's domain touch it, each its row. constant: the kernel only reads it.
+    """
 
     name: str
     kind: str  # int, float or double
     dtype: np.dtype | None
+    own: bool = False
+    constant: bool = False
 
 
-def _members(text: str, struct: str, real: str) -> list[Argument]:
+def _members(text: str, struct: str, types: dict[str, str]) -> list[Argument]:
     body = re.search(rf"struct {struct} \{{(.*?)\n\}};", text, re.DOTALL)
     if body is None:
         raise CompileError(f"no struct {struct} in the kernel text")
     members: list[Argument] = []
     for line in body.group(1).splitlines():
-        member = re.fullmatch(r"\s*(?:const )?(\w+)(\*?) (\w+);.*", line)
+        member = re.fullmatch(r"\s*(const )?(?:own<(\w+)>|(\w+)(\*?)) (\w+);.*", line)
         if member is None:
             if line.split("//")[0].strip():
                 raise CompileError(f"struct {struct}: cannot read the member {line.strip()!r}")
             continue
-        kind, star, name = member.groups()
-        kind = real if kind == "real" else kind
-        members.append(Argument(name, kind, np.dtype(_TYPES[kind]) if star else None))
+        constant, own, kind, star, name = member.groups()
+        kind = types.get(own or kind, own or kind)
+        dtype = np.dtype(_TYPES[kind]) if star or own else None
+        members.append(Argument(name, kind, dtype, bool(own), bool(constant)))
     return members
 
 
 def arguments_of(
-    text: str, kernel: str, module: str, real: str, given: dict[str, Any]
+    text: str, kernel: str, module: str, types: dict[str, str], given: dict[str, Any], converts: bool = False
 ) -> tuple[list[tuple[Argument, Any]], str, str]:
     """The members of a kernel's struct in order, each with its argument; the struct's name; "", "MAILED_" or "SUM_".
 
+    types: what `real` and `local` stand for. converts: an array of float64 may stand for one of float32.
     Raises CompileError for an unknown kernel, TypeError where an argument does not fit the text.
     """
     found = re.search(rf"^(MAILED_|SUM_)?KERNEL\({kernel}, (\w+)[,)]", text, re.MULTILINE)
     if found is None:
         raise CompileError(f"no kernel {kernel} in {module}.cu")
-    members = _members(text, found.group(2), real)
+    members = _members(text, found.group(2), types)
     if set(given) != {m.name for m in members}:
         raise TypeError(f"{module}.{kernel} takes {[m.name for m in members]}, not {sorted(given)}")
     for m in members:
         value = given[m.name]
-        if m.dtype is not None and not (
-            isinstance(value, np.ndarray) and value.dtype == m.dtype and value.flags.c_contiguous
-        ):
+        if m.dtype is None:
+            continue
+        fits = [m.dtype, np.dtype("f8")] if converts and m.dtype.kind == "f" else [m.dtype]
+        if not (isinstance(value, np.ndarray) and value.dtype in fits and value.flags.c_contiguous):
             raise TypeError(f"{module}.{kernel}: {m.name} must be a contiguous array of {m.dtype}")
     return [(m, given[m.name]) for m in members], found.group(2), found.group(1) or ""
 
@@ -192,7 +200,9 @@ class Module:
 
     def bind(self, kernel: str, n: int, **arguments: Any) -> Launch:
         """Argument struct of `kernel` over `n` items; raises TypeError where an argument does not fit the text."""
-        fields, _, _ = arguments_of(self._text, kernel, self.name, self.real, {"n": n, **arguments})
+        fields, _, _ = arguments_of(
+            self._text, kernel, self.name, {"real": self.real, "local": self.real}, {"n": n, **arguments}
+        )
         layout = type(
             kernel,
             (ctypes.Structure,),
@@ -224,7 +234,7 @@ class Cpu:
         return module(path)
 
     @staticmethod
-    def keep(*hosts: np.ndarray) -> None:
+    def keep(*hosts: np.ndarray, exact: bool = False) -> None:
         """Arrays that stay for the whole run: nothing to do here."""
 
     @staticmethod

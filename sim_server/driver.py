@@ -105,7 +105,7 @@ class Driver:
 
     def _job(self, t: Track, step: int, values: NDArray[np.float64]) -> Job:
         name = t.body.name
-        return Job(name, 1, step, self._warped[name], values, self.solver.factor_precision)
+        return Job(name, 1, step, self._warped[name], values, self.solver.factor_dtype)
 
     def _take_up(self, source: FactorSource) -> None:
         for factor in source.poll():

@@ -38,7 +38,8 @@ class Simulation:
             self._build(scene, device)
 
     def _build(self, scene: Scene, device: str) -> None:
-        self.world = World(scene, _backend(device))
+        scene.solver.check_device(device)
+        self.world = World(scene, _backend(device, scene.solver.precision))
         self.effects = build_effects(scene, self.world)
         stencilled = [e for e in self.effects.values() if e.tets is not None]
         self.system = System(self.world, [e.tets for e in stencilled if e.tets is not None], self._warped())
@@ -132,11 +133,11 @@ def _building(device: str) -> AbstractContextManager[None]:
     return nullcontext()
 
 
-def _backend(device: str) -> Any:
+def _backend(device: str, precision: str) -> Any:
     if device == "gpu":
         from sim_server.gpu.device import Gpu
 
-        return Gpu()
+        return Gpu(precision)
     return Cpu()
 
 

@@ -3,8 +3,10 @@
 
 A is block CSR with 3x3 blocks over all nodes of the scene, both triangles, columns ascending; bodies do not couple, so
 a body's blocks are one range of it. Rows of fixed nodes hold their diagonal block alone (the identity). Effects add to
-    b (n, 3) [N s], diagonal (n,) [kg] and sums (upper blocks, 3, 3) [kg], all in the world frame;
-`turn` and `assemble` then take b and A into the material frame, where the solve happens (kernels/assemble.cu).
+    b (n, 3) [N s], diagonal (n,) [kg], block (n, 6) [kg]: upper triangle of the nodes' own blocks,
+    sums (blocks above the diagonal, 3, 3) [kg] and mean (n, 10): of the rotations' products of quaternions,
+all in the world frame; `turn` and `assemble` then take b and A into the material frame, where the solve happens
+(kernels/nodes.cu, kernels/assemble.cu).
 """
 
 from dataclasses import dataclass
@@ -23,7 +25,7 @@ class Stencil:
     """Where the elements of an effect stand in the system.
 
     corner_start (nodes + 1,), corners: slots 4 e + a of the elements at each node.
-    pair_start (upper blocks + 1,), pairs (k, 2): slots of the corners that couple in each block.
+    pair_start (blocks above the diagonal + 1,), pairs (k,): 16 e + 4 a + b, the corners of e that couple in each block.
     """
 
     corner_start: Ints
@@ -41,56 +43,60 @@ class System:
     def __init__(self, world: World, tets: list[Ints], warped: NDArray[np.float64]):
         n = world.nodes
         self.world, self.warped = world, warped
-        keys = [_couplings(t, world.free, n)[0] for t in tets]
-        diagonal = np.arange(n, dtype=np.int64) * (n + 1)
-        upper = np.unique(np.concatenate([diagonal, *keys]))
-        self.row, self.column = (part.astype(np.int32) for part in np.divmod(upper, n))
+        couplings = [_couplings(t, world.free, n) for t in tets]
+        above = np.unique(np.concatenate([np.zeros(0, np.int64), *(keys for keys, _ in couplings)]))
+        self.row, self.column = (part.astype(np.int32) for part in np.divmod(above, n))
         self._number(n)
-        self.stencils = [_stencil(t, world.free, n, upper) for t in tets]
+        self.stencils = [_stencil(t, c, n, above) for t, c in zip(tets, couplings, strict=True)]
 
-        self.sums = np.zeros((len(upper), 3, 3))
+        self.sums = np.zeros((len(above), 3, 3))
         self.values = np.zeros((len(self.columns), 3, 3))
         self.diagonal = np.zeros(n)
-        self.diagonal_block = np.flatnonzero(self.row == self.column).astype(np.int32)  # of each node, among the sums
+        self.block = np.zeros((n, 6))
         self.b = np.zeros((n, 3))
-        self.mean = np.zeros((n, 3, 3))
+        self.mean = np.zeros((n, 10))
         self.rotation = np.tile(np.eye(3), (n, 1, 1))
         self.b_material = np.zeros((n, 3))
         self.y = np.zeros((n, 3))
         self.dv = np.zeros((n, 3))
         self.clock = np.zeros(1)
+        world.backend.keep(self.clock, exact=True)
         world.backend.keep(*(a for o in (world, self) for a in vars(o).values() if isinstance(a, np.ndarray)))
 
     def _number(self, n: int) -> None:
-        """Places of the upper blocks and of their transposes in block CSR."""
-        off = self.row != self.column
-        rows = np.concatenate([self.row, self.column[off]])
-        columns = np.concatenate([self.column, self.row[off]])
-        order = np.lexsort((columns, rows))
-        place = np.empty(len(order), dtype=np.int32)
-        place[order] = np.arange(len(order), dtype=np.int32)
-        self.columns: Ints = columns[order].astype(np.int32)
-        self.row_start: Ints = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=n))]).astype(np.int32)
-        self.upper: Ints = place[: len(self.row)].copy()
-        self.lower: Ints = self.upper.copy()
-        self.lower[off] = place[len(self.row) :]
+        """Places in block CSR of the blocks above the diagonal, of their transposes and of the nodes' own."""
+        below = np.argsort(self.column, kind="stable")  # row after row of the lower triangle, columns ascending
+        lower = np.bincount(self.column, minlength=n)
+        upper = np.bincount(self.row, minlength=n)
+        start = np.concatenate([[0], np.cumsum(lower + 1 + upper)])
+        own = start[:-1] + lower
+        self.row_start: Ints = start.astype(np.int32)
+        self.own: Ints = own.astype(np.int32)
+        self.upper: Ints = _runs(self.row, own + 1, upper)
+        self.lower: Ints = np.empty_like(self.upper)
+        self.lower[below] = _runs(self.column[below], start[:-1], lower)
+        self.columns: Ints = np.empty(start[-1], dtype=np.int32)
+        self.columns[self.own] = np.arange(n, dtype=np.int32)
+        self.columns[self.upper], self.columns[self.lower] = self.column, self.row
 
     def start(self) -> Launch:
         """b = 0, diagonal = mass."""
         return self.world.backend.module("kernels/nodes.cu").bind(
-            "start", self.world.nodes, mass=self.world.mass, diagonal=self.diagonal, b=self.b, mean=self.mean
-        )
+            "start", self.world.nodes, mass=self.world.mass, diagonal=self.diagonal, b=self.b, block=self.block,
+            mean=self.mean,
+        )  # fmt: skip
 
     def finish(self) -> list[Launch]:
         """Everything into the material frame: A' = R^T A R, b' = R^T b, and the start of the solve."""
-        w, free = self.world, self.world.free
+        w = self.world
         turn = self.world.backend.module("kernels/nodes.cu").bind(
-            "turn", w.nodes, free=free, warped=self.warped, mean=self.mean, b=self.b, dv=self.dv,
-            rotation=self.rotation, b_material=self.b_material, y=self.y,
+            "turn", w.nodes, free=w.free, warped=self.warped, place=self.own, mean=self.mean, b=self.b,
+            diagonal=self.diagonal, block=self.block, dv=self.dv, rotation=self.rotation, b_material=self.b_material,
+            y=self.y, values=self.values,
         )  # fmt: skip
         assemble = self.world.backend.module("kernels/assemble.cu").bind(
-            "assemble", len(self.row), row=self.row, column=self.column, upper=self.upper, lower=self.lower, free=free,
-            diagonal=self.diagonal, sums=self.sums, rotation=self.rotation, values=self.values,
+            "assemble", len(self.row), row=self.row, column=self.column, upper=self.upper, lower=self.lower,
+            sums=self.sums, rotation=self.rotation, values=self.values,
         )  # fmt: skip
         return [turn, assemble]
 
@@ -111,24 +117,29 @@ class System:
         return self.values[self.row_start[first] : self.row_start[last]]
 
 
-def _couplings(tets: Ints, free: NDArray[np.float64], n: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Key row * n + column and slot pair of every coupling on or above the diagonal between free corners."""
+def _runs(group: Ints, begin: NDArray[np.int64], count: NDArray[np.int64]) -> Ints:
+    """Consecutive places for the members of each group, counted from begin[group]; groups ascend."""
+    first = np.cumsum(count) - count
+    return (np.arange(len(group)) - first[group] + begin[group]).astype(np.int32)
+
+
+def _couplings(tets: Ints, free: NDArray[np.float64], n: int) -> tuple[NDArray[np.int64], Ints]:
+    """Key row * n + column and pair 16 e + 4 a + b of every coupling above the diagonal between free corners."""
     keys, pairs = [], []
-    element = 4 * np.arange(len(tets), dtype=np.int64)
+    element = 16 * np.arange(len(tets), dtype=np.int32)
     for a in range(4):
         for b in range(4):
-            i, j = tets[:, a].astype(np.int64), tets[:, b].astype(np.int64)
-            here = (i <= j) & (free[i] > 0) & (free[j] > 0)
-            keys.append((i * n + j)[here])
-            pairs.append(np.stack([element + a, element + b], axis=1)[here])
+            i, j = tets[:, a], tets[:, b]
+            here = (i < j) & (free[i] > 0) & (free[j] > 0)
+            keys.append(i[here].astype(np.int64) * n + j[here])
+            pairs.append((element + np.int32(4 * a + b))[here])
     return np.concatenate(keys), np.concatenate(pairs)
 
 
-def _stencil(tets: Ints, free: NDArray[np.float64], n: int, upper: NDArray[np.int64]) -> Stencil:
+def _stencil(tets: Ints, couplings: tuple[NDArray[np.int64], Ints], n: int, above: NDArray[np.int64]) -> Stencil:
     corners = np.argsort(tets.ravel(), kind="stable").astype(np.int32)
     corner_start = np.concatenate([[0], np.cumsum(np.bincount(tets.ravel(), minlength=n))]).astype(np.int32)
-    keys, pairs = _couplings(tets, free, n)
-    block = np.searchsorted(upper, keys)
-    order = np.argsort(block, kind="stable")
-    pair_start = np.concatenate([[0], np.cumsum(np.bincount(block, minlength=len(upper)))]).astype(np.int32)
-    return Stencil(corner_start, corners, pair_start, pairs[order].astype(np.int32))
+    keys, pairs = couplings
+    order = np.lexsort((pairs, keys))
+    pair_start = np.searchsorted(keys[order], np.append(above, np.int64(n) * n)).astype(np.int32)
+    return Stencil(corner_start, corners, pair_start, pairs[order])

@@ -42,46 +42,58 @@ class Params(Parameters):
 
 
 class Corotational(Effect):
-    """Elements of all bodies that list the effect, one after another."""
+    """Elements of all bodies that list the effect, in the order of their first nodes.
+
+    tets (m, 4); gradients (9, m), lame (2, m): constants of the elements, one kind after another. What a step makes of
+    them: turn (m, 4) unit quaternions, spread (m, 4, 4) scaled rotated gradients and lambda / mu, push (m, 4, 3).
+    """
 
     def __init__(self, world: World, listed: list[tuple[Body, Any]]):
         self.world = world
         self.rotated = tuple(body for body, _ in listed)
-        self.tets: NDArray[np.int32] = np.ascontiguousarray(np.concatenate([body.tets for body, _ in listed]))
+        tets = np.concatenate([body.tets for body, _ in listed])
+        order = np.argsort(tets.min(axis=1), kind="stable")  # neighbours in memory, whatever the mesh's order
+        self.tets: NDArray[np.int32] = np.ascontiguousarray(tets[order])
         self.elastic = {body.index: _constants(body, params) for body, params in listed}  # young, poisson
-        young = np.concatenate([self.elastic[body.index][0] for body, _ in listed])
-        poisson = np.concatenate([self.elastic[body.index][1] for body, _ in listed])
-        volume, self.gradients = shape_gradients(world.rest, self.tets)
+        young = np.concatenate([self.elastic[body.index][0] for body, _ in listed])[order]
+        poisson = np.concatenate([self.elastic[body.index][1] for body, _ in listed])[order]
+        volume, gradients = shape_gradients(world.rest, self.tets)
+        self.gradients = np.ascontiguousarray(gradients.reshape(-1, 9).T)
         lam = young * poisson / ((1 + poisson) * (1 - 2 * poisson))
         mu = young / (2 * (1 + poisson))
-        self.lame = np.ascontiguousarray(np.stack([lam * volume, mu * volume], axis=1))
-        self.ratio = lam / mu
-        self.owner = np.repeat([body.index for body, _ in listed], [len(body.mesh.tets) for body, _ in listed])
+        self.lame = np.stack([lam * volume, mu * volume])
+        owner = np.repeat([body.index for body, _ in listed], [len(body.mesh.tets) for body, _ in listed])
+        self.owner = owner[order]
         m = len(self.tets)
-        self.rotation = np.tile(np.eye(3), (m, 1, 1))
-        self.spread, self.push = np.zeros((m, 4, 3)), np.zeros((m, 4, 3))
+        self.turn, self.spread, self.push = np.zeros((m, 4)), np.zeros((m, 4, 4)), np.zeros((m, 4, 3))
+        self._energy = np.zeros(m)
 
     def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
         assert stencil is not None
         w, m = self.world, len(self.tets)
         stiffening = w.dt * (w.dt + w.beta[self.owner])
-        elements = self.world.backend.module("effects/corotational.cu").bind(
+        elements = w.backend.module("effects/corotational.cu").bind(
             "elements", m, tets=self.tets, x=w.x, v=w.v, gradients=self.gradients, lame=self.lame,
-            stiffening=stiffening, h=w.dt, rotation=self.rotation, spread=self.spread, push=self.push,
+            stiffening=stiffening, h=w.dt, turn=self.turn, spread=self.spread, push=self.push,
         )  # fmt: skip
-        gather = self.world.backend.module("kernels/gather.cu").bind(
+        gather = w.backend.module("effects/corotational_nodes.cu").bind(
             "gather", w.nodes, start=stencil.corner_start, corners=stencil.corners, push=self.push,
-            rotation=self.rotation, b=system.b, mean=system.mean,
+            spread=self.spread, turn=self.turn, b=system.b, block=system.block, mean=system.mean,
         )  # fmt: skip
-        blocks = self.world.backend.module("effects/corotational_blocks.cu").bind(
+        blocks = w.backend.module("effects/corotational_blocks.cu").bind(
             "blocks", len(system.row), accumulate=int(accumulate), start=stencil.pair_start, pairs=stencil.pairs,
-            ratio=self.ratio, spread=self.spread, sums=system.sums,
+            spread=self.spread, sums=system.sums,
         )  # fmt: skip
         return [elements, gather, blocks]
 
+    @property
+    def rotation(self) -> NDArray[np.float64]:
+        """(m, 3, 3) nearest rotations of the elements at the last step, from `turn`."""
+        return rotation_matrices(self.world.backend.fetch(self.turn))
+
     def energy(self) -> float:
         """sum V (mu |S - I|^2 + lambda / 2 tr(S - I)^2) with S = R^T F [J]."""
-        energy = np.zeros(len(self.tets))
+        energy = self._energy
         self.world.backend.module("effects/corotational.cu").bind(
             "energy", len(self.tets), tets=self.tets, x=self.world.x, gradients=self.gradients, lame=self.lame,
             energy=energy,
@@ -94,6 +106,17 @@ def _constants(body: Body, params: Params) -> tuple[NDArray[np.float64], NDArray
         return region_values(params.young, params.poisson, body.centroids)
     except InputError as error:
         raise InputError(f"object {body.name!r}, effect corotational: {error}") from error
+
+
+def rotation_matrices(turn: NDArray[Any]) -> NDArray[np.float64]:
+    """(m, 3, 3) of unit quaternions (m, 4), w first."""
+    w, x, y, z = turn.astype(float).T
+    entries = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return np.stack(entries, axis=1).reshape(-1, 3, 3)
 
 
 def shape_gradients(

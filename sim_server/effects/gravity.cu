@@ -7,7 +7,7 @@ struct Gravity {
     const real* mass;  // (n,) [kg]
     const real* g;     // (3,) [m/s2]
     real h;            // [s]
-    real* b;           // (n, 3) in, out: += h m g [N s]
+    own<real> b;       // (n, 3) in, out: += h m g [N s]
 };
 
 KERNEL(gravity, Gravity) {

@@ -4,17 +4,17 @@
 #include "mat3.cuh"
 
 struct Drag {
-    int n;              // nodes
-    const real* mass;   // (n,) [kg]
-    const real* alpha;  // (n,) [1/s]
-    const real* v;      // (n, 3) [m/s]
-    real h;             // [s]
-    real* diagonal;     // (n,) in, out: += h alpha m [kg]
-    real* b;            // (n, 3) in, out: -= h alpha m v [N s]
+    int n;               // nodes
+    const real* mass;    // (n,) [kg]
+    const real* alpha;   // (n,) [1/s]
+    const real* v;       // (n, 3) [m/s]
+    real h;              // [s]
+    own<real> diagonal;  // (n, 1) in, out: += h alpha m [kg]
+    own<real> b;         // (n, 3) in, out: -= h alpha m v [N s]
 };
 
 KERNEL(drag, Drag) {
     number c = p.h * at(p.alpha, i) * at(p.mass, i);
-    put(p.diagonal, i, at(p.diagonal, i) + c);
+    row_put<1>(p.diagonal, i, 0, row_at<1>(p.diagonal, i, 0) + c);
     store3(p.b, i, load3(p.b, i) - c * load3(p.v, i));
 }

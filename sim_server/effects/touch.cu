@@ -4,26 +4,25 @@
 
 struct Apply {
     int n;                  // nodes touched
-    const int* node;        // (n,)
+    const int* node;        // (n,) ascending
     const int* first;       // (n + 1,) into the entries
     const int* entry;       // (first[n],) interaction of each entry
     const real* offset;     // (first[n], 3) of the node from the grabbed point [m]
     const real* share;      // (interactions,) 1 / nodes of the interaction
-    real* start;            // (interactions,) in, out: negative until its first step [s]
-    const real* duration;   // (interactions,) [s]
+    double* start;          // (interactions,) in, out: negative until its first step [s]
+    const double* duration; // (interactions,) [s]
     const real* force;      // (interactions, 3) push [N]
     const real* target;     // (interactions, 3) of a grab [m]
     const real* stiffness;  // (interactions,) of a grab; 0: a push [N/m]
     const real* limit;      // (interactions,) largest force of a grab [N]
-    const real* clock;      // (1,) [s]
+    const double* clock;    // (1,) [s]
     const real* x;          // (nodes, 3) [m]
     const real* v;          // (nodes, 3) [m/s]
     const real* free;       // (nodes,) 1, or 0 at fixed nodes
-    const int* block;       // (nodes,) place of a node's own block among the sums
-    const real* sums;       // (blocks, 3, 3) what elements have put into A, world frame [kg]
+    own<local> block;       // (nodes, 6) what elements have put into the node's own block of A, world frame [kg]
     real h;                 // [s]
-    real* diagonal;         // (nodes,) in, out: += h2 k [kg]
-    real* b;                // (nodes, 3) in, out: += h f - h2 k v [N s]
+    own<real> diagonal;     // (nodes, 1) in, out: += h2 k [kg]
+    own<real> b;            // (nodes, 3) in, out: += h f - h2 k v [N s]
 };
 
 // A grab is a spring, implicit while it is below its limit and a constant force above. What it will be is reckoned at the end
@@ -32,12 +31,11 @@ struct Apply {
 MAILED_KERNEL(apply, Apply) {
     int node = p.node[i];
     vec3 x = load3(p.x, node), v = load3(p.v, node), b = load3(p.b, node);
-    real diagonal = p.diagonal[node];
-    const real* K = p.sums + 9 * p.block[node];
-    real inertia = diagonal + (K[0] + K[4] + K[8]) / 3;
+    real diagonal = row_at<1>(p.diagonal, node, 0);
+    real inertia = diagonal + (row_at<6>(p.block, node, 0) + row_at<6>(p.block, node, 3) + row_at<6>(p.block, node, 5)) / 3;
     for (int e = p.first[i]; e < p.first[i + 1]; ++e) {
         int k = p.entry[e];
-        real now = p.clock[0];
+        double now = p.clock[0];
         if (p.start[k] < 0) p.start[k] = now;  // whoever comes first writes the same
         if (now + p.h / 2 >= p.start[k] + p.duration[k]) continue;  // so many whole steps, whatever the rounding
         real share = p.share[k];
@@ -57,5 +55,5 @@ MAILED_KERNEL(apply, Apply) {
     }
     if (p.free[node] == 0) return;
     store3(p.b, node, b);
-    p.diagonal[node] = diagonal;
+    row_put<1>(p.diagonal, node, 0, diagonal);
 }

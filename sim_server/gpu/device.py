@@ -81,7 +81,8 @@ def compiled(name: str, module: Any, kernel: str) -> Any:
 
 
 @cache
-def _processors() -> int:
+def processors() -> int:
+    """Multiprocessors of the device."""
     return int(cupy().cuda.Device().attributes["MultiProcessorCount"])
 
 
@@ -94,7 +95,7 @@ def texts() -> str:
 
 def shape(threads: int) -> tuple[tuple[int], tuple[int]]:
     """Grid and thread blocks for so many threads: small blocks spread a small launch over more processors."""
-    block = next((b for b in (32, 64) if threads <= 16 * b * _processors()), 128)
+    block = next((b for b in (32, 64) if threads <= 16 * b * processors()), 128)
     return (max(1, -(-threads // block)),), (block,)
 
 
@@ -104,9 +105,11 @@ class DeviceLaunch:
     def __init__(
         self, name: str, function: Any, params: NDArray[Any], items: int, mailed: bool, arrays: dict[str, Any]
     ):  # fmt: skip
-        self.name, self.items, self.mailed, self._arrays = name, items, mailed, arrays
+        self.name, self.items, self.mailed, self.arrays = name, items, mailed, arrays
         self._function, self.params = function, params
         self.text = self.struct = ""  # where it comes from
+        self.types: dict[str, str] = {}  # what its reals are
+        self.fields: list[Argument] = []
         self.sums = False  # its items sum over lists
         self._mail = cupy().asarray(params.reshape(1).view(np.uint8)) if mailed else None
 
@@ -118,7 +121,7 @@ class DeviceLaunch:
 
     def fetch(self, name: str) -> NDArray[Any]:
         """One of its arrays as kernels have left it, copied."""
-        return self._arrays[name].get()
+        return self.arrays[name].get()
 
     @property
     def mail_address(self) -> int:
@@ -130,12 +133,13 @@ class DeviceLaunch:
 class DeviceModule:
     """A kernel text compiled by NVRTC; raises CompileError."""
 
-    def __init__(self, path: str, gpu: "Gpu", real: str = "double", cooperative: bool = False):
+    def __init__(self, path: str, gpu: "Gpu", real: str = "double", cooperative: bool = False, local: str = ""):
         source = HERE / path
-        self.name, self.real, self._gpu, self._text = source.stem, real, gpu, source.read_text()
+        self.name, self._gpu, self._text = source.stem, gpu, source.read_text()
+        self._types = {"real": real, "local": local or real}
         self._module = cupy().RawModule(
             code=self._text,
-            options=("-std=c++17", f"-I{INCLUDE}", f"-Dreal={real}", texts()),
+            options=options(self._types),
             backend="nvrtc",
             enable_cooperative_groups=cooperative,
         )
@@ -146,17 +150,21 @@ class DeviceModule:
 
     def bind(self, kernel: str, n: int, **arguments: Any) -> DeviceLaunch:
         """As backend.Module.bind, with the twins of the arrays."""
-        fields, struct, form = arguments_of(self._text, kernel, self.name, self.real, {"n": n, **arguments})
+        fields, struct, form = arguments_of(
+            self._text, kernel, self.name, self._types, {"n": n, **arguments}, converts=True
+        )
         mailed = form == "MAILED_"
         params = np.zeros((), dtype=_layout(fields))
         twins = {}
         for field, value in fields:
             if field.dtype is not None:
-                twins[field.name] = self._gpu.twin(value, keep=not mailed)
+                twins[field.name] = self._gpu.twin(value, keep=not mailed, dtype=field.dtype)
                 value = twins[field.name].data.ptr
             params[field.name] = value
         launch = DeviceLaunch(f"{self.name}.{kernel}", self.function(kernel), params, n, mailed, twins)
         launch.text, launch.struct, launch.sums = self._text, struct, form == "SUM_"
+        launch.types = self._types
+        launch.fields = [field for field, _ in fields]
         return launch
 
 
@@ -165,31 +173,54 @@ def _layout(fields: list[tuple[Argument, Any]]) -> np.dtype:
     return np.dtype([(f.name, "u8" if f.dtype is not None else types[f.kind]) for f, _ in fields], align=True)
 
 
+def options(types: dict[str, str]) -> tuple[str, ...]:
+    """For the compiler; types: what `real` and `local` stand for."""
+    return ("-std=c++17", f"-I{INCLUDE}", *(f"-D{name}={kind}" for name, kind in types.items()), texts())
+
+
+PRECISIONS = {
+    "float64": {"real": "double", "local": "double"},
+    "mixed": {"real": "double", "local": "float"},
+    "float32": {"real": "float", "local": "float"},
+}
+"""What kernel texts call the reals of state and system, and those of elements (kernels/kernel.h)."""
+
+
 class Gpu:
-    """The current CUDA device."""
+    """The current CUDA device. precision: of the kernels, a key of PRECISIONS; host arrays are float64 in any case."""
 
     name = "gpu"
 
-    def __init__(self) -> None:
+    def __init__(self, precision: str = "float64") -> None:
         self.cp = cupy()
+        self.precision, self.types = precision, PRECISIONS[precision]
+        self._real = np.dtype("f4" if self.types["real"] == "float" else "f8")
         self._twins: dict[int, tuple[NDArray[Any], Any]] = {}
+        self._kept: dict[int, tuple[NDArray[Any], np.dtype | None]] = {}  # keeping an array keeps its id its own
         self._modules: dict[str, DeviceModule] = {}
         self.properties = self.cp.cuda.runtime.getDeviceProperties(self.cp.cuda.Device().id)
 
-    def twin(self, host: NDArray[Any], keep: bool = True) -> Any:
-        """The device array of a host array. keep: the same one from now on; else of a new one just a copy."""
-        known = self._twins.get(id(host))
-        if known is not None:
-            return known[1]
-        copy = self.cp.asarray(host)
-        if keep:
-            self._twins[id(host)] = (host, copy)  # keeping the host array keeps its id its own
+    def twin(self, host: NDArray[Any], keep: bool = True, dtype: np.dtype | None = None) -> Any:
+        """The device array of a host array. keep: the same one from now on; else of a new one just a copy.
+
+        dtype: of its entries; None: what it has been kept with, else `real` for float64.
+        """
+        if id(host) in self._twins:
+            known = self._twins[id(host)][1]
+            if dtype not in (None, known.dtype):
+                raise TypeError(f"an array of {host.shape} is {known.dtype} on the GPU and cannot be {dtype} too")
+            return known
+        kept = self._kept.get(id(host))
+        dtype = dtype or (kept and kept[1]) or (self._real if host.dtype == np.float64 else host.dtype)
+        copy = self.cp.asarray(host.astype(dtype, copy=False))
+        if keep or kept:
+            self._twins[id(host)] = (host, copy)
         return copy
 
-    def keep(self, *hosts: NDArray[Any]) -> None:
-        """Arrays that stay for the whole run have one twin each from now on."""
+    def keep(self, *hosts: NDArray[Any], exact: bool = False) -> None:
+        """Arrays that stay for the whole run: one twin each, made when it is first asked for. exact: in their type."""
         for host in hosts:
-            self.twin(host)
+            self._kept.setdefault(id(host), (host, host.dtype if exact else None))
 
     def fetch(self, host: NDArray[Any]) -> NDArray[Any]:
         """The array with what kernels have made of its twin."""
@@ -200,5 +231,5 @@ class Gpu:
     def module(self, path: str) -> DeviceModule:
         """A kernel text, compiled once."""
         if path not in self._modules:
-            self._modules[path] = DeviceModule(path, self)
+            self._modules[path] = DeviceModule(path, self, self.types["real"], local=self.types["local"])
         return self._modules[path]

@@ -3,20 +3,43 @@
 
 A launch says in its text what its items are (`int n;  // nodes`). Items of a domain touch only what is their own, and
 read other domains in the order elements, nodes, blocks; so all launches of a domain may run one after another in the
-thread that has the item. Sums over lists are shared between LANES threads of an item.
+thread that has the item, and arrays that they alone share (`own<T>`) stay in its registers.
+
+Sums over lists come first: `lanes` threads of an item share its entries and leave the sum in shared memory. Then one
+thread per item does the rest, so that the threads of a warp all have one. A launch whose arguments may be replaced
+finds out for each item whether it is among its own (`node`, ascending).
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from numpy.typing import NDArray
 
-from sim_server.backend import INCLUDE
-from sim_server.gpu.device import DeviceLaunch, compiled, cupy, shape, texts
+from sim_server.gpu.device import DeviceLaunch, compiled, cupy, options, processors
 
 DOMAINS = ("elements", "nodes", "blocks")
-LANES = {"elements": 1, "nodes": 8, "blocks": 4}
+
+
+class Shape(NamedTuple):
+    """Threads of a thread block, and how many of them share the sums of an item."""
+
+    threads: int
+    lanes: int
+
+
+SHAPES = {  # up to so many items per multiprocessor; few items are spread over many multiprocessors
+    "elements": {64: Shape(32, 1), 256: Shape(64, 1), 1 << 30: Shape(128, 1)},
+    "nodes": {16: Shape(64, 8), 64: Shape(128, 8), 1 << 30: Shape(256, 8)},
+    "blocks": {64: Shape(64, 4), 1 << 30: Shape(128, 4)},
+}
+
+
+def shape(name: str, items: int, multiprocessors: int) -> Shape:
+    """For so many items of a domain."""
+    return next(s for most, s in SHAPES[name].items() if items <= most * multiprocessors)
 
 
 def domain(launch: DeviceLaunch) -> str:
@@ -35,22 +58,21 @@ class End(NamedTuple):
 
 
 class Fused:
-    """Several launches over the same items as one."""
+    """Several launches over the same items as one. private: addresses of arrays that need no memory (`own`)."""
 
-    def __init__(self, launches: Sequence[DeviceLaunch], end: End | None = None):
+    def __init__(
+        self, launches: Sequence[DeviceLaunch], end: End | None = None, private: frozenset[int] = frozenset()
+    ):  # fmt: skip
         self.name = "+".join(launch.name for launch in launches)
-        self.items = launches[0].items
-        self._lanes = LANES[domain(launches[0])] if any(launch.sums for launch in launches) else 1
-        self._arguments: tuple[NDArray[Any], ...] = tuple(launch.params for launch in launches)
-        if end:
-            self._arguments += (end.params,)
+        self.items = next(launch.items for launch in launches if not launch.mailed)
+        sums = any(launch.sums for launch in launches)
+        self.shape = shape(domain(launches[0]) if sums else "elements", self.items, processors())
         self._launches = list(launches)  # keeps their arrays
-        self._module = cupy().RawModule(
-            code=source(launches, self._lanes, end),
-            options=("-std=c++17", f"-I{INCLUDE}", "-Dreal=double", texts()),
-            backend="nvrtc",
-        )
+        text = Text(launches, self.shape, end, private)
+        self._arguments = (np.int32(self.items), *text.values, *([end.params] if end else []))
+        self._module = cupy().RawModule(code=text.source, options=options(launches[0].types), backend="nvrtc")
         self._function = self.function("fused")
+        self._ends = end is not None
 
     def function(self, kernel: str) -> Any:
         """A kernel of the whole text."""
@@ -58,65 +80,152 @@ class Fused:
 
     def __call__(self) -> None:
         """Puts it onto the current stream."""
-        self._function(*shape(self.items * self._lanes), self._arguments)
+        if self.items or self._ends:
+            blocks = max(1, -(-self.items * self.shape.lanes // self.shape.threads))
+            self._function((blocks,), (self.shape.threads,), self._arguments)
 
 
-def source(launches: Sequence[DeviceLaunch], lanes: int, end: End | None = None) -> str:
-    """Text of the kernel `fused`: each text once in a namespace of its own, then one item of each, then the end."""
-    texts = {launch.text: f"text{k}" for k, launch in enumerate(launches)}
-    lines = ["#define ITEMS_ONLY", f"#define LANES_PER_ITEM {lanes}", '#include "polar.cuh"', SUM_BY_LANES]
-    for text, name in texts.items():
-        body = re.sub(r"^#(include|define WIDE).*$", "", text, flags=re.MULTILINE)
-        lines += [f"namespace {name} {{", body, "}"]
-    spaces = [texts[launch.text] for launch in launches]
-    arguments = ", ".join(f"const {s}::{x.struct} p{k}" for k, (s, x) in enumerate(zip(spaces, launches, strict=True)))
-    if end:
-        lines.append(end.text)
-        arguments += f", const {end.struct} end"
-    lines += [
-        f'extern "C" __global__ void fused({arguments}) {{',
-        "    int thread = blockIdx.x * blockDim.x + threadIdx.x, i = thread / LANES_PER_ITEM;",
-        "    int lane = thread % LANES_PER_ITEM;",
-        "    bool here = i < p0.n;",
-    ]
-    for k, (space, launch) in enumerate(zip(spaces, launches, strict=True)):
-        kernel = launch.name.split(".")[1]
-        if launch.sums:
-            lines.append(f"    SUM_BY_LANES({space}::{kernel}, p{k})")
-        else:
-            lines.append(f"    if (here && lane == 0) {space}::{kernel}_item(p{k}, i);")
-    if end:
-        lines.append(f"    {end.struct.lower()}(end);")
-    return "\n".join([*lines, "}"])
+class Text:
+    """The kernel `fused` of some launches: its source, and the values of its arguments after the number of items.
 
+    Each array is one argument, whatever launches have it, and no other overlaps it: that tells the compiler what it
+    may keep in registers from one launch to the next. private: addresses of arrays that need no memory at all.
+    """
 
-SUM_BY_LANES = """
-#define SUM_BY_LANES(name, p) {                                                               \\
-    real sum[name##_reals];                                                                   \\
-    for (int m = 0; m < name##_reals; ++m) sum[m] = 0;                                        \\
-    if (here) for (int k = p.start[i] + lane; k < p.start[i + 1]; k += LANES_PER_ITEM)        \\
-        name##_add(p, i, k, sum);                                                             \\
-    for (int step = LANES_PER_ITEM / 2; step; step >>= 1)                                     \\
-        for (int m = 0; m < name##_reals; ++m) sum[m] += __shfl_xor_sync(0xffffffffu, sum[m], step); \\
-    if (here && lane == 0) name##_put(p, i, sum);                                             \\
-}
-"""
+    def __init__(
+        self, launches: Sequence[DeviceLaunch], shape: Shape, end: End | None = None,
+        private: frozenset[int] = frozenset(),
+    ):  # fmt: skip
+        self.values: list[Any] = []
+        self._launches, self._private = launches, private
+        self._parameters: list[str] = []
+        self._setup: list[str] = []
+        self._names: dict[int, str] = {}
+        texts = {launch.text: f"text{k}" for k, launch in enumerate(launches)}
+        self._spaces = [texts[launch.text] for launch in launches]
+        self._written = {
+            launch.arrays[f.name].data.ptr
+            for launch in launches for f in launch.fields if f.dtype is not None and not f.constant
+        }  # fmt: skip
+        lines = ["#define ITEMS_ONLY", f"#define BLOCK_ITEMS {shape.threads // shape.lanes}"]
+        lines += ['#include "polar.cuh"', '#include "together.cuh"', '#include "sums.cuh"']
+        for text, name in texts.items():
+            body = re.sub(r"^#(include|define WIDE).*$", "", text, flags=re.MULTILINE)
+            lines += [f"namespace {name} {{", body, "}"]
+        body_lines = [*self._sums(shape), *self._items()]
+        if end:
+            lines.append(end.text)
+            self._parameters.append(f"const {end.struct} end")
+            body_lines.append(f"{end.struct.lower()}(end);")
+        heading = f'extern "C" __global__ void __launch_bounds__({shape.threads}) fused(int n'
+        parameters = "".join(f", {p}" for p in self._parameters)
+        lines += [f"{heading}{parameters}) {{", *self._setup, *body_lines, "}"]
+        self.source = "\n".join(lines)
+
+    def _each(self) -> Iterator[tuple[int, DeviceLaunch, str, str]]:
+        for k, (launch, space) in enumerate(zip(self._launches, self._spaces, strict=True)):
+            yield k, launch, space, launch.name.split(".")[1]
+
+    def _sums(self, shape: Shape) -> list[str]:
+        """Sets the arguments up and sums over the lists."""
+        for k, launch, space, _ in self._each():
+            if launch.mailed:
+                self._parameters.append(f"const {space}::{launch.struct}* mail{k}")
+                self.values.append(np.uint64(launch.mail_address))
+                self._setup.append(f"const int touched{k} = mail{k}->n;")
+            else:
+                self._setup += [f"{space}::{launch.struct} p{k};", f"p{k}.n = n;"]
+                self._setup += self._members(k, launch)
+        sums = [(k, space, kernel) for k, launch, space, kernel in self._each() if launch.sums]
+        if not sums:
+            return []
+        lines = ["constexpr int ROWS = BLOCK_ITEMS;"]
+        for k, space, kernel in sums:
+            lines += [f"constexpr int SIZE{k} = padded({space}::{kernel}_sums, {shape.lanes});"]
+            lines += [f"__shared__ local sums{k}[ROWS][SIZE{k} | 1];"]
+        lines += [f"{{ const int slot = threadIdx.x / {shape.lanes}, lane = threadIdx.x % {shape.lanes};"]
+        lines += ["const int i = blockIdx.x * ROWS + slot;"]
+        for k, space, kernel in sums:
+            lines += [
+                f"{{ local sum[SIZE{k}];",
+                f"for (int m = 0; m < SIZE{k}; ++m) sum[m] = 0;",
+                f"if (i < n) for (int k = p{k}.start[i] + lane, end = p{k}.start[i + 1]; k < end; k += {shape.lanes})",
+                f"    {space}::{kernel}_add(p{k}, i, k, sum);",
+                f"share_sum<SIZE{k}, {shape.lanes}>(sum, lane, sums{k}[slot]); }}",
+            ]
+        return [*lines, "}", "__syncthreads();"]
+
+    def _members(self, k: int, launch: DeviceLaunch) -> Iterator[str]:
+        for f in launch.fields[1:]:
+            if f.dtype is None:
+                self._parameters.append(f"{f.kind} p{k}_{f.name}")
+                kind = {"int": np.int32, "float": np.float32, "double": np.float64}[f.kind]
+                self.values.append(kind(launch.params[f.name]))
+                yield f"p{k}.{f.name} = p{k}_{f.name};"
+            elif not f.own:
+                yield f"p{k}.{f.name} = {self._array(launch, f.name, f.kind)};"
+
+    def _array(self, launch: DeviceLaunch, name: str, kind: str) -> str:
+        """The argument of the kernel that is this array."""
+        array = launch.arrays[name]
+        address = int(array.data.ptr)
+        if array.size == 0:
+            return "nullptr"
+        if address not in self._names:
+            self._names[address] = f"a{len(self._names)}"
+            const = "" if address in self._written else "const "
+            self._parameters.append(f"{const}{kind}* __restrict__ {self._names[address]}")
+            self.values.append(np.uint64(address))
+        return self._names[address]
+
+    def _items(self) -> list[str]:
+        """One item of each launch, by one thread."""
+        lines = ["const int i = blockIdx.x * BLOCK_ITEMS + threadIdx.x;", "if (threadIdx.x < BLOCK_ITEMS && i < n) {"]
+        rows: dict[int, str] = {}
+        for k, launch, space, kernel in self._each():
+            own = list(self._rows(launch, rows, lines))
+            if launch.mailed:
+                lines += [
+                    f"if (touched{k}) {{ const int here = place(mail{k}->node, touched{k}, i);",
+                    f"    if (here >= 0) {{ {space}::{launch.struct} p{k} = *mail{k};",
+                    *(f"        p{k}.{name}.item = {row};" for name, row in own),
+                    f"        {space}::{kernel}_item(p{k}, here); }} }}",
+                ]
+                continue
+            lines += [f"p{k}.{name}.item = {row};" for name, row in own]
+            last = f"_put(p{k}, i, sums{k}[threadIdx.x])" if launch.sums else f"_item(p{k}, i)"
+            lines.append(f"{space}::{kernel}{last};")
+        return [*lines, "}"]
+
+    def _rows(self, launch: DeviceLaunch, rows: dict[int, str], lines: list[str]) -> Iterator[tuple[str, str]]:
+        """Where the item's rows of the arrays of its own are, by member."""
+        for f in (f for f in launch.fields if f.own):
+            array = launch.arrays[f.name]
+            address = int(array.data.ptr)
+            width = int(np.prod(array.shape[1:]))
+            if address not in rows:
+                if address in self._private:
+                    rows[address] = f"row{len(rows)}"
+                    lines.append(f"{f.kind} {rows[address]}[{width}];")
+                else:
+                    rows[address] = f"{self._array(launch, f.name, f.kind)} + {width} * (long long)i"
+            yield f.name, rows[address]
 
 
 def fused(launches: Sequence[DeviceLaunch]) -> list[Any]:
-    """The launches in as few kernels as their domains allow; one that may be replaced at any time stays as it is, and
-    those before it before it."""
-    out: list[Any] = []
-    run: list[DeviceLaunch] = []
-    for launch in launches:
-        if launch.mailed or domain(launch) not in DOMAINS:
-            out += [*_by_domain(run), launch]
-            run = []
-        else:
-            run.append(launch)
-    return out + _by_domain(run)
-
-
-def _by_domain(launches: Sequence[DeviceLaunch]) -> list[Any]:
+    """The launches in as few kernels as their domains allow."""
+    if any(domain(launch) not in DOMAINS for launch in launches):
+        return list(launches)
     together = [[x for x in launches if domain(x) == d] for d in DOMAINS]
-    return [Fused(group) if len(group) > 1 or group[0].sums else group[0] for group in together if group]
+    return [Fused(group, None, _private(group, launches)) for group in together if group]
+
+
+def _private(group: Sequence[DeviceLaunch], launches: Sequence[DeviceLaunch]) -> frozenset[int]:
+    """Addresses of the arrays that are `own` to all launches that have them, all of this group."""
+    owned, others = set(), set()
+    for launch in launches:
+        inside = any(launch is x for x in group)
+        for f in launch.fields:
+            if f.dtype is not None:
+                (owned if f.own and inside else others).add(int(launch.arrays[f.name].data.ptr))
+    return frozenset(owned - others)

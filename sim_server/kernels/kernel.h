@@ -7,9 +7,13 @@
 // NVRTC turns it into a __global__ function, one thread per item; a C++ compiler into a loop over a range of items.
 // A text that defines WIDE first is written on `number` and `index`: scalars on a GPU, as many items at once as a vector
 // register holds on a CPU (past the end the last item is repeated; an item loads before it stores, so that does no harm).
-// SUM_KERNEL(name, Params, N) is for items that sum N reals over a list of entries p.start[i] .. p.start[i + 1]: the text has
+// `real` is the type of the state and of the system, `local` that of an element's own arithmetic and of what it hands on; a
+// GPU may have float there beside double (`local_number` beside `number`).
+// `own<T>` is an array (n, k) whose rows only their items touch, from launch to launch of a domain: where launches are put
+// together (gpu/fuse.py) such a row stays in registers.
+// SUM_KERNEL(name, Params, N) is for items that sum N locals over a list of entries p.start[i] .. p.start[i + 1]: the text has
 // name_add(p, i, k, sum) for entry k and name_put(p, i, sum) for what becomes of the sum; a GPU may share the entries of an
-// item between threads (gpu/fuse.py).
+// item between threads (gpu/fuse.py), so name_add reads nothing that items of its own domain write.
 // MAILED_KERNEL is the same for a launch whose arguments are replaced while the simulation runs: on a GPU it reads them from
 // device memory and takes any number of items.
 // Structs hold 4-byte ints, reals and pointers; the Python side reads their layout from this very text (backend.py), so that
@@ -19,16 +23,30 @@
 #ifndef real
 #define real double
 #endif
+#ifndef local
+#define local real
+#endif
 
 #ifdef __CUDACC_RTC__
 
 #define INLINE __device__ __forceinline__
 typedef real number;
+typedef local local_number;
 typedef int index;
+constexpr int LANES = 1;
+template <class T> using entry = T;  // one of the scalars in a number
+
+#ifndef BLOCK_ITEMS  // of a thread block; neighbouring threads have neighbouring items
+#define BLOCK_ITEMS 128
+#endif
+
 #ifdef ITEMS_ONLY  // the texts of several kernels are put together into one
+template <class T> struct own { T* item; };
 #define KERNEL(name, Params) INLINE void name##_item(const Params& p, index i)
-#define SUM_KERNEL(name, Params, N) static constexpr int name##_reals = N;
+#define MAILED_KERNEL(name, Params) KERNEL(name, Params)
+#define SUM_KERNEL(name, Params, N) static constexpr int name##_sums = N;
 #else
+template <class T> using own = T*;
 #define KERNEL(name, Params)                                                \
     __device__ __forceinline__ void name##_item(const Params& p, index i);  \
     extern "C" __global__ void name(const Params p) {                       \
@@ -36,8 +54,6 @@ typedef int index;
         if (i < p.n) name##_item(p, i);                                     \
     }                                                                       \
     __device__ __forceinline__ void name##_item(const Params& p, index i)
-#define SUM_KERNEL(name, Params, N) KERNEL(name, Params) { SUM_OF_ENTRIES(name, N) }
-#endif
 #define MAILED_KERNEL(name, Params)                                         \
     __device__ __forceinline__ void name##_item(const Params& p, index i);  \
     extern "C" __global__ void name(const Params* mail) {                   \
@@ -45,11 +61,15 @@ typedef int index;
         for (int i = blockIdx.x * blockDim.x + threadIdx.x; i < p.n; i += gridDim.x * blockDim.x) name##_item(p, i); \
     }                                                                       \
     __device__ __forceinline__ void name##_item(const Params& p, index i)
+#define SUM_KERNEL(name, Params, N) KERNEL(name, Params) { SUM_OF_ENTRIES(name, N) }
+#endif
 
 #else
 
 #include <cmath>
 #define INLINE static inline __attribute__((always_inline))
+template <class T> using own = T*;
+template <class T> using entry = real;
 // `begin`..`end` lets the caller share a launch between threads.
 #define KERNEL(name, Params)                                                          \
     INLINE void name##_item(const Params& p, index i);                                \
@@ -106,19 +126,26 @@ INLINE index items(int first, int) { return first; }
 using std::sqrt;
 
 #endif
+typedef number local_number;
 #endif
 
 #if !defined(WIDE) || defined(__CUDACC_RTC__)
-INLINE number at(const real* a, index i) { return a[i]; }
-INLINE index at(const int* a, index i) { return a[i]; }
-INLINE void put(real* a, index i, number v) { a[i] = v; }
+template <class T> INLINE T at(const T* a, index i) { return a[i]; }
+template <class T> INLINE void put(T* a, index i, T v) { a[i] = v; }
+#endif
+
+// Entry k of row i of an array (n, K).
+template <int K, class T> INLINE auto row_at(const T* a, index i, int k) { return at(a, K * i + k); }
+template <int K, class T, class N> INLINE void row_put(T* a, index i, int k, N v) { put(a, K * i + k, v); }
+#if defined(__CUDACC_RTC__) && defined(ITEMS_ONLY)
+template <int K, class T> INLINE T row_at(own<T> a, index, int k) { return a.item[k]; }
+template <int K, class T, class N> INLINE void row_put(own<T> a, index, int k, N v) { a.item[k] = v; }
 #endif
 
 #define SUM_OF_ENTRIES(name, N)                                                   \
-    real sum[N];                                                                  \
+    local sum[N];                                                                 \
     for (int m = 0; m < N; ++m) sum[m] = 0;                                       \
     for (int k = p.start[i]; k < p.start[i + 1]; ++k) name##_add(p, i, k, sum);   \
     name##_put(p, i, sum);
 
-INLINE number constant(real c) { return number{} + c; }
-INLINE number larger(number a, number b) { return a > b ? a : b; }
+template <class T> INLINE T larger(T a, T b) { return a > b ? a : b; }

@@ -3,36 +3,55 @@
 #pragma once
 #include "kernel.h"
 
-struct mat3 { number m[9]; };
-struct vec3 { number x, y, z; };
+template <class T> struct mat { T m[9]; };
+template <class T> struct vec { T x, y, z; };
+typedef mat<number> mat3;
+typedef vec<number> vec3;
+typedef mat<local_number> local_mat3;
+typedef vec<local_number> local_vec3;
 
-INLINE vec3 load3(const real* a, index i) { return {at(a, 3 * i), at(a, 3 * i + 1), at(a, 3 * i + 2)}; }
-INLINE void store3(real* a, index i, vec3 v) { put(a, 3 * i, v.x); put(a, 3 * i + 1, v.y); put(a, 3 * i + 2, v.z); }
-INLINE vec3 operator+(vec3 a, vec3 b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
-INLINE vec3 operator-(vec3 a, vec3 b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
-INLINE vec3 operator-(vec3 a) { return {-a.x, -a.y, -a.z}; }
-INLINE vec3 operator*(number s, vec3 a) { return {s * a.x, s * a.y, s * a.z}; }
-INLINE number dot(vec3 a, vec3 b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
-
-INLINE mat3 load9(const real* a, index i) {
-    return {{at(a, 9 * i), at(a, 9 * i + 1), at(a, 9 * i + 2), at(a, 9 * i + 3), at(a, 9 * i + 4),
-             at(a, 9 * i + 5), at(a, 9 * i + 6), at(a, 9 * i + 7), at(a, 9 * i + 8)}};
+template <class A> INLINE auto load3(A a, index i) {
+    return vec<decltype(row_at<3>(a, i, 0))>{row_at<3>(a, i, 0), row_at<3>(a, i, 1), row_at<3>(a, i, 2)};
 }
-INLINE void store9(real* a, index i, const mat3& s) {
-    put(a, 9 * i, s.m[0]); put(a, 9 * i + 1, s.m[1]); put(a, 9 * i + 2, s.m[2]);
-    put(a, 9 * i + 3, s.m[3]); put(a, 9 * i + 4, s.m[4]); put(a, 9 * i + 5, s.m[5]);
-    put(a, 9 * i + 6, s.m[6]); put(a, 9 * i + 7, s.m[7]); put(a, 9 * i + 8, s.m[8]);
+template <class A, class T> INLINE void store3(A a, index i, vec<T> v) {
+    row_put<3>(a, i, 0, v.x); row_put<3>(a, i, 1, v.y); row_put<3>(a, i, 2, v.z);
+}
+template <class T> INLINE vec<T> operator+(vec<T> a, vec<T> b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
+template <class T> INLINE vec<T> operator-(vec<T> a, vec<T> b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
+template <class T> INLINE vec<T> operator-(vec<T> a) { return {-a.x, -a.y, -a.z}; }
+template <class S, class T> INLINE vec<T> operator*(S s, vec<T> a) { return {s * a.x, s * a.y, s * a.z}; }
+template <class T> INLINE T dot(vec<T> a, vec<T> b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+
+// The same in another precision.
+template <class S, class T> INLINE vec<S> as(vec<T> a) { return {(S)a.x, (S)a.y, (S)a.z}; }
+template <class S, class T> INLINE mat<S> as(const mat<T>& a) {
+    mat<S> s;
+    for (int k = 0; k < 9; ++k) s.m[k] = (S)a.m[k];
+    return s;
 }
 
-INLINE vec3 row(const mat3& a, int r) { return {a.m[3 * r], a.m[3 * r + 1], a.m[3 * r + 2]}; }
-INLINE number trace(const mat3& a) { return a.m[0] + a.m[4] + a.m[8]; }
-INLINE mat3 transposed(const mat3& a) {
+template <class A> INLINE auto load9(A a, index i) {
+    mat<decltype(row_at<9>(a, i, 0))> s;
+    for (int k = 0; k < 9; ++k) s.m[k] = row_at<9>(a, i, k);
+    return s;
+}
+template <class A, class T> INLINE void store9(A a, index i, const mat<T>& s) {
+    for (int k = 0; k < 9; ++k) row_put<9>(a, i, k, s.m[k]);
+}
+
+template <class T> INLINE vec<T> row(const mat<T>& a, int r) { return {a.m[3 * r], a.m[3 * r + 1], a.m[3 * r + 2]}; }
+template <class T> INLINE T trace(const mat<T>& a) { return a.m[0] + a.m[4] + a.m[8]; }
+template <class T> INLINE mat<T> transposed(const mat<T>& a) {
     return {{a.m[0], a.m[3], a.m[6], a.m[1], a.m[4], a.m[7], a.m[2], a.m[5], a.m[8]}};
 }
+// From the entries 00, 01, 02, 11, 12, 22 of a symmetric one.
+template <class T> INLINE mat<T> symmetric(T xx, T xy, T xz, T yy, T yz, T zz) {
+    return {{xx, xy, xz, xy, yy, yz, xz, yz, zz}};
+}
 
-INLINE vec3 mul(const mat3& a, vec3 v) { return {dot(row(a, 0), v), dot(row(a, 1), v), dot(row(a, 2), v)}; }
+template <class T> INLINE vec<T> mul(const mat<T>& a, vec<T> v) { return {dot(row(a, 0), v), dot(row(a, 1), v), dot(row(a, 2), v)}; }
 
-INLINE mat3 mul(const mat3& a, const mat3& b) {
+template <class T> INLINE mat<T> mul(const mat<T>& a, const mat<T>& b) {
     return {{a.m[0] * b.m[0] + a.m[1] * b.m[3] + a.m[2] * b.m[6],
              a.m[0] * b.m[1] + a.m[1] * b.m[4] + a.m[2] * b.m[7],
              a.m[0] * b.m[2] + a.m[1] * b.m[5] + a.m[2] * b.m[8],
@@ -45,6 +64,6 @@ INLINE mat3 mul(const mat3& a, const mat3& b) {
 }
 
 // sum_a u_a (x) g_a with g_a the rows of g: the gradient of a linear tetrahedron's field from its edge differences
-INLINE mat3 outer3(vec3 u1, vec3 u2, vec3 u3, const mat3& g) {
-    return mul(mat3{{u1.x, u2.x, u3.x, u1.y, u2.y, u3.y, u1.z, u2.z, u3.z}}, g);
+template <class T> INLINE mat<T> outer3(vec<T> u1, vec<T> u2, vec<T> u3, const mat<T>& g) {
+    return mul(mat<T>{{u1.x, u2.x, u3.x, u1.y, u2.y, u3.y, u1.z, u2.z, u3.z}}, g);
 }

@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import Field, PlainSerializer, PlainValidator
 
+from sim_server.errors import InputError
 from sim_server.scene.parameters import Parameters, complaint
 
 PRECONDITIONERS = ("auto", "none", "jacobi", "block_jacobi", "cholesky")
@@ -54,6 +55,14 @@ def _warp(value: Any) -> bool | str:
     raise complaint('must be true, false or "auto"')
 
 
+Precision = Literal["float64", "mixed", "float32"]
+FactorPrecision = Literal["auto", "float16", "float32", "float64"]
+_ONLY = {  # what the devices have
+    "precision": {"cpu": ("float64",), "gpu": ("float64", "mixed", "float32")},
+    "factor_precision": {"cpu": ("auto", "float32", "float64"), "gpu": ("auto", "float16", "float32")},
+}
+
+
 class Solver(Parameters):
     """How each step's linear system is solved."""
 
@@ -64,7 +73,12 @@ class Solver(Parameters):
         default="auto", description="solve in the material frame"
     )
     update: Annotated[Update, PlainValidator(_update), PlainSerializer(str)] = Update("async")
-    factor_precision: Literal["float32", "float64"] = "float32"
+    precision: Precision = Field(
+        default="float64", description="of the kernels: mixed = elements in float32, the rest in float64"
+    )
+    factor_precision: FactorPrecision = Field(
+        default="auto", description="of the factor as applied; auto: float16 on a GPU, float32 on a CPU"
+    )
     budget: float = Field(default=0.0, ge=0, description="wall time per solve [s]; 0 = none")
     threads: int = Field(default=1, ge=1, le=1024)
     warm_start: bool = Field(default=True, description="start from the last step's dv")
@@ -74,3 +88,16 @@ class Solver(Parameters):
     update_floor_steps: int = Field(
         default=1, ge=1, le=1_000_000, description="fewest steps between two factors of an object"
     )
+
+    @property
+    def factor_dtype(self) -> Literal["float32", "float64"]:
+        """Of the values of L on the wire; what is applied is made from them."""
+        return "float64" if self.factor_precision == "float64" else "float32"
+
+    def check_device(self, device: str) -> None:
+        """Raises InputError for what the device ("cpu" or "gpu") does not have."""
+        for field, allowed in _ONLY.items():
+            value = getattr(self, field)
+            if value not in allowed[device]:
+                words = ", ".join(repr(a) for a in allowed[device])
+                raise InputError(f"solver.{field} = {value!r}: must be one of {words} on a {device.upper()}")

@@ -210,11 +210,56 @@ def test_a_process_without_kernels_compiles_none(tmp_path):
 def test_the_last_kernel_of_a_step_compiles_with_the_end_of_the_step(arch, tmp_path):
     if (library := nvrtc.library()) is None:
         pytest.skip("needs the package nvidia-cuda-nvrtc")
-    advance = SimpleNamespace(
-        text=(PACKAGE / "kernels/nodes.cu").read_text(), struct="Advance", name="nodes.advance", sums=False
-    )
+    advance = _launch("kernels/nodes.cu", "Advance", "nodes.advance")
     end = fuse.End((PACKAGE / "gpu/tick.cu").read_text(), "Tick", np.zeros(()))
     text = tmp_path / "last.cu"
-    text.write_text(fuse.source([advance], 1, end))  # type: ignore[list-item]
+    text.write_text(fuse.Text([advance], fuse.Shape(32, 1), end).source)  # type: ignore[list-item]
     code, said = nvrtc.compiled(library, text, [f"-arch={arch}", "-std=c++17", f"-I{backend.INCLUDE}"])
+    assert len(code) > 1000 and not said, said
+
+
+def _launch(path: str, struct: str, name: str, mailed: bool = False) -> SimpleNamespace:
+    """What fusing reads of a DeviceLaunch, its arrays by name at addresses of their own."""
+    text = (PACKAGE / path).read_text()
+    fields = backend._members(text, struct, {"real": "double", "local": "double"})
+    arrays = {
+        f.name: SimpleNamespace(data=SimpleNamespace(ptr=hash(f.name) & 0xFFFFF00), shape=(9, 3), size=27)
+        for f in fields if f.dtype is not None
+    }  # fmt: skip
+    params = np.zeros((), [(f.name, "u8" if f.dtype is not None else "f8") for f in fields])
+    sums = f"SUM_KERNEL({name.split('.')[1]}," in text
+    return SimpleNamespace(
+        text=text, struct=struct, name=name, sums=sums, mailed=mailed, fields=fields, arrays=arrays, params=params,
+        mail_address=64, items=9,
+    )  # fmt: skip
+
+
+NODES = [
+    ("kernels/nodes.cu", "Start", "nodes.start"), ("effects/corotational_nodes.cu", "Gather", "corotational_nodes.gather"),
+    ("effects/touch.cu", "Apply", "touch.apply", True), ("effects/gravity.cu", "Gravity", "gravity.gravity"),
+    ("kernels/nodes.cu", "Turn", "nodes.turn"),
+]  # fmt: skip
+BLOCKS = [
+    ("effects/corotational_blocks.cu", "Blocks", "corotational_blocks.blocks"),
+    ("kernels/assemble.cu", "Assemble", "assemble.assemble"),
+]
+
+
+@pytest.mark.parametrize(("real", "local"), [("double", "double"), ("double", "float"), ("float", "float")])
+@pytest.mark.parametrize("group", [NODES, BLOCKS], ids=["nodes", "blocks"])
+def test_launches_put_together_compile_in_every_precision(group, real, local, tmp_path):
+    """With rows in registers, and one argument for each array whatever launches have it."""
+    if (library := nvrtc.library()) is None:
+        pytest.skip("needs the package nvidia-cuda-nvrtc")
+    launches = [_launch(*given) for given in group]
+    for launch, (path, struct, *_) in zip(launches, group, strict=True):
+        launch.fields = backend._members((PACKAGE / path).read_text(), struct, {"real": real, "local": local})
+    private = fuse._private(launches, launches)  # type: ignore[arg-type]
+    shape = fuse.Shape(64, 4)
+    made = fuse.Text(launches, shape, None, private)  # type: ignore[arg-type]
+    assert private and made.source.count("[3];") >= len(private)
+    text = tmp_path / "together.cu"
+    text.write_text(made.source)
+    options = ["-arch=sm_90", "-std=c++17", f"-Dreal={real}", f"-Dlocal={local}", f"-I{backend.INCLUDE}"]
+    code, said = nvrtc.compiled(library, text, options)
     assert len(code) > 1000 and not said, said

@@ -27,9 +27,9 @@ print(json.dumps({
 
 OBJECT = '[[object]]\nname = "block"\nmesh = { bar = [2, 2, 2], size = [1, 1, 1] }\n[object.effects]\n'
 FRAME = {"before": ["nodes.start"], "after": ["nodes.turn", "assemble.assemble", "nodes.advance"]}
-ELASTIC = ["corotational.elements", "gather.gather", "corotational_blocks.blocks"]
+ELASTIC = ["corotational.elements", "corotational_nodes.gather", "corotational_blocks.blocks"]
 ALWAYS = ["assemble.cu", "loop.cpp", "nodes.cu"]
-ELASTIC_TEXTS = ["corotational.cu", "corotational_blocks.cu", "gather.cu"]
+ELASTIC_TEXTS = ["corotational.cu", "corotational_blocks.cu", "corotational_nodes.cu"]
 COROTATIONAL = "corotational = { young = 1e5, poisson = 0.3 }\n"
 
 SCENES = {

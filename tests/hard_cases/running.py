@@ -133,7 +133,7 @@ def _determinants(sim: Simulation) -> Reals:
     """det F of each element."""
     effect: Any = sim.effects["corotational"]
     corners = sim.world.x[effect.tets]
-    return np.linalg.det(np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2) @ effect.gradients)
+    return np.linalg.det(np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2) @ effect.gradients.T.reshape(-1, 3, 3))
 
 
 def _goal(case: Case, sim: Simulation, folder: Path) -> Reals:

@@ -146,9 +146,9 @@ def test_regions_make_elements_differ_and_none_may_be_left_out():
     assert np.array_equal(young, np.where(centre < 1, 4e6, 1e4))
     assert np.array_equal(poisson, np.where(centre < 1, 0.1, 0.4))
     volume = 2.0 / len(young)
-    np.testing.assert_allclose(elements.lame[:, 1], young / (2 * (1 + poisson)) * volume, rtol=1e-12)
+    np.testing.assert_allclose(elements.lame[1], young / (2 * (1 + poisson)) * volume, rtol=1e-12)
     np.testing.assert_allclose(
-        elements.lame[:, 0], young * poisson / ((1 + poisson) * (1 - 2 * poisson)) * volume, rtol=1e-12
+        elements.lame[0], young * poisson / ((1 + poisson) * (1 - 2 * poisson)) * volume, rtol=1e-12
     )
     with pytest.raises(InputError, match=r"'bar', effect corotational: element .* is in no region of young"):
         simulation(bar(young=[{"where": "X < 1", "young": 1e4}]))

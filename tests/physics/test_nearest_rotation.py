@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from sim_server.backend import module
+from sim_server.effects.corotational import rotation_matrices
 from tests.reference.corotational import nearest_rotation
 from tests.scenes import random_rotations
 
@@ -21,14 +22,14 @@ def kernel(F: NDArray, real: str = "double") -> NDArray:
     m, dtype = len(F), np.dtype("f8" if real == "double" else "f4")
     corners = np.zeros((m, 4, 3), dtype)
     corners[:, 1:] = np.swapaxes(F, 1, 2)
-    out = np.full((m, 3, 3), np.nan, dtype)
+    turn = np.full((m, 4), np.nan, dtype)
     module("effects/corotational.cu", real).bind(
         "elements", m, tets=np.arange(4 * m, dtype=np.int32).reshape(m, 4), x=corners.reshape(-1, 3),
-        v=np.zeros((4 * m, 3), dtype), gradients=np.tile(np.eye(3, dtype=dtype), (m, 1, 1)),
-        lame=np.ones((m, 2), dtype), stiffening=np.ones(m, dtype), h=0.01, rotation=out,
-        spread=np.zeros((m, 4, 3), dtype), push=np.zeros((m, 4, 3), dtype),
+        v=np.zeros((4 * m, 3), dtype), gradients=np.repeat(np.eye(3, dtype=dtype).reshape(9, 1), m, axis=1),
+        lame=np.ones((2, m), dtype), stiffening=np.ones(m, dtype), h=0.01, turn=turn,
+        spread=np.zeros((m, 4, 4), dtype), push=np.zeros((m, 4, 3), dtype),
     )()  # fmt: skip
-    return out.astype(float)
+    return rotation_matrices(turn)
 
 
 def with_singular_values(s1, s2, s3, seed: int = 1) -> NDArray:

@@ -13,27 +13,28 @@ def in_precision(real: str, sim) -> dict[str, np.ndarray]:
     """What the elements' kernels make of the present state, in float64 for comparison."""
     dtype, e, w, s = np.dtype("f8" if real == "double" else "f4"), elastic(sim), sim.world, sim.system
     m, stencil = len(e.tets), s.stencils[0]
-    x, v, gradients, lame, ratio = (a.astype(dtype) for a in (w.x, w.v, e.gradients, e.lame, e.ratio))
+    x, v, gradients, lame = (a.astype(dtype) for a in (w.x, w.v, e.gradients, e.lame))
     out = {
-        "rotation": np.zeros((m, 3, 3), dtype), "spread": np.zeros((m, 4, 3), dtype),
-        "push": np.zeros((m, 4, 3), dtype), "energy": np.zeros(m, dtype),
-        "sums": np.zeros(s.sums.shape, dtype), "b": np.zeros((w.nodes, 3), dtype),
-        "mean": np.zeros((w.nodes, 3, 3), dtype),
+        "turn": np.zeros((m, 4), dtype), "spread": np.zeros((m, 4, 4), dtype), "push": np.zeros((m, 4, 3), dtype),
+        "energy": np.zeros(m, dtype), "sums": np.zeros(s.sums.shape, dtype), "b": np.zeros((w.nodes, 3), dtype),
+        "block": np.zeros((w.nodes, 6), dtype), "mean": np.zeros((w.nodes, 10), dtype),
     }  # fmt: skip
     corotational = module("effects/corotational.cu", real)
     corotational.bind(
         "elements", m, tets=e.tets, x=x, v=v, gradients=gradients, lame=lame, stiffening=np.full(m, w.dt**2, dtype),
-        h=w.dt, rotation=out["rotation"], spread=out["spread"], push=out["push"],
+        h=w.dt, turn=out["turn"], spread=out["spread"], push=out["push"],
     )()  # fmt: skip
     corotational.bind("energy", m, tets=e.tets, x=x, gradients=gradients, lame=lame, energy=out["energy"])()
     module("effects/corotational_blocks.cu", real).bind(
-        "blocks", len(s.row), accumulate=0, start=stencil.pair_start, pairs=stencil.pairs, ratio=ratio,
-        spread=out["spread"], sums=out["sums"],
+        "blocks", len(s.row), accumulate=0, start=stencil.pair_start, pairs=stencil.pairs, spread=out["spread"],
+        sums=out["sums"],
     )()  # fmt: skip
-    module("kernels/gather.cu", real).bind(
+    module("effects/corotational_nodes.cu", real).bind(
         "gather", w.nodes, start=stencil.corner_start, corners=stencil.corners, push=out["push"],
-        rotation=out["rotation"], b=out["b"], mean=out["mean"],
+        spread=out["spread"], turn=out["turn"], b=out["b"], block=out["block"], mean=out["mean"],
     )()  # fmt: skip
+    sign = np.sign(out["turn"][:, :1])  # q and -q are one rotation
+    out["turn"] *= np.where(sign == 0, 1, sign)
     return {name: array.astype(float) for name, array in out.items()}
 
 
@@ -53,4 +54,5 @@ def test_double_precision_is_what_a_step_uses(tmp_path):
     found = in_precision("double", sim)
     assert np.array_equal(found["b"], sim.system.b)
     assert np.array_equal(found["sums"], sim.system.sums)
+    assert np.array_equal(found["block"], sim.system.block)
     assert found["energy"].sum() == sim.potential_energy()

@@ -92,7 +92,7 @@ def test_the_unchanged_scene_is_good(tmp_path):
         (swap("tolerance = 1e-6", "warp = 1"), "solver.warp = 1: must be true, false or \"auto\""),
         (swap("tolerance = 1e-6", 'update = "every-0"'), 'solver.update = \'every-0\': must be "never", "async", "every-N"'),
         (swap("tolerance = 1e-6", 'update = "lockstep"'), "solver.update = 'lockstep'"),
-        (swap("tolerance = 1e-6", 'factor_precision = "half"'), "factor_precision = 'half': must be 'float32' or 'float64'"),
+        (swap("tolerance = 1e-6", 'factor_precision = "half"'), "factor_precision = 'half': must be 'auto', 'float16', 'float32' or 'float64'"),
         (swap("tolerance = 1e-6", "warm_start = 1"), "solver.warm_start = 1: must be true or false"),
         (swap("tolerance = 1e-6", "budget = -1"), "solver.budget = -1: must be greater than or equal to 0"),
         (swap("[solver]", "[record]\nevery = 0\n[solver]"), "record.every = 0: must be greater than or equal to 1"),
