@@ -57,6 +57,16 @@ def test_tight_tolerances_are_reached_in_spite_of_float16():
     assert (g["status"] == SolveStatus.CONVERGED).all() and g["residual"].max() <= 1e-11
 
 
+@pytest.mark.parametrize("preconditioner", ["block_jacobi", "cholesky"])
+@pytest.mark.parametrize("bar", ["[3, 3, 10]", "[5, 5, 20]"])
+def test_a_tolerance_out_of_reach_ends_at_rounding(preconditioner, bar):
+    solver = [f"solver.preconditioner={preconditioner}", "solver.update=every-5", "solver.tolerance=1e-25"]
+    solver += ["solver.max_iterations=400", f"object.beam.mesh.bar={bar}"]
+    (_, g), _ = both(solver, 10)
+    assert (g["status"] == SolveStatus.MAX_ITERATIONS).all()
+    assert g["residual"].max() < 1e-11
+
+
 def test_bodies_of_one_scene_are_solved_together():
     (on_gpu, g), (on_cpu, c) = both(["solver.preconditioner=cholesky", "solver.update=lockstep-3"], 15, "four_beams")
     assert g["body"].tolist() == c["body"].tolist()

@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: MIT
+"""gpu/planned.py: the lists that the kernel reads, applied in NumPy as it applies them."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from sim_server.gpu.partition import tree_of
+from sim_server.gpu.plan import lay_out, plan
+from sim_server.gpu.planned import Planned
+from sim_server.gpu.shares import first_shares, halo, shares
+from tests.reference.partitioned import stored
+from tests.solver.test_partitioned_inverse import GRAPHS, graphs, system
+
+
+class HostGpu:
+    """Arrays stay where they are."""
+
+    class cp:
+        zeros = staticmethod(np.zeros)
+
+        @staticmethod
+        def asarray(array: NDArray) -> SimpleNamespace:
+            return SimpleNamespace(data=SimpleNamespace(ptr=1), host=array)
+
+
+def applied(planned: Planned, chunks: NDArray, scale: NDArray, r: NDArray) -> NDArray:
+    """z of r, by phases and thread blocks: apply.cuh without its words."""
+    p = planned.plan
+    a = {name: array.host for name, array in planned._arrays.items()}
+    at = (a["place"][:, None] + np.arange(3)).ravel()
+    residual = np.zeros(p.size + 32)
+    residual[at] = scale[at] * r
+    formed, solved = np.full(p.size + 32, np.nan), np.zeros(p.size + 32)
+    given = np.full(len(p.slots) + 32, np.nan)
+    for phase in range(p.phases):
+        forward, puts, keeps = phase < p.groups - 1, {}, {}
+        for block in range(p.blocks):
+            part, lists = a["parts"][block], a["lists"][block]
+            own_pieces = a["pieces"][part[0] : part[0] + part[1]]
+            where = a["index"][part[0] : part[0] + part[1]]
+            x = np.full(p.x_area, np.nan)
+            for k in range(lists[phase], lists[phase + 1]):
+                kind, begin, to, keep = own_pieces[k]
+                valid = np.arange(32) < keep >> 1
+                if kind == 0:
+                    v = residual[begin : begin + 32].copy()
+                    low, many = where[k] & 0xFFFFFF, where[k].view(np.uint32) >> 24
+                    v -= [given[first : first + count].sum() for first, count in zip(low, many, strict=True)]
+                    if keep & 1:
+                        keeps |= dict(zip(begin + np.arange(32), np.where(valid, v, 0), strict=True))
+                else:
+                    v = (formed if kind == 1 else solved)[where[k]]
+                x[to : to + 32] = np.where(valid, v, 0)
+            starts, split = lists[p.phases + 1 : 2 * p.phases + 2], lists[2 * p.phases + 2 + phase]
+            assert split >= 1
+            for t in range(starts[phase], starts[phase + 1]):
+                chunk, to, count, out, rows = a["tiles"][part[2] + t][:5]
+                assert part[4] <= chunk and chunk + (rows // 8) * count * p.planes <= part[4] + part[5]
+                for eight in range(rows // 8):
+                    tile = chunks[chunk + eight * count * p.planes :][:count]
+                    value = np.einsum("crk,ck->r", tile, x[to : to + 32 * count].reshape(count, 32))
+                    puts |= dict(zip(out + 8 * eight + np.arange(8), value, strict=True))
+        for i, v in keeps.items():
+            formed[i] = v
+        for i, v in puts.items():
+            if forward:
+                given[a["target"][i]] = v
+            else:
+                solved[i] = v
+    return scale[:-1][at] * solved[at]
+
+
+@graphs
+@pytest.mark.parametrize("blocks", [1, 3, 16])
+def test_the_kernels_lists_apply_the_inverse(graph, blocks):
+    s = system(graph)
+    tree = tree_of(s.pattern)
+    sizes = np.unique(tree.size).tolist()
+    for groups in range(1, min(4, len(sizes)) + 1):
+        thresholds = tuple(sizes[k * len(sizes) // groups] for k in range(1, groups))
+        p = lay_out(tree, thresholds, blocks)
+        chunks, scale = stored(s.pattern, s.factor, p, np.float64)
+        z = applied(Planned(HostGpu, p, 8), chunks, scale, s.r)  # type: ignore[arg-type]
+        assert np.linalg.norm(z - s.z) <= 1e-11 * np.linalg.norm(s.z)
+
+
+def test_tiles_of_one_warp_each_and_of_several():
+    s = system(GRAPHS["bar"])
+    for blocks, warps in ((1, 2), (16, 8), (132, 8)):
+        planned = Planned(HostGpu, plan(s.pattern, blocks), warps)  # type: ignore[arg-type]
+        lists = planned._arrays["lists"].host
+        phases = planned.plan.phases
+        count, split = np.diff(lists[:, phases + 1 : 2 * phases + 2]), lists[:, 2 * phases + 2 :]
+        shared = split > 1
+        assert (count * split <= 64)[shared].all() and (16 * count <= 32 * warps)[shared].all()
+
+
+def test_thread_blocks_are_shared_out_by_size():
+    few = shares(np.array([4840, 720, 160]), 124)
+    assert few.pooled == 0 and few.blocks.sum() <= 124 and (few.blocks >= 1).all()
+    assert few.blocks[0] > few.blocks[1] > few.blocks[2]
+    assert few.first.tolist() == [0, few.blocks[0], few.blocks[0] + few.blocks[1]]
+    many = shares(np.r_[np.full(300, 160), 20000], 124)
+    assert many.pooled == 300 and many.order[0] == 300 and many.blocks[300] > 8
+    assert many.blocks[300] < 124, "some are left for the others"
+    alike = shares(np.full(1024, 720), 248)
+    assert alike.pooled == 1024 and (alike.first == -1).all()
+
+
+@pytest.mark.parametrize("counts", [[1], [3], [7, 2]])
+def test_each_thread_block_knows_the_nodes_that_its_rows_read(counts):
+    sizes = [216, 120][: len(counts)]
+    graphs_ = [GRAPHS["bar"], GRAPHS["two bars"]][: len(counts)]
+    offset = np.cumsum([0, *sizes])
+    columns = np.concatenate([np.asarray(g[1]) + o for g, o in zip(graphs_, offset, strict=False)])
+    starts = [np.asarray(g[0], np.int64) for g in graphs_]
+    row_start = np.concatenate([starts[0], *(s[1:] + starts[0][-1] for s in starts[1:])])
+    ranges = np.stack([offset[:-1], offset[1:]], axis=1)
+    seen = halo(ranges, np.array(counts), row_start, columns)
+    rows = 0
+    for share in seen.shares:
+        low = ranges[share["body"], 0]
+        nodes = seen.nodes[share["halo_first"] :][: share["halo"]] + low
+        own = low + share["begin"] + np.arange(share["own"])
+        blocks = slice(share["block_first"], share["block_first"] + share["blocks"])
+        assert nodes[: share["own"]].tolist() == own.tolist() and len(set(nodes.tolist())) == len(nodes)
+        assert (nodes[seen.local[blocks]] == columns[blocks]).all()
+        rows += share["own"]
+    assert rows == offset[-1]
+    given = shares(np.array(sizes), 12)
+    table = first_shares(given, halo(ranges, given.blocks, row_start, columns), 12)
+    assert sorted(table[table >= 0].tolist()) == list(range(given.blocks.sum()))
