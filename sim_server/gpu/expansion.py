@@ -62,6 +62,7 @@ class Expansion:
         self._tasks = [[cp.asarray(t) for t in (b.diagonal, b.finish, *b.merges)] for b in made.batches]
         self._workspace = workspace(cp.cuda.Device().id)
         self._workspace.reserve(made.room, HEAD + 4 * self._nonzeros)
+        self._functions = {name: gpu.module("gpu/expansion.cu").function(name) for name in KERNELS}
         self._graphs: dict[int | None, Any] = {}
         self._generation = -1
 
@@ -99,9 +100,12 @@ class Expansion:
             stream = self._workspace.stream
             with stream:
                 stream.begin_capture()
-                for number, batch in enumerate(self._layout.batches):
-                    self._batch(number, batch, limit)
-                self._graphs[limit] = stream.end_capture()
+                try:
+                    for number, batch in enumerate(self._layout.batches):
+                        self._batch(number, batch, limit)
+                finally:
+                    graph = stream.end_capture()
+                self._graphs[limit] = graph
         return self._graphs[limit]
 
     def _batch(self, number: int, batch: Batch, limit: int | None) -> None:
@@ -132,7 +136,7 @@ class Expansion:
         room = self._gpu.properties["sharedMemPerBlockOptin"] // max(1, shared)
         groups = min(large, room) if limit else small
         blocks = min(-(-tasks // groups), limit or tasks)
-        function = self._gpu.module("gpu/expansion.cu").function(name)
+        function = self._functions[name]
         if groups * shared > 48 << 10:
             function.max_dynamic_shared_size_bytes = groups * shared
         function((blocks,), (groups * threads,), arguments, shared_mem=groups * shared)
