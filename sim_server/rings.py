@@ -14,12 +14,13 @@ Reals = NDArray[np.float64]
 class Reports:
     """Base of the engines. loop: a ctypes structure with the fields of layouts.Rings.
 
-    records: room for so many, four steps at least. frames: memory (capacity, 2, nodes, 3) for x and v of frames.
+    records: room for so many, four steps at least. frames: memory (capacity, 2, nodes, 3) for x and v of frames, in the
+    type that the device has them in.
     """
 
     records_dtype = RECORD
 
-    def __init__(self, loop: Any, bodies: int, dt: float, records: int, frames: Reals):
+    def __init__(self, loop: Any, bodies: int, dt: float, records: int, frames: NDArray[Any]):
         self.loop = loop
         self._records = np.zeros(max(records, 4 * bodies), RECORD)
         self._frames = frames
@@ -47,6 +48,7 @@ class Reports:
         out = []
         for k in range(tail, head):
             slot = k % len(self._frame_steps)
-            out.append((int(self._frame_steps[slot]), self._frames[slot, 0].copy(), self._frames[slot, 1].copy()))
+            x, v = (part.astype(np.float64) for part in self._frames[slot])  # copies
+            out.append((int(self._frame_steps[slot]), x, v))
             self.loop.frame_tail = k + 1
         return out

@@ -29,7 +29,7 @@ struct Part {
 
 struct Column {                      // of L
     long long value, row;            // its first value, and that value's place among the rows
-    int length, part, local, unused; // local: in the part
+    int length, part, within, unused; // within: in the part
 };
 
 struct Task { int part, i, j, end; }; // tile in units of 64; end: of the first of two merged runs
@@ -59,7 +59,7 @@ KERNEL_OF(1024) scatter(const Part* parts, const Column* columns, int first, int
     for (int c = first + warp.first; c < last; c += warp.step) {
         const Column column = columns[c];
         const Part part = parts[column.part];
-        float* row = workspace + part.g + (long long)column.local * part.pitch_g;
+        float* row = workspace + part.g + (long long)column.within * part.pitch_g;
         const float* value = values + column.value;
         const int* to = place + column.row;
 #pragma unroll 4

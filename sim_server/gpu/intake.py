@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 from numpy.typing import NDArray
 
 from protocol.factor import FactorPattern
+from sim_server.backend import CompileError
 from sim_server.gpu.device import Gpu, no_memory_left
 from sim_server.gpu.loop import DeviceLoop, Mailbox
 from sim_server.gpu.solver import SETTINGS
@@ -114,7 +115,7 @@ class Intake:
         track = self._tracks[body]
         try:
             made = self._made(body, pattern, values, step)
-        except ValueError as error:
+        except (ValueError, CompileError) as error:
             self._tell(track, str(error))
             return
         except Exception as error:

@@ -118,7 +118,7 @@ class DeviceLoop(Reports):
 
     row_start: of A. ranges: nodes [first, last) of each body. mailboxes: (device address, bytes) of each.
     results, stamps: host memory (CAPACITY, bodies) of RESULT and (CAPACITY,) of STAMP that the steps write to. clock:
-    host array (1,). real: type of the values of A. values, x, v: device addresses.
+    host array (1,). real: of values, x and v on the device, whose addresses these are.
     """
 
     def __init__(
@@ -129,7 +129,8 @@ class DeviceLoop(Reports):
         self._device, self._ranges, bodies, nodes = device, ranges, len(ranges), len(row_start) - 1
         self._native = library()
         loop = layouts.Loop()
-        frames = device.pinned(FRAMES * 48 * nodes).view(np.float64).reshape(FRAMES, 2, nodes, 3)
+        frame = 3 * nodes * np.dtype(real).itemsize
+        frames = device.pinned(FRAMES * 2 * frame).view(real).reshape(FRAMES, 2, nodes, 3)
         super().__init__(loop, bodies, dt, records, frames)
         self._box = (layouts.Mailbox * max(len(mailboxes), 1))()
         for box, (target, size) in zip(self._box, mailboxes, strict=False):
@@ -147,8 +148,8 @@ class DeviceLoop(Reports):
         for name, address in addresses.items():
             setattr(loop, name, address)
         loop.capacity, loop.batch, loop.many, loop.span, loop.poll = CAPACITY, BATCH, MANY, SPAN, POLL
-        loop.frame_bytes, loop.clock, loop.matrix_step = 24 * nodes, clock.ctypes.data, -1
-        loop.pictures = device.memory(PICTURES * 48 * nodes)
+        loop.frame_bytes, loop.clock, loop.matrix_step = frame, clock.ctypes.data, -1
+        loop.pictures = device.memory(PICTURES * 2 * frame)
         loop.results, loop.stamps = results.ctypes.data, stamps.ctypes.data
         self._written = (results, stamps, clock)
         self._pinned = self._events_and_memory(loop, sum(-(-size // 16) * 16 for _, size in mailboxes))

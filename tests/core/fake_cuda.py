@@ -140,10 +140,10 @@ class FakeScene:
     """A loop over `bodies` bodies of two nodes with one block of A a node. Step k (from 0) leaves x = k + 1, v = -k,
     A = k; the settings of a body (one int64) come back as its iterations, its factor (one int64) as its factor_step."""
 
-    def __init__(self, bodies: int = 1, records: int = 8192):
+    def __init__(self, bodies: int = 1, records: int = 8192, real: str = "f8"):
         nodes = 2 * bodies
         self.device = device = FakeDevice()
-        self.x, self.v, self.values = np.zeros((nodes, 3)), np.zeros((nodes, 3)), np.zeros((nodes, 3, 3))
+        self.x, self.v, self.values = (np.zeros((nodes, *rest), real) for rest in ((3,), (3,), (3, 3)))
         self.settings, self.factor = np.zeros(bodies, np.int64), np.zeros(bodies, np.int64)
         self.argument = np.zeros(1, np.int64)
         self.results, self.stamps = np.zeros((CAPACITY, bodies), RESULT), np.zeros(CAPACITY, STAMP)
@@ -153,7 +153,8 @@ class FakeScene:
         addresses = {n: getattr(self, n).ctypes.data for n in ("x", "v", "values")}
         self.loop = DeviceLoop(
             device, [(2 * k, 2 * k + 2) for k in range(bodies)], np.arange(nodes + 1, dtype=np.int32), 0.5,
-            [*boxes, (self.argument.ctypes.data, 8)], self.results, self.stamps, self.clock, records, **addresses,
+            [*boxes, (self.argument.ctypes.data, 8)], self.results, self.stamps, self.clock, records,
+            real, **addresses,
         )  # fmt: skip
         device.graphs = {7: lambda: self._steps(1), 8: lambda: self._steps(MANY)}
         device.graphs |= {9: lambda: self._steps(1, True), 10: lambda: self._steps(MANY, True)}

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
+from sim_server.backend import CompileError
 from sim_server.gpu import intake as module
 from sim_server.gpu.intake import Intake
 from tests.core.fake_cuda import FakeScene
@@ -156,7 +157,9 @@ def test_settled_means_used_by_the_next_step_even_if_others_wait(parts):
     assert len(maker.targets) <= 2
 
 
-@pytest.mark.parametrize("error", [ValueError("not by nodes"), NoMemory("Out of memory allocating 5,000 bytes")])
+@pytest.mark.parametrize(
+    "error", [ValueError("not by nodes"), NoMemory("Out of memory allocating 5,000 bytes"), CompileError("x.cu(3): no")]
+)
 def test_a_factor_that_does_not_fit_leaves_what_is_there_and_is_told_once(parts, caplog, error):
     scene, maker, intake = parts
     post(intake, 5)

@@ -152,8 +152,9 @@ def test_what_mail_points_to_lives_until_the_device_is_done_with_it():
     assert scene.seen == [1, 21, 21, 21, 50]
 
 
-def test_frames_are_the_states_of_their_steps():
-    scene = FakeScene()
+@pytest.mark.parametrize("real", ["f4", "f8"])
+def test_frames_are_the_states_of_their_steps(real):
+    scene = FakeScene(real=real)
     scene.loop.loop.frame_every = 3
     scene.loop.run(14)
     frames = scene.loop.frames()
@@ -161,6 +162,7 @@ def test_frames_are_the_states_of_their_steps():
     for step, x, v in frames:
         assert (x == step).all()
         assert (v == 1 - step).all()
+        assert x.dtype == v.dtype == np.float64
     assert scene.loop.frames() == []
 
 
@@ -197,8 +199,9 @@ def test_records_that_nobody_fetches_are_dropped_by_whole_steps_and_counted():
     assert len(kept) + scene.loop.loop.records_dropped == 120
 
 
-def test_matrices_are_those_of_the_step_after_the_request_in_all_bodies():
-    scene = FakeScene(bodies=3)
+@pytest.mark.parametrize("real", ["f4", "f8"])
+def test_matrices_are_those_of_the_step_after_the_request_in_all_bodies(real):
+    scene = FakeScene(bodies=3, real=real)
     scene.loop.run(20)
     targets = [np.full((2, 3, 3), np.nan) for _ in range(2)]
     scene.loop.request_matrix(0, targets[0])

@@ -89,6 +89,25 @@ def test_matrices_and_frames_that_come_home_beside_the_steps_are_of_their_step()
         assert np.array_equal(v, world.v)
 
 
+@pytest.mark.parametrize("precision", ["mixed", "float32"])
+def test_frames_and_matrices_of_less_precise_runs_come_home_as_float64(precision):
+    sim, exact = on_gpu(f"solver.precision={precision}", "solver.tolerance=1e-4"), on_gpu()
+    target = np.zeros_like(sim.system.values)
+    sim.engine.loop.frame_every = 2
+    sim.engine.request_matrix(0, target)
+    sim.engine.run(4)
+    exact.engine.assemble()
+    first = exact.system.values.copy()
+    exact.engine.solve()
+    exact.engine.run(3)
+    frames = sim.engine.frames()
+    assert [step for step, _, _ in frames] == [2, 4]
+    assert np.array_equal(frames[-1][1], sim.fetch().x) and frames[-1][1].dtype == np.float64
+    assert np.abs(frames[-1][1] - exact.fetch().x).max() < 1e-3
+    assert sim.engine.matrix_step(0) == 0
+    assert np.abs(target - first).max() < 1e-5 * np.abs(target).max()
+
+
 def test_settings_and_factors_are_taken_up_while_it_runs():
     sim = on_gpu()
     factor = factor_of(sim)
