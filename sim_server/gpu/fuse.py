@@ -15,7 +15,6 @@ from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-
 from numpy.typing import NDArray
 
 from sim_server.gpu.device import DeviceLaunch, compiled, cupy, options, processors
@@ -32,8 +31,8 @@ class Shape(NamedTuple):
 
 SHAPES = {  # up to so many items per multiprocessor; few items are spread over many multiprocessors
     "elements": {64: Shape(32, 1), 256: Shape(64, 1), 1 << 30: Shape(128, 1)},
-    "nodes": {16: Shape(64, 8), 64: Shape(128, 8), 1 << 30: Shape(256, 8)},
-    "blocks": {64: Shape(64, 4), 1 << 30: Shape(128, 4)},
+    "nodes": {16: Shape(64, 16), 256: Shape(128, 8), 1 << 30: Shape(128, 4)},
+    "blocks": {64: Shape(128, 8), 160: Shape(128, 4), 1 << 30: Shape(128, 2)},
 }
 
 
@@ -222,7 +221,8 @@ def fused(launches: Sequence[DeviceLaunch]) -> list[Any]:
 
 def _private(group: Sequence[DeviceLaunch], launches: Sequence[DeviceLaunch]) -> frozenset[int]:
     """Addresses of the arrays that are `own` to all launches that have them, all of this group."""
-    owned, others = set(), set()
+    owned: set[int] = set()
+    others: set[int] = set()
     for launch in launches:
         inside = any(launch is x for x in group)
         for f in launch.fields:

@@ -23,10 +23,24 @@ template <class T> INLINE mat<T> rotation_matrix(quaternion<T> q) {
     return {{1 - yy - zz, xy - wz, xz + wy, xy + wz, 1 - xx - zz, yz - wx, xz - wy, yz + wx, 1 - xx - yy}};
 }
 
-// On a GPU an iteration may end early; on a CPU its neighbours in the vector go on.
+// On a GPU an iteration may end early; on a CPU its neighbours in the vector go on. What follows makes up for the rounding of
+// root and ratio.
 #ifdef __CUDACC_RTC__
+INLINE float root(float a) {
+    float r;
+    asm("sqrt.approx.f32 %0, %1;" : "=f"(r) : "f"(a));
+    return r;
+}
+INLINE double root(double a) { return sqrt(a); }
+INLINE float ratio(float a, float b) { return __fdividef(a, b); }
+INLINE double ratio(double a, double b) { return a / b; }
+// u and s to their ratio, where float32 has no subnormal numbers for their squares (CuPy turns them off).
+template <class T> INLINE void lift(T& u, T& s) { s = ratio(s, u); u = 1; }
 template <class T> INLINE bool settled(T step, T value) { return !(step > (single<T> ? (T)1e-4 : (T)1e-14) * value); }
 #else
+template <class T> INLINE T root(T a) { return sqrt(a); }
+template <class T> INLINE T ratio(T a, T b) { return a / b; }
+template <class T> INLINE void lift(T&, T&) {}
 template <class T> INLINE constexpr bool settled(T, T) { return false; }
 #endif
 
@@ -40,7 +54,7 @@ template <class T> INLINE T largest_root(T norm2, T det, T cofactor2) {
     for (int k = 0; k < 8; ++k) {
         T f = larger(((l * l - 2 * norm2) * l - 8 * det) * l + c0, T{});
         T slope = (4 * l * l - 4 * norm2) * l - 8 * det, bend = 12 * l * l - 4 * norm2;
-        T step = 4 * f / larger(slope + sqrt(larger(9 * slope * slope - 12 * f * bend, T{})), flat);
+        T step = ratio(4 * f, larger(slope + root(larger(9 * slope * slope - 12 * f * bend, T{})), flat));
         l -= step;
         if (settled(step, l)) break;
     }
@@ -92,7 +106,8 @@ template <class T> INLINE quaternion<T> polish(quaternion<T> q, const mat<T>& F)
     T cosine = dot(w, vec<T>{a * w.x + d * w.y + e * w.z, d * w.x + b * w.y + f * w.z, e * w.x + f * w.y + c * w.z});
     T sine = dot(w, g);  // over |w|
     const entry<T> none = single<T> ? (entry<T>)1e-18 : (entry<T>)1e-37;  // w = 0: no turn; its square must not be 0
-    T u = cosine + sqrt(cosine * cosine + sine * sine * dot(w, w)) + none;
+    T u = cosine + root(cosine * cosine + sine * sine * dot(w, w)) + none;
+    lift(u, sine);
     T wx = sine * w.x, wy = sine * w.y, wz = sine * w.z;
     quaternion<T> p = {u * q.w - q.x * wx - q.y * wy - q.z * wz, u * q.x + q.w * wx + q.y * wz - q.z * wy,
                     u * q.y + q.w * wy + q.z * wx - q.x * wz, u * q.z + q.w * wz + q.x * wy - q.y * wx};

@@ -57,7 +57,7 @@ def _warp(value: Any) -> bool | str:
 
 Precision = Literal["float64", "mixed", "float32"]
 FactorPrecision = Literal["auto", "float16", "float32", "float64"]
-_ONLY = {  # what the devices have
+_ONLY: dict[str, dict[str, tuple[str, ...]]] = {  # what the devices have
     "precision": {"cpu": ("float64",), "gpu": ("float64", "mixed", "float32")},
     "factor_precision": {"cpu": ("auto", "float32", "float64"), "gpu": ("auto", "float16", "float32")},
 }

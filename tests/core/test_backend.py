@@ -235,7 +235,8 @@ def _launch(path: str, struct: str, name: str, mailed: bool = False) -> SimpleNa
 
 
 NODES = [
-    ("kernels/nodes.cu", "Start", "nodes.start"), ("effects/corotational_nodes.cu", "Gather", "corotational_nodes.gather"),
+    ("kernels/nodes.cu", "Start", "nodes.start"),
+    ("effects/corotational_nodes.cu", "Gather", "corotational_nodes.gather"),
     ("effects/touch.cu", "Apply", "touch.apply", True), ("effects/gravity.cu", "Gravity", "gravity.gravity"),
     ("kernels/nodes.cu", "Turn", "nodes.turn"),
 ]  # fmt: skip

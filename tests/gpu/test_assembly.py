@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: MIT
+"""A, b and the rotations of a step as a GPU makes them, beside the CPU's. Runs where there is one: pytest -m gpu."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sim_server.backend import Cpu
+from sim_server.scene import load
+from sim_server.simulation import Simulation
+
+pytestmark = pytest.mark.gpu
+
+ARRAYS = ("values", "b_material", "y", "rotation")
+CASES = {  # scene, overrides, how far nodes are moved [m], cells being 0.2 m
+    "as it stands": ("beam", [], 0.0),
+    "stirred": ("beam", [], 0.02),
+    "inverted elements": ("beam", [], 0.2),
+    "one element a node": ("beam", ["object.beam.mesh.bar=[1, 1, 1]", "object.beam.mesh.size=[1, 1, 1]"], 0.1),
+    "several bodies": ("four_beams", [], 0.05),
+    "regions": ("heterogeneous", [], 0.02),
+    "posed": ("posed", [], 0.02),
+    "without warp": ("beam", ["solver.warp=false"], 0.02),
+    "large thread blocks": ("beam", ["object.beam.mesh.bar=[14, 14, 56]"], 0.01),
+}
+BOUND = {"float64": 1e-13, "mixed": 2e-5, "float32": 5e-5}  # of the largest entry; worst where elements are inverted
+INVERTED = {"float64": 1e-12, "mixed": 1e-3, "float32": 1e-2}
+
+
+@pytest.fixture(autouse=True)
+def gpu():
+    from sim_server.errors import DeviceError
+    from sim_server.gpu.device import cupy
+
+    try:
+        cupy()
+    except DeviceError as error:
+        pytest.skip(str(error))
+
+
+def stir(sim: Simulation, size: float) -> None:
+    """Moves nodes and gives them velocities, on the device too."""
+    random, w = np.random.default_rng(1), sim.world
+    for array, most in ((w.x, size), (w.v, 1.0), (sim.system.dv, 1.0)):
+        array += random.uniform(-most, most, array.shape)
+        if not isinstance(w.backend, Cpu):
+            twin = w.backend.twin(array)
+            twin.set(array.astype(twin.dtype))
+
+
+def assembled(case: str, precision: str | None, push: bool = False) -> Simulation:
+    """After the first half of a step; precision None: on the CPU."""
+    scene, overrides, size = CASES[case]
+    device = "gpu" if precision else "cpu"
+    more = [f"solver.precision={precision}"] if precision else []
+    path = f"deploy/scenes/{scene}.toml"
+    sim = Simulation(load(path, [*overrides, *more]), device)
+    if push:
+        touch: Any = sim.effects["touch"]
+        index = next(i for i, launch in enumerate(sim.engine.launches) if launch.name == "touch.apply")
+        touch.publish = lambda launch: sim.engine.replace(index, launch)
+        name = sim.world.bodies[0].name
+        far = tuple(sim.world.x[sim.world.free > 0].max(axis=0))
+        touch.push("me", name, far, 0.3, (800.0, 0.0, 0.0), 0.1)
+        touch.grab("me", name, far, 0.5, (far[0], far[1] + 0.1, far[2]), 1e4, 5000.0, 0.1)
+        touch.grab("me", name, far, 0.0, (far[0], far[1] + 9.0, far[2]), 1e9, 50.0, 0.1)
+    stir(sim, size)
+    sim.engine.assemble()
+    for name in ARRAYS:
+        sim.world.backend.fetch(getattr(sim.system, name))
+    return sim
+
+
+@pytest.mark.parametrize("precision", BOUND)
+@pytest.mark.parametrize("case", CASES)
+def test_it_is_the_cpus(case, precision):
+    found, expected = assembled(case, precision), assembled(case, None)
+    bound = (INVERTED if case == "inverted elements" else BOUND)[precision]
+    for name in ARRAYS:
+        a, b = getattr(found.system, name), getattr(expected.system, name)
+        assert np.abs(a - b).max() <= bound * np.abs(b).max(), name
+    for body in range(len(found.world.bodies)):
+        A = found.matrix(body)
+        assert abs(A - A.T).max() == 0, "symmetric to the last bit"
+
+
+@pytest.mark.parametrize("precision", BOUND)
+def test_pushes_and_grabs_are_the_cpus(precision):
+    found, expected = assembled("stirred", precision, push=True), assembled("stirred", None, push=True)
+    untouched = assembled("stirred", None)
+    for name in ("values", "b_material"):
+        a, b = getattr(found.system, name), getattr(expected.system, name)
+        assert np.abs(a - b).max() <= BOUND[precision] * np.abs(b).max(), name
+        assert np.abs(b - getattr(untouched.system, name)).max() > 1e-6 * np.abs(b).max(), "something was pushed"
+
+
+@pytest.mark.parametrize("precision", BOUND)
+def test_the_same_bits_every_time(precision):
+    one, two = assembled("stirred", precision), assembled("stirred", precision)
+    for name in ARRAYS:
+        assert np.array_equal(getattr(one.system, name), getattr(two.system, name)), name
