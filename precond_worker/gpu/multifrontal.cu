@@ -249,23 +249,13 @@ extern "C" __global__ void __launch_bounds__(THREADS) factor(const Front* fronts
 }
 
 // Tiles of 64 x 64 sums, 32 of them in each thread: where they stand, and adding a b^T of DEEP columns of a and b.
-template <class T> struct Product;
-
-template <> struct Product<double> {  // a warp has 32 x 32 sums, 4 x 4 squares of 8 x 8
+#if __CUDA_ARCH__ >= 800
+struct Matrix {  // float64 by matrix instructions: a warp has 32 x 32 sums, 4 x 4 squares of 8 x 8
     __device__ static int row(int e) { return 32 * (WARP % 2) + 8 * (e / 8) + LANE / 4; }
     __device__ static int column(int e) { return 32 * (WARP / 2) + 8 * (e / 2 % 4) + 2 * (LANE % 4) + e % 2; }
     __device__ static void multiply(double& s0, double& s1, double a, double b) {
-#if __CUDA_ARCH__ >= 800
         asm volatile("mma.sync.aligned.m8n8k4.row.col.f64.f64.f64.f64 {%0, %1}, {%2}, {%3}, {%0, %1};"
                      : "+d"(s0), "+d"(s1) : "d"(a), "d"(b));
-#else
-#pragma unroll
-        for (int k = 0; k < 4; k++) {
-            double x = __shfl_sync(~0u, a, 4 * (LANE / 4) + k);
-            s0 += x * __shfl_sync(~0u, b, 4 * (2 * (LANE % 4)) + k);
-            s1 += x * __shfl_sync(~0u, b, 4 * (2 * (LANE % 4) + 1) + k);
-        }
-#endif
     }
     __device__ static void add(double* sum, const double* a, const double* b) {
         const double* x = a + (LANE % 4) * PITCH + 32 * (WARP % 2) + LANE / 4;
@@ -282,15 +272,16 @@ template <> struct Product<double> {  // a warp has 32 x 32 sums, 4 x 4 squares 
         }
     }
 };
+#endif
 
-template <> struct Product<float> {
+struct Scalar {  // a thread has 4 x 8 sums
     __device__ static int row(int e) { return threadIdx.x % 16 + 16 * (e / 8); }
     __device__ static int column(int e) { return 8 * (threadIdx.x / 16) + e % 8; }
-    __device__ static void add(float* sum, const float* a, const float* b) {
-        const float *x = a + threadIdx.x % 16, *y = b + 8 * (threadIdx.x / 16);
-#pragma unroll 8
+    __device__ static void add(real* sum, const real* a, const real* b) {
+        const real *x = a + threadIdx.x % 16, *y = b + 8 * (threadIdx.x / 16);
+#pragma unroll 4
         for (int k = 0; k < DEEP; k++) {
-            float p[4], q[8];
+            real p[4], q[8];
 #pragma unroll
             for (int i = 0; i < 4; i++) p[i] = x[k * PITCH + 16 * i];
 #pragma unroll
@@ -303,7 +294,11 @@ template <> struct Product<float> {
     }
 };
 
-typedef Product<real> Tiles;
+template <class T> struct Choice { typedef Scalar Tiles; };
+#if __CUDA_ARCH__ >= 800
+template <> struct Choice<double> { typedef Matrix Tiles; };
+#endif
+typedef Choice<real>::Tiles Tiles;
 
 // 64 rows of DEEP columns into shared memory; zeros outside of rows x columns. Here and below reads come first, all of
 // them, then writes: a read that might follow a write to the same place would wait for it.
