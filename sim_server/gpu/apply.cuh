@@ -88,6 +88,13 @@ struct Inverse {
         return to;
     }
 
+    // What nothing can stand in for (Solver.planned sees to it that it fits).
+    __device__ __forceinline__ void reserve(const Plan* shared_plan, Arena& arena) {
+        vector.high = arena.take<unsigned short>(shared_plan->entries);
+        vector.low = arena.take<unsigned short>(shared_plan->entries);
+        tile_sums = arena.take<float>(16 * TILE_SUMS);
+    }
+
     __device__ __forceinline__ void set_up(const Body& body, const Plan* shared_plan, int index, Arena& arena) {
         plan = shared_plan;
         size = plan->size; phases = plan->phases; groups = plan->groups;
@@ -95,9 +102,6 @@ struct Inverse {
         residual = body.residual; product = body.product; z = body.z;
         formed = body.formed; solved = body.solved; given = body.given;
         const Part part = plan->parts[index];
-        vector.high = arena.take<unsigned short>(plan->entries);
-        vector.low = arena.take<unsigned short>(plan->entries);
-        tile_sums = arena.take<float>(16 * TILE_SUMS);
         lists = brought(plan->lists + index * (3 * phases + 2), 3 * phases + 2, arena);
         pieces = brought(plan->pieces + part.piece, part.pieces, arena);
         where = brought(plan->index + 32ll * part.piece, 32 * part.pieces, arena);

@@ -51,12 +51,13 @@ struct Solver {
     __device__ __forceinline__ void set_up(const Share& share) {
         const Body& body = memory.body;
         Arena arena = {dynamic, dynamic + s.shared};
+        Inverse inverse;
+        if (body.plan) inverse.reserve(&memory.plan, arena);
         Rows rows;
         rows.set_up(s, body, share, arena);
         real* diagonal = arena.take<real>(9 * rows.own);
         if (!diagonal) diagonal = s.diagonal + 9ll * (body.first + rows.begin);
         real* d = body.plan ? arena.take<real>(3 * rows.own) : nullptr;
-        Inverse inverse;
         if (body.plan) inverse.set_up(body, &memory.plan, team.index, arena);
         else copies_begin();
         if (threadIdx.x == 0) {

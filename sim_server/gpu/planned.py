@@ -22,6 +22,11 @@ PLAN = np.dtype(
 )  # fmt: skip
 
 
+def room(plan: Plan) -> int:
+    """Bytes of shared memory that a thread block must have: the vector of a phase in two float16, sums of tiles."""
+    return 4 * plan.x_area + 64 * TILE_SUMS + 48
+
+
 def by_block(start: NDArray[Any], phases: int, blocks: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Lists kept by phase and block, wanted by block and phase: where each begins then, and which items follow."""
     order = np.arange(phases * blocks).reshape(phases, blocks).T.ravel()

@@ -45,7 +45,7 @@ struct Rows {
         const int count = share.blocks;
         base = share.block_first;
         row_start = s.row_start + row;
-        columns = s.local + base;
+        columns = s.seat + base;
         blocks = s.values + 9ll * base;
         Arena before = arena;
         real* v = arena.take<real>(9 * count);

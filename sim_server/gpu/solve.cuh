@@ -83,7 +83,7 @@ struct Solve {
     const Share* shares;             // of all thread blocks of all bodies
     const int* own_share;            // (grid,) the one that a thread block begins with, or -1
     const int* halo;                 // nodes of the body whose values a thread block reads, its own first
-    const int* local;                // (blocks,) column as a place in that list
+    const int* seat;                 // (blocks,) column as a place in that list
     real* halo_values;               // (halo, 3) where they do not fit into shared memory
     int* halo_place;                 // (halo,) likewise
     real* own;                       // (3, nodes, 3) x, r, q likewise

@@ -13,7 +13,7 @@ from sim_server.backend import HERE, INCLUDE
 from sim_server.gpu.device import Gpu, compiled
 from sim_server.gpu.expansion import Expanded, Expansion
 from sim_server.gpu.plan import plan
-from sim_server.gpu.planned import PLAN, Planned
+from sim_server.gpu.planned import PLAN, Planned, room
 from sim_server.gpu.shares import first_shares, halo, shares
 
 BODY = np.dtype(
@@ -36,7 +36,7 @@ SOLVE = np.dtype(
     [
         ("bodies", "u8"), ("count", "i4"), ("capacity", "i4"), ("row_start", "u8"), ("columns", "u8"),
         ("values", "u8"), ("b", "u8"), ("y", "u8"), ("order", "u8"), ("pooled", "i4"), ("grid", "i4"),
-        ("shares", "u8"), ("own_share", "u8"), ("halo", "u8"), ("local", "u8"), ("halo_values", "u8"),
+        ("shares", "u8"), ("own_share", "u8"), ("halo", "u8"), ("seat", "u8"), ("halo_values", "u8"),
         ("halo_place", "u8"), ("own", "u8"), ("z", "u8"), ("diagonal", "u8"), ("board", "u8"), ("exchanges", "u8"),
         ("arrived", "u8"), ("step", "u8"), ("results", "u8"), ("nodes", "i4"), ("shared", "i4"),
     ]
@@ -97,7 +97,7 @@ class Solver:
         self._work = {
             "order": cp.asarray(share.order.astype(ints)), "shares": cp.asarray(seen.shares.view(ints)),
             "own_share": cp.asarray(first_shares(share, seen, self.grid)),
-            "halo": cp.asarray(seen.nodes.astype(ints)), "local": cp.asarray(seen.local.astype(ints)),
+            "halo": cp.asarray(seen.nodes.astype(ints)), "seat": cp.asarray(seen.local.astype(ints)),
             "halo_values": cp.zeros(3 * len(seen.nodes), self.real), "halo_place": cp.zeros(len(seen.nodes), ints),
             "own": cp.zeros(9 * total, self.real), "z": cp.zeros(6 * total),
             "diagonal": cp.zeros(9 * total, self.real), "board": cp.zeros(16 * self.grid * len(ranges)),
@@ -150,6 +150,11 @@ class Solver:
         key = (pattern.id, blocks)
         if key not in self._planned:
             found = plan(pattern, blocks, planes=self.planes)
+            if (needed := room(found)) > self._shared:
+                raise ValueError(
+                    f"{pattern.size} degrees of freedom in {blocks} thread blocks need {needed} bytes of shared memory "
+                    f"each, allowed: {self._shared}"
+                )
             planned = Planned(self.gpu, found, self.threads // 32)
             self._expansions[key] = Expansion(self.gpu, pattern, found)
             self._planned[key] = planned  # once there was memory for both
