@@ -6,7 +6,7 @@ import pytest
 
 from sim_server.backend import module
 from tests.physics.test_forces import solid_bar, stir
-from tests.scenes import elastic
+from tests.scenes import elastic, solid
 
 
 def in_precision(real: str, sim) -> dict[str, np.ndarray]:
@@ -45,6 +45,22 @@ def test_single_precision_agrees(tmp_path, size):
     single, double = in_precision("float", sim), in_precision("double", sim)
     for name, expected in double.items():
         assert np.abs(single[name] - expected).max() < 1e-5 * np.abs(expected).max(), name
+
+
+@pytest.mark.parametrize(("real", "bound"), [("float", 3e-6), ("double", 1e-13)])
+def test_how_far_a_and_b_are_from_the_reference(tmp_path, real, bound):
+    """Relative to the largest entry: what an element's arithmetic in float32 costs (`precision` of the solver)."""
+    sim = solid_bar(tmp_path)
+    stir(sim, 0.05)
+    reference, found, s = solid(sim), in_precision(real, sim), sim.system
+    K = (reference.matrix() - np.diag(np.repeat(reference.mass, 3))).reshape(sim.world.nodes, 3, sim.world.nodes, 3)
+    node = np.arange(sim.world.nodes)
+    pairs = {
+        "sums": K[s.row, :, s.column, :], "block": K[node, :, node, :][:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]],
+        "b": reference.right_side(),
+    }  # fmt: skip
+    for name, expected in pairs.items():
+        assert np.abs(found[name] - expected).max() < bound * np.abs(expected).max(), name
 
 
 def test_double_precision_is_what_a_step_uses(tmp_path):
