@@ -26,7 +26,7 @@ class Effect:
     elastic: Mapping[int, tuple[NDArray[np.float64], NDArray[np.float64]]] = MappingProxyType({})
 
     def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
-        """What adds the effect to system.b, .diagonal, .block, .sums, .mean. accumulate: sums hold something already."""
+        """What adds the effect to system.b, .diagonal, .block, .sums and .mean. accumulate: to sums, others have."""
         return []
 
     def energy(self) -> float:
