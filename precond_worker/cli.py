@@ -10,6 +10,8 @@ from typing import Annotated, NoReturn
 
 import typer
 
+from precond_worker.errors import DeviceUnusable
+
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
 EPILOG = """\b
@@ -63,6 +65,9 @@ def work(
             end_with_parent()
         library = _library(device, arithmetic)
         _serve(connect or [], threads, name or _default_name(), server, not no_shared_memory, library)
+    except DeviceUnusable as error:
+        print(f"precond-worker: {error}", file=sys.stderr)
+        raise typer.Exit(1) from None
     except KeyboardInterrupt:
         raise typer.Exit(130) from None
     except Terminated:
@@ -86,7 +91,6 @@ def _library(device: str, arithmetic: str) -> str:
         _bad_input(f"--arithmetic {arithmetic}: allowed are auto, float32, float64")
     if device == "cpu":
         return "auto"
-    from precond_worker.errors import DeviceUnusable
     from precond_worker.gpu.device import try_out
 
     try:
@@ -118,6 +122,9 @@ def _serve(connect: list[str], threads: int, name: str, server: str, shared_memo
     except (BadEndpoint, ValueError) as error:
         _bad_input(str(error))
     with session, Uplink(session, server, name, threads, shown, Counters(logging.getLogger("precond_worker"))) as up:
+        if up.namesake:
+            text = f"another worker of server {server} is called {name}: their jobs mix; --name gives this one its own"
+            print(f"precond-worker: {text}", file=sys.stderr, flush=True)
 
         def on_server(found: bool) -> None:
             where = f"server {server} at {', '.join(connect or [DEFAULT_ENDPOINT])}"

@@ -51,9 +51,11 @@ class Uplink:
         self._sequence: Counter[str] = Counter()
         self._saying = threading.Lock()
         zs = session.zenoh
+        own = key("alive_worker", server, worker=name)
+        self.namesake = any(reply.ok is not None for reply in zs.liveliness().get(own, timeout=1.0))  # one of this name
         # Subscribed first, announced last: the server sends as soon as it has heard of us.
         self._matrices = zs.declare_subscriber(key("matrix", server, worker=name), self.mailbox.put)
-        self._token = zs.liveliness().declare_token(key("alive_worker", server, worker=name))
+        self._token = zs.liveliness().declare_token(own)
         self._servers = zs.liveliness().declare_subscriber(
             key("alive_server", server), self._server_event, history=True
         )

@@ -10,6 +10,7 @@ import numpy as np
 import zenoh
 from numpy.typing import NDArray
 
+from precond_worker.errors import DeviceUnusable
 from precond_worker.job import Job, accept
 from precond_worker.uplink import ServerEvent, Uplink
 from protocol import FactorPattern
@@ -101,6 +102,9 @@ class Worker:
         except (ValueError, MemoryError) as error:
             self._counters.add("failures")
             self._answer(job, failure=str(error) or type(error).__name__)
+        except DeviceUnusable as error:  # for good: the process ends, and whoever started it may start another
+            self._answer(job, failure=str(error))
+            raise
         except zenoh.ZError as error:
             self._counters.trouble("unsent", f"a factor was not sent: {error}")
         except Exception as error:

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from precond_worker.errors import DeviceUnusable
 from precond_worker.gpu.device import cupy, kernels
 from precond_worker.gpu.plan import Plan
 from precond_worker.gpu.tables import Launch, front_table, launches
@@ -114,16 +115,25 @@ class Executor:
         }[launch.kernel]
 
     def run(self, matrix: NDArray[np.float64]) -> tuple[NDArray[Any], Outcome]:
-        """Values of L, (nonzeros,), of block values (blocks, 3, 3). The array is the caller's to keep."""
+        """Values of L, (nonzeros,), of block values (blocks, 3, 3). The array is the caller's to keep.
+
+        Raises DeviceUnusable if the device fails: nothing can be done with it in this process any more.
+        """
         np.copyto(self._sent, matrix.reshape(-1))
         values = self._pinned(self._plan.nonzeros, self._stored)
+        try:
+            self._send_launch_fetch(values)
+        except self._cp.cuda.runtime.CUDARuntimeError as error:
+            raise DeviceUnusable(f"the GPU failed: {error}") from error
+        pivot, range_, infinite = (-1 if c == NONE else int(c) for c in self._outcome)
+        return values, Outcome(pivot, range_, bool(infinite))
+
+    def _send_launch_fetch(self, values: NDArray[Any]) -> None:
         self._copy(self._blocks.data.ptr, self._sent.ctypes.data, self._sent.nbytes)
         self._graph.launch(self.stream)
         self._copy(self._outcome.ctypes.data, self._status.data.ptr, self._outcome.nbytes)
         self._copy(values.ctypes.data, self._values.data.ptr, values.nbytes)
         self.stream.synchronize()
-        pivot, range_, infinite = (-1 if c == NONE else int(c) for c in self._outcome)
-        return values, Outcome(pivot, range_, bool(infinite))
 
     def _copy(self, to: int, source: int, size: int) -> None:
         self._cp.cuda.runtime.memcpyAsync(to, source, size, self._cp.cuda.runtime.memcpyDefault, self.stream.ptr)

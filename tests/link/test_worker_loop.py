@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from precond_worker.errors import DeviceUnusable
 from precond_worker.mailbox import Mailbox
 from precond_worker.uplink import ServerEvent
 from precond_worker.worker import Worker
@@ -156,6 +157,37 @@ def test_what_cannot_be_factorized_is_answered_with_the_reason(worker: Worker, u
         reasons, ("positive definite", "checksum", "no topology", "Matrix.blocks is 3"), strict=True
     ):
         assert text in reason
+
+
+class Failing(Diagonal):
+    """Its first factorization fails in a way that may pass, or for good."""
+
+    error: Exception = MemoryError("GPU memory: this object needs 3.00 GiB, 1.00 of 8.0 GiB are free")
+
+    def factorize(self, values: np.ndarray, dtype: Any) -> np.ndarray:
+        if (error := Failing.error) is not None:
+            Failing.error = None  # type: ignore[assignment]
+            raise error
+        return super().factorize(values, dtype)
+
+
+def test_too_little_memory_for_one_object_is_told_and_the_worker_lives_on(uplink: FakeUplink) -> None:
+    worker = Worker(uplink, Failing)  # type: ignore[arg-type]
+    uplink.mailbox.put(ServerEvent(7, True))
+    drain(worker, uplink, matrix(1), matrix(2, "liver"))
+    (refused, _), (answered, _) = uplink.answers
+    assert refused.header.object == "beam" and "needs 3.00 GiB" in refused.failure
+    assert answered.header.object == "liver" and not answered.failure
+    assert (uplink.counters.failures, uplink.counters.jobs) == (1, 2)
+
+
+def test_a_device_that_fails_ends_the_worker_after_an_answer(uplink: FakeUplink) -> None:
+    Failing.error = DeviceUnusable("the GPU failed: cudaErrorIllegalAddress")
+    worker = Worker(uplink, Failing)  # type: ignore[arg-type]
+    uplink.mailbox.put(ServerEvent(7, True))
+    with pytest.raises(DeviceUnusable):
+        drain(worker, uplink, matrix(1))
+    assert [answer.failure for answer, _ in uplink.answers] == ["the GPU failed: cudaErrorIllegalAddress"]
 
 
 @pytest.mark.parametrize(

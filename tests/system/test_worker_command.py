@@ -42,6 +42,8 @@ def test_help_shows_examples() -> None:
         (["--threads", "0"], "--threads"),
         (["--threads", "many"], "--threads"),
         (["--nonsense"], "--nonsense"),
+        (["--device", "tpu"], "--device tpu: allowed are auto, cpu, gpu"),
+        (["--device", "gpu", "--arithmetic", "float16"], "--arithmetic float16: allowed are auto, float32, float64"),
     ],
 )
 def test_bad_input_is_one_clear_message(arguments: list[str], text: str) -> None:
@@ -65,6 +67,16 @@ def test_it_waits_for_the_server_and_says_so_once_and_ends_when_told(number: sig
         out, err = child.communicate(timeout=30)
         assert child.returncode == code
         assert out == "" and err == ""
+
+
+def test_a_second_worker_of_one_name_is_told() -> None:
+    endpoint = free_endpoint()
+    arguments = ("-m", "precond_worker", "--connect", endpoint, "--name", "twin")
+    with ServerLink(listen=[endpoint]), process(*arguments) as first:
+        assert first.stdout is not None and "twin ready: " in first.stdout.readline()
+        with process(*arguments) as second:
+            assert second.stderr is not None
+            assert "another worker of server sim is called twin: " in second.stderr.readline()
 
 
 def test_it_ends_with_its_parent() -> None:
