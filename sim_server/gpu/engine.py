@@ -19,7 +19,8 @@ from sim_server.gpu.device import DeviceLaunch, Gpu
 from sim_server.gpu.fuse import End, Fused, fused
 from sim_server.gpu.intake import Intake
 from sim_server.gpu.layouts import STAMP
-from sim_server.gpu.loop import CAPACITY, MANY, DeviceLoop, Mailbox
+from sim_server.gpu.loop import CAPACITY, MANY, DeviceLoop
+from sim_server.gpu.mailbox import Mailbox
 from sim_server.gpu.solver import BODY, RESULT, SETTINGS, Solver
 
 TICK = np.dtype(
@@ -48,14 +49,15 @@ class Settings:
 
 
 class GpuEngine(DeviceLoop):
-    """Arguments as engine.Engine's, launches from Gpu.module. names: of the bodies, for messages.
+    """Arguments as engine.Engine's, launches from Gpu.module. names: of the bodies, for messages. planes: float16
+    numbers that make an entry of a preconditioner (solver.py).
 
     Raises what Gpu.building translates.
     """
 
     def __init__(
         self, gpu: Gpu, assemble: Sequence[DeviceLaunch], integrate: Sequence[DeviceLaunch],
-        ranges: Sequence[tuple[int, int]], dt: float, names: Sequence[str] = (), records: int = 8192,
+        ranges: Sequence[tuple[int, int]], dt: float, names: Sequence[str] = (), records: int = 8192, planes: int = 1,
         **arrays: NDArray[Any],
     ):  # fmt: skip
         self.gpu, self.launches, self._arrays = gpu, [*assemble, *integrate], arrays
@@ -66,7 +68,7 @@ class GpuEngine(DeviceLoop):
         self._counter = cp.zeros(1, np.int64)
         self._stamps = device.pinned(CAPACITY * STAMP.itemsize)
         self._results = device.pinned(CAPACITY * RESULT.itemsize * bodies)
-        self.solver = Solver(gpu, ranges, arrays, self._counter, CAPACITY)
+        self.solver = Solver(gpu, ranges, arrays, self._counter, CAPACITY, planes)
         row, first = BODY.itemsize, self.solver.bodies_device
         boxes = [(first + row * k, SETTINGS) for k in range(bodies)]
         boxes += [(first + row * k + SETTINGS, row - SETTINGS) for k in range(bodies)]

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from protocol.factor import FactorPattern
 from sim_server.backend import CompileError
 from sim_server.gpu.device import Gpu, no_memory_left
-from sim_server.gpu.loop import DeviceLoop, Mailbox
+from sim_server.gpu.loop import DeviceLoop
+from sim_server.gpu.mailbox import Mailbox
 from sim_server.gpu.solver import SETTINGS
 
 log = logging.getLogger(__name__)

@@ -6,17 +6,15 @@ Nothing here knows CuPy: memory, events and the driver's functions come from a `
 
 import ctypes as c
 from collections.abc import Sequence
-from functools import cache
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_server.backend import native
 from sim_server.errors import DeviceLost
 from sim_server.gpu import layouts
-from sim_server.gpu.layouts import PICTURES, STAMP
-from sim_server.layouts import RECORD, check_sizes
+from sim_server.gpu.layouts import PICTURES
+from sim_server.gpu.mailbox import Mailbox, library
 from sim_server.rings import Reals, Reports
 
 BATCH = 16  # steps read back together at most
@@ -50,67 +48,6 @@ class Device(Protocol):
     def error(self, code: int) -> str:
         """What an error code of the driver means."""
         ...
-
-
-@cache
-def library() -> c.CDLL:
-    """The compiled loop."""
-    loop, p = c.POINTER(layouts.Loop), c.c_void_p
-    compiled = native(
-        "gpu/loop.cpp",
-        {
-            "wf_gpu_run": (c.c_int64, [loop, c.c_int64]), "wf_gpu_wait": (c.c_int32, [loop]),
-            "wf_gpu_open": (c.c_int32, [loop]), "wf_gpu_renew": (c.c_int32, [loop]),
-            "wf_gpu_close": (c.c_int32, [loop]), "wf_gpu_post": (p, [c.POINTER(layouts.Mailbox), p]),
-            "wf_gpu_sizes": (c.c_int32, [p]),
-        },
-    )  # fmt: skip
-    sizes = (c.c_int32 * 8)()
-    compiled.wf_gpu_sizes(sizes)
-    from sim_server.gpu.solver import RESULT
-
-    structures = (layouts.Cuda, layouts.Mail, layouts.Mailbox)
-    ours = [*map(c.sizeof, structures), RESULT.itemsize, STAMP.itemsize, c.sizeof(layouts.Body)]
-    check_sizes("gpu/loop.cpp", list(sizes), [*ours, c.sizeof(layouts.Loop), RECORD.itemsize])
-    return compiled
-
-
-class Mailbox:
-    """Bytes on the device that are replaced between batches. Old mail and what it leads to is kept until it is out of
-    use."""
-
-    def __init__(self, loop: Any, box: layouts.Mailbox):
-        self._loop, self._box, self.number = loop, box, 0
-        self._kept: list[Any] = []  # in use, waiting
-        self._leaving: list[tuple[int, Any]] = []  # (free once so many steps are completed, what)
-
-    def post(self, data: bytes, keep: Any = None, event: int | None = None) -> None:
-        """Replaces the bytes from the next batch on (once the event is done). keep: what the bytes point to."""
-        assert len(data) == self._box.size
-        self.number += 1
-        memory = c.create_string_buffer(data, len(data))
-        mail = layouts.Mail(c.addressof(memory), event, self.number)
-        displaced = library().wf_gpu_post(c.byref(self._box), c.addressof(mail))
-        self._leaving = [(step, what) for step, what in self._leaving if step > self._loop.step]
-        if displaced:
-            self._kept.pop()  # it was never taken up; what is in use must live on
-        elif len(self._kept) > 1:  # the last one was taken up: those before are done with after what is under way
-            self._leaving.append((int(self._loop.launched), self._kept[:-1]))
-            del self._kept[:-1]
-        self._kept.append((memory, mail, keep))
-
-    def withdraw(self) -> bool:
-        """Takes back what the loop has not looked at; only while it stands still. True if something came back."""
-        back = bool(library().wf_gpu_post(c.byref(self._box), None)) or bool(self._box.held)
-        self._box.held = None
-        if back:
-            self._kept.pop()
-        return back
-
-    @property
-    def taken(self) -> bool:
-        """What was posted last is on its way to the device."""
-        return bool(self._box.taken == self.number)
 
 
 class DeviceLoop(Reports):
