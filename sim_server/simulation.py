@@ -54,7 +54,8 @@ class Simulation:
 
             gpu: Any = w.backend
             names = [b.name for b in w.bodies]
-            self.engine = GpuEngine(gpu, assemble, integrate, ranges, w.dt, names, **arrays)  # type: ignore[arg-type]
+            planes = 2 if scene.solver.factor_precision == "float32" else 1
+            self.engine = GpuEngine(gpu, assemble, integrate, ranges, w.dt, names, planes=planes, **arrays)  # type: ignore[arg-type]
         else:
             self.engine = Engine(assemble, integrate, ranges, w.dt, threads=scene.solver.threads, **arrays)
         for body in w.bodies:

@@ -12,6 +12,8 @@ import pytest
 
 from sim_server import backend
 from sim_server.gpu import fuse
+from sim_server.gpu.device import PRECISIONS
+from sim_server.gpu.device import options as device_options
 from tests.core import nvrtc
 
 PUSH = """#include "kernel.h"
@@ -185,8 +187,8 @@ def test_every_text_of_the_package_compiles_for_gpus(path, arch):
     """By NVRTC, which needs no GPU and no driver; what it says counts as a failure too."""
     if (library := nvrtc.library()) is None:
         pytest.skip("needs the package nvidia-cuda-nvrtc")
-    for real in ("double", "float"):
-        options = [f"-arch={arch}", "-std=c++17", f"-Dreal={real}", f"-I{backend.INCLUDE}", f"-I{PACKAGE / 'gpu'}"]
+    for types in PRECISIONS.values():
+        options = [f"-arch={arch}", *device_options(types), f"-I{PACKAGE / 'gpu'}"]  # as they are compiled there
         code, said = nvrtc.compiled(library, PACKAGE / path, options)
         assert len(code) > 1000 and not said, said
 
