@@ -14,9 +14,9 @@ from sim_server.gpu.partition import COLUMNS, ROWS, Partition, Tree, padded, par
 from sim_server.gpu.sharing import Work, share
 
 Ints = NDArray[np.int64]
-LATENCY, LATENCY_ALONE = 1700.0, 400.0  # of a phase [ns]: with a barrier between many blocks, in one block
+LATENCY, LATENCY_ALONE = 3000.0, 400.0  # of a phase [ns]: between many blocks, in one block
 MEMORY, CACHE, SHARED = 4400 / 132, 7000 / 132, 25000 / 132  # bandwidths of one block [bytes/ns]
-CACHED = 50e6  # bytes that stay in the second-level cache
+CACHED = 25e6  # bytes that stay in the near half of the second-level cache
 KEPT, X_AREA = 190e3, 160e3  # bytes of a block's shared memory: for matrices and vectors, at most for vectors
 BRING, ENTRY = 250.0, 0.4  # of a part's vector [ns]: at all, per entry
 FLOPS, USES = 10e3, 3000  # making the matrices: float32 operations per ns; applications that share the cost
