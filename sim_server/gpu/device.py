@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from sim_server.backend import HERE, INCLUDE, Argument, CompileError, arguments_of
 from sim_server.errors import DeviceError
 
+LEAST = 80  # compute capability times 10: the solver multiplies by matrix instructions that came with it
 MAILED = 4096  # threads of a launch whose number of items may change
 
 
@@ -33,6 +34,10 @@ def cupy() -> Any:
         raise DeviceError(_no_device(error)) from error
     if count == 0:
         raise DeviceError("no GPU: CuPy sees no NVIDIA device (is CUDA_VISIBLE_DEVICES empty?)")
+    if int(capability := cp.cuda.Device().compute_capability) < LEAST:
+        raise DeviceError(
+            f"no GPU: this one has compute capability {int(capability) / 10:g}, allowed: {LEAST / 10:g} and above (Ampere)"
+        )
     return cp
 
 

@@ -28,7 +28,7 @@ class CompileException(Exception):
     pass
 
 
-def fake(devices: int | Exception = 1) -> types.ModuleType:
+def fake(devices: int | Exception = 1, capability: str = "90") -> types.ModuleType:
     """As much of CuPy as is asked before anything is made."""
 
     def count() -> int:
@@ -41,6 +41,7 @@ def fake(devices: int | Exception = 1) -> types.ModuleType:
         runtime=types.SimpleNamespace(
             getDeviceCount=count, CUDARuntimeError=CUDARuntimeError, memGetInfo=lambda: (2_000_000_000, 8_000_000_000)
         ),
+        Device=lambda: types.SimpleNamespace(compute_capability=capability),
         memory=types.SimpleNamespace(OutOfMemoryError=OutOfMemoryError),
         compiler=types.SimpleNamespace(CompileException=CompileException),
     )
@@ -71,6 +72,12 @@ MISSING = [
 ]
 
 
+def test_an_old_gpu_is_refused(cupy):
+    cupy(fake(1, "75"))
+    with pytest.raises(DeviceError, match="compute capability 7.5, allowed: 8 and above"):
+        device.cupy()
+
+
 @pytest.mark.parametrize(
     ("found", "text"), MISSING, ids=["no cupy", "none visible", "old driver", "no device", "other"]
 )
@@ -79,6 +86,12 @@ def test_without_a_gpu_one_message_says_what_to_do(cupy, found, text):
     with pytest.raises(DeviceError, match=text) as raised:
         device.cupy()
     assert "\n" not in str(raised.value)
+
+
+def test_an_old_gpu_is_refused(cupy):
+    cupy(fake(1, "75"))
+    with pytest.raises(DeviceError, match="compute capability 7.5, allowed: 8 and above"):
+        device.cupy()
 
 
 @pytest.mark.parametrize(
