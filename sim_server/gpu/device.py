@@ -36,7 +36,7 @@ def cupy() -> Any:
         raise DeviceError("no GPU: CuPy sees no NVIDIA device (is CUDA_VISIBLE_DEVICES empty?)")
     if int(capability := cp.cuda.Device().compute_capability) < LEAST:
         raise DeviceError(
-            f"no GPU: this one has compute capability {int(capability) / 10:g}, allowed: {LEAST / 10:g} and above (Ampere)"
+            f"no GPU: this one has compute capability {int(capability) / 10:g}, allowed: {LEAST / 10:g} and above"
         )
     return cp
 

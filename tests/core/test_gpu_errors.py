@@ -74,7 +74,7 @@ MISSING = [
 
 def test_an_old_gpu_is_refused(cupy):
     cupy(fake(1, "75"))
-    with pytest.raises(DeviceError, match="compute capability 7.5, allowed: 8 and above"):
+    with pytest.raises(DeviceError, match=r"compute capability 7\.5, allowed: 8 and above"):
         device.cupy()
 
 
@@ -86,12 +86,6 @@ def test_without_a_gpu_one_message_says_what_to_do(cupy, found, text):
     with pytest.raises(DeviceError, match=text) as raised:
         device.cupy()
     assert "\n" not in str(raised.value)
-
-
-def test_an_old_gpu_is_refused(cupy):
-    cupy(fake(1, "75"))
-    with pytest.raises(DeviceError, match="compute capability 7.5, allowed: 8 and above"):
-        device.cupy()
 
 
 @pytest.mark.parametrize(
