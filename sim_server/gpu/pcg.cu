@@ -52,20 +52,21 @@ struct Solver {
         const Body& body = memory.body;
         Arena arena = {dynamic, dynamic + s.shared};
         Inverse inverse;
-        if (body.plan) inverse.reserve(&memory.plan, arena);
+        const bool inverted = body.plan && (body.kind == CHOLESKY || body.probe > 0);
+        if (inverted) inverse.reserve(&memory.plan, arena);
         Rows rows;
         rows.set_up(s, body, share, arena);
         real* diagonal = arena.take<real>(9 * rows.own);
         if (!diagonal) diagonal = s.diagonal + 9ll * (body.first + rows.begin);
-        real* d = body.plan ? arena.take<real>(3 * rows.own) : nullptr;
-        if (body.plan) inverse.set_up(body, &memory.plan, team.index, arena);
+        real* d = inverted ? arena.take<real>(3 * rows.own) : nullptr;
+        if (inverted) inverse.set_up(body, &memory.plan, team.index, arena);
         else copies_begin();
         if (threadIdx.x == 0) {
             memory.rows = rows;
             memory.inverse = inverse;
             memory.diagonal = diagonal;
             memory.d = d;
-            if (body.plan) memory.peak = inverse.scale[inverse.size];
+            if (inverted) memory.peak = inverse.scale[inverse.size];
         }
         packed = body.kind == CHOLESKY && body.plan;
         copies_end<1>();  // all but the chunks
