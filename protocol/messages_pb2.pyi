@@ -49,7 +49,7 @@ class Slot(_message.Message):
     def __init__(self, segment: _Optional[str] = ..., offset: _Optional[int] = ..., capacity: _Optional[int] = ..., generation: _Optional[int] = ...) -> None: ...
 
 class Scene(_message.Message):
-    __slots__ = ("header", "name", "toml", "resolved", "dt", "started_ns", "software", "objects")
+    __slots__ = ("header", "name", "toml", "resolved", "dt", "started_ns", "software", "objects", "server", "device", "build")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     NAME_FIELD_NUMBER: _ClassVar[int]
     TOML_FIELD_NUMBER: _ClassVar[int]
@@ -58,6 +58,9 @@ class Scene(_message.Message):
     STARTED_NS_FIELD_NUMBER: _ClassVar[int]
     SOFTWARE_FIELD_NUMBER: _ClassVar[int]
     OBJECTS_FIELD_NUMBER: _ClassVar[int]
+    SERVER_FIELD_NUMBER: _ClassVar[int]
+    DEVICE_FIELD_NUMBER: _ClassVar[int]
+    BUILD_FIELD_NUMBER: _ClassVar[int]
     header: Header
     name: str
     toml: str
@@ -66,7 +69,10 @@ class Scene(_message.Message):
     started_ns: int
     software: str
     objects: _containers.RepeatedScalarFieldContainer[str]
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., name: _Optional[str] = ..., toml: _Optional[str] = ..., resolved: _Optional[str] = ..., dt: _Optional[float] = ..., started_ns: _Optional[int] = ..., software: _Optional[str] = ..., objects: _Optional[_Iterable[str]] = ...) -> None: ...
+    server: str
+    device: str
+    build: str
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., name: _Optional[str] = ..., toml: _Optional[str] = ..., resolved: _Optional[str] = ..., dt: _Optional[float] = ..., started_ns: _Optional[int] = ..., software: _Optional[str] = ..., objects: _Optional[_Iterable[str]] = ..., server: _Optional[str] = ..., device: _Optional[str] = ..., build: _Optional[str] = ...) -> None: ...
 
 class Topology(_message.Message):
     __slots__ = ("header", "nodes", "rest", "tets", "triangles", "row_start", "columns", "fixed", "young", "poisson")
@@ -213,7 +219,7 @@ class Echo(_message.Message):
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., slot: _Optional[_Union[Slot, _Mapping]] = ..., nonce: _Optional[int] = ...) -> None: ...
 
 class ObjectStep(_message.Message):
-    __slots__ = ("header", "step", "time", "iterations", "status", "residual", "factor_step", "factor_age", "preconditioner", "assemble_seconds", "solve_seconds", "integrate_seconds", "step_seconds", "late_seconds", "fallbacks", "excess", "interactions")
+    __slots__ = ("header", "step", "time", "iterations", "status", "residual", "factor_step", "factor_age", "preconditioner", "assemble_seconds", "solve_seconds", "integrate_seconds", "step_seconds", "late_seconds", "fallbacks", "excess", "interactions", "asked", "probe")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     STEP_FIELD_NUMBER: _ClassVar[int]
     TIME_FIELD_NUMBER: _ClassVar[int]
@@ -231,6 +237,8 @@ class ObjectStep(_message.Message):
     FALLBACKS_FIELD_NUMBER: _ClassVar[int]
     EXCESS_FIELD_NUMBER: _ClassVar[int]
     INTERACTIONS_FIELD_NUMBER: _ClassVar[int]
+    ASKED_FIELD_NUMBER: _ClassVar[int]
+    PROBE_FIELD_NUMBER: _ClassVar[int]
     header: Header
     step: int
     time: float
@@ -248,7 +256,9 @@ class ObjectStep(_message.Message):
     fallbacks: int
     excess: float
     interactions: _containers.RepeatedCompositeFieldContainer[Interaction]
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., time: _Optional[float] = ..., iterations: _Optional[int] = ..., status: _Optional[_Union[SolveStatus, str]] = ..., residual: _Optional[float] = ..., factor_step: _Optional[int] = ..., factor_age: _Optional[int] = ..., preconditioner: _Optional[str] = ..., assemble_seconds: _Optional[float] = ..., solve_seconds: _Optional[float] = ..., integrate_seconds: _Optional[float] = ..., step_seconds: _Optional[float] = ..., late_seconds: _Optional[float] = ..., fallbacks: _Optional[int] = ..., excess: _Optional[float] = ..., interactions: _Optional[_Iterable[_Union[Interaction, _Mapping]]] = ...) -> None: ...
+    asked: str
+    probe: int
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., time: _Optional[float] = ..., iterations: _Optional[int] = ..., status: _Optional[_Union[SolveStatus, str]] = ..., residual: _Optional[float] = ..., factor_step: _Optional[int] = ..., factor_age: _Optional[int] = ..., preconditioner: _Optional[str] = ..., assemble_seconds: _Optional[float] = ..., solve_seconds: _Optional[float] = ..., integrate_seconds: _Optional[float] = ..., step_seconds: _Optional[float] = ..., late_seconds: _Optional[float] = ..., fallbacks: _Optional[int] = ..., excess: _Optional[float] = ..., interactions: _Optional[_Iterable[_Union[Interaction, _Mapping]]] = ..., asked: _Optional[str] = ..., probe: _Optional[int] = ...) -> None: ...
 
 class Steps(_message.Message):
     __slots__ = ("header", "steps")
@@ -285,7 +295,7 @@ class Vector(_message.Message):
     def __init__(self, x: _Optional[float] = ..., y: _Optional[float] = ..., z: _Optional[float] = ...) -> None: ...
 
 class Interaction(_message.Message):
-    __slots__ = ("id", "client", "object", "kind", "point", "radius", "force", "duration", "target", "stiffness", "max_force", "nodes", "start")
+    __slots__ = ("id", "client", "object", "kind", "point", "radius", "force", "duration", "target", "stiffness", "max_force", "nodes", "start", "held", "offsets")
     ID_FIELD_NUMBER: _ClassVar[int]
     CLIENT_FIELD_NUMBER: _ClassVar[int]
     OBJECT_FIELD_NUMBER: _ClassVar[int]
@@ -299,6 +309,8 @@ class Interaction(_message.Message):
     MAX_FORCE_FIELD_NUMBER: _ClassVar[int]
     NODES_FIELD_NUMBER: _ClassVar[int]
     START_FIELD_NUMBER: _ClassVar[int]
+    HELD_FIELD_NUMBER: _ClassVar[int]
+    OFFSETS_FIELD_NUMBER: _ClassVar[int]
     id: int
     client: str
     object: str
@@ -312,7 +324,41 @@ class Interaction(_message.Message):
     max_force: float
     nodes: int
     start: float
-    def __init__(self, id: _Optional[int] = ..., client: _Optional[str] = ..., object: _Optional[str] = ..., kind: _Optional[str] = ..., point: _Optional[_Union[Vector, _Mapping]] = ..., radius: _Optional[float] = ..., force: _Optional[_Union[Vector, _Mapping]] = ..., duration: _Optional[float] = ..., target: _Optional[_Union[Vector, _Mapping]] = ..., stiffness: _Optional[float] = ..., max_force: _Optional[float] = ..., nodes: _Optional[int] = ..., start: _Optional[float] = ...) -> None: ...
+    held: bytes
+    offsets: bytes
+    def __init__(self, id: _Optional[int] = ..., client: _Optional[str] = ..., object: _Optional[str] = ..., kind: _Optional[str] = ..., point: _Optional[_Union[Vector, _Mapping]] = ..., radius: _Optional[float] = ..., force: _Optional[_Union[Vector, _Mapping]] = ..., duration: _Optional[float] = ..., target: _Optional[_Union[Vector, _Mapping]] = ..., stiffness: _Optional[float] = ..., max_force: _Optional[float] = ..., nodes: _Optional[int] = ..., start: _Optional[float] = ..., held: _Optional[bytes] = ..., offsets: _Optional[bytes] = ...) -> None: ...
+
+class TouchSet(_message.Message):
+    __slots__ = ("header", "step", "interactions")
+    HEADER_FIELD_NUMBER: _ClassVar[int]
+    STEP_FIELD_NUMBER: _ClassVar[int]
+    INTERACTIONS_FIELD_NUMBER: _ClassVar[int]
+    header: Header
+    step: int
+    interactions: _containers.RepeatedCompositeFieldContainer[Interaction]
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., interactions: _Optional[_Iterable[_Union[Interaction, _Mapping]]] = ...) -> None: ...
+
+class FactorUse(_message.Message):
+    __slots__ = ("header", "step", "pattern", "checksum", "dtype", "worker", "library", "threads", "seconds")
+    HEADER_FIELD_NUMBER: _ClassVar[int]
+    STEP_FIELD_NUMBER: _ClassVar[int]
+    PATTERN_FIELD_NUMBER: _ClassVar[int]
+    CHECKSUM_FIELD_NUMBER: _ClassVar[int]
+    DTYPE_FIELD_NUMBER: _ClassVar[int]
+    WORKER_FIELD_NUMBER: _ClassVar[int]
+    LIBRARY_FIELD_NUMBER: _ClassVar[int]
+    THREADS_FIELD_NUMBER: _ClassVar[int]
+    SECONDS_FIELD_NUMBER: _ClassVar[int]
+    header: Header
+    step: int
+    pattern: int
+    checksum: int
+    dtype: str
+    worker: str
+    library: str
+    threads: int
+    seconds: float
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., pattern: _Optional[int] = ..., checksum: _Optional[int] = ..., dtype: _Optional[str] = ..., worker: _Optional[str] = ..., library: _Optional[str] = ..., threads: _Optional[int] = ..., seconds: _Optional[float] = ...) -> None: ...
 
 class Command(_message.Message):
     __slots__ = ("header", "client", "verb", "interaction")
@@ -361,7 +407,7 @@ class ObjectStatus(_message.Message):
     def __init__(self, object: _Optional[str] = ..., nodes: _Optional[int] = ..., tets: _Optional[int] = ..., last: _Optional[_Union[ObjectStep, _Mapping]] = ..., mean_iterations: _Optional[float] = ..., excess: _Optional[float] = ..., factors_used: _Optional[int] = ..., factors_refused: _Optional[int] = ..., in_flight: _Optional[bool] = ...) -> None: ...
 
 class Status(_message.Message):
-    __slots__ = ("header", "scene", "state", "step", "time", "dt", "step_p50", "step_p99", "step_max", "late_steps", "objects", "workers", "clients", "bulk_shared", "bulk_copied", "refused", "frames_dropped", "device", "pid", "uptime", "records_dropped", "records_lost")
+    __slots__ = ("header", "scene", "state", "step", "time", "dt", "step_p50", "step_p99", "step_max", "late_steps", "objects", "workers", "clients", "bulk_shared", "bulk_copied", "refused", "frames_dropped", "device", "pid", "uptime", "records_dropped", "records_lost", "commands_refused", "moves_replaced", "bulk_bytes_out", "bulk_bytes_in")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     SCENE_FIELD_NUMBER: _ClassVar[int]
     STATE_FIELD_NUMBER: _ClassVar[int]
@@ -384,6 +430,10 @@ class Status(_message.Message):
     UPTIME_FIELD_NUMBER: _ClassVar[int]
     RECORDS_DROPPED_FIELD_NUMBER: _ClassVar[int]
     RECORDS_LOST_FIELD_NUMBER: _ClassVar[int]
+    COMMANDS_REFUSED_FIELD_NUMBER: _ClassVar[int]
+    MOVES_REPLACED_FIELD_NUMBER: _ClassVar[int]
+    BULK_BYTES_OUT_FIELD_NUMBER: _ClassVar[int]
+    BULK_BYTES_IN_FIELD_NUMBER: _ClassVar[int]
     header: Header
     scene: str
     state: str
@@ -406,4 +456,8 @@ class Status(_message.Message):
     uptime: float
     records_dropped: int
     records_lost: int
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., scene: _Optional[str] = ..., state: _Optional[str] = ..., step: _Optional[int] = ..., time: _Optional[float] = ..., dt: _Optional[float] = ..., step_p50: _Optional[float] = ..., step_p99: _Optional[float] = ..., step_max: _Optional[float] = ..., late_steps: _Optional[int] = ..., objects: _Optional[_Iterable[_Union[ObjectStatus, _Mapping]]] = ..., workers: _Optional[_Iterable[_Union[WorkerInfo, _Mapping]]] = ..., clients: _Optional[_Iterable[str]] = ..., bulk_shared: _Optional[int] = ..., bulk_copied: _Optional[int] = ..., refused: _Optional[int] = ..., frames_dropped: _Optional[int] = ..., device: _Optional[str] = ..., pid: _Optional[int] = ..., uptime: _Optional[float] = ..., records_dropped: _Optional[int] = ..., records_lost: _Optional[int] = ...) -> None: ...
+    commands_refused: int
+    moves_replaced: int
+    bulk_bytes_out: int
+    bulk_bytes_in: int
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., scene: _Optional[str] = ..., state: _Optional[str] = ..., step: _Optional[int] = ..., time: _Optional[float] = ..., dt: _Optional[float] = ..., step_p50: _Optional[float] = ..., step_p99: _Optional[float] = ..., step_max: _Optional[float] = ..., late_steps: _Optional[int] = ..., objects: _Optional[_Iterable[_Union[ObjectStatus, _Mapping]]] = ..., workers: _Optional[_Iterable[_Union[WorkerInfo, _Mapping]]] = ..., clients: _Optional[_Iterable[str]] = ..., bulk_shared: _Optional[int] = ..., bulk_copied: _Optional[int] = ..., refused: _Optional[int] = ..., frames_dropped: _Optional[int] = ..., device: _Optional[str] = ..., pid: _Optional[int] = ..., uptime: _Optional[float] = ..., records_dropped: _Optional[int] = ..., records_lost: _Optional[int] = ..., commands_refused: _Optional[int] = ..., moves_replaced: _Optional[int] = ..., bulk_bytes_out: _Optional[int] = ..., bulk_bytes_in: _Optional[int] = ...) -> None: ...

@@ -44,7 +44,10 @@ class Commands:
             return pb.Reply(error=str(error))
 
     def gone(self, clients: set[str]) -> int:
-        """Releases what clients that are no longer there still held; returns how many."""
+        """Releases what clients that are no longer there still held; returns how many.
+
+        Asked after each round of commands: one that waited while its client died takes hold for a moment at most.
+        """
         lost = self._owners - clients
         self._owners -= lost
         return sum(self._touch().release_all(client) for client in lost)

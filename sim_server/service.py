@@ -47,7 +47,6 @@ class Service:
         self.engine.loop.frame_every = self.telemetry.wanted_frames()
         self._waiting: deque[NDArray[Any]] = deque()
         self._failure: BaseException | None = None
-        self._clients: set[str] = set()
         self.beside: Callable[[], None] = lambda: None  # called each round: the supervisor of local workers
         self._alone = not self.driver.wants_factors or self.driver.kind == "async"  # the loop needs no Python
         self.telemetry.open()
@@ -90,11 +89,7 @@ class Service:
                 reply(pb.Reply())
                 continue
             reply(self.commands.carry_out(command))
-        clients = set(self.link.clients())
-        if clients != self._clients:
-            if "touch" in self.simulation.effects:
-                self.commands.gone(clients)
-            self._clients = clients
+        self.commands.gone(set(self.link.clients()))
         self.telemetry.publish_status(self._state(), force=False)
 
     def _drain(self) -> None:

@@ -6,8 +6,13 @@ by springs of stiffness k [N/m] in total, f = k (target - x), with a bounded for
 stays at the limit (by what f will be at the end of the step). The spring enters the system matrix (h^2 k on the
 diagonal), so a stiff grab is as stable as the rest; a push is a plain force.
 
+Interactions add up, also those of different clients: two who grab one point and pull to either side hold it between
+their targets, where the springs balance; nobody owns a point.
+
 Clients are not trusted: a push beyond `max_force` is refused, a grab is bounded by it, and at most `max_interactions`
-are alive at once on one object. An object that does not list this effect cannot be touched at all.
+are alive at once on one object. What they may exert together, each at its largest, is bounded by `max_total_force`; one
+that would go beyond is refused, and those that are there stay as they are. An object that does not list this effect
+cannot be touched at all.
 
 Usual ranges: max_force a few times the weight of the object (a 4000 kg beam weighs 4e4 N, a liver 15 N); a stiffness
 of a grab near young times the size of the grabbed patch moves that patch without tearing it from its neighbours.
@@ -32,7 +37,15 @@ SCOPE = "object"
 
 class Params(Parameters):
     max_force: float = Field(default=1e4, gt=0, description="largest total force of one push or grab [N]")
+    max_total_force: float | None = Field(
+        default=None, gt=0, description="largest force of all pushes and grabs together [N]; 4 max_force if left out"
+    )
     max_interactions: int = Field(default=16, ge=1, le=1024, description="pushes and grabs alive at once on the object")
+
+    @property
+    def total(self) -> float:
+        """max_total_force, or what stands for it [N]."""
+        return 4 * self.max_force if self.max_total_force is None else self.max_total_force
 
 
 Point = tuple[float, float, float]
@@ -55,6 +68,11 @@ class Interaction:
     stiffness: float = 0.0  # N/m
     limit: float = 0.0  # N
     start: float = -1.0  # s; negative until its first step
+
+    @property
+    def largest(self) -> float:
+        """Force that it never exceeds [N]."""
+        return self.limit if self.stiffness else float(np.linalg.norm(self.force))
 
 
 class TouchError(ValueError):
@@ -178,10 +196,18 @@ class Touch(Effect):
     def _add(self, new: Interaction) -> Interaction:
         if not np.isfinite([*new.point, *new.force, *new.target, new.radius, new.stiffness, new.limit]).all():
             raise TouchError("point, radius, force, target, stiffness and max_force must be finite numbers")
-        alive = self.alive()
-        most = self._params(new.object).max_interactions
-        if sum(a.object == new.object for a in alive) >= most:
-            raise TouchError(f"object {new.object!r} has {most} interactions already (max_interactions)")
+        alive, params = self.alive(), self._params(new.object)
+        others = [a for a in alive if a.object == new.object]
+        if len(others) >= params.max_interactions:
+            raise TouchError(
+                f"object {new.object!r} has {params.max_interactions} interactions already (max_interactions)"
+            )
+        taken = sum(a.largest for a in others)
+        if taken + new.largest > params.total * (1 + 1e-9):
+            raise TouchError(
+                f"object {new.object!r}: {new.largest:g} N beside the {taken:g} N of {len(others)} others: "
+                f"at most max_total_force = {params.total:g} N together"
+            )
         self._last_id += 1
         new = replace(new, id=self._last_id)
         self._put([*alive, new])

@@ -66,11 +66,11 @@ class Dispatch:
             self._answers.announce(topology)
             self._jobs.forget(topology.header.object)
 
-    def ready(self) -> bool:
-        """Somebody idle can take a job."""
+    def ready(self) -> int:
+        """How many are idle and can take a job."""
         with self._busy:
             self._receive()
-            return bool(self._idle())
+            return len(self._idle())
 
     def workers(self) -> list[WorkerInfo]:
         """Workers that may be given work."""
@@ -131,6 +131,7 @@ class Dispatch:
         if self._post(flight, job, lease, matrix_slot):
             self._last_worker[job.object] = worker
             self._counters.add("jobs")
+            self._counters.add("bytes_out", job.values.nbytes)
             return True
         self._jobs.cancel(flight)
         return False
@@ -225,6 +226,7 @@ class Dispatch:
         finally:
             self._jobs.end(flight, seconds)
         self._counters.add("factors")
+        self._counters.add("bytes_in", self._factors[-1].values.nbytes)
         self._count_bulk("matrix", flight, message.matrix_shared, bool(flight.slots))
         self._count_bulk("factor", flight, message.HasField("slot"), flight.factor_slot is not None)
 

@@ -2,32 +2,30 @@
 """Questions that others ask the server: status, scene, topology, shared memory, commands."""
 
 import logging
-from collections import deque
-from collections.abc import Callable
+from functools import partial
 
 import zenoh
 
 from protocol import echo
-from protocol.channels import CHANNELS, PROTOCOL, everything, key
+from protocol.channels import CHANNELS, PROTOCOL, key
 from protocol.check import check_header, check_numbers, check_strings, parse
 from protocol.counters import Counters
 from protocol.messages_pb2 import Command, Echo, Header, Reply
 from protocol.refused import Refused
 from protocol.session import Session
 from protocol.slots import Slot
+from sim_server.network.waiting import Asked, Waiting
 
 log = logging.getLogger(__name__)
 
-WAITING = 64  # commands that may wait for the simulation
-ASKED = 256  # queries that may wait for the thread below; beyond that the oldest goes unanswered
-ReplyFunction = Callable[[Reply], None]
+ASKED = 256  # queries of a channel that may wait for its thread; beyond that the oldest goes unanswered
+CHANNELS_ASKED = ("command", "status", "scene", "topology", "echo")
 
 
 class Inquiries:
-    """One queryable and one thread for all keys of the server.
+    """A queryable and a thread for each channel, so that a flood of commands holds up no other question.
 
-    What was published under a key is answered at once; commands wait for the simulation. A full queue turns new
-    commands away with an error, so that nothing here grows or blocks.
+    What was published under a key is answered at once; commands wait for the simulation, in bounded room (waiting.py).
     """
 
     def __init__(self, session: Session, server: str, incarnation: int, counters: Counters, slot: Slot | None):
@@ -38,26 +36,30 @@ class Inquiries:
         self._command_key = key("command", server)
         self._echo_prefix = key("echo", server, worker="*")[:-1]
         self._answers: dict[str, bytes] = {}
-        self._commands: deque[tuple[Command, ReplyFunction]] = deque()
-        self._queryable = session.zenoh.declare_queryable(everything(server), zenoh.handlers.RingChannel(ASKED))
-        session.thread("inquiries", self._run)
+        self._waiting = Waiting(counters)
+        self._queryables = {}
+        for channel in CHANNELS_ASKED:
+            ring: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(ASKED)
+            self._queryables[channel] = session.zenoh.declare_queryable(key(channel, server), ring)
+            session.thread(f"inquiries-{channel}", partial(self._run, channel))
 
     def offer(self, name: str, answer: bytes) -> None:
         """From now on a query of this key gets this answer."""
         self._answers[name] = answer
 
-    def commands(self) -> list[tuple[Command, ReplyFunction]]:
+    def commands(self) -> list[Asked]:
         """Commands that came since the last call, each with the function that answers it."""
-        return [self._commands.popleft() for _ in range(len(self._commands))]
+        return self._waiting.take()
 
-    def _run(self) -> None:
+    def _run(self, channel: str) -> None:
+        queryable, own = self._queryables[channel], zenoh.KeyExpr(key(channel, self._server))
         while True:
             try:
-                query = self._queryable.recv()
+                query = queryable.recv()
             except zenoh.ZError:
                 return  # the session was closed
             try:
-                self._serve(query)
+                self._serve(query, own)
             except Refused as refusal:
                 self._counters.refuse(refusal)
                 query.drop()
@@ -66,7 +68,7 @@ class Inquiries:
             except Exception:
                 log.exception("a query was not answered")
 
-    def _serve(self, query: zenoh.Query) -> None:
+    def _serve(self, query: zenoh.Query, own: zenoh.KeyExpr) -> None:
         asked = str(query.key_expr)
         if asked == self._command_key:
             return self._command(query)
@@ -74,7 +76,8 @@ class Inquiries:
             if asked.startswith(self._echo_prefix):
                 return self._echo(query)
             for name, answer in list(self._answers.items()):
-                if query.key_expr.intersects(zenoh.KeyExpr(name)):
+                name_expr = zenoh.KeyExpr(name)
+                if own.intersects(name_expr) and query.key_expr.intersects(name_expr):
                     query.reply(name, answer)
 
     def _echo(self, query: zenoh.Query) -> None:
@@ -106,6 +109,4 @@ class Inquiries:
         except Refused as refusal:
             self._counters.refuse(refusal)
             return reply(Reply(error=str(refusal)))
-        if len(self._commands) >= WAITING:
-            return reply(Reply(error=f"the server is busy: {WAITING} commands wait already"))
-        self._commands.append((command, reply))
+        self._waiting.offer(command, reply)

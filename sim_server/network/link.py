@@ -122,8 +122,8 @@ class ServerLink:
         """What queries for the scene are answered with."""
         self._inquiries.offer(key("scene", self.name), self._stamped(scene).SerializeToString())
 
-    def ready(self) -> bool:
-        """Somebody idle can take a job."""
+    def ready(self) -> int:
+        """How many are idle and can take a job."""
         return self._dispatch.ready()
 
     def submit(self, job: "Job") -> bool:
@@ -150,10 +150,10 @@ class ServerLink:
             except Refused as refusal:
                 self.counters.refuse(refusal)
                 continue
-            if sample.kind == zenoh.SampleKind.PUT:
-                self._clients.add(client)
-            else:
+            if sample.kind != zenoh.SampleKind.PUT:
                 self._clients.discard(client)
+            elif len(self._clients) < TOKENS:
+                self._clients.add(client)
         return sorted(self._clients)
 
     def commands(self) -> list[tuple[Command, Callable[[Reply], None]]]:
@@ -183,6 +183,8 @@ class ServerLink:
         status.clients.extend(self.clients())
         status.bulk_shared, status.bulk_copied = self.counters.bulk_shared, self.counters.bulk_copied
         status.refused = self.counters.refused
+        status.commands_refused, status.moves_replaced = self.counters.commands_refused, self.counters.moves_replaced
+        status.bulk_bytes_out, status.bulk_bytes_in = self.counters.bytes_out, self.counters.bytes_in
         status.frames_dropped += self.counters.frames_dropped
         self._inquiries.offer(key("status", self.name), self._stamped(status).SerializeToString())
         self._publications.put("status", status, self._stamp)

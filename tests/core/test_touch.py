@@ -258,3 +258,40 @@ def test_an_object_that_does_not_list_touch_is_not_touched():
     sim = Simulation.load("deploy/scenes/four_beams.toml")
     with pytest.raises(TouchError, match="object 'beam2' does not list the effect touch; these do: beam1"):
         sim.effects["touch"].push("anna", "beam2", (2.0, 0.5, 4.0), 0.5, (0.0, 1.0, 0.0), 1.0)
+
+
+def test_two_who_pull_one_point_to_either_side_hold_it_between_their_targets():
+    """Forces add: with springs of 1 : 3 the point rests where they balance, and the body there is not strained."""
+    sim, touch = held_bar(young=1e4, damping=(2.0, 0.0), fixed=None)
+    for client, stiffness, side in (("anna", 1e5, -0.4), ("ben", 3e5, 0.4)):
+        touch.grab(client, "bar", END, 0.0, (END[0], END[1] + side, END[2]), stiffness, 1e6, EVER)
+    begun = force_in(sim).sum(axis=0)
+    assert begun == pytest.approx([0, 0.4 * (3e5 - 1e5), 0], abs=1e-6)
+    sim.engine.run(800)
+    node = touch.alive()[0].nodes[0]
+    assert sim.world.x[node, 1] == pytest.approx(END[1] + 0.2, abs=1e-3)
+    assert np.abs(sim.world.v).max() < 1e-2
+
+
+def test_forces_together_are_bounded_and_those_that_are_there_stay():
+    sim, touch = held_bar({"max_force": 100.0, "max_total_force": 250.0})
+    touch.push("anna", "bar", END, 0.0, (0, 100, 0), 2 * H)
+    grab = touch.grab("ben", "bar", END, 0.0, END, 1e3, 80.0, EVER)
+    with pytest.raises(TouchError, match=r"'bar': 90 N beside the 180 N of 2 others: at most max_total_force = 250 N"):
+        touch.push("carl", "bar", END, 0.0, (90, 0, 0), H)
+    with pytest.raises(TouchError, match="max_total_force"):
+        touch.grab("carl", "bar", END, 0.0, END, 1e3, 0.0, EVER)  # 0: as the scene says, 100 N
+    assert [a.client for a in touch.alive()] == ["anna", "ben"]
+    touch.push("carl", "bar", END, 0.0, (70, 0, 0), H)
+    sim.engine.run(3)
+    touch.push("carl", "bar", END, 0.0, (90, 0, 0), H)  # the push of 100 N is over
+    touch.release("ben", grab.id)
+    touch.grab("dora", "bar", END, 0.0, END, 1e3, 100.0, EVER)
+
+
+def test_without_a_total_it_is_four_times_the_largest_force():
+    _, touch = held_bar({"max_force": 10.0})
+    for _ in range(4):
+        touch.push("anna", "bar", END, 0.0, (0, 0, 10), H)
+    with pytest.raises(TouchError, match="at most max_total_force = 40 N"):
+        touch.push("anna", "bar", END, 0.0, (0, 0, 1e-3), H)

@@ -26,7 +26,7 @@ from protocol.messages_pb2 import (
     Vector,
 )
 from protocol.session import open_session
-from sim_server.network.inquiries import WAITING
+from sim_server.network.waiting import WAITING
 from sim_server.network.link import ServerLink
 
 pytestmark = pytest.mark.system

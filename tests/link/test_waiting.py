@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: MIT
+"""Commands that wait: rates of clients by a given clock, bounded room, the newest move of each grab."""
+
+import logging
+
+from protocol.counters import Counters
+from protocol.messages_pb2 import Command, Interaction, Reply, Vector
+from sim_server.network import waiting as module
+from sim_server.network.rates import Bucket, Rates
+from sim_server.network.waiting import Waiting
+
+
+class Desk:
+    """A queue, its clock and the replies that came out of it."""
+
+    def __init__(self, rate: float = 10.0, burst: float = 3.0, room: int = 64):
+        self.now, self.counters, self.replies = 0.0, Counters(logging.getLogger("test")), {}
+        self.waiting = Waiting(self.counters, Rates(rate, burst), room, lambda: self.now)
+        self._count = 0
+
+    def offer(self, verb: str, client: str = "anna", id: int = 0, x: float = 0.0) -> int:
+        """Number of the command; its reply is then found in `replies`."""
+        self._count += 1
+        number = self._count
+
+        def reply(answer: Reply) -> None:
+            assert number not in self.replies, "answered twice"
+            self.replies[number] = answer.error
+
+        interaction = Interaction(id=id, target=Vector(x=x))
+        self.waiting.offer(Command(client=client, verb=verb, interaction=interaction), reply)
+        return number
+
+    def taken(self) -> list[tuple[str, str, float]]:
+        """(verb, client, x of the target) of all whose turn it is; they are answered."""
+        found = self.waiting.take()
+        for _, reply in found:
+            reply(Reply())
+        return [(c.verb, c.client, c.interaction.target.x) for c, _ in found]
+
+
+def test_a_bucket_gives_its_burst_and_then_its_rate() -> None:
+    bucket = Bucket(rate=10.0, burst=3.0, tokens=3.0, filled=100.0)
+    assert [bucket.take(100.0) for _ in range(5)] == [True, True, True, False, False]
+    assert not bucket.take(100.09) and bucket.take(100.11)
+    assert sum(bucket.take(101 + 0.001 * i) for i in range(2000)) in (22, 23), "two seconds at 10 a second, and 3"
+    assert not bucket.full(103.0) and bucket.full(103.4)
+    assert sum(bucket.take(200.0) for _ in range(100)) == 3, "a long rest saves no more than the burst"
+
+
+def test_a_bucket_may_owe_so_much_and_no_more() -> None:
+    bucket = Bucket(rate=10.0, burst=3.0, tokens=0.0, filled=0.0)
+    assert [bucket.take(0.0, debt=2.0) for _ in range(3)] == [True, True, False]
+    assert not bucket.take(0.25) and bucket.take(0.31)
+
+
+def test_a_clock_that_goes_back_gives_nothing() -> None:
+    bucket = Bucket(rate=10.0, burst=3.0, tokens=1.0, filled=50.0)
+    assert bucket.take(40.0) and not bucket.take(41.0)
+
+
+def test_clients_have_buckets_of_their_own_in_bounded_memory() -> None:
+    rates = Rates(rate=10.0, burst=2.0, clients=3)
+    for name in ("a", "b", "c"):
+        assert [rates.take(name, 0.0) for _ in range(3)] == [True, True, False]
+    shared = sum(rates.take(f"invented-{i}", 0.0) for i in range(1000))
+    assert shared == 2 and len(rates) == 3, "names without a bucket share one"
+    assert rates.take("d", 10.0) and len(rates) <= 3, "full buckets make room"
+    assert [rates.take("a", 10.0) for _ in range(3)] == [True, True, False]
+
+
+def test_what_is_over_the_rate_is_refused_and_counted() -> None:
+    desk = Desk(rate=10.0, burst=3.0)
+    numbers = [desk.offer("push") for _ in range(5)]
+    others = [desk.offer("push", "ben") for _ in range(2)]
+    assert len(desk.taken()) == 5
+    assert [desk.replies[n] == "" for n in numbers] == [True, True, True, False, False]
+    assert desk.replies[numbers[-1]] == "client 'anna' sends too much: at most 10 commands a second"
+    assert all(desk.replies[n] == "" for n in others), "one client's flood is not another's"
+    assert desk.counters.commands_refused == 2
+    desk.now = 0.2
+    desk.offer("grab"), desk.offer("grab"), desk.offer("grab")
+    assert len(desk.taken()) == 2 and desk.counters.commands_refused == 3
+
+
+def test_who_sends_too_much_can_still_let_go() -> None:
+    desk = Desk(rate=10.0, burst=3.0)
+    for _ in range(10):
+        desk.offer("push")
+    assert [desk.replies.get(desk.offer("release")) for _ in range(4)][:3] == [None] * 3
+    assert [verb for verb, _, _ in desk.taken()] == ["push"] * 3 + ["release"] * 3
+
+
+def test_the_newest_move_of_a_grab_is_the_one_that_counts() -> None:
+    desk = Desk()
+    moves = [desk.offer("move", id=7, x=float(i)) for i in range(50)]
+    other = desk.offer("move", id=8, x=-1.0)
+    assert desk.taken() == [("move", "anna", 49.0), ("move", "anna", -1.0)]
+    assert all(desk.replies[n] == "" for n in [*moves, other])
+    assert desk.counters.moves_replaced == 49 and desk.counters.commands_refused == 0
+
+
+def test_moves_of_equal_numbers_by_two_clients_are_two() -> None:
+    desk = Desk()
+    desk.offer("move", "anna", 7, 1.0), desk.offer("move", "ben", 7, 2.0)
+    assert desk.taken() == [("move", "anna", 1.0), ("move", "ben", 2.0)]
+
+
+def test_the_last_move_over_the_rate_waits_and_is_not_lost() -> None:
+    desk = Desk(rate=10.0, burst=3.0)
+    done = []
+    for i in range(400):  # 1 kHz for 0.4 s
+        desk.now = 0.001 * i
+        desk.offer("move", id=7, x=float(i))
+        done += desk.taken()
+    assert 3 <= len(done) <= 8, "the rate holds"
+    desk.now = 0.6
+    assert desk.taken() == [("move", "anna", 399.0)], "where the hand stopped"
+    assert desk.taken() == [] and len(desk.replies) == 400 and set(desk.replies.values()) == {""}
+    assert desk.counters.commands_refused == 0 and desk.counters.moves_replaced == 400 - len(done) - 1
+
+
+def test_a_full_queue_refuses_all_but_the_newest_moves() -> None:
+    desk = Desk(rate=1e6, burst=1e6, room=4)
+    kept = [desk.offer("push", f"c{i}") for i in range(4)]
+    surplus = desk.offer("push", "late")
+    moves = [desk.offer("move", "late", 1, float(i)) for i in range(3)]
+    assert desk.replies[surplus] == "the server is busy: 4 commands wait already"
+    assert len(desk.taken()) == 4
+    assert desk.taken() == [("move", "late", 2.0)]
+    assert all(desk.replies[n] == "" for n in [*kept, *moves])
+
+
+def test_moves_that_wait_are_bounded_too() -> None:
+    desk = Desk(rate=1e-3, burst=1.0)
+    numbers = [desk.offer("move", id=i) for i in range(3 * module.LATE)]
+    refused = [n for n in numbers if desk.replies.get(n)]
+    assert len(refused) == 2 * module.LATE - 1 == desk.counters.commands_refused
+    assert len(desk.taken()) == 1
