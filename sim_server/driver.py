@@ -12,52 +12,49 @@ that has let go of Python's lock) and `pump` is called beside it.
 
 import logging
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import Factor
-from sim_server.choice import Choice
 from sim_server.engine import Kind
 from sim_server.factors import FactorSource, Inline, Job
-from sim_server.schedule import Need, excess, pick
+from sim_server.schedule import oldest_possible, overdue_after, pick
 from sim_server.simulation import Simulation
+from sim_server.track import Track
 from sim_server.world import Body
 
 log = logging.getLogger(__name__)
 
 
-class Track:
-    """Counters of one body."""
-
-    def __init__(self, body: Body, auto: bool):
-        self.body = body
-        self.excess = 0.0
-        self.sent: int | None = None  # step of the last matrix that went out
-        self.in_flight = False
-        self.wanted: NDArray[np.float64] | None = None  # where the loop copies the matrix asked for
-        self.used = 0
-        self.refused = 0
-        self.newest = -1  # step of the newest factor taken up
-        self.choice = Choice() if auto else None
+COPIES = 8  # matrices that the loop may be asked to copy within one step
 
 
 class Driver:
-    """Runs one simulation under its scene's update policy. source: of factors; None: this process."""
+    """Runs one simulation under its scene's update policy.
 
-    def __init__(self, simulation: Simulation, source: FactorSource | None = None):
+    source: of factors; None: this process. counted: the scheduler and `auto` reckon with bytes and operations instead
+    of seconds, so that a run repeats exactly (None: unless the policy is async).
+    """
+
+    def __init__(self, simulation: Simulation, source: FactorSource | None = None, counted: bool | None = None):
         self.simulation, self.engine = simulation, simulation.engine
         self.solver = simulation.scene.solver
         self.kind, self.n = self.solver.update
         patterns = {b.name: simulation.system.body_pattern(b.first, b.last) for b in simulation.world.bodies}
         self.inline = Inline(patterns)
         self.source: FactorSource = source or self.inline
-        self.tracks = [Track(b, self.solver.preconditioner == "auto") for b in simulation.world.bodies]
+        self.counted = self.kind != "async" if counted is None else counted
+        auto = self.solver.preconditioner == "auto"
+        self.tracks = [Track(b, auto, self.counted) for b in simulation.world.bodies]
         self.by_name = {t.body.name: t for t in self.tracks}
         self.wants_factors = self.solver.preconditioner in ("auto", "cholesky")
+        self.adopted: Callable[[Factor], None] = lambda factor: None  # told of every factor put into a mailbox
         self._due: dict[str, int] = {}  # lockstep: step of the matrix whose factor is taken up n steps later
         self._arrived: dict[tuple[str, int], Factor] = {}
+        self._nobody_at = -1  # step at which nobody was left to be asked
         self._alone = False  # there was no worker for a matrix of lockstep
         self._warped = {t.body.name: bool(simulation.system.warped[t.body.nodes].any()) for t in self.tracks}
         bytes_a = {
@@ -116,21 +113,19 @@ class Driver:
     def adopt(self, factor: Factor) -> None:
         """Puts a factor into its body's mailbox, unless a newer one is there."""
         t = self.by_name[factor.object]
-        t.in_flight = False
-        if factor.step <= t.newest:
+        self._nobody_at = -1
+        if not t.came_in(factor, self.engine.step):
             return
-        t.newest = factor.step
-        t.used += 1
         self.engine.post_factor(t.body.index, factor.pattern, factor.values, factor.step)
+        self.adopted(factor)
         if t.choice is not None:
             t.choice.factor_arrived()
             self._settle(t)
 
     def failed(self, name: str, reason: str) -> None:
         """A job came to nothing; the object may be sent again."""
-        t = self.by_name[name]
-        t.in_flight = False
-        t.refused += 1
+        self.by_name[name].came_to_nothing()
+        self._nobody_at = -1
         log.warning("object %r: no factor: %s", name, reason)
 
     # --- lockstep -----------------------------------------------------------------------------------------------
@@ -197,7 +192,7 @@ class Driver:
             time.sleep(2e-4)
         else:
             self._alone = False
-        t.in_flight, t.sent, t.wanted, t.excess = True, step, None, 0.0
+        t.went_out(step)
         return True
 
     # --- async --------------------------------------------------------------------------------------------------
@@ -216,14 +211,40 @@ class Driver:
         for t in self.tracks:
             if t.wanted is not None and self.engine.matrix_step(t.body.index) >= 0:
                 self._send(t)
-        if not self.source.ready() or any(t.wanted is not None for t in self.tracks):
-            return
+        places = min(int(self.source.ready()), COPIES) - sum(t.wanted is not None for t in self.tracks)
         step = self.engine.step
-        needs = [
-            Need(t.body.name, t.excess, None if t.sent is None else step - t.sent, t.in_flight) for t in self.tracks
-        ]
-        for name in pick(needs, 1, self.solver.update_floor_steps):
+        if places <= 0 or step == self._nobody_at:
+            return
+        overdue = max(self._overdue(), self.solver.update_floor_steps)
+        needs = [t.need(step) for t in self.tracks]
+        chosen = pick(needs, places, self.solver.update_floor_steps, self.solver.schedule, overdue)
+        for name in chosen:
             self._ask(self.by_name[name])
+        if len(chosen) < places:
+            self._nobody_at = step
+
+    def _overdue(self) -> float:
+        return overdue_after(self.solver.schedule_rounds, self._latencies(), self._workers())
+
+    def _latencies(self) -> list[float]:
+        """Steps from matrix to factor, of each body; those not yet known are like the mean of the others."""
+        known = [t.latency.value for t in self.tracks if t.latency.value is not None]
+        mean = sum(known) / len(known) if known else 1.0
+        return [mean if t.latency.value is None else t.latency.value for t in self.tracks]
+
+    def _workers(self) -> int:
+        return len(getattr(self.source, "workers", lambda: [1])())
+
+    def age_bound(self) -> int:
+        """Oldest [steps] that a factor gets while all goes well, by what was measured so far; -1: no bound known."""
+        if not self.wants_factors or self.kind == "never":
+            return -1
+        if self.kind != "async":
+            return self.n - 1 if self.kind == "every" else 2 * self.n - 1
+        if all(t.latency.value is None for t in self.tracks):
+            return -1
+        overdue = max(self._overdue(), self.solver.update_floor_steps)
+        return oldest_possible(overdue, self._latencies(), self._workers())
 
     def _ask(self, t: Track) -> None:
         t.wanted = np.empty_like(self._values(t.body))
@@ -233,7 +254,7 @@ class Driver:
         step = self.engine.matrix_step(t.body.index)
         assert t.wanted is not None
         if self.source.submit(self._job(t, step, t.wanted)):
-            t.in_flight, t.sent, t.excess = True, step, 0.0
+            t.went_out(step)
         t.wanted = None
 
     # --- what the records say -----------------------------------------------------------------------------------
@@ -242,12 +263,10 @@ class Driver:
         """Sums up excess iterations and lets `auto` choose."""
         floor = self.solver.update_floor_iterations
         for r in records:
-            t, iterations = self.tracks[r["body"]], int(r["iterations"])
-            t.excess += excess(iterations, floor)
-            t.refused += int(r["fallbacks"])
+            t, iterations, kind = self.tracks[r["body"]], int(r["iterations"]), Kind(r["kind"])
+            cost = self._model(t, kind, iterations) if self.counted else float(r["solve"])
+            t.observe(r, floor, cost)
             if t.choice is not None:
-                kind = Kind(r["kind"])
-                cost = float(r["solve"]) if self.kind == "async" else self._model(t, kind, iterations)
                 t.choice.observe(kind, iterations, cost, Kind(r["asked"]))
                 self._settle(t)
 

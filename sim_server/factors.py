@@ -28,8 +28,8 @@ class Job:
 class FactorSource(Protocol):
     """Takes matrices, gives factors; nothing here waits."""
 
-    def ready(self) -> bool:
-        """Somebody idle can take a job now."""
+    def ready(self) -> int:
+        """How many idle ones could take a job now."""
         ...
 
     def submit(self, job: Job) -> bool:
@@ -48,15 +48,17 @@ class FactorSource(Protocol):
 class Inline:
     """Factorizes in this process, during submit. patterns: block pattern (row_start, columns) of each object."""
 
+    WORKER = "in process"
+
     def __init__(self, patterns: dict[str, tuple[NDArray[np.int32], NDArray[np.int32]]]):
         self._patterns = patterns
         self._analyses: dict[str, Any] = {}
         self._done: list[Factor] = []
         self._failed: list[tuple[str, str]] = []
 
-    def ready(self) -> bool:
-        """Always."""
-        return True
+    def ready(self) -> int:
+        """One job at a time, always."""
+        return 1
 
     def submit(self, job: Job) -> bool:
         """Factorizes now; the result waits for `poll`."""
@@ -73,9 +75,13 @@ class Inline:
             return True
         seconds = perf_counter() - start
         self._done.append(
-            Factor(job.object, job.epoch, job.step, job.warp, analysis.pattern, values, "in process", seconds)
+            Factor(job.object, job.epoch, job.step, job.warp, analysis.pattern, values, self.WORKER, seconds)
         )
         return True
+
+    def library(self, name: str) -> str:
+        """Library and version that factorizes the matrices of an object."""
+        return str(self._analysis(name).library)
 
     def _analysis(self, name: str) -> Any:
         from precond_worker.factorize import Analysis, default_library

@@ -1,23 +1,41 @@
 # SPDX-License-Identifier: MIT
 """Whose matrix is factorized next: pure functions of counters, no clock, no I/O.
 
-The rule of Courtecuisse et al. 2010, section 4: each object sums up its CG iterations above a floor, and the object
-with the largest sum goes next. A matrix that goes out sets its object's sum back to zero.
+excess       the rule of Courtecuisse et al. 2010, section 4: each object sums up its CG iterations above a floor, and
+             the object with the largest sum goes next; a matrix that goes out sets its object's sum back to zero
+round_robin  whoever was sent longest ago
+oldest       whoever has the oldest factor: a job that was lost does not cost its object the turn
+weighted     cost of the excess by time of a factorization, the sum growing a little with each step waited
+
+Whatever the rule, an object whose last matrix is `overdue` goes first, so none starves.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from math import ceil, inf
+from typing import Literal
+
+Rule = Literal["excess", "round_robin", "oldest", "weighted"]
+
+AGEING = 0.02  # iterations that a step of waiting counts as (weighted): between equals it is 50 steps to an iteration
+DOUBLINGS = 10  # of the floor of an object whose jobs fail
 
 
 @dataclass(frozen=True)
 class Need:
     """What is known of an object. excess: summed iterations above the floor; waited: steps since its last matrix went
-    out (None: none did yet); in_flight: a matrix of it is being factorized."""
+    out (None: none did yet); in_flight: a matrix of it is being factorized; age: steps since the matrix of its factor
+    (None: it has none); cost: of an iteration, service: of a factorization, each in any unit as long as it is the same
+    for all; failures: jobs in a row that came to nothing."""
 
     object: str
     excess: float
     waited: int | None
     in_flight: bool
+    age: int | None = None
+    cost: float = 1.0
+    service: float = 1.0
+    failures: int = 0
 
 
 def excess(iterations: int, floor: int) -> int:
@@ -25,12 +43,60 @@ def excess(iterations: int, floor: int) -> int:
     return max(0, iterations - floor)
 
 
-def pick(needs: Iterable[Need], places: int, floor_steps: int = 1) -> list[str]:
+def gain(need: Need) -> float:
+    """What a new factor is worth for the time that it takes (weighted)."""
+    return (need.excess + AGEING * (need.waited or 0)) * need.cost / max(need.service, 1e-12)
+
+
+_PRIORITY: dict[Rule, Callable[[Need], float]] = {
+    "excess": lambda need: need.excess,
+    "round_robin": lambda need: need.waited or 0,
+    "oldest": lambda need: inf if need.age is None else need.age,
+    "weighted": gain,
+}
+
+
+def pick(
+    needs: Iterable[Need], places: int, floor_steps: int = 1, rule: Rule = "excess", overdue: float = inf
+) -> list[str]:
     """Up to `places` objects, most urgent first.
 
-    Objects without any factor come first, then by excess, then by who waited longest, then by order. An object in
-    flight or whose last matrix went out less than floor_steps ago is left out.
+    Objects of which no matrix went out yet come first; then those that waited `overdue` steps, longest first; then by
+    the rule; among equals who waited longest, then by order. An object in flight or whose last matrix went out less
+    than floor_steps ago (twice as long after each failure) is left out.
     """
-    ready = [n for n in needs if not n.in_flight and (n.waited is None or n.waited >= floor_steps)]
-    ready.sort(key=lambda n: (n.waited is not None, -n.excess, -(n.waited or 0)))
+    priority = _PRIORITY[rule]
+
+    def urgency(need: Need) -> tuple[int, float, int]:
+        waited = need.waited or 0
+        if need.waited is None:
+            return 0, -need.excess, 0
+        return (1, -waited, 0) if waited >= overdue else (2, -priority(need), -waited)
+
+    ready = [n for n in needs if not n.in_flight and (n.waited is None or n.waited >= held_back(n, floor_steps))]
+    ready.sort(key=urgency)
     return [n.object for n in ready[: max(places, 0)]]
+
+
+def held_back(need: Need, floor_steps: int) -> int:
+    """Fewest steps between two matrices of an object."""
+    return floor_steps * 2 ** min(need.failures, DOUBLINGS)
+
+
+def one_round(services: Sequence[float], workers: int) -> float:
+    """Steps in which `workers` serve every object once. services: steps from matrix to factor of each; inf without
+    workers."""
+    return sum(services) / workers if workers > 0 else inf
+
+
+def overdue_after(rounds: float, services: Sequence[float], workers: int) -> float:
+    """Steps after which an object goes next whatever the rule: so many rounds, inf without workers."""
+    return rounds * one_round(services, workers)
+
+
+def oldest_possible(overdue: float, services: Sequence[float], workers: int) -> int:
+    """Bound on the age of any factor in steps, -1 without workers: overdue, then behind all the others, and a matrix
+    is copied, factorized and taken up while the factor before is still in use."""
+    if workers < 1 or not services:
+        return -1
+    return ceil(overdue + one_round(services, workers) + 2 * max(services) + 2)

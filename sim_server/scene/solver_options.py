@@ -8,6 +8,7 @@ from pydantic import Field, PlainSerializer, PlainValidator
 
 from sim_server.errors import InputError
 from sim_server.scene.parameters import Parameters, complaint
+from sim_server.schedule import Rule
 
 PRECONDITIONERS = ("auto", "none", "jacobi", "block_jacobi", "cholesky")
 NOT_YET = ("ssor", "incomplete_cholesky")
@@ -87,6 +88,10 @@ class Solver(Parameters):
     )
     update_floor_steps: int = Field(
         default=1, ge=1, le=1_000_000, description="fewest steps between two factors of an object"
+    )
+    schedule: Rule = Field(default="excess", description="whose matrix is factorized next")
+    schedule_rounds: float = Field(
+        default=8.0, ge=1, le=1e6, description="an object goes next after so many rounds, whatever the rule"
     )
 
     @property

@@ -13,11 +13,12 @@ import pytest
 from numpy.typing import NDArray
 
 from protocol.factor import Factor
-from sim_server.driver import Driver
+from sim_server.driver import COPIES, Driver
 from sim_server.engine import Kind
 from sim_server.factors import Inline, Job
 from sim_server.simulation import Simulation
-from tests.scenes import bar, simulation
+from sim_server.track import flops
+from tests.scenes import bar, factor_of, simulation
 
 
 def falling(*bodies: dict, **solver) -> Simulation:
@@ -159,6 +160,114 @@ def test_the_shaken_one_of_four_is_served_most():
     calm = used[:2] + used[3:]
     assert min(calm) >= 1
     assert used[2] > 2 * max(calm)
+
+
+class Idle(Inline):
+    """So many idle workers, whose factors never come; what each of them was sent."""
+
+    def __init__(self, patterns, idle: int):
+        super().__init__(patterns)
+        self.idle, self.sent = idle, []
+
+    def ready(self) -> int:
+        return self.idle - len(self.sent)
+
+    def workers(self) -> list[int]:
+        return list(range(self.idle))
+
+    def submit(self, job: Job) -> bool:
+        if self.ready() <= 0:
+            return False
+        self.sent.append((job.object, job.step))
+        return True
+
+
+@pytest.mark.parametrize("idle", [0, 1, 3, 5, 9])
+def test_all_idle_workers_get_a_matrix_of_the_same_step(idle):
+    sim = falling(*(bar(name=f"beam{k}", young=1e6, fixed="X < 0.01") for k in range(6)), update="async")
+    source = Idle(patterns_of(sim), idle)
+    driver = Driver(sim, source)
+    driver.advance(2)
+    assert source.sent == [(f"beam{k}", 0) for k in range(min(idle, 6))]
+    driver.advance(5)
+    assert len(source.sent) == min(idle, 6)  # one of an object at a time
+
+
+def test_of_many_idle_workers_some_are_served_in_each_step():
+    """The loop is not asked to copy everything at once."""
+    sim = falling(*(bar(name=f"beam{k}", young=1e6, fixed="X < 0.01") for k in range(COPIES + 3)), update="async")
+    source = Idle(patterns_of(sim), 100)
+    Driver(sim, source).advance(4)
+    steps = [step for _, step in source.sent]
+    assert [steps.count(k) for k in range(2)] == [COPIES, 3]
+
+
+@pytest.mark.parametrize("rule", ["round_robin", "oldest", "weighted"])
+def test_the_scene_names_the_rule(rule):
+    """A shaken object beside three calm ones: only the rules that look at excess serve it more."""
+    sim = falling(
+        *(bar((4, 2, 2), name=f"beam{k}", young=1e6, fixed="X < 0.01") for k in range(4)), update="async", schedule=rule
+    )
+    driver, shaken, rng = Driver(sim, counted=True), sim.world.bodies[2], np.random.default_rng(0)
+    for _ in range(60):
+        sim.world.v[shaken.nodes] += rng.normal(size=(shaken.last - shaken.first, 3))
+        driver.advance(1)
+    used = [t.used for t in driver.tracks]
+    if rule == "weighted":
+        assert used[2] > 2 * max(used[:2] + used[3:])
+    else:
+        assert max(used) - min(used) <= 1
+
+
+@pytest.mark.parametrize(("rule", "rounds"), [("excess", 1.0), ("excess", 3.0), ("weighted", 2.0)])
+def test_ages_stay_within_the_bound_that_is_told(rule, rounds):
+    bodies = [bar((4, 2, 2), name=f"beam{k}", young=1e6, fixed="X < 0.01") for k in range(5)]
+    sim = falling(*bodies, update="async", schedule=rule, schedule_rounds=rounds, update_floor_iterations=6)
+    driver, shaken, rng = Driver(sim, counted=True), sim.world.bodies[1:4], np.random.default_rng(0)
+    for _ in range(80):
+        for body in shaken:
+            sim.world.v[body.nodes] += rng.normal(size=(body.last - body.first, 3))
+        driver.advance(1)
+    bound = driver.age_bound()
+    ages = [t.age_max for t in driver.tracks]
+    assert max(ages) <= bound < 100
+    assert max(ages) >= 10 * rounds > min(ages) > 0  # the calm wait until they are overdue
+
+
+@pytest.mark.parametrize(("update", "bound"), [("never", -1), ("every-4", 3), ("lockstep-3", 5), ("async", -1)])
+def test_bound_of_the_age_by_policy(update, bound):
+    driver = Driver(falling(update=update))
+    assert driver.age_bound() == bound
+    records = driver.advance(14)
+    assert driver.tracks[0].age_max == (records["step"] - 1 - records["factor_step"])[3:].max()
+    assert update == "never" or driver.tracks[0].age_max <= driver.age_bound()
+
+
+def test_no_bound_where_no_factor_is_made():
+    assert Driver(falling(preconditioner="jacobi")).age_bound() == -1
+
+
+def test_an_object_whose_matrix_always_fails_does_not_take_the_turns_of_the_others():
+    sim = falling(*(bar(name=f"beam{k}", young=1e6, fixed="X < 0.01") for k in range(3)), update="async")
+    driver, jobs = Driver(sim, counted=True), []
+    submit = driver.inline.submit
+
+    def broken(job: Job) -> bool:
+        jobs.append(job.object)
+        values = -job.values if job.object == "beam1" else job.values
+        return submit(Job(job.object, job.epoch, job.step, job.warp, values, job.dtype))
+
+    driver.inline.submit = broken  # type: ignore[method-assign]
+    driver.advance(60)
+    assert jobs.count("beam1") <= 7 < min(jobs.count("beam0"), jobs.count("beam2"))
+
+
+def test_cost_of_a_factorization_is_the_sum_of_squared_column_lengths():
+    sim = falling()
+    sim.engine.assemble()
+    pattern, _ = factor_of(sim)
+    lengths = np.diff(np.append(pattern.diagonal, pattern.nonzeros))
+    assert flops(pattern) == pytest.approx(float((lengths.astype(float) ** 2).sum()))
 
 
 def test_a_failed_factorization_does_not_stop_a_run(caplog):

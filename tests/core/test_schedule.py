@@ -1,11 +1,16 @@
 # SPDX-License-Identifier: MIT
 """Whose matrix goes next, and what a solve adds to its object's sum: tables of pure functions."""
 
+import dataclasses
+import math
+from typing import get_args
+
 import pytest
 
-from sim_server.schedule import Need, excess, pick
+from sim_server.schedule import AGEING, Need, Rule, excess, oldest_possible, one_round, overdue_after, pick
 
 NEW, BUSY = None, True
+RULES = get_args(Rule)
 
 
 def needs(*rows: tuple) -> list[Need]:
@@ -67,3 +72,88 @@ def test_the_busy_do_not_starve_the_calm():
         sums[chosen] = 0
         order.append(chosen)
     assert order.count("calm") == 2
+
+
+def need(object: str, **counters) -> Need:
+    return Need(**({"object": object, "excess": 0.0, "waited": 10, "in_flight": False, "age": 12} | counters))
+
+
+RULE_TABLE = {
+    "round robin: sent longest ago": ("round_robin", [need("a", waited=5, excess=99), need("b", waited=9)], "ba"),
+    "round robin: of equals the first": ("round_robin", [need("a"), need("b")], "ab"),
+    "oldest factor, though sent of late": ("oldest", [need("a", waited=9, age=9), need("b", waited=2, age=50)], "ba"),
+    "oldest: none at all is older than any": ("oldest", [need("a", age=500), need("b", age=None)], "ba"),
+    "oldest: of equals who waited longer": ("oldest", [need("a", waited=3), need("b", waited=4)], "ba"),
+    "weighted by the cost of an iteration": ("weighted", [need("a", excess=5), need("b", excess=3, cost=2.0)], "ba"),
+    "weighted by the time it takes": ("weighted", [need("a", excess=9, service=4.0), need("b", excess=3)], "ba"),
+    "weighted: nothing known of the time": ("weighted", [need("a", excess=1), need("b", excess=1, service=0.0)], "ba"),
+    "weighted: ageing": ("weighted", [need("a", excess=1), need("b", waited=11 + round(1 / AGEING))], "ba"),
+    "weighted: ageing is slow": ("weighted", [need("a", excess=1), need("b", waited=9 + round(1 / AGEING))], "ab"),
+    "weighted: excess without cost": ("weighted", [need("a", excess=7, cost=0.0), need("b", excess=1)], "ba"),
+}
+
+
+@pytest.mark.parametrize(("rule", "rows", "expected"), RULE_TABLE.values(), ids=RULE_TABLE.keys())
+def test_rules(rule, rows, expected):
+    assert "".join(pick(rows, 9, rule=rule)) == expected
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_whatever_the_rule(rule):
+    """First those never sent, then the overdue, longest first; those in flight or just served are left out."""
+    rows = [need("wild", excess=1e9, waited=3, age=1000), need("late", waited=40), need("later", waited=41),
+            need("new", waited=None, age=None), need("busy", excess=1e9, waited=90, in_flight=True),
+            need("just", excess=1e9, waited=1, age=2000)]  # fmt: skip
+    assert pick(rows, 9, floor_steps=2, rule=rule, overdue=40) == ["new", "later", "late", "wild"]
+    assert pick(rows, 2, floor_steps=2, rule=rule, overdue=40) == ["new", "later"]
+
+
+@pytest.mark.parametrize(
+    ("failures", "waited", "ready"),
+    [(0, 3, True), (1, 5, False), (1, 6, True), (2, 11, False), (99, 3 * 2**10 - 1, False), (99, 3 * 2**10, True)],
+)
+def test_an_object_whose_jobs_fail_is_asked_less_and_less_often(failures, waited, ready):
+    assert bool(pick([need("a", waited=waited, failures=failures)], 1, floor_steps=3)) is ready
+
+
+def test_bounds_of_the_age():
+    assert one_round([1, 2, 3], 2) == 3
+    assert overdue_after(8, [1, 2, 3], 2) == 24
+    assert oldest_possible(24, [1, 2, 3], 2) == 24 + 3 + 2 * 3 + 2
+    assert overdue_after(8, [1.0], 0) == math.inf  # nobody serves: nobody is overdue before another
+    assert oldest_possible(math.inf, [1.0], 0) == oldest_possible(8, [], 1) == -1
+
+
+def oldest_seen(rule: Rule, services: list[int], wild: dict[int, float], workers: int, rounds: float) -> int:
+    """Largest age of a factor in 3000 steps of a server with such objects, whose factors take so many steps each."""
+    rows = [need(str(k), waited=0, age=0, service=float(s)) for k, s in enumerate(services)]
+    done: dict[int, int] = {}  # object: step at which its factor comes
+    seen, overdue = 0, overdue_after(rounds, services, workers)
+    for step in range(3000):
+        for k in [k for k, at in done.items() if at <= step]:
+            rows[k] = dataclasses.replace(rows[k], in_flight=False, age=rows[k].waited)
+            del done[k]
+        seen = max(seen, *(row.age or 0 for row in rows))
+        for name in pick(rows, workers - len(done), rule=rule, overdue=overdue):
+            k = int(name)
+            done[k] = step + services[k]
+            rows[k] = dataclasses.replace(rows[k], in_flight=True, waited=0, excess=0.0)
+        rows = [dataclasses.replace(row, waited=(row.waited or 0) + 1, age=(row.age or 0) + 1,
+                                    excess=row.excess + wild.get(k, 0)) for k, row in enumerate(rows)]  # fmt: skip
+    return seen
+
+
+@pytest.mark.parametrize("workers", [1, 3])
+@pytest.mark.parametrize("rounds", [1, 4])
+@pytest.mark.parametrize("rule", RULES)
+def test_nobody_starves(rule, rounds, workers):
+    """Three of twelve need all that the workers can do; the others are served within the bound all the same."""
+    services = [1, 2, 5, 9] * 3
+    bound = oldest_possible(overdue_after(rounds, services, workers), services, workers)
+    seen = oldest_seen(rule, services, {0: 50.0, 5: 80.0, 6: 100.0}, workers, rounds)
+    assert 0 < seen <= bound
+
+
+def test_without_a_bound_the_calm_would_starve():
+    """What test_nobody_starves guards against does happen otherwise."""
+    assert oldest_seen("excess", [1, 2, 5], {0: 50.0, 1: 80.0}, 1, math.inf) > 2900

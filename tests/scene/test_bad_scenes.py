@@ -87,6 +87,8 @@ def test_the_unchanged_scene_is_good(tmp_path):
         (swap("tolerance = 1e-6", "max_iterations = 5.5"), "max_iterations = 5.5: must be a whole number"),
         (swap("tolerance = 1e-6", 'preconditioner = "ssor"'), "ssor is a known preconditioner but not available yet; available: auto, none"),
         (swap("tolerance = 1e-6", 'preconditioner = "incomplete_cholesky"'), "incomplete_cholesky is a known preconditioner but not available yet"),
+        (swap("tolerance = 1e-6", 'schedule = "fair"'), "solver.schedule = 'fair': must be 'excess', 'round_robin', 'oldest' or 'weighted'"),
+        (swap("tolerance = 1e-6", "schedule_rounds = 0.5"), "solver.schedule_rounds = 0.5: must be greater than or equal to 1"),
         (swap("tolerance = 1e-6", 'preconditioner = "ilu"'), "preconditioner = 'ilu': must be one of auto, none, jacobi"),
         (swap("tolerance = 1e-6", 'warp = "true"'), "solver.warp = 'true': must be true, false or \"auto\""),
         (swap("tolerance = 1e-6", "warp = 1"), "solver.warp = 1: must be true, false or \"auto\""),

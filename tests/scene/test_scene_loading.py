@@ -59,6 +59,8 @@ def test_defaults_and_resolved(tmp_path):
             "warm_start": True,
             "update_floor_iterations": 3,
             "update_floor_steps": 1,
+            "schedule": "excess",
+            "schedule_rounds": 8.0,
         },
         "record": {"every": 1, "compression": "lz4"},
         "object": [

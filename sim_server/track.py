@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: MIT
+"""Counters of one body, from which schedule.py decides: what it was sent, what came of it, what its solves cost."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol.factor import Factor, FactorPattern
+from sim_server.choice import Choice
+from sim_server.schedule import Need, excess
+from sim_server.world import Body
+
+MEMORY = 0.2  # weight of the newest value in running means
+
+
+def flops(pattern: FactorPattern) -> float:
+    """Of a numeric Cholesky factorization: the squares of the column lengths of L."""
+    width, height = np.diff(pattern.super_start).astype(float), np.diff(pattern.row_start).astype(float)
+    low = height - width  # lengths of the columns of a supernode: low + 1 ... height
+    return float((height * (height + 1) * (2 * height + 1) - low * (low + 1) * (2 * low + 1)).sum() / 6)
+
+
+class Mean:
+    """Running mean; `value` is None before the first."""
+
+    def __init__(self) -> None:
+        self.value: float | None = None
+
+    def add(self, value: float) -> None:
+        self.value = value if self.value is None else self.value + MEMORY * (value - self.value)
+
+
+class Track:
+    """One body. counted: costs are bytes and operations instead of seconds, so that runs repeat exactly."""
+
+    def __init__(self, body: Body, auto: bool, counted: bool = False):
+        self.body, self.counted = body, counted
+        self.excess = 0.0
+        self.sent: int | None = None  # step of the last matrix that went out
+        self.in_flight = False
+        self.wanted: NDArray[np.float64] | None = None  # where the loop copies the matrix asked for
+        self.used = 0
+        self.refused = 0
+        self.failures = 0  # in a row
+        self.newest = -1  # step of the newest factor taken up
+        self.age_max = -1  # steps; largest age of a factor so far, -1: none was used
+        self.latency = Mean()  # steps from a matrix to its factor
+        self.seconds = Mean()  # s, or operations, of a factorization
+        self.per_iteration = Mean()  # s, or bytes
+        self.choice = Choice() if auto else None
+
+    def age(self, step: int) -> int:
+        """Steps since the matrix of the newest factor, -1 without one."""
+        return step - self.newest if self.newest >= 0 else -1
+
+    def need(self, step: int) -> Need:
+        """What the scheduler is told."""
+        return Need(
+            self.body.name,
+            self.excess,
+            None if self.sent is None else step - self.sent,
+            self.in_flight or self.wanted is not None,
+            self.age(step) if self.newest >= 0 else None,
+            1.0 if self.per_iteration.value is None else self.per_iteration.value,
+            1.0 if self.seconds.value is None else self.seconds.value,
+            self.failures,
+        )
+
+    def went_out(self, step: int) -> None:
+        """Its matrix of `step` is on the way."""
+        self.in_flight, self.sent, self.wanted, self.excess = True, step, None, 0.0
+
+    def came_in(self, factor: Factor, step: int) -> bool:
+        """A factor came during `step`; False if a newer one is there already."""
+        if self.in_flight and factor.step == self.sent:
+            self.latency.add(max(1, step - factor.step))
+        self.in_flight, self.failures = False, 0
+        if factor.step <= self.newest:
+            return False
+        self.seconds.add(flops(factor.pattern) if self.counted else max(factor.seconds, 1e-6))
+        self.newest = factor.step
+        self.sent = factor.step if self.sent is None else self.sent  # one made elsewhere
+        self.used += 1
+        return True
+
+    def came_to_nothing(self) -> None:
+        """Its job failed; it may be sent again."""
+        self.in_flight = False
+        self.refused += 1
+        self.failures += 1
+
+    def observe(self, record: Any, floor: int, cost: float) -> None:
+        """A solve was made (a record of the loop). floor: iterations above it are excess; cost: of the solve."""
+        self.excess += excess(int(record["iterations"]), floor)
+        self.refused += int(record["fallbacks"])
+        self.per_iteration.add(cost / (int(record["iterations"]) + 1))
+        if record["factor_step"] >= 0:
+            self.age_max = max(self.age_max, int(record["step"]) - 1 - int(record["factor_step"]))
