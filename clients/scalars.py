@@ -29,6 +29,7 @@ DTYPES: dict[str, str] = {
     "late_seconds": "f8",
     "fallbacks": "i8",
     "excess": "f8",
+    "factor_age_bound": "i8",  # steps; -1: none known
 }
 
 

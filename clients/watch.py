@@ -49,7 +49,7 @@ def _summary(status: pb.Status) -> Text:
 
 
 def _objects(status: pb.Status) -> Table:
-    table = Table("object", "nodes", "iter.", "mean", "residual", "status", "age", "preconditioner", **COMPACT)
+    table = Table("object", "nodes", "iter.", "mean", "residual", "status", "age", "bound", "preconditioner", **COMPACT)
     for found in status.objects:
         last = found.last
         table.add_row(
@@ -59,7 +59,8 @@ def _objects(status: pb.Status) -> Table:
             f"{found.mean_iterations:.1f}",
             f"{last.residual:.1e}",
             status_name(last.status),
-            str(last.factor_age) if last.factor_age >= 0 and last.step else "-",
+            _known(found.factor_age),
+            _known(found.factor_age_bound),
             last.preconditioner,
         )
     return table
@@ -74,6 +75,10 @@ def _workers(status: pb.Status) -> Table | Text:
         shared = "yes" if worker.shared_memory else "no"
         table.add_row(worker.worker, worker.host, str(worker.pid), worker.library, *map(str, numbers), shared)
     return table
+
+
+def _known(steps: int) -> str:
+    return str(steps) if steps >= 0 else "-"
 
 
 def _ms(seconds: float) -> str:

@@ -36,7 +36,17 @@ def test_npz_has_the_agreed_arrays(log: Log, tmp_path: Path) -> None:
     np.testing.assert_array_equal(arrays["v"], np.stack([velocities(s) for s in range(STEPS + 1)]))
     np.testing.assert_array_equal(arrays["tets"], TETS)
     steps = [object_step("beam", s) for s in range(1, STEPS + 1)]
-    for name in ("step", "iterations", "residual", "factor_step", "step_seconds", "time", "factor_age", "excess"):
+    for name in (
+        "step",
+        "iterations",
+        "residual",
+        "factor_step",
+        "step_seconds",
+        "time",
+        "factor_age",
+        "excess",
+        "factor_age_bound",
+    ):
         assert arrays[f"scalars/{name}"].tolist() == [getattr(s, name) for s in steps], name
     assert arrays["scalars/status"].tolist() == ["converged"] * 3 + ["max_iterations"] + ["converged"] * 5
     assert arrays["scalars/preconditioner"].tolist() == ["block_jacobi"] * 2 + ["cholesky"] * 7

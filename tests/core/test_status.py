@@ -33,3 +33,36 @@ def test_the_client_shows_these_numbers():
     text = io.StringIO()
     Console(width=200, file=text).print(tables(pb.Status(frames_dropped=4, records_dropped=51, records_lost=62)))
     assert "dropped: frames 4, step records 51; lost to the log 62" in text.getvalue()
+
+
+def test_the_status_and_the_log_tell_the_age_of_factors_and_its_bound():
+    """The log as it is written: each step carries the bound that held then."""
+    bodies = [bar(name=name, young=1e5, fixed="X < 0.01") for name in ("a", "b", "c")]
+    sim = simulation(*bodies, gravity=(0, -9.81, 0), preconditioner="cholesky", schedule_rounds=2.0)
+    found, logged = [], []
+    link = SimpleNamespace(publish_status=found.append, wants_steps=lambda: False)
+    recorder = SimpleNamespace(dropped=0, lost=0, step=lambda message, block: logged.append(message))
+    driver = Driver(sim)
+    telemetry = Telemetry(driver, link, recorder, patient=False)  # type: ignore[arg-type]
+    telemetry.publish_status("running")
+    assert [(o.factor_age, o.factor_age_max, o.factor_age_bound) for o in found[0].objects] == [(-1, -1, -1)] * 3
+    for _ in range(40):
+        telemetry.records(driver.advance(1))
+    telemetry.publish_status("running")
+    bound = driver.age_bound()
+    assert 0 < bound < 40
+    for status, track in zip(found[1].objects, driver.tracks, strict=True):
+        steps = [s for s in logged if s.header.object == status.object]
+        assert status.factor_age == 40 - track.newest > 0
+        assert status.factor_age_max == max(s.factor_age for s in steps) <= bound == status.factor_age_bound
+        assert {s.factor_age_bound for s in steps[:1]} == {-1} and steps[-1].factor_age_bound == bound
+
+
+def test_the_client_shows_the_age_and_its_bound():
+    text = io.StringIO()
+    ages = {"liver": (12, 345), "beam": (0, -1)}
+    objects = [pb.ObjectStatus(object=o, factor_age=a, factor_age_bound=b) for o, (a, b) in ages.items()]
+    Console(width=80, file=text).print(tables(pb.Status(objects=objects)))
+    rows = {words[0]: words[-2:] for line in text.getvalue().splitlines() if (words := line.split())}
+    assert (rows["liver"], rows["beam"]) == (["12", "345"], ["0", "-"])
+    assert "bound" in text.getvalue()
