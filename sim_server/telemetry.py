@@ -36,6 +36,7 @@ class Telemetry:
         self.seconds: deque[float] = deque(maxlen=WINDOW)
         self._last: dict[str, pb.ObjectStep] = {}
         self._bad: set[str] = set()
+        self._age_bound = -1  # steps; of factors
         self.solves = 0
         self.unconverged: Counter[str] = Counter()  # solves by status, of those that did not converge
         self._due = {"steps": 0.0, "state": 0.0, "status": 0.0}
@@ -68,6 +69,7 @@ class Telemetry:
         if len(records):
             self.seconds.extend(records["whole"][records["body"] == 0].tolist())
             messages = describe.steps(self.simulation, records)
+            self._age_bound = self.driver.age_bound()
             self._touch(messages)
             for message in messages:
                 self._note(message)
@@ -80,6 +82,7 @@ class Telemetry:
     def _note(self, message: pb.ObjectStep) -> None:
         name = message.header.object
         message.excess = self.driver.by_name[name].excess
+        message.factor_age_bound = self._age_bound
         self._window[name].append(message.iterations)
         self._last[name] = message
         if self.recorder:
@@ -142,6 +145,7 @@ class Telemetry:
         dropped = loop.frames_dropped + (self.recorder.dropped if self.recorder else 0)
         status.frames_dropped, status.records_dropped = dropped, loop.records_dropped
         status.records_lost = self.recorder.lost if self.recorder else 0
+        bound = self.driver.age_bound()
         for track in self.driver.tracks:
             body, window = track.body, self._window[track.body.name]
             status.objects.append(
@@ -155,6 +159,9 @@ class Telemetry:
                     factors_used=track.used,
                     factors_refused=track.refused,
                     in_flight=track.in_flight,
+                    factor_age=track.age(status.step),
+                    factor_age_max=track.age_max,
+                    factor_age_bound=bound,
                 )
             )
         self.link.publish_status(status)
