@@ -17,12 +17,10 @@ from mcap.records import Message as McapMessage
 
 from clients.errors import BadInput
 from clients.frames import Frame, Mesh, frame_of, mesh_of
-from clients.mcap_chunks import ChunkFile
 from clients.scalars import Columns, columns, row
-from protocol import PROTOCOL, Refused
+from protocol import Refused
 from protocol import messages_pb2 as pb
-
-PROFILE = "warpfactor"
+from protocol.log_chunks import BadLog, ChunkFile
 
 
 @dataclass
@@ -54,7 +52,7 @@ class Log:
         self.scene: pb.Scene | None = None
         self.objects: dict[str, ObjectLog] = {}
         self._malformed: list[str] = []
-        self._file = ChunkFile.open(self.path)
+        self._file = _opened(self.path)
         self._topics: dict[int, str] = {}
         self._cached: tuple[int, list[McapRecord]] = (-1, [])
         try:
@@ -77,14 +75,11 @@ class Log:
     @property
     def notes(self) -> list[str]:
         """What a reader should know about gaps, one sentence each; empty for a complete log."""
-        notes = [f"{self.path}: {problem}" for problem in self._file.problems]
+        notes = self._file.notes()
         if self._malformed:
             notes.append(
                 f"{self.path}: {len(self._malformed)} malformed messages left out, first: {self._malformed[0]}"
             )
-        for name, count in self._file.metadata.get("recorder", {}).items():
-            if count != "0":
-                notes.append(f"{self.path}: the recorder could not keep up: {name.replace('_', ' ')}: {count}")
         return notes
 
     def object_log(self, name: str) -> ObjectLog:
@@ -136,16 +131,10 @@ class Log:
         self.close()
 
     def _check_origin(self) -> None:
-        if self._file.problems and not self._file.metadata:
-            raise BadInput(f"{self.path}: nothing readable: {self._file.problems[0]}")
-        if self._file.header.profile != PROFILE:
-            raise BadInput(
-                f"{self.path}: an MCAP file, but not a log of sim-server "
-                f"(profile {self._file.header.profile!r}, expected {PROFILE!r})"
-            )
-        version = self._file.metadata.get("warpfactor", {}).get("protocol", "unknown")
-        if version != str(PROTOCOL):
-            raise BadInput(f"{self.path}: a log of protocol version {version}; this program reads version {PROTOCOL}")
+        try:
+            self._file.check_origin()
+        except BadLog as error:
+            raise BadInput(str(error)) from None
 
     def _keep(self, offset: int, number: int, record: McapRecord) -> None:
         if isinstance(record, Channel):
@@ -161,9 +150,11 @@ class Log:
         if topic == "/scene":
             self.scene = pb.Scene.FromString(record.data)
             return
+        if topic == "/touch":
+            return  # for replays that simulate
         _, _, rest = topic.partition("/")
         kind, _, name = rest.partition("/")
-        if kind not in ("topology", "state", "step", "interaction") or not name:
+        if kind not in ("topology", "state", "step", "interaction", "factor") or not name:
             raise Refused("a message of an unknown channel")
         found = self.objects.setdefault(name, ObjectLog(name))
         if kind == "topology":
@@ -174,5 +165,12 @@ class Log:
             found.frames.append((frame.step, frame.epoch, offset, number))
         elif kind == "step":
             found.rows.append(row(pb.ObjectStep.FromString(record.data)))
-        else:
+        elif kind == "interaction":
             found.interactions.append((record.log_time / 1e9, pb.Interaction.FromString(record.data)))
+
+
+def _opened(path: Path) -> ChunkFile:
+    try:
+        return ChunkFile.open(path)
+    except BadLog as error:
+        raise BadInput(str(error)) from None

@@ -39,6 +39,7 @@ FLAGS = [
 ]
 
 compiled: list[str] = []  # names of the texts this process uses, in order: what a scene costs can be tested
+libraries: set[str] = set()  # what they were compiled to, named by source, headers, flags, compiler and processor
 
 
 class CompileError(RuntimeError):
@@ -104,6 +105,7 @@ def build(source: Path, defines: tuple[str, ...] = ()) -> Path:
             raise CompileError(f"{source.name} did not compile:\n{' '.join(command)}\n{result.stderr}")
         os.replace(scratch, library)
     compiled.append(source.name)
+    libraries.add(library.name)
     return library
 
 
@@ -215,6 +217,11 @@ class Module:
         function = ctypes.cast(getattr(self._library, kernel), ctypes.c_void_p).value
         assert function is not None
         return Launch(f"{self.name}.{kernel}", function, params, n, arrays)
+
+
+def build_id() -> str:
+    """Digest of the compiled code in use: equal ones repeat a run bit for bit."""
+    return hashlib.sha256("\0".join(sorted(libraries)).encode()).hexdigest()[:24]
 
 
 @cache

@@ -113,14 +113,20 @@ class Commands:
 
     @staticmethod
     def _message(a) -> pb.Interaction:  # type: ignore[no-untyped-def]
-        def vector(v: tuple[float, float, float]) -> pb.Vector:
-            return pb.Vector(x=v[0], y=v[1], z=v[2])
+        return interaction_message(a)
 
-        return pb.Interaction(
-            id=a.id, client=a.client, object=a.object, kind="grab" if a.stiffness else "push", point=vector(a.point),
-            radius=a.radius, force=vector(a.force), duration=a.duration, target=vector(a.target),
-            stiffness=a.stiffness, max_force=a.limit, nodes=len(a.nodes), start=a.start,
-        )  # fmt: skip
+
+def interaction_message(a) -> pb.Interaction:  # type: ignore[no-untyped-def]
+    """An interaction of the effect touch in the words of the protocol."""
+
+    def vector(v: tuple[float, float, float]) -> pb.Vector:
+        return pb.Vector(x=v[0], y=v[1], z=v[2])
+
+    return pb.Interaction(
+        id=a.id, client=a.client, object=a.object, kind="grab" if a.stiffness else "push", point=vector(a.point),
+        radius=a.radius, force=vector(a.force), duration=a.duration, target=vector(a.target),
+        stiffness=a.stiffness, max_force=a.limit, nodes=len(a.nodes), start=a.start,
+    )  # fmt: skip
 
 
 def _tuple(v: pb.Vector) -> tuple[float, float, float]:

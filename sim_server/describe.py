@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol import messages_pb2 as pb
+from sim_server.backend import Cpu, build_id
 from sim_server.engine import Kind
 from sim_server.mesh import posed
 from sim_server.mesh.surface import surface_triangles
@@ -31,6 +32,8 @@ def scene(simulation: Simulation) -> pb.Scene:
         started_ns=time.time_ns(),
         software=f"warpfactor {_version()}, {simulation.world.backend.name}, Python {platform.python_version()}",
         objects=[b.name for b in simulation.world.bodies],
+        device="cpu" if isinstance(simulation.world.backend, Cpu) else "gpu",
+        build=build_id(),
     )
 
 
@@ -100,6 +103,8 @@ def _step(names: list[str], r: dict[str, Any]) -> pb.ObjectStep:
         step_seconds=r["whole"],
         late_seconds=r["late"],
         fallbacks=r["fallbacks"],
+        asked=NAMES[Kind(r["asked"])] if r["asked"] != r["kind"] else "",
+        probe=r["probe"],
     )
 
 

@@ -108,7 +108,8 @@ class Engine(Reports):
         self._native = _library()
         launches = [*assemble, *integrate]
         nodes, bodies = len(arrays["x"]), len(ranges)
-        self.launches, self._bindings = launches, [layouts.Binding(c.addressof(x.params), x.items, 0) for x in launches]
+        self.launches = launches
+        self._bindings = [layouts.Binding(c.addressof(x.params), x.items, 0, -1) for x in launches]
         self._launch = (layouts.Launch * max(len(launches), 1))()
         for entry, launch, binding in zip(self._launch, launches, self._bindings, strict=False):
             entry.kernel, entry.binding = launch.function, c.addressof(binding)
@@ -209,9 +210,10 @@ class Engine(Reports):
         """Forget the copy asked for (only while the loop stands still)."""
         self._body[body].snapshot = None
 
-    def replace(self, launch: int, new: Launch) -> None:
-        """Gives a launch other arguments, from the next step on."""
-        binding = layouts.Binding(c.addressof(new.params), new.items, 0)
+    def replace(self, launch: int, new: Launch) -> layouts.Binding:
+        """Gives a launch other arguments, from the next step on: the one after the result's `taken` steps, once it is
+        not below 0."""
+        binding = layouts.Binding(c.addressof(new.params), new.items, 0, -1)
         displaced = self._native.wf_post_binding(c.byref(self._launch[launch]), c.addressof(binding))
         kept = self._posted.setdefault(launch, [])  # in use, waiting
         if displaced:
@@ -219,3 +221,4 @@ class Engine(Reports):
         else:
             del kept[:-1]  # the last one was taken up, so those before are done with
         kept.append((binding, new))
+        return binding

@@ -46,12 +46,15 @@ class FactorSource(Protocol):
 
 
 class Inline:
-    """Factorizes in this process, during submit. patterns: block pattern (row_start, columns) of each object."""
+    """Factorizes in this process, during submit.
+
+    patterns: block pattern (row_start, columns) of each object. library: as in precond_worker.factorize.Analysis.
+    """
 
     WORKER = "in process"
 
-    def __init__(self, patterns: dict[str, tuple[NDArray[np.int32], NDArray[np.int32]]]):
-        self._patterns = patterns
+    def __init__(self, patterns: dict[str, tuple[NDArray[np.int32], NDArray[np.int32]]], library: str = "auto"):
+        self._patterns, self._library = patterns, library
         self._analyses: dict[str, Any] = {}
         self._done: list[Factor] = []
         self._failed: list[tuple[str, str]] = []
@@ -89,7 +92,7 @@ class Inline:
         if name not in self._analyses:
             if not self._analyses and (message := default_library()[1]):
                 log.warning("%s", message)
-            self._analyses[name] = Analysis(*self._patterns[name])
+            self._analyses[name] = Analysis(*self._patterns[name], self._library)
         return self._analyses[name]
 
     def poll(self) -> list[Factor]:

@@ -13,7 +13,7 @@ RECORD = np.dtype(
         ("step", "i8"), ("factor_step", "i8"), ("time", "f8"), ("residual", "f8"), ("assemble", "f8"), ("solve", "f8"),
         ("integrate", "f8"), ("whole", "f8"), ("late", "f8"), ("begin", "f8"), ("cpu", "f8"), ("body", "i4"),
         ("iterations", "i4"), ("status", "i4"), ("kind", "i4"), ("asked", "i4"), ("fallbacks", "i4"),
-        ("bad_node", "i4"), ("unused", "i4"),
+        ("bad_node", "i4"), ("probe", "i4"),
     ]
 )  # fmt: skip
 """One body, one step: what a loop reports. Seconds, except step numbers; `step` counts completed steps.
@@ -57,7 +57,7 @@ class Settings(c.Structure):
 
 
 class Binding(c.Structure):
-    _fields_ = [("params", c.c_void_p), ("items", c.c_int32), ("unused", c.c_int32)]
+    _fields_ = [("params", c.c_void_p), ("items", c.c_int32), ("unused", c.c_int32), ("taken", c.c_int64)]
 
 
 class Launch(c.Structure):

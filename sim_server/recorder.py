@@ -44,8 +44,8 @@ class _Record:
 class Recorder:
     """Writes scene, topologies, states, steps and interactions to an MCAP file from a thread of its own.
 
-    Messages are stored under /scene, /topology/OBJECT, /state/OBJECT, /step/OBJECT and /interaction/OBJECT with
-    `log_time` = simulation time and `publish_time` = wall clock, both in ns.
+    Messages are stored under /scene, /topology/OBJECT, /state/OBJECT, /step/OBJECT, /interaction/OBJECT, /touch and
+    /factor/OBJECT with `log_time` = simulation time and `publish_time` = wall clock, both in ns.
 
     Feeding never waits unless asked to (`block=True`, for runs faster than real time). While more than FRAME_BYTES
     wait for the disk, states are dropped and counted in `dropped`; everything else is kept up to TOTAL_BYTES and
@@ -98,6 +98,14 @@ class Recorder:
     def interaction(self, message: pb.Interaction, time: float, block: bool = False) -> None:
         """Appends a push or grab that took effect at `time` [s of simulation]."""
         self._feed(f"/interaction/{message.object}", message, self._stamp(time), message.id, block)
+
+    def touch_set(self, message: pb.TouchSet, time: float, block: bool = False) -> None:
+        """Appends the interactions that the loop works with from `time` [s of simulation] on."""
+        self._feed("/touch", message, self._stamp(time), message.step, block)
+
+    def factor(self, message: pb.FactorUse, block: bool = False) -> None:
+        """Appends what is known of a factor that was handed to the loop."""
+        self._feed(f"/factor/{message.header.object}", message, self._time, message.step, block)
 
     def close(self) -> None:
         """Writes what waits and the index of the file; may be called again."""

@@ -6,7 +6,9 @@ service thread   here: factors in, matrices out, commands, records to log and li
 recorder, link   threads of their own for the disk and the network
 """
 
+import contextlib
 import logging
+import os
 import threading
 import time
 from collections import deque
@@ -23,10 +25,12 @@ from sim_server.network.link import ServerLink
 from sim_server.recorder import Recorder
 from sim_server.simulation import Simulation
 from sim_server.telemetry import Telemetry
+from sim_server.trace import Trace
 
 log = logging.getLogger(__name__)
 
 NAP = 1e-3  # s between rounds of the service thread
+LOOP_NICE = -10  # of the loop's thread in real time: before workers, clients and our own threads on a full machine
 ENDLESS = 1 << 62
 
 
@@ -44,6 +48,7 @@ class Service:
         self.telemetry = Telemetry(self.driver, link, recorder, patient=not realtime)
         self.commands = Commands(simulation, self._accepted)
         self.telemetry.commands = self.commands
+        self.telemetry.trace = Trace(self.driver, link, recorder) if recorder else None
         self.engine.loop.frame_every = self.telemetry.wanted_frames()
         self._waiting: deque[NDArray[Any]] = deque()
         self._failure: BaseException | None = None
@@ -70,6 +75,9 @@ class Service:
             raise self._failure
 
     def _loop(self) -> None:
+        if self.engine.loop.realtime:
+            with contextlib.suppress(OSError, AttributeError):  # needs a privilege, and Linux
+                os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), LOOP_NICE)
         try:
             if self._alone:
                 self.engine.run(ENDLESS if self.steps is None else self.steps)

@@ -15,6 +15,7 @@ from sim_server.commands import Commands
 from sim_server.driver import Driver
 from sim_server.network.link import ServerLink
 from sim_server.recorder import Recorder
+from sim_server.trace import Trace
 
 STEPS_PERIOD = 0.05  # s between batches of step records
 STATE_PERIOD = 1 / 30  # s between states for viewers
@@ -29,6 +30,7 @@ class Telemetry:
         self.driver, self.link, self.recorder, self.patient = driver, link, recorder, patient
         self.simulation, self.engine = driver.simulation, driver.engine
         self.commands: Commands | None = None
+        self.trace: Trace | None = None
         self.begun = time.monotonic()
         self.every = self.simulation.scene.record.every if recorder else 0
         self._batch: list[pb.ObjectStep] = []
@@ -45,6 +47,7 @@ class Telemetry:
     def open(self) -> None:
         """Scene, topologies and the initial state: first in the log, first on the network."""
         message = describe.scene(self.simulation)
+        message.server = self.link.name
         self.link.set_scene(message)
         if self.recorder:
             self.recorder.scene(message)
@@ -66,6 +69,8 @@ class Telemetry:
 
     def records(self, records: NDArray[Any]) -> None:
         """Step records: all of them to the log, in batches to listeners."""
+        if self.trace:
+            self.trace.write(self.patient)
         if len(records):
             self.seconds.extend(records["whole"][records["body"] == 0].tolist())
             messages = describe.steps(self.simulation, records)

@@ -85,7 +85,7 @@ class Touch(Effect):
     def __init__(self, world: World, listed: list[tuple[Body, Any]]):
         self.world = world
         self.params: dict[str, Params] = {body.name: params for body, params in listed}
-        self.publish: Callable[[Launch], None] = lambda launch: None  # set by the server
+        self.publish: Callable[[Launch], Any] = lambda launch: None  # set by the server
         self._system: System | None = None
         self._applied: list[Interaction] = []
         self._launch: Launch | None = None  # in use, or about to be; it writes when each interaction began
@@ -150,6 +150,15 @@ class Touch(Effect):
         if len(kept) < len(alive):
             self._put(kept)
         return len(alive) - len(kept)
+
+    @property
+    def applied(self) -> list[Interaction]:
+        """All that the loop was given last, as it was given them."""
+        return self._applied
+
+    def restore(self, interactions: list[Interaction]) -> None:
+        """Has the loop work with exactly these from its next step on: those of a log."""
+        self._put(interactions)
 
     def known(self) -> list[Interaction]:
         """All that the loop was given last, also those that are over, with the time at which they began."""

@@ -12,12 +12,13 @@ struct Binding {           // arguments of a launch, replaceable between steps
     const void* params;
     int32_t items;
     int32_t unused;
+    int64_t taken;   // steps completed when the loop took it up, -1: it has not
 };
 
 struct Launch {
     Kernel kernel;
-    const Binding* binding;
-    std::atomic<const Binding*> mail;   // the next one, or null
+    Binding* binding;
+    std::atomic<Binding*> mail;   // the next one, or null
 };
 
 struct Body {
@@ -52,8 +53,11 @@ struct Loop {
     Rings rings;
 };
 
-static void run(Launch& l, int threads) {
-    if (const Binding* next = l.mail.exchange(nullptr)) l.binding = next;
+static void run(Launch& l, int threads, int64_t step) {
+    if (Binding* next = l.mail.exchange(nullptr)) {
+        l.binding = next;
+        next->taken = step;
+    }
     const int64_t items = l.binding->items, grain = 512;
     int parts = (int)(items / grain < threads ? items / grain : threads);
     if (parts < 2) {
@@ -108,7 +112,7 @@ void wf_assemble(Loop* loop) {
     Rings& rings = loop->rings;
     loop->cpu_begin = thread_time();
     loop->clock[0] = rings.start_time + rings.step * rings.dt;
-    for (int i = 0; i < loop->before; ++i) run(loop->launch[i], loop->threads);
+    for (int i = 0; i < loop->before; ++i) run(loop->launch[i], loop->threads, rings.step);
     for (int i = 0; i < loop->bodies; ++i) copy_matrix(*loop, loop->body[i]);
     loop->assemble_begin = begin;
     loop->assemble_seconds = now() - begin;
@@ -131,13 +135,13 @@ void wf_solve(Loop* loop) {
         ++body.steps;
         if (!keep) continue;
         Record& record = rings.records[(first + i) % rings.record_capacity];
-        bool used = r.kind == CHOLESKY || r.fallbacks;
+        bool used = body.factor && (settings.kind == CHOLESKY || r.kind == CHOLESKY || r.fallbacks);
         record = Record{step, used ? body.factor->step : -1, rings.start_time + step * rings.dt, r.residual,
                         loop->assemble_seconds, r.seconds, 0, 0, rings.late, loop->assemble_begin, 0, i, r.iterations, r.status,
-                        r.kind, settings.kind, r.fallbacks, r.status == NOT_FINITE ? first_bad_node(*loop, body) : -1, 0};
+                        r.kind, settings.kind, r.fallbacks, r.status == NOT_FINITE ? first_bad_node(*loop, body) : -1, settings.probe};
     }
     double solved = now();
-    for (int i = loop->before; i < loop->launches; ++i) run(loop->launch[i], loop->threads);
+    for (int i = loop->before; i < loop->launches; ++i) run(loop->launch[i], loop->threads, rings.step);
     double end = now(), cpu = thread_time() - loop->cpu_begin;
     ++rings.step;
     if (!keep) { rings.records_dropped += loop->bodies; }
@@ -166,7 +170,7 @@ int64_t wf_run(Loop* loop, int64_t steps) {
 }
 
 const Factor* wf_post_factor(Body* body, const Factor* factor) { return body->mail.exchange(factor); }
-const Binding* wf_post_binding(Launch* launch, const Binding* binding) { return launch->mail.exchange(binding); }
+Binding* wf_post_binding(Launch* launch, Binding* binding) { return launch->mail.exchange(binding); }
 
 // One application of a factor, for tests and measurements: z = P^-1 r.
 void wf_apply_factor(const Factor* factor, const double* r, double* z, double* work) {

@@ -27,7 +27,7 @@ struct Factor {
 
 struct SolveSettings {
     double tolerance;       // of |b|
-    double budget;          // s of wall time, 0: none
+    double budget;          // s of wall time, 0: none; below 0: ends after -budget - 1 iterations (replays)
     int32_t max_iterations;
     int32_t kind;           // Kind wanted; CHOLESKY without a factor is BLOCK_JACOBI
     int32_t warm_start;
@@ -127,7 +127,8 @@ static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor,
             switched = restart = true;
             continue;
         }
-        if (settings.budget > 0 && now() - start > settings.budget) return finish(BUDGET, residual(A, b, x, r), b2);
+        bool spent = settings.budget > 0 ? now() - start > settings.budget : out.iterations + 1 == -settings.budget;
+        if (spent) return finish(BUDGET, residual(A, b, x, r), b2);
 
         double pq = multiply(A, p, q);
         ++out.iterations;

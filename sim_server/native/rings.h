@@ -14,7 +14,7 @@ struct Record {
     double residual;
     double assemble, solve, integrate, whole, late, begin;  // s; begin: steady clock
     double cpu;            // s of processor time of the thread, whole step
-    int32_t body, iterations, status, kind, asked, fallbacks, bad_node, unused;
+    int32_t body, iterations, status, kind, asked, fallbacks, bad_node, probe;
 };
 
 struct Rings {

@@ -14,10 +14,9 @@ import zstandard
 from mcap.records import Chunk
 from mcap.writer import Writer
 
-from clients import mcap_chunks
 from clients.errors import BadInput
 from clients.log import Log
-from protocol import PROTOCOL
+from protocol import PROTOCOL, log_chunks
 from sim_server.mcap_file import McapFile
 from tests.sample_run import object_step, positions, record, state, topology
 
@@ -165,10 +164,10 @@ def test_a_chunk_that_unpacks_to_more_than_it_says(compression: str) -> None:
     packed = lz4.frame.compress(plain) if compression == "lz4" else zstandard.compress(plain)
     bomb = Chunk(compression, packed, 0, 0, zlib.crc32(b""), 100)
     with pytest.raises(ValueError, match="101 bytes instead of 100"):
-        mcap_chunks._unpack(bomb)
-    bomb.uncompressed_size = mcap_chunks.RECORD_LIMIT + 1
+        log_chunks._unpack(bomb)
+    bomb.uncompressed_size = log_chunks.RECORD_LIMIT + 1
     with pytest.raises(ValueError, match="at most"):
-        mcap_chunks._unpack(bomb)
+        log_chunks._unpack(bomb)
 
 
 def test_dropped_frames_are_told(tmp_path: Path) -> None:

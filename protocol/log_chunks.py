@@ -25,17 +25,22 @@ from mcap.records import Channel, Chunk, Header, McapRecord, Message, Metadata
 from mcap.stream_reader import breakup_chunk
 from mcap.writer import MCAP0_MAGIC
 
-from clients.errors import BadInput
+from protocol.channels import PROTOCOL
 
 RECORD_LIMIT = 1 << 30  # bytes of one record, compressed or not
+PROFILE = "warpfactor"
 BROKEN = (McapError, struct.error, UnicodeDecodeError, ValueError, RuntimeError, zstandard.ZstdError)
+
+
+class BadLog(ValueError):
+    """No log, or one of another protocol version; the text names the file."""
 
 
 @dataclass
 class ChunkFile:
     """The records of one file. `problems` and `complete` are known once `scan` has ended.
 
-    Raises BadInput from `open` if there is no such file or it is no MCAP file.
+    Raises BadLog from `open` if there is no such file or it is no MCAP file.
     """
 
     path: Path
@@ -53,10 +58,10 @@ class ChunkFile:
             size = os.fstat(stream.fileno()).st_size
             magic = stream.read(len(MCAP0_MAGIC))
         except OSError as error:
-            raise BadInput(f"{path}: cannot be read: {error.strerror}") from None
+            raise BadLog(f"{path}: cannot be read: {error.strerror}") from None
         if magic != MCAP0_MAGIC:
             stream.close()
-            raise BadInput(
+            raise BadLog(
                 f"{path}: {'an empty file' if size == 0 else 'not an MCAP file'}, a log of sim-server is wanted"
             )
         return cls(path, stream, size)
@@ -80,6 +85,27 @@ class ChunkFile:
             except BROKEN as error:
                 self.problems.append(f"the block at byte {offset} is damaged and left out ({error})")
         progress(self.size)
+
+    def check_origin(self) -> None:
+        """Raises BadLog unless it is a log of sim-server, of this protocol version. Before messages are decoded."""
+        if self.problems and not self.metadata:
+            raise BadLog(f"{self.path}: nothing readable: {self.problems[0]}")
+        if self.header.profile != PROFILE:
+            raise BadLog(
+                f"{self.path}: an MCAP file, but not a log of sim-server "
+                f"(profile {self.header.profile!r}, expected {PROFILE!r})"
+            )
+        version = self.metadata.get("warpfactor", {}).get("protocol", "unknown")
+        if version != str(PROTOCOL):
+            raise BadLog(f"{self.path}: a log of protocol version {version}; this program reads version {PROTOCOL}")
+
+    def notes(self) -> list[str]:
+        """What a reader should know about gaps, one sentence each, after `scan`."""
+        notes = [f"{self.path}: {problem}" for problem in self.problems]
+        for name, count in self.metadata.get("recorder", {}).items():
+            if count != "0":
+                notes.append(f"{self.path}: the recorder could not keep up: {name.replace('_', ' ')}: {count}")
+        return notes
 
     def chunk(self, offset: int) -> list[McapRecord]:
         """Records of the chunk at `offset`, one that `scan` has yielded."""

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""A recorded run made again and compared with its log."""

@@ -1,0 +1,42 @@
+# SPDX-License-Identifier: MIT
+"""`python -m sim_server.replay LOG.mcap [--json]`: exit code 0 the same, 1 diverged, 2 a bad log, 130 on Ctrl-C."""
+
+import argparse
+import json
+import logging
+import os
+import sys
+
+
+def main() -> int:
+    """Runs the log again and reports."""
+    parser = argparse.ArgumentParser(prog="python -m sim_server.replay", description="Run a log again and compare.")
+    parser.add_argument("log", metavar="LOG.mcap", help="A run recorded on a CPU by sim-server --record")
+    parser.add_argument("--json", action="store_true", help="For programs")
+    arguments = parser.parse_args()
+    os.environ["OPENBLAS_NUM_THREADS"] = "1"  # as workers have it: factors are then the same bit by bit
+    logging.basicConfig(level=logging.WARNING, format="replay: %(message)s")
+
+    from protocol.log_chunks import BadLog
+    from sim_server.backend import CompileError
+    from sim_server.errors import InputError
+    from sim_server.replay.log import Recording
+    from sim_server.replay.run import Replay
+
+    try:
+        with Recording(arguments.log) as recording:
+            found = Replay(recording).run()
+    except (BadLog, InputError, CompileError) as error:
+        print(f"replay: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return 130
+    if arguments.json:
+        print(json.dumps(found.plain()))
+    else:
+        print("\n".join(found.lines()))
+    return 0 if found.same else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: MIT
+"""A log as a replay needs it: scene, step records and where the frames lie, up to the first gap.
+
+Read twice: once here, for what each solve used; frames then one by one as the replay reaches them.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from google.protobuf.message import DecodeError
+from mcap.records import Channel, McapRecord
+from mcap.records import Message as McapMessage
+from numpy.typing import NDArray
+
+from protocol import messages_pb2 as pb
+from protocol.check import array
+from protocol.log_chunks import BadLog, ChunkFile
+from protocol.refused import Refused
+from sim_server.engine import Kind
+
+ROW = np.dtype(
+    [
+        ("step", "i8"), ("iterations", "i8"), ("status", "i8"), ("residual", "f8"), ("factor_step", "i8"),
+        ("kind", "i8"), ("asked", "i8"), ("probe", "i8"), ("fallbacks", "i8"),
+    ]
+)  # fmt: skip
+"""What a solve was made with and what came of it, from an ObjectStep."""
+_PACK = struct.Struct("<qqqdqqqqq")
+_KINDS = {kind.name.lower(): int(kind) for kind in Kind}
+
+
+@dataclass
+class Recorded:
+    """One object. frames: (offset of the chunk, number in it) by step."""
+
+    topology: pb.Topology | None = None
+    packed: bytearray = field(default_factory=bytearray)
+    frames: dict[int, tuple[int, int]] = field(default_factory=dict)
+    factors: dict[int, pb.FactorUse] = field(default_factory=dict)  # by the step they were made from
+    rows: NDArray = field(default_factory=lambda: np.zeros(0, ROW))  # rows[k] is of step k + 1
+
+
+class Recording:
+    """Reads a log. `steps`: how far it can be repeated; `notes`: what ended it there and what is missing.
+
+    Raises BadLog if it is none, one of another protocol version, or one that cannot be repeated at all.
+    """
+
+    def __init__(self, path: str | Path, progress: Callable[[int], None] = lambda _: None):
+        self.path = Path(path)
+        self.scene = pb.Scene()
+        self.objects: dict[str, Recorded] = {}
+        self.touch: list[pb.TouchSet] = []
+        self.notes: list[str] = []
+        self._file = ChunkFile.open(self.path)
+        self._topics: dict[int, str] = {}
+        self._cached: tuple[int, list[McapRecord]] = (-1, [])
+        malformed: list[str] = []
+        try:
+            for offset, records in self._file.scan(progress):
+                self._file.check_origin()
+                for number, record in enumerate(records):
+                    try:
+                        self._keep(offset, number, record)
+                    except (DecodeError, Refused, KeyError, struct.error) as error:
+                        malformed.append(str(error))
+            self._file.check_origin()
+            self.notes += self._file.notes()
+            if malformed:
+                self.notes.append(f"{self.path}: {len(malformed)} malformed messages left out, first: {malformed[0]}")
+            self.steps = self._complete()
+            self._check()
+        except BaseException:
+            self.close()
+            raise
+
+    def frame(self, name: str, step: int) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+        """x and v (nodes, 3) of an object after a step; None if the log holds no such frame."""
+        place = self.objects[name].frames.get(step)
+        if place is None:
+            return None
+        offset, number = place
+        if self._cached[0] != offset:
+            self._cached = (offset, self._file.chunk(offset))
+        record = self._cached[1][number]
+        assert isinstance(record, McapMessage)
+        state = pb.State.FromString(record.data)
+        shape = (state.nodes, 3)
+        return array(state.x, np.float64, shape, "State.x"), array(state.v, np.float64, shape, "State.v")
+
+    def close(self) -> None:
+        """Closes the file."""
+        self._file.close()
+
+    def __enter__(self) -> Recording:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _keep(self, offset: int, number: int, record: McapRecord) -> None:
+        if isinstance(record, Channel):
+            self._topics[record.id] = record.topic
+            return
+        assert isinstance(record, McapMessage)
+        topic = self._topics.get(record.channel_id, "")
+        if topic == "/scene":
+            self.scene = pb.Scene.FromString(record.data)
+        elif topic == "/touch":
+            self.touch.append(pb.TouchSet.FromString(record.data))
+        else:
+            self._keep_of_object(topic, offset, number, record)
+
+    def _keep_of_object(self, topic: str, offset: int, number: int, record: McapMessage) -> None:
+        _, kind, name = topic.split("/", 2)
+        found = self.objects.setdefault(name, Recorded())
+        if kind == "topology":
+            found.topology = pb.Topology.FromString(record.data)
+        elif kind == "state":
+            found.frames[pb.State.FromString(record.data).step] = (offset, number)
+        elif kind == "factor":
+            factor = pb.FactorUse.FromString(record.data)
+            found.factors[factor.step] = factor
+        elif kind == "step":
+            s = pb.ObjectStep.FromString(record.data)
+            kind_used = _KINDS[s.preconditioner]
+            asked = _KINDS[s.asked] if s.asked else kind_used
+            found.packed += _PACK.pack(
+                s.step, s.iterations, s.status, s.residual, s.factor_step, kind_used, asked, s.probe, s.fallbacks
+            )
+
+    def _complete(self) -> int:
+        """Sorts the rows; returns the last step up to which all objects have all of theirs."""
+        last, most, gap = [], 0, ""
+        for name in self.scene.objects:
+            found = self.objects.setdefault(name, Recorded())
+            rows = np.sort(np.frombuffer(bytes(found.packed), ROW), order="step")
+            found.packed = bytearray()
+            whole = len(rows)
+            wrong = np.flatnonzero(rows["step"] != np.arange(1, len(rows) + 1))
+            if len(wrong):
+                whole = int(wrong[0])
+                gap = f"{self.path}: no record of object {name!r}, step {whole + 1}"
+            found.rows = rows[:whole]
+            last.append(whole)
+            most = max(most, int(rows["step"].max(initial=0)))
+        steps = min(last, default=0)
+        if steps < most and gap:
+            self.notes.append(f"{gap}: the replay ends before it, the log at step {most}")
+        return steps
+
+    def _check(self) -> None:
+        if not self.scene.resolved:
+            raise BadLog(f"{self.path}: the log holds no scene; its beginning is damaged")
+        if self.scene.device != "cpu" and ", cpu," not in self.scene.software:  # old logs tell in `software` alone
+            raise BadLog(f"{self.path}: recorded on {self.scene.software}; only runs on the CPU can be repeated")
+        if missing := [name for name in self.scene.objects if self.objects[name].topology is None]:
+            raise BadLog(f"{self.path}: the log holds no mesh of {', '.join(missing)}; it is damaged")
+        if not self.steps:
+            raise BadLog(f"{self.path}: the log holds no step that could be repeated")
+        if not self.scene.build:
+            self.notes.append(
+                f"{self.path}: written by an older version, which did not record the build, the steps at which pushes "
+                "and grabs took effect, and probes of the automatic preconditioner: only runs without these repeat"
+            )

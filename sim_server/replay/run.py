@@ -1,0 +1,197 @@
+# SPDX-License-Identifier: MIT
+"""A recorded run made again and compared with its log, bit by bit.
+
+Every step gets what the log says it had: the interactions as the loop had taken them up, for each solve the
+preconditioner asked for, and the factor that it used, made here from the same step's matrix. What is left (kernels,
+solver, factorization) is a pure function of these on one build.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from protocol import messages_pb2 as pb
+from protocol.check import array, check_range, checksum
+from protocol.factor import Factor
+from protocol.log_chunks import BadLog
+from protocol.refused import Refused
+from sim_server import describe
+from sim_server.backend import build_id
+from sim_server.factors import Inline, Job
+from sim_server.replay.log import Recording
+from sim_server.replay.report import Comparison
+from sim_server.scene import Scene
+from sim_server.simulation import Simulation
+
+MESH = ("nodes", "tets", "row_start", "columns", "fixed")
+
+
+class Replay:
+    """One recording, run again. Raises BadLog if its scene cannot be built as it was."""
+
+    def __init__(self, recording: Recording):
+        self.recording = recording
+        try:
+            scene = Scene.model_validate(json.loads(recording.scene.resolved))
+        except (ValidationError, ValueError) as error:
+            raise BadLog(f"{recording.path}: the scene in the log cannot be built: {error}") from error
+        self.simulation = Simulation(scene)
+        self.engine, self.bodies = self.simulation.engine, self.simulation.world.bodies
+        self.compared = Comparison(recording)
+        self._same_meshes()
+        self._needed: set[tuple[str, int]] = set()  # (object, step) of matrices whose factor some solve used
+        for body in self.bodies:
+            made = np.unique(self._rows(body.name)["factor_step"])
+            self._needed |= {(body.name, int(step)) for step in made[made >= 0]}
+        self._last_use = self._last_uses()
+        self._factors: dict[tuple[str, int], Factor] = {}
+        self._in_use: dict[str, int] = {}
+        self._sets: dict[int, pb.TouchSet] = {t.step: t for t in recording.touch}
+        self._held: dict[int, tuple[Any, Any]] = {}  # nodes and offsets of interactions by id
+        self._inline = self._library()
+        if build_id() != recording.scene.build and recording.scene.build:
+            self.compared.notes.append(
+                "another build than the recorded one (kernels, compiler or processor): last digits may differ"
+            )
+        if "touch" in self.simulation.effects:
+            index = next(i for i, launch in enumerate(self.engine.launches) if launch.name == "touch.apply")
+            touch: Any = self.simulation.effects["touch"]
+            touch.publish = lambda launch: self.engine.replace(index, launch)
+
+    def run(self, progress: Callable[[int], None] = lambda _: None) -> Comparison:
+        """Repeats all steps and compares; `progress` gets the steps done."""
+        self._compare_frames(0)
+        for step in range(self.recording.steps):
+            self._touch(step)
+            self.engine.assemble()
+            self._make_factors(step)
+            for body in self.bodies:
+                self._settle(body.index, body.name, step)
+            self.engine.solve()
+            self.compared.solves(self.engine.records(), [self._rows(b.name)[step] for b in self.bodies])
+            self._compare_frames(step + 1)
+            progress(step + 1)
+        return self.compared
+
+    def _rows(self, name: str) -> Any:
+        return self.recording.objects[name].rows[: self.recording.steps]
+
+    def _last_uses(self) -> dict[tuple[str, int], int]:
+        uses: dict[tuple[str, int], int] = {}
+        for body in self.bodies:
+            for row in self._rows(body.name):
+                if row["factor_step"] >= 0:
+                    uses[body.name, int(row["factor_step"])] = int(row["step"])
+        return uses
+
+    def _same_meshes(self) -> None:
+        if [b.name for b in self.bodies] != list(self.recording.scene.objects):
+            raise BadLog(f"{self.recording.path}: the scene in the log has other objects than the log")
+        for body in self.bodies:
+            now, then = describe.topology(self.simulation, body), self.recording.objects[body.name].topology
+            assert then is not None
+            other = [name for name in MESH if getattr(now, name) != getattr(then, name)]
+            if not other and not np.allclose(np.frombuffer(now.rest), np.frombuffer(then.rest), rtol=1e-9, atol=1e-12):
+                other = ["rest"]
+            if other:
+                file = self.simulation.scene.objects[body.index].mesh.file
+                raise BadLog(
+                    f"{self.recording.path}: the mesh of object {body.name!r} is not the recorded one "
+                    f"({', '.join(other)}){f'; was {file} changed?' if file else ''}"
+                )
+
+    def _library(self) -> Inline:
+        """Factorizes with the library that the log names, if it is here."""
+        system = self.simulation.system
+        made = [f for o in self.recording.objects.values() for f in o.factors.values()]
+        recorded = {f.library.split()[0] for f in made if f.library}
+        wanted = recorded.pop() if recorded in ({"cholmod"}, {"superlu"}) else "auto"
+        if recorded:
+            self.compared.notes.append(
+                f"factors of the log were made by {', '.join(sorted(recorded))}; here by another"
+            )
+        return Inline({b.name: system.body_pattern(b.first, b.last) for b in self.bodies}, wanted)
+
+    # --- what a step had ----------------------------------------------------------------------------------------
+
+    def _touch(self, step: int) -> None:
+        """The interactions that the loop took up at this step."""
+        if step not in self._sets:
+            return
+        touch: Any = self.simulation.effects.get("touch")
+        if touch is None:
+            raise BadLog(f"{self.recording.path}: pushes or grabs in a scene that takes none")
+        try:
+            touch.restore([self._interaction(m) for m in self._sets[step].interactions])
+        except (Refused, KeyError) as error:
+            raise BadLog(f"{self.recording.path}: interactions of step {step}: {error}") from error
+
+    def _interaction(self, m: pb.Interaction) -> Any:
+        from sim_server.effects.touch import Interaction
+
+        if m.held:
+            nodes = array(m.held, np.int32, (m.nodes,), "Interaction.held")
+            check_range(nodes, 0, self.simulation.world.nodes, "Interaction.held")
+            offsets = array(m.offsets, np.float64, (m.nodes, 3), "Interaction.offsets", finite=True)
+            self._held[m.id] = (nodes.astype(np.int32), offsets.astype(np.float64))
+        nodes, offsets = self._held[m.id]
+        point, force, target = ((v.x, v.y, v.z) for v in (m.point, m.force, m.target))
+        return Interaction(
+            m.id, m.client, m.object, point, m.radius, nodes, offsets, m.duration, force, target, m.stiffness,
+            m.max_force, m.start,
+        )  # fmt: skip
+
+    def _make_factors(self, step: int) -> None:
+        for body in self.bodies:
+            if (body.name, step) not in self._needed:
+                continue
+            warped = bool(self.simulation.system.warped[body.nodes].any())
+            values = self.simulation.system.body_values(body.first, body.last)
+            self._inline.submit(Job(body.name, 1, step, warped, values, self.simulation.scene.solver.factor_dtype))
+        for factor in self._inline.poll():
+            self._factors[factor.object, factor.step] = factor
+            self._check_factor(factor)
+        for name, reason in self._inline.failures():
+            self.compared.diverged(step, name, "factor", f"the matrix cannot be factorized: {reason}")
+
+    def _check_factor(self, factor: Factor) -> None:
+        then = self.recording.objects[factor.object].factors.get(factor.step)
+        if then is None or (then.pattern, then.checksum) == (factor.pattern.id, checksum(factor.values)):
+            return
+        maker = f"{then.library or 'an unknown library'}, {then.threads} thread{'s' if then.threads != 1 else ''}"
+        here = self._inline.library(factor.object)
+        what = "values" if then.pattern == factor.pattern.id else "pattern"
+        self.compared.factor(factor.step, factor.object, f"other {what}; then {then.worker} ({maker}), now {here}")
+
+    def _settle(self, index: int, name: str, step: int) -> None:
+        """Solver settings and factor of one solve as they were."""
+        row, settings, solver = self._rows(name)[step], self.engine.settings(index), self.simulation.scene.solver
+        settings.kind, settings.probe = int(row["asked"]), int(row["probe"])
+        settings.budget = -float(row["iterations"] + 1) if row["status"] == pb.BUDGET and solver.budget else 0.0
+        made = int(row["factor_step"])
+        if made < 0:
+            return
+        if self._in_use.get(name) != made:
+            factor = self._factors.get((name, made))
+            if factor is None:
+                self.compared.diverged(step + 1, name, "factor", f"used that of step {made}, which there is not yet")
+                return
+            self.engine.post_factor(index, factor.pattern, factor.values, made)
+            self._in_use[name] = made
+        if self._last_use[name, made] == step + 1:
+            self._factors.pop((name, made), None)
+
+    def _compare_frames(self, step: int) -> None:
+        world = self.simulation.world
+        for body in self.bodies:
+            try:
+                frame = self.recording.frame(body.name, step)
+            except Refused as error:
+                raise BadLog(f"{self.recording.path}: step {step} of {body.name!r}: {error}") from error
+            if frame is not None and len(frame[0]) == body.last - body.first:
+                self.compared.frame(step, body.name, frame, (world.x[body.nodes], world.v[body.nodes]))
