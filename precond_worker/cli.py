@@ -6,11 +6,12 @@ import os
 import signal
 import socket
 import sys
+from threading import Event
 from typing import Annotated, NoReturn
 
 import typer
 
-from precond_worker.errors import DeviceUnusable
+from precond_worker.errors import DeviceUnusable, NameTaken
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
@@ -20,6 +21,10 @@ Examples:
         for a server on this machine
   precond-worker --connect tcp/10.0.0.5:7447 --threads 4 --name big-box
         for a server elsewhere, with four threads
+  precond-worker --server sim-0@tcp/10.0.0.5:7447 --server sim-1@tcp/10.0.0.6:7447
+        shared by two servers, a job of each in turn
+  precond-worker --connect tcp/10.0.0.1:7447 --server '*'
+        for every server on the network of that router, those to come too
   precond-worker --device auto
         on the GPU of this machine if it has a usable one
   precond-worker --no-shared-memory
@@ -46,7 +51,12 @@ def work(
     ] = "auto",
     threads: Annotated[int, typer.Option(metavar="N", min=1, max=1024, help="Threads of the linear algebra")] = 1,
     name: Annotated[str, typer.Option(metavar="NAME", help="Name, unique on its server [default: HOST-PID]")] = "",
-    server: Annotated[str, typer.Option(metavar="NAME", help="Name of the server")] = "sim",
+    server: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME[@EP]", help="Server to work for, may be repeated; '*': every server found [default: sim]"
+        ),
+    ] = None,
     no_shared_memory: Annotated[bool, typer.Option("--no-shared-memory", help="Send arrays as bytes")] = False,
     exit_with_parent: Annotated[
         bool, typer.Option("--exit-with-parent", help="End when the parent process ends")
@@ -64,7 +74,10 @@ def work(
 
             end_with_parent()
         library = _library(device, arithmetic)
-        _serve(connect or [], threads, name or _default_name(), server, not no_shared_memory, library)
+        servers = ["sim"] if server is None else server
+        _serve(connect or [], threads, name or _default_name(), servers, not no_shared_memory, library)
+    except NameTaken as error:
+        _bad_input(str(error))
     except DeviceUnusable as error:
         print(f"precond-worker: {error}", file=sys.stderr)
         raise typer.Exit(1) from None
@@ -103,39 +116,42 @@ def _library(device: str, arithmetic: str) -> str:
     return "gpu" if arithmetic == "auto" else f"gpu-{arithmetic}"
 
 
-def _serve(connect: list[str], threads: int, name: str, server: str, shared_memory: bool, library: str) -> None:
+def _serve(connect: list[str], threads: int, name: str, servers: list[str], shared_memory: bool, library: str) -> None:
     from functools import partial
 
     from precond_worker.factorize import Analysis
-    from precond_worker.joining import join
+    from precond_worker.places import Place, places
+    from precond_worker.serving import Serving
     from precond_worker.uplink import Uplink
     from precond_worker.worker import Worker
-    from protocol.channels import DEFAULT_ENDPOINT, check_name
+    from protocol.channels import check_name
     from protocol.counters import Counters
-    from protocol.endpoints import BadEndpoint
+    from protocol.session import Session
 
     try:
-        check_name(server, "--server")
         check_name(name, "--name")
-        shown = _shown(library)
-        session = join(connect, shared_memory)
-    except (BadEndpoint, ValueError) as error:
+        where = places(servers, connect)
+    except ValueError as error:  # BadEndpoint or Refused
         _bad_input(str(error))
-    with session, Uplink(session, server, name, threads, shown, Counters(logging.getLogger("precond_worker"))) as up:
-        if up.namesake:
-            text = f"another worker of server {server} is called {name}: their jobs mix; --name gives this one its own"
-            print(f"precond-worker: {text}", file=sys.stderr, flush=True)
+    shown = _shown(library)
 
+    def uplink(session: Session, server: str, bell: Event) -> Uplink:
+        return Uplink(session, server, name, threads, shown, Counters(logging.getLogger("precond_worker")), bell)
+
+    def worker(up: Uplink, place: Place) -> Worker:
         def on_server(found: bool) -> None:
-            where = f"server {server} at {', '.join(connect or [DEFAULT_ENDPOINT])}"
+            server = f"server {up.server} at {place}"
             if found:
                 count = f"{threads} thread{'s' if threads > 1 else ''}"
                 memory = "shared memory" if up.shared_memory else "no shared memory"
-                print(f"precond-worker {name} ready: {shown}, {count}, {memory}, {where}", flush=True)
+                print(f"precond-worker {name} ready: {shown}, {count}, {memory}, {server}", flush=True)
             else:
-                print(f"precond-worker {name}: {where} is gone, waiting for it", file=sys.stderr)
+                print(f"precond-worker {name}: {server} is gone, waiting for it", file=sys.stderr, flush=True)
 
-        Worker(up, partial(Analysis, library=library), on_server).run()
+        return Worker(up, partial(Analysis, library=library), on_server)
+
+    with Serving(where, shared_memory, uplink, worker) as serving:
+        serving.run()
 
 
 def _shown(library: str) -> str:

@@ -13,5 +13,9 @@ class NotPositiveDefinite(ValueError):
         self.column = column
 
 
+class NameTaken(RuntimeError):
+    """Another worker of this name serves the server."""
+
+
 class DeviceUnusable(RuntimeError):
     """There is no GPU to work on, and why."""

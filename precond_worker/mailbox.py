@@ -9,9 +9,13 @@ T = TypeVar("T")
 
 
 class Mailbox(Generic[T]):
-    """The oldest item goes when it is full, so that it never blocks a sender."""
+    """The oldest item goes when it is full, so that it never blocks a sender.
 
-    def __init__(self, capacity: int):
+    bell: set by each item, for a reader of several mailboxes.
+    """
+
+    def __init__(self, capacity: int, bell: threading.Event | None = None):
+        self._bell = bell
         self._items: deque[T] = deque(maxlen=capacity)
         self._arrived = threading.Condition()
         self.dropped = 0
@@ -22,6 +26,8 @@ class Mailbox(Generic[T]):
             self.dropped += len(self._items) == self._items.maxlen
             self._items.append(item)
             self._arrived.notify()
+        if self._bell is not None:
+            self._bell.set()
 
     def take(self, timeout: float) -> list[T]:
         """All items, oldest first; waits up to timeout seconds for the first."""

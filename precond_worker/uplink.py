@@ -5,12 +5,14 @@ import logging
 import os
 import socket
 import threading
+import time
 from collections import Counter
 from dataclasses import dataclass
 from typing import Self
 
 import zenoh
 
+from precond_worker.errors import NameTaken
 from precond_worker.heartbeat import Heartbeat
 from precond_worker.mailbox import Mailbox
 from protocol import FactorPattern, echo
@@ -19,7 +21,7 @@ from protocol.check import check_header, parse
 from protocol.counters import Counters
 from protocol.messages_pb2 import Factor, Header, Topology, WorkerInfo
 from protocol.refused import Refused
-from protocol.session import Session
+from protocol.session import LINK_LEASE, Session
 from protocol.slotmap import SlotMap
 
 log = logging.getLogger(__name__)
@@ -37,13 +39,19 @@ class ServerEvent:
 
 
 class Uplink:
-    """One worker on the network. mailbox holds what came: ServerEvent, or a sample with a matrix."""
+    """One worker of one server. mailbox holds what came: ServerEvent, or a sample with a matrix; it rings the bell.
 
-    def __init__(self, session: Session, server: str, name: str, threads: int, library: str, counters: Counters):
+    Raises NameTaken if another worker has that name.
+    """
+
+    def __init__(
+        self, session: Session, server: str, name: str, threads: int, library: str, counters: Counters,
+        bell: threading.Event | None = None,
+    ):  # fmt: skip
         self.server, self.name = check_name(server, "server name"), check_name(name, "worker name")
         self.library = library
         self.counters = counters
-        self.mailbox: Mailbox[ServerEvent | zenoh.Sample] = Mailbox(256)
+        self.mailbox: Mailbox[ServerEvent | zenoh.Sample] = Mailbox(256, bell)
         self.slots = SlotMap()
         self.incarnation = 0  # of the server that this worker works for; 0: none
         self.shared_memory = False
@@ -52,7 +60,7 @@ class Uplink:
         self._saying = threading.Lock()
         zs = session.zenoh
         own = key("alive_worker", server, worker=name)
-        self.namesake = any(reply.ok is not None for reply in zs.liveliness().get(own, timeout=1.0))  # one of this name
+        self._claim(zs, own)
         # Subscribed first, announced last: the server sends as soon as it has heard of us.
         self._matrices = zs.declare_subscriber(key("matrix", server, worker=name), self.mailbox.put)
         self._token = zs.liveliness().declare_token(own)
@@ -60,6 +68,16 @@ class Uplink:
             key("alive_server", server), self._server_event, history=True
         )
         self._heartbeat = Heartbeat(self._say)
+
+    def _claim(self, session: zenoh.Session, token: str) -> None:
+        """Wait until a process that died with this name is forgotten, which takes as long as the lease of its link."""
+        end = time.monotonic() + LINK_LEASE / 1000 + 0.5
+        while any(reply.ok is not None for reply in session.liveliness().get(token, timeout=1.0)):
+            if time.monotonic() > end:
+                raise NameTaken(
+                    f"another worker of server {self.server} is called {self.name}; --name gives this one its own"
+                )
+            time.sleep(0.1)
 
     def _server_event(self, sample: zenoh.Sample) -> None:
         try:

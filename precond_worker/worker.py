@@ -3,7 +3,7 @@
 
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import numpy as np
@@ -34,7 +34,7 @@ Analyse = Callable[[NDArray[np.int32], NDArray[np.int32]], Factorization]
 
 
 class Worker:
-    """Works for one server at a time, one job at a time, the oldest object first, the newest matrix of each."""
+    """Works for one server, one job at a time, the oldest object first, the newest matrix of each."""
 
     def __init__(self, uplink: Uplink, analyse: Analyse, on_server: Callable[[bool], None] = lambda found: None):
         self._uplink = uplink
@@ -51,12 +51,24 @@ class Worker:
 
     def step(self, timeout: float) -> None:
         """Take in what came, waiting up to timeout seconds for it, and do one job."""
-        self._take_in(self._uplink.mailbox.take(0.0 if self._pending else timeout))
-        if self._pending:
-            self._do(self._pending.pop(next(iter(self._pending))))
+        self.take_in(timeout)
+        self.work()
 
-    def _take_in(self, items: Sequence[ServerEvent | zenoh.Sample]) -> None:
-        for item in items:
+    @property
+    def waiting(self) -> int:
+        """Jobs taken in and not done."""
+        return len(self._pending)
+
+    def work(self) -> bool:
+        """Do one job; False if there is none."""
+        if not self._pending:
+            return False
+        self._do(self._pending.pop(next(iter(self._pending))))
+        return True
+
+    def take_in(self, timeout: float) -> None:
+        """Take in what came; with nothing to do yet, wait up to timeout seconds for it."""
+        for item in self._uplink.mailbox.take(0.0 if self._pending else timeout):
             try:
                 if isinstance(item, ServerEvent):
                     self._change_server(item)

@@ -67,7 +67,7 @@ def check_name(name: str, what: str) -> str:
 def key(channel: str, server: str = SERVER_NAME, **names: str) -> str:
     """Key of a channel, for example key("matrix", worker="w1", object="beam"); "*" stands for any name.
 
-    A name that is left out is any name too.
+    A name that is left out is any name too, and server "*" any server.
     """
     template = CHANNELS[channel].key
     fields = re.findall(r"{(\w+)}", template)
@@ -78,12 +78,22 @@ def key(channel: str, server: str = SERVER_NAME, **names: str) -> str:
     for field, name in filled.items():
         if name != "*":
             check_name(name, f"{field} name")
-    return f"{ROOT}/{check_name(server, 'server name')}/{template.format(**filled)}"
+    if server != "*":
+        check_name(server, "server name")
+    return f"{ROOT}/{server}/{template.format(**filled)}"
 
 
 def everything(server: str = SERVER_NAME) -> str:
     """Key expression that takes in all channels of a server."""
     return f"{ROOT}/{check_name(server, 'server name')}/**"
+
+
+def server_in(key_expression: object) -> str:
+    """The server that a received key belongs to; raises Refused if it is no key of ours."""
+    root, _, rest = str(key_expression).partition("/")
+    if root != ROOT:
+        raise Refused(f"key {str(key_expression)[:200]!r} does not begin with {ROOT}/", "malformed")
+    return check_name(rest.partition("/")[0], "server name in a key")
 
 
 def name_in(channel: str, key_expression: object, field: str) -> str:

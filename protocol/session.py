@@ -74,8 +74,9 @@ def _config(server: bool, listen: list[str], connect: list[str], shared_memory: 
     except zenoh.ZError as error:
         raise BadEndpoint(f"{EXTRA_CONFIG}={extra} cannot be used: {_reason(error)}") from error
     settings: dict[str, Any] = {
-        # A router passes messages on between its clients, so that no router process is needed.
-        "mode": "router" if server else "client",
+        # A router passes messages on between its clients, so that no router process is needed. Where one is, the server
+        # is a peer of it: among routers that come and go, declarations get lost (seen with zenoh 1.10.2).
+        "mode": ("peer" if connect else "router") if server else "client",
         "listen/endpoints": listen,
         "connect/endpoints": connect,
         "connect/timeout_ms": -1 if server else int(timeout * 1000),

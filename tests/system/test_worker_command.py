@@ -39,6 +39,8 @@ def test_help_shows_examples() -> None:
         (["--connect", "tcp/127.0.0.1:99999"], "PORT 1 to 65535"),
         (["--name", "a/b"], "--name is 'a/b'; allowed: 1 to 64 characters"),
         (["--server", ""], "--server is ''; allowed"),
+        (["--server", "a@nonsense"], "endpoint 'nonsense' cannot be used"),
+        (["--server", "a", "--server", "a"], "--server a is given twice"),
         (["--threads", "0"], "--threads"),
         (["--threads", "many"], "--threads"),
         (["--nonsense"], "--nonsense"),
@@ -69,14 +71,16 @@ def test_it_waits_for_the_server_and_says_so_once_and_ends_when_told(number: sig
         assert out == "" and err == ""
 
 
-def test_a_second_worker_of_one_name_is_told() -> None:
+def test_a_second_worker_of_one_name_is_told_and_leaves() -> None:
     endpoint = free_endpoint()
     arguments = ("-m", "precond_worker", "--connect", endpoint, "--name", "twin")
     with ServerLink(listen=[endpoint]), process(*arguments) as first:
         assert first.stdout is not None and "twin ready: " in first.stdout.readline()
         with process(*arguments) as second:
-            assert second.stderr is not None
-            assert "another worker of server sim is called twin: " in second.stderr.readline()
+            out, err = second.communicate(timeout=30)
+            assert (second.returncode, out) == (2, "")
+            assert "another worker of server sim is called twin; --name" in err
+        assert first.poll() is None
 
 
 def test_it_ends_with_its_parent() -> None:
