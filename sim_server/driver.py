@@ -29,7 +29,7 @@ from sim_server.world import Body
 log = logging.getLogger(__name__)
 
 
-COPIES = 8  # matrices that the loop may be asked to copy within one step
+COPIES = 32  # matrices that the loop may be asked to copy within one step
 
 
 class Driver:
@@ -217,7 +217,8 @@ class Driver:
             return
         overdue = max(self._overdue(), self.solver.update_floor_steps)
         needs = [t.need(step) for t in self.tracks]
-        chosen = pick(needs, places, self.solver.update_floor_steps, self.solver.schedule, overdue)
+        ahead = getattr(self.source, "ahead", lambda: 0)()  # the most urgent are left for faster workers
+        chosen = pick(needs, ahead + places, self.solver.update_floor_steps, self.solver.schedule, overdue)[ahead:]
         for name in chosen:
             self._ask(self.by_name[name])
         if len(chosen) < places:

@@ -22,6 +22,7 @@ from sim_server.network.jobs import LATE, Flight, Jobs
 from sim_server.network.outbox import Outbox
 from sim_server.network.roster import Roster
 from sim_server.network.shipment import load, matrix_message
+from sim_server.network.speeds import Speeds
 
 if TYPE_CHECKING:
     from sim_server.factors import Job
@@ -48,8 +49,10 @@ class Dispatch:
         self._answers = Answers(incarnation)
         self._roster = Roster(incarnation, silence)
         self._jobs = Jobs(pool)
+        self._speeds = Speeds()
         self._busy = threading.RLock()  # a status asks for the workers while the loop thread takes in a factor
         self._last_worker: dict[str, str] = {}  # of each object: it knows the pattern already
+        self._free_since: dict[str, float] = {}  # by worker, when it last answered
         self._factors: list[Factor] = []
         self._failures: list[tuple[str, str]] = []
         self._arrivals = Arrivals(session, server)
@@ -65,12 +68,21 @@ class Dispatch:
         with self._busy:
             self._answers.announce(topology)
             self._jobs.forget(topology.header.object)
+            self._speeds.forget_object(topology.header.object)
 
     def ready(self) -> int:
         """How many are idle and can take a job."""
         with self._busy:
             self._receive()
             return len(self._idle())
+
+    def ahead(self) -> int:
+        """How many of the most urgent objects are left for faster workers that are about to be free."""
+        with self._busy:
+            now = self._clock()
+            idle = [(name, now - self._free_since.get(name, 0.0)) for name in self._idle()]
+            busy = [(f.worker, f.object, now - f.sent) for f in self._jobs.by_worker.values()]
+            return self._speeds.ahead(idle, busy)
 
     def workers(self) -> list[WorkerInfo]:
         """Workers that may be given work."""
@@ -113,7 +125,7 @@ class Dispatch:
             return False
         worker = self._choose(idle, job.object)
         matrix_slot, factor_slot = self._lend(worker, job)
-        lease = self._jobs.lease(job.object, known.blocks)
+        lease, now = self._jobs.lease(job.object, known.blocks), self._clock()
         flight = Flight(
             self._jobs.next_number(),
             job.object,
@@ -122,10 +134,11 @@ class Dispatch:
             job.warp,
             np.dtype(job.dtype).name,
             worker,
-            self._clock() + lease,
+            now + lease,
             factor_slot,
             factor_slot.generation if factor_slot else 0,
             tuple(slot for slot in (matrix_slot, factor_slot) if slot is not None),
+            now,
         )
         self._jobs.start(flight)
         if self._post(flight, job, lease, matrix_slot):
@@ -141,11 +154,12 @@ class Dispatch:
         return [name for name in fit if name not in self._jobs.by_worker]
 
     def _choose(self, idle: list[str], object: str) -> str:
-        """Nobody late if it can be helped; then who knows the object; then who did least."""
+        """Nobody late if it can be helped; then the fastest; then who knows the object; then who did least."""
 
-        def rank(name: str) -> tuple[int, bool, int]:
+        def rank(name: str) -> tuple[int, float, bool, int]:
             info = self._roster.info(name)
-            return self._jobs.lateness(name), self._last_worker.get(object) != name, info.jobs if info else 0
+            late, expected = self._jobs.lateness(name), self._speeds.expected(name, object)
+            return late, expected, self._last_worker.get(object) != name, info.jobs if info else 0
 
         return min(idle, key=rank)
 
@@ -202,6 +216,8 @@ class Dispatch:
 
     def _leave(self, name: str) -> None:
         flight = self._jobs.lost(name)
+        self._speeds.forget_worker(name)
+        self._free_since.pop(name, None)
         if flight is not None:
             self._counters.add("jobs_lost")
             self._fail(flight, f"was lost with worker {name}")
@@ -212,14 +228,16 @@ class Dispatch:
     def _take_factor(self, sample: zenoh.Sample) -> None:
         message = self._answers.parse_factor(sample.key_expr, sample.attachment)
         flight = self._jobs.answered(message.job, message.worker, message.header.epoch)
-        self._roster.heard(flight.worker, self._clock())
-        seconds = None
+        now, seconds = self._clock(), None
+        self._roster.heard(flight.worker, now)
+        self._free_since[flight.worker] = now
         try:
             if message.failure:
                 self._counters.add("failures")
                 return self._fail(flight, f"failed: {message.failure}")
             self._factors.append(self._answers.factor(message, sample.payload, flight))
             seconds = message.seconds
+            self._speeds.note(flight.worker, flight.object, now - flight.sent, seconds)
         except Refused as refusal:
             self._fail(flight, f"was refused: {refusal}")
             raise

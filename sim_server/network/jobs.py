@@ -26,7 +26,7 @@ class Lender(Protocol):
 
 @dataclass(frozen=True)
 class Flight:
-    """One job sent to one worker; deadline [s, monotonic] is the end of its lease."""
+    """One job sent to one worker; deadline [s, monotonic] is the end of its lease, sent its beginning."""
 
     number: int
     object: str
@@ -39,6 +39,7 @@ class Flight:
     factor_slot: Slot | None = None
     factor_generation: int = 0
     slots: tuple[Slot, ...] = ()
+    sent: float = 0.0
 
 
 class Jobs:

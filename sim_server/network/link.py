@@ -126,6 +126,10 @@ class ServerLink:
         """How many are idle and can take a job."""
         return self._dispatch.ready()
 
+    def ahead(self) -> int:
+        """How many of the most urgent objects are left for faster workers that are about to be free."""
+        return self._dispatch.ahead()
+
     def submit(self, job: "Job") -> bool:
         """Send a job to an idle worker; False if there is none or the object is in flight. Copies the values."""
         return self._dispatch.submit(job)

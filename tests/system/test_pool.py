@@ -5,7 +5,7 @@ import contextlib
 from collections.abc import Iterator
 
 import pytest
-from link_helpers import Driver, chain, free_endpoint, process
+from link_helpers import Driver, chain, free_endpoint, light_worker, process
 
 from protocol.session import open_session
 from sim_server.network.link import ServerLink
@@ -115,3 +115,26 @@ def test_a_server_starts_again_while_the_other_is_served() -> None:
         assert len(incarnations) == 2
         assert factors(lasting, 5, 2, 100) == {"shared"}
         assert child.poll() is None
+
+
+def test_a_faster_worker_gets_the_object_when_both_are_idle() -> None:
+    endpoint = free_endpoint()
+    with (
+        servers(("sim", endpoint)) as (sim,),
+        light_worker(endpoint, "slow", "slow=0.2"),
+        light_worker(endpoint, "fast"),
+    ):
+        sim.until(lambda: len(sim.link.workers()) == 2, "both workers")
+        for topology in (chain(5, "a"), chain(6, "b")):
+            sim.link.announce(topology)
+        step = 0
+        while len({(factor.worker, factor.object) for factor in sim.factors}) < 4:  # each has tried each
+            step += 1
+            assert step < 100
+            for object, nodes in (("a", 5), ("b", 6)) if step % 2 else (("b", 6), ("a", 5)):
+                sim.submit(chain(nodes, object), step)
+        sim.until(lambda: sim.link.ready() == 2, "both to be idle")
+        sim.factors.clear()
+        for k in range(5):
+            assert sim.factor(chain(5, "a"), 1000 + k).worker == "fast"
+            sim.until(lambda: sim.link.ready() == 2, "both to be idle")
