@@ -254,6 +254,55 @@ def export(
         print(f"wrote {written[-1]}" + (f" and {len(written) - 1} more" if len(written) > 1 else ""))
 
 
+@app.command()
+def load(
+    objects: Annotated[int, typer.Option(metavar="K", help="Bodies of the scene.")] = 16,
+    tets: Annotated[str, typer.Option(metavar="A..B", help="Tetrahedra of a body, equally likely on every scale.")] = (
+        "200..3000"
+    ),
+    clients: Annotated[int, typer.Option(metavar="N", help="Clients; every second one grabs, the others push.")] = 8,
+    rate: Annotated[float, typer.Option(metavar="HZ", help="Commands a second of each client.")] = 50.0,
+    seconds: Annotated[float, typer.Option(metavar="S", help="For how long.")] = 20.0,
+    workers: Annotated[int, typer.Option(metavar="N", help="Local workers of the server.")] = 1,
+    seed: Annotated[int, typer.Option(metavar="N", help="Of sizes, materials and disturbances.")] = 1,
+    device: Annotated[str, typer.Option(metavar="auto|cpu|gpu", help="Of the server.")] = "cpu",
+    out: Annotated[Path | None, typer.Option(metavar="FOLDER", help="Keep scene, log, load.json and load.png.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
+    connect: Connect = None,
+    server: Server = SERVER_NAME,
+) -> None:
+    """Load a server and report what its steps, workers and clients make of it.
+
+    Starts a server with a scene of its own, which the same seed draws again. With --connect it loads one that runs
+    already: objects, tets, workers and device are what they are there.
+
+    \b
+    Examples:
+      sim-client load --objects 16 --tets 200..3000 --clients 8 --rate 50 --seconds 20 --workers 2
+      sim-client load --objects 4 --clients 50 --rate 1000 --out out/load
+      sim-client load --connect tcp/127.0.0.1:7447 --clients 20 --rate 200 --seconds 10 --json
+    """
+    from clients import load as loading
+
+    asked = loading.Load(
+        objects, loading.span(tets), clients, rate, seconds, workers, seed, device, out, connect, server
+    )
+    found = loading.run(asked)
+    if out is not None:
+        from clients.load_plots import draw
+
+        (out / "load.json").write_text(json.dumps(found, indent=1) + "\n")
+        (out / "load.png").write_bytes(draw(found))
+    if as_json:
+        print(json.dumps(found))
+        return
+    from rich.console import Console
+
+    from clients.load_report import tables
+
+    Console().print(tables(found))
+
+
 def _nodes(count: int) -> str:
     return f"{count} node{'s' if count != 1 else ''}"
 

@@ -12,7 +12,8 @@ from sim_server.network.rates import Rates
 
 WAITING = 64  # commands that may wait for the simulation
 LATE = 1024  # moves that may wait for a token of their client, or for room
-RATED = ("push", "grab", "move")  # of the others a client may owe a burst: it can always let go
+# For the other verbs there is as much room again, and a client may owe a burst: it can always let go, pause and stop.
+RATED = ("push", "grab", "move")
 
 ReplyFunction = Callable[[Reply], None]
 Asked = tuple[Command, ReplyFunction]
@@ -69,9 +70,10 @@ class Waiting:
                 _, older = waiting[key]
                 waiting[key] = command, reply
                 return older, ""
-        debt = 0.0 if command.verb in RATED else self._rates.burst
-        if len(self._queue) >= self._room:
-            refusal = f"the server is busy: {self._room} commands wait already"
+        rated = command.verb in RATED
+        debt, room = (0.0, self._room) if rated else (self._rates.burst, 2 * self._room)
+        if len(self._queue) >= room:
+            refusal = f"the server is busy: {room} commands wait already"
         elif not self._rates.take(command.client, self._clock(), debt):
             refusal = f"client {command.client!r} sends too much: at most {self._rates.rate:g} commands a second"
         else:

@@ -126,7 +126,9 @@ def test_a_full_queue_refuses_all_but_the_newest_moves() -> None:
     surplus = desk.offer("push", "late")
     moves = [desk.offer("move", "late", 1, float(i)) for i in range(3)]
     assert desk.replies[surplus] == "the server is busy: 4 commands wait already"
-    assert len(desk.taken()) == 4
+    held = [desk.offer("release", f"c{i}") for i in range(5)]
+    assert desk.replies[held[4]] == "the server is busy: 8 commands wait already"
+    assert len(desk.taken()) == 8, "there is room left to let go, pause and stop"
     assert desk.taken() == [("move", "late", 2.0)]
     assert all(desk.replies[n] == "" for n in [*kept, *moves])
 

@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: MIT
+"""Many clients on one real server: more commands than it can take, clients that die while they hold."""
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from clients.client import Client
+from clients.errors import BadInput
+from clients.load import plan
+from clients.load_processes import Drivers
+from clients.log import Log
+from protocol import messages_pb2 as pb
+from tests.system.link_helpers import ROOT
+from tests.system.server_process import Stage, beam, until
+
+pytestmark = pytest.mark.system
+HOLDER = Path(__file__).parent / "many_clients.py"
+
+
+@pytest.fixture
+def stage(tmp_path: Path) -> Iterator[Stage]:
+    stage = Stage(tmp_path)
+    yield stage
+    stage.close()
+
+
+def fresh(client: Client) -> pb.Status:
+    client.command("status")
+    return client.status()
+
+
+def flood(stage: Stage, client: Client, clients: int, rate: float, seconds: float) -> list[dict[str, Any]]:
+    """What became of the commands of each of so many clients."""
+    plans = plan(client.scene(), client.meshes(), clients, rate, seed=1)
+    with Drivers(plans, "sim", [stage.endpoint], seconds) as drivers:
+        drivers.begin()
+        return drivers.reports()
+
+
+def test_twenty_clients_that_send_too_much(stage: Stage, tmp_path: Path) -> None:
+    """Steps go on and converge, what is too much is refused and counted, nothing of it stays behind."""
+    log = tmp_path / "run.mcap"
+    server = stage.server(beam(tmp_path), "--record", str(log))
+    with stage.client() as client:
+        until(lambda: client.status().step > 10, "it runs")
+        begun = fresh(client)
+        reports = flood(stage, client, 20, 1000.0, 3.0)
+        sent, done, refused = (sum(r[key] for r in reports) for key in ("sent", "done", "refused"))
+        assert done > 0 and refused > 0 and sent > 20 * 100, (sent, done, refused)
+        until(lambda: len(client.status().clients) == 1, "they have gone")
+        ended = fresh(client)
+        assert ended.commands_refused + ended.moves_replaced > 0
+        assert ended.refused == 0, "none of it was malformed"
+        assert ended.step > begun.step + 30, "steps went on"
+        at_rest = ended.step
+        until(lambda: client.status().step > at_rest + 20, "and do so")
+        client.stop()
+    assert server.wait() == 0, server.output()
+    with Log(log) as found:
+        steps = found.scalars("beam")
+        assert set(steps["status"]) == {"converged"}
+        assert steps["step"].tolist() == list(range(1, len(steps["step"]) + 1)), "none is missing"
+
+
+def test_one_that_floods_does_not_shut_out_another(stage: Stage, tmp_path: Path) -> None:
+    stage.server(beam(tmp_path))
+    with stage.client() as client:
+        until(lambda: client.status().step > 5, "it runs")
+        plans = plan(client.scene(), client.meshes(), 1, 1500.0, seed=1)
+        with Drivers(plans, "sim", [stage.endpoint], 2.0) as drivers:
+            drivers.begin()
+            for _ in range(10):
+                pushed = client.push("beam", at=(0.5, 0.5, 4), force=(1, 0, 0), duration=0.02)
+                assert pushed.nodes == 1
+            (report,) = drivers.reports()
+        status = fresh(client)
+        assert report["sent"] > 500 and status.commands_refused + status.moves_replaced > 0
+
+
+def test_grabs_of_killed_clients_vanish(stage: Stage, tmp_path: Path) -> None:
+    """kill -9 in the middle of moves at 1 kHz, three at once; the one that lives keeps its grab."""
+    log = tmp_path / "run.mcap"
+    server = stage.server(beam(tmp_path), "--record", str(log))
+    with stage.client() as client:
+        mine = client.grab("beam", at=(0.5, 0.5, 4), stiffness=1e4, max_force=2e3)
+        holders = [holder(stage.endpoint) for _ in range(3)]
+        try:
+            names = [h.stdout.readline().strip() for h in holders if h.stdout]
+            assert len(set(names)) == 3 and all(names)
+            until(lambda: set(names) < set(client.status().clients), "the server knows them")
+            step = fresh(client).step
+            until(lambda: client.status().step > step + 20, "they hold for a while")
+            for each in holders:
+                os.kill(each.pid, signal.SIGKILL)
+            until(lambda: not set(names) & set(client.status().clients), "the server knows that they are dead")
+            step = fresh(client).step
+            until(lambda: client.status().step > step + 30, "it runs on")
+            mine.move((0.5, 1.0, 4.0))  # still there
+            mine.release()
+        finally:
+            for each in holders:
+                each.kill()
+                each.communicate()
+        client.stop()
+    assert server.wait() == 0, server.output()
+    with log.open("rb") as stream:
+        held = held_by(stream)
+    for name in names:
+        assert held[name], "it did hold"
+        assert max(held[name]) <= step + 1 < max(held[mine.interaction.client])
+
+
+def holder(endpoint: str) -> "subprocess.Popen[str]":
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, str(HOLDER), endpoint, "beam"]
+    return subprocess.Popen(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, text=True)
+
+
+def held_by(stream: Any) -> dict[str, list[int]]:
+    """Steps in which each client's interactions acted, from the log."""
+    from mcap.reader import make_reader
+    from mcap_protobuf.decoder import DecoderFactory
+
+    found: dict[str, list[int]] = {}
+    reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+    for _, _, _, step in reader.iter_decoded_messages(topics=["/step/beam"]):
+        for interaction in step.interactions:
+            found.setdefault(interaction.client, []).append(step.step)
+    return found
+
+
+def test_a_client_without_a_token_holds_nothing(stage: Stage, tmp_path: Path) -> None:
+    """The token is what tells the server that a client lives; a name without one is nobody's."""
+    stage.server(beam(tmp_path))
+    with stage.client() as client:
+        client.id = "somebody-else"
+        held = client.grab("beam", at=(0.5, 0.5, 4), stiffness=1e4, max_force=2e3)
+        with pytest.raises(BadInput, match="client 'somebody-else' has no interaction"):
+            until(lambda: held.move((0.5, 1.0, 4.0)), "it is let go")
