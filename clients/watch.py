@@ -49,7 +49,7 @@ def _summary(status: pb.Status) -> Text:
 
 
 def _objects(status: pb.Status) -> Table:
-    table = Table("object", "nodes", "iter.", "mean", "residual", "status", "age", "bound", "preconditioner", **COMPACT)
+    table = Table("object", "nodes", "iter.", "mean", "residual", "status", "age", "bound", "precond.", **COMPACT)
     for found in status.objects:
         last = found.last
         table.add_row(

@@ -61,8 +61,9 @@ def test_the_status_and_the_log_tell_the_age_of_factors_and_its_bound():
 def test_the_client_shows_the_age_and_its_bound():
     text = io.StringIO()
     ages = {"liver": (12, 345), "beam": (0, -1)}
-    objects = [pb.ObjectStatus(object=o, factor_age=a, factor_age_bound=b) for o, (a, b) in ages.items()]
+    last = pb.ObjectStep(preconditioner="block_jacobi")
+    objects = [pb.ObjectStatus(object=o, last=last, factor_age=a, factor_age_bound=b) for o, (a, b) in ages.items()]
     Console(width=80, file=text).print(tables(pb.Status(objects=objects)))
-    rows = {words[0]: words[-2:] for line in text.getvalue().splitlines() if (words := line.split())}
-    assert (rows["liver"], rows["beam"]) == (["12", "345"], ["0", "-"])
+    rows = {words[0]: words[-3:] for line in text.getvalue().splitlines() if (words := line.split())}
+    assert (rows["liver"], rows["beam"]) == (["12", "345", "block_jacobi"], ["0", "-", "block_jacobi"])
     assert "bound" in text.getvalue()
