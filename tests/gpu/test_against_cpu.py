@@ -12,17 +12,6 @@ from sim_server.simulation import Simulation
 pytestmark = pytest.mark.gpu
 
 
-@pytest.fixture(autouse=True)
-def gpu():
-    from sim_server.errors import DeviceError
-    from sim_server.gpu.device import cupy
-
-    try:
-        cupy()
-    except DeviceError as error:
-        pytest.skip(str(error))
-
-
 def both(overrides: list[str], steps: int, scene: str = "beam") -> list[tuple[Simulation, np.ndarray]]:
     """Simulation and records on either device."""
     path = f"deploy/scenes/{scene}.toml"

@@ -28,17 +28,6 @@ BOUND = {"float64": 1e-13, "mixed": 5e-6, "float32": 5e-5}  # of the largest ent
 INVERTED = {"float64": 1e-12, "mixed": 1e-4, "float32": 1e-3}
 
 
-@pytest.fixture(autouse=True)
-def gpu():
-    from sim_server.errors import DeviceError
-    from sim_server.gpu.device import cupy
-
-    try:
-        cupy()
-    except DeviceError as error:
-        pytest.skip(str(error))
-
-
 def stir(sim: Simulation, size: float) -> None:
     """Moves nodes and gives them velocities, on the device too."""
     random, w = np.random.default_rng(1), sim.world
