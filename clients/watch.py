@@ -49,7 +49,7 @@ def _summary(status: pb.Status) -> Text:
 
 
 def _objects(status: pb.Status) -> Table:
-    table = Table("object", "nodes", "iter.", "mean", "residual", "status", "age", "bound", "precond.", **COMPACT)
+    table = Table("object", "nodes", "iter.", "mean", "residual", "status", "age/max", "precond.", **COMPACT)
     for found in status.objects:
         last = found.last
         table.add_row(
@@ -59,8 +59,7 @@ def _objects(status: pb.Status) -> Table:
             f"{found.mean_iterations:.1f}",
             f"{last.residual:.1e}",
             status_name(last.status),
-            _known(found.factor_age),
-            _known(found.factor_age_bound),
+            f"{_known(found.factor_age)}/{_known(found.factor_age_bound)}",
             last.preconditioner,
         )
     return table
