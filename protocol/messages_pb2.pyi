@@ -414,8 +414,22 @@ class ObjectStatus(_message.Message):
     factor_age_bound: int
     def __init__(self, object: _Optional[str] = ..., nodes: _Optional[int] = ..., tets: _Optional[int] = ..., last: _Optional[_Union[ObjectStep, _Mapping]] = ..., mean_iterations: _Optional[float] = ..., excess: _Optional[float] = ..., factors_used: _Optional[int] = ..., factors_refused: _Optional[int] = ..., in_flight: _Optional[bool] = ..., factor_age: _Optional[int] = ..., factor_age_max: _Optional[int] = ..., factor_age_bound: _Optional[int] = ...) -> None: ...
 
+class LocalWorker(_message.Message):
+    __slots__ = ("worker", "state", "pid", "restarts", "exit_code")
+    WORKER_FIELD_NUMBER: _ClassVar[int]
+    STATE_FIELD_NUMBER: _ClassVar[int]
+    PID_FIELD_NUMBER: _ClassVar[int]
+    RESTARTS_FIELD_NUMBER: _ClassVar[int]
+    EXIT_CODE_FIELD_NUMBER: _ClassVar[int]
+    worker: str
+    state: str
+    pid: int
+    restarts: int
+    exit_code: int
+    def __init__(self, worker: _Optional[str] = ..., state: _Optional[str] = ..., pid: _Optional[int] = ..., restarts: _Optional[int] = ..., exit_code: _Optional[int] = ...) -> None: ...
+
 class Status(_message.Message):
-    __slots__ = ("header", "scene", "state", "step", "time", "dt", "step_p50", "step_p99", "step_max", "late_steps", "objects", "workers", "clients", "bulk_shared", "bulk_copied", "refused", "frames_dropped", "device", "pid", "uptime", "records_dropped", "records_lost", "commands_refused", "moves_replaced", "bulk_bytes_out", "bulk_bytes_in")
+    __slots__ = ("header", "scene", "state", "step", "time", "dt", "step_p50", "step_p99", "step_max", "late_steps", "objects", "workers", "clients", "bulk_shared", "bulk_copied", "refused", "frames_dropped", "device", "pid", "uptime", "records_dropped", "records_lost", "commands_refused", "moves_replaced", "bulk_bytes_out", "bulk_bytes_in", "local_workers")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     SCENE_FIELD_NUMBER: _ClassVar[int]
     STATE_FIELD_NUMBER: _ClassVar[int]
@@ -442,6 +456,7 @@ class Status(_message.Message):
     MOVES_REPLACED_FIELD_NUMBER: _ClassVar[int]
     BULK_BYTES_OUT_FIELD_NUMBER: _ClassVar[int]
     BULK_BYTES_IN_FIELD_NUMBER: _ClassVar[int]
+    LOCAL_WORKERS_FIELD_NUMBER: _ClassVar[int]
     header: Header
     scene: str
     state: str
@@ -468,4 +483,5 @@ class Status(_message.Message):
     moves_replaced: int
     bulk_bytes_out: int
     bulk_bytes_in: int
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., scene: _Optional[str] = ..., state: _Optional[str] = ..., step: _Optional[int] = ..., time: _Optional[float] = ..., dt: _Optional[float] = ..., step_p50: _Optional[float] = ..., step_p99: _Optional[float] = ..., step_max: _Optional[float] = ..., late_steps: _Optional[int] = ..., objects: _Optional[_Iterable[_Union[ObjectStatus, _Mapping]]] = ..., workers: _Optional[_Iterable[_Union[WorkerInfo, _Mapping]]] = ..., clients: _Optional[_Iterable[str]] = ..., bulk_shared: _Optional[int] = ..., bulk_copied: _Optional[int] = ..., refused: _Optional[int] = ..., frames_dropped: _Optional[int] = ..., device: _Optional[str] = ..., pid: _Optional[int] = ..., uptime: _Optional[float] = ..., records_dropped: _Optional[int] = ..., records_lost: _Optional[int] = ..., commands_refused: _Optional[int] = ..., moves_replaced: _Optional[int] = ..., bulk_bytes_out: _Optional[int] = ..., bulk_bytes_in: _Optional[int] = ...) -> None: ...
+    local_workers: _containers.RepeatedCompositeFieldContainer[LocalWorker]
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., scene: _Optional[str] = ..., state: _Optional[str] = ..., step: _Optional[int] = ..., time: _Optional[float] = ..., dt: _Optional[float] = ..., step_p50: _Optional[float] = ..., step_p99: _Optional[float] = ..., step_max: _Optional[float] = ..., late_steps: _Optional[int] = ..., objects: _Optional[_Iterable[_Union[ObjectStatus, _Mapping]]] = ..., workers: _Optional[_Iterable[_Union[WorkerInfo, _Mapping]]] = ..., clients: _Optional[_Iterable[str]] = ..., bulk_shared: _Optional[int] = ..., bulk_copied: _Optional[int] = ..., refused: _Optional[int] = ..., frames_dropped: _Optional[int] = ..., device: _Optional[str] = ..., pid: _Optional[int] = ..., uptime: _Optional[float] = ..., records_dropped: _Optional[int] = ..., records_lost: _Optional[int] = ..., commands_refused: _Optional[int] = ..., moves_replaced: _Optional[int] = ..., bulk_bytes_out: _Optional[int] = ..., bulk_bytes_in: _Optional[int] = ..., local_workers: _Optional[_Iterable[_Union[LocalWorker, _Mapping]]] = ...) -> None: ...

@@ -162,7 +162,7 @@ def _set_up(closing: ExitStack, o: Options) -> "tuple[Service, Supervisor | None
         reachable = _reachable(o.listen or [DEFAULT_ENDPOINT])
         supervisor = Supervisor(o.workers, o.name, reachable, ["--device", o.worker_device])
         closing.callback(supervisor.close)
-        service.beside = supervisor.look
+        service.beside, link.local_workers = supervisor.look, supervisor.report
     return service, supervisor
 
 

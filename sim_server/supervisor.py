@@ -1,11 +1,18 @@
 # SPDX-License-Identifier: MIT
-"""Local workers of `sim-server --workers N`: started, restarted within a budget, stopped with the server."""
+"""Local workers of `sim-server --workers N`: started, restarted within a budget, stopped with the server.
+
+A worker that ends is started again after a pause that doubles with each restart in the last PERIOD; with more than
+BUDGET of them it is left alone. The simulation goes on whatever happens to its workers.
+"""
 
 import logging
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
+
+from protocol.messages_pb2 import LocalWorker
 
 log = logging.getLogger(__name__)
 
@@ -21,6 +28,18 @@ class _Worker:
         self.restarts: list[float] = []
         self.due = 0.0
         self.given_up = False
+        self.count = 0  # restarts in all
+        self.exit_code = 0
+
+    def report(self) -> LocalWorker:
+        """For the status."""
+        state = "given up" if self.given_up else "restarting" if self.due else "running"
+        pid = self.process.pid if self.process is not None else 0
+        return LocalWorker(worker=self.name, state=state, pid=pid, restarts=self.count, exit_code=self.exit_code)
+
+
+Start = Callable[[Sequence[str]], "subprocess.Popen[bytes]"]
+_popen: Start = partial(subprocess.Popen, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
 
 
 class Supervisor:
@@ -28,21 +47,23 @@ class Supervisor:
 
     def __init__(
         self, count: int, server: str, connect: Sequence[str], arguments: Sequence[str] = (),
-        clock: Callable[[], float] = time.monotonic,
+        clock: Callable[[], float] = time.monotonic, start: Start = _popen,
     ):  # fmt: skip
         endpoints = [word for endpoint in connect for word in ("--connect", endpoint)]
         self._command = [
             sys.executable, "-m", "precond_worker", "--exit-with-parent", "--server", server, *endpoints, *arguments
         ]  # fmt: skip
-        self._clock = clock
+        self._clock, self._popen = clock, start
         self.workers = [_Worker(f"local-{i + 1}") for i in range(count)]
         for worker in self.workers:
             self._start(worker)
 
     def _start(self, worker: _Worker) -> None:
-        worker.process = subprocess.Popen(
-            [*self._command, "--name", worker.name], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL
-        )
+        worker.process = self._popen([*self._command, "--name", worker.name])
+
+    def report(self) -> list[LocalWorker]:
+        """All of them, alive or not."""
+        return [worker.report() for worker in self.workers]
 
     def look(self) -> None:
         """Restarts what has died, after a pause that doubles; gives up on a worker that keeps dying."""
@@ -51,16 +72,24 @@ class Supervisor:
             if worker.given_up or worker.process is None or worker.process.poll() is None:
                 continue
             if worker.due == 0.0:
+                worker.exit_code = worker.process.returncode
                 worker.restarts = [t for t in worker.restarts if now - t < PERIOD]
                 if len(worker.restarts) >= BUDGET:
                     worker.given_up = True
-                    log.error("worker %s died %d times within %g s: left alone", worker.name, BUDGET + 1, PERIOD)
+                    log.error(
+                        "worker %s ended %d times within %g s, the last time with %s: left alone",
+                        worker.name, BUDGET + 1, PERIOD, worker.exit_code,
+                    )  # fmt: skip
                     continue
                 worker.due = now + BACK_OFF * 2 ** len(worker.restarts)
-                log.warning("worker %s ended with %s: restarting", worker.name, worker.process.returncode)
+                log.warning(
+                    "worker %s ended with %s: starting it again in %.1f s (restart %d of %d within %g s)",
+                    worker.name, worker.exit_code, worker.due - now, len(worker.restarts) + 1, BUDGET, PERIOD,
+                )  # fmt: skip
             if now >= worker.due:
                 worker.restarts.append(now)
                 worker.due = 0.0
+                worker.count += 1
                 self._start(worker)
 
     def close(self) -> None:

@@ -20,7 +20,7 @@ from protocol import Factor
 from protocol.channels import PROTOCOL, SERVER_NAME, check_name, key, name_in
 from protocol.counters import Counters
 from protocol.memlock import POOL_LIMIT
-from protocol.messages_pb2 import Command, Header, Reply, Scene, State, Status, Steps, Topology, WorkerInfo
+from protocol.messages_pb2 import Command, Header, LocalWorker, Reply, Scene, State, Status, Steps, Topology, WorkerInfo
 from protocol.refused import Refused
 from protocol.session import open_session
 from protocol.slots import Slot, SlotPool, SlotsUnusable
@@ -59,6 +59,7 @@ class ServerLink:
         self.name = check_name(name, "server name")
         self.incarnation = secrets.randbits(63) | 1
         self.counters = Counters(log)
+        self.local_workers: Callable[[], list[LocalWorker]] = list  # those that this process supervises, for the status
         with ExitStack() as closing:
             self._session = open_session("server", listen=listen, connect=connect, shared_memory=shared_memory)
             closing.callback(self._session.close)
@@ -182,7 +183,8 @@ class ServerLink:
 
     def publish_status(self, status: Status) -> None:
         """Send and keep for queries; what the link knows best (workers, clients, counts) is filled in."""
-        del status.workers[:], status.clients[:]
+        del status.workers[:], status.clients[:], status.local_workers[:]
+        status.local_workers.extend(self.local_workers())
         status.workers.extend(self.workers())
         status.clients.extend(self.clients())
         status.bulk_shared, status.bulk_copied = self.counters.bulk_shared, self.counters.bulk_copied
