@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-BENCHES = {"accuracy": ["--no-processes"], "figure4": ["--no-processes"], "hard_cases": []}
+BENCHES = {"accuracy": ["--no-processes"], "figure4": ["--no-processes"], "hard_cases": [], "scheduler": []}
 
 
 def leaves(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
@@ -65,3 +65,13 @@ def test_reference_of_accuracy_is_no_competitor(tmp_path: Path) -> None:
     assert all(error > 0 for point in data["points"] for error in point["worst"])
     cg = {p["tolerance"]: p["worst"][0] for p in data["points"] if (p["beam"], p["scheme"]) == ("homogeneous", "CG")}
     assert cg[1e-6] < 1e-2 * cg[1e-2]
+
+
+def test_scheduler_repeats_to_the_digit_and_excess_goes_before_turns(tmp_path: Path) -> None:
+    runs = [bench("scheduler", tmp_path / name)["data"]["rows"] for name in ("one", "two")]
+    assert runs[0] == runs[1]
+    iterations = {(r["objects"], r["workers"], r["rule"]): r["iterations"] for r in runs[0]}
+    for workers in (1, 2):
+        oracle, excess = iterations[16, 0, "oracle"], iterations[16, workers, "excess"]
+        assert oracle < excess < 0.7 * iterations[16, workers, "round_robin"]
+    assert all(r["age, max"] <= r["age, bound"] for r in runs[0] if r["age, bound"] is not None)
