@@ -303,6 +303,44 @@ def load(
     Console().print(tables(found))
 
 
+@app.command()
+def replay(
+    log: Annotated[Path, typer.Argument(metavar="LOG.mcap", help="A recorded run.")],
+    simulate: Annotated[bool, typer.Option("--simulate", help="Run it again and compare bit by bit.")] = False,
+    speed: Annotated[str, typer.Option(metavar="N|max", help="Simulated seconds a second.")] = "1",
+    loop: Annotated[bool, typer.Option("--loop", help="From the beginning again at the end.")] = False,
+    begin: Annotated[float, typer.Option("--from", metavar="SECONDS", help="Where to begin, s of simulation.")] = 0.0,
+    end: Annotated[float | None, typer.Option("--to", metavar="SECONDS", help="Where to end.")] = None,
+    name: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Name of the server that it plays; else the log's, if free.")
+    ] = None,
+    connect: Connect = None,
+    listen: Annotated[
+        list[str] | None, typer.Option(metavar="ENDPOINT", help=f"Where to be reached, {DEFAULT_ENDPOINT} by default.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
+) -> None:
+    """Send a log out as if its server were live; or run it again and compare.
+
+    With --simulate: exit code 0 the same bit for bit, 1 diverged, 2 no log that can be run again.
+
+    \b
+    Examples:
+      sim-client replay run.mcap --loop          and elsewhere: sim-client view --live
+      sim-client replay run.mcap --speed 0.5 --from 2 --to 4
+      sim-client replay run.mcap --name old --connect tcp/127.0.0.1:7447
+      sim-client replay run.mcap --simulate
+    """
+    from clients import replay_command
+
+    if not simulate:
+        replay_command.republish(log, speed, loop, begin, end, name, connect, listen, as_json)
+        return
+    if speed != "1" or loop or begin or end is not None or name or connect or listen:
+        raise BadInput("replay: --simulate takes no other options than --json")
+    raise typer.Exit(replay_command.simulate(log, as_json))
+
+
 def _nodes(count: int) -> str:
     return f"{count} node{'s' if count != 1 else ''}"
 

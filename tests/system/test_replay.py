@@ -1,0 +1,204 @@
+# SPDX-License-Identifier: MIT
+"""A run with a worker, pushes and a grab, recorded by real processes and repeated bit for bit from its log."""
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from google.protobuf.message import Message
+from mcap.records import Channel
+from mcap.records import Message as McapMessage
+
+from protocol import messages_pb2 as pb
+from protocol.log_chunks import BadLog, ChunkFile
+from sim_server.mcap_file import McapFile
+from sim_server.replay.log import Recording
+from tests.system.server_process import Stage, beam, run, until
+
+pytestmark = pytest.mark.system
+
+STEPS = 200
+TYPES: dict[str, type[Message]] = {
+    "scene": pb.Scene, "topology": pb.Topology, "step": pb.ObjectStep, "state": pb.State,
+    "interaction": pb.Interaction, "touch": pb.TouchSet, "factor": pb.FactorUse,
+}  # fmt: skip
+Change = Callable[[Any], bool]  # of a message in place; False: leave it out
+
+
+def recorded(folder: Path, solver: str = "", preconditioner: str = "cholesky") -> Path:
+    """A log of a beam that is pushed, grabbed and moved about while a worker makes its factors."""
+    stage, log = Stage(folder), folder / "run.mcap"
+    scene = beam(folder, solver=solver)
+    scene.write_text(scene.read_text().replace('"cholesky"', f'"{preconditioner}"'))
+    try:
+        server = stage.server(scene, "--steps", str(STEPS), "--record", str(log), "--workers", "1")
+        with stage.client() as client:
+            until(lambda: client.status().step > 5, "the simulation runs")
+            client.push("beam", at=(0.5, 0.5, 4), force=(100, 0, 0), duration=0.3)
+            with client.grab("beam", (1, 1, 4), stiffness=2000, max_force=900) as held:
+                for k in range(25):
+                    held.move((1 + 0.02 * k, 1, 4))
+                    time.sleep(0.01)
+                client.pause()
+                client.push("beam", at=(0, 0, 3), force=(0, 90, 0), duration=0.1)
+                client.resume()
+        assert server.wait() == 0, server.output()
+    finally:
+        stage.close()
+    return log
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    yield recorded(tmp_path_factory.mktemp("run"))
+
+
+def messages(log: Path, kind: str) -> list[Any]:
+    """All messages of a kind in the order of the file."""
+    found: list[Any] = []
+    copied(log, log.with_name("copy.mcap"), {kind: lambda m: found.append(m) or True})  # type: ignore[func-returns-value]
+    return found
+
+
+def copied(log: Path, to: Path, changes: dict[str, Change]) -> Path:
+    """A copy of a log with messages changed."""
+    source, topics = ChunkFile.open(log), {}
+    file = McapFile(to, "lz4", overwrite=True)
+    for _, records in source.scan():
+        for record in records:
+            if isinstance(record, Channel):
+                topics[record.id] = record.topic
+                continue
+            assert isinstance(record, McapMessage)
+            topic = topics[record.channel_id]
+            kind = topic.split("/")[1]
+            message = TYPES[kind].FromString(record.data)
+            if changes.get(kind, lambda m: True)(message):
+                file.write(
+                    topic, TYPES[kind], record.log_time, record.publish_time, record.sequence,
+                    message.SerializeToString(),
+                )  # fmt: skip
+    file.finish({})
+    source.close()
+    return to
+
+
+def replayed(log: Path, code: int) -> dict[str, Any]:
+    """What `sim-client replay --simulate --json` says."""
+    result = run("clients", "replay", str(log), "--simulate", "--json")
+    assert result.returncode == code, result.stdout + result.stderr
+    found: dict[str, Any] = json.loads(result.stdout)
+    return found
+
+
+def test_the_same_bit_for_bit(log: Path) -> None:
+    found = replayed(log, 0)
+    assert found["same"] and found["first"] is None and found["other_factor"] is None and not found["notes"]
+    assert (found["steps"], found["solves"], found["frames"]) == (STEPS, STEPS, STEPS + 1)
+    factors = messages(log, "factor")
+    assert len(factors) > 20 and all(f.library and f.threads == 1 and f.worker for f in factors)
+    assert len({s.factor_step for s in messages(log, "step")}) > 20, "factors came from the worker all along"
+    assert len(messages(log, "touch")) > 5 and messages(log, "touch")[-1].step > messages(log, "touch")[0].step
+    told = run("clients", "replay", str(log), "--simulate")
+    assert told.returncode == 0 and f"{STEPS} steps repeated, the same bit for bit" in told.stdout
+
+
+def test_another_push_is_told_with_its_step(log: Path, tmp_path: Path) -> None:
+    """One force a little larger: the first step that differs is the one that it acts in first."""
+    at = messages(log, "touch")[0].step
+
+    def stronger(message: pb.TouchSet) -> bool:
+        for i in message.interactions:
+            i.force.x += 1e-6 if i.kind == "push" else 0
+        return True
+
+    found = replayed(copied(log, tmp_path / "other.mcap", {"touch": stronger}), 1)
+    assert (found["first"]["step"], found["first"]["object"]) == (at + 1, "beam")
+    assert 0 < found["largest"]["distance"] < 1e-3
+    assert found["largest"]["step"] > at
+
+
+def test_another_hand_over_is_told_with_its_step(log: Path, tmp_path: Path) -> None:
+    """One solve said to have used an older factor than it did."""
+    steps = {s.step: s for s in messages(log, "step")}
+    made = sorted({s.factor_step for s in steps.values()})
+    at = max((s for s in steps if steps[s].factor_step >= made[10]), key=lambda s: steps[s].iterations)
+    older = made[made.index(steps[at].factor_step) - 8]
+
+    def change(message: pb.ObjectStep) -> bool:
+        if message.step == at:
+            message.factor_step = older
+        return True
+
+    found = replayed(copied(log, tmp_path / "other.mcap", {"step": change}), 1)
+    assert (found["first"]["step"], found["first"]["object"]) == (at, "beam")
+    assert found["first"]["what"] == "solve" and "residual" in found["first"]["detail"]
+    told = run("clients", "replay", str(tmp_path / "other.mcap"), "--simulate")
+    assert told.returncode == 1 and f"diverged at step {at}, object 'beam'" in told.stdout
+
+
+def test_another_factor_is_told(log: Path, tmp_path: Path) -> None:
+    """The log says that the worker's factor was another one: a hint, and by itself no divergence."""
+    factor = messages(log, "factor")[3]
+
+    def change(message: pb.FactorUse) -> bool:
+        message.checksum ^= message.step == factor.step
+        return True
+
+    found = replayed(copied(log, tmp_path / "other.mcap", {"factor": change}), 0)
+    assert found["other_factor"]["step"] == factor.step and factor.worker in found["other_factor"]["detail"]
+
+
+def test_logs_with_gaps_are_repeated_up_to_them(log: Path, tmp_path: Path) -> None:
+    whole, cut = log.read_bytes(), tmp_path / "cut.mcap"
+    cut.write_bytes(whole[: len(whole) * 3 // 4])
+    found = replayed(cut, 0)
+    assert 10 < found["steps"] < STEPS and "without an end mark" in found["notes"][0]
+    gap = copied(log, tmp_path / "gap.mcap", {"step": lambda m: m.step != 50})
+    found = replayed(gap, 0)
+    assert found["steps"] == 49 and "step 50" in found["notes"][-1]
+
+
+def test_what_cannot_be_repeated_is_refused(log: Path, tmp_path: Path) -> None:
+    def elsewhere(message: pb.Scene) -> bool:
+        message.device, message.software = "gpu", "warpfactor 0.1, NVIDIA H200"
+        return True
+
+    other = tmp_path / "other.mcap"
+    refused: list[tuple[dict[str, Change], str]] = [
+        ({"scene": elsewhere}, "only runs on the CPU"), ({"scene": lambda m: False}, "no scene"),
+        ({"step": lambda m: False}, "no step"), ({"topology": lambda m: False}, "no mesh of beam"),
+    ]  # fmt: skip
+    for changes, told in refused:
+        with pytest.raises(BadLog, match=told):
+            Recording(copied(log, other, changes))
+    result = run("clients", "replay", str(other), "--simulate")
+    assert result.returncode == 2 and "no mesh of beam" in result.stderr and "Traceback" not in result.stderr
+    assert run("clients", "replay", str(tmp_path / "none.mcap"), "--simulate").returncode == 2
+    assert run("clients", "replay", str(log), "--simulate", "--loop").returncode == 2
+
+
+def test_an_old_log_says_what_it_lacks(log: Path, tmp_path: Path) -> None:
+    """Without the build, the interactions taken up and the factors' makers: read, compared, and said."""
+
+    def old(message: pb.Scene) -> bool:
+        message.device = message.build = message.server = ""
+        return True
+
+    changes: dict[str, Change] = {"scene": old, "touch": lambda m: False, "factor": lambda m: False}
+    found = replayed(copied(log, tmp_path / "old.mcap", changes), 1)
+    assert any("older version" in note for note in found["notes"])
+    assert found["first"]["step"] == messages(log, "touch")[0].step + 1, "the pushes are missing"
+
+
+@pytest.mark.parametrize("update", ["every-10", "lockstep-3"])
+def test_other_policies(update: str, tmp_path: Path) -> None:
+    assert replayed(recorded(tmp_path, f'update = "{update}"'), 0)["same"]
+
+
+def test_the_automatic_preconditioner(tmp_path: Path) -> None:
+    """Which solves probe is decided by the clock; the log holds it."""
+    assert replayed(recorded(tmp_path, preconditioner="auto"), 0)["same"]
