@@ -9,6 +9,7 @@ A scene lists the effects that it wants; only those are imported, and what is no
 """
 
 import importlib
+from functools import cache
 from pathlib import Path
 from types import ModuleType
 
@@ -17,7 +18,12 @@ from sim_server.errors import InputError
 
 def known_effects() -> list[str]:
     """Names of the effects, sorted; nothing is imported."""
-    return sorted(f.stem for f in Path(__file__).parent.glob("*.py") if not f.stem.startswith("_"))
+    return list(_files())
+
+
+@cache
+def _files() -> tuple[str, ...]:
+    return tuple(sorted(f.stem for f in Path(__file__).parent.glob("*.py") if not f.stem.startswith("_")))
 
 
 def effect(name: str) -> ModuleType:

@@ -59,6 +59,14 @@ def test_figure4_with_a_real_worker(tmp_path: Path) -> None:
     assert rows["real async+warp, real time"]["factor age, mean"] >= 0, "no factor ever came"
 
 
+@pytest.mark.system
+def test_scaling_with_a_real_worker(tmp_path: Path) -> None:
+    rows = bench("scaling", tmp_path)["data"]["rows"]
+    assert [(row["objects"], row["workers"], row["with a factor"]) for row in rows] == [(1, 1, 1), (3, 1, 3)]
+    assert all(row["unconverged"] == 0 and row["factor age, steps"] > 0 for row in rows)
+    assert (tmp_path / "scaling.png").read_bytes().startswith(b"\x89PNG")
+
+
 def test_reference_of_accuracy_is_no_competitor(tmp_path: Path) -> None:
     """PCG-1 against a reference of its own would show an error of exactly 0 at any tolerance."""
     data = bench("accuracy", tmp_path, "--no-processes")["data"]
