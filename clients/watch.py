@@ -42,7 +42,8 @@ def _summary(status: pb.Status) -> Text:
         f"step p50 {_ms(status.step_p50)}, p99 {_ms(status.step_p99)}, max {_ms(status.step_max)}, "
         f"late {status.late_steps}; dropped: frames {status.frames_dropped}, step records {status.records_dropped}; "
         f"lost to the log {status.records_lost}",
-        f"messages refused {status.refused}; arrays through shared memory {status.bulk_shared}, "
+        f"refused: messages {status.refused}, commands {status.commands_refused}; "
+        f"arrays through shared memory {status.bulk_shared}, "
         f"as bytes {status.bulk_copied}; clients {len(status.clients)}",
     ]
     return Text("\n".join(lines))
