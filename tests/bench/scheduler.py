@@ -103,7 +103,7 @@ def picture(rows: list[dict[str, Any]], sizes: list[int], workers: list[int]) ->
     for column, count in enumerate(workers):
         for name in (NEVER, *RULES, EACH):
             own = [r for r in rows if r["rule"] == name and (r["workers"] == count or name in (NEVER, EACH))]
-            style = ":" if name in (NEVER, EACH) else "-"
+            style = {NEVER: ":", EACH: ":", "oldest": "--"}.get(name, "-")  # oldest lies on round_robin
             axes[0, column].plot(sizes, [r["/ oracle"] for r in own], style, marker="o", ms=3, label=name)
             if name in RULES:
                 axes[1, column].plot(
@@ -143,7 +143,12 @@ at rest. The rows *default floor* have 3.""",
     )
 
 
-def _verdict(rows: list[dict[str, Any]]) -> list[str]:
+def _turn(row: dict[str, Any], setting: Setting) -> float:
+    """Steps in which the workers serve each wild object once."""
+    return row["wild"] * setting.steps / (row["factors"] - row["objects"])
+
+
+def _verdict(rows: list[dict[str, Any]], setting: Setting) -> list[str]:
     """Where the aims are met, and what stands in the way elsewhere."""
     each = {row["objects"]: row for row in rows if row["rule"] == EACH}
     turns = {(row["objects"], row["workers"]): row for row in rows if row["rule"] == "round_robin"}
@@ -158,11 +163,21 @@ def _verdict(rows: list[dict[str, Any]]) -> list[str]:
         lines.append(
             f"{where} {', '.join(missed)}. A worker for each object would make {best['/ oracle']:.2f} of the oracle's "
             f"and {best['iterations'] / other['iterations']:.2f} of round robin's (whose oldest factor is "
-            f"{other['age, max']} steps old); {row['wild'] / row['workers']:.3g} wild objects per worker."
+            f"{other['age, max']} steps old); {_turn(row, setting):.3g} steps pass before a wild object's next turn."
         )
-    rules = [r for r in rows if r["age, bound"] is not None and r["workers"]]
-    kept = sum(r["age, max"] <= r["age, bound"] for r in rules)
-    return ["\n".join(lines), f"Factors within the bound of age that the server tells: {kept} of {len(rules)} runs."]
+    told = [r for r in rows if r["age, bound"] is not None and r["workers"]]
+    longer = [r for r in told if r["age, bound"] < setting.steps]
+    kept = sum(r["age, max"] <= r["age, bound"] for r in longer)
+    return [
+        "\n".join(lines),
+        f"""\
+Where a worker for each object misses an aim too, asynchrony itself stands in the way (a factor at least 2 steps old
+against a fresh one each step), or round robin's turns are short already. Elsewhere it is the length of a turn: hands
+take hold elsewhere each {setting.hold} steps, and until its next factor an object solves against a spring that its
+factor does not know. Where round robin needs more than no updates, its factors hold springs that are gone besides
+lacking those that are there; the first factor holds none.""",
+        f"Bound of age that the server tells: kept in {kept} of the {len(longer)} runs that were longer than it.",
+    ]
 
 
 def _numbers(text: str) -> list[int]:
@@ -199,7 +214,7 @@ def main(
         print(f"{size} objects done", flush=True)
     report.say(*_explained(setting))
     report.figure(picture(rows, sizes, counts), "scheduler.png", "Iterations and the oldest factor under each rule.")
-    report.say(*_verdict(rows))
+    report.say(*_verdict(rows, setting))
     report.table([{**row, "workers": row["workers"] or None} for row in rows], COLUMNS)
     report.data["rows"] = rows
     report.write()
