@@ -29,8 +29,6 @@ def main() -> int:
     except (BadLog, InputError, CompileError) as error:
         print(f"replay: {error}", file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
-        return 130
     if arguments.json:
         print(json.dumps(found.plain()))
     else:
@@ -39,4 +37,7 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    try:
+        sys.exit(main())
+    except KeyboardInterrupt:  # also while it still imports
+        sys.exit(130)

@@ -128,7 +128,7 @@ class Replay:
             raise BadLog(f"{self.recording.path}: pushes or grabs in a scene that takes none")
         try:
             touch.restore([self._interaction(m) for m in self._sets[step].interactions])
-        except (Refused, KeyError) as error:
+        except Refused as error:
             raise BadLog(f"{self.recording.path}: interactions of step {step}: {error}") from error
 
     def _interaction(self, m: pb.Interaction) -> Any:
@@ -139,6 +139,8 @@ class Replay:
             check_range(nodes, 0, self.simulation.world.nodes, "Interaction.held")
             offsets = array(m.offsets, np.float64, (m.nodes, 3), "Interaction.offsets", finite=True)
             self._held[m.id] = (nodes.astype(np.int32), offsets.astype(np.float64))
+        if m.id not in self._held:
+            raise Refused(f"the nodes of interaction {m.id} are not in the log")
         nodes, offsets = self._held[m.id]
         point, force, target = ((v.x, v.y, v.z) for v in (m.point, m.force, m.target))
         return Interaction(

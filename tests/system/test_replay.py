@@ -202,3 +202,10 @@ def test_other_policies(update: str, tmp_path: Path) -> None:
 def test_the_automatic_preconditioner(tmp_path: Path) -> None:
     """Which solves probe is decided by the clock; the log holds it."""
     assert replayed(recorded(tmp_path, preconditioner="auto"), 0)["same"]
+
+
+def test_solves_that_ran_out_of_time(tmp_path: Path) -> None:
+    """Where a budget of wall time ended a solve is in its record."""
+    log = recorded(tmp_path, "budget = 2e-5", "block_jacobi")
+    assert any(s.status == pb.BUDGET for s in messages(log, "step"))
+    assert replayed(log, 0)["same"]
