@@ -76,11 +76,11 @@ def serve(
     if worker_device not in ("auto", "cpu", "gpu"):
         _bad_input(f"--worker-device {worker_device}: allowed are auto, cpu, gpu")
     say = (lambda text: None) if quiet else (lambda text: print(f"sim-server: {text}", flush=True))
-    options = Options(
-        scene, set_ or [], chosen(device, say), name, listen, connect, not no_shared_memory, record, steps, realtime,
-        workers, worker_device,
-    )  # fmt: skip
     try:
+        options = Options(
+            scene, set_ or [], chosen(device, say), name, listen, connect, not no_shared_memory, record, steps,
+            realtime, workers, worker_device,
+        )  # fmt: skip
         with ExitStack() as closing:
             service, supervisor = _set_up(closing, options)
             _announce(say, service, scene, listen)

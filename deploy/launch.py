@@ -1,0 +1,233 @@
+# SPDX-License-Identifier: MIT
+"""Starts several servers and a pool of workers that they share, from one scene whose objects are dealt out by size.
+
+Objects do not interact, so each may live on any server. Servers are called sim-0, sim-1, ... and listen on one port
+after another; every worker serves all of them, a job of each in turn. Ctrl-C stops everything.
+"""
+
+import json
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, NoReturn
+
+import typer
+
+from protocol.endpoints import BadEndpoint, check_endpoint
+from sim_server.errors import InputError
+from sim_server.scene import Scene, load
+from sim_server.supervisor import Supervisor
+
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+
+EPILOG = """\b
+Examples:
+  .venv/bin/python deploy/launch.py deploy/scenes/four_beams.toml --servers 2 --workers 1
+        two servers of two beams each, one worker for both
+  .venv/bin/python deploy/launch.py scene.toml --servers 4 --workers 8 --port 7500 --record logs --steps 5000
+        ports 7500 to 7503, logs/sim-0.mcap to logs/sim-3.mcap
+  .venv/bin/python deploy/launch.py scene.toml --servers 2 --host 0.0.0.0 --json
+        open to other hosts, where precond-worker --server sim-0@tcp/HOST:7447 --server sim-1@tcp/HOST:7448 may help;
+        prints as JSON what runs
+  sim-client status --connect tcp/127.0.0.1:7448 --server sim-1
+        asks the second of them
+"""
+
+PATIENCE = 5.0  # s for a server to end when told
+
+
+class Terminated(BaseException):
+    """SIGTERM: leave in good order."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """What one server simulates: objects by their place in the scene, and their tetrahedra in all."""
+
+    objects: tuple[int, ...]
+    tets: int
+
+
+def deal(tets: Sequence[int], servers: int) -> list[Part]:
+    """Objects of so many tetrahedra to at most `servers` servers, none without: the largest first, each to the server
+    that has least. The order within a server is that of the scene."""
+    hands: list[list[int]] = [[] for _ in range(min(servers, len(tets)))]
+    loads = [0] * len(hands)
+    for index in sorted(range(len(tets)), key=lambda i: (-tets[i], i)):
+        least = min(range(len(hands)), key=lambda k: (loads[k], len(hands[k])))
+        hands[least].append(index)
+        loads[least] += tets[index]
+    return [Part(tuple(sorted(hand)), load) for hand, load in zip(hands, loads, strict=True)]
+
+
+def toml(value: Any) -> str:
+    """A value of JSON types in TOML, on one line; TOML has no null, so that such entries are left out."""
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{json.dumps(k)} = {toml(v)}" for k, v in value.items() if v is not None) + " }"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(toml, value)) + "]"
+    return str(value) if isinstance(value, float) else json.dumps(value)  # str: inf and nan too are TOML's
+
+
+def part_of(scene: Scene, part: Part) -> str:
+    """The scene file of a part."""
+    table = scene.resolved()
+    table["object"] = [table["object"][index] for index in part.objects]
+    return "".join(f"{key} = {toml(value)}\n" for key, value in table.items())
+
+
+class Fleet:
+    """All servers and workers. Use it as a context manager: they end with it."""
+
+    def __init__(self, scene: Scene, parts: Sequence[Part], host: str, port: int, record: Path | None, quiet: bool):
+        self._scene, self._parts, self._record, self._quiet = scene, parts, record, quiet
+        self._folder = tempfile.TemporaryDirectory(prefix="warpfactor-")
+        self.names = [f"sim-{k}" for k in range(len(parts))]
+        self.listen = [f"tcp/{host}:{port + k}" for k in range(len(parts))]
+        self.endpoints = [e.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:") for e in self.listen]
+        self.servers: list[subprocess.Popen[bytes]] = []
+        self.workers: Supervisor | None = None
+
+    def start(self, workers: int, server_options: Sequence[str], worker_options: Sequence[str]) -> None:
+        """The servers, then the workers, which wait for them."""
+        for name, listen, part in zip(self.names, self.listen, self._parts, strict=True):
+            path = Path(self._folder.name) / f"{name}.toml"
+            path.write_text(part_of(self._scene, part))
+            record = ["--record", str(self._record / f"{name}.mcap")] if self._record else []
+            command = [sys.executable, "-m", "sim_server", str(path), "--name", name, "--listen", listen]
+            out = sys.stderr if self._quiet else None
+            self.servers.append(subprocess.Popen([*command, *record, *server_options], stdout=out))
+        if workers:
+            first, *others = [f"{n}@{e}" for n, e in zip(self.names, self.endpoints, strict=True)]
+            also = [word for server in others for word in ("--server", server)]
+            self.workers = Supervisor(workers, first, [], [*also, *worker_options])
+
+    def describe(self) -> dict[str, Any]:
+        """What was started, for JSON."""
+        names = [o.name for o in self._scene.objects]
+        servers = [
+            {
+                "name": name, "pid": process.pid, "endpoint": endpoint, "tets": part.tets,
+                "objects": [names[index] for index in part.objects],
+                "record": str(self._record / f"{name}.mcap") if self._record else None,
+            }
+            for name, endpoint, part, process in zip(
+                self.names, self.endpoints, self._parts, self.servers, strict=True
+            )
+        ]  # fmt: skip
+        pool = self.workers.report() if self.workers else []
+        return {
+            "scene": str(self._scene.path),
+            "servers": servers,
+            "workers": [{"name": w.worker, "pid": w.pid, "servers": self.names} for w in pool],
+        }
+
+    def wait(self) -> int:
+        """Until all servers are done, or one failed: its exit code."""
+        while True:
+            codes = [process.poll() for process in self.servers]
+            if failed := [code for code in codes if code]:
+                return failed[0]
+            if all(code == 0 for code in codes):
+                return 0
+            if self.workers:
+                self.workers.look()
+            time.sleep(0.05)
+
+    def close(self) -> None:
+        """SIGTERM, which ends a log well; SIGKILL for who does not listen."""
+        for process in self.servers:
+            if process.poll() is None:
+                process.terminate()
+        end = time.monotonic() + PATIENCE
+        for process in self.servers:
+            try:
+                process.wait(max(0.01, end - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+        if self.workers:
+            self.workers.close()
+        self._folder.cleanup()
+
+    def __enter__(self) -> "Fleet":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+@app.command(epilog=EPILOG)
+def launch(
+    scene: Annotated[Path, typer.Argument(metavar="SCENE.toml", help="What to simulate")],
+    servers: Annotated[int, typer.Option(metavar="N", min=1, max=64, help="Servers to share its objects")] = 2,
+    workers: Annotated[int, typer.Option(metavar="M", min=0, max=64, help="Workers, shared by all servers")] = 1,
+    host: Annotated[str, typer.Option(metavar="ADDRESS", help="Where servers listen")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(metavar="P", min=1, max=65535, help="Of the first server")] = 7447,
+    device: Annotated[str, typer.Option(metavar="auto|cpu|gpu", help="Of the servers")] = "auto",
+    worker_device: Annotated[str, typer.Option(metavar="auto|cpu|gpu", help="Of the workers")] = "cpu",
+    threads: Annotated[int, typer.Option(metavar="T", min=1, help="Of each worker")] = 1,
+    steps: Annotated[int | None, typer.Option(metavar="N", min=1, help="Stop after so many steps")] = None,
+    realtime: Annotated[bool, typer.Option("--realtime/--free-run", help="Keep pace with the clock or not")] = True,
+    record: Annotated[Path | None, typer.Option(metavar="FOLDER", help="Write a log of each server there")] = None,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Another value than the scene's")
+    ] = None,
+    json_: Annotated[bool, typer.Option("--json", help="Print what was started as JSON on one line")] = False,
+) -> None:
+    """Start N servers and M workers from one scene; its objects are dealt out by size."""
+    signal.signal(signal.SIGTERM, _terminate)
+    try:
+        whole = load(scene, set_ or [])
+        parts = deal([len(o.load_mesh().tets) for o in whole.objects], servers)
+        check_endpoint(f"tcp/{host}:{port + len(parts) - 1}", listen=True)
+        if record:
+            record.mkdir(parents=True, exist_ok=True)
+    except (InputError, BadEndpoint, OSError) as error:
+        _bad_input(str(error))
+    for_servers = ["--device", device, "--realtime" if realtime else "--free-run"]
+    for_servers += ["--steps", str(steps)] if steps else []
+    try:
+        with Fleet(whole, parts, host, port, record, json_) as fleet:
+            fleet.start(workers, for_servers, ["--device", worker_device, "--threads", str(threads)])
+            say(fleet.describe(), servers, json_)
+            raise typer.Exit(fleet.wait())
+    except KeyboardInterrupt:
+        raise typer.Exit(130) from None
+    except Terminated:
+        raise typer.Exit(0) from None
+
+
+def say(started: dict[str, Any], asked: int, as_json: bool) -> None:
+    """What runs where."""
+    if as_json:
+        print(json.dumps(started), flush=True)
+        return
+    if len(started["servers"]) < asked:
+        print(f"launch: {len(started['servers'])} of {asked} servers, one for each object", flush=True)
+    for s in started["servers"]:
+        shown = ", ".join(s["objects"][:6]) + (", ..." if len(s["objects"]) > 6 else "")
+        count = f"{len(s['objects'])} object{'s' * (len(s['objects']) > 1)}"
+        print(
+            f"launch: {s['name']} at {s['endpoint']}, pid {s['pid']}: {count}, {s['tets']} tets ({shown})", flush=True
+        )
+    for w in started["workers"]:
+        print(f"launch: worker {w['name']}, pid {w['pid']}, for all servers", flush=True)
+
+
+def _terminate(*_: object) -> None:
+    raise Terminated
+
+
+def _bad_input(text: str) -> NoReturn:
+    print(f"launch: {text}", file=sys.stderr)
+    raise typer.Exit(2)
+
+
+if __name__ == "__main__":
+    app(prog_name="deploy/launch.py")

@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: MIT
+"""deploy/launch.py: objects dealt out by size, and real servers with a worker that they share."""
+
+import importlib.util
+import json
+import os
+import signal
+import subprocess
+import sys
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from clients.client import Client
+from clients.errors import ClientError
+from sim_server.scene import load
+from tests.system.link_helpers import PATIENCE, ROOT, free_endpoint
+from tests.system.server_process import alive, until
+
+LAUNCH = ROOT / "deploy" / "launch.py"
+SCENE = """
+dt = 0.02
+[effects]
+gravity = { g = [0, -9.81, 0] }
+[solver]
+preconditioner = "cholesky"
+"""
+BAR = """
+[[object]]
+name = "bar{k}"
+mesh = {{ bar = [{cells}, 2, 4], size = [1, 1, 2] }}
+[object.effects]
+corotational = {{ young = [{{ where = "Z < 1", young = 1e6 }}, {{ young = 2e6 }}], poisson = 0.4 }}
+fixed = {{ where = "Z < 0.01" }}
+"""
+
+
+def module() -> Any:
+    spec = importlib.util.spec_from_file_location("launch", LAUNCH)
+    assert spec is not None and spec.loader is not None
+    launch = importlib.util.module_from_spec(spec)
+    sys.modules["launch"] = launch  # its dataclass looks itself up there
+    spec.loader.exec_module(launch)
+    return launch
+
+
+def scene(folder: Path, cells: Sequence[int]) -> Path:
+    path = folder / "bars.toml"
+    path.write_text(SCENE + "".join(BAR.format(k=k, cells=c) for k, c in enumerate(cells)))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("tets", "servers", "expected"),
+    [
+        ([5], 3, [(0,)]),
+        ([1, 1, 1, 1], 2, [(0, 2), (1, 3)]),
+        ([10, 1, 2, 3, 4], 2, [(0,), (1, 2, 3, 4)]),
+        ([3, 9, 5, 5], 2, [(0, 1), (2, 3)]),
+        ([0, 0, 0], 2, [(0, 2), (1,)]),
+    ],
+)
+def test_objects_are_dealt_out_by_size(tets: list[int], servers: int, expected: list[tuple[int, ...]]) -> None:
+    parts = module().deal(tets, servers)
+    assert [part.objects for part in parts] == expected
+    assert [part.tets for part in parts] == [sum(tets[i] for i in part.objects) for part in parts]
+
+
+def test_a_part_is_a_scene_with_its_objects_as_they_were(tmp_path: Path) -> None:
+    launch = module()
+    whole = load(scene(tmp_path, [2, 3, 4]), ["solver.tolerance=1e-8"])
+    part = tmp_path / "part.toml"
+    part.write_text(launch.part_of(whole, launch.Part((0, 2), 0)))
+    assert tomllib.loads(part.read_text())["solver"]["tolerance"] == 1e-8
+    objects = load(part).resolved()["object"]
+    assert objects == [whole.resolved()["object"][k] for k in (0, 2)]
+
+
+@pytest.mark.system
+def test_two_servers_and_a_worker_from_one_scene(tmp_path: Path) -> None:
+    port = int(free_endpoint().rpartition(":")[2])
+    command = [sys.executable, str(LAUNCH), str(scene(tmp_path, [4, 2, 3])), "--servers", "2", "--workers", "1"]
+    command += ["--port", str(port), "--record", str(tmp_path / "logs"), "--json"]
+    with (tmp_path / "err").open("w") as err:
+        process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=err, text=True)
+    assert process.stdout is not None
+    started = json.loads(process.stdout.readline())
+    assert [s["objects"] for s in started["servers"]] == [["bar0"], ["bar1", "bar2"]]
+    pids = [p["pid"] for p in started["servers"] + started["workers"]]
+    try:
+        for server in started["servers"]:
+            until(lambda s=server: used(s) > 1, f"{server['name']} has factors of the worker")
+    finally:
+        os.kill(process.pid, signal.SIGINT)
+        code = process.wait(PATIENCE)
+    assert code == 130, (tmp_path / "err").read_text()
+    assert not any(map(alive, pids))
+    assert sorted(path.name for path in (tmp_path / "logs").iterdir()) == ["sim-0.mcap", "sim-1.mcap"]
+
+
+def used(server: dict[str, Any]) -> int:
+    """Fewest factors that an object of the server used; 0 while it starts."""
+    try:
+        with Client(server["name"], [server["endpoint"]], timeout=1.0) as client:
+            return min(o.factors_used for o in client.status().objects)
+    except ClientError:
+        return 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["nowhere.toml"], "nowhere.toml"),
+        ([str(ROOT / "deploy/scenes/beam.toml"), "--set", "nonsense=1"], "nonsense"),
+        ([str(ROOT / "deploy/scenes/four_beams.toml"), "--port", "65535"], "PORT 0 to 65535"),
+    ],
+)
+def test_bad_input_is_one_clear_message(arguments: list[str], text: str) -> None:
+    done = subprocess.run([sys.executable, str(LAUNCH), *arguments], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2 and text in done.stderr and "Traceback" not in done.stderr
