@@ -67,7 +67,7 @@ struct Residual {
 struct Inverse {
     const Plan* plan;             // in shared memory
     const uint4* matrix;          // chunks of this block, of which `near` are in shared memory
-    const uint4* kept;
+    uint4* kept;
     int begin, near, planes;
     const float* scale;
     Word<float> *residual, *product, *z, *formed, *solved, *given;
@@ -110,9 +110,12 @@ struct Inverse {
         matrix = body.matrix + 32ll * begin;
         near = (int)((arena.end - arena.next) / 512);  // as many chunks as fit into what is left of shared memory
         near = near < part.chunks ? near : part.chunks;
-        uint4* to = arena.take<uint4>(32ll * near);
-        for (int k = threadIdx.x; k < 32 * near; k += THREADS) copy_async(to + k, matrix + k, 16);
-        kept = to;
+        kept = arena.take<uint4>(32ll * near);
+        copies_begin();
+    }
+
+    __device__ __forceinline__ void fetch() const {
+        for (int k = threadIdx.x; k < 32 * near; k += THREADS) copy_async(kept + k, matrix + k, 16);
         copies_begin();
     }
 
@@ -141,6 +144,7 @@ struct Inverse {
         Word<float> r[N], q[N];
         float rk[N], qk[N];
         bool all;
+        unsigned spins = 0;
         do {
 #pragma unroll
             for (int k = 0; k < N; ++k) {
@@ -156,7 +160,7 @@ struct Inverse {
                 rk[k] = valid ? rk[k] : 0;
                 qk[k] = valid && from.alpha != 0 ? qk[k] : 0;
             }
-        } while (!all);
+        } while (again(!all, spins));
 #pragma unroll
         for (int k = 0; k < N; ++k)
             if (at + k * WARPS < last) put(pieces[at + k * WARPS], rk[k] - from.alpha * qk[k], number, unit);
@@ -190,6 +194,7 @@ struct Inverse {
             Word<float> c[N][M];
             float ck[N][M];
             bool all;
+            unsigned spins = 0;
             do {
 #pragma unroll
                 for (int k = 0; k < N; ++k)
@@ -200,7 +205,7 @@ struct Inverse {
                 for (int k = 0; k < N; ++k)
 #pragma unroll
                     for (int j = 0; j < M; ++j) all &= c[k][j].is(ck[k][j], number) | (low[k] + m + j >= high[k]);
-            } while (!all);
+            } while (again(!all, spins));
 #pragma unroll
             for (int k = 0; k < N; ++k)
 #pragma unroll
@@ -212,7 +217,7 @@ struct Inverse {
             const Piece& piece = pieces[at + k * WARPS];
             const bool valid = lane < piece.keep >> 1;
             float rk = 0;
-            while (valid && !r[k].is(rk, from.r_number)) r[k] = from.r[piece.from + lane].seen();
+            for (unsigned spins = 0; again(valid && !r[k].is(rk, from.r_number), spins);) r[k] = from.r[piece.from + lane].seen();
             put(piece, valid ? rk + v[k] : 0, number, unit);
         }
     }
@@ -230,6 +235,7 @@ struct Inverse {
             const int p = min(at + k * WARPS, last - 1);
             word[k] = (pieces[p].kind == 1 ? formed : solved) + where[32 * p + lane];
         }
+        unsigned spins = 0;
         do {
 #pragma unroll
             for (int k = 0; k < N; ++k) w[k] = word[k]->seen();
@@ -240,7 +246,7 @@ struct Inverse {
                 all &= w[k].is(v[k], number) | !valid;
                 v[k] = valid ? v[k] : 0;
             }
-        } while (!all);
+        } while (again(!all, spins));
 #pragma unroll
         for (int k = 0; k < N; ++k)
             if (at + k * WARPS < last) put_halves(vector, pieces[at + k * WARPS].to + lane, unit * v[k]);
@@ -318,9 +324,9 @@ struct Inverse {
             z[i].put(d * value, number);
             if (d == 0) return;  // padding
             float ri, qi = 0;
-            while (!r.is(ri, from.r_number)) r = from.r[i].seen();
+            for (unsigned spins = 0; again(!r.is(ri, from.r_number), spins);) r = from.r[i].seen();
             if (from.alpha != 0)
-                while (!q.is(qi, from.q_number)) q = product[i].seen();
+                for (unsigned spins = 0; again(!q.is(qi, from.q_number), spins);) q = product[i].seen();
             zr += (double)value * (ri - from.alpha * qi);
         };
         const int row = threadIdx.x;
@@ -330,6 +336,7 @@ struct Inverse {
             if (here) look_up(tiles[first + row / 16], row % 16);
         }
         for (int job = warp; job < count * parts; job += WARPS) {
+            __syncwarp();  // some lanes may still be at what they finish
             const int at = parts > 1 ? job / parts : job, part = job - at * parts;
             const Tile tile = tiles[first + at];
             if (parts == 1 && lane < tile.rows) look_up(tile, lane);

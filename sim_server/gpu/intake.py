@@ -84,6 +84,7 @@ class Intake:
                 self._look(track)
                 if body in self._waiting:
                     if track.posted is not None and track.mailbox.withdraw():
+                        track.posted.expanded.event.synchronize()  # its target may be given away
                         track.posted = None
                     self._expand(body, *self._queued(body))
                 if track.posted is not None:

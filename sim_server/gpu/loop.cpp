@@ -49,7 +49,7 @@ static bool close_batch(Loop& l) {
 
 static int64_t batch_size(Loop& l, int64_t left) {
     int64_t size = l.rings.realtime || l.step_seconds == 0 ? 1 : (int64_t)(l.span / l.step_seconds) + 1;
-    return std::min({size, left, l.batch - l.launched % l.batch});  // so none goes over the end of the device's rings
+    return std::max<int64_t>(1, std::min({size, left, l.batch - l.launched % l.batch}));  // so none goes over the end of the device's rings
 }
 
 static bool launch_batch(Loop& l, int64_t steps) {
@@ -58,7 +58,7 @@ static bool launch_batch(Loop& l, int64_t steps) {
         l.stalled = 1;
         l.idle = now();
     }
-    for (int64_t left = steps; left;) {
+    for (int64_t left = steps; left > 0;) {
         int64_t every = l.rings.frame_every.load(), n = l.many;
         bool undisturbed = every <= 0 || every - l.launched % every >= n;
         bool wanted = l.asked.load(std::memory_order_relaxed) && l.matrix_step < 0;
@@ -83,7 +83,7 @@ static void report(Loop& l, const Batch& batch, int64_t k, double end, double cp
         rings.records[(head + i) % rings.record_capacity] =
             Record{step, r.factor_step, rings.start_time + step * rings.dt, r.residual, 0, r.seconds, 0,
                    1e-9 * (stamp.end - stamp.begin), k ? 0 : batch.late, end - 1e-9 * (last.end - stamp.begin), cpu, i,
-                   r.iterations, r.status, r.kind, r.asked, r.fallbacks, r.bad_node, 0};
+                   r.iterations, r.status, r.kind, r.asked, r.fallbacks, r.bad_node, r.probe};
     }
     rings.step.store(step);
     *l.clock = rings.start_time + step * rings.dt;

@@ -38,7 +38,7 @@ struct Mailbox {                // bytes on the device that are replaced between
 struct Result {                 // solve.cuh
     double residual, seconds;
     int64_t factor_step;
-    int32_t iterations, status, kind, asked, fallbacks, bad_node;
+    int32_t iterations, status, kind, asked, fallbacks, bad_node, probe, unused;
 };
 
 struct Stamp { int64_t begin, end; };  // of a step, ns of the device's clock

@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: MIT
 // Preconditioned conjugate gradients of all bodies in one persistent launch, numbered as native/pcg.h, which it mirrors.
 //
-// A body is solved by a team of thread blocks with a barrier of its own; small bodies of a large scene are taken one by one
-// by whichever block is free. An iteration has one barrier for A p and 2 P - 1 for the inverse in parts (one for a diagonal
-// preconditioner): x and r are updated in the preconditioner's first phase, and |r| after the update is known before it from
+// A body is solved by a team of thread blocks; small bodies of a large scene are taken one by one by whichever block is free.
+// What blocks tell each other goes in words that carry their number (team.cuh); there are no barriers but at the ends. x and r
+// are updated in the preconditioner's first phase, and |r| after the update is known before it from
 // |r|^2 - 2 alpha r.q + alpha^2 q.q, so that nothing is applied in vain at the end.
 //
 // Vectors and A are `real`, so that the residual is, whatever the preconditioner's precision. No float atomics.
@@ -18,7 +18,7 @@ struct Memory {  // fixed shared memory of a thread block: what is the same in a
     Inverse inverse;
     real* d;         // (own, 3) scale of the own degrees of freedom, or null
     real* diagonal;  // (own, 9) inverses of the diagonal blocks
-    float peak;      // largest scale
+    double peak;     // largest scale
     int next, bad;
     double b2, goal, quarter, rz;  // of the iteration: all threads write the same
     Result out;
@@ -35,9 +35,9 @@ __device__ __forceinline__ double inverse_of(double a) {
     return y * (2 - a * y);
 }
 
-// 2^-k, the largest with `a` 2^-k < 1.
+// 2^-k with sqrt(a) 2^-k < 1.
 __device__ __forceinline__ float unit_for(double a) {
-    const int k = ((__double2hiint(a) >> 20) & 0x7ff) - 1022;
+    const int k = (((__double2hiint(a) >> 20) & 0x7ff) - 1021) >> 1;  // a < 2^(2 k)
     return __int_as_float((127 - max(-120, min(120, k))) << 23);
 }
 
@@ -47,6 +47,8 @@ struct Solver {
     int turn = 0;                   // half of inverse.residual that holds d r before the update
     unsigned r_number = 0, q_number = 0, z_number = 0;  // exchanges in which d r, d q and z were put
     bool packed = false;            // places are those of the inverse
+    bool fresh = false;             // inverse.residual holds d r as it is after the update that is still to be made
+    bool fetched = false;           // the chunks of the inverse are on their way to shared memory
 
     __device__ __forceinline__ void set_up(const Share& share) {
         const Body& body = memory.body;
@@ -60,7 +62,6 @@ struct Solver {
         if (!diagonal) diagonal = s.diagonal + 9ll * (body.first + rows.begin);
         real* d = inverted ? arena.take<real>(3 * rows.own) : nullptr;
         if (inverted) inverse.set_up(body, &memory.plan, team.index, arena);
-        else copies_begin();
         if (threadIdx.x == 0) {
             memory.rows = rows;
             memory.inverse = inverse;
@@ -69,10 +70,16 @@ struct Solver {
             if (inverted) memory.peak = inverse.scale[inverse.size];
         }
         packed = body.kind == CHOLESKY && body.plan;
-        copies_end<1>();  // all but the chunks
+        copies_end<0>();
         __syncthreads();
+        if (packed && team.blocks > 1) fetch();  // beside the first residual; the pool has many that need no more than that
         find_places();
         __syncthreads();
+    }
+
+    __device__ __forceinline__ void fetch() {
+        memory.inverse.fetch();
+        fetched = true;
     }
 
     // Where the values that this block reads stand: with the inverse in its order, else in that of the nodes.
@@ -123,9 +130,9 @@ struct Solver {
             rows.q[k] = qk;
             if (!packed) return;
             publish(turn, k, bk);
-            publish_product(k, qk);
+            publish(1 - turn, k, (real)rk);  // not b - A x of float words: near the solution that would be noise
         });
-        r_number = q_number = team.number;
+        r_number = team.number;
         team.sums<2, 3>(mine, out);
         b2 = out[1];
         return out[0];
@@ -192,9 +199,11 @@ struct Solver {
     __device__ __forceinline__ double by_inverse(real alpha, double r2) {
         const Inverse inverse = memory.inverse;
         // a power of two that brings d r below 1: float16 has few of them
-        const float unit = unit_for((double)sqrtf((float)r2) * memory.peak);
-        Residual from = {residuals(turn), r_number, q_number, (float)alpha};  // the update is being made
+        const float unit = unit_for(r2 * memory.peak * memory.peak);
+        Residual from = {residuals(turn), r_number, q_number, fresh ? 0 : (float)alpha};  // the update is being made
         double mine = 0;
+        fresh = false;
+        if (!fetched) fetch();
         copies_end<0>();
         for (int phase = 0; phase < inverse.phases; ++phase) {
             inverse.gather(phase, from, team.number, unit);
@@ -231,6 +240,7 @@ struct Solver {
     __device__ __forceinline__ void change(int kind) {
         team.barrier();
         packed = kind == CHOLESKY;
+        fresh = false;
         find_places();
         __syncthreads();
         if (packed) {
@@ -242,14 +252,14 @@ struct Solver {
         }
     }
 
+    // Of the whole body, -1 if there is none: |b|^2 was too large.
     __device__ __forceinline__ int first_bad_node() const {
-        const Rows& rows = memory.rows;
         if (threadIdx.x == 0) memory.bad = 0x7fffffff;
         __syncthreads();
-        for (int k = threadIdx.x; k < 3 * rows.own; k += THREADS)
-            if (!isfinite(rows.r[k])) atomicMin(&memory.bad, rows.begin + k / 3);
+        for (int k = threadIdx.x; k < 3 * memory.body.nodes; k += THREADS)
+            if (!isfinite(s.b[3ll * memory.body.first + k])) atomicMin(&memory.bad, k / 3);
         __syncthreads();
-        return memory.bad;
+        return memory.bad == 0x7fffffff ? -1 : memory.bad;
     }
 
     __device__ __forceinline__ void solve();
@@ -260,7 +270,7 @@ __device__ __forceinline__ void Solver::solve() {
     const Body& body = memory.body;
     Result& out = memory.out;
     int kind = body.kind == CHOLESKY && !body.plan ? BLOCK_JACOBI : body.kind;
-    out = {0, 0, -1, 0, CONVERGED, kind, body.kind, 0, -1};
+    out = {0, 0, -1, 0, CONVERGED, kind, body.kind, 0, -1, body.probe, 0};
     double r2 = 0, alpha = 0, last = 1e300;
     int stop = CONVERGED, iterations = 0;
     bool begun = false, measure = true, restart = true, switched = false;
@@ -284,6 +294,7 @@ __device__ __forceinline__ void Solver::solve() {
                 }
                 memory.goal = body.tolerance * body.tolerance * bb;
                 if (!body.warm_start || !(r2 < bb)) { alpha = 0; r2 = bb; }
+                else fresh = true;
                 memory.quarter = r2 * sqrt(sqrt(memory.goal / r2));
                 if (r2 <= memory.goal) {
                     if (alpha == 0) give(0, 0);  // else the scene has it already
@@ -298,7 +309,9 @@ __device__ __forceinline__ void Solver::solve() {
                     return;
                 }
                 last = r2;  // the recursive residual was too good
+                fresh = true;
             }
+            if (fresh) turn = 1 - turn;
         }
         stop = r2 <= memory.goal ? CONVERGED : -1;
         if (stop < 0) {
@@ -367,6 +380,7 @@ __device__ __forceinline__ void solve_body(const Solve& s, const Share& share) {
         s.results[(s.step[0] % s.capacity) * s.count + k] = out;
         s.exchanges[k] = solver.team.number;  // all have read it before the first exchange
     }
+    copies_end<0>();  // the next body has the same memory
     __syncthreads();
 }
 

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from protocol.factor import FactorPattern
 from sim_server.gpu.partition import COLUMNS, NODE, ROWS, Partition, Tree, padded, partition, tree_of
 from sim_server.gpu.sharing import Pieces, share
-from sim_server.gpu.thresholds import choose, works
+from sim_server.gpu.thresholds import SHARED_MEMORY, choose, works
 
 Int32 = NDArray[np.int32]
 Ints = NDArray[np.int64]
@@ -101,21 +101,23 @@ class Plan:
         return sum(v.nbytes for v in vars(self).values() if isinstance(v, np.ndarray))
 
 
-_plans: dict[tuple[int, int, int | None, int], Plan] = {}
+_plans: dict[tuple[int, int, int | None, int, int], Plan] = {}
 
 
-def plan(pattern: FactorPattern, blocks: int, groups: int | None = None, planes: int = 1) -> Plan:
+def plan(
+    pattern: FactorPattern, blocks: int, groups: int | None = None, planes: int = 1, shared: int = SHARED_MEMORY
+) -> Plan:
     """The plan of least predicted time, with `groups` groups (or as many as the tree has) if given. planes: 1 or 2
-    float16 numbers per entry. Cached by pattern.id.
+    float16 numbers per entry. shared: bytes of shared memory of a thread block. Cached by pattern.id.
 
     Raises ValueError for a pattern that is not one of whole nodes of a Cholesky factor.
     """
-    key = (pattern.id, blocks, groups, planes)
+    key = (pattern.id, blocks, groups, planes, shared)
     if key not in _plans:
         if len(_plans) >= _KEPT:
             _plans.clear()
         tree = _tree(pattern)
-        thresholds, predicted = choose(tree, blocks, groups, planes)
+        thresholds, predicted = choose(tree, blocks, groups, planes, shared)
         _plans[key] = lay_out(tree, thresholds, blocks, planes, predicted)
     return _plans[key]
 

@@ -59,7 +59,10 @@ def index(plan: Plan, cut: NDArray[np.int32]) -> NDArray[np.int64]:
     start = plan.slot_start.astype(np.int64)
     many = np.diff(start)
     if len(many) and (many.max() > 255 or start[-1] >= 1 << 24):
-        raise ValueError(f"FactorPattern: up to {many.max()} couplings of parts to a row, allowed on a GPU: 255")
+        raise ValueError(
+            f"FactorPattern: {start[-1]} couplings of parts, {many.max()} to a row; "
+            f"allowed on a GPU: {(1 << 24) - 1}, 255"
+        )
     position = np.where(formed, entry, 0)
     slots = start[position] | many[position] << 24
     boundary = np.append(plan.boundary, 0)

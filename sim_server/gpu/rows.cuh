@@ -146,13 +146,14 @@ struct Rows {
                 const int k = min(first + n * THREADS, 3 * halo - 1);
                 at[n] = place[k / 3] + k % 3;
             }
+            unsigned spins = 0;
             do {  // no branch between the loads: they travel together
 #pragma unroll
                 for (int n = 0; n < 3; ++n) seen[n] = from[at[n]].seen();
                 all = true;
 #pragma unroll
                 for (int n = 0; n < 3; ++n) all &= seen[n].is(got[n], number);
-            } while (!all);
+            } while (again(!all, spins));
 #pragma unroll
             for (int n = 0; n < 3; ++n) {
                 const int k = first + n * THREADS;

@@ -67,7 +67,7 @@ struct Result {
     double residual;                 // true, relative
     double seconds;
     long long factor_step;           // -1: no factor used
-    int iterations, status, kind, asked, fallbacks, bad_node;
+    int iterations, status, kind, asked, fallbacks, bad_node, probe, unused;
 };
 
 struct Solve {

@@ -29,7 +29,7 @@ SETTINGS = BODY.fields["factor_step"][1]  # type: ignore[index]  # bytes of a ro
 RESULT = np.dtype(
     [
         ("residual", "f8"), ("seconds", "f8"), ("factor_step", "i8"), ("iterations", "i4"), ("status", "i4"),
-        ("kind", "i4"), ("asked", "i4"), ("fallbacks", "i4"), ("bad_node", "i4"),
+        ("kind", "i4"), ("asked", "i4"), ("fallbacks", "i4"), ("bad_node", "i4"), ("probe", "i4"), ("unused", "i4"),
     ]
 )  # fmt: skip
 SOLVE = np.dtype(
@@ -82,8 +82,9 @@ class Solver:
         spans = np.array(ranges, np.int64)
         nodes = spans[:, 1] - spans[:, 0]
         self.threads, blocks = threads_and_blocks(nodes, processors)
-        share = shares(nodes, blocks * (processors - SPARED))
-        self.grid = blocks * (processors - SPARED) if share.pooled else int(share.blocks.sum())
+        most = blocks * (processors - min(SPARED, processors // 4))
+        share = shares(nodes, most)
+        self.grid = most if share.pooled else int(share.blocks.sum())
         self.spared = processors - -(-self.grid // blocks)
         self.bodies = np.zeros(len(ranges), BODY)
         self.bodies["first"], self.bodies["nodes"] = spans[:, 0], nodes
@@ -101,7 +102,8 @@ class Solver:
             "halo_values": cp.zeros(3 * len(seen.nodes), self.real), "halo_place": cp.zeros(len(seen.nodes), ints),
             "own": cp.zeros(9 * total, self.real), "z": cp.zeros(6 * total),
             "diagonal": cp.zeros(9 * total, self.real), "board": cp.zeros(16 * self.grid * len(ranges)),
-            "exchanges": cp.zeros(len(ranges), np.uint32),
+            "exchanges": cp.ones(len(ranges), np.uint32),  # words that nobody has put are of exchange 0
+           
             "arrived": self.arrived, "results": self.results, "step": counter,
         }  # fmt: skip
         fixed = 2048  # bytes of its own that a thread block needs, and the driver's
@@ -149,7 +151,7 @@ class Solver:
         blocks = int(self.bodies[body]["blocks"])
         key = (pattern.id, blocks)
         if key not in self._planned:
-            found = plan(pattern, blocks, planes=self.planes)
+            found = plan(pattern, blocks, planes=self.planes, shared=self._shared)
             if (needed := room(found)) > self._shared:
                 raise ValueError(
                     f"{pattern.size} degrees of freedom in {blocks} thread blocks need {needed} bytes of shared memory "

@@ -79,6 +79,13 @@ template <> struct __align__(16) Word<double> {
     __device__ __forceinline__ bool get(double& v, unsigned number) const { return seen().is(v, number); }
 };
 
+// Whether to look once more. A word that never comes must not hang the device for good: after some minutes of looking the
+// launch fails, and the server says that the device is lost.
+__device__ __forceinline__ bool again(bool missing, unsigned& spins) {
+    if (missing && ++spins > 1u << 27) __trap();
+    return missing;
+}
+
 struct Team {
     int index, blocks;       // of this thread block in the team
     unsigned number;         // of the exchange: what is put now carries it
@@ -129,13 +136,14 @@ struct Team {
             Word<double> seen[AT_ONCE];
             double got[AT_ONCE];
             bool all;
+            unsigned spins = 0;
             do {  // no branch between the loads: they travel together
 #pragma unroll
                 for (int k = 0; k < AT_ONCE; ++k) seen[k] = row[min(first + 32 * k, blocks - 1)].seen();
                 all = true;
 #pragma unroll
                 for (int k = 0; k < AT_ONCE; ++k) all &= seen[k].is(got[k], number);
-            } while (!all);
+            } while (again(!all, spins));
 #pragma unroll
             for (int k = 0; k < AT_ONCE; ++k) sum += first + 32 * k < blocks ? got[k] : 0;
         }

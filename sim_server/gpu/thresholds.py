@@ -17,7 +17,8 @@ Ints = NDArray[np.int64]
 LATENCY, LATENCY_ALONE = 3000.0, 400.0  # of a phase [ns]: between many blocks, in one block
 MEMORY, CACHE, SHARED = 4400 / 132, 7000 / 132, 25000 / 132  # bandwidths of one block [bytes/ns]
 CACHED = 25e6  # bytes that stay in the near half of the second-level cache
-KEPT, X_AREA = 190e3, 160e3  # bytes of a block's shared memory: for matrices and vectors, at most for vectors
+SHARED_MEMORY = 227_000  # bytes of a thread block that has a multiprocessor for itself
+KEPT, X_AREA = 0.83, 0.7  # of a block's shared memory: for matrices and vectors, at most for vectors
 BRING, ENTRY = 250.0, 0.4  # of a part's vector [ns]: at all, per entry
 FLOPS, USES = 10e3, 3000  # making the matrices: float32 operations per ns; applications that share the cost
 MOST = 9  # groups
@@ -46,9 +47,9 @@ def _bytes(cut: Partition, planes: int) -> float:
     return float((v * v + 2 * v * b).sum()) * 2 * planes
 
 
-def estimate(cut: Partition, blocks: int, planes: int) -> float:
+def estimate(cut: Partition, blocks: int, planes: int, shared: int) -> float:
     """Time of one application [ns] if all blocks had the same to do, and a share in the cost of making the matrices."""
-    rate, kept, time = _rate(cut, planes), KEPT, 0.0
+    rate, kept, time = _rate(cut, planes), KEPT * shared, 0.0
     for which, work in works(cut, blocks, planes):
         if len(which) == 0:
             continue
@@ -62,9 +63,9 @@ def estimate(cut: Partition, blocks: int, planes: int) -> float:
     return time + _making(cut)
 
 
-def predict(cut: Partition, blocks: int, planes: int) -> float:
+def predict(cut: Partition, blocks: int, planes: int, shared: int) -> float:
     """As estimate, with the work shared out as it will be."""
-    rate, kept, time = _rate(cut, planes), np.full(blocks, KEPT), 0.0
+    rate, kept, time = _rate(cut, planes), np.full(blocks, KEPT * shared), 0.0
     for _, work in works(cut, blocks, planes):
         pieces = share(work, blocks)
         stream = np.bincount(pieces.block, pieces.tiles * work.tile[pieces.matrix], blocks)
@@ -108,12 +109,14 @@ def candidates(tree: Tree, groups: int) -> Iterator[tuple[int, ...]]:
                 yield cut
 
 
-def choose(tree: Tree, blocks: int, groups: int | None, planes: int) -> tuple[tuple[int, ...], float]:
+def choose(
+    tree: Tree, blocks: int, groups: int | None, planes: int, shared: int = SHARED_MEMORY
+) -> tuple[tuple[int, ...], float]:
     """Thresholds and predicted time [us]: of each number of groups the best by estimate, improved one by one, of these
     the best by prediction. groups: so many, or as many as the tree has."""
     found: list[tuple[float, tuple[int, ...]]] = []
     for count in range(groups, 0, -1) if groups else range(1, MOST + 1):
-        estimated = [(_estimate(tree, t, blocks, planes), t) for t in candidates(tree, count)]
+        estimated = [(_estimate(tree, t, blocks, planes, shared), t) for t in candidates(tree, count)]
         best = min(estimated, default=(np.inf, ()))
         if best[0] < np.inf:
             found.append(best)
@@ -121,13 +124,13 @@ def choose(tree: Tree, blocks: int, groups: int | None, planes: int) -> tuple[tu
                 break
         if not groups and best[0] > 1.5 * min(found)[0]:
             break  # more phases do not help any more
-    near = [_improved(tree, pair, blocks, planes) for pair in found if pair[0] < 1.3 * min(found)[0]]
-    time, thresholds = min((predict(partition(tree, t), blocks, planes), t) for _, t in near)
+    near = [_improved(tree, pair, blocks, planes, shared) for pair in found if pair[0] < 1.3 * min(found)[0]]
+    time, thresholds = min((predict(partition(tree, t), blocks, planes, shared), t) for _, t in near)
     return thresholds, time / 1000
 
 
 def _improved(
-    tree: Tree, best: tuple[float, tuple[int, ...]], blocks: int, planes: int
+    tree: Tree, best: tuple[float, tuple[int, ...]], blocks: int, planes: int, shared: int
 ) -> tuple[float, tuple[int, ...]]:
     """One threshold after another a third up or down, twice."""
     for k in [*range(len(best[1]))] * 2:
@@ -135,13 +138,13 @@ def _improved(
             moved = list(best[1])
             moved[k] = int(moved[k] * factor)
             if moved == sorted(set(moved)):
-                best = min(best, (_estimate(tree, tuple(moved), blocks, planes), tuple(moved)))
+                best = min(best, (_estimate(tree, tuple(moved), blocks, planes, shared), tuple(moved)))
     return best
 
 
-def _estimate(tree: Tree, thresholds: tuple[int, ...], blocks: int, planes: int) -> float:
+def _estimate(tree: Tree, thresholds: tuple[int, ...], blocks: int, planes: int, shared: int) -> float:
     cut = partition(tree, thresholds)
     if cut.groups > 1 and len(np.unique(cut.group)) < cut.groups:
         return np.inf
-    time = estimate(cut, blocks, planes)
-    return time * 10 if 4 * largest_area(cut, blocks) > X_AREA else time
+    time = estimate(cut, blocks, planes, shared)
+    return time * 10 if 4 * largest_area(cut, blocks) > X_AREA * shared else time

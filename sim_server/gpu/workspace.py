@@ -38,7 +38,7 @@ class Workspace:
         self.generation += 1
         if memory > self.memory.nbytes:
             before = self.memory.nbytes
-            self.memory = None  # freed before the new one is made
+            self.memory = cp.zeros(0, np.uint8)  # freed before the new one is made
             try:
                 self.memory = cp.zeros(memory, np.uint8)
             except Exception:

@@ -106,3 +106,7 @@ class Solver(Parameters):
             if value not in allowed[device]:
                 words = ", ".join(repr(a) for a in allowed[device])
                 raise InputError(f"solver.{field} = {value!r}: must be one of {words} on a {device.upper()}")
+        if device == "gpu" and self.budget:
+            raise InputError(
+                f"solver.budget = {self.budget:g}: must be 0 on a GPU, which bounds a solve by max_iterations"
+            )

@@ -7,6 +7,7 @@ import pytest
 from protocol.messages_pb2 import SolveStatus
 from sim_server.driver import Driver
 from sim_server.factors import Job
+from sim_server.gpu.solver import RESULT
 from sim_server.simulation import Simulation
 
 pytestmark = pytest.mark.gpu
@@ -54,6 +55,47 @@ def test_a_tolerance_out_of_reach_ends_at_rounding(preconditioner, bar):
     (_, g), _ = both(solver, 10)
     assert (g["status"] == SolveStatus.MAX_ITERATIONS).all()
     assert g["residual"].max() < 1e-11
+
+
+@pytest.mark.parametrize("precision", ["float16", "float32"])
+@pytest.mark.parametrize("nearness", [1e-6, 1e-8, 1e-10])
+def test_a_start_near_the_solution_is_no_trouble(precision, nearness):
+    """Its residual is not the difference of rounded vectors."""
+    solver = ["solver.preconditioner=cholesky", "solver.update=never", "solver.tolerance=1e-11"]
+    sim = Simulation.load("deploy/scenes/beam.toml", [*solver, f"solver.factor_precision={precision}"], "gpu")
+    Driver(sim).advance(2)
+    with sim.engine._steps as stream:  # one solve again and again, of the same system
+        y = sim.engine.gpu.twin(sim.system.y)
+        solution = y.copy()
+        y[...] = solution * (1 + nearness * np.sin(np.arange(y.size)).reshape(y.shape)).astype(float).mean() + (
+            nearness * abs(solution).max() * sim.engine.gpu.cp.sin(sim.engine.gpu.cp.arange(y.size)).reshape(y.shape)
+        )
+        sim.engine.solver.launch()
+        stream.synchronize()
+    step = int(sim.engine._counter.get()[0])
+    results = sim.engine.solver.results.get().view(RESULT)
+    last = results[step % (len(results))]
+    assert last["status"] == SolveStatus.CONVERGED and last["residual"] <= 1e-11
+    assert last["fallbacks"] == 0 and last["iterations"] <= 6
+
+
+@pytest.mark.parametrize("scale", [1e-24, 1e-12, 1e12])
+def test_right_hand_sides_of_any_size(scale):
+    solver = ["solver.preconditioner=cholesky", "solver.update=never", f"effects.gravity.g=[0, {-9.81 * scale}, 0]"]
+    (_, g), (_, c) = both(solver, 2)
+    assert (g["status"] == c["status"]).all() and (g["fallbacks"] == 0).all()
+    assert (g["iterations"] <= c["iterations"] + 2).all()
+
+
+def test_a_bad_number_is_named_wherever_it_is():
+    for node in (0, 300, 755):
+        sim = Simulation.load("deploy/scenes/beam.toml", ["solver.preconditioner=block_jacobi"], "gpu")
+        sim.engine.run(1)
+        sim.engine.gpu.twin(sim.world.v)[node, 1] = np.nan
+        sim.engine.run(1)
+        record = sim.engine.records()[-1]
+        assert record["status"] == SolveStatus.NOT_FINITE
+        assert 0 <= record["bad_node"] <= node
 
 
 def test_bodies_of_one_scene_are_solved_together():
