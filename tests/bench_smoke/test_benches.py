@@ -75,6 +75,7 @@ def test_reference_of_accuracy_is_no_competitor(tmp_path: Path) -> None:
     assert cg[1e-6] < 1e-2 * cg[1e-2]
 
 
+@pytest.mark.timeout(240)
 def test_scheduler_repeats_to_the_digit_and_excess_goes_before_turns(tmp_path: Path) -> None:
     runs = [bench("scheduler", tmp_path / name)["data"]["rows"] for name in ("one", "two")]
     assert runs[0] == runs[1]
