@@ -27,6 +27,11 @@ class Arrivals:
         )
 
     def __iter__(self) -> Iterator[tuple[str, zenoh.Sample]]:
-        for channel, ring in self._rings.items():
-            while (sample := ring.try_recv()) is not None:
-                yield channel, sample
+        for channel in self._rings:
+            yield from self._of(channel)
+
+    def _of(self, channel: str) -> Iterator[tuple[str, zenoh.Sample]]:
+        while (sample := self._rings[channel].try_recv()) is not None:
+            if channel == "factor":  # its pattern, sent just before it, may have come since patterns were looked at
+                yield from self._of("pattern")
+            yield channel, sample
