@@ -144,7 +144,7 @@ at rest. The rows *default floor* have 3.""",
 
 
 def _turn(row: dict[str, Any], setting: Setting) -> float:
-    """Steps in which the workers serve each wild object once."""
+    """Steps in which the workers would serve each wild object once, at the pace they had."""
     return row["wild"] * setting.steps / (row["factors"] - row["objects"])
 
 
@@ -163,7 +163,8 @@ def _verdict(rows: list[dict[str, Any]], setting: Setting) -> list[str]:
         lines.append(
             f"{where} {', '.join(missed)}. A worker for each object would make {best['/ oracle']:.2f} of the oracle's "
             f"and {best['iterations'] / other['iterations']:.2f} of round robin's (whose oldest factor is "
-            f"{other['age, max']} steps old); {_turn(row, setting):.3g} steps pass before a wild object's next turn."
+            f"{other['age, max']} steps old); serving nobody else, the workers would come round to each wild "
+            f"object in {_turn(row, setting):.3g} steps."
         )
     told = [r for r in rows if r["age, bound"] is not None and r["workers"]]
     longer = [r for r in told if r["age, bound"] < setting.steps]
