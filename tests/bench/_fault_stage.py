@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: MIT
+"""A real server with a log, real workers on a port of their own, and what the log says afterwards."""
+
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+
+from clients.client import Client
+from clients.errors import ClientError
+
+DT = 0.02  # s
+SCENE = f"""
+dt = {DT}
+[effects]
+gravity = {{ g = [0, -9.81, 0] }}
+[solver]
+preconditioner = "cholesky"
+[[object]]
+name = "beam"
+mesh = {{ bar = [4, 4, 12], size = [1, 1, 4] }}
+[object.effects]
+corotational = {{ young = 1e6, poisson = 0.4 }}
+fixed = {{ where = "Z < 0.01" }}
+touch = true
+"""
+PATIENCE = 60.0  # s
+
+
+def free_endpoint(host: str = "127.0.0.1") -> str:
+    """A port that nobody listens on."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/{host}:{probe.getsockname()[1]}"
+
+
+class Stage:
+    """One server in real time that swings a beam until it is told to stop; all processes end with it.
+
+    host: where it listens; far: words before a worker's command line, such as those that put it elsewhere.
+    """
+
+    def __init__(self, host: str = "127.0.0.1", far: Sequence[str] = ()):
+        self.endpoint = free_endpoint(host)
+        self._far = list(far)
+        self._folder = tempfile.TemporaryDirectory(prefix="warpfactor-faults-")
+        self.log = Path(self._folder.name) / "run.mcap"
+        scene = Path(self._folder.name) / "beam.toml"
+        scene.write_text(SCENE)
+        self._processes: list[subprocess.Popen[bytes]] = []
+        words = [str(scene), "--listen", self.endpoint, "--record", str(self.log), "--quiet"]
+        self.server = self.start(tool("sim_server", *words))
+
+    def start(self, command: Sequence[str]) -> "subprocess.Popen[bytes]":
+        """A process that ends with the stage."""
+        out = (Path(self._folder.name) / "output").open("ab")
+        process = subprocess.Popen(command, stdout=out, stderr=out)
+        out.close()
+        self._processes.append(process)
+        return process
+
+    def worker(self, name: str, *options: str) -> "subprocess.Popen[bytes]":
+        """One more worker."""
+        words = ["--connect", self.endpoint, "--name", name, *options]
+        return self.start([*self._far, *tool("precond_worker", *words)])
+
+    def client(self) -> Client:
+        """Once the server is up."""
+        end = time.monotonic() + PATIENCE
+        while True:
+            try:
+                client = Client(connect=[self.endpoint], timeout=1.0)
+                client.status()
+                return client
+            except ClientError:
+                if time.monotonic() > end or self.server.poll() is not None:
+                    raise
+
+    def finish(self, client: Client) -> dict[str, np.ndarray]:
+        """Stops the server; the scalars of all steps."""
+        client.stop()
+        code = self.server.wait(PATIENCE)
+        if code:
+            raise RuntimeError(f"the server ended with {code}: {self.output()[-2000:]}")
+        arrays = self.log.with_suffix(".npz")
+        command = tool("clients", "export", str(self.log), "--object", "beam", "--to", str(arrays))
+        subprocess.run(command, check=True, capture_output=True)
+        with np.load(arrays) as data:
+            return {name.removeprefix("scalars/"): data[name] for name in data.files if name.startswith("scalars/")}
+
+    def output(self) -> str:
+        """Of all processes."""
+        return (Path(self._folder.name) / "output").read_text()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: type[BaseException] | BaseException | TracebackType | None) -> None:
+        for process in self._processes:
+            if process.poll() is None:
+                process.send_signal(signal.SIGCONT)
+                process.kill()
+            process.wait()
+        self._folder.cleanup()
+
+
+def tool(package: str, *arguments: str) -> list[str]:
+    """Command line of one of our programs."""
+    return [sys.executable, "-m", package, *arguments]
+
+
+class Progress:
+    """What the server reports while it runs."""
+
+    def __init__(self, client: Client):
+        self._steps = client.steps()
+        self.step, self.factor_step = 0, -1
+
+    def look(self) -> None:
+        """Take in the newest records."""
+        for record in self._steps.new():
+            self.step, self.factor_step = record.step, max(self.factor_step, record.factor_step)
+
+    def until(self, holds: Any, seconds: float = PATIENCE) -> None:
+        """Look until a condition holds; raises TimeoutError."""
+        end = time.monotonic() + seconds
+        while not holds():
+            if time.monotonic() > end:
+                raise TimeoutError(f"waited {seconds:g} s at step {self.step}")
+            time.sleep(0.01)
+            self.look()
+
+    def past(self, step: int) -> None:
+        """Look until the run is past a step."""
+        self.until(lambda: self.step >= step)
+
+    def pause(self, seconds: float) -> None:
+        """Let time pass, looking."""
+        end = time.monotonic() + seconds
+        self.until(lambda: time.monotonic() > end, seconds + 1)
+
+
+def measured(data: dict[str, np.ndarray], seen: int, after: int | None) -> dict[str, Any]:
+    """One row. seen: the last step that a client heard of; after: step at which the fault was over (None: there was
+    none)."""
+    iterations, made = data["iterations"], data["factor_step"]
+    steps = max(seen, int(data["step"].max()))
+    fresh = np.flatnonzero(made > after) if after is not None else np.zeros(0, int)
+    return {
+        "steps": steps,
+        "missed": steps - len(np.unique(data["step"])),
+        "not converged": int(np.sum(data["status"] != "converged")),
+        "step p50 ms": 1e3 * float(np.median(data["step_seconds"])),
+        "step max ms": 1e3 * float(data["step_seconds"].max()),
+        "latest start ms": 1e3 * float(data["late_seconds"].max()),
+        "late steps": int(np.sum(data["late_seconds"] > 1e-3)),
+        "iterations": float(iterations.mean()),
+        "iterations max": int(iterations.max()),
+        "oldest factor": int(data["factor_age"].max()),
+        "next factor s": float(DT * (data["step"][fresh[0]] - after)) if len(fresh) and after is not None else None,
+    }
