@@ -13,6 +13,7 @@ that has let go of Python's lock) and `pump` is called beside it.
 import logging
 import time
 from collections.abc import Callable
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from sim_server.engine import Kind
 from sim_server.factors import FactorSource, Inline, Job
 from sim_server.schedule import oldest_possible, overdue_after, pick
 from sim_server.simulation import Simulation
+from sim_server.stock import Stock
 from sim_server.track import Track
 from sim_server.world import Body
 
@@ -30,6 +32,7 @@ log = logging.getLogger(__name__)
 
 
 COPIES = 32  # matrices that the loop may be asked to copy within one step
+KEPT = 2  # steps that a copied matrix may wait for a worker
 
 
 class Driver:
@@ -55,6 +58,8 @@ class Driver:
         self._due: dict[str, int] = {}  # lockstep: step of the matrix whose factor is taken up n steps later
         self._arrived: dict[tuple[str, int], Factor] = {}
         self._nobody_at = -1  # step at which nobody was left to be asked
+        self._stock = Stock()
+        self._asked = count()
         self._alone = False  # there was no worker for a matrix of lockstep
         self._warped = {t.body.name: bool(simulation.system.warped[t.body.nodes].any()) for t in self.tracks}
         bytes_a = {
@@ -202,27 +207,41 @@ class Driver:
         records = self.engine.records()
         self.observe(records)
         if self.wants_factors and self.kind == "async":
+            if self._stock.paced(self.engine.step, time.monotonic()) and not self.counted:
+                self._stock.reckon([t.seconds.value for t in self.tracks], self._workers())
             self.pump_factors()
         return records
 
     def pump_factors(self) -> None:
         """Takes up what came, sends what was copied, asks for the matrix of whoever needs it most."""
         self._take_up(self.source)
-        for t in self.tracks:
-            if t.wanted is not None and self.engine.matrix_step(t.body.index) >= 0:
-                self._send(t)
-        places = min(int(self.source.ready()), COPIES) - sum(t.wanted is not None for t in self.tracks)
-        step = self.engine.step
+        self._send_copies()
+        step, waiting = self.engine.step, sum(t.wanted is not None for t in self.tracks)
+        idle = max(min(int(self.source.ready()), COPIES) - waiting, 0)
+        places = max(idle, self._stock.size - waiting)
         if places <= 0 or step == self._nobody_at:
             return
         overdue = max(self._overdue(), self.solver.update_floor_steps)
         needs = [t.need(step) for t in self.tracks]
         ahead = getattr(self.source, "ahead", lambda: 0)()  # the most urgent are left for faster workers
         chosen = pick(needs, ahead + places, self.solver.update_floor_steps, self.solver.schedule, overdue)[ahead:]
-        for name in chosen:
-            self._ask(self.by_name[name])
-        if len(chosen) < places:
+        tracks = [self.by_name[name] for name in chosen]
+        wanted = tracks[:idle] + [t for t in tracks[idle:] if t.sent is None or t.excess > 0]  # in stock: who needs one
+        for t in wanted:
+            self._ask(t)
+        if len(wanted) < places:
             self._nobody_at = step
+
+    def _send_copies(self) -> None:
+        """To idle workers, in the order in which they were asked for; others wait their turn while there is a stock."""
+        copied = [t for t in self.tracks if t.wanted is not None and self.engine.matrix_step(t.body.index) >= 0]
+        idle = int(self.source.ready()) if copied else 0
+        for t in sorted(copied, key=lambda t: t.asked):
+            waited = self.engine.step - self.engine.matrix_step(t.body.index)
+            if idle <= 0 and self._stock.size and waited <= KEPT:
+                continue
+            self._send(t)
+            idle -= t.in_flight
 
     def _overdue(self) -> float:
         return overdue_after(self.solver.schedule_rounds, self._latencies(), self._workers())
@@ -248,7 +267,7 @@ class Driver:
         return oldest_possible(overdue, self._latencies(), self._workers())
 
     def _ask(self, t: Track) -> None:
-        t.wanted = np.empty_like(self._values(t.body))
+        t.wanted, t.asked = np.empty_like(self._values(t.body)), next(self._asked)
         self.engine.request_matrix(t.body.index, t.wanted)
 
     def _send(self, t: Track) -> None:

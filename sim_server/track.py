@@ -40,6 +40,7 @@ class Track:
         self.sent: int | None = None  # step of the last matrix that went out
         self.in_flight = False
         self.wanted: NDArray[np.float64] | None = None  # where the loop copies the matrix asked for
+        self.asked = 0  # number of the request for it, among those of all bodies
         self.used = 0
         self.refused = 0
         self.failures = 0  # in a row
