@@ -30,7 +30,7 @@ from sim_server.trace import Trace
 log = logging.getLogger(__name__)
 
 NAP = 1e-3  # s between rounds of the service thread
-LOOP_NICE = -10  # of the loop's thread in real time: before workers, clients and our own threads on a full machine
+LOOP_NICE = -5  # of the loop's thread in real time: before workers, clients and our own threads on a full machine
 ENDLESS = 1 << 62
 
 
