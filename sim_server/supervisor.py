@@ -10,7 +10,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
-from functools import partial
 
 from protocol.messages_pb2 import LocalWorker
 
@@ -39,7 +38,10 @@ class _Worker:
 
 
 Start = Callable[[Sequence[str]], "subprocess.Popen[bytes]"]
-_popen: Start = partial(subprocess.Popen, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+
+
+def _popen(command: Sequence[str]) -> "subprocess.Popen[bytes]":
+    return subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
 
 
 class Supervisor:

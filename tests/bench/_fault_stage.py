@@ -162,8 +162,8 @@ def measured(data: dict[str, np.ndarray], seen: int, after: int | None) -> dict[
         "step max ms": 1e3 * float(data["step_seconds"].max()),
         "latest start ms": 1e3 * float(data["late_seconds"].max()),
         "late steps": int(np.sum(data["late_seconds"] > 1e-3)),
-        "iterations": float(iterations.mean()),
-        "iterations max": int(iterations.max()),
+        "iterations": float(iterations[made >= 0].mean()),  # of steps with a factor: how long a start takes varies
+        "iterations max": int(iterations[made >= 0].max()),
         "oldest factor": int(data["factor_age"].max()),
         "next factor s": float(DT * (data["step"][fresh[0]] - after)) if len(fresh) and after is not None else None,
     }

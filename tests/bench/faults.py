@@ -262,7 +262,7 @@ def say_faults(report: Report, rows: list[dict[str, Any]], skipped: dict[str, st
     report.say(
         f"A beam of 1152 tetrahedra in real time, dt {1e3 * DT:g} ms. missed: steps that the log does not hold; latest "
         "start: the largest delay of a step after its time; late steps: by more than 1 ms; next factor: from the end "
-        "of the fault to the first step with a factor made after it."
+        "of the fault to the first step with a factor made after it. Iterations of steps with a factor."
     )
     if rows:
         columns = [
