@@ -188,7 +188,7 @@ class Driver:
                 return False
             self._collect()
             patient = not self._alone and time.monotonic() - asked < 1  # a worker may be about to join
-            if not patient and not getattr(self.source, "workers", lambda: [1])():
+            if not patient and not self._workers():
                 if not self._alone:
                     log.warning("lockstep without a worker: factors are made in this process")
                 self._alone = True

@@ -7,7 +7,8 @@ them would get one job a step: with a thousand small bodies, whose step takes a 
 
 from collections.abc import Iterable
 
-MEMORY = 0.2  # weight of the newest value in the mean time of a step
+from sim_server.track import Mean
+
 MOST = 256  # matrices held at once
 TRANSFER = 1e-3  # s of a job beside the factorization, about
 
@@ -17,7 +18,7 @@ class Stock:
 
     def __init__(self) -> None:
         self.size = 0
-        self._pace: float | None = None  # s from step to step
+        self._pace = Mean()  # s from step to step
         self._last: tuple[int, float] | None = None
 
     def paced(self, step: int, now: float) -> bool:
@@ -25,16 +26,15 @@ class Stock:
         if self._last is None or step <= self._last[0]:
             self._last = self._last or (step, now)
             return False
-        seconds = (now - self._last[1]) / (step - self._last[0])
-        self._pace = seconds if self._pace is None else self._pace + MEMORY * (seconds - self._pace)
+        self._pace.add((now - self._last[1]) / (step - self._last[0]))
         self._last = step, now
         return True
 
     def reckon(self, seconds: Iterable[float | None], workers: int) -> None:
         """seconds: of a factorization of each body, None: not yet known."""
         known = [s for s in seconds if s is not None]
-        if known and self._pace is not None:
+        if known and self._pace.value is not None:
             service = sum(known) / len(known) + TRANSFER
-            self.size = min(int(workers * self._pace / service), MOST)
+            self.size = min(int(workers * self._pace.value / service), MOST)
         else:
             self.size = 0

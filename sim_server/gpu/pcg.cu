@@ -8,6 +8,7 @@
 //
 // Vectors and A are `real`, so that the residual is, whatever the preconditioner's precision. No float atomics.
 #include "apply.cuh"
+#include "clock.cuh"
 #include "rows.cuh"
 
 struct Memory {  // fixed shared memory of a thread block: what is the same in all threads costs no registers
@@ -353,12 +354,6 @@ __device__ __forceinline__ void Solver::solve() {
         give(1, (real)alpha);
         measure = true;
     }
-}
-
-__device__ long long nanoseconds() {
-    long long t;
-    asm volatile("mov.u64 %0, %globaltimer;" : "=l"(t));
-    return t;
 }
 
 __device__ __forceinline__ void solve_body(const Solve& s, const Share& share) {

@@ -46,10 +46,10 @@ struct Share { int body, index, begin, own, halo_first, halo, block_first, block
 
 struct Body {
     int first, nodes;                // of the scene's nodes
-    int block, blocks;               // thread blocks [block, block + blocks) solve it; block -1: whichever is free
+    int blocks;                      // thread blocks that solve it
     int kind, max_iterations, warm_start, probe;
+    int share;                       // first of its thread blocks in Solve.shares
     double tolerance;
-    int share, unused;               // first of its thread blocks in Solve.shares
     long long factor_step;           // of the matrix it was made from
     const Plan* plan;                // null: no factor yet
     const uint4* matrix;             // chunks
@@ -60,7 +60,7 @@ struct Body {
     Word<float>* formed;             // (size + 32,)
     Word<float>* solved;             // (size + 32,) z / d
     Word<float>* given;              // contributions
-    int planes, unused_too;          // float16 values that make an entry of the inverse
+    int planes, unused;              // float16 values that make an entry of the inverse
 };
 
 struct Result {
@@ -74,7 +74,6 @@ struct Solve {
     const Body* bodies;
     int count, capacity;             // bodies; results kept per body
     const int* row_start;
-    const int* columns;
     const real* values;              // (blocks, 3, 3)
     const real* b;                   // (nodes, 3)
     real* y;                         // (nodes, 3) start in, solution out

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: MIT
 """Memory and launch of the persistent solver (pcg.cu): rows of the bodies in, rows of results out."""
 
-import hashlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -9,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import FactorPattern
-from sim_server.backend import HERE, INCLUDE
-from sim_server.gpu.device import Gpu, compiled
+from sim_server.backend import HERE
+from sim_server.gpu.device import Gpu, compiled, options
 from sim_server.gpu.expansion import Expanded, Expansion
 from sim_server.gpu.plan import plan
 from sim_server.gpu.planned import PLAN, Planned, room
@@ -18,11 +17,10 @@ from sim_server.gpu.shares import first_shares, halo, shares
 
 BODY = np.dtype(
     [
-        ("first", "i4"), ("nodes", "i4"), ("block", "i4"), ("blocks", "i4"), ("kind", "i4"), ("max_iterations", "i4"),
-        ("warm_start", "i4"), ("probe", "i4"), ("tolerance", "f8"), ("share", "i4"), ("unused", "i4"),
-        ("factor_step", "i8"), ("plan", "u8"), ("matrix", "u8"), ("scale", "u8"), ("residual", "u8"),
-        ("product", "u8"), ("z", "u8"), ("formed", "u8"), ("solved", "u8"), ("given", "u8"), ("planes", "i4"),
-        ("unused_too", "i4"),
+        ("first", "i4"), ("nodes", "i4"), ("blocks", "i4"), ("kind", "i4"), ("max_iterations", "i4"),
+        ("warm_start", "i4"), ("probe", "i4"), ("share", "i4"), ("tolerance", "f8"), ("factor_step", "i8"),
+        ("plan", "u8"), ("matrix", "u8"), ("scale", "u8"), ("residual", "u8"), ("product", "u8"), ("z", "u8"),
+        ("formed", "u8"), ("solved", "u8"), ("given", "u8"), ("planes", "i4"), ("unused", "i4"),
     ]
 )  # fmt: skip
 SETTINGS = BODY.fields["factor_step"][1]  # type: ignore[index]  # bytes of a row before the factor: they change apart
@@ -34,7 +32,7 @@ RESULT = np.dtype(
 )  # fmt: skip
 SOLVE = np.dtype(
     [
-        ("bodies", "u8"), ("count", "i4"), ("capacity", "i4"), ("row_start", "u8"), ("columns", "u8"),
+        ("bodies", "u8"), ("count", "i4"), ("capacity", "i4"), ("row_start", "u8"),
         ("values", "u8"), ("b", "u8"), ("y", "u8"), ("order", "u8"), ("pooled", "i4"), ("grid", "i4"),
         ("shares", "u8"), ("own_share", "u8"), ("halo", "u8"), ("seat", "u8"), ("halo_values", "u8"),
         ("halo_place", "u8"), ("own", "u8"), ("z", "u8"), ("diagonal", "u8"), ("board", "u8"), ("exchanges", "u8"),
@@ -44,12 +42,6 @@ SOLVE = np.dtype(
 
 
 SPARED = 8  # multiprocessors that a step leaves to expansions beside it: one that needs all would wait for them to end
-
-
-def texts() -> str:
-    """Of all that kernel texts may include: CuPy keeps compiled kernels by their own text and options alone."""
-    found = sorted([*HERE.glob("**/*.cuh"), *HERE.glob("kernels/*.h")])
-    return "x" + hashlib.sha256(b"".join(path.read_bytes() for path in found)).hexdigest()[:16]
 
 
 def threads_and_blocks(nodes: NDArray[np.int64], processors: int) -> tuple[int, int]:
@@ -77,7 +69,7 @@ class Solver:
     ):  # fmt: skip
         cp, processors = gpu.cp, gpu.properties["multiProcessorCount"]
         self.gpu, self._capacity, self.planes = gpu, capacity, planes
-        self._twins = {name: gpu.twin(arrays[name]) for name in ("row_start", "columns", "values", "b", "y")}
+        self._twins = {name: gpu.twin(arrays[name]) for name in ("row_start", "values", "b", "y")}
         self.real = np.dtype(self._twins["values"].dtype)
         spans = np.array(ranges, np.int64)
         nodes = spans[:, 1] - spans[:, 0]
@@ -88,7 +80,7 @@ class Solver:
         self.spared = processors - -(-self.grid // blocks)
         self.bodies = np.zeros(len(ranges), BODY)
         self.bodies["first"], self.bodies["nodes"] = spans[:, 0], nodes
-        self.bodies["block"], self.bodies["blocks"] = share.first, share.blocks
+        self.bodies["blocks"] = share.blocks
         seen = halo(spans, share.blocks, arrays["row_start"], arrays["columns"])
         self.bodies["share"] = seen.first
         self._rows = cp.zeros(self.bodies.nbytes, np.uint8)
@@ -103,7 +95,6 @@ class Solver:
             "own": cp.zeros(9 * total, self.real), "z": cp.zeros(6 * total),
             "diagonal": cp.zeros(9 * total, self.real), "board": cp.zeros(16 * self.grid * len(ranges)),
             "exchanges": cp.ones(len(ranges), np.uint32),  # words that nobody has put are of exchange 0
-           
             "arrived": self.arrived, "results": self.results, "step": counter,
         }  # fmt: skip
         fixed = 2048  # bytes of its own that a thread block needs, and the driver's
@@ -115,11 +106,6 @@ class Solver:
         self._expansions: dict[tuple[int, int], Expansion] = {}  # likewise by pattern and thread blocks
         self._vectors: dict[tuple[int, int], dict[str, Any]] = {}  # by body and plan
         self._applied = [0] * len(ranges)
-
-    @property
-    def real_name(self) -> str:
-        """As kernel texts call the type of A and the vectors."""
-        return "float" if self.real == np.float32 else "double"
 
     @property
     def bodies_device(self) -> int:
@@ -134,7 +120,7 @@ class Solver:
         module = self.gpu.cp.RawModule(
             code=(HERE / "gpu/pcg.cu").read_text(),
             options=(
-                "-std=c++17", f"-I{INCLUDE}", f"-I{HERE / 'gpu'}", f"-Dreal={self.real_name}", f"-DTEXTS={texts()}",
+                *options({"real": "float" if self.real == np.float32 else "double"}), f"-I{HERE / 'gpu'}",
                 *(f"-D{name}={number}" for name, number in numbers.items()),
             ),
             backend="nvrtc",

@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: MIT
 // The end of a step, done by whichever thread block of its last kernel finishes last: one more step is completed, the barriers
 // of the next solve begin at zero, and the results go to the host with the device's clock. fuse.py appends this to that kernel.
+#include "clock.cuh"
+
 struct Tick {
     double* clock;             // (1,) s of simulation
     long long* step;           // (1,) completed
@@ -13,12 +15,6 @@ struct Tick {
     long long* reports;        // likewise on the host
     int barriers, capacity, words, unused;
 };
-
-static __device__ __forceinline__ long long nanoseconds() {
-    long long t;
-    asm volatile("mov.u64 %0, %globaltimer;" : "=l"(t));
-    return t;
-}
 
 __device__ void tick(const Tick& t) {
     __shared__ bool last;

@@ -108,40 +108,31 @@ def python(text: str) -> list[str]:
     return [sys.executable, "-c", text]
 
 
-def cut(cable: Cable) -> Fault:
-    """No packet passes for a while."""
+def while_it_lasts(begin: Callable[[], None], seconds: float | None, end: Callable[[], None]) -> Fault:
+    """Something that is wrong with the cable for a while; None: as long as --cut says."""
 
     def fault(stage: Stage, progress: Progress, o: argparse.Namespace) -> int:
-        cable.cut(True)
-        progress.pause(o.cut)
-        cable.cut(False)
+        begin()
+        progress.pause(o.cut if seconds is None else seconds)
+        end()
         return progress.step
 
     return fault
+
+
+def cut(cable: Cable) -> Fault:
+    """No packet passes for a while."""
+    return while_it_lasts(lambda: cable.cut(True), None, lambda: cable.cut(False))
 
 
 def lossy(cable: Cable) -> Fault:
     """Half of all packets are lost, for 5 s."""
-
-    def fault(stage: Stage, progress: Progress, o: argparse.Namespace) -> int:
-        cable.lose(50)
-        progress.pause(5.0)
-        cable.mend()
-        return progress.step
-
-    return fault
+    return while_it_lasts(lambda: cable.lose(50), 5.0, cable.mend)
 
 
 def slow(cable: Cable) -> Fault:
     """100 ms in each direction, for 5 s."""
-
-    def fault(stage: Stage, progress: Progress, o: argparse.Namespace) -> int:
-        cable.delay(100)
-        progress.pause(5.0)
-        cable.mend()
-        return progress.step
-
-    return fault
+    return while_it_lasts(lambda: cable.delay(100), 5.0, cable.mend)
 
 
 HERE: dict[str, tuple[Fault, str]] = {

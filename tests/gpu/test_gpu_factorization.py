@@ -10,35 +10,17 @@ from precond_worker.factorize import Analysis, NotPositiveDefinite
 from protocol import FactorPattern
 from sim_server.simulation import Simulation
 from tests.reference import supernodal
+from tests.worker.block_matrices import GRAPHS as COMMON
 from tests.worker.block_matrices import bar_edges, dense_matrix, diagonal_blocks, pattern, spd
 
 pytestmark = pytest.mark.gpu
 
-TWO_BARS = np.concatenate([bar_edges(3, 2, 4), bar_edges(2, 2, 2) + 60])
-GRAPHS = {
+GRAPHS = COMMON | {
     "bar": pattern(9 * 9 * 13, bar_edges(8, 8, 12)),
-    "bar with a fixed end": pattern(5 * 4 * 13, bar_edges(4, 3, 12), np.arange(20)),
-    "bars with fixed nodes": pattern(60 + 27, TWO_BARS, np.array([0, 7, 13, 61, 86])),
-    "one node": pattern(1, np.empty((0, 2))),
-    "two nodes": pattern(2, np.array([[0, 1]])),
-    "all fixed": pattern(5, np.array([[0, 1], [1, 4]]), np.arange(5)),
-    "chain": pattern(70, np.array([[i, i + 1] for i in range(69)])),
-    "star": pattern(30, np.array([[11, i] for i in range(30) if i != 11])),
     "dense": pattern(60, np.array([[i, j] for i in range(60) for j in range(i)])),
 }
 graphs = pytest.mark.parametrize("graph", GRAPHS.values(), ids=GRAPHS.keys())
 arithmetic = pytest.mark.parametrize("library", ["gpu-float64", "gpu-float32"])
-
-
-@pytest.fixture(autouse=True)
-def gpu():
-    from precond_worker.errors import DeviceUnusable
-    from precond_worker.gpu.device import try_out
-
-    try:
-        try_out()
-    except DeviceUnusable as error:
-        pytest.skip(str(error))
 
 
 def sparse(factor_pattern: FactorPattern, values: NDArray) -> csc_matrix:

@@ -13,17 +13,6 @@ from tests.system.server_process import Stage, beam, run, until
 pytestmark = pytest.mark.gpu
 
 
-@pytest.fixture(autouse=True)
-def gpu():
-    from precond_worker.errors import DeviceUnusable
-    from precond_worker.gpu.device import try_out
-
-    try:
-        try_out()
-    except DeviceUnusable as error:
-        pytest.skip(str(error))
-
-
 @pytest.fixture
 def stage(tmp_path: Path) -> Iterator[Stage]:
     stage = Stage(tmp_path)

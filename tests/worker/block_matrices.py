@@ -64,3 +64,17 @@ def dense_matrix(row_start: NDArray, columns: NDArray, values: NDArray) -> NDArr
 def diagonal_blocks(row_start: NDArray, columns: NDArray) -> NDArray[np.int64]:
     """Index of each node's diagonal block."""
     return np.flatnonzero(np.repeat(np.arange(len(row_start) - 1), np.diff(row_start)) == columns)
+
+
+TWO_BARS = np.concatenate([bar_edges(3, 2, 4), bar_edges(2, 2, 2) + 60])
+GRAPHS = {
+    "bar": pattern(5 * 4 * 13, bar_edges(4, 3, 12)),
+    "bar with a fixed end": pattern(5 * 4 * 13, bar_edges(4, 3, 12), np.arange(20)),
+    "bars with fixed nodes": pattern(60 + 27, TWO_BARS, np.array([0, 7, 13, 61, 86])),
+    "one node": pattern(1, np.empty((0, 2))),
+    "two nodes": pattern(2, np.array([[0, 1]])),
+    "all fixed": pattern(5, np.array([[0, 1], [1, 4]]), np.arange(5)),
+    "chain": pattern(70, np.array([[i, i + 1] for i in range(69)])),
+    "star": pattern(30, np.array([[11, i] for i in range(30) if i != 11])),
+}
+"""Patterns of all shapes, for factorizations."""

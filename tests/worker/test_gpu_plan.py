@@ -15,19 +15,8 @@ from precond_worker.ordering import order_nodes
 from precond_worker.supernodes import fundamental, partition
 from protocol import FactorPattern
 from tests.reference import multifrontal, supernodal
-from tests.worker.block_matrices import bar_edges, dense_matrix, pattern, spd
+from tests.worker.block_matrices import GRAPHS, dense_matrix, pattern, spd
 
-TWO_BARS = np.concatenate([bar_edges(3, 2, 4), bar_edges(2, 2, 2) + 60])
-GRAPHS = {
-    "bar": pattern(5 * 4 * 13, bar_edges(4, 3, 12)),
-    "bar with a fixed end": pattern(5 * 4 * 13, bar_edges(4, 3, 12), np.arange(20)),
-    "bars with fixed nodes": pattern(60 + 27, TWO_BARS, np.array([0, 7, 13, 61, 86])),
-    "one node": pattern(1, np.empty((0, 2))),
-    "two nodes": pattern(2, np.array([[0, 1]])),
-    "all fixed": pattern(5, np.array([[0, 1], [1, 4]]), np.arange(5)),
-    "chain": pattern(70, np.array([[i, i + 1] for i in range(69)])),
-    "star": pattern(30, np.array([[11, i] for i in range(30) if i != 11])),
-}
 graphs = pytest.mark.parametrize("graph", GRAPHS.values(), ids=GRAPHS.keys())
 
 
