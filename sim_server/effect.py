@@ -16,12 +16,12 @@ from sim_server.world import Body, World
 class Effect:
     """Base of all effects. A file under effects/ has `build(world, listed) -> Effect`.
 
-    tets (m, 4): node numbers (of the scene) of the elements whose corners the effect couples, or None.
+    elements (m, c): node numbers (of the scene) of the elements whose c = 2 or 4 corners the effect couples, or None.
     rotated: the bodies whose elements have rotations, for the warp. elastic: by body index, Young's modulus [Pa] and
     Poisson's ratio of its elements, (m,) each, for viewers.
     """
 
-    tets: NDArray[np.int32] | None = None
+    elements: NDArray[np.int32] | None = None
     rotated: tuple[Body, ...] = ()
     elastic: Mapping[int, tuple[NDArray[np.float64], NDArray[np.float64]]] = MappingProxyType({})
 

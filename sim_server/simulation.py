@@ -41,8 +41,8 @@ class Simulation:
         scene.solver.check_device(device)
         self.world = World(scene, _backend(device, scene.solver.precision))
         self.effects = build_effects(scene, self.world)
-        stencilled = [e for e in self.effects.values() if e.tets is not None]
-        self.system = System(self.world, [e.tets for e in stencilled if e.tets is not None], self._warped())
+        elements = [e.elements for e in self.effects.values() if e.elements is not None]
+        self.system = System(self.world, elements, self._warped())
         assemble, integrate = self.launches()
         w, s = self.world, self.system
         arrays: dict[str, Any] = {"row_start": s.row_start, "columns": s.columns, "values": s.values}
@@ -84,8 +84,8 @@ class Simulation:
         assemble = [system.start()]
         stencils = iter(system.stencils)
         accumulate = False
-        for e in sorted(self.effects.values(), key=lambda e: e.tets is None):  # touch asks what the elements added
-            stencil = next(stencils) if e.tets is not None else None
+        for e in sorted(self.effects.values(), key=lambda e: e.elements is None):  # touch asks what the elements added
+            stencil = next(stencils) if e.elements is not None else None
             assemble += e.launches(system, stencil, accumulate)  # f and K, M, B of each effect
             accumulate = accumulate or stencil is not None
         assemble += system.finish()  # into the material frame (eq. 12 and 13)

@@ -24,8 +24,9 @@ Ints = NDArray[np.int32]
 class Stencil:
     """Where the elements of an effect stand in the system.
 
-    corner_start (nodes + 1,), corners: slots 4 e + a of the elements at each node.
-    pair_start (blocks above the diagonal + 1,), pairs (k,): 16 e + 4 a + b, the corners of e that couple in each block.
+    An element has c corners, 2 (a spring) or 4 (a tetrahedron).
+    corner_start (nodes + 1,), corners: slots c e + a of the elements at each node.
+    pair_start (blocks above the diagonal + 1,), pairs (k,): c^2 e + c a + b, the corners of e that couple in a block.
     """
 
     corner_start: Ints
@@ -37,17 +38,17 @@ class Stencil:
 class System:
     """Pattern and arrays of A' and b' for a world and the elements of its effects.
 
-    tets: per effect, (m, 4) node numbers of the elements that couple their corners.
+    elements: per effect, (m, c) node numbers of the elements that couple their corners, c = 2 or 4.
     """
 
-    def __init__(self, world: World, tets: list[Ints], warped: NDArray[np.float64]):
+    def __init__(self, world: World, elements: list[Ints], warped: NDArray[np.float64]):
         n = world.nodes
         self.world, self.warped = world, warped
-        couplings = [_couplings(t, world.free, n) for t in tets]
+        couplings = [_couplings(e, world.free, n) for e in elements]
         above = np.unique(np.concatenate([np.zeros(0, np.int64), *(keys for keys, _ in couplings)]))
         self.row, self.column = (part.astype(np.int32) for part in np.divmod(above, n))
         self._number(n)
-        self.stencils = [_stencil(t, c, n, above) for t, c in zip(tets, couplings, strict=True)]
+        self.stencils = [_stencil(e, c, n, above) for e, c in zip(elements, couplings, strict=True)]
 
         self.sums = np.zeros((len(above), 3, 3))
         self.values = np.zeros((len(self.columns), 3, 3))
@@ -123,22 +124,23 @@ def _runs(group: Ints, begin: NDArray[np.int64], count: NDArray[np.int64]) -> In
     return (np.arange(len(group)) - first[group] + begin[group]).astype(np.int32)
 
 
-def _couplings(tets: Ints, free: NDArray[np.float64], n: int) -> tuple[NDArray[np.int64], Ints]:
-    """Key row * n + column and pair 16 e + 4 a + b of every coupling above the diagonal between free corners."""
+def _couplings(elements: Ints, free: NDArray[np.float64], n: int) -> tuple[NDArray[np.int64], Ints]:
+    """Key row * n + column and pair c c e + c a + b of every coupling above the diagonal between free corners."""
     keys, pairs = [], []
-    element = 16 * np.arange(len(tets), dtype=np.int32)
-    for a in range(4):
-        for b in range(4):
-            i, j = tets[:, a], tets[:, b]
+    corners = elements.shape[1]
+    element = corners**2 * np.arange(len(elements), dtype=np.int32)
+    for a in range(corners):
+        for b in range(corners):
+            i, j = elements[:, a], elements[:, b]
             here = (i < j) & (free[i] > 0) & (free[j] > 0)
             keys.append(i[here].astype(np.int64) * n + j[here])
-            pairs.append((element + np.int32(4 * a + b))[here])
+            pairs.append((element + np.int32(corners * a + b))[here])
     return np.concatenate(keys), np.concatenate(pairs)
 
 
-def _stencil(tets: Ints, couplings: tuple[NDArray[np.int64], Ints], n: int, above: NDArray[np.int64]) -> Stencil:
-    corners = np.argsort(tets.ravel(), kind="stable").astype(np.int32)
-    corner_start = np.concatenate([[0], np.cumsum(np.bincount(tets.ravel(), minlength=n))]).astype(np.int32)
+def _stencil(elements: Ints, couplings: tuple[NDArray[np.int64], Ints], n: int, above: NDArray[np.int64]) -> Stencil:
+    corners = np.argsort(elements.ravel(), kind="stable").astype(np.int32)
+    corner_start = np.concatenate([[0], np.cumsum(np.bincount(elements.ravel(), minlength=n))]).astype(np.int32)
     keys, pairs = couplings
     order = np.lexsort((pairs, keys))
     pair_start = np.searchsorted(keys[order], np.append(above, np.int64(n) * n)).astype(np.int32)

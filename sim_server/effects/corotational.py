@@ -44,8 +44,8 @@ class Params(Parameters):
 class Corotational(Effect):
     """Elements of all bodies that list the effect, in the order of their first nodes.
 
-    tets (m, 4); gradients (9, m), lame (2, m): constants of the elements, one kind after another. What a step makes of
-    them: turn (m, 4) unit quaternions, spread (m, 4, 4) scaled rotated gradients and lambda / mu, push (m, 4, 3).
+    elements (m, 4); gradients (9, m), lame (2, m): constants of the elements, one kind after another. What a step makes
+    of them: turn (m, 4) unit quaternions, spread (m, 4, 4) scaled rotated gradients and lambda / mu, push (m, 4, 3).
     """
 
     def __init__(self, world: World, listed: list[tuple[Body, Any]]):
@@ -53,27 +53,27 @@ class Corotational(Effect):
         self.rotated = tuple(body for body, _ in listed)
         tets = np.concatenate([body.tets for body, _ in listed])
         order = np.argsort(tets.min(axis=1), kind="stable")  # neighbours in memory, whatever the mesh's order
-        self.tets: NDArray[np.int32] = np.ascontiguousarray(tets[order])
+        self.elements: NDArray[np.int32] = np.ascontiguousarray(tets[order])
         self.elastic = {body.index: _constants(body, params) for body, params in listed}  # young, poisson
         young = np.concatenate([self.elastic[body.index][0] for body, _ in listed])[order]
         poisson = np.concatenate([self.elastic[body.index][1] for body, _ in listed])[order]
-        volume, gradients = shape_gradients(world.rest, self.tets)
+        volume, gradients = shape_gradients(world.rest, self.elements)
         self.gradients = np.ascontiguousarray(gradients.reshape(-1, 9).T)
         lam = young * poisson / ((1 + poisson) * (1 - 2 * poisson))
         mu = young / (2 * (1 + poisson))
         self.lame = np.stack([lam * volume, mu * volume])
         owner = np.repeat([body.index for body, _ in listed], [len(body.mesh.tets) for body, _ in listed])
         self.owner = owner[order]
-        m = len(self.tets)
+        m = len(self.elements)
         self.turn, self.spread, self.push = np.zeros((m, 4)), np.zeros((m, 4, 4)), np.zeros((m, 4, 3))
         self._energy = np.zeros(m)
 
     def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
         assert stencil is not None
-        w, m = self.world, len(self.tets)
+        w, m = self.world, len(self.elements)
         stiffening = w.dt * (w.dt + w.beta[self.owner])
         elements = w.backend.module("effects/corotational.cu").bind(
-            "elements", m, tets=self.tets, x=w.x, v=w.v, gradients=self.gradients, lame=self.lame,
+            "elements", m, tets=self.elements, x=w.x, v=w.v, gradients=self.gradients, lame=self.lame,
             stiffening=stiffening, h=w.dt, turn=self.turn, spread=self.spread, push=self.push,
         )  # fmt: skip
         gather = w.backend.module("effects/corotational_nodes.cu").bind(
@@ -95,7 +95,7 @@ class Corotational(Effect):
         """sum V (mu |S - I|^2 + lambda / 2 tr(S - I)^2) with S = R^T F [J]."""
         energy = self._energy
         self.world.backend.module("effects/corotational.cu").bind(
-            "energy", len(self.tets), tets=self.tets, x=self.world.x, gradients=self.gradients, lame=self.lame,
+            "energy", len(self.elements), tets=self.elements, x=self.world.x, gradients=self.gradients, lame=self.lame,
             energy=energy,
         )()  # fmt: skip
         return float(self.world.backend.fetch(energy).sum())

@@ -215,8 +215,14 @@ def fused(launches: Sequence[DeviceLaunch]) -> list[Any]:
     """The launches in as few kernels as their domains allow."""
     if any(domain(launch) not in DOMAINS for launch in launches):
         return list(launches)
-    together = [[x for x in launches if domain(x) == d] for d in DOMAINS]
+    together = [group for d in DOMAINS for group in _alike([x for x in launches if domain(x) == d])]
     return [Fused(group, None, _private(group, launches)) for group in together if group]
+
+
+def _alike(launches: Sequence[DeviceLaunch]) -> list[list[DeviceLaunch]]:
+    """Those of one domain by number of items: the elements of one effect are not those of another."""
+    counts = {x.items: None for x in launches if not x.mailed}
+    return [[x for x in launches if x.mailed or x.items == n] for n in counts]
 
 
 def _private(group: Sequence[DeviceLaunch], launches: Sequence[DeviceLaunch]) -> frozenset[int]:

@@ -28,8 +28,8 @@ class ScipyStep:
         self.h, self.alpha, self.beta = world.dt, rayleigh.mass, rayleigh.stiffness  # type: ignore[attr-defined]
         self.x, self.v, self.mass = world.x.copy(), world.v.copy(), world.mass
         self.g = np.array(gravity.g)  # type: ignore[attr-defined]
-        assert elastic.tets is not None
-        self.tets = elastic.tets
+        assert elastic.elements is not None
+        self.tets = elastic.elements
         young, poisson = elastic.elastic[0]
         lam, mu = young * poisson / ((1 + poisson) * (1 - 2 * poisson)), young / (2 * (1 + poisson))
         volume, inner = shape_gradients(world.rest, self.tets)

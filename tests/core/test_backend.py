@@ -268,3 +268,13 @@ def test_launches_put_together_compile_in_every_precision(group, real, local, tm
     options = ["-arch=sm_90", "-std=c++17", f"-Dreal={real}", f"-Dlocal={local}", f"-I{backend.INCLUDE}"]
     code, said = nvrtc.compiled(library, text, options)
     assert len(code) > 1000 and not said, said
+
+
+def test_elements_of_effects_of_different_numbers_are_not_put_together():
+    def launch(name: str, items: int, mailed: bool = False) -> SimpleNamespace:
+        return SimpleNamespace(name=name, items=items, mailed=mailed)
+
+    tetrahedra, springs, also = launch("tetrahedra", 6), launch("springs", 19), launch("also tetrahedra", 6)
+    assert fuse._alike([tetrahedra, springs, also]) == [[tetrahedra, also], [springs]]  # type: ignore[list-item]
+    start, touch = launch("start", 5), launch("touch", 2, mailed=True)
+    assert fuse._alike([start, touch]) == [[start, touch]]  # type: ignore[list-item]

@@ -12,7 +12,7 @@ from tests.scenes import elastic, solid
 def in_precision(real: str, sim) -> dict[str, np.ndarray]:
     """What the elements' kernels make of the present state, in float64 for comparison."""
     dtype, e, w, s = np.dtype("f8" if real == "double" else "f4"), elastic(sim), sim.world, sim.system
-    m, stencil = len(e.tets), s.stencils[0]
+    m, stencil = len(e.elements), s.stencils[0]
     x, v, gradients, lame = (a.astype(dtype) for a in (w.x, w.v, e.gradients, e.lame))
     out = {
         "turn": np.zeros((m, 4), dtype), "spread": np.zeros((m, 4, 4), dtype), "push": np.zeros((m, 4, 3), dtype),
@@ -21,10 +21,10 @@ def in_precision(real: str, sim) -> dict[str, np.ndarray]:
     }  # fmt: skip
     corotational = module("effects/corotational.cu", real)
     corotational.bind(
-        "elements", m, tets=e.tets, x=x, v=v, gradients=gradients, lame=lame, stiffening=np.full(m, w.dt**2, dtype),
+        "elements", m, tets=e.elements, x=x, v=v, gradients=gradients, lame=lame, stiffening=np.full(m, w.dt**2, dtype),
         h=w.dt, turn=out["turn"], spread=out["spread"], push=out["push"],
     )()  # fmt: skip
-    corotational.bind("energy", m, tets=e.tets, x=x, gradients=gradients, lame=lame, energy=out["energy"])()
+    corotational.bind("energy", m, tets=e.elements, x=x, gradients=gradients, lame=lame, energy=out["energy"])()
     module("effects/corotational_blocks.cu", real).bind(
         "blocks", len(s.row), accumulate=0, start=stencil.pair_start, pairs=stencil.pairs, spread=out["spread"],
         sums=out["sums"],

@@ -55,7 +55,7 @@ def test_nodes_turn_with_the_body(tmp_path):
     R = sim.system.rotation
     assert np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max() < 1e-14
     sum_of_elements = np.zeros_like(R)
-    for tet, element in zip(elastic(sim).tets, elastic(sim).rotation, strict=True):
+    for tet, element in zip(elastic(sim).elements, elastic(sim).rotation, strict=True):
         sum_of_elements[tet] += element
     U, _, Vt = np.linalg.svd(sum_of_elements)
     assert np.abs(R - U @ Vt).max() < 1e-11

@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
-from sim_server.system import System
+from sim_server.system import Stencil, System
 from tests.scenes import bar, jittered_bar, mesh_file, simulation
 
 GRAVITY = (0.0, -9.81, 0.0)
@@ -44,28 +45,39 @@ def test_pattern_is_the_incidence_of_the_mesh(fixed):
 @settings(max_examples=25, deadline=None)
 @given(st.data())
 def test_pattern_of_any_elements(data):
-    """Elements in no particular order, with nodes that none has and nodes that are held."""
+    """Elements of two and of four corners in no particular order, with nodes that none has and nodes that are held."""
     n = data.draw(st.integers(4, 12))
-    nodes = st.permutations(range(n)).map(lambda p: p[:4])
-    tets = np.array(data.draw(st.lists(nodes, min_size=1, max_size=8)), np.int32)
+    several = [_elements(data, n, corners) for corners in data.draw(st.sampled_from([(4,), (2,), (4, 2), (2, 4)]))]
     world = simulation(bar((1, 1, 1), young=None)).world
     world.rest = world.x = world.v = np.zeros((n, 3))
     world.mass, world.free = (
         np.ones(n),
         np.array(data.draw(st.lists(st.sampled_from([0.0, 1.0]), min_size=n, max_size=n))),
     )
-    system = System(world, [tets], np.ones(n))
-    assert np.array_equal(dense_pattern(system), incidence(tets, world.free))
-    stencil = system.stencils[0]
-    for node in range(n):
+    system = System(world, several, np.ones(n))
+    patterns = [incidence(elements, world.free) for elements in several]
+    assert np.array_equal(dense_pattern(system), np.maximum.reduce(patterns))
+    for elements, stencil in zip(several, system.stencils, strict=True):
+        _check_stencil(system, elements, stencil)
+
+
+def _elements(data, n: int, corners: int) -> NDArray[np.int32]:
+    nodes = st.permutations(range(n)).map(lambda p: p[:corners])
+    return np.array(data.draw(st.lists(nodes, min_size=1, max_size=8)), np.int32)
+
+
+def _check_stencil(system: System, elements: NDArray[np.int32], stencil: Stencil) -> None:
+    corners, free = elements.shape[1], system.world.free
+    for node in range(system.world.nodes):
         slots = stencil.corners[stencil.corner_start[node] : stencil.corner_start[node + 1]]
-        assert sorted(slots) == np.flatnonzero(tets.ravel() == node).tolist()
+        assert sorted(slots) == np.flatnonzero(elements.ravel() == node).tolist()
     for block, (i, j) in enumerate(zip(system.row, system.column, strict=True)):
         pairs = stencil.pairs[stencil.pair_start[block] : stencil.pair_start[block + 1]]
-        assert (tets.ravel()[pairs // 4] == i).all()
-        assert (tets.ravel()[pairs // 16 * 4 + pairs % 4] == j).all()
-        sharing = sum(i in tet and j in tet for tet in tets.tolist())
-        assert len(pairs) == (sharing if world.free[i] and world.free[j] else 0)
+        e, a, b = pairs // corners**2, pairs // corners % corners, pairs % corners
+        assert (elements[e, a] == i).all()
+        assert (elements[e, b] == j).all()
+        sharing = sum(i in element and j in element for element in elements.tolist())
+        assert len(pairs) == (sharing if free[i] and free[j] else 0)
 
 
 def three_bodies(folder, **solver):
