@@ -132,7 +132,7 @@ def _energy(sim: Simulation) -> float:
 def _determinants(sim: Simulation) -> Reals:
     """det F of each element."""
     effect: Any = sim.effects["corotational"]
-    corners = sim.world.x[effect.tets]
+    corners = sim.world.x[effect.elements]
     return np.linalg.det(np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2) @ effect.gradients.T.reshape(-1, 3, 3))
 
 

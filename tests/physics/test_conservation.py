@@ -141,7 +141,7 @@ def test_masses_given_as_a_total_and_equal():
 def test_regions_make_elements_differ_and_none_may_be_left_out():
     stiff = [{"where": "X < 1", "young": 4e6, "poisson": 0.1}, {"young": 1e4}]
     elements = elastic(simulation(bar(young=stiff, poisson=0.4)))
-    centre = elements.world.rest[elements.tets].mean(axis=1)[:, 0]
+    centre = elements.world.rest[elements.elements].mean(axis=1)[:, 0]
     young, poisson = elements.elastic[0]
     assert np.array_equal(young, np.where(centre < 1, 4e6, 1e4))
     assert np.array_equal(poisson, np.where(centre < 1, 0.1, 0.4))
