@@ -51,7 +51,9 @@ class Cable:
         command("ip", "-n", FAR, "link", "set", FAR, "down" if is_cut else "up")
 
     def lose(self, percent: int) -> None:
-        """So many of a hundred packets in either direction."""
+        """So many of a hundred packets in either direction; raises Unavailable where there is no nft."""
+        if not shutil.which("nft"):
+            raise Unavailable("nft is not installed")
         drop = f"numgen random mod 100 < {percent} drop"
         text = "add table ip wf; "
         for hook in ("input", "output"):

@@ -45,10 +45,11 @@ def free_endpoint(host: str = "127.0.0.1") -> str:
 class Stage:
     """One server in real time that swings a beam until it is told to stop; all processes end with it.
 
-    host: where it listens; far: words before a worker's command line, such as those that put it elsewhere.
+    host: where it listens; far: words before a worker's command line, such as those that put it elsewhere; device: of
+    the server.
     """
 
-    def __init__(self, host: str = "127.0.0.1", far: Sequence[str] = ()):
+    def __init__(self, host: str = "127.0.0.1", far: Sequence[str] = (), device: str = "cpu"):
         self.endpoint = free_endpoint(host)
         self._far = list(far)
         self._folder = tempfile.TemporaryDirectory(prefix="warpfactor-faults-")
@@ -56,7 +57,7 @@ class Stage:
         scene = Path(self._folder.name) / "beam.toml"
         scene.write_text(SCENE)
         self._processes: list[subprocess.Popen[bytes]] = []
-        words = [str(scene), "--listen", self.endpoint, "--record", str(self.log), "--quiet"]
+        words = [str(scene), "--listen", self.endpoint, "--record", str(self.log), "--quiet", "--device", device]
         self.server = self.start(tool("sim_server", *words))
 
     def start(self, command: Sequence[str]) -> "subprocess.Popen[bytes]":

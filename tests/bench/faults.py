@@ -3,10 +3,11 @@
 
     deploy/run bench faults                      a few seconds of each
     deploy/run bench faults --minutes 10 --lives 100 --cut 30
-    deploy/run bench faults --only kill stop
+    deploy/run bench faults --only kill stop --device gpu --worker-device gpu --limit 500 --out a
+    deploy/run bench faults --merge a/faults.json b/faults.json
 
 Every process is a real one; a beam swings in real time, and its log is read afterwards. A step that is missing, or that
-starts late, would show. "next factor" counts from the end of the fault.
+starts late, would show. What needs root, network namespaces or a GPU is skipped with a message where that is missing.
 """
 
 import argparse
@@ -18,14 +19,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from tests.bench import _faults_page as page
 from tests.bench._fault_net import ADDRESS, Cable, Unavailable
-from tests.bench._fault_stage import DT, Progress, Stage, measured
-from tests.bench.report import Report
+from tests.bench._fault_stage import Progress, Stage, measured
+from tests.bench._pieces import Limit, Merged, Piece, arguments_of_pieces, say, shown
 
+TITLE = "What faults cost"
 SETTLE = 50  # steps before a fault, after the first factor
 AFTER = 100  # steps after the first factor after it
 RECOVERY = 30.0  # s that this factor is waited for
 
+Row = dict[str, Any]
 # Runs a fault; returns the step at which it was over, None if there was none.
 Fault = Callable[[Stage, Progress, argparse.Namespace], int | None]
 
@@ -65,7 +69,7 @@ def kill(stage: Stage, progress: Progress, o: argparse.Namespace) -> int:
     o.worker.wait()
     progress.look()
     at = progress.step
-    stage.worker("w2")
+    stage.worker("w2", *of_worker(o))
     return at
 
 
@@ -84,8 +88,11 @@ def storm(stage: Stage, progress: Progress, o: argparse.Namespace) -> int:
         worker.kill()
         worker.wait()
         life += 1
-        worker = stage.worker(f"life-{life % 2}")
-        progress.pause(min(4.0, max(0.1, end - time.monotonic())))
+        worker = stage.worker(f"life-{life % 2}", *of_worker(o))
+        progress.pause(min(o.every, max(0.1, end - time.monotonic())))
+        if life % 15 == 0:
+            say(f"storm: {life} workers killed, step {progress.step}")
+    o.killed = life
     return progress.step
 
 
@@ -135,25 +142,22 @@ def slow(cable: Cable) -> Fault:
     return while_it_lasts(lambda: cable.delay(100), 5.0, cable.mend)
 
 
-HERE: dict[str, tuple[Fault, str]] = {
-    "quiet": (quiet, "nothing"),
-    "kill": (kill, "kill -9 of the worker, another is started"),
-    "stop": (stop, "SIGSTOP of the worker for 5 s"),
-    "storm": (storm, "kill -9 and a new worker every 4 s"),
-    "sleeper": (sleeper, "a client that subscribes and sleeps"),
-    "flood": (flood, "garbage on all channels of workers"),
-}
-THERE: dict[str, tuple[Callable[[Cable], Fault], str]] = {
-    "cut": (cut, "network between server and worker cut"),
-    "lossy": (lossy, "50 % of the packets lost for 5 s"),
-    "slow": (slow, "100 ms of delay each way for 5 s"),
-}
+HERE: dict[str, Fault] = {
+    "quiet": quiet, "kill": kill, "stop": stop, "storm": storm, "sleeper": sleeper, "flood": flood,
+}  # fmt: skip
+THERE: dict[str, Callable[[Cable], Fault]] = {"cut": cut, "lossy": lossy, "slow": slow}
 
 
-def run(name: str, fault: Fault, stage: Stage, o: argparse.Namespace, *options: str) -> dict[str, Any]:
+def of_worker(o: argparse.Namespace) -> list[str]:
+    """Options of every worker."""
+    return ["--device", o.worker_device]
+
+
+def run(name: str, fault: Fault, stage: Stage, o: argparse.Namespace, *options: str) -> Row:
     """One fault, SETTLE steps after the first factor, until AFTER steps after the first factor that follows it."""
+    o.killed = 0
     with stage:
-        o.worker = stage.worker("w1", *options)
+        o.worker = stage.worker("w1", *of_worker(o), *options)
         with stage.client() as client:
             progress = Progress(client)
             progress.until(lambda: progress.factor_step > 0)
@@ -164,22 +168,27 @@ def run(name: str, fault: Fault, stage: Stage, o: argparse.Namespace, *options: 
                 progress.until(lambda: after is None or progress.factor_step > after, RECOVERY)
             progress.past(progress.step + AFTER)
             refused, data = client.status().refused, stage.finish(client)
-        return {"fault": name, **measured(data, progress.step, after), "messages refused": refused}
+        found = {**measured(data, progress.step, after), "messages refused": refused, "workers killed": o.killed}
+    return {"fault": name, "server": o.device, "workers on": o.worker_device, **found}
 
 
-def lives(o: argparse.Namespace) -> list[dict[str, Any]]:
+def lives(o: argparse.Namespace, limit: Limit) -> list[Row]:
     """Workers killed one after another, each after its first factor: what stays of them in the server's memory."""
-    rows = []
-    with Stage() as stage, stage.client() as client:
+    rows: list[Row] = []
+    with Stage(device=o.device) as stage, stage.client() as client:
         progress = Progress(client)
         for life in range(1, o.lives + 1):
-            worker, begun = stage.worker(f"life-{life}"), progress.step
+            if limit.reached(f"lives from {life} on"):
+                break
+            worker, begun = stage.worker(f"life-{life}", *of_worker(o)), progress.step
             progress.until(lambda begun=begun: progress.factor_step > begun)
             worker.kill()
             worker.wait()
             if life in (1, 2, 5, o.lives) or life % 10 == 0:
                 progress.pause(0.5)
-                rows.append({"workers so far": life, **memory(stage.server.pid)})
+                what = {"workers so far": life, "server": o.device, "workers on": o.worker_device}
+                rows.append({**what, **memory(stage.server.pid)})
+                say(shown(rows[-1]))
     return rows
 
 
@@ -194,75 +203,73 @@ def memory(pid: int) -> dict[str, float]:
     }
 
 
-def main() -> None:
+def faults(o: argparse.Namespace, limit: Limit, keep: Callable[[Row], None]) -> dict[str, str]:
+    """Rows to `keep`; returns what was skipped and why. What needs a network of its own has a quiet run on it too."""
+    skipped: dict[str, str] = {}
+    there = [name for name in o.only if name in THERE]
+    for name in [n for n in o.only if n in HERE] + ([page.QUIET_THERE] if there else []) + there:
+        if limit.reached(name):
+            continue
+        try:
+            if name in HERE:
+                keep(run(name, HERE[name], Stage(device=o.device), o))
+                continue
+            with Cable() as cable:
+                fault = quiet if name == page.QUIET_THERE else THERE[name](cable)
+                keep(run(name, fault, Stage(ADDRESS, cable.far, o.device), o, "--no-shared-memory"))
+        except Unavailable as why:
+            skipped[name] = str(why)
+            say(f"skipped: {name}: {why}")
+        except Exception as error:  # the others are worth having
+            say(f"FAILED: {name}: {type(error).__name__}: {error}")
+    return skipped
+
+
+def options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
-    parser.add_argument("--minutes", type=float, default=0.2, help="of killing workers every 4 s")
+    parser.add_argument("--minutes", type=float, default=0.2, help="of killing workers one after another")
+    parser.add_argument("--every", type=float, default=4.0, help="seconds from one of these to the next")
     parser.add_argument("--lives", type=int, default=10, help="workers killed one after another, for the memory")
     parser.add_argument("--cut", type=float, default=6.0, help="seconds without a network")
     parser.add_argument("--only", nargs="+", choices=[*HERE, *THERE, "lives"], help="these alone")
+    parser.add_argument("--device", choices=("cpu", "gpu"), default="cpu", help="of the server")
+    parser.add_argument("--worker-device", choices=("cpu", "gpu"), default="cpu", help="of its workers")
     parser.add_argument("--quick", action="store_true", help="kill alone, beside the quiet run")
-    parser.add_argument("--out", type=Path)
-    options = parser.parse_args()
+    arguments_of_pieces(parser)
+    o = parser.parse_args()
+    o.only = o.only or (["quiet", "kill"] if o.quick else [*HERE, *THERE, "lives"])
+    return o
+
+
+def main() -> None:
+    o = options()
+    if o.merge:
+        merged = Merged("faults", TITLE, o.merge, o.out)
+        page.write(merged, *page.merged([part["data"] for part in merged.parts]))
+        return
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that processes and namespaces go too
-    chosen = options.only or [*HERE, *([] if options.quick else [*THERE, "lives"])]
-    if options.quick:
-        chosen = ["quiet", "kill"]
-    arguments = {"minutes": options.minutes, "lives": options.lives, "cut": options.cut, "only": chosen}
-    report = Report("faults", "What faults cost", arguments, options.out, options.quick)
-    rows, skipped = table_of_faults([name for name in chosen if name != "lives"], options)
-    report.data["rows"], report.data["skipped"] = rows, skipped
-    say_faults(report, rows, skipped)
-    if "lives" in chosen:
-        report.data["lives"] = lives(options)
-        report.say("## Memory", "Workers killed with -9 one after another, each after its first factor.")
-        report.table(report.data["lives"])
-    report.write()
+    if "gpu" in (o.device, o.worker_device):
+        from sim_server.errors import DeviceError
+        from sim_server.gpu.device import cupy
 
-
-def table_of_faults(names: list[str], o: argparse.Namespace) -> tuple[list[dict[str, Any]], dict[str, str]]:
-    """Rows, and what was skipped and why. What needs a network of its own has a quiet run on it beside it."""
-    rows: list[dict[str, Any]] = []
-    skipped: dict[str, str] = {}
-    for name in (name for name in names if name in HERE):
-        rows.append(run(name, HERE[name][0], Stage(), o))
-        print(rows[-1], flush=True)
-    there = [name for name in names if name in THERE]
-    for name in (["quiet"] if there else []) + there:
         try:
-            with Cable() as cable:
-                fault = quiet if name == "quiet" else THERE[name][0](cable)
-                stage = Stage(ADDRESS, cable.far)
-                row = run(name, fault, stage, o, "--no-shared-memory")
-                rows.append({**row, "fault": "quiet, over a network" if name == "quiet" else name})
-                print(rows[-1], flush=True)
-        except Unavailable as why:
-            skipped[name] = str(why)
-            print(f"skipped: {name}: {why}", flush=True)
-    return rows, skipped
+            cupy()
+        except DeviceError as error:
+            raise SystemExit(f"bench faults: skipped: {error}") from None
+    names = ("minutes", "every", "lives", "cut", "only", "device", "worker_device", *(["quick"] if o.quick else []))
+    report, limit = Piece("faults", TITLE, {name: getattr(o, name) for name in names}, o.out, o.quick), Limit(o.limit)
+    rows: list[Row] = []
+    report.data.update(rows=rows, lives=[], skipped={})
 
+    def keep(row: Row) -> None:
+        rows.append(row)
+        say(shown(row))
+        report.keep()
 
-def say_faults(report: Report, rows: list[dict[str, Any]], skipped: dict[str, str]) -> None:
-    """The table, with penalties against the quiet run of the same network."""
-    plain = {"here": "quiet", "there": "quiet, over a network"}
-    base = {place: next((r for r in rows if r["fault"] == name), None) for place, name in plain.items()}
-    what = {name: text for name, (_, text) in {**HERE, **THERE}.items()}
-    for row in rows:
-        quiet_row = base["there" if row["fault"] in (*THERE, plain["there"]) else "here"]
-        row["what"] = what.get(row["fault"], "nothing; the worker gets bytes through a cable")
-        row["iterations, times quiet"] = row["iterations"] / quiet_row["iterations"] if quiet_row else None
-    report.say(
-        f"A beam of 1152 tetrahedra in real time, dt {1e3 * DT:g} ms. missed: steps that the log does not hold; latest "
-        "start: the largest delay of a step after its time; late steps: by more than 1 ms; next factor: from the end "
-        "of the fault to the first step with a factor made after it. Iterations of steps with a factor."
-    )
-    if rows:
-        columns = [
-            "what", "steps", "missed", "not converged", "step p50 ms", "step max ms", "latest start ms", "late steps",
-            "iterations", "iterations, times quiet", "oldest factor", "next factor s", "messages refused",
-        ]  # fmt: skip
-        report.table(rows, columns)
-    for name, why in skipped.items():
-        report.say(f"Skipped: {what[name]}: {why}")
+    skipped = faults(o, limit, keep)
+    found = lives(o, limit) if "lives" in o.only and not limit.reached("lives") else []
+    limit.tell()
+    page.write(report, rows, found, skipped)
 
 
 if __name__ == "__main__":

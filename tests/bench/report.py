@@ -157,15 +157,18 @@ class Report:
         figure.savefig(self.folder / file, dpi=110)
         self._body.append(f"![{caption}]({file})\n\n{caption}")
 
-    def header(self) -> dict[str, Any]:
-        """Where, when and with what, as at the start; the calibration before and now."""
+    def head(self) -> dict[str, Any]:
+        """Where, when and with what, as at the start."""
         return {
             "date": self._started.isoformat(timespec="seconds"),
             "commit": self._commit,
             "machine": self._machine,
             "versions": versions(),
-            "calibration": {"before": self._before, "after": calibration(self.quick)},
         }
+
+    def header(self) -> dict[str, Any]:
+        """The same, with the calibration before and now."""
+        return self.head() | {"calibration": {"before": self._before, "after": calibration(self.quick)}}
 
     def markdown(self, header: dict[str, Any]) -> str:
         """The whole text."""
@@ -187,10 +190,14 @@ class Report:
         """NAME.md and NAME.json; returns the folder."""
         header = self.header()
         (self.folder / f"{self.name}.md").write_text(self.markdown(header))
+        self.save(header)
+        print(f"written: {self.folder}/{self.name}.md, .json and pictures", flush=True)
+        return self.folder
+
+    def save(self, header: dict[str, Any]) -> None:
+        """NAME.json alone."""
         content = {"header": header, "arguments": self.arguments, "data": self.data}
         (self.folder / f"{self.name}.json").write_text(json.dumps(plain(content), indent=1, allow_nan=False) + "\n")
-        print(f"written: {self.folder}/{self.name}.md, .json and pictures")
-        return self.folder
 
 
 def _words(arguments: dict[str, Any]) -> str:

@@ -1,9 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""Throughput and age of the factors from one body to many, with a few workers.
+"""Throughput and age of the factors from one body to many, with a few workers, on a CPU and on a GPU.
+
+    deploy/run bench scaling                                     on the CPU, all of it
+    deploy/run bench scaling --device cpu gpu --worker-device cpu gpu --limit 500 --out a
+    deploy/run bench scaling --merge a/scaling.json b/scaling.json
 
 Beams of 540 tetrahedra in one server, worker processes of their own, matrices and factors over shared memory, as fast
 as it goes. The loop runs on its own and is served each millisecond, as in sim-server; every 100 steps the beams are put
-back to where they started, so that they keep swinging.
+back to where they started, so that they keep swinging. Where there is no GPU its rows are skipped with a message.
 """
 
 import os
@@ -23,13 +27,17 @@ from numpy.typing import NDArray
 
 from sim_server import describe
 from sim_server.driver import Driver
+from sim_server.errors import DeviceError
 from sim_server.network.link import ServerLink
 from sim_server.service import NAP
 from sim_server.simulation import Simulation
 from sim_server.supervisor import Supervisor
-from tests.bench.report import Report, plots
+from tests.bench import _scaling_page as page
+from tests.bench._pieces import Limit, Merged, Piece, arguments_of_pieces, say, shown
 
 OBJECTS, WORKERS = (1, 4, 16, 64, 256, 1024), (1, 2, 4)
+DEVICES = ("cpu", "gpu")
+TITLE = "From one body to many"
 SWING = 100  # steps until the beams are put back
 PATIENCE = 60.0  # s for the workers to join
 
@@ -78,6 +86,7 @@ class Run:
         self.driver = Driver(sim, self.link)
         self._thread = threading.Thread(target=self._loop)
         self._ended = False
+        self._failure: BaseException | None = None
 
     def __enter__(self) -> "Run":
         return self
@@ -91,42 +100,58 @@ class Run:
         self.link.close()
 
     def _loop(self) -> None:
-        while not self._ended:
-            self.engine.run(SWING)
-            world = self.sim.world
-            world.x[:], world.v[:] = self._start, 0.0
-            if world.backend.name == "gpu":
-                for array in (world.x, world.v):
-                    world.backend.twin(array).set(array)
-                world.backend.cp.cuda.Device().synchronize()
+        try:
+            while not self._ended:
+                self.engine.run(SWING)
+                self._put_back()
+        except BaseException as error:  # DeviceLost: told by who waits for records
+            self._failure = error
 
-    def measured(self, seconds: float, warm: float) -> tuple[NDArray[Any], int, float]:
-        """Records of `seconds`, factors taken up meanwhile, how long it was [s].
+    def _put_back(self) -> None:
+        world = self.sim.world
+        world.x[:], world.v[:] = self._start, 0.0
+        if world.backend.name == "gpu":
+            for array in (world.x, world.v):
+                twin = world.backend.twin(array)
+                twin.set(array.astype(twin.dtype))
+            world.backend.cp.cuda.Device().synchronize()
+
+    def measured(self, seconds: float, warm: float) -> tuple[NDArray[Any], Row]:
+        """Records of `seconds`, and what else was counted: steps, factors taken up, seconds.
 
         It begins when every body has had a factor, or after `warm` seconds of steps.
         """
         end = time.monotonic() + PATIENCE
         while len(self.link.workers()) < self.workers:
             if time.monotonic() > end:
-                raise SystemExit(f"{self.workers} workers have not joined within {PATIENCE:g} s")
+                raise RuntimeError(f"{self.workers} workers have not joined within {PATIENCE:g} s")
             time.sleep(NAP)
         self._thread.start()
-        end = time.monotonic() + warm
-        while min(t.used for t in self.driver.tracks) == 0 and time.monotonic() < end:
-            self.driver.pump()
-            time.sleep(NAP)
-        begun, before, found = time.monotonic(), self._used(), []
+        begun = time.monotonic()
+        while min(t.used for t in self.driver.tracks) == 0 and time.monotonic() < begun + warm:
+            self._round()
+        warmed, begun = time.monotonic() - begun, time.monotonic()
+        before, steps, dropped, found = self._used(), self.engine.step, self.engine.loop.records_dropped, []
         while time.monotonic() < begun + seconds or not len(found):
-            if len(records := self.driver.pump()):
+            if len(records := self._round()):
                 found.append(records)
-            time.sleep(NAP)
-        return np.concatenate(found), self._used() - before, time.monotonic() - begun
+        return np.concatenate(found), {
+            "lasted": time.monotonic() - begun, "steps": self.engine.step - steps, "warm": warmed,
+            "factors": self._used() - before, "dropped": int(self.engine.loop.records_dropped) - dropped,
+        }  # fmt: skip
+
+    def _round(self) -> NDArray[Any]:
+        if self._failure is not None:
+            raise self._failure
+        records = self.driver.pump()
+        time.sleep(NAP)
+        return records
 
     def _used(self) -> int:
         return sum(t.used for t in self.driver.tracks)
 
 
-def measure(objects: int, workers: int, seconds: float, warm: float, device: str) -> Row:
+def measure(objects: int, workers: int, seconds: float, warm: float, device: str, worker_device: str) -> Row:
     """One row of the table."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "beams.toml"
@@ -134,75 +159,97 @@ def measure(objects: int, workers: int, seconds: float, warm: float, device: str
         begun = time.monotonic()
         sim = Simulation.load(path, [], device)
         loaded = time.monotonic() - begun
-    with Run(sim, workers, device) as run:
-        r, factors, lasted = run.measured(seconds, warm)
+    with Run(sim, workers, worker_device) as run:
+        r, counted = run.measured(seconds, warm)
         helped = sum(t.used > 0 for t in run.driver.tracks)
     whole = 1e3 * r["whole"][r["body"] == 0]
     age = (r["step"] - 1 - r["factor_step"])[r["factor_step"] >= 0]
+    lasted, steps = counted["lasted"], counted["steps"]
     return {
-        "objects": objects, "workers": workers, "steps/s": len(r) / objects / lasted, "object-steps/s": len(r) / lasted,
-        "step ms p50": _percentile(whole, 50), "p99": _percentile(whole, 99),
+        "objects": objects, "server": device, "workers": workers, "workers on": worker_device,
+        "object-steps/s": objects * steps / lasted, "steps/s": steps / lasted,
+        "step ms p50": _percentile(whole, 50), "step ms p99": _percentile(whole, 99),
+        "age p50, steps": _percentile(age, 50), "age max, steps": int(age.max()) if len(age) else None,
+        "age p50, ms": _milliseconds(_percentile(age, 50), lasted, steps),
+        "age max, ms": _milliseconds(_percentile(age, 100), lasted, steps),
         "iterations": float(r["iterations"].mean()), "most": int(r["iterations"].max()),
-        "factor age, steps": _mean(age), "oldest": int(age.max()) if len(age) else None,
-        "factor age, ms": _mean(age * 1e3 * lasted * objects / len(r)), "factors/s": factors / lasted,
-        "with a factor": helped,
-        "unconverged": int((r["status"] != 0).sum()), "load s": loaded,
+        "factors/s": counted["factors"] / lasted, "with a factor": helped,
+        "unconverged": int((r["status"] != 0).sum()), "records dropped": counted["dropped"],
+        "warm s": counted["warm"], "load s": loaded,
     }  # fmt: skip
-
-
-def _mean(values: NDArray[Any]) -> float | None:
-    return float(values.mean()) if len(values) else None
 
 
 def _percentile(values: NDArray[np.float64], q: float) -> float | None:
     return float(np.percentile(values, q)) if len(values) else None
 
 
-def draw(report: Report, rows: list[Row]) -> None:
-    """Throughput and age over the number of bodies, a line for each number of workers."""
-    plt = plots()
-    figure, axes = plt.subplots(1, 3, figsize=(13, 4), layout="constrained")
-    for name, plot in zip(("object-steps/s", "factor age, ms", "iterations"), axes, strict=True):
-        for workers in sorted({r["workers"] for r in rows}):
-            mine = [r for r in rows if r["workers"] == workers]
-            plot.loglog([r["objects"] for r in mine], [r[name] for r in mine], "o-", label=f"{workers} workers")
-        plot.set(xlabel="objects", title=name)
-    axes[0].legend()
-    report.figure(figure, "scaling.png", "Throughput, mean age of the factors in use, mean iterations.")
+def _milliseconds(age: float | None, lasted: float, steps: int) -> float | None:
+    return None if age is None or not steps else 1e3 * age * lasted / steps
 
 
-def main() -> None:
+def usable(devices: list[str]) -> list[str]:
+    """Those of this machine; says why the others are skipped."""
+    if "gpu" not in devices:
+        return devices
+    from sim_server.gpu.device import cupy
+
+    try:
+        cupy()
+    except DeviceError as error:
+        say(f"skipped: gpu: {error}")
+        return [d for d in devices if d != "gpu"]
+    return devices
+
+
+def plan(o: argparse.Namespace) -> list[tuple[int, int, str, str]]:
+    """(objects, workers, device, device of the workers) of each row; smallest first."""
+    pairs = [(d, w) for d in usable(o.device) for w in (usable(o.worker_device) if o.worker_device else [d])]
+    return [(n, workers, *pair) for n in sorted(o.objects) for pair in pairs for workers in o.workers]
+
+
+def options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
     parser.add_argument("--objects", type=int, nargs="+", default=list(OBJECTS))
     parser.add_argument("--workers", type=int, nargs="+", default=list(WORKERS))
     parser.add_argument("--seconds", type=float, default=5.0, help="measured for each row")
     parser.add_argument("--warm", type=float, default=30.0, help="seconds at most until every body has a factor")
-    parser.add_argument("--device", choices=("cpu", "gpu"), default="cpu", help="of the server and its workers")
+    parser.add_argument("--device", choices=DEVICES, nargs="+", default=["cpu"], help="of the server")
+    parser.add_argument("--worker-device", choices=DEVICES, nargs="+", help="of its workers [default: as the server]")
     parser.add_argument("--quick", action="store_true", help="fewest objects and workers, an instant each")
-    parser.add_argument("--out", type=Path)
-    options = parser.parse_args()
-    if options.quick:
-        options.objects, options.workers, options.seconds = [1, 3], [1], 0.3
-    if min(options.objects) < 1 or min(options.workers) < 1 or not options.seconds > 0:
+    arguments_of_pieces(parser)
+    o = parser.parse_args()
+    if o.quick:
+        o.objects, o.workers, o.seconds = [1, 3], [1], 0.3
+    if min(o.objects) < 1 or min(o.workers) < 1 or not o.seconds > 0:
         parser.error("--objects, --workers and --seconds must be above 0")
-    arguments = {k: getattr(options, k) for k in ("objects", "workers", "seconds", "warm", "device")}
-    report = Report("scaling", "From one body to many", arguments, options.out, options.quick)
-    rows = []
-    for objects in options.objects:
-        for workers in options.workers:
-            rows.append(measure(objects, workers, options.seconds, options.warm, options.device))
-            print({k: round(v, 3) if isinstance(v, float) else v for k, v in rows[-1].items()}, flush=True)
-    report.data["rows"] = rows
-    report.say(
-        "Beams of 540 tetrahedra (176 nodes), E 1 to 4 MPa, dt 20 ms, tolerance 1e-6 of the true residual, as fast as "
-        "it goes, the loop on one thread; every 100 steps the beams are put back to where they started. Measured once "
-        f"every beam has a factor, or after {options.warm:g} s; those without one are solved with block Jacobi. Age: "
-        "of the factor that a solve used, from the matrix it was made from. Server and workers share the cores named "
-        "above."
-    )
-    report.table(rows)
-    draw(report, rows)
-    report.write()
+    return o
+
+
+def main() -> None:
+    o = options()
+    if o.merge:
+        merged = Merged("scaling", TITLE, o.merge, o.out)
+        page.write(merged, merged.rows("rows", page.KEYS))
+        return
+    arguments = {k: getattr(o, k) for k in ("objects", "workers", "seconds", "warm", "device")}
+    arguments |= {k: getattr(o, k) for k in ("worker_device", "quick") if getattr(o, k)}
+    report, limit, rows = Piece("scaling", TITLE, arguments, o.out, o.quick), Limit(o.limit), []
+    for n, workers, device, worker_device in plan(o):
+        name = f"{n} objects on {device}, {workers} workers on {worker_device}"
+        if limit.reached(name):
+            continue
+        try:
+            rows.append(measure(n, workers, o.seconds, o.warm, device, worker_device))
+        except Exception as error:  # the other rows are worth having
+            say(f"FAILED: {name}: {type(error).__name__}: {error}")
+            continue
+        say(shown(rows[-1]))
+        report.data["rows"] = rows
+        report.keep()
+    limit.tell()
+    if not rows:
+        raise SystemExit("bench scaling: nothing was measured")
+    page.write(report, rows)
 
 
 if __name__ == "__main__":

@@ -63,8 +63,17 @@ def test_figure4_with_a_real_worker(tmp_path: Path) -> None:
 def test_scaling_with_a_real_worker(tmp_path: Path) -> None:
     rows = bench("scaling", tmp_path)["data"]["rows"]
     assert [(row["objects"], row["workers"], row["with a factor"]) for row in rows] == [(1, 1, 1), (3, 1, 3)]
-    assert all(row["unconverged"] == 0 and row["factor age, steps"] > 0 for row in rows)
+    assert all(row["unconverged"] == 0 and row["age max, steps"] > 0 for row in rows)
     assert (tmp_path / "scaling.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.system
+def test_faults_with_real_workers_miss_no_step(tmp_path: Path) -> None:
+    found = bench("faults", tmp_path)
+    rows = {row["fault"]: row for row in found["data"]["rows"]}
+    assert set(rows) == {"quiet", "kill"} and all(row["missed"] == row["not converged"] == 0 for row in rows.values())
+    assert rows["kill"]["next factor s"] > 0
+    assert "kill -9 of the worker" in (tmp_path / "faults.md").read_text()
 
 
 def test_reference_of_accuracy_is_no_competitor(tmp_path: Path) -> None:
