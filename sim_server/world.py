@@ -49,6 +49,12 @@ class World:
     rest (n, 3): before the pose [m]; x (n, 3): positions [m]; v (n, 3): velocities [m/s]; mass (n,): lumped [kg];
     free (n,): 1, or 0 at fixed nodes; beta (bodies,): Rayleigh damping of the stiffness [s]; dt: time step [s];
     backend: where kernels run, Cpu or gpu.device.Gpu.
+
+    What effects need of the integrator instead of dt and v:
+    impulse [s]: times a force is what goes into b. reach [s]: x moves by reach (ahead + dv) until the end of the step,
+    dv the solution. ahead (n, 3) [m/s]. drift (n, 3) [m/s]: (reach ahead + beta v) / (reach + beta), what elements take
+    for the velocity, so that stiffening * (K drift) holds motion and damping. inertia: False in a quasi-static scene.
+    In backward Euler impulse = reach = dt, ahead and drift are v.
     """
 
     def __init__(self, scene: Scene, backend: Any = None):
@@ -66,6 +72,14 @@ class World:
         self.mass = np.concatenate([_lumped(o, mesh) for o, mesh in meshes])
         self.free = np.ones(first)
         self.beta = np.zeros(len(self.bodies))
+        self.impulse = self.reach = self.dt
+        self.inertia = True
+        self.ahead = self.drift = self.v
+
+    @property
+    def stiffening(self) -> Reals:
+        """impulse (reach + beta) of each body [s2]: times K is what goes into A."""
+        return self.impulse * (self.reach + self.beta)
 
     @property
     def nodes(self) -> int:

@@ -8,14 +8,14 @@ struct Elements {
     int n;                    // elements
     const int* tets;          // (n, 4) nodes
     const real* x;            // (nodes, 3) positions [m]
-    const real* v;            // (nodes, 3) velocities [m/s]
+    const real* v;            // (nodes, 3) world.drift [m/s]
     const local* gradients;   // (9, n) rest gradients of the shape functions of nodes 1, 2, 3, one after another [1/m]
     const local* lame;        // (2, n) lambda V, mu V [Pa m3]
-    const local* stiffening;  // (n,) h (h + beta) [s2], beta the Rayleigh damping of the stiffness
-    local h;                  // time step [s]
+    const local* stiffening;  // (n,) h (c + beta) [s2], c world.reach, beta the Rayleigh damping of the stiffness
+    local h;                  // world.impulse: the time step in backward Euler [s]
     local* turn;              // (n, 4) out: unit quaternion of the nearest rotation of F, w first
-    local* spread;            // (n, 4, 4) out: g_a = sqrt(h (h + beta) mu V) R grad N_a, and lambda / mu
-    local* push;              // (n, 4, 3) out: h f_a + h (h + beta) (K v)_a [N s]
+    local* spread;            // (n, 4, 4) out: g_a = sqrt(h (c + beta) mu V) R grad N_a, and lambda / mu
+    local* push;              // (n, 4, 3) out: h f_a + h (c + beta) (K v)_a [N s]
 };
 
 INLINE local_mat3 rest_gradients(const local* gradients, int n, index i) {
@@ -40,7 +40,7 @@ KERNEL(elements, Elements) {
     local_mat3 R = rotation_matrix(q), Rt = transposed(R);
     local_mat3 S = mul(Rt, F), T = mul(Rt, G);
 
-    // Stress of h (strain) + h (h + beta) (strain rate), times V
+    // Stress of h (strain) + h (c + beta) (strain rate), times V
     local_number k = at(p.stiffening, i), lambda = at(p.lame, i), mu = at(p.lame, p.n + i);
     local h = p.h;
     local_number pressure = lambda * (h * (trace(S) - 3) + k * trace(T));

@@ -71,10 +71,9 @@ class Corotational(Effect):
     def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
         assert stencil is not None
         w, m = self.world, len(self.elements)
-        stiffening = w.dt * (w.dt + w.beta[self.owner])
         elements = w.backend.module("effects/corotational.cu").bind(
-            "elements", m, tets=self.elements, x=w.x, v=w.v, gradients=self.gradients, lame=self.lame,
-            stiffening=stiffening, h=w.dt, turn=self.turn, spread=self.spread, push=self.push,
+            "elements", m, tets=self.elements, x=w.x, v=w.drift, gradients=self.gradients, lame=self.lame,
+            stiffening=w.stiffening[self.owner], h=w.impulse, turn=self.turn, spread=self.spread, push=self.push,
         )  # fmt: skip
         gather = w.backend.module("effects/corotational_nodes.cu").bind(
             "gather", w.nodes, start=stencil.corner_start, corners=stencil.corners, push=self.push,

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: MIT
 // Sums the element tangents of corotational tetrahedra block by block: with g_a the scaled rotated gradient of node a,
-// h (h + beta) K_ab = (lambda / mu) g_a g_b^T + g_b g_a^T + (g_a . g_b) I. A block gathers its elements from a list made once
+// h (c + beta) K_ab = (lambda / mu) g_a g_b^T + g_b g_a^T + (g_a . g_b) I. A block gathers its elements from a list made once
 // per topology: no atomics, the same sum in the same order every time, and no 12x12 matrix is ever formed. The nodes' own
 // blocks, those on the diagonal, are corotational_nodes.cu's.
 #include "together.cuh"

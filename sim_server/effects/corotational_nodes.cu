@@ -22,7 +22,7 @@ INLINE void gather_add(const Gather& p, int, int k, local* sum) {
     get_row(p.spread, corner, g);
     get_row(p.turn, corner >> 2, q);
     for (int m = 0; m < 3; ++m) sum[m] += f[m];
-    // (lambda / mu + 1) g g^T + (g . g) I: h (h + beta) K_aa
+    // (lambda / mu + 1) g g^T + (g . g) I: h (c + beta) K_aa
     local w = g[3] + 1, x = w * g[0], y = w * g[1], d = g[0] * g[0] + g[1] * g[1] + g[2] * g[2];
     sum[3] += x * g[0] + d; sum[4] += x * g[1]; sum[5] += x * g[2];
     sum[6] += y * g[1] + d; sum[7] += y * g[2]; sum[8] += w * g[2] * g[2] + d;

@@ -36,17 +36,17 @@ class Params(Parameters):
 
 
 class Drag(Effect):
-    """The damping of the mass, b -= h alpha m v; that of the stiffness is in the elements' h (h + beta)."""
+    """The damping of the mass, b -= h alpha m v; that of the stiffness is in world.stiffening."""
 
     def __init__(self, world: World, alpha: np.ndarray):
         self.world, self.alpha = world, alpha
 
     def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
-        if not self.alpha.any():
-            return []
         w = self.world
+        if not self.alpha.any() or not w.inertia:
+            return []
         drag = self.world.backend.module("effects/rayleigh.cu").bind(
-            "drag", w.nodes, mass=w.mass, alpha=self.alpha, v=w.v, h=w.dt, diagonal=system.diagonal, b=system.b
+            "drag", w.nodes, mass=w.mass, alpha=self.alpha, v=w.v, h=w.impulse, diagonal=system.diagonal, b=system.b
         )
         return [drag]
 

@@ -17,12 +17,14 @@ struct Apply {
     const real* limit;      // (interactions,) largest force of a grab [N]
     const double* clock;    // (1,) [s]
     const real* x;          // (nodes, 3) [m]
-    const real* v;          // (nodes, 3) [m/s]
+    const real* ahead;      // (nodes, 3) world.ahead: reach * ahead is the motion until the end of the step, dv apart [m/s]
     const real* free;       // (nodes,) 1, or 0 at fixed nodes
     own<local> block;       // (nodes, 6) what elements have put into the node's own block of A, world frame [kg]
-    real h;                 // [s]
-    own<real> diagonal;     // (nodes, 1) in, out: += h2 k [kg]
-    own<real> b;            // (nodes, 3) in, out: += h f - h2 k v [N s]
+    double dt;              // time step [s]
+    real h;                 // world.impulse: dt in backward Euler [s]
+    real reach;             // world.reach: dt in backward Euler [s]
+    own<real> diagonal;     // (nodes, 1) in, out: += h reach k [kg]
+    own<real> b;            // (nodes, 3) in, out: += h f - h reach k ahead [N s]
 };
 
 // A grab is a spring, implicit while it is below its limit and a constant force above. What it will be is reckoned at the end
@@ -30,27 +32,27 @@ struct Apply {
 // one side of its target to the other for ever.
 MAILED_KERNEL(apply, Apply) {
     int node = p.node[i];
-    vec3 x = load3(p.x, node), v = load3(p.v, node), b = load3(p.b, node);
+    vec3 x = load3(p.x, node), ahead = load3(p.ahead, node), b = load3(p.b, node);
     real diagonal = row_at<1>(p.diagonal, node, 0);
     real inertia = diagonal + (row_at<6>(p.block, node, 0) + row_at<6>(p.block, node, 3) + row_at<6>(p.block, node, 5)) / 3;
     for (int e = p.first[i]; e < p.first[i + 1]; ++e) {
         int k = p.entry[e];
         double now = p.clock[0];
         if (p.start[k] < 0) p.start[k] = now;  // whoever comes first writes the same
-        if (now + p.h / 2 >= p.start[k] + p.duration[k]) continue;  // so many whole steps, whatever the rounding
+        if (now + p.dt / 2 >= p.start[k] + p.duration[k]) continue;  // so many whole steps, whatever the rounding
         real share = p.share[k];
         if (p.stiffness[k] == 0) {
             b = b + (p.h * share) * load3(p.force, k);
             continue;
         }
         real spring = share * p.stiffness[k], limit = share * p.limit[k];
-        vec3 pull = spring * (load3(p.target, k) + load3(p.offset, e) - x - p.h * v);
+        vec3 pull = spring * (load3(p.target, k) + load3(p.offset, e) - x - p.reach * ahead);
         real size = sqrt(dot(pull, pull));
-        if (size > limit * (1 + p.h * p.h * spring / inertia)) {
+        if (size > limit * (1 + p.h * p.reach * spring / inertia)) {
             b = b + (p.h * limit / size) * pull;
         } else {
             b = b + p.h * pull;
-            diagonal += p.h * p.h * spring;
+            diagonal += p.h * p.reach * spring;
         }
     }
     if (p.free[node] == 0) return;

@@ -244,8 +244,8 @@ class Touch(Effect):
             "apply", len(touched), node=touched.astype(np.int32), first=np.append(first, len(nodes)).astype(np.int32),
             entry=entry, offset=np.ascontiguousarray(offset), share=1.0 / np.array(count, dtype=float), start=start,
             duration=per("duration"), force=per("force"), target=per("target"), stiffness=per("stiffness"),
-            limit=per("limit"), clock=system.clock, x=w.x, v=w.v, free=w.free, block=system.block,
-            h=w.dt, diagonal=system.diagonal, b=system.b,
+            limit=per("limit"), clock=system.clock, x=w.x, ahead=w.ahead, free=w.free,
+            block=system.block, dt=w.dt, h=w.impulse, reach=w.reach, diagonal=system.diagonal, b=system.b,
         )  # fmt: skip
         self._applied = interactions
         return self._launch
