@@ -79,23 +79,28 @@ class Driver:
     def _one(self) -> NDArray[Any]:
         if self.wants_factors and self._in_process_now():
             if self.engine.wait():
-                self._with_factors_of_this_step()
+                return self.step_with_fresh_factors()
         elif self.wants_factors and self.kind == "lockstep":
             self._lockstep()
         else:
             if self.wants_factors and self.kind == "async":
                 self.pump_factors()
             self.engine.run(1)
+        return self._observed()
+
+    def _observed(self) -> NDArray[Any]:
         records = self.engine.records()
         self.observe(records)
         return records
 
-    def _with_factors_of_this_step(self) -> None:
+    def step_with_fresh_factors(self) -> NDArray[Any]:
+        """A step that waits for the factors of its own matrices, made in this process; returns its records."""
         self.engine.assemble()
         for t in self.tracks:
             self.inline.submit(self._job(t, self.engine.step, self._values(t.body)))
         self._take_up(self.inline)
         self.engine.solve()
+        return self._observed()
 
     def _in_process_now(self) -> bool:
         if self.kind == "never":
@@ -204,8 +209,7 @@ class Driver:
 
     def pump(self) -> NDArray[Any]:
         """What happens beside the running loop: records in, factors in, matrices out. Returns the new records."""
-        records = self.engine.records()
-        self.observe(records)
+        records = self._observed()
         if self.wants_factors and self.kind == "async":
             if self._stock.paced(self.engine.step, time.monotonic()) and not self.counted:
                 self._stock.reckon([t.seconds.value for t in self.tracks], self._workers())

@@ -13,7 +13,10 @@ from typing import Any
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-BENCHES = {"accuracy": ["--no-processes"], "figure4": ["--no-processes"], "hard_cases": [], "scheduler": []}
+BENCHES = {
+    "accuracy": ["--no-processes"], "figure4": ["--no-processes"], "hard_cases": [], "scheduler": [],
+    "paper": ["--device", "cpu"],
+}  # fmt: skip
 
 
 def leaves(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
@@ -93,3 +96,16 @@ def test_scheduler_repeats_to_the_digit_and_excess_goes_before_turns(tmp_path: P
         oracle, excess = iterations[16, 0, "oracle"], iterations[16, workers, "excess"]
         assert oracle < excess < 0.7 * iterations[16, workers, "round_robin"]
     assert all(r["age, max"] <= r["age, bound"] for r in runs[0] if r["age, bound"] is not None)
+
+
+def test_iterations_of_the_papers_tables_repeat_to_the_digit(tmp_path: Path) -> None:
+    runs = [bench("paper", tmp_path / name, "--device", "cpu")["data"]["cpu"] for name in ("one", "two")]
+    for table in runs[0]:
+        assert [row["iterations"] for row in runs[0][table]] == [row["iterations"] for row in runs[1][table]]
+        assert all(row["repeats"] and row["unconverged"] == 0 for row in runs[0][table])
+    of = {(row["load"], row["model"], row["scheme"]): row["iterations"] for row in runs[0]["table2"]}
+    for load, model in {key[:2] for key in of}:
+        assert 0 < of[load, model, "async + warp"] < 0.5 * of[load, model, "none"]
+    assert all(abs(row["condition"] / 1246 - 1) < 1e-3 for row in runs[0]["table2"])
+    fresh = {row["preconditioner"]: row["iterations"] for row in runs[0]["table5"] if row["updated"] == "standard"}
+    assert fresh["cholesky"] < 2 < fresh["block_jacobi"] < fresh["none"]

@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: MIT
+"""One run of a beam of the paper's tables under one scheme, step by step."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_server.driver import Driver
+from sim_server.engine import Kind
+from tests.bench._paper_beam import Beam, Load
+
+Reals = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Way:
+    """A preconditioner and when it is renewed."""
+
+    preconditioner: str
+    update: str = "never"
+    warp: bool | str = False
+
+    @property
+    def solver(self) -> dict[str, Any]:
+        return {"preconditioner": self.preconditioner, "update": self.update, "warp": self.warp}
+
+
+@dataclass
+class Run:
+    """Step by step (k,), times in ms. invert: making a preconditioner that the step waits for."""
+
+    iterations: Reals
+    solve: Reals
+    step: Reals  # without invert
+    invert: Reals
+    unconverged: int
+    kinds: list[str]  # preconditioner of each step
+    factorize: list[float] = field(default_factory=list)  # of each factor that was made, ms
+
+
+def run(beam: Beam, load: Load, way: Way, steps: int, device: str = "cpu", **solver: Any) -> Run:
+    """Asynchronous schemes begin with the factor of the first matrix, as those that wait for it do (it is not counted
+    in `invert`)."""
+    driver = Driver(beam.simulation(load, device, **way.solver, **solver))
+    made: list[float] = []
+    driver.adopted = lambda factor: made.append(1e3 * factor.seconds)
+    early = driver.wants_factors and driver.kind == "lockstep"
+    first = [driver.step_with_fresh_factors()] if early else []
+    r = np.concatenate([*first, driver.advance(steps - len(first))])
+    own = r["assemble"] + r["solve"] + r["integrate"]
+    invert = 1e3 * np.maximum(r["whole"] - own, 0)
+    invert[: len(first)] = 0
+    return Run(
+        r["iterations"].astype(float), 1e3 * r["solve"], 1e3 * own, invert,
+        int((r["status"] != 0).sum()), [Kind(kind).name.lower() for kind in r["kind"]], made,
+    )  # fmt: skip
+
+
+@dataclass
+class Mean:
+    """Over the steps of a run that was made several times: iterations repeat, times are medians of the rounds'."""
+
+    iterations: float
+    most: int  # iterations of a step
+    solve: float  # ms
+    step: float  # ms, without invert
+    invert: float  # ms
+    factorize: float  # ms, nan: no factor was made
+    unconverged: int
+    factor_share: float  # of the steps, made with a factor
+    repeats: bool  # all rounds took the same iterations
+
+
+def mean(runs: list[Run]) -> Mean:
+    """Of the rounds of one case."""
+    first = runs[0]
+
+    def time(what: str) -> float:
+        return float(np.median([getattr(r, what) for r in runs], axis=0).mean())
+
+    made = [ms for r in runs for ms in r.factorize]
+    return Mean(
+        float(first.iterations.mean()), int(first.iterations.max()), time("solve"), time("step"), time("invert"),
+        float(np.median(made)) if made else float("nan"), sum(r.unconverged for r in runs),
+        float(np.mean([kind == "cholesky" for kind in first.kinds])),
+        all(np.array_equal(r.iterations, first.iterations) for r in runs),
+    )  # fmt: skip

@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: MIT
+"""The measurements behind the tables of bench paper: rows of numbers, the paper's own beside ours."""
+
+from dataclasses import dataclass
+from math import ceil
+from typing import Any
+
+from sim_server.scene import solver_options
+from tests.bench._paper_beam import CELLS, COROTATIONAL, LOADS, MODELS, QUICK, Beam, Load, calibrated
+from tests.bench._paper_figures import CONDITION, HETEROGENEOUS, TABLE1, TABLE2, TABLE5
+from tests.bench._paper_run import Mean, Way, mean, run
+
+PRECONDITIONERS = ("none", "jacobi", "block_jacobi", "ssor", "cholesky", "incomplete_cholesky")
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What all runs have in common. latency: steps from a matrix to its factor in tables 2 and 5."""
+
+    steps: int
+    rounds: int
+    latency: int
+    tolerance: float
+    quick: bool
+
+    @property
+    def cells(self) -> tuple[int, int, int]:
+        """Of the beams of tables 2 and 5."""
+        return QUICK if self.quick else CELLS[3000]
+
+    @property
+    def condition(self) -> float:
+        return CONDITION
+
+    @property
+    def sizes(self) -> dict[int, tuple[int, int, int]]:
+        """Elements along each axis of the beams of table 1, by the paper's number of tetrahedra."""
+        return {540: QUICK} if self.quick else CELLS
+
+    def solver(self) -> dict[str, Any]:
+        return {"tolerance": self.tolerance, "max_iterations": 20_000, "factor_precision": "float32"}
+
+    def ways(self) -> dict[str, Way]:
+        """Columns of table 2: the paper's, then ours."""
+        lockstep = f"lockstep-{self.latency}"
+        return {
+            "none": Way("none"),
+            "precomputed": Way("cholesky"),
+            "precomputed + warp": Way("cholesky", warp=True),
+            "async": Way("cholesky", lockstep),
+            "async + warp": Way("cholesky", lockstep, True),
+            "block Jacobi": Way("block_jacobi"),
+            "auto": Way("auto", lockstep, "auto"),
+        }
+
+
+def measured(cases: dict[str, tuple[Beam, Load, Way]], setting: Setting, device: str) -> dict[str, Mean]:
+    """Means of all cases (beam, load, way), which take turns within every round."""
+    found: dict[str, list[Any]] = {name: [] for name in cases}
+    for _ in range(setting.rounds):
+        for name, (beam, load, way) in cases.items():
+            found[name].append(run(beam, load, way, setting.steps, device, **setting.solver()))
+    return {name: mean(runs) for name, runs in found.items()}
+
+
+def table1(setting: Setting, device: str) -> list[dict[str, Any]]:
+    """Of each size: with the latency of the paper's table, then with our own."""
+    stiffness = calibrated(setting.cells, COROTATIONAL, setting.condition)[0].stiffness
+    rows = []
+    for tets, cells in setting.sizes.items():
+        beam, paper = Beam(cells, COROTATIONAL, stiffness), TABLE1[tets]
+        theirs = _at_latency(beam, ceil(paper.steps - 0.1), setting, device)
+        own = max(1, ceil(theirs.factorize / theirs.step))
+        ours = _at_latency(beam, own, setting, device)
+        rows.append(
+            {"device": device, "tets": 6 * cells[0] * cells[1] * cells[2], "condition": beam.condition(),
+             "factorize ms": theirs.factorize, "paper factorize ms": paper.factorize,
+             "latency": ceil(paper.steps - 0.1), "iterations": theirs.iterations, "paper iterations": paper.iterations,
+             "step ms": theirs.step, "paper step ms": paper.step,
+             "steps to factorize": theirs.factorize / theirs.step, "paper steps to factorize": paper.steps,
+             "own latency": own, "iterations at it": ours.iterations, "step ms at it": ours.step,
+             "unconverged": theirs.unconverged + ours.unconverged, "repeats": theirs.repeats and ours.repeats}
+        )  # fmt: skip
+        print(f"table 1: {device}, {tets} done", flush=True)
+    return rows
+
+
+def _at_latency(beam: Beam, latency: int, setting: Setting, device: str) -> Mean:
+    case = {"": (beam, LOADS[1], Way("cholesky", f"lockstep-{latency}", True))}
+    return measured(case, setting, device)[""]
+
+
+def table2(setting: Setting, device: str) -> list[dict[str, Any]]:
+    """A row for each load, model and scheme."""
+    rows = []
+    for place, load in enumerate(LOADS):
+        for model in MODELS:
+            beam, condition = calibrated(setting.cells, model, setting.condition)
+            found = measured({name: (beam, load, way) for name, way in setting.ways().items()}, setting, device)
+            for name, m in found.items():
+                row = {"device": device, "load": load.name, "model": model.name, "scheme": name,
+                       "condition": condition, "stiffness": beam.stiffness, "iterations": m.iterations,
+                       "most iterations": m.most, "step ms": m.step, "solve ms": m.solve,
+                       "with a factor": m.factor_share, "unconverged": m.unconverged, "repeats": m.repeats}  # fmt: skip
+                if paper := TABLE2.get((place, model.paper, name)):
+                    row |= {"paper iterations": paper.iterations, "paper ms": paper.ms}
+                rows.append(row)
+            print(f"table 2: {device}, {load.name}, {model.name} done", flush=True)
+    return rows
+
+
+def available() -> list[str]:
+    """Those of table 5 that this version has."""
+    return [name for name in PRECONDITIONERS if name in solver_options.PRECONDITIONERS]
+
+
+def table5(setting: Setting, device: str) -> list[dict[str, Any]]:
+    """A row for each preconditioner, renewed at each step and asynchronously with warp."""
+    beam, condition = calibrated(setting.cells, COROTATIONAL, HETEROGENEOUS, heterogeneous=True)
+    updates = {"standard": ("every-1", False), "async + warp": (f"lockstep-{setting.latency}", True)}
+    cases = {
+        (how, name): (beam, LOADS[1], Way(name, *update))
+        for how, update in updates.items()
+        for name in available()
+        if not (how == "async + warp" and name in ("none", "jacobi", "block_jacobi"))  # there is nothing to renew
+    }
+    found = measured({" ".join(key): case for key, case in cases.items()}, setting, device)
+    rows = []
+    for how, name in cases:
+        m, paper = found[f"{how} {name}"], TABLE5.get((how, name))
+        row = {"device": device, "updated": how, "preconditioner": name, "condition": condition,
+               "stiffness": beam.stiffness, "iterations": m.iterations, "most iterations": m.most,
+               "invert ms": m.invert, "solve ms": m.solve, "total ms": m.invert + m.solve,
+               "unconverged": m.unconverged, "repeats": m.repeats}  # fmt: skip
+        if paper:
+            row |= {"paper iterations": paper.iterations, "paper solve ms": paper.solve, "paper total ms": paper.total}
+            row |= {"paper invert ms": paper.invert} if paper.invert is not None else {}
+        rows.append(row)
+    print(f"table 5: {device} done", flush=True)
+    return rows
