@@ -23,8 +23,8 @@ After Courtecuisse et al. 2010 (their machine: Core i7 at 3.07 GHz, four cores, 
 m, {DENSITY:g} kg/m3, held at one end, dt = {DT:g} s, Rayleigh damping {DAMPING:g} /s of the mass, Poisson's ratio
 {POISSON:g} where the model has one. The stiffness is chosen so that A at rest (held nodes left out) has the paper's
 condition number, by Lanczos on the assembled matrix. {setting.steps} steps from rest, loads put on at once. Each
-solve ends at a true residual of {setting.tolerance:g} |b| and starts from the last step's solution where that is better than zero (the
-paper states neither). Factors are exact Cholesky ones in float32.""",
+solve ends at a true residual of {setting.tolerance:g} |b| and starts from the last step's solution where that
+is better than zero (the paper states neither). Factors are exact Cholesky ones in float32.""",
         f"""\
 *async* is lockstep-D here, its deterministic twin: the factor of the matrix of step t is used from step t + D to
 t + 2 D - 1, the first step has the factor of its own matrix. D is {setting.latency} in tables 2 and 5, about what the
