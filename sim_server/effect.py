@@ -17,8 +17,9 @@ class Effect:
     """Base of all effects. A file under effects/ has `build(world, listed) -> Effect`.
 
     elements (m, c): node numbers (of the scene) of the elements whose c = 2 or 4 corners the effect couples, or None.
-    rotated: the bodies whose elements have rotations, for the warp. elastic: by body index, Young's modulus [Pa] and
-    Poisson's ratio of its elements, (m,) each, for viewers.
+    rotated: the bodies whose elements have rotations, which go into system.mean for the warp; other bodies' nodes get
+    theirs by shape matching (shape.py). elastic: by body index, Young's modulus [Pa] and Poisson's ratio of its
+    elements, (m,) each, for viewers.
     """
 
     elements: NDArray[np.int32] | None = None

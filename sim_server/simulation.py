@@ -11,15 +11,13 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from sim_server.backend import Cpu, Launch
 from sim_server.effect import Effect
 from sim_server.effects import effect
 from sim_server.engine import Engine, Kind
 from sim_server.errors import DeviceError, InputError
 from sim_server.scene import Scene, load
+from sim_server.shape import ShapeMatching
 from sim_server.system import System
 from sim_server.world import Body, World
 
@@ -41,8 +39,9 @@ class Simulation:
         scene.solver.check_device(device)
         self.world = World(scene, _backend(device, scene.solver.precision))
         self.effects = build_effects(scene, self.world)
-        elements = [e.elements for e in self.effects.values() if e.elements is not None]
-        self.system = System(self.world, elements, self._warped())
+        self.system = System(self.world, [e.elements for e in self.effects.values() if e.elements is not None])
+        matched = self._warp()
+        self.shape = ShapeMatching(self.world, matched, scene.solver.warp_level) if matched else None
         assemble, integrate = self.launches()
         w, s = self.world, self.system
         arrays: dict[str, Any] = {"row_start": s.row_start, "columns": s.columns, "values": s.values}
@@ -88,17 +87,24 @@ class Simulation:
             stencil = next(stencils) if e.elements is not None else None
             assemble += e.launches(system, stencil, accumulate)  # f and K, M, B of each effect
             accumulate = accumulate or stencil is not None
+        if self.shape is not None:
+            assemble.append(self.shape.launch(system.mean))
         assemble += system.finish()  # into the material frame (eq. 12 and 13)
         return assemble, [system.advance()]
 
-    def _warped(self) -> NDArray[np.float64]:
-        """1 at nodes whose solve happens in the material frame."""
-        warped = np.zeros(self.world.nodes)
-        if self.scene.solver.warp is not False:
-            for e in self.effects.values():
-                for body in e.rotated:
-                    warped[body.nodes] = 1
-        return warped
+    def _warp(self) -> list[Body]:
+        """Decides whose solve happens in the material frame; returns those whose rotations are matched shapes."""
+        if self.scene.solver.warp is False:
+            return []
+        matched = self._matched()
+        for body in [*(body for e in self.effects.values() for body in e.rotated), *matched]:
+            self.system.warped[body.nodes] = 1
+        return matched
+
+    def _matched(self) -> list[Body]:
+        """Bodies with elements none of which have rotations."""
+        rotated = {body.index for e in self.effects.values() for body in e.rotated}
+        return [b for b in self.world.bodies if b.index not in rotated and self.system.couples(b.first, b.last)]
 
     def _settle(self, body: Body) -> None:
         solver, native = self.scene.solver, self.engine.settings(body.index)

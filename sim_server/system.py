@@ -38,12 +38,14 @@ class Stencil:
 class System:
     """Pattern and arrays of A' and b' for a world and the elements of its effects.
 
-    elements: per effect, (m, c) node numbers of the elements that couple their corners, c = 2 or 4.
+    elements: per effect, (m, c) node numbers of the elements that couple their corners, c = 2 or 4. warped (n,): 1 at
+    nodes whose solve happens in the material frame, for whoever sets a simulation up.
     """
 
-    def __init__(self, world: World, elements: list[Ints], warped: NDArray[np.float64]):
+    def __init__(self, world: World, elements: list[Ints]):
         n = world.nodes
-        self.world, self.warped = world, warped
+        self.world = world
+        self.warped = np.zeros(n)
         couplings = [_couplings(e, world.free, n) for e in elements]
         above = np.unique(np.concatenate([np.zeros(0, np.int64), *(keys for keys, _ in couplings)]))
         self.row, self.column = (part.astype(np.int32) for part in np.divmod(above, n))
@@ -107,6 +109,10 @@ class System:
         return self.world.backend.module("kernels/nodes.cu").bind(
             "advance", w.nodes, rotation=self.rotation, y=self.y, h=w.dt, dv=self.dv, v=w.v, x=w.x
         )
+
+    def couples(self, first: int, last: int) -> bool:
+        """Whether anything couples nodes of a body."""
+        return bool(self.row_start[last] - self.row_start[first] > last - first)
 
     def body_pattern(self, first: int, last: int) -> tuple[Ints, Ints]:
         """row_start and columns of one body, numbered from 0."""

@@ -73,6 +73,9 @@ class Solver(Parameters):
     warp: Annotated[Literal[True, False, "auto"], PlainValidator(_warp)] = Field(
         default="auto", description="solve in the material frame"
     )
+    warp_level: int = Field(
+        default=1, ge=1, le=2, description="neighbours that give a node its rotation where its elements have none"
+    )
     update: Annotated[Update, PlainValidator(_update), PlainSerializer(str)] = Update("async")
     precision: Precision = Field(
         default="float64", description="of the kernels: mixed = elements in float32, the rest in float64"

@@ -242,6 +242,7 @@ NODES = [
     ("kernels/nodes.cu", "Start", "nodes.start"),
     ("effects/corotational_nodes.cu", "Gather", "corotational_nodes.gather"),
     ("effects/touch.cu", "Apply", "touch.apply", True), ("effects/gravity.cu", "Gravity", "gravity.gravity"),
+    ("kernels/shape.cu", "Shape", "shape.shape"),
     ("kernels/nodes.cu", "Turn", "nodes.turn"),
 ]  # fmt: skip
 BLOCKS = [

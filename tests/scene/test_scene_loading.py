@@ -51,6 +51,7 @@ def test_defaults_and_resolved(tmp_path):
             "max_iterations": 500,
             "preconditioner": "auto",
             "warp": "auto",
+            "warp_level": 1,
             "update": "async",
             "precision": "float64",
             "factor_precision": "auto",
