@@ -15,11 +15,11 @@ BELONGS = {
 }
 
 
-def checked_effects(scope: str, table: Any) -> dict[str, BaseModel]:
+def checked_effects(scope: str, table: Any, context: Any = None) -> dict[str, BaseModel]:
     """Validated parameters of each effect in `table`, in the order of the file.
 
-    An effect is a table, or `true` for its defaults; one that is `false` is absent. Raises ValidationError with every
-    error in the table, each with its place.
+    context: of the validation, with its `folder`. An effect is a table, or `true` for its defaults; one that is `false`
+    is absent. Raises ValidationError with every error in the table, each with its place.
     """
     if not isinstance(table, dict):
         raise complaint("must be a table of effects, as { gravity = true }")
@@ -27,7 +27,7 @@ def checked_effects(scope: str, table: Any) -> dict[str, BaseModel]:
     errors: list[InitErrorDetails] = []
     for name, values in table.items():
         try:
-            params = _checked(scope, name, values)
+            params = _checked(scope, name, values, context)
         except ValidationError as error:
             errors += [_moved(e, name) for e in error.errors(include_url=False)]
         else:
@@ -37,7 +37,7 @@ def checked_effects(scope: str, table: Any) -> dict[str, BaseModel]:
     return checked
 
 
-def _checked(scope: str, name: str, values: Any) -> BaseModel | None:
+def _checked(scope: str, name: str, values: Any, context: Any) -> BaseModel | None:
     known = effects.known_effects()
     if name not in known:
         raise _error("no such effect" + nearest(name, known, "effects"), values)
@@ -50,7 +50,7 @@ def _checked(scope: str, name: str, values: Any) -> BaseModel | None:
         return values
     if values is not True and not isinstance(values, dict):
         raise _error("must be a table of parameters, true (its defaults) or false (absent)", values)
-    return module.Params.model_validate({} if values is True else values)
+    return module.Params.model_validate({} if values is True else values, context=context)
 
 
 def _error(message: str, value: Any) -> ValidationError:

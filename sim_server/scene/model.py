@@ -3,7 +3,6 @@
 
 from dataclasses import replace
 from functools import partial
-from os.path import isfile
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -22,9 +21,8 @@ from protocol.channels import check_name
 from protocol.refused import Refused
 from sim_server.errors import InputError
 from sim_server.mesh import Mesh, bar, check, read
-from sim_server.scene import where
 from sim_server.scene.effect_tables import checked_effects
-from sim_server.scene.parameters import Count, Counts, Parameters, Positive, Sizes, Vector, complaint
+from sim_server.scene.parameters import Count, Counts, File, Parameters, Positive, Sizes, Vector, complaint
 from sim_server.scene.solver_options import Solver
 
 
@@ -33,15 +31,6 @@ class Pose(Parameters):
 
     rotate: Vector = Field(default=(0.0, 0.0, 0.0), description="angles [degrees]")
     translate: Vector = Field(default=(0.0, 0.0, 0.0), description="[m]")
-
-
-def _found(name: str, info: ValidationInfo) -> str:
-    path = Path((info.context or {}).get("folder", ".")) / name
-    if not isfile(path):  # unlike Path.is_file, never raises: names may be too long or hold a null byte
-        raise complaint(
-            f"no such file ({where.shortened(str(path), 200)}); a relative path starts at the folder of the scene file"
-        )
-    return str(path.resolve())
 
 
 class MeshSource(Parameters):
@@ -53,7 +42,7 @@ class MeshSource(Parameters):
         default=None, description="of the cells of a bar: kuhn (default), or mirrored, which bends without twist"
     )
     scale: Positive | None = Field(default=None, description="of a file's coordinates: 0.001 for a mesh in mm")
-    file: Annotated[str, AfterValidator(_found)] | None = Field(default=None, description="a file that meshio reads")
+    file: File | None = Field(default=None, description="a file that meshio reads")
 
     @model_validator(mode="after")
     def _one_source(self) -> "MeshSource":
@@ -76,7 +65,11 @@ def _object_name(name: str) -> str:
 
 def _effects(scope: str) -> tuple[PlainValidator, PlainSerializer]:
     """A table of effects of one scope; it dumps as it was validated, one table per effect."""
-    return PlainValidator(partial(checked_effects, scope)), PlainSerializer(_dumped_effects)
+    return PlainValidator(partial(_effects_of, scope)), PlainSerializer(_dumped_effects)
+
+
+def _effects_of(scope: str, table: Any, info: ValidationInfo) -> dict[str, BaseModel]:
+    return checked_effects(scope, table, info.context)
 
 
 def _dumped_effects(effects: dict[str, BaseModel]) -> dict[str, Any]:

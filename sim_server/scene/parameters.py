@@ -6,9 +6,20 @@ reported in the same words everywhere, together with the keys that exist.
 """
 
 from difflib import get_close_matches
+from os.path import isfile
+from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    model_validator,
+)
 from pydantic_core import InitErrorDetails, PydanticCustomError
 from pydantic_core.core_schema import ValidatorFunctionWrapHandler
 
@@ -51,7 +62,8 @@ def nearest(word: str, known: list[str], what: str) -> str:
     return f"{guess} (known {what}: {', '.join(sorted(known))})"
 
 
-def _as_tuple(value: Any) -> Any:
+def as_tuple(value: Any) -> Any:
+    """An array of TOML as the tuple that it stands for."""
     return tuple(value) if isinstance(value, list) else value
 
 
@@ -63,9 +75,19 @@ def _readable_expression(text: str) -> str:
     return text
 
 
-Vector = Annotated[tuple[float, float, float], BeforeValidator(_as_tuple)]
+def _found(name: str, info: ValidationInfo) -> str:
+    path = Path((info.context or {}).get("folder", ".")) / name
+    if not isfile(path):  # unlike Path.is_file, never raises: names may be too long or hold a null byte
+        raise complaint(
+            f"no such file ({where.shortened(str(path), 200)}); a relative path starts at the folder of the scene file"
+        )
+    return str(path.resolve())
+
+
+Vector = Annotated[tuple[float, float, float], BeforeValidator(as_tuple)]
 Positive = Annotated[float, Field(gt=0)]
-Sizes = Annotated[tuple[Positive, Positive, Positive], BeforeValidator(_as_tuple)]
+Sizes = Annotated[tuple[Positive, Positive, Positive], BeforeValidator(as_tuple)]
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
-Counts = Annotated[tuple[Count, Count, Count], BeforeValidator(_as_tuple)]
+Counts = Annotated[tuple[Count, Count, Count], BeforeValidator(as_tuple)]
 Where = Annotated[str, AfterValidator(_readable_expression)]
+File = Annotated[str, AfterValidator(_found)]

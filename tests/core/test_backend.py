@@ -241,12 +241,14 @@ def _launch(path: str, struct: str, name: str, mailed: bool = False) -> SimpleNa
 NODES = [
     ("kernels/nodes.cu", "Start", "nodes.start"),
     ("effects/corotational_nodes.cu", "Gather", "corotational_nodes.gather"),
+    ("effects/mass_spring_nodes.cu", "Gather", "mass_spring_nodes.gather"),
     ("effects/touch.cu", "Apply", "touch.apply", True), ("effects/gravity.cu", "Gravity", "gravity.gravity"),
     ("kernels/shape.cu", "Shape", "shape.shape"),
     ("kernels/nodes.cu", "Turn", "nodes.turn"),
 ]  # fmt: skip
 BLOCKS = [
     ("effects/corotational_blocks.cu", "Blocks", "corotational_blocks.blocks"),
+    ("effects/mass_spring_blocks.cu", "Blocks", "mass_spring_blocks.blocks"),
     ("kernels/assemble.cu", "Assemble", "assemble.assemble"),
 ]
 

@@ -45,6 +45,11 @@ SCENES = {
         "", COROTATIONAL + "rayleigh = { mass = 0.1 }\n", ["corotational", "rayleigh"],
         [*ELASTIC_TEXTS, "rayleigh.cu"], [*ELASTIC, "rayleigh.drag"],
     ),
+    "springs": (
+        "", "mass_spring = { young = 1e5 }\n", ["mass_spring"],
+        ["mass_spring.cu", "mass_spring_blocks.cu", "mass_spring_nodes.cu"],
+        ["mass_spring.springs", "mass_spring_nodes.gather", "mass_spring_blocks.blocks"],
+    ),
     "everything": (
         "gravity = true", COROTATIONAL + 'rayleigh = { mass = 0.1 }\nfixed = { where = "X < 0.01" }\ntouch = true\n',
         ["corotational", "fixed", "gravity", "rayleigh", "touch"],

@@ -1,0 +1,53 @@
+// SPDX-License-Identifier: MIT
+// Springs between two nodes (formulas: mass_spring.py).
+#define WIDE
+#include "mat3.cuh"
+#include "together.cuh"
+
+struct Springs {
+    int n;                    // elements
+    const int* ends;          // (n, 2) nodes
+    const real* x;            // (nodes, 3) positions [m]
+    const real* v;            // (nodes, 3) velocities [m/s]
+    const local* stiffness;   // (n,) k [N/m]
+    const local* length;      // (n,) l0 [m]
+    const local* stiffening;  // (n,) h (h + beta) [s2], beta the Rayleigh damping of the stiffness
+    local h;                  // time step [s]
+    local* spread;            // (n, 4) out: g and d; h (h + beta) K = g g^T + d I on the diagonal, its negative off it
+    local* push;              // (n, 3) out: h f + h (h + beta) (K v) of the first end, the second has its negative [N s]
+};
+
+// From the first end to the second: the difference of a nodal field in the field's precision.
+INLINE local_vec3 difference(const real* field, const int* ends, index i) {
+    return as<local_number>(load3(field, at(ends, 2 * i + 1)) - load3(field, at(ends, 2 * i)));
+}
+
+// 1 / l; finite where the ends meet: the spring then has no direction and neither pulls nor pushes.
+INLINE local_number inverse(local_number l) { return 1 / (l + (local)1e-37); }
+
+KERNEL(springs, Springs) {
+    local_vec3 d = difference(p.x, p.ends, i), dv = difference(p.v, p.ends, i);
+    local_number k = at(p.stiffness, i), l0 = at(p.length, i), c = at(p.stiffening, i), l = sqrt(dot(d, d));
+    local_vec3 u = inverse(l) * d;
+    local_number across = larger(1 - l0 * inverse(l), local_number{});  // under compression 0: K has no negative part
+    local_vec3 g = sqrt(c * k * (1 - across)) * u;
+    local_number all = c * k * across;
+    local_vec3 f = (p.h * k * (l - l0)) * u + dot(g, dv) * g + all * dv;
+    put_row(p.spread, i, p.n, {g.x, g.y, g.z, all});
+    put_row(p.push, i, p.n, {f.x, f.y, f.z});
+}
+
+struct Energy {
+    int n;                   // elements
+    const int* ends;         // (n, 2)
+    const real* x;           // (nodes, 3) [m]
+    const local* stiffness;  // (n,) [N/m]
+    const local* length;     // (n,) [m]
+    local* energy;           // (n,) out: k / 2 (l - l0)^2 [J]
+};
+
+KERNEL(energy, Energy) {
+    local_vec3 d = difference(p.x, p.ends, i);
+    local_number longer = sqrt(dot(d, d)) - at(p.length, i);
+    put(p.energy, i, (local)0.5 * at(p.stiffness, i) * longer * longer);
+}
