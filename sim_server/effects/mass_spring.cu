@@ -8,13 +8,13 @@ struct Springs {
     int n;                    // elements
     const int* ends;          // (n, 2) nodes
     const real* x;            // (nodes, 3) positions [m]
-    const real* v;            // (nodes, 3) velocities [m/s]
+    const real* v;            // (nodes, 3) world.drift [m/s]
     const local* stiffness;   // (n,) k [N/m]
     const local* length;      // (n,) l0 [m]
-    const local* stiffening;  // (n,) h (h + beta) [s2], beta the Rayleigh damping of the stiffness
-    local h;                  // time step [s]
-    local* spread;            // (n, 4) out: g and d; h (h + beta) K = g g^T + d I on the diagonal, its negative off it
-    local* push;              // (n, 3) out: h f + h (h + beta) (K v) of the first end, the second has its negative [N s]
+    const local* stiffening;  // (n,) h (c + beta) [s2], c world.reach, beta the Rayleigh damping of the stiffness
+    local h;                  // world.impulse: the time step in backward Euler [s]
+    local* spread;            // (n, 4) out: g and d; h (c + beta) K = g g^T + d I on the diagonal, its negative off it
+    local* push;              // (n, 3) out: h f + h (c + beta) (K v) of the first end, the second has its negative [N s]
 };
 
 // From the first end to the second: the difference of a nodal field in the field's precision.

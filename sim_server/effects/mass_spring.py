@@ -132,10 +132,9 @@ class MassSpring(Effect):
     def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
         assert stencil is not None
         w, m = self.world, len(self.elements)
-        stiffening = w.dt * (w.dt + w.beta[self.owner])
         springs = w.backend.module("effects/mass_spring.cu").bind(
-            "springs", m, ends=self.elements, x=w.x, v=w.v, stiffness=self.stiffness, length=self.length,
-            stiffening=stiffening, h=w.dt, spread=self.spread, push=self.push,
+            "springs", m, ends=self.elements, x=w.x, v=w.drift, stiffness=self.stiffness, length=self.length,
+            stiffening=w.stiffening[self.owner], h=w.impulse, spread=self.spread, push=self.push,
         )  # fmt: skip
         gather = w.backend.module("effects/mass_spring_nodes.cu").bind(
             "gather", w.nodes, start=stencil.corner_start, corners=stencil.corners, push=self.push,

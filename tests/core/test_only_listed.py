@@ -47,8 +47,8 @@ SCENES = {
     ),
     "springs": (
         "", "mass_spring = { young = 1e5 }\n", ["mass_spring"],
-        ["mass_spring.cu", "mass_spring_blocks.cu", "mass_spring_nodes.cu"],
-        ["mass_spring.springs", "mass_spring_nodes.gather", "mass_spring_blocks.blocks"],
+        ["mass_spring.cu", "mass_spring_blocks.cu", "mass_spring_nodes.cu", "shape.cu"],
+        ["mass_spring.springs", "mass_spring_nodes.gather", "mass_spring_blocks.blocks", "shape.shape"],
     ),
     "everything": (
         "gravity = true", COROTATIONAL + 'rayleigh = { mass = 0.1 }\nfixed = { where = "X < 0.01" }\ntouch = true\n',

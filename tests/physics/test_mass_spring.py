@@ -11,6 +11,7 @@ from sim_server.effects.mass_spring import CALIBRATION, MassSpring
 from sim_server.errors import InputError
 from sim_server.simulation import Simulation
 from tests.physics.test_forces import elastic_forces, stir, stirred
+from tests.physics.test_system_matrix import frame
 from tests.reference.mass_spring import Net
 from tests.scenes import bar, jittered_bar, mesh_file, random_rotations, simulation
 
@@ -25,10 +26,10 @@ def springs_bar(springs: dict, damping: float = 0.0, fixed: str | None = None, *
     return made
 
 
-def unequal(folder: Path, dt: float = 0.02, **table) -> Simulation:
+def unequal(folder: Path, dt: float = 0.02, warp: bool = False, **table) -> Simulation:
     """A bar of unequal elements and two materials."""
     mesh = mesh_file(folder, *jittered_bar((3, 2, 2), SIZE, seed=2))
-    return simulation(springs_bar({"young": REGIONS}, mesh=mesh, **table), dt=dt)
+    return simulation(springs_bar({"young": REGIONS}, mesh=mesh, **table), dt=dt, warp=warp)
 
 
 def springs(sim: Simulation) -> MassSpring:
@@ -79,7 +80,16 @@ def test_matrix_and_right_side_are_those_of_the_reference(tmp_path, size, fixed,
     assert np.array_equal(found, found.T) and np.linalg.eigvalsh(found)[0] > 0
     b = net(sim).right_side()
     assert np.abs(sim.system.b - b).max() < 1e-12 * np.abs(b).max()
-    assert (sim.system.rotation == np.eye(3)).all()  # springs have no rotations of their own
+
+
+def test_in_the_material_frame(tmp_path):
+    """Springs have no rotations; the nodes' are those of matched shapes."""
+    sim = unequal(tmp_path, warp=True)
+    stir(sim, 0.05)
+    sim.engine.assemble()
+    A, R = net(sim).matrix(), frame(sim)
+    assert np.abs(R - np.eye(len(R))).max() > 0.01
+    assert np.abs(sim.matrix().toarray() - R.T @ A @ R).max() < 1e-12 * np.abs(A).max()
 
 
 def test_the_tangent_under_tension_is_the_slope_of_the_forces(tmp_path):

@@ -54,7 +54,7 @@ def test_pattern_of_any_elements(data):
         np.ones(n),
         np.array(data.draw(st.lists(st.sampled_from([0.0, 1.0]), min_size=n, max_size=n))),
     )
-    system = System(world, several, np.ones(n))
+    system = System(world, several)
     patterns = [incidence(elements, world.free) for elements in several]
     assert np.array_equal(dense_pattern(system), np.maximum.reduce(patterns))
     for elements, stencil in zip(several, system.stencils, strict=True):
