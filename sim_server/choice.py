@@ -45,6 +45,11 @@ class Choice:
         self._has_factor = False
         self._pending: Kind | None = None  # what the next solve goes back to if its probe is no gain
 
+    @property
+    def wants_another(self) -> bool:
+        """Block Jacobi is in use and will soon be compared with the factor: better with one that is not old."""
+        return self.kind is Kind.BLOCK_JACOBI and self._pending is None and self._since >= self._every // 2
+
     def factor_arrived(self) -> None:
         """The first factor is tried out; later ones only make the next probe sooner if block Jacobi is in use."""
         if not self._has_factor:

@@ -197,7 +197,7 @@ def _describe_objects(say, service: "Service") -> None:  # type: ignore[no-untyp
     for body in world.bodies[:20]:
         size = " x ".join(f"{s:.3g}" for s in body.mesh.rest.max(axis=0) - body.mesh.rest.min(axis=0))
         say(f"  {body.name}: {body.last - body.first} nodes, {size} m, {world.mass[body.nodes].sum():.3g} kg")
-    if service.driver.wants_factors and service.driver.kind == "async" and not service.link.workers():
+    if service.driver.wants_factors and service.driver.free and not service.link.workers():
         say("no worker yet: block Jacobi until one joins (precond-worker, or --workers 1)")
 
 

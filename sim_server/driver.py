@@ -4,10 +4,11 @@
     never       one factor, made in this process from the first matrix (PCG-0)
     every-N     a new one in this process each N-th step, which waits for it (PCG-1, PCG-30)
     async       matrices to workers, one of an object at a time; a factor is taken up as it comes; nothing waits
+    adaptive    async, but a matrix goes out only once the excess iterations have cost as much as a factorization
     lockstep-D  async, but a factor made from step t is taken up at step t + D exactly: the deterministic twin
 
-`advance` makes steps and waits where the policy says so. For async the loop runs on its own (Engine.run in a thread
-that has let go of Python's lock) and `pump` is called beside it.
+`advance` makes steps and waits where the policy says so. For async and adaptive the loop runs on its own (Engine.run in
+a thread that has let go of Python's lock) and `pump` is called beside it.
 """
 
 import logging
@@ -22,7 +23,7 @@ from numpy.typing import NDArray
 from protocol.factor import Factor
 from sim_server.engine import Kind
 from sim_server.factors import FactorSource, Inline, Job
-from sim_server.schedule import oldest_possible, overdue_after, pick
+from sim_server.schedule import oldest_possible, overdue_after, pays, pick
 from sim_server.simulation import Simulation
 from sim_server.stock import Stock
 from sim_server.track import Track
@@ -39,17 +40,18 @@ class Driver:
     """Runs one simulation under its scene's update policy.
 
     source: of factors; None: this process. counted: the scheduler and `auto` reckon with bytes and operations instead
-    of seconds, so that a run repeats exactly (None: unless the policy is async).
+    of seconds, so that a run repeats exactly (None: unless the loop runs freely).
     """
 
     def __init__(self, simulation: Simulation, source: FactorSource | None = None, counted: bool | None = None):
         self.simulation, self.engine = simulation, simulation.engine
         self.solver = simulation.scene.solver
         self.kind, self.n = self.solver.update
+        self.free = self.solver.update.free
         patterns = {b.name: simulation.system.body_pattern(b.first, b.last) for b in simulation.world.bodies}
         self.inline = Inline(patterns)
         self.source: FactorSource = source or self.inline
-        self.counted = self.kind != "async" if counted is None else counted
+        self.counted = not self.free if counted is None else counted
         auto = self.solver.preconditioner == "auto"
         self.tracks = [Track(b, auto, self.counted) for b in simulation.world.bodies]
         self.by_name = {t.body.name: t for t in self.tracks}
@@ -83,7 +85,7 @@ class Driver:
         elif self.wants_factors and self.kind == "lockstep":
             self._lockstep()
         else:
-            if self.wants_factors and self.kind == "async":
+            if self.wants_factors and self.free:
                 self.pump_factors()
             self.engine.run(1)
         return self._observed()
@@ -205,12 +207,12 @@ class Driver:
         t.went_out(step)
         return True
 
-    # --- async --------------------------------------------------------------------------------------------------
+    # --- async, adaptive ----------------------------------------------------------------------------------------
 
     def pump(self) -> NDArray[Any]:
         """What happens beside the running loop: records in, factors in, matrices out. Returns the new records."""
         records = self._observed()
-        if self.wants_factors and self.kind == "async":
+        if self.wants_factors and self.free:
             if self._stock.paced(self.engine.step, time.monotonic()) and not self.counted:
                 self._stock.reckon([t.seconds.value for t in self.tracks], self._workers())
             self.pump_factors()
@@ -227,6 +229,8 @@ class Driver:
             return
         overdue = max(self._overdue(), self.solver.update_floor_steps)
         needs = [t.need(step) for t in self.tracks]
+        if self.kind == "adaptive":
+            needs = [need for need in needs if pays(need, self.solver.update_threshold)]
         ahead = getattr(self.source, "ahead", lambda: 0)()  # the most urgent are left for faster workers
         chosen = pick(needs, ahead + places, self.solver.update_floor_steps, self.solver.schedule, overdue)[ahead:]
         tracks = [self.by_name[name] for name in chosen]
@@ -263,6 +267,8 @@ class Driver:
         """Oldest [steps] that a factor gets while all goes well, by what was measured so far; -1: no bound known."""
         if not self.wants_factors or self.kind == "never":
             return -1
+        if self.kind == "adaptive":
+            return -1  # a factor that does is kept
         if self.kind != "async":
             return self.n - 1 if self.kind == "every" else 2 * self.n - 1
         if all(t.latency.value is None for t in self.tracks):

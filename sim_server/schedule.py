@@ -26,7 +26,8 @@ class Need:
     """What is known of an object. excess: summed iterations above the floor; waited: steps since its last matrix went
     out (None: none did yet); in_flight: a matrix of it is being factorized; age: steps since the matrix of its factor
     (None: it has none); cost: of an iteration, service: of a factorization, each in any unit as long as it is the same
-    for all; failures: jobs in a row that came to nothing."""
+    for all; failures: jobs in a row that came to nothing; lost: summed iterations above the floor of solves with the
+    factor in use; trial: a new factor is wanted to be tried out, whatever was lost."""
 
     object: str
     excess: float
@@ -36,6 +37,8 @@ class Need:
     cost: float = 1.0
     service: float = 1.0
     failures: int = 0
+    lost: float = 0.0
+    trial: bool = False
 
 
 def excess(iterations: int, floor: int) -> int:
@@ -46,6 +49,17 @@ def excess(iterations: int, floor: int) -> int:
 def gain(need: Need) -> float:
     """What a new factor is worth for the time that it takes (weighted)."""
     return (need.excess + AGEING * (need.waited or 0)) * need.cost / max(need.service, 1e-12)
+
+
+def pays(need: Need, threshold: float = 1.0) -> bool:
+    """adaptive: whether a new factor is worth its time now.
+
+    It is once the iterations lost to the factor in use have cost `threshold` times a factorization. Where they grow
+    steadily with its age, by a in each step at a cost of c, that is the best there is: a factor of cost F each T steps
+    makes F / T + a c T / 2 a step, least where a c T^2 / 2, what was lost, is F. An object without a factor, or with
+    one to be tried out, does not wait. cost and service must be in the same unit here.
+    """
+    return need.age is None or need.trial or need.lost * need.cost >= threshold * need.service
 
 
 _PRIORITY: dict[Rule, Callable[[Need], float]] = {

@@ -53,7 +53,7 @@ class Service:
         self._waiting: deque[NDArray[Any]] = deque()
         self._failure: BaseException | None = None
         self.beside: Callable[[], None] = lambda: None  # called each round: the supervisor of local workers
-        self._alone = not self.driver.wants_factors or self.driver.kind == "async"  # the loop needs no Python
+        self._alone = not self.driver.wants_factors or self.driver.free  # the loop needs no Python
         self.telemetry.open()
 
     def run(self) -> None:

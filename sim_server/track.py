@@ -32,11 +32,14 @@ class Mean:
 
 
 class Track:
-    """One body. counted: costs are bytes and operations instead of seconds, so that runs repeat exactly."""
+    """One body. counted: costs are bytes and operations instead of seconds, so that runs repeat exactly; one of these
+    counts like the other, which is about what a core makes of them."""
 
     def __init__(self, body: Body, auto: bool, counted: bool = False):
         self.body, self.counted = body, counted
-        self.excess = 0.0
+        self.excess = 0.0  # since the last matrix went out
+        self.lost = 0.0  # to the factor in use
+        self._in_use = -1  # its step
         self.sent: int | None = None  # step of the last matrix that went out
         self.in_flight = False
         self.wanted: NDArray[np.float64] | None = None  # where the loop copies the matrix asked for
@@ -66,6 +69,8 @@ class Track:
             1.0 if self.per_iteration.value is None else self.per_iteration.value,
             1.0 if self.seconds.value is None else self.seconds.value,
             self.failures,
+            self.lost,
+            self.choice is not None and self.choice.wants_another,
         )
 
     def went_out(self, step: int) -> None:
@@ -97,4 +102,7 @@ class Track:
         self.refused += int(record["fallbacks"])
         self.per_iteration.add(cost / (int(record["iterations"]) + 1))
         if record["factor_step"] >= 0:
+            if record["factor_step"] != self._in_use:
+                self._in_use, self.lost = int(record["factor_step"]), 0.0
+            self.lost += excess(int(record["iterations"]), floor)
             self.age_max = max(self.age_max, int(record["step"]) - 1 - int(record["factor_step"]))

@@ -20,12 +20,18 @@ class Update(NamedTuple):
     """When a factor is renewed: kind and n (0 for never and async).
 
     never: made once, from the first matrix. every: made at each n-th step, the step waiting for it.
-    async: made beside the simulation, adopted when it comes. lockstep: as async, but adopted exactly n steps after
-    the step that its matrix is from; deterministic.
+    async: made beside the simulation, adopted when it comes. adaptive: as async, but only when the iterations lost to
+    an old factor have cost as much as a new one. lockstep: as async, but adopted exactly n steps after the step that
+    its matrix is from; deterministic.
     """
 
-    kind: Literal["never", "every", "async", "lockstep"]
+    kind: Literal["never", "every", "async", "adaptive", "lockstep"]
     n: int = 0
+
+    @property
+    def free(self) -> bool:
+        """Nothing ever waits for a factor: the loop runs by itself."""
+        return self.kind in ("async", "adaptive")
 
     def __str__(self) -> str:
         return f"{self.kind}-{self.n}" if self.kind in ("every", "lockstep") else self.kind
@@ -34,11 +40,13 @@ class Update(NamedTuple):
 def _update(value: Any) -> Update:
     if isinstance(value, Update):
         return value
-    if value in ("never", "async"):
+    if value in ("never", "async", "adaptive"):
         return Update(value)
     if isinstance(value, str) and (match := re.fullmatch(r"(every|lockstep)-([1-9][0-9]{0,5})", value)):
         return Update(match[1], int(match[2]))  # type: ignore[arg-type]  # one of two words by the pattern
-    raise complaint('must be "never", "async", "every-N" or "lockstep-D" with a whole number of steps, as "every-30"')
+    raise complaint(
+        'must be "never", "async", "adaptive", "every-N" or "lockstep-D" with a whole number of steps, as "every-30"'
+    )
 
 
 def _preconditioner(value: Any) -> str:
@@ -92,6 +100,10 @@ class Solver(Parameters):
     update_floor_steps: int = Field(
         default=1, ge=1, le=1_000_000, description="fewest steps between two factors of an object"
     )
+    update_threshold: float = Field(
+        default=1.0, ge=0, le=1e6,
+        description="adaptive: excess iterations must have cost so many times what a factorization takes",
+    )  # fmt: skip
     schedule: Rule = Field(default="excess", description="whose matrix is factorized next")
     schedule_rounds: float = Field(
         default=8.0, ge=1, le=1e6, description="an object goes next after so many rounds, whatever the rule"

@@ -7,9 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from precond_worker.factorize import Analysis
 from sim_server.driver import Driver
 from sim_server.engine import Kind
+from sim_server.simulation import Simulation
+from sim_server.track import flops
 from tests.bench._paper_beam import Beam, Load
+from tests.bench._virtual_workers import VirtualWorkers
 
 Reals = NDArray[np.float64]
 
@@ -21,6 +25,7 @@ class Way:
     preconditioner: str
     update: str = "never"
     warp: bool | str = False
+    latency: int = 0  # async and adaptive: steps that the one worker takes for a factor
 
     @property
     def solver(self) -> dict[str, Any]:
@@ -43,10 +48,11 @@ class Run:
 def run(beam: Beam, load: Load, way: Way, steps: int, device: str = "cpu", **solver: Any) -> Run:
     """Asynchronous schemes begin with the factor of the first matrix, as those that wait for it do (it is not counted
     in `invert`)."""
-    driver = Driver(beam.simulation(load, device, **way.solver, **solver))
-    made: list[float] = []
+    sim = beam.simulation(load, device, **way.solver, **solver)
+    driver = Driver(sim, _worker(sim, way.latency) if way.latency else None, counted=True)
+    made: list[float] = []  # ms
     driver.adopted = lambda factor: made.append(1e3 * factor.seconds)
-    early = driver.wants_factors and driver.kind == "lockstep"
+    early = driver.wants_factors and driver.kind in ("lockstep", "async", "adaptive")
     first = [driver.step_with_fresh_factors()] if early else []
     r = np.concatenate([*first, driver.advance(steps - len(first))])
     own = r["assemble"] + r["solve"] + r["integrate"]
@@ -56,6 +62,13 @@ def run(beam: Beam, load: Load, way: Way, steps: int, device: str = "cpu", **sol
         r["iterations"].astype(float), 1e3 * r["solve"], 1e3 * own, invert,
         int((r["status"] != 0).sum()), [Kind(kind).name.lower() for kind in r["kind"]], made,
     )  # fmt: skip
+
+
+def _worker(sim: Simulation, latency: int) -> VirtualWorkers:
+    """One that takes so many steps for a factor."""
+    body = sim.world.bodies[0]
+    pattern = Analysis(*sim.system.body_pattern(body.first, body.last)).pattern
+    return VirtualWorkers(sim, 1, 1.001 * flops(pattern) / latency)
 
 
 @dataclass
@@ -70,6 +83,7 @@ class Mean:
     factorize: float  # ms, nan: no factor was made
     unconverged: int
     factor_share: float  # of the steps, made with a factor
+    factors: int  # made in a round
     repeats: bool  # all rounds took the same iterations
 
 
@@ -85,5 +99,6 @@ def mean(runs: list[Run]) -> Mean:
         float(first.iterations.mean()), int(first.iterations.max()), time("solve"), time("step"), time("invert"),
         float(np.median(made)) if made else float("nan"), sum(r.unconverged for r in runs),
         float(np.mean([kind == "cholesky" for kind in first.kinds])),
+        len(first.factorize),
         all(np.array_equal(r.iterations, first.iterations) for r in runs),
     )  # fmt: skip

@@ -114,6 +114,19 @@ def available() -> list[str]:
     return [name for name in PRECONDITIONERS if name in solver_options.PRECONDITIONERS]
 
 
+def policies(setting: Setting, device: str) -> list[dict[str, Any]]:
+    """A row for each update policy, on the beam of table 2 under the load with most rotation; one virtual worker."""
+    beam, d = calibrated(setting.cells, COROTATIONAL, setting.condition)[0], setting.latency
+    ways = {name: Way("cholesky", name, True) for name in ("never", "every-1", "every-30", f"lockstep-{d}")}
+    ways |= {name: Way("cholesky", name, True, d) for name in ("async", "adaptive")}
+    found = measured({name: (beam, LOADS[2], way) for name, way in ways.items()}, setting, device)
+    return [
+        {"update": name, "iterations": m.iterations, "most iterations": m.most, "factors": m.factors,
+         "step ms": m.step, "wait ms": m.invert, "unconverged": m.unconverged, "repeats": m.repeats}
+        for name, m in found.items()
+    ]  # fmt: skip
+
+
 def table5(setting: Setting, device: str) -> list[dict[str, Any]]:
     """A row for each preconditioner, renewed at each step and asynchronously with warp."""
     beam, condition = calibrated(setting.cells, COROTATIONAL, HETEROGENEOUS, heterogeneous=True)

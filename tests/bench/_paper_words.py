@@ -15,6 +15,13 @@ COLUMNS1 = ("tets", "condition", "factorize ms", "paper factorize ms", "latency"
 COLUMNS5 = ("updated", "preconditioner", "iterations", "paper iterations", "most iterations", "invert ms",
             "paper invert ms", "solve ms", "paper solve ms", "total ms", "paper total ms")  # fmt: skip
 
+COLUMNS_OF_POLICIES = ("update", "iterations", "most iterations", "factors", "step ms", "wait ms")
+POLICIES = """\
+The beam of table 2 under *{load}*, Cholesky with warp. *async* and *adaptive* with one worker in virtual time that
+takes {latency} steps for a factor (a matrix is copied in the step after the last factor came); *adaptive* sends no matrix
+before the iterations lost to the factor in use have cost as much as a factorization, a byte moved counted like an
+operation. *wait*: for factors made within the step."""
+
 
 def explained(setting: Setting) -> tuple[str, ...]:
     return (

@@ -9,7 +9,7 @@ import typer
 from tests.bench import _paper_words as words
 from tests.bench import figure4
 from tests.bench._paper_beam import BANDS, LOADS
-from tests.bench._paper_tables import Setting, table1, table2, table5
+from tests.bench._paper_tables import Setting, policies, table1, table2, table5
 from tests.bench._schemes import SCENES, run
 from tests.bench.report import Report
 
@@ -18,7 +18,8 @@ def section(setting: Setting, device: str, report: Report) -> None:
     """All tables of one device."""
     name = device.upper()
     one, two, five = table1(setting, device), table2(setting, device), table5(setting, device)
-    report.data[device] = {"table1": one, "table2": two, "table5": five}
+    policy = policies(setting, device)
+    report.data[device] = {"table1": one, "table2": two, "table5": five, "policies": policy}
     report.say(
         f"## Table 1: sizes, {name}", f"Corotational, *{LOADS[1].name}*, async + warp, E of the beam of table 2."
     )
@@ -44,8 +45,11 @@ def section(setting: Setting, device: str, report: Report) -> None:
     )
     report.table(five, words.COLUMNS5)
     report.say(words.verdict5(five))
-    bad = sum(row["unconverged"] for rows in (one, two, five) for row in rows)
-    alike = all(row["repeats"] for rows in (one, two, five) for row in rows)
+    report.say(f"## Update policies, {name}", words.POLICIES.format(load=LOADS[2].name, latency=setting.latency))
+    report.table(policy, words.COLUMNS_OF_POLICIES)
+    tables = (one, two, five, policy)
+    bad = sum(row["unconverged"] for rows in tables for row in rows)
+    alike = all(row["repeats"] for rows in tables for row in rows)
     report.say(
         f"Solves that did not reach the tolerance: {bad}. Iterations of all rounds alike, step by step: "
         f"{'yes' if alike else 'NO'}."

@@ -18,6 +18,7 @@ from sim_server.engine import Kind
 from sim_server.factors import Inline, Job
 from sim_server.simulation import Simulation
 from sim_server.track import flops
+from tests.bench._virtual_workers import VirtualWorkers
 from tests.scenes import bar, factor_of, simulation
 
 
@@ -78,7 +79,7 @@ def test_async_without_workers_factorizes_in_this_process_between_steps():
 
 
 @pytest.mark.parametrize("preconditioner", ["none", "jacobi", "block_jacobi"])
-@pytest.mark.parametrize("update", ["never", "every-1", "lockstep-2", "async"])
+@pytest.mark.parametrize("update", ["never", "every-1", "lockstep-2", "async", "adaptive"])
 def test_without_use_for_factors_none_is_made(preconditioner, update, monkeypatch):
     def refuse(*_):
         raise AssertionError("factorized")
@@ -243,6 +244,48 @@ def test_bound_of_the_age_by_policy(update, bound):
     assert update == "never" or driver.tracks[0].age_max <= driver.age_bound()
 
 
+def adaptive(gravity: float, steps: int, **solver) -> tuple[Driver, NDArray]:
+    """A beam, one worker in virtual time: costs in bytes and operations."""
+    beam = bar((6, 3, 3), (4, 1, 1), young=2e5, fixed="X < 0.01")
+    table = {"preconditioner": "cholesky", "max_iterations": 2000} | solver
+    driver = simulation_driver(simulation(beam, gravity=(0, gravity, 0), **table))
+    return driver, driver.advance(steps)
+
+
+def simulation_driver(sim: Simulation) -> Driver:
+    return Driver(sim, VirtualWorkers(sim, 1, 2e6), counted=True)
+
+
+def test_adaptive_keeps_the_factor_of_a_body_at_rest():
+    driver, records = adaptive(-1e-6, 60, update="adaptive")
+    assert driver.tracks[0].used == 1
+    assert (records["factor_step"][10:] == 0).all()
+    assert driver.age_bound() == -1
+
+
+def test_adaptive_makes_few_factors_for_a_body_in_motion_at_little_cost():
+    """Fewer than async, with fewer iterations than never."""
+    driver, records = adaptive(-2.0, 150, update="adaptive", warp=False)
+    eager, often = adaptive(-2.0, 150, update="async", warp=False)
+    _, once = adaptive(-2.0, 150, update="never", warp=False)
+    assert 2 <= driver.tracks[0].used < 0.7 * eager.tracks[0].used
+    assert often["iterations"].sum() <= records["iterations"].sum() < 0.7 * once["iterations"].sum()
+
+
+def test_adaptive_with_threshold_0_is_async():
+    one, records = adaptive(-2.0, 40, update="adaptive", update_threshold=0)
+    other, same = adaptive(-2.0, 40, update="async")
+    assert one.tracks[0].used == other.tracks[0].used
+    assert records["factor_step"].tolist() == same["factor_step"].tolist()
+
+
+def test_what_was_lost_is_lost_to_the_factor_in_use():
+    driver, records = adaptive(-2.0, 60, update="adaptive")
+    newest = records["factor_step"][-1]
+    of_it = records[records["factor_step"] == newest]
+    assert driver.tracks[0].lost == np.maximum(of_it["iterations"] - 3, 0).sum()
+
+
 def test_no_bound_where_no_factor_is_made():
     assert Driver(falling(preconditioner="jacobi")).age_bound() == -1
 
@@ -282,7 +325,7 @@ def test_a_failed_factorization_does_not_stop_a_run(caplog):
     assert "object 'bar': no factor: matrix: not positive definite" in caplog.text
 
 
-@pytest.mark.parametrize("update", ["never", "every-1", "lockstep-2", "async"])
+@pytest.mark.parametrize("update", ["never", "every-1", "lockstep-2", "async", "adaptive"])
 def test_an_indefinite_matrix_leaves_block_jacobi(update, monkeypatch):
     """Every factorization fails: the run is that of block Jacobi, to the last bit."""
     plain = falling(preconditioner="block_jacobi")

@@ -7,7 +7,7 @@ from typing import get_args
 
 import pytest
 
-from sim_server.schedule import AGEING, Need, Rule, excess, oldest_possible, one_round, overdue_after, pick
+from sim_server.schedule import AGEING, Need, Rule, excess, oldest_possible, one_round, overdue_after, pays, pick
 
 NEW, BUSY = None, True
 RULES = get_args(Rule)
@@ -23,6 +23,45 @@ def needs(*rows: tuple) -> list[Need]:
 )
 def test_excess(iterations, floor, expected):
     assert excess(iterations, floor) == expected
+
+
+# lost, cost of an iteration, of a factorization, age of the factor, threshold, on trial
+PAYS = {
+    "nothing lost": (0, 1, 9, 5, 1, False, False),
+    "less than a factorization": (8, 1, 9, 5, 1, False, False),
+    "as much": (9, 1, 9, 5, 1, False, True),
+    "dear iterations": (3, 3, 9, 5, 1, False, True),
+    "cheap iterations": (9, 0.5, 9, 5, 1, False, False),
+    "a higher threshold": (9, 1, 9, 5, 2, False, False),
+    "a lower one": (5, 1, 9, 5, 0.5, False, True),
+    "threshold 0 is async": (0, 1, 9, 5, 0, False, True),
+    "no factor yet": (0, 1, 9, None, 1, False, True),
+    "to be tried out": (0, 1, 9, 5, 1, True, True),
+}
+
+
+@pytest.mark.parametrize("case", PAYS.values(), ids=PAYS.keys())
+def test_pays(case):
+    lost, cost, service, age, threshold, trial, expected = case
+    assert pays(Need("a", 0, 7, False, age, cost, service, lost=lost, trial=trial), threshold) is expected
+
+
+def test_what_pays_makes_the_least_sum_of_lost_iterations_and_factorizations():
+    """Iterations that grow by a each step: renewing when it pays against renewing each T steps, for every T."""
+    grows, cost, service, steps = 0.7, 2.0, 150.0, 5000
+
+    def total(renew) -> float:
+        age, lost, spent = 0, 0.0, 0.0
+        for _ in range(steps):
+            age, lost = age + 1, lost + grows * age
+            spent += grows * age * cost
+            if renew(age, lost):
+                age, lost, spent = 0, 0.0, spent + service
+        return spent
+
+    best = min(total(lambda age, lost, every=every: age >= every) for every in range(1, 200))
+    found = total(lambda age, lost: pays(Need("a", 0, age, False, age, cost, service, lost=lost)))
+    assert found < 1.02 * best
 
 
 TABLE = {

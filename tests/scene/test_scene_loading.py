@@ -60,6 +60,7 @@ def test_defaults_and_resolved(tmp_path):
             "warm_start": True,
             "update_floor_iterations": 3,
             "update_floor_steps": 1,
+            "update_threshold": 1.0,
             "schedule": "excess",
             "schedule_rounds": 8.0,
         },
@@ -79,7 +80,13 @@ def test_defaults_and_resolved(tmp_path):
 
 @pytest.mark.parametrize(
     ("text", "update"),
-    [("never", ("never", 0)), ("async", ("async", 0)), ("every-30", ("every", 30)), ("lockstep-3", ("lockstep", 3))],
+    [
+        ("never", ("never", 0)),
+        ("async", ("async", 0)),
+        ("adaptive", ("adaptive", 0)),
+        ("every-30", ("every", 30)),
+        ("lockstep-3", ("lockstep", 3)),
+    ],
 )
 def test_update_is_parsed_and_resolved_back(sample, text, update):
     scene = load(sample, [f"solver.update={text}"])
