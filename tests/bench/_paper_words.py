@@ -18,7 +18,7 @@ COLUMNS5 = ("updated", "preconditioner", "iterations", "paper iterations", "most
 COLUMNS_OF_POLICIES = ("update", "iterations", "most iterations", "factors", "step ms", "wait ms")
 POLICIES = """\
 The beam of table 2 under *{load}*, Cholesky with warp. *async* and *adaptive* with one worker in virtual time that
-takes {latency} steps for a factor (a matrix is copied in the step after the last factor came); *adaptive* sends no matrix
+takes {latency} steps for a factor (a matrix is copied in the step after the last factor came); *adaptive* sends none
 before the iterations lost to the factor in use have cost as much as a factorization, a byte moved counted like an
 operation. *wait*: for factors made within the step."""
 
