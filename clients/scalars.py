@@ -27,6 +27,7 @@ DTYPES: dict[str, str] = {
     "integrate_seconds": "f8",
     "step_seconds": "f8",
     "late_seconds": "f8",
+    "cpu_seconds": "f8",
     "fallbacks": "i8",
     "excess": "f8",
     "factor_age_bound": "i8",  # steps; -1: none known

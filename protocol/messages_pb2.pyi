@@ -219,7 +219,7 @@ class Echo(_message.Message):
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., slot: _Optional[_Union[Slot, _Mapping]] = ..., nonce: _Optional[int] = ...) -> None: ...
 
 class ObjectStep(_message.Message):
-    __slots__ = ("header", "step", "time", "iterations", "status", "residual", "factor_step", "factor_age", "preconditioner", "assemble_seconds", "solve_seconds", "integrate_seconds", "step_seconds", "late_seconds", "fallbacks", "excess", "interactions", "asked", "probe", "factor_age_bound")
+    __slots__ = ("header", "step", "time", "iterations", "status", "residual", "factor_step", "factor_age", "preconditioner", "assemble_seconds", "solve_seconds", "integrate_seconds", "step_seconds", "late_seconds", "fallbacks", "excess", "interactions", "asked", "probe", "factor_age_bound", "cpu_seconds")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     STEP_FIELD_NUMBER: _ClassVar[int]
     TIME_FIELD_NUMBER: _ClassVar[int]
@@ -240,6 +240,7 @@ class ObjectStep(_message.Message):
     ASKED_FIELD_NUMBER: _ClassVar[int]
     PROBE_FIELD_NUMBER: _ClassVar[int]
     FACTOR_AGE_BOUND_FIELD_NUMBER: _ClassVar[int]
+    CPU_SECONDS_FIELD_NUMBER: _ClassVar[int]
     header: Header
     step: int
     time: float
@@ -260,7 +261,8 @@ class ObjectStep(_message.Message):
     asked: str
     probe: int
     factor_age_bound: int
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., time: _Optional[float] = ..., iterations: _Optional[int] = ..., status: _Optional[_Union[SolveStatus, str]] = ..., residual: _Optional[float] = ..., factor_step: _Optional[int] = ..., factor_age: _Optional[int] = ..., preconditioner: _Optional[str] = ..., assemble_seconds: _Optional[float] = ..., solve_seconds: _Optional[float] = ..., integrate_seconds: _Optional[float] = ..., step_seconds: _Optional[float] = ..., late_seconds: _Optional[float] = ..., fallbacks: _Optional[int] = ..., excess: _Optional[float] = ..., interactions: _Optional[_Iterable[_Union[Interaction, _Mapping]]] = ..., asked: _Optional[str] = ..., probe: _Optional[int] = ..., factor_age_bound: _Optional[int] = ...) -> None: ...
+    cpu_seconds: float
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., time: _Optional[float] = ..., iterations: _Optional[int] = ..., status: _Optional[_Union[SolveStatus, str]] = ..., residual: _Optional[float] = ..., factor_step: _Optional[int] = ..., factor_age: _Optional[int] = ..., preconditioner: _Optional[str] = ..., assemble_seconds: _Optional[float] = ..., solve_seconds: _Optional[float] = ..., integrate_seconds: _Optional[float] = ..., step_seconds: _Optional[float] = ..., late_seconds: _Optional[float] = ..., fallbacks: _Optional[int] = ..., excess: _Optional[float] = ..., interactions: _Optional[_Iterable[_Union[Interaction, _Mapping]]] = ..., asked: _Optional[str] = ..., probe: _Optional[int] = ..., factor_age_bound: _Optional[int] = ..., cpu_seconds: _Optional[float] = ...) -> None: ...
 
 class Steps(_message.Message):
     __slots__ = ("header", "steps")

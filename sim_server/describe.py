@@ -102,6 +102,7 @@ def _step(names: list[str], r: dict[str, Any]) -> pb.ObjectStep:
         integrate_seconds=r["integrate"],
         step_seconds=r["whole"],
         late_seconds=r["late"],
+        cpu_seconds=r["cpu"],
         fallbacks=r["fallbacks"],
         asked=NAMES[Kind(r["asked"])] if r["asked"] != r["kind"] else "",
         probe=r["probe"],

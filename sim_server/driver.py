@@ -68,6 +68,7 @@ class Driver:
             t.body.name: 72.0 * len(simulation.system.body_values(t.body.first, t.body.last)) for t in self.tracks
         }
         self._bytes = bytes_a  # of A: deterministic cost of an iteration
+        self._spare: dict[int, list[NDArray[np.float64]]] = {}  # by blocks; what the loop copies into has been touched
 
     # --- one step after another ---------------------------------------------------------------------------------
 
@@ -191,6 +192,7 @@ class Driver:
         asked = time.monotonic()
         while not (self.source.ready() and self.source.submit(job)):
             if self.engine.loop.stop:
+                self._give_back(t.wanted)
                 t.wanted = None
                 return False
             self._collect()
@@ -204,6 +206,7 @@ class Driver:
             time.sleep(2e-4)
         else:
             self._alone = False
+        self._give_back(t.wanted)
         t.went_out(step)
         return True
 
@@ -277,12 +280,19 @@ class Driver:
         return oldest_possible(overdue, self._latencies(), self._workers())
 
     def _ask(self, t: Track) -> None:
-        t.wanted, t.asked = np.empty_like(self._values(t.body)), next(self._asked)
+        blocks = len(self._values(t.body))
+        spare = self._spare.setdefault(blocks, [])
+        t.wanted, t.asked = spare.pop() if spare else np.full((blocks, 3, 3), 0.0), next(self._asked)
         self.engine.request_matrix(t.body.index, t.wanted)
+
+    def _give_back(self, copy: NDArray[np.float64]) -> None:
+        """A copy of a matrix that was sent: its memory serves again."""
+        self._spare[len(copy)].append(copy)
 
     def _send(self, t: Track) -> None:
         step = self.engine.matrix_step(t.body.index)
         assert t.wanted is not None
+        self._give_back(t.wanted)
         if self.source.submit(self._job(t, step, t.wanted)):
             t.went_out(step)
         t.wanted = None

@@ -34,7 +34,7 @@ struct Rings {
     int32_t patient;                       // wait for room in the rings instead of dropping (no deadline to miss)
     std::atomic<int32_t> stop, pause;
     double deadline;                       // steady clock, of the next step; 0: now
-    double late;
+    double late;                           // s that the step began after its deadline
 };
 
 static inline double now() {
@@ -74,14 +74,14 @@ static bool wait_until_due(Rings& rings, Meanwhile meanwhile) {
     }
     rings.late = 0;
     if (rings.realtime && !rings.stop.load()) {
-        double t = now(), entered = t;
+        double t = now();
         if (rings.deadline == 0) rings.deadline = t;
-        for (; t < rings.deadline; t = now()) {
+        for (; t < rings.deadline && !rings.stop.load(); t = now()) {
             double left = rings.deadline - t;
             nap(meanwhile() && left > 2e-4 ? 2e-4 : left);
         }
-        if (entered > rings.deadline) rings.late = entered - rings.deadline;
-        if (rings.late > rings.dt) { ++rings.late_steps; rings.deadline = entered; }  // do not chase lost time
+        rings.late = t > rings.deadline ? t - rings.deadline : 0;  // also by a nap that lasted too long
+        if (rings.late > rings.dt) { ++rings.late_steps; rings.deadline = t; }  // do not chase lost time
         rings.deadline += rings.dt;
     }
     return !rings.stop.load();

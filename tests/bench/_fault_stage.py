@@ -161,6 +161,7 @@ def measured(data: dict[str, np.ndarray], seen: int, after: int | None) -> dict[
         "not converged": int(np.sum(data["status"] != "converged")),
         "step p50 ms": 1e3 * float(np.median(data["step_seconds"])),
         "step max ms": 1e3 * float(data["step_seconds"].max()),
+        "step CPU max ms": 1e3 * float(data["cpu_seconds"].max()),
         "latest start ms": 1e3 * float(data["late_seconds"].max()),
         "late steps": int(np.sum(data["late_seconds"] > 1e-3)),
         "iterations": float(iterations[made >= 0].mean()),  # of steps with a factor: how long a start takes varies

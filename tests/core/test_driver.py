@@ -203,6 +203,20 @@ def test_of_many_idle_workers_some_are_served_in_each_step():
     assert [steps.count(k) for k in range(2)] == [COPIES, 3]
 
 
+def test_matrices_are_copied_into_the_same_memory_again():
+    """So that the loop meets no page that was not touched before."""
+
+    class Watched(Inline):
+        def submit(self, job: Job) -> bool:
+            places.append(job.values.ctypes.data)
+            return super().submit(job)
+
+    places: list[int] = []
+    sim = falling(*(bar(name=f"beam{k}", young=1e6, fixed="X < 0.01") for k in range(3)), update="async")
+    Driver(sim, Watched(patterns_of(sim))).advance(12)
+    assert len(places) > 9 and len(set(places)) <= 2
+
+
 @pytest.mark.parametrize("rule", ["round_robin", "oldest", "weighted"])
 def test_the_scene_names_the_rule(rule):
     """A shaken object beside three calm ones: only the rules that look at excess serve it more."""

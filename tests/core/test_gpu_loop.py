@@ -3,6 +3,7 @@
 
 import gc
 import threading
+import time
 import weakref
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 
 from sim_server.errors import DeviceLost
 from sim_server.gpu.loop import BATCH, FRAMES
-from tests.core.fake_cuda import FakeScene, number
+from tests.core.fake_cuda import NOT_READY, FakeScene, number
 
 
 def steps_ahead(scene: FakeScene) -> list[int]:
@@ -63,6 +64,25 @@ def test_in_real_time_no_step_is_begun_before_the_last_one_is_reported():
     ahead = steps_ahead(scene)
     scene.loop.run(6)
     assert ahead == [0] * 6
+
+
+def test_a_step_whose_wait_lasted_too_long_began_late():
+    scene = FakeScene()
+    loop = scene.loop.loop
+    loop.realtime, loop.dt, loop.frame_every = 1, 0.02, 1
+    query, asked = scene.device._event_query, []
+
+    def slow(event: int) -> int:
+        if event != loop.picture[1].arrived or len(asked) > 3:
+            return query(event)
+        asked.append(event)
+        if len(asked) == 3:  # while the next step is waited for: before that it is looked for once or twice
+            time.sleep(max(loop.deadline + 1.2 * loop.dt - time.monotonic(), 0))
+        return NOT_READY
+
+    scene.device.set("event_query", slow)
+    scene.loop.run(5)
+    assert len(asked) > 3 and scene.loop.records()["late"].max() > loop.dt and loop.late_steps >= 1
 
 
 def test_the_clock_is_noted_first_where_the_device_had_nothing_to_do():
