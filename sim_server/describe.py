@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol import messages_pb2 as pb
-from sim_server.backend import Cpu, build_id
+from sim_server.backend import Cpu
 from sim_server.engine import Kind
 from sim_server.mesh import posed
 from sim_server.mesh.surface import surface_triangles
@@ -33,7 +33,7 @@ def scene(simulation: Simulation) -> pb.Scene:
         software=f"warpfactor {_version()}, {simulation.world.backend.name}, Python {platform.python_version()}",
         objects=[b.name for b in simulation.world.bodies],
         device="cpu" if isinstance(simulation.world.backend, Cpu) else "gpu",
-        build=build_id(),
+        build=simulation.world.backend.build(),
     )
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_server.backend import HERE, INCLUDE, Argument, CompileError, arguments_of
+from sim_server.backend import HERE, INCLUDE, Argument, CompileError, arguments_of, build_id
 from sim_server.errors import DeviceError
 
 LEAST = 80  # compute capability times 10: the solver multiplies by matrix instructions that came with it
@@ -92,10 +92,15 @@ def processors() -> int:
 
 
 @cache
+def digest(*suffixes: str) -> str:
+    """Of all texts of this package whose names end so."""
+    found = sorted(p for p in HERE.rglob("*") if p.suffix in suffixes)
+    return hashlib.sha256(b"".join(path.read_bytes() for path in found)).hexdigest()[:16]
+
+
 def texts() -> str:
     """Of all headers, in an option: CuPy keeps compiled kernels by their own text and options alone."""
-    found = sorted(p for p in HERE.rglob("*") if p.suffix in (".h", ".cuh"))
-    return "-DTEXTS=x" + hashlib.sha256(b"".join(path.read_bytes() for path in found)).hexdigest()[:16]
+    return "-DTEXTS=x" + digest(".h", ".cuh")
 
 
 def shape(threads: int) -> tuple[tuple[int], tuple[int]]:
@@ -232,6 +237,12 @@ class Gpu:
         if id(host) in self._twins:
             host[...] = self.twin(host).get()
         return host
+
+    def build(self) -> str:
+        """What a run depends on beside its scene: equal ones repeat it bit for bit."""
+        runtime = self.cp.cuda.runtime.runtimeGetVersion()
+        parts = [build_id(), digest(".cu", ".cuh", ".h"), self.properties["name"].decode(), str(runtime)]
+        return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:24]
 
     def module(self, path: str) -> DeviceModule:
         """A kernel text, compiled once."""

@@ -18,7 +18,7 @@ from sim_server.gpu.cuda import CudaDevice
 from sim_server.gpu.device import DeviceLaunch, Gpu
 from sim_server.gpu.fuse import End, Fused, fused
 from sim_server.gpu.intake import Intake
-from sim_server.gpu.layouts import STAMP
+from sim_server.gpu.layouts import STAMP, Mail
 from sim_server.gpu.loop import CAPACITY, MANY, DeviceLoop
 from sim_server.gpu.mailbox import Mailbox
 from sim_server.gpu.solver import BODY, RESULT, SETTINGS, Solver
@@ -180,10 +180,11 @@ class GpuEngine(DeviceLoop):
         """Of the inverse that an application reads."""
         return self.solver.factor_bytes(body)
 
-    def replace(self, launch: int, new: DeviceLaunch) -> None:
-        """Gives a mailed launch other arguments, from the next batch on."""
+    def replace(self, launch: int, new: DeviceLaunch) -> Mail:
+        """Gives a mailed launch other arguments, from the next batch on: its first step is the one after the result's
+        `taken` steps, once it is not below 0."""
         self.gpu.cp.cuda.get_current_stream().synchronize()  # its arrays are on the device
-        self.mailboxes[self._mailed[launch]].post(new.params.tobytes(), keep=new)
+        return self.mailboxes[self._mailed[launch]].post(new.params.tobytes(), keep=new)
 
     def records(self) -> NDArray[Any]:
         """New records since the last call, oldest first; also begins factors that have waited for room."""

@@ -25,7 +25,7 @@ class Cuda(c.Structure):
 
 
 class Mail(c.Structure):
-    _fields_ = [("bytes", p), ("event", p), ("number", i64)]
+    _fields_ = [("bytes", p), ("event", p), ("number", i64), ("taken", i64)]
 
 
 class Mailbox(c.Structure):

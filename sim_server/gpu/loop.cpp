@@ -10,9 +10,9 @@
 #include "home.h"
 
 // New arguments, settings and factors: copies in the order of the steps, from memory that is not written to until they are done.
-static bool deliver(Loop& l, Batch& batch) {
+static bool deliver(Loop& l, Batch& batch, int boxes) {
     char* room = batch.upload;
-    for (int k = 0; k < l.mailboxes; ++k) {
+    for (int k = 0; k < boxes; ++k) {
         Mailbox& box = l.mailbox[k];
         if (!box.held && box.mail.load(std::memory_order_relaxed)) box.held = box.mail.exchange(nullptr);
         if (!box.held || (box.held->event && !done(l, box.held->event))) continue;
@@ -20,6 +20,7 @@ static bool deliver(Loop& l, Batch& batch) {
         CALL(to_device, box.target, room, (size_t)box.size, l.stream);
         room += (box.size + 15) / 16 * 16;
         int64_t number = box.held->number;
+        box.held->taken.store(l.launched, std::memory_order_release);
         box.held = nullptr;
         box.taken.store(number, std::memory_order_release);
     }
@@ -31,7 +32,7 @@ static bool open_batch(Loop& l) {
     batch.first = l.launched;
     batch.steps = 0;
     batch.late = l.rings.late;
-    return deliver(l, batch);
+    return deliver(l, batch, l.mailboxes);
 }
 
 // So many steps were put onto the stream.
@@ -145,16 +146,16 @@ int64_t wf_gpu_run(Loop* loop, int64_t steps) {
 
 int32_t wf_gpu_wait(Loop* loop) { return wait(*loop); }
 
-// One step whose kernels the caller puts onto the stream: between `open` and `close`; `renew` looks into the mailboxes again,
-// with nothing under way.
+// One step whose kernels the caller puts onto the stream: between `open` and `close`; `renew` looks for settings and factors again,
+// with nothing under way. They come first among the mailboxes; arguments of launches that have run wait for the next step.
 int32_t wf_gpu_open(Loop* loop) { return begin(*loop) && open_batch(*loop); }
-int32_t wf_gpu_renew(Loop* loop) { return deliver(*loop, loop->batches[loop->begun % DEPTH]); }
+int32_t wf_gpu_renew(Loop* loop) { return deliver(*loop, loop->batches[loop->begun % DEPTH], 2 * loop->bodies); }
 int32_t wf_gpu_close(Loop* loop) {
     Loop& l = *loop;
     return count(l, 1) && close_batch(l) && finish_down_to(l, 0) && all_home(l);
 }
 
-const Mail* wf_gpu_post(Mailbox* box, const Mail* mail) { return box->mail.exchange(mail); }
+Mail* wf_gpu_post(Mailbox* box, Mail* mail) { return box->mail.exchange(mail); }
 
 int32_t wf_gpu_sizes(int32_t* sizes) {  // layouts, checked against the Python side
     int32_t ours[] = {sizeof(Cuda), sizeof(Mail), sizeof(Mailbox), sizeof(Result), sizeof(Stamp), sizeof(Body),

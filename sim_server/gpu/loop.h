@@ -25,13 +25,14 @@ struct Mail {
     const void* bytes;
     void* event;                // null, or what must be done before they are used
     int64_t number;
+    std::atomic<int64_t> taken;     // steps launched before it went to the device: it holds for those after; -1: it has not
 };
 
 struct Mailbox {                // bytes on the device that are replaced between batches
     Address target;
     int64_t size;
-    std::atomic<const Mail*> mail;
-    const Mail* held;           // taken out, its event not done yet
+    std::atomic<Mail*> mail;
+    Mail* held;                 // taken out, its event not done yet
     std::atomic<int64_t> taken; // number of the last one that went to the device
 };
 

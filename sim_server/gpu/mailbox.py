@@ -43,12 +43,15 @@ class Mailbox:
         self._kept: list[Any] = []  # in use, waiting
         self._leaving: list[tuple[int, Any]] = []  # (free once so many steps are completed, what)
 
-    def post(self, data: bytes, keep: Any = None, event: int | None = None) -> None:
-        """Replaces the bytes from the next batch on (once the event is done). keep: what the bytes point to."""
+    def post(self, data: bytes, keep: Any = None, event: int | None = None) -> layouts.Mail:
+        """Replaces the bytes from the next batch on (once the event is done). keep: what the bytes point to.
+
+        They hold from the step after the result's `taken` steps, once it is not below 0.
+        """
         assert len(data) == self._box.size
         self.number += 1
         memory = c.create_string_buffer(data, len(data))
-        mail = layouts.Mail(c.addressof(memory), event, self.number)
+        mail = layouts.Mail(c.addressof(memory), event, self.number, -1)
         displaced = library().wf_gpu_post(c.byref(self._box), c.addressof(mail))
         self._leaving = [(step, what) for step, what in self._leaving if step > self._loop.step]
         if displaced:
@@ -57,6 +60,7 @@ class Mailbox:
             self._leaving.append((int(self._loop.launched), self._kept[:-1]))
             del self._kept[:-1]
         self._kept.append((memory, mail, keep))
+        return mail
 
     def withdraw(self) -> bool:
         """Takes back what the loop has not looked at; only while it stands still. True if something came back."""

@@ -11,7 +11,7 @@ import sys
 def main() -> int:
     """Runs the log again and reports."""
     parser = argparse.ArgumentParser(prog="python -m sim_server.replay", description="Run a log again and compare.")
-    parser.add_argument("log", metavar="LOG.mcap", help="A run recorded on a CPU by sim-server --record")
+    parser.add_argument("log", metavar="LOG.mcap", help="A run recorded by sim-server --record")
     parser.add_argument("--json", action="store_true", help="For programs")
     arguments = parser.parse_args()
     os.environ["OPENBLAS_NUM_THREADS"] = "1"  # as workers have it: factors are then the same bit by bit
@@ -19,14 +19,14 @@ def main() -> int:
 
     from protocol.log_chunks import BadLog
     from sim_server.backend import CompileError
-    from sim_server.errors import InputError
+    from sim_server.errors import DeviceLost, InputError
     from sim_server.replay.log import Recording
     from sim_server.replay.run import Replay
 
     try:
         with Recording(arguments.log) as recording:
             found = Replay(recording).run()
-    except (BadLog, InputError, CompileError) as error:
+    except (BadLog, InputError, CompileError, DeviceLost) as error:
         print(f"replay: {error}", file=sys.stderr)
         return 2
     if arguments.json:

@@ -56,6 +56,7 @@ class Recording:
         self.scene = pb.Scene()
         self.objects: dict[str, Recorded] = {}
         self.touch: list[pb.TouchSet] = []
+        self.touched = False  # by pushes or grabs
         self.notes: list[str] = []
         self._file = ChunkFile.open(self.path)
         self._topics: dict[int, str] = {}
@@ -78,6 +79,11 @@ class Recording:
         except BaseException:
             self.close()
             raise
+
+    @property
+    def device(self) -> str:
+        """That the run was made on, "cpu" or "gpu"."""
+        return self.scene.device or ("cpu" if ", cpu," in self.scene.software else "gpu")  # old logs tell in `software`
 
     def frame(self, name: str, step: int) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
         """x and v (nodes, 3) of an object after a step; None if the log holds no such frame."""
@@ -123,6 +129,8 @@ class Recording:
             found.topology = pb.Topology.FromString(record.data)
         elif kind == "state":
             found.frames[pb.State.FromString(record.data).step] = (offset, number)
+        elif kind == "interaction":
+            self.touched = True
         elif kind == "factor":
             factor = pb.FactorUse.FromString(record.data)
             found.factors[factor.step] = factor
@@ -157,12 +165,15 @@ class Recording:
     def _check(self) -> None:
         if not self.scene.resolved:
             raise BadLog(f"{self.path}: the log holds no scene; its beginning is damaged")
-        if self.scene.device != "cpu" and ", cpu," not in self.scene.software:  # old logs tell in `software` alone
-            raise BadLog(f"{self.path}: recorded on {self.scene.software}; only runs on the CPU can be repeated")
         if missing := [name for name in self.scene.objects if self.objects[name].topology is None]:
             raise BadLog(f"{self.path}: the log holds no mesh of {', '.join(missing)}; it is damaged")
         if not self.steps:
             raise BadLog(f"{self.path}: the log holds no step that could be repeated")
+        if self.device == "gpu" and self.touched and not self.touch:
+            self.notes.append(
+                f"{self.path}: written by an older version, which did not record when a GPU took up pushes and grabs: the "
+                "replay diverges with the first of them"
+            )
         if not self.scene.build:
             self.notes.append(
                 f"{self.path}: written by an older version, which did not record the build, the steps at which pushes "

@@ -21,7 +21,7 @@ from protocol.factor import Factor
 from protocol.log_chunks import BadLog
 from protocol.refused import Refused
 from sim_server import describe
-from sim_server.backend import build_id
+from sim_server.errors import DeviceError
 from sim_server.factors import Inline, Job
 from sim_server.replay.log import Recording
 from sim_server.replay.report import Comparison
@@ -40,7 +40,12 @@ class Replay:
             scene = Scene.model_validate(json.loads(recording.scene.resolved))
         except (ValidationError, ValueError) as error:
             raise BadLog(f"{recording.path}: the scene in the log cannot be built: {error}") from error
-        self.simulation = Simulation(scene)
+        try:
+            self.simulation = Simulation(scene, recording.device)
+        except DeviceError as error:
+            raise BadLog(
+                f"{recording.path}: recorded on a GPU ({recording.scene.software}), can be run again on one alone: {error}"
+            ) from error
         self.engine, self.bodies = self.simulation.engine, self.simulation.world.bodies
         self.compared = Comparison(recording)
         self._same_meshes()
@@ -54,9 +59,9 @@ class Replay:
         self._sets: dict[int, pb.TouchSet] = {t.step: t for t in recording.touch}
         self._held: dict[int, tuple[Any, Any]] = {}  # nodes and offsets of interactions by id
         self._inline = self._library()
-        if build_id() != recording.scene.build and recording.scene.build:
+        if self.simulation.world.backend.build() != recording.scene.build and recording.scene.build:
             self.compared.notes.append(
-                "another build than the recorded one (kernels, compiler or processor): last digits may differ"
+                "another build than the recorded one (kernels, compiler, processor or GPU): last digits may differ"
             )
         if "touch" in self.simulation.effects:
             index = next(i for i, launch in enumerate(self.engine.launches) if launch.name == "touch.apply")
@@ -109,13 +114,16 @@ class Replay:
         """Factorizes with the library that the log names, if it is here."""
         system = self.simulation.system
         made = [f for o in self.recording.objects.values() for f in o.factors.values()]
-        recorded = {f.library.split()[0] for f in made if f.library}
-        wanted = recorded.pop() if recorded in ({"cholmod"}, {"superlu"}) else "auto"
-        if recorded:
+        recorded = {f.library for f in made if f.library}
+        wanted = {_library(name) for name in recorded}
+        choice = wanted.pop() if len(wanted) == 1 else "auto"
+        if choice.startswith("gpu") and not _usable(choice):
+            choice = "auto"
+        if wanted or (recorded and choice == "auto"):
             self.compared.notes.append(
                 f"factors of the log were made by {', '.join(sorted(recorded))}; here by another"
             )
-        return Inline({b.name: system.body_pattern(b.first, b.last) for b in self.bodies}, wanted)
+        return Inline({b.name: system.body_pattern(b.first, b.last) for b in self.bodies}, choice)
 
     # --- what a step had ----------------------------------------------------------------------------------------
 
@@ -189,7 +197,9 @@ class Replay:
             self._factors.pop((name, made), None)
 
     def _compare_frames(self, step: int) -> None:
-        world = self.simulation.world
+        if not any(step in o.frames for o in self.recording.objects.values()):
+            return
+        world = self.simulation.fetch()
         for body in self.bodies:
             try:
                 frame = self.recording.frame(body.name, step)
@@ -197,3 +207,20 @@ class Replay:
                 raise BadLog(f"{self.recording.path}: step {step} of {body.name!r}: {error}") from error
             if frame is not None and len(frame[0]) == body.last - body.first:
                 self.compared.frame(step, body.name, frame, (world.x[body.nodes], world.v[body.nodes]))
+
+
+def _library(name: str) -> str:
+    """What Analysis is asked for to get the library that a log names: "cholmod 3.0.14", "NVIDIA H200, float64"."""
+    gpu = next((f"gpu-{kind}" for kind in ("float32", "float64") if name.endswith(f", {kind}")), "")
+    return gpu or next((known for known in ("cholmod", "superlu") if name.split()[0] == known), "auto")
+
+
+def _usable(library: str) -> bool:
+    from precond_worker.errors import DeviceUnusable
+    from precond_worker.gpu.device import try_out
+
+    try:
+        try_out(library.removeprefix("gpu-"))
+    except DeviceUnusable:
+        return False
+    return True

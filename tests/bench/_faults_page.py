@@ -23,7 +23,8 @@ WHAT = {
 THERE = (QUIET_THERE, "cut", "lossy", "slow")
 COLUMNS = (
     "what", "steps", "missed", "not converged", "step p50 ms", "step max ms", "step CPU max ms", "latest start ms",
-    "late steps", "iterations", "iterations, times quiet", "oldest factor", "next factor s", "messages refused", "workers killed",
+    "late steps", "iterations", "iterations, times quiet", "oldest factor", "next factor s",
+    "messages refused", "workers killed",
 )  # fmt: skip
 SETTING = (
     f"A beam of 1152 tetrahedra in real time, dt {1e3 * DT:g} ms. missed: steps that the log does not hold; CPU: "
@@ -32,7 +33,10 @@ SETTING = (
     "the fault to the first step with a factor made after it. Iterations of steps with a factor."
 )
 SUMS = ("steps", "missed", "not converged", "late steps", "messages refused", "workers killed")
-LARGEST = ("step p50 ms", "step max ms", "step CPU max ms", "latest start ms", "iterations max", "oldest factor", "next factor s")
+LARGEST = (
+    "step p50 ms", "step max ms", "step CPU max ms", "latest start ms", "iterations max", "oldest factor",
+    "next factor s",
+)  # fmt: skip
 
 
 def write(report: Report, rows: list[Row], lives: list[Row], skipped: dict[str, str]) -> None:

@@ -117,6 +117,35 @@ def test_mail_holds_from_the_next_batch_on_and_the_last_one_wins():
     assert scene.loop.records()["iterations"].tolist() == [5, 5, 6]
 
 
+def test_mail_says_from_which_step_on_it_holds():
+    """As logs need it to repeat a run: the arguments of step k + 1 are those with the largest `taken` up to k."""
+    scene = FakeScene()
+    box, posted = scene.loop.mailboxes[-1], []
+    for value in range(1, 41):
+        posted.append((box.post(number(value)), value))
+        if value % 3:  # the others are replaced before the loop sees them
+            scene.loop.run(value % 7 + 1)
+    scene.loop.run(BATCH)
+    taken = {mail.taken: value for mail, value in posted if mail.taken >= 0}
+    assert [mail.taken < 0 for mail, _ in posted] == [value % 3 == 0 for _, value in posted]
+    held = [max(step for step in taken if step <= k) for k in range(scene.done)]
+    assert scene.seen == [taken[step] for step in held]
+
+
+def test_arguments_that_come_while_others_have_run_hold_from_the_next_step_on():
+    scene = FakeScene()
+    scene.loop.run(3)
+    scene.loop._open()
+    late, settings = scene.loop.mailboxes[-1].post(number(8)), scene.loop.mailboxes[0].post(number(4))
+    scene.loop._renew()
+    assert settings.taken == 3 and late.taken == -1
+    scene.device._graph_launch(7, scene.device.stream)
+    scene.loop._close()
+    scene.loop.run(1)
+    assert late.taken == 4 and scene.seen == [0, 0, 0, 0, 8]
+    assert scene.loop.records()["iterations"].tolist() == [0, 0, 0, 4, 4]
+
+
 def test_a_factor_is_used_once_its_event_is_done():
     scene = FakeScene()
     event, box = scene.device.event(), scene.loop.mailboxes[1]

@@ -44,9 +44,12 @@ def tool(package: str, *arguments: str) -> list[str]:
     return [sys.executable, "-m", package, *arguments]
 
 
-def run(package: str, *arguments: str, timeout: float = PATIENCE) -> "subprocess.CompletedProcess[str]":
-    """One of our programs, to its end."""
-    return subprocess.run(tool(package, *arguments), capture_output=True, text=True, cwd=ROOT, timeout=timeout)
+def run(
+    package: str, *arguments: str, timeout: float = PATIENCE, **environment: str
+) -> "subprocess.CompletedProcess[str]":
+    """One of our programs, to its end; environment: beside that of this process."""
+    command, variables = tool(package, *arguments), {**os.environ, **environment}
+    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=timeout, env=variables)
 
 
 class Process:
