@@ -171,8 +171,8 @@ class Recording:
             raise BadLog(f"{self.path}: the log holds no step that could be repeated")
         if self.device == "gpu" and self.touched and not self.touch:
             self.notes.append(
-                f"{self.path}: written by an older version, which did not record when a GPU took up pushes and grabs: the "
-                "replay diverges with the first of them"
+                f"{self.path}: written by an older version, which did not record when a GPU took up pushes and grabs: "
+                "the replay diverges with the first of them"
             )
         if not self.scene.build:
             self.notes.append(

@@ -44,7 +44,8 @@ class Replay:
             self.simulation = Simulation(scene, recording.device)
         except DeviceError as error:
             raise BadLog(
-                f"{recording.path}: recorded on a GPU ({recording.scene.software}), can be run again on one alone: {error}"
+                f"{recording.path}: recorded on a GPU ({recording.scene.software}), and only one can run it again: "
+                f"{error}"
             ) from error
         self.engine, self.bodies = self.simulation.engine, self.simulation.world.bodies
         self.compared = Comparison(recording)
