@@ -84,8 +84,20 @@ def _make(folder: Path) -> None:
         ) from error
 
 
-def build(source: Path, defines: tuple[str, ...] = ()) -> Path:
-    """Shared library of one text; compiles only what the cache lacks.
+def read_text(path: str) -> tuple[str, str]:
+    """Name and text of a kernel text of this package.
+
+    "a.cu+b.cuh" is the text a.cu with b.cuh in place of its line `#include LAW`, and its name is b.
+    """
+    frame, _, law = path.partition("+")
+    text = (HERE / frame).read_text()
+    if not law:
+        return Path(frame).stem, text
+    return Path(law).stem, text.replace("#include LAW\n", (HERE / law).read_text())
+
+
+def build(source: Path, defines: tuple[str, ...] = (), text: str | None = None) -> Path:
+    """Shared library of one text; compiles only what the cache lacks. text: where the file does not hold it.
 
     Raises CompileError with the compiler's output, or if there is no folder for it.
     """
@@ -93,14 +105,15 @@ def build(source: Path, defines: tuple[str, ...] = ()) -> Path:
     headers = sorted(p for folder in folders for p in folder.iterdir() if p.suffix in (".h", ".cuh"))
     flags = [*FLAGS, *(f"-D{d}" for d in defines)]
     digest = hashlib.sha256(
-        "\0".join([_machine(), *flags, *(p.name + p.read_text() for p in [source, *headers])]).encode()
+        "\0".join([_machine(), *flags, text or source.read_text(), *(p.name + p.read_text() for p in headers)]).encode()
     )
     library = cache_folder() / f"{source.stem}-{digest.hexdigest()[:24]}.so"
     if not library.exists():
         _make(library.parent)
         scratch = library.with_suffix(f".{os.getpid()}.tmp")  # another process may build the same
-        command = [compiler(), *flags, "-x", "c++", f"-I{INCLUDE}", str(source), "-o", str(scratch)]
-        result = subprocess.run(command, capture_output=True, text=True)
+        file = str(source) if text is None else "-"
+        command = [compiler(), *flags, "-x", "c++", f"-I{INCLUDE}", file, "-o", str(scratch)]
+        result = subprocess.run(command, input=text, capture_output=True, text=True)
         if result.returncode:
             raise CompileError(f"{source.name} did not compile:\n{' '.join(command)}\n{result.stderr}")
         os.replace(scratch, library)
@@ -192,13 +205,14 @@ class Launch:
 
 
 class Module:
-    """A compiled kernel text of this package, e.g. Module("effects/corotational.cu")."""
+    """A compiled kernel text of this package, e.g. Module("effects/corotational.cu"); paths: as of read_text."""
 
     def __init__(self, path: str, real: str = "double"):
-        source = HERE / path
-        self.name, self.real = source.stem, real
-        self._text = source.read_text()
-        self._library = ctypes.CDLL(str(build(source, (f"real={real}",))))
+        self.real = real
+        self.name, self._text = read_text(path)
+        source = HERE / path.rpartition("+")[2]
+        composed = self._text if "+" in path else None
+        self._library = ctypes.CDLL(str(build(source, (f"real={real}",), composed)))
 
     def bind(self, kernel: str, n: int, **arguments: Any) -> Launch:
         """Argument struct of `kernel` over `n` items; raises TypeError where an argument does not fit the text."""

@@ -2,6 +2,7 @@
 """What an effect is to the simulation: elements that couple nodes, and launches that add to the system of a step."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, Protocol
 
@@ -11,6 +12,20 @@ from numpy.typing import NDArray
 from sim_server.backend import Launch
 from sim_server.system import Stencil, System
 from sim_server.world import Body, World
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """An element whose deformation its law does not define: the first time [s] at which it was found, and its J.
+
+    element: its number in the object's mesh.
+    """
+
+    effect: str
+    body: int
+    element: int
+    time: float
+    J: float
 
 
 class Effect:
@@ -33,6 +48,13 @@ class Effect:
     def energy(self) -> float:
         """Potential energy of the present state [J]; 0 for an effect without one."""
         return 0.0
+
+    def refusals(self) -> list[Refusal]:
+        """Elements that had a state which the effect does not define, by the time at which they had it first.
+
+        The solver finds their forces not finite (status not_finite) and leaves the velocity as it was.
+        """
+        return []
 
 
 class Build(Protocol):

@@ -48,6 +48,7 @@ class World:
 
     rest (n, 3): before the pose [m]; x (n, 3): positions [m]; v (n, 3): velocities [m/s]; mass (n,): lumped [kg];
     free (n,): 1, or 0 at fixed nodes; beta (bodies,): Rayleigh damping of the stiffness [s]; dt: time step [s];
+    projection: of the elements' stiffness, the scene's choice;
     backend: where kernels run, Cpu or gpu.device.Gpu.
 
     What effects need of the integrator instead of dt and v:
@@ -60,6 +61,7 @@ class World:
     def __init__(self, scene: Scene, backend: Any = None):
         self.backend = backend or Cpu()
         self.dt = float(scene.dt)
+        self.projection = scene.solver.projection
         self.bodies: list[Body] = []
         meshes = [(o, o.load_mesh()) for o in scene.objects]
         first = 0

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_server.backend import HERE, INCLUDE, Argument, CompileError, arguments_of, build_id
+from sim_server.backend import HERE, INCLUDE, Argument, CompileError, arguments_of, build_id, read_text
 from sim_server.errors import DeviceError
 
 LEAST = 80  # compute capability times 10: the solver multiplies by matrix instructions that came with it
@@ -144,8 +144,8 @@ class DeviceModule:
     """A kernel text compiled by NVRTC; raises CompileError."""
 
     def __init__(self, path: str, gpu: "Gpu", real: str = "double", cooperative: bool = False, local: str = ""):
-        source = HERE / path
-        self.name, self._gpu, self._text = source.stem, gpu, source.read_text()
+        self._gpu = gpu
+        self.name, self._text = read_text(path)
         self._types = {"real": real, "local": local or real}
         self._module = cupy().RawModule(
             code=self._text,

@@ -107,7 +107,8 @@ class Text:
             for launch in launches for f in launch.fields if f.dtype is not None and not f.constant
         }  # fmt: skip
         lines = ["#define ITEMS_ONLY", f"#define BLOCK_ITEMS {shape.threads // shape.lanes}"]
-        lines += ['#include "polar.cuh"', '#include "together.cuh"', '#include "sums.cuh"']
+        headers = [h for text in texts for h in re.findall(r'^#include "[^"]+"', text, re.MULTILINE)]
+        lines += dict.fromkeys([*headers, '#include "sums.cuh"'])  # outside of the texts' namespaces, once
         for text, name in texts.items():
             body = re.sub(r"^#(include|define WIDE).*$", "", text, flags=re.MULTILINE)
             lines += [f"namespace {name} {{", body, "}"]

@@ -30,11 +30,13 @@
 #ifdef __CUDACC_RTC__
 
 #define INLINE __device__ __forceinline__
+#define UNROLL _Pragma("unroll")
 typedef real number;
 typedef local local_number;
 typedef int index;
 constexpr int LANES = 1;
 template <class T> using entry = T;  // one of the scalars in a number
+INLINE bool any(bool mask) { return mask; }  // is it so for one of the items at hand?
 
 #ifndef BLOCK_ITEMS  // of a thread block; neighbouring threads have neighbouring items
 #define BLOCK_ITEMS 128
@@ -68,6 +70,7 @@ template <class T> using own = T*;
 
 #include <cmath>
 #define INLINE static inline __attribute__((always_inline))
+#define UNROLL _Pragma("GCC unroll 16")
 template <class T> using own = T*;
 template <class T> using entry = real;
 // `begin`..`end` lets the caller share a launch between threads.
@@ -112,9 +115,20 @@ INLINE index at(const int* a, index i) {
 INLINE void put(real* a, index i, number v) {
     for (int k = 0; k < LANES; ++k) a[i[k]] = v[k];
 }
-INLINE number sqrt(number a) {
-    for (int k = 0; k < LANES; ++k) a[k] = std::sqrt(a[k]);
-    return a;
+#define BY_LANES(name)                                        \
+    INLINE number name(number a) {                            \
+        for (int k = 0; k < LANES; ++k) a[k] = std::name(a[k]); \
+        return a;                                             \
+    }
+BY_LANES(sqrt)
+BY_LANES(log)
+BY_LANES(exp)
+BY_LANES(cbrt)
+template <class V> INLINE auto lane(V a, int k) { return a[k]; }
+template <class M> INLINE bool any(M mask) {
+    bool found = false;
+    for (int k = 0; k < LANES; ++k) found |= mask[k] != 0;
+    return found;
 }
 
 #else
@@ -124,6 +138,11 @@ typedef real number;
 typedef int index;
 INLINE index items(int first, int) { return first; }
 using std::sqrt;
+using std::log;
+using std::exp;
+using std::cbrt;
+template <class V> INLINE V lane(V a, int) { return a; }
+INLINE bool any(bool mask) { return mask; }
 
 #endif
 typedef number local_number;
@@ -149,3 +168,5 @@ template <int K, class T, class N> INLINE void row_put(own<T> a, index, int k, N
     name##_put(p, i, sum);
 
 template <class T> INLINE T larger(T a, T b) { return a > b ? a : b; }
+template <class T> INLINE T smaller(T a, T b) { return a < b ? a : b; }
+template <class T> INLINE T magnitude(T a) { return a < 0 ? -a : a; }

@@ -75,13 +75,19 @@ INLINE void get_row(const int* a, int i, int (&row)[4]) {
 
 #else
 
+// Row after row: the entries of a row are neighbours in memory, those of a vector are not.
 template <int K, class T, class N>
 INLINE void put_row(T* a, index i, int, const N (&row)[K]) {
-    for (int k = 0; k < K; ++k) put(a, K * i + k, row[k]);
+    alignas(64) T staged[K][LANES];
+    for (int k = 0; k < K; ++k) __builtin_memcpy(staged[k], &row[k], sizeof(N));
+    for (int l = 0; l < LANES; ++l) {
+        T* mine = a + (long long)K * lane(i, l);
+        for (int k = 0; k < K; ++k) mine[k] = staged[k][l];
+    }
 }
 template <class T, class N>
-INLINE void put_block(T* a, index place, index, int, const N (&row)[9]) {
-    for (int k = 0; k < 9; ++k) put(a, 9 * place + k, row[k]);
+INLINE void put_block(T* a, index place, index, int n, const N (&row)[9]) {
+    put_row(a, place, n, row);
 }
 template <class T, class N>
 INLINE void get_row(const T* a, index i, N (&row)[4]) {

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""Elastic constants that differ from region to region of an object, chosen per element by its centroid."""
+"""Material constants that differ from region to region of an object, chosen per element by its centroid."""
 
 import logging
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, Discriminator, Field, Tag
+from pydantic import AfterValidator, Discriminator, Field, Tag, create_model
 
 from sim_server.errors import InputError
 from sim_server.scene import where
@@ -17,15 +18,20 @@ log = logging.getLogger(__name__)
 Poisson = Annotated[float, Field(ge=0, lt=0.5)]
 
 
-class Region(Parameters):
+class Place(Parameters):
     """Elements whose centroid satisfies `where`, or all that are left if there is none."""
 
     where: Where | None = Field(default=None, description="an expression in X, Y, Z, the rest coordinates [m]")
+
+
+class Region(Place):
+    """A place with the constants of linear elasticity."""
+
     young: Positive = Field(description="Young's modulus [Pa]")
     poisson: Poisson | None = Field(default=None, description="Poisson's ratio [-]; default: that of the object")
 
 
-def _last_takes_the_rest(regions: list[Region]) -> list[Region]:
+def _last_takes_the_rest(regions: list[Place]) -> list[Place]:
     if not regions:
         raise complaint("must have at least one region { where = ..., young = ... }")
     for i, region in enumerate(regions[:-1]):
@@ -34,44 +40,83 @@ def _last_takes_the_rest(regions: list[Region]) -> list[Region]:
     return regions
 
 
+def _is_list_of_tables(value: Any) -> str:
+    tables = isinstance(value, list) and (not value or isinstance(value[0], (dict, Place)))
+    return "<regions>" if tables else "<value>"
+
+
 def _shape_of_young(value: Any) -> str:
-    return "<regions>" if isinstance(value, list) else "<number>"
+    return "<regions>" if isinstance(value, list) else "<value>"
 
 
 # Tags in <> tell the two forms apart and are left out of messages.
 Young = Annotated[
-    Annotated[Positive, Tag("<number>")]
+    Annotated[Positive, Tag("<value>")]
     | Annotated[list[Region], AfterValidator(_last_takes_the_rest), Tag("<regions>")],
     Discriminator(_shape_of_young),
 ]
 
 
+def by_region(kinds: Mapping[str, Any]) -> Any:
+    """Type of a law's first constant, which may be a list of regions instead of one value.
+
+    kinds: the types of all its constants by name. In each region the first one is required; those not given there are
+    the object's.
+    """
+    first, *others = kinds
+    fields: dict[str, Any] = {first: (kinds[first], Field(...))}
+    fields |= {name: (kinds[name] | None, None) for name in others}
+    region = create_model(f"Region of {first}", __base__=Place, **fields)
+    return Annotated[
+        Annotated[kinds[first], Tag("<value>")]
+        | Annotated[list[region], AfterValidator(_last_takes_the_rest), Tag("<regions>")],  # type: ignore[valid-type]
+        Discriminator(_is_list_of_tables),
+    ]
+
+
+def constants_by_region(
+    constants: Mapping[str, Any], points: NDArray[np.float64], unit: str = ""
+) -> dict[str, NDArray[np.float64]]:
+    """Each constant of each element by name: (m,), or (m, 3) for vectors.
+
+    constants: by name as in the scene; the first may be a list of regions, of which the first that holds at the
+    centroid wins. points: centroids at rest, before the pose [m], (m, 3). unit: of the first, for messages. Raises
+    InputError for an element in no region.
+    """
+    first, *others = constants
+    regions = constants[first]
+    if not isinstance(regions, list):
+        return {name: _everywhere(value, len(points)) for name, value in constants.items()}
+    chosen = {name: _everywhere(constants[name], len(points)) for name in others}
+    chosen = {first: np.zeros((len(points), *np.shape(getattr(regions[0], first)))), **chosen}
+    left = np.ones(len(points), dtype=bool)
+    for i, region in enumerate(regions):
+        here = left & where.mask(region.where or "true", points)
+        if not here.any():
+            value = getattr(region, first)
+            shown = f"{value:g} {unit}".strip() if isinstance(value, float) else value
+            log.warning("region %d (where = %r, %s = %s) holds no element", i + 1, region.where, first, shown)
+        for name in constants:
+            if (given := getattr(region, name)) is not None:
+                chosen[name][here] = given
+        left &= ~here
+    if left.any():
+        number = int(np.flatnonzero(left)[0])
+        at = ", ".join(f"{c:.6g}" for c in points[number])
+        raise InputError(
+            f"element {number} with centroid ({at}) m is in no region of {first} ({int(left.sum())} such elements); "
+            "add a last region without where for the rest"
+        )
+    return chosen
+
+
+def _everywhere(value: Any, elements: int) -> NDArray[np.float64]:
+    return np.broadcast_to(np.asarray(value, float), (elements, *np.shape(value))).copy()
+
+
 def region_values(
     young: float | list[Region], poisson: float, points: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Young's modulus [Pa] and Poisson's ratio of each element: two arrays (m,).
-
-    young: one value or regions, of which the first that holds at the centroid wins; poisson: where a region gives
-    none; points: centroids at rest, before the pose [m], (m, 3). Raises InputError for an element in no region.
-    """
-    if not isinstance(young, list):
-        return np.full(len(points), float(young)), np.full(len(points), float(poisson))
-    chosen_young = np.zeros(len(points))
-    chosen_poisson = np.full(len(points), float(poisson))
-    left = np.ones(len(points), dtype=bool)
-    for i, region in enumerate(young):
-        here = left & where.mask(region.where or "true", points)
-        if not here.any():
-            log.warning("region %d (where = %r, young = %g Pa) holds no element", i + 1, region.where, region.young)
-        chosen_young[here] = region.young
-        if region.poisson is not None:
-            chosen_poisson[here] = region.poisson
-        left &= ~here
-    if left.any():
-        first = int(np.flatnonzero(left)[0])
-        at = ", ".join(f"{c:.6g}" for c in points[first])
-        raise InputError(
-            f"element {first} with centroid ({at}) m is in no region of young ({int(left.sum())} such elements); "
-            "add a last region without where for the rest"
-        )
-    return chosen_young, chosen_poisson
+    """Young's modulus [Pa] and Poisson's ratio of each element: two arrays (m,); see constants_by_region."""
+    found = constants_by_region({"young": young, "poisson": poisson}, points, "Pa")
+    return found["young"], found["poisson"]

@@ -84,6 +84,9 @@ class Solver(Parameters):
     warp_level: int = Field(
         default=1, ge=1, le=2, description="neighbours that give a node its rotation where its elements have none"
     )
+    projection: Literal["clamp", "absolute", "none"] = Field(
+        default="clamp", description="what becomes of negative eigenvalues of an element's stiffness"
+    )
     update: Annotated[Update, PlainValidator(_update), PlainSerializer(str)] = Update("async")
     precision: Precision = Field(
         default="float64", description="of the kernels: mixed = elements in float32, the rest in float64"

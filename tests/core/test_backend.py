@@ -167,7 +167,10 @@ def test_layouts_are_those_of_the_compiler(folder):
 
 
 PACKAGE = backend.HERE
+LAWS = sorted(p.relative_to(PACKAGE).as_posix() for p in PACKAGE.glob("effects/*.cuh"))
+FRAME = "kernels/hyperelastic.cu"  # of the laws: no text by itself
 GPU_TEXTS = sorted(p.relative_to(PACKAGE).as_posix() for p in PACKAGE.rglob("*.cu"))
+GPU_TEXTS = [path for path in GPU_TEXTS if path != FRAME] + [f"{FRAME}+{law}" for law in LAWS]
 TEXTS = [path for path in GPU_TEXTS if not path.startswith("gpu/")]
 
 
@@ -176,14 +179,14 @@ def test_every_text_of_the_package_compiles_without_warnings(path, tmp_path):
     """In both precisions; -Wall is on, and a warning is an error here."""
     for real in ("double", "float"):
         command = [backend.compiler(), *backend.FLAGS, "-Werror", "-fsyntax-only", f"-Dreal={real}", "-x", "c++"]
-        command += [f"-I{backend.INCLUDE}", str(PACKAGE / path)]
-        result = subprocess.run(command, capture_output=True, text=True)
+        command += [f"-I{backend.INCLUDE}", "-"]
+        result = subprocess.run(command, input=backend.read_text(path)[1], capture_output=True, text=True)
         assert result.returncode == 0, result.stderr
 
 
 @pytest.mark.parametrize("arch", ["sm_80", "sm_90"])
 @pytest.mark.parametrize("path", GPU_TEXTS)
-def test_every_text_of_the_package_compiles_for_gpus(path, arch):
+def test_every_text_of_the_package_compiles_for_gpus(path, arch, tmp_path):
     """By NVRTC, which needs no GPU and no driver; what it says counts as a failure too."""
     if (library := nvrtc.library()) is None:
         pytest.skip("needs the package nvidia-cuda-nvrtc")
@@ -191,7 +194,9 @@ def test_every_text_of_the_package_compiles_for_gpus(path, arch):
         if name == "mixed" and path.startswith("gpu/"):
             continue  # the same: they know no elements
         options = [f"-arch={arch}", *device_options(types), f"-I{PACKAGE / 'gpu'}"]  # as they are compiled there
-        code, said = nvrtc.compiled(library, PACKAGE / path, options)
+        text = tmp_path / "text.cu"
+        text.write_text(backend.read_text(path)[1])
+        code, said = nvrtc.compiled(library, text, options)
         assert len(code) > 1000 and not said, said
 
 
@@ -224,7 +229,7 @@ def test_the_last_kernel_of_a_step_compiles_with_the_end_of_the_step(arch, tmp_p
 
 def _launch(path: str, struct: str, name: str, mailed: bool = False) -> SimpleNamespace:
     """What fusing reads of a DeviceLaunch, its arrays by name at addresses of their own."""
-    text = (PACKAGE / path).read_text()
+    text = backend.read_text(path)[1]
     fields = backend._members(text, struct, {"real": "double", "local": "double"})
     arrays = {
         f.name: SimpleNamespace(data=SimpleNamespace(ptr=hash(f.name) & 0xFFFFF00), shape=(9, 3), size=27)
@@ -261,7 +266,7 @@ def test_launches_put_together_compile_in_every_precision(group, real, local, tm
         pytest.skip("needs the package nvidia-cuda-nvrtc")
     launches = [_launch(*given) for given in group]
     for launch, (path, struct, *_) in zip(launches, group, strict=True):
-        launch.fields = backend._members((PACKAGE / path).read_text(), struct, {"real": real, "local": local})
+        launch.fields = backend._members(backend.read_text(path)[1], struct, {"real": real, "local": local})
     private = fuse._private(launches, launches)  # type: ignore[arg-type]
     shape = fuse.Shape(64, 4)
     made = fuse.Text(launches, shape, None, private)  # type: ignore[arg-type]

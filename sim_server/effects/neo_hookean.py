@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: MIT
+"""Compressible Neo-Hookean solid: rubber and soft tissue at large strains.
+
+Energy density and first Piola-Kirchhoff stress, with J = det F and I1 = tr F^T F::
+
+    W = mu/2 (I1 - 3) - mu ln J + lambda/2 ln^2 J
+    P = mu (F - F^-T) + lambda ln J F^-T
+
+lambda = E nu / ((1 + nu) (1 - 2 nu)) and mu = E / (2 (1 + nu)): at small strains it is Hooke's law for `young` and
+`poisson`, which may differ by region (`young` as a list of tables { where, young, poisson }). In tension it softens
+(E = 1, nu = 0.45: P = 0.599 at twice the length), in compression it stiffens without bound.
+
+ln J is not defined at J <= 0: see `inversion` in hyperelastic.py. For scenes that turn elements inside out,
+stable_neo_hookean costs the same and is defined everywhere.
+
+Usual ranges: young 1e3 Pa (brain, liver) to 1e7 Pa (rubber), poisson 0.3 to 0.49; from 0.49 on linear tetrahedra lock.
+Strains to about 100 %; rubber at larger ones stiffens, which this law does not show (see mooney_rivlin, arruda_boyce).
+
+Source: Bonet and Wood, Nonlinear Continuum Mechanics for Finite Element Analysis, 2nd edition, 2008, section 6.4.3.
+"""
+
+from typing import Any
+
+from sim_server.hyperelastic import Constant, Hyperelastic, Law, lame, young_and_poisson
+from sim_server.scene.parameters import Positive
+from sim_server.scene.regions import Poisson
+from sim_server.world import Body, World
+
+SCOPE = "object"
+LAW = Law(
+    "neo_hookean",
+    (
+        Constant("young", Positive, "Young's modulus at small strains [Pa], or a list of regions"),
+        Constant("poisson", Poisson, "Poisson's ratio at small strains [-], of every element whose region gives none"),
+    ),
+    pack=lame,
+    elastic=young_and_poisson,
+)
+Params = LAW.parameters()
+
+
+def build(world: World, listed: list[tuple[Body, Any]]) -> Hyperelastic:
+    """The elements; raises InputError for an element in no region of young."""
+    return Hyperelastic(world, listed, LAW)

@@ -1,0 +1,33 @@
+// SPDX-License-Identifier: MIT
+// Sums the edge blocks that tetrahedra left (kernels/hyperelastic.cuh) block by block of A: a gather from a list made once per
+// topology, in its order. An edge of an element is stored once, from its lower to its higher corner; a block that couples
+// them the other way takes the transpose.
+#include "together.cuh"
+
+struct Blocks {
+    int n;               // blocks above the diagonal
+    int elements;
+    int accumulate;      // 0: write, 1: add to what another effect wrote
+    const int* start;    // (n + 1,) into pairs
+    const int* pairs;    // (start[n],) 16 e + 4 a + b: corners a and b of element e are at the block's row and column
+    const local* edges;  // (6, elements, 9) blocks of the edges 01, 02, 03, 12, 13, 23 [kg]
+    own<local> sums;     // (n, 9) out, world frame, row major [kg]
+};
+
+INLINE void blocks_add(const Blocks& p, int, int k, local* sum) {
+    int pair = p.pairs[k], a = (pair >> 2) & 3, b = pair & 3;
+    int low = a < b ? a : b, edge = low ? a + b : a + b - 1;
+    const local* m = p.edges + 9 * ((long long)p.elements * edge + (pair >> 4));
+    local row[9];
+    for (int j = 0; j < 9; ++j) row[j] = m[j];
+    bool turned = a > b;
+    sum[0] += row[0]; sum[1] += turned ? row[3] : row[1]; sum[2] += turned ? row[6] : row[2];
+    sum[3] += turned ? row[1] : row[3]; sum[4] += row[4]; sum[5] += turned ? row[7] : row[5];
+    sum[6] += turned ? row[2] : row[6]; sum[7] += turned ? row[5] : row[7]; sum[8] += row[8];
+}
+
+INLINE void blocks_put(const Blocks& p, int i, const local* sum) {
+    for (int m = 0; m < 9; ++m) row_put<9>(p.sums, i, m, p.accumulate ? row_at<9>(p.sums, i, m) + sum[m] : sum[m]);
+}
+
+SUM_KERNEL(blocks, Blocks, 9)

@@ -1,0 +1,85 @@
+// SPDX-License-Identifier: MIT
+// Tetrahedra of a law W(I1, I2, J), by MJED (formulas: sim_server/hyperelastic.py). LAW is its text, effects/<law>.cuh.
+#define WIDE
+#include "hyperelastic.cuh"
+#include "invariants.cuh"
+#include LAW
+
+struct Elements {
+    int n;                    // elements
+    int projection;           // of the tangent
+    const int* tets;          // (n, 4) nodes
+    const real* x;            // (nodes, 3) positions [m]
+    const real* v;            // (nodes, 3) what the tangent is applied to [m/s]
+    const local* gradients;   // (9, n) rest gradients of the shape functions of nodes 1, 2, 3, one after another [1/m]
+    const local* volume;      // (n,) [m3]
+    const local* constants;   // (CONSTANTS, n) of the law
+    const local* floor;       // (n,) J below which the law goes on as a parabola, 0: J <= 0 is refused
+    const local* stiffening;  // (n,) factor of the tangent [s2]
+    local h;                  // factor of the force [s]
+    const double* clock;      // (1,) [s]
+    double* refused;          // (n, 2) in, out: when the element was first refused [s], -1: never; its J then
+    local* corners;           // (4, n, 9) out: h f_a - factor (K v)_a [N s], upper triangle of factor K_aa [kg]
+    local* edges;             // (6, n, 9) out: factor K_ab, a < b [kg]
+};
+
+KERNEL(elements, Elements) {
+    index tet[4];
+    get_row(p.tets, i, tet);
+    local_vec3 edges[3], v[3];
+    field_edges(p.x, tet, edges);
+    field_edges(p.v, tet, v);
+    Tetrahedron<local_number> t = tetrahedron(edges, p.gradients, p.n, i);
+    local_number c[CONSTANTS], volume = at(p.volume, i), floor = at(p.floor, i), k = volume * at(p.stiffening, i);
+    for (int m = 0; m < CONSTANTS; ++m) c[m] = at(p.constants, m * p.n + i);
+    mat<local_number> left = mul(t.F, transposed(t.F));
+    Invariants<local_number> q = invariants<HAS>(left, t.J);
+    Slopes<local_number> w = slopes(c, q, floor);
+
+    local_vec3 push[4];
+    forces<HAS>(w, q, left, t, -p.h * volume, push);
+    Blocks6<local_number> B;
+    invariant_edges<HAS>(w, q, left, t, k, B);
+    if (p.projection != NONE) {
+        auto wrong = indefinite(B);
+        if (any(wrong)) {
+            Principal<local_number> frame = principal(t.F);
+            Modes<local_number> m = modes<HAS>(w, frame.s);
+            project(m, p.projection);
+            Blocks6<local_number> other;
+            principal_edges(frame, m, k, t.D, other);
+            for (int e = 0; e < 6; ++e)
+                for (int a = 0; a < 9; ++a) B.e[e].m[a] = wrong ? other.e[e].m[a] : B.e[e].m[a];
+        }
+    }
+    if constexpr (REFUSES) {
+        auto here = t.J <= 0 && floor == 0;
+        note_refusal(here, p.refused, i, p.clock[0], t.J);
+        refuse(here, B, push);
+    }
+    leave(B, push, v, p.corners, p.edges, p.n, i);
+}
+
+struct Energy {
+    int n;                   // elements
+    const int* tets;         // (n, 4)
+    const real* x;           // (nodes, 3) [m]
+    const local* gradients;  // (9, n) [1/m]
+    const local* volume;     // (n,) [m3]
+    const local* constants;  // (CONSTANTS, n)
+    const local* floor;      // (n,)
+    local* energy;           // (n,) out: V W [J]; NaN where the law is not defined
+};
+
+KERNEL(energy, Energy) {
+    index tet[4];
+    get_row(p.tets, i, tet);
+    local_vec3 edges[3];
+    field_edges(p.x, tet, edges);
+    Tetrahedron<local_number> t = tetrahedron(edges, p.gradients, p.n, i);
+    local_number c[CONSTANTS], floor = at(p.floor, i);
+    for (int m = 0; m < CONSTANTS; ++m) c[m] = at(p.constants, m * p.n + i);
+    local_number W = density(c, invariants<HAS>(mul(t.F, transposed(t.F)), t.J), floor);
+    if constexpr (REFUSES) W = t.J <= 0 && floor == 0 ? no_number<local_number>() : W;
+    put(p.energy, i, at(p.volume, i) * W);
+}

@@ -1,0 +1,304 @@
+// SPDX-License-Identifier: MIT
+// What the laws of hyperelastic tetrahedra share (formulas: sim_server/hyperelastic.py).
+#pragma once
+#include "polar.cuh"
+#include "together.cuh"
+
+template <class T> INLINE vec<T> cross(vec<T> a, vec<T> b) {
+    return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
+}
+template <class T> INLINE mat<T> mul_transposed(const mat<T>& a, const mat<T>& b) { return mul(a, transposed(b)); }
+
+// --- an element ------------------------------------------------------------------------------------------------------------
+
+// The six edges (i, j), i < j: 01, 02, 03, 12, 13, 23.
+INLINE constexpr int edge_first(int e) { return e < 3 ? 0 : e < 5 ? 1 : 2; }
+INLINE constexpr int edge_second(int e) { return e < 3 ? e + 1 : e < 5 ? e - 1 : 3; }
+
+template <class T> struct Tetrahedron {
+    mat<T> F;        // deformation gradient
+    vec<T> D[4];     // rest gradients of the shape functions [1/m]
+    vec<T> g[4];     // F D_i
+    vec<T> area[4];  // gradients of J = det F: cof(F) D_i [1/m]
+    vec<T> q[3];     // edges from corner 0, over 6 V [1/m2]
+    T J;
+};
+
+template <class T> INLINE void spread_to_four(vec<T> (&u)[4]) { u[0] = -(u[1] + u[2] + u[3]); }
+
+// edges: from corner 0 now; gradients (9, n): rest gradients of corners 1, 2, 3.
+template <class T> INLINE Tetrahedron<T> tetrahedron(const vec<T> (&edges)[3], const local* gradients, int n, index i) {
+    Tetrahedron<T> t;
+    mat<T> rows;
+    for (int k = 0; k < 9; ++k) rows.m[k] = at(gradients, k * n + i);
+    UNROLL for (int k = 0; k < 3; ++k) t.D[k + 1] = row(rows, k);
+    spread_to_four(t.D);
+    t.F = outer3(edges[0], edges[1], edges[2], rows);
+    T inverse = dot(t.D[1], cross(t.D[2], t.D[3]));  // 1 / (6 V)
+    UNROLL for (int k = 0; k < 3; ++k) t.q[k] = inverse * edges[k];
+    t.area[1] = cross(t.q[1], edges[2]);
+    t.area[2] = cross(t.q[2], edges[0]);
+    t.area[3] = cross(t.q[0], edges[1]);
+    spread_to_four(t.area);
+    t.J = dot(t.area[1], edges[0]);
+    UNROLL for (int k = 1; k < 4; ++k) t.g[k] = mul(t.F, t.D[k]);
+    spread_to_four(t.g);
+    return t;
+}
+
+// Edges from corner 0 of a nodal field, their differences in the field's precision.
+INLINE void field_edges(const real* field, const index (&tet)[4], local_vec3 (&edges)[3]) {
+    vec3 u = load3(field, tet[0]);
+    UNROLL for (int k = 0; k < 3; ++k) edges[k] = as<local_number>(load3(field, tet[k + 1]) - u);
+}
+
+// F (D_i x D_j) of an edge, from the current edges: no products.
+template <class T> INLINE vec<T> opposite(const vec<T> (&q)[3], int e) {
+    return e == 0 ? q[2] - q[1] : e == 1 ? q[0] - q[2] : e == 2 ? q[1] - q[0] : e == 3 ? q[2] : e == 4 ? -q[1] : q[0];
+}
+
+// --- sums of blocks --------------------------------------------------------------------------------------------------------
+
+template <class T> INLINE void add_outer(mat<T>& B, vec<T> a, vec<T> b) {
+    B.m[0] += a.x * b.x; B.m[1] += a.x * b.y; B.m[2] += a.x * b.z;
+    B.m[3] += a.y * b.x; B.m[4] += a.y * b.y; B.m[5] += a.y * b.z;
+    B.m[6] += a.z * b.x; B.m[7] += a.z * b.y; B.m[8] += a.z * b.z;
+}
+template <class T> INLINE void add_identity(mat<T>& B, T d) { B.m[0] += d; B.m[4] += d; B.m[8] += d; }
+// B -= [c]x, the matrix of v -> c x v
+template <class T> INLINE void subtract_cross(mat<T>& B, vec<T> c) {
+    B.m[1] += c.z; B.m[2] -= c.y; B.m[3] -= c.z; B.m[5] += c.x; B.m[6] += c.y; B.m[7] -= c.x;
+}
+
+template <class T> struct Blocks6 { mat<T> e[6]; };  // of the edges
+
+// Entry (r, c), r >= c, of the 9x9 stiffness of corners 1, 2, 3: the fourth corner follows by translation.
+template <class T> INLINE T corner_entry(const Blocks6<T>& B, int r, int c) {
+    int a = r / 3 + 1, b = c / 3 + 1, k = 3 * (r % 3) + c % 3, t = 3 * (c % 3) + r % 3;
+    if (a == b) {  // B_aa = - sum of the edges at a
+        int u = a == 1 ? 2 : 1, v = a == 3 ? 2 : 3;
+        T sum = B.e[a - 1].m[t];  // B_0a transposed
+        sum += u > a ? B.e[a + u].m[k] : B.e[a + u].m[t];
+        sum += v > a ? B.e[a + v].m[k] : B.e[a + v].m[t];
+        return -sum;
+    }
+    return B.e[a + b].m[t];  // a > b: the transpose of B_ba
+}
+
+// Whether the element's stiffness is positive semi-definite to rounding: no pivot of L D L^T is negative once rounding's share
+// of the trace stands on the diagonal. It is so where d2W/dF2 is, since one is the other in another basis.
+template <class T> INLINE auto indefinite(const Blocks6<T>& B) {
+    T a[45], sum = T{};
+    UNROLL for (int r = 0; r < 9; ++r) {
+        UNROLL for (int c = 0; c <= r; ++c) a[r * (r + 1) / 2 + c] = corner_entry(B, r, c);
+        sum += a[r * (r + 1) / 2 + r];
+    }
+    const T little = (single<T> ? (entry<T>)1e-6 : (entry<T>)1e-12) * sum;
+    T least = sum;
+    UNROLL for (int k = 0; k < 9; ++k) {
+        T pivot = a[k * (k + 1) / 2 + k] + little, inverse = 1 / pivot;
+        least = smaller(least, pivot);
+        UNROLL for (int r = k + 1; r < 9; ++r) {
+            T l = a[r * (r + 1) / 2 + k] * inverse;
+            UNROLL for (int c = k + 1; c <= r; ++c) a[r * (r + 1) / 2 + c] -= l * a[c * (c + 1) / 2 + k];
+        }
+    }
+    return !(least > 0);
+}
+
+// --- principal stretches ---------------------------------------------------------------------------------------------------
+
+// One rotation of Jacobi's method for symmetric matrices, in the plane of p and q; r is the third.
+template <class T, class M> INLINE void annul(T& pp, T& qq, T& pq, T& pr, T& qr, vec<T>& p, vec<T>& q, M settled) {
+    const T tiny = T{} + (single<T> ? (entry<T>)1e-37 : (entry<T>)1e-300);
+    T d = qq - pp, size = magnitude(d) + sqrt(d * d + 4 * pq * pq) + tiny;
+    T t = (d < 0 ? -2 * pq : 2 * pq) / size;
+    t = settled ? T{} : t;  // and its neighbours in a vector go on without it
+    T c = 1 / sqrt(1 + t * t), s = t * c, x = pr;
+    pp -= t * pq;
+    qq += t * pq;
+    pq = settled ? pq : T{};
+    pr = c * x - s * qr;
+    qr = s * x + c * qr;
+    vec<T> u = p;
+    p = c * u - s * q;
+    q = s * u + c * q;
+}
+
+// Eigenvalues l and eigenvectors v (columns of a rotation or reflection, from those given) of the symmetric matrix with the
+// entries 00, 01, 02, 11, 12, 22.
+template <class T> INLINE void eigen3(T (&a)[6], vec<T> (&v)[3]) {
+    const entry<T> eps = single<T> ? (entry<T>)1e-14 : (entry<T>)1e-32;
+    for (int sweep = 0; sweep < 7; ++sweep) {
+        T off = a[1] * a[1] + a[2] * a[2] + a[4] * a[4];
+        T on = a[0] * a[0] + a[3] * a[3] + a[5] * a[5];
+        auto settled = !(off > eps * on);
+        if (!any(off > eps * on)) break;
+        annul(a[0], a[3], a[1], a[2], a[4], v[0], v[1], settled);
+        annul(a[0], a[5], a[2], a[1], a[4], v[0], v[2], settled);
+        annul(a[3], a[5], a[4], a[1], a[2], v[1], v[2], settled);
+    }
+}
+
+// F = U diag(s) V^T with rotations U and V; where det F < 0 the smallest s is negative (Irving, Teran, Fedkiw 2004).
+template <class T> struct Principal {
+    vec<T> u[3], v[3];  // columns
+    T s[3];
+};
+
+template <class T> INLINE Principal<T> principal(const mat<T>& F) {
+    Principal<T> p;
+    mat<T> R = nearest_rotation(F), S = mul(transposed(R), F);
+    const entry<T> half = 0.5;
+    T a[6] = {S.m[0], half * (S.m[1] + S.m[3]), half * (S.m[2] + S.m[6]), S.m[4], half * (S.m[5] + S.m[7]), S.m[8]};
+    const T one = T{} + 1;
+    p.v[0] = {one, T{}, T{}};
+    p.v[1] = {T{}, one, T{}};
+    p.v[2] = {T{}, T{}, one};
+    eigen3(a, p.v);
+    UNROLL for (int k = 0; k < 3; ++k) p.u[k] = mul(R, p.v[k]);
+    p.s[0] = a[0]; p.s[1] = a[3]; p.s[2] = a[5];
+    return p;
+}
+
+// d2W/dF2 of an isotropic law in the frame of the principal stretches (Smith, de Goes, Kim 2019): the eigenvalues of the
+// twists and flips in the plane across axis k, and the matrix of the stretches, 00, 01, 02, 11, 12, 22.
+template <class T> struct Modes { T twist[3], flip[3], stretch[6]; };
+
+enum Projection { NONE = 0, CLAMP = 1, ABSOLUTE = 2 };
+
+template <class T> INLINE T projected(T eigenvalue, int projection) {
+    return projection == NONE ? eigenvalue : projection == ABSOLUTE ? magnitude(eigenvalue) : larger(eigenvalue, T{});
+}
+
+template <class T> INLINE void project(Modes<T>& m, int projection) {
+    UNROLL for (int k = 0; k < 3; ++k) {
+        m.twist[k] = projected(m.twist[k], projection);
+        m.flip[k] = projected(m.flip[k], projection);
+    }
+    const T one = T{} + 1;
+    vec<T> v[3] = {{one, T{}, T{}}, {T{}, one, T{}}, {T{}, T{}, one}};
+    T a[6];
+    UNROLL for (int k = 0; k < 6; ++k) a[k] = m.stretch[k];
+    eigen3(a, v);
+    T l[3] = {projected(a[0], projection), projected(a[3], projection), projected(a[5], projection)};
+    m.stretch[0] = l[0] * v[0].x * v[0].x + l[1] * v[1].x * v[1].x + l[2] * v[2].x * v[2].x;
+    m.stretch[1] = l[0] * v[0].x * v[0].y + l[1] * v[1].x * v[1].y + l[2] * v[2].x * v[2].y;
+    m.stretch[2] = l[0] * v[0].x * v[0].z + l[1] * v[1].x * v[1].z + l[2] * v[2].x * v[2].z;
+    m.stretch[3] = l[0] * v[0].y * v[0].y + l[1] * v[1].y * v[1].y + l[2] * v[2].y * v[2].y;
+    m.stretch[4] = l[0] * v[0].y * v[0].z + l[1] * v[1].y * v[1].z + l[2] * v[2].y * v[2].z;
+    m.stretch[5] = l[0] * v[0].z * v[0].z + l[1] * v[1].z * v[1].z + l[2] * v[2].z * v[2].z;
+}
+
+// The edge blocks of k d2W/dF2, from its modes.
+template <class T>
+INLINE void principal_edges(const Principal<T>& p, const Modes<T>& m, T k, const vec<T> (&D)[4], Blocks6<T>& B) {
+    vec<T> d[4];  // V^T D_i
+    UNROLL for (int i = 1; i < 4; ++i) d[i] = {dot(p.v[0], D[i]), dot(p.v[1], D[i]), dot(p.v[2], D[i])};
+    spread_to_four(d);
+    mat<T> U = {{p.u[0].x, p.u[1].x, p.u[2].x, p.u[0].y, p.u[1].y, p.u[2].y, p.u[0].z, p.u[1].z, p.u[2].z}};
+    T plus[3], minus[3];
+    const entry<T> half = 0.5;
+    UNROLL for (int a = 0; a < 3; ++a) {
+        plus[a] = half * k * (m.flip[a] + m.twist[a]);
+        minus[a] = half * k * (m.flip[a] - m.twist[a]);
+    }
+    T h[6];
+    UNROLL for (int a = 0; a < 6; ++a) h[a] = k * m.stretch[a];
+    UNROLL for (int e = 0; e < 6; ++e) {
+        vec<T> i = d[edge_first(e)], j = d[edge_second(e)];
+        T xx = i.x * j.x, yy = i.y * j.y, zz = i.z * j.z;
+        mat<T> C = {{h[0] * xx + plus[2] * yy + plus[1] * zz, h[1] * i.x * j.y + minus[2] * i.y * j.x,
+                     h[2] * i.x * j.z + minus[1] * i.z * j.x, h[1] * i.y * j.x + minus[2] * i.x * j.y,
+                     h[3] * yy + plus[2] * xx + plus[0] * zz, h[4] * i.y * j.z + minus[0] * i.z * j.y,
+                     h[2] * i.z * j.x + minus[1] * i.x * j.z, h[4] * i.z * j.y + minus[0] * i.y * j.z,
+                     h[5] * zz + plus[1] * xx + plus[0] * yy}};
+        B.e[e] = mul_transposed(mul(U, C), U);
+    }
+}
+
+// --- functions of J that laws have, and what becomes of them below a floor ---------------------------------------------------
+
+// f, f', f'' at J. Below `floor` > 0: the parabola that f has at the floor, so that W stays twice continuously differentiable
+// and is defined for any J; floor = 0 leaves J <= 0 undefined.
+template <class T> struct Jet { T f, d, dd; };
+
+template <class T> INLINE Jet<T> below(Jet<T> at_floor, T J, T floor) {
+    T x = J > floor ? T{} : J - floor;
+    const entry<T> half = 0.5;
+    return {at_floor.f + x * (at_floor.d + half * x * at_floor.dd), at_floor.d + x * at_floor.dd, at_floor.dd};
+}
+
+template <class T> INLINE Jet<T> logarithm(T J, T floor) {
+    T base = larger(J, floor), inverse = 1 / base;
+    return below({log(base), inverse, -inverse * inverse}, J, floor);
+}
+
+// J^p; `value`: base^p with base = max(J, floor)
+template <class T> INLINE Jet<T> power(entry<T> p, T value, T inverse, T J, T floor) {
+    T d = p * value * inverse;
+    return below({value, d, (p - 1) * d * inverse}, J, floor);
+}
+
+// --- what an element leaves for nodes and blocks ------------------------------------------------------------------------------
+
+// Remembers the first time at which the element was refused and its J there; refused (n, 2) begins with (-1, 0).
+#ifdef __CUDACC_RTC__
+INLINE void note_refusal(bool here, double* refused, index i, double now, local_number J) {
+    if (here && refused[2 * i] < 0) {
+        refused[2 * i + 1] = J;
+        refused[2 * i] = now;
+    }
+}
+#else
+template <class M, class T> INLINE void note_refusal(M here, double* refused, index i, double now, T J) {
+    if (!any(here)) return;
+    for (int k = 0; k < LANES; ++k) {
+        double* mine = refused + 2 * lane(i, k);
+        if (lane(here, k) && mine[0] < 0) { mine[0] = now; mine[1] = (double)lane(J, k); }
+    }
+}
+#endif
+
+template <class T> INLINE T no_number() {
+    T zero = T{};
+    return zero / zero;
+}
+
+// Of a refused element nothing but a force that is no number: the solver tells, and the matrix stays finite.
+template <class M, class T> INLINE void refuse(M here, Blocks6<T>& B, vec<T> (&push)[4]) {
+    const T zero = T{}, nan = no_number<T>();
+    UNROLL for (int e = 0; e < 6; ++e)
+        for (int a = 0; a < 9; ++a) B.e[e].m[a] = here ? zero : B.e[e].m[a];
+    UNROLL for (int a = 0; a < 4; ++a) push[a] = {here ? nan : push[a].x, here ? nan : push[a].y, here ? nan : push[a].z};
+}
+
+// push_i = -h grad_i - sum_j B_ij v_j, each with the upper triangle of its B_ii: rows of nine, one corner after another; and
+// the blocks of the edges, one edge after another. v: edges from corner 0 of the field that the tangent is applied to.
+template <class T>
+INLINE void leave(const Blocks6<T>& B, const vec<T> (&push)[4], const vec<T> (&v)[3], local* corners, local* edges, int n, index i) {
+    vec<T> f[4];
+    T own[4][6];
+    UNROLL for (int a = 0; a < 4; ++a) {
+        f[a] = push[a];
+        UNROLL for (int k = 0; k < 6; ++k) own[a][k] = T{};
+    }
+    UNROLL for (int e = 0; e < 6; ++e) {
+        const int a = edge_first(e), b = edge_second(e);
+        const T* m = B.e[e].m;
+        vec<T> w = a == 0 ? v[b - 1] : v[b - 1] - v[a > 0 ? a - 1 : 0];
+        f[a] = f[a] - mul(B.e[e], w);
+        f[b] = f[b] + mul(transposed(B.e[e]), w);
+        const T half = T{} + (entry<T>)0.5;
+        T xy = half * (m[1] + m[3]), xz = half * (m[2] + m[6]), yz = half * (m[5] + m[7]);  // their sums are symmetric
+        UNROLL for (int k = 0; k < 2; ++k) {
+            T* s = own[k ? b : a];
+            s[0] -= m[0]; s[1] -= xy; s[2] -= xz; s[3] -= m[4]; s[4] -= yz; s[5] -= m[8];
+        }
+        put_row(edges + 9 * (long long)n * e, i, n, B.e[e].m);
+    }
+    UNROLL for (int a = 0; a < 4; ++a) {
+        const T row[9] = {f[a].x, f[a].y, f[a].z, own[a][0], own[a][1], own[a][2], own[a][3], own[a][4], own[a][5]};
+        put_row(corners + 9 * (long long)n * a, i, n, row);
+    }
+}

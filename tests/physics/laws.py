@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: MIT
+"""The hyperelastic laws as the tests go through them: what a scene says, and the reference's energy."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_server.simulation import Simulation
+from tests.reference import hyperelastic as reference
+from tests.scenes import bar, jittered_bar, mesh_file, simulation
+
+SIZE = (1.5, 1.0, 0.8)
+ELASTIC = {"young": 3e4, "poisson": 0.35}
+
+
+@dataclass(frozen=True)
+class Law:
+    """table: of the effect; W: its energy by the reference; inverts: defined at J <= 0."""
+
+    name: str
+    table: dict[str, Any]
+    W: Callable[..., Any]
+    inverts: bool = False
+
+
+REGULARIZED = {"inversion": "regularize", "floor": 0.4}
+LAWS = {
+    "st_venant_kirchhoff": Law("st_venant_kirchhoff", ELASTIC, partial(reference.st_venant_kirchhoff, **ELASTIC), True),
+    "neo_hookean": Law("neo_hookean", ELASTIC, partial(reference.neo_hookean, **ELASTIC)),
+    "neo_hookean, regularized": Law(
+        "neo_hookean", ELASTIC | REGULARIZED, partial(reference.regularized_neo_hookean, floor=0.4, **ELASTIC), True
+    ),
+    "stable_neo_hookean": Law("stable_neo_hookean", ELASTIC, partial(reference.stable_neo_hookean, **ELASTIC), True),
+}
+
+
+def law_bar(law: Law | str, mesh: Any = None, table: dict[str, Any] | None = None, **scene: Any) -> Simulation:
+    """A bar of this law. mesh: its table; keywords of tests.scenes.bar and of the solver go there."""
+    name = law if isinstance(law, str) else law.name
+    body = {k: scene.pop(k) for k in ("cells", "size", "fixed", "damping", "density", "touch") if k in scene}
+    table = table or (law.table if isinstance(law, Law) else ELASTIC)
+    o = bar(young=None, **({"mesh": mesh} if mesh else {}), **body)
+    o["effects"][name] = table
+    return simulation(o, **scene)
+
+
+def odd_bar(folder: Path, law: Law | str, cells: tuple[int, int, int] = (2, 1, 2), **scene: Any) -> Simulation:
+    """Of unequal elements, all nodes free."""
+    return law_bar(law, mesh_file(folder, *jittered_bar(cells, SIZE, seed=2)), **scene)
+
+
+def elements(sim: Simulation) -> Any:
+    """The effect that has the elements."""
+    return next(e for e in sim.effects.values() if e.elements is not None)
+
+
+def determinants(sim: Simulation) -> NDArray[np.float64]:
+    """J of every element."""
+    corners, rest = (a[elements(sim).elements] for a in (sim.world.x, sim.world.rest))
+    now, then = (np.linalg.det(c[:, 1:] - c[:, :1]) for c in (corners, rest))
+    return now / then
+
+
+def deform(sim: Simulation, size: float, seed: int = 0) -> None:
+    """Moves the nodes at random by about `size` times an edge and gives them velocities; with size > 0.5 most elements
+    of a law that allows it are inverted."""
+    random = np.random.default_rng(seed)
+    sim.world.x += 0.5 * size * random.normal(size=sim.world.x.shape)
+    sim.world.v[:] = random.normal(size=sim.world.v.shape)
+
+
+def forces(sim: Simulation) -> NDArray[np.float64]:
+    """From the kernels: b / h of an undamped body, its velocity set to zero."""
+    sim.world.v[:] = 0
+    sim.engine.assemble()
+    return sim.system.b / sim.world.dt
+
+
+def stiffness(sim: Simulation) -> NDArray[np.float64]:
+    """(3 n, 3 n) from the kernels, of a body without fixed nodes, in the world's frame."""
+    sim.engine.assemble()
+    n = sim.world.nodes
+    A = sim.matrix().toarray().reshape(n, 3, n, 3)
+    A = np.einsum("aik,akbl,bjl->aibj", sim.system.rotation, A, sim.system.rotation).reshape(3 * n, 3 * n)
+    return (A - np.diag(np.repeat(sim.world.mass, 3))) / sim.world.dt**2
+
+
+def reference_system(sim: Simulation, law: Law, projection: str = "none") -> tuple[float, NDArray, NDArray]:
+    """Energy, forces (n, 3) and stiffness (3 n, 3 n) by the reference."""
+    x, rest = sim.world.x, sim.world.rest
+    energy, f, K = 0.0, np.zeros(x.size), np.zeros((x.size, x.size))
+    for tet in elements(sim).elements:
+        W, f_e, K_e = reference.element(law.W, x[tet], rest[tet], projection)
+        dofs = (3 * tet[:, None] + np.arange(3)).ravel()
+        energy += W
+        f[dofs] += f_e.ravel()
+        K[np.ix_(dofs, dofs)] += K_e
+    return energy, f.reshape(-1, 3), K

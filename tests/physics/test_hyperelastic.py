@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: MIT
+"""Every hyperelastic law: energy, forces and stiffness against the reference and against finite differences."""
+
+import numpy as np
+import pytest
+
+from tests.physics.laws import LAWS, Law, deform, determinants, forces, odd_bar, reference_system, stiffness
+from tests.scenes import random_rotations
+
+every_law = pytest.mark.parametrize("law", LAWS.values(), ids=LAWS.keys())
+CASES = [(law, size) for law in LAWS.values() for size in ((0.1, 0.9) if law.inverts else (0.1, 0.18))]
+every_state = pytest.mark.parametrize(("law", "size"), CASES, ids=[f"{name} {s}" for name, law in LAWS.items()
+    for s in ((0.1, 0.9) if law.inverts else (0.1, 0.18))])  # fmt: skip
+
+
+def stirred(folder, law: Law, size: float, **scene):
+    sim = odd_bar(folder, law, **scene)
+    deform(sim, size, seed=4)
+    J = determinants(sim)
+    assert (J.min() < -0.1 and (J < 0).sum() > 3) if law.inverts and size > 0.5 else J.min() > 0.05
+    return sim
+
+
+@every_state
+def test_energy_and_forces_are_those_of_the_reference(tmp_path, law, size):
+    sim = stirred(tmp_path, law, size)
+    energy, f, _ = reference_system(sim, law)
+    assert sim.potential_energy() == pytest.approx(energy, rel=1e-11)
+    assert np.abs(forces(sim) - f).max() < 1e-11 * np.abs(f).max()
+
+
+@every_state
+def test_forces_are_minus_the_slope_of_the_energy(tmp_path, law, size):
+    sim = stirred(tmp_path, law, size)
+    x, slope, step = sim.world.x, np.zeros_like(sim.world.x), 1e-5
+    for k in np.ndindex(*x.shape):
+        at, energy = x[k], []
+        for x[k] in (at + step, at - step, at + 2 * step, at - 2 * step):
+            energy.append(sim.potential_energy())
+        x[k] = at
+        slope[k] = (8 * (energy[0] - energy[1]) - (energy[2] - energy[3])) / (12 * step)
+    f = forces(sim)
+    assert np.abs(f + slope).max() < 1e-6 * np.abs(f).max()
+
+
+@every_state
+def test_the_stiffness_is_minus_the_slope_of_the_forces(tmp_path, law, size):
+    """With projection = "none"; and it is the reference's."""
+    sim = stirred(tmp_path, law, size, projection="none")
+    K = stiffness(sim)
+    assert np.abs(K - reference_system(sim, law)[2]).max() < 1e-8 * np.abs(K).max()
+    x, slope, step = sim.world.x, np.zeros_like(K), 1e-6
+    for j, k in enumerate(np.ndindex(*x.shape)):
+        at = x[k]
+        x[k] = at + step
+        above = forces(sim).ravel().copy()
+        x[k] = at - step
+        slope[:, j] = (above - forces(sim).ravel()) / (2 * step)
+        x[k] = at
+    assert np.abs(K + slope).max() < 1e-5 * np.abs(K).max()
+
+
+@every_state
+@pytest.mark.parametrize("projection", ["clamp", "absolute"])
+def test_projected_stiffness_is_that_of_the_reference_and_semidefinite(tmp_path, law, size, projection):
+    """Eigenvalues of every element's d2W/dF2 clamped at 0, or made absolute."""
+    sim = stirred(tmp_path, law, size, projection=projection)
+    K, expected = stiffness(sim), reference_system(sim, law, projection)[2]
+    assert np.abs(K - expected).max() < 1e-7 * np.abs(K).max()
+    values = np.linalg.eigvalsh(K)
+    assert values[0] > -1e-11 * values[-1]
+    plain = reference_system(sim, law)[2]
+    assert np.abs(K - plain).max() > 1e-5 * np.abs(K).max()  # there was something to project
+
+
+@every_law
+def test_the_stiffness_is_symmetric_and_blind_to_translations(tmp_path, law):
+    K = stiffness(stirred(tmp_path, law, 0.1))
+    assert np.abs(K - K.T).max() < 1e-14 * np.abs(K).max()
+    moved = np.tile(np.eye(3), (len(K) // 3, 1))
+    assert np.abs(K @ moved).max() < 1e-12 * np.abs(K).max()
+
+
+@every_law
+def test_the_right_hand_side_has_the_stiffness_times_the_velocity(tmp_path, law):
+    """b = h f - h (h + beta) K v with the projected K that stands in A."""
+    sim = stirred(tmp_path, law, 0.15, damping=(0.0, 0.03), dt=0.013)
+    v = sim.world.v.copy()
+    sim.engine.assemble()
+    b, c = sim.system.b.copy(), 0.013 * (0.013 + 0.03)
+    K = stiffness(sim) * 0.013**2 / c
+    expected = 0.013 * forces(sim) - c * (K * c / 0.013**2 / (c / 0.013**2) @ v.ravel()).reshape(-1, 3)
+    assert np.abs(b - expected).max() < 1e-11 * np.abs(expected).max()
+
+
+@every_law
+def test_no_force_and_no_energy_at_rest_moved_and_turned(tmp_path, law):
+    sim = odd_bar(tmp_path, law)
+    for R in random_rotations(5, seed=7):
+        sim.world.x[:] = sim.world.rest @ R.T + [3.0, -2.0, 7.0]
+        assert np.abs(forces(sim)).max() < 1e-10 * 3e4
+        assert abs(sim.potential_energy()) < 1e-11 * 3e4
+
+
+@every_law
+def test_forces_turn_with_the_body_and_balance(tmp_path, law):
+    sim = stirred(tmp_path, law, 0.12)
+    x, f = sim.world.x.copy(), forces(sim).copy()
+    assert np.abs(f.sum(axis=0)).max() < 1e-12 * np.abs(f).max()
+    assert np.abs(np.cross(x, f).sum(axis=0)).max() < 1e-11 * np.abs(f).max()
+    for R in random_rotations(3, seed=8):
+        sim.world.x[:] = x @ R.T
+        assert np.abs(forces(sim) - f @ R.T).max() < 1e-10 * np.abs(f).max()
