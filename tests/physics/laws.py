@@ -67,7 +67,7 @@ def determinants(sim: Simulation) -> NDArray[np.float64]:
 
 
 def deform(sim: Simulation, size: float, seed: int = 0) -> None:
-    """Moves the nodes at random by about `size` times an edge and gives them velocities; with size > 0.5 most elements
+    """Moves the nodes at random by about `size` times an edge and gives them velocities; with size > 0.3 some elements
     of a law that allows it are inverted."""
     random = np.random.default_rng(seed)
     sim.world.x += 0.5 * size * random.normal(size=sim.world.x.shape)

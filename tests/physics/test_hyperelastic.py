@@ -8,16 +8,16 @@ from tests.physics.laws import LAWS, Law, deform, determinants, forces, odd_bar,
 from tests.scenes import random_rotations
 
 every_law = pytest.mark.parametrize("law", LAWS.values(), ids=LAWS.keys())
-CASES = [(law, size) for law in LAWS.values() for size in ((0.1, 0.9) if law.inverts else (0.1, 0.18))]
+CASES = [(law, size) for law in LAWS.values() for size in ((0.1, 0.4) if law.inverts else (0.1, 0.18))]
 every_state = pytest.mark.parametrize(("law", "size"), CASES, ids=[f"{name} {s}" for name, law in LAWS.items()
-    for s in ((0.1, 0.9) if law.inverts else (0.1, 0.18))])  # fmt: skip
+    for s in ((0.1, 0.4) if law.inverts else (0.1, 0.18))])  # fmt: skip
 
 
 def stirred(folder, law: Law, size: float, **scene):
     sim = odd_bar(folder, law, **scene)
     deform(sim, size, seed=4)
     J = determinants(sim)
-    assert (J.min() < -0.1 and (J < 0).sum() > 3) if law.inverts and size > 0.5 else J.min() > 0.05
+    assert (J.min() < -0.1 and (J < 0).sum() > 1) if law.inverts and size > 0.3 else J.min() > 0.05
     return sim
 
 

@@ -52,6 +52,7 @@ def test_defaults_and_resolved(tmp_path):
             "preconditioner": "auto",
             "warp": "auto",
             "warp_level": 1,
+            "projection": "clamp",
             "update": "async",
             "precision": "float64",
             "factor_precision": "auto",
