@@ -41,6 +41,14 @@ def rows_of(row_start: NDArray[np.integer]) -> NDArray[np.int64]:
     return np.repeat(np.arange(len(row_start) - 1), np.diff(row_start))
 
 
+def node_norms(row_start: NDArray[np.integer], values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """What a shift of the diagonal is measured by, (nodes,): the norm of the largest block of a row, over sqrt(3).
+
+    In a positive definite matrix that is the diagonal block; where it is not, that may be zero.
+    """
+    return np.maximum.reduceat(np.linalg.norm(values, axis=(1, 2)), row_start[:-1]) / np.sqrt(BLOCK)
+
+
 def degrees_of_freedom(nodes: NDArray[np.integer]) -> NDArray[np.int64]:
     """The three degrees of freedom of each node, one node after another, (3 * len(nodes),)."""
     return (BLOCK * nodes.astype(np.int64)[:, None] + np.arange(BLOCK)).ravel()

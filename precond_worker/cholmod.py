@@ -36,6 +36,18 @@ class Cholmod:
             raise NotPositiveDefinite("pivot not positive", column=int(error.column)) from None
         return self._factor.L()
 
+    def ldl(self, values: NDArray[np.float64]) -> tuple[csc_matrix, NDArray[np.float64], NDArray[np.float64]]:
+        """L with a unit diagonal, D (n,) of any sign and the diagonal of the matrix; raises NotPositiveDefinite where a
+        pivot is zero. By the simplicial method, as CHOLMOD's supernodal one knows no D."""
+        matrix = self._gather.fill(values)
+        factor = cholmod.analyze(matrix, mode="simplicial", ordering_method="natural")
+        try:
+            factor.cholesky_inplace(matrix)
+        except cholmod.CholmodNotPositiveDefiniteError as error:
+            raise NotPositiveDefinite("pivot zero", column=int(error.column)) from None
+        unit, pivots = factor.L_D()
+        return csc_matrix(unit), pivots.diagonal(), matrix.diagonal()
+
 
 def version() -> str:
     """Of the CHOLMOD library itself, such as "3.0.14"."""

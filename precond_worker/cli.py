@@ -119,7 +119,7 @@ def _library(device: str, arithmetic: str) -> str:
 def _serve(connect: list[str], threads: int, name: str, servers: list[str], shared_memory: bool, library: str) -> None:
     from functools import partial
 
-    from precond_worker.factorize import Analysis
+    from precond_worker.methods import prepared
     from precond_worker.places import Place, places
     from precond_worker.serving import Serving
     from precond_worker.uplink import Uplink
@@ -148,7 +148,7 @@ def _serve(connect: list[str], threads: int, name: str, servers: list[str], shar
             else:
                 print(f"precond-worker {name}: {server} is gone, waiting for it", file=sys.stderr, flush=True)
 
-        return Worker(up, partial(Analysis, library=library), on_server)
+        return Worker(up, partial(prepared, library=library), on_server)
 
     with Serving(where, shared_memory, uplink, worker) as serving:
         serving.run()

@@ -13,6 +13,10 @@ class NotPositiveDefinite(ValueError):
         self.column = column
 
 
+class OutOfRange(NotPositiveDefinite):
+    """There is a factor, but its numbers do not fit into the precision asked for."""
+
+
 class NameTaken(RuntimeError):
     """Another worker of this name serves the server."""
 

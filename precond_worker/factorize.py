@@ -28,6 +28,10 @@ class Library(Protocol):
         self, matrix: NDArray[np.float64], dtype: np.dtype[np.floating], out: NDArray[np.floating] | None
     ) -> NDArray[np.floating]: ...
 
+    def turned(
+        self, matrix: NDArray[np.float64], dtype: np.dtype[np.floating], growth: float
+    ) -> tuple[NDArray[np.floating], int]: ...
+
 
 class Analysis:
     """Factors of matrices with one block pattern.
@@ -72,7 +76,15 @@ class Analysis:
         try:
             return self._library.factorize(matrix, kind, out)
         except NotPositiveDefinite as error:
-            raise NotPositiveDefinite(self._where(error), error.column) from None
+            raise type(error)(self._where(error), error.column) from None
+
+    def turned(self, matrix: NDArray[np.float64], dtype: DTypeLike, growth: float) -> tuple[NDArray[np.floating], int]:
+        """L |D|^1/2 of a matrix that `factorize` found not positive definite, and how many pivots were turned positive.
+
+        Raises NotPositiveDefinite if there is no such factor, or it is more than `growth` times the matrix.
+        """
+        kind: np.dtype[Any] = np.dtype(dtype)
+        return self._library.turned(matrix, kind, growth)
 
     def _where(self, error: NotPositiveDefinite) -> str:
         if error.column < 0:

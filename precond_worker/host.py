@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_matrix
 
-from precond_worker.blocks import Index
+from precond_worker.blocks import BLOCK, Index
 from precond_worker.elimination import eliminate
-from precond_worker.errors import NotPositiveDefinite
+from precond_worker.errors import NotPositiveDefinite, OutOfRange
 from precond_worker.ordering import order_nodes
 from precond_worker.packing import Packer
 from precond_worker.supernodes import pattern_arrays
@@ -17,11 +17,15 @@ from precond_worker.triangle import lower_triangle
 from protocol import FactorPattern
 from protocol.check import all_finite
 
+TINY = 1e-12  # of a node's diagonal: pivots of LDL^T are made at least this
+
 
 class Numeric(Protocol):
     """A library: L of block values, any csc_matrix that fits the pattern."""
 
     def factorize(self, values: NDArray[np.float64]) -> csc_matrix: ...
+
+    def ldl(self, values: NDArray[np.float64]) -> tuple[csc_matrix, NDArray[np.float64], NDArray[np.float64]]: ...
 
 
 class Host:
@@ -39,9 +43,30 @@ class Host:
         """Values of L (factorize.Analysis.factorize), computed in float64."""
         if not np.isfinite(matrix).all():
             raise ValueError("matrix: values hold NaN or infinity, allowed: finite numbers")
+        return self._packed(self.numeric.factorize(matrix), dtype, out)
+
+    def turned(
+        self, matrix: NDArray[np.float64], dtype: np.dtype[np.floating], growth: float
+    ) -> tuple[NDArray[np.floating], int]:
+        """Values of L |D|^1/2 of an LDL^T factorization of finite values, and how many pivots were not positive.
+
+        Raises NotPositiveDefinite if there is none without pivoting, or if L |D| L^T is more than `growth` times A.
+        """
+        unit, pivots, diagonal = self.numeric.ldl(matrix)
+        scale = np.repeat(np.abs(diagonal).reshape(-1, BLOCK).max(axis=1), BLOCK)  # of its node
+        size = np.maximum(np.abs(pivots), TINY * scale)
+        values = unit.data * np.repeat(np.sqrt(size), np.diff(unit.indptr))
+        lower = csc_matrix((values, unit.indices, unit.indptr), unit.shape)
+        if not (np.asarray(lower.multiply(lower).sum(axis=1)).ravel() <= growth * scale).all():
+            raise NotPositiveDefinite("LDL^T without pivoting grows out of hand")
+        return self._packed(lower, dtype, None), int(np.count_nonzero(pivots <= TINY * scale))
+
+    def _packed(
+        self, factor: csc_matrix, dtype: np.dtype[np.floating], out: NDArray[np.floating] | None
+    ) -> NDArray[np.floating]:
         result = np.empty(self.pattern.nonzeros, dtype) if out is None else out
         with np.errstate(over="ignore", under="ignore", invalid="ignore"):
-            self.packer.pack(self.numeric.factorize(matrix), result)
+            self.packer.pack(factor, result)
         self._check(result)
         return result
 
@@ -50,9 +75,9 @@ class Host:
         pivots = result[self.pattern.diagonal]
         usable = (pivots >= np.finfo(result.dtype).tiny) & np.isfinite(pivots)
         if not usable.all():
-            raise NotPositiveDefinite(f"pivot out of the range of {result.dtype}", int(np.argmin(usable)))
+            raise OutOfRange(f"pivot out of the range of {result.dtype}", int(np.argmin(usable)))
         if not all_finite(result):
-            raise NotPositiveDefinite(f"factor out of the range of {result.dtype}")
+            raise OutOfRange(f"factor out of the range of {result.dtype}")
 
 
 def numeric(library: str, lower: csc_matrix) -> tuple[str, Numeric]:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from protocol.channels import CHANNELS, name_in
 from protocol.check import array, check_header, check_strings, checksum, parse, take
 from protocol.messages_pb2 import Matrix
+from protocol.method import Method
 from protocol.refused import Refused
 from protocol.slotmap import SlotMap
 from protocol.slots import HEADER
@@ -25,6 +26,7 @@ class Job:
     message: Matrix
     payload: zenoh.ZBytes
     shared: bool
+    method: Method
 
     @property
     def object(self) -> str:
@@ -58,7 +60,6 @@ def accept(sample: zenoh.Sample, worker: str, incarnation: int) -> Job:
         raise Refused(f"Matrix is for {message.worker!r}, its key is {sample.key_expr}", "worker")
     if message.factor_dtype not in DTYPES:
         raise Refused(f"Matrix.factor_dtype is {message.factor_dtype!r}; allowed: {', '.join(DTYPES)}", "malformed")
-    if message.method != "cholesky":
-        raise Refused(f"Matrix.method is {message.method!r}; allowed: cholesky", "malformed")
+    method = Method(message.method, message.drop_tolerance, message.fill, message.omega).check()
     shared = message.HasField("matrix_slot") and sample.payload.as_shm() is not None
-    return Job(message, sample.payload, shared)
+    return Job(message, sample.payload, shared, method)

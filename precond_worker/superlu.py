@@ -27,10 +27,20 @@ class SuperLU:
 
         Raises NotPositiveDefinite where a pivot is not positive or had to be looked for off the diagonal.
         """
+        unit, pivots, _ = self.ldl(values)
+        if not np.all(pivots > 0):
+            raise NotPositiveDefinite("pivot not positive", column=int(np.argmax(~(pivots > 0))))
+        scale = np.repeat(np.sqrt(pivots), np.diff(unit.indptr))
+        return csc_matrix((unit.data * scale, unit.indices, unit.indptr), shape=unit.shape)
+
+    def ldl(self, values: NDArray[np.float64]) -> tuple[csc_matrix, NDArray[np.float64], NDArray[np.float64]]:
+        """L with a unit diagonal, D (n,) of any sign and the diagonal of the matrix; raises NotPositiveDefinite where a
+        pivot had to be looked for off the diagonal."""
+        matrix = self._gather.fill(values)
         try:
             # relax=1: with 24 the SuperLU of SciPy 1.17 writes past its arrays.
             lu = splu(
-                self._gather.fill(values),
+                matrix,
                 permc_spec="NATURAL",
                 diag_pivot_thresh=0.0,
                 relax=1,
@@ -42,8 +52,6 @@ class SuperLU:
             raise RuntimeError("SuperLU permuted a matrix that it was to factorize in its natural order")
         pivots = lu.U.diagonal()
         moved = lu.perm_r != self._natural
-        if np.any(moved) or not np.all(pivots > 0):
+        if np.any(moved):
             raise NotPositiveDefinite("pivot not positive", column=int(np.argmax(moved | ~(pivots > 0))))
-        unit = lu.L
-        scale = np.repeat(np.sqrt(pivots), np.diff(unit.indptr))
-        return csc_matrix((unit.data * scale, unit.indices, unit.indptr), shape=unit.shape)
+        return csc_matrix(lu.L), pivots, matrix.diagonal()

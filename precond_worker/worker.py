@@ -4,7 +4,7 @@
 import logging
 import time
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import zenoh
@@ -12,25 +12,18 @@ from numpy.typing import NDArray
 
 from precond_worker.errors import DeviceUnusable
 from precond_worker.job import Job, accept
+from precond_worker.methods import Factorization
 from precond_worker.uplink import ServerEvent, Uplink
 from protocol import FactorPattern
 from protocol.check import array, checksum
 from protocol.messages_pb2 import Factor
+from protocol.method import Method
 from protocol.refused import Refused
 
 log = logging.getLogger(__name__)
 
 
-class Factorization(Protocol):
-    """What the worker needs of precond_worker.factorize.Analysis."""
-
-    pattern: FactorPattern
-    library: str
-
-    def factorize(self, values: Any, dtype: Any) -> NDArray[Any]: ...
-
-
-Analyse = Callable[[NDArray[np.int32], NDArray[np.int32]], Factorization]
+Analyse = Callable[[NDArray[np.int32], NDArray[np.int32], Method], Factorization]  # as methods.prepared
 
 
 class Worker:
@@ -41,7 +34,7 @@ class Worker:
         self._counters = uplink.counters
         self._analyse = analyse
         self._on_server = on_server
-        self._analyses: dict[str, tuple[int, int, Factorization]] = {}  # of an object: epoch, blocks
+        self._analyses: dict[str, tuple[int, Method, int, Factorization]] = {}  # of an object: epoch, ..., blocks
         self._pending: dict[str, Job] = {}
 
     def run(self) -> None:
@@ -126,7 +119,7 @@ class Worker:
 
     def _factorize(self, job: Job) -> None:
         message = job.message
-        analysis = self._analysis(job.object, message.header.epoch, message.blocks)
+        analysis = self._analysis(job)
         values = job.values(self._uplink.slots)
         begin = time.perf_counter()
         # Into memory of our own, so that the checksum is of what was computed whatever happens to the slot.
@@ -134,20 +127,22 @@ class Worker:
         seconds = time.perf_counter() - begin
         if analysis.pattern.id not in message.known_patterns:
             self._uplink.send_pattern(analysis.pattern, job.object, message.header.epoch)
-        self._answer(job, analysis.pattern, factor, seconds)
+        self._answer(job, analysis.pattern, factor, seconds, remedy=analysis.remedy)
 
-    def _analysis(self, object: str, epoch: int, blocks: int) -> Factorization:
+    def _analysis(self, job: Job) -> Factorization:
         """The symbolic phase, once per epoch of an object."""
+        object, epoch, blocks = job.object, job.message.header.epoch, job.message.blocks
         known = self._analyses.get(object)
-        if known is None or known[0] != epoch:
+        if known is None or known[:2] != (epoch, job.method):
             topology = self._uplink.topology(object, epoch)
             row_start = array(topology.row_start, np.int32, (topology.nodes + 1,), "Topology.row_start")
             columns = array(topology.columns, np.int32, (-1,), "Topology.columns")
-            known = self._analyses[object] = (epoch, len(columns), self._analyse(row_start, columns))
-            self._uplink.library = known[2].library
-        if known[1] != blocks:
-            raise Refused(f"Matrix.blocks is {blocks}; allowed: {known[1]}, as in the topology", "shape")
-        return known[2]
+            analysis = self._analyse(row_start, columns, job.method)
+            known = self._analyses[object] = (epoch, job.method, len(columns), analysis)
+            self._uplink.library = analysis.library
+        if known[2] != blocks:
+            raise Refused(f"Matrix.blocks is {blocks}; allowed: {known[2]}, as in the topology", "shape")
+        return known[3]
 
     def _answer(
         self,
@@ -156,6 +151,7 @@ class Worker:
         values: NDArray[Any] | None = None,
         seconds: float = 0.0,
         failure: str = "",
+        remedy: str = "",
     ) -> None:
         message, uplink = job.message, self._uplink
         answer = Factor(
@@ -166,6 +162,7 @@ class Worker:
             worker=uplink.name,
             seconds=seconds,
             failure=failure[:500],
+            remedy=remedy,
             job=message.header.sequence,
             matrix_shared=job.shared,
         )

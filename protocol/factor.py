@@ -157,7 +157,8 @@ def _check_starts(starts: NDArray[Any], end: int, name: str, what: str) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Factor:
-    """L of one object at one step. values (pattern.nonzeros,) float32 or float64; seconds: what it took to make."""
+    """L of one object at one step. values (pattern.nonzeros,) float32 or float64; seconds: what it took to make;
+    remedy: what was done to a matrix that was not positive definite, in a few words."""
 
     object: str
     epoch: int
@@ -167,6 +168,7 @@ class Factor:
     values: NDArray[Any]
     worker: str
     seconds: float
+    remedy: str = ""
 
 
 def check_values(values: NDArray[Any], pattern: FactorPattern, expected: int | None) -> None:

@@ -15,6 +15,7 @@ from sim_server.backend import Cpu
 from sim_server.engine import Kind
 from sim_server.mesh import posed
 from sim_server.mesh.surface import surface_triangles
+from sim_server.scene.solver_options import FACTORS
 from sim_server.simulation import Simulation
 from sim_server.world import Body
 
@@ -81,11 +82,19 @@ def state(body: Body, step: int, time: float, x: NDArray[np.float64], v: NDArray
 def steps(simulation: Simulation, records: NDArray[Any]) -> list[pb.ObjectStep]:
     """Step records (engine.RECORD) as messages."""
     names = [b.name for b in simulation.world.bodies]
+    kinds = preconditioner_names(simulation)
     columns = [records[name].tolist() for name in records.dtype.names or ()]
-    return [_step(names, dict(zip(records.dtype.names or (), row, strict=True))) for row in zip(*columns, strict=True)]
+    rows = (dict(zip(records.dtype.names or (), row, strict=True)) for row in zip(*columns, strict=True))
+    return [_step(names, kinds, row) for row in rows]
 
 
-def _step(names: list[str], r: dict[str, Any]) -> pb.ObjectStep:
+def preconditioner_names(simulation: Simulation) -> dict[Kind, str]:
+    """Of the kinds that the loop knows: any factor is Kind.CHOLESKY there."""
+    wanted = simulation.scene.solver.preconditioner
+    return NAMES | ({Kind.CHOLESKY: wanted} if wanted in FACTORS else {})
+
+
+def _step(names: list[str], kinds: dict[Kind, str], r: dict[str, Any]) -> pb.ObjectStep:
     made = r["factor_step"]
     return pb.ObjectStep(
         header=pb.Header(object=names[r["body"]], epoch=1),
@@ -96,7 +105,7 @@ def _step(names: list[str], r: dict[str, Any]) -> pb.ObjectStep:
         residual=r["residual"],
         factor_step=made,
         factor_age=r["step"] - 1 - made if made >= 0 else -1,
-        preconditioner=NAMES[Kind(r["kind"])],
+        preconditioner=kinds[Kind(r["kind"])],
         assemble_seconds=r["assemble"],
         solve_seconds=r["solve"],
         integrate_seconds=r["integrate"],
@@ -104,7 +113,7 @@ def _step(names: list[str], r: dict[str, Any]) -> pb.ObjectStep:
         late_seconds=r["late"],
         cpu_seconds=r["cpu"],
         fallbacks=r["fallbacks"],
-        asked=NAMES[Kind(r["asked"])] if r["asked"] != r["kind"] else "",
+        asked=kinds[Kind(r["asked"])] if r["asked"] != r["kind"] else "",
         probe=r["probe"],
     )
 

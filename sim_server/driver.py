@@ -55,7 +55,7 @@ class Driver:
         auto = self.solver.preconditioner == "auto"
         self.tracks = [Track(b, auto, self.counted) for b in simulation.world.bodies]
         self.by_name = {t.body.name: t for t in self.tracks}
-        self.wants_factors = self.solver.preconditioner in ("auto", "cholesky")
+        self.wants_factors = self.solver.wants_factors
         self.adopted: Callable[[Factor], None] = lambda factor: None  # told of every factor put into a mailbox
         self._due: dict[str, int] = {}  # lockstep: step of the matrix whose factor is taken up n steps later
         self._arrived: dict[tuple[str, int], Factor] = {}
@@ -115,7 +115,7 @@ class Driver:
 
     def _job(self, t: Track, step: int, values: NDArray[np.float64]) -> Job:
         name = t.body.name
-        return Job(name, 1, step, self._warped[name], values, self.solver.factor_dtype)
+        return Job(name, 1, step, self._warped[name], values, self.solver.factor_dtype, self.solver.method)
 
     def _take_up(self, source: FactorSource) -> None:
         for factor in source.poll():
@@ -313,8 +313,10 @@ class Driver:
     def _model(self, t: Track, kind: int, iterations: int) -> float:
         """Bytes that a solve moved, about: the deterministic stand-in for its time."""
         matrix = self._bytes[t.body.name]
-        factor = self.engine.factor_bytes(t.body.index) if kind == Kind.CHOLESKY else 0
-        return (iterations + 1) * (matrix + 2.0 * factor)
+        other = matrix if kind == Kind.SSOR else 0.0
+        if kind == Kind.CHOLESKY:
+            other = 2.0 * self.engine.factor_bytes(t.body.index)
+        return (iterations + 1) * (matrix + other)
 
     def _settle(self, t: Track) -> None:
         assert t.choice is not None

@@ -30,7 +30,8 @@ class Kind(IntEnum):
     NONE = 0
     JACOBI = 1
     BLOCK_JACOBI = 2
-    CHOLESKY = 3
+    CHOLESKY = 3  # and any other factor
+    SSOR = 4  # by sweeps over the present matrix
 
 
 @cache

@@ -9,13 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import Factor
+from protocol.method import Method
 
 log = logging.getLogger(__name__)
+
+EXACT = Method()
 
 
 @dataclass(frozen=True)
 class Job:
-    """A matrix to factorize. values (blocks, 3, 3) float64, read during `submit` only; dtype: of the factor wanted."""
+    """A matrix to factorize. values (blocks, 3, 3) float64, read during `submit` only; dtype, method: of the factor
+    wanted."""
 
     object: str
     epoch: int
@@ -23,6 +27,7 @@ class Job:
     warp: bool
     values: NDArray[np.float64]
     dtype: str = "float32"
+    method: Method = EXACT
 
 
 class FactorSource(Protocol):
@@ -55,7 +60,7 @@ class Inline:
 
     def __init__(self, patterns: dict[str, tuple[NDArray[np.int32], NDArray[np.int32]]], library: str = "auto"):
         self._patterns, self._library = patterns, library
-        self._analyses: dict[str, Any] = {}
+        self._analyses: dict[str, tuple[Method, Any]] = {}
         self._done: list[Factor] = []
         self._failed: list[tuple[str, str]] = []
 
@@ -70,30 +75,31 @@ class Inline:
         from precond_worker.factorize import NotPositiveDefinite  # lazily: only in-process updates need a library
 
         start = perf_counter()
-        analysis = self._analysis(job.object)
+        analysis = self._analysis(job.object, job.method)
         try:
             values = analysis.factorize(job.values, np.dtype(job.dtype))
         except (NotPositiveDefinite, ValueError) as error:
             self._failed.append((job.object, str(error)))
             return True
         seconds = perf_counter() - start
-        self._done.append(
-            Factor(job.object, job.epoch, job.step, job.warp, analysis.pattern, values, self.WORKER, seconds)
-        )
+        made = (self.WORKER, seconds, analysis.remedy)
+        self._done.append(Factor(job.object, job.epoch, job.step, job.warp, analysis.pattern, values, *made))
         return True
 
     def library(self, name: str) -> str:
         """Library and version that factorizes the matrices of an object."""
-        return str(self._analysis(name).library)
+        known = self._analyses.get(name)
+        return str(self._analysis(name, known[0] if known else EXACT).library)
 
-    def _analysis(self, name: str) -> Any:
-        from precond_worker.factorize import Analysis, default_library
+    def _analysis(self, name: str, method: Method) -> Any:
+        from precond_worker.factorize import default_library
+        from precond_worker.methods import prepared
 
-        if name not in self._analyses:
-            if not self._analyses and (message := default_library()[1]):
+        if name not in self._analyses or self._analyses[name][0] != method:
+            if not self._analyses and method == EXACT and (message := default_library()[1]):
                 log.warning("%s", message)
-            self._analyses[name] = Analysis(*self._patterns[name], self._library)
-        return self._analyses[name]
+            self._analyses[name] = (method, prepared(*self._patterns[name], method, self._library))
+        return self._analyses[name][1]
 
     def poll(self) -> list[Factor]:
         """Factors made since the last call."""

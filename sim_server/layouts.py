@@ -52,7 +52,7 @@ class Factor(c.Structure):
 class Settings(c.Structure):
     _fields_ = [
         ("tolerance", c.c_double), ("budget", c.c_double), ("max_iterations", c.c_int32), ("kind", c.c_int32),
-        ("warm_start", c.c_int32), ("probe", c.c_int32),
+        ("warm_start", c.c_int32), ("probe", c.c_int32), ("omega", c.c_double),
     ]  # fmt: skip
 
 

@@ -21,7 +21,7 @@ from sim_server.shape import ShapeMatching
 from sim_server.system import System
 from sim_server.world import Body, World
 
-KINDS = {"none": Kind.NONE, "jacobi": Kind.JACOBI, "block_jacobi": Kind.BLOCK_JACOBI, "cholesky": Kind.CHOLESKY}
+KINDS = {"none": Kind.NONE, "jacobi": Kind.JACOBI, "block_jacobi": Kind.BLOCK_JACOBI, "ssor": Kind.SSOR}
 
 
 class Simulation:
@@ -110,7 +110,7 @@ class Simulation:
         solver, native = self.scene.solver, self.engine.settings(body.index)
         native.tolerance, native.max_iterations = solver.tolerance, solver.max_iterations
         native.budget, native.warm_start = solver.budget, int(solver.warm_start)
-        native.kind = KINDS.get(solver.preconditioner, Kind.CHOLESKY)
+        native.kind, native.omega = KINDS.get(solver.preconditioner, Kind.CHOLESKY), solver.omega
 
     def potential_energy(self) -> float:
         """Of all effects [J]."""

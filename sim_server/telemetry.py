@@ -163,6 +163,7 @@ class Telemetry:
                     excess=track.excess,
                     factors_used=track.used,
                     factors_refused=track.refused,
+                    factors_mended=track.mended,
                     in_flight=track.in_flight,
                     factor_age=track.age(status.step),
                     factor_age_max=track.age_max,

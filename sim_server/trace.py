@@ -18,6 +18,7 @@ from protocol.check import checksum
 from protocol.factor import Factor
 from sim_server.commands import interaction_message
 from sim_server.driver import Driver
+from sim_server.factors import EXACT
 from sim_server.network.link import ServerLink
 from sim_server.recorder import Recorder
 
@@ -79,8 +80,9 @@ class Trace:
             if factor.worker not in self._workers:
                 self._workers.update({w.worker: w for w in self._link.workers()})
             maker = self._workers.get(factor.worker, pb.WorkerInfo(worker=factor.worker))
+        library = maker.library if self._driver.solver.method == EXACT else "native"
         return pb.FactorUse(
             header=pb.Header(object=factor.object, epoch=factor.epoch), step=factor.step, pattern=factor.pattern.id,
             checksum=checksum(factor.values), dtype=factor.values.dtype.name, worker=factor.worker,
-            library=maker.library, threads=maker.threads, seconds=factor.seconds,
+            library=library, threads=maker.threads, seconds=factor.seconds, remedy=factor.remedy,
         )  # fmt: skip

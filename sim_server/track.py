@@ -46,6 +46,7 @@ class Track:
         self.asked = 0  # number of the request for it, among those of all bodies
         self.used = 0
         self.refused = 0
+        self.mended = 0  # of those used: from a matrix that was not positive definite
         self.failures = 0  # in a row
         self.newest = -1  # step of the newest factor taken up
         self.age_max = -1  # steps; largest age of a factor so far, -1: none was used
@@ -88,6 +89,7 @@ class Track:
         self.newest = factor.step
         self.sent = factor.step if self.sent is None else self.sent  # one made elsewhere
         self.used += 1
+        self.mended += bool(factor.remedy)
         return True
 
     def came_to_nothing(self) -> None:

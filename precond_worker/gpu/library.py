@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from precond_worker.blocks import Index
 from precond_worker.elimination import eliminate
-from precond_worker.errors import NotPositiveDefinite
+from precond_worker.errors import NotPositiveDefinite, OutOfRange
 from precond_worker.gpu.assembly_tree import assembly_tree
 from precond_worker.gpu.device import best_arithmetic, name, try_out
 from precond_worker.gpu.executor import Executor
@@ -40,11 +40,17 @@ class Gpu:
         if outcome.pivot >= 0:
             raise NotPositiveDefinite("pivot not positive", outcome.pivot)
         if outcome.range >= 0:
-            raise NotPositiveDefinite(f"factor out of the range of {dtype}", outcome.range)
+            raise OutOfRange(f"factor out of the range of {dtype}", outcome.range)
         if out is None:
             return values
         np.copyto(out, values)
         return out
+
+    def turned(
+        self, matrix: NDArray[np.float64], dtype: np.dtype[np.floating], growth: float
+    ) -> tuple[NDArray[np.floating], int]:
+        """None here: the fronts know no D. Raises NotPositiveDefinite."""
+        raise NotPositiveDefinite("no LDL^T on a GPU")
 
     def executor(self, stored: str) -> Executor:
         """For L in this type, made when it is first wanted."""

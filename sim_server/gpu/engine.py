@@ -42,7 +42,7 @@ class Settings:
         return self._row[name].item()
 
     def __setattr__(self, name: str, value: Any) -> None:
-        if name == "budget" or self._row[name] == value:  # a budget of wall time: not on a GPU
+        if name in ("budget", "omega") or self._row[name] == value:  # no budget of wall time and no SSOR on a GPU
             return
         self._row[name] = value
         self._mailbox.post(self._row.tobytes()[:SETTINGS])

@@ -83,6 +83,44 @@ static void invert_diagonal(const BlockCsr& A, bool whole, double* inverse) {
     }
 }
 
+static void multiply3(const double* a, const double* v, double* y) {
+    for (int i = 0; i < 3; ++i) y[i] = a[3 * i] * v[0] + a[3 * i + 1] * v[1] + a[3 * i + 2] * v[2];
+}
+
+// y -= sum of A_ik x_k over places [k, end) of row i
+static void subtract_row(const BlockCsr& A, int k, int end, const double* x, double y[3]) {
+    for (; k < end; ++k) {
+        const double *a = A.values + 9 * (int64_t)k, *v = x + 3 * (A.columns[k] - A.first);
+        y[0] -= a[0] * v[0] + a[1] * v[1] + a[2] * v[2];
+        y[1] -= a[3] * v[0] + a[4] * v[1] + a[5] * v[2];
+        y[2] -= a[6] * v[0] + a[7] * v[1] + a[8] * v[2];
+    }
+}
+
+// z = P^-1 r with P = (D/w + L) (D/w)^-1 (D/w + L^T) w / (2 - w), A = L + D + L^T in blocks: a sweep down, a sweep up.
+// inverse: of the diagonal blocks.
+static void apply_ssor(const BlockCsr& A, const double* inverse, double omega, const double* r, double* z) {
+    const int n = A.last - A.first;
+    for (int i = 0; i < n; ++i) {
+        const int* row = A.row_start + A.first + i;
+        int k = row[0];
+        while (A.columns[k] != A.first + i) ++k;
+        double t[3] = {0, 0, 0};
+        subtract_row(A, row[0], k, z, t);
+        for (int c = 0; c < 3; ++c) t[c] = (2 - omega) * r[3 * i + c] + omega * t[c];  // scaled here, not at the end
+        multiply3(inverse + 9 * i, t, z + 3 * i);
+    }
+    for (int i = n - 1; i >= 0; --i) {
+        const int* row = A.row_start + A.first + i;
+        int k = row[1] - 1;
+        while (A.columns[k] != A.first + i) --k;
+        double t[3] = {0, 0, 0}, d[3];
+        subtract_row(A, k + 1, row[1], z, t);
+        multiply3(inverse + 9 * i, t, d);
+        for (int c = 0; c < 3; ++c) z[3 * i + c] += omega * d[c];
+    }
+}
+
 static void apply_diagonal(int nodes, const double* inverse, const double* r, double* z) {
 #pragma omp simd
     for (int i = 0; i < nodes; ++i) {

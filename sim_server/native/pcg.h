@@ -14,7 +14,7 @@
 #include "rings.h"
 #include "supernodal.h"
 
-enum Kind { NONE = 0, JACOBI = 1, BLOCK_JACOBI = 2, CHOLESKY = 3 };
+enum Kind { NONE = 0, JACOBI = 1, BLOCK_JACOBI = 2, CHOLESKY = 3, SSOR = 4 };  // CHOLESKY: any factor
 enum Status { CONVERGED = 0, MAX_ITERATIONS = 1, BUDGET = 2, BREAKDOWN_MATRIX = 3, BREAKDOWN_PRECONDITIONER = 4, NOT_FINITE = 5 };
 
 struct Factor {
@@ -32,6 +32,7 @@ struct SolveSettings {
     int32_t kind;           // Kind wanted; CHOLESKY without a factor is BLOCK_JACOBI
     int32_t warm_start;
     int32_t probe;          // > 0: after so many iterations go from block Jacobi to the factor, or the other way
+    double omega;           // of SSOR
 };
 
 struct SolveResult {
@@ -48,9 +49,10 @@ struct Preconditioner {
     int kind;
     double* inverse;  // (nodes, 9)
     void* work;       // 2 n doubles
+    double omega;
 
     void prepare() {
-        if (kind == JACOBI || kind == BLOCK_JACOBI) invert_diagonal(A, kind == BLOCK_JACOBI, inverse);
+        if (kind == JACOBI || kind == BLOCK_JACOBI || kind == SSOR) invert_diagonal(A, kind != JACOBI, inverse);
     }
     // z = P^-1 r; returns z . r
     double apply(const double* r, double r_norm, double* z) {
@@ -59,6 +61,8 @@ struct Preconditioner {
             apply_factor(*factor->pattern, (const float*)factor->values, r, 1 / r_norm, z, (float*)work);
         else if (kind == CHOLESKY)
             apply_factor(*factor->pattern, (const double*)factor->values, r, 1 / r_norm, z, (double*)work);
+        else if (kind == SSOR)
+            apply_ssor(A, inverse, omega, r, z);
         else if (kind == NONE)
             for (int i = 0; i < n; ++i) z[i] = r[i];
         else
@@ -95,7 +99,7 @@ static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor,
     }
     if (r2 <= goal) return finish(CONVERGED, r2, b2);
 
-    Preconditioner P{A, factor, out.kind, inverse, scratch};
+    Preconditioner P{A, factor, out.kind, inverse, scratch, settings.omega};
     P.prepare();
     double rz = 0, last_true = INFINITY, quarter = r2 * std::pow(goal / r2, 0.25);
     bool restart = true, switched = false;
@@ -121,7 +125,7 @@ static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor,
             leave_factor();
             continue;
         }
-        if (out.iterations == settings.probe && settings.probe > 0 && factor && P.kind >= BLOCK_JACOBI && !switched) {
+        if (out.iterations == settings.probe && settings.probe > 0 && factor && (P.kind == BLOCK_JACOBI || P.kind == CHOLESKY) && !switched) {
             P.kind = out.kind = P.kind == CHOLESKY ? BLOCK_JACOBI : CHOLESKY;
             P.prepare();
             switched = restart = true;

@@ -24,9 +24,32 @@ struct Panel {
     const T* column(int k) const { return values + (int64_t)k * height - (int64_t)k * (k + 1) / 2; }
 };
 
+// A panel of one node: all there is in incomplete factors. Its few rows are gathered and scattered where they are used.
+template <class T>
+static void forward_node(const Panel<T>& L, T* x, const int32_t* rows, T* y) {
+    const T *a = L.column(0), *b = L.column(1), *c = L.column(2);
+    const T x0 = x[0] / a[0], x1 = (x[1] - a[1] * x0) / b[1], x2 = (x[2] - a[2] * x0 - b[2] * x1) / c[2];
+    x[0] = x0; x[1] = x1; x[2] = x2;
+    for (int r = 3; r < L.height; ++r) y[rows[r]] -= a[r] * x0 + b[r] * x1 + c[r] * x2;
+}
+
+template <class T>
+static void backward_node(const Panel<T>& L, T* x, const int32_t* rows, const T* y) {
+    const T *a = L.column(0), *b = L.column(1), *c = L.column(2);
+    T s0 = 0, s1 = 0, s2 = 0;
+    for (int r = 3; r < L.height; ++r) {
+        const T w = y[rows[r]];
+        s0 += a[r] * w; s1 += b[r] * w; s2 += c[r] * w;
+    }
+    const T x2 = (x[2] - s2) / c[2], x1 = (x[1] - s1 - b[2] * x2) / b[1];
+    x[0] = (x[0] - s0 - a[1] * x1 - a[2] * x2) / a[0];
+    x[1] = x1; x[2] = x2;
+}
+
 // below -= L_below x for the rows under the triangle; `sum` is scratch
 template <class T>
 static void forward_panel(const Panel<T>& L, T* x, const int32_t* rows, T* y, T* sum) {
+    if (L.columns == 3) return forward_node(L, x, rows, y);
     for (int k = 0; k < L.columns; ++k) {
         const T* c = L.column(k);
         T xk = x[k] / c[k];
@@ -55,6 +78,7 @@ static void forward_panel(const Panel<T>& L, T* x, const int32_t* rows, T* y, T*
 // x = L_triangle^-T (x - L_below^T y_below)
 template <class T>
 static void backward_panel(const Panel<T>& L, T* x, const int32_t* rows, const T* y, T* below) {
+    if (L.columns == 3) return backward_node(L, x, rows, y);
     int n = L.columns, h = L.height;
     for (int r = n; r < h; ++r) below[r] = y[rows[r]];
     int k = 0;

@@ -91,8 +91,9 @@ class Answers:
         values = _from_slot(message, flight) if slotted else _from_payload(message, payload)
         check_values(values, pattern, message.checksum)
         return Factor(
-            flight.object, flight.epoch, flight.step, flight.warp, pattern, values, flight.worker, message.seconds
-        )
+            flight.object, flight.epoch, flight.step, flight.warp, pattern, values, flight.worker, message.seconds,
+            message.remedy[:200],
+        )  # fmt: skip
 
     def _object(self, message: Any, key: object, channel: str) -> Known:
         header = check_header(message, incarnation=self._incarnation, object=self.known)

@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+ROOM = 8  # a slot for an incomplete factor is larger than the last ones by one part in so many
+
 
 class Dispatch:
     """Jobs, workers and answers of one server. Methods may be called from any thread; none waits for the network."""
@@ -169,6 +171,8 @@ class Dispatch:
         if self._pool is None or info is None or not info.shared_memory or self._jobs.lateness(worker) >= LATE:
             return None, None
         nonzeros = self._answers.known[job.object].nonzeros
+        if job.method.name == "incomplete_cholesky":
+            nonzeros += nonzeros // ROOM  # the next one may keep more
         matrix = self._pool.lend(job.values.nbytes)
         factor = self._pool.lend(nonzeros * np.dtype(job.dtype).itemsize) if nonzeros else None
         if matrix is None or (nonzeros and factor is None):
@@ -176,7 +180,7 @@ class Dispatch:
         return matrix, factor
 
     def _post(self, flight: Flight, job: "Job", lease: float, slot: Slot | None) -> bool:
-        message = matrix_message(flight, self._answers.known[job.object], self._incarnation, lease)
+        message = matrix_message(flight, self._answers.known[job.object], self._incarnation, lease, job.method)
         payload = load(message, job.values, slot)
         name = key("matrix", self._server, worker=flight.worker, object=flight.object)
         attachment = message.SerializeToString()

@@ -10,12 +10,13 @@ from numpy.typing import NDArray
 from protocol.channels import PROTOCOL
 from protocol.check import checksum
 from protocol.messages_pb2 import Header, Matrix
+from protocol.method import Method
 from protocol.slots import Slot
 from sim_server.network.answers import Known
 from sim_server.network.jobs import Flight
 
 
-def matrix_message(flight: Flight, known: Known, incarnation: int, lease: float) -> Matrix:
+def matrix_message(flight: Flight, known: Known, incarnation: int, lease: float, method: Method) -> Matrix:
     """The message beside the values; checksum and matrix slot are filled in by load."""
     message = Matrix(
         header=Header(
@@ -29,7 +30,10 @@ def matrix_message(flight: Flight, known: Known, incarnation: int, lease: float)
         warp=flight.warp,
         blocks=known.blocks,
         factor_dtype=flight.dtype,
-        method="cholesky",
+        method=method.name,
+        drop_tolerance=method.drop_tolerance,
+        fill=method.fill,
+        omega=method.omega,
         known_patterns=list(known.patterns),
         lease=lease,
         worker=flight.worker,

@@ -22,6 +22,7 @@ from protocol.check import array
 from protocol.log_chunks import BadLog, ChunkFile
 from protocol.refused import Refused
 from sim_server.engine import Kind
+from sim_server.scene.solver_options import FACTORS
 
 ROW = np.dtype(
     [
@@ -31,7 +32,7 @@ ROW = np.dtype(
 )  # fmt: skip
 """What a solve was made with and what came of it, from an ObjectStep."""
 _PACK = struct.Struct("<qqqdqqqqq")
-_KINDS = {kind.name.lower(): int(kind) for kind in Kind}
+_KINDS = {kind.name.lower(): int(kind) for kind in Kind} | dict.fromkeys(FACTORS, int(Kind.CHOLESKY))
 
 
 @dataclass

@@ -115,7 +115,7 @@ class Replay:
         """Factorizes with the library that the log names, if it is here."""
         system = self.simulation.system
         made = [f for o in self.recording.objects.values() for f in o.factors.values()]
-        recorded = {f.library for f in made if f.library}
+        recorded = {f.library for f in made if f.library} - {"native"}  # which is everywhere
         wanted = {_library(name) for name in recorded}
         choice = wanted.pop() if len(wanted) == 1 else "auto"
         if choice.startswith("gpu") and not _usable(choice):
@@ -163,7 +163,8 @@ class Replay:
                 continue
             warped = bool(self.simulation.system.warped[body.nodes].any())
             values = self.simulation.system.body_values(body.first, body.last)
-            self._inline.submit(Job(body.name, 1, step, warped, values, self.simulation.scene.solver.factor_dtype))
+            solver = self.simulation.scene.solver
+            self._inline.submit(Job(body.name, 1, step, warped, values, solver.factor_dtype, solver.method))
         for factor in self._inline.poll():
             self._factors[factor.object, factor.step] = factor
             self._check_factor(factor)

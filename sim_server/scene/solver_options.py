@@ -2,18 +2,20 @@
 """The [solver] table of a scene."""
 
 import re
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple, get_args
 
 from pydantic import Field, PlainSerializer, PlainValidator
 
+from protocol.method import Method
 from sim_server.errors import InputError
 from sim_server.scene.parameters import Parameters, complaint
 from sim_server.schedule import Rule
 
-PRECONDITIONERS = ("auto", "none", "jacobi", "block_jacobi", "cholesky")
-NOT_YET = ("ssor", "incomplete_cholesky")
-
-Preconditioner = Literal["auto", "none", "jacobi", "block_jacobi", "cholesky"]
+Preconditioner = Literal[
+    "auto", "none", "jacobi", "block_jacobi", "ssor", "ssor_factor", "incomplete_cholesky", "cholesky"
+]
+PRECONDITIONERS: tuple[str, ...] = get_args(Preconditioner)
+FACTORS = ("cholesky", "incomplete_cholesky", "ssor_factor")  # made elsewhere, from an older matrix
 
 
 class Update(NamedTuple):
@@ -52,10 +54,7 @@ def _update(value: Any) -> Update:
 def _preconditioner(value: Any) -> str:
     if isinstance(value, str) and value in PRECONDITIONERS:
         return value
-    allowed = ", ".join(PRECONDITIONERS)
-    if isinstance(value, str) and value in NOT_YET:
-        raise complaint(f"{value} is a known preconditioner but not available yet; available: {allowed}")
-    raise complaint(f"must be one of {allowed}")
+    raise complaint(f"must be one of {', '.join(PRECONDITIONERS)}")
 
 
 def _warp(value: Any) -> bool | str:
@@ -67,6 +66,10 @@ def _warp(value: Any) -> bool | str:
 Precision = Literal["float64", "mixed", "float32"]
 FactorPrecision = Literal["auto", "float16", "float32", "float64"]
 _ONLY: dict[str, dict[str, tuple[str, ...]]] = {  # what the devices have
+    "preconditioner": {
+        "cpu": PRECONDITIONERS,
+        "gpu": tuple(p for p in PRECONDITIONERS if p not in ("ssor", "ssor_factor", "incomplete_cholesky")),
+    },
     "precision": {"cpu": ("float64",), "gpu": ("float64", "mixed", "float32")},
     "factor_precision": {"cpu": ("auto", "float32", "float64"), "gpu": ("auto", "float16", "float32")},
 }
@@ -78,6 +81,13 @@ class Solver(Parameters):
     tolerance: float = Field(default=1e-6, gt=0, lt=1, description="of the true residual: |b - A dv| <= tolerance |b|")
     max_iterations: int = Field(default=500, ge=1, le=1_000_000)
     preconditioner: Annotated[Preconditioner, PlainValidator(_preconditioner)] = "auto"
+    omega: float = Field(default=1.0, gt=0, lt=2, description="relaxation of ssor and ssor_factor")
+    drop_tolerance: float = Field(
+        default=0.005, ge=0, lt=1, description="of a row's norm; incomplete_cholesky leaves out smaller blocks of L"
+    )
+    fill: float = Field(
+        default=10.0, ge=0, le=1e6, description="most blocks of a column of incomplete_cholesky, in A's; 0 = no bound"
+    )
     warp: Annotated[Literal[True, False, "auto"], PlainValidator(_warp)] = Field(
         default="auto", description="solve in the material frame"
     )
@@ -111,6 +121,18 @@ class Solver(Parameters):
     schedule_rounds: float = Field(
         default=8.0, ge=1, le=1e6, description="an object goes next after so many rounds, whatever the rule"
     )
+
+    @property
+    def wants_factors(self) -> bool:
+        """Matrices go out to be factorized."""
+        return self.preconditioner == "auto" or self.preconditioner in FACTORS
+
+    @property
+    def method(self) -> Method:
+        """What is made of a matrix."""
+        if self.preconditioner == "incomplete_cholesky":
+            return Method("incomplete_cholesky", drop_tolerance=self.drop_tolerance, fill=self.fill)
+        return Method("ssor", omega=self.omega) if self.preconditioner == "ssor_factor" else Method()
 
     @property
     def factor_dtype(self) -> Literal["float32", "float64"]:

@@ -5,6 +5,7 @@ Record k (from 0) is of the step made from state k; factor_step says which state
 factor).
 """
 
+import dataclasses
 import logging
 import time
 
@@ -311,7 +312,7 @@ def test_an_object_whose_matrix_always_fails_does_not_take_the_turns_of_the_othe
 
     def broken(job: Job) -> bool:
         jobs.append(job.object)
-        values = -job.values if job.object == "beam1" else job.values
+        values = np.nan * job.values if job.object == "beam1" else job.values
         return submit(Job(job.object, job.epoch, job.step, job.warp, values, job.dtype))
 
     driver.inline.submit = broken  # type: ignore[method-assign]
@@ -340,7 +341,7 @@ def test_a_failed_factorization_does_not_stop_a_run(caplog):
 
 
 @pytest.mark.parametrize("update", ["never", "every-1", "lockstep-2", "async", "adaptive"])
-def test_an_indefinite_matrix_leaves_block_jacobi(update, monkeypatch):
+def test_a_matrix_without_a_factor_leaves_block_jacobi(update, monkeypatch):
     """Every factorization fails: the run is that of block Jacobi, to the last bit."""
     plain = falling(preconditioner="block_jacobi")
     plain.engine.run(8)
@@ -348,10 +349,10 @@ def test_an_indefinite_matrix_leaves_block_jacobi(update, monkeypatch):
     driver = Driver(sim)
     submit = driver.inline.submit
 
-    def negated(job: Job) -> bool:
-        return submit(Job(job.object, job.epoch, job.step, job.warp, -job.values, job.dtype))
+    def spoilt(job: Job) -> bool:
+        return submit(Job(job.object, job.epoch, job.step, job.warp, np.nan * job.values, job.dtype))
 
-    monkeypatch.setattr(driver.inline, "submit", negated)
+    monkeypatch.setattr(driver.inline, "submit", spoilt)
     records = driver.advance(8)
     assert (records["kind"] == Kind.BLOCK_JACOBI).all()
     assert (records["factor_step"] == -1).all()
@@ -452,3 +453,48 @@ def test_auto_takes_the_factor_where_steps_are_hard_and_leaves_it_where_they_are
         records = Driver(sim).advance(60)
         assert (records["status"] == 0).all()
         assert (records["kind"][20:] == kind).mean() > 0.9
+
+
+@pytest.mark.parametrize("preconditioner", ["incomplete_cholesky", "ssor_factor"])
+@pytest.mark.parametrize("update", ["never", "every-2", "lockstep-2", "async"])
+def test_incomplete_factors_under_every_policy(preconditioner, update):
+    """They come and go as Cholesky factors do, and a run repeats to the last bit."""
+    options = {"preconditioner": preconditioner, "drop_tolerance": 0.05, "update": update}
+    runs = []
+    for _ in range(2):
+        sim = falling(**options)
+        records = Driver(sim).advance(12)
+        assert (records["status"] == 0).all()
+        runs.append((sim.world.x.tobytes(), records["iterations"].tolist(), records["factor_step"].tolist()))
+    assert runs[0] == runs[1]
+    assert runs[0][2] == factor_steps(update, 12)
+    plain = Driver(falling(preconditioner="block_jacobi")).advance(12)
+    assert sum(runs[0][1]) < sum(plain["iterations"])
+
+
+def test_sweeps_need_no_factor():
+    records = Driver(falling(preconditioner="ssor", omega=1.2, update="every-1")).advance(8)
+    plain = Driver(falling(preconditioner="block_jacobi")).advance(8)
+    assert (records["kind"] == Kind.SSOR).all() and (records["factor_step"] == -1).all()
+    assert (records["status"] == 0).all()
+    assert records["iterations"].sum() < 0.7 * plain["iterations"].sum()
+
+
+def test_a_factor_of_a_matrix_that_was_not_positive_definite_is_used_and_counted():
+    sim = falling(update="lockstep-2")
+    driver = Driver(sim)
+    submit, bad = driver.inline.submit, {2}
+
+    def spoilt(job: Job) -> bool:
+        values = job.values.copy()
+        if job.step in bad:  # the last node pushes where it should pull
+            start, columns = sim.system.row_start, sim.system.columns
+            own = np.flatnonzero(columns[start[-2] :] == len(start) - 2)[0] + start[-2]
+            values[own] -= 1.01 * np.linalg.eigvalsh(values[own])[-1] * np.eye(3)
+        return submit(dataclasses.replace(job, values=values))
+
+    driver.inline.submit = spoilt  # type: ignore[method-assign]
+    records = driver.advance(9)
+    assert records["factor_step"].tolist() == [-1, -1, 0, 0, 2, 2, 4, 4, 6]
+    assert (records["status"] == 0).all()
+    assert (driver.tracks[0].used, driver.tracks[0].mended, driver.tracks[0].refused) == (4, 1, 0)

@@ -16,6 +16,7 @@ from protocol.channels import key
 from protocol.check import check_header, checksum
 from protocol.counters import Counters
 from protocol.messages_pb2 import Factor, Header, Matrix, Topology
+from protocol.method import Method
 from protocol.slotmap import SlotMap
 
 
@@ -34,9 +35,10 @@ class Sample:
 class Diagonal:
     """Factorizes diagonal matrices: L is the root of the diagonal."""
 
-    library = "diagonal"
+    library, remedy = "diagonal", ""
 
-    def __init__(self, row_start: np.ndarray, columns: np.ndarray):
+    def __init__(self, row_start: np.ndarray, columns: np.ndarray, method: Method):
+        self.method = method
         self.size = 3 * (len(row_start) - 1)
         counts = np.arange(self.size + 1)
         self.pattern = FactorPattern.build(np.arange(self.size), counts, counts, np.arange(self.size))
@@ -139,6 +141,19 @@ def test_the_symbolic_phase_is_done_once_per_epoch(worker: Worker, uplink: FakeU
     assert len(uplink.answers) == 4
 
 
+def test_another_method_is_another_analysis(worker: Worker, uplink: FakeUplink) -> None:
+    made = []
+    worker._analyse = lambda *given: made.append(Diagonal(*given)) or made[-1]  # type: ignore[func-returns-value]
+    asked = {"method": "incomplete_cholesky", "drop_tolerance": 0.25, "fill": 3.0, "omega": 1.0}
+    for number, changes in enumerate(({}, asked, asked, asked | {"fill": 4.0}), start=1):
+        drain(worker, uplink, matrix(number, **changes))
+    assert [m.method.name for m in made] == ["cholesky", "incomplete_cholesky", "incomplete_cholesky"]
+    assert made[1].method == Method("incomplete_cholesky", drop_tolerance=0.25, fill=3.0)
+    made[2].remedy = "diagonal shifted by 1"
+    drain(worker, uplink, matrix(5, **asked | {"fill": 4.0}))
+    assert [answer.remedy for answer, _ in uplink.answers] == ["", "", "", "", "diagonal shifted by 1"]
+
+
 def test_a_pattern_that_the_server_knows_is_not_sent_again(worker: Worker, uplink: FakeUplink) -> None:
     drain(worker, uplink, matrix(1))
     known = uplink.answers[0][0].pattern
@@ -198,6 +213,8 @@ def test_a_device_that_fails_ends_the_worker_after_an_answer(uplink: FakeUplink)
         ({"worker": "x"}, "worker"),
         ({"factor_dtype": "float16"}, "malformed"),
         ({"method": "lu"}, "malformed"),
+        ({"method": "ssor", "omega": 2.5}, "malformed"),
+        ({"method": "incomplete_cholesky", "drop_tolerance": float("nan")}, "malformed"),
     ],
 )
 def test_what_is_not_for_it_is_dropped_and_counted(

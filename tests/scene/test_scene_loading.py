@@ -50,6 +50,9 @@ def test_defaults_and_resolved(tmp_path):
             "tolerance": 1e-6,
             "max_iterations": 500,
             "preconditioner": "auto",
+            "omega": 1.0,
+            "drop_tolerance": 0.005,
+            "fill": 10.0,
             "warp": "auto",
             "warp_level": 1,
             "projection": "clamp",
@@ -131,7 +134,7 @@ def test_overrides_of_names_with_dots_and_in_order(tmp_path):
 @pytest.mark.parametrize(
     ("override", "words"),
     [
-        ("solver.tolerence=1e-8", ["solver.tolerence = 1e-08", "unknown key", "did you mean 'tolerance'?"]),
+        ("solver.tolerence=1e-8", ["solver.tolerence = 1e-08", "unknown key", "did you mean 'tolerance'"]),
         ("solvr.tolerance=1e-8", ["solvr: unknown key", "did you mean 'solver'?"]),
         ("solver.tolerance=small", ["solver.tolerance = 'small'", "must be a number"]),
         ("dt=-1", ["dt = -1", "greater than 0"]),

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from protocol import Factor, FactorPattern
 from protocol.messages_pb2 import Header, Topology
+from protocol.method import Method
 from sim_server.factors import Job
 from sim_server.network.link import ServerLink
 
@@ -64,8 +65,9 @@ class DenseAnalysis:
     """Cholesky factors as one dense supernode: quick to import and to check."""
 
     library = "dense"
+    remedy = ""
 
-    def __init__(self, row_start: NDArray[np.int32], columns: NDArray[np.int32]):
+    def __init__(self, row_start: NDArray[np.int32], columns: NDArray[np.int32], method: Method | None = None):
         nodes = len(row_start) - 1
         n = 3 * nodes
         self._topology = Topology(nodes=nodes, row_start=row_start.tobytes(), columns=columns.tobytes())

@@ -220,3 +220,18 @@ def test_solves_that_ran_out_of_time(tmp_path: Path) -> None:
     log = recorded(tmp_path, "budget = 2e-5", "block_jacobi")
     assert any(s.status == pb.BUDGET for s in messages(log, "step"))
     assert replayed(log, 0)["same"]
+
+
+@pytest.mark.parametrize("preconditioner", ["incomplete_cholesky", "ssor_factor", "ssor"])
+def test_other_preconditioners(preconditioner: str, tmp_path: Path) -> None:
+    """A worker's incomplete factors, each with a pattern of its own, are made again from the same matrices."""
+    log = recorded(tmp_path, preconditioner=preconditioner)
+    used = messages(log, "step")
+    assert used[-1].preconditioner == preconditioner
+    if preconditioner != "ssor":
+        factors = messages(log, "factor")
+        assert len({s.factor_step for s in used}) > 10
+        assert all(f.library == "native" and not f.remedy for f in factors)
+        assert (len({f.pattern for f in factors}) == 1) == (preconditioner == "ssor_factor")
+    found = replayed(log, 0)
+    assert found["same"] and not found["notes"] and found["other_factor"] is None

@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: MIT
+"""What is to be made of a matrix: the factor that a worker sends back."""
+
+import math
+from dataclasses import dataclass
+
+from protocol.refused import Refused
+
+__all__ = ["METHODS", "Method"]
+
+METHODS = ("cholesky", "incomplete_cholesky", "ssor")
+
+
+@dataclass(frozen=True)
+class Method:
+    """A factor L whose L L^T approximates the matrix; an exact one by default.
+
+    incomplete_cholesky: blocks of L smaller than drop_tolerance times the norm of their row are left out, and of a
+        column the smallest if there are more than `fill` times as many as a column of the matrix has (0: no bound).
+    ssor: the symmetric successive over-relaxation of the matrix with relaxation omega.
+    """
+
+    name: str = "cholesky"
+    drop_tolerance: float = 0.0
+    fill: float = 0.0
+    omega: float = 1.0
+
+    def check(self) -> "Method":
+        """Itself; raises Refused unless every number is one that the method takes."""
+        if self.name not in METHODS:
+            raise Refused(f"Matrix.method is {self.name!r}; allowed: {', '.join(METHODS)}", "malformed")
+        if self.name == "incomplete_cholesky":
+            if not 0 <= self.drop_tolerance < 1:
+                raise Refused(
+                    f"Matrix.drop_tolerance is {self.drop_tolerance}; allowed: at least 0, below 1", "malformed"
+                )
+            if not (math.isfinite(self.fill) and self.fill >= 0):
+                raise Refused(f"Matrix.fill is {self.fill}; allowed: 0 or more", "malformed")
+        if self.name == "ssor" and not 0 < self.omega < 2:
+            raise Refused(f"Matrix.omega is {self.omega}; allowed: above 0, below 2", "malformed")
+        return self
