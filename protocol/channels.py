@@ -39,7 +39,7 @@ CHANNELS: dict[str, Channel] = {
         "matrix/{worker}/{object}", "Matrix", "server", "one in flight per object", 64 * KIB, GIB, False, "job"
     ),
     "pattern": Channel(
-        "pattern/{object}", "FactorPattern", "worker", "once per epoch and library", 256 * MIB, 0, False, "pattern of L"
+        "pattern/{object}", "FactorPattern", "worker", "when it is new", 256 * MIB, 0, False, "pattern of L"
     ),
     "factor": Channel("factor/{object}", "Factor", "worker", "one per matrix", 64 * KIB, GIB, False, "values of L"),
     "worker": Channel("worker/{worker}", "WorkerInfo", "worker", "5 Hz", 16 * KIB, 0, False, "hello, then heartbeat"),
