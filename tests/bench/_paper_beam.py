@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.sparse.linalg import eigsh
 
+from sim_server.effects import known_effects
 from sim_server.effects.touch import Touch
 from sim_server.scene.model import Scene
 from sim_server.simulation import Simulation
@@ -21,7 +22,10 @@ BANDS = (("Z < 1.4", 1000.0), ("Z < 2.6", 50.0), (None, 10.0))  # of 7, 6 and 7 
 
 @dataclass(frozen=True)
 class Load:
-    """gravity [m/s2]; twist: of the free end about the axis, by dead loads on its four edges, each [N]."""
+    """gravity [m/s2]; twist: of the free end about the axis, by dead loads on its four edges, each [N].
+
+    Both on a beam of 1 MPa; homogeneous ones are loaded in proportion to their stiffness, so that they deform alike.
+    """
 
     name: str
     gravity: tuple[float, float, float]
@@ -61,7 +65,16 @@ class Model:
 
 
 COROTATIONAL = Model("corotational", "corotational", "corotational", others={"poisson": POISSON})
-MODELS = (COROTATIONAL,)
+MODELS = tuple(
+    model
+    for model in (
+        COROTATIONAL,
+        Model("St Venant-Kirchhoff", "MJED", "st_venant_kirchhoff", others={"poisson": POISSON}),
+        Model("neo-Hookean", "MJED", "neo_hookean", others={"poisson": POISSON}),
+        Model("springs", "springs", "mass_spring"),
+    )
+    if model.effect in known_effects()
+)
 
 
 @dataclass(frozen=True)
@@ -73,29 +86,36 @@ class Beam:
     stiffness: float
     heterogeneous: bool = False
 
+    @property
+    def share(self) -> float:
+        """Of the loads."""
+        return 1.0 if self.heterogeneous else self.stiffness / 1e6
+
     def scene(self, load: Load, **solver: Any) -> Scene:
         """Checked. solver: the [solver] table."""
+        share = self.share
+        gravity = [share * g for g in load.gravity]
         effects = {
             self.model.effect: self.model.table(self.stiffness, self.heterogeneous),
             "rayleigh": {"mass": DAMPING},
             "fixed": {"where": "Z < 0.01"},
         }
         if load.twist:
-            effects["touch"] = {"max_force": load.twist, "max_total_force": 4 * load.twist}
+            effects["touch"] = {"max_force": 1.1 * share * load.twist, "max_total_force": 5 * share * load.twist}
         beam = {
             "name": "beam",
             "mesh": {"bar": list(self.cells), "size": [1, 1, LENGTH]},
             "density": DENSITY,
             "effects": effects,
         }
-        table = {"name": "paper", "dt": DT, "effects": {"gravity": {"g": list(load.gravity)}}, "object": [beam]}
+        table = {"name": "paper", "dt": DT, "effects": {"gravity": {"g": gravity}}, "object": [beam]}
         return Scene.model_validate(table | {"solver": solver}, context={"folder": "."})
 
     def simulation(self, load: Load, device: str = "cpu", **solver: Any) -> Simulation:
         """Of the scene, the load in place."""
         sim = Simulation(self.scene(load, **solver), device)
         if load.twist:
-            _twist(sim, load.twist)
+            _twist(sim, self.share * load.twist)
         return sim
 
     def condition(self) -> float:

@@ -46,7 +46,10 @@ own.""",
 def loads() -> str:
     """The three of table 2."""
     what = "\n".join(f"- *{load.name}*: {load.what}" for load in LOADS)
-    shown = "The paper shows its three loads as pictures only (material, geometrical and both non-linearities). Ours:"
+    shown = (
+        "The paper shows its three loads as pictures only (material, geometrical and both non-linearities). Ours, for "
+        "a beam of 1 MPa and in proportion to the stiffness of others:"
+    )
     return f"{shown}\n\n{what}"
 
 
