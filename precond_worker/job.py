@@ -2,6 +2,7 @@
 """A matrix that arrived, checked before anything is computed from it."""
 
 from dataclasses import dataclass
+from math import prod
 
 import numpy as np
 import zenoh
@@ -15,7 +16,6 @@ from protocol.refused import Refused
 from protocol.slotmap import SlotMap
 from protocol.slots import HEADER
 
-BLOCK_BYTES = 72  # float64 (3, 3)
 DTYPES = ("float32", "float64")
 
 
@@ -33,21 +33,31 @@ class Job:
         """Name of the object."""
         return self.message.header.object
 
+    @property
+    def positions(self) -> bool:
+        """The payload holds positions instead of a matrix."""
+        return self.message.nodes > 0
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Of the values."""
+        return (self.message.nodes, 3) if self.positions else (self.message.blocks, 3, 3)
+
     def values(self, slots: SlotMap) -> NDArray[np.float64]:
-        """(blocks, 3, 3), in place where they are in shared memory; raises Refused."""
-        count = 9 * self.message.blocks
+        """(blocks, 3, 3) or positions (nodes, 3), in place where they are in shared memory; raises Refused."""
+        count = prod(self.shape)
         if self.shared:
             values = slots.array(self.message.matrix_slot, np.float64, count)
         else:
             values = array(self._copied(), np.float64, (count,), "Matrix payload")
         if checksum(values) != self.message.checksum:
             raise Refused("Matrix.checksum does not match the values: lost or overwritten", "checksum")
-        return values.reshape(-1, 3, 3)
+        return values.reshape(self.shape)
 
     def _copied(self) -> bytes:
         data = take(self.payload, CHANNELS["matrix"].bulk, "Matrix payload")
         if self.message.HasField("matrix_slot"):  # the whole slot, as one without shared memory gets it
-            return data[HEADER : HEADER + BLOCK_BYTES * self.message.blocks]
+            return data[HEADER : HEADER + 8 * prod(self.shape)]
         return data
 
 

@@ -12,6 +12,7 @@ from typing import Self
 
 import zenoh
 
+from precond_worker.builders import can_build
 from precond_worker.errors import NameTaken
 from precond_worker.heartbeat import Heartbeat
 from precond_worker.mailbox import Mailbox
@@ -19,7 +20,7 @@ from protocol import FactorPattern, echo
 from protocol.channels import CHANNELS, PROTOCOL, check_name, key, name_in
 from protocol.check import check_header, parse
 from protocol.counters import Counters
-from protocol.messages_pb2 import Factor, Header, Topology, WorkerInfo
+from protocol.messages_pb2 import Factor, Header, Scene, Topology, WorkerInfo
 from protocol.refused import Refused
 from protocol.session import LINK_LEASE, Session
 from protocol.slotmap import SlotMap
@@ -55,7 +56,7 @@ class Uplink:
         self.slots = SlotMap()
         self.incarnation = 0  # of the server that this worker works for; 0: none
         self.shared_memory = False
-        self._session, self._threads = session, threads
+        self._session, self._threads, self._builds = session, threads, can_build()
         self._sequence: Counter[str] = Counter()
         self._saying = threading.Lock()
         zs = session.zenoh
@@ -120,6 +121,7 @@ class Uplink:
                 refused=self.counters.refused,
                 bulk_shared=self.counters.bulk_shared,
                 bulk_copied=self.counters.bulk_copied,
+                builds=self._builds,
             )
             self._session.zenoh.put(key("worker", self.server, worker=self.name), info.SerializeToString())
 
@@ -143,6 +145,16 @@ class Uplink:
             check_header(topology, incarnation=self.incarnation, object=object, epoch=epoch)
             return topology
         raise Refused(f"the server has no topology of {object}", "object")
+
+    def scene(self) -> Scene:
+        """Ask the server for what it simulates; raises Refused if it does not tell."""
+        for reply in self._session.zenoh.get(key("scene", self.server), timeout=TIMEOUT):
+            if reply.ok is None:
+                break
+            scene = parse(Scene, reply.ok.payload, CHANNELS["scene"].limit)
+            check_header(scene, incarnation=self.incarnation)
+            return scene
+        raise Refused("the server does not tell what it simulates", "object")
 
     def send_pattern(self, pattern: FactorPattern, object: str, epoch: int) -> None:
         """Send the pattern of an object's factors."""

@@ -10,6 +10,7 @@ import numpy as np
 import zenoh
 from numpy.typing import NDArray
 
+from precond_worker.builders import Builders
 from precond_worker.errors import DeviceUnusable
 from precond_worker.job import Job, accept
 from precond_worker.methods import Factorization
@@ -35,6 +36,7 @@ class Worker:
         self._analyse = analyse
         self._on_server = on_server
         self._analyses: dict[str, tuple[int, Method, int, Factorization]] = {}  # of an object: epoch, ..., blocks
+        self._builders = Builders(uplink)
         self._pending: dict[str, Job] = {}
 
     def run(self) -> None:
@@ -85,6 +87,7 @@ class Worker:
         self._counters.add("superseded", len(self._pending))
         self._pending.clear()
         self._analyses.clear()
+        self._builders.clear()
 
     def _enqueue(self, job: Job) -> None:
         waiting = self._pending.get(job.object)
@@ -121,7 +124,10 @@ class Worker:
         message = job.message
         analysis = self._analysis(job)
         values = job.values(self._uplink.slots)
+        builder = self._builders.of(job.object, message.header.epoch) if job.positions else None
         begin = time.perf_counter()
+        if builder is not None:
+            values = builder.matrix(values)
         # Into memory of our own, so that the checksum is of what was computed whatever happens to the slot.
         factor = np.ascontiguousarray(analysis.factorize(values, np.dtype(message.factor_dtype)))
         seconds = time.perf_counter() - begin

@@ -75,7 +75,7 @@ class Scene(_message.Message):
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., name: _Optional[str] = ..., toml: _Optional[str] = ..., resolved: _Optional[str] = ..., dt: _Optional[float] = ..., started_ns: _Optional[int] = ..., software: _Optional[str] = ..., objects: _Optional[_Iterable[str]] = ..., server: _Optional[str] = ..., device: _Optional[str] = ..., build: _Optional[str] = ...) -> None: ...
 
 class Topology(_message.Message):
-    __slots__ = ("header", "nodes", "rest", "tets", "triangles", "row_start", "columns", "fixed", "young", "poisson")
+    __slots__ = ("header", "nodes", "rest", "tets", "triangles", "row_start", "columns", "fixed", "young", "poisson", "reference")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     NODES_FIELD_NUMBER: _ClassVar[int]
     REST_FIELD_NUMBER: _ClassVar[int]
@@ -86,6 +86,7 @@ class Topology(_message.Message):
     FIXED_FIELD_NUMBER: _ClassVar[int]
     YOUNG_FIELD_NUMBER: _ClassVar[int]
     POISSON_FIELD_NUMBER: _ClassVar[int]
+    REFERENCE_FIELD_NUMBER: _ClassVar[int]
     header: Header
     nodes: int
     rest: bytes
@@ -96,10 +97,11 @@ class Topology(_message.Message):
     fixed: bytes
     young: bytes
     poisson: bytes
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., nodes: _Optional[int] = ..., rest: _Optional[bytes] = ..., tets: _Optional[bytes] = ..., triangles: _Optional[bytes] = ..., row_start: _Optional[bytes] = ..., columns: _Optional[bytes] = ..., fixed: _Optional[bytes] = ..., young: _Optional[bytes] = ..., poisson: _Optional[bytes] = ...) -> None: ...
+    reference: bytes
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., nodes: _Optional[int] = ..., rest: _Optional[bytes] = ..., tets: _Optional[bytes] = ..., triangles: _Optional[bytes] = ..., row_start: _Optional[bytes] = ..., columns: _Optional[bytes] = ..., fixed: _Optional[bytes] = ..., young: _Optional[bytes] = ..., poisson: _Optional[bytes] = ..., reference: _Optional[bytes] = ...) -> None: ...
 
 class Matrix(_message.Message):
-    __slots__ = ("header", "step", "warp", "blocks", "checksum", "factor_dtype", "method", "known_patterns", "lease", "factor_slot", "matrix_slot", "worker", "drop_tolerance", "fill", "omega")
+    __slots__ = ("header", "step", "warp", "blocks", "checksum", "factor_dtype", "method", "known_patterns", "lease", "factor_slot", "matrix_slot", "worker", "drop_tolerance", "fill", "omega", "nodes")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     STEP_FIELD_NUMBER: _ClassVar[int]
     WARP_FIELD_NUMBER: _ClassVar[int]
@@ -115,6 +117,7 @@ class Matrix(_message.Message):
     DROP_TOLERANCE_FIELD_NUMBER: _ClassVar[int]
     FILL_FIELD_NUMBER: _ClassVar[int]
     OMEGA_FIELD_NUMBER: _ClassVar[int]
+    NODES_FIELD_NUMBER: _ClassVar[int]
     header: Header
     step: int
     warp: bool
@@ -130,7 +133,8 @@ class Matrix(_message.Message):
     drop_tolerance: float
     fill: float
     omega: float
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., warp: _Optional[bool] = ..., blocks: _Optional[int] = ..., checksum: _Optional[int] = ..., factor_dtype: _Optional[str] = ..., method: _Optional[str] = ..., known_patterns: _Optional[_Iterable[int]] = ..., lease: _Optional[float] = ..., factor_slot: _Optional[_Union[Slot, _Mapping]] = ..., matrix_slot: _Optional[_Union[Slot, _Mapping]] = ..., worker: _Optional[str] = ..., drop_tolerance: _Optional[float] = ..., fill: _Optional[float] = ..., omega: _Optional[float] = ...) -> None: ...
+    nodes: int
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., warp: _Optional[bool] = ..., blocks: _Optional[int] = ..., checksum: _Optional[int] = ..., factor_dtype: _Optional[str] = ..., method: _Optional[str] = ..., known_patterns: _Optional[_Iterable[int]] = ..., lease: _Optional[float] = ..., factor_slot: _Optional[_Union[Slot, _Mapping]] = ..., matrix_slot: _Optional[_Union[Slot, _Mapping]] = ..., worker: _Optional[str] = ..., drop_tolerance: _Optional[float] = ..., fill: _Optional[float] = ..., omega: _Optional[float] = ..., nodes: _Optional[int] = ...) -> None: ...
 
 class FactorPattern(_message.Message):
     __slots__ = ("header", "id", "size", "supernodes", "nonzeros", "permutation", "super_start", "row_start", "rows")
@@ -187,7 +191,7 @@ class Factor(_message.Message):
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., warp: _Optional[bool] = ..., pattern: _Optional[int] = ..., dtype: _Optional[str] = ..., nonzeros: _Optional[int] = ..., checksum: _Optional[int] = ..., slot: _Optional[_Union[Slot, _Mapping]] = ..., worker: _Optional[str] = ..., seconds: _Optional[float] = ..., failure: _Optional[str] = ..., job: _Optional[int] = ..., matrix_shared: _Optional[bool] = ..., remedy: _Optional[str] = ...) -> None: ...
 
 class WorkerInfo(_message.Message):
-    __slots__ = ("header", "worker", "pid", "host", "library", "threads", "shared_memory", "jobs", "failures", "superseded", "refused", "bulk_shared", "bulk_copied")
+    __slots__ = ("header", "worker", "pid", "host", "library", "threads", "shared_memory", "jobs", "failures", "superseded", "refused", "bulk_shared", "bulk_copied", "builds")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     WORKER_FIELD_NUMBER: _ClassVar[int]
     PID_FIELD_NUMBER: _ClassVar[int]
@@ -201,6 +205,7 @@ class WorkerInfo(_message.Message):
     REFUSED_FIELD_NUMBER: _ClassVar[int]
     BULK_SHARED_FIELD_NUMBER: _ClassVar[int]
     BULK_COPIED_FIELD_NUMBER: _ClassVar[int]
+    BUILDS_FIELD_NUMBER: _ClassVar[int]
     header: Header
     worker: str
     pid: int
@@ -214,7 +219,8 @@ class WorkerInfo(_message.Message):
     refused: int
     bulk_shared: int
     bulk_copied: int
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., worker: _Optional[str] = ..., pid: _Optional[int] = ..., host: _Optional[str] = ..., library: _Optional[str] = ..., threads: _Optional[int] = ..., shared_memory: _Optional[bool] = ..., jobs: _Optional[int] = ..., failures: _Optional[int] = ..., superseded: _Optional[int] = ..., refused: _Optional[int] = ..., bulk_shared: _Optional[int] = ..., bulk_copied: _Optional[int] = ...) -> None: ...
+    builds: bool
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., worker: _Optional[str] = ..., pid: _Optional[int] = ..., host: _Optional[str] = ..., library: _Optional[str] = ..., threads: _Optional[int] = ..., shared_memory: _Optional[bool] = ..., jobs: _Optional[int] = ..., failures: _Optional[int] = ..., superseded: _Optional[int] = ..., refused: _Optional[int] = ..., bulk_shared: _Optional[int] = ..., bulk_copied: _Optional[int] = ..., builds: _Optional[bool] = ...) -> None: ...
 
 class Echo(_message.Message):
     __slots__ = ("header", "slot", "nonce")

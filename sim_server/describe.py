@@ -60,6 +60,8 @@ def topology(simulation: Simulation, body: Body) -> pb.Topology:
         columns=_bytes(columns, "<i4"),
         fixed=_bytes(fixed, "<i4"),
     )
+    if any(pose.rotate) or any(pose.translate):
+        message.reference = _bytes(body.mesh.rest, "<f8")
     for e in simulation.effects.values():
         if body.index in e.elastic:
             young, poisson = e.elastic[body.index]

@@ -33,6 +33,7 @@ log = logging.getLogger(__name__)
 
 
 COPIES = 32  # matrices that the loop may be asked to copy within one step
+UNBUILT = 3  # jobs of positions alone that may fail in a row before the matrix is sent for good
 KEPT = 2  # steps that a copied matrix may wait for a worker
 
 
@@ -68,7 +69,9 @@ class Driver:
             t.body.name: 72.0 * len(simulation.system.body_values(t.body.first, t.body.last)) for t in self.tracks
         }
         self._bytes = bytes_a  # of A: deterministic cost of an iteration
-        self._spare: dict[int, list[NDArray[np.float64]]] = {}  # by blocks; what the loop copies into has been touched
+        self._spare: dict[
+            tuple[int, ...], list[NDArray[np.float64]]
+        ] = {}  # by shape; what the loop copies into has been touched
 
     # --- one step after another ---------------------------------------------------------------------------------
 
@@ -280,14 +283,33 @@ class Driver:
         return oldest_possible(overdue, self._latencies(), self._workers())
 
     def _ask(self, t: Track) -> None:
-        blocks = len(self._values(t.body))
-        spare = self._spare.setdefault(blocks, [])
-        t.wanted, t.asked = spare.pop() if spare else np.full((blocks, 3, 3), 0.0), next(self._asked)
-        self.engine.request_matrix(t.body.index, t.wanted)
+        t.asked = next(self._asked)
+        if self._others_build(t):
+            t.wanted = self._room((t.body.last - t.body.first, 3))
+            self.engine.request_positions(t.body.index, t.wanted, self._ahead(t))
+        else:
+            t.wanted = self._room(self._values(t.body).shape)
+            self.engine.request_matrix(t.body.index, t.wanted)
+
+    def _room(self, shape: tuple[int, ...]) -> NDArray[np.float64]:
+        spare = self._spare.setdefault(shape, [])
+        return spare.pop() if spare else np.full(shape, 0.0)
 
     def _give_back(self, copy: NDArray[np.float64]) -> None:
-        """A copy of a matrix that was sent: its memory serves again."""
-        self._spare[len(copy)].append(copy)
+        """A copy that was sent: its memory serves again."""
+        self._spare[copy.shape].append(copy)
+
+    def _others_build(self, t: Track) -> bool:
+        """Whether positions will do: workers have all that the matrix is made of, and it was no use but a few times."""
+        if self.solver.build != "worker" or t.unbuilt >= UNBUILT:
+            return False
+        told = all(e.told for e in self.simulation.effects.values())
+        return told and getattr(self.source, "builds", lambda: False)()
+
+    def _ahead(self, t: Track) -> float:
+        """How far positions go ahead [s]: to when the factor is expected."""
+        latency = float(self.n) if self.kind == "lockstep" else t.latency.value or 0.0
+        return min(self.solver.extrapolate, latency * self.simulation.scene.dt)
 
     def _send(self, t: Track) -> None:
         step = self.engine.matrix_step(t.body.index)

@@ -41,6 +41,11 @@ class Effect:
     rotated: tuple[Body, ...] = ()
     elastic: Mapping[int, tuple[NDArray[np.float64], NDArray[np.float64]]] = MappingProxyType({})
 
+    @property
+    def told(self) -> bool:
+        """What it adds to A follows from the scene, the mesh and the positions, so that others can build A too."""
+        return True
+
     def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
         """What adds the effect to system.b, .diagonal, .block, .sums and .mean. accumulate: to sums, others have."""
         return []

@@ -199,9 +199,21 @@ class Engine(Reports):
 
     def request_matrix(self, body: int, target: Reals) -> None:
         """The loop copies the values of A into `target` once they are next assembled."""
+        self._request(body, target, -1.0)
+
+    def request_positions(self, body: int, target: Reals, ahead: float = 0.0) -> None:
+        """The loop copies x + ahead v, (nodes, 3), into `target` when it next assembles; ahead: 0 or more [s].
+
+        In all else like `request_matrix`; each replaces what the other asked for.
+        """
+        self._request(body, target, ahead)
+
+    def _request(self, body: int, target: Reals, ahead: float) -> None:
+        entry = self._body[body]
+        entry.snapshot = None  # or the loop might take one request for the other
         self._copies[body] = target
-        self._body[body].snapshot_step = -1
-        self._body[body].snapshot = target.ctypes.data
+        entry.snapshot_step, entry.ahead = -1, ahead
+        entry.snapshot = target.ctypes.data
 
     def matrix_step(self, body: int) -> int:
         """Step of the copy asked for last, -1 while it is not there. `step` counts the steps completed before it."""

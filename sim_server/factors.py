@@ -18,8 +18,8 @@ EXACT = Method()
 
 @dataclass(frozen=True)
 class Job:
-    """A matrix to factorize. values (blocks, 3, 3) float64, read during `submit` only; dtype, method: of the factor
-    wanted."""
+    """A matrix to factorize. values (blocks, 3, 3) float64, or positions (nodes, 3) [m] of which whoever takes the job
+    assembles it; read during `submit` only. dtype, method: of the factor wanted."""
 
     object: str
     epoch: int
@@ -28,6 +28,11 @@ class Job:
     values: NDArray[np.float64]
     dtype: str = "float32"
     method: Method = EXACT
+
+    @property
+    def positions(self) -> bool:
+        """Without the matrix."""
+        return self.values.ndim == 2
 
 
 class FactorSource(Protocol):
@@ -74,6 +79,9 @@ class Inline:
 
         from precond_worker.factorize import NotPositiveDefinite  # lazily: only in-process updates need a library
 
+        if job.positions:
+            self._failed.append((job.object, "positions without a worker that could build the matrix"))
+            return True
         start = perf_counter()
         analysis = self._analysis(job.object, job.method)
         try:

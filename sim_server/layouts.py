@@ -67,7 +67,8 @@ class Launch(c.Structure):
 class Body(c.Structure):
     _fields_ = [
         ("first", c.c_int32), ("last", c.c_int32), ("settings", Settings), ("factor", c.c_void_p),
-        ("mail", c.c_void_p), ("snapshot", c.c_void_p), ("snapshot_step", c.c_int64), ("steps", c.c_int64),
+        ("mail", c.c_void_p), ("snapshot", c.c_void_p), ("snapshot_step", c.c_int64), ("ahead", c.c_double),
+        ("steps", c.c_int64),
     ]  # fmt: skip
 
 

@@ -44,6 +44,8 @@ class Track:
         self.in_flight = False
         self.wanted: NDArray[np.float64] | None = None  # where the loop copies the matrix asked for
         self.asked = 0  # number of the request for it, among those of all bodies
+        self.unbuilt = 0  # jobs in a row that were sent positions and came to nothing
+        self.sent_positions = False  # with the last job
         self.used = 0
         self.refused = 0
         self.mended = 0  # of those used: from a matrix that was not positive definite
@@ -76,6 +78,7 @@ class Track:
 
     def went_out(self, step: int) -> None:
         """Its matrix of `step` is on the way."""
+        self.sent_positions = self.wanted is not None and self.wanted.ndim == 2
         self.in_flight, self.sent, self.wanted, self.excess = True, step, None, 0.0
 
     def came_in(self, factor: Factor, step: int) -> bool:
@@ -83,6 +86,8 @@ class Track:
         if self.in_flight and factor.step == self.sent:
             self.latency.add(max(1, step - factor.step))
         self.in_flight, self.failures = False, 0
+        if self.sent_positions:
+            self.unbuilt = 0
         if factor.step <= self.newest:
             return False
         self.seconds.add(flops(factor.pattern) if self.counted else max(factor.seconds, 1e-6))
@@ -97,6 +102,7 @@ class Track:
         self.in_flight = False
         self.refused += 1
         self.failures += 1
+        self.unbuilt += self.sent_positions
 
     def observe(self, record: Any, floor: int, cost: float) -> None:
         """A solve was made (a record of the loop). floor: iterations above it are excess; cost: of the solve."""

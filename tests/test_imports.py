@@ -13,11 +13,13 @@ ALLOWED = {
     "precond_worker": {"precond_worker", "protocol"},
     "clients": {"clients", "protocol"},
 }
-# Imported when they are needed: the server may factorize in its own process, a worker compiles as the server does.
+# Imported when they are needed: the server may factorize in its own process, a worker compiles as the server does and
+# may assemble the matrix itself.
 EXCEPTIONS = {
     ("sim_server", "precond_worker.factorize"),
     ("sim_server", "precond_worker.methods"),
     ("precond_worker", "sim_server.backend"),
+    ("precond_worker", "sim_server.assembly"),
 }
 
 

@@ -106,6 +106,7 @@ class MassSpring(Effect):
     def __init__(self, world: World, listed: list[tuple[Body, Any]]):
         self.world = world
         self.elastic: dict[int, tuple[Reals, Reals]] = {}
+        self._from_files = any(isinstance(params.springs, str) for _, params in listed)
         parts = [self._springs(body, params) for body, params in listed]
         ends = np.concatenate([part[0] for part in parts])
         order = np.argsort(ends.min(axis=1), kind="stable")  # neighbours in memory
@@ -116,6 +117,11 @@ class MassSpring(Effect):
         self.owner = owner[order]
         m = len(self.elements)
         self.spread, self.push, self._energy = np.zeros((m, 4)), np.zeros((m, 3)), np.zeros(m)
+
+    @property
+    def told(self) -> bool:
+        """Files are read here alone."""
+        return not self._from_files
 
     def _springs(self, body: Body, params: Params) -> tuple[Ints, Reals, Reals]:
         """Ends, stiffness and rest length of a body's springs."""

@@ -152,6 +152,11 @@ class Touch(Effect):
         return len(alive) - len(kept)
 
     @property
+    def told(self) -> bool:
+        """Not while there are grabs: they are known here alone."""
+        return not any(a.stiffness for a in self._applied)
+
+    @property
     def applied(self) -> list[Interaction]:
         """All that the loop was given last, as it was given them."""
         return self._applied

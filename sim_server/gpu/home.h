@@ -4,21 +4,27 @@
 #pragma once
 #include "loop.h"
 
+// Positions go through the room of the blocks: each node has at least its own.
+static int64_t coming_bytes(const Body& body) { return body.coming == 1 ? body.bytes : body.size; }
+
 static bool begin_matrices(Loop& l) {
     if (l.matrix_step >= 0 || !l.asked.exchange(0, std::memory_order_acquire)) return true;
     for (int i = 0; i < l.bodies; ++i) {
         Body& body = l.body[i];
         body.coming = body.wanted.exchange(0, std::memory_order_acquire);
-        if (body.coming) CALL(on_device, l.staged + body.begin, l.values + body.begin, (size_t)body.bytes, l.stream);
+        if (!body.coming) continue;
+        Address from = body.coming == 1 ? l.values + body.begin : l.x + body.place;
+        CALL(on_device, l.staged + body.begin, from, (size_t)coming_bytes(body), l.stream);
     }
     CALL(event_record, l.snapped, l.stream);
     CALL(stream_wait, l.copies, l.snapped, 0);
     for (int i = 0; i < l.bodies; ++i) {
         Body& body = l.body[i];
-        if (body.coming) CALL(to_host, l.matrices + body.begin, l.staged + body.begin, (size_t)body.bytes, l.copies);
+        if (body.coming)
+            CALL(to_host, l.matrices + body.begin, l.staged + body.begin, (size_t)coming_bytes(body), l.copies);
     }
     CALL(event_record, l.home, l.copies);
-    l.matrix_step = l.launched - 1;  // steps completed when they were assembled
+    l.matrix_step = l.launched - 1;  // steps completed when they were assembled; positions are those after it
     return true;
 }
 

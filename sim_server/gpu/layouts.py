@@ -33,7 +33,10 @@ class Mailbox(c.Structure):
 
 
 class Body(c.Structure):
-    _fields_ = [("begin", i64), ("bytes", i64), ("wanted", c.c_int32), ("coming", c.c_int32), ("copied", i64)]
+    _fields_ = [
+        ("begin", i64), ("bytes", i64), ("place", i64), ("size", i64), ("wanted", c.c_int32), ("coming", c.c_int32),
+        ("copied", i64),
+    ]  # fmt: skip
 
 
 class Batch(c.Structure):

@@ -46,7 +46,8 @@ struct Stamp { int64_t begin, end; };  // of a step, ns of the device's clock
 
 struct Body {
     int64_t begin, bytes;          // of its blocks among the values of A
-    std::atomic<int32_t> wanted;   // they are asked for
+    int64_t place, size;           // bytes: of its nodes in x
+    std::atomic<int32_t> wanted;   // 1: the blocks are asked for, 2: the positions
     int32_t coming;                // ... and under way
     std::atomic<int64_t> copied;   // step of the last copy made, -1: none
 };

@@ -77,8 +77,10 @@ class DeviceLoop(Reports):
         for entry, (first, last) in zip(self._body, ranges, strict=True):
             begin, end = block * int(row_start[first]), block * int(row_start[last])
             entry.begin, entry.bytes, entry.copied = begin, end - begin, -1
+            entry.place, entry.size = (3 * np.dtype(real).itemsize * k for k in (first, last - first))
         self._real, self._value_bytes = np.dtype(real), block * int(row_start[-1])
         self._targets: dict[int, Reals] = {}
+        self._asked_of: dict[int, int] = {}  # bytes, of each body
         loop.cuda = c.pointer(device.functions)
         loop.context, loop.stream, loop.copies = device.context, device.stream, device.copies
         loop.mailbox, loop.mailboxes, loop.body, loop.bodies = self._box, len(mailboxes), self._body, bodies
@@ -143,13 +145,23 @@ class DeviceLoop(Reports):
 
     def request_matrix(self, body: int, target: Reals) -> None:
         """The values of A of the next step are copied into `target`; it is filled once `matrix_step` says so."""
+        self._request(body, target, 1)
+
+    def request_positions(self, body: int, target: Reals, ahead: float = 0.0) -> None:
+        """Likewise the positions, (nodes, 3), those at the end of the step. ahead: must be 0 here."""
+        if ahead:
+            raise ValueError(f"positions of a GPU are copied as they are, not {ahead:g} s ahead")
+        self._request(body, target, 2)
+
+    def _request(self, body: int, target: Reals, what: int) -> None:
         if not self.loop.staged:  # made once, when the first one is asked for
             self.loop.staged = self._device.memory(self._value_bytes)
             self._pinned_values = self._device.pinned(self._value_bytes)
             self.loop.matrices = self._pinned_values.ctypes.data
         self._targets[body] = target
         entry = self._body[body]
-        entry.copied, entry.wanted = -1, 1
+        entry.copied, entry.wanted = -1, what
+        self._asked_of[body] = entry.bytes if what == 1 else entry.size
         self.loop.asked = 1
 
     def matrix_step(self, body: int) -> int:
@@ -157,7 +169,7 @@ class DeviceLoop(Reports):
         entry = self._body[body]
         step = int(entry.copied)
         if step >= 0 and body in self._targets:
-            data = self._pinned_values[entry.begin : entry.begin + entry.bytes]
+            data = self._pinned_values[entry.begin : entry.begin + self._asked_of[body]]
             target = self._targets.pop(body)
             target[...] = data.view(self._real).reshape(target.shape)
         return step

@@ -26,8 +26,9 @@ struct Body {
     SolveSettings settings;
     const Factor* factor;               // in use
     std::atomic<const Factor*> mail;    // a newer one, or null
-    std::atomic<double*> snapshot;      // where to copy the values of A, or null
+    std::atomic<double*> snapshot;      // where to copy the values of A, or the positions, or null
     std::atomic<int64_t> snapshot_step; // step of the last copy made, -1: none
+    double ahead;                       // s: below 0 the copy is of A, else of x + ahead v
     int64_t steps;                      // solved so far
 };
 
@@ -68,11 +69,16 @@ static void run(Launch& l, int threads, int64_t step) {
     for (int k = 0; k < parts; ++k) l.kernel(l.binding->params, (int)(items * k / parts), (int)(items * (k + 1) / parts));
 }
 
-static void copy_matrix(Loop& loop, Body& body) {
+static void copy_for_worker(Loop& loop, Body& body) {
     double* target = body.snapshot.load(std::memory_order_acquire);
     if (!target) return;
-    int64_t begin = loop.row_start[body.first], end = loop.row_start[body.last];
-    std::memcpy(target, loop.values + 9 * begin, 9 * sizeof(double) * (end - begin));
+    if (body.ahead < 0) {
+        int64_t begin = loop.row_start[body.first], end = loop.row_start[body.last];
+        std::memcpy(target, loop.values + 9 * begin, 9 * sizeof(double) * (end - begin));
+    } else {
+        for (int64_t k = 3 * (int64_t)body.first; k < 3 * (int64_t)body.last; ++k)
+            *target++ = loop.x[k] + body.ahead * loop.v[k];
+    }
     body.snapshot.store(nullptr, std::memory_order_relaxed);
     body.snapshot_step.store(loop.rings.step, std::memory_order_release);
 }
@@ -113,7 +119,7 @@ void wf_assemble(Loop* loop) {
     loop->cpu_begin = thread_time();
     loop->clock[0] = rings.start_time + rings.step * rings.dt;
     for (int i = 0; i < loop->before; ++i) run(loop->launch[i], loop->threads, rings.step);
-    for (int i = 0; i < loop->bodies; ++i) copy_matrix(*loop, loop->body[i]);
+    for (int i = 0; i < loop->bodies; ++i) copy_for_worker(*loop, loop->body[i]);
     loop->assemble_begin = begin;
     loop->assemble_seconds = now() - begin;
 }

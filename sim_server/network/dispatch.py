@@ -93,6 +93,11 @@ class Dispatch:
             infos = (self._roster.info(name) for name in self._roster.fit(self._clock(), self._jobs.deadlines()))
             return [info for info in infos if info is not None]
 
+    def builds(self) -> bool:
+        """There are workers, and all of them can assemble matrices from positions."""
+        infos = self.workers()
+        return bool(infos) and all(info.builds for info in infos)
+
     def poll(self) -> list[Factor]:
         """Good factors since the last call."""
         with self._busy:
@@ -117,12 +122,11 @@ class Dispatch:
         known = self._answers.known.get(job.object)
         if known is None or known.epoch != job.epoch:
             raise ValueError(f"job for {job.object} epoch {job.epoch}, which was not announced")
-        if job.values.shape != (known.blocks, 3, 3) or job.values.dtype != np.float64:
-            raise ValueError(
-                f"job for {job.object}: values {job.values.shape}, allowed: float64 ({known.blocks}, 3, 3)"
-            )
+        shape = (known.size // 3, 3) if job.positions else (known.blocks, 3, 3)
+        if job.values.shape != shape or job.values.dtype != np.float64:
+            raise ValueError(f"job for {job.object}: values {job.values.shape}, allowed: float64 {shape}")
         self._receive()
-        idle = self._idle()
+        idle = [name for name in self._idle() if not job.positions or self._builds(name)]
         if job.object in self._jobs.by_object or not idle:
             return False
         worker = self._choose(idle, job.object)
@@ -154,6 +158,10 @@ class Dispatch:
     def _idle(self) -> list[str]:
         fit = self._roster.fit(self._clock(), self._jobs.deadlines())
         return [name for name in fit if name not in self._jobs.by_worker]
+
+    def _builds(self, worker: str) -> bool:
+        info = self._roster.info(worker)
+        return info is not None and info.builds
 
     def _choose(self, idle: list[str], object: str) -> str:
         """Nobody late if it can be helped; then the fastest; then who knows the object; then who did least."""

@@ -147,6 +147,10 @@ class ServerLink:
         """Workers that may be given work, as they last described themselves."""
         return self._dispatch.workers()
 
+    def builds(self) -> bool:
+        """There are workers, and all of them can assemble matrices from positions."""
+        return self._dispatch.builds()
+
     def clients(self) -> list[str]:
         """Names of the clients that are connected."""
         while (sample := self._client_tokens.try_recv()) is not None:

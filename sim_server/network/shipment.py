@@ -44,7 +44,9 @@ def matrix_message(flight: Flight, known: Known, incarnation: int, lease: float,
 
 
 def load(message: Matrix, values: NDArray[np.float64], slot: Slot | None) -> Any:
-    """The payload: values (blocks, 3, 3), copied into the slot or, without one, into bytes."""
+    """The payload: values (blocks, 3, 3) or positions (nodes, 3), copied into the slot or, without one, into bytes."""
+    if values.ndim == 2:
+        message.nodes = len(values)
     if slot is None:
         data = values.tobytes()
         message.checksum = checksum(data)

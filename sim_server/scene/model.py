@@ -89,6 +89,12 @@ class SceneObject(Parameters):
     )
     effects: Annotated[dict[str, BaseModel], *_effects("object")] = Field(default_factory=dict)
 
+    _given: Mesh | None = PrivateAttr(None)
+
+    def use_mesh(self, mesh: Mesh) -> None:
+        """Instead of the one that `mesh` names."""
+        self._given = mesh
+
     @model_validator(mode="before")
     @classmethod
     def _water_by_default(cls, table: Any) -> Any:
@@ -104,6 +110,8 @@ class SceneObject(Parameters):
 
     def load_mesh(self) -> Mesh:
         """The checked mesh at rest, before the pose. Raises InputError naming the object."""
+        if self._given is not None:
+            return self._given
         source = self.mesh
         try:
             if source.file is not None:

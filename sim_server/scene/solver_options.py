@@ -107,6 +107,13 @@ class Solver(Parameters):
     budget: float = Field(default=0.0, ge=0, description="wall time per solve [s]; 0 = none")
     threads: int = Field(default=1, ge=1, le=1024)
     warm_start: bool = Field(default=True, description="start from the last step's dv")
+    build: Literal["server", "worker"] = Field(
+        default="server", description="who assembles the matrices to factorize; worker: it is sent positions"
+    )
+    extrapolate: float = Field(
+        default=0.0, ge=0, le=10,
+        description="build = worker: positions go out as x + v t, t what a factor is expected to take, at most so [s]",
+    )  # fmt: skip
     update_floor_iterations: int = Field(
         default=3, ge=0, le=1_000_000, description="iterations above this count as excess"
     )
@@ -146,6 +153,10 @@ class Solver(Parameters):
             if value not in allowed[device]:
                 words = ", ".join(repr(a) for a in allowed[device])
                 raise InputError(f"solver.{field} = {value!r}: must be one of {words} on a {device.upper()}")
+        if self.extrapolate and (self.build != "worker" or device == "gpu"):
+            raise InputError(
+                f'solver.extrapolate = {self.extrapolate:g}: must be 0 without build = "worker", and on a GPU'
+            )
         if device == "gpu" and self.budget:
             raise InputError(
                 f"solver.budget = {self.budget:g}: must be 0 on a GPU, which bounds a solve by max_iterations"

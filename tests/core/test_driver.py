@@ -184,6 +184,42 @@ class Idle(Inline):
         return True
 
 
+class Building(Idle):
+    """One idle worker that builds matrices; what it was sent fails."""
+
+    def builds(self) -> bool:
+        return True
+
+    def submit(self, job: Job) -> bool:
+        self.sent.append((job.positions, job.values.copy()))
+        return True
+
+    def failures(self) -> list[tuple[str, str]]:
+        failed, self.sent_all = [("bar", "broken")] * len(self.sent), [*getattr(self, "sent_all", []), *self.sent]
+        self.sent = []
+        return failed
+
+
+def test_positions_go_out_to_who_builds_and_the_matrix_after_three_failures(caplog):
+    sim = falling(update="async", build="worker")
+    driver = Driver(sim, source := Building(patterns_of(sim), 1))
+    driver.advance(60)
+    kinds = [positions for positions, _ in source.sent_all]
+    assert kinds[:3] == [True] * 3 and not any(kinds[3:]) and len(kinds) > 3
+
+
+@pytest.mark.parametrize(("extrapolate", "steps"), [(0.0, 0), (0.03, 1.5), (9.0, 3)])
+def test_positions_are_those_expected_when_the_factor_comes(extrapolate, steps):
+    sim = falling(update="lockstep-3", build="worker", extrapolate=extrapolate)
+    driver = Driver(sim, source := Building(patterns_of(sim), 1))
+    sim.engine.run(4)
+    expected = sim.world.x + steps * sim.world.dt * sim.world.v
+    driver.advance(1)
+    (positions, x), *_ = source.sent
+    assert positions
+    np.testing.assert_allclose(x, expected, rtol=0, atol=1e-15)
+
+
 @pytest.mark.parametrize("idle", [0, 1, 3, 5, 9])
 def test_all_idle_workers_get_a_matrix_of_the_same_step(idle):
     sim = falling(*(bar(name=f"beam{k}", young=1e6, fixed="X < 0.01") for k in range(6)), update="async")

@@ -265,6 +265,21 @@ def test_matrices_are_those_of_the_step_after_the_request_in_all_bodies(real):
     assert (targets[0] == 20).all()
 
 
+@pytest.mark.parametrize("real", ["f4", "f8"])
+def test_positions_are_those_at_the_end_of_the_step_beside_matrices_of_other_bodies(real):
+    scene = FakeScene(bodies=3, real=real)
+    scene.loop.run(20)
+    positions, matrix = np.full((2, 3), np.nan), np.full((2, 3, 3), np.nan)
+    scene.loop.request_positions(1, positions)
+    scene.loop.request_matrix(2, matrix)
+    scene.loop.run(40)
+    assert [scene.loop.matrix_step(k) for k in range(3)] == [-1, 20, 20]
+    assert (matrix == 20).all()
+    assert (positions == 21).all()
+    with pytest.raises(ValueError, match="ahead"):
+        scene.loop.request_positions(1, positions, 0.1)
+
+
 def test_a_matrix_asked_for_while_it_runs_is_whole():
     """Its copy is made aside: the steps that follow do not reach it."""
     scene = FakeScene()

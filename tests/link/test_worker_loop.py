@@ -2,6 +2,9 @@
 """The worker's loop without a network: what it keeps, drops and answers."""
 
 import logging
+import re
+import sys
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,7 +18,7 @@ from protocol import PROTOCOL, FactorPattern, Refused
 from protocol.channels import key
 from protocol.check import check_header, checksum
 from protocol.counters import Counters
-from protocol.messages_pb2 import Factor, Header, Matrix, Topology
+from protocol.messages_pb2 import Factor, Header, Matrix, Scene, Topology
 from protocol.method import Method
 from protocol.slotmap import SlotMap
 
@@ -76,6 +79,10 @@ class FakeUplink:
         row_start = np.arange(3, dtype=np.int32)
         return Topology(header=header, nodes=2, row_start=row_start.tobytes(), columns=row_start[:2].tobytes())
 
+    def scene(self) -> Scene:
+        self.asked.append(("scene", 0))
+        return Scene()
+
     def send_pattern(self, pattern: FactorPattern, object: str, epoch: int) -> None:
         self.patterns.append((object, epoch))
 
@@ -126,6 +133,68 @@ def test_a_matrix_is_answered_with_its_factor(worker: Worker, uplink: FakeUplink
     assert (answer.step, answer.job, answer.worker, answer.dtype, answer.failure) == (10, 1, "w", "float32", "")
     assert answer.checksum == checksum(data) and answer.nonzeros == 6
     assert uplink.patterns == [("beam", 1)] and uplink.library == "diagonal"
+
+
+class Doubling:
+    """Builds 2 (x + y + z) I for each of two nodes."""
+
+    made = 0
+
+    def __init__(self, scene: Scene, topology: Topology):
+        Doubling.made += 1
+
+    def matrix(self, x: np.ndarray) -> np.ndarray:
+        if x.shape != (2, 3):
+            raise ValueError(f"positions {x.shape}")
+        return 2 * x.sum(axis=1)[:, None, None] * np.eye(3)
+
+
+def positions(number: int, x: np.ndarray, **changes: Any) -> Sample:
+    message = Matrix.FromString(matrix(number).attachment)
+    message.nodes, message.checksum = len(x), checksum(x)
+    for name, value in changes.items():
+        setattr(message, name, value)
+    return Sample(message, x)
+
+
+@pytest.fixture
+def doubling(monkeypatch: pytest.MonkeyPatch) -> None:
+    Doubling.made = 0
+    monkeypatch.setitem(sys.modules, "sim_server.assembly", SimpleNamespace(Assembly=Doubling))
+
+
+def test_from_positions_the_worker_builds_the_matrix_itself(worker: Worker, uplink: FakeUplink, doubling: None) -> None:
+    x = np.array([[1.0, 2, 5], [0, 1, 1]])
+    drain(worker, uplink, positions(1, x))
+    drain(worker, uplink, positions(2, 2 * x))
+    assert [answer.failure for answer, _ in uplink.answers] == ["", ""]
+    assert np.frombuffer(uplink.answers[0][1], np.float32).tolist() == [4, 4, 4, 2, 2, 2]
+    assert (Doubling.made, uplink.asked.count(("scene", 0))) == (1, 1), "the description is asked for once"
+    drain(worker, uplink, matrix(3, scale=9.0))
+    assert np.frombuffer(uplink.answers[2][1], np.float32).tolist() == [3] * 6
+
+
+def test_a_new_server_is_asked_for_its_scene_again(worker: Worker, uplink: FakeUplink, doubling: None) -> None:
+    x = np.ones((2, 3))
+    drain(worker, uplink, positions(1, x))
+    uplink.mailbox.put(ServerEvent(7, False))
+    uplink.mailbox.put(ServerEvent(7, True))
+    worker.step(0.0)
+    drain(worker, uplink, positions(2, x))
+    assert Doubling.made == 2
+
+
+@pytest.mark.parametrize(("change", "words"), [({"checksum": 1}, "checksum"), ({"nodes": 3}, "positions|bytes")])
+def test_bad_positions_are_answered_with_the_reason(
+    worker: Worker, uplink: FakeUplink, doubling: None, change: dict, words: str
+) -> None:
+    drain(worker, uplink, positions(1, np.ones((2, 3)), **change))
+    assert re.search(words, uplink.answers[0][0].failure)
+
+
+def test_a_scene_that_cannot_be_built_is_answered_with_the_reason(worker: Worker, uplink: FakeUplink) -> None:
+    drain(worker, uplink, positions(1, np.ones((2, 3))))
+    assert "Topology.rest" in uplink.answers[0][0].failure
 
 
 def test_the_newest_matrix_of_an_object_wins(worker: Worker, uplink: FakeUplink) -> None:

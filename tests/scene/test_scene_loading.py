@@ -62,6 +62,8 @@ def test_defaults_and_resolved(tmp_path):
             "budget": 0.0,
             "threads": 1,
             "warm_start": True,
+            "build": "server",
+            "extrapolate": 0.0,
             "update_floor_iterations": 3,
             "update_floor_steps": 1,
             "update_threshold": 1.0,

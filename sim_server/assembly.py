@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: MIT
+"""The system matrix of one object from its positions: for workers that build it themselves (section 5 of Courtecuisse
+et al. 2010).
+
+The same kernels on the same constants as in the server's loop, so the same matrix. The object is what the server has
+described: its scene and topology are looked at like anything that came over a network, and no file that they name is
+read.
+"""
+
+import json
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from protocol.check import all_finite, array, check_range
+from protocol.messages_pb2 import Scene as SceneMessage
+from protocol.messages_pb2 import Topology
+from protocol.refused import Refused
+from sim_server.errors import InputError
+from sim_server.mesh import Mesh, check
+from sim_server.scene.model import Scene
+from sim_server.simulation import Simulation
+
+# What a worker has for the settings of its server's device.
+HERE = {"precision": "float64", "factor_precision": "auto", "threads": 1, "budget": 0.0, "build": "server",
+        "extrapolate": 0.0}  # fmt: skip
+
+
+class Assembly:
+    """Matrices of one object in one topology epoch. Raises Refused for a description that cannot be built."""
+
+    def __init__(self, scene: SceneMessage, topology: Topology):
+        name = topology.header.object
+        try:
+            self._simulation = Simulation(described(scene.resolved, name, _mesh(topology)))
+        except (InputError, ValidationError) as error:
+            raise Refused(f"Scene.resolved, object {name!r}: {error}", "malformed") from error
+        self._check_pattern(topology)
+
+    @property
+    def nodes(self) -> int:
+        """Of the object."""
+        return self._simulation.world.nodes
+
+    def matrix(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """A' of positions x (nodes, 3) [m]: (blocks, 3, 3) in the order of the topology; overwritten by the next call.
+
+        Velocities are taken for zero: no effect that may be built here has any in A. Raises ValueError for positions of
+        another shape or not finite.
+        """
+        world = self._simulation.world
+        if x.shape != world.x.shape or not all_finite(x):
+            raise ValueError(f"positions {x.shape}: must be finite, {world.x.shape}")
+        world.x[...] = x
+        self._simulation.engine.assemble()
+        return self._simulation.system.values
+
+    def _check_pattern(self, topology: Topology) -> None:
+        row_start, columns = self._simulation.system.body_pattern(0, self.nodes)
+        same = row_start.tobytes() == topology.row_start and columns.tobytes() == topology.columns
+        if not same:
+            raise Refused("Topology.columns is not the pattern that is built here: another version?", "pattern")
+
+
+def described(resolved: str, name: str, mesh: Mesh) -> Scene:
+    """The scene of one object alone, on a CPU, with this mesh. resolved: Scene.resolved. Raises InputError, Refused or
+    pydantic's ValidationError."""
+    try:
+        table: dict[str, Any] = json.loads(resolved)
+        listed = [o for o in table["object"] if o["name"] == name]
+        table["solver"] = {**table["solver"], **HERE}
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise Refused(f"Scene.resolved is no scene: {type(error).__name__}", "malformed") from error
+    if len(listed) != 1:
+        raise Refused(f"Scene.resolved has {len(listed)} objects called {name!r}; allowed: 1", "object")
+    table["object"] = [{**listed[0], "mesh": {"bar": [1, 1, 1], "size": [1.0, 1.0, 1.0]}}]  # in place of its source
+    scene = Scene.model_validate(table, context={"files": False})
+    scene.objects[0].use_mesh(mesh)
+    return scene
+
+
+def _mesh(topology: Topology) -> Mesh:
+    rest = array(topology.reference or topology.rest, np.float64, (topology.nodes, 3), "Topology.rest", finite=True)
+    tets = array(topology.tets, np.int32, (-1, 4), "Topology.tets")
+    check_range(tets, 0, topology.nodes, "Topology.tets")
+    return check(Mesh(rest, tets, topology.header.object))

@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: MIT
+"""A real worker that is sent positions: the factor is that of the server's own matrix."""
+
+import numpy as np
+import pytest
+from link_helpers import Driver, free_endpoint, process
+
+from sim_server import describe
+from sim_server.driver import Driver as Loop
+from sim_server.factors import Job
+from sim_server.network.link import ServerLink
+from sim_server.simulation import Simulation
+from tests.scenes import bar, simulation
+
+pytestmark = pytest.mark.system
+
+
+def served(update: str, **solver: object) -> Simulation:
+    beam = bar((6, 3, 3), (4, 1, 1), fixed="X < 0.01", pose={"rotate": [40, 0, 70]}, touch={"max_force": 1e4})
+    return simulation(beam, gravity=(0, -2, 0), preconditioner="cholesky", update=update, build="worker", **solver)
+
+
+def test_the_same_factor_as_of_the_matrix_sent() -> None:
+    sim, endpoint = served("async"), free_endpoint()
+    sim.engine.run(5)
+    sim.engine.assemble()
+    with ServerLink(listen=[endpoint]) as link, process("-m", "precond_worker", "--connect", endpoint):
+        driver = Driver(link)
+        link.set_scene(describe.scene(sim))
+        link.announce(describe.topology(sim, sim.world.bodies[0]))
+        driver.until(link.builds, "a worker that builds")
+        factors = []
+        for step, values in ((1, sim.system.values), (2, sim.world.x), (3, sim.system.values), (4, sim.world.x)):
+            job = Job("bar", 1, step, True, values.copy(), "float64")
+            driver.until(lambda job=job: link.ready() and link.submit(job), "a worker that is ready")
+            factors.append(driver.until(lambda: driver.factors.pop() if driver.factors else None, "a factor"))
+        assert not driver.failures
+    assert [f.step for f in factors] == [1, 2, 3, 4]
+    assert len({f.values.tobytes() for f in factors}) == 1, "bit for bit"
+
+
+def test_a_run_with_positions_alone_repeats_the_run_with_matrices() -> None:
+    """Lockstep: step by step the same iterations and the same state."""
+    ends, sent = [], []
+    for build in ("worker", "server"):
+        sim, endpoint = served("lockstep-2"), free_endpoint()
+        object.__setattr__(sim.scene.solver, "build", build)
+        with ServerLink(listen=[endpoint]) as link, process("-m", "precond_worker", "--connect", endpoint):
+            link.set_scene(describe.scene(sim))
+            link.announce(describe.topology(sim, sim.world.bodies[0]))
+            Driver(link).until(link.workers, "a worker")
+            records = Loop(sim, link).advance(15)
+            sent.append(link.counters.bytes_out / link.counters.jobs)
+            ends.append((records["iterations"].tolist(), sim.world.x.tobytes()))
+    assert ends[0] == ends[1]
+    assert sent == [24 * sim.world.nodes, 72 * len(sim.system.columns)]
+
+
+def test_while_something_is_grabbed_the_matrix_is_sent() -> None:
+    sim, endpoint = served("lockstep-2"), free_endpoint()
+    touch = sim.effects["touch"]
+    place = next(i for i, launch in enumerate(sim.engine.launches) if launch.name == "touch.apply")
+    touch.publish = lambda new: sim.engine.replace(place, new)  # type: ignore[attr-defined]
+    with ServerLink(listen=[endpoint]) as link, process("-m", "precond_worker", "--connect", endpoint):
+        link.set_scene(describe.scene(sim))
+        link.announce(describe.topology(sim, sim.world.bodies[0]))
+        Driver(link).until(link.workers, "a worker")
+        loop = Loop(sim, link)
+        held = touch.grab("me", "bar", (4, 1, 1), 0.0, (2, 3, 0), 1e4, 0.0, 1e9)  # type: ignore[attr-defined]
+        loop.advance(5)
+        blocks, jobs = 72 * len(sim.system.columns), link.counters.jobs
+        assert link.counters.bytes_out == jobs * blocks > 0
+        touch.release("me", held.id)  # type: ignore[attr-defined]
+        loop.advance(5)
+        assert link.counters.bytes_out < link.counters.jobs * blocks
+        assert np.isfinite(sim.world.x).all()
