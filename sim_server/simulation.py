@@ -149,10 +149,14 @@ def _backend(device: str, precision: str) -> Any:
 
 
 def build_effects(scene: Scene, world: World) -> dict[str, Effect]:
-    """The effects that the scene lists, and no others."""
+    """The effects that the scene lists, and no others, by name (and variant)."""
     built: dict[str, Effect] = {}
     for name in sorted({n for o in scene.objects for n in o.effects}):
-        built[name] = effect(name).build(world, world.with_effect(name))
+        variants: dict[str, list[tuple[Body, Any]]] = {}
+        for body, params in world.with_effect(name):
+            variants.setdefault(getattr(params, "variant", ""), []).append((body, params))
+        for variant, listed in variants.items():
+            built[name + variant] = effect(name).build(world, listed)
     for name, params in scene.effects.items():
         built[name] = effect(name).build(world, [(body, params) for body in world.bodies])
     return built

@@ -18,12 +18,13 @@ from tests.reference.corotational import Solid
 
 
 def bar(cells: tuple[int, int, int] = (4, 2, 2), size: tuple[float, float, float] = (2, 1, 1), **table: Any) -> dict:
-    """An [[object]]: a bar along x. young, poisson, fixed (an expression), damping (mass, stiffness), touch; other keys
-    go into the table as they are."""
+    """An [[object]]: a bar along x. young, poisson, rotation, tangent, fixed (an expression), damping (mass,
+    stiffness), touch; other keys go into the table as they are."""
     table.setdefault("name", "bar")
     effects: dict[str, Any] = {}
     if table.setdefault("young", 1e5) is not None:
         effects["corotational"] = {"young": table["young"], "poisson": table.pop("poisson", 0.3)}
+        effects["corotational"] |= {key: table.pop(key) for key in ("rotation", "tangent") if key in table}
     if fixed := table.pop("fixed", None):
         effects["fixed"] = {"where": fixed}
     if damping := table.pop("damping", None):
@@ -95,9 +96,7 @@ def random_rotations(count: int, seed: int = 0) -> NDArray[np.float64]:
 
 def elastic(sim: Simulation) -> Corotational:
     """The elements of a scene."""
-    effect = sim.effects["corotational"]
-    assert isinstance(effect, Corotational)
-    return effect
+    return next(e for e in sim.effects.values() if isinstance(e, Corotational))
 
 
 def solid(sim: Simulation, body: int = 0) -> Solid:
@@ -108,5 +107,6 @@ def solid(sim: Simulation, body: int = 0) -> Solid:
     return Solid(
         b.mesh.rest, b.mesh.tets, young, poisson, w.mass[b.nodes].copy(), w.free[b.nodes].copy(), w.x[b.nodes].copy(),
         w.v[b.nodes].copy(), w.dt, getattr(rayleigh, "mass", 0.0), getattr(rayleigh, "stiffness", 0.0),
-        getattr(gravity, "g", (0.0, 0.0, 0.0)),
+        getattr(gravity, "g", (0.0, 0.0, 0.0)), b.effects["corotational"].rotation,
+        b.effects["corotational"].tangent == "exact",
     )  # fmt: skip

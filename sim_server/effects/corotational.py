@@ -9,6 +9,24 @@ B holds the gradients of the linear shape functions, V is the rest volume, D is 
 lambda = E nu / ((1 + nu) (1 - 2 nu)) and mu = E / (2 (1 + nu)). The change of R with x is left out of the tangent,
 as usual; this keeps -df/dx positive semi-definite, which the conjugate gradients and the factorization need.
 
+Rotation of an element:
+
+* "polar" (default): the rotation nearest to the deformation gradient F = R S. No corner is preferred; the forces are
+  the slope of V (mu |S - I|^2 + lambda / 2 tr(S - I)^2); where an element is inverted, its least stretch is negative.
+* "qr": that of edge 01 and face 012, by Gram and Schmidt. Cheaper, and defined however the element is inverted (short
+  of a lost edge or face), but at large strains the answer depends on the order of the corners, forces have a torque
+  of second order in the strain and no energy: what `energy` tells is that of the strains alone.
+
+Both are exact for rigid motion and agree for small strains.
+
+Tangent: "usual" (default) as above. "exact" adds how R turns with x; in terms of F, with the eigenvectors u and
+eigenvalues h (sums of two stretches) of tr(S) I - S, the twists t have the eigenvalues e of d2W/dF2::
+
+    usual + sum e t t^T,   t = R [u]x / sqrt 2,   e = 2 mu + (lambda (tr S - 3) - 2 mu) 2 / h,  not below 0
+
+so Newton's iteration converges quadratically where no e is clamped (tension); where all are (compression) it is the
+usual one. For more work a step; it needs "polar".
+
 Large rotations are exact, strains are linear: good to about 10-20 % strain. `young` may be one value or a list of
 regions; in each region `where` is asked at the centroid of the element, at rest and before the pose; the first
 region that holds gives the value, and a region without `where` takes what is left.
@@ -16,19 +34,20 @@ region that holds gives the value, and a region without `where` takes what is le
 Usual ranges: young 1e3 Pa (brain, liver) to 1e7 Pa (rubber); 2e11 Pa (steel) works with small loads. poisson 0.3 to
 0.49; from 0.49 on linear tetrahedra lock (they bend too little), and at 0.5 lambda is infinite, so 0.5 is refused.
 
-Source: Müller and Gross, Interactive Virtual Materials, 2004; Nesme, Payan and Faure 2005; Felippa 2000.
+Source: Müller and Gross, Interactive Virtual Materials, 2004; Nesme, Payan and Faure 2005 (QR); Chao, Pinkall, Sanan
+and Schröder 2010, McAdams et al. 2011 (exact tangent); Felippa 2000.
 """
 
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from sim_server.backend import Launch
 from sim_server.effect import Effect
 from sim_server.errors import InputError
-from sim_server.scene.parameters import Parameters
+from sim_server.scene.parameters import Parameters, complaint
 from sim_server.scene.regions import Poisson, Young, region_values
 from sim_server.system import Stencil, System
 from sim_server.world import Body, World
@@ -39,17 +58,32 @@ SCOPE = "object"
 class Params(Parameters):
     young: Young = Field(description="Young's modulus [Pa], or a list of regions { where, young, poisson }")
     poisson: Poisson = Field(description="Poisson's ratio [-], of every element whose region gives none")
+    rotation: Literal["polar", "qr"] = Field(default="polar", description="of the elements")
+    tangent: Literal["usual", "exact"] = Field(default="usual", description="whether it knows how rotations change")
+
+    @model_validator(mode="after")
+    def _exact_is_polar(self) -> "Params":
+        if self.tangent == "exact" and self.rotation != "polar":
+            raise complaint('tangent = "exact" needs rotation = "polar": forces by qr have no energy to differentiate')
+        return self
+
+    @property
+    def variant(self) -> str:
+        """Of the kernels: that of the file name behind `corotational`."""
+        return "_exact" if self.tangent == "exact" else "_qr" if self.rotation == "qr" else ""
 
 
 class Corotational(Effect):
-    """Elements of all bodies that list the effect, in the order of their first nodes.
+    """Elements of all bodies that list the effect in one of its variants, in the order of their first nodes.
 
     elements (m, 4); gradients (9, m), lame (2, m): constants of the elements, one kind after another. What a step makes
-    of them: turn (m, 4) unit quaternions, spread (m, 4, 4) scaled rotated gradients and lambda / mu, push (m, 4, 3).
+    of them: turn (m, 4) unit quaternions, spread (m, 4, 4) scaled rotated gradients and lambda / mu, push (m, 4, 3);
+    of the exact tangent, twist (m, 6).
     """
 
     def __init__(self, world: World, listed: list[tuple[Body, Any]]):
         self.world = world
+        self.variant = listed[0][1].variant
         self.rotated = tuple(body for body, _ in listed)
         tets = np.concatenate([body.tets for body, _ in listed])
         order = np.argsort(tets.min(axis=1), kind="stable")  # neighbours in memory, whatever the mesh's order
@@ -66,34 +100,40 @@ class Corotational(Effect):
         self.owner = owner[order]
         m = len(self.elements)
         self.turn, self.spread, self.push = np.zeros((m, 4)), np.zeros((m, 4, 4)), np.zeros((m, 4, 3))
+        self.twist = np.zeros((m if self.variant == "_exact" else 0, 6))
         self._energy = np.zeros(m)
 
     def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
         assert stencil is not None
         w, m = self.world, len(self.elements)
-        elements = w.backend.module("effects/corotational.cu").bind(
+        text, exact = f"effects/corotational{self.variant}", self.variant == "_exact"
+        twist = {"twist": self.twist} if exact else {}
+        sums = text if exact else "effects/corotational"
+        elements = w.backend.module(f"{text}.cu").bind(
             "elements", m, tets=self.elements, x=w.x, v=w.drift, gradients=self.gradients, lame=self.lame,
             stiffening=w.stiffening[self.owner], h=w.impulse, turn=self.turn, spread=self.spread, push=self.push,
+            **twist,
         )  # fmt: skip
-        gather = w.backend.module("effects/corotational_nodes.cu").bind(
+        gather = w.backend.module(f"{sums}_nodes.cu").bind(
             "gather", w.nodes, start=stencil.corner_start, corners=stencil.corners, push=self.push,
-            spread=self.spread, turn=self.turn, b=system.b, block=system.block, mean=system.mean,
+            spread=self.spread, turn=self.turn, b=system.b, block=system.block, mean=system.mean, **twist,
         )  # fmt: skip
-        blocks = w.backend.module("effects/corotational_blocks.cu").bind(
+        blocks = w.backend.module(f"{sums}_blocks.cu").bind(
             "blocks", len(system.row), accumulate=int(accumulate), start=stencil.pair_start, pairs=stencil.pairs,
-            spread=self.spread, sums=system.sums,
+            spread=self.spread, sums=system.sums, **twist,
         )  # fmt: skip
         return [elements, gather, blocks]
 
     @property
     def rotation(self) -> NDArray[np.float64]:
-        """(m, 3, 3) nearest rotations of the elements at the last step, from `turn`."""
+        """(m, 3, 3) rotations of the elements at the last step, from `turn`."""
         return rotation_matrices(self.world.backend.fetch(self.turn))
 
     def energy(self) -> float:
         """sum V (mu |S - I|^2 + lambda / 2 tr(S - I)^2) with S = R^T F [J]."""
         energy = self._energy
-        self.world.backend.module("effects/corotational.cu").bind(
+        text = "effects/corotational_qr.cu" if self.variant == "_qr" else "effects/corotational.cu"
+        self.world.backend.module(text).bind(
             "energy", len(self.elements), tets=self.elements, x=self.world.x, gradients=self.gradients, lame=self.lame,
             energy=energy,
         )()  # fmt: skip

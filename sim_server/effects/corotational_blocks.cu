@@ -1,9 +1,8 @@
 // SPDX-License-Identifier: MIT
-// Sums the element tangents of corotational tetrahedra block by block: with g_a the scaled rotated gradient of node a,
-// h (c + beta) K_ab = (lambda / mu) g_a g_b^T + g_b g_a^T + (g_a . g_b) I. A block gathers its elements from a list made once
-// per topology: no atomics, the same sum in the same order every time, and no 12x12 matrix is ever formed. The nodes' own
-// blocks, those on the diagonal, are corotational_nodes.cu's.
-#include "together.cuh"
+// Sums the element tangents of corotational tetrahedra block by block (corotational_rows.cuh). A block gathers its elements
+// from a list made once per topology: no atomics, the same sum in the same order every time, and no 12x12 matrix is ever
+// formed. The nodes' own blocks, those on the diagonal, are corotational_nodes.cu's.
+#include "corotational_rows.cuh"
 
 struct Blocks {
     int n;                // blocks above the diagonal
@@ -19,10 +18,7 @@ INLINE void blocks_add(const Blocks& p, int, int k, local* s) {
     local a[4], b[4];
     get_row(p.spread, pair >> 2, a);
     get_row(p.spread, (pair >> 4) * 4 + (pair & 3), b);
-    local wx = a[3] * a[0], wy = a[3] * a[1], wz = a[3] * a[2], d = a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-    s[0] += wx * b[0] + b[0] * a[0] + d; s[1] += wx * b[1] + b[0] * a[1];     s[2] += wx * b[2] + b[0] * a[2];
-    s[3] += wy * b[0] + b[1] * a[0];     s[4] += wy * b[1] + b[1] * a[1] + d; s[5] += wy * b[2] + b[1] * a[2];
-    s[6] += wz * b[0] + b[2] * a[0];     s[7] += wz * b[1] + b[2] * a[1];     s[8] += wz * b[2] + b[2] * a[2] + d;
+    add_block(s, a, b);
 }
 
 INLINE void blocks_put(const Blocks& p, int i, const local* sum) {

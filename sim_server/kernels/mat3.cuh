@@ -21,6 +21,9 @@ template <class T> INLINE vec<T> operator-(vec<T> a, vec<T> b) { return {a.x - b
 template <class T> INLINE vec<T> operator-(vec<T> a) { return {-a.x, -a.y, -a.z}; }
 template <class S, class T> INLINE vec<T> operator*(S s, vec<T> a) { return {s * a.x, s * a.y, s * a.z}; }
 template <class T> INLINE T dot(vec<T> a, vec<T> b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+template <class T> INLINE vec<T> cross(vec<T> a, vec<T> b) {
+    return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
+}
 
 // The same in another precision.
 template <class S, class T> INLINE vec<S> as(vec<T> a) { return {(S)a.x, (S)a.y, (S)a.z}; }

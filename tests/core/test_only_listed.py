@@ -45,6 +45,16 @@ SCENES = {
         "", COROTATIONAL + "rayleigh = { mass = 0.1 }\n", ["corotational", "rayleigh"],
         [*ELASTIC_TEXTS, "rayleigh.cu"], [*ELASTIC, "rayleigh.drag"],
     ),
+    "another rotation": (
+        "", 'corotational = { young = 1e5, poisson = 0.3, rotation = "qr" }\n', ["corotational"],
+        ["corotational_qr.cu", "corotational_blocks.cu", "corotational_nodes.cu"],
+        ["corotational_qr.elements", "corotational_nodes.gather", "corotational_blocks.blocks"],
+    ),
+    "another tangent": (
+        "", 'corotational = { young = 1e5, poisson = 0.3, tangent = "exact" }\n', ["corotational"],
+        ["corotational_exact.cu", "corotational_exact_blocks.cu", "corotational_exact_nodes.cu"],
+        ["corotational_exact.elements", "corotational_exact_nodes.gather", "corotational_exact_blocks.blocks"],
+    ),
     "springs": (
         "", "mass_spring = { young = 1e5 }\n", ["mass_spring"],
         ["mass_spring.cu", "mass_spring_blocks.cu", "mass_spring_nodes.cu", "shape.cu"],

@@ -22,6 +22,8 @@ CASES = {  # scene, overrides, how far nodes are moved [m], cells being 0.2 m
     "regions": ("heterogeneous", [], 0.02),
     "posed": ("posed", [], 0.02),
     "without warp": ("beam", ["solver.warp=false"], 0.02),
+    "rotations by qr": ("beam", ['object.beam.effects.corotational.rotation="qr"'], 0.05),
+    "exact tangent": ("beam", ['object.beam.effects.corotational.tangent="exact"'], 0.02),
     "springs": ("beam", ["object.beam.effects.corotational=false", "object.beam.effects.mass_spring.young=2e5"], 0.02),
     "springs among elements": ("beam", ["object.beam.effects.mass_spring.young=2e5"], 0.02),
     "large thread blocks": ("beam", ["object.beam.mesh.bar=[14, 14, 56]"], 0.01),

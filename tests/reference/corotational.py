@@ -21,6 +21,19 @@ def nearest_rotation(F: Array) -> Array:
     return U @ Vt
 
 
+def frame(x: Array) -> Array:
+    """Axes, in columns, of edge 01 and face 012 of a tetrahedron with corners (4, 3)."""
+    first = (x[1] - x[0]) / np.linalg.norm(x[1] - x[0])
+    across = np.cross(x[1] - x[0], x[2] - x[0])
+    third = across / np.linalg.norm(across)
+    return np.column_stack([first, np.cross(third, first), third])
+
+
+def turned_frame(x: Array, X: Array) -> Array:
+    """Rotation of that frame from rest to now (Nesme, Payan, Faure 2005), (3, 3)."""
+    return frame(x) @ frame(X).T
+
+
 def deformation(x: Array, X: Array) -> Array:
     """F of a tetrahedron from its corners (4, 3) now and at rest."""
     return (x[1:] - x[0]).T @ np.linalg.inv((X[1:] - X[0]).T)
@@ -48,10 +61,32 @@ def stiffness(X: Array, young: float, poisson: float) -> Array:
     return volume(X) * B.T @ hooke(young, poisson) @ B
 
 
+def exact_tangent(x: Array, X: Array, young: float, poisson: float, clamped: bool = True) -> Array:
+    """-df/dx of an element, R turning with x: d2W/dF2 (9, 9) by singular vectors, contracted with dF/dx; (12, 12).
+
+    clamped: negative eigenvalues of the twists are zero.
+    """
+    lam, mu = young * poisson / ((1 + poisson) * (1 - 2 * poisson)), young / (2 * (1 + poisson))
+    F = deformation(x, X)
+    U, s, Vt = np.linalg.svd(F)
+    sign = np.sign(np.linalg.det(U @ Vt))
+    U[:, 2] *= sign
+    s[2] *= sign
+    r = (U @ Vt).ravel()
+    H = 2 * mu * np.eye(9) + lam * np.outer(r, r)
+    for a, b in ((0, 1), (1, 2), (0, 2)):
+        twist = (np.outer(U[:, a], Vt[b]) - np.outer(U[:, b], Vt[a])).ravel() / np.sqrt(2)
+        e = 2 * mu + (lam * (s.sum() - 3) - 2 * mu) * 2 / (s[a] + s[b])
+        H += ((max(e, 0.0) if clamped else e) - 2 * mu) * np.outer(twist, twist)
+    gradients = np.linalg.inv(np.column_stack([np.ones(4), X]))[1:].T
+    dF = np.einsum("aj,ik->ijak", gradients, np.eye(3)).reshape(9, 12)
+    return volume(X) * dF.T @ H @ dF
+
+
 @dataclass
 class Solid:
     """Mesh, material and state. rest, x, v (n, 3); tets (m, 4); young, poisson (m,); mass, free (n,); alpha, beta:
-    Rayleigh damping; h: time step."""
+    Rayleigh damping; h: time step; rotation: of the elements, polar or qr; exact: the tangent."""
 
     rest: Array
     tets: NDArray[np.int32]
@@ -65,11 +100,14 @@ class Solid:
     alpha: float = 0.0
     beta: float = 0.0
     gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    rotation: str = "polar"
+    exact: bool = False
 
     def elements(self) -> Iterator[tuple[Any, Any, Array]]:
         """(corner dofs (12,), block diagonal rotation (12, 12), K_e) of every element."""
         for tet, young, poisson in zip(self.tets, self.young, self.poisson, strict=True):
-            R = nearest_rotation(deformation(self.x[tet], self.rest[tet]))
+            x, X = self.x[tet], self.rest[tet]
+            R = turned_frame(x, X) if self.rotation == "qr" else nearest_rotation(deformation(x, X))
             dofs = (3 * tet[:, None] + np.arange(3)).ravel()
             yield dofs, np.kron(np.eye(4), R), stiffness(self.rest[tet], young, poisson)
 
@@ -89,8 +127,13 @@ class Solid:
         return f.reshape(-1, 3)
 
     def tangent(self) -> Array:
-        """sum R K_e R^T, (3 n, 3 n): -df/dx with R held."""
+        """sum R K_e R^T, (3 n, 3 n): -df/dx with R held, or, if exact, turning as far as K stays definite."""
         K = np.zeros((self.x.size, self.x.size))
+        if self.exact:
+            for tet, young, poisson in zip(self.tets, self.young, self.poisson, strict=True):
+                dofs = (3 * tet[:, None] + np.arange(3)).ravel()
+                K[np.ix_(dofs, dofs)] += exact_tangent(self.x[tet], self.rest[tet], young, poisson)
+            return K
         for dofs, R, K_e in self.elements():
             K[np.ix_(dofs, dofs)] += R @ K_e @ R.T
         return K

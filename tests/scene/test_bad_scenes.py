@@ -61,6 +61,8 @@ def test_the_unchanged_scene_is_good(tmp_path):
         (swap("young = 5e5", 'young = [{ where = "X", young = 1 }]'), "corotational.young[1].where = 'X': 'X' must be a"),
         (swap("young = 5e5", 'young = [{ where = "X<1", yung = 1 }]'), "young[1].yung = 1: unknown key; did you mean 'young'"),
         (swap("young = 5e5", "young = [3]"), "corotational.young[1] = 3: must be"),
+        (swap("poisson = 0.4", 'poisson = 0.4, rotation = "svd"'), "corotational.rotation = 'svd': must be 'polar' or 'qr'"),
+        (swap("poisson = 0.4", 'poisson = 0.4, rotation = "qr", tangent = "exact"'), 'tangent = "exact" needs rotation = "polar"'),
         (swap("fixed =", "mass_spring = { young = 1e5, poisson = 0.3 }\nfixed ="), "effects.mass_spring: poisson is not accepted: springs pull along the line between two nodes"),
         (swap("fixed =", "mass_spring = { young = [{ young = 1e5, poisson = 0.3 }] }\nfixed ="), "mass_spring: poisson is not accepted"),
         (swap("fixed =", "mass_spring = true\nfixed ="), "mass_spring: needs either young (springs on the edges of the elements) or springs"),

@@ -1,0 +1,58 @@
+// SPDX-License-Identifier: MIT
+// Corotational linear tetrahedra with the tangent that knows how their rotations change (formulas: corotational.py). Its part
+// beside the usual one, of corners a and b, is [g_a]x E [g_b]x^T with E = R (sum e / (2 mu) u u^T) R^T, one E per element.
+#define WIDE
+#include "corotational.cuh"
+#include "axes.cuh"
+
+struct Elements {
+    int n;                    // elements
+    const int* tets;          // (n, 4) nodes
+    const real* x;            // (nodes, 3) positions [m]
+    const real* v;            // (nodes, 3) world.drift [m/s]
+    const local* gradients;   // (9, n) rest gradients of the shape functions of nodes 1, 2, 3, one after another [1/m]
+    const local* lame;        // (2, n) lambda V, mu V [Pa m3]
+    const local* stiffening;  // (n,) h (c + beta) [s2], c world.reach, beta the Rayleigh damping of the stiffness
+    local h;                  // world.impulse: the time step in backward Euler [s]
+    local* turn;              // (n, 4) out: unit quaternion of the nearest rotation of F, w first
+    local* spread;            // (n, 4, 4) out: g_a = sqrt(h (c + beta) mu V) R grad N_a, and lambda / mu
+    local* twist;             // (n, 6) out: upper triangle of E, positive semi-definite
+    local* push;              // (n, 4, 3) out: h f_a + h (c + beta) (K v)_a [N s]
+};
+
+// sum e / (2 mu) u u^T over the twists, from S = R^T F; e is clamped at 0.
+INLINE local_mat3 twists(const local_mat3& S, local_number lambda, local_number mu) {
+    const local half = 0.5;
+    local_number xy = -half * (S.m[1] + S.m[3]), xz = -half * (S.m[2] + S.m[6]), yz = -half * (S.m[5] + S.m[7]);
+    Axes<local_number> h = axes_of(S.m[4] + S.m[8], xy, xz, S.m[0] + S.m[8], yz, S.m[0] + S.m[4]);
+    local_number over = lambda / mu * (trace(S) - 3) - 2;  // of mu
+    const local_number least = local_number{} + (local)1e-4;  // a sum of stretches: where R is not unique, e is not defined
+    local_mat3 E = {};
+    for (int k = 0; k < 3; ++k) {
+        local_number e = larger(1 + over / larger(h.value[k], least), local_number{});
+        local_vec3 u = h.axis[k], w = e * u;
+        E.m[0] += w.x * u.x; E.m[1] += w.x * u.y; E.m[2] += w.x * u.z;
+        E.m[4] += w.y * u.y; E.m[5] += w.y * u.z; E.m[8] += w.z * u.z;
+    }
+    return symmetric(E.m[0], E.m[1], E.m[2], E.m[4], E.m[5], E.m[8]);
+}
+
+KERNEL(elements, Elements) {
+    index tet[4];
+    get_row(p.tets, i, tet);
+    local_mat3 g = rest_gradients(p.gradients, p.n, i);
+    local_mat3 F = gradient(p.x, tet, g), G = gradient(p.v, tet, g);
+    quaternion<local_number> q = nearest_quaternion(F);
+    local_mat3 R = rotation_matrix(q), Rt = transposed(R);
+    local_mat3 S = mul(Rt, F), T = mul(Rt, G);
+
+    local_number k = at(p.stiffening, i), lambda = at(p.lame, i), mu = at(p.lame, p.n + i);
+    local_mat3 E = twists(S, lambda, mu), P = hooke(S, T, p.h, k, lambda, mu);
+    local_vec3 c = k * mu * mul(E, local_vec3{T.m[5] - T.m[7], T.m[6] - T.m[2], T.m[1] - T.m[3]});
+    P.m[1] += c.z; P.m[2] -= c.y; P.m[3] -= c.z; P.m[5] += c.x; P.m[6] += c.y; P.m[7] -= c.x;  // the spin of T
+    put_push(p.push, i, p.n, mul(R, P), g);
+    put_spread(p.spread, i, p.n, R, g, sqrt(k * mu), lambda / mu);
+    E = mul(R, mul(E, Rt));
+    put_row(p.twist, i, p.n, {E.m[0], E.m[1], E.m[2], E.m[4], E.m[5], E.m[8]});
+    put_row(p.turn, i, p.n, {q.w, q.x, q.y, q.z});
+}

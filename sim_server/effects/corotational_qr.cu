@@ -1,0 +1,62 @@
+// SPDX-License-Identifier: MIT
+// Corotational linear tetrahedra that turn with their first edge and the plane of their first face (formulas: corotational.py).
+#define WIDE
+#include "corotational.cuh"
+#include "frames.cuh"
+
+struct Elements {
+    int n;                    // elements
+    const int* tets;          // (n, 4) nodes
+    const real* x;            // (nodes, 3) positions [m]
+    const real* v;            // (nodes, 3) world.drift [m/s]
+    const local* gradients;   // (9, n) rest gradients of the shape functions of nodes 1, 2, 3, one after another [1/m]
+    const local* lame;        // (2, n) lambda V, mu V [Pa m3]
+    const local* stiffening;  // (n,) h (c + beta) [s2], c world.reach, beta the Rayleigh damping of the stiffness
+    local h;                  // world.impulse: the time step in backward Euler [s]
+    local* turn;              // (n, 4) out: unit quaternion of the rotation, w first
+    local* spread;            // (n, 4, 4) out: g_a = sqrt(h (c + beta) mu V) R grad N_a, and lambda / mu
+    local* push;              // (n, 4, 3) out: h f_a + h (c + beta) (K v)_a [N s]
+};
+
+// From the rest frame of edge 01 and face 012 to the present one.
+INLINE local_mat3 turned(const real* x, const index (&tet)[4], const local_mat3& g) {
+    vec3 origin = load3(x, tet[0]);
+    local_vec3 first = as<local_number>(load3(x, tet[1]) - origin), second = as<local_number>(load3(x, tet[2]) - origin);
+    // At rest: N_3 rises off the face, N_2 and N_3 are constant along the edge. In units of rest lengths no scale is special.
+    local_vec3 edge = cross(row(g, 1), row(g, 2));
+    local_number per_volume = dot(row(g, 0), edge), scale = per_volume / sqrt(dot(edge, edge));  // 1 / length
+    return between(unit(edge), unit(row(g, 2)), scale * first, scale * second);
+}
+
+KERNEL(elements, Elements) {
+    index tet[4];
+    get_row(p.tets, i, tet);
+    local_mat3 g = rest_gradients(p.gradients, p.n, i);
+    local_mat3 R = turned(p.x, tet, g), Rt = transposed(R);
+    local_mat3 S = mul(Rt, gradient(p.x, tet, g)), T = mul(Rt, gradient(p.v, tet, g));
+    local_number k = at(p.stiffening, i), lambda = at(p.lame, i), mu = at(p.lame, p.n + i);
+    put_push(p.push, i, p.n, mul(R, hooke(S, T, p.h, k, lambda, mu)), g);
+    put_spread(p.spread, i, p.n, R, g, sqrt(k * mu), lambda / mu);
+    quaternion<local_number> q = quaternion_of(R);
+    put_row(p.turn, i, p.n, {q.w, q.x, q.y, q.z});
+}
+
+struct Energy {
+    int n;                   // elements
+    const int* tets;         // (n, 4)
+    const real* x;           // (nodes, 3) [m]
+    const local* gradients;  // (9, n) [1/m]
+    const local* lame;       // (2, n) lambda V, mu V [Pa m3]
+    local* energy;           // (n,) out: V (mu |e|^2 + lambda / 2 tr(e)^2), e the symmetric part of R^T F - I [J]
+};
+
+KERNEL(energy, Energy) {
+    index tet[4];
+    get_row(p.tets, i, tet);
+    local_mat3 g = rest_gradients(p.gradients, p.n, i);
+    local_mat3 S = mul(transposed(turned(p.x, tet, g)), gradient(p.x, tet, g));
+    local_number xx = S.m[0] - 1, yy = S.m[4] - 1, zz = S.m[8] - 1, dilation = xx + yy + zz;
+    local_number xy = S.m[1] + S.m[3], xz = S.m[2] + S.m[6], yz = S.m[5] + S.m[7];
+    local_number square = xx * xx + yy * yy + zz * zz + (local)0.5 * (xy * xy + xz * xz + yz * yz);
+    put(p.energy, i, at(p.lame, p.n + i) * square + (local)0.5 * at(p.lame, i) * dilation * dilation);
+}
