@@ -3,7 +3,7 @@
 // beside the usual one, of corners a and b, is [g_a]x E [g_b]x^T with E = R (sum e / (2 mu) u u^T) R^T, one E per element.
 #define WIDE
 #include "corotational.cuh"
-#include "axes.cuh"
+#include "eigen3.cuh"
 
 struct Elements {
     int n;                    // elements
@@ -23,16 +23,18 @@ struct Elements {
 // sum e / (2 mu) u u^T over the twists, from S = R^T F; e is clamped at 0.
 INLINE local_mat3 twists(const local_mat3& S, local_number lambda, local_number mu) {
     const local half = 0.5;
-    local_number xy = -half * (S.m[1] + S.m[3]), xz = -half * (S.m[2] + S.m[6]), yz = -half * (S.m[5] + S.m[7]);
-    Axes<local_number> h = axes_of(S.m[4] + S.m[8], xy, xz, S.m[0] + S.m[8], yz, S.m[0] + S.m[4]);
+    local_number h[6] = {S.m[4] + S.m[8], -half * (S.m[1] + S.m[3]), -half * (S.m[2] + S.m[6]),
+                         S.m[0] + S.m[8], -half * (S.m[5] + S.m[7]), S.m[0] + S.m[4]};
+    const local_number zero = local_number{}, one = zero + 1, least = zero + (local)1e-4;  // below, R is not unique
+    local_vec3 u[3] = {{one, zero, zero}, {zero, one, zero}, {zero, zero, one}};
+    eigen3(h, u);
     local_number over = lambda / mu * (trace(S) - 3) - 2;  // of mu
-    const local_number least = local_number{} + (local)1e-4;  // a sum of stretches: where R is not unique, e is not defined
     local_mat3 E = {};
     for (int k = 0; k < 3; ++k) {
-        local_number e = larger(1 + over / larger(h.value[k], least), local_number{});
-        local_vec3 u = h.axis[k], w = e * u;
-        E.m[0] += w.x * u.x; E.m[1] += w.x * u.y; E.m[2] += w.x * u.z;
-        E.m[4] += w.y * u.y; E.m[5] += w.y * u.z; E.m[8] += w.z * u.z;
+        local_number e = larger(1 + over / larger(h[k == 0 ? 0 : k == 1 ? 3 : 5], least), zero);
+        local_vec3 w = e * u[k];
+        E.m[0] += w.x * u[k].x; E.m[1] += w.x * u[k].y; E.m[2] += w.x * u[k].z;
+        E.m[4] += w.y * u[k].y; E.m[5] += w.y * u[k].z; E.m[8] += w.z * u[k].z;
     }
     return symmetric(E.m[0], E.m[1], E.m[2], E.m[4], E.m[5], E.m[8]);
 }

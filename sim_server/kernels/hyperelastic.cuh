@@ -1,12 +1,10 @@
 // SPDX-License-Identifier: MIT
 // What the laws of hyperelastic tetrahedra share (formulas: sim_server/hyperelastic.py).
 #pragma once
+#include "eigen3.cuh"
 #include "polar.cuh"
 #include "together.cuh"
 
-template <class T> INLINE vec<T> cross(vec<T> a, vec<T> b) {
-    return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
-}
 template <class T> INLINE mat<T> mul_transposed(const mat<T>& a, const mat<T>& b) { return mul(a, transposed(b)); }
 
 // --- an element ------------------------------------------------------------------------------------------------------------
@@ -107,38 +105,6 @@ template <class T> INLINE auto indefinite(const Blocks6<T>& B) {
 }
 
 // --- principal stretches ---------------------------------------------------------------------------------------------------
-
-// One rotation of Jacobi's method for symmetric matrices, in the plane of p and q; r is the third.
-template <class T, class M> INLINE void annul(T& pp, T& qq, T& pq, T& pr, T& qr, vec<T>& p, vec<T>& q, M settled) {
-    const T tiny = T{} + (single<T> ? (entry<T>)1e-37 : (entry<T>)1e-300);
-    T d = qq - pp, size = magnitude(d) + sqrt(d * d + 4 * pq * pq) + tiny;
-    T t = (d < 0 ? -2 * pq : 2 * pq) / size;
-    t = settled ? T{} : t;  // and its neighbours in a vector go on without it
-    T c = 1 / sqrt(1 + t * t), s = t * c, x = pr;
-    pp -= t * pq;
-    qq += t * pq;
-    pq = settled ? pq : T{};
-    pr = c * x - s * qr;
-    qr = s * x + c * qr;
-    vec<T> u = p;
-    p = c * u - s * q;
-    q = s * u + c * q;
-}
-
-// Eigenvalues l and eigenvectors v (columns of a rotation or reflection, from those given) of the symmetric matrix with the
-// entries 00, 01, 02, 11, 12, 22.
-template <class T> INLINE void eigen3(T (&a)[6], vec<T> (&v)[3]) {
-    const entry<T> eps = single<T> ? (entry<T>)1e-14 : (entry<T>)1e-32;
-    for (int sweep = 0; sweep < 7; ++sweep) {
-        T off = a[1] * a[1] + a[2] * a[2] + a[4] * a[4];
-        T on = a[0] * a[0] + a[3] * a[3] + a[5] * a[5];
-        auto settled = !(off > eps * on);
-        if (!any(off > eps * on)) break;
-        annul(a[0], a[3], a[1], a[2], a[4], v[0], v[1], settled);
-        annul(a[0], a[5], a[2], a[1], a[4], v[0], v[2], settled);
-        annul(a[3], a[5], a[4], a[1], a[2], v[1], v[2], settled);
-    }
-}
 
 // F = U diag(s) V^T with rotations U and V; where det F < 0 the smallest s is negative (Irving, Teran, Fedkiw 2004).
 template <class T> struct Principal {
