@@ -405,7 +405,7 @@ class Reply(_message.Message):
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., error: _Optional[str] = ..., interaction: _Optional[_Union[Interaction, _Mapping]] = ..., status: _Optional[_Union[Status, _Mapping]] = ...) -> None: ...
 
 class ObjectStatus(_message.Message):
-    __slots__ = ("object", "nodes", "tets", "last", "mean_iterations", "excess", "factors_used", "factors_refused", "in_flight", "factor_age", "factor_age_max", "factor_age_bound", "factors_mended")
+    __slots__ = ("object", "nodes", "tets", "last", "mean_iterations", "excess", "factors_used", "factors_refused", "in_flight", "factor_age", "factor_age_max", "factor_age_bound", "factors_mended", "refusal")
     OBJECT_FIELD_NUMBER: _ClassVar[int]
     NODES_FIELD_NUMBER: _ClassVar[int]
     TETS_FIELD_NUMBER: _ClassVar[int]
@@ -419,6 +419,7 @@ class ObjectStatus(_message.Message):
     FACTOR_AGE_MAX_FIELD_NUMBER: _ClassVar[int]
     FACTOR_AGE_BOUND_FIELD_NUMBER: _ClassVar[int]
     FACTORS_MENDED_FIELD_NUMBER: _ClassVar[int]
+    REFUSAL_FIELD_NUMBER: _ClassVar[int]
     object: str
     nodes: int
     tets: int
@@ -432,7 +433,8 @@ class ObjectStatus(_message.Message):
     factor_age_max: int
     factor_age_bound: int
     factors_mended: int
-    def __init__(self, object: _Optional[str] = ..., nodes: _Optional[int] = ..., tets: _Optional[int] = ..., last: _Optional[_Union[ObjectStep, _Mapping]] = ..., mean_iterations: _Optional[float] = ..., excess: _Optional[float] = ..., factors_used: _Optional[int] = ..., factors_refused: _Optional[int] = ..., in_flight: _Optional[bool] = ..., factor_age: _Optional[int] = ..., factor_age_max: _Optional[int] = ..., factor_age_bound: _Optional[int] = ..., factors_mended: _Optional[int] = ...) -> None: ...
+    refusal: str
+    def __init__(self, object: _Optional[str] = ..., nodes: _Optional[int] = ..., tets: _Optional[int] = ..., last: _Optional[_Union[ObjectStep, _Mapping]] = ..., mean_iterations: _Optional[float] = ..., excess: _Optional[float] = ..., factors_used: _Optional[int] = ..., factors_refused: _Optional[int] = ..., in_flight: _Optional[bool] = ..., factor_age: _Optional[int] = ..., factor_age_max: _Optional[int] = ..., factor_age_bound: _Optional[int] = ..., factors_mended: _Optional[int] = ..., refusal: _Optional[str] = ...) -> None: ...
 
 class LocalWorker(_message.Message):
     __slots__ = ("worker", "state", "pid", "restarts", "exit_code")

@@ -12,6 +12,7 @@ a thread that has let go of Python's lock) and `pump` is called beside it.
 """
 
 import logging
+import re
 import time
 from collections.abc import Callable
 from itertools import count
@@ -23,6 +24,7 @@ from numpy.typing import NDArray
 from protocol.factor import Factor
 from sim_server.engine import Kind
 from sim_server.factors import FactorSource, Inline, Job
+from sim_server.guard import Guard
 from sim_server.schedule import oldest_possible, overdue_after, pays, pick
 from sim_server.simulation import Simulation
 from sim_server.stock import Stock
@@ -34,6 +36,7 @@ log = logging.getLogger(__name__)
 
 COPIES = 32  # matrices that the loop may be asked to copy within one step
 UNBUILT = 3  # jobs of positions alone that may fail in a row before the matrix is sent for good
+CAUSES = 20  # told of an object, each once
 KEPT = 2  # steps that a copied matrix may wait for a worker
 
 
@@ -50,7 +53,7 @@ class Driver:
         self.kind, self.n = self.solver.update
         self.free = self.solver.update.free
         patterns = {b.name: simulation.system.body_pattern(b.first, b.last) for b in simulation.world.bodies}
-        self.inline = Inline(patterns)
+        self.inline, self.guard = Inline(patterns), Guard(patterns)
         self.source: FactorSource = source or self.inline
         self.counted = not self.free if counted is None else counted
         auto = self.solver.preconditioner == "auto"
@@ -103,7 +106,9 @@ class Driver:
         """A step that waits for the factors of its own matrices, made in this process; returns its records."""
         self.engine.assemble()
         for t in self.tracks:
-            self.inline.submit(self._job(t, self.engine.step, self._values(t.body)))
+            values = self._values(t.body)
+            t.matrix = self.engine.step, values
+            self.inline.submit(self._job(t, self.engine.step, values))
         self._take_up(self.inline)
         self.engine.solve()
         return self._observed()
@@ -127,9 +132,13 @@ class Driver:
             self.failed(name, reason)
 
     def adopt(self, factor: Factor) -> None:
-        """Puts a factor into its body's mailbox, unless a newer one is there."""
+        """Puts a factor into its body's mailbox, unless a newer one is there or it is no good (guard.py)."""
         t = self.by_name[factor.object]
         self._nobody_at = -1
+        matrix = self._matrix_of(t, factor.step)
+        if factor.step > t.newest and (why := self.guard.complaint(factor, matrix)):
+            self.failed(factor.object, f"that of {factor.worker} is not used: {why}")
+            return
         if not t.came_in(factor, self.engine.step):
             return
         self.engine.post_factor(t.body.index, factor.pattern, factor.values, factor.step)
@@ -138,11 +147,24 @@ class Driver:
             t.choice.factor_arrived()
             self._settle(t)
 
+    def _matrix_of(self, t: Track, step: int) -> NDArray[np.float64] | None:
+        """The matrix that a factor of `step` was made from, if it was sent: its copy, which serves again then."""
+        if t.matrix is None:
+            return None
+        (made, values), t.matrix = t.matrix, None
+        self._give_back(values)
+        return values if made == step and values.ndim == 3 else None
+
     def failed(self, name: str, reason: str) -> None:
-        """A job came to nothing; the object may be sent again."""
-        self.by_name[name].came_to_nothing()
+        """A job came to nothing; the object may be sent again. Told once per cause: the status counts them."""
+        t = self.by_name[name]
+        self._matrix_of(t, -1)
+        t.came_to_nothing(reason)
         self._nobody_at = -1
-        log.warning("object %r: no factor: %s", name, reason)
+        cause = re.sub(r"[0-9.e+-]*[0-9]", "#", reason)
+        if cause not in t.causes and len(t.causes) < CAUSES:
+            t.causes.add(cause)
+            log.warning("object %r: no factor: %s", name, reason)
 
     # --- lockstep -----------------------------------------------------------------------------------------------
 
@@ -209,7 +231,6 @@ class Driver:
             time.sleep(2e-4)
         else:
             self._alone = False
-        self._give_back(t.wanted)
         t.went_out(step)
         return True
 
@@ -297,7 +318,8 @@ class Driver:
 
     def _give_back(self, copy: NDArray[np.float64]) -> None:
         """A copy that was sent: its memory serves again."""
-        self._spare[copy.shape].append(copy)
+        if copy.base is None:  # not the system's own
+            self._spare[copy.shape].append(copy)
 
     def _others_build(self, t: Track) -> bool:
         """Whether positions will do: workers have all that the matrix is made of, and it was no use but a few times."""
@@ -314,9 +336,10 @@ class Driver:
     def _send(self, t: Track) -> None:
         step = self.engine.matrix_step(t.body.index)
         assert t.wanted is not None
-        self._give_back(t.wanted)
         if self.source.submit(self._job(t, step, t.wanted)):
             t.went_out(step)
+            return
+        self._give_back(t.wanted)
         t.wanted = None
 
     # --- what the records say -----------------------------------------------------------------------------------

@@ -54,11 +54,11 @@ def _library() -> c.CDLL:
 
 
 class NativeFactor:
-    """A factor in memory that the loop can apply; values are copied when it is filled."""
+    """A factor in memory that native code can apply: to the given values, which are not copied."""
 
-    def __init__(self, pattern: FactorPattern, dtype: np.dtype | type):
+    def __init__(self, pattern: FactorPattern, values: NDArray[Any], step: int = -1):
         self.pattern = pattern
-        self.values = np.zeros(pattern.nonzeros, dtype)
+        self.values = values
         width, height = np.diff(pattern.super_start).astype(np.int64), np.diff(pattern.row_start)
         sizes = width * height - width * (width - 1) // 2
         self._value_start = np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64)
@@ -66,7 +66,12 @@ class NativeFactor:
             pattern.size, len(width), pattern.permutation.ctypes.data, pattern.super_start.ctypes.data,
             pattern.row_start.ctypes.data, pattern.rows.ctypes.data, self._value_start.ctypes.data,
         )  # fmt: skip
-        self.native = layouts.Factor(c.pointer(self._pattern), self.values.ctypes.data, -1, self.values.itemsize, 0)
+        self.native = layouts.Factor(c.pointer(self._pattern), values.ctypes.data, step, values.itemsize, 0)
+
+    @classmethod
+    def empty(cls, pattern: FactorPattern, dtype: np.dtype | type) -> "NativeFactor":
+        """Room for a factor, to be filled."""
+        return cls(pattern, np.zeros(pattern.nonzeros, dtype))
 
     @property
     def address(self) -> int:
@@ -74,7 +79,7 @@ class NativeFactor:
         return c.addressof(self.native)
 
     def fill(self, values: NDArray[Any], step: int) -> None:
-        """Takes over the values of L made from the matrix of `step`."""
+        """Copies the values of L made from the matrix of `step`."""
         self.values[:] = values
         self.native.step = step
 
@@ -182,9 +187,9 @@ class Engine(Reports):
             if buffer is mail.in_use:
                 continue
             if buffer.pattern is not pattern or buffer.values.dtype != dtype:
-                mail.buffers[i] = NativeFactor(pattern, dtype)
+                mail.buffers[i] = NativeFactor.empty(pattern, dtype)
             return mail.buffers[i]
-        mail.buffers.append(NativeFactor(pattern, dtype))
+        mail.buffers.append(NativeFactor.empty(pattern, dtype))
         return mail.buffers[-1]
 
     def factor_step(self, body: int) -> int:

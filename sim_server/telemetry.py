@@ -164,6 +164,7 @@ class Telemetry:
                     factors_used=track.used,
                     factors_refused=track.refused,
                     factors_mended=track.mended,
+                    refusal=track.refusal[:400],
                     in_flight=track.in_flight,
                     factor_age=track.age(status.step),
                     factor_age_max=track.age_max,

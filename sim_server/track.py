@@ -43,12 +43,15 @@ class Track:
         self.sent: int | None = None  # step of the last matrix that went out
         self.in_flight = False
         self.wanted: NDArray[np.float64] | None = None  # where the loop copies the matrix asked for
+        self.matrix: tuple[int, NDArray[np.float64]] | None = None  # of the job in flight: step and what was sent
         self.asked = 0  # number of the request for it, among those of all bodies
         self.unbuilt = 0  # jobs in a row that were sent positions and came to nothing
         self.sent_positions = False  # with the last job
         self.used = 0
         self.refused = 0
         self.mended = 0  # of those used: from a matrix that was not positive definite
+        self.refusal = ""  # the last reason why there was no factor
+        self.causes: set[str] = set()  # told of
         self.failures = 0  # in a row
         self.newest = -1  # step of the newest factor taken up
         self.age_max = -1  # steps; largest age of a factor so far, -1: none was used
@@ -77,7 +80,8 @@ class Track:
         )
 
     def went_out(self, step: int) -> None:
-        """Its matrix of `step` is on the way."""
+        """What was copied of `step` is on the way; it is kept, as a matrix is what its factor is judged by."""
+        self.matrix = None if self.wanted is None else (step, self.wanted)
         self.sent_positions = self.wanted is not None and self.wanted.ndim == 2
         self.in_flight, self.sent, self.wanted, self.excess = True, step, None, 0.0
 
@@ -97,9 +101,9 @@ class Track:
         self.mended += bool(factor.remedy)
         return True
 
-    def came_to_nothing(self) -> None:
+    def came_to_nothing(self, reason: str) -> None:
         """Its job failed; it may be sent again."""
-        self.in_flight = False
+        self.in_flight, self.refusal = False, reason
         self.refused += 1
         self.failures += 1
         self.unbuilt += self.sent_positions

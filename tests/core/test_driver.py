@@ -5,7 +5,6 @@ Record k (from 0) is of the step made from state k; factor_step says which state
 factor).
 """
 
-import dataclasses
 import logging
 import time
 
@@ -422,14 +421,15 @@ def test_excess_iterations_are_summed_until_the_next_matrix_goes_out():
     assert driver.tracks[0].excess == np.maximum(records["iterations"] - 3, 0).sum() > 0
 
 
-def test_a_poisoned_factor_is_counted_as_refused():
+def test_a_poisoned_factor_that_reached_the_loop_is_counted_as_refused():
+    """Past the guard (test_guard.py), which looks at one vector only."""
     sim = falling(update="async")
     driver = Driver(sim, Failing(patterns_of(sim), bad=range(1000)))
     driver.advance(1)
     before = driver.tracks[0].refused
     factor = made(driver, 5, sim.system.values)
     factor.values[7] = np.nan
-    driver.adopt(factor)
+    sim.engine.post_factor(0, factor.pattern, factor.values, 5)
     record = driver.advance(1)[0]
     assert (record["status"], record["fallbacks"], record["kind"]) == (0, 1, Kind.BLOCK_JACOBI)
     assert driver.tracks[0].refused >= before + 1
@@ -522,12 +522,11 @@ def test_a_factor_of_a_matrix_that_was_not_positive_definite_is_used_and_counted
     submit, bad = driver.inline.submit, {2}
 
     def spoilt(job: Job) -> bool:
-        values = job.values.copy()
         if job.step in bad:  # the last node pushes where it should pull
             start, columns = sim.system.row_start, sim.system.columns
             own = np.flatnonzero(columns[start[-2] :] == len(start) - 2)[0] + start[-2]
-            values[own] -= 1.01 * np.linalg.eigvalsh(values[own])[-1] * np.eye(3)
-        return submit(dataclasses.replace(job, values=values))
+            job.values[own] -= 1.01 * np.linalg.eigvalsh(job.values[own])[-1] * np.eye(3)
+        return submit(job)
 
     driver.inline.submit = spoilt  # type: ignore[method-assign]
     records = driver.advance(9)

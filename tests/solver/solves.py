@@ -59,9 +59,7 @@ def true_residual(sim: Simulation, y: NDArray) -> float:
 
 def applied(pattern: Any, values: NDArray) -> Callable[[NDArray], NDArray]:
     """r -> (L L^T)^-1 r by the native triangular solves."""
-    factor = NativeFactor(pattern, values.dtype)
-    factor.fill(values, 0)
-    return factor.apply
+    return NativeFactor(pattern, np.ascontiguousarray(values)).apply
 
 
 def stops(A: Any, b: NDArray, iterates: list[NDArray]) -> Iterator[tuple[int, float]]:

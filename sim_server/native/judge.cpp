@@ -1,0 +1,29 @@
+// SPDX-License-Identifier: MIT
+// What one application of a factor says about it, beside one of block Jacobi. For the service thread; no loop calls this.
+#include "pcg.h"
+
+extern "C" {
+
+// A: of one body, its nodes numbered from 0; values null: unknown. r: probe vector. work: 8 size entries.
+// out: z.r and z.Az with the factor, then both with block Jacobi; without a matrix only the first is written.
+void wf_judge(const Factor* factor, int32_t nodes, const int32_t* row_start, const int32_t* columns, const double* values,
+              const double* r, double* work, double* out) {
+    BlockCsr A{0, nodes, row_start, columns, values};
+    const int n = A.size();
+    double *z = work, *q = z + n, *inverse = q + n, *scratch = inverse + 3 * n;
+    Preconditioner P{A, factor, CHOLESKY, inverse, scratch, 1};
+    out[0] = P.apply(r, std::sqrt(dot(n, r, r)), z);
+    if (!values) return;
+    out[1] = multiply(A, z, q);
+    P.kind = BLOCK_JACOBI;
+    P.prepare();
+    out[2] = P.apply(r, 1, z);
+    out[3] = multiply(A, z, q);
+}
+
+int32_t wf_sizes(int32_t* sizes) {  // layouts, checked against the Python side
+    sizes[0] = sizeof(Factor);
+    sizes[1] = sizeof(Pattern);
+    return 2;
+}
+}
