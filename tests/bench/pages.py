@@ -12,7 +12,7 @@ from typing import Any
 
 from tests.bench.report import ROOT, table
 
-PAGES = ("cpu", "gpu", "paper", "figure4", "accuracy", "hard_cases", "scheduler", "scaling", "faults")
+PAGES = ("cpu", "gpu", "models", "paper", "figure4", "accuracy", "hard_cases", "scheduler", "scaling", "faults")
 README = ROOT / "README.md"
 
 

@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: MIT
+"""Times of the models' launches on a CPU and on a GPU, and of MJED beside derivatives of 9x9 numbers."""
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from tests.bench._gpu_problem import BARS
+from tests.bench._models import PARTS, Model, megabytes, model, part, states
+from tests.bench.report import best_of
+
+HERE = "../tests/bench/"  # from the package, where kernel texts are looked up
+LAWS = ("neo_hookean", "st_venant_kirchhoff")  # measured against 9x9
+GENERIC = {"six edges": "elements", "all blocks": "all_blocks"}  # and their kernels
+
+Row = dict[str, Any]
+
+
+def copy_speed(megabytes: int = 256) -> float:
+    """GB/s, read and written, of a copy on one thread."""
+    source = np.ones(megabytes << 17)
+    target = np.empty_like(source)
+    return 2 * source.nbytes / best_of(5, lambda: np.copyto(target, source)) / 1e9
+
+
+def on_cpu(call: Callable[[], Any], seconds: float) -> float:
+    """us of a call, the median of those that fit into so many seconds."""
+    call()
+    times: list[float] = []
+    end = time.perf_counter() + seconds
+    while len(times) < 3 or time.perf_counter() < end:
+        start = time.perf_counter()
+        call()
+        times.append(time.perf_counter() - start)
+    return 1e6 * float(np.median(times))
+
+
+def on_gpu(call: Callable[[], Any], seconds: float) -> float:
+    """us of a call among others in a graph."""
+    from tests.bench._gpu_device import timed, timed_in_graph
+
+    count = max(3, min(200, int(1e6 * seconds / timed(call, 3))))
+    return min(timed_in_graph(call, count) for _ in range(3))
+
+
+def row(name: str, tets: int, device: str, precision: str, seconds: float) -> Row:
+    """One model at one size. CPU: each kernel by itself, on one thread; GPU: as they are put together there."""
+    made = model(name, tets, device, precision)
+    clock, kernels = (on_gpu, _fused(made.launches)) if device == "gpu" else (on_cpu, _by_part(made.launches))
+    shapes = states(made.simulation.world.rest, BARS[tets][0])
+    made.put(*shapes["bent"])
+    us = {p: sum(clock(kernel, seconds / 10) for kernel in kernels[p]) for p in PARTS}
+    made.put(*shapes["stretched"])
+    stretched = sum(clock(kernel, seconds / 10) for kernel in kernels["elements"])
+    return {
+        "tets": tets, "model": name, "device": device, "precision": precision, "us": sum(us.values()),
+        **{f"{p} us": value for p, value in us.items()}, "elements us, stretched": stretched,
+        "MB": sum(megabytes(kernel) for several in kernels.values() for kernel in several),
+    }  # fmt: skip
+
+
+def _by_part(launches: Sequence[Any]) -> dict[str, list[Any]]:
+    return {p: [x for x in launches if part(x) == p] for p in PARTS}
+
+
+def _fused(launches: Sequence[Any]) -> dict[str, list[Any]]:
+    """Those of nodes and of blocks, whatever parts they have, count as sums."""
+    from sim_server.gpu.fuse import fused
+
+    kernels: dict[str, list[Any]] = {p: [] for p in PARTS}
+    for kernel in fused(launches):
+        kernels["elements" if part(kernel._launches[0]) == "elements" else "sums"].append(kernel)
+    return kernels
+
+
+def generic_row(law: str, tets: int, device: str, precision: str, seconds: float) -> Row:
+    """The elements' kernel of a law by MJED and by 9x9, without a projection, stretched."""
+    made = model(law, tets, device, precision, projection="none")
+    made.put(*states(made.simulation.world.rest, BARS[tets][0])["stretched"])
+    ours = next(x for x in made.launches if part(x) == "elements")
+    others = {kind: generic(made, kernel) for kind, kernel in GENERIC.items()}
+    clock = on_gpu if device == "gpu" else on_cpu
+    us = {"MJED": clock(ours, seconds / 8)} | {kind: clock(x, seconds / 8) for kind, x in others.items()}
+    row: Row = {"tets": tets, "law": law, "device": device, "precision": precision, "MJED us": us["MJED"]}
+    for kind in GENERIC:
+        row |= {f"9x9, {kind} us": us[kind], f"{kind} / MJED": us[kind] / us["MJED"]}
+        row[f"difference, {kind}"] = difference(ours, others[kind])
+    return row
+
+
+def generic(made: Model, kernel: str) -> Any:
+    """The launch of the yardstick for the elements of a model, with arrays of its own for what it leaves."""
+    e: Any = made.effect
+    w = made.simulation.world
+    module = w.backend.module(f"{HERE}_generic_elements.cu+{HERE}_generic_{made.name}.cuh")
+    return module.bind(
+        kernel, len(e.elements), tets=e.elements, x=w.x, v=w.drift, gradients=e.gradients, volume=e.volume,
+        constants=e.constants, stiffening=w.stiffening[e.owner], h=w.impulse, corners=np.zeros_like(e.corners),
+        edges=np.zeros_like(e.edges),
+    )  # fmt: skip
+
+
+def difference(one: Any, other: Any) -> float:
+    """Of what two launches leave, over the largest number."""
+    one()
+    other()
+    worst = 0.0
+    for name in ("corners", "edges"):
+        a, b = one.fetch(name).astype(float), other.fetch(name).astype(float)
+        worst = max(worst, float(np.abs(a - b).max() / np.abs(a).max()))
+    return worst
