@@ -25,24 +25,27 @@ def copy_speed(megabytes: int = 256) -> float:
     return 2 * source.nbytes / best_of(5, lambda: np.copyto(target, source)) / 1e9
 
 
-def on_cpu(call: Callable[[], Any], seconds: float) -> float:
-    """us of a call, the median of those that fit into so many seconds."""
-    call()
-    times: list[float] = []
-    end = time.perf_counter() + seconds
-    while len(times) < 3 or time.perf_counter() < end:
-        start = time.perf_counter()
+def on_cpu(calls: Sequence[Callable[[], Any]], seconds: float) -> list[float]:
+    """us of each by the thread's own clock: medians of as many rounds, all in turn, as fit into so many seconds."""
+    times: list[list[float]] = [[] for _ in calls]
+    for call in calls:
         call()
-        times.append(time.perf_counter() - start)
-    return 1e6 * float(np.median(times))
+    end = time.perf_counter() + seconds
+    while len(times[0]) < 3 or time.perf_counter() < end:
+        for call, found in zip(calls, times, strict=True):
+            start = time.thread_time_ns()
+            call()
+            found.append(1e-3 * (time.thread_time_ns() - start))
+    return [float(np.median(found)) for found in times]
 
 
-def on_gpu(call: Callable[[], Any], seconds: float) -> float:
-    """us of a call among others in a graph."""
+def on_gpu(calls: Sequence[Callable[[], Any]], seconds: float) -> list[float]:
+    """us of each among its like in a graph, the least of three."""
     from tests.bench._gpu_device import timed, timed_in_graph
 
-    count = max(3, min(200, int(1e6 * seconds / timed(call, 3))))
-    return min(timed_in_graph(call, count) for _ in range(3))
+    counts = [max(3, min(200, int(1e6 * seconds / len(calls) / timed(call, 3)))) for call in calls]
+    rounds = [[timed_in_graph(call, n) for call, n in zip(calls, counts, strict=True)] for _ in range(3)]
+    return [min(found) for found in zip(*rounds, strict=True)]
 
 
 def row(name: str, tets: int, device: str, precision: str, seconds: float) -> Row:
@@ -51,9 +54,11 @@ def row(name: str, tets: int, device: str, precision: str, seconds: float) -> Ro
     clock, kernels = (on_gpu, _fused(made.launches)) if device == "gpu" else (on_cpu, _by_part(made.launches))
     shapes = states(made.simulation.world.rest, BARS[tets][0])
     made.put(*shapes["bent"])
-    us = {p: sum(clock(kernel, seconds / 10) for kernel in kernels[p]) for p in PARTS}
+    every = [(p, kernel) for p in PARTS for kernel in kernels[p]]
+    found = clock([kernel for _, kernel in every], 0.8 * seconds)
+    us = {p: sum(t for (q, _), t in zip(every, found, strict=True) if q == p) for p in PARTS}
     made.put(*shapes["stretched"])
-    stretched = sum(clock(kernel, seconds / 10) for kernel in kernels["elements"])
+    stretched = sum(clock(kernels["elements"], 0.2 * seconds))
     return {
         "tets": tets, "model": name, "device": device, "precision": precision, "us": sum(us.values()),
         **{f"{p} us": value for p, value in us.items()}, "elements us, stretched": stretched,
@@ -82,7 +87,7 @@ def generic_row(law: str, tets: int, device: str, precision: str, seconds: float
     ours = next(x for x in made.launches if part(x) == "elements")
     others = {kind: generic(made, kernel) for kind, kernel in GENERIC.items()}
     clock = on_gpu if device == "gpu" else on_cpu
-    us = {"MJED": clock(ours, seconds / 8)} | {kind: clock(x, seconds / 8) for kind, x in others.items()}
+    us = dict(zip(("MJED", *others), clock([ours, *others.values()], seconds), strict=True))
     row: Row = {"tets": tets, "law": law, "device": device, "precision": precision, "MJED us": us["MJED"]}
     for kind in GENERIC:
         row |= {f"9x9, {kind} us": us[kind], f"{kind} / MJED": us[kind] / us["MJED"]}

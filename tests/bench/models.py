@@ -35,7 +35,7 @@ SETUP = (
     "another hundredth of an edge, velocities of 1 m/s at random. us: of the bent beam; elements: force and tangent of "
     "every element; sums: over elements at nodes and blocks; rest: start, rotations of nodes, A and b into the "
     "material frame. On a GPU sums and rest are one kernel for nodes and one for blocks, and stand together. CPU: one "
-    "thread, every kernel by itself, the median; GPU: many calls in a graph."
+    "thread by its own clock, every kernel by itself, all in turn, the median; GPU: many calls in a graph."
 )
 BYTES = (
     "MB: arrays of the kernels, each once a kernel (also rows that a GPU keeps in registers); bytes: over the speed of "
