@@ -12,6 +12,7 @@ from sim_server.driver import Driver
 from sim_server.engine import Kind
 from sim_server.simulation import Simulation
 from sim_server.track import flops
+from tests.bench._building import BuildingInline
 from tests.bench._paper_beam import Beam, Load
 from tests.bench._virtual_workers import VirtualWorkers
 
@@ -26,10 +27,12 @@ class Way:
     update: str = "never"
     warp: bool | str = False
     latency: int = 0  # async and adaptive: steps that the one worker takes for a factor
+    extrapolate: float = 0.0  # s
 
     @property
     def solver(self) -> dict[str, Any]:
-        return {"preconditioner": self.preconditioner, "update": self.update, "warp": self.warp}
+        table = {"preconditioner": self.preconditioner, "update": self.update, "warp": self.warp}
+        return table | ({"build": "worker", "extrapolate": self.extrapolate} if self.extrapolate else {})
 
 
 @dataclass
@@ -49,7 +52,8 @@ def run(beam: Beam, load: Load, way: Way, steps: int, device: str = "cpu", **sol
     """Asynchronous schemes begin with the factor of the first matrix, as those that wait for it do (it is not counted
     in `invert`)."""
     sim = beam.simulation(load, device, **way.solver, **solver)
-    driver = Driver(sim, _worker(sim, way.latency) if way.latency else None, counted=True)
+    source = BuildingInline(sim) if way.extrapolate else _worker(sim, way.latency) if way.latency else None
+    driver = Driver(sim, source, counted=True)
     made: list[float] = []  # ms
     driver.adopted = lambda factor: made.append(1e3 * factor.seconds)
     early = driver.wants_factors and driver.kind in ("lockstep", "async", "adaptive")

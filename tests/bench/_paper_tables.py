@@ -6,11 +6,16 @@ from math import ceil
 from typing import Any
 
 from sim_server.scene import solver_options
-from tests.bench._paper_beam import CELLS, COROTATIONAL, LOADS, MODELS, QUICK, Beam, Load, calibrated
+from tests.bench._paper_beam import CELLS, COROTATIONAL, DT, LOADS, MODELS, QUICK, Beam, Load, calibrated
 from tests.bench._paper_figures import CONDITION, HETEROGENEOUS, TABLE1, TABLE2, TABLE5
 from tests.bench._paper_run import Mean, Way, mean, run
 
-PRECONDITIONERS = ("none", "jacobi", "block_jacobi", "ssor", "cholesky", "incomplete_cholesky")
+PRECONDITIONERS = ("none", "jacobi", "block_jacobi", "ssor", "ssor_factor", "cholesky", "incomplete_cholesky")
+
+
+EXTRAPOLATED = "async + warp, extrapolated"
+AHEAD = 2  # steps that positions sent to a worker go ahead, at most (table 2)
+LATENCIES = (1, 3, 10)  # of the table of extrapolations
 
 
 @dataclass(frozen=True)
@@ -40,18 +45,20 @@ class Setting:
     def solver(self) -> dict[str, Any]:
         return {"tolerance": self.tolerance, "max_iterations": 20_000, "factor_precision": "float32"}
 
-    def ways(self) -> dict[str, Way]:
-        """Columns of table 2: the paper's, then ours."""
+    def ways(self, device: str) -> dict[str, Way]:
+        """Columns of table 2: the paper's, then ours. Positions of a GPU go out as they are."""
         lockstep = f"lockstep-{self.latency}"
-        return {
+        found = {
             "none": Way("none"),
             "precomputed": Way("cholesky"),
             "precomputed + warp": Way("cholesky", warp=True),
             "async": Way("cholesky", lockstep),
             "async + warp": Way("cholesky", lockstep, True),
+            EXTRAPOLATED: Way("cholesky", lockstep, True, extrapolate=AHEAD * DT),
             "block Jacobi": Way("block_jacobi"),
             "auto": Way("auto", lockstep, "auto"),
         }
+        return {name: way for name, way in found.items() if device == "cpu" or not way.extrapolate}
 
 
 def measured(cases: dict[str, tuple[Beam, Load, Way]], setting: Setting, device: str) -> dict[str, Mean]:
@@ -96,7 +103,7 @@ def table2(setting: Setting, device: str) -> list[dict[str, Any]]:
     for place, load in enumerate(LOADS):
         for model in MODELS:
             beam, condition = calibrated(setting.cells, model, setting.condition)
-            found = measured({name: (beam, load, way) for name, way in setting.ways().items()}, setting, device)
+            found = measured({name: (beam, load, way) for name, way in setting.ways(device).items()}, setting, device)
             for name, m in found.items():
                 row = {"device": device, "load": load.name, "model": model.name, "scheme": name,
                        "condition": condition, "stiffness": beam.stiffness, "iterations": m.iterations,
@@ -112,6 +119,23 @@ def table2(setting: Setting, device: str) -> list[dict[str, Any]]:
 def available() -> list[str]:
     """Those of table 5 that this version has."""
     return [name for name in PRECONDITIONERS if name in solver_options.PRECONDITIONERS]
+
+
+def extrapolations(setting: Setting, device: str) -> list[dict[str, Any]]:
+    """A row for each beam and latency: iterations by how far the positions sent go ahead."""
+    if device == "gpu":
+        return []  # positions of a GPU go out as they are
+    cases = [(model.name, *calibrated(setting.cells, model, setting.condition)) for model in MODELS]
+    cases.append(("heterogeneous", *calibrated(setting.cells, COROTATIONAL, HETEROGENEOUS, heterogeneous=True)))
+    rows = []
+    for name, beam, _ in cases:
+        for latency in LATENCIES:
+            row: dict[str, Any] = {"beam": name, "latency": latency}
+            for what, steps in (("as it is", 0), ("1 step", 1), ("2 steps", 2), ("latency", latency)):
+                way = Way("cholesky", f"lockstep-{latency}", True, extrapolate=min(steps, latency) * DT)
+                row[what] = float(run(beam, LOADS[2], way, setting.steps, **setting.solver()).iterations.mean())
+            rows.append(row)
+    return rows
 
 
 def policies(setting: Setting, device: str) -> list[dict[str, Any]]:
@@ -135,12 +159,12 @@ def table5(setting: Setting, device: str) -> list[dict[str, Any]]:
         (how, name): (beam, LOADS[1], Way(name, *update))
         for how, update in updates.items()
         for name in available()
-        if not (how == "async + warp" and name in ("none", "jacobi", "block_jacobi"))  # there is nothing to renew
+        if how == "standard" or name in solver_options.FACTORS  # the others are not made by workers
     }
     found = measured({" ".join(key): case for key, case in cases.items()}, setting, device)
     rows = []
     for how, name in cases:
-        m, paper = found[f"{how} {name}"], TABLE5.get((how, name))
+        m, paper = found[f"{how} {name}"], TABLE5.get((how, name.removesuffix("_factor")))
         row = {"device": device, "updated": how, "preconditioner": name, "condition": condition,
                "stiffness": beam.stiffness, "iterations": m.iterations, "most iterations": m.most,
                "invert ms": m.invert, "solve ms": m.solve, "total ms": m.invert + m.solve,

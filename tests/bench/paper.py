@@ -9,7 +9,7 @@ import typer
 from tests.bench import _paper_words as words
 from tests.bench import figure4
 from tests.bench._paper_beam import BANDS, LOADS
-from tests.bench._paper_tables import Setting, policies, table1, table2, table5
+from tests.bench._paper_tables import Setting, extrapolations, policies, table1, table2, table5
 from tests.bench._schemes import SCENES, run
 from tests.bench.report import Report
 
@@ -47,6 +47,11 @@ def section(setting: Setting, device: str, report: Report) -> None:
     report.say(words.verdict5(five))
     report.say(f"## Update policies, {name}", words.POLICIES.format(load=LOADS[2].name, latency=setting.latency))
     report.table(policy, words.COLUMNS_OF_POLICIES)
+    if ahead := extrapolations(setting, device):
+        report.data[device]["extrapolations"] = ahead
+        told = words.EXTRAPOLATIONS.format(load=LOADS[2].name, steps=setting.steps)
+        report.say(f"## Extrapolated states, {name}", told)
+        report.table(ahead)
     tables = (one, two, five, policy)
     bad = sum(row["unconverged"] for rows in tables for row in rows)
     alike = all(row["repeats"] for rows in tables for row in rows)

@@ -101,6 +101,9 @@ def test_scheduler_repeats_to_the_digit_and_excess_goes_before_turns(tmp_path: P
 def test_iterations_of_the_papers_tables_repeat_to_the_digit(tmp_path: Path) -> None:
     runs = [bench("paper", tmp_path / name, "--device", "cpu")["data"]["cpu"] for name in ("one", "two")]
     for table in runs[0]:
+        if table == "extrapolations":
+            assert runs[0][table] == runs[1][table]
+            continue
         assert [row["iterations"] for row in runs[0][table]] == [row["iterations"] for row in runs[1][table]]
         assert all(row["repeats"] and row["unconverged"] == 0 for row in runs[0][table])
     of = {(row["load"], row["model"], row["scheme"]): row["iterations"] for row in runs[0]["table2"]}
