@@ -73,7 +73,8 @@ struct Inverse {
     Word<float> *residual, *product, *z, *formed, *solved, *given;
     Vector vector;
     float* tile_sums;             // (TILE_SUMS, 16)
-    const int* lists;             // of the phases: first piece (phases + 1), first tile (phases + 1), warps that share a tile
+    const int* lists;             // of the phases: first piece (phases + 1), first tile (phases + 1), warps that share a tile,
+                                  // first piece that is not formed here
     const Piece* pieces;
     const int* where;             // (pieces, 32) Plan.index
     const Tile* tiles;
@@ -102,7 +103,7 @@ struct Inverse {
         residual = body.residual; product = body.product; z = body.z;
         formed = body.formed; solved = body.solved; given = body.given;
         const Part part = plan->parts[index];
-        lists = brought(plan->lists + index * (3 * phases + 2), 3 * phases + 2, arena);
+        lists = brought(plan->lists + index * (4 * phases + 2), 4 * phases + 2, arena);
         pieces = brought(plan->pieces + part.piece, part.pieces, arena);
         where = brought(plan->index + 32ll * part.piece, 32 * part.pieces, arena);
         tiles = brought(plan->tiles + part.tile, part.tiles, arena);
@@ -119,27 +120,29 @@ struct Inverse {
         copies_begin();
     }
 
-    // Brings together the vector of a phase. No branches between loads: they travel together.
+    // Brings together the vector of a phase: what this block forms, then what others do. No branches between loads: they
+    // travel together.
     __device__ __forceinline__ void gather(int phase, const Residual& from, unsigned number, float unit) const {
-        const int first = lists[phase] + (int)threadIdx.x / 32, last = lists[phase + 1];
-        const bool few = last - lists[phase] <= FEW * WARPS;
-        for (int at = first; at < last; at += (few ? FEW : MANY) * WARPS) {
-            if (phase == 0) {
-                if (few) residual_pieces<FEW>(at, last, from, number, unit);
-                else residual_pieces<MANY>(at, last, from, number, unit);
-            } else if (phase < groups) {
-                if (few) reduced_pieces<FEW, 5>(at, last, from, number, unit);
-                else for (int k = at; k < min(at + MANY * WARPS, last); k += 2 * WARPS) reduced_pieces<2, 6>(k, last, from, number, unit);
-            } else {
-                if (few) solved_pieces<FEW>(at, last, number, unit);
-                else solved_pieces<MANY>(at, last, number, unit);
-            }
+        const int warp = threadIdx.x / 32, first = lists[phase], last = lists[phase + 1];
+        const int middle = phase < groups ? lists[3 * phases + 2 + phase] : first, formed_here = middle - first;
+        if (phase == 0) {
+            if (formed_here <= FEW * WARPS) residual_pieces<FEW>(first + warp, middle, from, number, unit);
+            else for (int k = first + warp; k < middle; k += MANY * WARPS) residual_pieces<MANY>(k, middle, from, number, unit);
+        } else if (formed_here > FEW * WARPS) {
+            for (int k = first + warp; k < middle; k += 2 * WARPS) reduced_pieces<2, 6>(k, middle, from, number, unit);
+        } else if (formed_here > WARPS) {
+            reduced_pieces<FEW, 4>(first + warp, middle, from, number, unit);
+        } else {
+            reduced_pieces<1, 12>(first + warp, middle, from, number, unit);
         }
+        if (last - middle <= FEW * WARPS) solved_pieces<FEW>(middle + warp, last, number, unit);
+        else for (int k = middle + warp; k < last; k += MANY * WARPS) solved_pieces<MANY>(k, last, number, unit);
     }
 
     // Of the first phase: nothing has contributed yet.
     template <int N>
     __device__ __forceinline__ void residual_pieces(int at, int last, const Residual& from, unsigned number, float unit) const {
+        if (at >= last) return;
         const int lane = threadIdx.x % 32;
         Word<float> r[N], q[N];
         float rk[N], qk[N];
@@ -175,6 +178,7 @@ struct Inverse {
     // Of the phases up to the top: what has been contributed comes off.
     template <int N, int M>
     __device__ __forceinline__ void reduced_pieces(int at, int last, const Residual& from, unsigned number, float unit) const {
+        if (at >= last) return;
         const int lane = threadIdx.x % 32;
         int low[N], high[N], most = 0;
         Word<float> r[N];
@@ -222,9 +226,10 @@ struct Inverse {
         }
     }
 
-    // Of the phases after the top: what was formed on the way there, and what is solved.
+    // What has been formed, on the way to the top or in this phase by another block, and what is solved.
     template <int N>
     __device__ __forceinline__ void solved_pieces(int at, int last, unsigned number, float unit) const {
+        if (at >= last) return;
         const int lane = threadIdx.x % 32;
         const Word<float>* word[N];
         Word<float> w[N];

@@ -50,6 +50,7 @@ struct Solver {
     bool packed = false;            // places are those of the inverse
     bool fresh = false;             // inverse.residual holds d r as it is after the update that is still to be made
     bool fetched = false;           // the chunks of the inverse are on their way to shared memory
+    bool arrived = false;           // and there
 
     __device__ __forceinline__ void set_up(const Share& share) {
         const Body& body = memory.body;
@@ -57,11 +58,11 @@ struct Solver {
         Inverse inverse;
         const bool inverted = body.plan && (body.kind == CHOLESKY || body.probe > 0);
         if (inverted) inverse.reserve(&memory.plan, arena);
+        real* d = inverted ? arena.take<real>(3 * share.own) : nullptr;
         Rows rows;
         rows.set_up(s, body, share, arena);
         real* diagonal = arena.take<real>(9 * rows.own);
         if (!diagonal) diagonal = s.diagonal + 9ll * (body.first + rows.begin);
-        real* d = inverted ? arena.take<real>(3 * rows.own) : nullptr;
         if (inverted) inverse.set_up(body, &memory.plan, team.index, arena);
         if (threadIdx.x == 0) {
             memory.rows = rows;
@@ -120,8 +121,8 @@ struct Solver {
             rows.values[k] = __ldcg(s.y + 3 * (first + rows.nodes[k / 3]) + k % 3);
         __syncthreads();
         double mine[2] = {0, 0}, out[2];
-        rows.multiply([&](int node, real qk) {
-            const int k = 3 * node + team.lane;
+        rows.multiply([&](int node, int c, real qk) {
+            const int k = 3 * node + c;
             const real bk = s.b[begin + k];
             const double rk = (double)bk - (double)qk;
             mine[0] += rk * rk;
@@ -134,9 +135,17 @@ struct Solver {
             publish(1 - turn, k, (real)rk);  // not b - A x of float words: near the solution that would be noise
         });
         r_number = team.number;
+        into_three<2>(mine);
         team.sums<2, 3>(mine, out);
         b2 = out[1];
         return out[0];
+    }
+
+    // Sums of the lanes that Rows.finish used into lanes 0 to 2.
+    template <int N>
+    static __device__ __forceinline__ void into_three(double mine[N]) {
+        static_assert(TOGETHER == 3, "lanes 0 to 8 have sums");
+        for (int n = 0; n < N; ++n) mine[n] += __shfl_down_sync(ALL, mine[n], 3) + __shfl_down_sync(ALL, mine[n], 6);
     }
 
     // 7. 8. 2. p = z + beta p, q = A p; sums p.q, r.q, q.q, r.r
@@ -145,8 +154,8 @@ struct Solver {
         if (packed) rows.form(memory.inverse.z, z_number, beta);
         else rows.form(s.z, z_number, beta);
         double mine[4] = {0, 0, 0, 0};
-        rows.multiply([&](int node, real q) {
-            const int k = 3 * node + team.lane;
+        rows.multiply([&](int node, int c, real q) {
+            const int k = 3 * node + c;
             const double p = rows.values[k], r = rows.r[k], qk = q;
             mine[0] += p * qk;
             mine[1] += r * qk;
@@ -156,6 +165,7 @@ struct Solver {
             if (packed) publish_product(k, q);
         });
         q_number = team.number;
+        into_three<4>(mine);
         team.sums<4, 3>(mine, out);
     }
 
@@ -205,7 +215,8 @@ struct Solver {
         double mine = 0;
         fresh = false;
         if (!fetched) fetch();
-        copies_end<0>();
+        if (!arrived) copies_end<0>();
+        arrived = true;
         for (int phase = 0; phase < inverse.phases; ++phase) {
             inverse.gather(phase, from, team.number, unit);
             __syncthreads();

@@ -32,6 +32,8 @@ Int32 = NDArray[np.int32]
 Ints = NDArray[np.int64]
 FORM, READ, GATHER, WRITE = 0, 1, 2, 4  # kinds of segments
 CHUNK = 2 * ROWS * COLUMNS  # bytes
+TRIP_ENTRIES, TRIP_SLOTS = 512, 6  # entries of a part, contributions to each, that a block asks for in one trip
+TRIPS = 2  # more, and the blocks of a part form its entries once, each some of them, and read the others'
 _KEPT = 64  # plans
 
 
@@ -53,8 +55,8 @@ class Plan:
 
     segments (k, 4): kind, from, count, to: what a block brings into its x area before a phase, `to` entries from its
         beginning; count and to are multiples of 32. kind FORM: s~ at packed positions from.. out of residual and
-        contributions (| WRITE: and stores it for the others, exactly one block does); READ: s~ formed earlier;
-        GATHER: y at boundary[from..].
+        contributions (| WRITE: and stores it for the others, exactly one block does); READ: s~ formed earlier, or in
+        this phase by another block; GATHER: y at boundary[from..]. Those that are FORM come first.
     tiles (m, 4): chunk (the first one), x (offset in the x area, a multiple of 32), chunks (columns / 32), out (the
         first of 8 packed positions; forward: of 8 contributions). Sorted by [phase, block].
     segment_start, tile_start (phases * blocks + 1,): of each [phase, block].
@@ -136,7 +138,7 @@ def lay_out(tree: Tree, thresholds: tuple[int, ...], blocks: int, planes: int = 
     position[column[column >= 0]] = np.flatnonzero(column >= 0)
     boundary = _boundaries(tree, cut, parts, position, size)
     slot_start, slots = _slots(parts, boundary, size)
-    work = _shared_out(cut, parts, blocks, planes)
+    work = _shared_out(cut, parts, blocks, planes, _depth(parts, slot_start))
     return Plan(
         boundary=boundary, slot_start=slot_start, slots=slots, place=_places(tree.pattern, position), column=column,
         part=cut.part.astype(np.int32), parts=parts, thresholds=thresholds, size=size, phases=2 * cut.groups - 1,
@@ -184,12 +186,20 @@ def _slots(parts: Parts, boundary: Int32, size: int) -> tuple[Int32, Int32]:
     return start.astype(np.int32), source[order].astype(np.int32)
 
 
-def _shared_out(cut: Partition, parts: Parts, blocks: int, planes: int) -> dict:
+def _depth(parts: Parts, slot_start: Int32) -> Ints:
+    """(parts,) most contributions that come off an entry."""
+    order = np.argsort(parts.start, kind="stable")
+    depth = np.zeros(len(order), np.int64)
+    depth[order] = np.maximum.reduceat(np.append(np.diff(slot_start), 0), parts.start[order])
+    return depth
+
+
+def _shared_out(cut: Partition, parts: Parts, blocks: int, planes: int, depth: Ints) -> dict:
     """Segments and tiles of all phases, and where each block's storage begins."""
     segments, tiles, keys, areas = [], [], [], [0]
     for phase, (which, work) in enumerate(works(cut, blocks, planes)):
         pieces = share(work, blocks)
-        found = _Phase(phase, cut.groups, parts, which, pieces, planes)
+        found = _Phase(phase, cut.groups, parts, which, pieces, depth)
         segments.append(found.segments())
         tiles.append(found.tiles())
         keys.append((phase * blocks + segments[-1][:, 0], phase * blocks + tiles[-1][:, 0]))
@@ -218,7 +228,7 @@ def _starts(keys: Ints, count: int) -> Int32:
 class _Phase:
     """Segments and tiles of one phase, each with its block in front."""
 
-    def __init__(self, phase: int, groups: int, parts: Parts, which: Ints, pieces: Pieces, planes: int):
+    def __init__(self, phase: int, groups: int, parts: Parts, which: Ints, pieces: Pieces, depth: Ints):
         self.forward, self.backward = phase < groups - 1, phase >= groups
         self.pieces = pieces
         part = which[pieces.matrix]
@@ -230,19 +240,45 @@ class _Phase:
         total, opens = np.cumsum(length) - length, np.searchsorted(pieces.block, pieces.block)
         self.x = total - total[opens]
         self.area = int((self.x + length).max(initial=0))
+        trips = -(-self.inside // TRIP_ENTRIES) * -(-depth[part] // TRIP_SLOTS)
+        self.together = (trips > TRIPS) & (phase > 0) & (not self.backward)  # pieces of these are formed once
 
     def segments(self) -> Ints:
         """(k, 5): block, kind, from, count, to."""
-        kind = np.full(len(self.x), READ if self.backward else FORM)
+        if self.backward:
+            own, edge = np.full(len(self.x), READ), np.full(len(self.x), GATHER)
+            found = np.stack([self._segments(own, 0 * self.x, self.inside), self._edges(edge)], axis=1).reshape(-1, 5)
+            return found[found[:, 3] > 0]
+        kind = np.full(len(self.x), FORM)
         if self.forward:
-            kind[self.pieces.first == 0] |= WRITE
-        own = np.stack([self.pieces.block, kind, self.start, self.inside, self.x], axis=1)
-        if not self.backward:
-            return own
-        gather = np.full(len(self.x), GATHER)
-        edge = np.stack([self.pieces.block, gather, self.boundary, self.outside, self.x + self.inside], axis=1)
-        both = np.stack([own, edge], axis=1).reshape(-1, 5)
-        return both[both[:, 3] > 0]
+            kind[(self.pieces.first == 0) & ~self.together] |= WRITE
+        low, high = 0 * self.x, self.inside.copy()
+        low[self.together], high[self.together] = self._slices()
+        kind[self.together & (high > low)] |= WRITE
+        formed = self._segments(kind, low, high)
+        read = np.full(len(self.x), READ)
+        below, above = self._segments(read, 0 * low, low), self._segments(read, high, self.inside)
+        found = np.concatenate([formed, below, above])
+        found = found[found[:, 3] > 0]
+        return found[np.argsort(found[:, 0], kind="stable")]  # by block, what is formed first
+
+    def _segments(self, kind: Ints, low: Ints, high: Ints) -> Ints:
+        """Of entries low to high of each piece's part."""
+        return np.stack([self.pieces.block, kind, self.start + low, high - low, self.x + low], axis=1)
+
+    def _edges(self, kind: Ints) -> Ints:
+        return np.stack([self.pieces.block, kind, self.boundary, self.outside, self.x + self.inside], axis=1)
+
+    def _slices(self) -> tuple[Ints, Ints]:
+        """Entries of its part that each block forms for all that have rows of it, as evenly as whole 32 allow."""
+        matrix, groups = self.pieces.matrix[self.together], self.inside[self.together] // COLUMNS
+        order = np.argsort(matrix, kind="stable")
+        count = np.bincount(matrix)
+        first = np.cumsum(count) - count
+        k = np.empty(len(matrix), np.int64)
+        k[order] = np.arange(len(matrix)) - first[matrix[order]]
+        of = count[matrix]
+        return COLUMNS * (k * groups // of), COLUMNS * ((k + 1) * groups // of)
 
     def tiles(self) -> Ints:
         """(m, 5): block, 0 (the chunk comes later), x, chunks, out."""

@@ -109,12 +109,16 @@ def parts(piece_start: NDArray[Any], tile_start: NDArray[Any], plan: Plan) -> ND
     return found
 
 
-def lists(piece_start: NDArray[Any], tile_start: NDArray[Any], split: NDArray[Any]) -> NDArray[np.int64]:
-    """(blocks, 3 phases + 2): where the pieces of each phase begin, and its tiles, in a block's own; and the splits."""
+def lists(
+    piece_start: NDArray[Any], tile_start: NDArray[Any], split: NDArray[Any], formed: NDArray[Any]
+) -> NDArray[np.int64]:
+    """(blocks, 4 phases + 2): where the pieces of each phase begin, and its tiles, in a block's own; the splits; the
+    first piece that is not formed. formed (pieces,): whether a piece is; those of a phase come first."""
     blocks, phases = split.shape
     at = phases * np.arange(blocks)[:, None] + np.arange(phases + 1)
     own = [start[at] - start[at[:, :1]] for start in (piece_start, tile_start)]
-    return np.hstack([*own, split])
+    total = np.concatenate([[0], np.cumsum(formed)])[piece_start]
+    return np.hstack([*own, split, own[0][:, :-1] + np.diff(total[at], axis=1)])
 
 
 class Planned:
@@ -132,8 +136,9 @@ class Planned:
         target[plan.slots] = np.arange(len(plan.slots), dtype=np.int32)
         self._given = len(plan.slots) + DUMMY
         arrays: dict[str, NDArray[Any]] = {
-            "parts": parts(piece_start, tile_start, plan), "lists": lists(piece_start, tile_start, split),
-            "pieces": cut[piece_order], "index": index(plan, cut[piece_order]), "tiles": tiles,
+            "parts": parts(piece_start, tile_start, plan),
+            "lists": lists(piece_start, tile_start, split, cut[piece_order, 0] == 0), "pieces": cut[piece_order],
+            "index": index(plan, cut[piece_order]), "tiles": tiles,
             "target": target, "place": plan.place,
         }  # fmt: skip
         self._arrays = {

@@ -5,7 +5,10 @@
 #include "team.cuh"
 #include "invert3.cuh"
 
-#define TOGETHER 3  // rows of a warp at a time
+#define TOGETHER 3                   // rows of a warp at a time
+#define SLAB (TOGETHER * WARPS)      // rows that come into shared memory at a time where not all fit ...
+#define SLABS 3                      // ... so many times ahead
+#define SLAB_BLOCKS (20 * SLAB)      // of A, at most; a slab with more is read where it is
 
 struct Rows {
     int begin, own, halo;           // own nodes [begin, begin + own) of the body; nodes read
@@ -18,6 +21,7 @@ struct Rows {
     const real* blocks;
     int base;
     bool near;                      // A is in shared memory
+    char* slabs;                    // (SLABS, SLAB_BYTES) of shared memory that A passes through, or null
 
     __device__ __forceinline__ void set_up(const Solve& s, const Body& body, const Share& share, Arena& arena) {
         begin = share.begin; own = share.own; halo = share.halo;
@@ -47,59 +51,132 @@ struct Rows {
         row_start = s.row_start + row;
         columns = s.seat + base;
         blocks = s.values + 9ll * base;
+        slabs = nullptr;
         Arena before = arena;
         real* v = arena.take<real>(9 * count);
         int *c = arena.take<int>(count), *start = arena.take<int>(own + 1);
         near = v && c && start;
+        if (!near) {
+            arena = before;
+            start = arena.take<int>(own + 1);
+            slabs = start ? arena.take<char>(SLABS * SLAB_BYTES) : nullptr;
+        }
+        if (start)
+            for (int k = threadIdx.x; k <= own; k += THREADS) copy_async(start + k, row_start + k, 4);
         if (near) {
             for (int k = threadIdx.x; k < 9 * count; k += THREADS) copy_async(v + k, blocks + k, sizeof(real));
             for (int k = threadIdx.x; k < count; k += THREADS) copy_async(c + k, columns + k, 4);
-            for (int k = threadIdx.x; k <= own; k += THREADS) copy_async(start + k, row_start + k, 4);
-            blocks = v; columns = c; row_start = start;
-        } else {
-            arena = before;
+            blocks = v; columns = c;
+        }
+        copies_begin();
+        if (slabs)
+            for (int k = 0; k < SLABS - 1; ++k) ask(k, row_start);
+        if (start) row_start = start;
+    }
+
+    static constexpr int VALUE_BYTES = SLAB_BLOCKS * 9 * (int)sizeof(real) + 16, SLAB_BYTES = VALUE_BYTES + 4 * SLAB_BLOCKS + 16;
+
+    struct Slab { int low, high, first, count; };  // rows, and their blocks of A as places in `blocks`
+
+    __device__ __forceinline__ Slab slab(int k, const int* starts) const {
+        const int low = min(k * SLAB, own), high = min(low + SLAB, own);
+        return {low, high, starts[low] - base, starts[high] - starts[low]};
+    }
+
+    // Brings a slab into its place: from the 16 bytes on in which it begins.
+    __device__ __forceinline__ void ask(int k, const int* starts) const {
+        const Slab s = slab(k, starts);
+        char* to = slabs + k % SLABS * SLAB_BYTES;
+        if (s.count <= SLAB_BLOCKS && s.count > 0) {
+            all_of(to, blocks + 9ll * s.first, 9 * (int)sizeof(real) * s.count);
+            all_of(to + VALUE_BYTES, columns + s.first, 4 * s.count);
         }
         copies_begin();
     }
+    static __device__ __forceinline__ void all_of(char* to, const void* from, int bytes) {
+        const int skipped = (int)((unsigned long long)from & 15);
+        const char* begin = (const char*)from - skipped;
+        for (int k = 16 * threadIdx.x; k < skipped + bytes; k += 16 * THREADS) copy_async(to + k, begin + k, 16);
+    }
 
-    // q = A values for the own nodes. done(node, q): called by lanes 0, 1, 2 with entry `lane` of q.
+    // q = A values for the own nodes. done(node, c, q): entry c of a node's, called by as many lanes as there are.
     template <class Done>
     __device__ __forceinline__ void multiply(Done done) const {
-        if (own <= WARPS) some_rows<1>(done);
+        if (slabs) through_slabs(done);
+        else if (own <= WARPS) some_rows<1>(done);
         else some_rows<TOGETHER>(done);
     }
 
     template <int N, class Done>
     __device__ __forceinline__ void some_rows(Done done) const {
-        const int lane = threadIdx.x % 32;
         for (int first = threadIdx.x / 32; first < own; first += N * WARPS) {
             real sum[N];
-            if (near) of_near<N>(first, sum);
+            if (near) of_near<N>(first, own, row_start, base, blocks, columns, sum);
             else of_far<N>(first, sum);
-#pragma unroll
-            for (int n = 0; n < N; ++n)
-                if (lane < 3 && first + n * WARPS < own) done(first + n * WARPS, sum[n]);
+            finish<N>(first, own, sum, done);
         }
     }
 
+    // A passes through shared memory; the first slabs of the next product come beside what is between. Whole rounds of slabs,
+    // so that each finds its place.
+    template <class Done>
+    __device__ __forceinline__ void through_slabs(Done done) const {
+        const int count = (own + SLABS * SLAB - 1) / (SLABS * SLAB) * SLABS;
+        for (int k = 0; k < count; ++k) {
+            copies_end<SLABS - 2>();
+            __syncthreads();  // all have this one, and nobody reads the one before any more
+            const int next = k + SLABS - 1;
+            ask(next < count ? next : next - count, row_start);
+            const Slab s = slab(k, row_start);
+            const int first = s.low + (int)threadIdx.x / 32;
+            if (first >= s.high) continue;
+            real sum[TOGETHER];
+            if (s.count > SLAB_BLOCKS) {
+                of_far<TOGETHER>(first, sum);
+            } else {
+                const char* here = slabs + k % SLABS * SLAB_BYTES;
+                const real* a = (const real*)(here + ((unsigned long long)(blocks + 9ll * s.first) & 15));
+                const int* c = (const int*)(here + VALUE_BYTES + ((unsigned long long)(columns + s.first) & 15));
+                of_near<TOGETHER>(first, s.high, row_start, base + s.first, a, c, sum);
+            }
+            finish<TOGETHER>(first, s.high, sum, done);
+        }
+    }
+
+    // Hands on the sums of rows first, first + WARPS, ...: lane 3 n + c has entry c of the n-th.
+    template <int N, class Done>
+    static __device__ __forceinline__ void finish(int first, int end, const real sum[N], Done done) {
+        const int lane = threadIdx.x % 32, n = lane / 3, c = lane - 3 * n;
+        real mine = sum[0];
+        if (N > 1) {
+            mine = __shfl_sync(ALL, sum[0], c);
+#pragma unroll
+            for (int k = 1; k < N; ++k) {
+                const real other = __shfl_sync(ALL, sum[k], c);
+                mine = n == k ? other : mine;
+            }
+        }
+        if (lane < 3 * N && first + n * WARPS < end) done(first + n * WARPS, c, mine);
+    }
+
     // Eight blocks of a row at a time: lane 3 e + r has row r of block e. The sums end in lanes 0, 1, 2. Rows of up to 16 blocks
-    // go without a branch, so that the warp's rows overlap.
+    // go without a branch, so that the warp's rows overlap. a, c: values and columns from the block on that is `origin`-th.
     template <int N>
-    __device__ __forceinline__ void of_near(int first, real sum[N]) const {
+    __device__ __forceinline__ void of_near(int first, int end, const int* starts, int origin, const real* a_of, const int* c_of, real sum[N]) const {
         const int lane = threadIdx.x % 32, entry = lane / 3, r = lane - 3 * entry;
 #pragma unroll
         for (int n = 0; n < N; ++n) {
-            const int node = min(first + n * WARPS, own - 1), low = row_start[node] - base, high = row_start[node + 1] - base;
+            const int node = min(first + n * WARPS, end - 1), low = starts[node] - origin, high = starts[node + 1] - origin;
             sum[n] = 0;
 #pragma unroll
             for (int e = 0; e < 16; e += 8) {
                 const int k = low + e + entry, there = min(k, high - 1);
-                const real *a = blocks + 9 * there + 3 * r, *v = values + 3 * columns[there];
+                const real *a = a_of + 9 * there + 3 * r, *v = values + 3 * c_of[there];
                 const real product = a[0] * v[0] + a[1] * v[1] + a[2] * v[2];
                 sum[n] += lane < 24 && k < high ? product : 0;
             }
             for (int k = low + 16 + entry; k < high && lane < 24; k += 8) {
-                const real *a = blocks + 9 * k + 3 * r, *v = values + 3 * columns[k];
+                const real *a = a_of + 9 * k + 3 * r, *v = values + 3 * c_of[k];
                 sum[n] += a[0] * v[0] + a[1] * v[1] + a[2] * v[2];
             }
         }

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Ints = NDArray[np.int64]
+SPARED = 8  # multiprocessors that a step leaves to expansions beside it: one that needs all would wait for them to end
 NODES_A_BLOCK = 8  # a body of few nodes is not spread over more thread blocks than this gives
 
 
@@ -29,14 +30,41 @@ def shares(nodes: Ints, grid: int) -> Shares:
     free = grid - max(1, round(wanted[~own].sum())) if pooled else grid
     count = np.ones(bodies, np.int64)
     if own.any():
-        spread = np.floor(nodes[own] / nodes[own].sum() * (free - own.sum())).astype(np.int64)
-        most = -(-nodes[own] // NODES_A_BLOCK)
-        count[own] = np.clip(spread, 1, most)
+        count[own] = _spread(nodes[own], free)
     first = np.full(bodies, -1)
     first[own] = np.cumsum(count[own]) - count[own]
     rest = np.flatnonzero(~own)
     order = np.concatenate([np.flatnonzero(own), rest[np.argsort(-nodes[rest], kind="stable")]])
     return Shares(first, count, order, pooled)
+
+
+def _spread(nodes: Ints, blocks: int) -> Ints:
+    """Thread blocks of each body so that the busiest block of all has as few nodes as can be; no more than help."""
+    low, high = nodes.sum() / blocks, float(nodes.max())
+    for _ in range(40):
+        middle = (low + high) / 2
+        low, high = (low, middle) if np.ceil(nodes / middle).sum() <= blocks else (middle, high)
+    return np.minimum(np.ceil(nodes / high).astype(np.int64), -(-nodes // NODES_A_BLOCK))
+
+
+def busiest(nodes: Ints, given: Shares, grid: int) -> float:
+    """Nodes that the busiest thread block has to do with, one round of the pool after another."""
+    own, rest = given.first >= 0, given.first < 0
+    alone = float((nodes[own] / given.blocks[own]).max(initial=0))
+    if not given.pooled:
+        return alone
+    rounds = -(-given.pooled // max(1, grid - int(given.blocks[own].sum())))
+    return max(alone, rounds * float(nodes[rest].mean()))
+
+
+def shared_out(nodes: Ints, processors: int, blocks: int) -> tuple[Shares, int]:
+    """Shares and thread blocks; `blocks` of them on a multiprocessor. Some multiprocessors are spared, fewer where more
+    would leave many others idle."""
+    spared = min(SPARED, processors // 4)
+    grids = [blocks * (processors - s) for s in range(spared, spared // 2 - 1, -1)]
+    found = [(shares(nodes, grid), grid) for grid in grids]
+    load = [busiest(nodes, share, grid) for share, grid in found]
+    return found[int(np.argmax(np.array(load) <= 1.1 * min(load)))]
 
 
 SHARE = np.dtype([(n, "i4") for n in ("body", "index", "begin", "own", "halo_first", "halo", "block_first", "blocks")])

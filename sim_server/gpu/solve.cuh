@@ -28,8 +28,8 @@ struct Part { int piece, pieces, tile, tiles, chunk, chunks, unused[2]; };
 struct Plan {
     int phases, blocks, groups, size;
     const Part* parts;      // (blocks,)
-    const int* lists;       // (blocks, 3 phases + 2) of each phase: first piece (and the end), first tile (and the end), both
-                            // within the part; warps that share a tile
+    const int* lists;       // (blocks, 4 phases + 2) of each phase: first piece (and the end), first tile (and the end), both
+                            // within the part; warps that share a tile; first piece that is not formed here
     const Piece* pieces;
     const Tile* tiles;
     const int* index;       // (pieces, 32) of each entry: where it stands (kinds 1 and 2), or the first of the contributions

@@ -13,7 +13,7 @@ from sim_server.gpu.device import Gpu, compiled, options
 from sim_server.gpu.expansion import Expanded, Expansion
 from sim_server.gpu.plan import plan
 from sim_server.gpu.planned import PLAN, Planned, room
-from sim_server.gpu.shares import first_shares, halo, shares
+from sim_server.gpu.shares import SPARED, first_shares, halo, shared_out
 
 BODY = np.dtype(
     [
@@ -41,14 +41,11 @@ SOLVE = np.dtype(
 )  # fmt: skip
 
 
-SPARED = 8  # multiprocessors that a step leaves to expansions beside it: one that needs all would wait for them to end
-
-
 def threads_and_blocks(nodes: NDArray[np.int64], processors: int) -> tuple[int, int]:
     """Threads of a thread block, and thread blocks a processor: many small bodies are solved side by side."""
-    if len(nodes) < 2 * processors:
+    if len(nodes) <= processors - SPARED:
         return 256, 1  # 255 registers a thread: what is spilled to local memory costs a trip to L2
-    return (64, 4) if np.median(nodes) < 300 else (128, 2)
+    return (64, 4) if len(nodes) > 2 * processors and np.median(nodes) < 300 else (128, 2)
 
 
 class Solver:
@@ -74,8 +71,7 @@ class Solver:
         spans = np.array(ranges, np.int64)
         nodes = spans[:, 1] - spans[:, 0]
         self.threads, blocks = threads_and_blocks(nodes, processors)
-        most = blocks * (processors - min(SPARED, processors // 4))
-        share = shares(nodes, most)
+        share, most = shared_out(nodes, processors, blocks)
         self.grid = most if share.pooled else int(share.blocks.sum())
         self.spared = processors - -(-self.grid // blocks)
         self.bodies = np.zeros(len(ranges), BODY)

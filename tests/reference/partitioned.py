@@ -102,33 +102,43 @@ class Application:
         plan, forward = self.plan, phase < self.plan.groups - 1
         target = np.full(plan.contributions if forward else plan.size + COLUMNS, np.nan)
         written = np.zeros(len(target), int)
-        formed = self.formed.copy()
         for block in range(plan.blocks):
-            x = self._area(phase, block, formed)
+            self._form(phase, block)
+        for block in range(plan.blocks):
+            x = self._area(phase, block)
             for chunk, at, count, out in _tiles(plan, phase, block):
                 tile = self.chunks[chunk : chunk + count]
                 if plan.planes == 2:
                     tile = tile + self.chunks[chunk + count : chunk + 2 * count] / STEP
                 target[out : out + ROWS] = np.einsum("crk,ck->r", tile, x[at : at + COLUMNS * count].reshape(count, -1))
                 written[out : out + ROWS] += 1
-        self.formed = formed
         mine = self.c if forward else self.y
         mine[written > 0] = target[written > 0]
         self.writes.append(written)
 
-    def _area(self, phase: int, block: int, formed: Reals) -> Reals:
-        plan, at = self.plan, phase * self.plan.blocks + block
-        x = np.full(plan.x_area, np.nan)
-        for kind, start, count, to in plan.segments[plan.segment_start[at] : plan.segment_start[at + 1]]:
+    def _segments(self, phase: int, block: int) -> NDArray:
+        at = phase * self.plan.blocks + block
+        return self.plan.segments[self.plan.segment_start[at] : self.plan.segment_start[at + 1]]
+
+    def _form(self, phase: int, block: int) -> None:
+        """What a block leaves for all, once."""
+        for kind, start, count, _ in self._segments(phase, block):
+            if kind == FORM | WRITE:
+                assert np.isnan(self.formed[start : start + count]).all()
+                self.formed[start : start + count] = [self._formed(i) for i in range(start, start + count)]
+
+    def _area(self, phase: int, block: int) -> Reals:
+        x, forming = np.full(self.plan.x_area, np.nan), True
+        for kind, start, count, to in self._segments(phase, block):
             if kind & ~WRITE == FORM:
+                assert forming, "a block that waits for others before it forms its own could wait for ever"
                 x[to : to + count] = [self._formed(i) for i in range(start, start + count)]
-                if kind & WRITE:
-                    formed[start : start + count] = x[to : to + count]
             elif kind == READ:
                 x[to : to + count] = self.formed[start : start + count]
             else:
                 assert kind == GATHER
-                x[to : to + count] = self.y[plan.boundary[start : start + count]]
+                x[to : to + count] = self.y[self.plan.boundary[start : start + count]]
+            forming = kind & ~WRITE == FORM
         return x
 
     def _formed(self, i: int) -> float:

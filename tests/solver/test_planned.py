@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from sim_server.gpu import plan as plans
 from sim_server.gpu.partition import tree_of
 from sim_server.gpu.plan import lay_out, plan
 from sim_server.gpu.planned import Planned
-from sim_server.gpu.shares import first_shares, halo, shares
+from sim_server.gpu.shares import busiest, first_shares, halo, shared_out, shares
 from tests.reference.partitioned import stored
 from tests.solver.test_partitioned_inverse import GRAPHS, graphs, system
 
@@ -36,24 +37,28 @@ def applied(planned: Planned, chunks: NDArray, scale: NDArray, r: NDArray) -> ND
     formed, solved = np.full(p.size + 32, np.nan), np.zeros(p.size + 32)
     given = np.full(len(p.slots) + 32, np.nan)
     for phase in range(p.phases):
-        forward, puts, keeps = phase < p.groups - 1, {}, {}
-        for block in range(p.blocks):
+        forward, puts = phase < p.groups - 1, {}
+        for forming, block in [(True, b) for b in range(p.blocks)] + [(False, b) for b in range(p.blocks)]:
             part, lists = a["parts"][block], a["lists"][block]
             own_pieces = a["pieces"][part[0] : part[0] + part[1]]
             where = a["index"][part[0] : part[0] + part[1]]
             x = np.full(p.x_area, np.nan)
-            for k in range(lists[phase], lists[phase + 1]):
+            middle = lists[3 * p.phases + 2 + phase] if phase < p.groups else lists[phase]
+            for k in range(lists[phase], middle if forming else lists[phase + 1]):
                 kind, begin, to, keep = own_pieces[k]
                 valid = np.arange(32) < keep >> 1
+                assert (kind == 0) == (k < middle)
                 if kind == 0:
                     v = residual[begin : begin + 32].copy()
                     low, many = where[k] & 0xFFFFFF, where[k].view(np.uint32) >> 24
                     v -= [given[first : first + count].sum() for first, count in zip(low, many, strict=True)]
                     if keep & 1:
-                        keeps |= dict(zip(begin + np.arange(32), np.where(valid, v, 0), strict=True))
+                        formed[begin : begin + 32] = np.where(valid, v, 0)
                 else:
                     v = (formed if kind == 1 else solved)[where[k]]
                 x[to : to + 32] = np.where(valid, v, 0)
+            if forming:
+                continue
             starts, split = lists[p.phases + 1 : 2 * p.phases + 2], lists[2 * p.phases + 2 + phase]
             assert split >= 1
             for t in range(starts[phase], starts[phase + 1]):
@@ -63,8 +68,6 @@ def applied(planned: Planned, chunks: NDArray, scale: NDArray, r: NDArray) -> ND
                     tile = chunks[chunk + eight * count * p.planes :][:count]
                     value = np.einsum("crk,ck->r", tile, x[to : to + 32 * count].reshape(count, 32))
                     puts |= dict(zip(out + 8 * eight + np.arange(8), value, strict=True))
-        for i, v in keeps.items():
-            formed[i] = v
         for i, v in puts.items():
             if forward:
                 given[a["target"][i]] = v
@@ -74,8 +77,10 @@ def applied(planned: Planned, chunks: NDArray, scale: NDArray, r: NDArray) -> ND
 
 
 @graphs
+@pytest.mark.parametrize("trips", [0, 2])  # 0: all that is formed by several blocks is shared out among them
 @pytest.mark.parametrize("blocks", [1, 3, 16])
-def test_the_kernels_lists_apply_the_inverse(graph, blocks):
+def test_the_kernels_lists_apply_the_inverse(graph, blocks, trips, monkeypatch):
+    monkeypatch.setattr(plans, "TRIPS", trips)
     s = system(graph)
     tree = tree_of(s.pattern)
     sizes = np.unique(tree.size).tolist()
@@ -93,7 +98,7 @@ def test_tiles_of_one_warp_each_and_of_several():
         planned = Planned(HostGpu, plan(s.pattern, blocks), warps)  # type: ignore[arg-type]
         lists = planned._arrays["lists"].host
         phases = planned.plan.phases
-        count, split = np.diff(lists[:, phases + 1 : 2 * phases + 2]), lists[:, 2 * phases + 2 :]
+        count, split = np.diff(lists[:, phases + 1 : 2 * phases + 2]), lists[:, 2 * phases + 2 : 3 * phases + 2]
         shared = split > 1
         assert (count * split <= 64)[shared].all() and (16 * count <= 32 * warps)[shared].all()
 
@@ -108,6 +113,18 @@ def test_thread_blocks_are_shared_out_by_size():
     assert many.blocks[300] < 124, "some are left for the others"
     alike = shares(np.full(1024, 720), 248)
     assert alike.pooled == 1024 and (alike.first == -1).all()
+    assert shares(np.full(16, 720), 124).blocks.tolist() == [7] * 16, "an eighth for some would help nobody"
+    assert shares(np.array([4, 4]), 124).blocks.tolist() == [1, 1]
+
+
+@pytest.mark.parametrize(
+    "bodies, blocks, spared", [(1, 1, 8), (16, 1, 4), (64, 1, 4), (256, 2, 4), (1024, 2, 4), (100, 1, 8)]
+)
+def test_multiprocessors_are_spared_unless_others_would_idle(bodies, blocks, spared):
+    nodes = np.full(bodies, 720)
+    given, grid = shared_out(nodes, 132, blocks)
+    assert grid == blocks * (132 - spared)
+    assert busiest(nodes, given, grid) <= busiest(nodes, shares(nodes, blocks * 124), blocks * 124)
 
 
 @pytest.mark.parametrize("counts", [[1], [3], [7, 2]])
