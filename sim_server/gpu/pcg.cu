@@ -24,7 +24,6 @@ struct Memory {  // fixed shared memory of a thread block: what is the same in a
     double b2, goal, quarter, rz;  // of the iteration: all threads write the same
     Result out;
 };
-extern __shared__ __align__(16) char dynamic[];
 __shared__ Memory memory;
 
 __device__ __forceinline__ bool usable(double a) { return a > 0 && a < 1e300; }
@@ -144,8 +143,11 @@ struct Solver {
     // Sums of the lanes that Rows.finish used into lanes 0 to 2.
     template <int N>
     static __device__ __forceinline__ void into_three(double mine[N]) {
-        static_assert(TOGETHER == 3, "lanes 0 to 8 have sums");
-        for (int n = 0; n < N; ++n) mine[n] += __shfl_down_sync(ALL, mine[n], 3) + __shfl_down_sync(ALL, mine[n], 6);
+        static_assert(MANY_ROWS <= 6, "lanes up to 17 have sums");
+        for (int n = 0; n < N; ++n) {
+            mine[n] += __shfl_down_sync(ALL, mine[n], 9);
+            mine[n] += __shfl_down_sync(ALL, mine[n], 3) + __shfl_down_sync(ALL, mine[n], 6);
+        }
     }
 
     // 7. 8. 2. p = z + beta p, q = A p; sums p.q, r.q, q.q, r.r

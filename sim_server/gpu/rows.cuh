@@ -5,10 +5,11 @@
 #include "team.cuh"
 #include "invert3.cuh"
 
-#define TOGETHER 3                   // rows of a warp at a time
-#define SLAB (TOGETHER * WARPS)      // rows that come into shared memory at a time where not all fit ...
-#define SLABS 3                      // ... so many times ahead
-#define SLAB_BLOCKS (20 * SLAB)      // of A, at most; a slab with more is read where it is
+#define FEW_ROWS 3                   // of a warp at a time ...
+#define MANY_ROWS 6                  // ... where it has more
+#define SLAB (MANY_ROWS * WARPS)     // rows that come into shared memory at a time where not all fit, in turns into ...
+#define SLABS 2                      // ... so many places
+#define SLAB_BLOCKS (17 * SLAB)      // of A, at most; a slab with more is read where it is
 
 struct Rows {
     int begin, own, halo;           // own nodes [begin, begin + own) of the body; nodes read
@@ -21,12 +22,14 @@ struct Rows {
     const real* blocks;
     int base;
     bool near;                      // A is in shared memory
-    char* slabs;                    // (SLABS, SLAB_BYTES) of shared memory that A passes through, or null
+    int slabs;                      // place of (SLABS, SLAB_BYTES) of shared memory that A passes through, or -1
+    int near_values, near_blocks, near_columns;  // places, where they are near
 
     __device__ __forceinline__ void set_up(const Solve& s, const Body& body, const Share& share, Arena& arena) {
         begin = share.begin; own = share.own; halo = share.halo;
         nodes = s.halo + share.halo_first;
         values = arena.take<real>(3 * halo);
+        near_values = place_of(values);
         if (!values) values = s.halo_values + 3ll * share.halo_first;
         place = arena.take<int>(halo);
         if (!place) place = s.halo_place + share.halo_first;
@@ -51,15 +54,17 @@ struct Rows {
         row_start = s.row_start + row;
         columns = s.seat + base;
         blocks = s.values + 9ll * base;
-        slabs = nullptr;
+        slabs = -1;
         Arena before = arena;
         real* v = arena.take<real>(9 * count);
         int *c = arena.take<int>(count), *start = arena.take<int>(own + 1);
-        near = v && c && start;
+        near = v && c && start && near_values >= 0;
+        near_blocks = place_of(v);
+        near_columns = place_of(c);
         if (!near) {
             arena = before;
             start = arena.take<int>(own + 1);
-            slabs = start ? arena.take<char>(SLABS * SLAB_BYTES) : nullptr;
+            if (start && near_values >= 0) slabs = place_of(arena.take<char>(SLABS * SLAB_BYTES));
         }
         if (start)
             for (int k = threadIdx.x; k <= own; k += THREADS) copy_async(start + k, row_start + k, 4);
@@ -69,7 +74,7 @@ struct Rows {
             blocks = v; columns = c;
         }
         copies_begin();
-        if (slabs)
+        if (slabs >= 0)
             for (int k = 0; k < SLABS - 1; ++k) ask(k, row_start);
         if (start) row_start = start;
     }
@@ -86,7 +91,7 @@ struct Rows {
     // Brings a slab into its place: from the 16 bytes on in which it begins.
     __device__ __forceinline__ void ask(int k, const int* starts) const {
         const Slab s = slab(k, starts);
-        char* to = slabs + k % SLABS * SLAB_BYTES;
+        char* to = dynamic + slabs + k % SLABS * SLAB_BYTES;
         if (s.count <= SLAB_BLOCKS && s.count > 0) {
             all_of(to, blocks + 9ll * s.first, 9 * (int)sizeof(real) * s.count);
             all_of(to + VALUE_BYTES, columns + s.first, 4 * s.count);
@@ -102,17 +107,19 @@ struct Rows {
     // q = A values for the own nodes. done(node, c, q): entry c of a node's, called by as many lanes as there are.
     template <class Done>
     __device__ __forceinline__ void multiply(Done done) const {
-        if (slabs) through_slabs(done);
-        else if (own <= WARPS) some_rows<1>(done);
-        else some_rows<TOGETHER>(done);
+        if (slabs >= 0) through_slabs(done);
+        else if (!near) some_rows<FEW_ROWS, false>(done);
+        else if (own <= WARPS) some_rows<1, true>(done);
+        else if (own <= FEW_ROWS * WARPS) some_rows<FEW_ROWS, true>(done);
+        else some_rows<MANY_ROWS, true>(done);
     }
 
-    template <int N, class Done>
+    template <int N, bool NEAR, class Done>
     __device__ __forceinline__ void some_rows(Done done) const {
         for (int first = threadIdx.x / 32; first < own; first += N * WARPS) {
             real sum[N];
-            if (near) of_near<N>(first, own, row_start, base, blocks, columns, sum);
-            else of_far<N>(first, sum);
+            if (NEAR) of_near<N>(first, own, base, near_blocks, near_columns, sum);
+            else of_far<N>(first, own, sum);
             finish<N>(first, own, sum, done);
         }
     }
@@ -130,16 +137,20 @@ struct Rows {
             const Slab s = slab(k, row_start);
             const int first = s.low + (int)threadIdx.x / 32;
             if (first >= s.high) continue;
-            real sum[TOGETHER];
             if (s.count > SLAB_BLOCKS) {
-                of_far<TOGETHER>(first, sum);
-            } else {
-                const char* here = slabs + k % SLABS * SLAB_BYTES;
-                const real* a = (const real*)(here + ((unsigned long long)(blocks + 9ll * s.first) & 15));
-                const int* c = (const int*)(here + VALUE_BYTES + ((unsigned long long)(columns + s.first) & 15));
-                of_near<TOGETHER>(first, s.high, row_start, base + s.first, a, c, sum);
+                for (int row = first; row < s.high; row += FEW_ROWS * WARPS) {
+                    real sum[FEW_ROWS];
+                    of_far<FEW_ROWS>(row, s.high, sum);
+                    finish<FEW_ROWS>(row, s.high, sum, done);
+                }
+                continue;
             }
-            finish<TOGETHER>(first, s.high, sum, done);
+            const int here = slabs + k % SLABS * SLAB_BYTES;
+            const int a = here + (int)((unsigned long long)(blocks + 9ll * s.first) & 15);
+            const int c = here + VALUE_BYTES + (int)((unsigned long long)(columns + s.first) & 15);
+            real sum[MANY_ROWS];
+            of_near<MANY_ROWS>(first, s.high, base + s.first, a, c, sum);
+            finish<MANY_ROWS>(first, s.high, sum, done);
         }
     }
 
@@ -160,23 +171,26 @@ struct Rows {
     }
 
     // Eight blocks of a row at a time: lane 3 e + r has row r of block e. The sums end in lanes 0, 1, 2. Rows of up to 16 blocks
-    // go without a branch, so that the warp's rows overlap. a, c: values and columns from the block on that is `origin`-th.
+    // go without a branch, so that the warp's rows overlap. a_at, c_at: places of values and columns from the
+    // block on that is `origin`-th.
     template <int N>
-    __device__ __forceinline__ void of_near(int first, int end, const int* starts, int origin, const real* a_of, const int* c_of, real sum[N]) const {
+    __device__ __forceinline__ void of_near(int first, int end, int origin, int a_at, int c_at, real sum[N]) const {
+        const real *a_of = shared_at<real>(a_at), *v_of = shared_at<real>(near_values);
+        const int* c_of = shared_at<int>(c_at);
         const int lane = threadIdx.x % 32, entry = lane / 3, r = lane - 3 * entry;
 #pragma unroll
         for (int n = 0; n < N; ++n) {
-            const int node = min(first + n * WARPS, end - 1), low = starts[node] - origin, high = starts[node + 1] - origin;
+            const int node = min(first + n * WARPS, end - 1), low = row_start[node] - origin, high = row_start[node + 1] - origin;
             sum[n] = 0;
 #pragma unroll
             for (int e = 0; e < 16; e += 8) {
                 const int k = low + e + entry, there = min(k, high - 1);
-                const real *a = a_of + 9 * there + 3 * r, *v = values + 3 * c_of[there];
+                const real *a = a_of + 9 * there + 3 * r, *v = v_of + 3 * c_of[there];
                 const real product = a[0] * v[0] + a[1] * v[1] + a[2] * v[2];
                 sum[n] += lane < 24 && k < high ? product : 0;
             }
             for (int k = low + 16 + entry; k < high && lane < 24; k += 8) {
-                const real *a = a_of + 9 * k + 3 * r, *v = values + 3 * c_of[k];
+                const real *a = a_of + 9 * k + 3 * r, *v = v_of + 3 * c_of[k];
                 sum[n] += a[0] * v[0] + a[1] * v[1] + a[2] * v[2];
             }
         }
@@ -187,11 +201,11 @@ struct Rows {
 
     // Three at a time: lane 9 e + 3 r + c has entry (r, c) of block e, so that A is read in order.
     template <int N>
-    __device__ __forceinline__ void of_far(int first, real sum[N]) const {
+    __device__ __forceinline__ void of_far(int first, int end, real sum[N]) const {
         const int lane = threadIdx.x % 32, entry = lane / 9, c = lane % 3;
 #pragma unroll
         for (int n = 0; n < N; ++n) {
-            const int node = min(first + n * WARPS, own - 1), low = row_start[node] - base, high = row_start[node + 1] - base;
+            const int node = min(first + n * WARPS, end - 1), low = row_start[node] - base, high = row_start[node + 1] - base;
             sum[n] = 0;
 #pragma unroll
             for (int e = 0; e < 15; e += 3) {

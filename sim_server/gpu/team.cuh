@@ -15,6 +15,8 @@
 #define AT_ONCE 5  // words that a thread asks for at a time: 160 thread blocks, or 2560 entries of a vector, in one trip
 #endif
 
+extern __shared__ __align__(16) char dynamic[];
+
 // Shared memory given out once per body. Null where it does not fit: then global memory stands in.
 struct Arena {
     char* next;
@@ -28,6 +30,11 @@ struct Arena {
         return found;
     }
 };
+
+// Place of what an arena gave. Through `dynamic + place` it is read as shared memory, which a pointer kept in memory is not.
+__device__ __forceinline__ int place_of(const void* taken) { return taken ? (int)((const char*)taken - dynamic) : -1; }
+template <class T>
+__device__ __forceinline__ const T* shared_at(int place) { return (const T*)(dynamic + place); }
 
 __device__ __forceinline__ void copy_async(void* shared, const void* global, int bytes) {
     unsigned to = (unsigned)__cvta_generic_to_shared(shared);
