@@ -57,9 +57,8 @@ struct Solver {
         Inverse inverse;
         const bool inverted = body.plan && (body.kind == CHOLESKY || body.probe > 0);
         if (inverted) inverse.reserve(&memory.plan, arena);
-        real* d = inverted ? arena.take<real>(3 * share.own) : nullptr;
         Rows rows;
-        rows.set_up(s, body, share, arena);
+        rows.set_up(s, body, share, arena, inverted);
         real* diagonal = arena.take<real>(9 * rows.own);
         if (!diagonal) diagonal = s.diagonal + 9ll * (body.first + rows.begin);
         if (inverted) inverse.set_up(body, &memory.plan, team.index, arena);
@@ -67,7 +66,7 @@ struct Solver {
             memory.rows = rows;
             memory.inverse = inverse;
             memory.diagonal = diagonal;
-            memory.d = d;
+            memory.d = rows.scale;
             if (inverted) memory.peak = inverse.scale[inverse.size];
         }
         packed = body.kind == CHOLESKY && body.plan;
@@ -143,10 +142,10 @@ struct Solver {
     // Sums of the lanes that Rows.finish used into lanes 0 to 2.
     template <int N>
     static __device__ __forceinline__ void into_three(double mine[N]) {
-        static_assert(MANY_ROWS <= 6, "lanes up to 17 have sums");
+        static_assert(SLAB_ROWS <= 4 && TOGETHER <= 4, "lanes 0 to 11 have sums");
         for (int n = 0; n < N; ++n) {
-            mine[n] += __shfl_down_sync(ALL, mine[n], 9);
-            mine[n] += __shfl_down_sync(ALL, mine[n], 3) + __shfl_down_sync(ALL, mine[n], 6);
+            mine[n] += __shfl_down_sync(ALL, mine[n], 6);
+            mine[n] += __shfl_down_sync(ALL, mine[n], 3);
         }
     }
 

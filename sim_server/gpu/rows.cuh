@@ -5,9 +5,9 @@
 #include "team.cuh"
 #include "invert3.cuh"
 
-#define FEW_ROWS 3                   // of a warp at a time ...
-#define MANY_ROWS 6                  // ... where it has more
-#define SLAB (MANY_ROWS * WARPS)     // rows that come into shared memory at a time where not all fit, in turns into ...
+#define TOGETHER 3                   // rows of a warp at a time
+#define SLAB_ROWS 4                  // ... of a slab
+#define SLAB (SLAB_ROWS * WARPS)     // rows that come into shared memory at a time where not all fit, in turns into ...
 #define SLABS 2                      // ... so many places
 #define SLAB_BLOCKS (17 * SLAB)      // of A, at most; a slab with more is read where it is
 
@@ -17,6 +17,7 @@ struct Rows {
     real* values;                   // (halo, 3) of the vector that A multiplies
     int* place;                     // (halo,) where the next one is read
     real *x, *r, *q;                // (own, 3)
+    real* scale;                    // (own, 3) of the inverse, or null
     const int* row_start;           // (own + 1,), less `base`
     const int* columns;             // places in halo
     const real* blocks;
@@ -25,7 +26,8 @@ struct Rows {
     int slabs;                      // place of (SLABS, SLAB_BYTES) of shared memory that A passes through, or -1
     int near_values, near_blocks, near_columns;  // places, where they are near
 
-    __device__ __forceinline__ void set_up(const Solve& s, const Body& body, const Share& share, Arena& arena) {
+    // What is used most comes first. inverted: there is an inverse.
+    __device__ __forceinline__ void set_up(const Solve& s, const Body& body, const Share& share, Arena& arena, bool inverted) {
         begin = share.begin; own = share.own; halo = share.halo;
         nodes = s.halo + share.halo_first;
         values = arena.take<real>(3 * halo);
@@ -33,22 +35,25 @@ struct Rows {
         if (!values) values = s.halo_values + 3ll * share.halo_first;
         place = arena.take<int>(halo);
         if (!place) place = s.halo_place + share.halo_first;
+        const long long row = body.first + begin, all = 3ll * s.nodes;
+        bring(s, (int)row, share, arena, (inverted ? 12 : 9) * own * (int)sizeof(real) + 64);
+        scale = inverted ? arena.take<real>(3 * own) : nullptr;
+        r = taken(arena, s.own + 3 * row + all);
+        q = taken(arena, s.own + 3 * row + 2 * all);
+        x = taken(arena, s.own + 3 * row);
         int* list = arena.take<int>(halo);
-        if (list) {
-            for (int k = threadIdx.x; k < halo; k += THREADS) copy_async(list + k, nodes + k, 4);
-            nodes = list;
-        }
-        long long row = body.first + begin, all = 3ll * s.nodes;
-        x = arena.take<real>(9 * own);
-        long long step = x ? 3 * own : all;
-        if (!x) x = s.own + 3 * row;
-        r = x + step;
-        q = r + step;
-        bring(s, (int)row, share, arena);
+        if (!list) return;
+        for (int k = threadIdx.x; k < halo; k += THREADS) copy_async(list + k, nodes + k, 4);
+        nodes = list;
+        copies_begin();
+    }
+    __device__ __forceinline__ real* taken(Arena& arena, real* instead) const {
+        real* found = arena.take<real>(3 * own);
+        return found ? found : instead;
     }
 
-    // Copies the own rows of A into shared memory if they fit: loads after a barrier miss L1.
-    __device__ __forceinline__ void bring(const Solve& s, int row, const Share& share, Arena& arena) {
+    // Copies the own rows of A into shared memory if they fit beside `others` bytes: loads after a barrier miss L1.
+    __device__ __forceinline__ void bring(const Solve& s, int row, const Share& share, Arena& arena, int others) {
         const int count = share.blocks;
         base = share.block_first;
         row_start = s.row_start + row;
@@ -58,7 +63,7 @@ struct Rows {
         Arena before = arena;
         real* v = arena.take<real>(9 * count);
         int *c = arena.take<int>(count), *start = arena.take<int>(own + 1);
-        near = v && c && start && near_values >= 0;
+        near = v && c && start && near_values >= 0 && arena.end - arena.next >= others;
         near_blocks = place_of(v);
         near_columns = place_of(c);
         if (!near) {
@@ -108,10 +113,9 @@ struct Rows {
     template <class Done>
     __device__ __forceinline__ void multiply(Done done) const {
         if (slabs >= 0) through_slabs(done);
-        else if (!near) some_rows<FEW_ROWS, false>(done);
+        else if (!near) some_rows<TOGETHER, false>(done);
         else if (own <= WARPS) some_rows<1, true>(done);
-        else if (own <= FEW_ROWS * WARPS) some_rows<FEW_ROWS, true>(done);
-        else some_rows<MANY_ROWS, true>(done);
+        else some_rows<TOGETHER, true>(done);
     }
 
     template <int N, bool NEAR, class Done>
@@ -138,19 +142,19 @@ struct Rows {
             const int first = s.low + (int)threadIdx.x / 32;
             if (first >= s.high) continue;
             if (s.count > SLAB_BLOCKS) {
-                for (int row = first; row < s.high; row += FEW_ROWS * WARPS) {
-                    real sum[FEW_ROWS];
-                    of_far<FEW_ROWS>(row, s.high, sum);
-                    finish<FEW_ROWS>(row, s.high, sum, done);
+                for (int row = first; row < s.high; row += TOGETHER * WARPS) {
+                    real sum[TOGETHER];
+                    of_far<TOGETHER>(row, s.high, sum);
+                    finish<TOGETHER>(row, s.high, sum, done);
                 }
                 continue;
             }
             const int here = slabs + k % SLABS * SLAB_BYTES;
             const int a = here + (int)((unsigned long long)(blocks + 9ll * s.first) & 15);
             const int c = here + VALUE_BYTES + (int)((unsigned long long)(columns + s.first) & 15);
-            real sum[MANY_ROWS];
-            of_near<MANY_ROWS>(first, s.high, base + s.first, a, c, sum);
-            finish<MANY_ROWS>(first, s.high, sum, done);
+            real sum[SLAB_ROWS];
+            of_near<SLAB_ROWS>(first, s.high, base + s.first, a, c, sum);
+            finish<SLAB_ROWS>(first, s.high, sum, done);
         }
     }
 
