@@ -2,10 +2,13 @@
 """Whose matrix is factorized next: pure functions of counters, no clock, no I/O.
 
 excess       the rule of Courtecuisse et al. 2010, section 4: each object sums up its CG iterations above a floor, and
-             the object with the largest sum goes next; a matrix that goes out sets its object's sum back to zero
+             the object with the largest sum goes next; a matrix that goes out sets its object's sum back to zero. Two
+             things are ours: the sum begins anew when the factor is taken up, since what was summed while it was made
+             is what it is for; and sums are compared as they will be a few steps from now if the excess of the last
+             solve goes on, so that an object that has just been seized need not add up its claim first
 round_robin  whoever was sent longest ago
 oldest       whoever has the oldest factor: a job that was lost does not cost its object the turn
-weighted     cost of the excess by time of a factorization, the sum growing a little with each step waited
+weighted     cost of that sum by time of a factorization, growing a little with each step waited
 
 Whatever the rule, an object whose last matrix is `overdue` goes first, so none starves.
 """
@@ -18,6 +21,7 @@ from typing import Literal
 Rule = Literal["excess", "round_robin", "oldest", "weighted"]
 
 AGEING = 0.02  # iterations that a step of waiting counts as (weighted): between equals it is 50 steps to an iteration
+AHEAD = 10.0  # steps for which the excess of the last solve is taken to go on
 DOUBLINGS = 10  # of the floor of an object whose jobs fail
 
 
@@ -27,7 +31,8 @@ class Need:
     out (None: none did yet); in_flight: a matrix of it is being factorized; age: steps since the matrix of its factor
     (None: it has none); cost: of an iteration, service: of a factorization, each in any unit as long as it is the same
     for all; failures: jobs in a row that came to nothing; lost: summed iterations above the floor of solves with the
-    factor in use; trial: a new factor is wanted to be tried out, whatever was lost."""
+    factor in use; trial: a new factor is wanted to be tried out, whatever was lost; latest: excess of the last
+    solve."""
 
     object: str
     excess: float
@@ -39,6 +44,7 @@ class Need:
     failures: int = 0
     lost: float = 0.0
     trial: bool = False
+    latest: float = 0.0
 
 
 def excess(iterations: int, floor: int) -> int:
@@ -46,9 +52,14 @@ def excess(iterations: int, floor: int) -> int:
     return max(0, iterations - floor)
 
 
+def claim(need: Need) -> float:
+    """The sum as it will be if the latest excess goes on (excess)."""
+    return need.excess + AHEAD * need.latest
+
+
 def gain(need: Need) -> float:
     """What a new factor is worth for the time that it takes (weighted)."""
-    return (need.excess + AGEING * (need.waited or 0)) * need.cost / max(need.service, 1e-12)
+    return (claim(need) + AGEING * (need.waited or 0)) * need.cost / max(need.service, 1e-12)
 
 
 def pays(need: Need, threshold: float = 1.0) -> bool:
@@ -63,7 +74,7 @@ def pays(need: Need, threshold: float = 1.0) -> bool:
 
 
 _PRIORITY: dict[Rule, Callable[[Need], float]] = {
-    "excess": lambda need: need.excess,
+    "excess": claim,
     "round_robin": lambda need: need.waited or 0,
     "oldest": lambda need: inf if need.age is None else need.age,
     "weighted": gain,

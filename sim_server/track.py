@@ -37,7 +37,10 @@ class Track:
 
     def __init__(self, body: Body, auto: bool, counted: bool = False):
         self.body, self.counted = body, counted
-        self.excess = 0.0  # since the last matrix went out
+        self.excess = 0.0  # since the last matrix went out, or its factor came
+        self.latest = 0.0  # of the last solve
+        self._owed = 0.0  # of when the last matrix went out, should nothing come of it
+        self._usual = Mean()  # of the first solve with a new factor
         self.lost = 0.0  # to the factor in use
         self._in_use = -1  # its step
         self.sent: int | None = None  # step of the last matrix that went out
@@ -77,13 +80,15 @@ class Track:
             self.failures,
             self.lost,
             self.choice is not None and self.choice.wants_another,
+            self.latest,
         )
 
     def went_out(self, step: int) -> None:
         """What was copied of `step` is on the way; it is kept, as a matrix is what its factor is judged by."""
         self.matrix = None if self.wanted is None else (step, self.wanted)
         self.sent_positions = self.wanted is not None and self.wanted.ndim == 2
-        self.in_flight, self.sent, self.wanted, self.excess = True, step, None, 0.0
+        self.in_flight, self.sent, self.wanted = True, step, None
+        self._owed, self.excess = self.excess, 0.0
 
     def came_in(self, factor: Factor, step: int) -> bool:
         """A factor came during `step`; False if a newer one is there already."""
@@ -96,6 +101,8 @@ class Track:
             return False
         self.seconds.add(flops(factor.pattern) if self.counted else max(factor.seconds, 1e-6))
         self.newest = factor.step
+        self.lost = 0.0  # what is known of the solves so far is of another factor
+        self.excess = self.latest = self._usual.value or 0.0
         self.sent = factor.step if self.sent is None else self.sent  # one made elsewhere
         self.used += 1
         self.mended += bool(factor.remedy)
@@ -104,17 +111,24 @@ class Track:
     def came_to_nothing(self, reason: str) -> None:
         """Its job failed; it may be sent again."""
         self.in_flight, self.refusal = False, reason
+        self.excess += self._owed
         self.refused += 1
         self.failures += 1
         self.unbuilt += self.sent_positions
 
     def observe(self, record: Any, floor: int, cost: float) -> None:
         """A solve was made (a record of the loop). floor: iterations above it are excess; cost: of the solve."""
-        self.excess += excess(int(record["iterations"]), floor)
+        if not 0 <= record["factor_step"] < self.newest:  # else it was made before the newest factor was taken up
+            self._sum_up(excess(int(record["iterations"]), floor), record)
         self.refused += int(record["fallbacks"])
         self.per_iteration.add(cost / (int(record["iterations"]) + 1))
         if record["factor_step"] >= 0:
-            if record["factor_step"] != self._in_use:
-                self._in_use, self.lost = int(record["factor_step"]), 0.0
-            self.lost += excess(int(record["iterations"]), floor)
             self.age_max = max(self.age_max, int(record["step"]) - 1 - int(record["factor_step"]))
+
+    def _sum_up(self, above: int, record: Any) -> None:
+        if record["factor_step"] >= 0:
+            if record["factor_step"] != self._in_use:
+                self._in_use, self.lost, self.excess = int(record["factor_step"]), 0.0, 0.0
+                self._usual.add(above)
+            self.lost += above
+        self.excess, self.latest = self.excess + above, float(above)

@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 from sim_server.driver import Driver
 from sim_server.factors import Job
 from sim_server.simulation import Simulation
+from tests.bench._clairvoyant import Clairvoyant
 from tests.bench._few_wild import APART, Load, is_wild, scene
 from tests.bench._virtual_workers import VirtualWorkers
 from tests.bench.report import Report, plots
 
 RULES = ("round_robin", "oldest", "weighted", "excess")
-ORACLE, NEVER, EACH = "oracle", "no updates", "a worker for each object"
+ORACLE, NEVER, EACH, BEST = "oracle", "no updates", "a worker for each object", "best order, found afterwards"
 AIMS = (("/ round robin", "round robin's", 0.7), ("/ oracle", "the oracle's", 1.3))
 COLUMNS = ("objects", "wild", "workers", "rule", "iterations", "/ round robin", "/ oracle", "/ no updates",
            "wild, mean", "rest, mean", "p50", "p99", "age, mean", "age, max", "age, bound", "factors")  # fmt: skip
@@ -29,6 +30,7 @@ class Setting:
 
     steps: int
     hold: int  # steps
+    warm: int  # steps before those that count
     speed: float  # operations of a factorization that a worker does in a step
     floor: int  # iterations
     seed: int
@@ -41,13 +43,15 @@ def run(objects: int, workers: int, name: str, setting: Setting, **solver: Any) 
     driver = Driver(sim, VirtualWorkers(sim, workers, setting.speed), counted=True)
     _first_factors(driver)
     records = []
-    for _ in range(setting.steps):
+    for step in range(setting.warm + setting.steps):
+        if step == setting.warm:
+            before = sum(t.used for t in driver.tracks)
         load.act()
         records.append(driver.advance(1))
-    r = np.concatenate(records).reshape(setting.steps, objects)
+    r = np.concatenate(records[setting.warm :]).reshape(setting.steps, objects)
     assert (r["status"] == 0).all(), "a solve did not converge"
     bound = driver.age_bound()
-    made = sum(t.used for t in driver.tracks)
+    made = sum(t.used for t in driver.tracks) - before
     wild = np.array([is_wild(k) for k in range(objects)])
     return {"objects": objects, "wild": int(wild.sum()), "workers": workers, "rule": name,
             **_figures(r["iterations"].astype(int), r["step"] - 1 - r["factor_step"], wild),
@@ -76,7 +80,7 @@ def _figures(iterations: NDArray[Any], age: NDArray[Any], wild: NDArray[np.bool_
     }
 
 
-def compared(objects: int, workers: list[int], setting: Setting) -> list[dict[str, Any]]:
+def compared(objects: int, workers: list[int], setting: Setting, clairvoyant: bool) -> list[dict[str, Any]]:
     """The rows of one number of objects, with ratios."""
     rows = [
         run(objects, 0, ORACLE, setting, update="every-1"),
@@ -86,6 +90,10 @@ def compared(objects: int, workers: list[int], setting: Setting) -> list[dict[st
     for count in workers:
         rows += [run(objects, count, rule, setting, schedule=rule) for rule in RULES]
         rows.append(run(objects, count, "excess, default floor", setting, update_floor_iterations=3))
+    if clairvoyant:
+        found = Clairvoyant(objects, setting.steps, setting.warm, setting.hold, setting.speed, setting.seed)
+        few = {"objects": objects, "wild": rows[0]["wild"], "rule": BEST}
+        rows += [{**few, "workers": count, "iterations": found.best(count)} for count in workers]
     total = {(row["rule"], row["workers"]): row["iterations"] for row in rows}
     for row in rows:
         row["/ oracle"] = row["iterations"] / total[ORACLE, 0]
@@ -101,9 +109,9 @@ def picture(rows: list[dict[str, Any]], sizes: list[int], workers: list[int]) ->
     figure, axes = plt.subplots(2, len(workers), figsize=(4 * len(workers), 8), sharex=True, sharey="row",
                                 layout="constrained", squeeze=False)  # fmt: skip
     for column, count in enumerate(workers):
-        for name in (NEVER, *RULES, EACH):
+        for name in (NEVER, *RULES, EACH, *([BEST] if any(r["rule"] == BEST for r in rows) else [])):
             own = [r for r in rows if r["rule"] == name and (r["workers"] == count or name in (NEVER, EACH))]
-            style = {NEVER: ":", EACH: ":", "oldest": "--"}.get(name, "-")  # oldest lies on round_robin
+            style = {NEVER: ":", EACH: ":", BEST: "-.", "oldest": "--"}.get(name, "-")  # oldest lies on round_robin
             axes[0, column].plot(sizes, [r["/ oracle"] for r in own], style, marker="o", ms=3, label=name)
             if name in RULES:
                 axes[1, column].plot(
@@ -126,16 +134,19 @@ def _explained(setting: Setting) -> tuple[str, ...]:
 Beams of 96, 216 and 324 tetrahedra in turn, E 0.1 MPa, some a hundred times stiffer beyond their first third, held at
 one end, dt = 20 ms, tolerance 1e-6 of the true residual, warped float32 Cholesky factors. One in {APART} is *wild*: a
 stiff hand (1e7 N/m on all nodes within 0.8 m) takes hold somewhere, drags it about a metre away, lets go after
-{setting.hold} steps and takes hold elsewhere; the others tremble. {setting.steps} steps from seed {setting.seed};
-everybody begins with a factor of the first matrix.""",
+{setting.hold} steps and takes hold elsewhere; the others tremble. Everybody begins with a factor of the first matrix;
+{setting.steps} steps count, from seed {setting.seed}, after {setting.warm} in which the hands, which all take hold in
+the first step, come out of step with one another.""",
         f"""\
 Workers are virtual: one takes as many steps for a factor as its operations need at {setting.speed:.3g} a step (1, 2 and
 3 steps for the three sizes), one matrix at a time; a matrix is copied in the step after its worker became idle. So
 a factor is 2 steps old at best when it is taken up, and the counts below repeat to the digit. *oracle*: a factor of
 each step's own matrix for every object; *no updates*: the first factor only; *{EACH}*: what asynchrony
-alone costs, with hardly anybody to share with, so about the best that any rule can come to. *oldest* differs from
-*round_robin* only where jobs are lost, and here none is. Ratios are of the iterations of all objects and steps; the
-resting ones, alike under every rule, draw them towards 1. Ages are of the factors used [steps].""",
+alone costs, with hardly anybody to share with; *{BEST}*: what the same workers could do at
+best (a search through the iterations of every matrix with every older factor, told beforehand what no rule can know:
+when and where hands take hold). *oldest* differs from *round_robin* only where jobs are lost, and here none is. Ratios
+are of the iterations of all objects and steps; the resting ones, alike under every rule, draw them towards 1. Ages are
+of the factors used [steps].""",
         f"""\
 The floor of iterations is {setting.floor} here (default 3): a fresh float32 factor needs 1 or 2, so that what exceeds 2
 is what a new factor would save; with 3 an object dragged slowly looks satisfied at 3 iterations and turns go to those
@@ -145,13 +156,21 @@ at rest. The rows *default floor* have 3.""",
 
 def _turn(row: dict[str, Any], setting: Setting) -> float:
     """Steps in which the workers would serve each wild object once, at the pace they had."""
-    return row["wild"] * setting.steps / (row["factors"] - row["objects"])
+    return row["wild"] * setting.steps / row["factors"]
+
+
+def _at_best(row: dict[str, Any] | None) -> str:
+    if row is None:
+        return ""
+    ratios = f"{row['/ oracle']:.2f} of the oracle's and {row['/ round robin']:.2f} of round robin's"
+    return f"The best order, found afterwards, makes {ratios}. "
 
 
 def _verdict(rows: list[dict[str, Any]], setting: Setting) -> list[str]:
     """Where the aims are met, and what stands in the way elsewhere."""
     each = {row["objects"]: row for row in rows if row["rule"] == EACH}
     turns = {(row["objects"], row["workers"]): row for row in rows if row["rule"] == "round_robin"}
+    found = {(row["objects"], row["workers"]): row for row in rows if row["rule"] == BEST}
     lines = ["Aims: *excess* at most 0.7 of round robin's iterations and at most 1.3 of the oracle's.", ""]
     for row in (r for r in rows if r["rule"] == "excess"):
         other, best = turns[row["objects"], row["workers"]], each[row["objects"]]
@@ -160,23 +179,25 @@ def _verdict(rows: list[dict[str, Any]], setting: Setting) -> list[str]:
         if not missed:
             lines.append(f"{where} both met ({row['/ round robin']:.2f} and {row['/ oracle']:.2f}).")
             continue
+        ratio = best["iterations"] / other["iterations"]
         lines.append(
-            f"{where} {', '.join(missed)}. A worker for each object would make {best['/ oracle']:.2f} of the oracle's "
-            f"and {best['iterations'] / other['iterations']:.2f} of round robin's (whose oldest factor is "
-            f"{other['age, max']} steps old); serving nobody else, the workers would come round to each wild "
+            f"{where} {', '.join(missed)}. {_at_best(found.get((row['objects'], row['workers'])))}A worker for each "
+            f"object would make {best['/ oracle']:.2f} of the oracle's and {ratio:.2f} of round robin's (whose oldest "
+            f"factor is {other['age, max']} steps old); serving nobody else, the workers would come round to each wild "
             f"object in {_turn(row, setting):.3g} steps."
         )
-    told = [r for r in rows if r["age, bound"] is not None and r["workers"]]
-    longer = [r for r in told if r["age, bound"] < setting.steps]
+    told = [r for r in rows if r.get("age, bound") is not None and r["workers"]]
+    longer = [r for r in told if r["age, bound"] < setting.warm + setting.steps]
     kept = sum(r["age, max"] <= r["age, bound"] for r in longer)
     return [
         "\n".join(lines),
         f"""\
-Where a worker for each object misses an aim too, asynchrony itself stands in the way (a factor at least 2 steps old
-against a fresh one each step), or round robin's turns are short already. Elsewhere it is the length of a turn: hands
-take hold elsewhere each {setting.hold} steps, and until its next factor an object solves against a spring that its
-factor does not know. Where round robin needs more than no updates, its factors hold springs that are gone besides
-lacking those that are there; the first factor holds none.""",
+Where the best order or a worker for each object misses an aim too, no rule can meet it: asynchrony itself stands in the
+way (a factor at least 2 steps old against a fresh one each step), the workers are too few, or round robin's turns are
+short already. The rest is foresight: hands take hold elsewhere each {setting.hold} steps, and until its next factor an
+object solves against a spring that its factor does not know; a rule learns of it when iterations rise, and then a
+worker may be busy. Where round robin needs more than no updates, its factors hold springs that are gone besides lacking
+those that are there; the first factor holds none.""",
         f"Bound of age that the server tells: kept in {kept} of the {len(longer)} runs that were longer than it.",
     ]
 
@@ -194,24 +215,28 @@ def _numbers(text: str) -> list[int]:
 def main(
     objects: Annotated[str, typer.Option(help="Numbers of objects")] = "4,16,64,256",
     workers: Annotated[str, typer.Option(help="Numbers of workers")] = "1,2,4",
-    steps: Annotated[int, typer.Option(min=2, help="Steps of each run")] = 200,
+    steps: Annotated[int, typer.Option(min=2, help="Steps that count of each run")] = 200,
     hold: Annotated[int, typer.Option(min=2, help="Steps for which a hand holds")] = 60,
     speed: Annotated[
         float, typer.Option(min=1, help="Operations of a factorization that a worker does in a step")
     ] = 3e5,
     floor: Annotated[int, typer.Option(min=0, help="Iterations above which there is excess")] = 2,
     seed: Annotated[int, typer.Option(help="Of where the hands take hold")] = 0,
+    clairvoyant: Annotated[
+        bool, typer.Option("--clairvoyant", help="Also search the best order of jobs (minutes for 64 objects)")
+    ] = False,
     quick: Annotated[bool, typer.Option("--quick", help="A small smoke run")] = False,
     out: Annotated[Path | None, typer.Option(help="Folder of the results [default: out/bench/scheduler]")] = None,
 ) -> None:
     """Iterations and ages of factors under each rule, beside an oracle and no updates, in virtual time."""
     sizes, counts = _numbers("4,16" if quick else objects), _numbers("1,2" if quick else workers)
-    setting = Setting(30 if quick else steps, 10 if quick else hold, speed, floor, seed)
+    hold = 10 if quick else hold
+    setting = Setting(30 if quick else steps, hold, hold, speed, floor, seed)
     arguments = {"objects": sizes, "workers": counts, **vars(setting)}
     report = Report("scheduler", "Whose matrix is factorized next: the rules compared", arguments, out, quick)
     rows = []
     for size in sizes:
-        rows += compared(size, counts, setting)
+        rows += compared(size, counts, setting, clairvoyant)
         print(f"{size} objects done", flush=True)
     report.say(*_explained(setting))
     report.figure(picture(rows, sizes, counts), "scheduler.png", "Iterations and the oldest factor under each rule.")

@@ -7,6 +7,7 @@ factor).
 
 import logging
 import time
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from protocol.factor import Factor
 from sim_server.driver import COPIES, Driver
 from sim_server.engine import Kind
 from sim_server.factors import Inline, Job
+from sim_server.layouts import RECORD
 from sim_server.simulation import Simulation
 from sim_server.track import flops
 from tests.bench._virtual_workers import VirtualWorkers
@@ -419,6 +421,42 @@ def test_excess_iterations_are_summed_until_the_next_matrix_goes_out():
     driver.wants_factors = False  # nothing goes out
     records = driver.advance(10)
     assert driver.tracks[0].excess == np.maximum(records["iterations"] - 3, 0).sum() > 0
+
+
+def solved(iterations: int, factor_step: int, step: int) -> Any:
+    """A record of a solve."""
+    record = np.zeros(1, RECORD)[0]
+    record["iterations"], record["factor_step"], record["step"] = iterations, factor_step, step
+    return record
+
+
+def test_the_sum_begins_anew_with_the_factor_and_comes_back_where_there_is_none():
+    sim = falling(update="async")
+    driver = Driver(sim, Inline(patterns_of(sim)))
+    track, values = driver.tracks[0], driver._values(sim.world.bodies[0])
+    sim.engine.assemble()
+
+    def factor(step: int) -> Factor:
+        driver.inline.submit(Job("bar", 1, step, True, values))
+        return driver.inline.poll()[0]
+
+    assert track.came_in(factor(0), 1)
+    for step, iterations in ((1, 5), (2, 9), (3, 10)):
+        track.observe(solved(iterations, 0, step), 3, 1.0)
+    assert (track.excess, track.latest, track.lost) == (2 + 6 + 7, 7, 15)
+    track.went_out(3)
+    track.observe(solved(12, 0, 4), 3, 1.0)
+    assert (track.excess, track.latest) == (9, 9)
+    track.came_to_nothing("lost")
+    assert track.excess == 9 + 15, "nothing was done about it"
+    track.went_out(5)
+    track.observe(solved(20, 0, 6), 3, 1.0)
+    assert track.came_in(factor(5), 7)
+    assert (track.excess, track.latest, track.lost) == (2, 2, 0), "what the first solve with a new factor usually has"
+    track.observe(solved(40, 0, 7), 3, 1.0)  # made before the factor was taken up
+    assert (track.excess, track.latest, track.lost) == (2, 2, 0)
+    track.observe(solved(4, 5, 8), 3, 1.0)
+    assert (track.excess, track.latest, track.lost) == (1, 1, 1)
 
 
 def test_a_poisoned_factor_that_reached_the_loop_is_counted_as_refused():
