@@ -27,6 +27,9 @@ class Refusal:
     time: float
     J: float
 
+    def __str__(self) -> str:
+        return f"element {self.element} has J = {self.J:.3g}, which {self.effect} does not define"
+
 
 class Effect:
     """Base of all effects. A file under effects/ has `build(world, listed) -> Effect`.

@@ -81,7 +81,9 @@ class Law:
 
     pack: values of the constants, (m,) each -> (k, m) in the order of the kernel text. elastic: the Young's modulus
     [Pa] and Poisson's ratio that it has at small strains. axes: (m, 3, 3) material axes in columns, or None. text:
-    path of the kernel text. refuses: J <= 0 is not defined. regularizes: unless the scene asks for it."""
+    path of the kernel text. refuses: J <= 0 is not defined. regularizes: the text takes a floor of J, and where the
+    law refuses the scene may ask for it.
+    """
 
     name: str
     constants: Sequence[Constant]
@@ -181,16 +183,20 @@ class Hyperelastic(Tetrahedra):
         w = self.world
         elements = w.backend.module(self.law.path).bind(
             "elements", len(self.elements), projection=PROJECTIONS[w.projection], tets=self.elements, x=w.x,
-            gradients=self.gradients, volume=self.volume, constants=self.constants, floor=self.floor,
-            clock=system.clock, refused=self.refused, corners=self.corners, edges=self.edges, **self._of_a_step(),
+            gradients=self.gradients, volume=self.volume, constants=self.constants,
+            clock=system.clock, refused=self.refused, corners=self.corners, edges=self.edges, **self._floor(),
+            **self._of_a_step(),
         )  # fmt: skip
         return [elements, *self.gathers(system, stencil, accumulate)]
+
+    def _floor(self) -> dict[str, Any]:
+        return {"floor": self.floor} if self.law.regularizes else {}
 
     def energy(self) -> float:
         """sum V W [J]; NaN where an element has a deformation that the law does not define."""
         self.world.backend.module(self.law.path).bind(
             "energy", len(self.elements), tets=self.elements, x=self.world.x, gradients=self.gradients,
-            volume=self.volume, constants=self.constants, floor=self.floor, energy=self._energy,
+            volume=self.volume, constants=self.constants, energy=self._energy, **self._floor(),
         )()  # fmt: skip
         return float(self.world.backend.fetch(self._energy).sum())
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from sim_server.backend import Cpu, Launch
-from sim_server.effect import Effect
+from sim_server.effect import Effect, Refusal
 from sim_server.effects import effect
 from sim_server.engine import Engine, Kind
 from sim_server.errors import DeviceError, InputError
@@ -111,6 +111,11 @@ class Simulation:
         native.tolerance, native.max_iterations = solver.tolerance, solver.max_iterations
         native.budget, native.warm_start = solver.budget, int(solver.warm_start)
         native.kind, native.omega = KINDS.get(solver.preconditioner, Kind.CHOLESKY), solver.omega
+
+    def refusals(self) -> list[Refusal]:
+        """Elements in states that their law does not define, by the time at which they had them first."""
+        found = [r for e in self.effects.values() for r in e.refusals()]
+        return sorted(found, key=lambda r: r.time)
 
     def potential_energy(self) -> float:
         """Of all effects [J]."""

@@ -204,8 +204,7 @@ class Telemetry:
             name = self.simulation.world.bodies[int(r["body"])].name
             if name not in self._bad:
                 self._bad.add(name)
-                lines.append(
-                    f"object {name!r}, step {int(r['step'])}: force is not finite at node {int(r['bad_node'])}; "
-                    "its velocity is left as it was"
-                )
+                refused = [x for x in self.simulation.refusals() if x.body == int(r["body"])]
+                why = str(refused[0]) if refused else f"force is not finite at node {int(r['bad_node'])}"
+                lines.append(f"object {name!r}, step {int(r['step'])}: {why}; its velocity is left as it was")
         return lines

@@ -183,6 +183,91 @@ INLINE void principal_edges(const Principal<T>& p, const Modes<T>& m, T k, const
     }
 }
 
+// --- any law: the eigensystem by Jacobi's method --------------------------------------------------------------------------------
+
+// a, symmetric (9, 9), becomes its projection. Rows of v are eigenvectors.
+template <class T> OUT_OF_LINE void project9(T (&a)[9][9], int projection) {
+    const entry<T> eps = single<T> ? (entry<T>)1e-14 : (entry<T>)1e-30;
+    const T tiny = T{} + (single<T> ? (entry<T>)1e-37 : (entry<T>)1e-300);
+    T v[9][9];
+    for (int r = 0; r < 9; ++r)
+        for (int c = 0; c < 9; ++c) v[r][c] = T{} + (entry<T>)(r == c);
+    for (int sweep = 0; sweep < 12; ++sweep) {
+        T off = T{}, on = T{};
+        for (int r = 0; r < 9; ++r) {
+            on += a[r][r] * a[r][r];
+            for (int c = 0; c < r; ++c) off += a[r][c] * a[r][c];
+        }
+        auto settled = !(off > eps * on);
+        if (!any(off > eps * on)) break;
+        for (int p = 0; p < 8; ++p) {
+            for (int q = p + 1; q < 9; ++q) {
+                T d = a[q][q] - a[p][p], pq = a[p][q], size = magnitude(d) + sqrt(d * d + 4 * pq * pq) + tiny;
+                T t = (d < 0 ? -2 * pq : 2 * pq) / size;
+                t = settled ? T{} : t;
+                T c = 1 / sqrt(1 + t * t), s = t * c;
+                for (int k = 0; k < 9; ++k) {
+                    T x = a[k][p], y = a[k][q];
+                    a[k][p] = c * x - s * y;
+                    a[k][q] = s * x + c * y;
+                }
+                for (int k = 0; k < 9; ++k) {
+                    T x = a[p][k], y = a[q][k];
+                    a[p][k] = c * x - s * y;
+                    a[q][k] = s * x + c * y;
+                    T z = v[p][k], w = v[q][k];
+                    v[p][k] = c * z - s * w;
+                    v[q][k] = s * z + c * w;
+                }
+            }
+        }
+    }
+    T l[9];
+    for (int k = 0; k < 9; ++k) l[k] = projected(a[k][k], projection);
+    for (int r = 0; r < 9; ++r) {
+        for (int c = 0; c <= r; ++c) {
+            T sum = T{};
+            for (int k = 0; k < 9; ++k) sum += l[k] * v[k][r] * v[k][c];
+            a[r][c] = a[c][r] = sum;
+        }
+    }
+}
+
+// Blocks m (3, 3 of corners 1, 2, 3) = (X (x) I) K (X (x) I)^T
+template <class T> INLINE void congruent(const mat<T>& X, T (&K)[9][9]) {
+    for (int c = 0; c < 9; ++c) {
+        for (int d = 0; d < 3; ++d) {
+            T u = K[d][c], v = K[3 + d][c], w = K[6 + d][c];
+            for (int k = 0; k < 3; ++k) K[3 * k + d][c] = X.m[3 * k] * u + X.m[3 * k + 1] * v + X.m[3 * k + 2] * w;
+        }
+    }
+    for (int r = 0; r < 9; ++r) {
+        for (int d = 0; d < 3; ++d) {
+            T u = K[r][d], v = K[r][3 + d], w = K[r][6 + d];
+            for (int k = 0; k < 3; ++k) K[r][3 * k + d] = X.m[3 * k] * u + X.m[3 * k + 1] * v + X.m[3 * k + 2] * w;
+        }
+    }
+}
+
+// The edges with d2W/dF2 projected: to it from the stiffness of three corners by the rest edges, and back by the gradients.
+template <class T> OUT_OF_LINE void project_edges(const vec<T> (&D)[4], int projection, Blocks6<T>& B) {
+    T K[9][9];
+    for (int r = 0; r < 9; ++r)
+        for (int c = 0; c < 9; ++c) K[r][c] = r >= c ? corner_entry(B, r, c) : corner_entry(B, c, r);
+    vec<T> x = cross(D[2], D[3]), y = cross(D[3], D[1]), z = cross(D[1], D[2]);
+    T det = dot(D[1], x);
+    x = (1 / det) * x; y = (1 / det) * y; z = (1 / det) * z;
+    congruent(mat<T>{{x.x, y.x, z.x, x.y, y.y, z.y, x.z, y.z, z.z}}, K);
+    project9(K, projection);
+    congruent(mat<T>{{D[1].x, D[1].y, D[1].z, D[2].x, D[2].y, D[2].z, D[3].x, D[3].y, D[3].z}}, K);
+    for (int e = 0; e < 6; ++e) {
+        for (int m = 0; m < 9; ++m) {
+            int r = m / 3, c = 3 * edge_second(e) - 3 + m % 3;
+            B.e[e].m[m] = e < 3 ? -(K[r][c] + K[3 + r][c] + K[6 + r][c]) : K[3 * edge_first(e) - 3 + r][c];
+        }
+    }
+}
+
 // --- functions of J that laws have, and what becomes of them below a floor ---------------------------------------------------
 
 // f, f', f'' at J. Below `floor` > 0: the parabola that f has at the floor, so that W stays twice continuously differentiable
@@ -200,10 +285,21 @@ template <class T> INLINE Jet<T> logarithm(T J, T floor) {
     return below({log(base), inverse, -inverse * inverse}, J, floor);
 }
 
-// J^p; `value`: base^p with base = max(J, floor)
-template <class T> INLINE Jet<T> power(entry<T> p, T value, T inverse, T J, T floor) {
-    T d = p * value * inverse;
-    return below({value, d, (p - 1) * d * inverse}, J, floor);
+// Powers J^(-2 i / 3), as isochoric invariants have them.
+template <class T> struct Thirds {
+    T root, inverse, J, floor;  // base^(-2/3) and 1 / base, base = max(J, floor)
+    INLINE_MEMBER Jet<T> minus(int i) const {
+        T value = root;
+        UNROLL for (int k = 1; k < i; ++k) value = value * root;
+        const entry<T> p = (entry<T>)(-2. * i / 3);
+        T d = p * value * inverse;
+        return below({value, d, (p - 1) * d * inverse}, J, floor);
+    }
+};
+
+template <class T> INLINE Thirds<T> thirds(T J, T floor) {
+    T base = larger(J, floor), r = 1 / cbrt(base);
+    return {r * r, 1 / base, J, floor};
 }
 
 // --- what an element leaves for nodes and blocks ------------------------------------------------------------------------------

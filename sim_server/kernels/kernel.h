@@ -30,6 +30,8 @@
 #ifdef __CUDACC_RTC__
 
 #define INLINE __device__ __forceinline__
+#define INLINE_MEMBER __device__ __forceinline__
+#define OUT_OF_LINE __device__ __noinline__  // rare and large: its registers would be everybody's
 #define UNROLL _Pragma("unroll")
 typedef real number;
 typedef local local_number;
@@ -70,6 +72,8 @@ template <class T> using own = T*;
 
 #include <cmath>
 #define INLINE static inline __attribute__((always_inline))
+#define INLINE_MEMBER inline __attribute__((always_inline))
+#define OUT_OF_LINE static __attribute__((noinline, unused))
 #define UNROLL _Pragma("GCC unroll 16")
 template <class T> using own = T*;
 template <class T> using entry = real;

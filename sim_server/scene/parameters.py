@@ -88,6 +88,7 @@ def _found(name: str, info: ValidationInfo) -> str:
 
 Vector = Annotated[tuple[float, float, float], BeforeValidator(as_tuple)]
 Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
 Sizes = Annotated[tuple[Positive, Positive, Positive], BeforeValidator(as_tuple)]
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
 Counts = Annotated[tuple[Count, Count, Count], BeforeValidator(as_tuple)]

@@ -51,7 +51,7 @@ def parabola(f: Callable[[Any], Any], first: float, second: float, floor: float,
 def regularized_neo_hookean(F: Any, young: float, poisson: float, floor: float) -> Any:
     lam, mu = lame(young, poisson)
     I1, _, J = strain_invariants(F)
-    L = parabola(np.log, 1 / floor, -1 / floor**2, floor, J)
+    L = regularized_logarithm(floor, J)
     return mu / 2 * (I1 - 3) - mu * L + lam / 2 * L**2
 
 
@@ -61,6 +61,80 @@ def stable_neo_hookean(F: Any, young: float, poisson: float) -> Any:
     I1, _, J = strain_invariants(F)
     a = 1 + 3 * m / (4 * k)
     return m / 2 * (I1 - 3) - m / 2 * np.log((I1 + 1) / 4) + k / 2 * (J - a) ** 2 - k / 2 * (1 - a) ** 2
+
+
+def mooney_rivlin(F: Any, c1: float, c2: float, bulk: float) -> Any:
+    I1, I2, J = strain_invariants(F)
+    return c1 * (J ** (-2 / 3) * I1 - 3) + c2 * (J ** (-4 / 3) * I2 - 3) + bulk / 2 * np.log(J) ** 2
+
+
+CHAIN = (1 / 2, 1 / 20, 11 / 1050, 19 / 7000, 519 / 673750)
+
+
+def arruda_boyce(F: Any, shear: float, segments: float, bulk: float) -> Any:
+    I1, _, J = strain_invariants(F)
+    I1 = J ** (-2 / 3) * I1
+    terms = [a / segments ** (i - 1) * (I1**i - 3**i) for i, a in enumerate(CHAIN, 1)]
+    return shear * sum(terms) + bulk / 2 * np.log(J) ** 2
+
+
+def veronda_westmann(F: Any, c1: float, c2: float, bulk: float) -> Any:
+    I1, I2, J = strain_invariants(F)
+    I1, I2 = J ** (-2 / 3) * I1, J ** (-4 / 3) * I2
+    return c1 * (np.exp(c2 * (I1 - 3)) - 1) - c1 * c2 / 2 * (I2 - 3) + bulk / 2 * np.log(J) ** 2
+
+
+def regularized_power(p: float, floor: float, J: Any) -> Any:
+    return parabola(lambda J: J**p, p * floor ** (p - 1), p * (p - 1) * floor ** (p - 2), floor, J)
+
+
+def regularized_logarithm(floor: float, J: Any) -> Any:
+    return parabola(np.log, 1 / floor, -1 / floor**2, floor, J)
+
+
+def regularized_mooney_rivlin(F: Any, c1: float, c2: float, bulk: float, floor: float) -> Any:
+    I1, I2, J = strain_invariants(F)
+    f, g, L = regularized_power(-2 / 3, floor, J), regularized_power(-4 / 3, floor, J), regularized_logarithm(floor, J)
+    return c1 * (f * I1 - 3) + c2 * (g * I2 - 3) + bulk / 2 * L**2
+
+
+def ogden(F: Any, mu: list[float], alpha: list[float], bulk: float) -> Any:
+    """By the eigenvalues of C, so that complex steps work."""
+    J = determinant(F)
+    squares = eigenvalues(F.T @ F)
+    W = bulk / 2 * np.log(J) ** 2
+    for m, a in zip(mu, alpha, strict=True):
+        W = W + m / a * (J ** (-a / 3) * sum(s ** (a / 2) for s in squares) - 3)
+    return W
+
+
+def eigenvalues(C: Any) -> Any:
+    """Of a symmetric matrix with an imaginary part far below rounding: first order in it is exact."""
+    real, vectors = np.linalg.eigh(np.real(C))
+    return real + 1j * np.einsum("ik,ij,jk->k", vectors, np.imag(C), vectors)
+
+
+def costa(F: Any, a: float, b: dict[str, float], bulk: float, axes: Array) -> Any:
+    """axes: columns f, s, n."""
+    E = axes.T @ (F.T @ F - np.eye(3)) @ axes / 2
+    J = determinant(F)
+    Q = sum(
+        b["".join(sorted((p, q), key="fsn".index))] * E["fsn".index(p), "fsn".index(q)] ** 2
+        for p in "fsn"
+        for q in "fsn"
+    )
+    return a / 2 * (np.exp(Q) - 1) + bulk * (J * np.log(J) - J + 1)
+
+
+def fibres(F: Any, stiffness: float, exponent: float, directions: Array) -> Any:
+    W = 0.0
+    for direction in directions:
+        a = direction / np.linalg.norm(direction)
+        I4 = a @ F.T @ F @ a
+        if np.real(I4) > 1:
+            y = (I4 - 1) ** 2
+            W = W + (stiffness / (2 * exponent) * (np.exp(exponent * y) - 1) if exponent else stiffness / 2 * y)
+    return W
 
 
 # --- derivatives and elements -----------------------------------------------------------------------------------------

@@ -1,0 +1,26 @@
+// SPDX-License-Identifier: MIT
+// W = c1 (exp(c2 (J^-2/3 I1 - 3)) - 1) - c1 c2 / 2 (J^-4/3 I2 - 3) + bulk/2 ln^2 J
+constexpr int CONSTANTS = 3;  // c1 [Pa], c2 [-], bulk [Pa]
+constexpr unsigned HAS = W_1 | W_2 | W_J | W_11 | W_1J | W_2J | W_JJ;
+constexpr bool REFUSES = true;
+
+template <class T> INLINE T density(const T (&c)[CONSTANTS], const Invariants<T>& q, T floor) {
+    Thirds<T> r = thirds(q.J, floor);
+    T L = logarithm(q.J, floor).f, half = T{} + (entry<T>)0.5;
+    return c[0] * (exp(c[1] * (r.minus(1).f * q.I1 - 3)) - 1) - half * c[0] * c[1] * (r.minus(2).f * q.I2 - 3) + half * c[2] * L * L;
+}
+
+template <class T> INLINE Slopes<T> slopes(const T (&c)[CONSTANTS], const Invariants<T>& q, T floor) {
+    Thirds<T> r = thirds(q.J, floor);
+    Jet<T> A = r.minus(1), B = r.minus(2), L = logarithm(q.J, floor);
+    T e = c[0] * c[1] * exp(c[1] * (A.f * q.I1 - 3)), s = (entry<T>)-0.5 * c[0] * c[1], dI = A.d * q.I1;
+    Slopes<T> w = {};
+    w.w1 = e * A.f;
+    w.w11 = e * c[1] * A.f * A.f;
+    w.w1J = e * A.d * (1 + c[1] * A.f * q.I1);
+    w.w2 = s * B.f;
+    w.w2J = s * B.d;
+    w.wJ = e * dI + w.w2J * q.I2 + c[2] * L.f * L.d;
+    w.wJJ = e * (A.dd * q.I1 + c[1] * dI * dI) + s * B.dd * q.I2 + c[2] * (L.d * L.d + L.f * L.dd);
+    return w;
+}

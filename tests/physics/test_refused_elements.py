@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: MIT
+"""J <= 0 in laws with powers or a logarithm of J: the solve ends, the run does not, and the element is named."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from protocol.messages_pb2 import SolveStatus
+from sim_server.driver import Driver
+from sim_server.telemetry import Telemetry
+from tests.physics.laws import LAWS, Law, determinants, forces, law_bar, stiffness
+
+REFUSING = {name: law for name, law in LAWS.items() if not law.inverts}
+refusing = pytest.mark.parametrize("law", REFUSING.values(), ids=REFUSING.keys())
+
+
+def pushed_through(law: Law, **scene):
+    """A bar with one element just turned over, by its corner at (1, 1, 1) of the first cell."""
+    sim = law_bar(law, cells=(2, 1, 1), size=(2, 1, 1), **scene)
+    corner = int(np.argmin(np.abs(sim.world.rest - [0, 1, 1]).sum(axis=1)))
+    sim.world.x[corner] += [1.2, -0.3, -0.2]
+    bad = np.flatnonzero(determinants(sim) <= 0)
+    assert 0 < len(bad) < 12
+    return sim, sorted(sim.effects[law.name].number[bad])
+
+
+@refusing
+def test_the_element_is_named_and_the_run_goes_on(law):
+    sim, bad = pushed_through(law)
+    sim.world.v[:, 1] = 0.25
+    x = sim.world.x.copy()
+    records = Driver(sim).advance(3)
+    assert (records["status"] == SolveStatus.NOT_FINITE).all() and (records["bad_node"] >= 0).all()
+    assert (sim.world.v == [0, 0.25, 0]).all()  # as it was
+    np.testing.assert_allclose(sim.world.x, x + [0, 3 * 0.02 * 0.25, 0], rtol=1e-14)
+    assert [r.element for r in sim.refusals()] == bad
+    first = sim.refusals()[0]
+    assert (first.effect, first.body, first.time) == (law.name, 0, 0.0)
+    J = determinants(sim)[list(sim.effects[law.name].number).index(first.element)]
+    assert first.J == pytest.approx(J, rel=1e-12)
+    lines = Telemetry.bad_steps(SimpleNamespace(simulation=sim, _bad=set()), records)  # type: ignore[arg-type]
+    assert lines == [
+        f"object 'bar', step 1: element {bad[0]} has J = {J:.3g}, which {law.name} does not define; "
+        "its velocity is left as it was"
+    ]
+
+
+@refusing
+def test_the_matrix_stays_finite_and_the_energy_is_no_number(law):
+    sim, _ = pushed_through(law)
+    assert np.isfinite(stiffness(sim)).all()
+    assert np.linalg.eigvalsh(stiffness(sim))[0] > -1e-9
+    assert np.isnan(sim.potential_energy())
+
+
+def test_other_bodies_and_later_times():
+    """A body that is pressed through itself while the run lasts; its neighbour takes no notice."""
+    law = LAWS["neo_hookean"]
+    sim, _ = pushed_through(law)
+    sim.world.x[:] = sim.world.rest
+    assert (Driver(sim).advance(4)["status"] == SolveStatus.CONVERGED).all() and sim.refusals() == []
+    sim.world.x[0] += [1.5, 0.3, 0.2]
+    assert Driver(sim).advance(1)["status"][0] == SolveStatus.NOT_FINITE
+    assert [r.time for r in sim.refusals()] == pytest.approx([4 * 0.02] * len(sim.refusals())) and sim.refusals()
+
+
+@pytest.mark.parametrize("name", ["neo_hookean, regularized", "mooney_rivlin, regularized"])
+def test_regularized_laws_bring_the_element_back(name):
+    sim, _ = pushed_through(LAWS[name], damping=(2.0, 0.0), dt=0.01)
+    records = Driver(sim).advance(300)
+    assert (records["status"] == SolveStatus.CONVERGED).all() and sim.refusals() == []
+    assert determinants(sim).min() > 0.5
+    rest = forces(sim)
+    assert np.abs(rest).max() < 1e-2 * 3e4
