@@ -16,6 +16,7 @@ Preconditioner = Literal[
 ]
 PRECONDITIONERS: tuple[str, ...] = get_args(Preconditioner)
 FACTORS = ("cholesky", "incomplete_cholesky", "ssor_factor")  # made elsewhere, from an older matrix
+CPU_ONLY = ("ssor", "ssor_factor", "incomplete_cholesky")  # sweeps and sparse solves follow one row after another
 
 
 class Update(NamedTuple):
@@ -68,7 +69,7 @@ FactorPrecision = Literal["auto", "float16", "float32", "float64"]
 _ONLY: dict[str, dict[str, tuple[str, ...]]] = {  # what the devices have
     "preconditioner": {
         "cpu": PRECONDITIONERS,
-        "gpu": tuple(p for p in PRECONDITIONERS if p not in ("ssor", "ssor_factor", "incomplete_cholesky")),
+        "gpu": tuple(p for p in PRECONDITIONERS if p not in CPU_ONLY),
     },
     "precision": {"cpu": ("float64",), "gpu": ("float64", "mixed", "float32")},
     "factor_precision": {"cpu": ("auto", "float32", "float64"), "gpu": ("auto", "float16", "float32")},
@@ -83,7 +84,7 @@ class Solver(Parameters):
     preconditioner: Annotated[Preconditioner, PlainValidator(_preconditioner)] = "auto"
     omega: float = Field(default=1.0, gt=0, lt=2, description="relaxation of ssor and ssor_factor")
     drop_tolerance: float = Field(
-        default=0.005, ge=0, lt=1, description="of a row's norm; incomplete_cholesky leaves out smaller blocks of L"
+        default=0.003, ge=0, lt=1, description="of a row's norm; incomplete_cholesky leaves out smaller blocks of L"
     )
     fill: float = Field(
         default=10.0, ge=0, le=1e6, description="most blocks of a column of incomplete_cholesky, in A's; 0 = no bound"

@@ -116,9 +116,10 @@ def table2(setting: Setting, device: str) -> list[dict[str, Any]]:
     return rows
 
 
-def available() -> list[str]:
-    """Those of table 5 that this version has."""
-    return [name for name in PRECONDITIONERS if name in solver_options.PRECONDITIONERS]
+def available(device: str = "cpu") -> list[str]:
+    """Those of table 5 that this version has on a device."""
+    there = set(solver_options.PRECONDITIONERS) - set(solver_options.CPU_ONLY if device == "gpu" else ())
+    return [name for name in PRECONDITIONERS if name in there]
 
 
 def extrapolations(setting: Setting, device: str) -> list[dict[str, Any]]:
@@ -158,7 +159,7 @@ def table5(setting: Setting, device: str) -> list[dict[str, Any]]:
     cases = {
         (how, name): (beam, LOADS[1], Way(name, *update))
         for how, update in updates.items()
-        for name in available()
+        for name in available(device)
         if how == "standard" or name in solver_options.FACTORS  # the others are not made by workers
     }
     found = measured({" ".join(key): case for key, case in cases.items()}, setting, device)

@@ -12,7 +12,8 @@ from typing import Any
 
 from tests.bench.report import ROOT, table
 
-PAGES = ("cpu", "gpu", "models", "paper", "figure4", "accuracy", "hard_cases", "scheduler", "scaling", "faults")
+FIRST = ("cpu", "gpu", "models", "paper", "figure4", "preconditioners")
+PAGES = (*FIRST, "accuracy", "hard_cases", "scheduler", "scaling", "faults")
 README = ROOT / "README.md"
 
 

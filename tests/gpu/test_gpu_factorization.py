@@ -161,7 +161,9 @@ def test_too_little_memory_is_said_with_sizes_and_the_rest_goes_on(monkeypatch):
     values = fine.factorize(matrix)
     pool = cupy().get_default_memory_pool()
     with monkeypatch.context() as patch:
-        patch.setattr(runtime, "memGetInfo", lambda: (1000 - pool.free_bytes(), 1 << 34))  # what the pool has counts too
+        patch.setattr(
+            runtime, "memGetInfo", lambda: (1000 - pool.free_bytes(), 1 << 34)
+        )  # what the pool has counts too
         with pytest.raises(MemoryError, match=r"GPU memory: this object needs 0\.\d\d GiB, 0\.00 of 16\.0 GiB"):
             small.factorize(matrix)
         assert np.array_equal(fine.factorize(matrix), values)

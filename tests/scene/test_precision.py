@@ -10,6 +10,9 @@ from tests.scenes import bar, simulation
 WRONG = {
     ("precision", "mixed", "cpu"): "solver.precision = 'mixed': must be one of 'float64' on a CPU",
     ("precision", "float32", "cpu"): "solver.precision = 'float32': must be one of 'float64' on a CPU",
+    ("preconditioner", "ssor", "gpu"): "must be one of 'auto', 'none', 'jacobi', 'block_jacobi', 'cholesky' on a GPU",
+    ("preconditioner", "ssor_factor", "gpu"): "solver.preconditioner = 'ssor_factor': must be one of",
+    ("preconditioner", "incomplete_cholesky", "gpu"): "solver.preconditioner = 'incomplete_cholesky': must be one of",
     ("factor_precision", "float16", "cpu"): "must be one of 'auto', 'float32', 'float64' on a CPU",
     ("factor_precision", "float64", "gpu"): "must be one of 'auto', 'float16', 'float32' on a GPU",
 }

@@ -51,7 +51,7 @@ def test_defaults_and_resolved(tmp_path):
             "max_iterations": 500,
             "preconditioner": "auto",
             "omega": 1.0,
-            "drop_tolerance": 0.005,
+            "drop_tolerance": 0.003,
             "fill": 10.0,
             "warp": "auto",
             "warp_level": 1,
