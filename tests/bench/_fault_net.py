@@ -66,6 +66,12 @@ class Cable:
         command("tc", "qdisc", "replace", "dev", NEAR, *netem)
         command(*self.far, "tc", "qdisc", "replace", "dev", FAR, *netem)
 
+    def pace(self, megabits: int) -> None:
+        """At most so many a second each way; raises Unavailable where the kernel has no token bucket."""
+        bucket = ("root", "tbf", "rate", f"{megabits}mbit", "burst", "256kb", "latency", "50ms")
+        command("tc", "qdisc", "replace", "dev", NEAR, *bucket)
+        command(*self.far, "tc", "qdisc", "replace", "dev", FAR, *bucket)
+
     def mend(self) -> None:
         """No loss and no delay any more."""
         for words in (

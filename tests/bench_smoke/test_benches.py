@@ -79,6 +79,17 @@ def test_faults_with_real_workers_miss_no_step(tmp_path: Path) -> None:
     assert "kill -9 of the worker" in (tmp_path / "faults.md").read_text()
 
 
+@pytest.mark.system
+def test_build_with_a_real_worker(tmp_path: Path) -> None:
+    data = bench("build", tmp_path)["data"]
+    of = {(row["link"], row["assembled by"]): row for row in data["rows"]}
+    assert all(row["unconverged"] == 0 for row in data["rows"])
+    for link in ("shared memory", "bytes, same host"):
+        assert of[link, "worker"]["bytes a job"] * 20 < of[link, "server"]["bytes a job"]
+        assert of[link, "worker"]["factors a second"] > 0
+    assert (tmp_path / "build.png").read_bytes().startswith(b"\x89PNG")
+
+
 def test_reference_of_accuracy_is_no_competitor(tmp_path: Path) -> None:
     """PCG-1 against a reference of its own would show an error of exactly 0 at any tolerance."""
     data = bench("accuracy", tmp_path, "--no-processes")["data"]

@@ -38,7 +38,7 @@ def test_the_element_is_named_and_the_run_goes_on(law):
     first = sim.refusals()[0]
     assert (first.effect, first.body, first.time) == (law.name, 0, 0.0)
     expected = determinants(sim)[list(sim.effects[law.name].number).index(first.element)]
-    assert first.J == pytest.approx(expected, rel=1e-12)
+    assert pytest.approx(expected, rel=1e-12) == first.J
     lines = Telemetry.bad_steps(SimpleNamespace(simulation=sim, _bad=set()), records)  # type: ignore[arg-type]
     assert lines == [
         f"object 'bar', step 1: element {bad[0]} has J = {expected:.3g}, which {law.name} does not define; "
