@@ -249,7 +249,7 @@ NODES = [
     ("effects/corotational_exact_nodes.cu", "Gather", "corotational_exact_nodes.gather"),
     ("effects/mass_spring_nodes.cu", "Gather", "mass_spring_nodes.gather"),
     ("effects/touch.cu", "Apply", "touch.apply", True), ("effects/gravity.cu", "Gravity", "gravity.gravity"),
-    ("kernels/shape.cu", "Shape", "shape.shape"),
+    ("kernels/corner_rows.cu", "Gather", "corner_rows.gather"), ("kernels/shape.cu", "Shape", "shape.shape"),
     ("kernels/nodes.cu", "Turn", "nodes.turn"),
 ]  # fmt: skip
 ELEMENTS = [
@@ -258,16 +258,22 @@ ELEMENTS = [
     ("effects/corotational_exact.cu", "Elements", "corotational_exact.elements"),
     ("effects/mass_spring.cu", "Springs", "mass_spring.springs"),
 ]  # fmt: skip
+LAW_ELEMENTS = [
+    (f"{FRAME}+effects/neo_hookean.cuh", "Elements", "neo_hookean.elements"),
+    (f"{FRAME}+effects/mooney_rivlin.cuh", "Elements", "mooney_rivlin.elements"),
+    ("effects/fibres.cu", "Elements", "fibres.elements"),
+]
 BLOCKS = [
     ("effects/corotational_blocks.cu", "Blocks", "corotational_blocks.blocks"),
     ("effects/corotational_exact_blocks.cu", "Blocks", "corotational_exact_blocks.blocks"),
     ("effects/mass_spring_blocks.cu", "Blocks", "mass_spring_blocks.blocks"),
+    ("kernels/edge_rows.cu", "Blocks", "edge_rows.blocks"),
     ("kernels/assemble.cu", "Assemble", "assemble.assemble"),
 ]
 
 
 @pytest.mark.parametrize(("real", "local"), [("double", "double"), ("double", "float"), ("float", "float")])
-@pytest.mark.parametrize("group", [NODES, BLOCKS, ELEMENTS], ids=["nodes", "blocks", "elements"])
+@pytest.mark.parametrize("group", [NODES, BLOCKS, ELEMENTS, LAW_ELEMENTS], ids=["nodes", "blocks", "elements", "laws"])
 def test_launches_put_together_compile_in_every_precision(group, real, local, tmp_path):
     """With rows in registers, and one argument for each array whatever launches have it."""
     if (library := nvrtc.library()) is None:
@@ -278,7 +284,7 @@ def test_launches_put_together_compile_in_every_precision(group, real, local, tm
     private = fuse._private(launches, launches)  # type: ignore[arg-type]
     shape = fuse.Shape(64, 4)
     made = fuse.Text(launches, shape, None, private)  # type: ignore[arg-type]
-    assert (group is ELEMENTS or private) and made.source.count("[3];") >= len(private)
+    assert (group in (ELEMENTS, LAW_ELEMENTS) or private) and made.source.count("[3];") >= len(private)
     text = tmp_path / "together.cu"
     text.write_text(made.source)
     options = ["-arch=sm_90", "-std=c++17", f"-Dreal={real}", f"-Dlocal={local}", f"-I{backend.INCLUDE}"]
