@@ -150,7 +150,7 @@ class Tetrahedra(Effect):
         """What collects corners and edges into the system."""
         w, m = self.world, len(self.elements)
         gather = w.backend.module("kernels/corner_rows.cu").bind(
-            "gather", w.nodes, elements=m, start=stencil.corner_start, slots=stencil.corners, corners=self.corners,
+            "gather", w.nodes, elements=m, start=stencil.corner_start, slots=stencil.corners, rows=self.corners,
             b=system.b, block=system.block,
         )  # fmt: skip
         blocks = w.backend.module("kernels/edge_rows.cu").bind(

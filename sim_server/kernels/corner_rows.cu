@@ -8,14 +8,14 @@ struct Gather {
     int elements;
     const int* start;     // (n + 1,) into slots
     const int* slots;     // (start[n],) 4 e + a: corner a of element e is at the node
-    const local* corners; // (4, elements, 9) push [N s], upper triangle of the corner's own block [kg]
+    const local* rows;    // (4, elements, 9) push [N s], upper triangle of the corner's own block [kg]
     own<real> b;          // (n, 3) in, out: right-hand side, world frame [N s]
     own<local> block;     // (n, 6) in, out: upper triangle of the node's own block of A, world frame [kg]
 };
 
 INLINE void gather_add(const Gather& p, int, int k, local* sum) {
     int slot = p.slots[k];
-    const local* row = p.corners + 9 * ((long long)p.elements * (slot & 3) + (slot >> 2));
+    const local* row = p.rows + 9 * ((long long)p.elements * (slot & 3) + (slot >> 2));
     for (int m = 0; m < 9; ++m) sum[m] += row[m];
 }
 
