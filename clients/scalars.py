@@ -31,6 +31,8 @@ DTYPES: dict[str, str] = {
     "fallbacks": "i8",
     "excess": "f8",
     "factor_age_bound": "i8",  # steps; -1: none known
+    "linearizations": "i8",  # of Newton-Raphson; 0: the scene has one a step
+    "nonlinear_residual": "f8",  # of the step's first |b|
 }
 
 

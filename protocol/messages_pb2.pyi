@@ -15,12 +15,14 @@ class SolveStatus(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     BREAKDOWN_MATRIX: _ClassVar[SolveStatus]
     BREAKDOWN_PRECONDITIONER: _ClassVar[SolveStatus]
     NOT_FINITE: _ClassVar[SolveStatus]
+    MAX_LINEARIZATIONS: _ClassVar[SolveStatus]
 CONVERGED: SolveStatus
 MAX_ITERATIONS: SolveStatus
 BUDGET: SolveStatus
 BREAKDOWN_MATRIX: SolveStatus
 BREAKDOWN_PRECONDITIONER: SolveStatus
 NOT_FINITE: SolveStatus
+MAX_LINEARIZATIONS: SolveStatus
 
 class Header(_message.Message):
     __slots__ = ("protocol", "incarnation", "object", "epoch", "sequence")
@@ -233,7 +235,7 @@ class Echo(_message.Message):
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., slot: _Optional[_Union[Slot, _Mapping]] = ..., nonce: _Optional[int] = ...) -> None: ...
 
 class ObjectStep(_message.Message):
-    __slots__ = ("header", "step", "time", "iterations", "status", "residual", "factor_step", "factor_age", "preconditioner", "assemble_seconds", "solve_seconds", "integrate_seconds", "step_seconds", "late_seconds", "fallbacks", "excess", "interactions", "asked", "probe", "factor_age_bound", "cpu_seconds")
+    __slots__ = ("header", "step", "time", "iterations", "status", "residual", "factor_step", "factor_age", "preconditioner", "assemble_seconds", "solve_seconds", "integrate_seconds", "step_seconds", "late_seconds", "fallbacks", "excess", "interactions", "asked", "probe", "factor_age_bound", "cpu_seconds", "linearizations", "nonlinear_residual")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     STEP_FIELD_NUMBER: _ClassVar[int]
     TIME_FIELD_NUMBER: _ClassVar[int]
@@ -255,6 +257,8 @@ class ObjectStep(_message.Message):
     PROBE_FIELD_NUMBER: _ClassVar[int]
     FACTOR_AGE_BOUND_FIELD_NUMBER: _ClassVar[int]
     CPU_SECONDS_FIELD_NUMBER: _ClassVar[int]
+    LINEARIZATIONS_FIELD_NUMBER: _ClassVar[int]
+    NONLINEAR_RESIDUAL_FIELD_NUMBER: _ClassVar[int]
     header: Header
     step: int
     time: float
@@ -276,7 +280,9 @@ class ObjectStep(_message.Message):
     probe: int
     factor_age_bound: int
     cpu_seconds: float
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., time: _Optional[float] = ..., iterations: _Optional[int] = ..., status: _Optional[_Union[SolveStatus, str]] = ..., residual: _Optional[float] = ..., factor_step: _Optional[int] = ..., factor_age: _Optional[int] = ..., preconditioner: _Optional[str] = ..., assemble_seconds: _Optional[float] = ..., solve_seconds: _Optional[float] = ..., integrate_seconds: _Optional[float] = ..., step_seconds: _Optional[float] = ..., late_seconds: _Optional[float] = ..., fallbacks: _Optional[int] = ..., excess: _Optional[float] = ..., interactions: _Optional[_Iterable[_Union[Interaction, _Mapping]]] = ..., asked: _Optional[str] = ..., probe: _Optional[int] = ..., factor_age_bound: _Optional[int] = ..., cpu_seconds: _Optional[float] = ...) -> None: ...
+    linearizations: int
+    nonlinear_residual: float
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., time: _Optional[float] = ..., iterations: _Optional[int] = ..., status: _Optional[_Union[SolveStatus, str]] = ..., residual: _Optional[float] = ..., factor_step: _Optional[int] = ..., factor_age: _Optional[int] = ..., preconditioner: _Optional[str] = ..., assemble_seconds: _Optional[float] = ..., solve_seconds: _Optional[float] = ..., integrate_seconds: _Optional[float] = ..., step_seconds: _Optional[float] = ..., late_seconds: _Optional[float] = ..., fallbacks: _Optional[int] = ..., excess: _Optional[float] = ..., interactions: _Optional[_Iterable[_Union[Interaction, _Mapping]]] = ..., asked: _Optional[str] = ..., probe: _Optional[int] = ..., factor_age_bound: _Optional[int] = ..., cpu_seconds: _Optional[float] = ..., linearizations: _Optional[int] = ..., nonlinear_residual: _Optional[float] = ...) -> None: ...
 
 class Steps(_message.Message):
     __slots__ = ("header", "steps")

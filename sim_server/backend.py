@@ -184,6 +184,12 @@ def arguments_of(
     return [(m, given[m.name]) for m in members], found.group(2), found.group(1) or ""
 
 
+def domain_of(text: str, struct: str) -> str:
+    """What the items of a kernel are: the first word behind `int n;` in its struct."""
+    found = re.search(rf"struct {struct} \{{\s*int n;\s*// (\w+)", text)
+    return found.group(1) if found else ""
+
+
 @dataclass
 class Launch:
     """One kernel with its arguments: what the native loop calls, `items` times."""
@@ -193,6 +199,7 @@ class Launch:
     params: ctypes.Structure
     items: int
     arrays: dict[str, np.ndarray]  # kept alive
+    domain: str = ""  # what its items are, as its text says
 
     def fetch(self, name: str) -> np.ndarray:
         """One of its arrays as kernels have left it."""
@@ -216,7 +223,7 @@ class Module:
 
     def bind(self, kernel: str, n: int, **arguments: Any) -> Launch:
         """Argument struct of `kernel` over `n` items; raises TypeError where an argument does not fit the text."""
-        fields, _, _ = arguments_of(
+        fields, struct, _ = arguments_of(
             self._text, kernel, self.name, {"real": self.real, "local": self.real}, {"n": n, **arguments}
         )
         layout = type(
@@ -230,7 +237,7 @@ class Module:
         arrays = {a.name: value for a, value in fields if a.dtype is not None}
         function = ctypes.cast(getattr(self._library, kernel), ctypes.c_void_p).value
         assert function is not None
-        return Launch(f"{self.name}.{kernel}", function, params, n, arrays)
+        return Launch(f"{self.name}.{kernel}", function, params, n, arrays, domain_of(self._text, struct))
 
 
 def build_id() -> str:

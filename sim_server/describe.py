@@ -117,6 +117,8 @@ def _step(names: list[str], kinds: dict[Kind, str], r: dict[str, Any]) -> pb.Obj
         fallbacks=r["fallbacks"],
         asked=kinds[Kind(r["asked"])] if r["asked"] != r["kind"] else "",
         probe=r["probe"],
+        linearizations=0 if r["nonlinear"] == -1 else r["linearizations"],
+        nonlinear_residual=0.0 if r["nonlinear"] == -1 else r["nonlinear"],
     )
 
 

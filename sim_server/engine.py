@@ -20,6 +20,7 @@ from sim_server import layouts
 from sim_server.backend import Launch, native
 from sim_server.layouts import RECORD
 from sim_server.rings import Reports
+from sim_server.scene.integrator_options import Integrator
 
 Reals = NDArray[np.float64]
 
@@ -46,10 +47,11 @@ def _library() -> c.CDLL:
             "wf_apply_factor": (None, [c.POINTER(layouts.Factor), p, p, p]), "wf_sizes": (c.c_int32, [p]),
         },
     )  # fmt: skip
-    sizes = (c.c_int32 * 6)()
+    sizes = (c.c_int32 * 8)()
     library.wf_sizes(sizes)
+    newton = [c.sizeof(layouts.Newton), c.sizeof(layouts.Search)]
     shared = (layouts.Launch, layouts.Body, layouts.Loop, layouts.Factor, layouts.Pattern)
-    layouts.check_sizes("native/loop.cpp", list(sizes), [*(c.sizeof(t) for t in shared), RECORD.itemsize])
+    layouts.check_sizes("native/loop.cpp", list(sizes), [*(c.sizeof(t) for t in shared), RECORD.itemsize, *newton])
     return library
 
 
@@ -100,16 +102,43 @@ class Mailbox:
     in_use: NativeFactor | None = None  # as far as the mailbox has told
 
 
+class Newton:
+    """Memory of the search for the state at the end of a step (native/newton.h).
+
+    options: of the scene, linearizations, trials, tolerance; reach [s]. parts: (bodies + 1,) items of each body, per
+    assembling launch, or None where they are not told apart. arrays: rotation (n, 3, 3), mass (n,), beta (n,), ahead,
+    drift, carried (n, 3).
+    """
+
+    def __init__(
+        self, options: Integrator, reach: float, parts: Sequence[NDArray[np.int32] | None], **arrays: Reals
+    ):  # fmt: skip
+        self._arrays, self._parts = arrays, parts
+        self._room = np.zeros((18, len(arrays["mass"])))
+        self.native = layouts.Newton(options.linearizations, options.trials, options.tolerance, reach)
+        for name, array in {**arrays, "room": self._room}.items():
+            setattr(self.native, name, array.ctypes.data)
+
+    def attach(self, loop: layouts.Loop, launches: Any) -> "Newton":
+        """To a loop and its launches."""
+        self._search = (layouts.Search * loop.bodies)()
+        self.native.search = self._search
+        loop.newton = c.pointer(self.native)
+        for launch, part in zip(launches, self._parts, strict=False):
+            launch.parts = None if part is None else part.ctypes.data
+        return self
+
+
 class Engine(Reports):
     """The loop over one system.
 
     assemble, integrate: the launches of a step, in order. ranges: nodes [first, last) of each body. arrays: those of
-    the system by name (row_start, columns, values, b, y, x, v, clock).
+    the system by name (row_start, columns, values, b, y, x, v, clock). newton: for several linearizations a step.
     """
 
     def __init__(
         self, assemble: Sequence[Launch], integrate: Sequence[Launch], ranges: Sequence[tuple[int, int]], dt: float,
-        records: int = 8192, frames: int = 8, threads: int = 1, **arrays: NDArray[Any],
+        records: int = 8192, frames: int = 8, threads: int = 1, newton: Newton | None = None, **arrays: NDArray[Any],
     ):  # fmt: skip
         self._native = _library()
         launches = [*assemble, *integrate]
@@ -134,20 +163,30 @@ class Engine(Reports):
         for name in ("row_start", "columns", "values", "b", "y", "x", "v", "clock"):
             setattr(loop, name, arrays[name].ctypes.data)
         loop.work, loop.threads = self._work.ctypes.data, threads
+        self._newton = newton and newton.attach(loop, self._launch)
+        self.begin: list[Launch] = []  # before the first step
 
     # --- running ------------------------------------------------------------------------------------------------
 
     def run(self, steps: int) -> int:
         """Runs up to `steps` steps without Python; returns those done (fewer only after `stop`)."""
+        self._begin()
         return int(self._native.wf_run(c.byref(self.loop), steps))
 
     def assemble(self) -> None:
         """First half of one step: the system matrix and right-hand side."""
+        self._begin()
         self._native.wf_assemble(c.byref(self.loop))
 
     def solve(self) -> None:
         """Second half: solve, integrate, report."""
         self._native.wf_solve(c.byref(self.loop))
+
+    def _begin(self) -> None:
+        """What a scheme makes of the state before the first step."""
+        if self.step == 0:
+            for launch in self.begin:
+                launch()
 
     def wait(self) -> bool:
         """Sleeps until the next step is due (real time) and while paused, as `run` does before each step.

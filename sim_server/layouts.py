@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Memory that the native loop and Python share, as ctypes and NumPy see it.
 
-The C++ side is native/rings.h and native/loop.cpp; sizes are compared when a library is loaded.
+The C++ side is native/rings.h and native/loop.h; sizes are compared when a library is loaded.
 """
 
 import ctypes as c
@@ -11,9 +11,9 @@ import numpy as np
 RECORD = np.dtype(
     [
         ("step", "i8"), ("factor_step", "i8"), ("time", "f8"), ("residual", "f8"), ("assemble", "f8"), ("solve", "f8"),
-        ("integrate", "f8"), ("whole", "f8"), ("late", "f8"), ("begin", "f8"), ("cpu", "f8"), ("body", "i4"),
-        ("iterations", "i4"), ("status", "i4"), ("kind", "i4"), ("asked", "i4"), ("fallbacks", "i4"),
-        ("bad_node", "i4"), ("probe", "i4"),
+        ("integrate", "f8"), ("whole", "f8"), ("late", "f8"), ("begin", "f8"), ("cpu", "f8"), ("nonlinear", "f8"),
+        ("body", "i4"), ("iterations", "i4"), ("status", "i4"), ("kind", "i4"), ("asked", "i4"), ("fallbacks", "i4"),
+        ("bad_node", "i4"), ("probe", "i4"), ("linearizations", "i4"), ("unused", "i4"),
     ]
 )  # fmt: skip
 """One body, one step: what a loop reports. Seconds, except step numbers; `step` counts completed steps.
@@ -61,7 +61,7 @@ class Binding(c.Structure):
 
 
 class Launch(c.Structure):
-    _fields_ = [("kernel", c.c_void_p), ("binding", c.c_void_p), ("mail", c.c_void_p)]
+    _fields_ = [("kernel", c.c_void_p), ("binding", c.c_void_p), ("mail", c.c_void_p), ("parts", c.c_void_p)]
 
 
 class Body(c.Structure):
@@ -72,13 +72,31 @@ class Body(c.Structure):
     ]  # fmt: skip
 
 
+class Search(c.Structure):
+    _fields_ = [
+        ("first", c.c_double), ("floor", c.c_double), ("last", c.c_double), ("slope", c.c_double),
+        ("scale", c.c_double), ("norm", c.c_double), ("residual", c.c_double), ("seconds", c.c_double),
+        ("phase", c.c_int32), ("linearizations", c.c_int32), ("tried", c.c_int32), ("iterations", c.c_int32),
+        ("status", c.c_int32), ("kind", c.c_int32), ("fallbacks", c.c_int32), ("unused", c.c_int32),
+    ]  # fmt: skip
+
+
+class Newton(c.Structure):
+    _fields_ = [
+        ("linearizations", c.c_int32), ("trials", c.c_int32), ("tolerance", c.c_double), ("reach", c.c_double),
+        ("rotation", c.c_void_p), ("mass", c.c_void_p), ("beta", c.c_void_p), ("ahead", c.c_void_p),
+        ("drift", c.c_void_p), ("carried", c.c_void_p), ("room", c.c_void_p), ("search", c.POINTER(Search)),
+    ]  # fmt: skip
+
+
 class Loop(c.Structure):
     _anonymous_ = ("rings",)
     _fields_ = [
         ("launches", c.c_int32), ("before", c.c_int32), ("launch", c.POINTER(Launch)), ("bodies", c.c_int32),
         ("nodes", c.c_int32), ("body", c.POINTER(Body)), ("row_start", c.c_void_p), ("columns", c.c_void_p),
         ("values", c.c_void_p), ("b", c.c_void_p), ("y", c.c_void_p), ("x", c.c_void_p), ("v", c.c_void_p),
-        ("work", c.c_void_p), ("clock", c.c_void_p), ("threads", c.c_int32), ("unused", c.c_int32),
+        ("work", c.c_void_p), ("newton", c.POINTER(Newton)), ("clock", c.c_void_p), ("threads", c.c_int32),
+        ("unused", c.c_int32),
         ("assemble_begin", c.c_double), ("assemble_seconds", c.c_double), ("cpu_begin", c.c_double), ("rings", Rings),
     ]  # fmt: skip
 

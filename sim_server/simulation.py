@@ -2,8 +2,8 @@
 """A scene made ready to run: effects built, the launches of a step listed, the native loop set up.
 
 THE STEP is the list made in `launches`: backward Euler with one linearization (Courtecuisse et al. 2010, eq. 5),
-    (M - h B - h^2 K) dv = h f + h^2 K v,    v += dv,    x += h v.
-Start reading there.
+    (M - h B - h^2 K) dv = h f + h^2 K v,    v += dv,    x += h v,
+unless the scene asks for another integrator (integrator.py). Start reading there.
 """
 
 from collections.abc import Sequence
@@ -15,7 +15,9 @@ from sim_server.backend import Cpu, Launch
 from sim_server.effect import Effect, Refusal
 from sim_server.effects import effect
 from sim_server.engine import Engine, Kind
+from sim_server.equilibrium import check_held
 from sim_server.errors import DeviceError, InputError
+from sim_server.integrator import Integrator
 from sim_server.scene import Scene, load
 from sim_server.shape import ShapeMatching
 from sim_server.system import System
@@ -37,11 +39,16 @@ class Simulation:
 
     def _build(self, scene: Scene, device: str) -> None:
         scene.solver.check_device(device)
+        scene.integrator.check_device(device)
         self.world = World(scene, _backend(device, scene.solver.precision))
         self.effects = build_effects(scene, self.world)
-        self.system = System(self.world, [e.elements for e in self.effects.values() if e.elements is not None])
+        elements = [e.elements for e in self.effects.values() if e.elements is not None]
+        self.system = System(self.world, elements)
         matched = self._warp()
         self.shape = ShapeMatching(self.world, matched, scene.solver.warp_level) if matched else None
+        self.integrator = Integrator(scene, self.system)
+        if not self.world.inertia:
+            check_held(self.world, elements)
         assemble, integrate = self.launches()
         w, s = self.world, self.system
         arrays: dict[str, Any] = {"row_start": s.row_start, "columns": s.columns, "values": s.values}
@@ -56,7 +63,10 @@ class Simulation:
             planes = 2 if scene.solver.factor_precision == "float32" else 1
             self.engine = GpuEngine(gpu, assemble, integrate, ranges, w.dt, names, planes=planes, **arrays)  # type: ignore[arg-type]
         else:
-            self.engine = Engine(assemble, integrate, ranges, w.dt, threads=scene.solver.threads, **arrays)
+            newton = self.integrator.newton(assemble, list(self.effects.values()))
+            threads = scene.solver.threads
+            self.engine = Engine(assemble, integrate, ranges, w.dt, threads=threads, newton=newton, **arrays)
+        self.engine.begin = self.integrator.begin(assemble)
         for body in w.bodies:
             self._settle(body)
 
@@ -80,7 +90,7 @@ class Simulation:
     def launches(self) -> tuple[list[Launch], list[Launch]]:
         """What a step runs: before and after the solve."""
         system = self.system
-        assemble = [system.start()]
+        assemble = [self.integrator.start()]
         stencils = iter(system.stencils)
         accumulate = False
         for e in sorted(self.effects.values(), key=lambda e: e.elements is None):  # touch asks what the elements added
@@ -90,7 +100,7 @@ class Simulation:
         if self.shape is not None:
             assemble.append(self.shape.launch(system.mean))
         assemble += system.finish()  # into the material frame (eq. 12 and 13)
-        return assemble, [system.advance()]
+        return assemble, [self.integrator.advance()]
 
     def _warp(self) -> list[Body]:
         """Decides whose solve happens in the material frame; returns those whose rotations are matched shapes."""

@@ -82,10 +82,10 @@ class System:
         self.columns[self.own] = np.arange(n, dtype=np.int32)
         self.columns[self.upper], self.columns[self.lower] = self.column, self.row
 
-    def start(self) -> Launch:
-        """b = 0, diagonal = mass."""
+    def start(self, mass: NDArray[np.float64]) -> Launch:
+        """b = 0, diagonal = mass (n,) [kg]."""
         return self.world.backend.module("kernels/nodes.cu").bind(
-            "start", self.world.nodes, mass=self.world.mass, diagonal=self.diagonal, b=self.b, block=self.block,
+            "start", self.world.nodes, mass=mass, diagonal=self.diagonal, b=self.b, block=self.block,
             mean=self.mean,
         )  # fmt: skip
 
@@ -104,7 +104,7 @@ class System:
         return [turn, assemble]
 
     def advance(self) -> Launch:
-        """v += R y, x += h v."""
+        """v += R y, x += h v: backward Euler."""
         w = self.world
         return self.world.backend.module("kernels/nodes.cu").bind(
             "advance", w.nodes, rotation=self.rotation, y=self.y, h=w.dt, dv=self.dv, v=w.v, x=w.x

@@ -119,6 +119,7 @@ class Track:
     def observe(self, record: Any, floor: int, cost: float) -> None:
         """A solve was made (a record of the loop). floor: iterations above it are excess; cost: of the solve."""
         if not 0 <= record["factor_step"] < self.newest:  # else it was made before the newest factor was taken up
+            floor *= max(int(record["linearizations"]), 1)
             self._sum_up(excess(int(record["iterations"]), floor), record)
         self.refused += int(record["fallbacks"])
         self.per_iteration.add(cost / (int(record["iterations"]) + 1))

@@ -51,7 +51,7 @@ class World:
     projection: of the elements' stiffness, the scene's choice;
     backend: where kernels run, Cpu or gpu.device.Gpu.
 
-    What effects need of the integrator instead of dt and v:
+    What effects need of the integrator (formulas: integrator.py) instead of dt and v:
     impulse [s]: times a force is what goes into b. reach [s]: x moves by reach (ahead + dv) until the end of the step,
     dv the solution. ahead (n, 3) [m/s]. drift (n, 3) [m/s]: (reach ahead + beta v) / (reach + beta), what elements take
     for the velocity, so that stiffening * (K drift) holds motion and damping. inertia: False in a quasi-static scene.
@@ -74,9 +74,12 @@ class World:
         self.mass = np.concatenate([_lumped(o, mesh) for o, mesh in meshes])
         self.free = np.ones(first)
         self.beta = np.zeros(len(self.bodies))
-        self.impulse = self.reach = self.dt
-        self.inertia = True
-        self.ahead = self.drift = self.v
+        integrator = scene.integrator
+        self.impulse, self.reach = integrator.impulse(self.dt), integrator.reach(self.dt)
+        self.inertia = integrator.scheme != "quasi_static"
+        self.plain = integrator.scheme == "backward_euler" and integrator.linearizations == 1
+        self.ahead = self.v if self.plain else np.zeros_like(self.v)
+        self.drift = self.v if self.plain else np.zeros_like(self.v)
 
     @property
     def stiffening(self) -> Reals:

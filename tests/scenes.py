@@ -38,11 +38,12 @@ def bar(cells: tuple[int, int, int] = (4, 2, 2), size: tuple[float, float, float
 
 def scene(
     *objects: dict, dt: float = 0.02, gravity: tuple[float, float, float] | None = None, record: dict | None = None,
-    **solver: Any,
+    integrator: dict | None = None, **solver: Any,
 ) -> Scene:  # fmt: skip
     """Checked, as if read from a file. Keyword arguments left over are the [solver] table."""
     effects = {"gravity": {"g": list(gravity)}} if gravity else {}
     table = {"name": "test", "dt": dt, "effects": effects, "solver": solver, "object": list(objects)}
+    table |= {"integrator": integrator} if integrator else {}
     return Scene.model_validate(table | ({"record": record} if record else {}), context={"folder": "."})
 
 

@@ -10,6 +10,8 @@ motion (falling and swinging as a whole), `stiffness` on fast vibration. In the 
 A = (1 + h mass) M + h (h + stiffness) (-K): stiffness damping makes A stiffer, by the factor 1 + stiffness / h, and
 the system harder to solve; at h = 0.02 s, stiffness = 0.1 s multiplies the stiff part by six.
 
+In a quasi-static scene nothing moves, so the damping is left out.
+
 Usual ranges: mass 0 to 1 1/s, stiffness 0 to 0.1 s. SOFA's beam scenes use 0.1 for both; for visible swinging take
 stiffness = 0, since backward Euler damps fast modes by itself.
 
@@ -43,7 +45,7 @@ class Drag(Effect):
 
     def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
         w = self.world
-        if not self.alpha.any() or not w.inertia:
+        if not self.alpha.any():
             return []
         drag = self.world.backend.module("effects/rayleigh.cu").bind(
             "drag", w.nodes, mass=w.mass, alpha=self.alpha, v=w.v, h=w.impulse, diagonal=system.diagonal, b=system.b
@@ -53,6 +55,8 @@ class Drag(Effect):
 
 def build(world: World, listed: list[tuple[Body, Any]]) -> Drag:
     """Tells the elements their beta and drags the nodes by alpha."""
+    if not world.inertia:
+        return Drag(world, np.zeros(world.nodes))
     for body, params in listed:
         world.beta[body.index] = params.stiffness
     return Drag(world, per_node(world, listed, "mass"))

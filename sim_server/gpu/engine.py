@@ -86,6 +86,7 @@ class GpuEngine(DeviceLoop):
             whole = self.solver.bodies[k : k + 1].tobytes()
             self.mailboxes[k].post(whole[:SETTINGS])
             self.mailboxes[bodies + k].post(whole[SETTINGS:])
+        self.begin: list[DeviceLaunch] = []  # before the first step
         self._graphs: list[Any] = []
         self._tick = self._end_of_step(dt)
         self._last = Fused(integrate, End((HERE / "gpu/tick.cu").read_text(), "Tick", self._tick))
@@ -111,7 +112,15 @@ class GpuEngine(DeviceLoop):
 
     def run(self, steps: int) -> int:
         self._intake.advance()
+        self._make_ready()
         return super().run(steps)
+
+    def _make_ready(self) -> None:
+        """What a scheme makes of the state before the first step."""
+        if self.begin and self.step == 0:
+            for launch in self.begin:
+                launch()
+            self.gpu.cp.cuda.get_current_stream().synchronize()
 
     def _capture(self) -> None:
         for begin in (False, True):
@@ -142,6 +151,7 @@ class GpuEngine(DeviceLoop):
 
     def assemble(self) -> None:
         """First half of one step: the system matrix, which the host has then too."""
+        self._make_ready()
         self._open()
         with self._steps:
             self._begin()

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_server.backend import domain_of
 from sim_server.gpu.device import DeviceLaunch, compiled, cupy, options, processors
 
 DOMAINS = ("elements", "nodes", "blocks")
@@ -43,8 +44,7 @@ def shape(name: str, items: int, multiprocessors: int) -> Shape:
 
 def domain(launch: DeviceLaunch) -> str:
     """What its items are: the first word behind `int n;` in its struct."""
-    found = re.search(rf"struct {launch.struct} \{{\s*int n;\s*// (\w+)", launch.text)
-    return found.group(1) if found else ""
+    return domain_of(launch.text, launch.struct)
 
 
 class End(NamedTuple):

@@ -4,61 +4,16 @@
 // go of Python's lock, so no Python code, network, worker or disk can delay a step.
 #include <cstring>
 
-#include "pcg.h"
+#include "newton.h"
 
-typedef void (*Kernel)(const void* params, int begin, int end);
-
-struct Binding {           // arguments of a launch, replaceable between steps
-    const void* params;
-    int32_t items;
-    int32_t unused;
-    int64_t taken;   // steps completed when the loop took it up, -1: it has not
-};
-
-struct Launch {
-    Kernel kernel;
-    Binding* binding;
-    std::atomic<Binding*> mail;   // the next one, or null
-};
-
-struct Body {
-    int32_t first, last;                // nodes
-    SolveSettings settings;
-    const Factor* factor;               // in use
-    std::atomic<const Factor*> mail;    // a newer one, or null
-    std::atomic<double*> snapshot;      // where to copy the values of A, or the positions, or null
-    std::atomic<int64_t> snapshot_step; // step of the last copy made, -1: none
-    double ahead;                       // s: below 0 the copy is of A, else of x + ahead v
-    int64_t steps;                      // solved so far
-};
-
-struct Loop {
-    int32_t launches, before;          // launches; how many of them assemble (the others integrate)
-    Launch* launch;
-    int32_t bodies, nodes;
-    Body* body;
-    const int32_t* row_start;
-    const int32_t* columns;
-    const double* values;
-    const double* b;                   // (nodes, 3) right-hand side in the material frame
-    double* y;                         // (nodes, 3) start in, solution out
-    double* x;                         // (nodes, 3) for frames
-    double* v;
-    double* work;                      // 45 doubles a node
-    double* clock;                     // (1,) s, read by kernels
-    int32_t threads;                   // of this process, for launches and bodies
-    int32_t unused;
-    double assemble_begin;
-    double assemble_seconds;
-    double cpu_begin;
-    Rings rings;
-};
-
-static void run(Launch& l, int threads, int64_t step) {
+static void take_mail(Launch& l, int64_t step) {
     if (Binding* next = l.mail.exchange(nullptr)) {
         l.binding = next;
         next->taken = step;
     }
+}
+
+static void run(const Launch& l, int threads) {
     const int64_t items = l.binding->items, grain = 512;
     int parts = (int)(items / grain < threads ? items / grain : threads);
     if (parts < 2) {
@@ -67,6 +22,35 @@ static void run(Launch& l, int threads, int64_t step) {
     }
 #pragma omp parallel for num_threads(parts) schedule(static, 1)
     for (int k = 0; k < parts; ++k) l.kernel(l.binding->params, (int)(items * k / parts), (int)(items * (k + 1) / parts));
+}
+
+// The same for the bodies whose search is not over: arguments stay as they are within a step. What is not told apart by bodies
+// runs for all; the next step begins all over.
+static void run_for_those_left(const Loop& loop, const Launch& l) {
+    const Search* search = loop.newton->search;
+    int left = 0;
+    for (int i = 0; i < loop.bodies; ++i) left += search[i].phase != DONE;
+    if (!l.parts || left == loop.bodies) { run(l, loop.threads); return; }
+#pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) if (loop.threads > 1 && left > 1)
+    for (int i = 0; i < loop.bodies; ++i)
+        if (search[i].phase != DONE && l.parts[i] < l.parts[i + 1]) l.kernel(l.binding->params, l.parts[i], l.parts[i + 1]);
+}
+
+// Linearizes, solves and tries until every body has what it is to have; then y is its whole change of velocity.
+static void search_all(Loop& loop) {
+    double begin = now(), solving = 0;
+    for (bool left = true; left;) {
+        double t = now();
+#pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) if (loop.threads > 1 && loop.bodies > 1)
+        for (int i = 0; i < loop.bodies; ++i) solve(loop, i);
+        solving += now() - t;
+        for (int i = 0; i < loop.before; ++i) run_for_those_left(loop, loop.launch[i]);
+        left = false;
+#pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) reduction(|| : left) if (loop.threads > 1 && loop.bodies > 1)
+        for (int i = 0; i < loop.bodies; ++i) left = judge(loop, i) != DONE || left;
+    }
+    for (int i = 0; i < loop.bodies; ++i) end_search(loop, i);
+    loop.assemble_seconds += now() - begin - solving;
 }
 
 static void copy_for_worker(Loop& loop, Body& body) {
@@ -118,7 +102,10 @@ void wf_assemble(Loop* loop) {
     Rings& rings = loop->rings;
     loop->cpu_begin = thread_time();
     loop->clock[0] = rings.start_time + rings.step * rings.dt;
-    for (int i = 0; i < loop->before; ++i) run(loop->launch[i], loop->threads, rings.step);
+    for (int i = 0; i < loop->before; ++i) {
+        take_mail(loop->launch[i], rings.step);
+        run(loop->launch[i], loop->threads);
+    }
     for (int i = 0; i < loop->bodies; ++i) copy_for_worker(*loop, loop->body[i]);
     loop->assemble_begin = begin;
     loop->assemble_seconds = now() - begin;
@@ -130,24 +117,39 @@ void wf_solve(Loop* loop) {
     double entered = now();
     bool keep = room_for_records(rings, loop->bodies, [] {});
     double waited = now() - entered;  // no part of the step
+    for (int i = 0; i < loop->bodies; ++i)
+        if (const Factor* next = loop->body[i].mail.exchange(nullptr)) loop->body[i].factor = next;
+    if (loop->newton) {
+        for (int i = 0; i < loop->bodies; ++i) begin_search(*loop, i);
+        search_all(*loop);
+    }
 #pragma omp parallel for num_threads(loop->threads) schedule(dynamic, 1) if (loop->threads > 1 && loop->bodies > 1)
     for (int i = 0; i < loop->bodies; ++i) {
         Body& body = loop->body[i];
-        if (const Factor* next = body.mail.exchange(nullptr)) body.factor = next;
-        BlockCsr A{body.first, body.last, loop->row_start, loop->columns, loop->values};
         const SolveSettings settings = body.settings;  // they may change meanwhile
-        SolveResult r = pcg(A, loop->b + 3 * body.first, body.factor, settings, loop->y + 3 * body.first,
-                            loop->work + 45 * (int64_t)body.first);
+        int linearizations = 1;
+        double nonlinear = -1;
+        SolveResult r;
+        if (loop->newton) {
+            r = found(loop->newton->search[i]);
+            linearizations = std::max(1, loop->newton->search[i].linearizations);
+            nonlinear = remaining(loop->newton->search[i]);
+        } else {
+            BlockCsr A{body.first, body.last, loop->row_start, loop->columns, loop->values};
+            r = pcg(A, loop->b + 3 * body.first, body.factor, settings, loop->y + 3 * body.first,
+                    loop->work + 45 * (int64_t)body.first);
+        }
         ++body.steps;
         if (!keep) continue;
         Record& record = rings.records[(first + i) % rings.record_capacity];
         bool used = body.factor && (settings.kind == CHOLESKY || r.kind == CHOLESKY || r.fallbacks);
         record = Record{step, used ? body.factor->step : -1, rings.start_time + step * rings.dt, r.residual,
-                        loop->assemble_seconds, r.seconds, 0, 0, rings.late, loop->assemble_begin, 0, i, r.iterations, r.status,
-                        r.kind, settings.kind, r.fallbacks, r.status == NOT_FINITE ? first_bad_node(*loop, body) : -1, settings.probe};
+                        loop->assemble_seconds, r.seconds, 0, 0, rings.late, loop->assemble_begin, 0, nonlinear, i, r.iterations,
+                        r.status, r.kind, settings.kind, r.fallbacks, r.status == NOT_FINITE ? first_bad_node(*loop, body) : -1,
+                        settings.probe, linearizations, 0};
     }
     double solved = now();
-    for (int i = loop->before; i < loop->launches; ++i) run(loop->launch[i], loop->threads, rings.step);
+    for (int i = loop->before; i < loop->launches; ++i) run(loop->launch[i], loop->threads);
     double end = now(), cpu = thread_time() - loop->cpu_begin;
     ++rings.step;
     if (!keep) { rings.records_dropped += loop->bodies; }
@@ -186,7 +188,7 @@ void wf_apply_factor(const Factor* factor, const double* r, double* z, double* w
 
 int32_t wf_sizes(int32_t* sizes) {  // layouts, checked against the Python side
     sizes[0] = sizeof(Launch); sizes[1] = sizeof(Body); sizes[2] = sizeof(Loop); sizes[3] = sizeof(Factor);
-    sizes[4] = sizeof(Pattern); sizes[5] = sizeof(Record);
-    return 6;
+    sizes[4] = sizeof(Pattern); sizes[5] = sizeof(Record); sizes[6] = sizeof(Newton); sizes[7] = sizeof(Search);
+    return 8;
 }
 }

@@ -27,11 +27,11 @@ from sim_server.scene.solver_options import FACTORS
 ROW = np.dtype(
     [
         ("step", "i8"), ("iterations", "i8"), ("status", "i8"), ("residual", "f8"), ("factor_step", "i8"),
-        ("kind", "i8"), ("asked", "i8"), ("probe", "i8"), ("fallbacks", "i8"),
+        ("kind", "i8"), ("asked", "i8"), ("probe", "i8"), ("fallbacks", "i8"), ("linearizations", "i8"),
     ]
 )  # fmt: skip
 """What a solve was made with and what came of it, from an ObjectStep."""
-_PACK = struct.Struct("<qqqdqqqqq")
+_PACK = struct.Struct("<qqqdqqqqqq")
 _KINDS = {kind.name.lower(): int(kind) for kind in Kind} | dict.fromkeys(FACTORS, int(Kind.CHOLESKY))
 
 
@@ -140,7 +140,16 @@ class Recording:
             kind_used = _KINDS[s.preconditioner]
             asked = _KINDS[s.asked] if s.asked else kind_used
             found.packed += _PACK.pack(
-                s.step, s.iterations, s.status, s.residual, s.factor_step, kind_used, asked, s.probe, s.fallbacks
+                s.step,
+                s.iterations,
+                s.status,
+                s.residual,
+                s.factor_step,
+                kind_used,
+                asked,
+                s.probe,
+                s.fallbacks,
+                max(s.linearizations, 1),
             )
 
     def _complete(self) -> int:

@@ -14,7 +14,7 @@ from sim_server.engine import Kind
 from sim_server.replay.log import Recording
 
 Pair = tuple[NDArray[np.float64], NDArray[np.float64]]
-COMPARED = ("iterations", "residual", "status", "kind", "fallbacks", "factor_step")
+COMPARED = ("iterations", "residual", "status", "kind", "fallbacks", "factor_step", "linearizations")
 
 
 class Comparison:

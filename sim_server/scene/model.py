@@ -22,6 +22,7 @@ from protocol.refused import Refused
 from sim_server.errors import InputError
 from sim_server.mesh import Mesh, bar, check, read
 from sim_server.scene.effect_tables import checked_effects
+from sim_server.scene.integrator_options import Integrator
 from sim_server.scene.parameters import Count, Counts, File, Parameters, Positive, Sizes, Vector, complaint
 from sim_server.scene.solver_options import Solver
 
@@ -145,12 +146,22 @@ class Scene(Parameters):
     dt: Positive = Field(description="time step [s]")
     name: Annotated[str, Field(min_length=1, max_length=200)]
     effects: Annotated[dict[str, BaseModel], *_effects("scene")] = Field(default_factory=dict)
+    integrator: Integrator = Integrator()
     solver: Solver = Solver()
     record: Record = Record()
     objects: Annotated[list[SceneObject], AfterValidator(_some_objects)] = Field(alias="object")
 
     _path: Path = PrivateAttr(Path())
     _text: str = PrivateAttr("")
+
+    @model_validator(mode="after")
+    def _budget_of_one_solve(self) -> "Scene":
+        if self.solver.budget and self.integrator.linearizations > 1:
+            raise complaint(
+                f"solver.budget = {self.solver.budget:g} with integrator.linearizations = "
+                f"{self.integrator.linearizations}: a budget is for one solve a step; allowed: one of the two"
+            )
+        return self
 
     @property
     def path(self) -> Path:

@@ -1,0 +1,79 @@
+// SPDX-License-Identifier: MIT
+// Memory of the simulation loop (loop.cpp). layouts.py holds the same layouts.
+#pragma once
+#include "pcg.h"
+
+typedef void (*Kernel)(const void* params, int begin, int end);
+
+struct Binding {           // arguments of a launch, replaceable between steps
+    const void* params;
+    int32_t items;
+    int32_t unused;
+    int64_t taken;   // steps completed when the loop took it up, -1: it has not
+};
+
+struct Launch {
+    Kernel kernel;
+    Binding* binding;
+    std::atomic<Binding*> mail;   // the next one, or null
+    const int32_t* parts;         // (bodies + 1,) items of each body, or null: not told apart
+};
+
+struct Body {
+    int32_t first, last;                // nodes
+    SolveSettings settings;
+    const Factor* factor;               // in use
+    std::atomic<const Factor*> mail;    // a newer one, or null
+    std::atomic<double*> snapshot;      // where to copy the values of A, or the positions, or null
+    std::atomic<int64_t> snapshot_step; // step of the last copy made, -1: none
+    double ahead;                       // s: below 0 the copy is of A, else of x + ahead v
+    int64_t steps;                      // solved so far
+};
+
+enum Phase { SOLVE = 0, TRY = 1, DONE = 2 };
+
+struct Search {                        // for the state at the end of a step, of one body
+    double first;                      // |b| of the first linearization
+    double floor;                      // rounding of b
+    double last, slope;                // |b| and way . b at the present linearization
+    double scale;                      // of the way that is tried
+    double norm;                       // |b| at what is tried
+    double residual, seconds;          // largest of the solves; of all
+    int32_t phase, linearizations, tried;
+    int32_t iterations, status, kind, fallbacks, unused;
+};
+
+struct Newton {                        // several linearizations a step (newton.h)
+    int32_t linearizations, trials;    // most of them in a step; of shorter ways in a line search
+    double tolerance;                  // of the first |b|
+    double reach;                      // dx / dv [s]
+    const double* rotation;            // (nodes, 3, 3)
+    const double* mass;                // (nodes,) in A [kg]
+    const double* beta;                // (nodes,) [s]
+    double *ahead, *drift, *carried;   // (nodes, 3) [m/s]
+    double* room;                      // 18 doubles a node
+    Search* search;                    // (bodies,)
+};
+
+struct Loop {
+    int32_t launches, before;          // launches; how many of them assemble (the others integrate)
+    Launch* launch;
+    int32_t bodies, nodes;
+    Body* body;
+    const int32_t* row_start;
+    const int32_t* columns;
+    const double* values;
+    const double* b;                   // (nodes, 3) right-hand side in the material frame
+    double* y;                         // (nodes, 3) start in, solution out
+    double* x;                         // (nodes, 3) for frames
+    double* v;
+    double* work;                      // 45 doubles a node
+    Newton* newton;                    // null: one linearization a step
+    double* clock;                     // (1,) s, read by kernels
+    int32_t threads;                   // of this process, for launches and bodies
+    int32_t unused;
+    double assemble_begin;
+    double assemble_seconds;
+    double cpu_begin;
+    Rings rings;
+};

@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: MIT
+"""The [integrator] table of a scene."""
+
+from typing import Literal
+
+from pydantic import Field, model_validator
+
+from sim_server.errors import InputError
+from sim_server.scene.parameters import Parameters, complaint
+
+SchemeName = Literal["backward_euler", "newmark", "bdf2", "quasi_static"]
+
+
+class Integrator(Parameters):
+    """How a step goes from one state to the next, and how often it linearizes."""
+
+    scheme: SchemeName = "backward_euler"
+    beta: float | None = Field(default=None, gt=0, le=1, description="of Newmark's scheme [-]; 1/4 if left out")
+    gamma: float | None = Field(default=None, ge=0.5, le=1, description="of Newmark's scheme [-]; 1/2 if left out")
+    linearizations: int = Field(default=1, ge=1, le=1000, description="most of them in a step; above 1: Newton-Raphson")
+    tolerance: float = Field(
+        default=1e-4, gt=0, lt=1, description="of Newton-Raphson: nonlinear residual over the step's first |b|"
+    )
+    trials: int = Field(default=8, ge=0, le=100, description="of shorter ways in a line search, at most; 0: none")
+
+    @model_validator(mode="after")
+    def _stable(self) -> "Integrator":
+        if self.scheme != "newmark":
+            if given := [name for name in ("beta", "gamma") if getattr(self, name) is not None]:
+                raise complaint(f"{' and '.join(given)} belong to scheme newmark, not to {self.scheme}")
+            return self
+        beta, gamma = self.newmark
+        if 2 * beta < gamma:
+            raise complaint(
+                f"newmark with beta = {beta:g}, gamma = {gamma:g} is stable for small steps only; "
+                "allowed: 1/2 <= gamma <= 2 beta"
+            )
+        return self
+
+    @property
+    def newmark(self) -> tuple[float, float]:
+        """beta and gamma [-]."""
+        return (0.25 if self.beta is None else self.beta, 0.5 if self.gamma is None else self.gamma)
+
+    def impulse(self, dt: float) -> float:
+        """What forces are multiplied by to become a change of momentum [s]."""
+        if self.scheme == "newmark":
+            return self.newmark[1] * dt
+        return 2 * dt / 3 if self.scheme == "bdf2" else dt
+
+    def reach(self, dt: float) -> float:
+        """dx / dv at the end of the step [s]."""
+        if self.scheme == "newmark":
+            beta, gamma = self.newmark
+            return beta * dt / gamma
+        return self.impulse(dt)
+
+    def check_device(self, device: str) -> None:
+        """Raises InputError for what the device ("cpu" or "gpu") does not have."""
+        if device == "gpu" and self.linearizations > 1:
+            raise InputError(f"integrator.linearizations = {self.linearizations}: must be 1 on a GPU")
