@@ -37,6 +37,7 @@ class Assembly:
             self._simulation = Simulation(described(scene.resolved, name, _mesh(topology)))
         except (InputError, ValidationError) as error:
             raise Refused(f"Scene.resolved, object {name!r}: {error}", "malformed") from error
+        self._simulation.engine.begin = []  # A of a scheme that looks back does not depend on what it saw
         self._check_pattern(topology)
 
     @property

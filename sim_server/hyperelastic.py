@@ -144,7 +144,7 @@ class Tetrahedra(Effect):
     def _of_a_step(self) -> dict[str, Any]:
         """What the integrator asks for: factors of force and tangent, and the field that the tangent is applied to."""
         w = self.world
-        return {"h": w.dt, "stiffening": w.dt * (w.dt + w.beta[self.owner]), "v": w.v}
+        return {"h": w.impulse, "stiffening": w.stiffening[self.owner], "v": w.drift}
 
     def gathers(self, system: System, stencil: Stencil, accumulate: bool) -> list[Launch]:
         """What collects corners and edges into the system."""

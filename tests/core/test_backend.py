@@ -215,11 +215,12 @@ def test_a_process_without_kernels_compiles_none(tmp_path):
     assert run.stdout.strip() == "[]"
 
 
+@pytest.mark.parametrize("name", ["nodes", "schemes"])
 @pytest.mark.parametrize("arch", ["sm_80", "sm_90"])
-def test_the_last_kernel_of_a_step_compiles_with_the_end_of_the_step(arch, tmp_path):
+def test_the_last_kernel_of_a_step_compiles_with_the_end_of_the_step(arch, name, tmp_path):
     if (library := nvrtc.library()) is None:
         pytest.skip("needs the package nvidia-cuda-nvrtc")
-    advance = _launch("kernels/nodes.cu", "Advance", "nodes.advance")
+    advance = _launch(f"kernels/{name}.cu", "Advance", f"{name}.advance")
     end = fuse.End((PACKAGE / "gpu/tick.cu").read_text(), "Tick", np.zeros(()))
     text = tmp_path / "last.cu"
     text.write_text(fuse.Text([advance], fuse.Shape(32, 1), end).source)  # type: ignore[list-item]
@@ -263,6 +264,7 @@ LAW_ELEMENTS = [
     (f"{FRAME}+effects/mooney_rivlin.cuh", "Elements", "mooney_rivlin.elements"),
     ("effects/fibres.cu", "Elements", "fibres.elements"),
 ]
+OTHER_SCHEME = [("kernels/schemes.cu", "Inertia", "schemes.inertia"), *NODES[1:]]
 BLOCKS = [
     ("effects/corotational_blocks.cu", "Blocks", "corotational_blocks.blocks"),
     ("effects/corotational_exact_blocks.cu", "Blocks", "corotational_exact_blocks.blocks"),
@@ -273,7 +275,11 @@ BLOCKS = [
 
 
 @pytest.mark.parametrize(("real", "local"), [("double", "double"), ("double", "float"), ("float", "float")])
-@pytest.mark.parametrize("group", [NODES, BLOCKS, ELEMENTS, LAW_ELEMENTS], ids=["nodes", "blocks", "elements", "laws"])
+@pytest.mark.parametrize(
+    "group",
+    [NODES, OTHER_SCHEME, BLOCKS, ELEMENTS, LAW_ELEMENTS],
+    ids=["nodes", "other scheme", "blocks", "elements", "laws"],
+)
 def test_launches_put_together_compile_in_every_precision(group, real, local, tmp_path):
     """With rows in registers, and one argument for each array whatever launches have it."""
     if (library := nvrtc.library()) is None:

@@ -235,3 +235,11 @@ def test_other_preconditioners(preconditioner: str, tmp_path: Path) -> None:
         assert (len({f.pattern for f in factors}) == 1) == (preconditioner == "ssor_factor")
     found = replayed(log, 0)
     assert found["same"] and not found["notes"] and found["other_factor"] is None
+
+
+def test_several_linearizations_of_another_scheme(tmp_path: Path) -> None:
+    """What a step begins with, each of its solves and the line search follow from the scene."""
+    integrator = '\n[integrator]\nscheme = "bdf2"\nlinearizations = 5\ntolerance = 1e-8\n'
+    log = recorded(tmp_path, integrator)
+    assert any(s.linearizations > 1 and 0 < s.nonlinear_residual < 1e-6 for s in messages(log, "step"))
+    assert replayed(log, 0)["same"]

@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: MIT
+"""The [integrator] table: what is allowed, and that what is not asked for costs nothing."""
+
+import numpy as np
+import pytest
+
+from sim_server.errors import InputError
+from sim_server.scene import load
+from sim_server.scene.integrator_options import Integrator
+from tests.scenes import bar, simulation
+
+SCENE = """dt = 0.01
+[[object]]
+name = "beam"
+mesh = {{ bar = [2, 1, 1], size = [2, 1, 1] }}
+[integrator]
+{}
+"""
+
+BAD = {
+    'scheme = "euler"': "integrator.scheme = 'euler': must be 'backward_euler', 'newmark', 'bdf2' or 'quasi_static'",
+    "beta = 0.25": "beta belong to scheme newmark, not to backward_euler",
+    'scheme = "newmark"\nbeta = 0.1': "newmark with beta = 0.1, gamma = 0.5 is stable for small steps only; "
+    "allowed: 1/2 <= gamma <= 2 beta",
+    'scheme = "newmark"\ngamma = 0.4': "integrator.gamma = 0.4: must be greater than or equal to 0.5",
+    "linearizations = 0": "integrator.linearizations = 0: must be greater than or equal to 1",
+    "linearizations = 2.5": "integrator.linearizations = 2.5: must be a whole number",
+    "tolerance = 0.0": "integrator.tolerance = 0.0: must be greater than 0",
+    "newton = true": "unknown key .known keys: beta, gamma, linearizations, scheme, tolerance, trials",
+    "linearizations = 4\n[solver]\nbudget = 0.01": "a budget is for one solve a step; allowed: one of the two",
+}
+
+
+@pytest.mark.parametrize("table", BAD)
+def test_mistakes_are_told(tmp_path, table):
+    path = tmp_path / "bad.toml"
+    path.write_text(SCENE.format(table))
+    with pytest.raises(InputError, match=r"scene bad.toml, .*" + BAD[table].replace("(", r"\(")):
+        load(path)
+
+
+def test_on_a_gpu_there_is_one_linearization():
+    Integrator(scheme="bdf2").check_device("gpu")
+    Integrator(linearizations=3).check_device("cpu")
+    with pytest.raises(InputError, match=r"integrator.linearizations = 3: must be 1 on a GPU"):
+        Integrator(linearizations=3).check_device("gpu")
+
+
+def test_the_default_has_the_launches_of_backward_euler_alone():
+    sim = simulation(bar(fixed="X < 0.01"))
+    names = [launch.name for launch in sim.engine.launches]
+    assert names[0] == "nodes.start" and names[-1] == "nodes.advance"
+    assert sim.world.drift is sim.world.v and sim.world.ahead is sim.world.v
+    assert sim.engine.begin == [] and not sim.engine.loop.newton
+    other = simulation(bar(fixed="X < 0.01"), integrator={"scheme": "bdf2"})
+    assert [launch.name for launch in other.engine.launches] == ["schemes.inertia", *names[1:-1], "schemes.advance"]
+
+
+def test_a_scheme_starts_from_the_state_that_it_finds():
+    """What a test or a program puts into x and v before the first step is what the history is made from."""
+    runs = []
+    for early in (True, False):
+        sim = simulation(bar((3, 1, 1), (3, 1, 1), young=1e5), dt=0.01, tolerance=1e-10, integrator={"scheme": "bdf2"})
+        if early:
+            sim.world.v[:] = [1.0, 0.0, 2.0]
+        sim.engine.assemble()
+        sim.world.v[:] = [1.0, 0.0, 2.0]
+        sim.engine.run(5)
+        runs.append(sim.world.x.copy())
+    assert np.array_equal(*runs)
+    np.testing.assert_allclose(runs[0] - sim.world.rest, np.tile([0.05, 0, 0.1], (sim.world.nodes, 1)), atol=1e-9)
