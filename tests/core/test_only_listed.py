@@ -60,6 +60,11 @@ SCENES = {
         ["mass_spring.cu", "mass_spring_blocks.cu", "mass_spring_nodes.cu", "shape.cu"],
         ["mass_spring.springs", "mass_spring_nodes.gather", "mass_spring_blocks.blocks", "shape.shape"],
     ),
+    "a hyperelastic law": (
+        "", "neo_hookean = { young = 1e5, poisson = 0.3 }\n", ["corotational", "neo_hookean"],
+        ["corner_rows.cu", "edge_rows.cu", "neo_hookean.cuh", "shape.cu"],
+        ["neo_hookean.elements", "corner_rows.gather", "edge_rows.blocks", "shape.shape"],
+    ),
     "everything": (
         "gravity = true", COROTATIONAL + 'rayleigh = { mass = 0.1 }\nfixed = { where = "X < 0.01" }\ntouch = true\n',
         ["corotational", "fixed", "gravity", "rayleigh", "touch"],
