@@ -58,7 +58,8 @@ class Effect:
         return 0.0
 
     def refusals(self) -> list[Refusal]:
-        """Elements that had a state which the effect does not define, by the time at which they had it first.
+        """Elements that had a state which the effect does not define, by the time at which they had it first; that a
+        line search tried it is enough.
 
         The solver finds their forces not finite (status not_finite) and leaves the velocity as it was.
         """

@@ -204,7 +204,9 @@ class Telemetry:
             name = self.simulation.world.bodies[int(r["body"])].name
             if name not in self._bad:
                 self._bad.add(name)
-                refused = [x for x in self.simulation.refusals() if x.body == int(r["body"])]
-                why = str(refused[0]) if refused else f"force is not finite at node {int(r['bad_node'])}"
+                begin = float(r["time"]) - self.simulation.world.dt / 2
+                refused = [x for x in self.simulation.refusals() if x.body == int(r["body"]) and x.time < begin]
+                latest = max(refused, key=lambda x: x.time, default=None)  # before, a line search may have tried one
+                why = str(latest) if latest else f"force is not finite at node {int(r['bad_node'])}"
                 lines.append(f"object {name!r}, step {int(r['step'])}: {why}; its velocity is left as it was")
         return lines

@@ -73,3 +73,19 @@ def test_regularized_laws_bring_the_element_back(name):
     assert determinants(sim).min() > 0.5
     rest = forces(sim)
     assert np.abs(rest).max() < 1e-2 * 3e4
+
+
+def test_the_element_named_is_that_of_the_step():
+    """One that was refused before and came back (as in a line search) is not the one."""
+    sim, bad = pushed_through(LAWS["neo_hookean"])
+    pressed = sim.world.x.copy()
+    Driver(sim).advance(1)
+    assert [r.element for r in sim.refusals()] == bad
+    sim.world.x[:] = sim.world.rest
+    Driver(sim).advance(2)
+    other = int(np.argmax(pressed[:, 0] * (pressed == sim.world.rest).all(axis=1)))
+    sim.world.x[other] -= [2.5, 0.2, 0.1]
+    records = Driver(sim).advance(1)
+    (line,) = Telemetry.bad_steps(SimpleNamespace(simulation=sim, _bad=set()), records)  # type: ignore[arg-type]
+    number = int(line.split("element ")[1].split()[0])
+    assert number not in bad and {r.element: r.time for r in sim.refusals()}[number] == pytest.approx(3 * 0.02)
