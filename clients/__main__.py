@@ -263,6 +263,7 @@ def load(
     clients: Annotated[int, typer.Option(metavar="N", help="Clients; every second one grabs, the others push.")] = 8,
     rate: Annotated[float, typer.Option(metavar="HZ", help="Commands a second of each client.")] = 50.0,
     seconds: Annotated[float, typer.Option(metavar="S", help="For how long.")] = 20.0,
+    quiet: Annotated[float, typer.Option(metavar="S", help="Watched before without clients, to compare with.")] = 3.0,
     workers: Annotated[int, typer.Option(metavar="N", help="Local workers of the server.")] = 1,
     seed: Annotated[int, typer.Option(metavar="N", help="Of sizes, materials and disturbances.")] = 1,
     device: Annotated[str, typer.Option(metavar="auto|cpu|gpu", help="Of the server.")] = "cpu",
@@ -285,7 +286,18 @@ def load(
     from clients import load as loading
 
     asked = loading.Load(
-        objects, loading.span(tets), clients, rate, seconds, workers, seed, device, out, connect, server
+        objects,
+        loading.span(tets),
+        clients,
+        rate,
+        seconds,
+        workers,
+        seed,
+        device,
+        out,
+        connect,
+        server,
+        quiet,
     )
     found = loading.run(asked)
     if out is not None:

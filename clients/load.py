@@ -21,7 +21,7 @@ from clients.client import Client
 from clients.errors import BadInput, ClientError
 from clients.frames import Mesh
 from clients.load_processes import Drivers, free_endpoint, server
-from clients.load_report import report
+from clients.load_report import Looks, report
 from clients.log import Log
 from clients.scalars import Columns, columns, row
 from protocol import messages_pb2 as pb
@@ -46,6 +46,7 @@ class Load:
     out: Path | None
     connect: list[str] | None
     server: str
+    quiet: float = 3.0  # s that steps are watched before the clients begin
 
     def __post_init__(self) -> None:
         low, high = self.tets
@@ -53,6 +54,7 @@ class Load:
         _within("--clients", self.clients, 0, 256)
         _within("--rate", self.rate, 0.1, 2000.0)
         _within("--seconds", self.seconds, 0.5, 86_400.0)
+        _within("--quiet", self.quiet, 0.0, 3600.0)
         _within("--workers", self.workers, 0, 64)
         _within("--seed", self.seed, 0, 2**63)
         if not 6 <= low <= high <= 100_000:
@@ -83,38 +85,40 @@ def run(load: Load) -> dict[str, Any]:
         scene, log, endpoint = folder / "load.toml", folder / "load.mcap", free_endpoint()
         scene.write_text(load_scene.scene(load.objects, load.tets, load.seed))
         with server(scene, log, load.server, endpoint, load.workers, load.device):
-            begun, ended, clients, _ = _drive(load, [endpoint], watch=False)
+            looks, clients, _ = _drive(load, [endpoint], watch=False)
         with Log(log) as recorded:  # it is whole once the server has ended
             steps = {name: recorded.scalars(name) for name in recorded.objects}
-        return report(load, begun, ended, clients, steps)
+        return report(load, looks, clients, steps)
 
 
 def _on_a_running_server(load: Load, connect: list[str]) -> dict[str, Any]:
-    begun, ended, clients, seen = _drive(load, connect, watch=True)
-    rows: dict[str, list[tuple]] = {o.object: [] for o in ended.objects}
+    looks, clients, seen = _drive(load, connect, watch=True)
+    rows: dict[str, list[tuple]] = {o.object: [] for o in looks[-1].objects}
     for step in seen:
         rows.setdefault(step.header.object, []).append(row(step))
     steps: dict[str, Columns] = {name: columns(found) for name, found in rows.items()}
-    return report(load, begun, ended, clients, steps)
+    return report(load, looks, clients, steps)
 
 
-def _drive(
-    load: Load, connect: list[str], watch: bool
-) -> tuple[pb.Status, pb.Status, list[dict[str, Any]], list[pb.ObjectStep]]:
-    """Status before and after, what became of each client's commands, and the steps seen if asked for."""
+def _drive(load: Load, connect: list[str], watch: bool) -> tuple[Looks, list[dict[str, Any]], list[pb.ObjectStep]]:
+    """Looks at the status, what became of each client's commands, and the steps seen if asked for."""
     with Client(load.server, connect) as client:
         plans = plan(client.scene(), client.meshes(), load.clients, load.rate, load.seed)
         with Drivers(plans, load.server, connect, load.seconds) as drivers:
             batches = client.steps() if watch else None
-            begun = _status(client)
-            drivers.begin()
             seen: list[pb.ObjectStep] = []
-            deadline = time.monotonic() + load.seconds
-            while (left := deadline - time.monotonic()) > 0:
-                time.sleep(min(left, POLL))
-                seen += batches.new() if batches else []
-            ended = _status(client)
-            return begun, ended, drivers.reports(), seen
+
+            def watched(seconds: float) -> pb.Status:
+                deadline = time.monotonic() + seconds
+                while (left := deadline - time.monotonic()) > 0:
+                    time.sleep(min(left, POLL))
+                    seen.extend(batches.new() if batches else [])
+                return _status(client)
+
+            before = watched(0)
+            begun = watched(load.quiet) if load.clients and load.quiet else before
+            drivers.begin()
+            return (before, begun, watched(load.seconds)), drivers.reports(), seen
 
 
 def _status(client: Client) -> pb.Status:

@@ -16,13 +16,15 @@ if TYPE_CHECKING:
 
     from clients.load import Load
 
+Looks = tuple[pb.Status, pb.Status, pb.Status]  # at first, as the clients begin, at the end
+FELT = ("ms_p50", "ms_p99", "ms_max", "start_ms_p99", "start_ms_max")
 SHOWN = 24  # bodies in the table on a terminal; all are in the JSON
 
 
-def report(
-    load: Load, begun: pb.Status, ended: pb.Status, clients: list[dict[str, Any]], steps: dict[str, Columns]
-) -> dict[str, Any]:
-    """Figures of the steps between the two looks at the status. steps: scalars of each body, also from before."""
+def report(load: Load, looks: Looks, clients: list[dict[str, Any]], steps: dict[str, Columns]) -> dict[str, Any]:
+    """Figures of the steps between the last two looks at the status, beside those between the first two, without
+    clients. steps: scalars of each body, also from before."""
+    before, begun, ended = looks
     seconds = max(ended.uptime - begun.uptime, 1e-9)
     within = {name: _between(found, begun.step, ended.step) for name, found in steps.items()}
     tets = {found.object: found.tets for found in ended.objects}
@@ -31,7 +33,7 @@ def report(
     return {
         "scene": ended.scene, "seed": None if load.connect else load.seed, "device": ended.device, "dt": ended.dt,
         "seconds": seconds,
-        "steps": _steps(begun, ended, seconds, within),
+        "steps": _steps(begun, ended, steps) | {"quiet": _quiet(before, begun, ended, steps)},
         "objects": [
             {"object": name, "tets": tets.get(name), "factors": used[name] - used_before.get(name, 0), **_body(found)}
             for name, found in sorted(within.items())
@@ -54,16 +56,30 @@ def _between(found: Columns, first: int, last: int) -> Columns:
     return {name: values[mine] for name, values in found.items()}
 
 
-def _steps(begun: pb.Status, ended: pb.Status, seconds: float, within: dict[str, Columns]) -> dict[str, Any]:
+def _steps(begun: pb.Status, ended: pb.Status, steps: dict[str, Columns]) -> dict[str, Any]:
     """Of whole steps, all bodies together. late: began a whole dt after their time; over_dt: took longer than dt;
-    ms: of each."""
-    whole = next((1e3 * found["step_seconds"] for found in within.values() if len(found["step"])), np.zeros(0))
+    ms: of each; start_ms: how long after its time it began; cpu_ms_max: processor time of the loop's thread."""
+    seconds = max(ended.uptime - begun.uptime, 1e-9)
+    found = (_between(columns, begun.step, ended.step) for columns in steps.values())
+    mine: Columns = next((columns for columns in found if len(columns["step"])), {})
+    whole, start, cpu = (1e3 * mine.get(f"{n}_seconds", np.zeros(0)) for n in ("step", "late", "cpu"))
     return {
         "count": ended.step - begun.step, "per_second": (ended.step - begun.step) / seconds,
+        "start_ms_p99": _percentile(start, 99), "start_ms_max": _percentile(start, 100),
+        "cpu_ms_max": _percentile(cpu, 100),
         "ms_p50": _percentile(whole, 50), "ms_p99": _percentile(whole, 99), "ms_max": _percentile(whole, 100),
         "late": ended.late_steps - begun.late_steps, "over_dt": int((whole > 1e3 * ended.dt).sum()),
         "ms": np.round(whole, 4).tolist(),
     }  # fmt: skip
+
+
+def _quiet(before: pb.Status, begun: pb.Status, ended: pb.Status, steps: dict[str, Columns]) -> dict[str, Any] | None:
+    """The same without clients, and how many times as much it is with them; None if nobody looked."""
+    if begun.step <= before.step:
+        return None
+    alone, loaded = _steps(before, begun, steps), _steps(begun, ended, steps)
+    ratio = {name: loaded[name] / alone[name] if loaded[name] and alone[name] else None for name in FELT}
+    return {**{k: v for k, v in alone.items() if k != "ms"}, "ratio": ratio}
 
 
 def _body(found: Columns) -> dict[str, Any]:
@@ -131,6 +147,7 @@ def tables(found: dict[str, Any]) -> Group:
         f"dt {1e3 * found['dt']:g} ms",
         f"step p50 {_cell(steps['ms_p50'])}, p99 {_cell(steps['ms_p99'])}, max {_cell(steps['ms_max'])} ms; "
         f"late {steps['late']}, longer than dt {steps['over_dt']}",
+        *_beside(steps),
         f"{workers['count']} workers: {workers['factors_per_second']:.1f} factors/s, "
         f"{workers['bytes_out'] / 1e6:.1f} MB to them, {workers['bytes_in'] / 1e6:.1f} MB from them",
         f"{len(found['clients']['each'])} clients: {commands['sent']} commands sent ({commands['per_second']:.0f}/s), "
@@ -150,6 +167,23 @@ def tables(found: dict[str, Any]) -> Group:
         )
     more = len(found["objects"]) - SHOWN
     return Group(Text("\n".join(lines)), table, *([Text(f"and {more} more")] if more > 0 else []))
+
+
+def _beside(steps: dict[str, Any]) -> list[str]:
+    quiet = steps["quiet"]
+    if quiet is None:
+        return []
+    words = {
+        "ms_p50": "step p50",
+        "ms_p99": "p99",
+        "ms_max": "max",
+        "start_ms_p99": "begun late p99",
+        "start_ms_max": "max",
+    }
+    shown = (
+        f"{word} {_cell(quiet[k])} -> {_cell(steps[k])} ms (x {_cell(quiet['ratio'][k])})" for k, word in words.items()
+    )
+    return [f"without clients -> with: {', '.join(shown)}; late {quiet['late']} -> {steps['late']}"]
 
 
 def _cell(value: float | None) -> str:

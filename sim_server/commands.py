@@ -3,6 +3,7 @@
 
 import math
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 
 from protocol import messages_pb2 as pb
 from sim_server.simulation import Simulation
@@ -42,6 +43,10 @@ class Commands:
             return verb(self, command)
         except ValueError as error:  # Refusal and TouchError
             return pb.Reply(error=str(error))
+
+    def together(self) -> AbstractContextManager[None]:
+        """Around the commands of a round: what they change goes to the loop at once."""
+        return self._touch().together() if "touch" in self.simulation.effects else nullcontext()
 
     def gone(self, clients: set[str]) -> int:
         """Releases what clients that are no longer there still held; returns how many.
@@ -88,6 +93,8 @@ class Commands:
         return pb.Reply()
 
     def _resume(self, command: pb.Command) -> pb.Reply:
+        if "touch" in self.simulation.effects:
+            self._touch().flush()  # what came before it holds from the first step on
         self.engine.loop.pause = 0
         return pb.Reply()
 

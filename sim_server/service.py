@@ -30,6 +30,8 @@ from sim_server.trace import Trace
 log = logging.getLogger(__name__)
 
 NAP = 1e-3  # s between rounds of the service thread
+BESIDE = 0.02  # s between looks at local workers
+STATUS_AGAIN = 0.02  # s between two statuses that clients ask for
 LOOP_NICE = -5  # of the loop's thread in real time: before workers, clients and our own threads on a full machine
 ENDLESS = 1 << 62
 
@@ -52,7 +54,9 @@ class Service:
         self.engine.loop.frame_every = self.telemetry.wanted_frames()
         self._waiting: deque[NDArray[Any]] = deque()
         self._failure: BaseException | None = None
-        self.beside: Callable[[], None] = lambda: None  # called each round: the supervisor of local workers
+        self._asked: list[Callable[[pb.Reply], None]] = []  # those who want a fresh status
+        self._status_due = self._beside_due = 0.0
+        self.beside: Callable[[], None] = lambda: None  # called now and then: the supervisor of local workers
         self._alone = not self.driver.wants_factors or self.driver.free  # the loop needs no Python
         self.telemetry.open()
 
@@ -90,15 +94,37 @@ class Service:
     def round(self) -> None:
         """One turn of the service thread: everything that is due, nothing that waits."""
         self._drain()
-        self.beside()
-        for command, reply in self.link.commands():
-            if command.verb == "status":
-                self.telemetry.publish_status(self._state())
-                reply(pb.Reply())
-                continue
-            reply(self.commands.carry_out(command))
+        if time.monotonic() >= self._beside_due:
+            self._beside_due = time.monotonic() + BESIDE
+            self.beside()
+        self._carry_out()
+        self._tell_status()
         self.commands.gone(set(self.link.clients()))
         self.telemetry.publish_status(self._state(), force=False)
+
+    def _carry_out(self) -> None:
+        """All commands that wait; they are answered once the loop has what they change."""
+        waiting = self.link.commands()
+        if not waiting:
+            return
+        answers = []
+        with self.commands.together():
+            for command, reply in waiting:
+                if command.verb == "status":
+                    self._asked.append(reply)
+                else:
+                    answers.append((reply, self.commands.carry_out(command)))
+        for reply, answer in answers:
+            reply(answer)
+
+    def _tell_status(self) -> None:
+        """A fresh one to all who asked since the last: it costs more than any other command."""
+        if self._asked and time.monotonic() >= self._status_due:
+            self.telemetry.publish_status(self._state())
+            self._status_due = time.monotonic() + STATUS_AGAIN
+            for reply in self._asked:
+                reply(pb.Reply())
+            self._asked.clear()
 
     def _drain(self) -> None:
         if self._alone:

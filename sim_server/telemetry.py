@@ -20,6 +20,7 @@ from sim_server.trace import Trace
 STEPS_PERIOD = 0.05  # s between batches of step records
 STATE_PERIOD = 1 / 30  # s between states for viewers
 STATUS_PERIOD = 1.0  # s
+LOOK_PERIOD = 0.02  # s between looks at whether somebody listens to states
 WINDOW = 1000  # steps that percentiles are taken over
 
 
@@ -41,7 +42,8 @@ class Telemetry:
         self._age_bound = -1  # steps; of factors
         self.solves = 0
         self.unconverged: Counter[str] = Counter()  # solves by status, of those that did not converge
-        self._due = {"steps": 0.0, "state": 0.0, "status": 0.0}
+        self._due = {"steps": 0.0, "state": 0.0, "status": 0.0, "look": 0.0}
+        self._watched = False
         self._touched: dict[int, pb.Interaction] = {}
 
     def open(self) -> None:
@@ -102,13 +104,13 @@ class Telemetry:
         for id in set(self._touched) - set(known):  # over or released: it acted up to the step under way at most
             self._touched[id].duration = min(self._touched[id].duration, max(clock + dt - self._touched[id].start, 0))
         self._touched.update(known)
+        of: dict[str, list[pb.Interaction]] = {}
+        for i in self._touched.values():
+            of.setdefault(i.object, []).append(i)
         for message in messages:
             begin = message.time - dt
-            message.interactions.extend(
-                i
-                for i in self._touched.values()
-                if i.object == message.header.object and 0 <= i.start <= begin + 0.5 * dt < i.start + i.duration
-            )
+            mine = of.get(message.header.object, ())
+            message.interactions.extend(i for i in mine if 0 <= i.start <= begin + 0.5 * dt < i.start + i.duration)
         for id in set(self._touched) - set(known):
             del self._touched[id]
 
@@ -126,8 +128,9 @@ class Telemetry:
 
     def wanted_frames(self) -> int:
         """Steps between frames that the loop should copy out: 0 if nobody looks."""
-        watched = any(self.link.wants_state(b.name) for b in self.simulation.world.bodies)
-        return self.every or (max(1, round(STATE_PERIOD / self.simulation.world.dt)) if watched else 0)
+        if self._period("look", LOOK_PERIOD):
+            self._watched = self.link.wants_state()
+        return self.every or (max(1, round(STATE_PERIOD / self.simulation.world.dt)) if self._watched else 0)
 
     def _record_frame(self, step: int, x: NDArray[np.float64], v: NDArray[np.float64]) -> None:
         assert self.recorder is not None

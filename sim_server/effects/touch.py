@@ -18,8 +18,10 @@ Usual ranges: max_force a few times the weight of the object (a 4000 kg beam wei
 of a grab near young times the size of the grabbed patch moves that patch without tearing it from its neighbours.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from math import hypot
 from typing import Any
 
 import numpy as np
@@ -72,7 +74,7 @@ class Interaction:
     @property
     def largest(self) -> float:
         """Force that it never exceeds [N]."""
-        return self.limit if self.stiffness else float(np.linalg.norm(self.force))
+        return self.limit if self.stiffness else hypot(*self.force)
 
 
 class TouchError(ValueError):
@@ -88,6 +90,8 @@ class Touch(Effect):
         self.publish: Callable[[Launch], Any] = lambda launch: None  # set by the server
         self._system: System | None = None
         self._applied: list[Interaction] = []
+        self._together = False
+        self._changed: list[Interaction] | None = None  # what the loop is to be given at the end of `together`
         self._launch: Launch | None = None  # in use, or about to be; it writes when each interaction began
         self._last_id = 0
 
@@ -156,6 +160,23 @@ class Touch(Effect):
         """Not while there are grabs: they are known here alone."""
         return not any(a.stiffness for a in self._applied)
 
+    @contextmanager
+    def together(self) -> Iterator[None]:
+        """Changes made within the block go to the loop at its end, as one: with many clients a launch for each command
+        is what costs most."""
+        self._together = True
+        try:
+            yield
+        finally:
+            self._together = False
+            self.flush()
+
+    def flush(self) -> None:
+        """Gives the loop what has changed."""
+        if self._changed is not None:
+            changed, self._changed = self._changed, None
+            self.publish(self._bind(changed))
+
     @property
     def applied(self) -> list[Interaction]:
         """All that the loop was given last, as it was given them."""
@@ -175,6 +196,8 @@ class Touch(Effect):
     def alive(self) -> list[Interaction]:
         """Interactions that are not over, with the time at which they began."""
         assert self._system is not None
+        if self._changed is not None:
+            return self._changed
         time = float(self._system.clock[0])
         return [a for a in self.known() if a.start < 0 or time + self.world.dt / 2 < a.start + a.duration]
 
@@ -228,7 +251,9 @@ class Touch(Effect):
         return new
 
     def _put(self, interactions: list[Interaction]) -> None:
-        self.publish(self._bind(interactions))
+        self._changed = interactions
+        if not self._together:
+            self.flush()
 
     def _bind(self, interactions: list[Interaction]) -> Launch:
         """The launch that applies these interactions, sorted by node."""

@@ -14,6 +14,7 @@ from protocol.messages_pb2 import Command, Echo, Header, Reply
 from protocol.refused import Refused
 from protocol.session import Session
 from protocol.slots import Slot
+from sim_server.network.outbox import Outbox
 from sim_server.network.waiting import Asked, Waiting
 
 log = logging.getLogger(__name__)
@@ -26,9 +27,13 @@ class Inquiries:
     """A queryable and a thread for each channel, so that a flood of commands holds up no other question.
 
     What was published under a key is answered at once; commands wait for the simulation, in bounded room (waiting.py).
+    Their answers go through an outbox: zenoh waits where a client does not read.
     """
 
-    def __init__(self, session: Session, server: str, incarnation: int, counters: Counters, slot: Slot | None):
+    def __init__(
+        self, session: Session, server: str, incarnation: int, counters: Counters, slot: Slot | None, replies: Outbox
+    ):  # fmt: skip
+        self._replies = replies
         self._server = server
         self._incarnation = incarnation
         self._counters = counters
@@ -90,16 +95,21 @@ class Inquiries:
             reply, payload = echo.answer(self._echo_slot, question, self._incarnation)
             query.reply(query.key_expr, payload, attachment=reply.SerializeToString())
 
+    def _send(self, query: zenoh.Query, data: bytes) -> None:
+        try:
+            query.reply(self._command_key, data)
+        except zenoh.ZError as error:
+            log.debug("a command was not answered: %s", error)
+        finally:
+            query.drop()
+
     def _command(self, query: zenoh.Query) -> None:
         def reply(answer: Reply) -> None:
             answer.header.protocol = PROTOCOL
             answer.header.incarnation = self._incarnation
-            try:
-                query.reply(self._command_key, answer.SerializeToString())
-            except zenoh.ZError as error:
-                log.debug("a command was not answered: %s", error)
-            finally:
-                query.drop()
+            data = answer.SerializeToString()
+            if not self._replies.post(lambda: self._send(query, data)):
+                log.debug("a command was not answered: too many answers wait")
 
         try:
             command = parse(Command, query.payload, CHANNELS["command"].limit)

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 TOKENS = 4096  # joins and leaves that may wait
+REPLIES = 1024  # answers to commands that may wait to be sent
 
 
 class ServerLink:
@@ -67,6 +68,8 @@ class ServerLink:
             if self._pool is not None:
                 closing.callback(self._pool.close)
             self._jobs_out, self._telemetry = Outbox("jobs", 64), Outbox("telemetry", 64)
+            self._replies = Outbox("replies", REPLIES)
+            closing.callback(self._replies.close, finish=True)
             closing.callback(self._telemetry.close)
             closing.callback(self._jobs_out.close)
             self._declare(echo_slot, silence, clock)
@@ -77,7 +80,7 @@ class ServerLink:
         self._dispatch = Dispatch(
             session, self.name, self.incarnation, self._pool, self._jobs_out, self.counters, silence, clock
         )
-        self._inquiries = Inquiries(self._session, self.name, self.incarnation, self.counters, echo_slot)
+        self._inquiries = Inquiries(self._session, self.name, self.incarnation, self.counters, echo_slot, self._replies)
         self._publications = Publications(session, self.name, self._telemetry, self.counters)
         self._clients: set[str] = set()
         self._client_tokens = session.liveliness().declare_subscriber(
@@ -173,8 +176,8 @@ class ServerLink:
         """Somebody listens to step records."""
         return self._publications.wanted("steps")
 
-    def wants_state(self, object: str) -> bool:
-        """Somebody listens to the state of an object."""
+    def wants_state(self, object: str = "*") -> bool:
+        """Somebody listens to the state of an object; "*": of any."""
         return self._publications.wanted("state", object=object)
 
     def publish_steps(self, steps: Steps) -> None:

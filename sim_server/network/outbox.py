@@ -41,7 +41,7 @@ class Outbox:
             with self._changed:
                 while self._open and not self._waiting:
                     self._changed.wait()
-                if not self._open:
+                if not self._waiting:
                     return
                 _, send = self._waiting.popitem(last=False)
             try:
@@ -52,10 +52,11 @@ class Outbox:
                 log.exception("a message was not sent")
             del send  # it may hold a slot
 
-    def close(self, timeout: float = 1.0) -> None:
-        """Drop what waits and end the thread; one send under way may outlive the timeout."""
+    def close(self, timeout: float = 1.0, finish: bool = False) -> None:
+        """End the thread; what waits is dropped, or sent first (finish). A send may outlive the timeout."""
         with self._changed:
             self._open = False
-            self._waiting.clear()
+            if not finish:
+                self._waiting.clear()
             self._changed.notify()
         self._thread.join(timeout)

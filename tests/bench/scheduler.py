@@ -223,8 +223,8 @@ def main(
     floor: Annotated[int, typer.Option(min=0, help="Iterations above which there is excess")] = 2,
     seed: Annotated[int, typer.Option(help="Of where the hands take hold")] = 0,
     clairvoyant: Annotated[
-        bool, typer.Option("--clairvoyant", help="Also search the best order of jobs (minutes for 64 objects)")
-    ] = False,
+        int, typer.Option(min=0, help="Also search the best order of jobs, of up to so many objects (64: minutes)")
+    ] = 0,
     quick: Annotated[bool, typer.Option("--quick", help="A small smoke run")] = False,
     out: Annotated[Path | None, typer.Option(help="Folder of the results [default: out/bench/scheduler]")] = None,
 ) -> None:
@@ -236,7 +236,7 @@ def main(
     report = Report("scheduler", "Whose matrix is factorized next: the rules compared", arguments, out, quick)
     rows = []
     for size in sizes:
-        rows += compared(size, counts, setting, clairvoyant)
+        rows += compared(size, counts, setting, size <= clairvoyant)
         print(f"{size} objects done", flush=True)
     report.say(*_explained(setting))
     report.figure(picture(rows, sizes, counts), "scheduler.png", "Iterations and the oldest factor under each rule.")

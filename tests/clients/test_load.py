@@ -131,7 +131,22 @@ def run(*arguments: str) -> tuple[int, str, str]:
     return process.returncode, out, err
 
 
-TINY = ("--objects", "2", "--tets", "24..96", "--clients", "4", "--rate", "40", "--seconds", "2", "--workers", "1")
+TINY = (
+    "--objects",
+    "2",
+    "--tets",
+    "24..96",
+    "--clients",
+    "4",
+    "--rate",
+    "40",
+    "--seconds",
+    "2",
+    "--quiet",
+    "1",
+    "--workers",
+    "1",
+)
 
 
 @pytest.mark.system
@@ -145,6 +160,9 @@ def test_a_short_run(tmp_path: Path) -> None:
     steps, commands = found["steps"], found["clients"]["commands"]
     assert steps["count"] > 10 and 0 < steps["ms_p50"] <= steps["ms_p99"] <= steps["ms_max"]
     assert len(steps["ms"]) == steps["count"], "every step is in the log"
+    quiet = steps["quiet"]
+    assert quiet["count"] > 10 and 0 < quiet["ms_p50"] <= quiet["ms_p99"] <= quiet["ms_max"]
+    assert quiet["ratio"]["ms_p50"] == pytest.approx(steps["ms_p50"] / quiet["ms_p50"])
     assert [body["steps"] for body in found["objects"]] == [steps["count"]] * 2
     assert all(body["iterations_mean"] > 0 and body["unconverged"] == 0 for body in found["objects"])
     assert commands["sent"] > 40 and commands["done"] > 0 and commands["unanswered"] == 0

@@ -72,6 +72,39 @@ def test_nodes_are_those_within_the_radius_now_and_free():
     assert (sim.world.free[held.nodes] > 0).all()  # the nearest of all is fixed
 
 
+def test_changes_together_are_given_to_the_loop_as_one():
+    sims = {together: held_bar() for together in (False, True)}
+    given: dict[bool, list[int]] = {False: [], True: []}
+    for together, (sim, touch) in sims.items():
+        publish = touch.publish
+
+        def counted(launch: Any, publish: Any = publish, together: bool = together) -> Any:
+            given[together].append(launch.items)
+            return publish(launch)
+
+        touch.publish = counted
+
+        def act(touch: Touch = touch) -> None:
+            first = touch.push("anna", "bar", END, 0.6, (0, 5, 0), 1.0)
+            held = touch.grab("bert", "bar", END, 0.0, END, 1e3, 0.0, EVER)
+            touch.move("bert", held.id, (2.0, 0.9, 0.5))
+            assert [a.id for a in touch.alive()] == [first.id, held.id]
+            with pytest.raises(TouchError, match="max_force"):
+                touch.push("anna", "bar", END, 0.6, (0, 5e9, 0), 1.0)
+            touch.release("anna", first.id)
+
+        if together:
+            with touch.together():
+                act()
+        else:
+            act()
+        sim.engine.run(3)
+    assert len(given[False]) == 4 and len(given[True]) == 1
+    (apart, _), (once, touch) = sims.values()
+    assert np.array_equal(apart.world.x, once.world.x)
+    assert touch.known()[0].start == 0.0 and touch.known()[0].target == (2.0, 0.9, 0.5)
+
+
 def test_nodes_of_the_named_body_only():
     bodies = [bar(name=name, young=1e5, touch={"max_force": 100}) for name in ("a", "b")]
     sim = simulation(*bodies, dt=H)

@@ -45,3 +45,16 @@ def test_a_stuck_send_blocks_no_sender_and_newer_replaces_older() -> None:
     assert done.wait(10)
     assert sent == ["new", "other"]
     outbox.close()
+
+
+def test_closing_may_send_what_waits() -> None:
+    sent: list[int] = []
+    begun, go_on = threading.Event(), threading.Event()
+    outbox = Outbox("test", 10)
+    outbox.post(lambda: (begun.set(), go_on.wait(5)))  # type: ignore[arg-type,return-value]
+    begun.wait(5)
+    for k in range(5):
+        outbox.post(lambda k=k: sent.append(k))  # type: ignore[misc]
+    threading.Timer(0.05, go_on.set).start()
+    outbox.close(timeout=5, finish=True)
+    assert sent == list(range(5)) and not outbox.post(lambda: None)
