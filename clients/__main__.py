@@ -42,6 +42,23 @@ class Color(StrEnum):
     von_mises = "von_mises"
 
 
+def _version(asked: bool) -> None:
+    if asked:
+        from protocol.version import version
+
+        print(f"sim-client {version()}")
+        raise typer.Exit
+
+
+@app.callback()
+def client(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Say which version this is, and end.")
+    ] = False,
+) -> None:
+    """Look at a running sim-server, push its bodies about, view and export its logs."""
+
+
 @app.command()
 def status(
     as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,

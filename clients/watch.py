@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import signal
 import time
 from typing import Any
 
@@ -31,8 +32,9 @@ def watch(client: Client, count: int = 0) -> None:
 
 
 def tables(status: pb.Status) -> Group:
-    """Summary, objects and workers."""
-    return Group(_summary(status), _objects(status), _workers(status))
+    """Summary, objects and workers; what the server makes of those that it supervises."""
+    local = [_local(status)] if status.local_workers else []
+    return Group(_summary(status), _objects(status), _workers(status), *local)
 
 
 def _summary(status: pb.Status) -> Text:
@@ -75,6 +77,24 @@ def _workers(status: pb.Status) -> Table | Text:
         shared = "yes" if worker.shared_memory else "no"
         table.add_row(worker.worker, worker.host, str(worker.pid), worker.library, *map(str, numbers), shared)
     return table
+
+
+def _local(status: pb.Status) -> Table:
+    table = Table("local worker", "state", "pid", "restarts", "last end", **COMPACT)
+    for worker in status.local_workers:
+        ended = _end(worker.exit_code) if worker.restarts or worker.state != "running" else "-"
+        table.add_row(worker.worker, worker.state, str(worker.pid or "-"), str(worker.restarts), ended)
+    return table
+
+
+def _end(code: int) -> str:
+    """Of a process: its exit code, or the signal that ended it."""
+    if code >= 0:
+        return f"exit {code}"
+    try:
+        return signal.Signals(-code).name
+    except ValueError:
+        return f"signal {-code}"
 
 
 def _known(steps: int) -> str:

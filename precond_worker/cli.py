@@ -32,6 +32,14 @@ Examples:
 """
 
 
+def _version(asked: bool) -> None:
+    if asked:
+        from protocol.version import version
+
+        print(f"precond-worker {version()}")
+        raise typer.Exit
+
+
 class Terminated(BaseException):
     """SIGTERM: leave in good order."""
 
@@ -62,6 +70,9 @@ def work(
         bool, typer.Option("--exit-with-parent", help="End when the parent process ends")
     ] = False,
     verbose: Annotated[bool, typer.Option("--verbose", help="Say more on standard error")] = False,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Say which version this is, and end")
+    ] = False,
 ) -> None:
     """Factorize the matrices of a simulation server, until SIGTERM or Ctrl-C."""
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):

@@ -29,6 +29,7 @@ log = logging.getLogger(__name__)
 
 BLOCK = zenoh.CongestionControl.BLOCK
 TIMEOUT = 5.0  # s for a topology
+SETTLED = 3.0  # s after the first hello in which a worker gives way to another of its name that joins too
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,8 @@ class ServerEvent:
 class Uplink:
     """One worker of one server. mailbox holds what came: ServerEvent, or a sample with a matrix; it rings the bell.
 
-    Raises NameTaken if another worker has that name.
+    Raises NameTaken if another worker has that name. Two that join at the same instant see neither's token: of these
+    one finds a NameTaken in its mailbox.
     """
 
     def __init__(
@@ -52,7 +54,7 @@ class Uplink:
         self.server, self.name = check_name(server, "server name"), check_name(name, "worker name")
         self.library = library
         self.counters = counters
-        self.mailbox: Mailbox[ServerEvent | zenoh.Sample] = Mailbox(256, bell)
+        self.mailbox: Mailbox[ServerEvent | zenoh.Sample | NameTaken] = Mailbox(256, bell)
         self.slots = SlotMap()
         self.incarnation = 0  # of the server that this worker works for; 0: none
         self.shared_memory = False
@@ -68,6 +70,8 @@ class Uplink:
         self._servers = zs.liveliness().declare_subscriber(
             key("alive_server", server), self._server_event, history=True
         )
+        self._settled = float("inf")  # when it is too late for another of this name [s, monotonic]
+        self._others = zs.declare_subscriber(key("worker", server, worker=name), self._heard)
         self._heartbeat = Heartbeat(self._say)
 
     def _claim(self, session: zenoh.Session, token: str) -> None:
@@ -75,10 +79,21 @@ class Uplink:
         end = time.monotonic() + LINK_LEASE / 1000 + 0.5
         while any(reply.ok is not None for reply in session.liveliness().get(token, timeout=1.0)):
             if time.monotonic() > end:
-                raise NameTaken(
-                    f"another worker of server {self.server} is called {self.name}; --name gives this one its own"
-                )
+                raise self._taken("another worker")
             time.sleep(0.1)
+
+    def _taken(self, who: str) -> NameTaken:
+        return NameTaken(f"{who} of server {self.server} is called {self.name}; --name gives this one its own")
+
+    def _heard(self, sample: zenoh.Sample) -> None:
+        """A hello of this name: of ours, or of another that joined just now; the larger process number gives way."""
+        try:
+            info = parse(WorkerInfo, sample.payload, CHANNELS["worker"].limit)
+        except Refused as refusal:
+            self.counters.refuse(refusal)
+            return
+        if (info.host, info.pid) < (_host(), os.getpid()) and time.monotonic() < self._settled:
+            self.mailbox.put(self._taken(f"another worker, process {info.pid} on {info.host},"))
 
     def _server_event(self, sample: zenoh.Sample) -> None:
         try:
@@ -101,6 +116,7 @@ class Uplink:
             if obstacle and self._session.shared_memory:
                 self.counters.warn("no_shared_memory", f"arrays travel as bytes: {obstacle}")
             self.incarnation = incarnation
+            self._settled = min(self._settled, time.monotonic() + SETTLED)
             self._heartbeat.wake()
 
     def _say(self) -> None:
@@ -111,7 +127,7 @@ class Uplink:
                 header=self.header("", 0, "worker"),
                 worker=self.name,
                 pid=os.getpid(),
-                host=socket.gethostname()[:64],
+                host=_host(),
                 library=self.library,
                 threads=self._threads,
                 shared_memory=self.shared_memory,
@@ -176,3 +192,7 @@ class Uplink:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def _host() -> str:
+    return socket.gethostname()[:64]

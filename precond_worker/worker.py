@@ -11,7 +11,7 @@ import zenoh
 from numpy.typing import NDArray
 
 from precond_worker.builders import Builders
-from precond_worker.errors import DeviceUnusable
+from precond_worker.errors import DeviceUnusable, NameTaken
 from precond_worker.job import Job, accept
 from precond_worker.methods import Factorization
 from precond_worker.uplink import ServerEvent, Uplink
@@ -64,6 +64,8 @@ class Worker:
     def take_in(self, timeout: float) -> None:
         """Take in what came; with nothing to do yet, wait up to timeout seconds for it."""
         for item in self._uplink.mailbox.take(0.0 if self._pending else timeout):
+            if isinstance(item, NameTaken):
+                raise item
             try:
                 if isinstance(item, ServerEvent):
                     self._change_server(item)

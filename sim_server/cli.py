@@ -37,6 +37,14 @@ Examples:
 WORKERS_JOIN = 15.0  # s to wait for the first local worker before the simulation starts
 
 
+def _version(asked: bool) -> None:
+    if asked:
+        from protocol.version import version
+
+        print(f"sim-server {version()}")
+        raise typer.Exit
+
+
 class Terminated(BaseException):
     """SIGTERM: leave in good order."""
 
@@ -66,6 +74,9 @@ def serve(
     name: Annotated[str, typer.Option(metavar="NAME", help="Name of this server in all keys")] = "sim",
     no_shared_memory: Annotated[bool, typer.Option("--no-shared-memory", help="Send arrays as bytes")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing but errors")] = False,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Say which version this is, and end")
+    ] = False,
 ) -> None:
     """Simulate the objects of a scene, helped by preconditioner workers, open to clients."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

@@ -4,13 +4,13 @@
 import json
 import platform
 import time
-from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from protocol import messages_pb2 as pb
+from protocol.version import version
 from sim_server.backend import Cpu
 from sim_server.engine import Kind
 from sim_server.mesh import posed
@@ -31,18 +31,11 @@ def scene(simulation: Simulation) -> pb.Scene:
         resolved=json.dumps(s.resolved()),
         dt=s.dt,
         started_ns=time.time_ns(),
-        software=f"warpfactor {_version()}, {simulation.world.backend.name}, Python {platform.python_version()}",
+        software=f"warpfactor {version()}, {simulation.world.backend.name}, Python {platform.python_version()}",
         objects=[b.name for b in simulation.world.bodies],
         device="cpu" if isinstance(simulation.world.backend, Cpu) else "gpu",
         build=simulation.world.backend.build(),
     )
-
-
-def _version() -> str:
-    try:
-        return version("warpfactor")
-    except PackageNotFoundError:
-        return "(not installed)"
 
 
 def topology(simulation: Simulation, body: Body) -> pb.Topology:

@@ -59,6 +59,15 @@ def test_status_as_json(server: FakeServer) -> None:
     assert found["workers"][0]["jobs"] == 3 and found["refused"] == 0
 
 
+@pytest.mark.parametrize(("package", "name"), [
+    ("clients", "sim-client"), ("sim_server", "sim-server"), ("precond_worker", "precond-worker")
+])  # fmt: skip
+def test_version(package: str, name: str) -> None:
+    result = subprocess.run([sys.executable, "-m", package, "--version"], capture_output=True, text=True, cwd=ROOT)
+    assert result.returncode == 0 and result.stderr == ""
+    assert result.stdout.startswith(f"{name} ") and len(result.stdout.split()) >= 2
+
+
 def test_watch_a_few_times(server: FakeServer) -> None:
     code, out, _ = run("watch", "--count", "2", "--connect", server.endpoint)
     assert code == 0 and "beam" in out

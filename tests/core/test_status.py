@@ -35,6 +35,23 @@ def test_the_client_shows_these_numbers():
     assert "dropped: frames 4, step records 51; lost to the log 62" in text.getvalue()
 
 
+def test_the_client_shows_the_workers_that_the_server_supervises():
+    workers = [
+        pb.LocalWorker(worker="local-1", state="running", pid=71),
+        pb.LocalWorker(worker="local-2", state="restarting", pid=72, restarts=3, exit_code=-9),
+        pb.LocalWorker(worker="local-3", state="given up", pid=73, restarts=5, exit_code=1),
+    ]
+    text = io.StringIO()
+    Console(width=80, file=text).print(tables(pb.Status(local_workers=workers)))
+    rows = {line.split()[0]: line.split()[1:] for line in text.getvalue().splitlines() if "local-" in line}
+    assert rows["local-1"] == ["running", "71", "0", "-"]
+    assert rows["local-2"] == ["restarting", "72", "3", "SIGKILL"]
+    assert rows["local-3"] == ["given", "up", "73", "5", "exit", "1"]
+    bare = io.StringIO()
+    Console(width=80, file=bare).print(tables(pb.Status()))
+    assert "local" not in bare.getvalue()
+
+
 def test_the_status_and_the_log_tell_the_age_of_factors_and_its_bound():
     """The log as it is written: each step carries the bound that held then."""
     bodies = [bar(name=name, young=1e5, fixed="X < 0.01") for name in ("a", "b", "c")]

@@ -73,7 +73,7 @@ def test_server_worker_client_and_log(stage: Stage, tmp_path: Path) -> None:
 def test_a_killed_worker_costs_no_step(stage: Stage, tmp_path: Path) -> None:
     """kill -9 in the middle of factorizations; the run goes on, another worker is used as soon as it is there."""
     log = tmp_path / "run.mcap"
-    server = stage.server(beam(tmp_path, (8, 8, 32)), "--steps", "600", "--record", str(log))
+    server = stage.server(beam(tmp_path, (8, 8, 32)), "--record", str(log))
     worker = stage.worker()
     with stage.client() as client:
         until(lambda: client.status().objects[0].factors_used > 2, "the worker is used")
@@ -82,9 +82,12 @@ def test_a_killed_worker_costs_no_step(stage: Stage, tmp_path: Path) -> None:
         before = client.status().objects[0].factors_used
         stage.worker("w2")
         until(lambda: client.status().objects[0].factors_used > before + 1, "the second worker is used")
+        seen = client.status().step
+        client.stop()
     assert server.wait(60) == 0, server.output()
     data = exported(log, tmp_path)
-    assert data["scalars/step"].tolist() == list(range(1, 601)), "no step is lost"
+    steps = data["scalars/step"].tolist()
+    assert steps == list(range(1, len(steps) + 1)) and len(steps) >= seen, "no step is lost"
     assert set(data["scalars/status"]) == {"converged"}
 
 

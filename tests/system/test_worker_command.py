@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 
 import pytest
 from link_helpers import ROOT, free_endpoint, process
@@ -81,6 +82,27 @@ def test_a_second_worker_of_one_name_is_told_and_leaves() -> None:
             assert (second.returncode, out) == (2, "")
             assert "another worker of server sim is called twin; --name" in err
         assert first.poll() is None
+
+
+def test_of_two_of_one_name_that_join_at_the_same_instant_one_leaves() -> None:
+    """Both wait for the server, find nobody of their name when it comes, and are told by one another's hello."""
+    endpoint = free_endpoint()
+    arguments = ("-m", "precond_worker", "--connect", endpoint, "--name", "twin")
+    with process(*arguments) as one, process(*arguments) as other:
+        for child in (one, other):
+            assert child.stderr is not None and "trying until the server is there" in child.stderr.readline()
+        with ServerLink(listen=[endpoint]) as link:
+            end = time.monotonic() + 40
+            while one.poll() is None and other.poll() is None:
+                assert time.monotonic() < end, "both stay"
+                time.sleep(0.05)
+            left, stays = (one, other) if one.poll() is not None else (other, one)
+            assert left.stderr is not None and left.returncode == 2
+            assert "of server sim is called twin; --name gives this one its own" in left.stderr.read()
+            while [worker.pid for worker in link.workers()] != [stays.pid]:
+                assert time.monotonic() < end, "the other one is not taken"
+                time.sleep(0.05)
+            assert stays.poll() is None
 
 
 def test_it_ends_with_its_parent() -> None:
