@@ -64,11 +64,18 @@ class Launch(c.Structure):
     _fields_ = [("kernel", c.c_void_p), ("binding", c.c_void_p), ("mail", c.c_void_p), ("parts", c.c_void_p)]
 
 
+class Recycled(c.Structure):
+    _fields_ = [
+        ("capacity", c.c_int32), ("unused", c.c_int32), ("stored", c.c_int64), ("pairs", c.c_void_p),
+        ("weight", c.c_void_p),
+    ]  # fmt: skip
+
+
 class Body(c.Structure):
     _fields_ = [
         ("first", c.c_int32), ("last", c.c_int32), ("settings", Settings), ("factor", c.c_void_p),
         ("mail", c.c_void_p), ("snapshot", c.c_void_p), ("snapshot_step", c.c_int64), ("ahead", c.c_double),
-        ("steps", c.c_int64),
+        ("steps", c.c_int64), ("recycled", Recycled),
     ]  # fmt: skip
 
 

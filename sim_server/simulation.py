@@ -120,6 +120,8 @@ class Simulation:
         solver, native = self.scene.solver, self.engine.settings(body.index)
         native.tolerance, native.max_iterations = solver.tolerance, solver.max_iterations
         native.budget, native.warm_start = solver.budget, int(solver.warm_start)
+        if solver.recycle:
+            self.engine.recycle(body.index, solver.recycle)
         native.kind, native.omega = KINDS.get(solver.preconditioner, Kind.CHOLESKY), solver.omega
 
     def refusals(self) -> list[Refusal]:

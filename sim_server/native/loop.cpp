@@ -137,7 +137,7 @@ void wf_solve(Loop* loop) {
         } else {
             BlockCsr A{body.first, body.last, loop->row_start, loop->columns, loop->values};
             r = pcg(A, loop->b + 3 * body.first, body.factor, settings, loop->y + 3 * body.first,
-                    loop->work + 45 * (int64_t)body.first);
+                    loop->work + 45 * (int64_t)body.first, &body.recycled);
         }
         ++body.steps;
         if (!keep) continue;

@@ -28,6 +28,7 @@ struct Body {
     std::atomic<int64_t> snapshot_step; // step of the last copy made, -1: none
     double ahead;                       // s: below 0 the copy is of A, else of x + ahead v
     int64_t steps;                      // solved so far
+    Recycled recycled;
 };
 
 enum Phase { SOLVE = 0, TRY = 1, DONE = 2 };

@@ -89,7 +89,7 @@ static void turn(const Newton& newton, const Body& body, bool back, const double
 // One linearization, if it is the body's turn.
 static void solve(Loop& loop, int index) {
     const Newton& newton = *loop.newton;
-    const Body& body = loop.body[index];
+    Body& body = loop.body[index];
     Search& search = newton.search[index];
     if (search.phase != SOLVE) return;
     Room room(newton, body);
@@ -98,7 +98,7 @@ static void solve(Loop& loop, int index) {
     BlockCsr A{body.first, body.last, loop.row_start, loop.columns, loop.values};
     SolveSettings settings = body.settings;
     settings.warm_start = settings.warm_start && search.linearizations == 0;  // the last step's is no guess for a correction
-    SolveResult r = pcg(A, loop.b + at, body.factor, settings, y, work);
+    SolveResult r = pcg(A, loop.b + at, body.factor, settings, y, work, &body.recycled);
     search.residual = std::fmax(search.residual, r.residual);
     search.seconds += r.seconds;
     search.iterations += r.iterations;

@@ -11,6 +11,7 @@
 // An iteration is one application of A after the initial residual.
 #pragma once
 #include "block_csr.h"
+#include "recycle.h"
 #include "rings.h"
 #include "supernodal.h"
 
@@ -51,12 +52,26 @@ struct Preconditioner {
     double* inverse;  // (nodes, 9)
     void* work;       // 2 n doubles
     double omega;
+    const Recycling* recycling = nullptr;
+    double* turned = nullptr;  // n doubles, for those
 
     void prepare() {
         if (kind == JACOBI || kind == BLOCK_JACOBI || kind == SSOR) invert_diagonal(A, kind != JACOBI, inverse);
     }
     // z = P^-1 r; returns z . r
     double apply(const double* r, double r_norm, double* z) {
+        int n = A.size();
+        if (kind == CHOLESKY && recycling && recycling->any()) {
+            for (int i = 0; i < n; ++i) turned[i] = r[i];
+            recycling->before(turned);
+            alone(turned, r_norm, z);
+            recycling->after(z);
+        } else {
+            alone(r, r_norm, z);
+        }
+        return dot(n, z, r);
+    }
+    void alone(const double* r, double r_norm, double* z) {
         int n = A.size();
         if (kind == CHOLESKY && factor->bytes == 4)
             apply_factor(*factor->pattern, (const float*)factor->values, r, 1 / r_norm, z, (float*)work);
@@ -68,19 +83,21 @@ struct Preconditioner {
             for (int i = 0; i < n; ++i) z[i] = r[i];
         else
             apply_diagonal(n / 3, inverse, r, z);
-        return dot(n, z, r);
     }
 };
 
-// work: 15 n doubles. x: start in, solution out.
+// work: 15 n doubles. x: start in, solution out. recycled: pairs of the last solves, or null.
 static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor, const SolveSettings& settings, double* x,
-                       double* work) {
+                       double* work, Recycled* recycled = nullptr) {
     double start = now();
     int n = A.size();
     double *r = work, *z = r + n, *p = z + n, *q = p + n, *inverse = q + n, *scratch = inverse + 3 * n;
+    double* turned = work + 14 * (int64_t)n;
     SolveResult out{0, 0, 0, CONVERGED, settings.kind, 0};
     if (out.kind == CHOLESKY && !factor) out.kind = BLOCK_JACOBI;
+    Recycling recycling(recycled, n);
     auto finish = [&](int status, double r2, double b2) {
+        recycling.close();
         out.status = status;
         out.residual = b2 > 0 ? std::sqrt(r2 / b2) : 0;
         out.seconds = now() - start;
@@ -100,13 +117,14 @@ static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor,
     }
     if (r2 <= goal) return finish(CONVERGED, r2, b2);
 
-    Preconditioner P{A, factor, out.kind, inverse, scratch, settings.omega};
+    Preconditioner P{A, factor, out.kind, inverse, scratch, settings.omega, &recycling, turned};
     P.prepare();
     double rz = 0, last_true = INFINITY, quarter = r2 * std::pow(goal / r2, 0.25);
     bool restart = true, switched = false;
     auto leave_factor = [&] {
         P.kind = out.kind = BLOCK_JACOBI;
         out.fallbacks = 1;
+        recycling.forget();
         P.prepare();
         r2 = residual(A, b, x, r);
         restart = true;
@@ -138,6 +156,7 @@ static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor,
         double pq = multiply(A, p, q);
         ++out.iterations;
         if (!(pq > 0)) return finish(BREAKDOWN_MATRIX, residual(A, b, x, r), b2);
+        if (P.kind == CHOLESKY) recycling.keep(p, q, pq);
         r2 = descend(n, rz / pq, p, q, x, r);                                    // 3. 4. 5.
         if (r2 > goal) continue;
         r2 = residual(A, b, x, r);

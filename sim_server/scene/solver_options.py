@@ -108,6 +108,9 @@ class Solver(Parameters):
     budget: float = Field(default=0.0, ge=0, description="wall time per solve [s]; 0 = none")
     threads: int = Field(default=1, ge=1, le=1024)
     warm_start: bool = Field(default=True, description="start from the last step's dv")
+    recycle: int = Field(
+        default=0, ge=0, le=64, description="directions of the last solves that correct a factor grown old; 0: none"
+    )
     build: Literal["server", "worker"] = Field(
         default="server", description="who assembles the matrices to factorize; worker: it is sent positions"
     )
@@ -158,6 +161,8 @@ class Solver(Parameters):
             raise InputError(
                 f'solver.extrapolate = {self.extrapolate:g}: must be 0 without build = "worker", and on a GPU'
             )
+        if device == "gpu" and self.recycle:
+            raise InputError(f"solver.recycle = {self.recycle}: must be 0 on a GPU")
         if device == "gpu" and self.budget:
             raise InputError(
                 f"solver.budget = {self.budget:g}: must be 0 on a GPU, which bounds a solve by max_iterations"

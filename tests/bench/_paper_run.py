@@ -28,10 +28,12 @@ class Way:
     warp: bool | str = False
     latency: int = 0  # async and adaptive: steps that the one worker takes for a factor
     extrapolate: float = 0.0  # s
+    recycle: int = 0
 
     @property
     def solver(self) -> dict[str, Any]:
-        table = {"preconditioner": self.preconditioner, "update": self.update, "warp": self.warp}
+        table: dict[str, Any] = {"preconditioner": self.preconditioner, "update": self.update, "warp": self.warp}
+        table |= {"recycle": self.recycle} if self.recycle else {}
         return table | ({"build": "worker", "extrapolate": self.extrapolate} if self.extrapolate else {})
 
 
@@ -44,6 +46,7 @@ class Run:
     step: Reals  # without invert
     invert: Reals
     unconverged: int
+    cpu: Reals  # processor time of the step, all of it
     kinds: list[str]  # preconditioner of each step
     factorize: list[float] = field(default_factory=list)  # of each factor that was made, ms
 
@@ -64,7 +67,7 @@ def run(beam: Beam, load: Load, way: Way, steps: int, device: str = "cpu", **sol
     invert[: len(first)] = 0
     return Run(
         r["iterations"].astype(float), 1e3 * r["solve"], 1e3 * own, invert,
-        int((r["status"] != 0).sum()), [Kind(kind).name.lower() for kind in r["kind"]], made,
+        int((r["status"] != 0).sum()), 1e3 * r["cpu"], [Kind(kind).name.lower() for kind in r["kind"]], made,
     )  # fmt: skip
 
 
@@ -84,6 +87,7 @@ class Mean:
     solve: float  # ms
     step: float  # ms, without invert
     invert: float  # ms
+    cpu: float  # ms of processor time, median over the steps, least of the rounds
     factorize: float  # ms, nan: no factor was made
     unconverged: int
     factor_share: float  # of the steps, made with a factor
@@ -101,6 +105,7 @@ def mean(runs: list[Run]) -> Mean:
     made = [ms for r in runs for ms in r.factorize]
     return Mean(
         float(first.iterations.mean()), int(first.iterations.max()), time("solve"), time("step"), time("invert"),
+        min(float(np.median(r.cpu)) for r in runs),
         float(np.median(made)) if made else float("nan"), sum(r.unconverged for r in runs),
         float(np.mean([kind == "cholesky" for kind in first.kinds])),
         len(first.factorize),

@@ -13,7 +13,8 @@ from tests.bench._paper_run import Mean, Way, mean, run
 PRECONDITIONERS = ("none", "jacobi", "block_jacobi", "ssor", "ssor_factor", "cholesky", "incomplete_cholesky")
 
 
-EXTRAPOLATED = "async + warp, extrapolated"
+EXTRAPOLATED, RECYCLED = "async + warp, extrapolated", "async + warp, recycled"
+PAIRS = 8  # directions recycled (table 2)
 AHEAD = 2  # steps that positions sent to a worker go ahead, at most (table 2)
 LATENCIES = (1, 3, 10)  # of the table of extrapolations
 
@@ -46,7 +47,7 @@ class Setting:
         return {"tolerance": self.tolerance, "max_iterations": 20_000, "factor_precision": "float32"}
 
     def ways(self, device: str) -> dict[str, Way]:
-        """Columns of table 2: the paper's, then ours. Positions of a GPU go out as they are."""
+        """Columns of table 2: the paper's, then ours. A GPU neither extrapolates nor recycles."""
         lockstep = f"lockstep-{self.latency}"
         found = {
             "none": Way("none"),
@@ -55,10 +56,11 @@ class Setting:
             "async": Way("cholesky", lockstep),
             "async + warp": Way("cholesky", lockstep, True),
             EXTRAPOLATED: Way("cholesky", lockstep, True, extrapolate=AHEAD * DT),
+            RECYCLED: Way("cholesky", lockstep, True, recycle=PAIRS),
             "block Jacobi": Way("block_jacobi"),
             "auto": Way("auto", lockstep, "auto"),
         }
-        return {name: way for name, way in found.items() if device == "cpu" or not way.extrapolate}
+        return {name: way for name, way in found.items() if device == "cpu" or not (way.extrapolate or way.recycle)}
 
 
 def measured(cases: dict[str, tuple[Beam, Load, Way]], setting: Setting, device: str) -> dict[str, Mean]:
@@ -136,6 +138,28 @@ def extrapolations(setting: Setting, device: str) -> list[dict[str, Any]]:
                 way = Way("cholesky", f"lockstep-{latency}", True, extrapolate=min(steps, latency) * DT)
                 row[what] = float(run(beam, LOADS[2], way, setting.steps, **setting.solver()).iterations.mean())
             rows.append(row)
+    return rows
+
+
+def recycled(setting: Setting, device: str) -> list[dict[str, Any]]:
+    """A row for each beam and latency: iterations and processor time by the number of recycled directions."""
+    if device == "gpu":
+        return []
+    beams = {
+        "corotational": calibrated(setting.cells, COROTATIONAL, setting.condition)[0],
+        "heterogeneous": calibrated(setting.cells, COROTATIONAL, HETEROGENEOUS, heterogeneous=True)[0],
+    }
+    rows = []
+    for name, beam in beams.items():
+        for latency in LATENCIES:
+            ways = {pairs: Way("cholesky", f"lockstep-{latency}", True, recycle=pairs) for pairs in (0, 4, 8, 16, 24)}
+            found = measured({str(pairs): (beam, LOADS[2], way) for pairs, way in ways.items()}, setting, device)
+            rows += [
+                {"beam": name, "latency": latency, "recycled": pairs, "iterations": found[str(pairs)].iterations,
+                 "most iterations": found[str(pairs)].most, "step CPU ms": found[str(pairs)].cpu,
+                 "unconverged": found[str(pairs)].unconverged, "repeats": found[str(pairs)].repeats}
+                for pairs in ways
+            ]  # fmt: skip
     return rows
 
 

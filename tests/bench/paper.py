@@ -9,7 +9,7 @@ import typer
 from tests.bench import _paper_words as words
 from tests.bench import figure4
 from tests.bench._paper_beam import BANDS, LOADS
-from tests.bench._paper_tables import Setting, extrapolations, policies, table1, table2, table5
+from tests.bench._paper_tables import Setting, extrapolations, policies, recycled, table1, table2, table5
 from tests.bench._schemes import SCENES, run
 from tests.bench.report import Report
 
@@ -52,7 +52,11 @@ def section(setting: Setting, device: str, report: Report) -> None:
         told = words.EXTRAPOLATIONS.format(load=LOADS[2].name, steps=setting.steps)
         report.say(f"## Extrapolated states, {name}", told)
         report.table(ahead)
-    tables = (one, two, five, policy)
+    if again := recycled(setting, device):
+        report.data[device]["recycled"] = again
+        report.say(f"## Recycled directions, {name}", words.RECYCLING.format(load=LOADS[2].name))
+        report.table(again, words.COLUMNS_OF_RECYCLED)
+    tables = (one, two, five, policy, again)
     bad = sum(row["unconverged"] for rows in tables for row in rows)
     alike = all(row["repeats"] for rows in tables for row in rows)
     report.say(

@@ -10,6 +10,8 @@ from protocol import messages_pb2 as pb
 from protocol.refused import Refused
 from sim_server import describe
 from sim_server.assembly import Assembly
+from sim_server.driver import Driver
+from sim_server.scene.model import Scene
 from sim_server.simulation import Simulation
 from tests.scenes import bar, jittered_bar, mesh_file, scene, simulation
 
@@ -44,6 +46,15 @@ def test_the_same_matrix_bit_for_bit(solid, warp):
         deformed(sim, seed)
         sim.engine.assemble()
         assert built.matrix(sim.world.x.copy()).tobytes() == sim.system.values.tobytes()
+
+
+@pytest.mark.parametrize("scheme", ["newmark", "bdf2", "quasi_static"])
+def test_the_same_matrix_under_any_integrator(scheme):
+    table = scene(bar((4, 2, 2), fixed="X < 0.01", damping=(0.1, 0.02)), gravity=(0, -1, 0)).resolved()
+    sim = Simulation(Scene.model_validate(table | {"integrator": {"scheme": scheme}}, context={"folder": "."}))
+    Driver(sim).advance(5)
+    sim.engine.assemble()
+    assert Assembly(*described(sim)).matrix(sim.world.x.copy()).tobytes() == sim.system.values.tobytes()
 
 
 def test_each_of_several_bodies_by_itself():

@@ -63,6 +63,7 @@ def test_defaults_and_resolved(tmp_path):
             "budget": 0.0,
             "threads": 1,
             "warm_start": True,
+            "recycle": 0,
             "build": "server",
             "extrapolate": 0.0,
             "update_floor_iterations": 3,
