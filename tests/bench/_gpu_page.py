@@ -36,8 +36,8 @@ BATCHED = (
 )
 BYTES = (
     "MB of a step counted from sizes and iterations, each array once per pass over it, over the bandwidth measured: a "
-    "floor for what does not stay in caches (smaller bodies do, and may be faster). Latency: in each iteration two sums "
-    "and the phases of the factor's application wait for other thread blocks; each taken as the barrier measured."
+    "floor for what does not stay in caches (smaller bodies do, and may be faster). Latency: in each iteration two "
+    "sums and the phases of the factor's application wait for other thread blocks; each taken as the barrier measured."
 )
 OTHERS = (
     "Of the last matrix of a run. The first two are one application of the factor that ours applies once an "
