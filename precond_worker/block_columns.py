@@ -35,7 +35,7 @@ def _library() -> c.CDLL:
     """Compiled at the first call; raises sim_server.backend.CompileError without a C++ compiler."""
     from sim_server.backend import build  # lazily: a worker that makes complete factors needs no compiler
 
-    library, p, lower = c.CDLL(str(build(SOURCE))), c.c_void_p, c.POINTER(_Lower)
+    library, p, lower = c.CDLL(str(build(SOURCE, stepping=False))), c.c_void_p, c.POINTER(_Lower)
     signatures: dict[str, tuple[Any, list[Any]]] = {
         "ic_new": (p, []), "ic_delete": (None, [p]), "ic_blocks": (c.c_int64, [p]),
         "ic_factorize": (c.c_int32, [lower, p, c.c_double, c.c_double, c.c_double, p]),

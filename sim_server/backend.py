@@ -96,8 +96,9 @@ def read_text(path: str) -> tuple[str, str]:
     return Path(law).stem, text.replace("#include LAW\n", (HERE / law).read_text())
 
 
-def build(source: Path, defines: tuple[str, ...] = (), text: str | None = None) -> Path:
-    """Shared library of one text; compiles only what the cache lacks. text: where the file does not hold it.
+def build(source: Path, defines: tuple[str, ...] = (), text: str | None = None, stepping: bool = True) -> Path:
+    """Shared library of one text; compiles only what the cache lacks. text: where the file does not hold it. stepping:
+    what a step computes comes out of it, so it counts among `libraries`.
 
     Raises CompileError with the compiler's output, or if there is no folder for it.
     """
@@ -118,7 +119,8 @@ def build(source: Path, defines: tuple[str, ...] = (), text: str | None = None) 
             raise CompileError(f"{source.name} did not compile:\n{' '.join(command)}\n{result.stderr}")
         os.replace(scratch, library)
     compiled.append(source.name)
-    libraries.add(library.name)
+    if stepping:
+        libraries.add(library.name)
     return library
 
 
@@ -276,9 +278,9 @@ class Cpu:
         return host
 
 
-def native(path: str, signatures: dict[str, tuple[Any, list[Any]]]) -> ctypes.CDLL:
+def native(path: str, signatures: dict[str, tuple[Any, list[Any]]], stepping: bool = True) -> ctypes.CDLL:
     """A host-only C++ text of this package with its functions' types declared."""
-    library = ctypes.CDLL(str(build(HERE / path)))
+    library = ctypes.CDLL(str(build(HERE / path, stepping=stepping)))
     for name, (result, arguments) in signatures.items():
         function: Callable[..., Any] = getattr(library, name)
         function.restype, function.argtypes = result, arguments  # type: ignore[attr-defined]

@@ -60,6 +60,8 @@ class Driver:
         self.tracks = [Track(b, auto, self.counted) for b in simulation.world.bodies]
         self.by_name = {t.body.name: t for t in self.tracks}
         self.wants_factors = self.solver.wants_factors
+        if self.wants_factors:
+            self.guard.prepare()
         self.adopted: Callable[[Factor], None] = lambda factor: None  # told of every factor put into a mailbox
         self._due: dict[str, int] = {}  # lockstep: step of the matrix whose factor is taken up n steps later
         self._arrived: dict[tuple[str, int], Factor] = {}

@@ -26,7 +26,8 @@ SHARE = 0.9  # of what block Jacobi takes off: below it a factor is refused; not
 def _library() -> c.CDLL:
     p = c.c_void_p
     arguments = [c.POINTER(layouts.Factor), c.c_int32, p, p, p, p, p, p]
-    library = native("native/judge.cpp", {"wf_judge": (None, arguments), "wf_sizes": (c.c_int32, [p])})
+    signatures: dict[str, tuple[Any, list[Any]]] = {"wf_judge": (None, arguments), "wf_sizes": (c.c_int32, [p])}
+    library = native("native/judge.cpp", signatures, stepping=False)
     sizes = (c.c_int32 * 2)()
     library.wf_sizes(sizes)
     layouts.check_sizes("native/judge.cpp", list(sizes), [c.sizeof(layouts.Factor), c.sizeof(layouts.Pattern)])
@@ -39,6 +40,10 @@ class Guard:
     def __init__(self, patterns: dict[str, tuple[NDArray[np.int32], NDArray[np.int32]]]):
         self._patterns = patterns
         self._room: dict[int, tuple[Reals, Reals]] = {}  # by size: probe vector, work
+
+    def prepare(self) -> None:
+        """Compiles what is needed, so that the first factor does not wait for it."""
+        _library()
 
     def complaint(self, factor: Factor, matrix: Reals | None) -> str:
         """Why a factor is not to be used, empty if it is. matrix: values (blocks, 3, 3) it was made from, if known."""
