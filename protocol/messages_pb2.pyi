@@ -235,7 +235,7 @@ class Echo(_message.Message):
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., slot: _Optional[_Union[Slot, _Mapping]] = ..., nonce: _Optional[int] = ...) -> None: ...
 
 class ObjectStep(_message.Message):
-    __slots__ = ("header", "step", "time", "iterations", "status", "residual", "factor_step", "factor_age", "preconditioner", "assemble_seconds", "solve_seconds", "integrate_seconds", "step_seconds", "late_seconds", "fallbacks", "excess", "interactions", "asked", "probe", "factor_age_bound", "cpu_seconds", "linearizations", "nonlinear_residual")
+    __slots__ = ("header", "step", "time", "iterations", "status", "residual", "factor_step", "factor_age", "preconditioner", "assemble_seconds", "solve_seconds", "integrate_seconds", "step_seconds", "late_seconds", "fallbacks", "excess", "interactions", "asked", "probe", "factor_age_bound", "cpu_seconds", "linearizations", "nonlinear_residual", "warping")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     STEP_FIELD_NUMBER: _ClassVar[int]
     TIME_FIELD_NUMBER: _ClassVar[int]
@@ -259,6 +259,7 @@ class ObjectStep(_message.Message):
     CPU_SECONDS_FIELD_NUMBER: _ClassVar[int]
     LINEARIZATIONS_FIELD_NUMBER: _ClassVar[int]
     NONLINEAR_RESIDUAL_FIELD_NUMBER: _ClassVar[int]
+    WARPING_FIELD_NUMBER: _ClassVar[int]
     header: Header
     step: int
     time: float
@@ -282,7 +283,8 @@ class ObjectStep(_message.Message):
     cpu_seconds: float
     linearizations: int
     nonlinear_residual: float
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., time: _Optional[float] = ..., iterations: _Optional[int] = ..., status: _Optional[_Union[SolveStatus, str]] = ..., residual: _Optional[float] = ..., factor_step: _Optional[int] = ..., factor_age: _Optional[int] = ..., preconditioner: _Optional[str] = ..., assemble_seconds: _Optional[float] = ..., solve_seconds: _Optional[float] = ..., integrate_seconds: _Optional[float] = ..., step_seconds: _Optional[float] = ..., late_seconds: _Optional[float] = ..., fallbacks: _Optional[int] = ..., excess: _Optional[float] = ..., interactions: _Optional[_Iterable[_Union[Interaction, _Mapping]]] = ..., asked: _Optional[str] = ..., probe: _Optional[int] = ..., factor_age_bound: _Optional[int] = ..., cpu_seconds: _Optional[float] = ..., linearizations: _Optional[int] = ..., nonlinear_residual: _Optional[float] = ...) -> None: ...
+    warping: int
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., time: _Optional[float] = ..., iterations: _Optional[int] = ..., status: _Optional[_Union[SolveStatus, str]] = ..., residual: _Optional[float] = ..., factor_step: _Optional[int] = ..., factor_age: _Optional[int] = ..., preconditioner: _Optional[str] = ..., assemble_seconds: _Optional[float] = ..., solve_seconds: _Optional[float] = ..., integrate_seconds: _Optional[float] = ..., step_seconds: _Optional[float] = ..., late_seconds: _Optional[float] = ..., fallbacks: _Optional[int] = ..., excess: _Optional[float] = ..., interactions: _Optional[_Iterable[_Union[Interaction, _Mapping]]] = ..., asked: _Optional[str] = ..., probe: _Optional[int] = ..., factor_age_bound: _Optional[int] = ..., cpu_seconds: _Optional[float] = ..., linearizations: _Optional[int] = ..., nonlinear_residual: _Optional[float] = ..., warping: _Optional[int] = ...) -> None: ...
 
 class Steps(_message.Message):
     __slots__ = ("header", "steps")

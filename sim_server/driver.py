@@ -22,13 +22,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import Factor
-from sim_server.engine import Kind
+from sim_server.engine import HELD, NOTE_ALWAYS, NOTE_COPIES, Kind
 from sim_server.factors import FactorSource, Inline, Job
 from sim_server.guard import Guard
 from sim_server.schedule import oldest_possible, overdue_after, pays, pick
 from sim_server.simulation import Simulation
 from sim_server.stock import Stock
 from sim_server.track import Track
+from sim_server.warping import Warping
 from sim_server.world import Body
 
 log = logging.getLogger(__name__)
@@ -69,10 +70,15 @@ class Driver:
         self._stock = Stock()
         self._asked = count()
         self._alone = False  # there was no worker for a matrix of lockstep
-        self._warped = {t.body.name: bool(simulation.system.warped[t.body.nodes].any()) for t in self.tracks}
+        self._warped = {t.body.name: t.body.index in simulation.warped for t in self.tracks}
         bytes_a = {
             t.body.name: 72.0 * len(simulation.system.body_values(t.body.first, t.body.last)) for t in self.tracks
         }
+        follows = (
+            self.solver.build == "worker" or self.solver.recycle
+        )  # what is built or kept elsewhere goes by rotations
+        if self.solver.warp == "auto" and self.wants_factors and not follows:
+            self._auto_warp()
         self._bytes = bytes_a  # of A: deterministic cost of an iteration
         self._spare: dict[
             tuple[int, ...], list[NDArray[np.float64]]
@@ -96,6 +102,8 @@ class Driver:
         else:
             if self.wants_factors and self.free:
                 self.pump_factors()
+            else:
+                self._note([])
             self.engine.run(1)
         return self._observed()
 
@@ -106,6 +114,7 @@ class Driver:
 
     def step_with_fresh_factors(self) -> NDArray[Any]:
         """A step that waits for the factors of its own matrices, made in this process; returns its records."""
+        self._note(self.tracks)
         self.engine.assemble()
         for t in self.tracks:
             values = self._values(t.body)
@@ -177,6 +186,7 @@ class Driver:
             if made + self.n == now:
                 self._await(name, made)
         fresh = [t for t in self.tracks if t.body.name not in self._due]
+        self._note(fresh)
         for t in fresh:
             self._ask(t)
         self.engine.run(1)
@@ -352,10 +362,14 @@ class Driver:
         for r in records:
             t, iterations, kind = self.tracks[r["body"]], int(r["iterations"]), Kind(r["kind"])
             cost = self._model(t, kind, iterations) if self.counted else float(r["solve"])
-            t.observe(r, floor, cost)
+            tried = t.warping is not None and bool(r["warping"] & HELD) != t.warping.decided  # no fault of the factor
+            t.observe(r, max(floor, iterations) if tried else floor, cost)
             if t.choice is not None:
                 t.choice.observe(kind, iterations, cost, Kind(r["asked"]))
                 self._settle(t)
+            if t.warping is not None and kind == r["asked"] == Kind.CHOLESKY and not (r["probe"] or r["fallbacks"]):
+                t.warping.observe(int(r["step"]) - 1, int(r["factor_step"]), iterations, bool(r["warping"] & HELD))
+                self._warp(t)
 
     def _model(self, t: Track, kind: int, iterations: int) -> float:
         """Bytes that a solve moved, about: the deterministic stand-in for its time."""
@@ -370,3 +384,34 @@ class Driver:
         assert t.choice is not None
         native = self.engine.settings(t.body.index)
         native.kind, native.probe = t.choice.kind, t.choice.probe
+
+    # --- warp = "auto" ------------------------------------------------------------------------------------------
+
+    def _auto_warp(self) -> None:
+        known = self.engine.exact or not self.free
+        for t in self.tracks:
+            if t.body.index not in self.simulation.warped:
+                continue
+            t.warping = Warping(known)
+            if self.free:  # the loop knows which matrices it copies
+                settings = self.engine.settings(t.body.index)
+                settings.note = NOTE_COPIES if known else NOTE_ALWAYS
+                if not known:
+                    settings.adopt = 1
+
+    def _note(self, fresh: list[Track]) -> None:
+        """Before a step of a policy that waits: whose matrices of it become factors."""
+        for t in self.tracks:
+            if t.warping is None:
+                continue
+            settings = self.engine.settings(t.body.index)
+            settings.note = NOTE_ALWAYS if t in fresh else 0
+            if not self.engine.exact:
+                settings.adopt = int(t.newest == t.noted != t.made)
+                t.made = t.noted if settings.adopt else t.made
+            t.noted = self.engine.step if t in fresh else t.noted
+
+    def _warp(self, t: Track) -> None:
+        assert t.warping is not None
+        t.warping.consider(lambda: self.simulation.system.turned(t.body.nodes))
+        self.engine.settings(t.body.index).hold = int(t.warping.hold)

@@ -23,6 +23,8 @@ from sim_server.rings import Reports
 from sim_server.scene.integrator_options import Integrator
 
 Reals = NDArray[np.float64]
+HELD, NOTED, MOVED, ADOPTED = 1, 2, 4, 8  # of the frames of a body in a step, kernels/nodes.cu
+NOTE_ALWAYS, NOTE_COPIES = 1, 2  # native/pcg.h
 
 
 class Kind(IntEnum):
@@ -132,8 +134,8 @@ class Newton:
 class Engine(Reports):
     """The loop over one system.
 
-    assemble, integrate: the launches of a step, in order. ranges: nodes [first, last) of each body. arrays: those of
-    the system by name (row_start, columns, values, b, y, x, v, clock). newton: for several linearizations a step.
+    assemble, integrate: the launches of a step, in order. ranges: nodes [first, last) of each body. newton: for several
+    linearizations a step. arrays: those of the system by name (row_start, columns, values, b, y, x, v, clock, warping).
     """
 
     def __init__(
@@ -151,6 +153,7 @@ class Engine(Reports):
         self._body = (layouts.Body * bodies)()
         for entry_body, (first, last) in zip(self._body, ranges, strict=True):
             entry_body.first, entry_body.last, entry_body.snapshot_step = first, last, -1
+            entry_body.noted = entry_body.made = -1
         self._work = np.zeros(45 * nodes)
         self._recycled: dict[int, Any] = {}
         self._arrays = arrays
@@ -161,11 +164,13 @@ class Engine(Reports):
         super().__init__(loop, bodies, dt, records, np.zeros((frames, 2, nodes, 3)))
         loop.launches, loop.before, loop.launch = len(launches), len(assemble), self._launch
         loop.bodies, loop.nodes, loop.body = bodies, nodes, self._body
-        for name in ("row_start", "columns", "values", "b", "y", "x", "v", "clock"):
+        for name in ("row_start", "columns", "values", "b", "y", "x", "v", "clock", "warping"):
             setattr(loop, name, arrays[name].ctypes.data)
         loop.work, loop.threads = self._work.ctypes.data, threads
         self._newton = newton and newton.attach(loop, self._launch)
         self.begin: list[Launch] = []  # before the first step
+
+    exact = True  # frames are reckoned from the very step of the factor, whenever it is taken up
 
     # --- running ------------------------------------------------------------------------------------------------
 

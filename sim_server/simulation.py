@@ -44,15 +44,16 @@ class Simulation:
         self.effects = build_effects(scene, self.world)
         elements = [e.elements for e in self.effects.values() if e.elements is not None]
         self.system = System(self.world, elements)
-        matched = self._warp()
+        matched = self._matched()
         self.shape = ShapeMatching(self.world, matched, scene.solver.warp_level) if matched else None
+        self.warped = {body.index for body in self._rotated() + matched}  # whose solve is in the material frame
         self.integrator = Integrator(scene, self.system)
         if not self.world.inertia:
             check_held(self.world, elements)
         assemble, integrate = self.launches()
         w, s = self.world, self.system
         arrays: dict[str, Any] = {"row_start": s.row_start, "columns": s.columns, "values": s.values}
-        arrays |= {"b": s.b_material, "y": s.y, "x": w.x, "v": w.v, "clock": s.clock}
+        arrays |= {"b": s.b_material, "y": s.y, "x": w.x, "v": w.v, "clock": s.clock, "warping": s.warping}
         ranges = [(b.first, b.last) for b in w.bodies]
         self.engine: Any
         if device == "gpu":
@@ -102,18 +103,17 @@ class Simulation:
         assemble += system.finish()  # into the material frame (eq. 12 and 13)
         return assemble, [self.integrator.advance()]
 
-    def _warp(self) -> list[Body]:
-        """Decides whose solve happens in the material frame; returns those whose rotations are matched shapes."""
+    def _rotated(self) -> list[Body]:
+        """Bodies whose rotations for the warp are those of elements."""
         if self.scene.solver.warp is False:
             return []
-        matched = self._matched()
-        for body in [*(body for e in self.effects.values() for body in e.rotated), *matched]:
-            self.system.warped[body.nodes] = 1
-        return matched
+        return [body for e in self.effects.values() for body in e.rotated]
 
     def _matched(self) -> list[Body]:
-        """Bodies with elements none of which have rotations."""
-        rotated = {body.index for e in self.effects.values() for body in e.rotated}
+        """Bodies with elements none of which have rotations: theirs are matched shapes."""
+        if self.scene.solver.warp is False:
+            return []
+        rotated = {body.index for body in self._rotated()}
         return [b for b in self.world.bodies if b.index not in rotated and self.system.couples(b.first, b.last)]
 
     def _settle(self, body: Body) -> None:
@@ -122,6 +122,7 @@ class Simulation:
         native.budget, native.warm_start = solver.budget, int(solver.warm_start)
         if solver.recycle:
             self.engine.recycle(body.index, solver.recycle)
+        native.hold = int(body.index not in self.warped)  # in the frame that they begin with, the identity
         native.kind, native.omega = KINDS.get(solver.preconditioner, Kind.CHOLESKY), solver.omega
 
     def refusals(self) -> list[Refusal]:

@@ -38,14 +38,15 @@ class Stencil:
 class System:
     """Pattern and arrays of A' and b' for a world and the elements of its effects.
 
-    elements: per effect, (m, c) node numbers of the elements that couple their corners, c = 2 or 4. warped (n,): 1 at
-    nodes whose solve happens in the material frame, for whoever sets a simulation up.
+    elements: per effect, (m, c) node numbers of the elements that couple their corners, c = 2 or 4.
+
+    rotation (n, 3, 3): frames of the nodes. warping (bodies,), used and noted (n, 8): by which they can be held and let
+    go (kernels/nodes.cu); the loop sets warping in each step.
     """
 
     def __init__(self, world: World, elements: list[Ints]):
         n = world.nodes
         self.world = world
-        self.warped = np.zeros(n)
         couplings = [_couplings(e, world.free, n) for e in elements]
         above = np.unique(np.concatenate([np.zeros(0, np.int64), *(keys for keys, _ in couplings)]))
         self.row, self.column = (part.astype(np.int32) for part in np.divmod(above, n))
@@ -58,6 +59,11 @@ class System:
         self.block = np.zeros((n, 6))
         self.b = np.zeros((n, 3))
         self.mean = np.zeros((n, 10))
+        self.body = np.repeat([b.index for b in world.bodies], [b.last - b.first for b in world.bodies]).astype(
+            np.int32
+        )
+        self.warping = np.zeros(len(world.bodies), np.int32)
+        self.used, self.noted = (np.tile([1.0, 0.0, 0.0, 0.0], (n, 2)) for _ in range(2))
         self.rotation = np.tile(np.eye(3), (n, 1, 1))
         self.b_material = np.zeros((n, 3))
         self.y = np.zeros((n, 3))
@@ -93,9 +99,9 @@ class System:
         """Everything into the material frame: A' = R^T A R, b' = R^T b, and the start of the solve."""
         w = self.world
         turn = self.world.backend.module("kernels/nodes.cu").bind(
-            "turn", w.nodes, free=w.free, warped=self.warped, place=self.own, mean=self.mean, b=self.b,
-            diagonal=self.diagonal, block=self.block, dv=self.dv, rotation=self.rotation, b_material=self.b_material,
-            y=self.y, values=self.values,
+            "turn", w.nodes, free=w.free, body=self.body, warping=self.warping, place=self.own, mean=self.mean,
+            b=self.b, diagonal=self.diagonal, block=self.block, dv=self.dv, used=self.used, noted=self.noted,
+            rotation=self.rotation, b_material=self.b_material, y=self.y, values=self.values,
         )  # fmt: skip
         assemble = self.world.backend.module("kernels/assemble.cu").bind(
             "assemble", len(self.row), row=self.row, column=self.column, upper=self.upper, lower=self.lower,
@@ -109,6 +115,18 @@ class System:
         return self.world.backend.module("kernels/nodes.cu").bind(
             "advance", w.nodes, rotation=self.rotation, y=self.y, h=w.dt, dv=self.dv, v=w.v, x=w.x
         )
+
+    def turned(self, nodes: slice) -> float:
+        """Mean angle of frames from where they were when the factor in use was made [rad]."""
+        backend = self.world.backend
+        now, made = backend.fetch(self.rotation)[nodes], backend.fetch(self.used)[nodes, :4]
+        w, v = made[:, 0], made[:, 1:]
+        axial = np.stack(
+            [now[:, 2, 1] - now[:, 1, 2], now[:, 0, 2] - now[:, 2, 0], now[:, 1, 0] - now[:, 0, 1]], axis=1
+        )
+        along = np.einsum("ni,nij,nj->n", v, now, v) + w * np.einsum("ni,ni->n", v, axial)
+        trace = (w**2 - (v**2).sum(axis=1)) * np.trace(now, axis1=1, axis2=2) + 2 * along
+        return float(np.arccos(np.clip((trace - 1) / 2, -1, 1)).mean())
 
     def couples(self, first: int, last: int) -> bool:
         """Whether anything couples nodes of a body."""

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from protocol.factor import Factor, FactorPattern
 from sim_server.choice import Choice
 from sim_server.schedule import Need, excess
+from sim_server.warping import Warping
 from sim_server.world import Body
 
 MEMORY = 0.2  # weight of the newest value in running means
@@ -62,6 +63,8 @@ class Track:
         self.seconds = Mean()  # s, or operations, of a factorization
         self.per_iteration = Mean()  # s, or bytes
         self.choice = Choice() if auto else None
+        self.warping: Warping | None = None  # warp = "auto"
+        self.noted = self.made = -1  # steps, for a device that is told: its matrix noted last; what frames go by
 
     def age(self, step: int) -> int:
         """Steps since the matrix of the newest factor, -1 without one."""

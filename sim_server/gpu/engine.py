@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from protocol.factor import FactorPattern
 from sim_server.backend import HERE
+from sim_server.engine import ADOPTED, HELD, MOVED, NOTED
 from sim_server.gpu.cuda import CudaDevice
 from sim_server.gpu.device import DeviceLaunch, Gpu
 from sim_server.gpu.fuse import End, Fused, fused
@@ -31,17 +32,49 @@ TICK = np.dtype(
 )  # fmt: skip
 
 
+class Warping:
+    """How the frames of all bodies are (kernels/nodes.cu), (bodies,) on the device; what is set holds from the next
+    batch on. While both ADOPTED and NOTED are set, frames are held where they are and follow from there."""
+
+    def __init__(self, flags: NDArray[np.int32]):
+        self._flags = flags.copy()
+        self.mailbox: Mailbox | None = None
+
+    def __getitem__(self, place: tuple[int, int]) -> int:
+        """Of (body, bit): 0 or 1."""
+        body, bit = place
+        return int(self._flags[body] & bit != 0)
+
+    def __setitem__(self, place: tuple[int, int], value: int) -> None:
+        body, bit = place
+        if self[place] == bool(value):
+            return
+        self._flags[body] ^= bit
+        if bit == HELD and value:
+            self._flags[body] |= MOVED
+        assert self.mailbox is not None
+        self.mailbox.post(self._flags.tobytes())
+
+
+BITS = {"hold": HELD, "note": NOTED, "adopt": ADOPTED}
+
+
 class Settings:
     """Solver settings of a body; what is set holds from its next batch on."""
 
-    def __init__(self, row: NDArray[Any], mailbox: Mailbox):
+    def __init__(self, row: NDArray[Any], mailbox: Mailbox, body: int, warping: Warping):
         object.__setattr__(self, "_row", row)
         object.__setattr__(self, "_mailbox", mailbox)
+        object.__setattr__(self, "_body", body)
+        object.__setattr__(self, "_warping", warping)
 
     def __getattr__(self, name: str) -> Any:
-        return self._row[name].item()
+        return self._warping[self._body, BITS[name]] if name in BITS else self._row[name].item()
 
     def __setattr__(self, name: str, value: Any) -> None:
+        if name in BITS:
+            self._warping[self._body, BITS[name]] = value
+            return
         if name in ("budget", "omega") or self._row[name] == value:  # no budget of wall time and no SSOR on a GPU
             return
         self._row[name] = value
@@ -74,12 +107,16 @@ class GpuEngine(DeviceLoop):
         boxes += [(first + row * k + SETTINGS, row - SETTINGS) for k in range(bodies)]
         self._mailed = {k: len(boxes) + i for i, k in enumerate(k for k, x in enumerate(self.launches) if x.mailed)}
         boxes += [(self.launches[k].mail_address, self.launches[k].params.nbytes) for k in self._mailed]
+        warping = gpu.twin(arrays["warping"])
+        boxes.append((int(warping.data.ptr), warping.nbytes))
+        self._warping = Warping(arrays["warping"])
         twins = {name: gpu.twin(arrays[name]) for name in ("values", "x", "v")}
         addresses = {name: int(twin.data.ptr) for name, twin in twins.items()}
         super().__init__(
             device, ranges, arrays["row_start"], dt, boxes, self._results, self._stamps, arrays["clock"],
             records, twins["values"].dtype, **addresses,
         )  # fmt: skip
+        self._warping.mailbox = self.mailboxes[-1]
         names = names or [f"body {k}" for k in range(bodies)]
         self._intake = Intake(gpu, self.solver, self, names, self.mailboxes[bodies : 2 * bodies])
         for k in range(bodies):
@@ -107,6 +144,8 @@ class GpuEngine(DeviceLoop):
         tick["dt"], tick["barriers"], tick["capacity"] = dt, len(self.solver.arrived), CAPACITY
         tick["words"] = len(self._ranges) * RESULT.itemsize // 8
         return tick
+
+    exact = False  # settings hold for batches of steps
 
     # --- running ------------------------------------------------------------------------------------------------
 
@@ -172,7 +211,8 @@ class GpuEngine(DeviceLoop):
 
     def settings(self, body: int) -> Settings:
         """Solver settings of a body."""
-        return Settings(self.solver.bodies[body : body + 1].reshape(()), self.mailboxes[body])
+        row = self.solver.bodies[body : body + 1].reshape(())
+        return Settings(row, self.mailboxes[body], body, self._warping)
 
     def post_factor(self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int) -> None:
         """Has L expanded beside the steps; taken up between batches once that is done."""

@@ -84,7 +84,7 @@ static void report(Loop& l, const Batch& batch, int64_t k, double end, double cp
         rings.records[(head + i) % rings.record_capacity] =
             Record{step, r.factor_step, rings.start_time + step * rings.dt, r.residual, 0, r.seconds, 0,
                    1e-9 * (stamp.end - stamp.begin), k ? 0 : batch.late, end - 1e-9 * (last.end - stamp.begin), cpu, -1, i,
-                   r.iterations, r.status, r.kind, r.asked, r.fallbacks, r.bad_node, r.probe, 1, 0};
+                   r.iterations, r.status, r.kind, r.asked, r.fallbacks, r.bad_node, r.probe, 1, r.warping};
     }
     rings.step.store(step);
     *l.clock = rings.start_time + step * rings.dt;

@@ -39,7 +39,7 @@ struct Mailbox {                // bytes on the device that are replaced between
 struct Result {                 // solve.cuh
     double residual, seconds;
     int64_t factor_step;
-    int32_t iterations, status, kind, asked, fallbacks, bad_node, probe, unused;
+    int32_t iterations, status, kind, asked, fallbacks, bad_node, probe, warping;
 };
 
 struct Stamp { int64_t begin, end; };  // of a step, ns of the device's clock

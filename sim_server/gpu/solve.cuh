@@ -67,7 +67,7 @@ struct Result {
     double residual;                 // true, relative
     double seconds;
     long long factor_step;           // -1: no factor used
-    int iterations, status, kind, asked, fallbacks, bad_node, probe, unused;
+    int iterations, status, kind, asked, fallbacks, bad_node, probe, warping;
 };
 
 struct Solve {
@@ -93,6 +93,7 @@ struct Solve {
     unsigned* arrived;               // (1,) zero at launch: next of the pool
     const long long* step;           // completed steps: where the result goes
     Result* results;                 // (capacity, bodies)
+    const int* warping;              // (bodies,) of the step under way (kernels/nodes.cu), for the results
     int nodes, shared;               // of the scene; bytes of dynamic shared memory
 };
 

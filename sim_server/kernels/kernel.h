@@ -134,6 +134,16 @@ template <class M> INLINE bool any(M mask) {
     for (int k = 0; k < LANES; ++k) found |= mask[k] != 0;
     return found;
 }
+INLINE number as_number(index a) {
+    number r;
+    for (int k = 0; k < LANES; ++k) r[k] = a[k];
+    return r;
+}
+INLINE bool any(index a) {
+    for (int k = 0; k < LANES; ++k)
+        if (a[k]) return true;
+    return false;
+}
 
 #else
 
@@ -155,6 +165,8 @@ typedef number local_number;
 #if !defined(WIDE) || defined(__CUDACC_RTC__)
 template <class T> INLINE T at(const T* a, index i) { return a[i]; }
 template <class T> INLINE void put(T* a, index i, T v) { a[i] = v; }
+INLINE number as_number(index a) { return a; }
+INLINE bool any(index a) { return a; }
 #endif
 
 // Entry k of row i of an array (n, K).

@@ -5,6 +5,7 @@
 #include <cstring>
 
 #include "newton.h"
+#include "warping.h"
 
 static void take_mail(Launch& l, int64_t step) {
     if (Binding* next = l.mail.exchange(nullptr)) {
@@ -102,23 +103,27 @@ void wf_assemble(Loop* loop) {
     Rings& rings = loop->rings;
     loop->cpu_begin = thread_time();
     loop->clock[0] = rings.start_time + rings.step * rings.dt;
+    for (int i = 0; i < loop->bodies; ++i) begin_frames(*loop, i);
     for (int i = 0; i < loop->before; ++i) {
         take_mail(loop->launch[i], rings.step);
         run(loop->launch[i], loop->threads);
     }
-    for (int i = 0; i < loop->bodies; ++i) copy_for_worker(*loop, loop->body[i]);
+    for (int i = 0; i < loop->bodies; ++i) {
+        Body& body = loop->body[i];
+        bool noted = body.settings.note != NOTE_COPIES || body.warping & NOTED;  // else it was asked for meanwhile
+        if (noted) copy_for_worker(*loop, body);
+        loop->warping[i] = body.warping & ~(NOTED | ADOPTED);  // further linearizations change nothing of that
+    }
     loop->assemble_begin = begin;
     loop->assemble_seconds = now() - begin;
 }
 
-void wf_solve(Loop* loop) {
+static void finish_step(Loop* loop) {
     Rings& rings = loop->rings;
     int64_t first = rings.record_head.load(), step = rings.step + 1;
     double entered = now();
     bool keep = room_for_records(rings, loop->bodies, [] {});
     double waited = now() - entered;  // no part of the step
-    for (int i = 0; i < loop->bodies; ++i)
-        if (const Factor* next = loop->body[i].mail.exchange(nullptr)) loop->body[i].factor = next;
     if (loop->newton) {
         for (int i = 0; i < loop->bodies; ++i) begin_search(*loop, i);
         search_all(*loop);
@@ -146,7 +151,7 @@ void wf_solve(Loop* loop) {
         record = Record{step, used ? body.factor->step : -1, rings.start_time + step * rings.dt, r.residual,
                         loop->assemble_seconds, r.seconds, 0, 0, rings.late, loop->assemble_begin, 0, nonlinear, i, r.iterations,
                         r.status, r.kind, settings.kind, r.fallbacks, r.status == NOT_FINITE ? first_bad_node(*loop, body) : -1,
-                        settings.probe, linearizations, 0};
+                        settings.probe, linearizations, body.warping};
     }
     double solved = now();
     for (int i = loop->before; i < loop->launches; ++i) run(loop->launch[i], loop->threads);
@@ -165,6 +170,12 @@ void wf_solve(Loop* loop) {
     write_frame(*loop);
 }
 
+// A factor posted since `wf_assemble` is made from the matrix of this step, or the caller does not mind.
+void wf_solve(Loop* loop) {
+    for (int i = 0; i < loop->bodies; ++i) take_factor(loop->body[i]);
+    finish_step(loop);
+}
+
 int32_t wf_wait(Loop* loop) { return wait_until_due(loop->rings, [] { return false; }); }
 
 // Runs until `steps` are done or `stop` is set; returns the steps done.
@@ -172,7 +183,7 @@ int64_t wf_run(Loop* loop, int64_t steps) {
     int64_t done = 0;
     for (; done < steps && wf_wait(loop); ++done) {
         wf_assemble(loop);
-        wf_solve(loop);
+        finish_step(loop);
     }
     return done;
 }

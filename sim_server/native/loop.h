@@ -29,6 +29,8 @@ struct Body {
     double ahead;                       // s: below 0 the copy is of A, else of x + ahead v
     int64_t steps;                      // solved so far
     Recycled recycled;
+    int64_t noted, made;                // steps, -1: none; noted last; of the factor that frames are reckoned from
+    int32_t warping, unused;            // of the step under way (warping.h)
 };
 
 enum Phase { SOLVE = 0, TRY = 1, DONE = 2 };
@@ -71,6 +73,7 @@ struct Loop {
     double* work;                      // 45 doubles a node
     Newton* newton;                    // null: one linearization a step
     double* clock;                     // (1,) s, read by kernels
+    int32_t* warping;                  // (bodies,) likewise
     int32_t threads;                   // of this process, for launches and bodies
     int32_t unused;
     double assemble_begin;

@@ -15,7 +15,7 @@ struct Record {
     double assemble, solve, integrate, whole, late, begin;  // s; begin: steady clock
     double cpu;            // s of processor time of the thread, whole step
     double nonlinear;      // |b| at the end of the step over the first |b|; -1: not evaluated
-    int32_t body, iterations, status, kind, asked, fallbacks, bad_node, probe, linearizations, unused;
+    int32_t body, iterations, status, kind, asked, fallbacks, bad_node, probe, linearizations, warping;
 };
 
 struct Rings {

@@ -28,10 +28,11 @@ ROW = np.dtype(
     [
         ("step", "i8"), ("iterations", "i8"), ("status", "i8"), ("residual", "f8"), ("factor_step", "i8"),
         ("kind", "i8"), ("asked", "i8"), ("probe", "i8"), ("fallbacks", "i8"), ("linearizations", "i8"),
+        ("warping", "i8"),
     ]
 )  # fmt: skip
 """What a solve was made with and what came of it, from an ObjectStep."""
-_PACK = struct.Struct("<qqqdqqqqqq")
+_PACK = struct.Struct("<qqqdqqqqqqq")
 _KINDS = {kind.name.lower(): int(kind) for kind in Kind} | dict.fromkeys(FACTORS, int(Kind.CHOLESKY))
 
 
@@ -150,6 +151,7 @@ class Recording:
                 s.probe,
                 s.fallbacks,
                 max(s.linearizations, 1),
+                s.warping,
             )
 
     def _complete(self) -> int:

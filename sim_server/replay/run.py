@@ -21,6 +21,7 @@ from protocol.factor import Factor
 from protocol.log_chunks import BadLog
 from protocol.refused import Refused
 from sim_server import describe
+from sim_server.engine import ADOPTED, HELD, NOTED
 from sim_server.errors import DeviceError
 from sim_server.factors import Inline, Job
 from sim_server.replay.log import Recording
@@ -74,10 +75,13 @@ class Replay:
         self._compare_frames(0)
         for step in range(self.recording.steps):
             self._touch(step)
+            for body in self.bodies:
+                self._settle(body.index, body.name, step)
+                self._use_factor(body.index, body.name, step, fresh=False)
             self.engine.assemble()
             self._make_factors(step)
             for body in self.bodies:
-                self._settle(body.index, body.name, step)
+                self._use_factor(body.index, body.name, step, fresh=True)
             self.engine.solve()
             self.compared.solves(self.engine.records(), [self._rows(b.name)[step] for b in self.bodies])
             self._compare_frames(step + 1)
@@ -161,7 +165,7 @@ class Replay:
         for body in self.bodies:
             if (body.name, step) not in self._needed:
                 continue
-            warped = bool(self.simulation.system.warped[body.nodes].any())
+            warped = body.index in self.simulation.warped
             values = self.simulation.system.body_values(body.first, body.last)
             solver = self.simulation.scene.solver
             self._inline.submit(Job(body.name, 1, step, warped, values, solver.factor_dtype, solver.method))
@@ -181,12 +185,19 @@ class Replay:
         self.compared.factor(factor.step, factor.object, f"other {what}; then {then.worker} ({maker}), now {here}")
 
     def _settle(self, index: int, name: str, step: int) -> None:
-        """Solver settings and factor of one solve as they were."""
+        """Solver settings of one solve as they were."""
         row, settings, solver = self._rows(name)[step], self.engine.settings(index), self.simulation.scene.solver
         settings.kind, settings.probe = int(row["asked"]), int(row["probe"])
         settings.budget = -float(row["iterations"] + 1) if row["status"] == pb.BUDGET and solver.budget else 0.0
-        made = int(row["factor_step"])
-        if made < 0:
+        if solver.warp == "auto" and index in self.simulation.warped:
+            settings.hold, settings.note = bool(row["warping"] & HELD), bool(row["warping"] & NOTED)
+            if not self.engine.exact:
+                settings.adopt = bool(row["warping"] & ADOPTED)
+
+    def _use_factor(self, index: int, name: str, step: int, fresh: bool) -> None:
+        """The factor of one solve. fresh: one made from the matrix of this very step; others were there before it."""
+        made = int(self._rows(name)[step]["factor_step"])
+        if made < 0 or fresh != (made == step):
             return
         if self._in_use.get(name) != made:
             factor = self._factors.get((name, made))
