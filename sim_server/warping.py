@@ -26,7 +26,7 @@ SHARE = 0.02  # of all iterations that trials may cost
 EVERY = 12  # solves between trials, doubled after each that was no gain ...
 RARELY = 3000  # ... up to so many
 HARDER = 1.25  # a held body is tried again soon when solves cost so many times what they did when that was decided
-FAR = 0.12  # rad, mean over nodes since the factor's matrix: following is better for certain
+FAR = 0.2  # rad, mean over nodes since the factor's matrix: following is better for certain
 NEAR = 1e-4  # rad: both are the same
 RECENT = 64  # solves remembered
 
