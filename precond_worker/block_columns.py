@@ -38,7 +38,7 @@ def _library() -> c.CDLL:
     library, p, lower = c.CDLL(str(build(SOURCE, stepping=False))), c.c_void_p, c.POINTER(_Lower)
     signatures: dict[str, tuple[Any, list[Any]]] = {
         "ic_new": (p, []), "ic_delete": (None, [p]), "ic_blocks": (c.c_int64, [p]),
-        "ic_factorize": (c.c_int32, [lower, p, c.c_double, c.c_double, c.c_double, p]),
+        "ic_factorize": (c.c_int32, [lower, p, c.c_double, c.c_double, c.c_double, c.c_double, p]),
         "ic_ssor": (c.c_int32, [lower, p, c.c_double, p]),
         "ic_pattern": (None, [p, p, p]), "ic_values": (None, [p, p]),
     }  # fmt: skip
@@ -76,14 +76,16 @@ class BlockColumns:
         weakref.finalize(self, self._native.ic_delete, self._made)
         self.pattern: FactorPattern | None = None  # of the factor made last
 
-    def incomplete(self, values: NDArray[np.float64], shift: float, drop_tolerance: float, fill: float) -> int:
+    def incomplete(
+        self, values: NDArray[np.float64], shift: float, drop_tolerance: float, fill: float, noise: float
+    ) -> int:
         """Factorizes with `shift` times the norm of each node (blocks.node_norms) added to its diagonal.
 
-        values (blocks, 3, 3). fill: most blocks of a column, in mean columns of A; 0: no bound. Returns -1, or the node
-        where it broke down.
+        values (blocks, 3, 3). fill: most blocks of a column, in mean columns of A; 0: no bound. noise: least pivot of a
+        node, of its norm. Returns -1, or the node where it broke down.
         """
         found = self._native.ic_factorize(
-            c.byref(self._lower), values.ctypes.data, shift, drop_tolerance, fill, self._made
+            c.byref(self._lower), values.ctypes.data, shift, drop_tolerance, fill, noise, self._made
         )
         return int(self._order[found]) if found >= 0 else -1
 

@@ -2,7 +2,7 @@
 """The block pattern of a system matrix: 3 x 3 blocks, one block row per node, both triangles."""
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 BLOCK = 3  # degrees of freedom of a node
 Index = NDArray[np.int32]
@@ -47,6 +47,14 @@ def node_norms(row_start: NDArray[np.integer], values: NDArray[np.float64]) -> N
     In a positive definite matrix that is the diagonal block; where it is not, that may be zero.
     """
     return np.maximum.reduceat(np.linalg.norm(values, axis=(1, 2)), row_start[:-1]) / np.sqrt(BLOCK)
+
+
+def noise(dtype: DTypeLike) -> float:
+    """A pivot below this part of its node's diagonal is what rounding left of one, in a factor of this type.
+
+    Such a factor is worse than none: what it divides by is in a direction that is not the matrix's.
+    """
+    return 1e-7 if np.dtype(dtype) == np.float32 else 1e-13
 
 
 def degrees_of_freedom(nodes: NDArray[np.integer]) -> NDArray[np.int64]:

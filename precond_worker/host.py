@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_matrix
 
-from precond_worker.blocks import BLOCK, Index
+from precond_worker.blocks import BLOCK, Index, noise
 from precond_worker.elimination import eliminate
 from precond_worker.errors import NotPositiveDefinite, OutOfRange
 from precond_worker.ordering import order_nodes
@@ -16,8 +16,6 @@ from precond_worker.supernodes import pattern_arrays
 from precond_worker.triangle import lower_triangle
 from protocol import FactorPattern
 from protocol.check import all_finite
-
-TINY = 1e-12  # of a node's diagonal: pivots of LDL^T are made at least this
 
 
 class Numeric(Protocol):
@@ -50,16 +48,18 @@ class Host:
     ) -> tuple[NDArray[np.floating], int]:
         """Values of L |D|^1/2 of an LDL^T factorization of finite values, and how many pivots were not positive.
 
-        Raises NotPositiveDefinite if there is none without pivoting, or if L |D| L^T is more than `growth` times A.
+        Raises NotPositiveDefinite if there is none without pivoting, if pivots are noise (of a matrix that is singular
+        but for rounding), or if L |D| L^T is more than `growth` times A.
         """
         unit, pivots, diagonal = self.numeric.ldl(matrix)
         scale = np.repeat(np.abs(diagonal).reshape(-1, BLOCK).max(axis=1), BLOCK)  # of its node
-        size = np.maximum(np.abs(pivots), TINY * scale)
-        values = unit.data * np.repeat(np.sqrt(size), np.diff(unit.indptr))
+        if not (np.abs(pivots) > noise(dtype) * scale).all():
+            raise NotPositiveDefinite("pivots of LDL^T are noise")
+        values = unit.data * np.repeat(np.sqrt(np.abs(pivots)), np.diff(unit.indptr))
         lower = csc_matrix((values, unit.indices, unit.indptr), unit.shape)
         if not (np.asarray(lower.multiply(lower).sum(axis=1)).ravel() <= growth * scale).all():
             raise NotPositiveDefinite("LDL^T without pivoting grows out of hand")
-        return self._packed(lower, dtype, None), int(np.count_nonzero(pivots <= TINY * scale))
+        return self._packed(lower, dtype, None), int(np.count_nonzero(pivots < 0))
 
     def _packed(
         self, factor: csc_matrix, dtype: np.dtype[np.floating], out: NDArray[np.floating] | None

@@ -5,7 +5,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from precond_worker.block_columns import BlockColumns, banded_order
-from precond_worker.blocks import BLOCK, checked_pattern
+from precond_worker.blocks import BLOCK, checked_pattern, noise
 from precond_worker.errors import NotPositiveDefinite
 from protocol import FactorPattern
 from protocol.method import Method
@@ -48,7 +48,7 @@ class Sparse:
             raise ValueError(f"matrix: values of shape {matrix.shape}, allowed: ({self._blocks}, {BLOCK}, {BLOCK})")
         if not np.isfinite(matrix).all():
             raise ValueError("matrix: values hold NaN or infinity, allowed: finite numbers")
-        self._make(matrix)
+        self._make(matrix, noise(dtype))
         with np.errstate(over="ignore", under="ignore"):
             made = self._native.take().astype(dtype)
         pivots = made[self.pattern.diagonal]
@@ -56,17 +56,17 @@ class Sparse:
             raise NotPositiveDefinite(f"matrix: incomplete factor out of the range of {made.dtype}")
         return made
 
-    def _make(self, matrix: NDArray[np.float64]) -> None:
+    def _make(self, matrix: NDArray[np.float64], noise: float) -> None:
         raise NotImplementedError
 
 
 class IncompleteCholesky(Sparse):
     """Never breaks down: where a pivot is not positive it begins again with more on the diagonal (Manteuffel 1980)."""
 
-    def _make(self, matrix: NDArray[np.float64]) -> None:
+    def _make(self, matrix: NDArray[np.float64], noise: float) -> None:
         shift, node = 0.0, -1
         for shift in (0.0, *(FIRST_SHIFT * 2.0**k for k in range(SHIFTS))):
-            node = self._native.incomplete(matrix, shift, self._method.drop_tolerance, self._method.fill)
+            node = self._native.incomplete(matrix, shift, self._method.drop_tolerance, self._method.fill, noise)
             if node < 0:
                 self.remedy = f"diagonal shifted by {shift:g}" if shift else ""
                 return
@@ -76,6 +76,6 @@ class IncompleteCholesky(Sparse):
 class Ssor(Sparse):
     """P = (D/w + L) (D/w)^-1 (D/w + L)^T w / (2 - w) with A = L + D + L^T in blocks (Saad, 2nd edition, 10.2)."""
 
-    def _make(self, matrix: NDArray[np.float64]) -> None:
+    def _make(self, matrix: NDArray[np.float64], noise: float) -> None:
         if (node := self._native.ssor(matrix, self._method.omega)) >= 0:
             raise NotPositiveDefinite(f"matrix: diagonal block of node {node} is not positive definite")

@@ -161,8 +161,9 @@ Made* ic_new() { return new Made; }
 void ic_delete(Made* made) { delete made; }
 
 // Factorizes A with shift |A_j| / sqrt(3) (|A_j|: largest block of node j) more on the diagonal; fill: most blocks of a column, in mean columns of A, 0: no
-// bound. Returns -1, or the column where it broke down.
-int32_t ic_factorize(const Lower* lower, const double* values, double shift, double tolerance, double fill, Made* made) {
+// bound; noise: least pivot of a node, of its norm. Returns -1, or the column where it broke down.
+int32_t ic_factorize(const Lower* lower, const double* values, double shift, double tolerance, double fill, double noise,
+                     Made* made) {
     const Lower& A = *lower;
     Made& L = *made;
     reset(A, L);
@@ -171,7 +172,7 @@ int32_t ic_factorize(const Lower* lower, const double* values, double shift, dou
     const int64_t most = fill > 0 ? (int64_t)std::ceil(fill * column) : INT64_MAX;
     for (int j = 0; j < A.nodes; ++j) {
         form(A, values, shift, L, j);
-        if (!(L.norm[j] > 0 && cholesky3(L.w[j].a, 1e-14 * L.norm[j], L.diagonal[j].a))) return j;
+        if (!(L.norm[j] > 0 && cholesky3(L.w[j].a, noise * L.norm[j], L.diagonal[j].a))) return j;
         keep(L, j, tolerance, most);
         L.at[j] = L.start[j];
         link(L, j);
