@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Counters of one body, from which schedule.py decides: what it was sent, what came of it, what its solves cost."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,10 @@ class Mean:
     def add(self, value: float) -> None:
         self.value = value if self.value is None else self.value + MEMORY * (value - self.value)
 
+    def add_all(self, mean: float, rest: float, first: float) -> None:
+        """Many at once. mean: theirs with their weights; rest: weight of what was before, or else of the first."""
+        self.value = mean + rest * ((first if self.value is None else self.value) - mean)
+
 
 class Track:
     """One body. counted: costs are bytes and operations instead of seconds, so that runs repeat exactly; one of these
@@ -43,7 +48,7 @@ class Track:
         self._owed = 0.0  # of when the last matrix went out, should nothing come of it
         self._usual = Mean()  # of the first solve with a new factor
         self.lost = 0.0  # to the factor in use
-        self._in_use = -1  # its step
+        self.in_use = -1  # its step
         self.sent: int | None = None  # step of the last matrix that went out
         self.in_flight = False
         self.wanted: NDArray[np.float64] | None = None  # where the loop copies the matrix asked for
@@ -121,18 +126,56 @@ class Track:
 
     def observe(self, record: Any, floor: int, cost: float) -> None:
         """A solve was made (a record of the loop). floor: iterations above it are excess; cost: of the solve."""
-        if not 0 <= record["factor_step"] < self.newest:  # else it was made before the newest factor was taken up
-            floor *= max(int(record["linearizations"]), 1)
-            self._sum_up(excess(int(record["iterations"]), floor), record)
+        floor *= max(int(record["linearizations"]), 1)
+        self.sum_up(excess(int(record["iterations"]), floor), int(record["factor_step"]))
         self.refused += int(record["fallbacks"])
         self.per_iteration.add(cost / (int(record["iterations"]) + 1))
         if record["factor_step"] >= 0:
             self.age_max = max(self.age_max, int(record["step"]) - 1 - int(record["factor_step"]))
 
-    def _sum_up(self, above: int, record: Any) -> None:
-        if record["factor_step"] >= 0:
-            if record["factor_step"] != self._in_use:
-                self._in_use, self.lost, self.excess = int(record["factor_step"]), 0.0, 0.0
+    def sum_up(self, above: int, made: int) -> None:
+        """Excess of a solve with the factor of step `made`, -1: with none."""
+        if 0 <= made < self.newest:  # before the newest factor was taken up
+            return
+        if made >= 0:
+            if made != self.in_use:
+                self.in_use, self.lost, self.excess = made, 0.0, 0.0
                 self._usual.add(above)
             self.lost += above
         self.excess, self.latest = self.excess + above, float(above)
+
+
+def observe_steps(tracks: Sequence[Track], records: NDArray[Any], floor: int) -> None:
+    """As Track.observe of each record of whole steps, of all bodies in order, in seconds.
+
+    A worker gets a job each time that the service thread comes round: with a thousand bodies this is what it waits for.
+    """
+    r = records.reshape(-1, len(tracks))
+    steps, made = len(r), r["factor_step"]
+    above = np.maximum(r["iterations"] - floor * np.maximum(r["linearizations"], 1), 0)
+    weights = (1 - MEMORY) ** np.arange(steps - 1, -1, -1)
+    each = r["solve"] / (r["iterations"] + 1)
+    costs = weights @ each / weights.sum()
+    rest = float((1 - MEMORY) ** steps)
+    age = np.where(made >= 0, r["step"] - 1 - made, -1).max(axis=0)
+    columns = (
+        above.sum(axis=0),
+        above[-1],
+        (made == made[0]).all(axis=0),
+        made[0],
+        costs,
+        r["fallbacks"].sum(axis=0),
+        age,
+    )
+    for k, (t, total, last, one, factor, cost, fallbacks, oldest) in enumerate(
+        zip(tracks, *(column.tolist() for column in columns), strict=True)
+    ):
+        t.refused += fallbacks
+        t.per_iteration.add_all(cost, rest, float(each[0, k]))
+        t.age_max = max(t.age_max, oldest)
+        if one and (factor < 0 or factor == t.in_use == t.newest):
+            t.excess, t.latest = t.excess + total, float(last)
+            t.lost += total if factor >= 0 else 0
+            continue
+        for i in range(steps):
+            t.sum_up(int(above[i, k]), int(made[i, k]))

@@ -459,6 +459,31 @@ def test_the_sum_begins_anew_with_the_factor_and_comes_back_where_there_is_none(
     assert (track.excess, track.latest, track.lost) == (1, 1, 1)
 
 
+def test_records_of_many_steps_count_as_one_after_another():
+    """For runs by the clock there is a quick way; the factor in use changes in some bodies and not in others."""
+    rng, bodies = np.random.default_rng(0), [bar(name=f"b{k}", young=1e6, fixed="X < 0.01") for k in range(5)]
+    one, all_at_once = (Driver(falling(*bodies, update="async"), counted=False) for _ in range(2))
+    for batch in range(6):
+        records = np.zeros((7, 5), RECORD)
+        records["step"] = 7 * batch + np.arange(1, 8)[:, None]
+        records["iterations"], records["solve"] = rng.integers(0, 12, (7, 5)), rng.random((7, 5))
+        records["factor_step"], records["body"] = -1 if not batch else 7 * (batch - 1), np.arange(5)
+        records["factor_step"][4:, 1:3] = 7 * batch
+        records["fallbacks"][2, 3], records["linearizations"][3] = 1, 2
+        for driver in (one, all_at_once):
+            for t in driver.tracks:
+                t.newest = 7 * batch if t.body.index in (1, 2) and batch else t.newest
+                t.newest = 7 * (batch - 1) if t.body.index == 0 and batch else t.newest
+        for k in range(7):
+            one.observe(records[k])
+        all_at_once.observe(records.ravel())
+        for a, b in zip(one.tracks, all_at_once.tracks, strict=True):
+            assert (a.excess, a.latest, a.lost, a.in_use) == (b.excess, b.latest, b.lost, b.in_use)
+            assert (a.refused, a.age_max) == (b.refused, b.age_max)
+            assert a.per_iteration.value == pytest.approx(b.per_iteration.value, rel=1e-12)
+            assert a.need(99).excess == b.need(99).excess
+
+
 def test_a_poisoned_factor_that_reached_the_loop_is_counted_as_refused():
     """Past the guard (test_guard.py), which looks at one vector only."""
     sim = falling(update="async")
