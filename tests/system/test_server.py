@@ -73,7 +73,7 @@ def test_server_worker_client_and_log(stage: Stage, tmp_path: Path) -> None:
 def test_a_killed_worker_costs_no_step(stage: Stage, tmp_path: Path) -> None:
     """kill -9 in the middle of factorizations; the run goes on, another worker is used as soon as it is there."""
     log = tmp_path / "run.mcap"
-    server = stage.server(beam(tmp_path, (8, 8, 32)), "--record", str(log))
+    server = stage.server(beam(tmp_path, (8, 8, 32)), "--record", str(log), "--set", "record.every=100")
     worker = stage.worker()
     with stage.client() as client:
         until(lambda: client.status().objects[0].factors_used > 2, "the worker is used")
