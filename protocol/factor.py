@@ -158,7 +158,7 @@ def _check_starts(starts: NDArray[Any], end: int, name: str, what: str) -> None:
 @dataclass(frozen=True, eq=False)
 class Factor:
     """L of one object at one step. values (pattern.nonzeros,) float32 or float64; seconds: what it took to make;
-    remedy: what was done to a matrix that was not positive definite, in a few words."""
+    remedy: what was done to a matrix that was not positive definite, in a few words; ahead, later: as in FactorUse."""
 
     object: str
     epoch: int
@@ -169,6 +169,8 @@ class Factor:
     worker: str
     seconds: float
     remedy: str = ""
+    ahead: float = 0.0
+    later: bool = False
 
 
 def check_values(values: NDArray[Any], pattern: FactorPattern, expected: int | None) -> None:

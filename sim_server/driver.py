@@ -15,6 +15,7 @@ import logging
 import re
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import count
 from typing import Any
 
@@ -153,7 +154,8 @@ class Driver:
         if not t.came_in(factor, self.engine.step):
             return
         self.engine.post_factor(t.body.index, factor.pattern, factor.values, factor.step)
-        self.adopted(factor)
+        later = t.sent_positions and self.engine.positions_later and factor.worker != self.inline.WORKER
+        self.adopted(replace(factor, ahead=t.ahead, later=later) if t.ahead or later else factor)
         if t.choice is not None:
             t.choice.factor_arrived()
             self._settle(t)
@@ -319,8 +321,10 @@ class Driver:
         t.asked = next(self._asked)
         if self._others_build(t):
             t.wanted = self._room((t.body.last - t.body.first, 3))
-            self.engine.request_positions(t.body.index, t.wanted, self._ahead(t))
+            t.ahead = self._ahead(t)
+            self.engine.request_positions(t.body.index, t.wanted, t.ahead)
         else:
+            t.ahead = 0.0
             t.wanted = self._room(self._values(t.body).shape)
             self.engine.request_matrix(t.body.index, t.wanted)
 

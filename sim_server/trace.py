@@ -85,4 +85,5 @@ class Trace:
             header=pb.Header(object=factor.object, epoch=factor.epoch), step=factor.step, pattern=factor.pattern.id,
             checksum=checksum(factor.values), dtype=factor.values.dtype.name, worker=factor.worker,
             library=library, threads=maker.threads, seconds=factor.seconds, remedy=factor.remedy,
+            ahead=factor.ahead, later=factor.later,
         )  # fmt: skip

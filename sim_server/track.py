@@ -55,7 +55,8 @@ class Track:
         self.matrix: tuple[int, NDArray[np.float64]] | None = None  # of the job in flight: step and what was sent
         self.asked = 0  # number of the request for it, among those of all bodies
         self.unbuilt = 0  # jobs in a row that were sent positions and came to nothing
-        self.sent_positions = False  # with the last job
+        self.sent_positions = False  # with the last job ...
+        self.ahead = 0.0  # ... so far ahead [s]
         self.used = 0
         self.refused = 0
         self.mended = 0  # of those used: from a matrix that was not positive definite

@@ -58,6 +58,8 @@ class DeviceLoop(Reports):
     host array (1,). real: of values, x and v on the device, whose addresses these are.
     """
 
+    positions_later = True
+
     def __init__(
         self, device: Device, ranges: Sequence[tuple[int, int]], row_start: NDArray[Any], dt: float,
         mailboxes: Sequence[tuple[int, int]], results: NDArray[Any], stamps: NDArray[Any], clock: Reals,

@@ -21,6 +21,7 @@ from protocol.factor import Factor
 from protocol.log_chunks import BadLog
 from protocol.refused import Refused
 from sim_server import describe
+from sim_server.assembly import Assembly
 from sim_server.engine import ADOPTED, HELD, NOTED
 from sim_server.errors import DeviceError
 from sim_server.factors import Inline, Job
@@ -28,6 +29,7 @@ from sim_server.replay.log import Recording
 from sim_server.replay.report import Comparison
 from sim_server.scene import Scene
 from sim_server.simulation import Simulation
+from sim_server.world import Body
 
 MESH = ("nodes", "tets", "row_start", "columns", "fixed")
 
@@ -61,6 +63,8 @@ class Replay:
         self._sets: dict[int, pb.TouchSet] = {t.step: t for t in recording.touch}
         self._held: dict[int, tuple[Any, Any]] = {}  # nodes and offsets of interactions by id
         self._inline = self._library()
+        self._ahead: dict[str, Any] = {}  # positions that went out instead of the matrix and are not its, by body
+        self._assemblies: dict[str, Assembly] = {}
         if self.simulation.world.backend.build() != recording.scene.build and recording.scene.build:
             self.compared.notes.append(
                 "another build than the recorded one (kernels, compiler, processor or GPU): last digits may differ"
@@ -78,6 +82,7 @@ class Replay:
             for body in self.bodies:
                 self._settle(body.index, body.name, step)
                 self._use_factor(body.index, body.name, step, fresh=False)
+            self._ask(step)
             self.engine.assemble()
             self._make_factors(step)
             for body in self.bodies:
@@ -161,14 +166,38 @@ class Replay:
             m.max_force, m.start,
         )  # fmt: skip
 
-    def _make_factors(self, step: int) -> None:
+    def _ask(self, step: int) -> None:
+        """For positions ahead, where a factor was made of such."""
+        self._ahead.clear()
         for body in self.bodies:
-            if (body.name, step) not in self._needed:
-                continue
-            warped = body.index in self.simulation.warped
-            values = self.simulation.system.body_values(body.first, body.last)
-            solver = self.simulation.scene.solver
-            self._inline.submit(Job(body.name, 1, step, warped, values, solver.factor_dtype, solver.method))
+            use = self.recording.objects[body.name].factors.get(step)
+            if use is not None and use.ahead > 0 and (body.name, step) in self._needed:
+                self._ahead[body.name] = np.empty((body.last - body.first, 3))
+                self.engine.request_positions(body.index, self._ahead[body.name], use.ahead)
+
+    def _make_factors(self, step: int) -> None:
+        """Of this step, and of the last one where positions went out at its end."""
+        for body in self.bodies:
+            for made in (step - 1, step):
+                use = self.recording.objects[body.name].factors.get(made)
+                later = use is not None and use.later
+                if (body.name, made) in self._needed and later == (made < step):
+                    if later:
+                        self._ahead[body.name] = self.simulation.fetch().x[body.nodes].copy()
+                    self._submit(body, made)
+        self._collect(step)
+
+    def _submit(self, body: Body, made: int) -> None:
+        warped = body.index in self.simulation.warped
+        values, solver = self.simulation.system.body_values(body.first, body.last), self.simulation.scene.solver
+        if body.name in self._ahead:
+            if body.name not in self._assemblies:
+                topology = describe.topology(self.simulation, body)
+                self._assemblies[body.name] = Assembly(describe.scene(self.simulation), topology)
+            values = self._assemblies[body.name].matrix(self._ahead[body.name])
+        self._inline.submit(Job(body.name, 1, made, warped, values, solver.factor_dtype, solver.method))
+
+    def _collect(self, step: int) -> None:
         for factor in self._inline.poll():
             self._factors[factor.object, factor.step] = factor
             self._check_factor(factor)

@@ -216,6 +216,13 @@ def test_the_automatic_preconditioner(tmp_path: Path) -> None:
     assert replayed(recorded(tmp_path, preconditioner="auto"), 0)["same"]
 
 
+def test_factors_of_positions_sent_ahead_and_recycled_directions_too(tmp_path: Path) -> None:
+    log = recorded(tmp_path, 'build = "worker"\nextrapolate = 0.02\nrecycle = 8\nupdate = "adaptive"')
+    assert replayed(log, 0)["same"]
+    ahead = {f.ahead for f in messages(log, "factor")}
+    assert 0.0 in ahead and max(ahead) > 0, "matrices while grabbed, positions otherwise"
+
+
 def test_solves_that_ran_out_of_time(tmp_path: Path) -> None:
     """Where a budget of wall time ended a solve is in its record."""
     log = recorded(tmp_path, "budget = 2e-5", "block_jacobi")
