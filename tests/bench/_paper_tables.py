@@ -134,7 +134,7 @@ def extrapolations(setting: Setting, device: str) -> list[dict[str, Any]]:
     for name, beam, _ in cases:
         for latency in LATENCIES:
             row: dict[str, Any] = {"beam": name, "latency": latency}
-            for what, steps in (("as it is", 0), ("1 step", 1), ("2 steps", 2), ("latency", latency)):
+            for what, steps in (("as it is", 0), ("1 step", 1), ("2 steps", 2), ("all of it", latency)):
                 way = Way("cholesky", f"lockstep-{latency}", True, extrapolate=min(steps, latency) * DT)
                 row[what] = float(run(beam, LOADS[2], way, setting.steps, **setting.solver()).iterations.mean())
             rows.append(row)

@@ -24,8 +24,8 @@ operation. *wait*: for factors made within the step."""
 
 EXTRAPOLATIONS = """\
 With build = "worker" the state that a matrix is made of costs nothing to change: positions go out as x + v t. Mean
-iterations by t, under *{load}*, asynchronous with warp (lockstep), {steps} steps; *latency*: t is the time from the
-matrix to its factor."""
+iterations by t, under *{load}*, asynchronous with warp (lockstep), {steps} steps; *all of it*: t is the time from
+the matrix to its factor, the latency."""
 
 COLUMNS_OF_RECYCLED = ("beam", "latency", "recycled", "iterations", "most iterations", "step CPU ms")
 RECYCLING = """\
