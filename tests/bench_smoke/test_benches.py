@@ -15,7 +15,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 BENCHES = {
     "accuracy": ["--no-processes"], "figure4": ["--no-processes"], "hard_cases": [], "scheduler": [],
-    "paper": ["--device", "cpu"], "models": ["--devices", "cpu"], "preconditioners": [],
+    "paper": ["--device", "cpu"], "models": ["--devices", "cpu"], "preconditioners": [], "warp": [],
 }  # fmt: skip
 
 

@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: MIT
+"""The warp off, on and automatic: table 2 of Courtecuisse et al. 2010, and what `warp = "auto"` makes of its rows."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from numpy.typing import NDArray
+
+from sim_server.driver import Driver
+from sim_server.engine import HELD
+from tests.bench._paper_beam import CELLS, LOADS, MODELS, QUICK, Beam, Load, calibrated
+from tests.bench._paper_figures import CONDITION
+from tests.bench.report import Report, plots
+
+MODES: dict[str, Any] = {"off": False, "on": True, "auto": "auto"}
+ALLOWED = 1.05  # of the better of on and off
+SOLVER = {"preconditioner": "cholesky", "tolerance": 1e-6, "max_iterations": 20_000, "factor_precision": "float32"}
+EXPLAINED = """\
+The beams, loads and models of bench paper (3000 tetrahedra, condition number 1246, dt 30 ms, true residual 1e-6,
+float32 Cholesky factors), each with the warp off, on and `"auto"`. *never*: one factor, of the first matrix (the
+paper's precomputed); *every-N*: made within each N-th step; *lockstep-D*: taken up D steps after its matrix, the
+deterministic twin of async. Iterations are means over all steps and repeat to the digit; ms are means of the steps'
+times without factorizations, least of the rounds. *held*: steps that auto made without the warp, trials among them.
+*turned*: mean angle of the nodes from where the factor was made, over steps [rad], with the warp on."""
+
+
+@dataclass
+class Made:
+    """One run: of each step, (k,)."""
+
+    iterations: NDArray[Any]
+    seconds: NDArray[Any]
+    held: NDArray[np.bool_]
+    unconverged: int
+
+
+def run(beam: Beam, load: Load, update: str, warp: Any, steps: int) -> Made:
+    """Lockstep begins with the factor of the first matrix."""
+    driver = Driver(beam.simulation(load, **SOLVER, update=update, warp=warp), counted=True)
+    first = [driver.step_with_fresh_factors()] if driver.kind == "lockstep" else []
+    r = np.concatenate([*first, driver.advance(steps - len(first))])
+    seconds = r["assemble"] + r["solve"] + r["integrate"]
+    return Made(r["iterations"], seconds, r["warping"] & HELD > 0, int((r["status"] != 0).sum()))
+
+
+def measured(beam: Beam, load: Load, update: str, steps: int, rounds: int) -> dict[str, Any]:
+    """A row: the three modes taking turns in every round."""
+    runs: dict[str, list[Made]] = {mode: [] for mode in MODES}
+    for _ in range(rounds):
+        for mode, warp in MODES.items():
+            runs[mode].append(run(beam, load, update, warp, steps))
+    row: dict[str, Any] = {"load": load.name, "model": beam.model.name, "update": update}
+    iterations = {mode: float(made[0].iterations.mean()) for mode, made in runs.items()}
+    ms = {mode: 1e3 * min(float(m.seconds.mean()) for m in made) for mode, made in runs.items()}
+    row |= iterations | {"auto / better": iterations["auto"] / min(iterations["on"], iterations["off"])}
+    row |= {f"{mode} [ms]": value for mode, value in ms.items()}
+    row |= {"auto / better [ms]": ms["auto"] / min(ms["on"], ms["off"])}
+    row["held %"] = 100 * float(runs["auto"][0].held.mean())
+    row["turned"] = _turned(beam, load, update, steps)
+    row["unconverged"] = sum(made.unconverged for several in runs.values() for made in several)
+    row["repeats"] = all(np.array_equal(m.iterations, made[0].iterations) for made in runs.values() for m in made)
+    return row
+
+
+def _turned(beam: Beam, load: Load, update: str, steps: int) -> float:
+    """With frames that are noted, which they are only where auto may hold them; without holding any."""
+    sim = beam.simulation(load, **SOLVER, update=update, warp="auto")
+    driver = Driver(sim, counted=True)
+    for track in driver.tracks:
+        assert track.warping is not None
+        track.warping.consider = lambda turned: None  # type: ignore[method-assign]
+    found = []
+    for _ in range(steps):
+        driver.advance(1)
+        if sim.engine.factor_step(0) >= 0:
+            found.append(sim.system.turned(sim.world.bodies[0].nodes))
+    return float(np.mean(found)) if found else 0.0
+
+
+def picture(rows: list[dict[str, Any]]) -> Any:
+    """Iterations of off and auto against those of on."""
+    plt = plots()
+    figure, axis = plt.subplots(figsize=(9, 0.28 * len(rows) + 1.6), layout="constrained")
+    place = np.arange(len(rows))
+    for mode, mark in (("off", "o"), ("auto", "D")):
+        axis.plot([row[mode] / row["on"] for row in rows], place, mark, label=mode)
+    axis.axvline(1, color="0.4", lw=1, label="on")
+    axis.set(xscale="log", xlabel="iterations by those with the warp on", yticks=place)
+    axis.set_yticklabels([f"{row['load']}, {row['model']}, {row['update']}" for row in rows], fontsize="small")
+    axis.invert_yaxis()
+    axis.grid(True, axis="x", which="both", alpha=0.3)
+    axis.legend()
+    return figure
+
+
+def verdict(rows: list[dict[str, Any]]) -> str:
+    """Where auto is within what it is allowed, and where not."""
+    beyond = [row for row in rows if row["auto / better"] > ALLOWED]
+    slower = [row for row in rows if row["auto / better [ms]"] > ALLOWED]
+    off = [row for row in rows if row["off"] < row["on"]]
+    names = "; ".join(f"{r['load']}, {r['model']}, {r['update']}: {r['auto / better']:.3f}" for r in beyond)
+    return (
+        f"The warp costs iterations in {len(off)} of {len(rows)} rows. Iterations of auto: at most "
+        f"{max(r['auto / better'] for r in rows):.3f} times those of the better of on and off"
+        + (f"; beyond {ALLOWED:g} in: {names}. " if beyond else ". ")
+        + f"By the clock beyond {ALLOWED:g} in {len(slower)} rows (largest "
+        f"{max(r['auto / better [ms]'] for r in rows):.3f}). Solves that did not reach the tolerance: "
+        f"{sum(r['unconverged'] for r in rows)}. Iterations of all rounds alike: "
+        f"{'yes' if all(r['repeats'] for r in rows) else 'NO'}."
+    )
+
+
+def main(
+    steps: Annotated[int, typer.Option(min=2, help="Steps of each run")] = 150,
+    rounds: Annotated[int, typer.Option(min=1, help="Repetitions, the modes taking turns")] = 2,
+    updates: Annotated[str, typer.Option(help="Update policies")] = "never,every-30,lockstep-3,lockstep-10",
+    quick: Annotated[bool, typer.Option("--quick", help="A small smoke run")] = False,
+    out: Annotated[Path | None, typer.Option(help="Folder of the results [default: out/bench/warp]")] = None,
+) -> None:
+    """Iterations and time of a step with the warp off, on and automatic, for each load, model and update policy."""
+    if quick:
+        steps, rounds, updates = 30, 1, "never,lockstep-3"
+    report = Report("warp", "The warp off, on and automatic", {"steps": steps, "rounds": rounds, "updates": updates},
+                    out, quick)  # fmt: skip
+    rows = []
+    for model in MODELS[:2] if quick else MODELS:
+        beam, _ = calibrated(QUICK if quick else CELLS[3000], model, CONDITION)
+        for load in LOADS:
+            for update in updates.split(","):
+                rows.append(measured(beam, load, update, steps, rounds))
+                row = rows[-1]
+                print(f"{model.name}, {load.name}, {update}: {row['off']:.2f} {row['on']:.2f} {row['auto']:.2f}")
+    report.say(EXPLAINED, verdict(rows))
+    report.figure(picture(rows), "warp.png", "Iterations with the warp off and automatic, by those with it on.")
+    columns = [key for key in rows[0] if key not in ("unconverged", "repeats")]
+    report.table(rows, columns)
+    report.data["rows"] = rows
+    report.write()
+
+
+if __name__ == "__main__":
+    typer.run(main)
