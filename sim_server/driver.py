@@ -23,14 +23,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import Factor
-from sim_server.engine import HELD, NOTE_ALWAYS, NOTE_COPIES, Kind
+from sim_server.engine import HELD, NOTE_ALWAYS, NOTE_COPIES, NOTED, Kind
 from sim_server.factors import FactorSource, Inline, Job
 from sim_server.guard import Guard
 from sim_server.schedule import oldest_possible, overdue_after, pays, pick
 from sim_server.simulation import Simulation
 from sim_server.stock import Stock
 from sim_server.track import Track, observe_steps
-from sim_server.warping import Warping
+from sim_server.warping import FAR, Warping
 from sim_server.world import Body
 
 log = logging.getLogger(__name__)
@@ -377,7 +377,7 @@ class Driver:
                 self._settle(t)
             if t.warping is not None and kind == r["asked"] == Kind.CHOLESKY and not (r["probe"] or r["fallbacks"]):
                 t.warping.observe(int(r["step"]) - 1, int(r["factor_step"]), iterations, bool(r["warping"] & HELD))
-                self._warp(t)
+                self._warp(t, int(r["step"]) - 1, int(r["warping"]))
 
     def _model(self, t: Track, kind: int, iterations: int) -> float:
         """Bytes that a solve moved, about: the deterministic stand-in for its time."""
@@ -396,16 +396,12 @@ class Driver:
     # --- warp = "auto" ------------------------------------------------------------------------------------------
 
     def _auto_warp(self) -> None:
-        known = self.engine.exact or not self.free
         for t in self.tracks:
             if t.body.index not in self.simulation.warped:
                 continue
-            t.warping = Warping(known)
-            if self.free:  # the loop knows which matrices it copies
-                settings = self.engine.settings(t.body.index)
-                settings.note = NOTE_COPIES if known else NOTE_ALWAYS
-                if not known:
-                    settings.adopt = 1
+            t.warping = Warping(self.engine.exact or not self.free)
+            if self.free and self.engine.exact:
+                self.engine.settings(t.body.index).note = NOTE_COPIES
 
     def _note(self, fresh: list[Track]) -> None:
         """Before a step of a policy that waits: whose matrices of it become factors."""
@@ -419,7 +415,17 @@ class Driver:
                 t.made = t.noted if settings.adopt else t.made
             t.noted = self.engine.step if t in fresh else t.noted
 
-    def _warp(self, t: Track) -> None:
+    def _warp(self, t: Track, step: int, frames: int) -> None:
+        """step, frames: of the solve that was observed last (Record.warping)."""
         assert t.warping is not None
-        t.warping.consider(lambda: self.simulation.system.turned(t.body.nodes))
-        self.engine.settings(t.body.index).hold = int(t.warping.hold)
+        settings = self.engine.settings(t.body.index)
+        if self.engine.exact or not self.free:
+            t.warping.consider(lambda: self.simulation.system.turned(t.body.nodes))
+            settings.hold = int(t.warping.hold)
+            return
+        # Steps are not told apart: frames are noted from before they are held until they follow again.
+        t.warping.consider(lambda: FAR / 2)  # not known
+        if t.warping.hold and not settings.note:
+            t.noted = self.engine.step
+        settings.hold = int(t.warping.hold and settings.note and frames & NOTED > 0 and step >= t.noted)
+        settings.note = settings.adopt = int(t.warping.hold or frames & HELD > 0)

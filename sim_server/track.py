@@ -70,7 +70,7 @@ class Track:
         self.per_iteration = Mean()  # s, or bytes
         self.choice = Choice() if auto else None
         self.warping: Warping | None = None  # warp = "auto"
-        self.noted = self.made = -1  # steps, for a device that is told: its matrix noted last; what frames go by
+        self.noted = self.made = -1  # steps, for a device that is told: noted last, or from when on; what frames go by
 
     def age(self, step: int) -> int:
         """Steps since the matrix of the newest factor, -1 without one."""
