@@ -43,7 +43,7 @@ class Clairvoyant:
         self.resting = int(sum(np.delete(row[2], self._wild).sum() for row in rows[warm:]))
         self.counts = np.zeros((len(self._wild), len(rows), len(rows)), int)
         for k in range(len(self._wild)):
-            made = [_native(row[0][k], t) for t, row in enumerate(rows)]
+            made = [NativeFactor(row[0][k].pattern, row[0][k].values, t) for t, row in enumerate(rows)]
             for t, row in enumerate(rows):
                 self.counts[k, t, : t + 1] = [iterations(*row[1][k], factor) for factor in made[: t + 1]]
 
@@ -106,12 +106,6 @@ class Clairvoyant:
                 at, new = coming.get(k, (u + 1, s))
                 cost += int(self.counts[k, u, new if at <= u else s])
         return cost
-
-
-def _native(factor: Any, step: int) -> NativeFactor:
-    native = NativeFactor(factor.pattern, factor.values.dtype)
-    native.fill(factor.values, step)
-    return native
 
 
 def _system(sim: Simulation, body: int) -> tuple[Any, NDArray[Any], NDArray[Any]]:

@@ -21,7 +21,7 @@ APART = 16  # one object in so many is wild, one at least
 def scene(objects: int, **solver: Any) -> Scene:
     """Beams of mixed sizes, every second one uneven, each held at one end."""
     table = {"name": "few wild", "dt": DT, "object": [_object(k) for k in range(objects)],
-             "solver": {"preconditioner": "cholesky", **solver}}  # fmt: skip
+             "solver": {"preconditioner": "cholesky", "warp": True, **solver}}  # fmt: skip
     return Scene.model_validate(table, context={"folder": "."})
 
 

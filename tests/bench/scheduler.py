@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Whose matrix is factorized next: the rules of the scheduler where a few objects are dragged about and most rest."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,6 +14,7 @@ from sim_server.factors import Job
 from sim_server.simulation import Simulation
 from tests.bench._clairvoyant import Clairvoyant
 from tests.bench._few_wild import APART, Load, is_wild, scene
+from tests.bench._pieces import Merged, Piece
 from tests.bench._virtual_workers import VirtualWorkers
 from tests.bench.report import Report, plots
 
@@ -112,10 +113,11 @@ def picture(rows: list[dict[str, Any]], sizes: list[int], workers: list[int]) ->
         for name in (NEVER, *RULES, EACH, *([BEST] if any(r["rule"] == BEST for r in rows) else [])):
             own = [r for r in rows if r["rule"] == name and (r["workers"] == count or name in (NEVER, EACH))]
             style = {NEVER: ":", EACH: ":", BEST: "-.", "oldest": "--"}.get(name, "-")  # oldest lies on round_robin
-            axes[0, column].plot(sizes, [r["/ oracle"] for r in own], style, marker="o", ms=3, label=name)
+            along = [r["objects"] for r in own]
+            axes[0, column].plot(along, [r["/ oracle"] for r in own], style, marker="o", ms=3, label=name)
             if name in RULES:
                 axes[1, column].plot(
-                    sizes, [r["age, max"] for r in own], style, marker="o", ms=3, color=f"C{1 + RULES.index(name)}"
+                    along, [r["age, max"] for r in own], style, marker="o", ms=3, color=f"C{1 + RULES.index(name)}"
                 )
         axes[0, column].axhline(1.3, color="0.6", lw=0.8)
         axes[0, column].set(title=f"{count} worker{'s' * (count > 1)}", xscale="log", xticks=sizes, xticklabels=sizes)
@@ -226,18 +228,36 @@ def main(
         int, typer.Option(min=0, help="Also search the best order of jobs, of up to so many objects (64: minutes)")
     ] = 0,
     quick: Annotated[bool, typer.Option("--quick", help="A small smoke run")] = False,
+    merge: Annotated[
+        list[Path] | None, typer.Option(metavar="JSON", help="Only make one page of these results; may be repeated")
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder of the results [default: out/bench/scheduler]")] = None,
 ) -> None:
     """Iterations and ages of factors under each rule, beside an oracle and no updates, in virtual time."""
     sizes, counts = _numbers("4,16" if quick else objects), _numbers("1,2" if quick else workers)
     hold = 10 if quick else hold
     setting = Setting(30 if quick else steps, hold, hold, speed, floor, seed)
-    arguments = {"objects": sizes, "workers": counts, **vars(setting)}
-    report = Report("scheduler", "Whose matrix is factorized next: the rules compared", arguments, out, quick)
+    title = "Whose matrix is factorized next: the rules compared"
+    if merge:
+        merged = Merged("scheduler", title, merge, out)
+        told = merged.parts[-1]["arguments"]
+        rows = sorted(merged.rows("rows", ("objects", "workers", "rule")), key=lambda row: row["objects"])
+        write(merged, rows, Setting(**{field.name: told[field.name] for field in fields(Setting)}))
+        return
+    report = Piece("scheduler", title, {"objects": sizes, "workers": counts, **vars(setting)}, out, quick)
     rows = []
     for size in sizes:
         rows += compared(size, counts, setting, size <= clairvoyant)
+        report.data["rows"] = rows
+        report.keep()
         print(f"{size} objects done", flush=True)
+    write(report, rows, setting)
+
+
+def write(report: Report, rows: list[dict[str, Any]], setting: Setting) -> None:
+    """Page, picture and JSON."""
+    sizes = sorted({row["objects"] for row in rows})
+    counts = sorted({row["workers"] for row in rows if row["rule"] in RULES})
     report.say(*_explained(setting))
     report.figure(picture(rows, sizes, counts), "scheduler.png", "Iterations and the oldest factor under each rule.")
     report.say(*_verdict(rows, setting))

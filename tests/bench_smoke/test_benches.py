@@ -98,6 +98,14 @@ def test_reference_of_accuracy_is_no_competitor(tmp_path: Path) -> None:
     assert cg[1e-6] < 1e-2 * cg[1e-2]
 
 
+def test_best_order_found_afterwards_is_no_worse_than_any_rule(tmp_path: Path) -> None:
+    rows = bench("scheduler", tmp_path, "--clairvoyant", "4")["data"]["rows"]
+    few = {(r["workers"], r["rule"]): r["iterations"] for r in rows if r["objects"] == 4}
+    for workers in (1, 2):
+        best = few[workers, "best order, found afterwards"]
+        assert few[0, "oracle"] < best <= min(v for (w, rule), v in few.items() if w == workers)
+
+
 @pytest.mark.timeout(240)
 def test_scheduler_repeats_to_the_digit_and_excess_goes_before_turns(tmp_path: Path) -> None:
     runs = [bench("scheduler", tmp_path / name)["data"]["rows"] for name in ("one", "two")]
