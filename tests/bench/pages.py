@@ -13,7 +13,7 @@ from typing import Any
 from tests.bench.report import ROOT, table
 
 FIRST = ("cpu", "gpu", "models", "paper", "figure4", "warp", "preconditioners", "build")
-PAGES = (*FIRST, "accuracy", "hard_cases", "scheduler", "scaling", "faults")
+PAGES = (*FIRST, "verification", "accuracy", "hard_cases", "scheduler", "scaling", "faults")
 README = ROOT / "README.md"
 
 

@@ -16,6 +16,7 @@ ROOT = Path(__file__).resolve().parents[2]
 BENCHES = {
     "accuracy": ["--no-processes"], "figure4": ["--no-processes"], "hard_cases": [], "scheduler": [],
     "paper": ["--device", "cpu"], "models": ["--devices", "cpu"], "preconditioners": [], "warp": [],
+    "verification": [],
 }  # fmt: skip
 
 

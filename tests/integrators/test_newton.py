@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from sim_server.simulation import Simulation
+from tests.physics.laws import law_bar
 from tests.scenes import bar, simulation, solid
 
 GRAVITY = (0.0, -9.81, 0.0)
@@ -59,6 +60,23 @@ def test_each_linearization_takes_the_residual_down():
         left.append(sim.engine.records()["nonlinear"][-1])
     assert left[0] < 1e-3
     assert all(b < 0.05 * a for a, b in pairwise(left))
+
+
+@pytest.mark.parametrize("law", ["neo_hookean", "stable_neo_hookean", "st_venant_kirchhoff"])
+def test_convergence_is_quadratic_or_better_with_exact_tangents(law):
+    """The exponent log(r3 / r2) / log(r2 / r1) of consecutive residuals."""
+    left = []
+    for most in (3, 4, 5):
+        sim = law_bar(
+            law, cells=(6, 2, 2), size=(3, 1, 1), fixed="X < 0.01", gravity=GRAVITY, dt=1.0, projection="none",
+            integrator={"linearizations": most, "tolerance": 1e-15, "trials": 0, "scheme": "quasi_static"},
+            tolerance=1e-12, preconditioner="block_jacobi", max_iterations=3000,
+            table={"young": 1e6, "poisson": 0.3},
+        )  # fmt: skip
+        sim.engine.run(1)
+        left.append(sim.engine.records()["nonlinear"][0])
+    exponent = np.log(left[2] / left[1]) / np.log(left[1] / left[0])
+    assert 1e-13 < left[2] < 1e-6 and exponent > 1.8, (left, exponent)
 
 
 def test_larger_steps_are_stable_where_one_linearization_is_not():

@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: MIT
+"""`bench verification`: every law against differences of its own energy, the patch test, and uniaxial tests."""
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from scipy.optimize import brentq, minimize_scalar
+
+from tests.bench._verify_row import Row, absolute, relative
+from tests.physics.laws import LAWS, Law, deform, forces, law_bar, odd_bar, stiffness
+from tests.physics.test_law_answers import AFFINE, UNIAXIAL, cube, pulled
+from tests.scenes import interior, jittered_bar, mesh_file
+
+DIFFERENCES = "central differences of our own energy and forces"
+OTHERS = {
+    "corotational": (Law("corotational", {"young": 3e4, "poisson": 0.35}, lambda: None, True), False),
+    "mass_spring": (Law("mass_spring", {"young": 3e4}, lambda: None, True), False),
+}
+
+
+def derivatives(law: Law, size: float, tangent: bool) -> tuple[float, float]:
+    """Relative errors of forces and stiffness at random positions; no stiffness: 0."""
+    with tempfile.TemporaryDirectory() as folder:
+        sim = odd_bar(Path(folder), law, projection="none")
+    deform(sim, size, seed=2)
+    x, slope, step = sim.world.x, np.zeros_like(sim.world.x), 1e-5
+    for k in np.ndindex(*x.shape):
+        at, energy = x[k], []
+        for x[k] in (at + step, at - step, at + 2 * step, at - 2 * step):
+            energy.append(sim.potential_energy())
+        x[k] = at
+        slope[k] = (8 * (energy[0] - energy[1]) - (energy[2] - energy[3])) / (12 * step)
+    f = forces(sim).copy()
+    off = float(np.abs(f + slope).max() / np.abs(f).max())
+    if not tangent:
+        return off, 0.0
+    K, change, step = stiffness(sim), np.zeros((x.size, x.size)), 1e-6
+    for j, k in enumerate(np.ndindex(*x.shape)):
+        at = x[k]
+        x[k] = at + step
+        above = forces(sim).ravel().copy()
+        x[k] = at - step
+        change[:, j] = (above - forces(sim).ravel()) / (2 * step)
+        x[k] = at
+    return off, float(np.abs(K + change).max() / np.abs(K).max())
+
+
+def slopes(quick: bool) -> list[Row]:
+    """Forces of every law, and the stiffness where it is meant to be exact."""
+    laws = {name: (law, True) for name, law in LAWS.items()} | OTHERS
+    rows = []
+    for name, (law, exact) in list(laws.items())[:: 5 if quick else 1]:
+        inverted = law.inverts and exact
+        off, change = derivatives(law, 0.6 if inverted else 0.15, exact)
+        where = "some elements inverted" if inverted else "strains of 0.15"
+        rows.append(Row(f"{name}: force, {where}", 0, off, off, 1e-6, DIFFERENCES))
+        if exact:
+            rows.append(Row(f"{name}: stiffness, {where}", 0, change, change, 1e-5, DIFFERENCES))
+    return rows
+
+
+def patch(quick: bool) -> list[Row]:
+    """Largest force inside an affine displacement, over the largest outside."""
+    size, worst = (1.2, 1.0, 0.8), 0.0
+    for law in list(LAWS.values())[:: 5 if quick else 1]:
+        with tempfile.TemporaryDirectory() as folder:
+            sim = law_bar(law, mesh_file(Path(folder), *jittered_bar((3, 3, 3), size, seed=1)))
+        inside = interior(sim.world.rest, size)
+        sim.world.x[:] = sim.world.rest @ AFFINE.T
+        f = np.abs(forces(sim))
+        worst = max(worst, float(f[inside].max() / f.max()))
+    return [Row("patch test, all laws: force inside over force outside", 0, worst, worst, 1e-12, "exact")]
+
+
+def uniaxial(quick: bool) -> list[Row]:
+    rows, sim = [], cube("neo_hookean", 1.0, 0.45)
+    for along, (across, stress) in list(UNIAXIAL.items())[:: 3 if quick else 1]:
+        found = float(brentq(lambda s, a=along: pulled(sim, a, s)[1], 0.3, 2.0, xtol=1e-13))
+        case, source = f"neo_hookean, E = 1, ν = 0.45, stretch {along:g}", "roots of P22 = 0, solved apart, six digits"
+        rows.append(absolute(f"{case}: lateral stretch", across, found, 1e-6, source))
+        rows.append(absolute(f"{case}: P11", stress, pulled(sim, along, found)[0], 1e-6, source))
+    sim = cube("st_venant_kirchhoff", 1.0, 0.0)
+    least = minimize_scalar(
+        lambda s: pulled(sim, s, 1.0)[0], bounds=(0.2, 0.9), method="bounded", options={"xatol": 1e-8}
+    )
+    source = "P = E s (s² - 1) / 2 is least at 1/√3"
+    rows.append(relative("st_venant_kirchhoff: stretch of the largest pressure", 3**-0.5, least.x, 1e-4, source))
+    rows.append(relative("st_venant_kirchhoff: that pressure over E", -(27**-0.5), least.fun, 1e-4, source))
+    return rows

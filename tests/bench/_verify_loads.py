@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: MIT
+"""Static problems of `bench verification`: bodies in equilibrium under forces on their nodes."""
+
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_server.driver import Driver
+from sim_server.effects.touch import Interaction, Touch
+from sim_server.simulation import Simulation
+from tests.scenes import bar, mesh_file, simulation
+
+Reals = NDArray[np.float64]
+Group = tuple[NDArray[Any], Sequence[float]]
+FOR_EVER = 1e30  # s
+NEWTON = {"scheme": "quasi_static", "linearizations": 60, "tolerance": 1e-8, "trials": 0}
+
+
+def statics(
+    rest: Reals, tets: NDArray[Any], law: dict[str, Any], fixed: str, gravity: Any = None,
+    slender: bool = True,
+) -> Simulation:  # fmt: skip
+    """A body without inertia, each step to 1e-8 of its first residual, with exact tangents. slender: one that bends far
+    without much strain, with full steps; else with a line search."""
+    preconditioner, newton = ("cholesky", NEWTON) if slender else ("block_jacobi", NEWTON | {"trials": 8})
+    with tempfile.TemporaryDirectory() as folder:
+        mesh = mesh_file(Path(folder), rest, tets)
+        o = bar(mesh=mesh, young=None, fixed=fixed, touch={"max_force": 1e30})
+        o["effects"] |= law
+        return simulation(
+            o, gravity=gravity, integrator=newton, dt=1.0, update="every-1", preconditioner=preconditioner,
+            factor_precision="float64", tolerance=1e-9, max_iterations=3000, projection="none",
+        )  # fmt: skip
+
+
+def push(sim: Simulation, groups: Sequence[Group]) -> None:
+    """Forces that stay, in place of those before: nodes (k,) and the force on all of them together (3,) [N]."""
+    touch = cast(Touch, sim.effects["touch"])
+    index = next(i for i, launch in enumerate(sim.engine.launches) if launch.name == "touch.apply")
+    touch.publish = lambda launch: sim.engine.replace(index, launch)
+    touch.restore(
+        [
+            Interaction(
+                k + 1, "bench", "bar", (0.0, 0.0, 0.0), 0.0, nodes.astype(np.int32), np.zeros((len(nodes), 3)),
+                FOR_EVER, force=(float(force[0]), float(force[1]), float(force[2])),
+            )
+            for k, (nodes, force) in enumerate(groups)
+        ]
+    )  # fmt: skip
+
+
+def settle(sim: Simulation, driver: Driver | None = None, steps: int = 3) -> Reals:
+    """Displacements (nodes, 3) [m] in equilibrium, after as many steps as it takes; raises ArithmeticError."""
+    driver = driver or Driver(sim)
+    for _ in range(steps):
+        if driver.advance(1)[-1]["status"] == 0:
+            return np.asarray(sim.world.x - sim.world.rest)
+    raise ArithmeticError("no equilibrium was found")
+
+
+def raised(sim: Simulation, groups: Sequence[Group], parts: int) -> Reals:
+    """The same under loads raised in so many equal parts."""
+    driver, u = Driver(sim), np.zeros(0)
+    for part in range(1, parts + 1):
+        push(sim, [(nodes, [part / parts * f for f in force]) for nodes, force in groups])
+        u = settle(sim, driver)
+    return u
