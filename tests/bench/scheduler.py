@@ -146,9 +146,9 @@ a factor is 2 steps old at best when it is taken up, and the counts below repeat
 each step's own matrix for every object; *no updates*: the first factor only; *{EACH}*: what asynchrony
 alone costs, with hardly anybody to share with; *{BEST}*: what the same workers could do at
 best (a search through the iterations of every matrix with every older factor, told beforehand what no rule can know:
-when and where hands take hold). *oldest* differs from *round_robin* only where jobs are lost, and here none is. Ratios
-are of the iterations of all objects and steps; the resting ones, alike under every rule, draw them towards 1. Ages are
-of the factors used [steps].""",
+when and where hands take hold; resting objects as in the oracle's run; good to about half a percent). *oldest* differs
+from *round_robin* only where jobs are lost, and here none is. Ratios are of the iterations of all objects and steps;
+the resting ones, alike under every rule, draw them towards 1. Ages are of the factors used [steps].""",
         f"""\
 The floor of iterations is {setting.floor} here (default 3): a fresh float32 factor needs 1 or 2, so that what exceeds 2
 is what a new factor would save; with 3 an object dragged slowly looks satisfied at 3 iterations and turns go to those
