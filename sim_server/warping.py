@@ -4,7 +4,7 @@
 Following is nearly free and saves iterations wherever nodes turn, so it is where a body begins. Where strains matter
 more than rotations it may cost some; what it is worth is known only from trying. A *trial* is a few solves of the other
 way. They show it at once, as frames are reckoned from where the factor in use was made, whatever was done meanwhile
-(kernels/nodes.cu). They are compared with solves before and after them, with factors as old; as motion makes
+(kernels/nodes.cu). They are compared with solves before and after them, with factors about as old; as motion makes
 iterations swing, trials go on until their mean says which way is better by more than its standard error. Holding must
 be better by a margin.
 
@@ -15,6 +15,7 @@ nodes have turned far since the matrix holding is not tried at all. A pure state
 from collections import deque
 from collections.abc import Callable, Sequence
 from math import log, sqrt
+from typing import NamedTuple
 
 SAMPLES = 6  # solves of a trial
 AFTER = 12  # at most so many after it are waited for one with a factor as old
@@ -26,11 +27,22 @@ SHARE = 0.02  # of all iterations that trials may cost
 EVERY = 12  # solves between trials, doubled after each that was no gain ...
 RARELY = 3000  # ... up to so many
 HARDER = 1.25  # a held body is tried again soon when solves cost so many times what they did when that was decided
-FAR = 0.2  # rad, mean over nodes since the factor's matrix: following is better for certain
+FAR = 0.12  # rad, mean over nodes since the factor's matrix: following is better for certain
 NEAR = 1e-4  # rad: both are the same
 RECENT = 64  # solves remembered
+STEPS = 5  # of time between two solves that make as much of a difference as one of age
 
-Solve = tuple[int, int]  # age of its factor [steps], iterations
+
+class Solve(NamedTuple):
+    """step: completed before it; age: of its factor [steps]."""
+
+    step: int
+    age: int
+    iterations: int
+
+    def unlike(self, other: "Solve") -> float:
+        """How little it says about another one: an older factor is worth so many steps of motion."""
+        return abs(self.age - other.age) + abs(self.step - other.step) / STEPS
 
 
 class Warping:
@@ -56,7 +68,7 @@ class Warping:
         if held != self._held:
             self._held, self._changed = held, step
         counts = self._exact or self._changed <= factor_step
-        solve = step - factor_step, iterations
+        solve = Solve(step, step - factor_step, iterations)
         self._all += iterations
         self._since += 1
         if self._trial is not None and held == self.hold != self.decided:
@@ -80,12 +92,12 @@ class Warping:
             self._trial, self._after, self._solves = [], [], 0
 
     def _now(self) -> float:
-        last = [iterations for _, iterations in self._recent][-SAMPLES:]
-        return sum(last) / max(len(last), 1)
+        last = list(self._recent)[-SAMPLES:]
+        return total(last) / max(len(last), 1)
 
     def _tried(self, trial: list[Solve], solve: Solve, counts: bool) -> None:
         self._solves += 1
-        self.lost += max(0, solve[1] - alike(solve[0], self._recent))
+        self.lost += max(0, solve.iterations - alike(solve, self._recent))
         if counts:
             trial.append(solve)
         tried, before = total(trial), expected(trial, self._recent)
@@ -99,10 +111,10 @@ class Warping:
 
     def _compare(self, trial: list[Solve], solve: Solve) -> None:
         self._after.append(solve)
-        missing = {age for age, _ in trial} - {age for age, _ in self._after}
+        missing = {s.age for s in trial} - {s.age for s in self._after}
         if missing and len(self._after) < AFTER:
             return
-        before, after = expected(trial, list(self._recent)[: -len(self._after)]), expected(trial, self._after[::-1])
+        before, after = expected(trial, list(self._recent)[: -len(self._after)]), expected(trial, self._after)
         self._judge(log(sqrt(max(before, 1) * max(after, 1)) / max(total(trial), 1)))
 
     def _judge(self, gain: float) -> None:
@@ -140,14 +152,14 @@ def mean_and_error(values: Sequence[float]) -> tuple[float, float]:
 
 def total(solves: Sequence[Solve]) -> int:
     """Iterations of all."""
-    return sum(iterations for _, iterations in solves)
+    return sum(solve.iterations for solve in solves)
 
 
-def alike(age: int, solves: Sequence[Solve]) -> int:
-    """Iterations of the solve whose factor was nearest to this age, of equals the last."""
-    return min(reversed(solves), key=lambda solve: abs(solve[0] - age))[1]
+def alike(solve: Solve, others: Sequence[Solve]) -> int:
+    """Iterations of the one that says most about a solve, of equals the last."""
+    return min(reversed(others), key=solve.unlike).iterations
 
 
-def expected(trial: Sequence[Solve], solves: Sequence[Solve]) -> int:
-    """What the trial's solves took as others did with factors as old."""
-    return sum(alike(age, solves) for age, _ in trial)
+def expected(trial: Sequence[Solve], others: Sequence[Solve]) -> int:
+    """What a trial's solves took as others did."""
+    return sum(alike(solve, others) for solve in trial)

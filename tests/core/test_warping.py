@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from sim_server.warping import AFTER, EVERY, RECENT, SAMPLES, SHARE, TRIALS, Warping, alike, expected
+from sim_server.warping import AFTER, EVERY, RECENT, SAMPLES, SHARE, TRIALS, Solve, Warping, alike, expected
 
 Cost = Callable[[int, int], float]  # iterations of a solve in a step with a factor so old
 
@@ -145,7 +145,11 @@ def test_a_trial_whose_solves_never_count_ends():
     assert 0 < bench.run(900) <= RECENT * bench.warping.trials
 
 
-def test_solves_are_compared_with_those_of_factors_as_old():
-    solves = [(3, 10), (4, 20), (5, 30), (3, 11), (4, 21)]
-    assert [alike(age, solves) for age in (3, 4, 5, 9)] == [11, 21, 30, 30]
-    assert expected([(3, 0), (5, 0), (5, 0)], solves) == 71
+def test_solves_are_compared_with_those_that_say_most_about_them():
+    """As old a factor in the last epoch, if it is short; else the ones next in time."""
+    epochs = [Solve(k, k % 3 + 3, 10 * (k % 3) + k // 3) for k in range(6)]  # 0 10 20 1 11 21
+    assert [alike(Solve(6 + k, k + 3, 0), epochs) for k in range(3)] == [1, 11, 21]
+    long = [Solve(k, k % 30, k) for k in range(60)]
+    assert alike(Solve(61, 1, 0), [*long[:31], *long[31:59]]) == 31
+    assert alike(Solve(45, 15, 0), [*long[:44], *long[46:]]) == 46
+    assert expected([Solve(6, 3, 0), Solve(8, 5, 0)], epochs) == 22
