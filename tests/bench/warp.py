@@ -22,10 +22,10 @@ EXPLAINED = """\
 The beams, loads and models of bench paper (3000 tetrahedra, condition number 1246, dt 30 ms, true residual 1e-6,
 float32 Cholesky factors), each with the warp off, on and `"auto"`. *never*: one factor, of the first matrix (the
 paper's precomputed); *every-N*: made within each N-th step; *lockstep-D*: taken up D steps after its matrix, the
-deterministic twin of async. Iterations are means over all steps and repeat to the digit; ms are means of
-processor time over the steps that made no factor, of each step the least of the rounds. *held*: steps that auto made without the warp,
-trials among them. *turned*: mean angle of the nodes from where the factor was made, over steps [rad], with the warp
-on."""
+deterministic twin of async. Iterations are means over all steps and repeat to the digit; ms are means of processor
+time over the steps that made no factor, of each step the least of the rounds. *held*: steps that auto made without the
+warp, trials among them. *turned*: mean angle of the nodes from where the factor was made, over steps [rad], with the
+warp on."""
 
 
 @dataclass
