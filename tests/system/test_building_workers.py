@@ -17,7 +17,9 @@ pytestmark = pytest.mark.system
 
 def served(update: str, **solver: object) -> Simulation:
     beam = bar((6, 3, 3), (4, 1, 1), fixed="X < 0.01", pose={"rotate": [40, 0, 70]}, touch={"max_force": 1e4})
-    return simulation(beam, gravity=(0, -2, 0), preconditioner="cholesky", update=update, build="worker", **solver)
+    return simulation(
+        beam, gravity=(0, -2, 0), preconditioner="cholesky", update=update, build="worker", warp=True, **solver
+    )
 
 
 def test_the_same_factor_as_of_the_matrix_sent() -> None:
