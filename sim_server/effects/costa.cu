@@ -42,13 +42,11 @@ template <class T> INLINE T exponential(const T (&c)[CONSTANTS], const mat<T>& F
 KERNEL(elements, Elements) {
     typedef local_number T;
     index tet[4];
-    get_row(p.tets, i, tet);
-    local_vec3 edges[3], v[3];
-    field_edges(p.x, tet, edges);
+    local_vec3 v[3];
+    Tetrahedron<T> t = element_at(p, i, tet);
     field_edges(p.v, tet, v);
-    Tetrahedron<T> t = tetrahedron(edges, p.gradients, p.n, i);
     T c[CONSTANTS], volume = at(p.volume, i), k = volume * at(p.stiffening, i), s[6];
-    for (int m = 0; m < CONSTANTS; ++m) c[m] = at(p.constants, m * p.n + i);
+    constants_at(p, i, c);
     T stress = exponential(c, t.F, s);
     mat<T> S = symmetric(s[0], s[1], s[2], s[3], s[4], s[5]), Ft = transposed(t.F);
     T dU = c[7] * log(t.J), ddU = c[7] / t.J;
@@ -111,12 +109,9 @@ struct Energy {
 KERNEL(energy, Energy) {
     typedef local_number T;
     index tet[4];
-    get_row(p.tets, i, tet);
-    local_vec3 edges[3];
-    field_edges(p.x, tet, edges);
-    Tetrahedron<T> t = tetrahedron(edges, p.gradients, p.n, i);
+    Tetrahedron<T> t = element_at(p, i, tet);
     T c[CONSTANTS], s[6];
-    for (int m = 0; m < CONSTANTS; ++m) c[m] = at(p.constants, m * p.n + i);
+    constants_at(p, i, c);
     T W = (entry<T>)0.5 * (exponential(c, t.F, s) - c[0]) + c[7] * (t.J * log(t.J) - t.J + 1);
     put(p.energy, i, t.J <= 0 ? no_number<T>() : at(p.volume, i) * W);
 }

@@ -34,11 +34,9 @@ template <class T> INLINE Family<T> family(const local* directions, int n, index
 KERNEL(elements, Elements) {
     typedef local_number T;
     index tet[4];
-    get_row(p.tets, i, tet);
-    local_vec3 edges[3], v[3], push[4];
-    field_edges(p.x, tet, edges);
+    local_vec3 v[3], push[4];
+    Tetrahedron<T> t = element_at(p, i, tet);
     field_edges(p.v, tet, v);
-    Tetrahedron<T> t = tetrahedron(edges, p.gradients, p.n, i);
     T volume = at(p.volume, i), k = volume * at(p.stiffening, i), k1 = at(p.constants, i), k2 = at(p.constants, p.n + i);
     Blocks6<T> B;
     UNROLL for (int a = 0; a < 4; ++a) push[a] = {T{}, T{}, T{}};
@@ -73,10 +71,7 @@ struct Energy {
 KERNEL(energy, Energy) {
     typedef local_number T;
     index tet[4];
-    get_row(p.tets, i, tet);
-    local_vec3 edges[3];
-    field_edges(p.x, tet, edges);
-    Tetrahedron<T> t = tetrahedron(edges, p.gradients, p.n, i);
+    Tetrahedron<T> t = element_at(p, i, tet);
     T k1 = at(p.constants, i), k2 = at(p.constants, p.n + i), W = T{};
     for (int which = 0; which < 2; ++which) {
         T y = family(p.directions, p.n, i, which, t.F).stretch, z = k2 * y * y;

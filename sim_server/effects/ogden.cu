@@ -48,13 +48,11 @@ template <class T> INLINE T logarithmic(const T (&c)[CONSTANTS], const T (&s)[3]
 KERNEL(elements, Elements) {
     typedef local_number T;
     index tet[4];
-    get_row(p.tets, i, tet);
-    local_vec3 edges[3], v[3];
-    field_edges(p.x, tet, edges);
+    local_vec3 v[3];
+    Tetrahedron<T> e = element_at(p, i, tet);
     field_edges(p.v, tet, v);
-    Tetrahedron<T> e = tetrahedron(edges, p.gradients, p.n, i);
     T c[CONSTANTS], volume = at(p.volume, i), t[3], m[6], slope[3], inverse[3];
-    for (int k = 0; k < CONSTANTS; ++k) c[k] = at(p.constants, k * p.n + i);
+    constants_at(p, i, c);
     Principal<T> frame = principal(e.F);
     const T (&s)[3] = frame.s;
     logarithmic(c, s, s[0] * s[1] * s[2], t, m);
@@ -108,12 +106,9 @@ struct Energy {
 KERNEL(energy, Energy) {
     typedef local_number T;
     index tet[4];
-    get_row(p.tets, i, tet);
-    local_vec3 edges[3];
-    field_edges(p.x, tet, edges);
-    Tetrahedron<T> e = tetrahedron(edges, p.gradients, p.n, i);
+    Tetrahedron<T> e = element_at(p, i, tet);
     T c[CONSTANTS], t[3], m[6];
-    for (int k = 0; k < CONSTANTS; ++k) c[k] = at(p.constants, k * p.n + i);
+    constants_at(p, i, c);
     Principal<T> frame = principal(e.F);
     T W = logarithmic(c, frame.s, e.J, t, m);
     put(p.energy, i, e.J <= 0 ? no_number<T>() : at(p.volume, i) * W);

@@ -25,13 +25,11 @@ struct Elements {
 
 KERNEL(elements, Elements) {
     index tet[4];
-    get_row(p.tets, i, tet);
-    local_vec3 edges[3], v[3];
-    field_edges(p.x, tet, edges);
+    local_vec3 v[3];
+    Tetrahedron<local_number> t = element_at(p, i, tet);
     field_edges(p.v, tet, v);
-    Tetrahedron<local_number> t = tetrahedron(edges, p.gradients, p.n, i);
     local_number c[CONSTANTS], volume = at(p.volume, i), floor = at(p.floor, i), k = volume * at(p.stiffening, i);
-    for (int m = 0; m < CONSTANTS; ++m) c[m] = at(p.constants, m * p.n + i);
+    constants_at(p, i, c);
     mat<local_number> left = mul(t.F, transposed(t.F));
     Invariants<local_number> q = invariants<HAS>(left, t.J);
     Slopes<local_number> w = slopes(c, q, floor);
@@ -73,12 +71,9 @@ struct Energy {
 
 KERNEL(energy, Energy) {
     index tet[4];
-    get_row(p.tets, i, tet);
-    local_vec3 edges[3];
-    field_edges(p.x, tet, edges);
-    Tetrahedron<local_number> t = tetrahedron(edges, p.gradients, p.n, i);
+    Tetrahedron<local_number> t = element_at(p, i, tet);
     local_number c[CONSTANTS], floor = at(p.floor, i);
-    for (int m = 0; m < CONSTANTS; ++m) c[m] = at(p.constants, m * p.n + i);
+    constants_at(p, i, c);
     local_number W = density(c, invariants<HAS>(mul(t.F, transposed(t.F)), t.J), floor);
     if constexpr (REFUSES) W = t.J <= 0 && floor == 0 ? no_number<local_number>() : W;
     put(p.energy, i, at(p.volume, i) * W);

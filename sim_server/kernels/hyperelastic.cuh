@@ -50,6 +50,19 @@ INLINE void field_edges(const real* field, const index (&tet)[4], local_vec3 (&e
     UNROLL for (int k = 0; k < 3; ++k) edges[k] = as<local_number>(load3(field, tet[k + 1]) - u);
 }
 
+// Element i of a kernel's parameters as it stands now; tet: its nodes.
+template <class P> INLINE Tetrahedron<local_number> element_at(const P& p, index i, index (&tet)[4]) {
+    get_row(p.tets, i, tet);
+    local_vec3 edges[3];
+    field_edges(p.x, tet, edges);
+    return tetrahedron(edges, p.gradients, p.n, i);
+}
+
+// Its constants of the law, (N, n) one after another.
+template <int N, class P> INLINE void constants_at(const P& p, index i, local_number (&c)[N]) {
+    for (int k = 0; k < N; ++k) c[k] = at(p.constants, k * p.n + i);
+}
+
 // F (D_i x D_j) of an edge, from the current edges: no products.
 template <class T> INLINE vec<T> opposite(const vec<T> (&q)[3], int e) {
     return e == 0 ? q[2] - q[1] : e == 1 ? q[0] - q[2] : e == 2 ? q[1] - q[0] : e == 3 ? q[2] : e == 4 ? -q[1] : q[0];
