@@ -72,31 +72,34 @@ def measured(case: Case, steps: int) -> dict[str, Any]:
     """The row of a case, counted from the third factor on (none: from the first)."""
     sim = case.simulation()
     far = case.way == GIGABIT
-    endpoint = f"tcp/{ADDRESS if far else '127.0.0.1'}:{_free_port()}"
+    endpoint = f"tcp/{ADDRESS if far else '127.0.0.1'}:{free_port()}"
     prefix = Cable.far if far else ()
     with ServerLink("bench", [endpoint], shared_memory=case.way == SHARED) as link:
         link.set_scene(describe.scene(sim))
         link.announce(describe.topology(sim, sim.world.bodies[0]))
-        workers = Supervisor(1, "bench", [endpoint], start=lambda command: _started([*prefix, *command]))
+        workers = Supervisor(1, "bench", [endpoint], start=lambda command: started([*prefix, *command]))
         try:
-            _until(link.workers)
+            until(link.workers)
             return _row(case, _run(sim, link, steps, 1 if case.build == "none" else FIRST))
         finally:
             workers.close()
 
 
-def _free_port() -> int:
+def free_port() -> int:
+    """That nobody listens on now."""
     with socket.socket() as probe:
         probe.bind(("", 0))
         return int(probe.getsockname()[1])
 
 
-def _started(command: Sequence[str]) -> "subprocess.Popen[bytes]":
+def started(command: Sequence[str]) -> "subprocess.Popen[bytes]":
+    """A worker, silent."""
     quiet = subprocess.DEVNULL  # it says each time that it has no shared memory
     return subprocess.Popen(command, stdin=quiet, stdout=quiet, stderr=quiet, cwd=ROOT)
 
 
-def _until(condition: Callable[[], Any]) -> None:
+def until(condition: Callable[[], Any]) -> None:
+    """Waits for a worker."""
     end = time.monotonic() + 30
     while not condition():
         if time.monotonic() > end:

@@ -86,6 +86,7 @@ class Mean:
     most: int  # iterations of a step
     solve: float  # ms
     step: float  # ms, without invert
+    step_of_rounds: list[float]  # ms, of each round
     invert: float  # ms
     cpu: float  # ms of processor time, median over the steps, least of the rounds
     factorize: float  # ms, nan: no factor was made
@@ -104,7 +105,8 @@ def mean(runs: list[Run]) -> Mean:
 
     made = [ms for r in runs for ms in r.factorize]
     return Mean(
-        float(first.iterations.mean()), int(first.iterations.max()), time("solve"), time("step"), time("invert"),
+        float(first.iterations.mean()), int(first.iterations.max()), time("solve"), time("step"),
+        [float(r.step.mean()) for r in runs], time("invert"),
         min(float(np.median(r.cpu)) for r in runs),
         float(np.median(made)) if made else float("nan"), sum(r.unconverged for r in runs),
         float(np.mean([kind == "cholesky" for kind in first.kinds])),

@@ -6,17 +6,18 @@ from math import ceil
 from typing import Any
 
 from sim_server.scene import solver_options
-from tests.bench._paper_beam import CELLS, COROTATIONAL, DT, LOADS, MODELS, QUICK, Beam, Load, calibrated
+from tests.bench._paper_beam import CELLS, COROTATIONAL, DT, LOADS, MODELS, QUICK, Beam, Load, Model, calibrated
 from tests.bench._paper_figures import CONDITION, HETEROGENEOUS, TABLE1, TABLE2, TABLE5
 from tests.bench._paper_run import Mean, Way, mean, run
 
 PRECONDITIONERS = ("none", "jacobi", "block_jacobi", "ssor", "ssor_factor", "cholesky", "incomplete_cholesky")
 
 
+Row = dict[str, Any]
 EXTRAPOLATED, RECYCLED = "async + warp, extrapolated", "async + warp, recycled"
 PAIRS = 8  # directions recycled (table 2)
 AHEAD = 2  # steps that positions sent to a worker go ahead, at most (table 2)
-LATENCIES = (1, 3, 10)  # of the table of extrapolations
+LATENCIES = (1, 3, 10)  # of the tables of extrapolations and of recycled directions
 
 
 @dataclass(frozen=True)
@@ -72,26 +73,23 @@ def measured(cases: dict[str, tuple[Beam, Load, Way]], setting: Setting, device:
     return {name: mean(runs) for name, runs in found.items()}
 
 
-def table1(setting: Setting, device: str) -> list[dict[str, Any]]:
-    """Of each size: with the latency of the paper's table, then with our own."""
+def table1(setting: Setting, device: str, tets: int) -> list[Row]:
+    """A size: with the latency of the paper's table, then with our own."""
     stiffness = calibrated(setting.cells, COROTATIONAL, setting.condition)[0].stiffness
-    rows = []
-    for tets, cells in setting.sizes.items():
-        beam, paper = Beam(cells, COROTATIONAL, stiffness), TABLE1[tets]
-        theirs = _at_latency(beam, ceil(paper.steps - 0.1), setting, device)
-        own = max(1, ceil(theirs.factorize / theirs.step))
-        ours = _at_latency(beam, own, setting, device)
-        rows.append(
-            {"device": device, "tets": 6 * cells[0] * cells[1] * cells[2], "condition": beam.condition(),
-             "factorize ms": theirs.factorize, "paper factorize ms": paper.factorize,
-             "latency": ceil(paper.steps - 0.1), "iterations": theirs.iterations, "paper iterations": paper.iterations,
-             "step ms": theirs.step, "paper step ms": paper.step,
-             "steps to factorize": theirs.factorize / theirs.step, "paper steps to factorize": paper.steps,
-             "own latency": own, "iterations at it": ours.iterations, "step ms at it": ours.step,
-             "unconverged": theirs.unconverged + ours.unconverged, "repeats": theirs.repeats and ours.repeats}
-        )  # fmt: skip
-        print(f"table 1: {device}, {tets} done", flush=True)
-    return rows
+    cells = setting.sizes[tets]
+    beam, paper = Beam(cells, COROTATIONAL, stiffness), TABLE1[tets]
+    theirs = _at_latency(beam, ceil(paper.steps - 0.1), setting, device)
+    own = max(1, ceil(theirs.factorize / theirs.step))
+    ours = _at_latency(beam, own, setting, device)
+    return [
+        {"device": device, "tets": 6 * cells[0] * cells[1] * cells[2], "condition": beam.condition(),
+         "factorize ms": theirs.factorize, "paper factorize ms": paper.factorize,
+         "latency": ceil(paper.steps - 0.1), "iterations": theirs.iterations, "paper iterations": paper.iterations,
+         "step ms": theirs.step, "paper step ms": paper.step,
+         "steps to factorize": theirs.factorize / theirs.step, "paper steps to factorize": paper.steps,
+         "own latency": own, "iterations at it": ours.iterations, "step ms at it": ours.step,
+         "unconverged": theirs.unconverged + ours.unconverged, "repeats": theirs.repeats and ours.repeats}
+    ]  # fmt: skip
 
 
 def _at_latency(beam: Beam, latency: int, setting: Setting, device: str) -> Mean:
@@ -99,22 +97,20 @@ def _at_latency(beam: Beam, latency: int, setting: Setting, device: str) -> Mean
     return measured(case, setting, device)[""]
 
 
-def table2(setting: Setting, device: str) -> list[dict[str, Any]]:
-    """A row for each load, model and scheme."""
+def table2(setting: Setting, device: str, load: Load, model: Model) -> list[Row]:
+    """A row for each scheme."""
     rows = []
-    for place, load in enumerate(LOADS):
-        for model in MODELS:
-            beam, condition = calibrated(setting.cells, model, setting.condition)
-            found = measured({name: (beam, load, way) for name, way in setting.ways(device).items()}, setting, device)
-            for name, m in found.items():
-                row = {"device": device, "load": load.name, "model": model.name, "scheme": name,
-                       "condition": condition, "stiffness": beam.stiffness, "iterations": m.iterations,
-                       "most iterations": m.most, "step ms": m.step, "solve ms": m.solve,
-                       "with a factor": m.factor_share, "unconverged": m.unconverged, "repeats": m.repeats}  # fmt: skip
-                if paper := TABLE2.get((place, model.paper, name)):
-                    row |= {"paper iterations": paper.iterations, "paper ms": paper.ms}
-                rows.append(row)
-            print(f"table 2: {device}, {load.name}, {model.name} done", flush=True)
+    beam, condition = calibrated(setting.cells, model, setting.condition)
+    found = measured({name: (beam, load, way) for name, way in setting.ways(device).items()}, setting, device)
+    for name, m in found.items():
+        row = {"device": device, "load": load.name, "model": model.name, "scheme": name,
+               "condition": condition, "stiffness": beam.stiffness, "iterations": m.iterations,
+               "most iterations": m.most, "step ms": m.step, "step ms of rounds": m.step_of_rounds,
+               "solve ms": m.solve, "with a factor": m.factor_share, "unconverged": m.unconverged,
+               "repeats": m.repeats}  # fmt: skip
+        if paper := TABLE2.get((LOADS.index(load), model.paper, name)):
+            row |= {"paper iterations": paper.iterations, "paper ms": paper.ms}
+        rows.append(row)
     return rows
 
 
@@ -124,59 +120,59 @@ def available(device: str = "cpu") -> list[str]:
     return [name for name in PRECONDITIONERS if name in there]
 
 
-def extrapolations(setting: Setting, device: str) -> list[dict[str, Any]]:
-    """A row for each beam and latency: iterations by how far the positions sent go ahead."""
-    if device == "gpu":
-        return []  # positions of a GPU go out as they are
-    cases = [(model.name, *calibrated(setting.cells, model, setting.condition)) for model in MODELS]
-    cases.append(("heterogeneous", *calibrated(setting.cells, COROTATIONAL, HETEROGENEOUS, heterogeneous=True)))
-    rows = []
-    for name, beam, _ in cases:
-        for latency in LATENCIES:
-            row: dict[str, Any] = {"beam": name, "latency": latency}
-            for what, steps in (("as it is", 0), ("1 step", 1), ("2 steps", 2), ("all of it", latency)):
-                way = Way("cholesky", f"lockstep-{latency}", True, extrapolate=min(steps, latency) * DT)
-                row[what] = float(run(beam, LOADS[2], way, setting.steps, **setting.solver()).iterations.mean())
-            rows.append(row)
+def extrapolated_beams() -> list[str]:
+    """Of the table of extrapolations: homogeneous ones by their model, and the heterogeneous one."""
+    return [*(model.name for model in MODELS), "heterogeneous"]
+
+
+def _beam(setting: Setting, name: str) -> Beam:
+    """By the name of its model, or the heterogeneous one."""
+    if name == "heterogeneous":
+        return calibrated(setting.cells, COROTATIONAL, HETEROGENEOUS, heterogeneous=True)[0]
+    return calibrated(setting.cells, next(m for m in MODELS if m.name == name), setting.condition)[0]
+
+
+def extrapolations(setting: Setting, device: str, name: str) -> list[Row]:
+    """A row for each latency: iterations by how far the positions sent go ahead."""
+    beam, rows = _beam(setting, name), []
+    for latency in LATENCIES:
+        row: Row = {"device": device, "beam": name, "latency": latency}
+        for what, steps in (("as it is", 0), ("1 step", 1), ("2 steps", 2), ("all of it", latency)):
+            way = Way("cholesky", f"lockstep-{latency}", True, extrapolate=min(steps, latency) * DT)
+            row[what] = float(run(beam, LOADS[2], way, setting.steps, **setting.solver()).iterations.mean())
+        rows.append(row)
     return rows
 
 
-def recycled(setting: Setting, device: str) -> list[dict[str, Any]]:
-    """A row for each beam and latency: iterations and processor time by the number of recycled directions."""
-    if device == "gpu":
-        return []
-    beams = {
-        "corotational": calibrated(setting.cells, COROTATIONAL, setting.condition)[0],
-        "heterogeneous": calibrated(setting.cells, COROTATIONAL, HETEROGENEOUS, heterogeneous=True)[0],
-    }
-    rows = []
-    for name, beam in beams.items():
-        for latency in LATENCIES:
-            ways = {pairs: Way("cholesky", f"lockstep-{latency}", True, recycle=pairs) for pairs in (0, 4, 8, 16, 24)}
-            found = measured({str(pairs): (beam, LOADS[2], way) for pairs, way in ways.items()}, setting, device)
-            rows += [
-                {"beam": name, "latency": latency, "recycled": pairs, "iterations": found[str(pairs)].iterations,
-                 "most iterations": found[str(pairs)].most, "step CPU ms": found[str(pairs)].cpu,
-                 "unconverged": found[str(pairs)].unconverged, "repeats": found[str(pairs)].repeats}
-                for pairs in ways
-            ]  # fmt: skip
-    return rows
+def recycled(setting: Setting, device: str, name: str, latency: int) -> list[Row]:
+    """A row for each number of recycled directions: iterations and processor time."""
+    beam = _beam(setting, name)
+    ways = {pairs: Way("cholesky", f"lockstep-{latency}", True, recycle=pairs) for pairs in (0, 4, 8, 16, 24)}
+    found = measured({str(pairs): (beam, LOADS[2], way) for pairs, way in ways.items()}, setting, device)
+    return [
+        {"device": device, "beam": name, "latency": latency, "recycled": pairs,
+         "iterations": found[str(pairs)].iterations, "most iterations": found[str(pairs)].most,
+         "step CPU ms": found[str(pairs)].cpu, "unconverged": found[str(pairs)].unconverged,
+         "repeats": found[str(pairs)].repeats}
+        for pairs in ways
+    ]  # fmt: skip
 
 
-def policies(setting: Setting, device: str) -> list[dict[str, Any]]:
+def policies(setting: Setting, device: str) -> list[Row]:
     """A row for each update policy, on the beam of table 2 under the load with most rotation; one virtual worker."""
     beam, d = calibrated(setting.cells, COROTATIONAL, setting.condition)[0], setting.latency
     ways = {name: Way("cholesky", name, True) for name in ("never", "every-1", "every-30", f"lockstep-{d}")}
     ways |= {name: Way("cholesky", name, True, d) for name in ("async", "adaptive")}
     found = measured({name: (beam, LOADS[2], way) for name, way in ways.items()}, setting, device)
     return [
-        {"update": name, "iterations": m.iterations, "most iterations": m.most, "factors": m.factors,
-         "step ms": m.step, "wait ms": m.invert, "unconverged": m.unconverged, "repeats": m.repeats}
+        {"device": device, "update": name, "iterations": m.iterations, "most iterations": m.most,
+         "factors": m.factors, "step ms": m.step, "wait ms": m.invert, "unconverged": m.unconverged,
+         "repeats": m.repeats}
         for name, m in found.items()
     ]  # fmt: skip
 
 
-def table5(setting: Setting, device: str) -> list[dict[str, Any]]:
+def table5(setting: Setting, device: str) -> list[Row]:
     """A row for each preconditioner, renewed at each step and asynchronously with warp."""
     beam, condition = calibrated(setting.cells, COROTATIONAL, HETEROGENEOUS, heterogeneous=True)
     updates = {"standard": ("every-1", False), "async + warp": (f"lockstep-{setting.latency}", True)}
@@ -198,5 +194,4 @@ def table5(setting: Setting, device: str) -> list[dict[str, Any]]:
             row |= {"paper iterations": paper.iterations, "paper solve ms": paper.solve, "paper total ms": paper.total}
             row |= {"paper invert ms": paper.invert} if paper.invert is not None else {}
         rows.append(row)
-    print(f"table 5: {device} done", flush=True)
     return rows

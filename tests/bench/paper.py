@@ -1,81 +1,25 @@
 # SPDX-License-Identifier: MIT
-"""Tables 1, 2 and 5 and figure 4 of Courtecuisse et al. 2010, measured here, each beside the paper's own figures."""
+"""Tables 1, 2 and 5 and figure 4 of Courtecuisse et al. 2010, measured here, each beside the paper's own figures.
 
-from pathlib import Path
-from typing import Annotated
+    deploy/run bench paper                                           all of it
+    deploy/run bench paper --only table1 "table2 bend, springs" --limit 500 --out a
+    deploy/run bench paper --share 3/16 --limit 500 --out 3          the third of 16 processes that run at once
+    deploy/run bench paper --merge a/paper.json 3/paper.json
 
-import typer
+Pieces that are made at once share the memory and the clock of the machine: iterations are the same, times may not be.
+"""
 
-from tests.bench import _paper_words as words
-from tests.bench import figure4
-from tests.bench._paper_beam import BANDS, LOADS
-from tests.bench._paper_tables import Setting, extrapolations, policies, recycled, table1, table2, table5
-from tests.bench._schemes import SCENES, run
-from tests.bench.report import Report
+import argparse
+from typing import Any
 
+from tests.bench import _paper_page as page
+from tests.bench._paper_tables import Setting
+from tests.bench._paper_units import KEYS, units
+from tests.bench._pieces import Limit, Merged, Piece, arguments_of_pieces
+from tests.bench._units import arguments_of_units, asked_for, chosen, measure
 
-def section(setting: Setting, device: str, report: Report) -> None:
-    """All tables of one device."""
-    name = device.upper()
-    one, two, five = table1(setting, device), table2(setting, device), table5(setting, device)
-    policy = policies(setting, device)
-    report.data[device] = {"table1": one, "table2": two, "table5": five, "policies": policy}
-    report.say(
-        f"## Table 1: sizes, {name}", f"Corotational, *{LOADS[1].name}*, async + warp, E of the beam of table 2."
-    )
-    report.table(one, words.COLUMNS1)
-    report.say(
-        "*latency* is the paper's steps to factorize, rounded up; *own latency* what a factorization takes here in "
-        "steps of this machine, one thread each."
-    )
-    calibrations = {row["model"]: f"{row['model']} {row['stiffness']:.5g} ({row['condition']:.1f})" for row in two}
-    report.say(
-        f"## Table 2: loads, models and schemes, {name}",
-        words.loads(),
-        f"Stiffness and the condition number that it gives: {', '.join(calibrations.values())}. In each cell: "
-        "iterations and ms per step, in brackets the paper's.",
-    )
-    report.table(words.shown2(two))
-    report.say(words.verdict2(two))
-    bands = " : ".join(f"{share:g}" for _, share in BANDS)
-    report.say(
-        f"## Table 5: preconditioners on the heterogeneous beam, {name}",
-        f"E in three bands {bands}, stiffest at the held end ({five[0]['stiffness']:.5g} Pa there), condition number "
-        f"{five[0]['condition']:.0f}; *{LOADS[1].name}*. *invert*: what a step waits for.",
-    )
-    report.table(five, words.COLUMNS5)
-    report.say(words.verdict5(five))
-    report.say(f"## Update policies, {name}", words.POLICIES.format(load=LOADS[2].name, latency=setting.latency))
-    report.table(policy, words.COLUMNS_OF_POLICIES)
-    if ahead := extrapolations(setting, device):
-        report.data[device]["extrapolations"] = ahead
-        told = words.EXTRAPOLATIONS.format(load=LOADS[2].name, steps=setting.steps)
-        report.say(f"## Extrapolated states, {name}", told)
-        report.table(ahead)
-    if again := recycled(setting, device):
-        report.data[device]["recycled"] = again
-        report.say(f"## Recycled directions, {name}", words.RECYCLING.format(load=LOADS[2].name))
-        report.table(again, words.COLUMNS_OF_RECYCLED)
-    tables = (one, two, five, policy, again)
-    bad = sum(row["unconverged"] for rows in tables for row in rows)
-    alike = all(row["repeats"] for rows in tables for row in rows)
-    report.say(
-        f"Solves that did not reach the tolerance: {bad}. Iterations of all rounds alike, step by step: "
-        f"{'yes' if alike else 'NO'}."
-    )
-
-
-def figure(report: Report, setting: Setting, latency: int, steps: int) -> None:
-    """Figure 4, without processes: the page of figure4 has those too."""
-    more = ("solver.factor_precision=float32", *(("object.beam.mesh.bar=[2, 2, 6]",) if setting.quick else ()))
-    results = {
-        kind.name: [run(SCENES / "beam.toml", kind, steps, more)] for kind in figure4.schemes(latency, processes=False)
-    }
-    rows = [figure4.row(name, runs, latency) for name, runs in results.items()]
-    report.say("## Figure 4: schemes step by step", "Of deploy/scenes/beam.toml; more of it: figure4.md. On the CPU.")
-    report.figure(figure4.pictures(results, latency), "paper.png", "Iterations and time of each step.")
-    report.table(rows, ("scheme", "iterations, mean", "iterations, max", "step p50 [ms]", "step max [ms]"))
-    report.say(figure4.order(rows, latency))
+TITLE = "The tables of Courtecuisse et al. 2010"
+MEASURED = ("steps", "rounds", "latency", "tolerance")  # arguments of a setting
 
 
 def devices(wanted: str) -> list[str]:
@@ -87,28 +31,49 @@ def devices(wanted: str) -> list[str]:
     return ["cpu"] if chosen("auto", print) == "cpu" else ["cpu", "gpu"]
 
 
-def main(
-    steps: Annotated[int, typer.Option(min=2, help="Steps of each run")] = 150,
-    rounds: Annotated[int, typer.Option(min=1, help="Repetitions, the schemes taking turns")] = 3,
-    latency: Annotated[int, typer.Option(min=1, help="Steps from a matrix to its factor, tables 2 and 5")] = 3,
-    tolerance: Annotated[float, typer.Option(help="Of the true residual")] = 1e-6,
-    device: Annotated[str, typer.Option(help="cpu, gpu, or auto: both, as far as they are there")] = "auto",
-    quick: Annotated[bool, typer.Option("--quick", help="A small smoke run")] = False,
-    out: Annotated[Path | None, typer.Option(help="Folder of the results [default: out/bench/paper]")] = None,
-) -> None:
-    """The tables of the paper, measured here, beside its own figures."""
-    if device not in ("auto", "cpu", "gpu"):
-        raise typer.BadParameter(f"--device {device}: allowed are auto, cpu, gpu")
-    setting = Setting(12, 2, latency, tolerance, True) if quick else Setting(steps, rounds, latency, tolerance, False)
-    arguments = {"steps": setting.steps, "rounds": setting.rounds, "latency": latency, "tolerance": tolerance,
-                 "device": device}  # fmt: skip
-    report = Report("paper", "The tables of Courtecuisse et al. 2010", arguments, out, quick)
-    report.say(*words.explained(setting))
-    for name in devices(device):
-        section(setting, name, report)
-    figure(report, setting, *((4, 12) if quick else (30, 150)))
-    report.write()
+def options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
+    parser.add_argument("--steps", type=int, default=150, help="of each run")
+    parser.add_argument("--rounds", type=int, default=3, help="repetitions, the schemes taking turns")
+    parser.add_argument("--latency", type=int, default=3, help="steps from a matrix to its factor, tables 2 and 5")
+    parser.add_argument("--tolerance", type=float, default=1e-6, help="of the true residual")
+    parser.add_argument("--device", choices=("auto", "cpu", "gpu"), default="auto", help="auto: both, if there")
+    arguments_of_units(parser, f"{', '.join(KEYS)}, 'table2 bend, springs'")
+    parser.add_argument("--quick", action="store_true", help="a small smoke run")
+    arguments_of_pieces(parser)
+    o = parser.parse_args()
+    if o.steps < 2 or o.rounds < 1 or o.latency < 1 or not 0 < o.tolerance < 1:
+        parser.error("allowed: --steps 2 or more, --rounds and --latency 1 or more, --tolerance between 0 and 1")
+    return o
+
+
+def setting_of(arguments: dict[str, Any]) -> Setting:
+    """As given, or as in the JSON of a piece."""
+    return Setting(*(arguments[name] for name in MEASURED), bool(arguments.get("quick")))
+
+
+def merge(o: argparse.Namespace) -> None:
+    """One page of several pieces; where two have measured the same, the later one counts."""
+    merged = Merged("paper", TITLE, o.merge, o.out)
+    settings = {setting_of(part["arguments"]) for part in merged.parts}
+    if len(settings) > 1:
+        raise SystemExit(f"bench paper: the pieces differ in {', '.join(MEASURED)} or --quick: {settings}")
+    page.write(merged, settings.pop(), {name: merged.rows(name, keys) for name, keys in KEYS.items()})
+
+
+def main() -> None:
+    o = options()
+    if o.merge:
+        merge(o)
+        return
+    arguments: dict[str, Any] = {name: getattr(o, name) for name in (*MEASURED, "device")}
+    if o.quick:
+        arguments |= {"steps": 12, "rounds": 2, "quick": True}
+    setting = setting_of(arguments)
+    wanted = chosen(units(setting, devices(o.device), processes=not o.quick or bool(o.only)), o)
+    report = Piece("paper", TITLE, arguments | asked_for(o), o.out, o.quick)
+    page.write(report, setting, measure(wanted, Limit(o.limit), report))
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    main()

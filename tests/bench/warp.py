@@ -1,19 +1,32 @@
 # SPDX-License-Identifier: MIT
-"""The warp off, on and automatic: table 2 of Courtecuisse et al. 2010, and what `warp = "auto"` makes of its rows."""
+"""The warp off, on and automatic: table 2 of Courtecuisse et al. 2010, and what `warp = "auto"` makes of its rows.
 
+    deploy/run bench warp                                            all of it
+    deploy/run bench warp --only "rows bend, springs" --limit 500 --out a
+    deploy/run bench warp --share 3/12 --out 3                       the third of 12 processes that run at once
+    deploy/run bench warp --merge a/warp.json 3/warp.json
+
+Pieces that are made at once share the memory and the clock of the machine: iterations are the same, times may not be.
+"""
+
+import argparse
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, Any
+from functools import partial
+from typing import Any
 
 import numpy as np
-import typer
 from numpy.typing import NDArray
 
 from sim_server.driver import Driver
 from sim_server.engine import HELD
-from tests.bench._paper_beam import CELLS, LOADS, MODELS, QUICK, Beam, Load, calibrated
+from tests.bench._paper_beam import CELLS, LOADS, MODELS, QUICK, Beam, Load, Model, calibrated
 from tests.bench._paper_figures import CONDITION
+from tests.bench._pieces import Limit, Merged, Piece, Row, arguments_of_pieces
+from tests.bench._units import Unit, arguments_of_units, asked_for, chosen, measure
 from tests.bench.report import Report, plots
+
+TITLE = "The warp off, on and automatic"
+KEYS = ("load", "model", "update")  # what tells rows apart
 
 MODES: dict[str, Any] = {"off": False, "on": True, "auto": "auto"}
 ALLOWED = 1.05  # of the better of on and off
@@ -47,13 +60,13 @@ def run(beam: Beam, load: Load, update: str, warp: Any, steps: int) -> Made:
     return Made(r["iterations"], r["cpu"][steps_alone], r["warping"] & HELD > 0, int((r["status"] != 0).sum()))
 
 
-def measured(beam: Beam, load: Load, update: str, steps: int, rounds: int) -> dict[str, Any]:
+def measured(beam: Beam, load: Load, update: str, steps: int, rounds: int) -> Row:
     """A row: the three modes taking turns in every round."""
     runs: dict[str, list[Made]] = {mode: [] for mode in MODES}
     for _ in range(rounds):
         for mode, warp in MODES.items():
             runs[mode].append(run(beam, load, update, warp, steps))
-    row: dict[str, Any] = {"load": load.name, "model": beam.model.name, "update": update}
+    row: Row = {"load": load.name, "model": beam.model.name, "update": update}
     iterations = {mode: float(made[0].iterations.mean()) for mode, made in runs.items()}
     least = {mode: np.min([m.seconds for m in made], axis=0) for mode, made in runs.items()}  # they do the same
     ms = {mode: 1e3 * float(seconds.mean()) for mode, seconds in least.items()}
@@ -82,7 +95,7 @@ def _turned(beam: Beam, load: Load, update: str, steps: int) -> float:
     return float(np.mean(found)) if found else 0.0
 
 
-def picture(rows: list[dict[str, Any]]) -> Any:
+def picture(rows: list[Row]) -> Any:
     """Iterations of off and auto against those of on."""
     plt = plots()
     figure, axis = plt.subplots(figsize=(9, 0.28 * len(rows) + 1.6), layout="constrained")
@@ -98,7 +111,7 @@ def picture(rows: list[dict[str, Any]]) -> Any:
     return figure
 
 
-def verdict(rows: list[dict[str, Any]]) -> str:
+def verdict(rows: list[Row]) -> str:
     """Where auto is within what it is allowed, and where not."""
     beyond = [row for row in rows if row["auto / better"] > ALLOWED]
     slower = [row for row in rows if row["auto / better [ms]"] > ALLOWED]
@@ -115,33 +128,62 @@ def verdict(rows: list[dict[str, Any]]) -> str:
     )
 
 
-def main(
-    steps: Annotated[int, typer.Option(min=2, help="Steps of each run")] = 150,
-    rounds: Annotated[int, typer.Option(min=1, help="Repetitions, the modes taking turns")] = 2,
-    updates: Annotated[str, typer.Option(help="Update policies")] = "never,every-30,lockstep-3,lockstep-10",
-    quick: Annotated[bool, typer.Option("--quick", help="A small smoke run")] = False,
-    out: Annotated[Path | None, typer.Option(help="Folder of the results [default: out/bench/warp]")] = None,
-) -> None:
-    """Iterations and time of a step with the warp off, on and automatic, for each load, model and update policy."""
-    if quick:
-        steps, rounds, updates = 30, 1, "never,lockstep-3"
-    report = Report("warp", "The warp off, on and automatic", {"steps": steps, "rounds": rounds, "updates": updates},
-                    out, quick)  # fmt: skip
-    rows = []
-    for model in MODELS[:2] if quick else MODELS:
-        beam, _ = calibrated(QUICK if quick else CELLS[3000], model, CONDITION)
-        for load in LOADS:
-            for update in updates.split(","):
-                rows.append(measured(beam, load, update, steps, rounds))
-                row = rows[-1]
-                print(f"{model.name}, {load.name}, {update}: {row['off']:.2f} {row['on']:.2f} {row['auto']:.2f}")
+def units(o: argparse.Namespace) -> list[Unit]:
+    """A unit for each load and model."""
+    cells = QUICK if o.quick else CELLS[3000]
+
+    def rows(load: Load, model: Model) -> list[Row]:
+        beam, _ = calibrated(cells, model, CONDITION)
+        return [measured(beam, load, update, o.steps, o.rounds) for update in o.updates]
+
+    models = MODELS[:2] if o.quick else MODELS
+    return [Unit("rows", f"{load.name}, {m.name}", 60, partial(rows, load, m)) for m in models for load in LOADS]
+
+
+def ordered(rows: list[Row]) -> list[Row]:
+    """As a single run has them: pieces come in any order."""
+    models, loads = [model.name for model in MODELS], [load.name for load in LOADS]
+    return sorted(rows, key=lambda row: (models.index(row["model"]), loads.index(row["load"])))
+
+
+def page(report: Report, rows: list[Row]) -> None:
+    """Text, picture and JSON."""
+    rows = ordered(rows)
     report.say(EXPLAINED, verdict(rows))
     report.figure(picture(rows), "warp.png", "Iterations with the warp off and automatic, by those with it on.")
-    columns = [key for key in rows[0] if key not in ("unconverged", "repeats")]
-    report.table(rows, columns)
+    report.table(rows, [key for key in rows[0] if key not in ("unconverged", "repeats")])
     report.data["rows"] = rows
     report.write()
 
 
+def options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
+    parser.add_argument("--steps", type=int, default=150, help="of each run")
+    parser.add_argument("--rounds", type=int, default=2, help="repetitions, the modes taking turns")
+    parser.add_argument("--updates", type=lambda text: text.split(","), metavar="POLICY,POLICY",
+                        default=["never", "every-30", "lockstep-3", "lockstep-10"], help="update policies")  # fmt: skip
+    parser.add_argument("--quick", action="store_true", help="a small smoke run")
+    arguments_of_units(parser, "'rows bend, springs'")
+    arguments_of_pieces(parser)
+    o = parser.parse_args()
+    if o.steps < 2 or o.rounds < 1:
+        parser.error("allowed: --steps 2 or more, --rounds 1 or more")
+    if o.quick:
+        o.steps, o.rounds, o.updates = 30, 1, ["never", "lockstep-3"]
+    return o
+
+
+def main() -> None:
+    o = options()
+    if o.merge:
+        merged = Merged("warp", TITLE, o.merge, o.out)
+        page(merged, merged.rows("rows", KEYS))
+        return
+    wanted = chosen(units(o), o)
+    arguments = {"steps": o.steps, "rounds": o.rounds, "updates": o.updates, **({"quick": True} if o.quick else {})}
+    report = Piece("warp", TITLE, arguments | asked_for(o), o.out, o.quick)
+    page(report, measure(wanted, Limit(o.limit), report)["rows"])
+
+
 if __name__ == "__main__":
-    typer.run(main)
+    main()

@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: MIT
+"""What bench paper can measure by itself: a few rows of one table each, in any order, on any machine."""
+
+from collections.abc import Sequence
+from functools import partial
+
+from tests.bench import _paper_tables as tables
+from tests.bench import figure4
+from tests.bench._paper_beam import LOADS, MODELS
+from tests.bench._paper_publishing import publishing
+from tests.bench._paper_tables import Row, Setting
+from tests.bench._schemes import SCENES, run
+from tests.bench._units import Unit
+
+KEYS = {  # what tells the rows of a table apart
+    "table1": ("device", "tets"),
+    "publishing": ("device", "tets"),
+    "table2": ("device", "load", "model", "scheme"),
+    "table5": ("device", "updated", "preconditioner"),
+    "policies": ("device", "update"),
+    "extrapolations": ("device", "beam", "latency"),
+    "recycled": ("device", "beam", "latency", "recycled"),
+    "figure4": ("scheme",),
+}
+
+
+def units(setting: Setting, devices: Sequence[str], processes: bool = True) -> list[Unit]:
+    """All of them. processes: also those with workers in processes of their own."""
+    beside = [Unit("publishing", f"{tets}, cpu", 40 + tets / 400, partial(publishing, setting, tets))
+              for tets in setting.sizes if processes and "cpu" in devices]  # fmt: skip
+    return [*(unit for device in devices for unit in _of_device(setting, device)), *beside, _figure4(setting)]
+
+
+def _of_device(setting: Setting, device: str) -> list[Unit]:
+    found = [
+        Unit("table1", f"{tets}, {device}", tets / 100, partial(tables.table1, setting, device, tets))
+        for tets in setting.sizes
+    ]
+    found += [
+        Unit("table2", f"{load.name}, {model.name}, {device}", 30, partial(tables.table2, setting, device, load, model))
+        for load in LOADS
+        for model in MODELS
+    ]
+    found.append(Unit("table5", device, 60, partial(tables.table5, setting, device)))
+    found.append(Unit("policies", device, 20, partial(tables.policies, setting, device)))
+    if device == "gpu":  # positions of a GPU go out as they are, and nothing is recycled there
+        return found
+    found += [
+        Unit("extrapolations", f"{beam}, {device}", 25, partial(tables.extrapolations, setting, device, beam))
+        for beam in tables.extrapolated_beams()
+    ]
+    found += [
+        Unit("recycled", f"{beam}, {latency}, {device}", 20, partial(tables.recycled, setting, device, beam, latency))
+        for beam in ("corotational", "heterogeneous")
+        for latency in tables.LATENCIES
+    ]
+    return found
+
+
+def _figure4(setting: Setting) -> Unit:
+    latency, steps = (4, 12) if setting.quick else (30, 150)
+    more = ("solver.factor_precision=float32", *(("object.beam.mesh.bar=[2, 2, 6]",) if setting.quick else ()))
+
+    def rows() -> list[Row]:
+        """Without processes: the page of figure4 has those too."""
+        found = []
+        for kind in figure4.schemes(latency, processes=False):
+            one = run(SCENES / "beam.toml", kind, steps, more)
+            row = figure4.row(kind.name, [one], latency)
+            steps_of_it = {"iterations": one.iterations, "seconds": one.seconds, "age": one.age}
+            found.append({**row, "latency": latency, "steps": steps_of_it})
+        return found
+
+    return Unit("figure4", "cpu", 20, rows)
