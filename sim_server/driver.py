@@ -16,28 +16,27 @@ import re
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import count
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import Factor
-from sim_server.engine import HELD, NOTE_ALWAYS, NOTE_COPIES, NOTED, Kind
+from sim_server.copies import Copies
+from sim_server.engine import Kind
 from sim_server.factors import FactorSource, Inline, Job
 from sim_server.guard import Guard
 from sim_server.schedule import oldest_possible, overdue_after, pays, pick
 from sim_server.simulation import Simulation
 from sim_server.stock import Stock
 from sim_server.track import Track, observe_steps
-from sim_server.warping import FAR, Warping
+from sim_server.warp_trials import WarpTrials
 from sim_server.world import Body
 
 log = logging.getLogger(__name__)
 
 
 COPIES = 32  # matrices that the loop may be asked to copy within one step
-UNBUILT = 3  # jobs of positions alone that may fail in a row before the matrix is sent for good
 CAUSES = 20  # told of an object, each once
 KEPT = 2  # steps that a copied matrix may wait for a worker
 
@@ -69,21 +68,14 @@ class Driver:
         self._arrived: dict[tuple[str, int], Factor] = {}
         self._nobody_at = -1  # step at which nobody was left to be asked
         self._stock = Stock()
-        self._asked = count()
+        self._copies = Copies(simulation, self.source)
         self._alone = False  # there was no worker for a matrix of lockstep
         self._warped = {t.body.name: t.body.index in simulation.warped for t in self.tracks}
-        bytes_a = {
-            t.body.name: 72.0 * len(simulation.system.body_values(t.body.first, t.body.last)) for t in self.tracks
-        }
-        follows = (
-            self.solver.build == "worker" or self.solver.recycle
-        )  # what is built or kept elsewhere goes by rotations
-        if self.solver.warp == "auto" and self.wants_factors and not follows:
-            self._auto_warp()
-        self._bytes = bytes_a  # of A: deterministic cost of an iteration
-        self._spare: dict[
-            tuple[int, ...], list[NDArray[np.float64]]
-        ] = {}  # by shape; what the loop copies into has been touched
+        elsewhere = self.solver.build == "worker" or self.solver.recycle > 0  # built or kept: it goes by rotations
+        tried = self.solver.warp == "auto" and self.wants_factors and not elsewhere
+        self._warping = WarpTrials(simulation, self.tracks if tried else [], self.free)
+        values = {t.body.name: simulation.system.body_values(t.body.first, t.body.last) for t in self.tracks}
+        self._bytes = {name: 72.0 * len(v) for name, v in values.items()}  # of A: deterministic cost of an iteration
 
     # --- one step after another ---------------------------------------------------------------------------------
 
@@ -104,7 +96,7 @@ class Driver:
             if self.wants_factors and self.free:
                 self.pump_factors()
             else:
-                self._note([])
+                self._warping.note([])
             self.engine.run(1)
         return self._observed()
 
@@ -115,7 +107,7 @@ class Driver:
 
     def step_with_fresh_factors(self) -> NDArray[Any]:
         """A step that waits for the factors of its own matrices, made in this process; returns its records."""
-        self._note(self.tracks)
+        self._warping.note(self.tracks)
         self.engine.assemble()
         for t in self.tracks:
             values = self._values(t.body)
@@ -147,7 +139,7 @@ class Driver:
         """Puts a factor into its body's mailbox, unless a newer one is there or it is no good (guard.py)."""
         t = self.by_name[factor.object]
         self._nobody_at = -1
-        matrix = self._matrix_of(t, factor.step)
+        matrix = self._copies.take_back(t, factor.step)
         if factor.step > t.newest and (why := self.guard.complaint(factor, matrix)):
             self.failed(factor.object, f"that of {factor.worker} is not used: {why}")
             return
@@ -160,18 +152,10 @@ class Driver:
             t.choice.factor_arrived()
             self._settle(t)
 
-    def _matrix_of(self, t: Track, step: int) -> NDArray[np.float64] | None:
-        """The matrix that a factor of `step` was made from, if it was sent: its copy, which serves again then."""
-        if t.matrix is None:
-            return None
-        (made, values), t.matrix = t.matrix, None
-        self._give_back(values)
-        return values if made == step and values.ndim == 3 else None
-
     def failed(self, name: str, reason: str) -> None:
         """A job came to nothing; the object may be sent again. Told once per cause: the status counts them."""
         t = self.by_name[name]
-        self._matrix_of(t, -1)
+        self._copies.take_back(t)
         t.came_to_nothing(reason)
         self._nobody_at = -1
         cause = re.sub(r"[0-9.e+-]*[0-9]", "#", reason)
@@ -188,9 +172,9 @@ class Driver:
             if made + self.n == now:
                 self._await(name, made)
         fresh = [t for t in self.tracks if t.body.name not in self._due]
-        self._note(fresh)
+        self._warping.note(fresh)
         for t in fresh:
-            self._ask(t)
+            self._copies.ask(t)
         self.engine.run(1)
         if self.engine.step == now:
             return  # stopped
@@ -225,14 +209,13 @@ class Driver:
 
     def _send_patiently(self, t: Track) -> bool:
         """To a worker, waiting for an idle one; into this process where there is no worker at all. False: stopped."""
-        step = self.engine.matrix_step(t.body.index)
+        step = self._copies.step(t)
         assert t.wanted is not None
         job = self._job(t, step, t.wanted)
         asked = time.monotonic()
         while not (self.source.ready() and self.source.submit(job)):
             if self.engine.loop.stop:
-                self._give_back(t.wanted)
-                t.wanted = None
+                self._copies.discard(t)
                 return False
             self._collect()
             patient = not self._alone and time.monotonic() - asked < 1  # a worker may be about to join
@@ -277,16 +260,16 @@ class Driver:
         tracks = [self.by_name[name] for name in chosen]
         wanted = tracks[:idle] + [t for t in tracks[idle:] if t.sent is None or t.excess > 0]  # in stock: who needs one
         for t in wanted:
-            self._ask(t)
+            self._copies.ask(t)
         if len(wanted) < places:
             self._nobody_at = step
 
     def _send_copies(self) -> None:
         """To idle workers, in the order in which they were asked for; others wait their turn while there is a stock."""
-        copied = [t for t in self.tracks if t.wanted is not None and self.engine.matrix_step(t.body.index) >= 0]
+        copied = self._copies.made(self.tracks)
         idle = int(self.source.ready()) if copied else 0
-        for t in sorted(copied, key=lambda t: t.asked):
-            waited = self.engine.step - self.engine.matrix_step(t.body.index)
+        for t in copied:
+            waited = self.engine.step - self._copies.step(t)
             if idle <= 0 and self._stock.size and waited <= KEPT:
                 continue
             self._send(t)
@@ -317,46 +300,13 @@ class Driver:
         overdue = max(self._overdue(), self.solver.update_floor_steps)
         return oldest_possible(overdue, self._latencies(), self._workers())
 
-    def _ask(self, t: Track) -> None:
-        t.asked = next(self._asked)
-        if self._others_build(t):
-            t.wanted = self._room((t.body.last - t.body.first, 3))
-            t.ahead = self._ahead(t)
-            self.engine.request_positions(t.body.index, t.wanted, t.ahead)
-        else:
-            t.ahead = 0.0
-            t.wanted = self._room(self._values(t.body).shape)
-            self.engine.request_matrix(t.body.index, t.wanted)
-
-    def _room(self, shape: tuple[int, ...]) -> NDArray[np.float64]:
-        spare = self._spare.setdefault(shape, [])
-        return spare.pop() if spare else np.full(shape, 0.0)
-
-    def _give_back(self, copy: NDArray[np.float64]) -> None:
-        """A copy that was sent: its memory serves again."""
-        if copy.base is None:  # not the system's own
-            self._spare[copy.shape].append(copy)
-
-    def _others_build(self, t: Track) -> bool:
-        """Whether positions will do: workers have all that the matrix is made of, and it was no use but a few times."""
-        if self.solver.build != "worker" or t.unbuilt >= UNBUILT:
-            return False
-        told = all(e.told for e in self.simulation.effects.values())
-        return told and getattr(self.source, "builds", lambda: False)()
-
-    def _ahead(self, t: Track) -> float:
-        """How far positions go ahead [s]: to when the factor is expected."""
-        latency = float(self.n) if self.kind == "lockstep" else t.latency.value or 0.0
-        return min(self.solver.extrapolate, latency * self.simulation.scene.dt)
-
     def _send(self, t: Track) -> None:
-        step = self.engine.matrix_step(t.body.index)
+        step = self._copies.step(t)
         assert t.wanted is not None
         if self.source.submit(self._job(t, step, t.wanted)):
             t.went_out(step)
             return
-        self._give_back(t.wanted)
-        t.wanted = None
+        self._copies.discard(t)
 
     # --- what the records say -----------------------------------------------------------------------------------
 
@@ -370,14 +320,11 @@ class Driver:
         for r in records:
             t, iterations, kind = self.tracks[r["body"]], int(r["iterations"]), Kind(r["kind"])
             cost = self._model(t, kind, iterations) if self.counted else float(r["solve"])
-            tried = t.warping is not None and bool(r["warping"] & HELD) != t.warping.decided  # no fault of the factor
-            t.observe(r, max(floor, iterations) if tried else floor, cost)
+            t.observe(r, max(floor, iterations) if self._warping.tried(t, r) else floor, cost)
             if t.choice is not None:
                 t.choice.observe(kind, iterations, cost, Kind(r["asked"]))
                 self._settle(t)
-            if t.warping is not None and kind == r["asked"] == Kind.CHOLESKY and not (r["probe"] or r["fallbacks"]):
-                t.warping.observe(int(r["step"]) - 1, int(r["factor_step"]), iterations, bool(r["warping"] & HELD))
-                self._warp(t, int(r["step"]) - 1, int(r["warping"]))
+            self._warping.observe(t, r)
 
     def _model(self, t: Track, kind: int, iterations: int) -> float:
         """Bytes that a solve moved, about: the deterministic stand-in for its time."""
@@ -392,40 +339,3 @@ class Driver:
         assert t.choice is not None
         native = self.engine.settings(t.body.index)
         native.kind, native.probe = t.choice.kind, t.choice.probe
-
-    # --- warp = "auto" ------------------------------------------------------------------------------------------
-
-    def _auto_warp(self) -> None:
-        for t in self.tracks:
-            if t.body.index not in self.simulation.warped:
-                continue
-            t.warping = Warping(self.engine.exact or not self.free)
-            if self.free and self.engine.exact:
-                self.engine.settings(t.body.index).note = NOTE_COPIES
-
-    def _note(self, fresh: list[Track]) -> None:
-        """Before a step of a policy that waits: whose matrices of it become factors."""
-        for t in self.tracks:
-            if t.warping is None:
-                continue
-            settings = self.engine.settings(t.body.index)
-            settings.note = NOTE_ALWAYS if t in fresh else 0
-            if not self.engine.exact:
-                settings.adopt = int(t.newest == t.noted != t.made)
-                t.made = t.noted if settings.adopt else t.made
-            t.noted = self.engine.step if t in fresh else t.noted
-
-    def _warp(self, t: Track, step: int, frames: int) -> None:
-        """step, frames: of the solve that was observed last (Record.warping)."""
-        assert t.warping is not None
-        settings = self.engine.settings(t.body.index)
-        if self.engine.exact or not self.free:
-            t.warping.consider(lambda: self.simulation.system.turned(t.body.nodes))
-            settings.hold = int(t.warping.hold)
-            return
-        # Steps are not told apart: frames are noted from before they are held until they follow again.
-        t.warping.consider(lambda: FAR / 2)  # not known
-        if t.warping.hold and not settings.note:
-            t.noted = self.engine.step
-        settings.hold = int(t.warping.hold and settings.note and frames & NOTED > 0 and step >= t.noted)
-        settings.note = settings.adopt = int(t.warping.hold or frames & HELD > 0)

@@ -192,8 +192,7 @@ def test_the_copy_of_a_matrix_is_kept_until_its_factor_came(monkeypatch):
     monkeypatch.setattr(driver.guard, "complaint", looked)
     driver.advance(20)
     assert len(seen) > 5 and all(same for _, same in seen)
-    (spare,) = driver._spare.values()
-    assert len(spare) + sum(t.matrix is not None or t.wanted is not None for t in driver.tracks) <= 2
+    assert len(driver._copies.spare) + sum(t.matrix is not None or t.wanted is not None for t in driver.tracks) <= 2
 
 
 def made_of(driver: Driver, values: NDArray) -> NDArray:

@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: MIT
+"""warp = "auto" at work: what warping.py wants of each body becomes settings of the loop, whose records come back."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from sim_server.engine import HELD, NOTE_ALWAYS, NOTE_COPIES, NOTED, Kind
+from sim_server.simulation import Simulation
+from sim_server.track import Track
+from sim_server.warping import FAR, Warping
+
+
+class WarpTrials:
+    """Of those bodies of a simulation that are warped. free: the loop runs beside, and does not wait for settings.
+
+    A loop is exact (Engine.exact) if it reckons frames from the very step of the factor; else it is told which one.
+    """
+
+    def __init__(self, simulation: Simulation, tracks: Sequence[Track], free: bool):
+        self._simulation, self._engine, self._free = simulation, simulation.engine, free
+        self._tracks = [t for t in tracks if t.body.index in simulation.warped]
+        for t in self._tracks:
+            t.warping = Warping(self._engine.exact or not free)
+            if free and self._engine.exact:
+                self._engine.settings(t.body.index).note = NOTE_COPIES
+
+    def note(self, fresh: Sequence[Track]) -> None:
+        """Before a step of a policy that waits: whose matrices of it become factors."""
+        for t in self._tracks:
+            settings = self._engine.settings(t.body.index)
+            settings.note = NOTE_ALWAYS if t in fresh else 0
+            if not self._engine.exact:
+                settings.adopt = int(t.newest == t.noted != t.made)
+                t.made = t.noted if settings.adopt else t.made
+            t.noted = self._engine.step if t in fresh else t.noted
+
+    def tried(self, t: Track, record: Any) -> bool:
+        """The solve was part of a trial: what it took is no fault of the factor."""
+        return t.warping is not None and bool(record["warping"] & HELD) != t.warping.decided
+
+    def observe(self, t: Track, record: Any) -> None:
+        """A solve was made; if with a factor alone, it says something of the warp."""
+        if t.warping is None or not record["kind"] == record["asked"] == Kind.CHOLESKY:
+            return
+        if record["probe"] or record["fallbacks"]:
+            return
+        step, frames = int(record["step"]) - 1, int(record["warping"])
+        t.warping.observe(step, int(record["factor_step"]), int(record["iterations"]), bool(frames & HELD))
+        self._set(t, t.warping, step, frames)
+
+    def _set(self, t: Track, warping: Warping, step: int, frames: int) -> None:
+        """step, frames: of the solve that was observed last (Record.warping)."""
+        settings = self._engine.settings(t.body.index)
+        if self._engine.exact or not self._free:
+            warping.consider(lambda: self._simulation.system.turned(t.body.nodes))
+            settings.hold = int(warping.hold)
+            return
+        # Steps are not told apart: frames are noted from before they are held until they follow again.
+        warping.consider(lambda: FAR / 2)  # not known
+        if warping.hold and not settings.note:
+            t.noted = self._engine.step
+        settings.hold = int(warping.hold and settings.note and frames & NOTED > 0 and step >= t.noted)
+        settings.note = settings.adopt = int(warping.hold or frames & HELD > 0)
