@@ -8,6 +8,7 @@ probe at worst doubles one solve. A pure state machine over (kind, iterations, c
 cost is seconds or, where runs must repeat exactly, bytes moved.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from sim_server.engine import Kind
@@ -17,6 +18,7 @@ EVERY = 200  # solves between probes, doubled after each probe that was no gain 
 RARELY = 6400  # ... up to so many
 HARDER = 2.0  # probe at once when solves cost so many times what they did at the last one
 MARGIN = 1.1  # switch only for a clear gain
+KINDS = tuple(Kind)  # by number
 
 
 @dataclass
@@ -73,6 +75,13 @@ class Choice:
             self._reference = mean
         if self._has_factor and (self._since >= self._every or mean > HARDER * self._reference):
             self._begin_probe(Kind.CHOLESKY if self.kind is Kind.BLOCK_JACOBI else Kind.BLOCK_JACOBI)
+
+    def observe_steps(
+        self, kinds: Sequence[int], iterations: Sequence[int], costs: Sequence[float], asked: Sequence[int]
+    ) -> None:
+        """As `observe` of each of many solves."""
+        for kind, n, cost, began in zip(kinds, iterations, costs, asked, strict=True):
+            self.observe(KINDS[kind], n, cost, KINDS[began])
 
     def _begin_probe(self, other: Kind) -> None:
         known, probed = self._means[self.kind], self._means[other]

@@ -38,6 +38,7 @@ log = logging.getLogger(__name__)
 
 COPIES = 32  # matrices that the loop may be asked to copy within one step
 CAUSES = 20  # told of an object, each once
+TOGETHER = 8  # records at least that are summed up together
 KEPT = 2  # steps that a copied matrix may wait for a worker
 
 
@@ -312,10 +313,9 @@ class Driver:
 
     def observe(self, records: NDArray[Any]) -> None:
         """Sums up excess iterations and lets `auto` choose."""
-        floor = self.solver.update_floor_iterations
-        many = len(records) >= len(self.tracks) > 1 and len(records) % len(self.tracks) == 0
-        if many and not self.counted and all(t.choice is t.warping is None for t in self.tracks):
-            observe_steps(self.tracks, records, floor)
+        floor, bodies = self.solver.update_floor_iterations, len(self.tracks)
+        if not self.counted and len(records) >= max(bodies, TOGETHER) and len(records) % bodies == 0:
+            self._observe_steps(records.reshape(-1, bodies))
             return
         for r in records:
             t, iterations, kind = self.tracks[r["body"]], int(r["iterations"]), Kind(r["kind"])
@@ -325,6 +325,17 @@ class Driver:
                 t.choice.observe(kind, iterations, cost, Kind(r["asked"]))
                 self._settle(t)
             self._warping.observe(t, r)
+
+    def _observe_steps(self, r: NDArray[Any]) -> None:
+        """Of whole steps, (steps, bodies): where bodies are many, this is what decides how many factors they get."""
+        observe_steps(self.tracks, r, self.solver.update_floor_iterations, self._warping.tried_in(r))
+        if any(t.choice for t in self.tracks):
+            columns = (r[name].T.tolist() for name in ("kind", "iterations", "solve", "asked"))
+            for t, *rows in zip(self.tracks, *columns, strict=True):
+                if t.choice is not None:
+                    t.choice.observe_steps(*rows)
+                    self._settle(t)
+        self._warping.observe_steps(r)
 
     def _model(self, t: Track, kind: int, iterations: int) -> float:
         """Bytes that a solve moved, about: the deterministic stand-in for its time."""

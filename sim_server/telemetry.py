@@ -21,6 +21,7 @@ STEPS_PERIOD = 0.05  # s between batches of step records
 STATE_PERIOD = 1 / 30  # s between states for viewers
 STATUS_PERIOD = 1.0  # s
 LOOK_PERIOD = 0.02  # s between looks at whether somebody listens to states
+BATCH = 4096  # steps sent together at most
 WINDOW = 1000  # steps that percentiles are taken over
 
 
@@ -35,11 +36,11 @@ class Telemetry:
         self.begun = time.monotonic()
         self.every = self.simulation.scene.record.every if recorder else 0
         self._batch: list[pb.ObjectStep] = []
-        self._window: dict[str, deque[int]] = {b.name: deque(maxlen=WINDOW) for b in self.simulation.world.bodies}
+        self._window: list[deque[int]] = [deque(maxlen=WINDOW) for _ in self.simulation.world.bodies]  # iterations
         self.seconds: deque[float] = deque(maxlen=WINDOW)
-        self._last: dict[str, pb.ObjectStep] = {}
+        self._last: NDArray[Any] = np.zeros(len(self._window), self.engine.records_dtype)
         self._bad: set[str] = set()
-        self._age_bound = -1  # steps; of factors
+        self._listened = False
         self.solves = 0
         self.unconverged: Counter[str] = Counter()  # solves by status, of those that did not converge
         self._due = {"steps": 0.0, "state": 0.0, "status": 0.0, "look": 0.0}
@@ -75,25 +76,45 @@ class Telemetry:
             self.trace.write(self.patient)
         if len(records):
             self.seconds.extend(records["whole"][records["body"] == 0].tolist())
-            messages = describe.steps(self.simulation, records)
-            self._age_bound = self.driver.age_bound()
+            self._note(records)
+            messages = self._messages(records)
             self._touch(messages)
-            for message in messages:
-                self._note(message)
-            self._batch += messages
+            if self.recorder:
+                for message in messages:
+                    self.recorder.step(message, block=self.patient)
+            self._batch = (self._batch + messages)[-BATCH:]
         if self._period("steps", STEPS_PERIOD) and self._batch:
-            if self.link.wants_steps():
-                self.link.publish_steps(pb.Steps(steps=self._batch[-4096:]))
+            if self._listened:
+                self.link.publish_steps(pb.Steps(steps=self._batch))
             self._batch = []
 
-    def _note(self, message: pb.ObjectStep) -> None:
-        name = message.header.object
-        message.excess = self.driver.by_name[name].excess
-        message.factor_age_bound = self._age_bound
-        self._window[name].append(message.iterations)
-        self._last[name] = message
-        if self.recorder:
-            self.recorder.step(message, block=self.patient)
+    def _note(self, records: NDArray[Any]) -> None:
+        """For the status: the last record of each body, and iterations of those before."""
+        order = np.argsort(records["body"], kind="stable")
+        present, first = np.unique(records["body"][order], return_index=True)
+        iterations = records["iterations"][order].tolist()
+        ends = [*first[1:].tolist(), len(order)]
+        self._last[present] = records[order[np.array(ends) - 1]]
+        for body, begin, end in zip(present.tolist(), first.tolist(), ends, strict=True):
+            self._window[body].extend(iterations[begin:end])
+
+    def _messages(self, records: NDArray[Any]) -> list[pb.ObjectStep]:
+        """Those that somebody wants: to make one takes longer than all else that is done with a record."""
+        self._listened = self.link.wants_steps()
+        wanted = records if self.recorder else records[-BATCH:] if self._listened else records[:0]
+        messages = describe.steps(self.simulation, wanted)
+        bound = self.driver.age_bound() if messages else -1
+        for message in messages:
+            message.excess = self.driver.by_name[message.header.object].excess
+            message.factor_age_bound = bound
+        return messages
+
+    def _latest(self, body: int, bound: int) -> pb.ObjectStep | None:
+        if not self._window[body]:
+            return None
+        message = describe.steps(self.simulation, self._last[body : body + 1])[0]
+        message.excess, message.factor_age_bound = self.driver.tracks[body].excess, bound
+        return message
 
     def _touch(self, messages: list[pb.ObjectStep]) -> None:
         """Adds to each step the interactions that acted in it."""
@@ -155,13 +176,13 @@ class Telemetry:
         status.records_lost = self.recorder.lost if self.recorder else 0
         bound = self.driver.age_bound()
         for track in self.driver.tracks:
-            body, window = track.body, self._window[track.body.name]
+            body, window = track.body, self._window[track.body.index]
             status.objects.append(
                 pb.ObjectStatus(
                     object=body.name,
                     nodes=body.last - body.first,
                     tets=len(body.mesh.tets),
-                    last=self._last.get(body.name),
+                    last=self._latest(body.index, bound),
                     mean_iterations=float(np.mean(window)) if window else 0.0,
                     excess=track.excess,
                     factors_used=track.used,

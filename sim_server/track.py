@@ -146,14 +146,14 @@ class Track:
         self.excess, self.latest = self.excess + above, float(above)
 
 
-def observe_steps(tracks: Sequence[Track], records: NDArray[Any], floor: int) -> None:
-    """As Track.observe of each record of whole steps, of all bodies in order, in seconds.
+def observe_steps(tracks: Sequence[Track], r: NDArray[Any], floor: int, tried: NDArray[np.bool_]) -> None:
+    """As Track.observe of each record of whole steps, (steps, bodies), in seconds. tried: solves without excess.
 
     A worker gets a job each time that the service thread comes round: with a thousand bodies this is what it waits for.
     """
-    r = records.reshape(-1, len(tracks))
     steps, made = len(r), r["factor_step"]
     above = np.maximum(r["iterations"] - floor * np.maximum(r["linearizations"], 1), 0)
+    above[tried] = 0
     weights = (1 - MEMORY) ** np.arange(steps - 1, -1, -1)
     each = r["solve"] / (r["iterations"] + 1)
     costs = weights @ each / weights.sum()

@@ -4,6 +4,9 @@
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from sim_server.engine import HELD, NOTE_ALWAYS, NOTE_COPIES, NOTED, Kind
 from sim_server.simulation import Simulation
 from sim_server.track import Track
@@ -19,6 +22,7 @@ class WarpTrials:
     def __init__(self, simulation: Simulation, tracks: Sequence[Track], free: bool):
         self._simulation, self._engine, self._free = simulation, simulation.engine, free
         self._tracks = [t for t in tracks if t.body.index in simulation.warped]
+        self._indices = [t.body.index for t in self._tracks]
         for t in self._tracks:
             t.warping = Warping(self._engine.exact or not free)
             if free and self._engine.exact:
@@ -38,15 +42,39 @@ class WarpTrials:
         """The solve was part of a trial: what it took is no fault of the factor."""
         return t.warping is not None and bool(record["warping"] & HELD) != t.warping.decided
 
+    def tried_in(self, r: NDArray[Any]) -> NDArray[np.bool_]:
+        """The same of records (steps, bodies) of all bodies."""
+        tried = np.zeros(r.shape, bool)
+        if self._tracks:
+            bodies, decided = self._indices, [t.warping is not None and t.warping.decided for t in self._tracks]
+            tried[:, bodies] = (r["warping"][:, bodies] & HELD != 0) != np.array(decided)
+        return tried
+
     def observe(self, t: Track, record: Any) -> None:
         """A solve was made; if with a factor alone, it says something of the warp."""
-        if t.warping is None or not record["kind"] == record["asked"] == Kind.CHOLESKY:
-            return
-        if record["probe"] or record["fallbacks"]:
+        if t.warping is None or not telling(record):
             return
         step, frames = int(record["step"]) - 1, int(record["warping"])
         t.warping.observe(step, int(record["factor_step"]), int(record["iterations"]), bool(frames & HELD))
         self._set(t, t.warping, step, frames)
+
+    def observe_steps(self, r: NDArray[Any]) -> None:
+        """As `observe` of each, of records (steps, bodies) of all bodies; what follows is set once."""
+        if not self._tracks:
+            return
+        r = r[:, self._indices]
+        usable = telling(r)
+        whole = usable.all(axis=0).tolist()
+        columns = (r["step"] - 1, r["factor_step"], r["iterations"], r["warping"] & HELD != 0)
+        rows = zip(*(column.T.tolist() for column in columns), strict=True)
+        for k, (t, solves) in enumerate(zip(self._tracks, rows, strict=True)):
+            if not whole[k]:
+                chosen = np.flatnonzero(usable[:, k]).tolist()
+                solves = tuple([column[i] for i in chosen] for column in solves)
+            if solves[0]:
+                assert t.warping is not None
+                t.warping.observe_steps(*solves)
+                self._set(t, t.warping, solves[0][-1], int(r["warping"][-1, k]))
 
     def _set(self, t: Track, warping: Warping, step: int, frames: int) -> None:
         """step, frames: of the solve that was observed last (Record.warping)."""
@@ -61,3 +89,9 @@ class WarpTrials:
             t.noted = self._engine.step
         settings.hold = int(warping.hold and settings.note and frames & NOTED > 0 and step >= t.noted)
         settings.note = settings.adopt = int(warping.hold or frames & HELD > 0)
+
+
+def telling(record: Any) -> Any:
+    """Whether a solve (or each of many) began and ended with a factor, which alone says something of the warp."""
+    with_factor = (record["kind"] == Kind.CHOLESKY) & (record["asked"] == Kind.CHOLESKY)
+    return with_factor & (record["probe"] == 0) & (record["fallbacks"] == 0)

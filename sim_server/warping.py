@@ -78,6 +78,21 @@ class Warping:
             if self._trial is not None and self.hold == self.decided:
                 self._compare(self._trial, solve)
 
+    def observe_steps(
+        self, steps: Sequence[int], factor_steps: Sequence[int], iterations: Sequence[int], held: Sequence[bool]
+    ) -> None:
+        """As `observe` of each of many solves."""
+        if self._trial is not None or not all(h == self._held for h in held):
+            for solve in zip(steps, factor_steps, iterations, held, strict=True):
+                self.observe(*solve)
+            return
+        self._all += sum(iterations)
+        self._since += len(steps)
+        if self._held == self.decided:
+            for step, made, n in list(zip(steps, factor_steps, iterations, strict=True))[-RECENT:]:
+                if self._exact or self._changed <= made:
+                    self._recent.append(Solve(step, step - made, n))
+
     def consider(self, turned: Callable[[], float]) -> None:
         """Begins a trial if it is time. turned: mean angle of nodes since the factor's matrix [rad], asked rarely."""
         if self._trial is not None or len(self._recent) < SAMPLES:

@@ -85,7 +85,7 @@ class Served:
         if world.backend.name == "gpu":
             for array in (world.x, world.v):
                 world.backend.twin(array).set(array)
-            world.backend.cp.cuda.Device().synchronize()
+            world.backend.cp.cuda.get_current_stream().synchronize()  # not the device: a capture may be under way
 
     def helped(self, seconds: float) -> NDArray[Any]:
         """Records of `seconds` with factors coming and going; it begins half a second after the first."""

@@ -114,7 +114,7 @@ class Run:
             for array in (world.x, world.v):
                 twin = world.backend.twin(array)
                 twin.set(array.astype(twin.dtype))
-            world.backend.cp.cuda.Device().synchronize()
+            world.backend.cp.cuda.get_current_stream().synchronize()  # not the device: a capture may be under way
 
     def measured(self, seconds: float, warm: float) -> tuple[NDArray[Any], Row]:
         """Records of `seconds`, and what else was counted: steps, factors taken up, seconds.
