@@ -1,15 +1,22 @@
 # SPDX-License-Identifier: MIT
-"""A network namespace at the end of a cable that can be cut, made to lose or to delay. Needs root."""
+"""A network namespace at the end of a cable that can be cut, made to lose, to delay or to be slow. Needs root.
 
+The cable is a process of ours between two tun devices (_fault_relay.py): it wants nothing of the kernel but these.
+"""
+
+import json
 import os
 import shutil
 import subprocess
+import sys
 from types import TracebackType
 from typing import Self
 
 FAR = "wf-far"  # namespace, and the device in it
 NEAR = "wf-near"  # device on this side
 ADDRESS = "10.231.7.1"  # of this side
+THERE = "10.231.7.2"
+MTU = 9000  # bytes
 
 
 class Unavailable(Exception):
@@ -33,60 +40,61 @@ class Cable:
     def __enter__(self) -> Self:
         if os.geteuid() != 0:
             raise Unavailable("network namespaces need root")
+        self._relay: subprocess.Popen[str] | None = None
         self.close()
         try:
             command("ip", "netns", "add", FAR)
-            command("ip", "link", "add", NEAR, "type", "veth", "peer", "name", FAR, "netns", FAR)
-            command("ip", "addr", "add", f"{ADDRESS}/24", "dev", NEAR)
-            command("ip", "link", "set", NEAR, "up")
-            for words in (("addr", "add", "10.231.7.2/24", "dev", FAR), ("link", "set", FAR, "up")):
-                command("ip", "-n", FAR, *words)
+            self._begin()
+            for words, address, name in (((), ADDRESS, NEAR), (("-n", FAR), THERE, FAR)):
+                command("ip", *words, "addr", "add", f"{address}/24", "dev", name)
+                command("ip", *words, "link", "set", name, "mtu", str(MTU), "up")
         except Unavailable:
             self.close()
             raise
         return self
 
+    def _begin(self) -> None:
+        words = [sys.executable, "-m", "tests.bench._fault_relay", FAR, NEAR, FAR]
+        pipe = subprocess.PIPE
+        self._relay = subprocess.Popen(words, stdin=pipe, stdout=pipe, stderr=pipe, text=True)
+        assert self._relay.stdout is not None
+        if self._relay.stdout.readline() != "ready\n":
+            said = self._relay.communicate()[1].strip().splitlines()
+            raise Unavailable(f"no tun device: {said[-1] if said else 'no message'}")
+
+    def _is_like(self, loss: float = 0.0, delay: float = 0.0, rate: float = 0.0) -> None:
+        assert self._relay is not None and self._relay.stdin is not None
+        self._relay.stdin.write(json.dumps({"loss": loss, "delay": delay, "rate": rate}) + "\n")
+        self._relay.stdin.flush()
+
     def cut(self, is_cut: bool) -> None:
         """No packet passes; or all do again."""
-        command("ip", "-n", FAR, "link", "set", FAR, "down" if is_cut else "up")
+        self._is_like(loss=float(is_cut))
 
     def lose(self, percent: int) -> None:
-        """So many of a hundred packets in either direction; raises Unavailable where there is no nft."""
-        if not shutil.which("nft"):
-            raise Unavailable("nft is not installed")
-        drop = f"numgen random mod 100 < {percent} drop"
-        text = "add table ip wf; "
-        for hook in ("input", "output"):
-            text += f"add chain ip wf {hook} {{ type filter hook {hook} priority 0; }}; add rule ip wf {hook} {drop}; "
-        command(*self.far, "nft", text)
+        """So many of a hundred packets in either direction."""
+        self._is_like(loss=percent / 100)
 
     def delay(self, milliseconds: int) -> None:
-        """Each way; raises Unavailable where the kernel has no netem."""
-        netem = ("root", "netem", "delay", f"{milliseconds}ms")
-        command("tc", "qdisc", "replace", "dev", NEAR, *netem)
-        command(*self.far, "tc", "qdisc", "replace", "dev", FAR, *netem)
+        """Each way."""
+        self._is_like(delay=milliseconds / 1000)
 
     def pace(self, megabits: int) -> None:
-        """At most so many a second each way; raises Unavailable where the kernel has no token bucket."""
-        bucket = ("root", "tbf", "rate", f"{megabits}mbit", "burst", "256kb", "latency", "50ms")
-        command("tc", "qdisc", "replace", "dev", NEAR, *bucket)
-        command(*self.far, "tc", "qdisc", "replace", "dev", FAR, *bucket)
+        """At most so many a second each way."""
+        self._is_like(rate=megabits * 1e6 / 8)
 
     def mend(self) -> None:
         """No loss and no delay any more."""
-        for words in (
-            ("tc", "qdisc", "del", "dev", NEAR, "root"),
-            (*self.far, "tc", "qdisc", "del", "dev", FAR, "root"),
-            (*self.far, "nft", "delete table ip wf"),
-        ):
-            if shutil.which(words[0]):
-                subprocess.run(words, capture_output=True)
+        self._is_like()
 
     def close(self) -> None:
         """The namespace goes, and the cable with it."""
+        if self._relay is not None:
+            self._relay.kill()
+            self._relay.communicate()
+            self._relay = None
         if shutil.which("ip"):
-            for words in (("netns", "del", FAR), ("link", "del", NEAR)):
-                subprocess.run(["ip", *words], capture_output=True)
+            subprocess.run(["ip", "netns", "del", FAR], capture_output=True)
 
     def __exit__(self, *_: type[BaseException] | BaseException | TracebackType | None) -> None:
         self.close()

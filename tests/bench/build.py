@@ -2,7 +2,7 @@
 """Who assembles the matrix that a worker factorizes: bytes, step time, time from matrix to factor, on one host and over
 1 Gbit/s (section 5 of Courtecuisse et al. 2010).
 
-A cable of 1 Gbit/s is a network namespace with a token bucket at both ends, where root may make one.
+A cable of 1 Gbit/s is a network namespace at the end of a process that keeps packets back, where root may make one.
 """
 
 from contextlib import ExitStack

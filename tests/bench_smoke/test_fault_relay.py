@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: MIT
+"""What the cable of the faults does to packets: nothing, losing them, or keeping them for a while."""
+
+import os
+import socket
+
+import pytest
+
+from tests.bench._fault_net import FAR, Cable, Unavailable, command
+from tests.bench._fault_relay import BACKLOG, Way
+
+FREE = {"loss": 0.0, "delay": 0.0, "rate": 0.0}
+
+
+@pytest.fixture
+def way():
+    """A direction, the end that sends and the end that gets."""
+    ends = [
+        *socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM),
+        *socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM),
+    ]
+    for end in ends:
+        end.setblocking(False)
+    yield Way(ends[1].fileno(), ends[2].fileno()), ends[0], ends[3]
+    for end in ends:
+        end.close()
+
+
+def arrived(end: socket.socket) -> list[bytes]:
+    found = []
+    while True:
+        try:
+            found.append(end.recv(1 << 16))
+        except BlockingIOError:
+            return found
+
+
+def test_packets_pass_in_order(way):
+    way, near, far = way
+    for k in range(5):
+        near.send(bytes([k]) * 10)
+    way.take(**FREE)
+    assert way.give() is None
+    assert arrived(far) == [bytes([k]) * 10 for k in range(5)]
+
+
+def test_a_cut_cable_passes_nothing_and_one_that_loses_passes_some(way):
+    way, near, far = way
+    for loss, most, least in ((1.0, 0, 0), (0.5, 190, 10)):
+        for _ in range(20):
+            for _ in range(10):
+                near.send(b"x")
+            way.take(**FREE | {"loss": loss})
+        way.give()
+        assert least <= len(arrived(far)) <= most
+
+
+def test_a_delayed_packet_waits(way):
+    way, near, far = way
+    near.send(b"x")
+    way.take(**FREE | {"delay": 100.0})
+    wait = way.give()
+    assert wait is not None and 90 < wait <= 100 and not arrived(far)
+
+
+def test_a_slow_cable_keeps_what_fits_and_drops_the_rest(way):
+    way, near, _ = way
+    rate = 1000 / BACKLOG  # bytes/s: ten packets of 100 bytes may wait
+    for _ in range(8):
+        for _ in range(4):
+            near.send(bytes(100))
+        way.take(**FREE | {"rate": rate / 1e3})
+    assert 1 <= len(way._under_way) <= 2
+
+
+def test_a_namespace_at_the_end_of_a_cable():
+    """Where root may make one."""
+    try:
+        with Cable() as cable:
+            for make in (lambda: cable.lose(100), cable.mend):
+                make()
+                command(*cable.far, "ip", "link", "show", FAR)
+    except Unavailable as why:
+        assert os.geteuid() or str(why)
+        pytest.skip(str(why))
+    with pytest.raises(Unavailable):
+        command("ip", "netns", "exec", FAR, "true")
