@@ -170,10 +170,7 @@ def arguments_of(
     types: what `real` and `local` stand for. converts: an array of float64 may stand for one of float32.
     Raises CompileError for an unknown kernel, TypeError where an argument does not fit the text.
     """
-    found = re.search(rf"^(MAILED_|SUM_)?KERNEL\({kernel}, (\w+)[,)]", text, re.MULTILINE)
-    if found is None:
-        raise CompileError(f"no kernel {kernel} in {module}.cu")
-    members = _members(text, found.group(2), types)
+    members, struct, form = _signature(text, kernel, module, tuple(types.items()))
     if set(given) != {m.name for m in members}:
         raise TypeError(f"{module}.{kernel} takes {[m.name for m in members]}, not {sorted(given)}")
     for m in members:
@@ -183,9 +180,21 @@ def arguments_of(
         fits = [m.dtype, np.dtype("f8")] if converts and m.dtype.kind == "f" else [m.dtype]
         if not (isinstance(value, np.ndarray) and value.dtype in fits and value.flags.c_contiguous):
             raise TypeError(f"{module}.{kernel}: {m.name} must be a contiguous array of {m.dtype}")
-    return [(m, given[m.name]) for m in members], found.group(2), found.group(1) or ""
+    return [(m, given[m.name]) for m in members], struct, form
 
 
+@cache
+def _signature(
+    text: str, kernel: str, module: str, types: tuple[tuple[str, str], ...]
+) -> tuple[list[Argument], str, str]:
+    """Once for each kernel: touch.apply is bound anew whenever clients move what they hold."""
+    found = re.search(rf"^(MAILED_|SUM_)?KERNEL\({kernel}, (\w+)[,)]", text, re.MULTILINE)
+    if found is None:
+        raise CompileError(f"no kernel {kernel} in {module}.cu")
+    return _members(text, found.group(2), dict(types)), found.group(2), found.group(1) or ""
+
+
+@cache
 def domain_of(text: str, struct: str) -> str:
     """What the items of a kernel are: the first word behind `int n;` in its struct."""
     found = re.search(rf"struct {struct} \{{\s*int n;\s*// (\w+)", text)
@@ -222,18 +231,17 @@ class Module:
         source = HERE / path.rpartition("+")[2]
         composed = self._text if "+" in path else None
         self._library = ctypes.CDLL(str(build(source, (f"real={real}",), composed)))
+        self._layouts: dict[str, type[ctypes.Structure]] = {}  # of the kernels bound so far
 
     def bind(self, kernel: str, n: int, **arguments: Any) -> Launch:
         """Argument struct of `kernel` over `n` items; raises TypeError where an argument does not fit the text."""
         fields, struct, _ = arguments_of(
             self._text, kernel, self.name, {"real": self.real, "local": self.real}, {"n": n, **arguments}
         )
-        layout = type(
-            kernel,
-            (ctypes.Structure,),
-            {"_fields_": [(a.name, ctypes.c_void_p if a.dtype is not None else _SCALARS[a.kind]) for a, _ in fields]},
-        )
-        params = layout()
+        if kernel not in self._layouts:
+            members = [(a.name, _SCALARS[a.kind] if a.dtype is None else ctypes.c_void_p) for a, _ in fields]
+            self._layouts[kernel] = type(kernel, (ctypes.Structure,), {"_fields_": members})
+        params = self._layouts[kernel]()
         for a, value in fields:
             setattr(params, a.name, value if a.dtype is None else value.ctypes.data)
         arrays = {a.name: value for a, value in fields if a.dtype is not None}

@@ -65,7 +65,7 @@ class Commands:
 
     def _push(self, command: pb.Command) -> pb.Reply:
         i = command.interaction
-        _finite(i)
+        _finite(i, "point", "force", "radius", "duration")
         point, force = _tuple(i.point), _tuple(i.force)
         return self._took(
             command, self._touch(i.object).push(command.client, i.object, point, i.radius, force, i.duration)
@@ -73,7 +73,7 @@ class Commands:
 
     def _grab(self, command: pb.Command) -> pb.Reply:
         i = command.interaction
-        _finite(i)
+        _finite(i, "point", "target", "radius", "duration", "stiffness", "max_force")
         duration = i.duration if i.duration > 0 else math.inf
         taken = self._touch(i.object).grab(
             command.client, i.object, _tuple(i.point), i.radius, _tuple(i.target), i.stiffness, i.max_force, duration
@@ -81,8 +81,8 @@ class Commands:
         return self._took(command, taken)
 
     def _move(self, command: pb.Command) -> pb.Reply:
-        _finite(command.interaction)
         i = command.interaction
+        _finite(i, "target")
         return self._took(command, self._touch().move(command.client, i.id, _tuple(i.target)))
 
     def _release(self, command: pb.Command) -> pb.Reply:
@@ -140,13 +140,11 @@ def _tuple(v: pb.Vector) -> tuple[float, float, float]:
     return (v.x, v.y, v.z)
 
 
-def _finite(i: pb.Interaction) -> None:
-    numbers = {
-        "point": _tuple(i.point), "force": _tuple(i.force), "target": _tuple(i.target), "radius": (i.radius,),
-        "duration": (i.duration,), "stiffness": (i.stiffness,), "max_force": (i.max_force,),
-    }  # fmt: skip
-    for name, values in numbers.items():
-        if not all(math.isfinite(v) for v in values):
+def _finite(i: pb.Interaction, *names: str) -> None:
+    for name in names:
+        value = getattr(i, name)
+        values = _tuple(value) if isinstance(value, pb.Vector) else (value,)
+        if not all(map(math.isfinite, values)):
             raise Refusal(f"{name} = {values}: must be finite")
 
 

@@ -90,8 +90,10 @@ class Touch(Effect):
         self.publish: Callable[[Launch], Any] = lambda launch: None  # set by the server
         self._system: System | None = None
         self._applied: list[Interaction] = []
+        self._begun: list[Interaction] = []  # the same, with the times at which they began as far as they are known
         self._together = False
-        self._changed: list[Interaction] | None = None  # what the loop is to be given at the end of `together`
+        self._changed: dict[int, Interaction] | None = None  # by id: what the loop is to be given after `together`
+        self._same: tuple[list[int], dict[str, Any]] | None = None  # ids, and what of a launch no move changes
         self._launch: Launch | None = None  # in use, or about to be; it writes when each interaction began
         self._last_id = 0
 
@@ -133,24 +135,26 @@ class Touch(Effect):
 
     def move(self, client: str, id: int, target: Point) -> Interaction:
         """Moves the target of a grab of this client. Raises TouchError."""
-        old = self._find(client, id)
+        alive = self._alive()
+        old = self._found(alive, client, id)
         if old.stiffness == 0:
             raise TouchError(f"interaction {id} is a push; only a grab has a target")
-        alive = self.alive()
-        moved = replace(next(a for a in alive if a.id == id), target=target)
-        self._put([moved if a.id == id else a for a in alive])
+        alive[id] = moved = replace(old, target=target)
+        self._put(alive)
         return moved
 
     def release(self, client: str, id: int) -> Interaction:
         """Ends an interaction of this client. Raises TouchError."""
-        old = self._find(client, id)
-        self._put([a for a in self.alive() if a.id != id])
+        alive = self._alive()
+        old = self._found(alive, client, id)
+        del alive[id]
+        self._put(alive)
         return old
 
     def release_all(self, client: str) -> int:
         """Ends the grabs of a client that has gone; its pushes end by themselves. Returns how many."""
-        alive = self.alive()
-        kept = [a for a in alive if a.client != client or a.stiffness == 0]
+        alive = self._alive()
+        kept = {id: a for id, a in alive.items() if a.client != client or a.stiffness == 0}
         if len(kept) < len(alive):
             self._put(kept)
         return len(alive) - len(kept)
@@ -175,7 +179,7 @@ class Touch(Effect):
         """Gives the loop what has changed."""
         if self._changed is not None:
             changed, self._changed = self._changed, None
-            self.publish(self._bind(changed))
+            self.publish(self._bind(list(changed.values())))
 
     @property
     def applied(self) -> list[Interaction]:
@@ -184,20 +188,22 @@ class Touch(Effect):
 
     def restore(self, interactions: list[Interaction]) -> None:
         """Has the loop work with exactly these from its next step on: those of a log."""
-        self._put(interactions)
+        self._same = None
+        self._put({a.id: a for a in interactions})
 
     def known(self) -> list[Interaction]:
         """All that the loop was given last, also those that are over, with the time at which they began."""
         if not self._applied or self._launch is None:
             return []
-        begun = self._launch.fetch("start")
-        return [replace(a, start=float(s)) for a, s in zip(self._applied, begun, strict=True)]
+        begun = zip(self._begun, self._launch.fetch("start").tolist(), strict=True)
+        self._begun = [a if a.start == s else replace(a, start=s) for a, s in begun]
+        return self._begun
 
     def alive(self) -> list[Interaction]:
         """Interactions that are not over, with the time at which they began."""
         assert self._system is not None
         if self._changed is not None:
-            return self._changed
+            return list(self._changed.values())
         time = float(self._system.clock[0])
         return [a for a in self.known() if a.start < 0 or time + self.world.dt / 2 < a.start + a.duration]
 
@@ -210,9 +216,13 @@ class Touch(Effect):
             raise TouchError(f"object {name!r} does not list the effect touch; these do: {listed}")
         return self.params[name]
 
-    def _find(self, client: str, id: int) -> Interaction:
-        found = next((a for a in self.alive() if a.id == id and a.client == client), None)
-        if found is None:
+    def _alive(self) -> dict[int, Interaction]:
+        """`alive` by id, to be changed and put."""
+        return {a.id: a for a in self.alive()} if self._changed is None else self._changed
+
+    def _found(self, alive: dict[int, Interaction], client: str, id: int) -> Interaction:
+        found = alive.get(id)
+        if found is None or found.client != client:
             raise TouchError(f"client {client!r} has no interaction {id}; it may be over")
         return found
 
@@ -233,8 +243,8 @@ class Touch(Effect):
     def _add(self, new: Interaction) -> Interaction:
         if not np.isfinite([*new.point, *new.force, *new.target, new.radius, new.stiffness, new.limit]).all():
             raise TouchError("point, radius, force, target, stiffness and max_force must be finite numbers")
-        alive, params = self.alive(), self._params(new.object)
-        others = [a for a in alive if a.object == new.object]
+        alive, params = self._alive(), self._params(new.object)
+        others = [a for a in alive.values() if a.object == new.object]
         if len(others) >= params.max_interactions:
             raise TouchError(
                 f"object {new.object!r} has {params.max_interactions} interactions already (max_interactions)"
@@ -246,39 +256,48 @@ class Touch(Effect):
                 f"at most max_total_force = {params.total:g} N together"
             )
         self._last_id += 1
-        new = replace(new, id=self._last_id)
-        self._put([*alive, new])
+        alive[self._last_id] = new = replace(new, id=self._last_id)
+        self._put(alive)
         return new
 
-    def _put(self, interactions: list[Interaction]) -> None:
+    def _put(self, interactions: dict[int, Interaction]) -> None:
         self._changed = interactions
         if not self._together:
             self.flush()
 
     def _bind(self, interactions: list[Interaction]) -> Launch:
         """The launch that applies these interactions, sorted by node."""
-        w, system, n = self.world, self._system, len(interactions)
+        w, system = self.world, self._system
         assert system is not None
-        count = [len(a.nodes) for a in interactions]
-        nodes = np.concatenate([a.nodes for a in interactions]) if n else np.zeros(0, np.int32)
-        order = np.argsort(nodes, kind="stable")
-        touched, first = np.unique(nodes[order], return_index=True)
-        entry = np.repeat(np.arange(n, dtype=np.int32), count)[order]
-        offset = np.concatenate([a.offset for a in interactions])[order] if n else np.zeros((0, 3))
-        start = np.array([a.start for a in interactions], dtype=float)
-
-        def per(value: str) -> NDArray[np.float64]:
-            return np.array([getattr(a, value) for a in interactions], dtype=float)
-
-        self._launch = self.world.backend.module("effects/touch.cu").bind(
-            "apply", len(touched), node=touched.astype(np.int32), first=np.append(first, len(nodes)).astype(np.int32),
-            entry=entry, offset=np.ascontiguousarray(offset), share=1.0 / np.array(count, dtype=float), start=start,
-            duration=per("duration"), force=per("force"), target=per("target"), stiffness=per("stiffness"),
-            limit=per("limit"), clock=system.clock, x=w.x, ahead=w.ahead, free=w.free,
-            block=system.block, dt=w.dt, h=w.impulse, reach=w.reach, diagonal=system.diagonal, b=system.b,
+        ids = [a.id for a in interactions]
+        if self._same is None or self._same[0] != ids:
+            self._same = ids, _unmoved(interactions)
+        self._launch = w.backend.module("effects/touch.cu").bind(
+            "apply", **self._same[1], start=_each(interactions, "start"), target=_each(interactions, "target"),
+            clock=system.clock, x=w.x, ahead=w.ahead, free=w.free, block=system.block, dt=w.dt, h=w.impulse,
+            reach=w.reach, diagonal=system.diagonal, b=system.b,
         )  # fmt: skip
-        self._applied = interactions
+        self._applied = self._begun = interactions
         return self._launch
+
+
+def _each(interactions: list[Interaction], value: str) -> NDArray[np.float64]:
+    return np.array([getattr(a, value) for a in interactions], dtype=float)
+
+
+def _unmoved(interactions: list[Interaction]) -> dict[str, Any]:
+    """What a launch is told of interactions but for when they began and where their targets are."""
+    n, count = len(interactions), [len(a.nodes) for a in interactions]
+    nodes = np.concatenate([a.nodes for a in interactions]) if n else np.zeros(0, np.int32)
+    order = np.argsort(nodes, kind="stable")
+    touched, first = np.unique(nodes[order], return_index=True)
+    offset = np.concatenate([a.offset for a in interactions])[order] if n else np.zeros((0, 3))
+    return {
+        "n": len(touched), "node": touched.astype(np.int32), "first": np.append(first, len(nodes)).astype(np.int32),
+        "entry": np.repeat(np.arange(n, dtype=np.int32), count)[order], "offset": np.ascontiguousarray(offset),
+        "share": 1.0 / np.array(count, dtype=float),
+        **{value: _each(interactions, value) for value in ("duration", "force", "stiffness", "limit")},
+    }  # fmt: skip
 
 
 def build(world: World, listed: list[tuple[Body, Any]]) -> Touch:

@@ -2,6 +2,7 @@
 """Questions that others ask the server: status, scene, topology, shared memory, commands."""
 
 import logging
+from collections.abc import Callable
 from functools import partial
 
 import zenoh
@@ -14,6 +15,7 @@ from protocol.messages_pb2 import Command, Echo, Header, Reply
 from protocol.refused import Refused
 from protocol.session import Session
 from protocol.slots import Slot
+from sim_server.network.newest import newest_moves
 from sim_server.network.outbox import Outbox
 from sim_server.network.waiting import Asked, Waiting
 
@@ -26,8 +28,9 @@ CHANNELS_ASKED = ("command", "status", "scene", "topology", "echo")
 class Inquiries:
     """A queryable and a thread for each channel, so that a flood of commands holds up no other question.
 
-    What was published under a key is answered at once; commands wait for the simulation, in bounded room (waiting.py).
-    Their answers go through an outbox: zenoh waits where a client does not read.
+    What was published under a key is answered at once; commands wait for the simulation, in bounded room (waiting.py),
+    but for moves that newer ones have overtaken (newest.py). Their answers go through an outbox: zenoh waits where a
+    client does not read.
     """
 
     def __init__(
@@ -42,6 +45,7 @@ class Inquiries:
         self._echo_prefix = key("echo", server, worker="*")[:-1]
         self._answers: dict[str, bytes] = {}
         self._waiting = Waiting(counters)
+        self._done = self._stamped(Reply())
         self._queryables = {}
         for channel in CHANNELS_ASKED:
             ring: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(ASKED)
@@ -58,27 +62,38 @@ class Inquiries:
 
     def _run(self, channel: str) -> None:
         queryable, own = self._queryables[channel], zenoh.KeyExpr(key(channel, self._server))
+        together = ASKED if channel == "command" else 1
         while True:
             try:
-                query = queryable.recv()
+                queries = [queryable.recv()]
+                while len(queries) < together and (query := queryable.try_recv()) is not None:
+                    queries.append(query)
             except zenoh.ZError:
                 return  # the session was closed
             try:
-                self._serve(query, own)
-            except Refused as refusal:
-                self._counters.refuse(refusal)
-                query.drop()
+                self._serve_all(queries, own)
             except zenoh.ZError as error:
                 log.debug("a query was not answered: %s", error)
             except Exception:
                 log.exception("a query was not answered")
 
+    def _serve_all(self, queries: list[zenoh.Query], own: zenoh.KeyExpr) -> None:
+        commands = []
+        for query in queries:
+            if str(query.key_expr) == self._command_key:
+                commands.append(query)
+                continue
+            try:
+                self._serve(query, own)
+            except Refused as refusal:
+                self._counters.refuse(refusal)
+                query.drop()
+        if commands:
+            self._commands(commands)
+
     def _serve(self, query: zenoh.Query, own: zenoh.KeyExpr) -> None:
-        asked = str(query.key_expr)
-        if asked == self._command_key:
-            return self._command(query)
         with query:
-            if asked.startswith(self._echo_prefix):
+            if str(query.key_expr).startswith(self._echo_prefix):
                 return self._echo(query)
             for name, answer in list(self._answers.items()):
                 name_expr = zenoh.KeyExpr(name)
@@ -103,20 +118,40 @@ class Inquiries:
         finally:
             query.drop()
 
-    def _command(self, query: zenoh.Query) -> None:
-        def reply(answer: Reply) -> None:
-            answer.header.protocol = PROTOCOL
-            answer.header.incarnation = self._incarnation
-            data = answer.SerializeToString()
-            if not self._replies.post(lambda: self._send(query, data)):
-                log.debug("a command was not answered: too many answers wait")
+    def _commands(self, queries: list[zenoh.Query]) -> None:
+        asked = []
+        for query in queries:
+            try:
+                asked.append((parse(Command, query.payload, CHANNELS["command"].limit), query))
+            except Refused as refusal:
+                self._refuse(refusal, query)
+        found = newest_moves(asked, self._check)
+        for refusal, query in found.refused:
+            self._refuse(refusal, query)
+        for query in found.replaced:
+            self._post(query, self._done)
+        if found.replaced:
+            self._counters.add("moves_replaced", len(found.replaced))
+        for command, query in found.taken:
+            self._waiting.offer(command, self._replier(query))
 
-        try:
-            command = parse(Command, query.payload, CHANNELS["command"].limit)
-            check_header(command, incarnation=self._incarnation if command.header.incarnation else None)
-            check_strings(command)
-            check_numbers(command)
-        except Refused as refusal:
-            self._counters.refuse(refusal)
-            return reply(Reply(error=str(refusal)))
-        self._waiting.offer(command, reply)
+    def _check(self, command: Command) -> None:
+        check_header(command, incarnation=self._incarnation if command.header.incarnation else None)
+        check_strings(command)
+        check_numbers(command)
+
+    def _refuse(self, refusal: Refused, query: zenoh.Query) -> None:
+        self._counters.refuse(refusal)
+        self._post(query, self._stamped(Reply(error=str(refusal))))
+
+    def _replier(self, query: zenoh.Query) -> Callable[[Reply], None]:
+        return lambda answer: self._post(query, self._stamped(answer))
+
+    def _stamped(self, answer: Reply) -> bytes:
+        answer.header.protocol = PROTOCOL
+        answer.header.incarnation = self._incarnation
+        return answer.SerializeToString()
+
+    def _post(self, query: zenoh.Query, data: bytes) -> None:
+        if not self._replies.post(lambda: self._send(query, data)):
+            log.debug("a command was not answered: too many answers wait")

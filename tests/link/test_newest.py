@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: MIT
+"""Commands that came together: what is checked, what is passed over, who is answered what."""
+
+import logging
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from protocol import PROTOCOL
+from protocol.channels import key
+from protocol.counters import Counters
+from protocol.messages_pb2 import Command, Header, Interaction, Reply, Vector
+from protocol.refused import Refused
+from sim_server.network.inquiries import Inquiries
+from sim_server.network.newest import newest_moves
+
+NAN = float("nan")
+
+
+def command(verb: str, client: str = "anna", id: int = 0, x: float = 0.0, protocol: int = PROTOCOL) -> Command:
+    interaction = Interaction(id=id, target=Vector(x=x))
+    return Command(header=Header(protocol=protocol), client=client, verb=verb, interaction=interaction)
+
+
+def sorted_out(*commands: Command) -> tuple[list[int], list[int], list[int], list[int]]:
+    """Numbers of the commands taken, refused, replaced, and of those that were checked; a target of NaN is refused."""
+    checked: list[int] = []
+
+    def check(given: Command) -> None:
+        checked.append(next(n for n, c in enumerate(commands) if c is given))
+        if given.interaction.target.x != given.interaction.target.x:
+            raise Refused("NaN", "not_finite")
+
+    found = newest_moves([(c, n) for n, c in enumerate(commands)], check)
+    return [n for _, n in found.taken], [n for _, n in found.refused], found.replaced, sorted(checked)
+
+
+def test_only_the_newest_move_of_a_grab_is_checked_and_taken() -> None:
+    moves = [command("move", id=7, x=float(i)) for i in range(5)]
+    assert sorted_out(*moves) == ([4], [], [3, 2, 1, 0], [4])
+
+
+def test_other_commands_and_other_grabs_keep_their_order() -> None:
+    given = [
+        command("push"), command("move", id=7), command("move", "ben", 7), command("push"), command("move", id=8),
+        command("release", id=7), command("move", "ben", 7), command("move", id=7),
+    ]  # fmt: skip
+    assert sorted_out(*given) == ([0, 3, 4, 5, 6, 7], [], [2, 1], [0, 3, 4, 5, 6, 7])
+
+
+def test_a_malformed_move_replaces_nothing() -> None:
+    """The hand is where its last good move says, not where nobody said."""
+    given = [command("move", id=7, x=1.0), command("move", id=7, x=2.0), command("move", id=7, x=NAN)]
+    assert sorted_out(*given) == ([1], [2], [0], [1, 2])
+
+
+class Query:
+    """As zenoh hands it over. answers: what was replied; dropped: how often."""
+
+    def __init__(self, payload: bytes, asked: str = "command"):
+        self.key_expr, self.payload = key("command", "sim") if asked == "command" else asked, payload
+        self.answers: list[Reply] = []
+        self.dropped = 0
+
+    def reply(self, name: str, data: bytes) -> None:
+        self.answers.append(Reply.FromString(data))
+
+    def drop(self) -> None:
+        self.dropped += 1
+
+    def __enter__(self) -> "Query":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.drop()
+
+
+@pytest.fixture
+def desk() -> Any:
+    """Inquiries without a network: what is posted is sent at once."""
+    session: Any = SimpleNamespace(zenoh=SimpleNamespace(declare_queryable=lambda *_: None), thread=lambda *_: None)
+    replies: Any = SimpleNamespace(post=lambda send: send() or True)
+    return Inquiries(session, "sim", 5, Counters(logging.getLogger("test")), None, replies)
+
+
+def test_each_of_a_round_is_answered_once(desk: Inquiries) -> None:
+    moves = [Query(command("move", id=7, x=float(i)).SerializeToString()) for i in range(40)]
+    push, old = Query(command("push").SerializeToString()), Query(command("push", protocol=99).SerializeToString())
+    broken, elsewhere = Query(b"\xff\xff"), Query(b"", key("status", "sim"))
+    wrong = Query(command("move", id=7, x=NAN).SerializeToString())
+    desk._serve_all([*moves[:20], push, broken, old, elsewhere, *moves[20:], wrong], None)  # type: ignore[arg-type, list-item]
+    taken = desk.commands()
+    assert [(c.verb, c.interaction.target.x) for c, _ in taken] == [("push", 0.0), ("move", 39.0)]
+    assert not push.answers and not moves[-1].answers, "they are answered once they are carried out"
+    for _, reply in taken:
+        reply(Reply())
+    everybody = [*moves, push, broken, old, wrong]
+    assert [len(q.answers) for q in everybody] == [q.dropped for q in everybody] == [1] * len(everybody)
+    assert all(q.answers[0].header.incarnation == 5 for q in everybody)
+    assert [bool(q.answers[0].error) for q in everybody] == [False] * 41 + [True] * 3
+    assert wrong.answers[0].error == "Vector.x is nan; allowed: finite"
+    assert not elsewhere.answers and elsewhere.dropped == 1
+    assert desk._counters.as_dict()["moves_replaced"] == 39 and desk._counters.refused == 3
