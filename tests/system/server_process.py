@@ -12,6 +12,7 @@ from pathlib import Path
 
 from clients.client import Client
 from clients.errors import ClientError
+from protocol import messages_pb2 as pb
 from tests.system.link_helpers import PATIENCE, ROOT, free_endpoint
 
 BEAM = """
@@ -98,11 +99,12 @@ class Stage:
 
     @contextlib.contextmanager
     def client(self) -> Iterator[Client]:
-        """A client, once the server is up."""
+        """A client, once the server is up. Its questions may take as long as a test waits: the machine may be full."""
         deadline = time.monotonic() + PATIENCE
         while True:
             try:
                 client = Client(connect=[self.endpoint], timeout=1.0)
+                client._timeout = PATIENCE
                 break
             except ClientError:
                 if time.monotonic() > deadline:
@@ -125,6 +127,12 @@ def until(holds: Callable[[], object], what: str, timeout: float = PATIENCE) -> 
     while not holds():
         assert time.monotonic() < deadline, f"not within {timeout} s: {what}"
         time.sleep(0.02)
+
+
+def fresh(client: Client) -> pb.Status:
+    """The status of now, where Client.status may be a second old."""
+    client.command("status")
+    return client.status()
 
 
 def alive(pid: int) -> bool:
