@@ -126,8 +126,8 @@ class Inquiries:
             except Refused as refusal:
                 self._refuse(refusal, query)
         found = newest_moves(asked, self._check)
-        for refusal, query in found.refused:
-            self._refuse(refusal, query)
+        for reason, query in found.refused:
+            self._refuse(reason, query)
         for query in found.replaced:
             self._post(query, self._done)
         if found.replaced:
