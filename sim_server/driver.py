@@ -73,7 +73,8 @@ class Driver:
         self._alone = False  # there was no worker for a matrix of lockstep
         self._warped = {t.body.name: t.body.index in simulation.warped for t in self.tracks}
         elsewhere = self.solver.build == "worker" or self.solver.recycle > 0  # built or kept: it goes by rotations
-        tried = self.solver.warp == "auto" and self.wants_factors and not elsewhere
+        told = self.engine.exact or not self.free  # frames are reckoned from the very step of a factor
+        tried = self.solver.warp == "auto" and self.wants_factors and told and not elsewhere
         self._warping = WarpTrials(simulation, self.tracks if tried else [], self.free)
         values = {t.body.name: simulation.system.body_values(t.body.first, t.body.last) for t in self.tracks}
         self._bytes = {name: 72.0 * len(v) for name, v in values.items()}  # of A: deterministic cost of an iteration

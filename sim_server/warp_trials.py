@@ -7,25 +7,27 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_server.engine import HELD, NOTE_ALWAYS, NOTE_COPIES, NOTED, Kind
+from sim_server.engine import HELD, NOTE_ALWAYS, NOTE_COPIES, Kind
 from sim_server.simulation import Simulation
 from sim_server.track import Track
-from sim_server.warping import FAR, Warping
+from sim_server.warping import Warping
 
 
 class WarpTrials:
     """Of those bodies of a simulation that are warped. free: the loop runs beside, and does not wait for settings.
 
-    A loop is exact (Engine.exact) if it reckons frames from the very step of the factor; else it is told which one.
+    A loop is exact (Engine.exact) if it reckons frames from the very step of the factor; else it is told which one,
+    which it cannot be while it runs freely: then there are no trials, as frames that follow again would not fit factors
+    whose matrices were copied while they were held.
     """
 
     def __init__(self, simulation: Simulation, tracks: Sequence[Track], free: bool):
-        self._simulation, self._engine, self._free = simulation, simulation.engine, free
+        self._simulation, self._engine = simulation, simulation.engine
         self._tracks = [t for t in tracks if t.body.index in simulation.warped]
         self._indices = [t.body.index for t in self._tracks]
         for t in self._tracks:
-            t.warping = Warping(self._engine.exact or not free)
-            if free and self._engine.exact:
+            t.warping = Warping()
+            if free:
                 self._engine.settings(t.body.index).note = NOTE_COPIES
 
     def note(self, fresh: Sequence[Track]) -> None:
@@ -54,9 +56,9 @@ class WarpTrials:
         """A solve was made; if with a factor alone, it says something of the warp."""
         if t.warping is None or not telling(record):
             return
-        step, frames = int(record["step"]) - 1, int(record["warping"])
-        t.warping.observe(step, int(record["factor_step"]), int(record["iterations"]), bool(frames & HELD))
-        self._set(t, t.warping, step, frames)
+        step, held = int(record["step"]) - 1, bool(record["warping"] & HELD)
+        t.warping.observe(step, int(record["factor_step"]), int(record["iterations"]), held)
+        self._set(t, t.warping)
 
     def observe_steps(self, r: NDArray[Any]) -> None:
         """As `observe` of each, of records (steps, bodies) of all bodies; what follows is set once."""
@@ -74,21 +76,11 @@ class WarpTrials:
             if solves[0]:
                 assert t.warping is not None
                 t.warping.observe_steps(*solves)
-                self._set(t, t.warping, solves[0][-1], int(r["warping"][-1, k]))
+                self._set(t, t.warping)
 
-    def _set(self, t: Track, warping: Warping, step: int, frames: int) -> None:
-        """step, frames: of the solve that was observed last (Record.warping)."""
-        settings = self._engine.settings(t.body.index)
-        if self._engine.exact or not self._free:
-            warping.consider(lambda: self._simulation.system.turned(t.body.nodes))
-            settings.hold = int(warping.hold)
-            return
-        # Steps are not told apart: frames are noted from before they are held until they follow again.
-        warping.consider(lambda: FAR / 2)  # not known
-        if warping.hold and not settings.note:
-            t.noted = self._engine.step
-        settings.hold = int(warping.hold and settings.note and frames & NOTED > 0 and step >= t.noted)
-        settings.note = settings.adopt = int(warping.hold or frames & HELD > 0)
+    def _set(self, t: Track, warping: Warping) -> None:
+        warping.consider(lambda: self._simulation.system.turned(t.body.nodes))
+        self._engine.settings(t.body.index).hold = int(warping.hold)
 
 
 def telling(record: Any) -> Any:

@@ -46,34 +46,27 @@ class Solve(NamedTuple):
 
 
 class Warping:
-    """Of one body. `hold` is the setting of its next step. exact: what was done before a solve makes no difference to
-    it; else it counts only if the same was done since its factor's matrix."""
+    """Of one body. `hold` is the setting of its next step."""
 
-    def __init__(self, exact: bool = True) -> None:
+    def __init__(self) -> None:
         self.hold = self.decided = False  # decided: hold apart from trials
         self.trials = 0
-        self._exact = exact
         self._recent: deque[Solve] = deque(maxlen=RECENT)
         self._trial: list[Solve] | None = None
         self._after: list[Solve] = []
-        self._solves = 0  # of the trial, counted or not
         self._all = self.lost = 0.0  # iterations; of them by trials
         self._since, self._wait, self._every = 0, EVERY, EVERY  # solves since the last trial; so many before the next
         self._reference = 0.0
         self._gains: list[float] = []  # of trials since the last decision: logarithm of expected by tried
-        self._held, self._changed = False, 0  # as reported last, and since which step
 
     def observe(self, step: int, factor_step: int, iterations: int, held: bool) -> None:
         """A solve with a factor was made. step: steps completed before it; factor_step: of the factor's matrix."""
-        if held != self._held:
-            self._held, self._changed = held, step
-        counts = self._exact or self._changed <= factor_step
         solve = Solve(step, step - factor_step, iterations)
         self._all += iterations
         self._since += 1
         if self._trial is not None and held == self.hold != self.decided:
-            self._tried(self._trial, solve, counts)
-        elif held == self.decided and counts:
+            self._tried(self._trial, solve)
+        elif held == self.decided:
             self._recent.append(solve)
             if self._trial is not None and self.hold == self.decided:
                 self._compare(self._trial, solve)
@@ -82,16 +75,14 @@ class Warping:
         self, steps: Sequence[int], factor_steps: Sequence[int], iterations: Sequence[int], held: Sequence[bool]
     ) -> None:
         """As `observe` of each of many solves."""
-        if self._trial is not None or not all(h == self._held for h in held):
+        if self._trial is not None or not all(h == self.decided for h in held):
             for solve in zip(steps, factor_steps, iterations, held, strict=True):
                 self.observe(*solve)
             return
         self._all += sum(iterations)
         self._since += len(steps)
-        if self._held == self.decided:
-            for step, made, n in list(zip(steps, factor_steps, iterations, strict=True))[-RECENT:]:
-                if self._exact or self._changed <= made:
-                    self._recent.append(Solve(step, step - made, n))
+        for step, made, n in list(zip(steps, factor_steps, iterations, strict=True))[-RECENT:]:
+            self._recent.append(Solve(step, step - made, n))
 
     def consider(self, turned: Callable[[], float]) -> None:
         """Begins a trial if it is time. turned: mean angle of nodes since the factor's matrix [rad], asked rarely."""
@@ -104,22 +95,18 @@ class Warping:
         if self.decided or NEAR < turned() < FAR:
             self.trials += 1
             self.hold = not self.decided
-            self._trial, self._after, self._solves = [], [], 0
+            self._trial, self._after = [], []
 
     def _now(self) -> float:
         last = list(self._recent)[-SAMPLES:]
         return total(last) / max(len(last), 1)
 
-    def _tried(self, trial: list[Solve], solve: Solve, counts: bool) -> None:
-        self._solves += 1
+    def _tried(self, trial: list[Solve], solve: Solve) -> None:
         self.lost += max(0, solve.iterations - alike(solve, self._recent))
-        if counts:
-            trial.append(solve)
+        trial.append(solve)
         tried, before = total(trial), expected(trial, self._recent)
         dear = self.lost > SHARE * self._all + 2 and tried >= before
-        if self._solves >= RECENT or (dear and not trial):
-            self._decide(False)
-        elif dear or tried > WORSE * before + 1:
+        if dear or tried > WORSE * before + 1:
             self._judge(log(max(before, 1) / max(tried, 1)))
         elif len(trial) == SAMPLES:
             self.hold = self.decided  # and now the solves after it

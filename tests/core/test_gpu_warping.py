@@ -1,17 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""How settings of the frames reach a GPU: one mailbox with the flags of all bodies, posted when one changes; and what a
-driver does with them where settings hold for batches of steps."""
-
-from types import SimpleNamespace
+"""How settings of the frames reach a GPU: one mailbox with the flags of all bodies, posted when one changes; and when a
+driver makes use of them."""
 
 import numpy as np
 import pytest
 
 from sim_server.driver import Driver
-from sim_server.engine import ADOPTED, HELD, MOVED, NOTED, Engine, Kind
+from sim_server.engine import ADOPTED, HELD, MOVED, NOTED, Engine
 from sim_server.gpu.engine import Settings, Warping
 from sim_server.gpu.solver import BODY
-from sim_server.layouts import RECORD
 from tests.scenes import bar, simulation
 
 
@@ -43,31 +40,9 @@ def test_flags_of_all_bodies_are_posted_when_one_changes():
     assert len(others.posts) == 1 and len(warping.mailbox.posts) == 5  # type: ignore[union-attr]
 
 
-@pytest.mark.parametrize("delay", [1, 5])
-def test_where_steps_are_not_told_apart_frames_are_noted_before_they_are_held(delay, monkeypatch):
-    """Records come some steps after the settings that they were made with."""
+@pytest.mark.parametrize(("update", "tried"), [("async", False), ("lockstep-3", True), ("every-4", True)])
+def test_where_steps_are_not_told_apart_frames_follow(update, tried, monkeypatch):
+    """What is noted of a batch of steps is not what the factor of one of them was made from."""
     monkeypatch.setattr(Engine, "exact", False)
-    sim = simulation(bar(), preconditioner="cholesky", update="async")
-    settings = SimpleNamespace(hold=0, note=0, adopt=0)
-    sim.engine.settings = lambda body: settings  # type: ignore[method-assign, assignment]
-    driver = Driver(sim)
-    monkeypatch.setattr(Engine, "step", property(lambda engine: max(0, len(past) - delay)))
-    assert (settings.hold, settings.note, settings.adopt) == (0, 0, 0)
-    past: list[int] = []
-    for step in range(300):
-        flags = settings.hold * HELD | settings.note * NOTED | settings.adopt * ADOPTED
-        if flags & HELD:
-            assert past[-1] & NOTED and flags == HELD | NOTED | ADOPTED
-        past.append(flags)
-        if step >= delay:
-            made = past[step - delay]
-            record = np.zeros(1, RECORD)
-            record["step"], record["factor_step"] = step - delay + 1, max(0, (step - delay) // 4 * 4 - 4)
-            record["kind"] = record["asked"] = Kind.CHOLESKY
-            record["iterations"], record["warping"] = 8 if made & HELD else 10, made
-            driver.observe(record)
-    held = [flags & HELD for flags in past]
-    assert sum(held[-100:]) > 60, "holding was found to be better"
-    noted = [flags & NOTED for flags in past]
-    assert not any(noted[: 2 * delay + 5]), "nothing is written while nobody asks"
-    assert all(n or not h for n, h in zip(noted, held, strict=True))
+    driver = Driver(simulation(bar(), preconditioner="cholesky", update=update, warp="auto"))
+    assert [t.warping is not None for t in driver.tracks] == [tried]

@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from sim_server.warping import AFTER, EVERY, RECENT, SAMPLES, SHARE, TRIALS, Solve, Warping, alike, expected
+from sim_server.warping import AFTER, EVERY, SAMPLES, SHARE, TRIALS, Solve, Warping, alike, expected
 
 Cost = Callable[[int, int], float]  # iterations of a solve in a step with a factor so old
 
@@ -14,9 +14,9 @@ Cost = Callable[[int, int], float]  # iterations of a solve in a step with a fac
 class Bench:
     """A world where following and holding take so many iterations, under lockstep-D (0: one factor for ever)."""
 
-    def __init__(self, follow: Cost, hold: Cost, latency: int = 3, turned: float = 0.03, exact: bool = True):
+    def __init__(self, follow: Cost, hold: Cost, latency: int = 3, turned: float = 0.03):
         self.costs, self.latency, self.turned = {False: follow, True: hold}, latency, turned
-        self.warping = Warping(exact)
+        self.warping = Warping()
         self.step, self.iterations, self.asked = 0, 0, 0
 
     def solve(self) -> bool:
@@ -127,22 +127,6 @@ def test_a_held_body_whose_solves_become_harder_follows_again_soon():
     assert not bench.warping.hold  # in a trial at least
     bench.run(AFTER)
     assert not bench.warping.decided
-
-
-def test_where_it_is_not_exact_solves_count_once_the_factor_is_of_the_same_way():
-    """Freezing midway makes little difference at first; judged by that, holding would look like nothing lost."""
-    bench = Bench(flat(12), flat(10), latency=10, exact=False)
-    while not bench.solve():
-        pass
-    assert bench.run(10) == 10 and bench.warping.hold, "longer than a trial has samples: those before do not count"
-    bench.run(400)
-    assert bench.warping.decided
-
-
-def test_a_trial_whose_solves_never_count_ends():
-    bench = Bench(flat(12), flat(12), latency=1000, exact=False)
-    bench.step = 1000
-    assert 0 < bench.run(900) <= RECENT * bench.warping.trials
 
 
 def test_solves_are_compared_with_those_that_say_most_about_them():
