@@ -65,14 +65,16 @@ class First:
 
 
 class Integrator:
-    """The launches of a scheme. carried (n, 3) [m/s]: see above; beta (n,): damping of the stiffness at nodes [s]."""
+    """The launches of a scheme. carried (n, 3) [m/s]: see above; beta (n,): damping of the stiffness at nodes [s];
+    before (n, 3) [m]: x when the step before began, to which a body goes back whose forces are no numbers."""
 
     def __init__(self, scene: Scene, system: System):
         self.options, self.system, self.world = scene.integrator, system, system.world
         w = self.world
         self.carried = np.zeros((0 if w.plain else w.nodes, 3))
         self.beta = np.repeat(w.beta, [b.last - b.first for b in w.bodies]) if not w.plain else np.zeros(0)
-        w.backend.keep(self.carried, self.beta)
+        self.before = w.x[: len(self.carried)].copy()
+        w.backend.keep(self.carried, self.beta, self.before)
         self._parts, self._first = _coefficients(scene)
 
     def start(self) -> Launch:
@@ -93,7 +95,7 @@ class Integrator:
             return s.advance()
         return self._bind(
             "advance", rotation=s.rotation, y=s.y, beta=self.beta, reach=w.reach, carried=self.carried, ahead=w.ahead,
-            drift=w.drift, dv=s.dv, v=w.v, x=w.x, **asdict(self._parts),
+            drift=w.drift, dv=s.dv, v=w.v, x=w.x, before=self.before, **asdict(self._parts),
         )  # fmt: skip
 
     def begin(self, assemble: list[Launch]) -> list[Launch]:

@@ -302,7 +302,7 @@ __device__ __forceinline__ void Solver::solve() {
                     out.status = NOT_FINITE;
                     out.residual = bb;
                     out.bad_node = first_bad_node();
-                    give(0, 0);
+                    give(1, (real)(0 * bb));  // NaN: the kernel `advance` takes the body back
                     return;
                 }
                 memory.goal = body.tolerance * body.tolerance * bb;

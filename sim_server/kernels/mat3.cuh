@@ -20,6 +20,9 @@ template <class T> INLINE vec<T> operator+(vec<T> a, vec<T> b) { return {a.x + b
 template <class T> INLINE vec<T> operator-(vec<T> a, vec<T> b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
 template <class T> INLINE vec<T> operator-(vec<T> a) { return {-a.x, -a.y, -a.z}; }
 template <class S, class T> INLINE vec<T> operator*(S s, vec<T> a) { return {s * a.x, s * a.y, s * a.z}; }
+template <class M, class T> INLINE vec<T> select(M mask, vec<T> a, vec<T> b) {
+    return {mask ? a.x : b.x, mask ? a.y : b.y, mask ? a.z : b.z};
+}
 template <class T> INLINE T dot(vec<T> a, vec<T> b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
 template <class T> INLINE vec<T> cross(vec<T> a, vec<T> b) {
     return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};

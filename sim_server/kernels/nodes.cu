@@ -133,11 +133,13 @@ struct Advance {
     real* x;                // (n, 3) in, out [m]
 };
 
-// v += dv, x += h v (eq. 2).
+// v += dv, x += h v (eq. 2). A body whose forces are no numbers has a y that is none (native/pcg.h): it goes back to where the
+// step before began, from which the forces were known, and rests there. So no energy comes in, and what does not press it through
+// itself again lets it go on.
 KERNEL(advance, Advance) {
-    vec3 dv = mul(as<number>(load9(p.rotation, i)), load3(p.y, i));
-    vec3 v = load3(p.v, i) + dv;
-    store3(p.dv, i, dv);
-    store3(p.v, i, v);
-    store3(p.x, i, load3(p.x, i) + p.h * v);
+    vec3 y = load3(p.y, i), dv = mul(as<number>(load9(p.rotation, i)), y), before = load3(p.v, i), v = before + dv, zero = {};
+    auto refused = y.x != y.x, known = dot(before, zero) == 0;
+    store3(p.dv, i, select(refused, zero, dv));
+    store3(p.v, i, select(refused, zero, v));
+    store3(p.x, i, load3(p.x, i) + p.h * select(refused, select(known, -before, zero), v));
 }

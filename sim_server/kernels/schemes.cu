@@ -90,18 +90,22 @@ struct Advance {
     real* dv;               // (n, 3) out: R y [m/s]
     real* v;                // (n, 3) in, out [m/s]
     real* x;                // (n, 3) in, out [m]
+    real* before;           // (n, 3) in, out: x when the step before began [m]
 };
 
-// v += dv, x += reach (ahead + dv), and what the next step is to know of this one.
+// v += dv, x += reach (ahead + dv), and what the next step is to know of this one. A body whose forces are no numbers goes back
+// and rests there, as in nodes.cu.
 KERNEL(advance, Advance) {
-    vec3 dv = mul(as<number>(load9(p.rotation, i)), load3(p.y, i));
+    vec3 y = load3(p.y, i), dv = mul(as<number>(load9(p.rotation, i)), y), x = load3(p.x, i), before = load3(p.before, i), zero = {};
     vec3 way = load3(p.ahead, i) + dv, gain = dv - load3(p.carried, i);
     vec3 v = p.keeps_v * load3(p.v, i) + dv;
     vec3 ahead = p.of_v * v + p.of_way * way + p.of_gain * gain;
-    store3(p.dv, i, dv);
-    store3(p.v, i, v);
-    store3(p.x, i, load3(p.x, i) + p.reach * way);
-    store3(p.ahead, i, ahead);
-    store3(p.drift, i, drift_of(ahead, v, p.reach, at(p.beta, i)));
-    store3(p.carried, i, p.carries_gain * gain + p.carries_dv * dv);
+    auto refused = y.x != y.x;
+    store3(p.dv, i, select(refused, zero, dv));
+    store3(p.v, i, select(refused, zero, v));
+    store3(p.x, i, select(refused, before, x + p.reach * way));
+    store3(p.before, i, select(refused, before, x));
+    store3(p.ahead, i, select(refused, zero, ahead));
+    store3(p.drift, i, select(refused, zero, drift_of(ahead, v, p.reach, at(p.beta, i))));
+    store3(p.carried, i, select(refused, zero, p.carries_gain * gain + p.carries_dv * dv));
 }

@@ -105,8 +105,8 @@ static void solve(Loop& loop, int index) {
     search.fallbacks += r.fallbacks;
     search.kind = r.kind;
     if (r.status != CONVERGED) search.status = r.status;
-    if (r.status == NOT_FINITE) {  // the velocity stays
-        if (search.linearizations == 0) std::fill(room.gain, room.gain + room.n, 0.0);
+    if (r.status == NOT_FINITE) {  // back, as after one linearization (pcg.h)
+        if (search.linearizations == 0) std::fill(room.gain, room.gain + room.n, NAN);
         search.phase = DONE;
         return;
     }
@@ -146,7 +146,7 @@ static int judge(Loop& loop, int index) {
         return search.phase;
     }
     if (!std::isfinite(search.norm)) {  // nothing on this way is a state
-        if (search.linearizations == 1) std::fill(room.gain, room.gain + room.n, 0.0);
+        if (search.linearizations == 1) std::fill(room.gain, room.gain + room.n, NAN);  // as of pcg
         search.status = NOT_FINITE;
         return search.phase = DONE;
     }

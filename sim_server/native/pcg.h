@@ -107,7 +107,10 @@ static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor,
     auto zero = [&] { for (int i = 0; i < n; ++i) x[i] = 0; };
 
     double b2 = dot(n, b, b);
-    if (!std::isfinite(b2)) { zero(); return finish(NOT_FINITE, b2, 1); }
+    if (!std::isfinite(b2)) {
+        for (int i = 0; i < n; ++i) x[i] = NAN;  // the kernel `advance` takes the body back
+        return finish(NOT_FINITE, b2, 1);
+    }
     if (b2 == 0) { zero(); return finish(CONVERGED, 0, 0); }
     double goal = settings.tolerance * settings.tolerance * b2;
     double r2 = settings.warm_start ? residual(A, b, x, r) : b2;                 // 1. r = b - A x

@@ -137,16 +137,14 @@ def test_linearizations_that_do_not_suffice_are_told():
     assert (records["nonlinear"] > 1e-12).all() and (records["nonlinear"] < 0.1).all()
 
 
-def test_a_force_that_is_not_finite_is_told_and_leaves_what_one_linearization_leaves():
-    velocities = []
+def test_a_force_that_is_not_finite_is_told_and_the_body_rests_as_with_one_linearization():
     for integrator in (None, {"linearizations": 10}):
         sim = beam(integrator=integrator)
         sim.engine.run(3)
         sim.world.x[20, 1] = np.nan
         sim.engine.run(1)
         assert sim.engine.records()["status"][-1] == 5
-        velocities.append(np.isnan(sim.world.v))
-    assert np.array_equal(*velocities) and 0 < velocities[0].any(axis=1).sum() < 10
+        assert not sim.world.v.any() and np.isfinite(np.delete(sim.world.x, 20, axis=0)).all()
 
 
 def test_a_body_that_only_moves_as_a_whole_takes_one_linearization():
