@@ -46,8 +46,8 @@ from sim_server.backend import Launch
 from sim_server.effect import Effect, Refusal
 from sim_server.effects.corotational import shape_gradients
 from sim_server.errors import InputError
-from sim_server.scene.parameters import Parameters
-from sim_server.scene.regions import by_region, constants_by_region
+from sim_server.scene.parameters import Parameters, Positive
+from sim_server.scene.regions import Poisson, by_region, constants_by_region
 from sim_server.system import Stencil, System
 from sim_server.world import Body, World
 
@@ -208,6 +208,12 @@ class Hyperelastic(Tetrahedra):
             Refusal(self.law.name, int(self.owner[e]), int(self.number[e]), float(found[e, 0]), float(found[e, 1]))
             for e in here
         ]
+
+
+YOUNG_AND_POISSON = (
+    Constant("young", Positive, "Young's modulus at small strains [Pa], or a list of regions"),
+    Constant("poisson", Poisson, "Poisson's ratio at small strains [-], of every element whose region gives none"),
+)
 
 
 def lame(values: Values) -> list[Reals]:

@@ -21,18 +21,13 @@ Source: Bonet and Wood, Nonlinear Continuum Mechanics for Finite Element Analysi
 
 from typing import Any
 
-from sim_server.hyperelastic import Constant, Hyperelastic, Law, lame, young_and_poisson
-from sim_server.scene.parameters import Positive
-from sim_server.scene.regions import Poisson
+from sim_server.hyperelastic import YOUNG_AND_POISSON, Hyperelastic, Law, lame, young_and_poisson
 from sim_server.world import Body, World
 
 SCOPE = "object"
 LAW = Law(
     "neo_hookean",
-    (
-        Constant("young", Positive, "Young's modulus at small strains [Pa], or a list of regions"),
-        Constant("poisson", Poisson, "Poisson's ratio at small strains [-], of every element whose region gives none"),
-    ),
+    YOUNG_AND_POISSON,
     pack=lame,
     elastic=young_and_poisson,
 )

@@ -20,18 +20,13 @@ Source: Ciarlet, Mathematical Elasticity I, 1988, section 4.4; Bonet and Wood 20
 
 from typing import Any
 
-from sim_server.hyperelastic import Constant, Hyperelastic, Law, lame, young_and_poisson
-from sim_server.scene.parameters import Positive
-from sim_server.scene.regions import Poisson
+from sim_server.hyperelastic import YOUNG_AND_POISSON, Hyperelastic, Law, lame, young_and_poisson
 from sim_server.world import Body, World
 
 SCOPE = "object"
 LAW = Law(
     "st_venant_kirchhoff",
-    (
-        Constant("young", Positive, "Young's modulus [Pa], or a list of regions"),
-        Constant("poisson", Poisson, "Poisson's ratio [-], of every element whose region gives none"),
-    ),
+    YOUNG_AND_POISSON,
     pack=lame,
     elastic=young_and_poisson,
     refuses=False,

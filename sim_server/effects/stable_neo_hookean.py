@@ -25,9 +25,7 @@ Source: Smith, de Goes and Kim, Stable Neo-Hookean Flesh Simulation, ACM Transac
 
 from typing import Any
 
-from sim_server.hyperelastic import Constant, Hyperelastic, Law, Reals, Values, lame, young_and_poisson
-from sim_server.scene.parameters import Positive
-from sim_server.scene.regions import Poisson
+from sim_server.hyperelastic import YOUNG_AND_POISSON, Hyperelastic, Law, Reals, Values, lame, young_and_poisson
 from sim_server.world import Body, World
 
 SCOPE = "object"
@@ -41,10 +39,7 @@ def pack(values: Values) -> list[Reals]:
 
 LAW = Law(
     "stable_neo_hookean",
-    (
-        Constant("young", Positive, "Young's modulus at small strains [Pa], or a list of regions"),
-        Constant("poisson", Poisson, "Poisson's ratio at small strains [-], of every element whose region gives none"),
-    ),
+    YOUNG_AND_POISSON,
     pack=pack,
     elastic=young_and_poisson,
     refuses=False,
