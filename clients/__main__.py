@@ -209,7 +209,7 @@ def view(
     log: Annotated[Path | None, typer.Argument(metavar="[LOG.mcap]", help="A recorded run.")] = None,
     live: Annotated[bool, typer.Option("--live", help="Show a running server instead.")] = False,
     save: Annotated[Path | None, typer.Option(metavar="FILE.rrd", help="Write a file for rerun instead.")] = None,
-    screenshot: Annotated[Path | None, typer.Option(metavar="FILE.png", help="Write a picture instead.")] = None,
+    screenshot: Annotated[Path | None, typer.Option(metavar="FILE.png", help="Or .jpg: write a picture.")] = None,
     color: Annotated[Color, typer.Option(help="What the surfaces are coloured by.")] = Color.displacement,
     web: Annotated[bool, typer.Option("--web", help="A page for a browser of this machine, no window.")] = False,
     connect: Connect = None,

@@ -17,6 +17,7 @@ import numpy as np
 from clients.client import Client
 from clients.errors import BadInput, ClientError
 from clients.export import written_whole
+from clients.image_file import encoded, kind_of
 from clients.log import Log
 from clients.progress import progress_bar
 from clients.rerun_viewer import Viewer, has_display
@@ -91,7 +92,11 @@ def save_rrd(log: Log, to: Path, coloring: Coloring) -> None:
 
 
 def save_screenshot(log: Log, to: Path, coloring: Coloring) -> None:
-    """Writes a PNG of the last frame: from the viewer, or by matplotlib where it cannot run. Raises ClientError."""
+    """Writes a picture of the last frame: from the viewer, or by matplotlib where it cannot run.
+
+    PNG or JPEG, as the suffix says. Raises BadInput for another one, ClientError.
+    """
+    kind = kind_of(to)
     steps = [found.frames[-1][0] for found in log.objects.values() if found.frames]
     if not steps:
         raise BadInput(f"{log.path}: no frames were recorded")
@@ -110,6 +115,7 @@ def save_screenshot(log: Log, to: Path, coloring: Coloring) -> None:
         from clients.picture import draw
 
         picture = draw(log, coloring, color_limit(log, coloring))
+    picture = encoded(picture, kind)
     try:
         with written_whole(to) as part:
             part.write_bytes(picture)

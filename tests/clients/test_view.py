@@ -205,6 +205,34 @@ def test_picture_without_vulkan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     assert capsys.readouterr().err.count("\n") == 1
 
 
+@pytest.mark.parametrize(
+    ("name", "begins"), [("a.png", b"\x89PNG"), ("b.JPG", b"\xff\xd8\xff"), ("c.jpeg", b"\xff\xd8\xff")]
+)
+def test_the_suffix_says_what_the_file_holds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, begins: bytes
+) -> None:
+    image = pytest.importorskip("PIL.Image")
+    file = BytesIO()
+    image.new("RGBA", (40, 30), (200, 30, 60, 255)).save(file, "PNG")
+    monkeypatch.setattr(view, "has_vulkan_driver", lambda: False)
+    monkeypatch.setattr("clients.picture.draw", lambda *_: file.getvalue())
+    with Log(record_bent(tmp_path / "run.mcap")) as log:
+        view.save_screenshot(log, tmp_path / name, "displacement")
+    assert (tmp_path / name).read_bytes().startswith(begins)
+    with image.open(tmp_path / name) as picture:
+        assert np.abs(np.asarray(picture.convert("RGB"), int) - [200, 30, 60]).max() <= 3
+
+
+@pytest.mark.parametrize("name", ["run.gif", "run", "run.png.gz"])
+def test_other_suffixes_are_refused_before_anything_is_drawn(tmp_path: Path, name: str) -> None:
+    with (
+        Log(record_bent(tmp_path / "run.mcap")) as log,
+        pytest.raises(BadInput, match=r"--screenshot .*: the suffix is '.*'; allowed are .png, .jpg, .jpeg"),
+    ):
+        view.save_screenshot(log, tmp_path / name, "displacement")
+    assert not (tmp_path / name).exists()
+
+
 @pytest.mark.slow
 @pytest.mark.system
 @pytest.mark.skipif(not has_vulkan_driver(), reason="no Vulkan driver (mesa-vulkan-drivers)")

@@ -1,0 +1,36 @@
+# SPDX-License-Identifier: MIT
+"""Pictures as files, of the kind that their suffix says."""
+
+from __future__ import annotations
+
+from io import BytesIO
+from pathlib import Path
+from typing import Literal
+
+from clients.errors import BadInput, ClientError
+
+Kind = Literal["PNG", "JPEG"]
+SUFFIXES: dict[str, Kind] = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG"}
+QUALITY = 92  # of 100: edges of surfaces and thin curves stay clean
+
+
+def kind_of(to: Path) -> Kind:
+    """What the file is to hold. Raises BadInput."""
+    kind = SUFFIXES.get(to.suffix.lower())
+    if kind is None:
+        raise BadInput(f"--screenshot {to}: the suffix is {to.suffix!r}; allowed are {', '.join(SUFFIXES)}")
+    return kind
+
+
+def encoded(png: bytes, kind: Kind) -> bytes:
+    """A picture in PNG as the bytes of a file of this kind. Raises ClientError where that cannot be made."""
+    if kind == "PNG":
+        return png
+    try:
+        from PIL import Image
+    except ImportError:
+        raise ClientError("Pillow is not installed: pip install 'warpfactor[view]', or ask for a .png") from None
+    file = BytesIO()
+    with Image.open(BytesIO(png)) as picture:
+        picture.convert("RGB").save(file, kind, quality=QUALITY)
+    return file.getvalue()
