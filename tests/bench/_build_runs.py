@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: MIT
 """Runs of a server loop in this process with one worker process, matrices or positions sent to it."""
 
-import socket
 import subprocess
 import threading
 import time
@@ -21,6 +20,7 @@ from sim_server.supervisor import Supervisor
 from tests.bench._fault_net import ADDRESS, Cable
 from tests.bench._schemes import SCENES
 from tests.bench.report import ROOT
+from tests.ports import free_port
 
 CELLS = {540: (3, 3, 10), 3000: (5, 5, 20), 24000: (10, 10, 40)}  # of sofa_beam.toml
 SHARED, BYTES, GIGABIT = "shared memory", "bytes, same host", "1 Gbit/s"
@@ -83,13 +83,6 @@ def measured(case: Case, steps: int) -> dict[str, Any]:
             return _row(case, _run(sim, link, steps, 1 if case.build == "none" else FIRST))
         finally:
             workers.close()
-
-
-def free_port() -> int:
-    """That nobody listens on now."""
-    with socket.socket() as probe:
-        probe.bind(("", 0))
-        return int(probe.getsockname()[1])
 
 
 def started(command: Sequence[str]) -> "subprocess.Popen[bytes]":

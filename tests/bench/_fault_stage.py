@@ -2,7 +2,6 @@
 """A real server with a log, real workers on a port of their own, and what the log says afterwards."""
 
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
@@ -16,6 +15,7 @@ import numpy as np
 
 from clients.client import Client
 from clients.errors import ClientError
+from tests.ports import free_port
 
 DT = 0.02  # s
 SCENE = f"""
@@ -37,9 +37,7 @@ PATIENCE = 60.0  # s
 
 def free_endpoint(host: str = "127.0.0.1") -> str:
     """A port that nobody listens on."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/{host}:{probe.getsockname()[1]}"
+    return f"tcp/{host}:{free_port()}"
 
 
 class Stage:

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: MIT
 """Runs a scene under an update scheme, in this process or through server and worker processes."""
 
-import socket
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ from protocol import messages_pb2 as pb
 from sim_server.driver import Driver
 from sim_server.simulation import Simulation
 from tests.bench.report import ROOT
+from tests.ports import free_port
 
 Reals = NDArray[np.float64]
 SCENES = ROOT / "deploy" / "scenes"
@@ -63,13 +63,6 @@ def run(scene: Path, scheme: Scheme, steps: int, more: tuple[str, ...] = (), fol
     return Run(r["iterations"].astype(float), r["whole"], r["residual"], age, status, np.array(x))
 
 
-def _free_endpoint() -> str:
-    """A TCP port of this machine that nobody listens on now."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-
-
 def _in_processes(scene: Path, scheme: Scheme, steps: int, more: tuple[str, ...], folder: Path) -> Run:
     """sim-server with one local worker, read back from its log."""
     from clients.log import Log
@@ -77,7 +70,7 @@ def _in_processes(scene: Path, scheme: Scheme, steps: int, more: tuple[str, ...]
     path = folder / "run.mcap"
     command = [sys.executable, "-m", "sim_server", str(scene), "--steps", str(steps), "--workers", "1"]
     command += ["--realtime" if scheme.realtime else "--free-run"]
-    command += ["--record", str(path), "--listen", _free_endpoint(), "--name", "bench", "--quiet"]
+    command += ["--record", str(path), "--listen", f"tcp/127.0.0.1:{free_port()}", "--name", "bench", "--quiet"]
     for override in scheme.overrides(*more):
         command += ["--set", override]
     subprocess.run(command, check=True, cwd=ROOT, timeout=600)

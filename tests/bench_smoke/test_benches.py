@@ -6,7 +6,8 @@ import math
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ BENCHES = {
     "paper": ["--device", "cpu"], "models": ["--devices", "cpu"], "preconditioners": [], "warp": [],
     "verification": [],
 }  # fmt: skip
+Once = Callable[[str], tuple[dict[str, Any], Path]]
 
 
 def leaves(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
@@ -40,9 +42,21 @@ def bench(name: str, out: Path, *arguments: str) -> dict[str, Any]:
     return json.loads((out / f"{name}.json").read_text())
 
 
+@pytest.fixture(scope="module")
+def once(tmp_path_factory: pytest.TempPathFactory) -> Once:
+    """Report and folder of a bench with its arguments in BENCHES, run when the first test asks for it."""
+
+    @cache
+    def made(name: str) -> tuple[dict[str, Any], Path]:
+        folder = tmp_path_factory.mktemp(name)
+        return bench(name, folder, *BENCHES[name]), folder
+
+    return made
+
+
 @pytest.mark.parametrize("name", BENCHES)
-def test_bench_writes_its_report(name: str, tmp_path: Path) -> None:
-    content = bench(name, tmp_path, *BENCHES[name])
+def test_bench_writes_its_report(name: str, once: Once) -> None:
+    content, folder = once(name)
     numbers = [v for _, v in leaves(content["data"]) if isinstance(v, int | float)]
     assert len(numbers) > 20 and all(math.isfinite(v) for v in numbers)
     missing = {key for key, v in leaves(content["data"]) if v is None}
@@ -51,9 +65,9 @@ def test_bench_writes_its_report(name: str, tmp_path: Path) -> None:
     header = content["header"]
     assert {"date", "commit", "machine", "versions", "calibration"} <= set(header)
     assert all(v > 0 for _, v in leaves(header["calibration"]))
-    text = (tmp_path / f"{name}.md").read_text()
+    text = (folder / f"{name}.md").read_text()
     assert header["machine"]["cpu"] in text and f"]({name}.png)" in text
-    assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+    assert (folder / f"{name}.png").read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.system
@@ -91,9 +105,9 @@ def test_build_with_a_real_worker(tmp_path: Path) -> None:
     assert (tmp_path / "build.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_reference_of_accuracy_is_no_competitor(tmp_path: Path) -> None:
+def test_reference_of_accuracy_is_no_competitor(once: Once) -> None:
     """PCG-1 against a reference of its own would show an error of exactly 0 at any tolerance."""
-    data = bench("accuracy", tmp_path, "--no-processes")["data"]
+    data = once("accuracy")[0]["data"]
     assert all(error > 0 for point in data["points"] for error in point["worst"])
     cg = {p["tolerance"]: p["worst"][0] for p in data["points"] if (p["beam"], p["scheme"]) == ("homogeneous", "CG")}
     assert cg[1e-6] < 1e-2 * cg[1e-2]
@@ -108,8 +122,8 @@ def test_best_order_found_afterwards_is_no_worse_than_any_rule(tmp_path: Path) -
 
 
 @pytest.mark.timeout(240)
-def test_scheduler_repeats_to_the_digit_and_excess_goes_before_turns(tmp_path: Path) -> None:
-    runs = [bench("scheduler", tmp_path / name)["data"]["rows"] for name in ("one", "two")]
+def test_scheduler_repeats_to_the_digit_and_excess_goes_before_turns(once: Once, tmp_path: Path) -> None:
+    runs = [content["data"]["rows"] for content in (once("scheduler")[0], bench("scheduler", tmp_path))]
     assert runs[0] == runs[1]
     iterations = {(r["objects"], r["workers"], r["rule"]): r["iterations"] for r in runs[0]}
     for workers in (1, 2):
@@ -118,8 +132,8 @@ def test_scheduler_repeats_to_the_digit_and_excess_goes_before_turns(tmp_path: P
     assert all(r["age, max"] <= r["age, bound"] for r in runs[0] if r["age, bound"] is not None)
 
 
-def test_iterations_of_the_papers_tables_repeat_to_the_digit(tmp_path: Path) -> None:
-    whole = bench("paper", tmp_path / "one", "--device", "cpu")["data"]
+def test_iterations_of_the_papers_tables_repeat_to_the_digit(once: Once, tmp_path: Path) -> None:
+    whole = once("paper")[0]["data"]
     pieces = [bench("paper", tmp_path / k, "--device", "cpu", "--share", f"{k}/2") for k in ("1", "2")]
     assert all(piece["data"] != whole for piece in pieces)
     bench("paper", tmp_path / "two", "--merge", *(str(tmp_path / k / "paper.json") for k in ("1", "2")))

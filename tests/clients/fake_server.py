@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import socket
 import threading
 from types import TracebackType
 from typing import Self
@@ -13,14 +12,13 @@ import zenoh
 from protocol import messages_pb2 as pb
 from protocol.channels import everything, key
 from protocol.session import open_session
+from tests.ports import free_port
 from tests.sample_run import DT, header, object_step, scene, state, topology
 
 
 class FakeServer:
     def __init__(self, name: str = "sim", objects: tuple[str, ...] = ("beam", "liver")) -> None:
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            self.endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+        self.endpoint = f"tcp/127.0.0.1:{free_port()}"
         self.name, self.objects = name, objects
         self.commands: list[pb.Command] = []
         self.state = "running"

@@ -135,8 +135,15 @@ WRONG = {
 }
 
 
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory) -> str:
+    """A cache for tests that do not look at it: the first compiles."""
+    return str(tmp_path_factory.mktemp("kept"))
+
+
 @pytest.mark.parametrize(("change", "message"), WRONG.values(), ids=WRONG.keys())
-def test_arguments_that_do_not_fit_are_refused(folder, change, message):
+def test_arguments_that_do_not_fit_are_refused(folder, kept, monkeypatch, change, message):
+    monkeypatch.setenv("WARPFACTOR_CACHE", kept)
     given = {k: v for k, v in (arguments() | change).items() if v is not None}
     with pytest.raises(TypeError, match=message):
         backend.Module("push.cu").bind("push", 5, **given)

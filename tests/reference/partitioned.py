@@ -5,6 +5,8 @@
 tiles and the chunks, block by block.
 """
 
+from bisect import bisect_right
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -47,14 +49,17 @@ def stored(pattern: FactorPattern, values: NDArray, plan: Plan, dtype: type = np
         forward, backward = phase < plan.groups - 1, phase >= plan.groups
         starts = (plan.parts.out if forward else plan.parts.start).tolist()
         group = min(phase, plan.phases - 1 - phase)
-        members = np.flatnonzero((plan.parts.group == group) & (b_of > 0 if forward else v_of > 0))
-        for chunk, _, count, out in _tiles(plan, phase):
-            p = max(members.tolist(), key=lambda p: starts[p] if starts[p] <= out else -1)
-            inverse, coupling = made[p]
-            whole = coupling.T if forward else inverse
-            pieces = [whole] if not backward else [whole, -coupling]
+        members = np.flatnonzero((plan.parts.group == group) & (b_of > 0 if forward else v_of > 0)).tolist()
+        members.sort(key=lambda p: starts[p])
+        begins, wide = [starts[p] for p in members], {}
+        for chunk, _, count, out in _tiles(plan, phase).tolist():
+            p = members[bisect_right(begins, out) - 1]
+            if p not in wide:
+                inverse, coupling = made[p]
+                whole = coupling.T if forward else inverse
+                wide[p] = np.hstack([_padded(m) for m in ([whole] if not backward else [whole, -coupling])])
             row = out - starts[p]
-            tile = np.hstack([_padded(m)[row : row + ROWS] for m in pieces])
+            tile = wide[p][row : row + ROWS]
             assert tile.shape == (ROWS, COLUMNS * count)
             planes = tile.reshape(ROWS, count, COLUMNS).transpose(1, 0, 2)
             chunks[chunk : chunk + count] = planes

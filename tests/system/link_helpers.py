@@ -4,7 +4,6 @@
 import contextlib
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -20,6 +19,7 @@ from protocol.messages_pb2 import Header, Topology
 from protocol.method import Method
 from sim_server.factors import Job
 from sim_server.network.link import ServerLink
+from tests.ports import free_port
 
 ROOT = Path(__file__).parents[2]
 PATIENCE = 30.0  # s until a test gives up
@@ -27,9 +27,7 @@ PATIENCE = 30.0  # s until a test gives up
 
 def free_endpoint() -> str:
     """A loopback endpoint that nobody listens on."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    return f"tcp/127.0.0.1:{free_port()}"
 
 
 def chain(nodes: int = 8, object: str = "beam", epoch: int = 1) -> Topology:
