@@ -6,6 +6,16 @@ from typing import Any
 
 import pytest
 
+# Folders and files of tests that one process runs, when there are several: servers and workers in real time have the
+# rest of the machine to themselves and one other process of tests; there is one GPU.
+TOGETHER = {
+    "tests/bench_smoke/test_benches_with_workers.py": "real time",
+    "tests/clients/": "real time",
+    "tests/faults/": "real time",
+    "tests/gpu/": "GPU",
+    "tests/system/": "real time",
+}
+
 
 def pytest_configure() -> None:
     """Programs that tests start end on Ctrl-C, also where a shell started the tests in the background: it lets them
@@ -16,14 +26,14 @@ def pytest_configure() -> None:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """Files of tests are dealt out to processes whole (--dist loadfile), those beside a GPU to one process: it has one
-    GPU."""
+    """--dist loadfile deals out files of tests whole, what is TOGETHER as if it were one file."""
     if config.getoption("dist") != "loadfile":
         return None
     from xdist.scheduler import LoadFileScheduling
 
-    class ByFile(LoadFileScheduling):
+    class Together(LoadFileScheduling):
         def _split_scope(self, nodeid: str) -> str:
-            return "gpu" if nodeid.startswith("tests/gpu/") else super()._split_scope(nodeid)
+            found = (group for start, group in TOGETHER.items() if nodeid.startswith(start))
+            return next(found, None) or super()._split_scope(nodeid)
 
-    return ByFile(config, log)
+    return Together(config, log)

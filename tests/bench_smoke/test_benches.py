@@ -1,11 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Each benchmark runs, at a small size, and writes what it says it writes. How long anything took is not looked at."""
 
-import json
 import math
-import os
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
@@ -13,7 +9,8 @@ from typing import Any
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests.bench_smoke.quickly import bench
+
 BENCHES = {
     "accuracy": ["--no-processes"], "figure4": ["--no-processes"], "hard_cases": [], "scheduler": [],
     "paper": ["--device", "cpu"], "models": ["--devices", "cpu"], "preconditioners": [], "warp": [],
@@ -32,14 +29,6 @@ def leaves(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
             yield from leaves(inner, key)
     else:
         yield key, value
-
-
-def bench(name: str, out: Path, *arguments: str) -> dict[str, Any]:
-    command = [sys.executable, f"tests/bench/{name}.py", "--quick", "--out", str(out), *arguments]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    result = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=110)
-    assert result.returncode == 0, result.stdout + result.stderr
-    return json.loads((out / f"{name}.json").read_text())
 
 
 @pytest.fixture(scope="module")
@@ -68,41 +57,6 @@ def test_bench_writes_its_report(name: str, once: Once) -> None:
     text = (folder / f"{name}.md").read_text()
     assert header["machine"]["cpu"] in text and f"]({name}.png)" in text
     assert (folder / f"{name}.png").read_bytes().startswith(b"\x89PNG")
-
-
-@pytest.mark.system
-def test_figure4_with_a_real_worker(tmp_path: Path) -> None:
-    rows = {row["scheme"]: row for row in bench("figure4", tmp_path)["data"]["rows"]}
-    assert rows["real async+warp"]["unconverged"] == 0
-    assert rows["real async+warp, real time"]["factor age, mean"] >= 0, "no factor ever came"
-
-
-@pytest.mark.system
-def test_scaling_with_a_real_worker(tmp_path: Path) -> None:
-    rows = bench("scaling", tmp_path)["data"]["rows"]
-    assert [(row["objects"], row["workers"], row["with a factor"]) for row in rows] == [(1, 1, 1), (3, 1, 3)]
-    assert all(row["unconverged"] == 0 and row["age max, steps"] > 0 for row in rows)
-    assert (tmp_path / "scaling.png").read_bytes().startswith(b"\x89PNG")
-
-
-@pytest.mark.system
-def test_faults_with_real_workers_miss_no_step(tmp_path: Path) -> None:
-    found = bench("faults", tmp_path)
-    rows = {row["fault"]: row for row in found["data"]["rows"]}
-    assert set(rows) == {"quiet", "kill"} and all(row["missed"] == row["not converged"] == 0 for row in rows.values())
-    assert rows["kill"]["next factor s"] > 0
-    assert "kill -9 of the worker" in (tmp_path / "faults.md").read_text()
-
-
-@pytest.mark.system
-def test_build_with_a_real_worker(tmp_path: Path) -> None:
-    data = bench("build", tmp_path)["data"]
-    of = {(row["link"], row["assembled by"]): row for row in data["rows"]}
-    assert all(row["unconverged"] == 0 for row in data["rows"])
-    for link in ("shared memory", "bytes, same host"):
-        assert of[link, "worker"]["bytes a job"] * 20 < of[link, "server"]["bytes a job"]
-        assert of[link, "worker"]["factors a second"] > 0
-    assert (tmp_path / "build.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_reference_of_accuracy_is_no_competitor(once: Once) -> None:

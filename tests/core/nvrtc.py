@@ -16,6 +16,13 @@ def library() -> ctypes.CDLL | None:
     return ctypes.CDLL(str(found[0].locate())) if found else None
 
 
+def arch(name: str) -> list[str]:
+    """Options for a text in every precision: sm_90 as a run compiles it, others with the least of optimization. They
+    show that the text and its instructions are there too; most of a compilation's time is optimization.
+    """
+    return [f"-arch={name}", *([] if name == "sm_90" else ["--Ofast-compile=max"])]
+
+
 def compiled(nvrtc: ctypes.CDLL, source: Path, options: list[str]) -> tuple[bytes, str]:
     """Machine code of a text (empty if it was refused), and what the compiler said."""
     program = ctypes.c_void_p()

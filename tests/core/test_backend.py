@@ -200,7 +200,7 @@ def test_every_text_of_the_package_compiles_for_gpus(path, arch, tmp_path):
     for name, types in PRECISIONS.items():
         if name == "mixed" and path.startswith("gpu/"):
             continue  # the same: they know no elements
-        options = [f"-arch={arch}", *device_options(types), f"-I{PACKAGE / 'gpu'}"]  # as they are compiled there
+        options = [*nvrtc.arch(arch), *device_options(types), f"-I{PACKAGE / 'gpu'}"]  # as they are compiled there
         text = tmp_path / "text.cu"
         text.write_text(backend.read_text(path)[1])
         code, said = nvrtc.compiled(library, text, options)
