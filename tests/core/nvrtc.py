@@ -16,11 +16,13 @@ def library() -> ctypes.CDLL | None:
     return ctypes.CDLL(str(found[0].locate())) if found else None
 
 
-def arch(name: str) -> list[str]:
-    """Options for a text in every precision: sm_90 as a run compiles it, others with the least of optimization. They
-    show that the text and its instructions are there too; most of a compilation's time is optimization.
+def arch(name: str, fast: str = "mid") -> list[str]:
+    """Options for a text in every precision: sm_90 as a run compiles it, others with less optimization, which is most
+    of a compilation's time. They show that the text and its instructions are there too.
+
+    fast: min, mid or max. At max calls stay calls, and ptxas warns of the stack of templates that call themselves.
     """
-    return [f"-arch={name}", *([] if name == "sm_90" else ["--Ofast-compile=max"])]
+    return [f"-arch={name}", *([] if name == "sm_90" else [f"--Ofast-compile={fast}"])]
 
 
 def compiled(nvrtc: ctypes.CDLL, source: Path, options: list[str]) -> tuple[bytes, str]:

@@ -9,6 +9,7 @@ from bisect import bisect_right
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dtrtri
 
 from protocol.factor import FactorPattern
 from sim_server.gpu.batches import EDGE, Batch, Layout
@@ -28,7 +29,8 @@ def matrices(pattern: FactorPattern, values: NDArray, plan: Plan) -> tuple[list[
     for start, v, b, edge in zip(plan.parts.start, plan.parts.v, plan.parts.b, plan.parts.boundary, strict=True):
         inside = plan.column[start : start + v]
         outside = plan.column[plan.boundary[edge : edge + b]]
-        half = np.linalg.inv(low[np.ix_(inside, inside)])
+        half, failed = dtrtri(low[np.ix_(inside, inside)], lower=1)
+        assert not failed
         halves.append((half, low[np.ix_(outside, inside)] @ half))
         scale[start : start + v] = np.sqrt((half**2).sum(axis=0))
     scale[-1] = scale.max()
@@ -130,14 +132,14 @@ class Application:
         for kind, start, count, _ in self._segments(phase, block):
             if kind == FORM | WRITE:
                 assert np.isnan(self.formed[start : start + count]).all()
-                self.formed[start : start + count] = [self._formed(i) for i in range(start, start + count)]
+                self.formed[start : start + count] = self._formed(start, count)
 
     def _area(self, phase: int, block: int) -> Reals:
         x, forming = np.full(self.plan.x_area, np.nan), True
         for kind, start, count, to in self._segments(phase, block):
             if kind & ~WRITE == FORM:
                 assert forming, "a block that waits for others before it forms its own could wait for ever"
-                x[to : to + count] = [self._formed(i) for i in range(start, start + count)]
+                x[to : to + count] = self._formed(start, count)
             elif kind == READ:
                 x[to : to + count] = self.formed[start : start + count]
             else:
@@ -146,9 +148,12 @@ class Application:
             forming = kind & ~WRITE == FORM
         return x
 
-    def _formed(self, i: int) -> float:
-        slots = self.plan.slots[self.plan.slot_start[i] : self.plan.slot_start[i + 1]]
-        return self.scale[i] * self.r[i] - self.c[slots].sum()
+    def _formed(self, start: int, count: int) -> Reals:
+        """The scaled residual less the contributions of parts before, at positions one after another."""
+        bounds = self.plan.slot_start[start : start + count + 1]
+        contributions, position = np.zeros(count), np.repeat(np.arange(count), np.diff(bounds))
+        np.add.at(contributions, position, self.c[self.plan.slots[bounds[0] : bounds[-1]]])
+        return self.scale[start : start + count] * self.r[start : start + count] - contributions
 
 
 def by_tasks(layout: Layout, values: NDArray, plan: Plan) -> tuple[NDArray, Reals]:
