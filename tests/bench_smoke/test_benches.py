@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Each benchmark runs, at a small size, and writes what it says it writes. How long anything took is not looked at."""
 
+import json
 import math
 from collections.abc import Callable, Iterator
 from functools import cache
