@@ -21,9 +21,9 @@ current edges. There is no inverse of C and no fourth-order tensor. D_i . D_j co
 `[solver] projection` makes the stiffness of every element positive semi-definite, which conjugate gradients and the
 factorization need: "clamp" (default) sets negative eigenvalues of d2W/dF2 to zero (Teran, Sifakis, Irving, Fedkiw
 2005), "absolute" takes their absolute values (Chen, Liu, Jacobson, Levin, Zheng 2024), "none" leaves them. Where L D
-L^T of the element's stiffness finds no negative pivot nothing is done; elsewhere the stiffness is made again from the
-eigensystem by principal stretches s_i, in closed form (Smith, de Goes, Kim 2019): in the plane of i and j, with k the
-third axis, ::
+L^T of the element's stiffness finds no negative pivot nothing is done; elsewhere what its negative eigenvalues lack is
+added, one mode after another, from the eigensystem by principal stretches s_i, in closed form (Smith, de Goes, Kim
+2019): in the plane of i and j, with k the third axis, ::
 
     twist = 2 W_1 + 2 W_2 (s_k^2 + s_i s_j) + W_J s_k,   flip = 2 W_1 + 2 W_2 (s_k^2 - s_i s_j) - W_J s_k
 

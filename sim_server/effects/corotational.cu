@@ -19,14 +19,14 @@ struct Elements {
 
 KERNEL(elements, Elements) {
     index tet[4];
-    get_row(p.tets, i, tet);
+    get_item_row(p.tets, i, tet);
     local_mat3 g = rest_gradients(p.gradients, p.n, i);
     local_mat3 F = gradient(p.x, tet, g), G = gradient(p.v, tet, g);
     quaternion<local_number> q = nearest_quaternion(F);
     local_mat3 R = rotation_matrix(q), Rt = transposed(R);
     local_mat3 S = mul(Rt, F), T = mul(Rt, G);
 
-    local_number k = at(p.stiffening, i), lambda = at(p.lame, i), mu = at(p.lame, p.n + i);
+    local_number k = at_items(p.stiffening, i), lambda = at_items(p.lame, i), mu = at_items(p.lame + p.n, i);
     local_mat3 P = mul(R, hooke(S, T, p.h, k, lambda, mu));
     put_push(p.push, i, p.n, P, g);
     local_number w = sqrt(k * mu), ratio = lambda / mu;
@@ -46,7 +46,7 @@ struct Energy {
 
 KERNEL(energy, Energy) {
     index tet[4];
-    get_row(p.tets, i, tet);
+    get_item_row(p.tets, i, tet);
     local_mat3 F = gradient(p.x, tet, rest_gradients(p.gradients, p.n, i));
     local_mat3 S = mul(transposed(nearest_rotation(F)), F);
     local_number square = local_number{}, dilation = trace(S) - 3;
@@ -54,5 +54,5 @@ KERNEL(energy, Energy) {
         local_number e = k % 4 == 0 ? S.m[k] - 1 : S.m[k];
         square += e * e;
     }
-    put(p.energy, i, at(p.lame, p.n + i) * square + (local)0.5 * at(p.lame, i) * dilation * dilation);
+    put(p.energy, i, at_items(p.lame + p.n, i) * square + (local)0.5 * at_items(p.lame, i) * dilation * dilation);
 }

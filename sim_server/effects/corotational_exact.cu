@@ -41,14 +41,14 @@ INLINE local_mat3 twists(const local_mat3& S, local_number lambda, local_number 
 
 KERNEL(elements, Elements) {
     index tet[4];
-    get_row(p.tets, i, tet);
+    get_item_row(p.tets, i, tet);
     local_mat3 g = rest_gradients(p.gradients, p.n, i);
     local_mat3 F = gradient(p.x, tet, g), G = gradient(p.v, tet, g);
     quaternion<local_number> q = nearest_quaternion(F);
     local_mat3 R = rotation_matrix(q), Rt = transposed(R);
     local_mat3 S = mul(Rt, F), T = mul(Rt, G);
 
-    local_number k = at(p.stiffening, i), lambda = at(p.lame, i), mu = at(p.lame, p.n + i);
+    local_number k = at_items(p.stiffening, i), lambda = at_items(p.lame, i), mu = at_items(p.lame + p.n, i);
     local_mat3 E = twists(S, lambda, mu), P = hooke(S, T, p.h, k, lambda, mu);
     local_vec3 c = k * mu * mul(E, local_vec3{T.m[5] - T.m[7], T.m[6] - T.m[2], T.m[1] - T.m[3]});
     P.m[1] += c.z; P.m[2] -= c.y; P.m[3] -= c.z; P.m[5] += c.x; P.m[6] += c.y; P.m[7] -= c.x;  // the spin of T

@@ -30,11 +30,11 @@ INLINE local_mat3 turned(const real* x, const index (&tet)[4], const local_mat3&
 
 KERNEL(elements, Elements) {
     index tet[4];
-    get_row(p.tets, i, tet);
+    get_item_row(p.tets, i, tet);
     local_mat3 g = rest_gradients(p.gradients, p.n, i);
     local_mat3 R = turned(p.x, tet, g), Rt = transposed(R);
     local_mat3 S = mul(Rt, gradient(p.x, tet, g)), T = mul(Rt, gradient(p.v, tet, g));
-    local_number k = at(p.stiffening, i), lambda = at(p.lame, i), mu = at(p.lame, p.n + i);
+    local_number k = at_items(p.stiffening, i), lambda = at_items(p.lame, i), mu = at_items(p.lame + p.n, i);
     put_push(p.push, i, p.n, mul(R, hooke(S, T, p.h, k, lambda, mu)), g);
     put_spread(p.spread, i, p.n, R, g, sqrt(k * mu), lambda / mu);
     quaternion<local_number> q = quaternion_of(R);
@@ -52,11 +52,11 @@ struct Energy {
 
 KERNEL(energy, Energy) {
     index tet[4];
-    get_row(p.tets, i, tet);
+    get_item_row(p.tets, i, tet);
     local_mat3 g = rest_gradients(p.gradients, p.n, i);
     local_mat3 S = mul(transposed(turned(p.x, tet, g)), gradient(p.x, tet, g));
     local_number xx = S.m[0] - 1, yy = S.m[4] - 1, zz = S.m[8] - 1, dilation = xx + yy + zz;
     local_number xy = S.m[1] + S.m[3], xz = S.m[2] + S.m[6], yz = S.m[5] + S.m[7];
     local_number square = xx * xx + yy * yy + zz * zz + (local)0.5 * (xy * xy + xz * xz + yz * yz);
-    put(p.energy, i, at(p.lame, p.n + i) * square + (local)0.5 * at(p.lame, i) * dilation * dilation);
+    put(p.energy, i, at_items(p.lame + p.n, i) * square + (local)0.5 * at_items(p.lame, i) * dilation * dilation);
 }

@@ -45,7 +45,7 @@ KERNEL(elements, Elements) {
     local_vec3 v[3];
     Tetrahedron<T> t = element_at(p, i, tet);
     field_edges(p.v, tet, v);
-    T c[CONSTANTS], volume = at(p.volume, i), k = volume * at(p.stiffening, i), s[6];
+    T c[CONSTANTS], volume = at_items(p.volume, i), k = volume * at_items(p.stiffening, i), s[6];
     constants_at(p, i, c);
     T stress = exponential(c, t.F, s);
     mat<T> S = symmetric(s[0], s[1], s[2], s[3], s[4], s[5]), Ft = transposed(t.F);
@@ -86,12 +86,7 @@ KERNEL(elements, Elements) {
     refuse(here, B, push);
     if (p.projection != NONE) {
         auto wrong = indefinite(B);
-        if (any(wrong)) {
-            Blocks6<T> other = B;
-            project_edges(t.D, p.projection, other);
-            for (int e = 0; e < 6; ++e)
-                for (int m = 0; m < 9; ++m) B.e[e].m[m] = wrong && !here ? other.e[e].m[m] : B.e[e].m[m];
-        }
+        if (any(wrong)) project_edges(t.D, p.projection, wrong && !here, B);
     }
     leave(B, push, v, p.corners, p.edges, p.n, i);
 }
@@ -113,5 +108,5 @@ KERNEL(energy, Energy) {
     T c[CONSTANTS], s[6];
     constants_at(p, i, c);
     T W = (entry<T>)0.5 * (exponential(c, t.F, s) - c[0]) + c[7] * (t.J * log(t.J) - t.J + 1);
-    put(p.energy, i, t.J <= 0 ? no_number<T>() : at(p.volume, i) * W);
+    put(p.energy, i, t.J <= 0 ? no_number<T>() : at_items(p.volume, i) * W);
 }

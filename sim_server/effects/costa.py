@@ -12,7 +12,7 @@ what `sheet` has along `fibre` is taken off. `a` may be a list of regions { wher
 fibres turn through a wall.
 
 ln J is not defined at J <= 0, which is refused; there is no regularization. Negative eigenvalues of the stiffness are
-projected by an eigendecomposition of the 9x9 matrix d2W/dF2 of those elements that have any.
+projected by the eigensystem of the 9x9 matrix d2W/dF2 of those elements that have any (kernels/eigen9.cuh).
 
 Usual ranges: heart muscle a = 0.2 to 2 kPa, b_ff = 10 to 40, b_ss and b_nn = 2 to 20, b_fs, b_fn and b_sn = 2 to 12
 (defaults: 18.5, 3.58, 3.58, 2.8, 2.8, 2.8 with a = 0.88 kPa); bulk 10 to 1000 kPa.

@@ -37,7 +37,7 @@ KERNEL(elements, Elements) {
     local_vec3 v[3], push[4];
     Tetrahedron<T> t = element_at(p, i, tet);
     field_edges(p.v, tet, v);
-    T volume = at(p.volume, i), k = volume * at(p.stiffening, i), k1 = at(p.constants, i), k2 = at(p.constants, p.n + i);
+    T volume = at_items(p.volume, i), k = volume * at_items(p.stiffening, i), k1 = at_items(p.constants, i), k2 = at_items(p.constants + p.n, i);
     Blocks6<T> B;
     UNROLL for (int a = 0; a < 4; ++a) push[a] = {T{}, T{}, T{}};
     UNROLL for (int e = 0; e < 6; ++e) B.e[e] = mat<T>{};
@@ -72,12 +72,12 @@ KERNEL(energy, Energy) {
     typedef local_number T;
     index tet[4];
     Tetrahedron<T> t = element_at(p, i, tet);
-    T k1 = at(p.constants, i), k2 = at(p.constants, p.n + i), W = T{};
+    T k1 = at_items(p.constants, i), k2 = at_items(p.constants + p.n, i), W = T{};
     for (int which = 0; which < 2; ++which) {
         T y = family(p.directions, p.n, i, which, t.F).stretch, z = k2 * y * y;
         const entry<T> few = single<T> ? (entry<T>)1e-3 : (entry<T>)1e-7;
         T quotient = z > few ? (exp(z) - 1) / (z + (entry<T>)1e-37) : 1 + (entry<T>)0.5 * z;  // (e^z - 1) / z
         W += (entry<T>)0.5 * k1 * y * y * quotient;
     }
-    put(p.energy, i, at(p.volume, i) * W);
+    put(p.energy, i, at_items(p.volume, i) * W);
 }

@@ -27,7 +27,7 @@ INLINE local_number inverse(local_number l) { return 1 / (l + (local)1e-37); }
 
 KERNEL(springs, Springs) {
     local_vec3 d = difference(p.x, p.ends, i), dv = difference(p.v, p.ends, i);
-    local_number k = at(p.stiffness, i), l0 = at(p.length, i), c = at(p.stiffening, i), l = sqrt(dot(d, d));
+    local_number k = at_items(p.stiffness, i), l0 = at_items(p.length, i), c = at_items(p.stiffening, i), l = sqrt(dot(d, d));
     local_vec3 u = inverse(l) * d;
     local_number across = larger(1 - l0 * inverse(l), local_number{});  // under compression 0: K has no negative part
     local_vec3 g = sqrt(c * k * (1 - across)) * u;
@@ -48,6 +48,6 @@ struct Energy {
 
 KERNEL(energy, Energy) {
     local_vec3 d = difference(p.x, p.ends, i);
-    local_number longer = sqrt(dot(d, d)) - at(p.length, i);
-    put(p.energy, i, (local)0.5 * at(p.stiffness, i) * longer * longer);
+    local_number longer = sqrt(dot(d, d)) - at_items(p.length, i);
+    put(p.energy, i, (local)0.5 * at_items(p.stiffness, i) * longer * longer);
 }

@@ -51,7 +51,7 @@ KERNEL(elements, Elements) {
     local_vec3 v[3];
     Tetrahedron<T> e = element_at(p, i, tet);
     field_edges(p.v, tet, v);
-    T c[CONSTANTS], volume = at(p.volume, i), t[3], m[6], slope[3], inverse[3];
+    T c[CONSTANTS], volume = at_items(p.volume, i), t[3], m[6], slope[3], inverse[3];
     constants_at(p, i, c);
     Principal<T> frame = principal(e.F);
     const T (&s)[3] = frame.s;
@@ -86,7 +86,7 @@ KERNEL(elements, Elements) {
     }
     spread_to_four(push);
     Blocks6<T> B;
-    principal_edges(frame, modes, volume * at(p.stiffening, i), e.D, B);
+    principal_edges(frame, modes, volume * at_items(p.stiffening, i), e.D, B);
     auto here = e.J <= 0;
     note_refusal(here, p.refused, i, p.clock[0], e.J);
     refuse(here, B, push);
@@ -111,5 +111,5 @@ KERNEL(energy, Energy) {
     constants_at(p, i, c);
     Principal<T> frame = principal(e.F);
     T W = logarithmic(c, frame.s, e.J, t, m);
-    put(p.energy, i, e.J <= 0 ? no_number<T>() : at(p.volume, i) * W);
+    put(p.energy, i, e.J <= 0 ? no_number<T>() : at_items(p.volume, i) * W);
 }

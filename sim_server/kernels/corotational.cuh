@@ -6,7 +6,7 @@
 
 INLINE local_mat3 rest_gradients(const local* gradients, int n, index i) {
     local_mat3 g;
-    for (int k = 0; k < 9; ++k) g.m[k] = at(gradients, k * n + i);
+    for (int k = 0; k < 9; ++k) g.m[k] = at_items(gradients + k * n, i);
     return g;
 }
 

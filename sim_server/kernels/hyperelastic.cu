@@ -28,7 +28,7 @@ KERNEL(elements, Elements) {
     local_vec3 v[3];
     Tetrahedron<local_number> t = element_at(p, i, tet);
     field_edges(p.v, tet, v);
-    local_number c[CONSTANTS], volume = at(p.volume, i), floor = at(p.floor, i), k = volume * at(p.stiffening, i);
+    local_number c[CONSTANTS], volume = at_items(p.volume, i), floor = at_items(p.floor, i), k = volume * at_items(p.stiffening, i);
     constants_at(p, i, c);
     mat<local_number> left = mul(t.F, transposed(t.F));
     Invariants<local_number> q = invariants<HAS>(left, t.J);
@@ -42,12 +42,7 @@ KERNEL(elements, Elements) {
         auto wrong = indefinite(B);
         if (any(wrong)) {
             Principal<local_number> frame = principal(t.F);
-            Modes<local_number> m = modes<HAS>(w, frame.s);
-            project(m, p.projection);
-            Blocks6<local_number> other;
-            principal_edges(frame, m, k, t.D, other);
-            for (int e = 0; e < 6; ++e)
-                for (int a = 0; a < 9; ++a) B.e[e].m[a] = wrong ? other.e[e].m[a] : B.e[e].m[a];
+            lift_modes(frame, modes<HAS>(w, frame.s), p.projection, wrong, k, t.D, B);
         }
     }
     if constexpr (REFUSES) {
@@ -72,9 +67,9 @@ struct Energy {
 KERNEL(energy, Energy) {
     index tet[4];
     Tetrahedron<local_number> t = element_at(p, i, tet);
-    local_number c[CONSTANTS], floor = at(p.floor, i);
+    local_number c[CONSTANTS], floor = at_items(p.floor, i);
     constants_at(p, i, c);
     local_number W = density(c, invariants<HAS>(mul(t.F, transposed(t.F)), t.J), floor);
     if constexpr (REFUSES) W = t.J <= 0 && floor == 0 ? no_number<local_number>() : W;
-    put(p.energy, i, at(p.volume, i) * W);
+    put(p.energy, i, at_items(p.volume, i) * W);
 }

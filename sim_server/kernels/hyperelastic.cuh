@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: MIT
 // What the laws of hyperelastic tetrahedra share (formulas: sim_server/hyperelastic.py).
 #pragma once
-#include "eigen3.cuh"
-#include "polar.cuh"
+#include "eigen9.cuh"
+#include "svd3.cuh"
 #include "together.cuh"
 
 template <class T> INLINE mat<T> mul_transposed(const mat<T>& a, const mat<T>& b) { return mul(a, transposed(b)); }
@@ -28,7 +28,7 @@ template <class T> INLINE void spread_to_four(vec<T> (&u)[4]) { u[0] = -(u[1] + 
 template <class T> INLINE Tetrahedron<T> tetrahedron(const vec<T> (&edges)[3], const local* gradients, int n, index i) {
     Tetrahedron<T> t;
     mat<T> rows;
-    for (int k = 0; k < 9; ++k) rows.m[k] = at(gradients, k * n + i);
+    for (int k = 0; k < 9; ++k) rows.m[k] = at_items(gradients + k * n, i);
     UNROLL for (int k = 0; k < 3; ++k) t.D[k + 1] = row(rows, k);
     spread_to_four(t.D);
     t.F = outer3(edges[0], edges[1], edges[2], rows);
@@ -52,7 +52,7 @@ INLINE void field_edges(const real* field, const index (&tet)[4], local_vec3 (&e
 
 // Element i of a kernel's parameters as it stands now; tet: its nodes.
 template <class P> INLINE Tetrahedron<local_number> element_at(const P& p, index i, index (&tet)[4]) {
-    get_row(p.tets, i, tet);
+    get_item_row(p.tets, i, tet);
     local_vec3 edges[3];
     field_edges(p.x, tet, edges);
     return tetrahedron(edges, p.gradients, p.n, i);
@@ -60,7 +60,7 @@ template <class P> INLINE Tetrahedron<local_number> element_at(const P& p, index
 
 // Its constants of the law, (N, n) one after another.
 template <int N, class P> INLINE void constants_at(const P& p, index i, local_number (&c)[N]) {
-    for (int k = 0; k < N; ++k) c[k] = at(p.constants, k * p.n + i);
+    for (int k = 0; k < N; ++k) c[k] = at_items(p.constants + k * p.n, i);
 }
 
 // F (D_i x D_j) of an edge, from the current edges: no products.
@@ -119,54 +119,88 @@ template <class T> INLINE auto indefinite(const Blocks6<T>& B) {
 
 // --- principal stretches ---------------------------------------------------------------------------------------------------
 
-// F = U diag(s) V^T with rotations U and V; where det F < 0 the smallest s is negative (Irving, Teran, Fedkiw 2004).
-template <class T> struct Principal {
-    vec<T> u[3], v[3];  // columns
-    T s[3];
-};
-
-template <class T> INLINE Principal<T> principal(const mat<T>& F) {
-    Principal<T> p;
-    mat<T> R = nearest_rotation(F), S = mul(transposed(R), F);
-    const entry<T> half = 0.5;
-    T a[6] = {S.m[0], half * (S.m[1] + S.m[3]), half * (S.m[2] + S.m[6]), S.m[4], half * (S.m[5] + S.m[7]), S.m[8]};
-    const T one = T{} + 1;
-    p.v[0] = {one, T{}, T{}};
-    p.v[1] = {T{}, one, T{}};
-    p.v[2] = {T{}, T{}, one};
-    eigen3(a, p.v);
-    UNROLL for (int k = 0; k < 3; ++k) p.u[k] = mul(R, p.v[k]);
-    p.s[0] = a[0]; p.s[1] = a[3]; p.s[2] = a[5];
-    return p;
-}
-
 // d2W/dF2 of an isotropic law in the frame of the principal stretches (Smith, de Goes, Kim 2019): the eigenvalues of the
 // twists and flips in the plane across axis k, and the matrix of the stretches, 00, 01, 02, 11, 12, 22.
 template <class T> struct Modes { T twist[3], flip[3], stretch[6]; };
 
 enum Projection { NONE = 0, CLAMP = 1, ABSOLUTE = 2 };
 
-template <class T> INLINE T projected(T eigenvalue, int projection) {
-    return projection == NONE ? eigenvalue : projection == ABSOLUTE ? magnitude(eigenvalue) : larger(eigenvalue, T{});
+// Whether the symmetric matrix 00, 01, 02, 11, 12, 22 has a negative eigenvalue, to rounding.
+template <class T> INLINE auto indefinite3(const T (&a)[6]) {
+    const T little = (single<T> ? (entry<T>)1e-6 : (entry<T>)1e-14) * (magnitude(a[0]) + magnitude(a[3]) + magnitude(a[5]));
+    T first = a[0] + little, l = a[1] / first, r = a[2] / first, second = a[3] + little - l * a[1], across = a[4] - l * a[2];
+    return !(first > 0 && second > 0 && second * (a[5] + little - r * a[2]) > across * across);
 }
 
-template <class T> INLINE void project(Modes<T>& m, int projection) {
-    UNROLL for (int k = 0; k < 3; ++k) {
-        m.twist[k] = projected(m.twist[k], projection);
-        m.flip[k] = projected(m.flip[k], projection);
-    }
+// What a projection adds to an eigenvalue.
+template <class T> INLINE T lifted(T eigenvalue, int projection) {
+    return eigenvalue < 0 ? (projection == ABSOLUTE ? -2 * eigenvalue : -eigenvalue) : T{};
+}
+
+// What it adds to the matrix of the stretches: sum of share_k v_k v_k^T; nothing where it stays as it is.
+template <class T> struct Lift3 { T share[3]; vec<T> v[3]; };
+
+template <class T, class M> INLINE Lift3<T> stretch_lift(const T (&stretch)[6], int projection, M where) {
     const T one = T{} + 1;
-    vec<T> v[3] = {{one, T{}, T{}}, {T{}, one, T{}}, {T{}, T{}, one}};
+    Lift3<T> lift = {{T{}, T{}, T{}}, {{one, T{}, T{}}, {T{}, one, T{}}, {T{}, T{}, one}}};
+    auto wrong = where && indefinite3(stretch);
+    if (!any(wrong)) return lift;
     T a[6];
-    UNROLL for (int k = 0; k < 6; ++k) a[k] = m.stretch[k];
-    eigen3(a, v);
-    T l[3] = {projected(a[0], projection), projected(a[3], projection), projected(a[5], projection)};
-    m.stretch[0] = l[0] * v[0].x * v[0].x + l[1] * v[1].x * v[1].x + l[2] * v[2].x * v[2].x;
-    m.stretch[1] = l[0] * v[0].x * v[0].y + l[1] * v[1].x * v[1].y + l[2] * v[2].x * v[2].y;
-    m.stretch[2] = l[0] * v[0].x * v[0].z + l[1] * v[1].x * v[1].z + l[2] * v[2].x * v[2].z;
-    m.stretch[3] = l[0] * v[0].y * v[0].y + l[1] * v[1].y * v[1].y + l[2] * v[2].y * v[2].y;
-    m.stretch[4] = l[0] * v[0].y * v[0].z + l[1] * v[1].y * v[1].z + l[2] * v[2].y * v[2].z;
-    m.stretch[5] = l[0] * v[0].z * v[0].z + l[1] * v[1].z * v[1].z + l[2] * v[2].z * v[2].z;
+    UNROLL for (int k = 0; k < 6; ++k) a[k] = stretch[k];
+    eigen3(a, lift.v);
+    lift.share[0] = wrong ? lifted(a[0], projection) : T{};
+    lift.share[1] = wrong ? lifted(a[3], projection) : T{};
+    lift.share[2] = wrong ? lifted(a[5], projection) : T{};
+    return lift;
+}
+
+// All modes projected.
+template <class T> INLINE void project(Modes<T>& m, int projection) {
+    if (projection == NONE) return;
+    UNROLL for (int k = 0; k < 3; ++k) {
+        m.twist[k] += lifted(m.twist[k], projection);
+        m.flip[k] += lifted(m.flip[k], projection);
+    }
+    Lift3<T> lift = stretch_lift(m.stretch, projection, m.stretch[0] == m.stretch[0]);
+    UNROLL for (int k = 0; k < 3; ++k) {
+        vec<T> u = lift.v[k], w = lift.share[k] * u;
+        m.stretch[0] += w.x * u.x; m.stretch[1] += w.x * u.y; m.stretch[2] += w.x * u.z;
+        m.stretch[3] += w.y * u.y; m.stretch[4] += w.y * u.z; m.stretch[5] += w.z * u.z;
+    }
+}
+
+// B_ij += share y_i y_j^T: a mode of d2W/dF2 with y_i its matrix times D_i.
+template <class T> INLINE void add_mode(Blocks6<T>& B, T share, vec<T> (&y)[4]) {
+    spread_to_four(y);
+    vec<T> w[3] = {share * y[0], share * y[1], share * y[2]};
+    UNROLL for (int e = 0; e < 6; ++e) add_outer(B.e[e], w[edge_first(e)], y[edge_second(e)]);
+}
+
+// k d2W/dF2 projected: what its negative modes lack is added, where it is so.
+template <class T, class M>
+INLINE void lift_modes(const Principal<T>& p, const Modes<T>& m, int projection, M where, T k, const vec<T> (&D)[4], Blocks6<T>& B) {
+    const entry<T> half = 0.5;
+    vec<T> y[4];
+    UNROLL for (int a = 0; a < 3; ++a) {
+        const vec<T> &u = p.u[(a + 1) % 3], &w = p.u[(a + 2) % 3], &r = p.v[(a + 1) % 3], &q = p.v[(a + 2) % 3];
+        T twist = where ? lifted(m.twist[a], projection) : T{}, flip = where ? lifted(m.flip[a], projection) : T{};
+        if (any(twist > 0)) {
+            UNROLL for (int i = 1; i < 4; ++i) y[i] = dot(q, D[i]) * u - dot(r, D[i]) * w;
+            add_mode(B, half * k * twist, y);
+        }
+        if (any(flip > 0)) {
+            UNROLL for (int i = 1; i < 4; ++i) y[i] = dot(q, D[i]) * u + dot(r, D[i]) * w;
+            add_mode(B, half * k * flip, y);
+        }
+    }
+    Lift3<T> lift = stretch_lift(m.stretch, projection, where);
+    UNROLL for (int a = 0; a < 3; ++a) {
+        if (!any(lift.share[a] > 0)) continue;
+        const vec<T>& l = lift.v[a];
+        UNROLL for (int i = 1; i < 4; ++i)
+            y[i] = (l.x * dot(p.v[0], D[i])) * p.u[0] + (l.y * dot(p.v[1], D[i])) * p.u[1] + (l.z * dot(p.v[2], D[i])) * p.u[2];
+        add_mode(B, k * lift.share[a], y);
+    }
 }
 
 // The edge blocks of k d2W/dF2, from its modes.
@@ -196,55 +230,7 @@ INLINE void principal_edges(const Principal<T>& p, const Modes<T>& m, T k, const
     }
 }
 
-// --- any law: the eigensystem by Jacobi's method --------------------------------------------------------------------------------
-
-// a, symmetric (9, 9), becomes its projection. Rows of v are eigenvectors.
-template <class T> OUT_OF_LINE void project9(T (&a)[9][9], int projection) {
-    const entry<T> eps = single<T> ? (entry<T>)1e-14 : (entry<T>)1e-30;
-    const T tiny = T{} + (single<T> ? (entry<T>)1e-37 : (entry<T>)1e-300);
-    T v[9][9];
-    for (int r = 0; r < 9; ++r)
-        for (int c = 0; c < 9; ++c) v[r][c] = T{} + (entry<T>)(r == c);
-    for (int sweep = 0; sweep < 12; ++sweep) {
-        T off = T{}, on = T{};
-        for (int r = 0; r < 9; ++r) {
-            on += a[r][r] * a[r][r];
-            for (int c = 0; c < r; ++c) off += a[r][c] * a[r][c];
-        }
-        auto settled = !(off > eps * on);
-        if (!any(off > eps * on)) break;
-        for (int p = 0; p < 8; ++p) {
-            for (int q = p + 1; q < 9; ++q) {
-                T d = a[q][q] - a[p][p], pq = a[p][q], size = magnitude(d) + sqrt(d * d + 4 * pq * pq) + tiny;
-                T t = (d < 0 ? -2 * pq : 2 * pq) / size;
-                t = settled ? T{} : t;
-                T c = 1 / sqrt(1 + t * t), s = t * c;
-                for (int k = 0; k < 9; ++k) {
-                    T x = a[k][p], y = a[k][q];
-                    a[k][p] = c * x - s * y;
-                    a[k][q] = s * x + c * y;
-                }
-                for (int k = 0; k < 9; ++k) {
-                    T x = a[p][k], y = a[q][k];
-                    a[p][k] = c * x - s * y;
-                    a[q][k] = s * x + c * y;
-                    T z = v[p][k], w = v[q][k];
-                    v[p][k] = c * z - s * w;
-                    v[q][k] = s * z + c * w;
-                }
-            }
-        }
-    }
-    T l[9];
-    for (int k = 0; k < 9; ++k) l[k] = projected(a[k][k], projection);
-    for (int r = 0; r < 9; ++r) {
-        for (int c = 0; c <= r; ++c) {
-            T sum = T{};
-            for (int k = 0; k < 9; ++k) sum += l[k] * v[k][r] * v[k][c];
-            a[r][c] = a[c][r] = sum;
-        }
-    }
-}
+// --- any law: the eigensystem of 9x9 ------------------------------------------------------------------------------------------
 
 // Blocks m (3, 3 of corners 1, 2, 3) = (X (x) I) K (X (x) I)^T
 template <class T> INLINE void congruent(const mat<T>& X, T (&K)[9][9]) {
@@ -262,8 +248,9 @@ template <class T> INLINE void congruent(const mat<T>& X, T (&K)[9][9]) {
     }
 }
 
-// The edges with d2W/dF2 projected: to it from the stiffness of three corners by the rest edges, and back by the gradients.
-template <class T> OUT_OF_LINE void project_edges(const vec<T> (&D)[4], int projection, Blocks6<T>& B) {
+// The edges with d2W/dF2 projected: to it from the stiffness of three corners by the rest edges; what its negative modes lack is
+// added, where it is so.
+template <class T, class M> OUT_OF_LINE void project_edges(const vec<T> (&D)[4], int projection, const M& where, Blocks6<T>& B) {
     T K[9][9];
     for (int r = 0; r < 9; ++r)
         for (int c = 0; c < 9; ++c) K[r][c] = r >= c ? corner_entry(B, r, c) : corner_entry(B, c, r);
@@ -271,13 +258,16 @@ template <class T> OUT_OF_LINE void project_edges(const vec<T> (&D)[4], int proj
     T det = dot(D[1], x);
     x = (1 / det) * x; y = (1 / det) * y; z = (1 / det) * z;
     congruent(mat<T>{{x.x, y.x, z.x, x.y, y.y, z.y, x.z, y.z, z.z}}, K);
-    project9(K, projection);
-    congruent(mat<T>{{D[1].x, D[1].y, D[1].z, D[2].x, D[2].y, D[2].z, D[3].x, D[3].y, D[3].z}}, K);
-    for (int e = 0; e < 6; ++e) {
-        for (int m = 0; m < 9; ++m) {
-            int r = m / 3, c = 3 * edge_second(e) - 3 + m % 3;
-            B.e[e].m[m] = e < 3 ? -(K[r][c] + K[3 + r][c] + K[6 + r][c]) : K[3 * edge_first(e) - 3 + r][c];
-        }
+    Eigen9<T> eigen;
+    eigen9(K, eigen);
+    for (int k = 0; k < 9; ++k) {
+        T share = where ? lifted(eigen.value[k], projection) : T{};
+        if (!any(share > 0)) continue;
+        const T (&v)[9] = eigen.vector[k];
+        vec<T> mode[4];
+        for (int i = 1; i < 4; ++i)
+            mode[i] = D[i].x * vec<T>{v[0], v[1], v[2]} + D[i].y * vec<T>{v[3], v[4], v[5]} + D[i].z * vec<T>{v[6], v[7], v[8]};
+        add_mode(B, share, mode);
     }
 }
 

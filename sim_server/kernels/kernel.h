@@ -16,6 +16,7 @@
 // item between threads (gpu/fuse.py), so name_add reads nothing that items of its own domain write.
 // MAILED_KERNEL is the same for a launch whose arguments are replaced while the simulation runs: on a GPU it reads them from
 // device memory and takes any number of items.
+// at(a, i) reads any items, at_items(a, i) those of the kernel itself: neighbours in memory.
 // Structs hold 4-byte ints, reals and pointers; the Python side reads their layout from this very text (backend.py), so that
 // names and order stand nowhere else.
 #pragma once
@@ -119,15 +120,28 @@ INLINE index at(const int* a, index i) {
 INLINE void put(real* a, index i, number v) {
     for (int k = 0; k < LANES; ++k) a[i[k]] = v[k];
 }
+INLINE number at_items(const real* a, index i) {
+    if (i[LANES - 1] - i[0] != LANES - 1) return at(a, i);
+    number r;
+    __builtin_memcpy(&r, a + i[0], sizeof r);
+    return r;
+}
 #define BY_LANES(name)                                        \
     INLINE number name(number a) {                            \
         for (int k = 0; k < LANES; ++k) a[k] = std::name(a[k]); \
         return a;                                             \
     }
 BY_LANES(sqrt)
+#define IS_double 1
+#define PASTED(a, b) a##b
+#define IS(type) PASTED(IS_, type)
+#if IS(real)
+#include "elementary.h"
+#else
 BY_LANES(log)
 BY_LANES(exp)
 BY_LANES(cbrt)
+#endif
 template <class V> INLINE auto lane(V a, int k) { return a[k]; }
 template <class M> INLINE bool any(M mask) {
     bool found = false;
@@ -167,6 +181,7 @@ template <class T> INLINE T at(const T* a, index i) { return a[i]; }
 template <class T> INLINE void put(T* a, index i, T v) { a[i] = v; }
 INLINE number as_number(index a) { return a; }
 INLINE bool any(index a) { return a; }
+template <class T> INLINE T at_items(const T* a, index i) { return a[i]; }
 #endif
 
 // Entry k of row i of an array (n, K).
@@ -183,6 +198,11 @@ template <int K, class T, class N> INLINE void row_put(own<T> a, index, int k, N
     for (int k = p.start[i]; k < p.start[i + 1]; ++k) name##_add(p, i, k, sum);   \
     name##_put(p, i, sum);
 
+#ifdef __CUDACC_RTC__
+template <class T> INLINE T inverse_root(T a) { return rsqrt(a); }
+#else
+template <class T> INLINE T inverse_root(T a) { return 1 / sqrt(a); }
+#endif
 template <class T> INLINE T larger(T a, T b) { return a > b ? a : b; }
 template <class T> INLINE T smaller(T a, T b) { return a < b ? a : b; }
 template <class T> INLINE T magnitude(T a) { return a < 0 ? -a : a; }

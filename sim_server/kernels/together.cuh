@@ -73,17 +73,53 @@ INLINE void get_row(const int* a, int i, int (&row)[4]) {
     row[0] = v.x; row[1] = v.y; row[2] = v.z; row[3] = v.w;
 }
 
+INLINE void get_item_row(const int* a, int i, int (&row)[4]) { get_row(a, i, row); }
+
 #else
+
+#if defined(WIDE) && defined(__GNUC__) && !defined(__clang__)
+// a and b exchange blocks of LEAP entries: a stage of a transposition.
+template <int LEAP> INLINE void exchange(number& a, number& b) {
+    decltype(a < b) first = {}, second = {};
+    for (int k = 0; k < LANES; ++k) {
+        first[k] = k & LEAP ? k - LEAP + LANES : k;
+        second[k] = k & LEAP ? k + LANES : k + LEAP;
+    }
+    number x = a;
+    a = __builtin_shuffle(x, b, first);
+    b = __builtin_shuffle(x, b, second);
+}
+template <int LEAP = LANES / 2> INLINE void transpose(number (&v)[LANES]) {
+    UNROLL for (int k = 0; k < LANES; ++k)
+        if ((k & LEAP) == 0) exchange<LEAP>(v[k], v[k + LEAP]);
+    if constexpr (LEAP > 1) transpose<LEAP / 2>(v);
+}
+// Entries from FIRST on, as many as lanes, row after row: transposed in registers.
+template <int FIRST, int K> INLINE int put_wide(real* a, const long long (&place)[LANES], const number (&row)[K]) {
+    if constexpr (FIRST + LANES > K) return FIRST;
+    else {
+        number v[LANES];
+        UNROLL for (int k = 0; k < LANES; ++k) v[k] = row[FIRST + k];
+        transpose(v);
+        UNROLL for (int l = 0; l < LANES; ++l) __builtin_memcpy(a + place[l] + FIRST, &v[l], sizeof(number));
+        return put_wide<FIRST + LANES>(a, place, row);
+    }
+}
+#else
+template <int FIRST, class T, class P, class N, int K> INLINE int put_wide(T*, const P&, const N (&)[K]) { return 0; }
+#endif
 
 // Row after row: the entries of a row are neighbours in memory, those of a vector are not.
 template <int K, class T, class N>
 INLINE void put_row(T* a, index i, int, const N (&row)[K]) {
+    long long place[LANES];
+    UNROLL for (int l = 0; l < LANES; ++l) place[l] = (long long)K * lane(i, l);
+    const int done = put_wide<0>(a, place, row);
+    if (done == K) return;
     alignas(64) T staged[K][LANES];
-    for (int k = 0; k < K; ++k) __builtin_memcpy(staged[k], &row[k], sizeof(N));
-    for (int l = 0; l < LANES; ++l) {
-        T* mine = a + (long long)K * lane(i, l);
-        for (int k = 0; k < K; ++k) mine[k] = staged[k][l];
-    }
+    for (int k = done; k < K; ++k) __builtin_memcpy(staged[k], &row[k], sizeof(N));
+    UNROLL for (int l = 0; l < LANES; ++l)
+        for (int k = done; k < K; ++k) a[place[l] + k] = staged[k][l];
 }
 template <class T, class N>
 INLINE void put_block(T* a, index place, index, int n, const N (&row)[9]) {
@@ -92,6 +128,29 @@ INLINE void put_block(T* a, index place, index, int n, const N (&row)[9]) {
 template <class T, class N>
 INLINE void get_row(const T* a, index i, N (&row)[4]) {
     for (int k = 0; k < 4; ++k) row[k] = at(a, 4 * i + k);
+}
+// Those of the items of the kernel: neighbours in memory.
+INLINE void get_item_row(const int* a, index i, index (&row)[4]) {
+#if defined(WIDE) && defined(__GNUC__) && !defined(__clang__)
+    if (i[LANES - 1] - i[0] == LANES - 1) {
+        index v[4], even = {}, odd = {}, low = {}, high = {};
+        __builtin_memcpy(v, a + 4 * (long long)i[0], sizeof v);
+        for (int k = 0; k < LANES; ++k) {
+            const int half = LANES / 2, second = k >= half;
+            even[k] = 4 * (k - second * half) + second;
+            odd[k] = even[k] + 2;
+            low[k] = second ? k + half : k;
+            high[k] = low[k] + half;
+        }
+        UNROLL for (int k = 0; k < 4; k += 2) {
+            index first = __builtin_shuffle(v[0], v[1], k ? odd : even), last = __builtin_shuffle(v[2], v[3], k ? odd : even);
+            row[k] = __builtin_shuffle(first, last, low);
+            row[k + 1] = __builtin_shuffle(first, last, high);
+        }
+        return;
+    }
+#endif
+    get_row(a, i, row);
 }
 
 #endif

@@ -40,16 +40,16 @@ struct Read {
 
 INLINE void evaluated(const Elements& p, index i, Read& e) {
     index tet[4];
-    get_row(p.tets, i, tet);
+    get_item_row(p.tets, i, tet);
     local_vec3 edges[3];
     field_edges(p.x, tet, edges);
     field_edges(p.v, tet, e.v);
     local_mat3 g, P;
-    for (int k = 0; k < 9; ++k) g.m[k] = at(p.gradients, k * p.n + i);
+    for (int k = 0; k < 9; ++k) g.m[k] = at_items(p.gradients + k * p.n, i);
     for (int k = 0; k < 3; ++k) e.D[k + 1] = row(g, k);
     spread_to_four(e.D);
-    local_number volume = at(p.volume, i), k = volume * at(p.stiffening, i), force = -p.h * volume;
-    derivatives(outer3(edges[0], edges[1], edges[2], g), at(p.constants, i), at(p.constants, p.n + i), P, e.A);
+    local_number volume = at_items(p.volume, i), k = volume * at_items(p.stiffening, i), force = -p.h * volume;
+    derivatives(outer3(edges[0], edges[1], edges[2], g), at_items(p.constants, i), at_items(p.constants + p.n, i), P, e.A);
     UNROLL for (int m = 0; m < 81; ++m) e.A[m] *= k;
     for (int a = 0; a < 4; ++a) e.push[a] = force * mul(P, e.D[a]);
 }
