@@ -35,7 +35,8 @@ class Worker:
         self._counters = uplink.counters
         self._analyse = analyse
         self._on_server = on_server
-        self._analyses: dict[str, tuple[int, Method, int, Factorization]] = {}  # of an object: epoch, ..., blocks
+        self._analyses: dict[tuple[str, str], tuple[int, Method, int, Factorization]] = {}
+        # of an object by name of the method: epoch, method, blocks, and what factorizes
         self._builders = Builders(uplink)
         self._pending: dict[str, Job] = {}
 
@@ -140,13 +141,13 @@ class Worker:
     def _analysis(self, job: Job) -> Factorization:
         """The symbolic phase, once per epoch of an object."""
         object, epoch, blocks = job.object, job.message.header.epoch, job.message.blocks
-        known = self._analyses.get(object)
+        known = self._analyses.get((object, job.method.name))
         if known is None or known[:2] != (epoch, job.method):
             topology = self._uplink.topology(object, epoch)
             row_start = array(topology.row_start, np.int32, (topology.nodes + 1,), "Topology.row_start")
             columns = array(topology.columns, np.int32, (-1,), "Topology.columns")
             analysis = self._analyse(row_start, columns, job.method)
-            known = self._analyses[object] = (epoch, job.method, len(columns), analysis)
+            known = self._analyses[object, job.method.name] = (epoch, job.method, len(columns), analysis)
             self._uplink.library = analysis.library
         if known[2] != blocks:
             raise Refused(f"Matrix.blocks is {blocks}; allowed: {known[2]}, as in the topology", "shape")

@@ -158,7 +158,8 @@ def _check_starts(starts: NDArray[Any], end: int, name: str, what: str) -> None:
 @dataclass(frozen=True, eq=False)
 class Factor:
     """L of one object at one step. values (pattern.nonzeros,) float32 or float64; seconds: what it took to make;
-    remedy: what was done to a matrix that was not positive definite, in a few words; ahead, later: as in FactorUse."""
+    remedy: what was done to a matrix that was not positive definite, in a few words; ahead, later, method: as in
+    FactorUse."""
 
     object: str
     epoch: int
@@ -171,6 +172,7 @@ class Factor:
     remedy: str = ""
     ahead: float = 0.0
     later: bool = False
+    method: str = ""
 
 
 def check_values(values: NDArray[Any], pattern: FactorPattern, expected: int | None) -> None:

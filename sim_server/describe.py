@@ -4,12 +4,14 @@
 import json
 import platform
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from protocol import messages_pb2 as pb
+from protocol.method import Method
 from protocol.version import version
 from sim_server.backend import Cpu
 from sim_server.engine import Kind
@@ -74,19 +76,27 @@ def state(body: Body, step: int, time: float, x: NDArray[np.float64], v: NDArray
     )
 
 
-def steps(simulation: Simulation, records: NDArray[Any]) -> list[pb.ObjectStep]:
-    """Step records (engine.RECORD) as messages."""
+def steps(
+    simulation: Simulation, records: NDArray[Any], methods: Callable[[int, int], Method | None] | None = None
+) -> list[pb.ObjectStep]:
+    """Step records (engine.RECORD) as messages. methods: of body and step, how that factor was made ("auto")."""
     names = [b.name for b in simulation.world.bodies]
     kinds = preconditioner_names(simulation)
     columns = [records[name].tolist() for name in records.dtype.names or ()]
     rows = (dict(zip(records.dtype.names or (), row, strict=True)) for row in zip(*columns, strict=True))
-    return [_step(names, kinds, row) for row in rows]
+    if methods is None or simulation.scene.solver.preconditioner != "auto":
+        return [_step(names, kinds, row) for row in rows]
+    return [_step(names, kinds | _factor_name(methods(row["body"], row["factor_step"])), row) for row in rows]
 
 
 def preconditioner_names(simulation: Simulation) -> dict[Kind, str]:
     """Of the kinds that the loop knows: any factor is Kind.CHOLESKY there."""
     wanted = simulation.scene.solver.preconditioner
     return NAMES | ({Kind.CHOLESKY: wanted} if wanted in FACTORS else {})
+
+
+def _factor_name(method: Method | None) -> dict[Kind, str]:
+    return {} if method is None else {Kind.CHOLESKY: method.name}
 
 
 def _step(names: list[str], kinds: dict[Kind, str], r: dict[str, Any]) -> pb.ObjectStep:

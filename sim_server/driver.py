@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import Factor
+from protocol.method import Method
 from sim_server.copies import Copies
 from sim_server.engine import Kind
 from sim_server.factors import FactorSource, Inline, Job
@@ -58,8 +59,8 @@ class Driver:
         self.inline, self.guard = Inline(patterns), Guard(patterns)
         self.source: FactorSource = source or self.inline
         self.counted = not self.free if counted is None else counted
-        auto = self.solver.preconditioner == "auto"
-        self.tracks = [Track(b, auto, self.counted) for b in simulation.world.bodies]
+        methods = self.solver.choices(simulation.world.backend.name)
+        self.tracks = [Track(b, methods, self.counted) for b in simulation.world.bodies]
         self.by_name = {t.body.name: t for t in self.tracks}
         self.wants_factors = self.solver.wants_factors
         if self.wants_factors:
@@ -128,8 +129,9 @@ class Driver:
         return self.simulation.system.body_values(body.first, body.last)
 
     def _job(self, t: Track, step: int, values: NDArray[np.float64]) -> Job:
-        name = t.body.name
-        return Job(name, 1, step, self._warped[name], values, self.solver.factor_dtype, self.solver.method)
+        name, method = t.body.name, self.solver.method if t.choice is None else t.choice.making.method
+        t.job(step, method)
+        return Job(name, 1, step, self._warped[name], values, self.solver.factor_dtype, method)
 
     def _take_up(self, source: FactorSource) -> None:
         for factor in source.poll():
@@ -149,9 +151,11 @@ class Driver:
             return
         self.engine.post_factor(t.body.index, factor.pattern, factor.values, factor.step)
         later = t.sent_positions and self.engine.positions_later and factor.worker != self.inline.WORKER
-        self.adopted(replace(factor, ahead=t.ahead, later=later) if t.ahead or later else factor)
+        method = t.method(factor.step)
+        told = replace(factor, ahead=t.ahead, later=later) if t.ahead or later else factor
+        self.adopted(replace(told, method=method.name) if method else told)
         if t.choice is not None:
-            t.choice.factor_arrived()
+            t.choice.factor_arrived(method)
             self._settle(t)
 
     def failed(self, name: str, reason: str) -> None:
@@ -159,6 +163,8 @@ class Driver:
         t = self.by_name[name]
         self._copies.take_back(t)
         t.came_to_nothing(reason)
+        if t.choice is not None:
+            t.choice.making.failed()
         self._nobody_at = -1
         cause = re.sub(r"[0-9.e+-]*[0-9]", "#", reason)
         if cause not in t.causes and len(t.causes) < CAUSES:
@@ -322,21 +328,32 @@ class Driver:
             t, iterations, kind = self.tracks[r["body"]], int(r["iterations"]), Kind(r["kind"])
             cost = self._model(t, kind, iterations) if self.counted else float(r["solve"])
             t.observe(r, max(floor, iterations) if self._warping.tried(t, r) else floor, cost)
+            factor = (t.method(int(r["factor_step"])), int(r["factor_step"]))
             if t.choice is not None:
-                t.choice.observe(kind, iterations, cost, Kind(r["asked"]))
+                t.choice.observe(kind, iterations, cost, Kind(r["asked"]), factor, self._waited(t, factor[0]))
                 self._settle(t)
-            self._warping.observe(t, r)
+            if t.tries(factor[0]):
+                self._warping.wait(t)
+            else:
+                self._warping.observe(t, r)
 
     def _observe_steps(self, r: NDArray[Any]) -> None:
         """Of whole steps, (steps, bodies): where bodies are many, this is what decides how many factors they get."""
         observe_steps(self.tracks, r, self.solver.update_floor_iterations, self._warping.tried_in(r))
+        others = np.zeros(r.shape, bool)  # with factors that are tried out
         if any(t.choice for t in self.tracks):
-            columns = (r[name].T.tolist() for name in ("kind", "iterations", "solve", "asked"))
-            for t, *rows in zip(self.tracks, *columns, strict=True):
+            columns = (r[name].T.tolist() for name in ("kind", "iterations", "solve", "asked", "factor_step"))
+            for k, (t, *rows, made) in enumerate(zip(self.tracks, *columns, strict=True)):
                 if t.choice is not None:
-                    t.choice.observe_steps(*rows)
+                    factors = [(t.method(step), step) for step in made]
+                    t.choice.observe_steps(*rows, factors)
                     self._settle(t)
-        self._warping.observe_steps(r)
+                    others[:, k] = [t.tries(method) for method, _ in factors]
+        self._warping.observe_steps(r, others)
+
+    def _waited(self, t: Track, method: Method | None) -> float:
+        """What falls to each solve of the making of a factor that a step waits for."""
+        return t.making(method) / self.n if method and self.kind == "every" else 0.0
 
     def _model(self, t: Track, kind: int, iterations: int) -> float:
         """Bytes that a solve moved, about: the deterministic stand-in for its time."""
@@ -351,3 +368,6 @@ class Driver:
         assert t.choice is not None
         native = self.engine.settings(t.body.index)
         native.kind, native.probe = t.choice.kind, t.choice.probe
+        if t.decided != (decided := t.choice.making.decided):
+            t.decided = decided
+            self._warping.begin_anew(t)

@@ -254,9 +254,10 @@ class Engine(Reports):
         return int(c.cast(address, c.POINTER(layouts.Factor)).contents.step) if address else -1
 
     def factor_bytes(self, body: int) -> int:
-        """Size of the values of the factor buffers of a body, 0 while there are none."""
-        buffers = self._mail[body].buffers
-        return buffers[-1].values.nbytes if buffers else 0
+        """What an application reads of the factor posted last, values and rows; 0 while there is none."""
+        mail = self._mail[body]
+        newest = mail.waiting or mail.in_use
+        return newest.values.nbytes + newest.pattern.rows.nbytes if newest else 0
 
     def request_matrix(self, body: int, target: Reals) -> None:
         """The loop copies the values of A into `target` once they are next assembled."""

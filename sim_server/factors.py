@@ -65,7 +65,9 @@ class Inline:
 
     def __init__(self, patterns: dict[str, tuple[NDArray[np.int32], NDArray[np.int32]]], library: str = "auto"):
         self._patterns, self._library = patterns, library
-        self._analyses: dict[str, tuple[Method, Any]] = {}
+        self._analyses: dict[tuple[str, Method], Any] = {}
+        self._latest: dict[str, Method] = {}
+        self._warned = False
         self._done: list[Factor] = []
         self._failed: list[tuple[str, str]] = []
 
@@ -95,19 +97,21 @@ class Inline:
         return True
 
     def library(self, name: str) -> str:
-        """Library and version that factorizes the matrices of an object."""
-        known = self._analyses.get(name)
-        return str(self._analysis(name, known[0] if known else EXACT).library)
+        """Library and version that factorizes the matrices of an object; of exact factors if it has had any."""
+        exact = (name, EXACT) in self._analyses
+        return str(self._analysis(name, EXACT if exact else self._latest.get(name, EXACT)).library)
 
     def _analysis(self, name: str, method: Method) -> Any:
         from precond_worker.factorize import default_library
         from precond_worker.methods import prepared
 
-        if name not in self._analyses or self._analyses[name][0] != method:
-            if not self._analyses and method == EXACT and (message := default_library()[1]):
+        self._latest[name] = method
+        if (name, method) not in self._analyses:
+            if method == EXACT and not self._warned and (message := default_library()[1]):
+                self._warned = True
                 log.warning("%s", message)
-            self._analyses[name] = (method, prepared(*self._patterns[name], method, self._library))
-        return self._analyses[name][1]
+            self._analyses[name, method] = prepared(*self._patterns[name], method, self._library)
+        return self._analyses[name, method]
 
     def poll(self) -> list[Factor]:
         """Factors made since the last call."""

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol import messages_pb2 as pb
+from protocol.method import Method
 from sim_server import describe
 from sim_server.commands import Commands
 from sim_server.driver import Driver
@@ -102,17 +103,21 @@ class Telemetry:
         """Those that somebody wants: to make one takes longer than all else that is done with a record."""
         self._listened = self.link.wants_steps()
         wanted = records if self.recorder else records[-BATCH:] if self._listened else records[:0]
-        messages = describe.steps(self.simulation, wanted)
+        messages = describe.steps(self.simulation, wanted, self._method)
         bound = self.driver.age_bound() if messages else -1
         for message in messages:
             message.excess = self.driver.by_name[message.header.object].excess
             message.factor_age_bound = bound
         return messages
 
+    def _method(self, body: int, step: int) -> Method | None:
+        """How the factor of a step was made."""
+        return self.driver.tracks[body].method(step)
+
     def _latest(self, body: int, bound: int) -> pb.ObjectStep | None:
         if not self._window[body]:
             return None
-        message = describe.steps(self.simulation, self._last[body : body + 1])[0]
+        message = describe.steps(self.simulation, self._last[body : body + 1], self._method)[0]
         message.excess, message.factor_age_bound = self.driver.tracks[body].excess, bound
         return message
 

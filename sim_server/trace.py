@@ -80,10 +80,11 @@ class Trace:
             if factor.worker not in self._workers:
                 self._workers.update({w.worker: w for w in self._link.workers()})
             maker = self._workers.get(factor.worker, pb.WorkerInfo(worker=factor.worker))
-        library = maker.library if self._driver.solver.method == EXACT else "native"
+        exact = factor.method in ("", EXACT.name)
+        library = maker.library if exact else "native"
         return pb.FactorUse(
             header=pb.Header(object=factor.object, epoch=factor.epoch), step=factor.step, pattern=factor.pattern.id,
             checksum=checksum(factor.values), dtype=factor.values.dtype.name, worker=factor.worker,
             library=library, threads=maker.threads, seconds=factor.seconds, remedy=factor.remedy,
-            ahead=factor.ahead, later=factor.later,
+            method=factor.method, ahead=factor.ahead, later=factor.later,
         )  # fmt: skip

@@ -8,12 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import Factor, FactorPattern
+from protocol.method import Method
 from sim_server.choice import Choice
 from sim_server.schedule import Need, excess
 from sim_server.warping import Warping
 from sim_server.world import Body
 
 MEMORY = 0.2  # weight of the newest value in running means
+METHODS = 32  # jobs of which it is remembered by which method they were made
 
 
 def flops(pattern: FactorPattern) -> float:
@@ -38,10 +40,11 @@ class Mean:
 
 
 class Track:
-    """One body. counted: costs are bytes and operations instead of seconds, so that runs repeat exactly; one of these
-    counts like the other, which is about what a core makes of them."""
+    """One body. methods: by which `auto` may have its factors made, none without it. counted: costs are bytes and
+    operations instead of seconds, so that runs repeat exactly; one of these counts like the other, which is about what
+    a core makes of them."""
 
-    def __init__(self, body: Body, auto: bool, counted: bool = False):
+    def __init__(self, body: Body, methods: Sequence[Method] = (), counted: bool = False):
         self.body, self.counted = body, counted
         self.excess = 0.0  # since the last matrix went out, or its factor came
         self.latest = 0.0  # of the last solve
@@ -68,9 +71,31 @@ class Track:
         self.latency = Mean()  # steps from a matrix to its factor
         self.seconds = Mean()  # s, or operations, of a factorization
         self.per_iteration = Mean()  # s, or bytes
-        self.choice = Choice() if auto else None
+        self.choice = Choice(methods) if methods else None
+        self.decided = methods[0] if methods else None  # method of the factors in use, apart from trials
+        self._methods: dict[int, Method] = {}  # of the last jobs, by step
+        self._making: dict[str, Mean] = {}  # s, or operations, by name of the method
         self.warping: Warping | None = None  # warp = "auto"
         self.noted = self.made = -1  # steps, for a device that is told: noted last, or from when on; what frames go by
+
+    def job(self, step: int, method: Method) -> None:
+        """The matrix of a step is to be factorized."""
+        self._methods[step] = method
+        if len(self._methods) > METHODS:
+            del self._methods[next(iter(self._methods))]
+
+    def method(self, step: int) -> Method | None:
+        """How the factor of a step was made; None where that is not known any more."""
+        return self._methods.get(step)
+
+    def tries(self, method: Method | None) -> bool:
+        """A factor of this method is tried out: what solves with it take says nothing of those in use."""
+        return method is not None and self.choice is not None and method != self.choice.making.decided
+
+    def making(self, method: Method) -> float:
+        """What a factor costs to make."""
+        mean = self._making.get(method.name)
+        return 0.0 if mean is None or mean.value is None else mean.value
 
     def age(self, step: int) -> int:
         """Steps since the matrix of the newest factor, -1 without one."""
@@ -108,7 +133,10 @@ class Track:
             self.unbuilt = 0
         if factor.step <= self.newest:
             return False
-        self.seconds.add(flops(factor.pattern) if self.counted else max(factor.seconds, 1e-6))
+        made = flops(factor.pattern) if self.counted else max(factor.seconds, 1e-6)
+        self.seconds.add(made)
+        if method := self.method(factor.step):
+            self._making.setdefault(method.name, Mean()).add(made)
         self.newest = factor.step
         self.lost = 0.0  # what is known of the solves so far is of another factor
         self.excess = self.latest = self._usual.value or 0.0

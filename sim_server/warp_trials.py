@@ -60,12 +60,24 @@ class WarpTrials:
         t.warping.observe(step, int(record["factor_step"]), int(record["iterations"]), held)
         self._set(t, t.warping)
 
-    def observe_steps(self, r: NDArray[Any]) -> None:
-        """As `observe` of each, of records (steps, bodies) of all bodies; what follows is set once."""
+    def begin_anew(self, t: Track) -> None:
+        """Factors are made in another way from now on."""
+        if t.warping is not None:
+            t.warping.begin_anew()
+            self._set(t, t.warping)
+
+    def wait(self, t: Track) -> None:
+        """While other factors are tried out: one thing at a time."""
+        if t.warping is not None:
+            self._engine.settings(t.body.index).hold = int(t.warping.decided)
+
+    def observe_steps(self, r: NDArray[Any], others: NDArray[np.bool_]) -> None:
+        """As `observe` of each, of records (steps, bodies) of all bodies; what follows is set once. others: solves with
+        factors that are not like those in use, which are left out."""
         if not self._tracks:
             return
         r = r[:, self._indices]
-        usable = telling(r)
+        usable = telling(r) & ~others[:, self._indices]
         whole = usable.all(axis=0).tolist()
         columns = (r["step"] - 1, r["factor_step"], r["iterations"], r["warping"] & HELD != 0)
         rows = zip(*(column.T.tolist() for column in columns), strict=True)
@@ -77,6 +89,8 @@ class WarpTrials:
                 assert t.warping is not None
                 t.warping.observe_steps(*solves)
                 self._set(t, t.warping)
+            if others[-1, t.body.index]:
+                self.wait(t)
 
     def _set(self, t: Track, warping: Warping) -> None:
         warping.consider(lambda: self._simulation.system.turned(t.body.nodes))

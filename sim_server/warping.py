@@ -84,6 +84,14 @@ class Warping:
         for step, made, n in list(zip(steps, factor_steps, iterations, strict=True))[-RECENT:]:
             self._recent.append(Solve(step, step - made, n))
 
+    def begin_anew(self) -> None:
+        """Other factors are in use from now on: what was found says nothing of them."""
+        self.hold = self.decided = False
+        self._recent.clear()
+        self._gains.clear()
+        self._every, self._trial = EVERY, None
+        self._next(EVERY)
+
     def consider(self, turned: Callable[[], float]) -> None:
         """Begins a trial if it is time. turned: mean angle of nodes since the factor's matrix [rad], asked rarely."""
         if self._trial is not None or len(self._recent) < SAMPLES:

@@ -195,7 +195,9 @@ class Replay:
                 topology = describe.topology(self.simulation, body)
                 self._assemblies[body.name] = Assembly(describe.scene(self.simulation), topology)
             values = self._assemblies[body.name].matrix(self._ahead[body.name])
-        self._inline.submit(Job(body.name, 1, made, warped, values, solver.factor_dtype, solver.method))
+        use = self.recording.objects[body.name].factors.get(made)
+        method = solver.method_named(use.method if use is not None else "")
+        self._inline.submit(Job(body.name, 1, made, warped, values, solver.factor_dtype, method))
 
     def _collect(self, step: int) -> None:
         for factor in self._inline.poll():

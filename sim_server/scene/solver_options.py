@@ -140,10 +140,29 @@ class Solver(Parameters):
 
     @property
     def method(self) -> Method:
-        """What is made of a matrix."""
+        """What is made of a matrix; "auto": unless it chooses another of its `choices`."""
         if self.preconditioner == "incomplete_cholesky":
-            return Method("incomplete_cholesky", drop_tolerance=self.drop_tolerance, fill=self.fill)
+            return self._incomplete
         return Method("ssor", omega=self.omega) if self.preconditioner == "ssor_factor" else Method()
+
+    @property
+    def _incomplete(self) -> Method:
+        return Method("incomplete_cholesky", drop_tolerance=self.drop_tolerance, fill=self.fill)
+
+    def choices(self, device: str) -> tuple[Method, ...]:
+        """Methods that "auto" may choose from on a device, the one to begin with first; empty without "auto".
+
+        The incomplete factor is the first to come. It is for CPUs, and one that is made once and for ever is exact.
+        """
+        if self.preconditioner != "auto":
+            return ()
+        exact = device != "cpu" or self.update.kind == "never"
+        return (Method(),) if exact else (self._incomplete, Method())
+
+    def method_named(self, name: str) -> Method:
+        """That of a factor in a log; "": the scene's."""
+        known = {m.name: m for m in (Method(), self._incomplete)}
+        return self.method if self.preconditioner != "auto" else known.get(name, Method())
 
     @property
     def factor_dtype(self) -> Literal["float32", "float64"]:

@@ -33,8 +33,8 @@ def write(report: Report, setting: Setting, tables: Tables) -> None:
 
 def ordered(table: str, rows: Sequence[Row]) -> list[Row]:
     """As a single run has them: pieces come in any order."""
-    if table in ("table1", "publishing"):
-        return sorted(rows, key=lambda row: row["tets"])
+    if table in ("table1", "publishing", "automatic"):
+        return sorted(rows, key=lambda row: (row["tets"], row.get("E") != "one"))
     if table == "table2":
         loads = [load.name for load in LOADS]
         return sorted(rows, key=lambda row: loads.index(row["load"]))
@@ -42,8 +42,10 @@ def ordered(table: str, rows: Sequence[Row]) -> list[Row]:
 
 
 def _section(report: Report, setting: Setting, device: str, tables: Tables) -> None:
-    shown = {"table1": _table1, "publishing": _publishing, "table2": _table2, "table5": _table5, "policies": _policies,
-             "extrapolations": _extrapolations, "recycled": _recycled}  # fmt: skip
+    shown = {
+        "table1": _table1, "publishing": _publishing, "table2": _table2, "table5": _table5, "automatic": _automatic,
+        "policies": _policies, "extrapolations": _extrapolations, "recycled": _recycled,
+    }  # fmt: skip
     for name, show in shown.items():
         if rows := tables.get(name):
             show(report, setting, device.upper(), rows)
@@ -96,6 +98,12 @@ def _table5(report: Report, setting: Setting, name: str, rows: list[Row]) -> Non
     )
     report.table(rows, words.COLUMNS5)
     report.say(words.verdict5(rows))
+
+
+def _automatic(report: Report, setting: Setting, name: str, rows: list[Row]) -> None:
+    report.say(f'## preconditioner = "auto" and what it chooses from, {name}', words.AUTOMATIC)
+    report.table(rows, [key for key in rows[0] if key not in ("device", "unconverged", "repeats")])
+    report.say(words.verdict_of_automatic(rows))
 
 
 def _policies(report: Report, setting: Setting, name: str, rows: list[Row]) -> None:

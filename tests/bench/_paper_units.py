@@ -6,6 +6,7 @@ from functools import partial
 
 from tests.bench import _paper_tables as tables
 from tests.bench import figure4
+from tests.bench._paper_automatic import automatic
 from tests.bench._paper_beam import LOADS, MODELS
 from tests.bench._paper_publishing import publishing
 from tests.bench._paper_tables import Row, Setting
@@ -15,6 +16,7 @@ from tests.bench._units import Unit
 KEYS = {  # what tells the rows of a table apart
     "table1": ("device", "tets"),
     "publishing": ("device", "tets"),
+    "automatic": ("device", "tets", "E", "load"),
     "table2": ("device", "load", "model", "scheme"),
     "table5": ("device", "updated", "preconditioner"),
     "policies": ("device", "update"),
@@ -49,6 +51,12 @@ def _of_device(setting: Setting, device: str) -> list[Unit]:
         Unit("extrapolations", f"{beam}, {device}", 25, partial(tables.extrapolations, setting, device, beam))
         for beam in tables.extrapolated_beams()
     ]
+    found += [
+        Unit("automatic", f"{tets}, {'heterogeneous' if bands else 'homogeneous'}, {device}", 30 + tets / 120,
+             partial(automatic, setting, tets, bands))
+        for tets in setting.sizes
+        for bands in (False, True)
+    ]  # fmt: skip
     found += [
         Unit("recycled", f"{beam}, {latency}, {device}", 20, partial(tables.recycled, setting, device, beam, latency))
         for beam in ("corotational", "heterogeneous")

@@ -28,6 +28,12 @@ take
 the same iterations step by step. *publishing*: median over all steps of the time of a step by that of its twin, less
 one; *of steps that publish*: over those whose matrix went out. Times are wall clock, *CPU* of the simulation thread."""
 
+AUTOMATIC = """\
+Corotational beams of the sizes of table 1, with the stiffness of table 2 (*one*) and with that of table 5, in bands.
+update = "async" with one worker in virtual time that takes *latency* steps for an exact factor and fewer for an
+incomplete one, by its operations; warp. ms: processor time of the simulation thread, of each step the least of the
+rounds, mean over the steps, the first ones without a factor among them."""
+
 COLUMNS_OF_POLICIES = ("update", "iterations", "most iterations", "factors", "step ms", "wait ms")
 POLICIES = """\
 The beam of table 2 under *{load}*, Cholesky with warp. *async* and *adaptive* with one worker in virtual time that
@@ -140,6 +146,17 @@ def verdict2(rows: list[dict[str, Any]]) -> str:
     return (
         f"Near the fastest in {sum(fast for fast, _ in met)} of {len(met)} rows, no more iterations than the paper's "
         f"in {sum(few for _, few in met)}, both in {sum(fast and few for fast, few in met)}."
+    )
+
+
+def verdict_of_automatic(rows: list[dict[str, Any]]) -> str:
+    """How far from the best of its choices, and what the incomplete factor is good for."""
+    far, best = max(rows, key=lambda row: row["auto / best"]), min(rows, key=lambda row: row["IC / best of the others"])
+    better = sum(row["IC / best of the others"] < 1 for row in rows)
+    return (
+        f"Incomplete Cholesky costs less than the better of Cholesky and block Jacobi in {better} of {len(rows)} rows, "
+        f"at best {best['IC / best of the others']:.2f} times as much ({best['tets']}, E {best['E']}, {best['load']}). "
+        f"auto: at most {far['auto / best']:.2f} times the best ({far['tets']}, E {far['E']}, {far['load']})."
     )
 
 

@@ -212,8 +212,12 @@ def test_other_policies(update: str, tmp_path: Path) -> None:
 
 
 def test_the_automatic_preconditioner(tmp_path: Path) -> None:
-    """Which solves probe is decided by the clock; the log holds it."""
-    assert replayed(recorded(tmp_path, preconditioner="auto"), 0)["same"]
+    """Which solves probe and which factors are asked for is decided by the clock; the log holds it."""
+    log = recorded(tmp_path, preconditioner="auto")
+    assert replayed(log, 0)["same"]
+    factors = messages(log, "factor")
+    assert factors[0].method == "incomplete_cholesky" and factors[0].library == "native"
+    assert {f.method for f in factors} <= {"incomplete_cholesky", "cholesky"}
 
 
 def test_factors_of_positions_sent_ahead_and_recycled_directions_too(tmp_path: Path) -> None:
