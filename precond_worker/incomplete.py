@@ -10,8 +10,8 @@ from precond_worker.errors import NotPositiveDefinite
 from protocol import FactorPattern
 from protocol.method import Method
 
-FIRST_SHIFT = 1e-3  # of each node's norm, doubled ...
-SHIFTS = 20  # ... so often
+FIRST_SHIFT = 1e-4  # of each node's norm, three times as much each time ...
+SHIFTS = 15  # ... at most so often
 
 
 class Sparse:
@@ -65,7 +65,7 @@ class IncompleteCholesky(Sparse):
 
     def _make(self, matrix: NDArray[np.float64], noise: float) -> None:
         shift, node = 0.0, -1
-        for shift in (0.0, *(FIRST_SHIFT * 2.0**k for k in range(SHIFTS))):
+        for shift in (0.0, *(FIRST_SHIFT * 3.0**k for k in range(SHIFTS))):
             node = self._native.incomplete(matrix, shift, self._method.drop_tolerance, self._method.fill, noise)
             if node < 0:
                 self.remedy = f"diagonal shifted by {shift:g}" if shift else ""
