@@ -139,7 +139,7 @@ def test_a_factor_is_taken_up_between_steps_and_the_last_one_wins():
     assert sim.engine.factor_step(0) == 12
     sim.engine.run(1)
     assert sim.engine.records()["factor_step"].tolist() == [-1, 12, 12]
-    assert sim.engine.factor_bytes(0) == values.nbytes
+    assert sim.engine.factor_bytes(0) == values.nbytes + pattern.rows.nbytes
 
 
 def test_a_factor_in_use_is_never_overwritten():

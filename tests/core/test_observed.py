@@ -79,7 +79,7 @@ def told(listening: bool, monkeypatch) -> tuple[list[pb.Steps], list[pb.Status],
     driver = drivers("cholesky")[0]
     made, sent, statuses = [], [], []
     plain = describe.steps
-    monkeypatch.setattr(describe, "steps", lambda sim, records: made.extend(records) or plain(sim, records))
+    monkeypatch.setattr(describe, "steps", lambda sim, records, *more: made.extend(records) or plain(sim, records))
     link = SimpleNamespace(wants_steps=lambda: listening, publish_steps=sent.append, publish_status=statuses.append)
     telemetry = Telemetry(driver, link, None, patient=False)  # type: ignore[arg-type]
     telemetry.records(solves(np.random.default_rng(0), 0, 10).ravel())
