@@ -41,12 +41,14 @@ class Case:
     file, scene: scene file and overrides; build: what makes the simulation from the overrides, instead. done: in words;
     start, hold and source do it. steps: of the run.
     rests: where it comes back to: "pose" (no load), "static" (its equilibrium, found by a heavily damped run at another
-    time step), "same" (at every step where the same run without any preconditioner, solved to 1e-10, is) or "spin"
-    (nowhere: free). within: distance to it, largest over the nodes / length of the bar; recovered: step from which it
-    must stay there.
+    time step), "still" (wherever it is at the end), "same" (at every step where the same run without any
+    preconditioner, solved to 1e-10, is) or "spin" (nowhere: free). within: distance to it, largest over the nodes /
+    length of the bar; recovered: step from which it must stay there.
     energy: largest allowed rise of energy - work of loads over its lowest earlier value, as a part of what the run
     dissipates. unconverged: how many steps may end with a status other than converged, by status.
-    upright: det F > 0 in every element at the end. iterations: largest allowed mean over the steps with a factor.
+    upright: det F > 0 in every element at the end. refused: the model does not define the state: every solve ends with
+    not_finite, an element is named, nothing moves, and put back to rest the body goes on. fails: known not to hold all
+    of this; the statuses must tell. iterations: largest allowed mean over the steps with a factor.
     note: what must be known to read the line; where something does not hold, why.
     """
 
@@ -59,22 +61,31 @@ class Case:
     source: Source | None = None
     build: Callable[[list[str], Path], Simulation] | None = None
     steps: int = 400
-    rests: Literal["pose", "static", "same", "spin"] = "pose"
+    rests: Literal["pose", "static", "still", "same", "spin"] = "pose"
     within: float = 1e-3
     recovered: int = 0
     energy: float = 1e-9
     unconverged: dict[str, int] = field(default_factory=dict)
     upright: bool = True
+    refused: bool = False
+    fails: bool = False
     iterations: float = 0
     note: str = ""
 
     def must_hold(self) -> str:
         """In words, from the same numbers that are asserted."""
+        if self.refused:
+            return "refused: every solve not_finite, an element named, nothing moves; put back to rest it goes on"
         energy = f"energy rises by at most {self.energy:g}" if self.energy > 1e-6 else "energy never rises"
         parts = ["finite", energy]
         allowed = [f"{count} × {status}" for status, count in self.unconverged.items()]
         parts.append("converged" + (f" but for at most {', '.join(allowed)}" if allowed else ""))
-        to = {"pose": "of rest", "static": "of its static state", "same": "of plain CG solved to 1e-10,"}
+        to = {
+            "pose": "of rest",
+            "static": "of its static state",
+            "still": "of where it ends",
+            "same": "of plain CG solved to 1e-10,",
+        }
         if self.rests != "spin":
             since = f" from step {self.recovered} on" if self.rests != "same" else " at every step"
             parts.append(f"within {self.within:g} L {to[self.rests]}{since}")

@@ -15,15 +15,17 @@ from tests.hard_cases.case import BAR
 THICKNESS = 1e-3  # of the squeezed layer / cell
 
 
-def sliver_bar(overrides: list[str], folder: Path) -> Simulation:
-    """bar.toml on that mesh, which goes through a file as a user's would."""
+def sliver_bar(
+    overrides: list[str], folder: Path, file: Path = BAR, cells: tuple[int, int, int] = (3, 3, 12)
+) -> Simulation:
+    """A scene's bar on that mesh, which goes through a file as a user's would."""
     path = folder / "slivers.vtu"
-    mesh = bar([3, 3, 12], [1, 1, 4])
-    rest, cell = mesh.rest.copy(), 4 / 12
-    above = rest[:, 2] > 6.5 * cell
+    mesh = bar(list(cells), [1, 1, 4])
+    rest, cell = mesh.rest.copy(), 4 / cells[2]
+    above = rest[:, 2] > (cells[2] // 2 + 0.5) * cell
     rest[above, 2] -= (1 - THICKNESS) * cell
     meshio.write(path, meshio.Mesh(rest, [("tetra", mesh.tets)]))
-    return Simulation.load(BAR, [f'object.bar.mesh={{ file = "{path}" }}', *overrides])
+    return Simulation.load(file, [f'object.bar.mesh={{ file = "{path}" }}', *overrides])
 
 
 def smallest_dihedral(rest: NDArray[np.float64], tets: NDArray[np.int32]) -> float:

@@ -78,6 +78,27 @@ def spinning(speed: float) -> Start:
     return start
 
 
+def twisting(speed: float) -> Start:
+    """About Z, the more the farther from the held end: the free end at so many rad/s."""
+
+    def start(sim: Simulation) -> None:
+        w = sim.world
+        along = w.x[:, 2] / w.x[:, 2].max()
+        w.v[:] = speed * along[:, None] * np.cross([0, 0, 1], w.x - [0.5, 0.5, 0])
+
+    return start
+
+
+def thrown(speed: float) -> Start:
+    """Sideways, the more the farther from the held end: the free end at so many m/s."""
+
+    def start(sim: Simulation) -> None:
+        w = sim.world
+        w.v[:, 1] = speed * (w.x[:, 2] / w.x[:, 2].max()) ** 2
+
+    return start
+
+
 def mass_times(factor: float, below: float) -> Start:
     """Nodal masses with Z < below multiplied; a scene has one density, so they are changed in the arrays."""
 

@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 
 from sim_server.driver import Driver
+from sim_server.effects import known_effects
 from sim_server.simulation import Simulation
 from tests.hard_cases.case import BAR, FREE_BAR, Case
-from tests.hard_cases.running import Outcome, broken, finer, run_case
+from tests.hard_cases.models import MODEL_CASES, MODELS, QUICK, SITUATIONS
+from tests.hard_cases.running import Outcome, broken, finer, run_case, unexpected
 from tests.hard_cases.slivers import THICKNESS, sliver_bar, smallest_dihedral
 from tests.hard_cases.starts import mirrored, spinning
 from tests.hard_cases.table import CASES
@@ -24,6 +26,25 @@ def test_hard_case(case: Case, tmp_path: Path) -> None:
     assert broken(case, run_case(case, tmp_path)) == []
 
 
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # numbers without end are what some of them are about
+@pytest.mark.parametrize("case", QUICK, ids=lambda case: case.name)
+def test_models(case: Case, tmp_path: Path) -> None:
+    """Some of the cases; all of them: deploy/run bench hard_cases."""
+    assert unexpected(case, run_case(case, tmp_path)) == []
+
+
+def test_every_model_and_every_situation_is_among_those_tested() -> None:
+    names = [case.name.split(": ", 1) for case in QUICK]
+    assert {model for _, model in names} == set(MODELS)
+    assert {situation.removesuffix(", Newton") for situation, _ in names} == set(SITUATIONS)
+    assert any(case.fails for case in QUICK) and any(case.refused for case in QUICK)
+
+
+def test_every_effect_with_elements_is_a_model_of_the_hard_cases() -> None:
+    others = {"fixed", "gravity", "rayleigh", "touch"}
+    assert {model.effect for model in MODELS.values()} == set(known_effects()) - others
+
+
 @pytest.mark.parametrize("case", [c for c in CASES if c.energy > 1e-6], ids=lambda case: case.name)
 def test_energy_that_rises_is_an_error_of_the_time_step(case: Case, tmp_path: Path) -> None:
     """What the notes of the table say of every case that is allowed to gain energy."""
@@ -31,7 +52,7 @@ def test_energy_that_rises_is_an_error_of_the_time_step(case: Case, tmp_path: Pa
 
 
 def test_names_of_the_table_differ() -> None:
-    names = [case.name for case in CASES]
+    names = [case.name for case in CASES + MODEL_CASES]
     assert len(set(names)) == len(names)
 
 
@@ -74,6 +95,15 @@ def test_what_breaks_the_rules_is_told() -> None:
     for name, value in bad.items():
         assert len(broken(case, replace(good, **{name: value}))) == 1, name
     assert len(broken(replace(case, rests="same"), replace(good, distance=1.0))) == 1
+    refused = replace(good, status=Counter(not_finite=400), named=3, farthest=0.0, recovered=400, distance=0.0)
+    assert broken(replace(case, refused=True), refused) == []
+    worse: dict[str, Any] = {"status": Counter(converged=400), "named": 0, "farthest": 0.1, "recovered": None}
+    for name, value in worse.items():
+        assert len(broken(replace(case, refused=True), replace(refused, **{name: value}))) == 1, name
+    lost = replace(good, finite=False)
+    assert unexpected(case, lost) == broken(case, lost) and len(unexpected(replace(case, fails=True), good)) == 1
+    assert len(unexpected(replace(case, fails=True), lost)) == 1  # not told
+    assert unexpected(replace(case, fails=True), replace(lost, status=Counter(not_finite=10))) == []
 
 
 def test_a_late_factor_is_not_left_for_being_slow_at_first() -> None:
