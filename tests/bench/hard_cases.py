@@ -10,7 +10,7 @@ import typer
 
 from tests.bench.report import Report, plots
 from tests.hard_cases.case import Case
-from tests.hard_cases.models import MODEL_CASES, QUICK, SITUATIONS
+from tests.hard_cases.models import MODEL_CASES, MODELS, QUICK, SITUATIONS
 from tests.hard_cases.running import Outcome, broken, finer, run_case, unexpected
 from tests.hard_cases.table import CASES
 
@@ -75,7 +75,7 @@ def matrix(results: list[tuple[Case, Outcome]]) -> list[dict[str, str]]:
     """Models against situations."""
     found = {case.name: verdict(case, out) for case, out in results}
     columns = list(dict.fromkeys(name.split(": ")[0] for name in found))
-    models = list(dict.fromkeys(name.split(": ")[1] for name in found))
+    models = [model for model in MODELS if any(name.endswith(f": {model}") for name in found)]
     return [{"model": m, **{c: found.get(f"{c}: {m}", "–") for c in columns}} for m in models]
 
 
