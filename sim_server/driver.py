@@ -131,6 +131,8 @@ class Driver:
     def _job(self, t: Track, step: int, values: NDArray[np.float64]) -> Job:
         name, method = t.body.name, self.solver.method if t.choice is None else t.choice.making.method
         t.job(step, method)
+        if t.choice is not None:
+            t.choice.making.sent()
         return Job(name, 1, step, self._warped[name], values, self.solver.factor_dtype, method)
 
     def _take_up(self, source: FactorSource) -> None:

@@ -23,10 +23,10 @@ COSTS, TAIL = 2.0, 1.3  # % of a step at the median; p99 by p50
 PUBLISHING = """\
 The beams of table 1 under *{load}*, update = "async": a worker process on another core gets a matrix whenever the last
 factor has come, the loop runs freely ({cores}). *off*: the same steps with the same factors, taken up at the same
-steps, but nothing is copied or sent, and the worker is idle; both take turns, {stretch} steps each, in one process, and
-take
-the same iterations step by step. *publishing*: median over all steps of the time of a step by that of its twin, less
-one; *of steps that publish*: over those whose matrix went out. Times are wall clock, *CPU* of the simulation thread."""
+steps, but nothing is copied or sent, and the worker is idle. They take turns, {stretch} steps each, in one process, and
+take the same iterations step by step. *publishing*: median over all steps of the time of a step by that of its twin,
+less one; *of steps that publish*: over those whose matrix went out. Times are wall clock, *CPU* of
+the simulation thread."""
 
 AUTOMATIC = """\
 Corotational beams of the sizes of table 1, with the stiffness of table 2 (*one*) and with that of table 5, in bands.

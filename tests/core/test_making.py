@@ -8,7 +8,7 @@ import pytest
 from protocol.method import Method
 from sim_server.choice import Choice
 from sim_server.engine import Kind
-from sim_server.making import EVERY, FAILURES, LONG, RARELY, SOLVES, SOON, Making
+from sim_server.making import EARLY, EVERY, FAILURES, LONG, RARELY, SOLVES, SOON, Making
 
 IC, EXACT = Method("incomplete_cholesky", drop_tolerance=0.003, fill=10), Method()
 
@@ -27,6 +27,7 @@ class Bench:
         for _ in range(solves):
             if self.step % self.life == 0:
                 self.made, self.used = self.step, self.making.method
+                self.making.sent()
                 self.making.answered()
             self.making.observe(self.used, self.made, self.costs[self.used])
             found.append(self.used)
@@ -56,9 +57,18 @@ def test_a_trial_that_is_clearly_worse_ends_with_its_first_factor():
     assert bench.run(EVERY).count(EXACT) == bench.life
 
 
+@pytest.mark.parametrize("life", [1, 2])
+def test_factors_that_live_for_a_solve_or_two_are_tried_too(life):
+    bench = Bench(2.0, 1.0, life)
+    bench.run(6 * SOLVES)
+    assert bench.making.decided == EXACT
+    bench = Bench(1.0, 3.0, life)
+    assert bench.run(EVERY).count(EXACT) == life
+
+
 def test_factors_that_live_long_are_judged_all_the_same():
     bench = Bench(2.0, 1.0, life=1000)
-    bench.run(1000 + LONG)
+    bench.run(1000 + EARLY + LONG)
     assert bench.making.decided == EXACT
 
 
@@ -78,16 +88,32 @@ def test_equal_costs_make_no_changes():
 
 def test_a_method_whose_jobs_fail_is_left():
     making = Making([IC, EXACT])
-    for _ in range(FAILURES - 1):
-        making.failed()
+
+    def fail(times: int) -> None:
+        for _ in range(times):
+            making.sent()
+            making.failed()
+
+    fail(FAILURES - 1)
+    making.sent()
     making.answered()
-    making.failed()
+    fail(1)
     assert making.method == IC, "not in a row"
-    making.failed()
+    fail(1)
     assert making.method == making.decided == EXACT
-    for _ in range(3 * FAILURES):
-        making.failed()  # nothing is left to go over to
+    fail(3 * FAILURES)  # nothing is left to go over to
     assert making.method == EXACT
+
+
+def test_a_trial_whose_job_fails_is_over():
+    making = Making([IC, EXACT])
+    for step in range(SOLVES):
+        making.observe(IC, step, 1.0)
+    assert making.method == EXACT
+    making.sent()
+    making.failed()
+    assert making.method == making.decided == IC
+    assert not any(making.observe(IC, step, 1.0) for step in range(EVERY - 1)) and making.method == IC
 
 
 def test_one_method_alone_is_never_left():
