@@ -148,7 +148,8 @@ class Worker:
             columns = array(topology.columns, np.int32, (-1,), "Topology.columns")
             analysis = self._analyse(row_start, columns, job.method)
             known = self._analyses[object, job.method.name] = (epoch, job.method, len(columns), analysis)
-            self._uplink.library = analysis.library
+            if job.method.name == "cholesky":  # of which there are several
+                self._uplink.library = analysis.library
         if known[2] != blocks:
             raise Refused(f"Matrix.blocks is {blocks}; allowed: {known[2]}, as in the topology", "shape")
         return known[3]

@@ -7,6 +7,8 @@
     deploy/run bench paper --merge a/paper.json 3/paper.json
 
 Pieces that are made at once share the memory and the clock of the machine: iterations are the same, times may not be.
+`publishing` sets its threads and its worker on cores of their own, the first of those that it may use: best run alone,
+or under taskset.
 """
 
 import argparse

@@ -60,6 +60,12 @@ def test_bench_writes_its_report(name: str, once: Once) -> None:
     assert (folder / f"{name}.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.system
+def test_publishing_with_a_real_worker_makes_the_same_steps(tmp_path: Path) -> None:
+    row = bench("paper", tmp_path, "--device", "cpu", "--only", "publishing")["data"]["publishing"][0]
+    assert row["repeats"] and row["unconverged"] == 0 and row["steps"] > row["steps a matrix"] > 1
+
+
 def test_reference_of_accuracy_is_no_competitor(once: Once) -> None:
     """PCG-1 against a reference of its own would show an error of exactly 0 at any tolerance."""
     data = once("accuracy")[0]["data"]
