@@ -25,6 +25,7 @@ from sim_server.scene.integrator_options import Integrator
 Reals = NDArray[np.float64]
 HELD, NOTED, MOVED, ADOPTED = 1, 2, 4, 8  # of the frames of a body in a step, kernels/nodes.cu
 NOTE_ALWAYS, NOTE_COPIES = 1, 2  # native/pcg.h
+HISTORY = 1024  # changes of the diagonal that are remembered, of each body
 
 
 class Kind(IntEnum):
@@ -47,6 +48,7 @@ def _library() -> c.CDLL:
             "wf_wait": (c.c_int32, [loop]),
             "wf_post_factor": (p, [c.POINTER(layouts.Body), p]), "wf_post_binding": (p, [c.POINTER(layouts.Launch), p]),
             "wf_apply_factor": (None, [c.POINTER(layouts.Factor), p, p, p]), "wf_sizes": (c.c_int32, [p]),
+            "wf_precondition": (None, [loop, c.c_int32, p, p, p]),
         },
     )  # fmt: skip
     sizes = (c.c_int32 * 8)()
@@ -156,6 +158,7 @@ class Engine(Reports):
             entry_body.noted = entry_body.made = -1
         self._work = np.zeros(45 * nodes)
         self._recycled: dict[int, Any] = {}
+        self._corrections: dict[int, Any] = {}
         self._arrays = arrays
         self._mail: list[Mailbox] = [Mailbox([]) for _ in ranges]
         self._copies: list[Reals | None] = [None] * bodies
@@ -215,6 +218,42 @@ class Engine(Reports):
         self._recycled[body] = room
         entry.recycled.capacity = pairs
         entry.recycled.pairs, entry.recycled.weight = (array.ctypes.data for array in room)
+
+    def correct(self, body: int, nodes: int, diagonal: Reals, double: bool = False) -> None:
+        """Factors of the body are corrected for what has come onto the diagonal since their matrix, or has left it, at
+        so many nodes at most (native/woodbury.h).
+
+        nodes: 1 to 64. diagonal: (nodes of the scene,) [kg], as assembled. double: also factors in float64. Before the
+        first step only.
+        """
+        assert 1 <= nodes <= 64, "MOST in native/woodbury.h"
+        entry = self._body[body]
+        count, width = entry.last - entry.first, -(-3 * nodes // 8) * 8
+        room: dict[str, NDArray[Any]] = {
+            "last": np.full(count, 0.0), "then": np.full(count, 0.0), "change": np.full((HISTORY, 3), 0.0),
+            "node": np.full(nodes, 0, np.int32), "supernode": np.full(3 * count, 0, np.int32),
+            "marked": np.full(3 * count, 0, np.uint8), "delta": np.full(nodes, 0.0),
+            "small": np.full(4 * width**2 + 2 * width, 0.0),
+            "columns": np.zeros((3 * count, width), np.float64 if double else np.float32),  # touched by the first grab
+            "diagonal": diagonal[entry.first : entry.last],
+        }  # fmt: skip
+        self._corrections[body] = room
+        correction = entry.correction
+        correction.capacity, correction.history, correction.nodes, correction.forgotten = nodes, HISTORY, count, -1
+        for name, array in room.items():
+            setattr(correction, name, array.ctypes.data)
+
+    def corrected(self, body: int) -> int:
+        """Nodes at which the factor in use was corrected in the last solve with it (while the loop stands still)."""
+        return int(self._body[body].correction.used)
+
+    def precondition(self, body: int, r: Reals) -> Reals:
+        """P^-1 r, (3 nodes of the body,), with its factor as the next solve has it: for tests. Needs a factor and an
+        assembled matrix; r must not be 0."""
+        r = np.ascontiguousarray(r, dtype=np.float64)
+        z, work = np.empty_like(r), np.empty(2 * len(r))
+        self._native.wf_precondition(c.byref(self.loop), body, r.ctypes.data, z.ctypes.data, work.ctypes.data)
+        return z
 
     # --- mailboxes ----------------------------------------------------------------------------------------------
 

@@ -72,12 +72,23 @@ class Recycled(c.Structure):
     ]  # fmt: skip
 
 
+class Correction(c.Structure):
+    _fields_ = [
+        ("capacity", c.c_int32), ("history", c.c_int32), ("nodes", c.c_int32), ("count", c.c_int32),
+        ("supernodes", c.c_int32), ("usable", c.c_int32), ("used", c.c_int32), ("unused", c.c_int32),
+        ("changes", c.c_int64), ("forgotten", c.c_int64), ("step", c.c_int64), ("factor", c.c_void_p),
+        ("diagonal", c.c_void_p), ("last", c.c_void_p), ("then", c.c_void_p), ("change", c.c_void_p),
+        ("node", c.c_void_p), ("supernode", c.c_void_p), ("marked", c.c_void_p), ("delta", c.c_void_p),
+        ("small", c.c_void_p), ("columns", c.c_void_p),
+    ]  # fmt: skip
+
+
 class Body(c.Structure):
     _fields_ = [
         ("first", c.c_int32), ("last", c.c_int32), ("settings", Settings), ("factor", c.c_void_p),
         ("mail", c.c_void_p), ("snapshot", c.c_void_p), ("snapshot_step", c.c_int64), ("ahead", c.c_double),
-        ("steps", c.c_int64), ("recycled", Recycled), ("noted", c.c_int64), ("made", c.c_int64),
-        ("warping", c.c_int32), ("unused", c.c_int32),
+        ("steps", c.c_int64), ("recycled", Recycled), ("correction", Correction), ("noted", c.c_int64),
+        ("made", c.c_int64), ("warping", c.c_int32), ("unused", c.c_int32),
     ]  # fmt: skip
 
 

@@ -122,6 +122,9 @@ class Simulation:
         native.budget, native.warm_start = solver.budget, int(solver.warm_start)
         if solver.recycle:
             self.engine.recycle(body.index, solver.recycle)
+        if solver.woodbury and solver.wants_factors and "touch" in body.effects and isinstance(self.engine, Engine):
+            double = solver.factor_precision == "float64"
+            self.engine.correct(body.index, solver.woodbury, self.system.diagonal, double)
         native.hold = int(body.index not in self.warped)  # in the frame that they begin with, the identity
         native.kind, native.omega = KINDS.get(solver.preconditioner, Kind.CHOLESKY), solver.omega
 

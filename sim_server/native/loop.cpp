@@ -110,6 +110,7 @@ void wf_assemble(Loop* loop) {
     }
     for (int i = 0; i < loop->bodies; ++i) {
         Body& body = loop->body[i];
+        note_changes(body.correction, rings.step, body.steps == 0);
         bool noted = body.settings.note != NOTE_COPIES || body.warping & NOTED;  // else it was asked for meanwhile
         if (noted) copy_for_worker(*loop, body);
         loop->warping[i] = body.warping & ~(NOTED | ADOPTED);  // further linearizations change nothing of that
@@ -142,7 +143,7 @@ static void finish_step(Loop* loop) {
         } else {
             BlockCsr A{body.first, body.last, loop->row_start, loop->columns, loop->values};
             r = pcg(A, loop->b + 3 * body.first, body.factor, settings, loop->y + 3 * body.first,
-                    loop->work + 45 * (int64_t)body.first, &body.recycled);
+                    loop->work + 45 * (int64_t)body.first, &body.recycled, &body.correction);
         }
         ++body.steps;
         if (!keep) continue;
@@ -195,6 +196,16 @@ Binding* wf_post_binding(Launch* launch, Binding* binding) { return launch->mail
 void wf_apply_factor(const Factor* factor, const double* r, double* z, double* work) {
     if (factor->bytes == 4) apply_factor(*factor->pattern, (const float*)factor->values, r, 1, z, (float*)work);
     else apply_factor(*factor->pattern, (const double*)factor->values, r, 1, z, work);
+}
+
+// The same of what a solve of a body with its factor would use now, corrected for changes of the diagonal. work: 2 n doubles.
+void wf_precondition(Loop* loop, int32_t index, const double* r, double* z, double* work) {
+    Body& body = loop->body[index];
+    take_factor(body);
+    BlockCsr A{body.first, body.last, loop->row_start, loop->columns, loop->values};
+    Preconditioner P{A, body.factor, CHOLESKY, nullptr, work, 1, nullptr, nullptr, &body.correction};
+    P.prepare();
+    P.apply(r, std::sqrt(dot(A.size(), r, r)), z);
 }
 
 int32_t wf_sizes(int32_t* sizes) {  // layouts, checked against the Python side

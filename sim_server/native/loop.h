@@ -29,6 +29,7 @@ struct Body {
     double ahead;                       // s: below 0 the copy is of A, else of x + ahead v
     int64_t steps;                      // solved so far
     Recycled recycled;
+    Correction correction;
     int64_t noted, made;                // steps, -1: none; noted last; of the factor that frames are reckoned from
     int32_t warping, unused;            // of the step under way (warping.h)
 };

@@ -98,7 +98,7 @@ static void solve(Loop& loop, int index) {
     BlockCsr A{body.first, body.last, loop.row_start, loop.columns, loop.values};
     SolveSettings settings = body.settings;
     settings.warm_start = settings.warm_start && search.linearizations == 0;  // the last step's is no guess for a correction
-    SolveResult r = pcg(A, loop.b + at, body.factor, settings, y, work, &body.recycled);
+    SolveResult r = pcg(A, loop.b + at, body.factor, settings, y, work, &body.recycled, &body.correction);
     search.residual = std::fmax(search.residual, r.residual);
     search.seconds += r.seconds;
     search.iterations += r.iterations;

@@ -13,19 +13,11 @@
 #include "block_csr.h"
 #include "recycle.h"
 #include "rings.h"
-#include "supernodal.h"
+#include "woodbury.h"
 
 enum Kind { NONE = 0, JACOBI = 1, BLOCK_JACOBI = 2, CHOLESKY = 3, SSOR = 4 };  // CHOLESKY: any factor
 enum Status { CONVERGED = 0, MAX_ITERATIONS = 1, BUDGET = 2, BREAKDOWN_MATRIX = 3, BREAKDOWN_PRECONDITIONER = 4, NOT_FINITE = 5,
               MAX_LINEARIZATIONS = 6 };  // of a step
-
-struct Factor {
-    const Pattern* pattern;
-    const void* values;
-    int64_t step;      // of the matrix it was made from
-    int32_t bytes;     // of a value: 4 or 8
-    int32_t unused;
-};
 
 struct SolveSettings {
     double tolerance;       // of |b|
@@ -55,8 +47,11 @@ struct Preconditioner {
     double omega;
     const Recycling* recycling = nullptr;
     double* turned = nullptr;  // n doubles, for those
+    Correction* correction = nullptr;
+    bool corrects = false;
 
     void prepare() {
+        corrects = kind == CHOLESKY && correction && correction->capacity && Corrected{*correction, A, *factor}.prepare();
         if (kind == JACOBI || kind == BLOCK_JACOBI || kind == SSOR) invert_diagonal(A, kind != JACOBI, inverse);
     }
     // z = P^-1 r; returns z . r
@@ -75,9 +70,9 @@ struct Preconditioner {
     void alone(const double* r, double r_norm, double* z) {
         int n = A.size();
         if (kind == CHOLESKY && factor->bytes == 4)
-            apply_factor(*factor->pattern, (const float*)factor->values, r, 1 / r_norm, z, (float*)work);
+            with_factor<float>(r, r_norm, z);
         else if (kind == CHOLESKY)
-            apply_factor(*factor->pattern, (const double*)factor->values, r, 1 / r_norm, z, (double*)work);
+            with_factor<double>(r, r_norm, z);
         else if (kind == SSOR)
             apply_ssor(A, inverse, omega, r, z);
         else if (kind == NONE)
@@ -85,11 +80,18 @@ struct Preconditioner {
         else
             apply_diagonal(n / 3, inverse, r, z);
     }
+    template <class T>
+    void with_factor(const double* r, double r_norm, double* z) {
+        const T* values = (const T*)factor->values;
+        auto correct = [&](T* y) { Corrected{*correction, A, *factor}.between(y); };
+        if (corrects) apply_factor(*factor->pattern, values, r, 1 / r_norm, z, (T*)work, correct);
+        else apply_factor(*factor->pattern, values, r, 1 / r_norm, z, (T*)work);
+    }
 };
 
-// work: 15 n doubles. x: start in, solution out. recycled: pairs of the last solves, or null.
+// work: 15 n doubles. x: start in, solution out. recycled: pairs of the last solves; correction: of the factor; or null.
 static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor, const SolveSettings& settings, double* x,
-                       double* work, Recycled* recycled = nullptr) {
+                       double* work, Recycled* recycled = nullptr, Correction* correction = nullptr) {
     double start = now();
     int n = A.size();
     double *r = work, *z = r + n, *p = z + n, *q = p + n, *inverse = q + n, *scratch = inverse + 3 * n;
@@ -121,7 +123,7 @@ static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor,
     }
     if (r2 <= goal) return finish(CONVERGED, r2, b2);
 
-    Preconditioner P{A, factor, out.kind, inverse, scratch, settings.omega, &recycling, turned};
+    Preconditioner P{A, factor, out.kind, inverse, scratch, settings.omega, &recycling, turned, correction};
     P.prepare();
     double rz = 0, last_true = INFINITY, quarter = r2 * std::pow(goal / r2, 0.25);
     bool restart = true, switched = false;

@@ -107,9 +107,10 @@ static void backward_panel(const Panel<T>& L, T* x, const int32_t* rows, const T
     }
 }
 
-// scale: 1 / |r|, so that a float factor neither overflows nor underflows. work: 2 size entries.
-template <class T>
-static void apply_factor(const Pattern& p, const T* values, const double* r, double scale, double* z, T* work) {
+// scale: 1 / |r|, so that a float factor neither overflows nor underflows. work: 2 size entries. between: what is done to
+// L^-1 P r.
+template <class T, class F>
+static void apply_factor(const Pattern& p, const T* values, const double* r, double scale, double* z, T* work, F between) {
     T *y = work, *scratch = work + p.size;
     for (int i = 0; i < p.size; ++i) y[i] = (T)(scale * r[p.permutation[i]]);
     for (int s = 0; s < p.supernodes; ++s) {
@@ -117,6 +118,7 @@ static void apply_factor(const Pattern& p, const T* values, const double* r, dou
         Panel<T> L{values + p.value_start[s], p.super_start[s + 1] - p.super_start[s], (int)(p.row_start[s + 1] - start)};
         forward_panel(L, y + p.super_start[s], p.rows + start, y, scratch);
     }
+    between(y);
     for (int s = p.supernodes - 1; s >= 0; --s) {
         int64_t start = p.row_start[s];
         Panel<T> L{values + p.value_start[s], p.super_start[s + 1] - p.super_start[s], (int)(p.row_start[s + 1] - start)};
@@ -124,4 +126,9 @@ static void apply_factor(const Pattern& p, const T* values, const double* r, dou
     }
     double back = 1 / scale;
     for (int i = 0; i < p.size; ++i) z[p.permutation[i]] = back * (double)y[i];
+}
+
+template <class T>
+static void apply_factor(const Pattern& p, const T* values, const double* r, double scale, double* z, T* work) {
+    apply_factor(p, values, r, scale, z, work, [](T*) {});
 }

@@ -111,6 +111,10 @@ class Solver(Parameters):
     recycle: int = Field(
         default=0, ge=0, le=64, description="directions of the last solves that correct a factor grown old; 0: none"
     )
+    woodbury: int = Field(
+        default=32, ge=0, le=64,
+        description="on a CPU: factors are corrected for grabs begun or ended since, of at most so many nodes; 0: none",
+    )  # fmt: skip
     build: Literal["server", "worker"] = Field(
         default="server", description="who assembles the matrices to factorize; worker: it is sent positions"
     )

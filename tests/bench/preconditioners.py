@@ -2,7 +2,8 @@
 """What every preconditioner costs and saves: bytes, time to make, time of an iteration, iterations.
 
 The heterogeneous beam of deploy/scenes, let go from horizontal, at two sizes. Factors are as old as they would be from
-a worker (lockstep, the deterministic twin of async), in the material frame.
+a worker (lockstep, the deterministic twin of async), in the material frame. And what grabs cost that a factor does not
+know, with and without the correction (_grabs.py).
 """
 
 from dataclasses import dataclass, field
@@ -16,11 +17,19 @@ from protocol.factor import Factor, FactorPattern
 from sim_server.driver import Driver
 from sim_server.guard import Guard
 from sim_server.simulation import Simulation
+from tests.bench._grabs import WAYS, Hand, grab_row, short
+from tests.bench._grabs import WORDS as WORDS_OF_GRABS
 from tests.bench._schemes import SCENES
 from tests.bench.report import Report, best_of, plots
 
 SIZES = {3150: (5, 5, 21), 24000: (10, 10, 40)}  # cells by number of tetrahedra
 NAMES = ("none", "jacobi", "block_jacobi", "ssor", "ssor_factor", "incomplete_cholesky", "cholesky")
+GRABS = (  # scene, cells, latencies, nodes, stiffnesses
+    ("beam", (5, 5, 20), (1, 3), (1, 4, 16, 32, 64), (0.1, 1.0, 100.0, 1e4)),
+    ("heterogeneous", (5, 5, 21), (3,), (1, 4, 16), (0.1, 1.0, 100.0, 1e4)),
+    ("beam", (10, 10, 40), (3,), (16,), (0.1, 1.0)),
+)
+QUICK_GRABS = (("beam", (2, 2, 8), (2,), (4,), (1.0, 100.0)),)
 WORDS = """\
 *sent MB*: a factor as it travels, values in float32 and, where it changes with the matrix, its pattern; *make*: its
 numeric factorization, the least of all; *iteration*: time of a solve over its iterations plus one, the least of all;
@@ -124,6 +133,17 @@ def main(
     report.figure(diagram(rows), "preconditioners.png", "Time of a solve and its iterations.")
     report.table(rows)
     report.say(WORDS)
+    grabs = [
+        grab_row(scene, cells, d, Hand(nodes, stiffness), rounds)
+        for scene, cells, latencies, counts, many in (QUICK_GRABS if quick else GRABS)
+        for d in latencies
+        for nodes in counts
+        for stiffness in many
+    ]
+    report.data["grabs"] = grabs
+    report.say("## Grabs", f"Iterations: {' / '.join(WAYS)}.")
+    report.table(short(grabs))
+    report.say(WORDS_OF_GRABS)
     report.write()
 
 

@@ -64,6 +64,7 @@ def test_defaults_and_resolved(tmp_path):
             "threads": 1,
             "warm_start": True,
             "recycle": 0,
+            "woodbury": 32,
             "build": "server",
             "extrapolate": 0.0,
             "update_floor_iterations": 3,
