@@ -55,7 +55,8 @@ struct Correction {
     void* columns;          // (3 nodes, width) V, in the values' type, only rows of its supernodes
 };
 
-constexpr double WEAK = 0.05;   // of the node's own block: less is left to the iteration
+constexpr double NOTHING = 0.004;              // of the node's own block: so much is no change
+constexpr double WEAK = 0.2, WEAK_EACH = 0.02;  // likewise, all changes together and their mean: less is left to the iteration
 constexpr double STIFF = 1e5;   // likewise: more is corrected as so much, which leaves one cluster of eigenvalues and no rounding;
                                 // of more that has gone 1e-4 stays
 constexpr double LEAST = 1e-6;  // pivot of G
@@ -189,18 +190,22 @@ private:
     }
 
     // The nodes of V; those that it has stay while no others are needed, as springs that are at their limit come and go.
-    // More than fit: none.
+    // False: more than fit, or too little to be worth it.
     bool choose() {
         if (c.count < 0) return false;
         int changed = 0, others = 0, chosen[MOST];
+        double together = 0;
         for (int i = 0; i < c.nodes; ++i) {
             const double delta = c.diagonal[i] - c.then[i];
-            if (delta == 0 || !(std::fabs(delta) > WEAK * (own(i) - std::fmax(delta, 0)))) continue;
+            if (delta == 0) continue;
+            const double share = std::fabs(delta) / (own(i) - std::fmax(delta, 0));
+            if (!(share > NOTHING)) continue;
+            together += share;
             others += std::find(c.node, c.node + c.count, i) == c.node + c.count;
             if (changed < c.capacity) chosen[changed] = i;
             ++changed;
         }
-        if (changed == 0 || changed > c.capacity) return false;
+        if (changed > c.capacity || together < WEAK || together < WEAK_EACH * changed) return false;
         if (others) {
             std::copy(chosen, chosen + changed, c.node);
             c.count = changed;
@@ -253,8 +258,9 @@ private:
             const T* v = V + (int64_t)row * w;
             for (int i = 0; i < 3 * c.count; ++i) {
                 const double f = v[i];
+                const int end = (i + 8) / 8 * 8;  // the lower triangle, in whole vectors
 #pragma omp simd
-                for (int j = 0; j < w; ++j) S[i * w + j] += f * v[j];
+                for (int j = 0; j < end; ++j) S[i * w + j] += f * v[j];
             }
         });
     }

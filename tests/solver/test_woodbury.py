@@ -72,7 +72,7 @@ def iterations(sim: Simulation) -> int:
     return int(record["iterations"])
 
 
-@pytest.mark.parametrize("stiffness", [1.0, 1e2, 1e4])
+@pytest.mark.parametrize("stiffness", [0.3, 1.0, 1e2, 1e4])
 @pytest.mark.parametrize("radius", [0.0, 0.6])
 def test_the_factor_of_the_matrix_before_is_corrected_to_the_inverse_of_the_one_after(stiffness, radius):
     sim, touch = touched(**EXACT)
@@ -271,3 +271,27 @@ def test_bodies_that_cannot_be_touched_and_the_option_off_take_no_room():
 def test_a_gpu_leaves_it_out():
     """No word of refusal, as it is on by default."""
     touched()[0].scene.solver.check_device("gpu")
+
+
+def test_factors_posted_again_at_the_same_steps_are_corrected_alike():
+    """As a replay does it, which asks for no matrices."""
+    options: dict[str, Any] = {"preconditioner": "cholesky", "update": "lockstep-3", "warp": True}
+    sims = [touched(**options) for _ in range(2)]
+    (sim, _), (other, _) = sims
+    driver, posted, records = Driver(sim), {}, []
+    driver.adopted = lambda factor: posted.setdefault(sim.engine.step, factor)
+    for step in range(14):
+        if step == 5:
+            for each, its in sims:
+                each.world.x[:] = sim.world.x
+                its.grab(
+                    "anna", "bar", tuple(END), 0.6, tuple(END + np.array((0, 0.1, 0))), 20 * spring(sim, 1.0), 0, 1e9
+                )
+        (record,) = driver.advance(1)
+        if step in posted:
+            other.engine.post_factor(0, posted[step].pattern, posted[step].values, posted[step].step)
+        other.engine.run(1)
+        records.append((record["iterations"], sim.engine.corrected(0)))
+        assert records[-1] == (other.engine.records()[0]["iterations"], other.engine.corrected(0))
+        assert np.array_equal(sim.world.x, other.world.x)
+    assert len(posted) > 3 and {corrected for _, corrected in records} > {0}

@@ -41,7 +41,7 @@ def recorded(folder: Path, solver: str = "", preconditioner: str = "cholesky", *
         with stage.client() as client:
             until(lambda: client.status().step > 5, "the simulation runs")
             client.push("beam", at=(0.5, 0.5, 4), force=(100, 0, 0), duration=0.3)
-            with client.grab("beam", (1, 1, 4), stiffness=2000, max_force=900) as held:
+            with client.grab("beam", (1, 1, 4), stiffness=1e5, max_force=9000) as held:
                 for k in range(25):
                     held.move((1 + 0.02 * k, 1, 4))
                     time.sleep(0.01)
