@@ -72,7 +72,7 @@ def iterations(sim: Simulation) -> int:
     return int(record["iterations"])
 
 
-@pytest.mark.parametrize("stiffness", [0.3, 1.0, 1e2, 1e4])
+@pytest.mark.parametrize("stiffness", [1.0, 1e2, 1e4])
 @pytest.mark.parametrize("radius", [0.0, 0.6])
 def test_the_factor_of_the_matrix_before_is_corrected_to_the_inverse_of_the_one_after(stiffness, radius):
     sim, touch = touched(**EXACT)
