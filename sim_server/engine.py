@@ -107,28 +107,29 @@ class Mailbox:
 
 
 class Newton:
-    """Memory of the search for the state at the end of a step (native/newton.h).
+    """What the search for the state at the end of a step (kernels/search.cuh) needs, and its memory on a CPU.
 
     options: of the scene, linearizations, trials, tolerance; reach [s]. parts: (bodies + 1,) items of each body, per
     assembling launch, or None where they are not told apart. arrays: rotation (n, 3, 3), mass (n,), beta (n,), ahead,
-    drift, carried (n, 3).
+    drift, carried (n, 3); on a GPU also settled (bodies,).
     """
 
     def __init__(
-        self, options: Integrator, reach: float, parts: Sequence[NDArray[np.int32] | None], **arrays: Reals
+        self, options: Integrator, reach: float, parts: Sequence[NDArray[np.int32] | None], **arrays: NDArray[Any]
     ):  # fmt: skip
-        self._arrays, self._parts = arrays, parts
-        self._room = np.zeros((18, len(arrays["mass"])))
-        self.native = layouts.Newton(options.linearizations, options.trials, options.tolerance, reach)
-        for name, array in {**arrays, "room": self._room}.items():
-            setattr(self.native, name, array.ctypes.data)
+        self.options, self.reach, self.parts, self.arrays = options, reach, parts, arrays
 
     def attach(self, loop: layouts.Loop, launches: Any) -> "Newton":
-        """To a loop and its launches."""
+        """To a loop of the CPU and its launches."""
+        self._room = np.zeros((18, len(self.arrays["mass"])))
         self._search = (layouts.Search * loop.bodies)()
+        options = self.options
+        self.native = layouts.Newton(options.linearizations, options.trials, options.tolerance, self.reach)
+        for name, array in {**self.arrays, "room": self._room}.items():
+            setattr(self.native, name, array.ctypes.data)
         self.native.search = self._search
         loop.newton = c.pointer(self.native)
-        for launch, part in zip(launches, self._parts, strict=False):
+        for launch, part in zip(launches, self.parts, strict=False):
             launch.parts = None if part is None else part.ctypes.data
         return self
 

@@ -19,8 +19,8 @@ beta K, and the solution dv = v' - v,
 
 where f has all forces but beta K v, which is in drift; then v += dv, x += c (ahead + dv). So a scheme is a few numbers:
 what it makes of dv for the next ahead and carried (kernels/schemes.cu). In backward Euler ahead and drift are v,
-nothing is carried, and the launches are those of kernels/nodes.cu. Newton-Raphson (native/newton.h) linearizes again at
-what came out: there ahead = 0.
+nothing is carried, and the launches are those of kernels/nodes.cu. Newton-Raphson (kernels/search.cuh) linearizes again
+at what came out: there ahead = 0.
 
 Order: 1, 2 (gamma = 1/2), 2. One linearization keeps it only where K is the exact slope of the forces; the usual
 tangent of corotational elements is not, by as much as they are strained.
@@ -112,18 +112,20 @@ class Integrator:
         )
         return [self._bind("prepare", of_v=0.0, **state), *assemble, begin]
 
-    def newton(self, assemble: list[Launch], effects: list[Effect]) -> Newton | None:
-        """Memory for several linearizations a step; None for one. assemble: the launches before the solve."""
+    def newton(self, assemble: list[Launch], effects: list[Effect], **arrays: Any) -> Newton | None:
+        """What several linearizations a step need; None for one. assemble: the launches that make all but the first.
+        arrays: more of them."""
         w, s = self.world, self.system
         if self.options.linearizations == 1:
             return None
         mass = w.mass if w.inertia else np.zeros(w.nodes)
+        w.backend.keep(mass)
         starts = np.array([*(b.first for b in w.bodies), w.nodes], dtype=np.int32)
         rows = [e.elements[:, 0] for e in effects if e.elements is not None]
         parts = [_parts(launch, starts, s.row, rows) for launch in assemble]
         return Newton(
             self.options, w.reach, parts, rotation=s.rotation, mass=mass, beta=self.beta, ahead=w.ahead, drift=w.drift,
-            carried=self.carried,
+            carried=self.carried, **arrays,
         )  # fmt: skip
 
     def _bind(self, kernel: str, **arguments: Any) -> Launch:

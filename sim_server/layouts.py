@@ -97,7 +97,7 @@ class Search(c.Structure):
         ("first", c.c_double), ("floor", c.c_double), ("last", c.c_double), ("slope", c.c_double),
         ("scale", c.c_double), ("norm", c.c_double), ("residual", c.c_double), ("seconds", c.c_double),
         ("phase", c.c_int32), ("linearizations", c.c_int32), ("tried", c.c_int32), ("iterations", c.c_int32),
-        ("status", c.c_int32), ("kind", c.c_int32), ("fallbacks", c.c_int32), ("unused", c.c_int32),
+        ("status", c.c_int32), ("kind", c.c_int32), ("fallbacks", c.c_int32), ("verdict", c.c_int32),
     ]  # fmt: skip
 
 

@@ -11,10 +11,12 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from sim_server.backend import Cpu, Launch
 from sim_server.effect import Effect, Refusal
 from sim_server.effects import effect
-from sim_server.engine import Engine, Kind
+from sim_server.engine import Engine, Kind, Newton
 from sim_server.equilibrium import check_held
 from sim_server.errors import DeviceError, InputError
 from sim_server.integrator import Integrator
@@ -62,7 +64,8 @@ class Simulation:
             gpu: Any = w.backend
             names = [b.name for b in w.bodies]
             planes = 2 if scene.solver.factor_precision == "float32" else 1
-            self.engine = GpuEngine(gpu, assemble, integrate, ranges, w.dt, names, planes=planes, **arrays)  # type: ignore[arg-type]
+            more = self._more(assemble)
+            self.engine = GpuEngine(gpu, assemble, integrate, ranges, w.dt, names, planes=planes, more=more, **arrays)  # type: ignore[arg-type]
         else:
             newton = self.integrator.newton(assemble, list(self.effects.values()))
             threads = scene.solver.threads
@@ -102,6 +105,18 @@ class Simulation:
             assemble.append(self.shape.launch(system.mean))
         assemble += system.finish()  # into the material frame (eq. 12 and 13)
         return assemble, [self.integrator.advance()]
+
+    def _more(self, assemble: list[Launch]) -> tuple[Newton, list[Launch]] | None:
+        """On a GPU, for further linearizations in a step: what they need, and what assembles it again."""
+        if self.scene.integrator.linearizations == 1:
+            return None
+        settled = np.zeros_like(self.system.warping)
+        self.world.backend.keep(settled)
+        finish = self.system.finish(settled)
+        again = [*assemble[: -len(finish)], *finish]
+        newton = self.integrator.newton(again, list(self.effects.values()), settled=settled)
+        assert newton is not None
+        return newton, again
 
     def _rotated(self) -> list[Body]:
         """Bodies whose rotations for the warp are those of elements."""

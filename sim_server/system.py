@@ -95,13 +95,17 @@ class System:
             mean=self.mean,
         )  # fmt: skip
 
-    def finish(self) -> list[Launch]:
-        """Everything into the material frame: A' = R^T A R, b' = R^T b, and the start of the solve."""
+    def finish(self, warping: Ints | None = None) -> list[Launch]:
+        """Everything into the material frame: A' = R^T A R, b' = R^T b, and the start of the solve.
+
+        warping: another array than that of the loop.
+        """
         w = self.world
         turn = self.world.backend.module("kernels/nodes.cu").bind(
-            "turn", w.nodes, free=w.free, body=self.body, warping=self.warping, place=self.own, mean=self.mean,
-            b=self.b, diagonal=self.diagonal, block=self.block, dv=self.dv, used=self.used, noted=self.noted,
-            rotation=self.rotation, b_material=self.b_material, y=self.y, values=self.values,
+            "turn", w.nodes, free=w.free, body=self.body, warping=self.warping if warping is None else warping,
+            place=self.own, mean=self.mean, b=self.b, diagonal=self.diagonal, block=self.block, dv=self.dv,
+            used=self.used, noted=self.noted, rotation=self.rotation, b_material=self.b_material, y=self.y,
+            values=self.values,
         )  # fmt: skip
         assemble = self.world.backend.module("kernels/assemble.cu").bind(
             "assemble", len(self.row), row=self.row, column=self.column, upper=self.upper, lower=self.lower,

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_server.backend import HERE, INCLUDE, Argument, CompileError, arguments_of, build_id, read_text
+from sim_server.backend import HERE, INCLUDE, Argument, CompileError, arguments_of, build_id, domain_of, read_text
 from sim_server.errors import DeviceError
 
 LEAST = 80  # compute capability times 10: the solver multiplies by matrix instructions that came with it
@@ -132,6 +132,11 @@ class DeviceLaunch:
     def fetch(self, name: str) -> NDArray[Any]:
         """One of its arrays as kernels have left it, copied."""
         return self.arrays[name].get()
+
+    @property
+    def domain(self) -> str:
+        """What its items are."""
+        return domain_of(self.text, self.struct)
 
     @property
     def mail_address(self) -> int:

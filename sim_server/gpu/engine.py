@@ -14,16 +14,18 @@ from numpy.typing import NDArray
 
 from protocol.factor import FactorPattern
 from sim_server.backend import HERE
-from sim_server.engine import ADOPTED, HELD, MOVED, NOTED
+from sim_server.engine import ADOPTED, HELD, MOVED, NOTED, Newton
 from sim_server.gpu.cuda import CudaDevice
 from sim_server.gpu.device import DeviceLaunch, Gpu
 from sim_server.gpu.fuse import End, Fused, fused
 from sim_server.gpu.intake import Intake
-from sim_server.gpu.layouts import STAMP, Mail
+from sim_server.gpu.layouts import FOUND, STAMP, Mail
 from sim_server.gpu.loop import CAPACITY, MANY, DeviceLoop
 from sim_server.gpu.mailbox import Mailbox
+from sim_server.gpu.search import Search, Turns
 from sim_server.gpu.solver import BODY, RESULT, SETTINGS, Solver
 
+FEW = 16  # trials in a step up to which MANY steps make one graph
 TICK = np.dtype(
     [
         ("clock", "u8"), ("step", "u8"), ("dt", "f8"), ("arrived", "u8"), ("finished", "u8"), ("stamps", "u8"),
@@ -83,7 +85,8 @@ class Settings:
 
 class GpuEngine(DeviceLoop):
     """Arguments as engine.Engine's, launches from Gpu.module. names: of the bodies, for messages. planes: float16
-    numbers that make an entry of a preconditioner (solver.py).
+    numbers that make an entry of a preconditioner (solver.py). more: for several linearizations a step, what they need
+    and the launches that assemble it again (search.py).
 
     Raises what Gpu.building translates.
     """
@@ -91,7 +94,7 @@ class GpuEngine(DeviceLoop):
     def __init__(
         self, gpu: Gpu, assemble: Sequence[DeviceLaunch], integrate: Sequence[DeviceLaunch],
         ranges: Sequence[tuple[int, int]], dt: float, names: Sequence[str] = (), records: int = 8192, planes: int = 1,
-        **arrays: NDArray[Any],
+        more: tuple[Newton, Sequence[DeviceLaunch]] | None = None, **arrays: NDArray[Any],
     ):  # fmt: skip
         self.gpu, self.launches, self._arrays = gpu, [*assemble, *integrate], arrays
         self._fused = fused(assemble)
@@ -101,7 +104,14 @@ class GpuEngine(DeviceLoop):
         self._counter = cp.zeros(1, np.int64)
         self._stamps = device.pinned(CAPACITY * STAMP.itemsize)
         self._results = device.pinned(CAPACITY * RESULT.itemsize * bodies)
-        self.solver = Solver(gpu, ranges, arrays, self._counter, CAPACITY, planes)
+        turns = Turns(gpu, bodies) if more else None
+        self.solver = Solver(
+            gpu, ranges, arrays, self._counter, CAPACITY, planes, (turns.left, turns.phase) if turns else ()
+        )
+        self._search, found = None, device.pinned(CAPACITY * FOUND.itemsize * bodies) if more else None
+        if more and turns and found is not None:
+            newton, again = more
+            self._search = Search(gpu, newton, again, ranges, arrays, turns, self.solver, self._counter, found)
         row, first = BODY.itemsize, self.solver.bodies_device
         boxes = [(first + row * k, SETTINGS) for k in range(bodies)]
         boxes += [(first + row * k + SETTINGS, row - SETTINGS) for k in range(bodies)]
@@ -112,9 +122,11 @@ class GpuEngine(DeviceLoop):
         self._warping = Warping(arrays["warping"])
         twins = {name: gpu.twin(arrays[name]) for name in ("values", "x", "v")}
         addresses = {name: int(twin.data.ptr) for name, twin in twins.items()}
+        if self._search:
+            addresses["values"] = int(self._search.first_values.data.ptr)
         super().__init__(
             device, ranges, arrays["row_start"], dt, boxes, self._results, self._stamps, arrays["clock"],
-            records, twins["values"].dtype, **addresses,
+            records, twins["values"].dtype, found, **addresses,
         )  # fmt: skip
         self._warping.mailbox = self.mailboxes[-1]
         names = names or [f"body {k}" for k in range(bodies)]
@@ -162,8 +174,12 @@ class GpuEngine(DeviceLoop):
             self.gpu.cp.cuda.get_current_stream().synchronize()
 
     def _capture(self) -> None:
+        many = self._search is None or self._search.rounds <= FEW
         for begin in (False, True):
             for steps in (1, MANY):
+                if steps > 1 and not many:
+                    self._graphs.append(None)
+                    continue
                 with self._steps:
                     self._steps.begin_capture()
                     if begin:
@@ -171,7 +187,7 @@ class GpuEngine(DeviceLoop):
                     for _ in range(steps):
                         self._one_step()
                     self._graphs.append(self._steps.end_capture())
-        self.use_graphs([int(graph.graphExec) for graph in self._graphs])
+        self.use_graphs([int(graph.graphExec) if graph else 0 for graph in self._graphs])
 
     def _begin(self) -> None:
         """Notes the time: the device has had nothing to do until now."""
@@ -185,7 +201,7 @@ class GpuEngine(DeviceLoop):
 
     def _finish_step(self) -> None:
         """Solve, integrate, count."""
-        self.solver.launch()
+        (self._search or self.solver).launch()
         self._last()
 
     def assemble(self) -> None:

@@ -11,7 +11,7 @@ finds out for each item whether it is among its own (`node`, ascending).
 """
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -56,18 +56,34 @@ class End(NamedTuple):
     params: NDArray[Any]
 
 
+class Guard(NamedTuple):
+    """Addresses of what says whether a launch of a step with several linearizations has anything to do (search.cu):
+    left (1,), phase (bodies,), and the body of each item (items,), 0 where it is not known."""
+
+    left: int
+    phase: int
+    body: int
+
+    LINES = (
+        "if (*left == 0) return;",
+        "if (body && !__syncthreads_or(threadIdx.x < BLOCK_ITEMS && blockIdx.x * BLOCK_ITEMS + threadIdx.x < n &&",
+        "                              phase[body[blockIdx.x * BLOCK_ITEMS + threadIdx.x]] != 2)) return;",
+    )
+
+
 class Fused:
     """Several launches over the same items as one. private: addresses of arrays that need no memory (`own`)."""
 
     def __init__(
-        self, launches: Sequence[DeviceLaunch], end: End | None = None, private: frozenset[int] = frozenset()
+        self, launches: Sequence[DeviceLaunch], end: End | None = None, private: frozenset[int] = frozenset(),
+        guard: Guard | None = None,
     ):  # fmt: skip
         self.name = "+".join(launch.name for launch in launches)
         self.items = next(launch.items for launch in launches if not launch.mailed)
         sums = any(launch.sums for launch in launches)
         self.shape = shape(domain(launches[0]) if sums else "elements", self.items, processors())
         self._launches = list(launches)  # keeps their arrays
-        text = Text(launches, self.shape, end, private)
+        text = Text(launches, self.shape, end, private, guard)
         self._arguments = (np.int32(self.items), *text.values, *([end.params] if end else []))
         self._module = cupy().RawModule(code=text.source, options=options(launches[0].types), backend="nvrtc")
         self._function = self.function("fused")
@@ -88,16 +104,17 @@ class Text:
     """The kernel `fused` of some launches: its source, and the values of its arguments after the number of items.
 
     Each array is one argument, whatever launches have it, and no other overlaps it: that tells the compiler what it
-    may keep in registers from one launch to the next. private: addresses of arrays that need no memory at all.
+    may keep in registers from one launch to the next. private: addresses of arrays that need no memory at all. guard:
+    thread blocks without an item of a body whose search is not over return at once.
     """
 
     def __init__(
         self, launches: Sequence[DeviceLaunch], shape: Shape, end: End | None = None,
-        private: frozenset[int] = frozenset(),
+        private: frozenset[int] = frozenset(), guard: Guard | None = None,
     ):  # fmt: skip
-        self.values: list[Any] = []
         self._launches, self._private = launches, private
-        self._parameters: list[str] = []
+        self.values: list[Any] = [np.uint64(address) for address in guard or ()]
+        self._parameters = [f"const int* __restrict__ {name}" for name in guard._fields] if guard else []
         self._setup: list[str] = []
         self._names: dict[int, str] = {}
         texts = {launch.text: f"text{k}" for k, launch in enumerate(launches)}
@@ -119,7 +136,8 @@ class Text:
             body_lines.append(f"{end.struct.lower()}(end);")
         heading = f'extern "C" __global__ void __launch_bounds__({shape.threads}) fused(int n'
         parameters = "".join(f", {p}" for p in self._parameters)
-        lines += [f"{heading}{parameters}) {{", *self._setup, *body_lines, "}"]
+        first = guard.LINES if guard else ()
+        lines += [f"{heading}{parameters}) {{", *first, *self._setup, *body_lines, "}"]
         self.source = "\n".join(lines)
 
     def _each(self) -> Iterator[tuple[int, DeviceLaunch, str, str]]:
@@ -212,12 +230,16 @@ class Text:
             yield f.name, rows[address]
 
 
-def fused(launches: Sequence[DeviceLaunch]) -> list[Any]:
-    """The launches in as few kernels as their domains allow."""
+def fused(
+    launches: Sequence[DeviceLaunch], guard: Callable[[Sequence[DeviceLaunch]], Guard] | None = None
+) -> list[Any]:
+    """The launches in as few kernels as their domains allow. guard: makes that of those in one kernel."""
     if any(domain(launch) not in DOMAINS for launch in launches):
         return list(launches)
     together = [group for d in DOMAINS for group in _alike([x for x in launches if domain(x) == d])]
-    return [Fused(group, None, _private(group, launches)) for group in together if group]
+    return [
+        Fused(group, None, _private(group, launches), guard(group) if guard else None) for group in together if group
+    ]
 
 
 def _alike(launches: Sequence[DeviceLaunch]) -> list[list[DeviceLaunch]]:

@@ -76,15 +76,19 @@ static void report(Loop& l, const Batch& batch, int64_t k, double end, double cp
     Rings& rings = l.rings;
     const Stamp &stamp = l.stamps[(batch.first + k) % l.capacity];
     const Stamp &last = l.stamps[(batch.first + batch.steps - 1) % l.capacity];
-    const Result* results = l.results + (batch.first + k) % l.capacity * l.bodies;
+    const int64_t slot = (batch.first + k) % l.capacity * l.bodies;
+    const Result* results = l.results + slot;
+    const Found once{-1, 1, 0};
     int64_t step = batch.first + k + 1, head = rings.record_head.load();
     bool keep = room_for_records(rings, l.bodies, [&] { publish(l); });
     for (int i = 0; keep && i < l.bodies; ++i) {
         const Result& r = results[i];
+        const Found& found = l.found ? l.found[slot + i] : once;
         rings.records[(head + i) % rings.record_capacity] =
             Record{step, r.factor_step, rings.start_time + step * rings.dt, r.residual, 0, r.seconds, 0,
-                   1e-9 * (stamp.end - stamp.begin), k ? 0 : batch.late, end - 1e-9 * (last.end - stamp.begin), cpu, -1, i,
-                   r.iterations, r.status, r.kind, r.asked, r.fallbacks, r.bad_node, r.probe, 1, r.warping};
+                   1e-9 * (stamp.end - stamp.begin), k ? 0 : batch.late, end - 1e-9 * (last.end - stamp.begin), cpu,
+                   found.nonlinear, i, r.iterations, r.status, r.kind, r.asked, r.fallbacks, r.bad_node, r.probe,
+                   found.linearizations, r.warping};
     }
     rings.step.store(step);
     *l.clock = rings.start_time + step * rings.dt;
@@ -158,7 +162,7 @@ int32_t wf_gpu_close(Loop* loop) {
 Mail* wf_gpu_post(Mailbox* box, Mail* mail) { return box->mail.exchange(mail); }
 
 int32_t wf_gpu_sizes(int32_t* sizes) {  // layouts, checked against the Python side
-    int32_t ours[] = {sizeof(Cuda), sizeof(Mail), sizeof(Mailbox), sizeof(Result), sizeof(Stamp), sizeof(Body),
+    int32_t ours[] = {sizeof(Cuda), sizeof(Mail), sizeof(Mailbox), sizeof(Result), sizeof(Stamp), sizeof(Found), sizeof(Body),
                       sizeof(Loop), sizeof(Record)};
     std::memcpy(sizes, ours, sizeof ours);
     return sizeof ours / sizeof *ours;

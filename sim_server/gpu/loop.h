@@ -42,6 +42,8 @@ struct Result {                 // solve.cuh
     int32_t iterations, status, kind, asked, fallbacks, bad_node, probe, warping;
 };
 
+struct Found { double nonlinear; int32_t linearizations, unused; };  // search.cu
+
 struct Stamp { int64_t begin, end; };  // of a step, ns of the device's clock
 
 struct Body {
@@ -73,6 +75,7 @@ struct Loop {
     int32_t mailboxes, bodies;
     const Result* results;             // (capacity, bodies) pinned; the steps write there themselves
     const Stamp* stamps;               // (capacity,) likewise
+    const Found* found;                // (capacity, bodies) likewise; null: one linearization a step
     int64_t capacity, batch;           // batch: most steps in one; divides the capacity
     Address values, staged;            // A of all bodies, and as much room beside
     char* matrices;                    // ... and on the host, pinned

@@ -7,7 +7,7 @@ from typing import Any
 
 from sim_server.backend import native
 from sim_server.gpu import layouts
-from sim_server.gpu.layouts import STAMP
+from sim_server.gpu.layouts import FOUND, STAMP
 from sim_server.layouts import RECORD, check_sizes
 
 
@@ -24,13 +24,13 @@ def library() -> c.CDLL:
             "wf_gpu_sizes": (c.c_int32, [p]),
         },
     )  # fmt: skip
-    sizes = (c.c_int32 * 8)()
+    sizes = (c.c_int32 * 9)()
     compiled.wf_gpu_sizes(sizes)
     from sim_server.gpu.solver import RESULT
 
     structures = (layouts.Cuda, layouts.Mail, layouts.Mailbox)
-    ours = [*map(c.sizeof, structures), RESULT.itemsize, STAMP.itemsize, c.sizeof(layouts.Body)]
-    check_sizes("gpu/loop.cpp", list(sizes), [*ours, c.sizeof(layouts.Loop), RECORD.itemsize])
+    ours = [*map(c.sizeof, structures), RESULT.itemsize, STAMP.itemsize, FOUND.itemsize]
+    check_sizes("gpu/loop.cpp", list(sizes), [*ours, c.sizeof(layouts.Body), c.sizeof(layouts.Loop), RECORD.itemsize])
     return compiled
 
 

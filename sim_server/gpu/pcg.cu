@@ -392,7 +392,16 @@ __device__ __forceinline__ void solve_body(const Solve& s, const Share& share) {
     __syncthreads();
 }
 
-extern "C" __global__ void __launch_bounds__(THREADS, PER_PROCESSOR) pcg(const Solve s) {
+#ifdef SEARCHED  // a launch of a step with several linearizations: for the bodies in phase 0 alone (search.cu)
+#define TURNS , const int* __restrict__ left, const int* __restrict__ phase
+#else
+#define TURNS
+#endif
+
+extern "C" __global__ void __launch_bounds__(THREADS, PER_PROCESSOR) pcg(const Solve s TURNS) {
+#ifdef SEARCHED
+    if (*left == 0) return;
+#endif
     for (int next = s.own_share[blockIdx.x];; next = -1) {
         if (next < 0) {  // the next one of those that any block may take
             if (threadIdx.x == 0) memory.next = s.pooled > 0 ? atomicAdd(s.arrived, 1) : s.pooled;
@@ -400,6 +409,12 @@ extern "C" __global__ void __launch_bounds__(THREADS, PER_PROCESSOR) pcg(const S
             if (memory.next >= s.pooled) return;
             next = s.bodies[s.order[s.count - s.pooled + memory.next]].share;
         }
+#ifdef SEARCHED
+        if (phase[s.shares[next].body] != 0) {
+            __syncthreads();  // all have read memory.next
+            continue;
+        }
+#endif
         solve_body(s, s.shares[next]);
     }
 }

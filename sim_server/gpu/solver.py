@@ -53,7 +53,8 @@ class Solver:
 
     ranges: nodes [first, last) of each body. arrays: host arrays by name (row_start, columns, values, b, y, warping),
     solved for their twins. counter: device array (1,) of completed steps. capacity: steps whose results are kept.
-    planes: 1 for a preconditioner in float16, 2 for one of 22 bits.
+    planes: 1 for a preconditioner in float16, 2 for one of 22 bits. turns: for several linearizations a step, device
+    arrays `left` and `phase` (search.py).
 
     bodies: host rows (BODY), one per body; whoever runs the loop uploads them, settings (the first SETTINGS bytes) and
     factor (the rest) apart. results: device ring (capacity, bodies) of RESULT. arrived: zero at launch.
@@ -62,10 +63,10 @@ class Solver:
 
     def __init__(
         self, gpu: Gpu, ranges: Sequence[tuple[int, int]], arrays: Mapping[str, NDArray[Any]], counter: Any,
-        capacity: int, planes: int = 1,
+        capacity: int, planes: int = 1, turns: Sequence[Any] = (),
     ):  # fmt: skip
         cp, processors = gpu.cp, gpu.properties["multiProcessorCount"]
-        self.gpu, self._capacity, self.planes = gpu, capacity, planes
+        self.gpu, self.counter, self._capacity, self.planes, self._turns = gpu, counter, capacity, planes, turns
         self._twins = {name: gpu.twin(arrays[name]) for name in ("row_start", "values", "b", "y", "warping")}
         self.real = np.dtype(self._twins["values"].dtype)
         spans = np.array(ranges, np.int64)
@@ -117,7 +118,7 @@ class Solver:
             code=(HERE / "gpu/pcg.cu").read_text(),
             options=(
                 *options({"real": "float" if self.real == np.float32 else "double"}), f"-I{HERE / 'gpu'}",
-                *(f"-D{name}={number}" for name, number in numbers.items()),
+                *(f"-D{name}={number}" for name, number in numbers.items()), *(["-DSEARCHED"] if self._turns else []),
             ),
             backend="nvrtc",
             enable_cooperative_groups=True,
@@ -126,7 +127,8 @@ class Solver:
 
     def launch(self) -> None:
         """Puts a solve onto the current stream."""
-        self._function((self.grid,), (self.threads,), (self._params,), shared_mem=self._shared)
+        turns = (np.uint64(array.data.ptr) for array in self._turns)
+        self._function((self.grid,), (self.threads,), (self._params, *turns), shared_mem=self._shared)
 
     def planned(self, body: int, pattern: FactorPattern) -> Planned:
         """How the inverse of factors of this pattern is shared out for a body. Raises ValueError if it cannot be."""

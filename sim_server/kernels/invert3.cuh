@@ -1,10 +1,6 @@
 // SPDX-License-Identifier: MIT
 #pragma once
-#ifdef __CUDACC_RTC__
-#define ANYWHERE __device__ __forceinline__
-#else
-#define ANYWHERE static inline
-#endif
+#include "anywhere.cuh"
 
 // v = inverse of the symmetric 3x3 block a, row major; whole = false: of its diagonal alone.
 template <class T>

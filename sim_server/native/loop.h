@@ -2,6 +2,7 @@
 // Memory of the simulation loop (loop.cpp). layouts.py holds the same layouts.
 #pragma once
 #include "pcg.h"
+#include "search.cuh"
 
 typedef void (*Kernel)(const void* params, int begin, int end);
 
@@ -34,22 +35,8 @@ struct Body {
     int32_t warping, unused;            // of the step under way (warping.h)
 };
 
-enum Phase { SOLVE = 0, TRY = 1, DONE = 2 };
-
-struct Search {                        // for the state at the end of a step, of one body
-    double first;                      // |b| of the first linearization
-    double floor;                      // rounding of b
-    double last, slope;                // |b| and way . b at the present linearization
-    double scale;                      // of the way that is tried
-    double norm;                       // |b| at what is tried
-    double residual, seconds;          // largest of the solves; of all
-    int32_t phase, linearizations, tried;
-    int32_t iterations, status, kind, fallbacks, unused;
-};
-
 struct Newton {                        // several linearizations a step (newton.h)
-    int32_t linearizations, trials;    // most of them in a step; of shorter ways in a line search
-    double tolerance;                  // of the first |b|
+    Limits most;
     double reach;                      // dx / dv [s]
     const double* rotation;            // (nodes, 3, 3)
     const double* mass;                // (nodes,) in A [kg]

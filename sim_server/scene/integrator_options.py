@@ -8,6 +8,7 @@ from pydantic import Field, model_validator
 from sim_server.errors import InputError
 from sim_server.scene.parameters import Parameters, complaint
 
+ROUNDS = 1024  # of a step on a GPU, whose graph has them all
 SchemeName = Literal["backward_euler", "newmark", "bdf2", "quasi_static"]
 
 
@@ -55,7 +56,15 @@ class Integrator(Parameters):
             return beta * dt / gamma
         return self.impulse(dt)
 
+    @property
+    def rounds(self) -> int:
+        """Trials that a step has, at most."""
+        return self.linearizations * (1 + self.trials)
+
     def check_device(self, device: str) -> None:
         """Raises InputError for what the device ("cpu" or "gpu") does not have."""
-        if device == "gpu" and self.linearizations > 1:
-            raise InputError(f"integrator.linearizations = {self.linearizations}: must be 1 on a GPU")
+        if device == "gpu" and self.linearizations > 1 and self.rounds > ROUNDS:
+            raise InputError(
+                f"integrator.linearizations = {self.linearizations} with trials = {self.trials}: a step on a GPU holds "
+                f"them all, {self.rounds}; allowed: linearizations * (1 + trials) up to {ROUNDS}"
+            )
