@@ -104,14 +104,12 @@ class GpuEngine(DeviceLoop):
         self._counter = cp.zeros(1, np.int64)
         self._stamps = device.pinned(CAPACITY * STAMP.itemsize)
         self._results = device.pinned(CAPACITY * RESULT.itemsize * bodies)
-        turns = Turns(gpu, bodies) if more else None
-        self.solver = Solver(
-            gpu, ranges, arrays, self._counter, CAPACITY, planes, (turns.left, turns.phase) if turns else ()
-        )
-        self._search, found = None, device.pinned(CAPACITY * FOUND.itemsize * bodies) if more else None
-        if more and turns and found is not None:
-            newton, again = more
-            self._search = Search(gpu, newton, again, ranges, arrays, turns, self.solver, self._counter, found)
+        turns = Turns.of(gpu, bodies) if more else None
+        self.solver = Solver(gpu, ranges, arrays, self._counter, CAPACITY, planes, turns or ())
+        self._search, found = None, None
+        if more and turns:
+            found = device.pinned(CAPACITY * FOUND.itemsize * bodies)
+            self._search = Search(gpu, *more, ranges, arrays, turns, self.solver, found)
         row, first = BODY.itemsize, self.solver.bodies_device
         boxes = [(first + row * k, SETTINGS) for k in range(bodies)]
         boxes += [(first + row * k + SETTINGS, row - SETTINGS) for k in range(bodies)]

@@ -64,11 +64,12 @@ class Guard(NamedTuple):
     phase: int
     body: int
 
-    LINES = (
-        "if (*left == 0) return;",
-        "if (body && !__syncthreads_or(threadIdx.x < BLOCK_ITEMS && blockIdx.x * BLOCK_ITEMS + threadIdx.x < n &&",
-        "                              phase[body[blockIdx.x * BLOCK_ITEMS + threadIdx.x]] != 2)) return;",
-    )
+
+GUARD = [
+    "if (*left == 0) return;",
+    "if (body && !__syncthreads_or(threadIdx.x < BLOCK_ITEMS && blockIdx.x * BLOCK_ITEMS + threadIdx.x < n &&",
+    "                              phase[body[blockIdx.x * BLOCK_ITEMS + threadIdx.x]] != 2)) return;",
+]
 
 
 class Fused:
@@ -136,7 +137,7 @@ class Text:
             body_lines.append(f"{end.struct.lower()}(end);")
         heading = f'extern "C" __global__ void __launch_bounds__({shape.threads}) fused(int n'
         parameters = "".join(f", {p}" for p in self._parameters)
-        first = guard.LINES if guard else ()
+        first = GUARD if guard else []
         lines += [f"{heading}{parameters}) {{", *first, *self._setup, *body_lines, "}"]
         self.source = "\n".join(lines)
 
