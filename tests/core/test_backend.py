@@ -199,7 +199,7 @@ def test_every_text_of_the_package_compiles_for_gpus(path, arch, tmp_path):
         pytest.skip("needs the package nvidia-cuda-nvrtc")
     own = path.startswith("gpu/")
     for name, types in PRECISIONS.items():
-        if name == "mixed" and own:
+        if name == "mixed" and own and "local*" not in backend.read_text(path)[1]:
             continue  # the same: they know no elements
         options = nvrtc.arch(arch, "max" if own else "mid")
         options += [*device_options(types), f"-I{PACKAGE / 'gpu'}"]  # as they are compiled there
@@ -303,6 +303,28 @@ def test_launches_put_together_compile_in_every_precision(group, real, local, tm
     text = tmp_path / "together.cu"
     text.write_text(made.source)
     options = ["-arch=sm_90", "-std=c++17", f"-Dreal={real}", f"-Dlocal={local}", f"-I{backend.INCLUDE}"]
+    code, said = nvrtc.compiled(library, text, options)
+    assert len(code) > 1000 and not said, said
+
+
+@pytest.mark.parametrize("group", [OTHER_SCHEME, BLOCKS], ids=["nodes", "blocks"])
+def test_what_lets_further_linearizations_return_comes_in_front_and_changes_nothing_else(group, tmp_path):
+    if (library := nvrtc.library()) is None:
+        pytest.skip("needs the package nvidia-cuda-nvrtc")
+    launches = [_launch(*given) for given in group]
+    private = fuse._private(launches, launches)  # type: ignore[arg-type]
+    plain, guarded = (
+        fuse.Text(launches, fuse.Shape(64, 4), None, private, guard)  # type: ignore[arg-type]
+        for guard in (None, fuse.Guard(64, 128, 192))
+    )
+    before, after = plain.source.split("fused(int n"), guarded.source.split("fused(int n")
+    arguments = ", const int* __restrict__ left, const int* __restrict__ phase, const int* __restrict__ body"
+    assert "".join(["\n", *(f"{line}\n" for line in fuse.GUARD)]) in after[1]
+    assert after[1].replace(arguments, "").replace("\n".join(fuse.GUARD) + "\n", "") == before[1]
+    assert before[0] == after[0] and guarded.values == [64, 128, 192, *plain.values]
+    text = tmp_path / "guarded.cu"
+    text.write_text(guarded.source)
+    options = ["-arch=sm_90", "-std=c++17", "-Dreal=double", "-Dlocal=double", f"-I{backend.INCLUDE}"]
     code, said = nvrtc.compiled(library, text, options)
     assert len(code) > 1000 and not said, said
 

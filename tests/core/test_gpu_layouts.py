@@ -9,18 +9,20 @@ import pytest
 from sim_server.backend import HERE
 from sim_server.gpu.device import PRECISIONS
 from sim_server.gpu.device import options as device_options
+from sim_server.gpu.layouts import FOUND
 from sim_server.gpu.planned import PLAN
+from sim_server.gpu.search import LANES, SEARCH, SEARCHING, SPAN, STRETCH, bodies_of, stretches
 from sim_server.gpu.shares import SHARE
 from sim_server.gpu.solver import BODY, RESULT, SOLVE, threads_and_blocks
 from tests.core import nvrtc
 
 SIZES = {"int": 4, "unsigned": 4, "float": 4, "double": 8, "long long": 8}
-TEXT = (HERE / "gpu/solve.cuh").read_text()
+TEXTS = "".join((HERE / name).read_text() for name in ("gpu/solve.cuh", "gpu/search.cu", "kernels/search.cuh"))
 
 
 def fields(name: str) -> list[tuple[str, int]]:
     """Names and bytes of a struct's fields, pointers 8."""
-    body = re.search(rf"struct (?:__align__\(\d+\) )?{name} \{{(.*?)\}};", TEXT, re.DOTALL)
+    body = re.search(rf"struct (?:__align__\(\d+\) )?{name} \{{(.*?)\}};", TEXTS, re.DOTALL)
     assert body, name
     found = []
     for line in re.sub(r"//.*", "", body[1]).split(";"):
@@ -36,21 +38,27 @@ def fields(name: str) -> list[tuple[str, int]]:
 
 
 @pytest.mark.parametrize(
-    ("name", "layout"), [("Plan", PLAN), ("Body", BODY), ("Result", RESULT), ("Solve", SOLVE), ("Share", SHARE)]
-)
+    ("name", "layout"),
+    [
+        ("Plan", PLAN), ("Body", BODY), ("Result", RESULT), ("Solve", SOLVE), ("Share", SHARE), ("Stretch", SPAN),
+        ("Found", FOUND), ("Search", SEARCH), ("Searching", SEARCHING),
+    ],
+)  # fmt: skip
 def test_both_sides_agree(name: str, layout: np.dtype) -> None:
     assert layout.names is not None
     ours = [(n, layout[n].itemsize) for n in layout.names]
     assert fields(name) == ours
 
 
-@pytest.mark.parametrize(("threads", "blocks"), [(256, 1), (128, 2), (64, 4)])
-def test_the_solver_spills_no_registers(threads, blocks):
+@pytest.mark.parametrize(
+    ("threads", "blocks", "more"), [(256, 1, []), (128, 2, []), (64, 4, []), (64, 4, ["-DSEARCHED"])]
+)
+def test_the_solver_spills_no_registers(threads, blocks, more):
     """What does not fit into registers would cost a trip through L2 in each phase: it did, and doubled the time."""
     if (library := nvrtc.library()) is None:
         pytest.skip("needs the package nvidia-cuda-nvrtc")
     options = [*device_options(PRECISIONS["float64"]), f"-I{HERE / 'gpu'}", "--ptxas-options=-v"]
-    options += [f"-DTHREADS={threads}", f"-DPER_PROCESSOR={blocks}", "-arch=sm_90"]
+    options += [f"-DTHREADS={threads}", f"-DPER_PROCESSOR={blocks}", "-arch=sm_90", *more]
     code, said = nvrtc.compiled(library, HERE / "gpu/pcg.cu", options)
     spilled = [int(n) for n in re.findall(r"(\d+) bytes (?:stack frame|spill stores|spill loads)", said)]
     assert code and spilled and max(spilled) <= 32, said
@@ -60,3 +68,34 @@ def test_thread_blocks_take_all_registers():
     for bodies, nodes in ((1, 720), (400, 720), (1000, 160)):
         threads, blocks = threads_and_blocks(np.full(bodies, nodes), 132)
         assert (threads, blocks) in ((256, 1), (128, 2), (64, 4)) and threads * blocks == 256
+
+
+@pytest.mark.parametrize("arch", ["sm_80", "sm_90"])
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_the_search_compiles_with_the_layouts_of_this_side_and_spills_no_registers(precision, arch):
+    if (library := nvrtc.library()) is None:
+        pytest.skip("needs the package nvidia-cuda-nvrtc")
+    sizes = {"SEARCHING": SEARCHING, "SEARCH": SEARCH, "STRETCH": SPAN, "FOUND": FOUND}
+    options = [*device_options(PRECISIONS[precision]), f"-I{HERE / 'gpu'}", "--ptxas-options=-v", f"-arch={arch}"]
+    options += [f"-D{name}_BYTES={layout.itemsize}" for name, layout in sizes.items()]
+    code, said = nvrtc.compiled(library, HERE / "gpu/search.cu", options)
+    spilled = [int(n) for n in re.findall(r"(\d+) bytes (?:stack frame|spill stores|spill loads)", said)]
+    assert code and len(spilled) >= 12 and max(spilled) == 0, said
+
+
+def test_the_nodes_of_a_body_are_shared_out_in_stretches():
+    text = (HERE / "gpu/search.cu").read_text()
+    assert f"STRETCH = {STRETCH}, LANES = {LANES}," in text
+    found, start = stretches(np.array([[0, 1], [1, 1 + 2 * STRETCH], [1 + 2 * STRETCH, 5 + 3 * STRETCH]]))
+    assert start.tolist() == [0, 1, 3, 5]
+    assert found["body"].tolist() == [0, 1, 1, 2, 2]
+    nodes = [n for row in found for n in range(row["first"], row["last"])]
+    assert nodes == list(range(5 + 3 * STRETCH)) and (found["last"] - found["first"]).max() == STRETCH
+
+
+def test_the_body_of_each_item_is_known_where_all_launches_agree():
+    start = np.array([0, 2, 2, 5], np.int32)
+    found = bodies_of([start, start.copy()])
+    assert found is not None and found.tolist() == [0, 0, 2, 2, 2] and found.dtype == np.int32
+    assert bodies_of([start, None]) is None and bodies_of([start, start + 0 * start + [0, 1, 0, 0]]) is None
+    assert bodies_of([]) is None and bodies_of([np.zeros(3, np.int32)]) is None

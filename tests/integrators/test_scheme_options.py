@@ -39,11 +39,12 @@ def test_mistakes_are_told(tmp_path, table):
         load(path)
 
 
-def test_on_a_gpu_there_is_one_linearization():
-    Integrator(scheme="bdf2").check_device("gpu")
-    Integrator(linearizations=3).check_device("cpu")
-    with pytest.raises(InputError, match=r"integrator.linearizations = 3: must be 1 on a GPU"):
-        Integrator(linearizations=3).check_device("gpu")
+def test_a_gpu_has_room_for_so_many_trials():
+    Integrator(scheme="bdf2", trials=100).check_device("gpu")
+    Integrator(linearizations=113).check_device("gpu")
+    Integrator(linearizations=300).check_device("cpu")
+    with pytest.raises(InputError, match=r"linearizations = 114 with trials = 8: .* 1026; allowed: .* up to 1024"):
+        Integrator(linearizations=114).check_device("gpu")
 
 
 def test_the_default_has_the_launches_of_backward_euler_alone():
