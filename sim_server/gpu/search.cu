@@ -210,7 +210,7 @@ extern "C" __global__ void __launch_bounds__(ALL_LANES) move(const Searching p) 
             place(p, i, 1);
         }
     } else if (mine) {
-        for (int k = 3 * i; k < 3 * i + 3; ++k) p.gain[k] = first ? 0 : gain_after(search, p.gain[k], p.way[k]);
+        for (int k = 3 * i; k < 3 * i + 3; ++k) p.gain[k] = gain_after(search, p.gain[k], p.way[k]);
     }
     if (!sum_body<ALL_LANES>(p, here.body, sum)) return;
     note_solve(search, r.residual, r.seconds, r.iterations, r.fallbacks, r.kind, r.status);

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from sim_server.errors import DeviceLost
-from sim_server.gpu.loop import BATCH, FRAMES
+from sim_server.gpu.layouts import FOUND
+from sim_server.gpu.loop import BATCH, CAPACITY, FRAMES
 from tests.core.fake_cuda import NOT_READY, FakeScene, number
 
 
@@ -38,6 +39,21 @@ def test_every_step_is_reported_once_and_in_order():
     assert (records["solve"] == 1e-6).all()
     assert scene.done == scene.loop.step == 300
     assert scene.clock[0] == 150.0
+
+
+def test_what_a_search_has_come_to_is_reported_where_there_is_one():
+    once, often = FakeScene(bodies=2), FakeScene(bodies=2)
+    found = np.zeros((CAPACITY, 2), FOUND)
+    found["linearizations"], found["nonlinear"] = np.arange(2 * CAPACITY).reshape(-1, 2), 0.5
+    often.loop.loop.found = found.ctypes.data
+    for scene in (once, often):
+        scene.loop.run(100)
+    records = often.loop.records()
+    slot = (records["step"] - 1) % CAPACITY
+    assert records["linearizations"].tolist() == (2 * slot + records["body"]).tolist()
+    assert (records["nonlinear"] == 0.5).all()
+    records = once.loop.records()
+    assert (records["linearizations"] == 1).all() and (records["nonlinear"] == -1).all()
 
 
 def test_the_time_of_a_step_is_its_own_and_not_a_share_of_its_batch():

@@ -313,7 +313,7 @@ def test_a_push_moves_it_as_on_the_cpu():
         if step == 2:
             touch.push("me", "bar", (2.0, 0.4, 0.4), 0.3, (0.0, 0.0, 90.0), 0.1)
         if step == 4:
-            touch.grab("me", "bar", (2.0, 0.8, 0.8), 0.3, (2.0, 1.4, 1.0), 400.0)
+            touch.grab("me", "bar", (2.0, 0.8, 0.8), 0.3, (2.0, 1.4, 1.0), 400.0, 50.0, 0.2)
 
     cpu, _ = both(make, 8, None, push)
     assert np.abs(cpu.x[3] - cpu.x[2])[:, 2].max() > 1e-3
