@@ -140,8 +140,9 @@ class Search:
 
     def launch(self) -> None:
         """Puts the whole search of a step that has been assembled onto the current stream."""
-        stream = self._gpu.cp.cuda.get_current_stream()
-        self.first_values.data.copy_from_device_async(self._values.data, self._values.nbytes, stream)
+        cuda, kept, values = self._gpu.cp.cuda, self.first_values, self._values
+        to, stream = cuda.runtime.memcpyDeviceToDevice, cuda.get_current_stream().ptr
+        cuda.runtime.memcpyAsync(kept.data.ptr, values.data.ptr, values.nbytes, to, stream)
         self._put(self._open, STRETCH)
         for _ in range(self.rounds):
             self._solver.launch()
