@@ -11,7 +11,6 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import argparse
-import json
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ from sim_server.errors import DeviceError
 from tests.bench import _models as models
 from tests.bench import _models_time as timing
 from tests.bench._gpu_problem import BARS
+from tests.bench._pieces import Merged
 from tests.bench.report import Report, plots
 
 SIZES = (3000, 24_000, 98_304)
@@ -133,24 +133,16 @@ def draw(report: Report, rows: list[Row]) -> None:
     report.figure(figure, "models.png", f"Force, tangent and assembly at {tets:,} tetrahedra")
 
 
+KEYS = {
+    "devices": ("device",), "models": ("device", "precision", "tets", "model"),
+    "generic": ("device", "precision", "tets", "law"),
+}  # fmt: skip
+
+
 def merge(files: list[Path], out: Path | None) -> None:
     """One page of the results of several runs; where two have the same row, that of the later one."""
-    parts = [json.loads(file.read_text()) for file in files]
-    keys = {"devices": ("device",), "models": ("device", "precision", "tets", "model"),
-            "generic": ("device", "precision", "tets", "law")}  # fmt: skip
-    data: Data = {}
-    for section, names in keys.items():
-        found = {tuple(row[n] for n in names): row for part in parts for row in part["data"][section]}
-        data[section] = list(found.values())
-    report = Report("models", TITLE, {"pieces": len(parts)}, out, quick=True)
-    report.say("Put together of several runs:")
-    report.table([{k: part["header"][k] for k in ("date", "commit")} | _where(part) for part in parts])
-    write(report, data)
-
-
-def _where(part: dict[str, Any]) -> dict[str, str]:
-    words = {k: " ".join(map(str, v)) if isinstance(v, list) else str(v) for k, v in part["arguments"].items()}
-    return {"machine": part["header"]["machine"]["cpu"], **{k: words.get(k, "") for k in ("devices", "sizes")}}
+    merged = Merged("models", TITLE, files, out)
+    write(merged, {section: merged.rows(section, names) for section, names in KEYS.items()})
 
 
 def options() -> argparse.Namespace:
