@@ -71,6 +71,56 @@ def test_what_a_worker_sends_is_symmetric_positive_definite(method):
     symmetric_positive_definite(operator(applied(*made(sim, method)), A.shape[0]))
 
 
+def loop_operator(sim: Simulation, kind: Kind) -> NDArray:
+    """P^-1 of the loop up to one positive factor. A column z_j comes as s_j z_j; what the sum of two unit vectors gives
+    is a combination of both columns, and tells s_j / s_0."""
+    unit = np.eye(3 * sim.world.nodes)
+    found = np.column_stack([by_loop(sim, kind, e) for e in unit])
+    for j in range(1, len(unit)):
+        pair = found[:, [0, j]]
+        together = by_loop(sim, kind, unit[0] + unit[j])
+        of, left, _, _ = np.linalg.lstsq(pair, together, rcond=None)
+        assert left[0] < 1e-20 * (together @ together)
+        found[:, j] *= of[1] / of[0]
+    return found
+
+
+def small(turn: NDArray | None = None) -> Simulation:
+    """A bar of few nodes off its rest, held at one end; turned as a whole."""
+    sim = simulation(bar((3, 1, 1), (1.5, 0.5, 0.5), young=1e6, fixed="X < 0.01"), preconditioner="none", warp=True)
+    sim.world.x += 0.03 * np.random.default_rng(4).normal(size=sim.world.x.shape)
+    if turn is not None:
+        sim.world.x[:] = sim.world.x @ turn.T + [1, 0, -2]
+    sim.engine.assemble()
+    return sim
+
+
+@pytest.mark.parametrize("kind", IN_LOOP, ids=[k.name for k in IN_LOOP])
+def test_what_the_loop_applies_is_symmetric_positive_definite_and_its_formula(kind):
+    sim = small()
+    sim.engine.settings(0).omega = 1.3
+    A = system(sim)[0].toarray()
+    n = len(A)
+    own = np.arange(n) // 3
+    formula = {
+        Kind.NONE: np.eye(n), Kind.JACOBI: np.diag(np.diag(A)),
+        Kind.BLOCK_JACOBI: np.where(own[:, None] == own, A, 0), Kind.SSOR: ssor(A, 1.3),
+    }[kind]  # fmt: skip
+    found, expected = loop_operator(sim, kind), np.linalg.inv(formula)
+    symmetric_positive_definite(found)
+    scale = np.vdot(found, expected) / np.vdot(found, found)
+    assert scale > 0
+    assert np.abs(scale * found - expected).max() < 1e-9 * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("kind", [Kind.JACOBI, Kind.BLOCK_JACOBI, Kind.SSOR], ids=lambda k: k.name)
+def test_what_the_loop_applies_turns_with_the_body(kind):
+    """The same operator in the material frame, up to rounding."""
+    here, turned = (loop_operator(small(R), kind) for R in (None, rotation((1, 2, -1), 2.0)))
+    here, turned = here / np.abs(here).max(), turned / np.abs(turned).max()
+    assert np.abs(here - turned).max() < 1e-9
+
+
 @pytest.mark.parametrize("omega", [0.6, 1.0, 1.4])
 def test_the_ssor_factor_is_the_formula(omega):
     sim = bent()
@@ -146,6 +196,7 @@ def free_bar(update: str, **solver) -> Simulation:
 def test_a_turned_body_takes_as_many_iterations(kind):
     """In the material frame, whatever is applied: the matrix is the same there, and so is that of the factor."""
     sim = free_bar("never", preconditioner="cholesky")
+    rounding = kind in (Kind.NONE, Kind.JACOBI, WORKERS["incomplete, bounded"])  # it grows to some 10 % of the residual
     if isinstance(kind, Method):
         posted(sim, kind)
         kind = Kind.CHOLESKY
@@ -155,7 +206,7 @@ def test_a_turned_body_takes_as_many_iterations(kind):
         sim.world.x[:], sim.world.v[:] = sim.world.x @ R.T + [1, -2, 3], sim.world.v @ R.T
         sim.engine.assemble()
         counts.append(int(solve(sim, kind=kind)[1]["iterations"]))
-    assert max(counts) - min(counts) <= (1 if kind in (Kind.NONE, Kind.JACOBI) else 0)
+    assert max(counts) - min(counts) <= rounding
 
 
 @pytest.mark.parametrize(

@@ -87,7 +87,7 @@ def trajectory(tolerance: float = TOLERANCE, **solver) -> tuple[NDArray, NDArray
     for step in range(STEPS):
         if step == GRABBED[0]:
             tip = sim.world.x[sim.world.bodies[0].nodes][-1]
-            touch.grab("anna", "bar", tuple(tip), 0.6, tuple(tip + [0, 0.5, 0.2]), 1e6, 0, 1e9)
+            touch.grab("anna", "bar", tuple(tip), 0.6, tuple(np.add(tip, (0, 0.5, 0.2))), 1e6, 0, 1e9)
         if step == GRABBED[1]:
             touch.release("anna", 1)
         records.append(driver.advance(1))
