@@ -24,7 +24,7 @@ material models, Journal of Elasticity 61, 2000 (there with the isochoric part o
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BeforeValidator
+from pydantic import BeforeValidator, PlainSerializer
 
 from sim_server.backend import Launch
 from sim_server.errors import InputError
@@ -48,7 +48,14 @@ def _families(value: Any) -> Any:
     return (*listed[0], *(listed[1] if len(listed) == 2 else (0.0, 0.0, 0.0)))
 
 
-Families = Annotated[tuple[float, float, float, float, float, float], BeforeValidator(_families)]
+def _as_listed(families: tuple[float, ...]) -> list[list[float]]:
+    """As a scene has them."""
+    return [list(v) for v in (families[:3], families[3:]) if any(v)]
+
+
+Families = Annotated[
+    tuple[float, float, float, float, float, float], BeforeValidator(_families), PlainSerializer(_as_listed)
+]
 TEXT = "effects/fibres.cu"
 LAW = Law(
     "fibres",

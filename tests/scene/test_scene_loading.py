@@ -203,7 +203,17 @@ def test_the_folder_is_the_registry():
 
 @pytest.mark.parametrize(
     ("name", "elements"),
-    [("beam", [3000]), ("sofa_beam", [3000]), ("heterogeneous", [3150]), ("four_beams", [3000] * 4), ("posed", [3000])],
+    [
+        ("beam", [3000]),
+        ("sofa_beam", [3000]),
+        ("heterogeneous", [3150]),
+        ("four_beams", [3000] * 4),
+        ("posed", [3000]),
+        ("fibres", [648]),
+        ("springs", [768, 12]),
+        ("vibration", [864]),
+        ("equilibrium", [768]),
+    ],
 )
 def test_shipped_scenes(name, elements):
     scene = load(SCENES / f"{name}.toml")
@@ -214,7 +224,7 @@ def test_shipped_scenes(name, elements):
 def test_shipped_scenes_resolve_to_scenes():
     """`resolved()` loses nothing: validated again, also after JSON, it gives the same scene."""
     paths = sorted(SCENES.glob("*.toml"))
-    assert len(paths) >= 5
+    assert len(paths) >= 9
     for path in paths:
         scene = load(path)
         again = type(scene).model_validate(json.loads(json.dumps(scene.resolved())))
