@@ -237,5 +237,8 @@ class Telemetry:
                 refused = [x for x in self.simulation.refusals() if x.body == int(r["body"]) and x.time < begin]
                 latest = max(refused, key=lambda x: x.time, default=None)  # before, a line search may have tried one
                 why = str(latest) if latest else f"force is not finite at node {int(r['bad_node'])}"
-                lines.append(f"object {name!r}, step {int(r['step'])}: {why}; it goes back a step and rests there")
+                lines.append(
+                    f"object {name!r}, step {int(r['step'])}: {why}; "
+                    "it goes back to where the step before began and rests there"
+                )
         return lines

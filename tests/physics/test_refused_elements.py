@@ -42,7 +42,7 @@ def test_the_element_is_named_and_the_run_goes_on(law):
     lines = Telemetry.bad_steps(SimpleNamespace(simulation=sim, _bad=set()), records)  # type: ignore[arg-type]
     assert lines == [
         f"object 'bar', step 1: element {bad[0]} has J = {expected:.3g}, which {law.name} does not define; "
-        "it goes back a step and rests there"
+        "it goes back to where the step before began and rests there"
     ]
 
 
