@@ -2,16 +2,18 @@
 """Starts several servers and a pool of workers that they share, from one scene whose objects are dealt out by size.
 
 Objects do not interact, so each may live on any server. Servers are called sim-0, sim-1, ... and listen on one port
-after another; every worker serves all of them, a job of each in turn. Ctrl-C stops everything.
+after another; every worker serves all of them, a job of each in turn. Several GPUs are dealt out, one for each process:
+first to servers, then to workers, then again from the first. Ctrl-C stops everything.
 """
 
 import json
+import os
 import signal
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
@@ -39,6 +41,7 @@ Examples:
 """
 
 PATIENCE = 5.0  # s for a server to end when told
+VISIBLE = "CUDA_VISIBLE_DEVICES"
 
 
 class Terminated(BaseException):
@@ -81,6 +84,38 @@ def part_of(scene: Scene, part: Part) -> str:
     return "".join(f"{key} = {toml(value)}\n" for key, value in table.items())
 
 
+def installed_gpus() -> int:
+    """GPUs that nvidia-smi lists; 0 where it does not run."""
+    try:
+        listed = subprocess.run(["nvidia-smi", "-L"], capture_output=True, text=True, timeout=20)
+    except (OSError, subprocess.SubprocessError):
+        return 0
+    return sum(line.startswith("GPU ") for line in listed.stdout.splitlines()) if listed.returncode == 0 else 0
+
+
+def gpu_pool(environment: Mapping[str, str]) -> list[str]:
+    """Names of the GPUs that may be used, as CUDA_VISIBLE_DEVICES has them: those it lists already, else all."""
+    listed = environment.get(VISIBLE)
+    if listed is None:
+        return [str(k) for k in range(installed_gpus())]
+    names = [name.strip() for name in listed.split(",")]
+    unusable = (k for k, name in enumerate(names) if not name or name.startswith("-"))
+    return names[: next(unusable, len(names))]  # CUDA takes none from the first bad one on
+
+
+def deal_gpus(pool: Sequence[str], servers: int, workers: int) -> tuple[list[str | None], list[str | None]]:
+    """The GPU of each server and of each worker in turn; None: as it is, where there is nothing to choose from."""
+    if len(pool) < 2:
+        return [None] * servers, [None] * workers
+    dealt: list[str | None] = [pool[k % len(pool)] for k in range(servers + workers)]
+    return dealt[:servers], dealt[servers:]
+
+
+def seeing(gpu: str | None) -> dict[str, str] | None:
+    """Environment of a process that sees this GPU alone; None: ours."""
+    return None if gpu is None else {**os.environ, VISIBLE: gpu}
+
+
 class Fleet:
     """All servers and workers. Use it as a context manager: they end with it."""
 
@@ -90,41 +125,60 @@ class Fleet:
         self.names = [f"sim-{k}" for k in range(len(parts))]
         self.listen = [f"tcp/{host}:{port + k}" for k in range(len(parts))]
         self.endpoints = [e.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:") for e in self.listen]
+        self.gpus: list[str | None] = [None] * len(parts)  # of the servers
+        self.worker_gpus: dict[str, str | None] = {}
         self.servers: list[subprocess.Popen[bytes]] = []
         self.workers: Supervisor | None = None
 
     def start(self, workers: int, server_options: Sequence[str], worker_options: Sequence[str]) -> None:
         """The servers, then the workers, which wait for them."""
-        for name, listen, part in zip(self.names, self.listen, self._parts, strict=True):
+        for name, listen, part, gpu in zip(self.names, self.listen, self._parts, self.gpus, strict=True):
             path = Path(self._folder.name) / f"{name}.toml"
             path.write_text(part_of(self._scene, part))
             record = ["--record", str(self._record / f"{name}.mcap")] if self._record else []
             command = [sys.executable, "-m", "sim_server", str(path), "--name", name, "--listen", listen]
             out = sys.stderr if self._quiet else None
-            self.servers.append(subprocess.Popen([*command, *record, *server_options], stdout=out))
+            command += [*record, *server_options]
+            self.servers.append(subprocess.Popen(command, stdout=out, env=seeing(gpu)))
         if workers:
             first, *others = [f"{n}@{e}" for n, e in zip(self.names, self.endpoints, strict=True)]
             also = [word for server in others for word in ("--server", server)]
-            self.workers = Supervisor(workers, first, [], [*also, *worker_options])
+            self.workers = Supervisor(workers, first, [], [*also, *worker_options], start=self._start_worker)
+
+    def _start_worker(self, command: Sequence[str]) -> "subprocess.Popen[bytes]":
+        """Again on the GPU it had."""
+        gpu = self.worker_gpus.get(command[command.index("--name") + 1])
+        null = subprocess.DEVNULL
+        return subprocess.Popen(command, stdin=null, stdout=null, env=seeing(gpu))
+
+    def use_gpus(self, pool: Sequence[str], servers: bool, workers: int) -> None:
+        """Before `start`: deals these out to the servers, or not, and to so many workers."""
+        count = len(self._parts)
+        mine, others = deal_gpus(pool, count * servers, workers)
+        self.gpus = mine or [None] * count
+        self.worker_gpus = {f"local-{k + 1}": gpu for k, gpu in enumerate(others)}
 
     def describe(self) -> dict[str, Any]:
         """What was started, for JSON."""
         names = [o.name for o in self._scene.objects]
         servers = [
             {
-                "name": name, "pid": process.pid, "endpoint": endpoint, "tets": part.tets,
+                "name": name, "pid": process.pid, "endpoint": endpoint, "tets": part.tets, "gpu": gpu,
                 "objects": [names[index] for index in part.objects],
                 "record": str(self._record / f"{name}.mcap") if self._record else None,
             }
-            for name, endpoint, part, process in zip(
-                self.names, self.endpoints, self._parts, self.servers, strict=True
+            for name, endpoint, part, process, gpu in zip(
+                self.names, self.endpoints, self._parts, self.servers, self.gpus, strict=True
             )
         ]  # fmt: skip
         pool = self.workers.report() if self.workers else []
         return {
             "scene": str(self._scene.path),
             "servers": servers,
-            "workers": [{"name": w.worker, "pid": w.pid, "servers": self.names} for w in pool],
+            "workers": [
+                {"name": w.worker, "pid": w.pid, "servers": self.names, "gpu": self.worker_gpus.get(w.worker)}
+                for w in pool
+            ],
         }
 
     def wait(self) -> int:
@@ -194,6 +248,8 @@ def launch(
     for_servers += ["--steps", str(steps)] if steps else []
     try:
         with Fleet(whole, parts, host, port, record, json_) as fleet:
+            if "gpu" in (device, worker_device):
+                fleet.use_gpus(gpu_pool(os.environ), device == "gpu", workers if worker_device == "gpu" else 0)
             fleet.start(workers, for_servers, ["--device", worker_device, "--threads", str(threads)])
             say(fleet.describe(), servers, json_)
             raise typer.Exit(fleet.wait())
@@ -213,11 +269,15 @@ def say(started: dict[str, Any], asked: int, as_json: bool) -> None:
     for s in started["servers"]:
         shown = ", ".join(s["objects"][:6]) + (", ..." if len(s["objects"]) > 6 else "")
         count = f"{len(s['objects'])} object{'s' * (len(s['objects']) > 1)}"
-        print(
-            f"launch: {s['name']} at {s['endpoint']}, pid {s['pid']}: {count}, {s['tets']} tets ({shown})", flush=True
-        )
+        where = f"{s['endpoint']}, pid {s['pid']}{on_gpu(s)}"
+        print(f"launch: {s['name']} at {where}: {count}, {s['tets']} tets ({shown})", flush=True)
     for w in started["workers"]:
-        print(f"launch: worker {w['name']}, pid {w['pid']}, for all servers", flush=True)
+        print(f"launch: worker {w['name']}, pid {w['pid']}{on_gpu(w)}, for all servers", flush=True)
+
+
+def on_gpu(process: dict[str, Any]) -> str:
+    """For people."""
+    return "" if process["gpu"] is None else f", GPU {process['gpu']}"
 
 
 def _terminate(*_: object) -> None:

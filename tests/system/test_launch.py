@@ -10,6 +10,7 @@ import sys
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -77,6 +78,77 @@ def test_a_part_is_a_scene_with_its_objects_as_they_were(tmp_path: Path) -> None
     assert tomllib.loads(part.read_text())["solver"]["tolerance"] == 1e-8
     objects = load(part).resolved()["object"]
     assert objects == [whole.resolved()["object"][k] for k in (0, 2)]
+
+
+@pytest.mark.parametrize(
+    ("visible", "expected"),
+    [
+        (None, ["0", "1", "2"]), ("2,0", ["2", "0"]), (" GPU-ab , MIG-cd", ["GPU-ab", "MIG-cd"]), ("", []),
+        ("1,-1,0", ["1"]),
+    ],
+)  # fmt: skip
+def test_gpus_are_those_that_the_user_lets_be_seen(visible: str | None, expected: list[str], monkeypatch: Any) -> None:
+    launch = module()
+    monkeypatch.setattr(launch, "installed_gpus", lambda: 3)
+    assert launch.gpu_pool({} if visible is None else {"CUDA_VISIBLE_DEVICES": visible}) == expected
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("#!/bin/sh\nprintf 'GPU 0: one (UUID: a)\\n  MIG 1g.10gb Device 0: (UUID: b)\\nGPU 1: two (UUID: c)\\n'\n", 2),
+        ("#!/bin/sh\necho 'GPU 0: but failed'; exit 9\n", 0),
+        (None, 0),
+    ],
+    ids=["two", "fails", "is not there"],
+)
+def test_gpus_are_counted_where_there_are_any(
+    text: str | None, expected: int, tmp_path: Path, monkeypatch: Any
+) -> None:
+    if text is not None:
+        (tmp_path / "nvidia-smi").write_text(text)
+        (tmp_path / "nvidia-smi").chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert module().installed_gpus() == expected
+
+
+@pytest.mark.parametrize(
+    ("pool", "servers", "workers", "expected"),
+    [
+        (["0", "1"], 3, 0, (["0", "1", "0"], [])),
+        (["3", "5", "7"], 2, 2, (["3", "5"], ["7", "3"])),
+        (["0", "1"], 0, 3, ([], ["0", "1", "0"])),
+        (["0"], 2, 1, ([None, None], [None])),
+        ([], 1, 1, ([None], [None])),
+    ],
+)
+def test_gpus_go_round(pool: list[str], servers: int, workers: int, expected: Any) -> None:
+    assert module().deal_gpus(pool, servers, workers) == expected
+
+
+def test_each_process_sees_its_gpu_alone(tmp_path: Path, monkeypatch: Any) -> None:
+    """Servers and workers, the latter also when they are started again; without a choice nothing is set."""
+    launch = module()
+    seen: list[tuple[str, str | None]] = []
+
+    def popen(command: Sequence[str], env: dict[str, str] | None = None, **_: Any) -> Any:
+        seen.append((command[command.index("--name") + 1], None if env is None else env["CUDA_VISIBLE_DEVICES"]))
+        return SimpleNamespace(pid=1, returncode=0, poll=lambda: 0, wait=lambda timeout=None: 0)
+
+    monkeypatch.setattr(launch.subprocess, "Popen", popen)
+    whole = load(scene(tmp_path, [2, 2]))
+    for pool, expected in (
+        (["4", "6", "8"], [("sim-0", "4"), ("sim-1", "6"), ("local-1", "8"), ("local-2", "4"), ("local-2", "4")]),
+        (["0"], [("sim-0", None), ("sim-1", None), ("local-1", None), ("local-2", None), ("local-2", None)]),
+    ):
+        seen.clear()
+        with launch.Fleet(whole, launch.deal([1, 1], 2), "127.0.0.1", 7447, None, True) as fleet:
+            fleet.use_gpus(pool, True, 2)
+            fleet.start(2, ["--device", "gpu"], ["--device", "gpu"])
+            fleet.workers._start(fleet.workers.workers[1])
+            told = fleet.describe()
+        assert seen == expected
+        assert [(p["name"], p["gpu"]) for p in told["servers"] + told["workers"]] == expected[:4]
 
 
 @pytest.mark.system
