@@ -33,7 +33,7 @@ class Clairvoyant:
     """The table of one load. warm: steps before those that count; speed: as in VirtualWorkers."""
 
     def __init__(self, objects: int, steps: int, warm: int, hold: int, speed: float, seed: int):
-        self._sim = Simulation(scene(objects))
+        self._sim = Simulation(scene(objects, woodbury=0))
         self._load, self._driver = Load(self._sim, hold, seed), Driver(self._sim, counted=True)
         self._wild = [k for k in range(objects) if is_wild(k)]
         first, *rest = self._steps(steps + warm)
