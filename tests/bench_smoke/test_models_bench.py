@@ -71,7 +71,10 @@ def piece(path: Path, device: str, us: float) -> Path:
         "sums us": 2.0, "rest us": 3.0, "elements us, stretched": 1.0, "MB": 0.5, "bytes us": 1.5, "us / bytes": 4.0,
     }  # fmt: skip
     data = {"devices": [{"device": device, "what": path.stem, "copy GB/s": 9.0}], "models": [row], "generic": []}
-    header = {"date": "2026-01-01", "commit": path.stem, "machine": {"cpu": "fast"}}
+    machine = {"cpu": "fast", "cores": 3, "governor": "none", "load": 0.0, "system": "some"}
+    speed = {"dgemm_ms": 1.0, "spmv_ms": 2.0}
+    header = {"date": "2026-01-01", "commit": path.stem, "machine": machine, "versions": {"python": "3"}}
+    header["calibration"] = {"before": speed, "after": speed}
     path.write_text(json.dumps({"header": header, "arguments": {"devices": [device], "sizes": [540]}, "data": data}))
     return path
 
@@ -82,4 +85,5 @@ def test_pieces_become_one_page(tmp_path: Path) -> None:
     text = (tmp_path / "out" / "models.md").read_text()
     assert "## CPU, float64" in text and "## GPU, float64" in text and "| mass_spring | 6.5 | 1 | 2 | 3 |" in text
     assert "| mass_spring | 7 |" not in text and "| cpu | c | 9 |" in text
+    assert "commit c" in text and "fast, 3 cores" in text, "the head is that of the last piece"
     assert (tmp_path / "out" / "models.png").read_bytes().startswith(b"\x89PNG")
