@@ -26,6 +26,7 @@ from sim_server.service import NAP
 from sim_server.simulation import Simulation
 from sim_server.supervisor import Supervisor
 from tests.bench._gpu_problem import Problem
+from tests.state import put
 
 SWING = 100  # steps until the beam is put back
 PATIENCE = 60.0  # s for a worker to join, for a first factor to come
@@ -80,12 +81,8 @@ class Served:
             self._put_back()
 
     def _put_back(self) -> None:
-        world = self.sim.world
-        world.x[:], world.v[:] = self._start, 0.0
-        if world.backend.name == "gpu":
-            for array in (world.x, world.v):
-                world.backend.twin(array).set(array)
-            world.backend.cp.cuda.get_current_stream().synchronize()  # not the device: a capture may be under way
+        put(self.sim, self.sim.world.x, self._start)
+        put(self.sim, self.sim.world.v, 0.0)
 
     def helped(self, seconds: float) -> NDArray[Any]:
         """Records of `seconds` with factors coming and going; it begins half a second after the first."""

@@ -10,7 +10,17 @@ from scipy.optimize import brentq, minimize_scalar
 
 from sim_server.simulation import Simulation
 from tests.bench._verify_row import Row, absolute, relative
-from tests.physics.laws import ELASTIC, LAWS, Law, deform, forces, law_bar, odd_bar, stiffness
+from tests.physics.laws import (
+    ELASTIC,
+    LAWS,
+    Law,
+    deform,
+    error_of_forces,
+    error_of_stiffness,
+    forces,
+    law_bar,
+    odd_bar,
+)  # fmt: skip
 from tests.physics.test_law_answers import AFFINE, UNIAXIAL, cube, pulled
 from tests.scenes import interior, jittered_bar, mesh_file, rotation
 
@@ -53,33 +63,6 @@ def placed(at: At) -> Simulation:
     sim.world.x[:] = at.stretch * sim.world.rest @ TURN.T
     deform(sim, at.size, seed=2)
     return sim
-
-
-def error_of_forces(sim: Simulation) -> float:
-    """Relative, against the slope of the energy."""
-    x, slope, step = sim.world.x, np.zeros_like(sim.world.x), 1e-5
-    for k in np.ndindex(*x.shape):
-        at, energy = x[k], []
-        for x[k] in (at + step, at - step, at + 2 * step, at - 2 * step):
-            energy.append(sim.potential_energy())
-        x[k] = at
-        slope[k] = (8 * (energy[0] - energy[1]) - (energy[2] - energy[3])) / (12 * step)
-    f = forces(sim).copy()
-    return float(np.abs(f + slope).max() / np.abs(f).max())
-
-
-def error_of_stiffness(sim: Simulation) -> float:
-    """Relative, against the slope of the forces."""
-    x = sim.world.x
-    K, change, step = stiffness(sim), np.zeros((x.size, x.size)), 1e-6
-    for j, k in enumerate(np.ndindex(*x.shape)):
-        at = x[k]
-        x[k] = at + step
-        above = forces(sim).ravel().copy()
-        x[k] = at - step
-        change[:, j] = (above - forces(sim).ravel()) / (2 * step)
-        x[k] = at
-    return float(np.abs(K + change).max() / np.abs(K).max())
 
 
 def slopes(quick: bool) -> list[Row]:

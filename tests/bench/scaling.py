@@ -34,6 +34,7 @@ from sim_server.simulation import Simulation
 from sim_server.supervisor import Supervisor
 from tests.bench import _scaling_page as page
 from tests.bench._pieces import Limit, Merged, Piece, arguments_of_pieces, say, shown
+from tests.state import put
 
 OBJECTS, WORKERS = (1, 4, 16, 64, 256, 1024), (1, 2, 4)
 DEVICES = ("cpu", "gpu")
@@ -108,13 +109,8 @@ class Run:
             self._failure = error
 
     def _put_back(self) -> None:
-        world = self.sim.world
-        world.x[:], world.v[:] = self._start, 0.0
-        if world.backend.name == "gpu":
-            for array in (world.x, world.v):
-                twin = world.backend.twin(array)
-                twin.set(array.astype(twin.dtype))
-            world.backend.cp.cuda.get_current_stream().synchronize()  # not the device: a capture may be under way
+        put(self.sim, self.sim.world.x, self._start)
+        put(self.sim, self.sim.world.v, 0.0)
 
     def measured(self, seconds: float, warm: float) -> tuple[NDArray[Any], Row]:
         """Records of `seconds`, and what else was counted: steps, factors taken up, seconds.

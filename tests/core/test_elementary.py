@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from sim_server import backend
+from tests.texts import compiled
 
 TEXT = """#define WIDE
 #include "kernel.h"
@@ -32,11 +32,8 @@ GIVEN = {
 @pytest.fixture(scope="module")
 def texts(tmp_path_factory):
     """The module in double and single precision."""
-    folder = tmp_path_factory.mktemp("texts")
-    (folder / "map.cu").write_text(TEXT)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(backend, "HERE", folder)
-        yield {real: backend.Module("map.cu", real) for real in ("double", "float")}
+    with compiled(TEXT, tmp_path_factory.mktemp("texts")) as modules:
+        yield modules
 
 
 def of(texts, name: str, a: np.ndarray, real: str = "double") -> np.ndarray:

@@ -21,6 +21,7 @@ from sim_server.gpu.engine import FEW
 from sim_server.scene import Scene
 from sim_server.simulation import Simulation
 from tests.scenes import bar, scene
+from tests.state import put
 
 pytestmark = pytest.mark.gpu
 
@@ -37,13 +38,6 @@ def of_law(law: str, **table: Any) -> dict:
     made = bar(young=None, **{"cells": (4, 2, 2), "size": (2, 0.8, 0.8), "fixed": "X < 0.01"} | table)
     made["effects"][law] = dict(constants)
     return made
-
-
-def put(sim: Simulation, array: NDArray, value: NDArray) -> None:
-    """Into a world's array, wherever it is."""
-    array[...] = value
-    if sim.world.backend.name == "gpu":
-        sim.world.backend.twin(array).set(np.ascontiguousarray(value, dtype=sim.world.backend.twin(array).dtype))
 
 
 def thrown(velocity: tuple[float, float, float], body: int = 0) -> Prepare:

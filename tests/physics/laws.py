@@ -150,3 +150,30 @@ def reference_system(sim: Simulation, law: Law, projection: str = "none") -> tup
         f[dofs] += f_e.ravel()
         K[np.ix_(dofs, dofs)] += K_e
     return energy, f.reshape(-1, 3), K
+
+
+def error_of_forces(sim: Simulation) -> float:
+    """Relative, against the slope of the energy."""
+    x, slope, step = sim.world.x, np.zeros_like(sim.world.x), 1e-5
+    for k in np.ndindex(*x.shape):
+        at, energy = x[k], []
+        for x[k] in (at + step, at - step, at + 2 * step, at - 2 * step):
+            energy.append(sim.potential_energy())
+        x[k] = at
+        slope[k] = (8 * (energy[0] - energy[1]) - (energy[2] - energy[3])) / (12 * step)
+    f = forces(sim).copy()
+    return float(np.abs(f + slope).max() / np.abs(f).max())
+
+
+def error_of_stiffness(sim: Simulation) -> float:
+    """Relative, against the slope of the forces."""
+    x = sim.world.x
+    K, change, step = stiffness(sim), np.zeros((x.size, x.size)), 1e-6
+    for j, k in enumerate(np.ndindex(*x.shape)):
+        at = x[k]
+        x[k] = at + step
+        above = forces(sim).ravel().copy()
+        x[k] = at - step
+        change[:, j] = (above - forces(sim).ravel()) / (2 * step)
+        x[k] = at
+    return float(np.abs(K + change).max() / np.abs(K).max())

@@ -4,8 +4,8 @@
 import numpy as np
 import pytest
 
-from sim_server import backend
 from tests.scenes import random_rotations
+from tests.texts import compiled
 
 TEXT = """#define WIDE
 #include "hyperelastic.cuh"
@@ -44,11 +44,8 @@ COUNT = 600
 
 @pytest.fixture(scope="module")
 def texts(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("texts")
-    (folder / "decompose.cu").write_text(TEXT)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(backend, "HERE", folder)
-        yield {real: backend.Module("decompose.cu", real) for real in PRECISIONS}
+    with compiled(TEXT, tmp_path_factory.mktemp("texts")) as modules:
+        yield modules
 
 
 def with_stretches(*s) -> np.ndarray:
