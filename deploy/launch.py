@@ -23,7 +23,7 @@ import typer
 from protocol.endpoints import BadEndpoint, check_endpoint
 from sim_server.errors import InputError
 from sim_server.scene import Scene, load
-from sim_server.supervisor import Supervisor
+from sim_server.supervisor import Supervisor, worker_process
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
@@ -147,9 +147,7 @@ class Fleet:
 
     def _start_worker(self, command: Sequence[str]) -> "subprocess.Popen[bytes]":
         """Again on the GPU it had."""
-        gpu = self.worker_gpus.get(command[command.index("--name") + 1])
-        null = subprocess.DEVNULL
-        return subprocess.Popen(command, stdin=null, stdout=null, env=seeing(gpu))
+        return worker_process(command, seeing(self.worker_gpus.get(command[command.index("--name") + 1])))
 
     def use_gpus(self, pool: Sequence[str], servers: bool, workers: int) -> None:
         """Before `start`: deals these out to the servers, or not, and to so many workers."""

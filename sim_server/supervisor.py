@@ -9,7 +9,7 @@ import logging
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from protocol.messages_pb2 import LocalWorker
 
@@ -40,8 +40,9 @@ class _Worker:
 Start = Callable[[Sequence[str]], "subprocess.Popen[bytes]"]
 
 
-def _popen(command: Sequence[str]) -> "subprocess.Popen[bytes]":
-    return subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+def worker_process(command: Sequence[str], env: Mapping[str, str] | None = None) -> "subprocess.Popen[bytes]":
+    """A worker that neither reads nor prints. env: None: ours."""
+    return subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, env=env)
 
 
 class Supervisor:
@@ -49,7 +50,7 @@ class Supervisor:
 
     def __init__(
         self, count: int, server: str, connect: Sequence[str], arguments: Sequence[str] = (),
-        clock: Callable[[], float] = time.monotonic, start: Start = _popen,
+        clock: Callable[[], float] = time.monotonic, start: Start = worker_process,
     ):  # fmt: skip
         endpoints = [word for endpoint in connect for word in ("--connect", endpoint)]
         self._command = [
