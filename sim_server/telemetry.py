@@ -36,12 +36,11 @@ class Telemetry:
         self.trace: Trace | None = None
         self.begun = time.monotonic()
         self.every = self.simulation.scene.record.every if recorder else 0
-        self._batch: list[pb.ObjectStep] = []
+        self._batch: deque[pb.ObjectStep] = deque(maxlen=BATCH)
         self._window: list[deque[int]] = [deque(maxlen=WINDOW) for _ in self.simulation.world.bodies]  # iterations
         self.seconds: deque[float] = deque(maxlen=WINDOW)
         self._last: NDArray[Any] = np.zeros(len(self._window), self.engine.records_dtype)
         self._bad: set[str] = set()
-        self._listened = False
         self.solves = 0
         self.unconverged: Counter[str] = Counter()  # solves by status, of those that did not converge
         self._due = {"steps": 0.0, "state": 0.0, "status": 0.0, "look": 0.0}
@@ -83,11 +82,11 @@ class Telemetry:
             if self.recorder:
                 for message in messages:
                     self.recorder.step(message, block=self.patient)
-            self._batch = (self._batch + messages)[-BATCH:]
+            self._batch.extend(messages)
         if self._period("steps", STEPS_PERIOD) and self._batch:
-            if self._listened:
+            if self.link.wants_steps():
                 self.link.publish_steps(pb.Steps(steps=self._batch))
-            self._batch = []
+            self._batch.clear()
 
     def _note(self, records: NDArray[Any]) -> None:
         """For the status: the last record of each body, and iterations of those before."""
@@ -101,8 +100,7 @@ class Telemetry:
 
     def _messages(self, records: NDArray[Any]) -> list[pb.ObjectStep]:
         """Those that somebody wants: to make one takes longer than all else that is done with a record."""
-        self._listened = self.link.wants_steps()
-        wanted = records if self.recorder else records[-BATCH:] if self._listened else records[:0]
+        wanted = records if self.recorder else records[-BATCH:] if self.link.wants_steps() else records[:0]
         messages = describe.steps(self.simulation, wanted, self._method)
         bound = self.driver.age_bound() if messages else -1
         for message in messages:
