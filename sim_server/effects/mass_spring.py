@@ -177,6 +177,11 @@ def listed_springs(body: Body, params: Params) -> tuple[Ints, Reals, Reals]:
     """Ends (of the scene), stiffness and length of the springs that the scene lists; raises InputError."""
     ends = _pairs_of(params.springs) if isinstance(params.springs, str) else np.array(params.springs or [], np.int64)
     nodes = body.last - body.first
+    if body.mesh.dropped:
+        raise InputError(
+            f"springs name nodes by number, but {body.mesh.dropped} nodes of {body.mesh.name} are no corner of a cell "
+            "and were dropped, so that numbers differ from the file's: remove those nodes from the file"
+        )
     if not len(ends):
         raise InputError("springs has no pair of nodes")
     if (

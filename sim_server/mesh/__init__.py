@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sim_server.errors import InputError
-from sim_server.mesh.check import complaints, indices
+from sim_server.mesh.cells import tetrahedra
+from sim_server.mesh.check import complaints, crowded_faces, indices
 from sim_server.mesh.surface import volumes
 
 log = logging.getLogger(__name__)
@@ -28,12 +29,14 @@ MOST_TETS = 10_000_000  # of a bar: what a typing error may ask for
 class Mesh:
     """Nodes at rest, before the pose, and tetrahedra.
 
-    rest: float64 (n, 3) [m]; tets: int32 (m, 4), positive volume once checked; name: for messages.
+    rest: float64 (n, 3) [m]; tets: int32 (m, 4), positive volume once checked; name: for messages; dropped: number of
+    nodes of the file that are left out, so that the others have other numbers than there.
     """
 
     rest: NDArray[np.float64]
     tets: NDArray[np.int32]
     name: str = "mesh"
+    dropped: int = 0
 
 
 def bar(cells: Sequence[int], size: Sequence[float], split: str = "kuhn") -> Mesh:
@@ -80,28 +83,34 @@ def _kuhn_paths(stride: NDArray[np.integer]) -> NDArray[np.integer]:
 
 
 def read(path: str | Path) -> Mesh:
-    """The tetrahedra of a file in any format that meshio knows; unchecked, see `check`.
+    """The volume cells of a file in any format that meshio knows, as tetrahedra; unchecked, see `check`.
 
-    10-node tetrahedra are reduced to their corners. Triangles, lines and points of the file are left out.
-    Raises InputError naming the file: missing, unreadable, unknown format, or no tetrahedra.
+    Quadratic cells are reduced to their corners; hexahedra, wedges and pyramids are split (cells.py). Triangles, lines
+    and points of the file are left out, and so are nodes without a cell; what was changed is logged in one line.
+    Raises InputError naming the file: missing, unreadable, unknown format, or cells that cannot be used.
     """
     path = Path(path)
     if not isfile(path):
         raise InputError(f"mesh {path}: no such file")
     data = _meshio_read(path)
     rest = np.asarray(data.points, dtype=np.float64)
-    linear = [np.asarray(block.data) for block in data.cells if block.type == "tetra"]
-    quadratic = [np.asarray(block.data) for block in data.cells if block.type == "tetra10"]
-    if not linear and not quadratic:
-        found = ", ".join(sorted({block.type for block in data.cells})) or "none"
-        raise InputError(f"mesh {path}: no tetrahedra; cells in it: {found}; needed: tetra or tetra10")
-    tets = np.concatenate([block[:, :4] for block in linear + quadratic]).astype(np.int64)
+    if rest.shape[1:] != (3,):
+        raise InputError(f"mesh {path}: node coordinates have shape {rest.shape}: must be (n, 3)")
+    try:
+        tets, changed = tetrahedra(rest, data.cells)
+    except InputError as error:
+        raise InputError(f"mesh {path}: {error}") from None
     if wrong := indices(rest, tets):
         raise InputError(f"mesh {path}: {wrong}")
-    if quadratic:
-        rest, tets = _without_midnodes(rest, tets, np.concatenate(quadratic)[:, 4:])
-        log.info("mesh %s: 10-node tetrahedra reduced to their 4 corners, mid-edge nodes dropped", path)
-    return Mesh(rest, tets.astype(np.int32), path.name)
+    used = np.zeros(len(rest), dtype=bool)
+    used[tets] = True
+    dropped = int((~used).sum())
+    if dropped:
+        changed.append(f"{dropped} of {len(rest)} nodes dropped, which are no corner of a cell")
+    if changed:
+        log.warning("mesh %s: %s", path, "; ".join(changed))
+    number = np.cumsum(used) - 1
+    return Mesh(rest[used], number[tets].astype(np.int32), path.name, dropped)
 
 
 def _meshio_read(path: Path) -> Any:
@@ -121,16 +130,6 @@ def _meshio_read(path: Path) -> Any:
         raise InputError(f"mesh {path}: cannot be read ({reason}); {formats}") from error
 
 
-def _without_midnodes(
-    rest: NDArray[np.float64], tets: NDArray[np.int64], midnodes: NDArray[np.integer]
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    keep = np.ones(len(rest), dtype=bool)
-    keep[midnodes[(midnodes >= 0) & (midnodes < len(rest))]] = False
-    keep[tets] = True
-    number = np.cumsum(keep) - 1
-    return rest[keep], number[tets]
-
-
 def check(mesh: Mesh) -> Mesh:
     """`mesh` with every tetrahedron wound to positive volume; how many were turned is logged.
 
@@ -139,6 +138,8 @@ def check(mesh: Mesh) -> Mesh:
     """
     if wrong := list(complaints(mesh.rest, mesh.tets)):
         raise InputError("\n".join(f"mesh {mesh.name}: {text}" for text in wrong))
+    if odd := crowded_faces(mesh.rest, mesh.tets):
+        log.warning("mesh %s: %s", mesh.name, odd)
     inverted = volumes(mesh.rest, mesh.tets) < 0
     if not inverted.any():
         return mesh

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_server.mesh.surface import volumes
+from sim_server.mesh.surface import FACES, volumes
 
 FLAT = 1e-12  # |volume| / (longest edge)^3 below which a tetrahedron is flat; rounding alone gives about 1e-15
 COINCIDENT = 1e-9  # distance / diagonal of the bounding box below which two nodes are one
@@ -88,6 +88,16 @@ def unused_nodes(rest: Rest, tets: Tets) -> str | None:
     bad = np.flatnonzero(np.bincount(tets.ravel(), minlength=len(rest)) == 0)
     reason = "belongs to no tetrahedron (meshio: mesh.remove_orphaned_nodes())"
     return _named("node", bad, reason, lambda i: f"at {_point(rest[i])}")
+
+
+def crowded_faces(rest: Rest, tets: Tets) -> str | None:
+    """Faces of more than two tetrahedra: parts of such a mesh lie in one another. No complaint, but worth a line."""
+    faces = np.sort(tets[:, FACES].reshape(-1, 3), axis=1)
+    faces = faces[np.lexsort(faces.T)]
+    bad = np.flatnonzero((faces[2:] == faces[:-2]).all(axis=1))
+    if not bad.size:
+        return None
+    return f"{bad.size} faces belong to more than two tets, as that of nodes {faces[bad[0]].tolist()}"
 
 
 def _point(x: NDArray[np.float64]) -> str:

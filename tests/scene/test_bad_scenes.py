@@ -168,16 +168,16 @@ def test_missing_scene_and_folder(tmp_path):
 
 
 def test_mesh_files_are_found_beside_the_scene_and_checked(tmp_path, monkeypatch):
-    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [5, 5, 5]])
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0]])
     tet = np.array([[0, 2, 1, 3]])  # inverted
     (tmp_path / "scenes" / "meshes").mkdir(parents=True)
     meshio.write(tmp_path / "scenes" / "meshes" / "good.vtk", meshio.Mesh(corners[:4], [("tetra", tet)]))
-    meshio.write(tmp_path / "scenes" / "meshes" / "unused.vtk", meshio.Mesh(corners, [("tetra", tet)]))
+    meshio.write(tmp_path / "scenes" / "meshes" / "flat.vtk", meshio.Mesh(corners, [("tetra", np.array([[0, 1, 2, 4]]))]))
     path = tmp_path / "scenes" / "file.toml"
     path.write_text(swap("bar = [2, 1, 1], size = [2, 1, 1]", 'file = "meshes/good.vtk"'))
     monkeypatch.chdir(tmp_path)
     scene = load("scenes/file.toml")
     assert scene.objects[0].load_mesh().tets.tolist() == [[0, 2, 3, 1]]
     assert scene.resolved()["object"][0]["mesh"] == {"file": str(tmp_path / "scenes" / "meshes" / "good.vtk")}
-    with pytest.raises(InputError, match=r"object 'beam': mesh unused.vtk: node 4 \(at \(5, 5, 5\)\)"):
-        load(path, ["object.beam.mesh.file=meshes/unused.vtk"]).objects[0].load_mesh()
+    with pytest.raises(InputError, match=r"object 'beam': mesh flat.vtk: tet 0 .*zero volume"):
+        load(path, ["object.beam.mesh.file=meshes/flat.vtk"]).objects[0].load_mesh()

@@ -46,9 +46,10 @@ def test_quadratic_tets_are_reduced(tmp_path, caplog, suffix, form):
     cell = np.array([[6, 7, 8, 9, 0, 1, 2, 3, 4, 5]])
     path = tmp_path / f"quadratic{suffix}"
     meshio.write(path, meshio.Mesh(points, [("tetra10", cell)]), form)
-    with caplog.at_level(logging.INFO):
+    with caplog.at_level(logging.WARNING):
         mesh = check(read(path))
-    assert "10-node tetrahedra reduced to their 4 corners" in caplog.text
+    assert "1 tetra10 cells reduced to their corners; 6 of 10 nodes dropped" in caplog.text
+    assert len(caplog.records) == 1 and mesh.dropped == 6
     assert np.allclose(mesh.rest, CORNERS[:4]) and mesh.tets.tolist() == [[0, 1, 2, 3]]
 
 
@@ -69,7 +70,7 @@ def test_unreadable_files(tmp_path, capsys):
     for path, words in [
         (tmp_path / "absent.msh", ["absent.msh", "no such file"]),
         (tmp_path, ["no such file"]),
-        (surface, ["surface.vtk", "no tetrahedra", "cells in it: triangle", "tetra10"]),
+        (surface, ["surface.vtk", "no tetrahedra", "cells in it: 1 triangle", "tetra10"]),
         (broken, ["broken.msh", "cannot be read", ".vtu", ".inp"]),
         (truncated, ["truncated.vtu", "cannot be read", "formats by extension"]),
         (other, ["mesh.docx", "cannot be read", ".msh"]),
@@ -132,6 +133,15 @@ def test_check_lets_slivers_and_small_units_through():
     assert check(box) is box
     far = Mesh(box.rest * 1e6 + 1000.0, box.tets)
     assert check(far) is far
+
+
+def test_three_tets_on_one_face_are_told(caplog):
+    points = np.array([*CORNERS, [0.2, 0.2, 2.0]])
+    with caplog.at_level(logging.WARNING):
+        check(Mesh(points, np.array([*TETS, [1, 2, 3, 5]]), "liver.msh"))
+    assert [r.getMessage() for r in caplog.records] == [
+        "mesh liver.msh: 1 faces belong to more than two tets, as that of nodes [1, 2, 3]"
+    ]
 
 
 def test_a_file_in_millimetres_is_scaled(tmp_path):
