@@ -47,7 +47,7 @@ from sim_server.effect import Effect, Refusal
 from sim_server.effects.corotational import shape_gradients
 from sim_server.errors import InputError
 from sim_server.scene.parameters import Parameters, Positive
-from sim_server.scene.regions import Poisson, by_region, constants_by_region
+from sim_server.scene.regions import Poisson, Regional, by_region, constants_by_region
 from sim_server.system import Stencil, System
 from sim_server.world import Body, World
 
@@ -102,13 +102,15 @@ class Law:
     def parameters(self) -> type[Parameters]:
         """The table of the effect in a scene."""
         kinds = {c.name: c.kind for c in self.constants}
-        kinds_here = kinds | {self.constants[0].name: by_region(kinds)}
         fields: dict[str, Any] = {}
         for c in self.constants:
-            required = {} if c.default is None else {"default": c.default}
-            fields[c.name] = (kinds_here[c.name], Field(description=c.text, **required))
+            if c is self.constants[0]:
+                fields[c.name] = (by_region(kinds), Field(description=c.text))
+            else:  # None: required, unless every region gives it
+                kind = c.kind | None if c.default is None else c.kind
+                fields[c.name] = (kind, Field(default=c.default, description=c.text))
         extra = INVERSION if self.refuses and self.regularizes else {}
-        return create_model(f"Params of {self.name}", __base__=Parameters, **fields, **extra)
+        return create_model(f"Params of {self.name}", __base__=Regional, **fields, **extra)
 
 
 def constants_of(law: Law, body: Body, params: Any) -> Values:
@@ -210,10 +212,15 @@ class Hyperelastic(Tetrahedra):
         ]
 
 
-YOUNG_AND_POISSON = (
-    Constant("young", Positive, "Young's modulus at small strains [Pa], or a list of regions"),
-    Constant("poisson", Poisson, "Poisson's ratio at small strains [-], of every element whose region gives none"),
-)
+def young_and_poisson_of(poisson: Any = Poisson) -> tuple[Constant, Constant]:
+    """The constants of a law that is Hooke's at small strains. poisson: type of Poisson's ratio, with its bounds."""
+    return (
+        Constant("young", Positive, "Young's modulus at small strains [Pa], or a list of regions"),
+        Constant("poisson", poisson, "Poisson's ratio at small strains [-], of every element whose region gives none"),
+    )
+
+
+YOUNG_AND_POISSON = young_and_poisson_of()
 
 
 def lame(values: Values) -> list[Reals]:

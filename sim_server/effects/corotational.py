@@ -32,7 +32,8 @@ regions; in each region `where` is asked at the centroid of the element, at rest
 region that holds gives the value, and a region without `where` takes what is left.
 
 Usual ranges: young 1e3 Pa (brain, liver) to 1e7 Pa (rubber); 2e11 Pa (steel) works with small loads. poisson 0.3 to
-0.49; from 0.49 on linear tetrahedra lock (they bend too little), and at 0.5 lambda is infinite, so 0.5 is refused.
+0.49; from 0.49 on linear tetrahedra lock (they bend too little), and at 0.5 lambda is infinite, so 0.5 is refused. Below
+0 (auxetic foams, -0.7 to 0) lambda is negative; the stiffness stays positive semi-definite down to -1, which is refused.
 
 Source: Müller and Gross, Interactive Virtual Materials, 2004; Nesme, Payan and Faure 2005 (QR); Chao, Pinkall, Sanan
 and Schröder 2010, McAdams et al. 2011 (exact tangent); Felippa 2000.
@@ -47,17 +48,19 @@ from pydantic import Field, model_validator
 from sim_server.backend import Launch
 from sim_server.effect import Effect
 from sim_server.errors import InputError
-from sim_server.scene.parameters import Parameters, complaint
-from sim_server.scene.regions import Poisson, Young, region_values
+from sim_server.scene.parameters import complaint
+from sim_server.scene.regions import Poisson, Regional, Young, region_values
 from sim_server.system import Stencil, System
 from sim_server.world import Body, World
 
 SCOPE = "object"
 
 
-class Params(Parameters):
+class Params(Regional):
     young: Young = Field(description="Young's modulus [Pa], or a list of regions { where, young, poisson }")
-    poisson: Poisson = Field(description="Poisson's ratio [-], of every element whose region gives none")
+    poisson: Poisson | None = Field(
+        default=None, description="Poisson's ratio [-], of every element whose region gives none"
+    )
     rotation: Literal["polar", "qr"] = Field(default="polar", description="of the elements")
     tangent: Literal["usual", "exact"] = Field(default="usual", description="whether it knows how rotations change")
 

@@ -65,6 +65,7 @@ LAW = Law(
         Constant("direction", Families, "direction at rest, or two of them for two families"),
     ),
     pack=lambda values: [values["stiffness"], values["exponent"]],
+    refuses=False,
 )
 Params = LAW.parameters()
 

@@ -10,6 +10,8 @@ lambda = E nu / ((1 + nu) (1 - 2 nu)) and mu = E / (2 (1 + nu)): at small strain
 `poisson`, which may differ by region (`young` as a list of tables { where, young, poisson }). In tension it softens
 (E = 1, nu = 0.45: P = 0.599 at twice the length), in compression it stiffens without bound.
 
+poisson below 0 is refused: lambda ln^2 J with a negative lambda has no lower bound.
+
 ln J is not defined at J <= 0: see `inversion` in hyperelastic.py. For scenes that turn elements inside out,
 stable_neo_hookean costs the same and is defined everywhere.
 
@@ -19,15 +21,29 @@ Strains to about 100 %; rubber at larger ones stiffens, which this law does not 
 Source: Bonet and Wood, Nonlinear Continuum Mechanics for Finite Element Analysis, 2nd edition, 2008, section 6.4.3.
 """
 
-from typing import Any
+from typing import Annotated, Any
 
-from sim_server.hyperelastic import YOUNG_AND_POISSON, Hyperelastic, Law, lame, young_and_poisson
+from pydantic import AfterValidator, Field
+
+from sim_server.hyperelastic import Hyperelastic, Law, lame, young_and_poisson, young_and_poisson_of
+from sim_server.scene.parameters import complaint
 from sim_server.world import Body, World
 
 SCOPE = "object"
+
+
+def _not_auxetic(poisson: float) -> float:
+    if poisson < 0:
+        raise complaint(
+            "must be 0 or more: below, lambda is negative, and the energy falls without bound where an element is pressed "
+            "flat; corotational, st_venant_kirchhoff and stable_neo_hookean take such a material"
+        )
+    return poisson
+
+
 LAW = Law(
     "neo_hookean",
-    YOUNG_AND_POISSON,
+    young_and_poisson_of(Annotated[float, Field(lt=0.5), AfterValidator(_not_auxetic)]),
     pack=lame,
     elastic=young_and_poisson,
 )

@@ -13,6 +13,8 @@ bar pressed to 1/sqrt(3) = 0.577 of its length is the largest that it can bear (
 falls to zero at J = 0. There the stiffness is indefinite, and `[solver] projection` makes it semi-definite. The law is
 defined for inverted elements, which have another rest shape: the mirrored one.
 
+W is nowhere negative for any poisson from -1 to 0.5, both exclusive.
+
 Usual ranges: as of corotational, which at small strains gives the same and does not collapse.
 
 Source: Ciarlet, Mathematical Elasticity I, 1988, section 4.4; Bonet and Wood 2008, section 6.3.

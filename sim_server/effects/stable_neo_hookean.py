@@ -19,12 +19,16 @@ or `[solver] projection = "absolute"`: one linearization with clamped eigenvalue
 
 Usual ranges: young 1e3 Pa (brain, liver) to 1e7 Pa (rubber), poisson 0.3 to 0.49; from 0.49 on linear tetrahedra lock.
 
+poisson may be as low as -0.8: from about -0.85 on a body shrunk to some six tenths of its size is at rest, too.
+
 Source: Smith, de Goes and Kim, Stable Neo-Hookean Flesh Simulation, ACM Transactions on Graphics 37(2), 2018.
 """
 
-from typing import Any
+from typing import Annotated, Any
 
-from sim_server.hyperelastic import YOUNG_AND_POISSON, Hyperelastic, Law, Reals, Values, lame, young_and_poisson
+from pydantic import Field
+
+from sim_server.hyperelastic import Hyperelastic, Law, Reals, Values, lame, young_and_poisson, young_and_poisson_of
 from sim_server.world import Body, World
 
 SCOPE = "object"
@@ -36,9 +40,10 @@ def pack(values: Values) -> list[Reals]:
     return [lam + 5 / 6 * mu, 4 / 3 * mu]
 
 
+AUXETIC = Annotated[float, Field(ge=-0.8, lt=0.5)]
 LAW = Law(
     "stable_neo_hookean",
-    YOUNG_AND_POISSON,
+    young_and_poisson_of(AUXETIC),
     pack=pack,
     elastic=young_and_poisson,
     refuses=False,

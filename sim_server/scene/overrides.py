@@ -30,7 +30,17 @@ def apply(override: str, table: dict[str, Any]) -> None:
         if not isinstance(below, dict):
             raise InputError(f"{'.'.join(parents[: depth + 1])} = {below!r} is no table, so it has no keys")
         place = below
-    place[last] = value(text.strip())
+    given, there = value(text.strip()), place.get(last)
+    if _tables(there) and not _tables(given):
+        raise InputError(
+            f"{last} is a list of {len(there)} regions in the scene, which one value would take the place of; allowed: "
+            f"a list of regions, for all elements {override.partition('=')[0].strip()}=[{{ {last} = {text.strip()} }}]"
+        )
+    place[last] = given
+
+
+def _tables(value: Any) -> bool:
+    return isinstance(value, list) and bool(value) and all(isinstance(v, dict) for v in value)
 
 
 def _object(key: str, table: dict[str, Any]) -> tuple[dict[str, Any], str]:

@@ -7,7 +7,9 @@ from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, Discriminator, Field, Tag, create_model
+from pydantic import AfterValidator, Discriminator, Field, Tag, ValidationError, create_model, model_validator
+from pydantic_core import InitErrorDetails
+from pydantic_core.core_schema import ValidatorFunctionWrapHandler
 
 from sim_server.errors import InputError
 from sim_server.scene import where
@@ -15,7 +17,7 @@ from sim_server.scene.parameters import Parameters, Positive, Where, complaint
 
 log = logging.getLogger(__name__)
 
-Poisson = Annotated[float, Field(ge=0, lt=0.5)]
+Poisson = Annotated[float, Field(gt=-1, lt=0.5)]  # positive definite in between; below 0: auxetic
 
 
 class Place(Parameters):
@@ -29,6 +31,32 @@ class Region(Place):
 
     young: Positive = Field(description="Young's modulus [Pa]")
     poisson: Poisson | None = Field(default=None, description="Poisson's ratio [-]; default: that of the object")
+
+
+class Regional(Parameters):
+    """Constants of a material. The first field may be a list of regions.
+
+    A field behind it whose default is None is required, unless every region gives it.
+    """
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _given_somewhere(cls, table: Any, validate: ValidatorFunctionWrapHandler) -> Any:
+        made = validate(table)
+        first, *others = cls.model_fields
+        regions = getattr(made, first)
+        regions = regions if isinstance(regions, list) and isinstance(regions[0], Place) else [made]
+        missing = [
+            name
+            for name in others
+            if cls.model_fields[name].default is None
+            and getattr(made, name) is None
+            and any(getattr(r, name, None) is None for r in regions)
+        ]
+        if missing:
+            details = [InitErrorDetails(type="missing", loc=(name,), input=table) for name in missing]
+            raise ValidationError.from_exception_data(cls.__name__, details)
+        return made
 
 
 def _last_takes_the_rest(regions: list[Place]) -> list[Place]:
@@ -61,7 +89,7 @@ def by_region(kinds: Mapping[str, Any]) -> Any:
     """Type of a law's first constant, which may be a list of regions instead of one value.
 
     kinds: the types of all its constants by name. In each region the first one is required; those not given there are
-    the object's.
+    the object's (see Regional).
     """
     first, *others = kinds
     fields: dict[str, Any] = {first: (kinds[first], Field(...))}
@@ -87,7 +115,8 @@ def constants_by_region(
     regions = constants[first]
     if not isinstance(regions, list):
         return {name: _everywhere(value, len(points)) for name, value in constants.items()}
-    chosen = {name: _everywhere(constants[name], len(points)) for name in others}
+    beside = {n: getattr(regions[0], n) if constants[n] is None else constants[n] for n in others}  # None: in each region
+    chosen = {name: _everywhere(value, len(points)) for name, value in beside.items()}
     chosen = {first: np.zeros((len(points), *np.shape(getattr(regions[0], first)))), **chosen}
     left = np.ones(len(points), dtype=bool)
     for i, region in enumerate(regions):
@@ -115,7 +144,7 @@ def _everywhere(value: Any, elements: int) -> NDArray[np.float64]:
 
 
 def region_values(
-    young: float | list[Region], poisson: float, points: NDArray[np.float64]
+    young: float | list[Region], poisson: float | None, points: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Young's modulus [Pa] and Poisson's ratio of each element: two arrays (m,); see constants_by_region."""
     found = constants_by_region({"young": young, "poisson": poisson}, points, "Pa")

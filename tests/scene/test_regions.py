@@ -9,8 +9,9 @@ import pytest
 
 from sim_server.errors import InputError
 from sim_server.mesh.surface import centroids
-from sim_server.scene import load
+from sim_server.scene import Scene, load
 from sim_server.scene.regions import Region, region_values
+from sim_server.simulation import Simulation
 
 POINTS = np.array([[0.5, 0, 0], [1.5, 0, 0], [2.5, 0, 0]])
 
@@ -47,3 +48,35 @@ def test_bands_of_the_heterogeneous_scene():
     values, counts = np.unique(young, return_counts=True)
     assert values.tolist() == [5e4, 2.5e5, 5e6] and counts.tolist() == [1050, 1050, 1050]
     assert set(poisson) == {0.4}
+
+
+def test_constants_that_every_region_gives_need_not_stand_beside_them(tmp_path):
+    """Of all laws, vectors too; the scene as resolved loads again."""
+    path = tmp_path / "scene.toml"
+    path.write_text(
+        'dt = 0.01\n[[object]]\nname = "a"\nmesh = { bar = [2, 1, 1], size = [2, 1, 1] }\n[object.effects]\n'
+        'corotational = { young = [{ where = "X < 1", young = 1e4, poisson = -0.2 }, { young = 2e4, poisson = 0.3 }] }\n'
+        'mooney_rivlin = { c1 = [{ c1 = 1e3, c2 = 2e3, bulk = 3e4 }] }\n'
+        "fibres = { stiffness = [{ where = 'X < 1', stiffness = 1, direction = [1, 0, 0] }, "
+        "{ stiffness = 1, direction = [0, 0, 2] }] }\n"
+    )
+    scene = load(path)
+    sim = Simulation(scene)
+    young, poisson = sim.effects["corotational"].elastic[0]
+    assert sorted(set(zip(young.tolist(), poisson.tolist(), strict=True))) == [(1e4, -0.2), (2e4, 0.3)]
+    assert sim.effects["mooney_rivlin"].constants[:, 0].tolist() == [1e3, 2e3, 3e4]
+    directions = sim.effects["fibres"].directions[:3].T
+    assert {tuple(d) for d in directions.tolist()} == {(1.0, 0.0, 0.0), (0.0, 0.0, 1.0)}
+    assert Scene.model_validate(scene.resolved()).resolved() == scene.resolved()
+
+
+def test_an_override_does_not_take_the_place_of_regions_unasked():
+    scene = Path(__file__).parents[2] / "deploy" / "scenes" / "heterogeneous.toml"
+    name = load(scene).objects[0].name
+    key = f"object.{name}.effects.corotational.young"
+    with pytest.raises(InputError) as error:
+        load(scene, [f"{key}=1e6"])
+    assert "young is a list of 3 regions in the scene" in str(error.value)
+    assert str(error.value).endswith(f"{key}=[{{ young = 1e6 }}]")
+    regions = load(scene, [f"{key}=[{{ young = 1e6 }}]"]).objects[0].effects["corotational"].young
+    assert [(r.where, r.young) for r in regions] == [(None, 1e6)]
