@@ -203,11 +203,15 @@ def _announce(say, service: "Service", scene: Path, listen: list[str] | None) ->
 
 
 def _describe_objects(say, service: "Service") -> None:  # type: ignore[no-untyped-def]
-    """Size and mass of each object: where a mesh in millimetres or a density in g/cm3 shows."""
+    """Size and mass of each object: where a mesh in millimetres or a density in g/cm3 shows. Then notices."""
+    from sim_server.notices import notices
+
     world = service.simulation.world
     for body in world.bodies[:20]:
         size = " x ".join(f"{s:.3g}" for s in body.mesh.rest.max(axis=0) - body.mesh.rest.min(axis=0))
         say(f"  {body.name}: {body.last - body.first} nodes, {size} m, {world.mass[body.nodes].sum():.3g} kg")
+    for line in notices(service.simulation):
+        say(f"note: {line}")
     if service.driver.wants_factors and service.driver.free and not service.link.workers():
         say("no worker yet: block Jacobi until one joins (precond-worker, or --workers 1)")
 
