@@ -32,8 +32,9 @@ regions; in each region `where` is asked at the centroid of the element, at rest
 region that holds gives the value, and a region without `where` takes what is left.
 
 Usual ranges: young 1e3 Pa (brain, liver) to 1e7 Pa (rubber); 2e11 Pa (steel) works with small loads. poisson 0.3 to
-0.49; from 0.49 on linear tetrahedra lock (they bend too little), and at 0.5 lambda is infinite, so 0.5 is refused. Below
-0 (auxetic foams, -0.7 to 0) lambda is negative; the stiffness stays positive semi-definite down to -1, which is refused.
+0.49; from 0.49 on linear tetrahedra lock (they bend too little), and at 0.5 lambda is infinite, so 0.5 is refused.
+Below 0 (auxetic foams, -0.7 to 0) lambda is negative; the stiffness is positive semi-definite down to -1, which is
+refused.
 
 Source: Müller and Gross, Interactive Virtual Materials, 2004; Nesme, Payan and Faure 2005 (QR); Chao, Pinkall, Sanan
 and Schröder 2010, McAdams et al. 2011 (exact tangent); Felippa 2000.

@@ -35,8 +35,8 @@ SCOPE = "object"
 def _not_auxetic(poisson: float) -> float:
     if poisson < 0:
         raise complaint(
-            "must be 0 or more: below, lambda is negative, and the energy falls without bound where an element is pressed "
-            "flat; corotational, st_venant_kirchhoff and stable_neo_hookean take such a material"
+            "must be 0 or more: below, lambda is negative, and the energy falls without bound where an element is "
+            "pressed flat; corotational, st_venant_kirchhoff and stable_neo_hookean take such a material"
         )
     return poisson
 

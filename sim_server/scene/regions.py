@@ -115,7 +115,8 @@ def constants_by_region(
     regions = constants[first]
     if not isinstance(regions, list):
         return {name: _everywhere(value, len(points)) for name, value in constants.items()}
-    beside = {n: getattr(regions[0], n) if constants[n] is None else constants[n] for n in others}  # None: in each region
+    # None: given in each region, whose values then replace those of the first
+    beside = {n: getattr(regions[0], n) if constants[n] is None else constants[n] for n in others}
     chosen = {name: _everywhere(value, len(points)) for name, value in beside.items()}
     chosen = {first: np.zeros((len(points), *np.shape(getattr(regions[0], first)))), **chosen}
     left = np.ones(len(points), dtype=bool)

@@ -42,7 +42,7 @@ def test_a_body_without_elasticity_is_said():
 
 def test_springs_hold_a_part_that_tetrahedra_leave_loose(tmp_path):
     rest, tets = jittered_bar((1, 1, 1), (1, 1, 1), seed=0)
-    two = np.concatenate([rest, rest + [3.0, 0, 0]]), np.concatenate([tets, tets + len(rest)])
+    two = np.concatenate([rest, rest + np.array([3.0, 0, 0])]), np.concatenate([tets, tets + len(rest)])
     body = bar(mesh=mesh_file(tmp_path, *two), name="a", fixed="X < 0.01")
     assert notices(simulation(body, gravity=GRAVITY)) == [
         "object 'a' with parts that no element connects to a fixed node: these fall"

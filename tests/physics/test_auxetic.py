@@ -73,7 +73,7 @@ def test_corotational_elements_are_the_reference_and_their_matrix_is_definite(tm
 @every_law
 @pytest.mark.parametrize("size", [0.1, 0.6])
 def test_a_law_and_its_derivatives(tmp_path, law, size):
-    """Energy, forces, stiffness: the reference's, and each the slope of the one before. At 0.6 elements are inverted."""
+    """Energy, forces, stiffness: the reference's, each the slope of the one before. At 0.6 elements are inverted."""
     sim = odd_bar(tmp_path, law, projection="none")
     deform(sim, size, seed=2)
     energy, f, K = reference_system(sim, law)
