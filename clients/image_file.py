@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from clients.errors import BadInput, ClientError
+from protocol.extras import to_install
 
 Kind = Literal["PNG", "JPEG"]
 SUFFIXES: dict[str, Kind] = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG"}
@@ -29,7 +30,7 @@ def encoded(png: bytes, kind: Kind) -> bytes:
     try:
         from PIL import Image
     except ImportError:
-        raise ClientError("Pillow is not installed: pip install 'warpfactor[view]', or ask for a .png") from None
+        raise ClientError(f"Pillow is not installed: {to_install('view')}, or ask for a .png") from None
     file = BytesIO()
     with Image.open(BytesIO(png)) as picture:
         picture.convert("RGB").save(file, kind, quality=QUALITY)

@@ -12,6 +12,7 @@ from clients.colors import colors
 from clients.errors import ClientError
 from clients.log import Log
 from clients.surface import Coloring, Surface, legend
+from protocol.extras import to_install
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -25,7 +26,7 @@ def draw(log: Log, coloring: Coloring, top: float) -> bytes:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
     except ImportError:
-        raise ClientError("matplotlib is not installed: pip install 'warpfactor[view]'") from None
+        raise ClientError(f"matplotlib is not installed: {to_install('view')}") from None
     figure = Figure(figsize=(12.8, 8), dpi=100, layout="constrained")
     FigureCanvasAgg(figure)
     grid = figure.add_gridspec(4, 2, width_ratios=[3, 2])

@@ -14,6 +14,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from clients.errors import ClientError
+from protocol.extras import to_install
 
 START_SECONDS = 30.0
 
@@ -22,7 +23,7 @@ def viewer_binary() -> Path:
     """The program itself: the `rerun` command is a Python wrapper that would leave it behind when stopped."""
     spec = importlib.util.find_spec("rerun_cli")
     if spec is None or spec.origin is None:
-        raise ClientError("rerun-sdk is not installed: pip install 'warpfactor[view]'")
+        raise ClientError(f"rerun-sdk is not installed: {to_install('view')}")
     return Path(spec.origin).with_name("rerun")
 
 

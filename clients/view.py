@@ -24,6 +24,7 @@ from clients.rerun_viewer import Viewer, has_display
 from clients.scalars import columns, row
 from clients.screenshot import has_vulkan_driver, screenshot
 from clients.surface import Coloring, Surface
+from protocol.extras import to_install
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -190,5 +191,5 @@ def _recording() -> rr.RecordingStream:
     try:
         import rerun as rr
     except ImportError:
-        raise ClientError("rerun-sdk is not installed: pip install 'warpfactor[view]'") from None
+        raise ClientError(f"rerun-sdk is not installed: {to_install('view')}") from None
     return rr.RecordingStream("warpfactor")

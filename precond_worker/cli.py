@@ -12,6 +12,7 @@ from typing import Annotated, NoReturn
 import typer
 
 from precond_worker.errors import DeviceUnusable, NameTaken
+from protocol.nvidia import nvidia_device
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
@@ -114,6 +115,8 @@ def _library(device: str, arithmetic: str) -> str:
     if arithmetic not in ("auto", "float32", "float64"):
         _bad_input(f"--arithmetic {arithmetic}: allowed are auto, float32, float64")
     if device == "cpu":
+        return "auto"
+    if device == "auto" and not nvidia_device():
         return "auto"
     from precond_worker.gpu.device import try_out
 

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from precond_worker.blocks import BLOCK, Index, checked_pattern
 from precond_worker.errors import NotPositiveDefinite
 from protocol import FactorPattern
+from protocol.extras import to_install
 
 __all__ = ["CHOICE", "LIBRARIES", "Analysis", "NotPositiveDefinite", "default_library"]
 
@@ -120,5 +121,6 @@ def default_library() -> tuple[str, str]:
         import sksparse.cholmod  # noqa: F401
     except ImportError as error:
         if not forced:
-            return "superlu", f"pip install 'warpfactor[cholmod]' for CHOLMOD ({error}). {SUPERLU_COST}"
+            needed = f"{to_install('cholmod')} builds it on Debian's libsuitesparse-dev"
+            return "superlu", f"no scikit-sparse ({error}): {SUPERLU_COST}. {needed}"
     return "cholmod", ""

@@ -17,11 +17,13 @@ import shutil
 import subprocess
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from sim_server.compiling import CompileError, Job, compilers
 
 HERE = Path(__file__).parent
 INCLUDE = HERE / "kernels"
@@ -40,10 +42,6 @@ FLAGS = [
 
 compiled: list[str] = []  # names of the texts this process uses, in order: what a scene costs can be tested
 libraries: set[str] = set()  # what they were compiled to, named by source, headers, flags, compiler and processor
-
-
-class CompileError(RuntimeError):
-    """The C++ compiler is missing or refused a text; the message holds its output."""
 
 
 @cache
@@ -96,11 +94,10 @@ def read_text(path: str) -> tuple[str, str]:
     return Path(law).stem, text.replace("#include LAW\n", (HERE / law).read_text())
 
 
-def build(source: Path, defines: tuple[str, ...] = (), text: str | None = None, stepping: bool = True) -> Path:
-    """Shared library of one text; compiles only what the cache lacks. text: where the file does not hold it. stepping:
-    what a step computes comes out of it, so it counts among `libraries`.
+def begin(source: Path, defines: tuple[str, ...] = (), text: str | None = None) -> Path:
+    """The shared library of one text, which exists after `compilers.finish`; compiles only what the cache lacks.
 
-    Raises CompileError with the compiler's output, or if there is no folder for it.
+    text: where the file does not hold it. Raises CompileError without a compiler or a folder for the library.
     """
     folders = [f for f in {INCLUDE, source.parent, HERE / "native"} if f.is_dir()]
     headers = sorted(p for folder in folders for p in folder.iterdir() if p.suffix in (".h", ".cuh"))
@@ -111,17 +108,31 @@ def build(source: Path, defines: tuple[str, ...] = (), text: str | None = None, 
     library = cache_folder() / f"{source.stem}-{digest.hexdigest()[:24]}.so"
     if not library.exists():
         _make(library.parent)
-        scratch = library.with_suffix(f".{os.getpid()}.tmp")  # another process may build the same
         file = str(source) if text is None else "-"
-        command = [compiler(), *flags, "-x", "c++", f"-I{INCLUDE}", file, "-o", str(scratch)]
-        result = subprocess.run(command, input=text, capture_output=True, text=True)
-        if result.returncode:
-            raise CompileError(f"{source.name} did not compile:\n{' '.join(command)}\n{result.stderr}")
-        os.replace(scratch, library)
+        command = [compiler(), *flags, "-x", "c++", f"-I{INCLUDE}", file]
+        compilers.begin(Job(source.name, library, command, text))
+    return library
+
+
+def used(source: Path, library: Path, stepping: bool = True) -> None:
+    """Notes that this process uses a library. stepping: what a step computes comes out of it."""
     compiled.append(source.name)
     if stepping:
         libraries.add(library.name)
+
+
+def build(source: Path, stepping: bool = True) -> Path:
+    """The shared library of a text, made. Raises CompileError with the compiler's output."""
+    library = begin(source)
+    compilers.finish(library)
+    used(source, library, stepping)
     return library
+
+
+def ahead(*paths: str) -> None:
+    """Begins to compile host-only texts of this package that will be asked for soon."""
+    for path in paths:
+        begin(HERE / path)
 
 
 _SCALARS = {"int": ctypes.c_int32, "double": ctypes.c_double, "float": ctypes.c_float}
@@ -206,11 +217,16 @@ class Launch:
     """One kernel with its arguments: what the native loop calls, `items` times."""
 
     name: str
-    function: int  # address of void(const void* params, int begin, int end)
+    address: Callable[[], int]
     params: ctypes.Structure
     items: int
     arrays: dict[str, np.ndarray]  # kept alive
     domain: str = ""  # what its items are, as its text says
+
+    @property
+    def function(self) -> int:
+        """Address of void(const void* params, int begin, int end); waits until its text is compiled."""
+        return self.address()
 
     def fetch(self, name: str) -> np.ndarray:
         """One of its arrays as kernels have left it."""
@@ -223,15 +239,32 @@ class Launch:
 
 
 class Module:
-    """A compiled kernel text of this package, e.g. Module("effects/corotational.cu"); paths: as of read_text."""
+    """A kernel text of this package, e.g. Module("effects/corotational.cu"); paths: as of read_text.
+
+    Its compiler is started here; who first asks for the address of a kernel waits for it, so that those of a scene are
+    compiled side by side.
+    """
 
     def __init__(self, path: str, real: str = "double"):
         self.real = real
         self.name, self._text = read_text(path)
         source = HERE / path.rpartition("+")[2]
         composed = self._text if "+" in path else None
-        self._library = ctypes.CDLL(str(build(source, (f"real={real}",), composed)))
+        self._path = begin(source, (f"real={real}",), composed)
+        used(source, self._path)
         self._layouts: dict[str, type[ctypes.Structure]] = {}  # of the kernels bound so far
+
+    @cached_property
+    def library(self) -> ctypes.CDLL:
+        """The compiled text; raises CompileError with the compiler's output."""
+        compilers.finish(self._path)
+        return ctypes.CDLL(str(self._path))
+
+    def address(self, kernel: str) -> int:
+        """Of a kernel's function."""
+        found = ctypes.cast(getattr(self.library, kernel), ctypes.c_void_p).value
+        assert found is not None
+        return found
 
     def bind(self, kernel: str, n: int, **arguments: Any) -> Launch:
         """Argument struct of `kernel` over `n` items; raises TypeError where an argument does not fit the text."""
@@ -245,9 +278,8 @@ class Module:
         for a, value in fields:
             setattr(params, a.name, value if a.dtype is None else value.ctypes.data)
         arrays = {a.name: value for a, value in fields if a.dtype is not None}
-        function = ctypes.cast(getattr(self._library, kernel), ctypes.c_void_p).value
-        assert function is not None
-        return Launch(f"{self.name}.{kernel}", function, params, n, arrays, domain_of(self._text, struct))
+        address = partial(self.address, kernel)
+        return Launch(f"{self.name}.{kernel}", address, params, n, arrays, domain_of(self._text, struct))
 
 
 def build_id() -> str:

@@ -7,13 +7,15 @@ import signal
 import sys
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
+from protocol.nvidia import nvidia_device
+from sim_server.compile_notice import compiling_told
 from sim_server.errors import DeviceError, DeviceLost, InputError
 
 if TYPE_CHECKING:
@@ -93,7 +95,8 @@ def serve(
             realtime, workers, worker_device,
         )  # fmt: skip
         with ExitStack() as closing:
-            service, supervisor = _set_up(closing, options)
+            with nullcontext() if quiet else compiling_told(say):
+                service, supervisor = _set_up(closing, options)
             _announce(say, service, scene, listen)
             _wait_for_workers(service, supervisor)
             _describe_objects(say, service)
@@ -111,9 +114,11 @@ def serve(
 
 
 def chosen(device: str, say: Callable[[str], None]) -> str:
-    """The device to run on: auto is the GPU if there is a usable one. Says why if there is none."""
+    """The device to run on: auto is the GPU if there is a usable one. Says why if there is one that is not usable."""
     if device != "auto":
         return device
+    if not nvidia_device():
+        return "cpu"
     from sim_server.gpu.device import cupy
 
     try:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from sim_server.backend import Cpu, Launch
+from sim_server.backend import Cpu, Launch, ahead
 from sim_server.effect import Effect, Refusal
 from sim_server.effects import effect
 from sim_server.engine import Engine, Kind, Newton
@@ -42,6 +42,8 @@ class Simulation:
     def _build(self, scene: Scene, device: str) -> None:
         scene.solver.check_device(device)
         scene.integrator.check_device(device)
+        loop = "gpu/loop.cpp" if device == "gpu" else "native/loop.cpp"  # takes longest to compile
+        ahead(loop, *(["native/judge.cpp"] if scene.solver.wants_factors else []))
         self.world = World(scene, _backend(device, scene.solver.precision))
         self.effects = build_effects(scene, self.world)
         elements = [e.elements for e in self.effects.values() if e.elements is not None]

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from precond_worker.errors import DeviceUnusable
+from protocol.extras import to_install
 
 SOURCE = Path(__file__).with_name("multifrontal.cu")
 ARITHMETIC = ("auto", "float32", "float64")
@@ -19,7 +20,7 @@ def cupy() -> Any:
     try:
         import cupy as cp
     except ImportError as error:
-        raise DeviceUnusable(f"needs CuPy: pip install 'warpfactor[gpu]' ({_first_line(error)})") from error
+        raise DeviceUnusable(f"needs CuPy ({_first_line(error)}); {to_install('gpu')}") from error
     try:
         count = cp.cuda.runtime.getDeviceCount()
     except cp.cuda.runtime.CUDARuntimeError as error:

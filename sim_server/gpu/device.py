@@ -14,7 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from protocol.extras import to_install
 from sim_server.backend import HERE, INCLUDE, Argument, CompileError, arguments_of, build_id, domain_of, read_text
+from sim_server.compiling import compilers
 from sim_server.errors import DeviceError
 
 LEAST = 80  # compute capability times 10: the solver multiplies by matrix instructions that came with it
@@ -27,7 +29,7 @@ def cupy() -> Any:
     try:
         import cupy as cp
     except ImportError as error:
-        raise DeviceError(f"no GPU: CuPy is not usable ({error}); pip install 'warpfactor[gpu]'") from error
+        raise DeviceError(f"no GPU: CuPy is not usable ({error}); {to_install('gpu')}") from error
     try:
         count = cp.cuda.runtime.getDeviceCount()
     except cp.cuda.runtime.CUDARuntimeError as error:
@@ -78,7 +80,8 @@ def building() -> Iterator[None]:
 def compiled(name: str, module: Any, kernel: str) -> Any:
     """A kernel of a text; raises CompileError with the first error of the compiler."""
     try:
-        return module.get_function(kernel)
+        with compilers.counted():
+            return module.get_function(kernel)
     except cupy().cuda.compiler.CompileException as error:
         lines = str(error).splitlines()
         first = next((line for line in lines if "error" in line), lines[0] if lines else "no message")

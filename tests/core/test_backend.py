@@ -62,16 +62,16 @@ def test_a_cache_that_cannot_be_made_is_named(folder, monkeypatch, tmp_path):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("WARPFACTOR_CACHE", str(tmp_path / "file" / "cache"))
     with pytest.raises(backend.CompileError, match=r"kept in .*file/cache: Not a directory; WARPFACTOR"):
-        backend.Module("push.cu")
+        backend.Module("push.cu").address("push")
 
 
 def test_nothing_is_compiled_twice(folder):
-    backend.Module("push.cu")
+    backend.Module("push.cu").address("push")
     first = libraries(folder)
     assert len(first) == 1
     assert next(iter(first)).startswith("push-")
     stamp = next((folder.parent / "cache").iterdir()).stat().st_mtime_ns
-    backend.Module("push.cu")
+    backend.Module("push.cu").address("push")
     assert libraries(folder) == first
     assert next((folder.parent / "cache").iterdir()).stat().st_mtime_ns == stamp
 
@@ -96,7 +96,7 @@ def test_the_cache_knows_text_headers_flags_and_precision(folder, monkeypatch):
     monkeypatch.setattr(backend, "FLAGS", [*backend.FLAGS, "-DUNUSED"])
     assert result() == 30.0
     assert len(libraries(folder)) == 4
-    backend.Module("push.cu", "float")
+    backend.Module("push.cu", "float").address("push")
     assert len(libraries(folder)) == 5
     (folder / "mine.cuh").write_text("#define FACTOR 2\n")
     source.write_text(PUSH)
@@ -106,7 +106,7 @@ def test_the_cache_knows_text_headers_flags_and_precision(folder, monkeypatch):
 def test_a_text_that_does_not_compile_says_why_and_leaves_nothing(folder):
     (folder / "push.cu").write_text(PUSH.replace("p.h", "p.nonsense"))
     with pytest.raises(backend.CompileError, match=r"push\.cu did not compile:[\s\S]*nonsense"):
-        backend.Module("push.cu")
+        backend.Module("push.cu").address("push")
     assert not any(name.endswith(".so") for name in libraries(folder))
 
 

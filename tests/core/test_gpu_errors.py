@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from sim_server import cli
 from sim_server.backend import CompileError
 from sim_server.cli import chosen
 from sim_server.errors import DeviceError
@@ -61,7 +62,7 @@ def cupy(monkeypatch):
 
 
 MISSING = [
-    (None, r"CuPy is not usable \(.*cupy.*\); pip install 'warpfactor\[gpu\]'"),
+    (None, r"CuPy is not usable \(.*cupy.*\); .*-m pip install -e '.*\[gpu\]'"),
     (0, "sees no NVIDIA device"),
     (
         CUDARuntimeError("cudaErrorInsufficientDriver: CUDA driver version is insufficient for CUDA runtime version"),
@@ -91,8 +92,9 @@ def test_without_a_gpu_one_message_says_what_to_do(cupy, found, text):
 @pytest.mark.parametrize(
     ("found", "text"), MISSING, ids=["no cupy", "none visible", "old driver", "no device", "other"]
 )
-def test_auto_goes_on_with_the_cpu_and_says_why_in_one_line(cupy, found, text):
+def test_auto_goes_on_with_the_cpu_and_says_why_in_one_line(cupy, found, text, monkeypatch):
     cupy(None if found is None else fake(found))
+    monkeypatch.setattr(cli, "nvidia_device", lambda: True)
     said: list[str] = []
     assert chosen("auto", said.append) == "cpu"
     assert len(said) == 1
@@ -100,8 +102,18 @@ def test_auto_goes_on_with_the_cpu_and_says_why_in_one_line(cupy, found, text):
     assert "\n" not in said[0]
 
 
-def test_auto_takes_a_gpu_that_is_there_and_says_nothing(cupy):
+@pytest.mark.parametrize("installed", [None, fake(0)], ids=["no cupy", "cupy"])
+def test_auto_says_nothing_of_gpus_where_there_is_none(cupy, installed, monkeypatch):
+    cupy(installed)
+    monkeypatch.setattr(cli, "nvidia_device", lambda: False)
+    said: list[str] = []
+    assert chosen("auto", said.append) == "cpu"
+    assert said == []
+
+
+def test_auto_takes_a_gpu_that_is_there_and_says_nothing(cupy, monkeypatch):
     cupy(fake())
+    monkeypatch.setattr(cli, "nvidia_device", lambda: True)
     said: list[str] = []
     assert chosen("auto", said.append) == "gpu"
     assert [chosen(d, said.append) for d in ("cpu", "gpu")] == ["cpu", "gpu"]

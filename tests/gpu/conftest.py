@@ -1,7 +1,20 @@
 # SPDX-License-Identifier: MIT
-"""Tests beside a GPU: skipped, with the reason, where there is none."""
+"""Tests beside a GPU: left out without an NVIDIA device; skipped, with the reason, where there is no usable one."""
+
+from pathlib import Path
 
 import pytest
+
+from protocol.nvidia import nvidia_device
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if nvidia_device():
+        return
+    here = [item for item in items if item.path.is_relative_to(Path(__file__).parent)]
+    if here:
+        items[:] = [item for item in items if item not in here]
+        config.hook.pytest_deselected(items=here)
 
 
 @pytest.fixture(autouse=True)

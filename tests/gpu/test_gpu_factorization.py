@@ -144,11 +144,25 @@ def test_nothing_is_allocated_once_it_runs():
     analysis = Analysis(*graph, "gpu")
     matrix = spd(*graph)
     analysis.factorize(matrix)
-    device, pinned = cp.get_default_memory_pool(), cp.get_default_pinned_memory_pool()
-    before = device.total_bytes(), cp.cuda.runtime.memGetInfo(), pinned.n_free_blocks()
-    for _ in range(50):
-        analysis.factorize(matrix)
-    assert (device.total_bytes(), cp.cuda.runtime.memGetInfo(), pinned.n_free_blocks()) == before
+    asked: list[int] = []  # bytes that this process asked its pool or the device for; others may work on the device
+
+    class Hook(cp.cuda.MemoryHook):
+        name = "requests"
+
+        def alloc_preprocess(self, **request):
+            asked.append(request["mem_size"])
+
+        def malloc_preprocess(self, **request):
+            asked.append(request["mem_size"])
+
+    pinned = cp.get_default_pinned_memory_pool()
+    before = pinned.n_free_blocks()
+    with Hook():
+        for _ in range(50):
+            analysis.factorize(matrix)
+        assert asked == [] and pinned.n_free_blocks() == before
+        cp.empty(1000)
+    assert asked, "the hook hears of what this process allocates"
 
 
 def test_too_little_memory_is_said_with_sizes_and_the_rest_goes_on(monkeypatch):

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from precond_worker.factorize import CHOICE, Analysis, NotPositiveDefinite, default_library
+from protocol.extras import to_install
 from tests.reference import supernodal
 from tests.worker.block_matrices import bar_edges, dense_matrix, diagonal_blocks, pattern, spd
 
@@ -233,7 +234,7 @@ def test_without_scikit_sparse_superlu_is_the_default(monkeypatch):
         monkeypatch.setitem(sys.modules, module, None)
     name, message = default_library()
     assert name == "superlu"
-    assert "warpfactor[cholmod]" in message
+    assert "no scikit-sparse" in message and to_install("cholmod") in message
     assert Analysis(*graph).library == "superlu"
     monkeypatch.setenv(CHOICE, "cholmod")
     assert default_library() == ("cholmod", "")

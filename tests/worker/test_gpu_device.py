@@ -52,7 +52,7 @@ def forgotten():
 
 
 OBSTACLES = {
-    "no CuPy": (None, r"needs CuPy: pip install 'warpfactor\[gpu\]'"),
+    "no CuPy": (None, r"needs CuPy \(.*cupy.*\); .*-m pip install -e '.*\[gpu\]'"),
     "no driver": (installed(CUDARuntimeError("cudaErrorInsufficientDriver")), r"no usable NVIDIA driver.*Insufficient"),
     "no device": (installed(0), r"no NVIDIA GPU is visible \(CUDA_VISIBLE_DEVICES\?\)"),
     "no compiler": (installed(1, RuntimeError("libnvrtc.so\nmore")), r"does not compile for this GPU: libnvrtc\.so$"),
@@ -73,6 +73,7 @@ def test_an_unusable_gpu_is_named_in_one_line(module, text, monkeypatch):
 @obstacles
 def test_the_worker_ends_with_code_2_or_takes_the_cpu(module, text, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "cupy", module)
+    monkeypatch.setattr(cli, "nvidia_device", lambda: True)
     with pytest.raises(cli.typer.Exit) as ended:
         cli._library("gpu", "auto")
     assert ended.value.exit_code == 2
@@ -81,8 +82,17 @@ def test_the_worker_ends_with_code_2_or_takes_the_cpu(module, text, monkeypatch,
     assert "--device auto takes the CPU: " in capsys.readouterr().err
 
 
+@obstacles
+def test_the_worker_says_nothing_of_gpus_where_there_is_none(module, text, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "cupy", module)
+    monkeypatch.setattr(cli, "nvidia_device", lambda: False)
+    assert cli._library("auto", "auto") == "auto"
+    assert capsys.readouterr().err == ""
+
+
 def test_the_worker_takes_the_gpu_where_there_is_one(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "cupy", installed())
+    monkeypatch.setattr(cli, "nvidia_device", lambda: True)
     assert cli._library("auto", "auto") == cli._library("gpu", "auto") == "gpu"
     assert cli._library("gpu", "float64") == "gpu-float64"
     assert cli._library("cpu", "auto") == "auto"

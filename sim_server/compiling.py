@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: MIT
+"""Compilers at work: shared libraries are made several at a time, begun before anybody waits for one of them."""
+
+import atexit
+import contextlib
+import os
+import signal
+import subprocess
+import tempfile
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO
+
+LOOK = 5e-3  # s between looks at the compilers that run
+KEPT = 0.3  # s that it takes at most to fetch a kernel from a cache
+PATIENCE = 2.0  # s for a compiler to end when told
+Progress = Callable[[int, int], None]
+
+
+class CompileError(RuntimeError):
+    """The C++ compiler is missing or refused a text; the message holds its output."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """A shared library to make. command: without its -o. text: what the compiler reads where no file holds it."""
+
+    name: str
+    library: Path
+    command: list[str]
+    text: str | None = None
+
+    @property
+    def scratch(self) -> Path:
+        """Where the compiler writes: another process may make the same library."""
+        return self.library.with_suffix(f".{os.getpid()}.tmp")
+
+
+@dataclass(frozen=True)
+class Running:
+    """A compiler at work on a job. said: the file of its messages."""
+
+    job: Job
+    process: "subprocess.Popen[bytes]"
+    said: IO[bytes]
+
+
+class Compilers:
+    """Runs up to `cores` compilers at a time.
+
+    progress: called with the number of texts compiled and of all asked for, counted since there was last nothing to do,
+    while somebody waits.
+    """
+
+    def __init__(self, cores: int):
+        self.cores = cores
+        self.progress: Progress | None = None
+        self._lock = threading.Lock()
+        self._waiting: deque[Job] = deque()
+        self._running: dict[Path, Running] = {}
+        self._failed: dict[Path, str] = {}
+        self._done = self._total = 0
+
+    def begin(self, job: Job) -> None:
+        """Starts a compiler now or once one of the others has ended; returns at once."""
+        with self._lock:
+            if job.library in self._running or any(job.library == other.library for other in self._waiting):
+                return
+            if not self._waiting and not self._running:
+                self._done = self._total = 0
+            self._failed.pop(job.library, None)
+            self._waiting.append(job)
+            self._total += 1
+            self._turn()
+
+    def finish(self, library: Path) -> None:
+        """Waits until it is made, if it was begun; raises CompileError with the compiler's output."""
+        while not self._finished(library):
+            if self.progress is not None:
+                self.progress(self._done, self._total)
+            time.sleep(LOOK)
+
+    @contextmanager
+    def counted(self) -> Iterator[None]:
+        """For a kernel that another compiler makes, within: it counts for `progress`, unless that compiler had it."""
+        begun = time.monotonic()
+        yield
+        if time.monotonic() - begun > KEPT and self.progress is not None:
+            self._done, self._total = self._done + 1, self._total + 1
+            self.progress(self._done, self._total)
+
+    def stop(self) -> None:
+        """Ends all compilers; what they were to make is not made."""
+        with self._lock:
+            self._waiting.clear()
+            for running in self._running.values():
+                with contextlib.suppress(ProcessLookupError):
+                    os.killpg(running.process.pid, signal.SIGTERM)
+            for running in self._running.values():
+                try:
+                    running.process.wait(PATIENCE)
+                except subprocess.TimeoutExpired:
+                    os.killpg(running.process.pid, signal.SIGKILL)
+                running.job.scratch.unlink(missing_ok=True)
+            self._running.clear()
+
+    def _finished(self, library: Path) -> bool:
+        with self._lock:
+            self._turn()
+            if library in self._failed:
+                raise CompileError(self._failed[library])
+            return library not in self._running and all(library != job.library for job in self._waiting)
+
+    def _turn(self) -> None:
+        """Collects compilers that have ended and starts those there is room for."""
+        for running in [r for r in self._running.values() if r.process.poll() is not None]:
+            del self._running[running.job.library]
+            self._collect(running)
+            self._done += 1
+        while self._waiting and len(self._running) < self.cores:
+            job = self._waiting.popleft()
+            self._running[job.library] = _start(job)
+
+    def _collect(self, running: Running) -> None:
+        job = running.job
+        with running.said as file:
+            if running.process.returncode:
+                file.seek(0)
+                said = file.read().decode(errors="replace")
+                self._failed[job.library] = f"{job.name} did not compile:\n{' '.join(job.command)}\n{said}"
+                job.scratch.unlink(missing_ok=True)
+            else:
+                os.replace(job.scratch, job.library)
+
+
+def _start(job: Job) -> Running:
+    said = tempfile.TemporaryFile()  # noqa: SIM115  _collect closes it. No pipe: nobody reads while it runs
+    with tempfile.TemporaryFile() as text:
+        text.write((job.text or "").encode())
+        text.seek(0)
+        process = subprocess.Popen(
+            [*job.command, "-o", str(job.scratch)], stdin=text, stdout=said, stderr=said,
+            start_new_session=True,  # stop() ends the compiler proper too, which the command starts
+        )  # fmt: skip
+    return Running(job, process, said)
+
+
+compilers = Compilers(len(os.sched_getaffinity(0)))
+atexit.register(compilers.stop)
