@@ -34,7 +34,8 @@ def watch(client: Client, count: int = 0) -> None:
 def tables(status: pb.Status) -> Group:
     """Summary, objects and workers; what the server makes of those that it supervises."""
     local = [_local(status)] if status.local_workers else []
-    return Group(_summary(status), _objects(status), _workers(status), *local)
+    pace = [Text(status.pace, "bold red")] if status.pace else []
+    return Group(_summary(status), *pace, _objects(status), _workers(status), *local)
 
 
 def _summary(status: pb.Status) -> Text:

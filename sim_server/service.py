@@ -19,9 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol import messages_pb2 as pb
+from protocol.nvidia import nvidia_device
 from sim_server.commands import Commands
 from sim_server.driver import Driver
 from sim_server.network.link import ServerLink
+from sim_server.pace import Pace
 from sim_server.recorder import Recorder
 from sim_server.simulation import Simulation
 from sim_server.telemetry import Telemetry
@@ -57,6 +59,7 @@ class Service:
         self._asked: list[Callable[[pb.Reply], None]] = []  # those who want a fresh status
         self._status_due = self._beside_due = 0.0
         self.beside: Callable[[], None] = lambda: None  # called now and then: the supervisor of local workers
+        self.pace = Pace(simulation.world.dt, self._advice, not self._on_gpu) if realtime else None
         self._alone = not self.driver.wants_factors or self.driver.free  # the loop needs no Python
         self.telemetry.open()
 
@@ -99,6 +102,7 @@ class Service:
             self.beside()
         self._carry_out()
         self._tell_status()
+        self._look_at_pace()
         self.commands.gone(set(self.link.clients()))
         self.telemetry.publish_status(self._state(), force=False)
 
@@ -126,6 +130,30 @@ class Service:
                 reply(pb.Reply())
             self._asked.clear()
 
+    def _look_at_pace(self) -> None:
+        """Says so if the run does not keep pace with the clock."""
+        if self.pace is None:
+            return
+        warm = not self.driver.wants_factors or all(track.used for track in self.driver.tracks)
+        line = self.pace.look(time.monotonic(), self.engine.step, self._state() != "running", warm)
+        if line:
+            log.warning("%s", line)
+        self.telemetry.pace = self.pace.verdict
+
+    @property
+    def _on_gpu(self) -> bool:
+        return bool(self.simulation.world.backend.name == "gpu")
+
+    def _advice(self) -> str:
+        """What makes steps take less time, or lets them take it."""
+        ways = ["a larger dt (--set dt=...)", "a coarser mesh"]
+        workers = len(self.link.workers())
+        if self.driver.wants_factors and workers < len(self.driver.tracks):
+            ways.append("more workers" if workers else "a worker (--workers 1)")
+        if not self._on_gpu and nvidia_device():
+            ways.append("--device gpu")
+        return f"What helps: {', '.join(ways)}; --free-run does without the clock"
+
     def _drain(self) -> None:
         if self._alone:
             records = self.driver.pump()
@@ -136,6 +164,8 @@ class Service:
             log.warning("%s", line)
         for line in self.telemetry.bad_steps(records):
             log.error("%s", line)
+        if self.pace is not None:
+            self.pace.note(records)
         self.telemetry.records(records)
         self.telemetry.frames()
         self.engine.loop.frame_every = self.telemetry.wanted_frames()

@@ -42,6 +42,7 @@ class Telemetry:
         self._last: NDArray[Any] = np.zeros(len(self._window), self.engine.records_dtype)
         self._bad: set[str] = set()
         self.solves = 0
+        self.pace = ""  # why the run does not keep pace with the clock; empty: it does, or need not
         self.unconverged: Counter[str] = Counter()  # solves by status, of those that did not converge
         self._due = {"steps": 0.0, "state": 0.0, "status": 0.0, "look": 0.0}
         self._watched = False
@@ -172,7 +173,7 @@ class Telemetry:
             scene=self.simulation.scene.name, state=state, step=self.engine.step, time=self.engine.step * world.dt,
             dt=world.dt, step_p50=p50, step_p99=p99, step_max=most, late_steps=loop.late_steps,
             device=self.simulation.world.backend.name,
-            pid=os.getpid(), uptime=time.monotonic() - self.begun,
+            pid=os.getpid(), uptime=time.monotonic() - self.begun, pace=self.pace,
         )  # fmt: skip
         dropped = loop.frames_dropped + (self.recorder.dropped if self.recorder else 0)
         status.frames_dropped, status.records_dropped = dropped, loop.records_dropped
