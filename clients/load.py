@@ -23,6 +23,7 @@ from clients.frames import Mesh
 from clients.load_processes import Drivers, free_endpoint, server
 from clients.load_report import Looks, report
 from clients.log import Log
+from clients.progress import progress_bar
 from clients.scalars import Columns, columns, row
 from protocol import messages_pb2 as pb
 
@@ -108,17 +109,19 @@ def _drive(load: Load, connect: list[str], watch: bool) -> tuple[Looks, list[dic
             batches = client.steps() if watch else None
             seen: list[pb.ObjectStep] = []
 
-            def watched(seconds: float) -> pb.Status:
+            def watched(seconds: float, what: str = "") -> pb.Status:
                 deadline = time.monotonic() + seconds
-                while (left := deadline - time.monotonic()) > 0:
-                    time.sleep(min(left, POLL))
-                    seen.extend(batches.new() if batches else [])
+                with progress_bar(what, seconds) as progress:
+                    while (left := deadline - time.monotonic()) > 0:
+                        time.sleep(min(left, POLL))
+                        seen.extend(batches.new() if batches else [])
+                        progress(seconds - left)
                 return _status(client)
 
             before = watched(0)
-            begun = watched(load.quiet) if load.clients and load.quiet else before
+            begun = watched(load.quiet, "without clients") if load.clients and load.quiet else before
             drivers.begin()
-            return (before, begun, watched(load.seconds)), drivers.reports(), seen
+            return (before, begun, watched(load.seconds, "with clients")), drivers.reports(), seen
 
 
 def _status(client: Client) -> pb.Status:

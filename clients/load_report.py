@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clients.load_verdict import verdict
 from clients.scalars import Columns
 from protocol import messages_pb2 as pb
 
@@ -30,10 +31,12 @@ def report(load: Load, looks: Looks, clients: list[dict[str, Any]], steps: dict[
     tets = {found.object: found.tets for found in ended.objects}
     used = {o.object: o.factors_used for o in ended.objects}
     used_before = {o.object: o.factors_used for o in begun.objects}
+    ours = _steps(begun, ended, steps)
     return {
+        "verdict": verdict(ended, ours, seconds, within),
         "scene": ended.scene, "seed": None if load.connect else load.seed, "device": ended.device, "dt": ended.dt,
         "seconds": seconds,
-        "steps": _steps(begun, ended, steps) | {"quiet": _quiet(before, begun, ended, steps)},
+        "steps": ours | {"quiet": _quiet(before, begun, ended, steps)},
         "objects": [
             {"object": name, "tets": tets.get(name), "factors": used[name] - used_before.get(name, 0), **_body(found)}
             for name, found in sorted(within.items())
@@ -143,6 +146,7 @@ def tables(found: dict[str, Any]) -> Group:
     steps, workers, server, commands = found["steps"], found["workers"], found["server"], found["clients"]["commands"]
     seed = "" if found["seed"] is None else f", seed {found['seed']}"
     lines = [
+        found["verdict"],
         f"{found['scene']} on {found['device']}{seed}: {steps['count']} steps in {found['seconds']:.1f} s, "
         f"dt {1e3 * found['dt']:g} ms",
         f"step p50 {_cell(steps['ms_p50'])}, p99 {_cell(steps['ms_p99'])}, max {_cell(steps['ms_max'])} ms; "

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 
 @contextmanager
-def progress_bar(title: str, total: int) -> Iterator[Callable[[int], None]]:
+def progress_bar(title: str, total: float) -> Iterator[Callable[[float], None]]:
     """Gives a function that takes how much of `total` is done; the bar goes to stderr and vanishes at the end."""
     if not sys.stderr.isatty():
         yield lambda done: None

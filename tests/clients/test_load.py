@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -154,6 +155,7 @@ def test_a_short_run(tmp_path: Path) -> None:
     code, out, err = run(*TINY, "--json", "--out", str(tmp_path))
     assert code == 0, err
     found = json.loads(out)
+    assert "keep" in found["verdict"] and "steps late" in found["verdict"]
     assert found == json.loads((tmp_path / "load.json").read_text())
     assert (tmp_path / "load.toml").read_text() == load_scene.scene(2, (24, 96), 1)
     assert (tmp_path / "load.png").read_bytes().startswith(b"\x89PNG") and (tmp_path / "load.mcap").stat().st_size
@@ -183,6 +185,7 @@ def test_on_a_server_that_runs_already(tmp_path: Path) -> None:
             until(lambda: client.status().step > 5, "it runs")
             code, out, err = run("--connect", stage.endpoint, "--clients", "3", "--rate", "40", "--seconds", "1.5")
             assert code == 0, err
+            assert re.match(r"(keeps pace: .* steps late|does not keep pace: .* s simulated a second, )", out), out
             assert "beam on cpu" in out and "3 clients" in out and "0 unanswered" in out
             assert client.status().state == "running", "it is left as it was"
             until(lambda: len(client.status().clients) == 1, "its clients have gone")
