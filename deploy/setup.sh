@@ -15,6 +15,45 @@ stop() {
     exit "$code"
 }
 
+# --- commands that take their time -----------------------------------------------------------------------------------
+
+EVERY=20  # s between lines that say how far a command is, where nobody sits at a terminal
+
+# newest LOG: its last line, shortened.
+newest() { tail -c 2000 "$1" 2>/dev/null | tr '\r' '\n' | grep -v '^[[:space:]]*$' | tail -n 1 | cut -c 1-70; }
+
+# tell_progress WHAT LOG: until it is killed, or this script is gone, shows the time and what LOG says: on a terminal in one
+# line that is written over again and again.
+tell_progress() {
+    local begun=$SECONDS told=$SECONDS line text
+    while sleep 1 && kill -0 $$ 2>/dev/null; do
+        line=$(newest "$2") || line=
+        if [ -t 2 ]; then
+            text="deploy/run: $1, $((SECONDS - begun)) s: $line"
+            printf '\r\033[K%s' "${text:0:${COLUMNS:-80}-1}" >&2
+        elif ((SECONDS - told >= EVERY)); then
+            told=$SECONDS
+            say "still $1, $((SECONDS - begun)) s: $line"
+        fi
+    done
+}
+
+# shown WHAT LOG COMMAND...: runs a command with its output at the end of LOG, and says meanwhile how far it is, at last how
+# long it took.
+shown() {
+    local what=$1 log=$2 begun=$SECONDS code=0 teller
+    shift 2
+    [ -t 2 ] || say "$what"
+    tell_progress "$what" "$log" 9<&- &  # without the lock of set_up
+    teller=$!
+    "$@" >>"$log" 2>&1 || code=$?
+    kill "$teller" 2>/dev/null || true
+    wait "$teller" 2>/dev/null || true
+    [ ! -t 2 ] || printf '\r\033[K' >&2
+    [ $code -ne 0 ] || say "$what: done in $((SECONDS - begun)) s"
+    return $code
+}
+
 # --- what the machine has -------------------------------------------------------------------------------------------
 
 have() { command -v "$1" >/dev/null 2>&1; }
@@ -62,7 +101,7 @@ may_be_root() {
 
 apt_get() {
     as_root env DEBIAN_FRONTEND=noninteractive NEEDRESTART_SUSPEND=1 \
-        apt-get -qq -y -o Dpkg::Use-Pty=0 -o DPkg::Lock::Timeout=300 "$@"
+        apt-get -q -y -o Dpkg::Use-Pty=0 -o DPkg::Lock::Timeout=300 "$@"
 }
 
 install_system_packages() {
@@ -73,9 +112,12 @@ install_system_packages() {
     if ! have apt-get; then
         say "this is not Debian or Ubuntu; wanted, under its Debian names: ${missing[*]}"
     elif may_be_root; then
-        say "installing system packages, a minute or so: ${missing[*]}"
+        say "needs system packages: ${missing[*]}"
         log=$(mktemp)
-        if ! { apt_get update && apt_get install --no-install-recommends "${missing[@]}"; } >"$log" 2>&1; then
+        [ "$(id -u)" -eq 0 ] || sudo -v || true  # asks for a password here, where nothing is written over it
+        if ! { shown "reading lists of packages (apt-get)" "$log" apt_get update &&
+            shown "installing system packages (apt-get)" "$log" \
+                apt_get install --no-install-recommends "${missing[@]}"; }; then
             tail -n 20 "$log" >&2
             say "this failed; going on without: $words"
         fi
@@ -91,7 +133,8 @@ require_essentials() {
     have_compiler || stop 2 "a C++ compiler is needed: kernels are compiled at run time (Debian: g++)"
 }
 
-# Debian chooses OpenBLAS by itself unless somebody once set the alternative by hand.
+# Debian chooses OpenBLAS by itself unless somebody once set the alternative by hand. It is the whole machine's: who set it
+# may change it.
 check_blas() {
     local name
     have update-alternatives || return 0
@@ -100,8 +143,8 @@ check_blas() {
             */blas/* | */lapack/*) ;;
             *) continue ;;
         esac
-        [ "$(id -u)" -eq 0 ] && update-alternatives --quiet --auto "$name" && continue
-        say "$name is the slow reference library; better: sudo update-alternatives --auto $name"
+        say "$name is the slow reference library here; factors take a quarter of the time with OpenBLAS," \
+            "which this chooses for the whole machine: sudo update-alternatives --auto $name"
     done
 }
 
@@ -128,26 +171,29 @@ fingerprint() {
 
 pip_install() {
     # PIP_USER: a user = true in somebody's pip.conf would contradict the virtual environment.
-    PIP_USER=0 "$venv/bin/python" -m pip --disable-pip-version-check install -q -c "$root/deploy/constraints.txt" "$@" \
-        >>"$venv/setup.log" 2>&1
+    PIP_USER=0 PIP_ROOT_USER_ACTION=ignore "$venv/bin/python" -m pip --disable-pip-version-check --no-color \
+        install --progress-bar off -c "$root/deploy/constraints.txt" "$@"
 }
 
 make_venv() {
-    local wanted present
+    local wanted present log
     wanted=$("${PYTHON:-python3}" -c 'import sys; print(sys.version_info[:2])')
     present=$("$venv/bin/python" -m pip --version >/dev/null 2>&1 &&
         "$venv/bin/python" -c 'import sys; print(sys.version_info[:2])') || present=none
     [ "$present" != "$wanted" ] || return 0
-    say "making the virtual environment $venv"
-    "${PYTHON:-python3}" -m venv --clear "$venv" || stop 1 "cannot make $venv"
+    log=$(mktemp)
+    shown "making the virtual environment .venv" "$log" "${PYTHON:-python3}" -m venv --clear "$venv" ||
+        { cat "$log" >&2; stop 1 "cannot make $venv"; }
+    rm -f "$log"
 }
+
+build_cholmod() { pip_install setuptools cython && pip_install --no-build-isolation scikit-sparse; }
 
 install_cholmod() {
     have_suitesparse && have_python_headers || return 0
     have_sksparse && return
-    say "building scikit-sparse (CHOLMOD), about half a minute"
     # Not isolated: built with the setuptools, Cython and NumPy of constraints.txt, today and in a year.
-    { pip_install setuptools cython && pip_install --no-build-isolation scikit-sparse; } ||
+    shown "building scikit-sparse, for CHOLMOD (pip)" "$venv/setup.log" build_cholmod ||
         say "scikit-sparse could not be built; $venv/setup.log says why"
 }
 
@@ -158,9 +204,8 @@ install_python_packages() {
     now=$(fingerprint "$extras")
     if [ "$(cat "$stamp" 2>/dev/null)" != "$now" ] || ! [ -x "$venv/bin/python" ]; then
         make_venv
-        say "installing Python packages, a minute or two; log in $venv/setup.log"
         : >"$venv/setup.log"
-        if ! pip_install -e "${root}[$extras]"; then
+        if ! shown "installing Python packages (pip)" "$venv/setup.log" pip_install -e "${root}[$extras]"; then
             tail -n 20 "$venv/setup.log" >&2
             stop 1 "pip failed; $venv/setup.log has all of it"
         fi
