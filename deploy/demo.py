@@ -8,11 +8,13 @@ lies under out/demo: the log (beam.mcap), a rerun recording (beam.rrd), a pictur
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
 from clients.client import Client
@@ -33,9 +35,23 @@ def tool(package: str, *arguments: str) -> list[str]:
     return [sys.executable, "-m", package, *arguments]
 
 
-def sim_client(*arguments: str) -> None:
-    """Runs sim-client, which must succeed."""
-    result = subprocess.run(tool("clients", *arguments), capture_output=True, text=True, cwd=ROOT)
+@contextmanager
+def told(what: str) -> Iterator[None]:
+    """Says what goes on and how long it has been: in a line that vanishes on a terminal, elsewhere once before."""
+    if not console.is_terminal:
+        console.print(f"{what} ...")
+        yield
+        return
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+    with Progress(*columns, console=console, transient=True) as progress:
+        progress.add_task(what, total=None)
+        yield
+
+
+def sim_client(what: str, *arguments: str) -> None:
+    """Runs sim-client, which must succeed; what: it does."""
+    with told(what):
+        result = subprocess.run(tool("clients", *arguments), capture_output=True, text=True, cwd=ROOT)
     if result.returncode:
         raise SystemExit(f"sim-client {' '.join(arguments)} failed:\n{result.stdout}{result.stderr}")
 
@@ -96,6 +112,7 @@ def main() -> int:
     """Exit code: the server's."""
     OUT.mkdir(parents=True, exist_ok=True)
     log = OUT / "beam.mcap"
+    console.print("a beam in real time: a server and a worker start, then a client pushes and grabs it")
     run = [str(SCENE), "--workers", "1", "--steps", str(STEPS), "--record", str(log), "--listen", ENDPOINT]
     server = subprocess.Popen(tool("sim_server", *run), cwd=ROOT)
     try:
@@ -107,9 +124,9 @@ def main() -> int:
     if server.returncode:
         return server.returncode
     made = {"recording": OUT / "beam.rrd", "picture": OUT / "beam.png", "arrays": OUT / "beam.npz"}
-    sim_client("view", str(log), "--save", str(made["recording"]))
-    sim_client("view", str(log), "--screenshot", str(made["picture"]))
-    sim_client("export", str(log), "--object", "beam", "--to", str(made["arrays"]))
+    sim_client("making the recording for rerun", "view", str(log), "--save", str(made["recording"]))
+    sim_client("drawing the picture", "view", str(log), "--screenshot", str(made["picture"]))
+    sim_client("writing the arrays", "export", str(log), "--object", "beam", "--to", str(made["arrays"]))
     console.print(summary(made["arrays"]))
     for what, path in {"log": log, **made}.items():
         console.print(f"{what:10} {path.relative_to(ROOT)}  ({path.stat().st_size / 1e6:.1f} MB)", highlight=False)
