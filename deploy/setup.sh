@@ -29,11 +29,11 @@ tell_progress() {
     while sleep 1 && kill -0 $$ 2>/dev/null; do
         line=$(newest "$2") || line=
         if [ -t 2 ]; then
-            text="deploy/run: $1, $((SECONDS - begun)) s: $line"
+            text="deploy/run: $1, $((SECONDS - begun)) s${line:+: $line}"
             printf '\r\033[K%s' "${text:0:${COLUMNS:-80}-1}" >&2
         elif ((SECONDS - told >= EVERY)); then
             told=$SECONDS
-            say "still $1, $((SECONDS - begun)) s: $line"
+            say "still $1, $((SECONDS - begun)) s${line:+: $line}"
         fi
     done
 }

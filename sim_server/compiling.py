@@ -53,8 +53,8 @@ class Running:
 class Compilers:
     """Runs up to `cores` compilers at a time.
 
-    progress: called with the number of texts compiled and of all asked for, counted since there was last nothing to do,
-    while somebody waits.
+    progress: called while somebody waits, with the number of texts compiled and of all asked for (0: not known), both
+    counted since there was last nothing to do.
     """
 
     def __init__(self, cores: int):
@@ -80,10 +80,14 @@ class Compilers:
 
     def finish(self, library: Path) -> None:
         """Waits until it is made, if it was begun; raises CompileError with the compiler's output."""
+        waited = False
         while not self._finished(library):
+            waited = True
             if self.progress is not None:
                 self.progress(self._done, self._total)
             time.sleep(LOOK)
+        if waited and self.progress is not None:
+            self.progress(self._done, self._total)
 
     @contextmanager
     def counted(self) -> Iterator[None]:
@@ -91,13 +95,14 @@ class Compilers:
         begun = time.monotonic()
         yield
         if time.monotonic() - begun > KEPT and self.progress is not None:
-            self._done, self._total = self._done + 1, self._total + 1
-            self.progress(self._done, self._total)
+            self._done += 1
+            self.progress(self._done, 0)
 
     def stop(self) -> None:
-        """Ends all compilers; what they were to make is not made."""
+        """Ends all compilers; what they have not made yet is not made."""
         with self._lock:
             self._waiting.clear()
+            self._turn()
             for running in self._running.values():
                 with contextlib.suppress(ProcessLookupError):
                     os.killpg(running.process.pid, signal.SIGTERM)

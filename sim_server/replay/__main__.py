@@ -6,6 +6,7 @@ import json
 import logging
 import os
 import sys
+from functools import partial
 
 
 def main() -> int:
@@ -19,12 +20,14 @@ def main() -> int:
 
     from protocol.log_chunks import BadLog
     from sim_server.backend import CompileError
+    from sim_server.compile_notice import compiling_told
     from sim_server.errors import DeviceLost, InputError
     from sim_server.replay.log import Recording
     from sim_server.replay.run import Replay
 
     try:
-        with Recording(arguments.log) as recording:
+        say = partial(print, "replay:", file=sys.stderr, flush=True)
+        with Recording(arguments.log) as recording, compiling_told(say):
             found = Replay(recording).run()
     except (BadLog, InputError, CompileError, DeviceLost) as error:
         print(f"replay: {error}", file=sys.stderr)

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import time
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -76,10 +77,21 @@ def test_progress_counts_texts_until_nothing_is_left_to_do(tmp_path):
     compilers, seen = Compilers(1), []
     compilers.progress = lambda done, total: seen.append((done, total))
     finish(compilers, *(job(tmp_path, name, 'sleep 0.05; touch "$2"') for name in "abc"))
-    assert sorted(set(seen)) == [(0, 3), (1, 3), (2, 3)] and seen == sorted(seen)
+    assert sorted(set(seen)) == [(0, 3), (1, 3), (2, 3), (3, 3)] and seen == sorted(seen)
     seen.clear()
     finish(compilers, job(tmp_path, "d", 'sleep 0.05; touch "$2"'))
-    assert set(seen) == {(0, 1)}
+    assert set(seen) == {(0, 1), (1, 1)}
+
+
+def test_what_nobody_has_waited_for_is_kept_at_the_end(tmp_path):
+    compilers, one = Compilers(2), job(tmp_path, "a", 'touch "$2"')
+    compilers.begin(one)
+    deadline = time.monotonic() + 20
+    while compilers._running and not all(r.process.poll() is not None for r in compilers._running.values()):
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    compilers.stop()
+    assert one.library.exists()
 
 
 def test_with_the_process_its_compilers_end(tmp_path):
@@ -113,19 +125,28 @@ def test_one_line_says_that_kernels_are_compiled_and_one_that_they_are(tmp_path)
     bars: list[list[tuple[int, int]]] = []
     now = [100.0]
 
-    def bar():
+    def bar(closing: ExitStack):
         bars.append([])
+        closing.callback(said.append, "the bar is gone")
         return lambda done, total: bars[-1].append((done, total))
 
     notice = Notice(said.append, bar, lambda: now[0])
     notice.end()
     assert said == [], "nothing was compiled"
-    for done in range(3):
-        notice.progress(done, 14)
+    for done in range(4):
+        notice.progress(done, 3)
         now[0] += 10
+    begin = "compiling kernels for this machine, once: less than a minute"
+    assert said == [begin, "the bar is gone", "compiled 3 kernel texts in 30 s"]
+    assert bars == [[(0, 3), (1, 3), (2, 3), (3, 3)]]
     notice.end()
-    assert said == ["compiling kernels for this machine, once: less than a minute", "compiled 14 kernel texts in 30 s"]
-    assert bars == [[(0, 14), (1, 14), (2, 14)]]
+    assert len(said) == 3, "said once"
+    notice.progress(1, 0)  # by a compiler that does not say how many there are
+    now[0] += 5
+    notice.progress(2, 0)
+    now[0] += 60
+    notice.end()
+    assert said[3:] == [begin, "the bar is gone", "compiled 2 kernel texts in 5 s"]
 
 
 def test_what_another_compiler_makes_counts_if_it_took_its_time(monkeypatch):
@@ -138,7 +159,7 @@ def test_what_another_compiler_makes_counts_if_it_took_its_time(monkeypatch):
         pass  # from a cache
     with compilers.counted():
         pass
-    assert said == ["1 of 1"]
+    assert said == ["1 of 0"]
 
 
 def test_progress_is_told_within_and_not_after(tmp_path, capsys):
