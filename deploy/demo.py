@@ -100,8 +100,10 @@ def summary(arrays: Path) -> Table:
     table = Table("what the log says", "")
     table.add_row("steps", f"{len(iterations)}")
     table.add_row("iterations before the first factor", f"{without.mean():.0f}" if len(without) else "-")
-    table.add_row("iterations with a factor, mean / max", f"{with_factor.mean():.1f} / {with_factor.max()}")
-    table.add_row("age of the factor, mean / max", f"{age[age >= 0].mean():.1f} / {age.max()} steps")
+    used = len(with_factor) > 0
+    shown = f"{with_factor.mean():.1f} / {with_factor.max()}" if used else "no factor came in time"
+    table.add_row("iterations with a factor, mean / max", shown)
+    table.add_row("age of the factor, mean / max", f"{age[age >= 0].mean():.1f} / {age.max()} steps" if used else "-")
     table.add_row("largest true residual", f"{residual.max():.1e}")
     percentiles = np.percentile(milliseconds, [50, 99, 100])
     table.add_row("step time, p50 / p99 / max", " / ".join(f"{v:.2f}" for v in percentiles) + " ms")
@@ -112,7 +114,7 @@ def main() -> int:
     """Exit code: the server's."""
     OUT.mkdir(parents=True, exist_ok=True)
     log = OUT / "beam.mcap"
-    console.print("a beam in real time: a server and a worker start, then a client pushes and grabs it")
+    console.print("a beam in real time: a server, a worker, a client that pushes and grabs it")
     run = [str(SCENE), "--workers", "1", "--steps", str(STEPS), "--record", str(log), "--listen", ENDPOINT]
     server = subprocess.Popen(tool("sim_server", *run), cwd=ROOT)
     try:

@@ -5,6 +5,7 @@ A node is a supernode of its own, so these factors travel and are applied as Cho
 of L they save in bytes and time.
 """
 
+import contextlib
 import ctypes as c
 import weakref
 from functools import cache
@@ -46,6 +47,16 @@ def _library() -> c.CDLL:
         function = getattr(library, name)
         function.restype, function.argtypes = result, arguments
     return library
+
+
+def prepare() -> None:
+    """Compiles before a server waits for the first factor. Where that cannot be, the jobs that need it say why."""
+    try:
+        from sim_server.compiling import CompileError
+    except ImportError:  # not installed beside the worker
+        return
+    with contextlib.suppress(CompileError):
+        _library()
 
 
 def banded_order(row_start: Index, columns: Index) -> Order:

@@ -133,6 +133,7 @@ def _library(device: str, arithmetic: str) -> str:
 def _serve(connect: list[str], threads: int, name: str, servers: list[str], shared_memory: bool, library: str) -> None:
     from functools import partial
 
+    from precond_worker.block_columns import prepare
     from precond_worker.methods import prepared
     from precond_worker.places import Place, places
     from precond_worker.serving import Serving
@@ -148,6 +149,7 @@ def _serve(connect: list[str], threads: int, name: str, servers: list[str], shar
     except ValueError as error:  # BadEndpoint or Refused
         _bad_input(str(error))
     shown = _shown(library)
+    prepare()
 
     def uplink(session: Session, server: str, bell: Event) -> Uplink:
         return Uplink(session, server, name, threads, shown, Counters(logging.getLogger("precond_worker")), bell)

@@ -21,6 +21,7 @@ EXCEPTIONS = {
     ("sim_server", "precond_worker.errors"),
     ("sim_server", "precond_worker.gpu.device"),
     ("precond_worker", "sim_server.backend"),
+    ("precond_worker", "sim_server.compiling"),
     ("precond_worker", "sim_server.assembly"),
 }
 

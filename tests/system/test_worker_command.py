@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 from link_helpers import ROOT, free_endpoint, process
@@ -70,6 +71,20 @@ def test_it_waits_for_the_server_and_says_so_once_and_ends_when_told(number: sig
         out, err = child.communicate(timeout=30)
         assert child.returncode == code
         assert out == "" and err == ""
+
+
+@pytest.mark.parametrize("compiler", ['exec g++ "$@" -O0', "exit 1"], ids=["with a compiler", "without"])
+def test_it_compiles_before_a_server_waits_for_it(
+    compiler: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also a worker that cannot comes so far: complete factors need no compiler."""
+    (tmp_path / "c++").write_text(f'#!/bin/sh\n[ "$1" != --version ] || exec g++ --version\n{compiler}\n')
+    (tmp_path / "c++").chmod(0o755)
+    monkeypatch.setenv("CXX", str(tmp_path / "c++"))
+    monkeypatch.setenv("WARPFACTOR_CACHE", str(tmp_path / "cache"))
+    with process("-m", "precond_worker", "--connect", free_endpoint(), "--name", "early") as child:
+        assert child.stderr is not None and "trying until the server is there" in child.stderr.readline()
+        assert len(list((tmp_path / "cache").glob("incomplete-*.so"))) == (compiler != "exit 1")
 
 
 def test_a_second_worker_of_one_name_is_told_and_leaves() -> None:
