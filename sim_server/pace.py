@@ -47,8 +47,6 @@ class Pace:
     def look(self, now: float, step: int, paused: bool, warm: bool) -> str:
         """What to say now, mostly nothing. step: completed so far. warm: all objects have the factors they want."""
         last = self._marks[-1][0] if self._marks else now
-        if self._marks and now - last < LOOKS:
-            return ""
         if self._begun is None:
             self._begun = now
         if paused or now - last > ASLEEP:

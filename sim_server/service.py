@@ -23,7 +23,7 @@ from protocol.nvidia import nvidia_device
 from sim_server.commands import Commands
 from sim_server.driver import Driver
 from sim_server.network.link import ServerLink
-from sim_server.pace import Pace
+from sim_server.pace import LOOKS, Pace
 from sim_server.recorder import Recorder
 from sim_server.simulation import Simulation
 from sim_server.telemetry import Telemetry
@@ -57,7 +57,7 @@ class Service:
         self._waiting: deque[NDArray[Any]] = deque()
         self._failure: BaseException | None = None
         self._asked: list[Callable[[pb.Reply], None]] = []  # those who want a fresh status
-        self._status_due = self._beside_due = 0.0
+        self._status_due = self._beside_due = self._pace_due = 0.0
         self.beside: Callable[[], None] = lambda: None  # called now and then: the supervisor of local workers
         self.pace = Pace(simulation.world.dt, self._advice, not self._on_gpu) if realtime else None
         self._alone = not self.driver.wants_factors or self.driver.free  # the loop needs no Python
@@ -132,10 +132,12 @@ class Service:
 
     def _look_at_pace(self) -> None:
         """Says so if the run does not keep pace with the clock."""
-        if self.pace is None:
+        now = time.monotonic()
+        if self.pace is None or now < self._pace_due:
             return
+        self._pace_due = now + LOOKS
         warm = not self.driver.wants_factors or all(track.used for track in self.driver.tracks)
-        line = self.pace.look(time.monotonic(), self.engine.step, self._state() != "running", warm)
+        line = self.pace.look(now, self.engine.step, self._state() != "running", warm)
         if line:
             log.warning("%s", line)
         self.telemetry.pace = self.pace.verdict
@@ -164,7 +166,7 @@ class Service:
             log.warning("%s", line)
         for line in self.telemetry.bad_steps(records):
             log.error("%s", line)
-        if self.pace is not None:
+        if self.pace is not None and len(records):
             self.pace.note(records)
         self.telemetry.records(records)
         self.telemetry.frames()

@@ -12,7 +12,7 @@ from rich.console import Console
 from clients.watch import tables
 from protocol import messages_pb2 as pb
 from sim_server.layouts import RECORD
-from sim_server.pace import Pace
+from sim_server.pace import LOOKS, Pace
 
 DT = 0.02
 NAP = 2.5e-3  # s between rounds of the service thread
@@ -28,7 +28,7 @@ class Run:
         self.takes, self.warm, self.share = takes, warm, share
         self.now, self.step, self.busy_until, self.due = 0.0, 0, -1.0, 0.0
         self.paused = self.stopped = False
-        self.whole = 0.0
+        self.whole = self.look_due = 0.0
         self.pace = Pace(DT, lambda: "ADVICE")
         self.said: list[tuple[float, str]] = []
 
@@ -37,8 +37,10 @@ class Run:
         before = len(self.said)
         while self.now < end:
             self._loop()
-            if not self.stopped and (line := self.pace.look(self.now, self.step, self.paused, self.now >= self.warm)):
+            look = not self.stopped and self.now >= self.look_due
+            if look and (line := self.pace.look(self.now, self.step, self.paused, self.now >= self.warm)):
                 self.said.append((self.now, line))
+            self.look_due = self.now + LOOKS if look else self.look_due
             self.now += NAP
         return self.said[before:]
 
