@@ -41,11 +41,15 @@ class Notice:
 
     def end(self) -> None:
         """Says how long it took, if that was not said yet."""
-        self._closing.close()
+        self.close()
         if self._begun is not None:
             texts = f"{self._count} kernel text{'s' * (self._count > 1)}"
             self._say(f"compiled {texts} in {self._ended - self._begun:.0f} s")
             self._begun = None
+
+    def close(self) -> None:
+        """Takes the bar away."""
+        self._closing.close()
 
 
 @contextmanager
@@ -55,9 +59,10 @@ def compiling_told(say: Say, by: Compilers = compilers) -> Iterator[None]:
     by.progress = notice.progress
     try:
         yield
+        notice.end()
     finally:
         by.progress = None
-        notice.end()
+        notice.close()
 
 
 def _bar(closing: ExitStack) -> Progress:

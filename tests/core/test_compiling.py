@@ -168,6 +168,9 @@ def test_progress_is_told_within_and_not_after(tmp_path, capsys):
         finish(compilers, job(tmp_path, "a", 'sleep 0.05; touch "$2"'))
     finish(compilers, job(tmp_path, "b", 'sleep 0.05; touch "$2"'))
     assert [line.split()[0] for line in said] == ["compiling", "compiled"]
+    with pytest.raises(CompileError), compiling_told(said.append, compilers):
+        finish(compilers, job(tmp_path, "c", "sleep 0.05; exit 1"))
+    assert [line.split()[0] for line in said[2:]] == ["compiling"], "it has not been compiled"
     assert capsys.readouterr().err == ""  # stderr is no terminal: no bar
 
 
