@@ -142,6 +142,6 @@ def _joined(connect: Sequence[str] | None, listen: Sequence[str] | None) -> tupl
         except ConnectionFailed:
             if listen:
                 raise
-            return open_session("client", shared_memory=False), DEFAULT_ENDPOINT
+            return open_session("client", connect=[DEFAULT_ENDPOINT], shared_memory=False), DEFAULT_ENDPOINT
     except ConnectionFailed as error:
         raise ClientError(str(error)) from None

@@ -14,7 +14,7 @@ import typer
 from precond_worker.errors import DeviceUnusable, NameTaken
 from protocol.nvidia import nvidia_device
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+app = typer.Typer(pretty_exceptions_enable=False, rich_markup_mode=None)
 
 EPILOG = """\b
 Examples:
@@ -49,7 +49,10 @@ class Terminated(BaseException):
 def work(
     connect: Annotated[
         list[str] | None,
-        typer.Option(metavar="EP", help="Endpoint of the server, may be repeated [default: tcp/127.0.0.1:7447]"),
+        typer.Option(
+            metavar="EP",
+            help="Endpoint of the server, may be repeated [default: WARPFACTOR_CONNECT or tcp/127.0.0.1:7447]",
+        ),
     ] = None,
     device: Annotated[
         str, typer.Option(metavar="auto|cpu|gpu", help="What factorizes; auto: an NVIDIA GPU if it is usable")

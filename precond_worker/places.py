@@ -4,8 +4,8 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from protocol.channels import DEFAULT_ENDPOINT, check_name
-from protocol.endpoints import check_endpoint
+from protocol.channels import check_name
+from protocol.endpoints import check_endpoint, usual_endpoints
 
 EVERY = "*"
 
@@ -28,7 +28,7 @@ def places(servers: Sequence[str], connect: Sequence[str]) -> list[Place]:
     """
     for endpoint in connect:
         check_endpoint(endpoint)
-    usual = tuple(connect) or (DEFAULT_ENDPOINT,)
+    usual = tuple(connect) or tuple(usual_endpoints())
     names: dict[tuple[str, ...], list[str]] = {}
     for server in servers:
         name, at, endpoint = server.partition("@")

@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: MIT
 """Endpoints as people type them: tcp/127.0.0.1:7447, tls/host:7447, unixsock-stream//run/sim.sock."""
 
+import os
 import re
 
 from protocol.channels import DEFAULT_ENDPOINT
 
 NETWORK = ("tcp", "udp", "tls", "quic", "ws")
 LOCAL = ("unixsock-stream",)
+CONNECT = "WARPFACTOR_CONNECT"  # endpoints of the server, where none is given on the command line
 _ADDRESS = re.compile(r"(\[[0-9A-Fa-f:.%\w]+\]|[^:\s/\[\]]+):(\d{1,5})")
 
 
@@ -28,3 +30,19 @@ def check_endpoint(endpoint: str, *, listen: bool = False) -> str:
             f"{', '.join(NETWORK)} and PORT {low} to 65535, or unixsock-stream/PATH; for example {DEFAULT_ENDPOINT}"
         )
     return endpoint
+
+
+def usual_endpoints() -> list[str]:
+    """Where workers and clients connect unless told otherwise. Raises BadEndpoint."""
+    found = re.split(r"[,\s]+", os.environ.get(CONNECT, "").strip(", \t\n"))
+    try:
+        return [check_endpoint(endpoint) for endpoint in found if endpoint] or [DEFAULT_ENDPOINT]
+    except BadEndpoint as error:
+        raise BadEndpoint(f"{CONNECT}: {error}") from None
+
+
+def host_of(endpoint: str) -> str:
+    """Host name or address of an endpoint; empty where it has none (a path)."""
+    protocol, _, rest = endpoint.partition("/")
+    match = _ADDRESS.fullmatch(re.split(r"[?#]", rest, maxsplit=1)[0])
+    return match.group(1).strip("[]") if match and protocol not in LOCAL else ""

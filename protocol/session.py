@@ -6,6 +6,7 @@ import logging
 import os
 import re
 import threading
+import time
 from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any, Literal, Self
@@ -14,7 +15,8 @@ import zenoh
 
 from protocol import memlock
 from protocol.channels import DEFAULT_ENDPOINT
-from protocol.endpoints import BadEndpoint, check_endpoint
+from protocol.endpoints import BadEndpoint, check_endpoint, usual_endpoints
+from protocol.hosts import unknown_hosts
 
 log = logging.getLogger(__name__)
 
@@ -24,6 +26,14 @@ EXTRA_CONFIG = "WARPFACTOR_ZENOH_CONFIG"  # JSON5 file: certificates, users, acc
 
 class ConnectionFailed(Exception):
     """No session; the text says where it was tried and why not."""
+
+
+class UnknownHost(ConnectionFailed):
+    """A host name of an endpoint does not resolve."""
+
+
+class AddressInUse(ConnectionFailed):
+    """Another process listens there."""
 
 
 def open_session(
@@ -36,23 +46,43 @@ def open_session(
 ) -> "Session":
     """Open a session: the server listens and passes messages on between clients, a client connects.
 
-    listen (server) and connect (client) default to loopback, port 7447. timeout: seconds a client tries to connect.
+    listen (server) and connect (client, unless WARPFACTOR_CONNECT is set) default to loopback, port 7447. timeout:
+    seconds a client tries to connect.
     Raises BadEndpoint or ConnectionFailed.
     """
     server = role == "server"
     listening = [DEFAULT_ENDPOINT] if server and listen is None else list(listen or [])
-    connecting = list(connect or []) or ([] if server else [DEFAULT_ENDPOINT])
+    connecting = list(connect or []) or ([] if server else usual_endpoints())
     for endpoint in listening:
         check_endpoint(endpoint, listen=True)
     for endpoint in connecting:
         check_endpoint(endpoint)
     shared_memory = shared_memory and _shared_memory_works()
-    config = _config(server, listening, connecting, shared_memory, timeout)
     try:
-        return Session(zenoh.open(config), shared_memory)
+        if server or len(connecting) == 1:
+            config = _config(server, listening, connecting, shared_memory, timeout)
+            return Session(zenoh.open(config), shared_memory)
+        return Session(_first_that_answers(connecting, shared_memory, timeout), shared_memory)
     except zenoh.ZError as error:
         where = f"listen on {', '.join(listening)}" if server else f"connect to {', '.join(connecting)}"
-        raise ConnectionFailed(f"cannot {where}: {_reason(error)}") from error
+        if unknown := unknown_hosts(listening if server else connecting):
+            names = ", ".join(repr(name) for name in unknown)
+            raise UnknownHost(f"cannot {where}: the name {names} does not resolve") from error
+        taken = server and ("in use" in str(error) or "acquire lock" in str(error))  # of a port, of a socket file
+        failure = AddressInUse if taken else ConnectionFailed
+        raise failure(f"cannot {where}: {_reason(error)}") from error
+
+
+def _first_that_answers(connect: list[str], shared_memory: bool, timeout: float) -> zenoh.Session:
+    """Tries all endpoints in turn, again and again: with a time-out zenoh would try the first alone."""
+    end = time.monotonic() + timeout
+    while True:
+        try:
+            return zenoh.open(_config(False, [], connect, shared_memory, 0))
+        except zenoh.ZError:
+            if time.monotonic() >= end:
+                raise
+            time.sleep(0.1)
 
 
 def _shared_memory_works() -> bool:

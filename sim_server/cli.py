@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from sim_server.service import Service
     from sim_server.supervisor import Supervisor
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+app = typer.Typer(pretty_exceptions_enable=False, rich_markup_mode=None)
 
 EPILOG = """\b
 Examples:
@@ -151,8 +151,9 @@ def _set_up(closing: ExitStack, o: Options) -> "tuple[Service, Supervisor | None
     """Everything that can fail on bad input, before the simulation starts."""
     from protocol.channels import DEFAULT_ENDPOINT
     from protocol.endpoints import BadEndpoint
+    from protocol.exposure import unrestricted
     from protocol.refused import Refused
-    from protocol.session import ConnectionFailed
+    from protocol.session import AddressInUse, ConnectionFailed
     from sim_server.backend import CompileError
     from sim_server.network.link import ServerLink
     from sim_server.recorder import Recorder
@@ -169,10 +170,15 @@ def _set_up(closing: ExitStack, o: Options) -> "tuple[Service, Supervisor | None
             compression = simulation.scene.record.compression
             recorder = closing.enter_context(Recorder(o.record, compression, overwrite=True, report=logging.error))
         service = Service(simulation, link, recorder, o.steps, o.realtime)
-    except ConnectionFailed as error:
+    except AddressInUse as error:
         _bad_input(f"{error}; is another sim-server there? --listen tcp/127.0.0.1:7448 takes another port")
-    except (InputError, BadEndpoint, Refused, CompileError) as error:
+    except (InputError, BadEndpoint, ConnectionFailed, Refused, CompileError) as error:
         _bad_input(str(error))
+    for endpoint in unrestricted(o.listen or []):
+        logging.warning(
+            "--listen %s: anybody who reaches it may stop this server, and push, grab and pause; "
+            "docs/protocol.md (Security) tells how to restrict that", endpoint
+        )  # fmt: skip
     supervisor = None
     if o.workers:
         reachable = _reachable(o.listen or [DEFAULT_ENDPOINT])

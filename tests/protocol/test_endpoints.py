@@ -3,7 +3,9 @@
 
 import pytest
 
-from protocol.endpoints import BadEndpoint, check_endpoint
+from precond_worker.places import Place, places
+from protocol.channels import DEFAULT_ENDPOINT
+from protocol.endpoints import CONNECT, BadEndpoint, check_endpoint, usual_endpoints
 
 
 @pytest.mark.parametrize(
@@ -32,3 +34,28 @@ def test_bad_ones_say_what_is_allowed(endpoint: str) -> None:
 
 def test_any_free_port_may_be_listened_on() -> None:
     assert check_endpoint("tcp/127.0.0.1:0", listen=True)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (None, [DEFAULT_ENDPOINT]),
+        ("", [DEFAULT_ENDPOINT]),
+        (" , ", [DEFAULT_ENDPOINT]),
+        ("tcp/a:1", ["tcp/a:1"]),
+        ("tcp/a:1,tcp/b:2", ["tcp/a:1", "tcp/b:2"]),
+        (" tcp/a:1  tls/b:2,\tudp/c:3\n", ["tcp/a:1", "tls/b:2", "udp/c:3"]),
+    ],
+)
+def test_endpoints_of_the_environment(text: str | None, expected: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(CONNECT, raising=False)
+    if text is not None:
+        monkeypatch.setenv(CONNECT, text)
+    assert usual_endpoints() == expected
+    assert places(["sim"], []) == [Place(tuple(expected), ("sim",))]
+
+
+def test_a_bad_endpoint_of_the_environment_names_the_variable(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(CONNECT, "tcp/a:1 nonsense")
+    with pytest.raises(BadEndpoint, match="WARPFACTOR_CONNECT: endpoint 'nonsense' cannot be used"):
+        usual_endpoints()
