@@ -321,7 +321,7 @@ class Vector(_message.Message):
     def __init__(self, x: _Optional[float] = ..., y: _Optional[float] = ..., z: _Optional[float] = ...) -> None: ...
 
 class Interaction(_message.Message):
-    __slots__ = ("id", "client", "object", "kind", "point", "radius", "force", "duration", "target", "stiffness", "max_force", "nodes", "start", "held", "offsets")
+    __slots__ = ("id", "client", "object", "kind", "point", "radius", "force", "duration", "target", "stiffness", "max_force", "nodes", "start", "held", "offsets", "at")
     ID_FIELD_NUMBER: _ClassVar[int]
     CLIENT_FIELD_NUMBER: _ClassVar[int]
     OBJECT_FIELD_NUMBER: _ClassVar[int]
@@ -337,6 +337,7 @@ class Interaction(_message.Message):
     START_FIELD_NUMBER: _ClassVar[int]
     HELD_FIELD_NUMBER: _ClassVar[int]
     OFFSETS_FIELD_NUMBER: _ClassVar[int]
+    AT_FIELD_NUMBER: _ClassVar[int]
     id: int
     client: str
     object: str
@@ -352,7 +353,8 @@ class Interaction(_message.Message):
     start: float
     held: bytes
     offsets: bytes
-    def __init__(self, id: _Optional[int] = ..., client: _Optional[str] = ..., object: _Optional[str] = ..., kind: _Optional[str] = ..., point: _Optional[_Union[Vector, _Mapping]] = ..., radius: _Optional[float] = ..., force: _Optional[_Union[Vector, _Mapping]] = ..., duration: _Optional[float] = ..., target: _Optional[_Union[Vector, _Mapping]] = ..., stiffness: _Optional[float] = ..., max_force: _Optional[float] = ..., nodes: _Optional[int] = ..., start: _Optional[float] = ..., held: _Optional[bytes] = ..., offsets: _Optional[bytes] = ...) -> None: ...
+    at: str
+    def __init__(self, id: _Optional[int] = ..., client: _Optional[str] = ..., object: _Optional[str] = ..., kind: _Optional[str] = ..., point: _Optional[_Union[Vector, _Mapping]] = ..., radius: _Optional[float] = ..., force: _Optional[_Union[Vector, _Mapping]] = ..., duration: _Optional[float] = ..., target: _Optional[_Union[Vector, _Mapping]] = ..., stiffness: _Optional[float] = ..., max_force: _Optional[float] = ..., nodes: _Optional[int] = ..., start: _Optional[float] = ..., held: _Optional[bytes] = ..., offsets: _Optional[bytes] = ..., at: _Optional[str] = ...) -> None: ...
 
 class TouchSet(_message.Message):
     __slots__ = ("header", "step", "interactions")
@@ -395,31 +397,35 @@ class FactorUse(_message.Message):
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., pattern: _Optional[int] = ..., checksum: _Optional[int] = ..., dtype: _Optional[str] = ..., worker: _Optional[str] = ..., library: _Optional[str] = ..., threads: _Optional[int] = ..., seconds: _Optional[float] = ..., remedy: _Optional[str] = ..., method: _Optional[str] = ..., ahead: _Optional[float] = ..., later: _Optional[bool] = ...) -> None: ...
 
 class Command(_message.Message):
-    __slots__ = ("header", "client", "verb", "interaction")
+    __slots__ = ("header", "client", "verb", "interaction", "secret")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     CLIENT_FIELD_NUMBER: _ClassVar[int]
     VERB_FIELD_NUMBER: _ClassVar[int]
     INTERACTION_FIELD_NUMBER: _ClassVar[int]
+    SECRET_FIELD_NUMBER: _ClassVar[int]
     header: Header
     client: str
     verb: str
     interaction: Interaction
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., client: _Optional[str] = ..., verb: _Optional[str] = ..., interaction: _Optional[_Union[Interaction, _Mapping]] = ...) -> None: ...
+    secret: bytes
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., client: _Optional[str] = ..., verb: _Optional[str] = ..., interaction: _Optional[_Union[Interaction, _Mapping]] = ..., secret: _Optional[bytes] = ...) -> None: ...
 
 class Reply(_message.Message):
-    __slots__ = ("header", "error", "interaction", "status")
+    __slots__ = ("header", "error", "interaction", "status", "unchanged")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     ERROR_FIELD_NUMBER: _ClassVar[int]
     INTERACTION_FIELD_NUMBER: _ClassVar[int]
     STATUS_FIELD_NUMBER: _ClassVar[int]
+    UNCHANGED_FIELD_NUMBER: _ClassVar[int]
     header: Header
     error: str
     interaction: Interaction
     status: Status
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., error: _Optional[str] = ..., interaction: _Optional[_Union[Interaction, _Mapping]] = ..., status: _Optional[_Union[Status, _Mapping]] = ...) -> None: ...
+    unchanged: bool
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., error: _Optional[str] = ..., interaction: _Optional[_Union[Interaction, _Mapping]] = ..., status: _Optional[_Union[Status, _Mapping]] = ..., unchanged: _Optional[bool] = ...) -> None: ...
 
 class ObjectStatus(_message.Message):
-    __slots__ = ("object", "nodes", "tets", "last", "mean_iterations", "excess", "factors_used", "factors_refused", "in_flight", "factor_age", "factor_age_max", "factor_age_bound", "factors_mended", "refusal")
+    __slots__ = ("object", "nodes", "tets", "last", "mean_iterations", "excess", "factors_used", "factors_refused", "in_flight", "factor_age", "factor_age_max", "factor_age_bound", "factors_mended", "refusal", "low", "high", "tip")
     OBJECT_FIELD_NUMBER: _ClassVar[int]
     NODES_FIELD_NUMBER: _ClassVar[int]
     TETS_FIELD_NUMBER: _ClassVar[int]
@@ -434,6 +440,9 @@ class ObjectStatus(_message.Message):
     FACTOR_AGE_BOUND_FIELD_NUMBER: _ClassVar[int]
     FACTORS_MENDED_FIELD_NUMBER: _ClassVar[int]
     REFUSAL_FIELD_NUMBER: _ClassVar[int]
+    LOW_FIELD_NUMBER: _ClassVar[int]
+    HIGH_FIELD_NUMBER: _ClassVar[int]
+    TIP_FIELD_NUMBER: _ClassVar[int]
     object: str
     nodes: int
     tets: int
@@ -448,7 +457,10 @@ class ObjectStatus(_message.Message):
     factor_age_bound: int
     factors_mended: int
     refusal: str
-    def __init__(self, object: _Optional[str] = ..., nodes: _Optional[int] = ..., tets: _Optional[int] = ..., last: _Optional[_Union[ObjectStep, _Mapping]] = ..., mean_iterations: _Optional[float] = ..., excess: _Optional[float] = ..., factors_used: _Optional[int] = ..., factors_refused: _Optional[int] = ..., in_flight: _Optional[bool] = ..., factor_age: _Optional[int] = ..., factor_age_max: _Optional[int] = ..., factor_age_bound: _Optional[int] = ..., factors_mended: _Optional[int] = ..., refusal: _Optional[str] = ...) -> None: ...
+    low: Vector
+    high: Vector
+    tip: Vector
+    def __init__(self, object: _Optional[str] = ..., nodes: _Optional[int] = ..., tets: _Optional[int] = ..., last: _Optional[_Union[ObjectStep, _Mapping]] = ..., mean_iterations: _Optional[float] = ..., excess: _Optional[float] = ..., factors_used: _Optional[int] = ..., factors_refused: _Optional[int] = ..., in_flight: _Optional[bool] = ..., factor_age: _Optional[int] = ..., factor_age_max: _Optional[int] = ..., factor_age_bound: _Optional[int] = ..., factors_mended: _Optional[int] = ..., refusal: _Optional[str] = ..., low: _Optional[_Union[Vector, _Mapping]] = ..., high: _Optional[_Union[Vector, _Mapping]] = ..., tip: _Optional[_Union[Vector, _Mapping]] = ...) -> None: ...
 
 class LocalWorker(_message.Message):
     __slots__ = ("worker", "state", "pid", "restarts", "exit_code")

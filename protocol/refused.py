@@ -7,7 +7,7 @@ class Refused(ValueError):
 
     kind is one of a few words (see below) under which receivers count refusals:
     malformed, version, incarnation, object, epoch, sequence, size, shape, not_finite, not_positive, checksum,
-    pattern, slot, late, duplicate, worker.
+    pattern, slot, late, duplicate, worker, secret.
     """
 
     def __init__(self, text: str, kind: str = "malformed"):

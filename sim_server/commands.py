@@ -6,6 +6,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 
 from protocol import messages_pb2 as pb
+from protocol.limits import LONGEST_PUSH
 from sim_server.simulation import Simulation
 
 
@@ -33,6 +34,11 @@ class Commands:
     def engine_paused(self) -> bool:
         """The loop stands still until `resume`."""
         return bool(self.engine.loop.pause)
+
+    @property
+    def engine_stands(self) -> bool:
+        """After `pause`: the step under way has ended. The loop sets its deadline to 0 while it waits."""
+        return bool(self.engine.loop.deadline == 0)
 
     def carry_out(self, command: pb.Command) -> pb.Reply:
         """Does it and says so; what cannot be done is answered with an error."""
@@ -66,7 +72,9 @@ class Commands:
     def _push(self, command: pb.Command) -> pb.Reply:
         i = command.interaction
         _finite(i, "point", "force", "radius", "duration")
-        point, force = _tuple(i.point), _tuple(i.force)
+        if i.duration > LONGEST_PUSH:
+            raise Refusal(f"duration = {i.duration:g} s: a push lasts at most {LONGEST_PUSH:g} s")
+        point, force = self._point(i), _tuple(i.force)
         return self._took(
             command, self._touch(i.object).push(command.client, i.object, point, i.radius, force, i.duration)
         )
@@ -75,8 +83,10 @@ class Commands:
         i = command.interaction
         _finite(i, "point", "target", "radius", "duration", "stiffness", "max_force")
         duration = i.duration if i.duration > 0 else math.inf
+        point = self._point(i)
+        target = point if i.at and not i.HasField("target") else _tuple(i.target)
         taken = self._touch(i.object).grab(
-            command.client, i.object, _tuple(i.point), i.radius, _tuple(i.target), i.stiffness, i.max_force, duration
+            command.client, i.object, point, i.radius, target, i.stiffness, i.max_force, duration
         )
         return self._took(command, taken)
 
@@ -89,18 +99,32 @@ class Commands:
         return pb.Reply(interaction=self._message(self._touch().release(command.client, command.interaction.id)))
 
     def _pause(self, command: pb.Command) -> pb.Reply:
-        self.engine.loop.pause = 1
-        return pb.Reply()
+        unchanged, loop = self.engine_paused, self.engine.loop
+        if not unchanged and not loop.realtime:
+            loop.deadline = -1.0  # not looked at without a pace; 0 again once the loop stands still
+        loop.pause = 1
+        return pb.Reply(status=self._happened("paused"), unchanged=unchanged)
 
     def _resume(self, command: pb.Command) -> pb.Reply:
+        unchanged = not self.engine_paused
         if "touch" in self.simulation.effects:
             self._touch().flush()  # what came before it holds from the first step on
         self.engine.loop.pause = 0
-        return pb.Reply()
+        return pb.Reply(status=self._happened("running"), unchanged=unchanged)
 
     def _stop(self, command: pb.Command) -> pb.Reply:
         self.stopping = True
-        return pb.Reply()
+        return pb.Reply(status=self._happened("stopping"))
+
+    def _happened(self, state: str) -> pb.Status:
+        status = pb.Status(state=state)
+        self.date(status)
+        return status
+
+    def date(self, status: pb.Status) -> None:
+        """Sets step and time to those of now."""
+        status.step = self.engine.step
+        status.time = status.step * self.simulation.world.dt
 
     def _took(self, command: pb.Command, taken: object) -> pb.Reply:
         message = self._message(taken)
@@ -117,6 +141,10 @@ class Commands:
                 else "no object of the scene lists the effect touch"
             )
         return self.simulation.effects["touch"]
+
+    def _point(self, i: pb.Interaction) -> tuple[float, float, float]:
+        """Where a push or grab is to begin, in coordinates [m]."""
+        return self._touch(i.object).points(i.object).named(i.at) if i.at else _tuple(i.point)
 
     @staticmethod
     def _message(a) -> pb.Interaction:  # type: ignore[no-untyped-def]

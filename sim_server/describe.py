@@ -17,6 +17,7 @@ from sim_server.backend import Cpu
 from sim_server.engine import Kind
 from sim_server.mesh import posed
 from sim_server.mesh.surface import surface_triangles
+from sim_server.points import Points
 from sim_server.scene.solver_options import FACTORS
 from sim_server.simulation import Simulation
 from sim_server.world import Body
@@ -62,6 +63,14 @@ def topology(simulation: Simulation, body: Body) -> pb.Topology:
             young, poisson = e.elastic[body.index]
             message.young, message.poisson = _bytes(young, "<f4"), _bytes(poisson, "<f4")
     return message
+
+
+def places(points: list[Points], status: pb.Status) -> None:
+    """Adds to a status where each object is now."""
+    for found, place in zip(status.objects, points, strict=True):
+        low, high = place.box()
+        for vector, (x, y, z) in ((found.low, low), (found.high, high), (found.tip, place.tip())):
+            vector.CopyFrom(pb.Vector(x=x, y=y, z=z))
 
 
 def state(body: Body, step: int, time: float, x: NDArray[np.float64], v: NDArray[np.float64]) -> pb.State:

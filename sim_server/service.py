@@ -34,6 +34,8 @@ log = logging.getLogger(__name__)
 NAP = 1e-3  # s between rounds of the service thread
 BESIDE = 0.02  # s between looks at local workers
 STATUS_AGAIN = 0.02  # s between two statuses that clients ask for
+STEP_ENDS = 1.0  # s that the answer to `pause` or `stop` waits at most for the end of the step under way
+HALTS = 64  # such answers that may wait at once
 LOOP_NICE = -5  # of the loop's thread in real time: before workers, clients and our own threads on a full machine
 ENDLESS = 1 << 62
 
@@ -57,6 +59,7 @@ class Service:
         self._waiting: deque[NDArray[Any]] = deque()
         self._failure: BaseException | None = None
         self._asked: list[Callable[[pb.Reply], None]] = []  # those who want a fresh status
+        self._halts: list[tuple[float, Callable[[pb.Reply], None], pb.Reply]] = []  # pause and stop, until when to wait
         self._status_due = self._beside_due = self._pace_due = 0.0
         self.beside: Callable[[], None] = lambda: None  # called now and then: the supervisor of local workers
         self.pace = Pace(simulation.world.dt, self._advice, not self._on_gpu) if realtime else None
@@ -75,8 +78,10 @@ class Service:
             self.engine.loop.stop = 1
             while loop.is_alive():  # it may wait for room in its rings
                 self._drain()
+                self._answer_halts()
                 loop.join(0.01)
             self._drain()
+            self._answer_halts(ended=True)
             self.telemetry.publish_status("stopping")
         if self._failure is not None:
             raise self._failure
@@ -101,6 +106,7 @@ class Service:
             self._beside_due = time.monotonic() + BESIDE
             self.beside()
         self._carry_out()
+        self._answer_halts()
         self._tell_status()
         self._look_at_pace()
         self.commands.gone(set(self.link.clients()))
@@ -116,15 +122,31 @@ class Service:
             for command, reply in waiting:
                 if command.verb == "status":
                     self._asked.append(reply)
+                    continue
+                answer = self.commands.carry_out(command)
+                if command.verb in ("pause", "stop") and not answer.error and len(self._halts) < HALTS:
+                    self._halts.append((time.monotonic() + STEP_ENDS, reply, answer))
                 else:
-                    answers.append((reply, self.commands.carry_out(command)))
+                    answers.append((reply, answer))
         for reply, answer in answers:
             reply(answer)
+
+    def _answer_halts(self, ended: bool = False) -> None:
+        """Answers those who paused or stopped the loop once it has, with the number of its steps."""
+        waiting = []
+        for until, reply, answer in self._halts:
+            stands = self.commands.engine_stands or not self.commands.engine_paused  # or it goes on already
+            if (stands and answer.status.state == "paused") or ended or time.monotonic() >= until:
+                self.commands.date(answer.status)
+                reply(answer)
+            else:
+                waiting.append((until, reply, answer))
+        self._halts = waiting
 
     def _tell_status(self) -> None:
         """A fresh one to all who asked since the last: it costs more than any other command."""
         if self._asked and time.monotonic() >= self._status_due:
-            self.telemetry.publish_status(self._state())
+            self.telemetry.publish_status(self._state(), where=True)
             self._status_due = time.monotonic() + STATUS_AGAIN
             for reply in self._asked:
                 reply(pb.Reply())

@@ -15,6 +15,7 @@ from sim_server import describe
 from sim_server.commands import Commands
 from sim_server.driver import Driver
 from sim_server.network.link import ServerLink
+from sim_server.points import Points
 from sim_server.recorder import Recorder
 from sim_server.trace import Trace
 
@@ -47,6 +48,7 @@ class Telemetry:
         self._due = {"steps": 0.0, "state": 0.0, "status": 0.0, "look": 0.0}
         self._watched = False
         self._touched: dict[int, pb.Interaction] = {}
+        self._points: list[Points] = []
 
     def open(self) -> None:
         """Scene, topologies and the initial state: first in the log, first on the network."""
@@ -163,10 +165,11 @@ class Telemetry:
             message = describe.state(body, step, step * self.simulation.world.dt, x, v)
             self.recorder.state(message, block=self.patient)
 
-    def publish_status(self, state: str, force: bool = True) -> None:
-        """The health of the whole scene."""
+    def publish_status(self, state: str, force: bool = True, where: bool = False) -> None:
+        """The health of the whole scene. where: also where its objects are, which a GPU has to be asked for."""
         if not self._period("status", STATUS_PERIOD) and not force:
             return
+        self._due["status"] = time.monotonic() + STATUS_PERIOD
         loop, world = self.engine.loop, self.simulation.world
         p50, p99, most = self.percentiles()
         status = pb.Status(
@@ -199,7 +202,18 @@ class Telemetry:
                     factor_age_bound=bound,
                 )
             )
+        if where:
+            describe.places(self._places(), status)
         self.link.publish_status(status)
+
+    def _places(self) -> list[Points]:
+        """Of all objects, as they are now."""
+        world = self.simulation.world
+        self._points = self._points or [Points(world, body) for body in world.bodies]
+        x = world.backend.fetch(world.x)
+        for points in self._points:
+            points.now(x)
+        return self._points
 
     def percentiles(self) -> tuple[float, float, float]:
         """p50, p99 and maximum of the step time over the last steps [s]."""

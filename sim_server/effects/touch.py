@@ -11,8 +11,9 @@ their targets, where the springs balance; nobody owns a point.
 
 Clients are not trusted: a push beyond `max_force` is refused, a grab is bounded by it, and at most `max_interactions`
 are alive at once on one object. What they may exert together, each at its largest, is bounded by `max_total_force`; one
-that would go beyond is refused, and those that are there stay as they are. An object that does not list this effect
-cannot be touched at all.
+that would go beyond is refused, and those that are there stay as they are. Points and targets farther than REACH sizes
+of the object are refused, and stiffnesses that could exceed STRONGEST there: the kernel squares the force, in single
+precision too. An object that does not list this effect cannot be touched at all.
 
 Usual ranges: max_force a few times the weight of the object (a 4000 kg beam weighs 4e4 N, a liver 15 N); a stiffness
 of a grab near young times the size of the grabbed patch moves that patch without tearing it from its neighbours.
@@ -21,20 +22,24 @@ of a grab near young times the size of the grabbed patch moves that patch withou
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from math import hypot
+from math import dist, hypot
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from protocol.limits import ORPHANED_PUSH
 from sim_server.backend import Launch
 from sim_server.effect import Effect
+from sim_server.points import Points, shown
 from sim_server.scene.parameters import Parameters
 from sim_server.system import Stencil, System
 from sim_server.world import Body, World
 
 SCOPE = "object"
+REACH = 1e3  # sizes of the object: how far from it a point, and from its point a target, may be
+STRONGEST = 1e18  # N, stiffness times the farthest target
 
 
 class Params(Parameters):
@@ -96,6 +101,7 @@ class Touch(Effect):
         self._same: tuple[list[int], dict[str, Any]] | None = None  # ids, and what of a launch no move changes
         self._launch: Launch | None = None  # in use, or about to be; it writes when each interaction began
         self._last_id = 0
+        self._points: dict[str, Points] = {}
 
     def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
         self._system = system
@@ -107,7 +113,7 @@ class Touch(Effect):
         Raises TouchError.
         """
         limit = self._params(name).max_force
-        size = float(np.linalg.norm(force))
+        size = hypot(*force)
         if not size <= limit:
             raise TouchError(f"push of {size:g} N on {name!r}: at most max_force = {limit:g} N")
         if not duration > 0:
@@ -126,6 +132,7 @@ class Touch(Effect):
         limit = min(max_force, self._params(name).max_force) if max_force > 0 else self._params(name).max_force
         if not stiffness > 0 or not duration > 0:
             raise TouchError(f"grab with stiffness = {stiffness:g} N/m, duration = {duration:g} s: must be above 0")
+        self._check_spring(name, point, target, stiffness)
         nodes, offset = self._near(name, point, radius)
         return self._add(
             Interaction(
@@ -139,6 +146,7 @@ class Touch(Effect):
         old = self._found(alive, client, id)
         if old.stiffness == 0:
             raise TouchError(f"interaction {id} is a push; only a grab has a target")
+        self._check_spring(old.object, old.point, target, old.stiffness)
         alive[id] = moved = replace(old, target=target)
         self._put(alive)
         return moved
@@ -152,12 +160,23 @@ class Touch(Effect):
         return old
 
     def release_all(self, client: str) -> int:
-        """Ends the grabs of a client that has gone; its pushes end by themselves. Returns how many."""
+        """Ends the grabs of a client that has gone, and its pushes ORPHANED_PUSH s from now at the latest.
+
+        Returns the number of grabs.
+        """
         alive = self._alive()
-        kept = {id: a for id, a in alive.items() if a.client != client or a.stiffness == 0}
-        if len(kept) < len(alive):
+        kept = {id: self._orphaned(a) if a.client == client else a for id, a in alive.items()
+                if a.client != client or a.stiffness == 0}  # fmt: skip
+        if any(kept.get(id) is not a for id, a in alive.items()):
+            self._same = None  # it holds durations, too
             self._put(kept)
         return len(alive) - len(kept)
+
+    def _orphaned(self, push: Interaction) -> Interaction:
+        """The push with what is left of it bounded."""
+        assert self._system is not None
+        past = max(float(self._system.clock[0]) - push.start, 0.0) if push.start >= 0 else 0.0
+        return push if push.duration <= past + ORPHANED_PUSH else replace(push, duration=past + ORPHANED_PUSH)
 
     @property
     def told(self) -> bool:
@@ -226,19 +245,44 @@ class Touch(Effect):
             raise TouchError(f"client {client!r} has no interaction {id}; it may be over")
         return found
 
+    def points(self, name: str) -> Points:
+        """Where the object is now. Raises TouchError if it cannot be touched."""
+        self._params(name)
+        if name not in self._points:
+            self._points[name] = Points(self.world, self.world.body(name))
+        return self._points[name]
+
+    def _check_spring(self, name: str, point: Point, target: Point, stiffness: float) -> None:
+        """Raises TouchError if the force of a spring from point to target might not be finite."""
+        points = self.points(name)
+        far, away = REACH * points.size, dist(point, target)
+        if not away <= far:
+            raise TouchError(f"target {shown(target)} is {away:.4g} m from the grabbed point: {_allowed(name, far)}")
+        if not stiffness * far <= STRONGEST:
+            raise TouchError(
+                f"stiffness = {stiffness:g} N/m: at most {STRONGEST / far:.4g} N/m on {name!r}, "
+                f"whose targets may be {far:.4g} m away"
+            )
+
     def _near(self, name: str, point: Point, radius: float) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
-        body = self.world.body(name)
+        points = self.points(name)
         if radius < 0:
             raise TouchError(f"radius = {radius:g} m: must not be negative (0 = the nearest node)")
-        x = self.world.backend.fetch(self.world.x)[body.nodes].copy()
-        free = self.world.free[body.nodes] > 0
-        distance = np.where(free, np.linalg.norm(x - point, axis=1), np.inf)
-        near = np.flatnonzero(distance <= radius) if radius > 0 else np.array([int(distance.argmin())])
+        x, far = points.now(), REACH * points.size
+        away = points.distance(point)
+        if not away <= far:
+            raise TouchError(
+                f"point {shown(point)} is {away:.4g} m from {name!r}: {_allowed(name, far)}; {points.where()}"
+            )
+        distance = np.where(points.free, np.linalg.norm(x - point, axis=1), np.inf)
+        nearest = int(distance.argmin())
+        near = np.flatnonzero(distance <= radius) if radius > 0 else np.array([nearest])
         if len(near) == 0:
             raise TouchError(
-                f"no free node of {name!r} within {radius:g} m of {point}; the nearest is {distance.min():.4g} m away"
+                f"no free node of {name!r} within {radius:g} m of {shown(point)}; the nearest is "
+                f"{distance[nearest]:.4g} m away at {shown(x[nearest])}; {points.where()}"
             )
-        return (near + body.first).astype(np.int32), x[near] - point
+        return (near + points.body.first).astype(np.int32), x[near] - point
 
     def _add(self, new: Interaction) -> Interaction:
         if not np.isfinite([*new.point, *new.force, *new.target, new.radius, new.stiffness, new.limit]).all():
@@ -279,6 +323,10 @@ class Touch(Effect):
         )  # fmt: skip
         self._applied = self._begun = interactions
         return self._launch
+
+
+def _allowed(name: str, far: float) -> str:
+    return f"at most {far:.4g} m, {REACH:g} times the size of {name!r}"
 
 
 def _each(interactions: list[Interaction], value: str) -> NDArray[np.float64]:

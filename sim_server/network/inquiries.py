@@ -10,6 +10,7 @@ import zenoh
 from protocol import echo
 from protocol.channels import CHANNELS, PROTOCOL, key
 from protocol.check import check_header, check_numbers, check_strings, parse
+from protocol.client_name import check_client
 from protocol.counters import Counters
 from protocol.messages_pb2 import Command, Echo, Header, Reply
 from protocol.refused import Refused
@@ -139,6 +140,7 @@ class Inquiries:
         check_header(command, incarnation=self._incarnation if command.header.incarnation else None)
         check_strings(command)
         check_numbers(command)
+        check_client(command.client, command.secret)
 
     def _refuse(self, refusal: Refused, query: zenoh.Query) -> None:
         self._counters.refuse(refusal)

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from protocol.limits import ORPHANED_PUSH
 from sim_server.effects.touch import Touch, TouchError
 from sim_server.simulation import Simulation
 from tests.scenes import bar, simulation
@@ -239,10 +240,26 @@ REFUSED = {
     "a grab without stiffness": ("grab", {"stiffness": 0.0}, "stiffness = 0 N/m"),
     "a grab with stiffness NaN": ("grab", {"stiffness": float("nan")}, "must be above 0"),
     "a grab of negative duration": ("grab", {"duration": -1.0}, "must be above 0"),
+    "a target beyond all numbers": (
+        "grab", {"target": (1e308, 0.0, 0.0)}, r"target \(1e\+308, 0, 0\) is 1e\+308 m from .*at most 2449 m",
+    ),
+    "a target whose square is none": (
+        "grab", {"target": (1e200, 0.0, 0.0), "stiffness": 1e308}, "1000 times the size of 'bar'",
+    ),
+    "a stiffness beyond all springs": (
+        "grab", {"stiffness": 1e308}, r"stiffness = 1e\+308 N/m: at most 4.082e\+14 N/m on 'bar'",
+    ),
+    "a point beyond all numbers": (
+        "grab", {"point": (1e308, 0.0, 0.0), "target": (1e308, 0.0, 0.0), "radius": 0.0},
+        r"point \(1e\+308, 0, 0\) is 1e\+308 m from 'bar': at most 2449 m",
+    ),
+    "a push far away": ("push", {"point": (0.0, -1e5, 0.0), "radius": 0.0}, "point .* is 1e.05 m from 'bar'"),
+    "a push whose square is none": ("push", {"force": (1e200, 1e200, 0.0)}, "at most max_force"),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize(("verb", "change", "message"), REFUSED.values(), ids=REFUSED.keys())
+@pytest.mark.filterwarnings("error")
 def test_what_cannot_be_done_is_refused_and_changes_nothing(verb, change, message):
     sim, touch = held_bar()
     given = {"client": "anna", "name": "bar", "point": END, "radius": 0.6, "duration": 1.0}
@@ -251,6 +268,37 @@ def test_what_cannot_be_done_is_refused_and_changes_nothing(verb, change, messag
         getattr(touch, verb)(**(given | change))
     assert touch.alive() == []
     assert not force_in(sim).any()
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_target_out_of_bounds_leaves_a_grab_where_it_was():
+    sim, touch = held_bar()
+    grab = touch.grab("anna", "bar", END, 0.0, END, 1e4, 100.0, EVER)
+    with pytest.raises(TouchError, match="1000 times the size of 'bar'"):
+        touch.move("anna", grab.id, (1e200, 0.0, 0.0))
+    sim.engine.run(3)
+    assert touch.alive()[0].target == END and (sim.engine.records()["status"] == 0).all()
+
+
+def test_what_the_bounds_allow_gives_finite_steps():
+    """The stiffest spring to the farthest target, in double precision and squared in single precision."""
+    sim, touch = held_bar()
+    far = 1e3 * np.sqrt(6) * 0.999
+    touch.grab("anna", "bar", END, 0.6, (END[0], END[1] + far, END[2]), 1e18 / (1e3 * np.sqrt(6)), 50.0, EVER)
+    sim.engine.run(5)
+    assert (sim.engine.records()["status"] == 0).all() and np.isfinite(sim.world.x).all()
+    assert np.isfinite(np.float32(1e18) ** 2)
+
+
+def test_one_who_misses_is_told_where_the_body_is():
+    sim, touch = held_bar()
+    sim.world.x += [0.0, 10.0, 0.0]
+    with pytest.raises(TouchError) as told:
+        touch.push("anna", "bar", (2.0, 0.0, 0.0), 0.6, (0.0, 1.0, 0.0), 1.0)
+    assert str(told.value) == (
+        "no free node of 'bar' within 0.6 m of (2, 0, 0); the nearest is 10 m away at (2, 10, 0); "
+        "'bar' now fills x from 0 to 2, y from 10 to 11, z from 0 to 1 m"
+    )
 
 
 def test_at_most_so_many_at_once():
@@ -285,6 +333,22 @@ def test_what_a_lost_client_held_is_let_go_and_others_are_left_alone():
     assert touch.release_all("anna") == 2
     assert [a.id for a in touch.alive()] == [push.id, other.id]  # a push ends by itself
     assert touch.release_all("nobody") == 0
+
+
+@pytest.mark.parametrize("begun", [False, True])
+def test_a_push_outlives_its_client_by_a_bounded_time(begun):
+    sim, touch = held_bar()
+    touch.push("anna", "bar", END, 0.0, (0, 1e-3, 0), 1000.0)
+    if begun:
+        sim.engine.run(10)
+    assert touch.release_all("anna") == 0
+    past = 9 * H if begun else 0.0  # the clock shows when the last step began
+    assert touch.alive()[0].duration == pytest.approx(past + ORPHANED_PUSH)
+    sim.engine.run(round(ORPHANED_PUSH / H) - begun)
+    assert len(touch.alive()) == 1
+    assert touch.release_all("anna") == 0  # again: no longer
+    sim.engine.run(1)
+    assert touch.alive() == []
 
 
 def test_an_object_that_does_not_list_touch_is_not_touched():
