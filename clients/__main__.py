@@ -11,18 +11,24 @@ import time
 from collections.abc import Iterator
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from clients.errors import BadInput, ClientError
+from clients.point_option import AT_HELP, PointCommand, point
 from protocol.channels import DEFAULT_ENDPOINT, SERVER_NAME
+from protocol.endpoints import CONNECT
+from protocol.limits import ORPHANED_PUSH
+
+if TYPE_CHECKING:
+    from clients.client import Client
+    from protocol import messages_pb2 as pb
 
 app = typer.Typer(
     name="sim-client",
     help="Look at a running sim-server, push its bodies about, view and export its logs.",
     no_args_is_help=True,
-    add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
@@ -30,10 +36,19 @@ app = typer.Typer(
 Triple = tuple[float, float, float]
 Connect = Annotated[
     list[str] | None,
-    typer.Option(metavar="ENDPOINT", help=f"Where the server listens, {DEFAULT_ENDPOINT} by default; may be repeated."),
+    typer.Option(
+        metavar="ENDPOINT",
+        help=f"Where the server listens; may be repeated. By default {CONNECT} (separated by commas or spaces) "
+        f"or {DEFAULT_ENDPOINT}.",
+    ),
+]
+Elsewhere = Annotated[
+    list[str] | None, typer.Option(metavar="ENDPOINT", help="Of a server or router that runs; may be repeated.")
 ]
 Server = Annotated[str, typer.Option(metavar="NAME", help="Name of the server.")]
 Object = Annotated[str, typer.Option("--object", metavar="NAME", help="Object of the scene.")]
+At = Annotated[str, typer.Option("--at", metavar="POINT", help=AT_HELP)]
+Json = Annotated[bool, typer.Option("--json", help="For programs.")]
 MOVES_PER_SECOND = 30
 
 
@@ -65,7 +80,7 @@ def status(
     connect: Connect = None,
     server: Server = SERVER_NAME,
 ) -> None:
-    """Show the server's health once.
+    """Show the server's health and where its objects are, once.
 
     \b
     Examples:
@@ -77,15 +92,15 @@ def status(
     from clients.plain import plain
 
     with Client(server, connect) as client:
-        found = client.status()
+        found = client.status(fresh=True)
     if as_json:
         print(json.dumps(plain(found)))
         return
     from rich.console import Console
 
-    from clients.watch import tables
+    from clients.watch import places, tables
 
-    Console().print(tables(found))
+    Console().print(tables(found), places(found))
 
 
 @app.command()
@@ -107,11 +122,11 @@ def watch(
         run(client, count)
 
 
-@app.command()
+@app.command(cls=PointCommand)
 def push(
     object: Object,
-    at: Annotated[Triple, typer.Option(metavar="X Y Z", help="Where, in the world as it is now, m.")],
     force: Annotated[Triple, typer.Option(metavar="FX FY FZ", help="Force in all, N.")],
+    at: At = "tip",
     radius: Annotated[float, typer.Option(help="Nodes so far around are pushed, m; 0 = the nearest free one.")] = 0.0,
     duration: Annotated[float, typer.Option(help="For how long, s of simulation.")] = 0.1,
     connect: Connect = None,
@@ -119,23 +134,33 @@ def push(
 ) -> None:
     """Push an object.
 
+    A push of more than 10 s keeps the command until it is over: without its client it would end after 10 s.
+
     \b
     Examples:
+      sim-client push --object beam --force 5000 0 0
+      sim-client push --object beam --at top --radius 0.6 --force 0 0 500 --duration 0.5
       sim-client push --object beam --at 10 1 1 --force 0 -200 0
-      sim-client push --object beam --at 10 1 1 --radius 0.6 --force 0 0 500 --duration 0.5
     """
     from clients.client import Client
 
+    begin = point(at)
     with Client(server, connect) as client:
-        taken = client.push(object, at, force, radius, duration)
-    print(f"pushed {_nodes(taken.nodes)} of {object} for {duration:g} s")
+        taken = client.push(object, begin, force, radius, duration)
+        what = f"{_nodes(taken.nodes)} of {object} at {_coordinates(taken.point)} for {duration:g} s"
+        if duration <= ORPHANED_PUSH:
+            print(f"pushed {what}")
+            return
+        print(f"pushing {what}; Ctrl-C ends it", flush=True)
+        _await_end(client, taken)
+    print("done")
 
 
-@app.command()
+@app.command(cls=PointCommand)
 def grab(
     object: Object,
-    at: Annotated[Triple, typer.Option(metavar="X Y Z", help="Where to take hold, m.")],
     to: Annotated[Triple, typer.Option(metavar="X Y Z", help="Where to pull it on a straight line, m.")],
+    at: At = "tip",
     radius: Annotated[float, typer.Option(help="Nodes so far around are held, m; 0 = the nearest free one.")] = 0.0,
     stiffness: Annotated[float, typer.Option(help="Of the spring that pulls, N/m.")] = 1000.0,
     max_force: Annotated[float, typer.Option(help="That the spring never exceeds, N.")] = 100.0,
@@ -147,61 +172,87 @@ def grab(
 
     \b
     Examples:
-      sim-client grab --object beam --at 10 1 1 --to 10 4 1 --duration 2
+      sim-client grab --object beam --to 10 4 1 --duration 2
       sim-client grab --object beam --at 10 1 1 --to 12 1 1 --stiffness 5000 --max-force 500
     """
     from clients.client import Client, number
 
     number(duration, "duration", positive=True)
-    with Client(server, connect) as client, client.grab(object, at, at, radius, stiffness, max_force) as held:
-        print(f"holding {_nodes(held.interaction.nodes)} of {object}")
+    begin = point(at)
+    with Client(server, connect) as client, client.grab(object, begin, None, radius, stiffness, max_force) as held:
+        found = held.interaction
+        print(f"holding {_nodes(found.nodes)} of {object} at {_coordinates(found.point)}", flush=True)
+        start = (found.point.x, found.point.y, found.point.z)
         began = time.monotonic()
         while (share := (time.monotonic() - began) / duration) < 1:
-            held.move([a + share * (b - a) for a, b in zip(at, to, strict=True)])
+            held.move([a + share * (b - a) for a, b in zip(start, to, strict=True)])
             time.sleep(1 / MOVES_PER_SECOND)
         held.move(to)
     print("released")
 
 
-def _command(verb: str, connect: Connect, server: str) -> None:
-    """Sends a command that needs nothing but its verb."""
+def _await_end(client: Client, push: pb.Interaction) -> None:
+    """Waits until a push is over, or takes it back on Ctrl-C."""
+    from protocol import messages_pb2 as pb
+
+    end = client.status(fresh=True).time + push.duration
+    try:
+        while client.status().time < end:
+            time.sleep(0.2)
+    except KeyboardInterrupt:
+        client.command("release", pb.Interaction(id=push.id, object=push.object))
+        raise
+
+
+def _command(verb: str, connect: Connect, server: str, as_json: bool) -> None:
+    """Sends a command that needs nothing but its verb, and says what happened."""
     from clients.client import Client
 
     with Client(server, connect) as client:
-        client.command(verb)
+        reply = client.command(verb)
+    found = reply.status
+    if as_json:
+        what = {"state": found.state, "step": found.step, "time": found.time, "changed": not reply.unchanged}
+        print(json.dumps(what))
+        return
+    said = {"pause": "paused at", "resume": "goes on from", "stop": "stopped after"}[verb]
+    if reply.unchanged:
+        said = {"pause": "already paused, at", "resume": "already running, at"}[verb]
+    steps = f"{found.step} step{'s' * (found.step != 1)}" if verb == "stop" else f"step {found.step}"
+    print(f"{said} {steps} (t = {found.time:.3f} s)")
 
 
 @app.command()
-def pause(connect: Connect = None, server: Server = SERVER_NAME) -> None:
+def pause(as_json: Json = False, connect: Connect = None, server: Server = SERVER_NAME) -> None:
     """Halt the simulation; the server goes on answering.
 
     \b
     Examples:
       sim-client pause
     """
-    _command("pause", connect, server)
+    _command("pause", connect, server, as_json)
 
 
 @app.command()
-def resume(connect: Connect = None, server: Server = SERVER_NAME) -> None:
+def resume(as_json: Json = False, connect: Connect = None, server: Server = SERVER_NAME) -> None:
     """Go on after a pause.
 
     \b
     Examples:
       sim-client resume
     """
-    _command("resume", connect, server)
+    _command("resume", connect, server, as_json)
 
 
 @app.command()
-def stop(connect: Connect = None, server: Server = SERVER_NAME) -> None:
+def stop(as_json: Json = False, connect: Connect = None, server: Server = SERVER_NAME) -> None:
     """End the server; it closes its log first.
 
     \b
     Examples:
       sim-client stop
     """
-    _command("stop", connect, server)
+    _command("stop", connect, server, as_json)
 
 
 @app.command()
@@ -286,7 +337,7 @@ def load(
     device: Annotated[str, typer.Option(metavar="auto|cpu|gpu", help="Of the server.")] = "cpu",
     out: Annotated[Path | None, typer.Option(metavar="FOLDER", help="Keep scene, log, load.json and load.png.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
-    connect: Connect = None,
+    connect: Elsewhere = None,
     server: Server = SERVER_NAME,
 ) -> None:
     """Load a server and report what its steps, workers and clients make of it.
@@ -343,7 +394,7 @@ def replay(
     name: Annotated[
         str | None, typer.Option(metavar="NAME", help="Name of the server that it plays; else the log's, if free.")
     ] = None,
-    connect: Connect = None,
+    connect: Elsewhere = None,
     listen: Annotated[
         list[str] | None, typer.Option(metavar="ENDPOINT", help=f"Where to be reached, {DEFAULT_ENDPOINT} by default.")
     ] = None,
@@ -374,6 +425,10 @@ def _nodes(count: int) -> str:
     return f"{count} node{'s' if count != 1 else ''}"
 
 
+def _coordinates(point: pb.Vector) -> str:
+    return f"({point.x:.4g}, {point.y:.4g}, {point.z:.4g})"
+
+
 @contextlib.contextmanager
 def _opened(path: Path) -> Iterator:
     """A log, with its gaps told on stderr."""
@@ -393,7 +448,7 @@ def main() -> None:
     """Exit codes: 0 done, 2 bad input, 1 anything else, 130 on Ctrl-C."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that viewers and sessions are closed
     try:
-        app()
+        app(prog_name="sim-client")
     except BadInput as error:
         print(f"sim-client: {error}", file=sys.stderr)
         sys.exit(2)

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import secrets
 from collections.abc import Callable, Sequence
 from types import TracebackType
 from typing import Self, TypeVar
@@ -13,16 +12,18 @@ from typing import Self, TypeVar
 import zenoh
 from google.protobuf.message import Message
 
+from clients.asking import Asking, read
+from clients.asking import send as send_query
 from clients.errors import BadInput, ClientError
 from clients.frames import Mesh, mesh_of
 from clients.grab import Grab
 from clients.subscriptions import States, Steps
 from protocol import PROTOCOL, Refused
 from protocol import messages_pb2 as pb
-from protocol.channels import CHANNELS, DEFAULT_ENDPOINT, ROOT, SERVER_NAME, check_name, key
-from protocol.check import check_header, parse
-from protocol.endpoints import BadEndpoint
-from protocol.session import ConnectionFailed, open_session
+from protocol.channels import ROOT, SERVER_NAME, check_name, key
+from protocol.client_name import new_client
+from protocol.endpoints import BadEndpoint, usual_endpoints
+from protocol.session import ConnectionFailed, UnknownHost, open_session
 
 M = TypeVar("M", bound=Message)
 Point = Sequence[float]
@@ -31,72 +32,86 @@ Point = Sequence[float]
 class Client:
     """A connection to the server `name`; use it as a context manager, which always closes it.
 
-    connect: endpoints, tcp/127.0.0.1:7447 by default. timeout [s]: for connecting and for every answer.
+    connect: endpoints; by default those of the environment variable WARPFACTOR_CONNECT, or tcp/127.0.0.1:7447.
+    timeout [s]: for connecting and for every answer.
     Raises ClientError if there is no such server, BadInput for a bad name or endpoint.
 
     >>> with Client() as client:
-    ...     client.push("beam", at=(10, 0, 0), force=(0, -50, 0), duration=0.2)
+    ...     client.push("beam", at="tip", force=(0, -50, 0), duration=0.2)
     """
 
     def __init__(self, name: str = SERVER_NAME, connect: Sequence[str] | None = None, timeout: float = 3.0) -> None:
         self.name = name
-        self.id = f"client-{secrets.token_hex(4)}"
-        self._where = ", ".join(connect or [DEFAULT_ENDPOINT])
+        self.id, self._secret = new_client()
         self._timeout = timeout
         try:
             check_name(name, "server name")
+            connect = list(connect or usual_endpoints())
+            self._where = ", ".join(connect)
             self._session = open_session("client", connect=connect, timeout=timeout, shared_memory=False)
         except (Refused, BadEndpoint) as error:
             raise BadInput(str(error)) from None
+        except UnknownHost as error:
+            raise ClientError(str(error)) from None
         except ConnectionFailed:
             raise self._no_server() from None
         try:
+            self._asking = Asking(self._session.zenoh, name, self._where)
             self._token = self._session.zenoh.liveliness().declare_token(key("alive_client", name, client=self.id))
             self.status()
         except BaseException:
             self.close()
             raise
 
-    def status(self) -> pb.Status:
-        """The server's health, at most a second old."""
+    def status(self, fresh: bool = False) -> pb.Status:
+        """The server's health, at most a second old; fresh: of now, and with where the objects are."""
+        if fresh:
+            self.command("status")
         found = self._query("status", pb.Status)
         if not found:
             raise self._no_server()
-        return found[-1]
+        return found[0]
 
     def scene(self) -> pb.Scene:
         """What is simulated, with the text of the scene file."""
         found = self._query("scene", pb.Scene)
         if not found:
             raise ClientError(f"server {self.name!r} has not announced its scene")
-        return found[-1]
+        return found[0]
 
     def meshes(self) -> dict[str, Mesh]:
         """The present mesh of every object."""
+        objects = {name for scene in self._query("scene", pb.Scene) for name in scene.objects}
+        found = self._query(
+            "topology", pb.Topology, complete=lambda all: bool(objects) and objects <= {t.header.object for t in all}
+        )
         try:
-            return {mesh.object: mesh for mesh in map(mesh_of, self._query("topology", pb.Topology))}
+            return {mesh.object: mesh for mesh in map(mesh_of, found)}
         except Refused as error:
             raise ClientError(f"server {self.name!r} sent a mesh that cannot be used: {error}") from None
 
-    def push(self, object: str, at: Point, force: Point, radius: float = 0.0, duration: float = 0.1) -> pb.Interaction:
+    def push(
+        self, object: str, at: Point | str, force: Point, radius: float = 0.0, duration: float = 0.1
+    ) -> pb.Interaction:
         """Pushes the nodes of `object` within `radius` [m] of `at` [m] with `force` [N] in all for `duration` [s].
 
-        radius 0 takes the nearest free node. Returns the interaction as the server took it.
+        at: coordinates, or a named point of the object: tip (the free node farthest from what is fixed), top, bottom,
+        left, right, front, back. radius 0 takes the nearest free node. Returns the interaction as the server took it.
         """
         wanted = pb.Interaction(
             object=object,
             kind="push",
-            point=vector(at, "at"),
             force=vector(force, "force"),
             radius=number(radius, "radius"),
             duration=number(duration, "duration", positive=True),
         )
+        _begin(wanted, at)
         return self.command("push", wanted).interaction
 
     def grab(
         self,
         object: str,
-        at: Point,
+        at: Point | str,
         target: Point | None = None,
         radius: float = 0.0,
         stiffness: float = 1000.0,
@@ -104,28 +119,32 @@ class Client:
     ) -> Grab:
         """Holds the nodes of `object` around `at` [m] by a spring to `target` (first `at` itself) that can be moved.
 
+        at: coordinates or a named point, as of a push; `interaction.point` of the handle tells where that is.
         stiffness [N/m] of the spring, max_force [N] that it never exceeds. The handle releases as a context manager.
         """
         wanted = pb.Interaction(
             object=object,
             kind="grab",
-            point=vector(at, "at"),
-            target=vector(at if target is None else target, "target"),
             radius=number(radius, "radius"),
             stiffness=number(stiffness, "stiffness", positive=True),
             max_force=number(max_force, "max-force", positive=True),
         )
+        _begin(wanted, at)
+        if target is not None or not isinstance(at, str):
+            wanted.target.CopyFrom(vector(at if target is None else target, "target"))  # type: ignore[arg-type]
         return Grab(self.command, self.command("grab", wanted).interaction)
 
-    def pause(self) -> None:
-        self.command("pause")
+    def pause(self) -> pb.Reply:
+        """Halts the simulation. The answer comes when the step under way has ended; its status tells which that was."""
+        return self.command("pause")
 
-    def resume(self) -> None:
-        self.command("resume")
+    def resume(self) -> pb.Reply:
+        """Lets it go on; status of the answer: from which step."""
+        return self.command("resume")
 
-    def stop(self) -> None:
-        """Ends the server, which closes its log first."""
-        self.command("stop")
+    def stop(self) -> pb.Reply:
+        """Ends the server, which then closes its log; status of the answer: after how many steps."""
+        return self.command("stop")
 
     def states(self, objects: Sequence[str] | None = None) -> States:
         """Frames of the named objects (all by default) from now on, the newest of each alone."""
@@ -140,9 +159,9 @@ class Client:
         found = self._query("command", pb.Reply, self._command(verb, interaction))
         if not found:
             raise self._no_server()
-        if found[-1].error:
-            raise BadInput(f"{verb}: {found[-1].error}")
-        return found[-1]
+        if found[0].error:
+            raise BadInput(f"{verb}: {found[0].error}")
+        return found[0]
 
     def send(
         self, verb: str, interaction: pb.Interaction | None = None,
@@ -152,27 +171,27 @@ class Client:
 
         answered: gets the reply, or None if there came none in time, in a thread of its own.
         """
-        replies: list[pb.Reply] = []
+        others: list[pb.Reply] = []  # of another incarnation: the server may have been started again
+        told: list[bool] = []
 
         def take(reply: zenoh.Reply) -> None:
-            if reply.ok is None or replies:
+            if reply.ok is None or told:
                 return
             with contextlib.suppress(Refused):
-                message = parse(pb.Reply, reply.ok.payload, CHANNELS["reply"].limit)
-                check_header(message)
-                replies.append(message)
+                message = read(reply, "command", pb.Reply)
+                if message.header.incarnation == self._asking.incarnation:
+                    told.append(True)
+                    answered(message)
+                elif not others:
+                    others.append(message)
 
         def done() -> None:
-            answered(replies[0] if replies else None)
+            if not told:
+                answered(others[0] if others else None)
 
         try:
-            self._session.zenoh.get(
-                key("command", self.name),
-                zenoh.handlers.Callback(take, done),
-                payload=self._command(verb, interaction),
-                timeout=self._timeout,
-                target=zenoh.QueryTarget.ALL,
-            )
+            payload = self._command(verb, interaction)
+            send_query(self._session.zenoh, self.name, "command", payload, self._timeout, take, done)
         except zenoh.ZError as error:
             raise ClientError(f"lost the server {self.name!r} at {self._where}: {error}") from None
 
@@ -191,27 +210,14 @@ class Client:
         if interaction is not None:
             interaction.client = self.id
         header = pb.Header(protocol=PROTOCOL)
-        return pb.Command(header=header, client=self.id, verb=verb, interaction=interaction).SerializeToString()
+        command = pb.Command(header=header, client=self.id, secret=self._secret, verb=verb, interaction=interaction)
+        return command.SerializeToString()
 
-    def _query(self, channel: str, kind: type[M], payload: bytes | None = None) -> list[M]:
-        limit = CHANNELS["reply" if channel == "command" else channel].limit
-        found = []
-        try:
-            replies = self._session.zenoh.get(
-                key(channel, self.name), payload=payload, timeout=self._timeout, target=zenoh.QueryTarget.ALL
-            )
-            for reply in replies:
-                if reply.ok is None:
-                    text = reply.err.payload.to_string() if reply.err else "an error"
-                    raise ClientError(f"server {self.name!r} at {self._where} did not answer in time ({text})")
-                message = parse(kind, reply.ok.payload, limit)
-                check_header(message)
-                found.append(message)
-        except Refused as error:
-            raise ClientError(f"server {self.name!r} sent what this client does not understand: {error}") from None
-        except zenoh.ZError as error:
-            raise ClientError(f"lost the server {self.name!r} at {self._where}: {error}") from None
-        return found
+    def _query(
+        self, channel: str, kind: type[M], payload: bytes | None = None,
+        complete: Callable[[list[M]], bool] = bool,
+    ) -> list[M]:  # fmt: skip
+        return self._asking.ask(channel, kind, payload, self._timeout, complete)
 
     def _no_server(self) -> ClientError:
         others = self._servers() if hasattr(self, "_session") else []
@@ -222,6 +228,14 @@ class Client:
         tokens = self._session.zenoh.liveliness().get(f"{ROOT}/*/alive/server/*", timeout=self._timeout)
         names = {str(token.ok.key_expr).split("/")[1] for token in tokens if token.ok is not None}
         return sorted(repr(name) for name in names)
+
+
+def _begin(wanted: pb.Interaction, at: Point | str) -> None:
+    """Where the interaction begins: a named point or coordinates."""
+    if isinstance(at, str):
+        wanted.at = at
+    else:
+        wanted.point.CopyFrom(vector(at, "at"))
 
 
 def vector(values: Point, what: str) -> pb.Vector:

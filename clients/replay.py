@@ -113,12 +113,17 @@ class Replay:
     def _obey(self, verb: str, query: zenoh.Query) -> None:
         reply = pb.Reply()
         if verb in ("pause", "resume"):
+            reply.unchanged = self.paused == (verb == "pause")
             self.paused = verb == "pause"
         elif verb == "stop":
             self.stopping = True
         elif verb != "status":
             reply.error = f"this is a replay of {self.timeline.path.name}: it takes pause, resume and stop, no {verb!r}"
         self._publish_status("stopping" if self.stopping else "paused" if self.paused else "running")
+        if verb in ("pause", "resume", "stop"):
+            reply.status.state, reply.status.step, reply.status.time = (
+                self._status.state, self._status.step, self._status.time
+            )  # fmt: skip
         self.station.answer(query, reply)
 
     # --- messages -----------------------------------------------------------------------------------------------

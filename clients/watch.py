@@ -69,6 +69,19 @@ def _objects(status: pb.Status) -> Table:
     return table
 
 
+def places(status: pb.Status) -> Table:
+    """Where the objects are."""
+    table = Table("object", "x", "y", "z [m]", "tip", **COMPACT)
+    for found in status.objects:
+        if found.HasField("low"):
+            low, high, tip = found.low, found.high, found.tip
+            spans = ((low.x, high.x), (low.y, high.y), (low.z, high.z))
+            table.add_row(
+                found.object, *(f"{a:.3g} … {b:.3g}" for a, b in spans), f"{tip.x:.3g} {tip.y:.3g} {tip.z:.3g}"
+            )
+    return table
+
+
 def _workers(status: pb.Status) -> Table | Text:
     if not status.workers:
         return Text("no workers")

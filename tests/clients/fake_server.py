@@ -15,6 +15,8 @@ from protocol.session import open_session
 from tests.ports import free_port
 from tests.sample_run import DT, header, object_step, scene, state, topology
 
+LOW, TIP = pb.Vector(x=-1, y=0, z=0), pb.Vector(x=1, y=2, z=3)
+
 
 class FakeServer:
     def __init__(self, name: str = "sim", objects: tuple[str, ...] = ("beam", "liver")) -> None:
@@ -35,7 +37,8 @@ class FakeServer:
         found.header.protocol = self.protocol
         found.step_p50, found.step_p99 = 0.004, 0.006
         for name in self.objects:
-            found.objects.append(pb.ObjectStatus(object=name, nodes=5, tets=2, last=object_step(name, 50)))
+            last = object_step(name, 50)
+            found.objects.append(pb.ObjectStatus(object=name, nodes=5, tets=2, last=last, low=LOW, high=TIP, tip=TIP))
         found.workers.append(pb.WorkerInfo(worker="w1", host="here", pid=1, library="superlu", threads=1, jobs=3))
         return found
 
@@ -85,11 +88,15 @@ class FakeServer:
         if command.verb in ("push", "grab") and wanted.object not in self.objects:
             return pb.Reply(header=header(), error=f"no object {wanted.object!r}; there is {', '.join(self.objects)}")
         if command.verb in ("pause", "resume"):
-            self.state = "paused" if command.verb == "pause" else "running"
+            state = "paused" if command.verb == "pause" else "running"
+            unchanged, self.state = self.state == state, state
+            return pb.Reply(header=header(), status=self.status(), unchanged=unchanged)
         taken = pb.Interaction()
         taken.CopyFrom(wanted)
         taken.id, taken.nodes, taken.start = 11, 4, 1.0
-        return pb.Reply(header=header(), interaction=taken)
+        if wanted.at:
+            taken.point.CopyFrom(TIP)
+        return pb.Reply(header=header(), interaction=taken, status=self.status())
 
     def __enter__(self) -> Self:
         return self

@@ -28,17 +28,17 @@ def server() -> Iterator[FakeServer]:
         yield started
 
 
-def start(*arguments: str | Path) -> subprocess.Popen:
+def start(*arguments: str | Path, **variables: str) -> subprocess.Popen:
     command = [sys.executable, "-m", "clients", *map(str, arguments)]
-    environment = os.environ | {"COLUMNS": "160"}
+    environment = os.environ | {"COLUMNS": "160"} | variables
     return subprocess.Popen(
         command, cwd=ROOT, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
     )
 
 
-def run(*arguments: str | Path) -> tuple[int, str, str]:
-    """Exit code, stdout, stderr; never a traceback."""
-    process = start(*arguments)
+def run(*arguments: str | Path, **variables: str) -> tuple[int, str, str]:
+    """Exit code, stdout, stderr; never a traceback. variables: of the environment."""
+    process = start(*arguments, **variables)
     out, err = process.communicate(timeout=100)
     assert "Traceback" not in err, err
     return process.returncode, out, err
@@ -77,8 +77,57 @@ def test_push(server: FakeServer) -> None:
     code, out, err = run(
         "push", "--object", "beam", "--at", "-1", "0", "0", "--force", "0", "-50", "0", "--connect", server.endpoint
     )
-    assert (code, err) == (0, "") and "pushed 4 nodes of beam for 0.1 s" in out
+    assert (code, err) == (0, "") and "pushed 4 nodes of beam at (-1, 0, 0) for 0.1 s" in out
     assert server.commands[-1].interaction.point.x == -1 and server.commands[-1].interaction.force.y == -50
+
+
+@pytest.mark.parametrize(
+    ("at", "point"),
+    [
+        ((), "tip"),
+        (("--at", "top"), "top"),
+        (("--at", "-1", ".5", "2e0"), (-1, 0.5, 2)),
+        (("--at=-1,.5,2",), (-1, 0.5, 2)),
+    ],
+)
+def test_where_to_push(server: FakeServer, at: tuple[str, ...], point: str | tuple[float, float, float]) -> None:
+    command = ("push", "--object", "beam", *at, "--force", "0", "-50", "0")
+    code, out, err = run(*command, WARPFACTOR_CONNECT=server.endpoint)
+    assert (code, err) == (0, "")
+    sent = server.commands[-1].interaction
+    assert sent.force.y == -50
+    if isinstance(point, str):
+        assert sent.at == point and not sent.HasField("point") and "4 nodes of beam at (1, 2, 3)" in out
+    else:
+        assert sent.at == "" and (sent.point.x, sent.point.y, sent.point.z) == point
+
+
+def test_the_server_of_the_environment(server: FakeServer) -> None:
+    both = f"tcp/127.0.0.1:9, {server.endpoint}"
+    assert run("status", "--json", WARPFACTOR_CONNECT=both)[0] == 0
+    code, _, err = run("status", "--connect", "tcp/127.0.0.1:9", WARPFACTOR_CONNECT=server.endpoint)
+    assert code == 1 and "no server 'sim' at tcp/127.0.0.1:9" in err, "the option comes first"
+    code, _, err = run("status", WARPFACTOR_CONNECT="nonsense")
+    assert code == 2 and "WARPFACTOR_CONNECT: endpoint 'nonsense' cannot be used" in err
+
+
+@pytest.mark.parametrize(
+    ("package", "words", "found"),
+    [
+        ("clients", "sim-client pu", {"push"}),
+        ("clients", "sim-client push --ra", {"--radius"}),
+        ("sim_server", "sim-server --wor", {"--workers", "--worker-device"}),
+        ("precond_worker", "precond-worker --arith", {"--arithmetic"}),
+    ],
+)
+def test_completion(package: str, words: str, found: set[str]) -> None:
+    """What the script asks that --install-completion puts into bash."""
+    variable = f"_{words.split()[0].upper().replace('-', '_')}_COMPLETE"
+    asked = {variable: "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(len(words.split()) - 1)}
+    result = subprocess.run(
+        [sys.executable, "-m", package], capture_output=True, text=True, cwd=ROOT, env=os.environ | asked
+    )
+    assert set(result.stdout.split()) == found and result.stderr == ""
 
 
 def test_grab_moves_on_a_line(server: FakeServer) -> None:
@@ -109,8 +158,9 @@ def test_ctrl_c_releases_and_says_130(server: FakeServer) -> None:
 
 
 def test_pause_resume_stop(server: FakeServer) -> None:
-    for verb in ("pause", "resume", "stop"):
-        assert run(verb, "--connect", server.endpoint)[0] == 0
+    said = ("paused at step 50", "goes on from step 50", "stopped after 50 steps")
+    for verb, expected in zip(("pause", "resume", "stop"), said, strict=True):
+        assert run(verb, "--connect", server.endpoint)[:2] == (0, f"{expected} (t = 1.000 s)\n")
     assert [command.verb for command in server.commands] == ["pause", "resume", "stop"]
 
 
@@ -129,6 +179,8 @@ def test_refused_command_is_bad_input(server: FakeServer) -> None:
         (("push",), 2, "Missing option '--object'"),
         (("push", "--object", "b", "--at", "1", "2", "x", "--force", "0", "0", "0"), 2, "--at"),
         (("status", "--connect", "nowhere"), 2, "endpoint 'nowhere' cannot be used"),
+        (("push", "--object", "b", "--at", "1", "2", "--force", "0", "0", "0"), 2, "--at 1 2: allowed are three"),
+        (("status", "--connect", "tcp/no-such-host.invalid:1"), 1, "the name 'no-such-host.invalid' does not resolve"),
         (("status", "--connect", "tcp/127.0.0.1:9"), 1, "no server 'sim' at tcp/127.0.0.1:9; is it running?"),
         (("view",), 2, "give either a log or --live"),
         (("view", "x.mcap", "--live"), 2, "give either a log or --live"),
