@@ -195,8 +195,8 @@ def _await_end(client: Client, push: pb.Interaction) -> None:
     """Waits until a push is over, or takes it back on Ctrl-C."""
     from protocol import messages_pb2 as pb
 
-    end = client.status(fresh=True).time + push.duration
     try:
+        end = client.status(fresh=True).time + push.duration
         while client.status().time < end:
             time.sleep(0.2)
     except KeyboardInterrupt:

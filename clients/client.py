@@ -64,9 +64,13 @@ class Client:
             raise
 
     def status(self, fresh: bool = False) -> pb.Status:
-        """The server's health, at most a second old; fresh: of now, and with where the objects are."""
+        """The server's health, at most a second old.
+
+        fresh: of now, and with where the objects are, unless the server has no time for that.
+        """
         if fresh:
-            self.command("status")
+            with contextlib.suppress(BadInput, ClientError):
+                self.command("status")
         found = self._query("status", pb.Status)
         if not found:
             raise self._no_server()

@@ -80,8 +80,8 @@ class Service:
                 self._drain()
                 self._answer_halts()
                 loop.join(0.01)
-            self._drain()
             self._answer_halts(ended=True)
+            self._drain()
             self.telemetry.publish_status("stopping")
         if self._failure is not None:
             raise self._failure

@@ -143,11 +143,13 @@ def test_grab_moves_on_a_line(server: FakeServer) -> None:
     assert [t.y for t in targets] == sorted(t.y for t in targets) and targets[-1].y == 2
 
 
-def test_ctrl_c_releases_and_says_130(server: FakeServer) -> None:
-    process = start(
-        *("grab", "--object", "beam", "--at", "1", "0", "0", "--to", "1", "2", "4"),
-        *("--duration", "60", "--connect", server.endpoint),
-    )
+@pytest.mark.parametrize(
+    "command",
+    [("grab", "--at", "1", "0", "0", "--to", "1", "2", "4"), ("push", "--force", "1", "0", "0")],
+    ids=["grab", "push"],
+)
+def test_ctrl_c_releases_and_says_130(server: FakeServer, command: tuple[str, ...]) -> None:
+    process = start(*command, "--object", "beam", "--duration", "60", "--connect", server.endpoint)
     deadline = time.monotonic() + 30
     while len(server.commands) < 2 and time.monotonic() < deadline:
         time.sleep(0.05)
