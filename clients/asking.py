@@ -9,12 +9,11 @@ answers, answers that cannot be read and those who do not answer at all change n
 from __future__ import annotations
 
 import math
-import queue
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import zenoh
 from google.protobuf.message import Message
@@ -27,19 +26,19 @@ from protocol.check import check_header, parse
 M = TypeVar("M", bound=Message)
 OTHERS_ANSWER = 0.3  # s that another live server of the same name has to answer, too
 LOOK_AGAIN = 0.05  # s between two looks at the tokens
+REPLIES = 256  # that wait to be read
 SERVERS = 16  # incarnations whose answers are kept
 OBJECTS = 4096  # answers of an incarnation that are kept
 
 
 def send(
-    session: zenoh.Session, server: str, channel: str, payload: bytes | None, timeout: float,
-    take: Callable[[zenoh.Reply], None], done: Callable[[], None],
-) -> None:  # fmt: skip
-    """Asks all who answer under a key. take: gets each reply as it comes (by default zenoh would keep the last one of
-    each key back until everybody has answered). done: called when all have answered, or after the time-out."""
-    session.get(
+    session: zenoh.Session, server: str, channel: str, payload: bytes | None, timeout: float, handler: Any
+) -> Any:
+    """Asks all who answer under a key; returns zenoh's handler, which gets each reply as it comes (by default zenoh
+    would keep the last one of each key back until everybody has answered)."""
+    return session.get(
         key(channel, server),
-        zenoh.handlers.Callback(take, done),
+        handler,
         payload=payload,
         timeout=timeout,
         target=zenoh.QueryTarget.ALL,
@@ -100,13 +99,13 @@ class Asking:
 
         Raises ClientError.
         """
-        replies: queue.SimpleQueue[zenoh.Reply | None] = queue.SimpleQueue()
         found: _Found[M] = _Found()
         alive: set[int] = set()
         end, settled, look = time.monotonic() + timeout + LOOK_AGAIN, math.inf, 0.0
         try:
-            send(self._session, self._name, channel, payload, timeout, replies.put, lambda: replies.put(None))
-            while (reply := _next(replies, min(end, settled))) is not None:
+            room: zenoh.handlers.FifoChannel[zenoh.Reply] = zenoh.handlers.FifoChannel(REPLIES)
+            replies = send(self._session, self._name, channel, payload, timeout, room)
+            while (reply := _next(replies, settled)) is not None:
                 who, now = found.take(reply, channel, kind), time.monotonic()
                 if who and who != self.incarnation:
                     if who not in alive and now >= look:
@@ -161,10 +160,15 @@ class Asking:
         return answers
 
 
-def _next(replies: queue.SimpleQueue[zenoh.Reply | None], until: float) -> zenoh.Reply | None:
+def _next(replies: zenoh.handlers.Handler[zenoh.Reply], until: float) -> zenoh.Reply | None:
+    """The next reply; None once all have answered or timed out, or at `until`."""
     try:
-        return replies.get(timeout=max(until - time.monotonic(), 0.0))
-    except queue.Empty:
+        if until == math.inf:
+            return replies.recv()
+        while (reply := replies.try_recv()) is None and time.monotonic() < until:
+            time.sleep(2e-3)
+        return reply
+    except zenoh.ZError:
         return None
 
 

@@ -195,7 +195,8 @@ class Client:
 
         try:
             payload = self._command(verb, interaction)
-            send_query(self._session.zenoh, self.name, "command", payload, self._timeout, take, done)
+            handler = zenoh.handlers.Callback(take, done)
+            send_query(self._session.zenoh, self.name, "command", payload, self._timeout, handler)
         except zenoh.ZError as error:
             raise ClientError(f"lost the server {self.name!r} at {self._where}: {error}") from None
 
