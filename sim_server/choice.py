@@ -4,22 +4,30 @@
 At small time steps the matrix is easy and block Jacobi beats any factor; at large ones the factor wins many times
 over. Neither is known beforehand, so both are measured. The one not in use is tried again now and then by a *probe*: a
 solve that begins with it and goes over to the other after as many iterations as that one's whole solve costs, so that a
-probe at worst doubles one solve. A pure state machine over (kind, iterations, cost); whoever drives it decides whether
-cost is seconds or, where runs must repeat exactly, bytes moved.
+probe at worst doubles one solve. A pure state machine over (kind, iterations, cost, reached); whoever drives it decides
+whether cost is seconds or, where runs must repeat exactly, bytes moved.
+
+A solve that is cut off before it converged (max_iterations, budget) is cheap for nothing. So what converges is preferred
+to what does not, whatever either costs; if neither does, the smaller cost of a decade of the residual decides. A probe
+of block Jacobi leaves enough of what is allowed for the factor to converge after it, or is not made.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from protocol.method import Method
 from sim_server.engine import Kind
 from sim_server.making import Making
+from sim_server.reached import CONVERGED, Reached
 
 MEMORY = 0.2  # weight of the newest solve in the running means
 EVERY = 200  # solves between probes, doubled after each probe that was no gain ...
 RARELY = 6400  # ... up to so many
 HARDER = 2.0  # probe at once when solves cost so many times what they did at the last one
 MARGIN = 1.1  # switch only for a clear gain
+FAILING = 0.3  # running mean of solves not converged from which a kind does not converge: two in a row
+ROOM = 1.5  # times what a solve uses of what it is allowed is left to it by a probe of block Jacobi
+CUT_OFF = 100.0  # times its cost is at least what counts for a solve not converged, among factors
 KINDS = tuple(Kind)  # by number
 Made = tuple[Method | None, int]  # a factor: how it was made (None: not known), and of which step's matrix
 
@@ -28,13 +36,37 @@ Made = tuple[Method | None, int]  # a factor: how it was made (None: not known),
 class _Mean:
     cost: float = -1.0  # of a solve
     per_iteration: float = -1.0
+    full: float = -1.0  # as if the solves not converged had gone on at their pace
+    failed: float = 0.0  # solves not converged
+    used: float = 0.0  # of the iterations or time allowed
 
-    def add(self, iterations: int, cost: float) -> None:
-        each = cost / max(iterations, 1)
+    @classmethod
+    def of(cls, iterations: float, cost: float, reached: Reached) -> "_Mean":
+        """Of one solve."""
+        full, failed = cost * max(reached.lack, 1.0), float(reached.lack > 0)
+        return cls(cost, cost / max(iterations, 1), full, failed, reached.used)
+
+    def add(self, iterations: float, cost: float, reached: Reached) -> None:
+        new = self.of(iterations, cost, reached)
         if self.cost < 0:
-            self.cost, self.per_iteration = cost, each
-        self.cost += MEMORY * (cost - self.cost)
-        self.per_iteration += MEMORY * (each - self.per_iteration)
+            self.cost, self.per_iteration, self.full, self.used = new.cost, new.per_iteration, new.full, new.used
+        for name in ("cost", "per_iteration", "full", "failed", "used"):
+            before = getattr(self, name)
+            setattr(self, name, before + MEMORY * (getattr(new, name) - before))
+
+    @property
+    def failing(self) -> bool:
+        return self.failed > FAILING
+
+    def beats(self, other: "_Mean") -> bool:
+        """Clearly."""
+        if self.failing != other.failing:
+            return other.failing
+        return self.full * MARGIN < other.full if self.failing else self.cost * MARGIN < other.cost
+
+    def harder_than(self, before: "_Mean") -> bool:
+        """Than at the last probe."""
+        return self.cost > HARDER * before.cost or (self.failing and not before.failing)
 
 
 class Choice:
@@ -50,7 +82,7 @@ class Choice:
         self._means = {Kind.BLOCK_JACOBI: _Mean(), Kind.CHOLESKY: _Mean()}
         self._since = 0
         self._every = EVERY
-        self._reference = -1.0
+        self._reference: _Mean | None = None
         self._has_factor = False
         self._untried = set(methods)
         self._pending: Kind | None = None  # what the next solve goes back to if its probe is no gain
@@ -71,59 +103,77 @@ class Choice:
             self._begin_probe(Kind.CHOLESKY)
 
     def observe(
-        self, kind: Kind, iterations: int, cost: float, asked: Kind | None = None,
-        factor: Made = (None, -1), waited: float = 0.0,
+        self, kind: Kind, iterations: float, cost: float, asked: Kind | None = None,
+        factor: Made | None = None, waited: float = 0.0, reached: Reached = CONVERGED,
     ) -> None:  # fmt: skip
         """A solve was made that ended with `kind`. asked: the one it began with; what is reported late may be older
-        than the settings made last (None: it is not). waited: cost of the making of the factor that falls to each
-        solve, as the steps wait for it."""
+        than the settings made last (None: it is not). factor: None where it is not told; made -1: the loop had none.
+        waited: cost of the making of the factor that falls to each solve, as the steps wait for it."""
+        if not iterations or (asked is Kind.CHOLESKY and kind is not asked and factor is not None and factor[1] < 0):
+            return  # nothing was to be solved, or the factor asked for is still on its way: it says nothing
         if self._pending is not None and asked in (None, self.kind):
-            self._end_probe(kind, iterations, cost, factor)
+            self._end_probe(kind, _Mean.of(iterations, cost, reached), factor)
             return
         if kind not in self._means:
             return
-        method, made = factor
+        method, made = factor or (None, -1)
         if method is not None and kind is Kind.CHOLESKY:
-            if self.making.observe(method, made, cost + waited):  # from now on by this method
-                self._means[kind] = _Mean(cost, cost / max(iterations, 1))
-                self._reference = cost
+            counted = cost + waited if reached.lack == 0 else CUT_OFF * reached.lack * (cost + waited)
+            if self.making.observe(method, made, counted):  # from now on by this method
+                self._means[kind] = _Mean.of(iterations, cost, reached)
+                self._reference = replace(self._means[kind])
             elif method != self.making.decided:
                 return  # a trial, which says nothing of what is in use
-        self._means[kind].add(iterations, cost)
+        mean = self._means[kind]
+        mean.add(iterations, cost, reached)
         self._since += 1
-        mean = self._means[kind].cost
-        if self._reference < 0:
-            self._reference = mean
-        if self._has_factor and (self._since >= self._every or mean > HARDER * self._reference):
+        self._reference = self._reference or replace(mean)
+        if self._has_factor and (self._since >= self._every or mean.harder_than(self._reference)):
             self._begin_probe(Kind.CHOLESKY if self.kind is Kind.BLOCK_JACOBI else Kind.BLOCK_JACOBI)
 
     def observe_steps(
-        self, kinds: Sequence[int], iterations: Sequence[int], costs: Sequence[float], asked: Sequence[int],
-        factors: Sequence[Made],
+        self, kinds: Sequence[int], iterations: Sequence[float], costs: Sequence[float], asked: Sequence[int],
+        lack: Sequence[float], used: Sequence[float], factors: Sequence[Made],
     ) -> None:  # fmt: skip
         """As `observe` of each of many solves."""
-        for kind, n, cost, began, factor in zip(kinds, iterations, costs, asked, factors, strict=True):
-            self.observe(KINDS[kind], n, cost, KINDS[began], factor)
+        columns = zip(kinds, iterations, costs, asked, lack, used, factors, strict=True)
+        for kind, n, cost, began, short, share, factor in columns:
+            self.observe(KINDS[kind], n, cost, KINDS[began], factor, reached=Reached(short, share))
 
     def _begin_probe(self, other: Kind) -> None:
-        known, probed = self._means[self.kind], self._means[other]
-        each = probed.per_iteration if probed.per_iteration > 0 else known.per_iteration
-        self.probe = max(2, int(known.cost / each)) if known.cost > 0 and each > 0 else 0
+        if (limit := self._limit(other)) is None:
+            self._since, self._reference = 0, replace(self._means[self.kind])
+            return
+        self.probe = limit
         self._pending, self.kind = self.kind, other
 
-    def _end_probe(self, kind: Kind, iterations: int, cost: float, factor: Made) -> None:
+    def _limit(self, other: Kind) -> int | None:
+        """Iterations of a solve after which a probe of `other` goes back to what is in use. 0: it does not, as nothing
+        is lost. None: no room for a probe."""
+        known, probed = self._means[self.kind], self._means[other]
+        each = probed.per_iteration if probed.per_iteration > 0 else known.per_iteration
+        if known.failing or known.cost <= 0 or each <= 0:
+            return 0
+        limit = max(2, int(known.cost / each))
+        share = known.used * max(each, known.per_iteration) / known.cost  # of what is allowed, at most, per iteration
+        if other is Kind.CHOLESKY or share <= 0:
+            return limit  # where block Jacobi uses nearly all it is allowed, a factor is to be tried all the more
+        room = int((1 - ROOM * known.used) / share)
+        return min(limit, room) if room >= 2 else None
+
+    def _end_probe(self, kind: Kind, found: _Mean, factor: Made | None) -> None:
         before, tried = self._pending, self.kind
         assert before is not None
         self._pending, self.probe, self._since = None, 0, 0
         gave_up = kind is not tried
         if not gave_up:
-            self._means[tried] = _Mean(cost, cost / max(iterations, 1))
-        better = not gave_up and (self._means[before].cost < 0 or cost * MARGIN < self._means[before].cost)
+            self._means[tried] = found
+        better = not gave_up and (self._means[before].cost < 0 or found.beats(self._means[before]))
         self.kind = tried if better else before
         if tried is Kind.CHOLESKY:
             if not better:
                 self.making.alternate()
-            elif factor[0] is not None:
+            elif factor is not None and factor[0] is not None:
                 self.making.decide(factor[0])
         self._every = EVERY if better else min(2 * self._every, RARELY)
-        self._reference = self._means[self.kind].cost
+        self._reference = replace(self._means[self.kind])

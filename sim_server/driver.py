@@ -27,6 +27,7 @@ from sim_server.copies import Copies
 from sim_server.engine import Kind
 from sim_server.factors import FactorSource, Inline, Job
 from sim_server.guard import Guard
+from sim_server.reached import Reached, reached
 from sim_server.schedule import oldest_possible, overdue_after, pays, pick
 from sim_server.simulation import Simulation
 from sim_server.stock import Stock
@@ -332,7 +333,12 @@ class Driver:
             t.observe(r, max(floor, iterations) if self._warping.tried(t, r) else floor, cost)
             factor = (t.method(int(r["factor_step"])), int(r["factor_step"]))
             if t.choice is not None:
-                t.choice.observe(kind, iterations, cost, Kind(r["asked"]), factor, self._waited(t, factor[0]))
+                lack, used = reached(r, self.solver)
+                solves, waited = max(int(r["linearizations"]), 1), self._waited(t, factor[0])
+                t.choice.observe(
+                    kind, iterations / solves, cost / solves, Kind(r["asked"]), factor, waited,
+                    Reached(float(lack), float(used)),
+                )  # fmt: skip
                 self._settle(t)
             if t.tries(factor[0]):
                 self._warping.wait(t)
@@ -344,7 +350,10 @@ class Driver:
         observe_steps(self.tracks, r, self.solver.update_floor_iterations, self._warping.tried_in(r))
         others = np.zeros(r.shape, bool)  # with factors that are tried out
         if any(t.choice for t in self.tracks):
-            columns = (r[name].T.tolist() for name in ("kind", "iterations", "solve", "asked", "factor_step"))
+            lack, used = reached(r, self.solver)
+            solves = np.maximum(r["linearizations"], 1)
+            each = (r["kind"], r["iterations"] / solves, r["solve"] / solves, r["asked"], lack, used, r["factor_step"])
+            columns = (column.T.tolist() for column in each)
             for k, (t, *rows, made) in enumerate(zip(self.tracks, *columns, strict=True)):
                 if t.choice is not None:
                     factors = [(t.method(step), step) for step in made]

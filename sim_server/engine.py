@@ -138,7 +138,8 @@ class Engine(Reports):
     """The loop over one system.
 
     assemble, integrate: the launches of a step, in order. ranges: nodes [first, last) of each body. newton: for several
-    linearizations a step. arrays: those of the system by name (row_start, columns, values, b, y, x, v, clock, warping).
+    linearizations a step. arrays: those of the system by name (row_start, columns, values, b, y, x, v, clock, warping,
+    moving).
     """
 
     def __init__(
@@ -168,7 +169,7 @@ class Engine(Reports):
         super().__init__(loop, bodies, dt, records, np.zeros((frames, 2, nodes, 3)))
         loop.launches, loop.before, loop.launch = len(launches), len(assemble), self._launch
         loop.bodies, loop.nodes, loop.body = bodies, nodes, self._body
-        for name in ("row_start", "columns", "values", "b", "y", "x", "v", "clock", "warping"):
+        for name in ("row_start", "columns", "values", "b", "y", "x", "v", "clock", "warping", "moving"):
             setattr(loop, name, arrays[name].ctypes.data)
         loop.work, loop.threads = self._work.ctypes.data, threads
         self._newton = newton and newton.attach(loop, self._launch)

@@ -85,7 +85,7 @@ class Correction(c.Structure):
 
 class Body(c.Structure):
     _fields_ = [
-        ("first", c.c_int32), ("last", c.c_int32), ("settings", Settings), ("factor", c.c_void_p),
+        ("first", c.c_int32), ("last", c.c_int32), ("settings", Settings), ("now", Settings), ("factor", c.c_void_p),
         ("mail", c.c_void_p), ("snapshot", c.c_void_p), ("snapshot_step", c.c_int64), ("ahead", c.c_double),
         ("steps", c.c_int64), ("recycled", Recycled), ("correction", Correction), ("noted", c.c_int64),
         ("made", c.c_int64), ("warping", c.c_int32), ("unused", c.c_int32),
@@ -116,6 +116,7 @@ class Loop(c.Structure):
         ("nodes", c.c_int32), ("body", c.POINTER(Body)), ("row_start", c.c_void_p), ("columns", c.c_void_p),
         ("values", c.c_void_p), ("b", c.c_void_p), ("y", c.c_void_p), ("x", c.c_void_p), ("v", c.c_void_p),
         ("work", c.c_void_p), ("newton", c.POINTER(Newton)), ("clock", c.c_void_p), ("warping", c.c_void_p),
+        ("moving", c.c_void_p),
         ("threads", c.c_int32), ("unused", c.c_int32), ("assemble_begin", c.c_double),
         ("assemble_seconds", c.c_double), ("cpu_begin", c.c_double), ("rings", Rings),
     ]  # fmt: skip

@@ -58,6 +58,7 @@ class Simulation:
         w, s = self.world, self.system
         arrays: dict[str, Any] = {"row_start": s.row_start, "columns": s.columns, "values": s.values}
         arrays |= {"b": s.b_material, "y": s.y, "x": w.x, "v": w.v, "clock": s.clock, "warping": s.warping}
+        arrays["moving"] = s.moving
         ranges = [(b.first, b.last) for b in w.bodies]
         self.engine: Any
         if device == "gpu":

@@ -40,6 +40,8 @@ class System:
 
     elements: per effect, (m, c) node numbers of the elements that couple their corners, c = 2 or 4.
 
+    moving (bodies,): 1 where a step is to be solved, as some node does not rest (kernels/nodes.cu), set by `turn` and
+    cleared by the loop. extent (n,): diagonal of the box around the node's body at rest [m]; gain (n,) [1/s].
     rotation (n, 3, 3): frames of the nodes. warping (bodies,), used and noted (n, 8): by which they can be held and let
     go (kernels/nodes.cu); the loop sets warping in each step.
     """
@@ -63,6 +65,9 @@ class System:
             np.int32
         )
         self.warping = np.zeros(len(world.bodies), np.int32)
+        self.moving = np.zeros(len(world.bodies), np.int32)
+        extents = np.array([np.linalg.norm(np.ptp(world.rest[b.nodes], axis=0)) for b in world.bodies])
+        self.extent, self.gain = extents[self.body], 1 / (world.reach + world.beta[self.body])
         self.used, self.noted = (np.tile([1.0, 0.0, 0.0, 0.0], (n, 2)) for _ in range(2))
         self.rotation = np.tile(np.eye(3), (n, 1, 1))
         self.b_material = np.zeros((n, 3))
@@ -101,9 +106,11 @@ class System:
         warping: another array than that of the loop.
         """
         w = self.world
+        velocity = w.v if w.inertia else w.ahead  # without inertia that of the last step is no velocity to begin with
         turn = self.world.backend.module("kernels/nodes.cu").bind(
             "turn", w.nodes, free=w.free, body=self.body, warping=self.warping if warping is None else warping,
             place=self.own, mean=self.mean, b=self.b, diagonal=self.diagonal, block=self.block, dv=self.dv,
+            x=w.x, v=velocity, extent=self.extent, gain=self.gain, h=w.dt, moving=self.moving,
             used=self.used, noted=self.noted, rotation=self.rotation, b_material=self.b_material, y=self.y,
             values=self.values,
         )  # fmt: skip

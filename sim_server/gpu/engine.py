@@ -29,7 +29,8 @@ FEW = 16  # trials in a step up to which MANY steps make one graph
 TICK = np.dtype(
     [
         ("clock", "u8"), ("step", "u8"), ("dt", "f8"), ("arrived", "u8"), ("finished", "u8"), ("stamps", "u8"),
-        ("results", "u8"), ("reports", "u8"), ("barriers", "i4"), ("capacity", "i4"), ("words", "i4"), ("unused", "i4"),
+        ("results", "u8"), ("reports", "u8"), ("moving", "u8"), ("barriers", "i4"), ("capacity", "i4"),
+        ("words", "i4"), ("bodies", "i4"),
     ]
 )  # fmt: skip
 
@@ -147,12 +148,13 @@ class GpuEngine(DeviceLoop):
         arrays = {
             "clock": self.gpu.twin(self._arrays["clock"]), "step": self._counter, "arrived": self.solver.arrived,
             "finished": self._finished, "results": self.solver.results,
+            "moving": self.gpu.twin(self._arrays["moving"]),
         }  # fmt: skip
         for name, array in arrays.items():
             tick[name] = array.data.ptr
         tick["stamps"], tick["reports"] = self._stamps.ctypes.data, self._results.ctypes.data
         tick["dt"], tick["barriers"], tick["capacity"] = dt, len(self.solver.arrived), CAPACITY
-        tick["words"] = len(self._ranges) * RESULT.itemsize // 8
+        tick["words"], tick["bodies"] = len(self._ranges) * RESULT.itemsize // 8, len(self._ranges)
         return tick
 
     exact = False  # settings hold for batches of steps

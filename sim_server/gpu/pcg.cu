@@ -20,7 +20,7 @@ struct Memory {  // fixed shared memory of a thread block: what is the same in a
     real* d;         // (own, 3) scale of the own degrees of freedom, or null
     real* diagonal;  // (own, 9) inverses of the diagonal blocks
     double peak;     // largest scale
-    int next, bad;
+    int next, bad, rests;
     double b2, goal, quarter, rz;  // of the iteration: all threads write the same
     Result out;
 };
@@ -305,11 +305,15 @@ __device__ __forceinline__ void Solver::solve() {
                     give(1, (real)(0 * bb));  // NaN: the kernel `advance` takes the body back
                     return;
                 }
+                if (memory.rests && body.warm_start && bb > 0) {  // rounding is not solved for; the scene has what it starts from
+                    out.residual = sqrt(r2 / bb);
+                    return;
+                }
                 memory.goal = body.tolerance * body.tolerance * bb;
                 if (!body.warm_start || !(r2 < bb)) { alpha = 0; r2 = bb; }
                 else fresh = true;
                 memory.quarter = r2 * sqrt(sqrt(memory.goal / r2));
-                if (r2 <= memory.goal) {
+                if (r2 <= memory.goal || memory.rests) {
                     if (alpha == 0) give(0, 0);  // else the scene has it already
                     out.residual = bb > 0 ? sqrt(r2 / bb) : 0;
                     return;
@@ -333,7 +337,7 @@ __device__ __forceinline__ void Solver::solve() {
             int other = -1;
             if (!usable(zr)) stop = BREAKDOWN_PRECONDITIONER;
             else if (iterations == body.max_iterations) stop = MAX_ITERATIONS;
-            else if (kind == CHOLESKY && iterations > 0 && iterations == body.max_iterations / 2 && !(r2 < memory.quarter))
+            else if (kind == CHOLESKY && body.max_iterations >= ENOUGH && iterations == body.max_iterations / 2 && !(r2 < memory.quarter))
                 stop = BREAKDOWN_PRECONDITIONER;  // not a quarter of the way: pcg.h says why
             if (stop == BREAKDOWN_PRECONDITIONER && kind == CHOLESKY) {  // a useless factor: on with block Jacobi
                 other = BLOCK_JACOBI;
@@ -374,6 +378,7 @@ __device__ __forceinline__ void solve_body(const Solve& s, const Share& share) {
     __syncthreads();
     if (memory.body.plan)
         for (int i = threadIdx.x; i < (int)(sizeof(Plan) / 4); i += THREADS) ((int*)&memory.plan)[i] = ((const int*)memory.body.plan)[i];
+    if (threadIdx.x == 0) memory.rests = s.moving[k] == 0;
     __syncthreads();
     const long long begin = nanoseconds();
     Solver solver = {s, {share.index, memory.body.blocks, s.exchanges[k], s.board + 8ll * s.grid * k, s.grid, memory.scratch, memory.totals,
@@ -383,7 +388,7 @@ __device__ __forceinline__ void solve_body(const Solve& s, const Share& share) {
     if (share.index == 0 && threadIdx.x == 0) {
         Result out = memory.out;
         out.seconds = 1e-9 * (nanoseconds() - begin);
-        if (out.kind == CHOLESKY || out.fallbacks) out.factor_step = memory.body.factor_step;
+        if (memory.body.plan && (out.asked == CHOLESKY || out.kind == CHOLESKY || out.fallbacks)) out.factor_step = memory.body.factor_step;
         out.warping = s.warping[k];
         s.results[(s.step[0] % s.capacity) * s.count + k] = out;
         s.exchanges[k] = solver.team.number;  // all have read it before the first exchange

@@ -42,6 +42,8 @@ struct Plan {
 
 template <class T> struct Word;  // team.cuh
 
+constexpr int ENOUGH = 20;  // native/pcg.h
+
 // The rows of A that a thread block has of a body, and the nodes that they read.
 struct Share { int body, index, begin, own, halo_first, halo, block_first, blocks; };
 
@@ -95,6 +97,7 @@ struct Solve {
     const long long* step;           // completed steps: where the result goes
     Result* results;                 // (capacity, bodies)
     const int* warping;              // (bodies,) of the step under way (kernels/nodes.cu), for the results
+    const int* moving;               // (bodies,) 0: the body rests (kernels/nodes.cu)
     int nodes, shared;               // of the scene; bytes of dynamic shared memory
 };
 

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: MIT
 // The end of a step, done by whichever thread block of its last kernel finishes last: one more step is completed, the barriers
-// of the next solve begin at zero, and the results go to the host with the device's clock. fuse.py appends this to that kernel.
+// of the next solve begin at zero, all bodies rest until their nodes say otherwise, and the results go to the host with the device's clock. fuse.py appends this to that kernel.
 #include "clock.cuh"
 
 struct Tick {
@@ -13,7 +13,8 @@ struct Tick {
                                // has ended, or when `stamp` says so
     const long long* results;  // (capacity, words)
     long long* reports;        // likewise on the host
-    int barriers, capacity, words, unused;
+    int* moving;               // (bodies,)
+    int barriers, capacity, words, bodies;
 };
 
 __device__ void tick(const Tick& t) {
@@ -28,6 +29,7 @@ __device__ void tick(const Tick& t) {
     const long long done = t.step[0], slot = done % t.capacity;
     for (int k = threadIdx.x; k < t.words; k += blockDim.x) t.reports[slot * t.words + k] = t.results[slot * t.words + k];
     for (int k = threadIdx.x; k < t.barriers; k += blockDim.x) t.arrived[k] = 0;
+    for (int k = threadIdx.x; k < t.bodies; k += blockDim.x) t.moving[k] = 0;
     __syncthreads();
     if (threadIdx.x == 0) {
         long long now = nanoseconds();

@@ -40,6 +40,7 @@ typedef int index;
 constexpr int LANES = 1;
 template <class T> using entry = T;  // one of the scalars in a number
 INLINE bool any(bool mask) { return mask; }  // is it so for one of the items at hand?
+INLINE void mark(int* a, index i, bool mask) { if (mask) a[i] = 1; }
 
 #ifndef BLOCK_ITEMS  // of a thread block; neighbouring threads have neighbouring items
 #define BLOCK_ITEMS 128
@@ -148,6 +149,10 @@ template <class M> INLINE bool any(M mask) {
     for (int k = 0; k < LANES; ++k) found |= mask[k] != 0;
     return found;
 }
+template <class M> INLINE void mark(int* a, index i, M mask) {
+    for (int k = 0; k < LANES; ++k)
+        if (mask[k]) a[i[k]] = 1;
+}
 INLINE number as_number(index a) {
     number r;
     for (int k = 0; k < LANES; ++k) r[k] = a[k];
@@ -171,6 +176,7 @@ using std::exp;
 using std::cbrt;
 template <class V> INLINE V lane(V a, int) { return a; }
 INLINE bool any(bool mask) { return mask; }
+INLINE void mark(int* a, index i, bool mask) { if (mask) a[i] = 1; }
 
 #endif
 typedef number local_number;

@@ -32,11 +32,17 @@ struct Turn {
     own<real> diagonal;  // (n, 1) [kg]
     own<local> block;    // (n, 6) upper triangle, world frame [kg]
     const real* dv;      // (n, 3) solution of the last step, world frame [m/s]
+    const real* x;       // (n, 3) [m]
+    const real* v;       // (n, 3) velocity that the step begins with; zero without inertia [m/s]
+    const real* extent;  // (n,) of the node's body [m]
+    const real* gain;    // (n,) 1 / (c + beta), c world.reach, beta the Rayleigh damping of the stiffness [1/s]
+    real h;              // time step [s]
     local* used;         // (n, 8) in, out: Made of the factor in use
     local* noted;        // (n, 8) in, out: Made of the step noted last
     local* rotation;     // (n, 3, 3) out: frame of the node: its rotation from rest to now, unless it was held
     real* b_material;    // (n, 3) out: R^T b, 0 at fixed nodes
-    real* y;             // (n, 3) out: R^T dv, 0 at fixed nodes: where the solve starts
+    real* y;             // (n, 3) out: where the solve starts: R^T dv, R^T (-v) where the node rests, 0 at fixed nodes
+    int* moving;         // (bodies,) out: 1 where a node does not rest; else left as it is
     real* values;        // (blocks, 3, 3) out: R^T A R of the node's own block; the identity's at fixed nodes [kg]
 };
 
@@ -103,17 +109,35 @@ INLINE local_mat3 frame_of(const Turn& p, index i) {
     return rotation_matrix(frame);
 }
 
+// A node rests if it moves in a step by less than its position is rounded, and b there is less than the rounding of the forces
+// that act on it: what its own stiffness makes of rounded positions (all of x) and of rounded strains (of the body's extent). SAFETY
+// times that: at rest b is 0.1 of it. A node that rests is solved for no further: the step takes its velocity away.
+template <class T> constexpr entry<T> EPSILON = sizeof(entry<T>) == 8 ? (entry<T>)2.2e-16 : (entry<T>)1.2e-7;
+constexpr int SAFETY = 4;
+
+INLINE number largest(vec3 a) { return larger(larger(magnitude(a.x), magnitude(a.y)), magnitude(a.z)); }
+
+INLINE auto rests(const Turn& p, index i, vec3 b, vec3 v, number stiffness) {
+    number from = largest(load3(p.x, i)), extent = at(p.extent, i);
+    number place = EPSILON<number> * (from + extent), strain = EPSILON<local_number> * extent;
+    number rounding = SAFETY * stiffness * at(p.gain, i) * larger(place, strain);
+    return (largest(b) <= rounding) & (p.h * largest(v) <= place);
+}
+
 KERNEL(turn, Turn) {
     local_mat3 R = frame_of(p, i);
     number keep = at(p.free, i), d = row_at<1>(p.diagonal, i, 0);
     local_number k[6];
     put_row(p.rotation, i, p.n, R.m);
     mat3 Rt = as<number>(transposed(R));
-    vec3 b = keep * mul(Rt, load3(p.b, i)), y = keep * mul(Rt, load3(p.dv, i));
+    for (int m = 0; m < 6; ++m) k[m] = row_at<6>(p.block, i, m);
+    vec3 b = keep * mul(Rt, load3(p.b, i)), v = load3(p.v, i);
+    auto still = rests(p, i, b, v, (number)((k[0] + k[3] + k[5]) / 3));
+    vec3 y = keep * mul(Rt, select(still, -v, load3(p.dv, i)));
     put_row(p.b_material, i, p.n, {b.x, b.y, b.z});
     put_row(p.y, i, p.n, {y.x, y.y, y.z});
+    mark(p.moving, at(p.body, i), !still);
 
-    for (int m = 0; m < 6; ++m) k[m] = row_at<6>(p.block, i, m);
     local_mat3 K = symmetric(k[0], k[1], k[2], k[3], k[4], k[5]);
     mat3 A = as<number>(mul(transposed(R), mul(K, R)));
     // R^T d R = d; symmetric to the last bit

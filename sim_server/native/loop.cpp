@@ -111,7 +111,7 @@ void wf_assemble(Loop* loop) {
     for (int i = 0; i < loop->bodies; ++i) {
         Body& body = loop->body[i];
         note_changes(body.correction, rings.step, body.steps == 0);
-        bool noted = body.settings.note != NOTE_COPIES || body.warping & NOTED;  // else it was asked for meanwhile
+        bool noted = body.now.note != NOTE_COPIES || body.warping & NOTED;  // else it was asked for meanwhile
         if (noted) copy_for_worker(*loop, body);
         loop->warping[i] = body.warping & ~(NOTED | ADOPTED);  // further linearizations change nothing of that
     }
@@ -132,7 +132,7 @@ static void finish_step(Loop* loop) {
 #pragma omp parallel for num_threads(loop->threads) schedule(dynamic, 1) if (loop->threads > 1 && loop->bodies > 1)
     for (int i = 0; i < loop->bodies; ++i) {
         Body& body = loop->body[i];
-        const SolveSettings settings = body.settings;  // they may change meanwhile
+        const SolveSettings& settings = body.now;
         int linearizations = 1;
         double nonlinear = -1;
         SolveResult r;
@@ -143,7 +143,7 @@ static void finish_step(Loop* loop) {
         } else {
             BlockCsr A{body.first, body.last, loop->row_start, loop->columns, loop->values};
             r = pcg(A, loop->b + 3 * body.first, body.factor, settings, loop->y + 3 * body.first,
-                    loop->work + 45 * (int64_t)body.first, &body.recycled, &body.correction);
+                    loop->work + 45 * (int64_t)body.first, !loop->moving[i], &body.recycled, &body.correction);
         }
         ++body.steps;
         if (!keep) continue;
@@ -171,9 +171,9 @@ static void finish_step(Loop* loop) {
     write_frame(*loop);
 }
 
-// A factor posted since `wf_assemble` is made from the matrix of this step, or the caller does not mind.
+// A factor posted since `wf_assemble` is made from the matrix of this step, or the caller does not mind; likewise settings.
 void wf_solve(Loop* loop) {
-    for (int i = 0; i < loop->bodies; ++i) take_factor(loop->body[i]);
+    for (int i = 0; i < loop->bodies; ++i) take_orders(loop->body[i]);
     finish_step(loop);
 }
 

@@ -22,7 +22,8 @@ struct Launch {
 
 struct Body {
     int32_t first, last;                // nodes
-    SolveSettings settings;
+    SolveSettings settings;             // as wanted, written from outside at any time
+    SolveSettings now;                  // of the step under way
     const Factor* factor;               // in use
     std::atomic<const Factor*> mail;    // a newer one, or null
     std::atomic<double*> snapshot;      // where to copy the values of A, or the positions, or null
@@ -62,6 +63,7 @@ struct Loop {
     Newton* newton;                    // null: one linearization a step
     double* clock;                     // (1,) s, read by kernels
     int32_t* warping;                  // (bodies,) likewise
+    int32_t* moving;                   // (bodies,) 0: the body rests (kernels/nodes.cu)
     int32_t threads;                   // of this process, for launches and bodies
     int32_t unused;
     double assemble_begin;

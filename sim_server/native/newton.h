@@ -41,7 +41,7 @@ static void begin_search(Loop& loop, int index) {
         room.carried[k] = newton.carried[at + k];
         room.gain[k] = -room.ahead[k];
     }
-    start_search(newton.search[index], norm(room.n, loop.b + at), rounding(loop, body), body.settings.kind);
+    start_search(newton.search[index], norm(room.n, loop.b + at), rounding(loop, body), body.now.kind);
 }
 
 // The state after gain + scale * way.
@@ -76,9 +76,9 @@ static void solve(Loop& loop, int index) {
     const int64_t at = 3 * (int64_t)body.first;
     double *y = loop.y + at, *work = loop.work + 45 * (int64_t)body.first, *turned = work, *product = work + room.n;
     BlockCsr A{body.first, body.last, loop.row_start, loop.columns, loop.values};
-    SolveSettings settings = body.settings;
+    SolveSettings settings = body.now;
     settings.warm_start = settings.warm_start && search.linearizations == 0;  // the last step's is no guess for a correction
-    SolveResult r = pcg(A, loop.b + at, body.factor, settings, y, work, &body.recycled, &body.correction);
+    SolveResult r = pcg(A, loop.b + at, body.factor, settings, y, work, !loop.moving[index], &body.recycled, &body.correction);
     note_solve(search, r.residual, r.seconds, r.iterations, r.fallbacks, r.kind, r.status);
     if (search.phase == DONE) {
         for (int k = 0; k < room.n; ++k) room.gain[k] = gain_after(search, room.gain[k], room.way[k]);

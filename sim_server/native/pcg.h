@@ -4,10 +4,12 @@
 //   - a step counts as solved only by its true residual |b - A x| <= tolerance |b|, computed at the end; where the recursive one was
 //     too good the iteration starts again from the true one;
 //   - it starts from the last solution where that is better than zero;
+//   - a body at rest, whose b is rounding (kernels/nodes.cu says when), keeps what it starts from: nothing is gained by solving for rounding;
 //   - p'Ap <= 0 and z'r <= 0 are looked for and named; a factor with z'r <= 0 is left for block Jacobi on the spot, and one that
-//     is not a quarter of the way (in decades of the residual) after half the iterations allowed is left then: a useless factor
-//     costs iterations and never the answer. Not half of the way: the method speeds up, and an old factor would be left that
-//     still gets there;
+//     is not a quarter of the way (in decades of the residual) after half the iterations allowed, if these are ENOUGH, is left
+//     then: a useless factor costs iterations and never the answer. Not half of the way: the method speeds up, and an old factor
+//     would be left that still gets there. Of few iterations the first ones tell nothing, and block Jacobi makes nothing of the rest;
+//   - a budget of time makes one iteration at least: zero would leave a body without its forces;
 // An iteration is one application of A after the initial residual.
 #pragma once
 #include "block_csr.h"
@@ -18,6 +20,8 @@
 enum Kind { NONE = 0, JACOBI = 1, BLOCK_JACOBI = 2, CHOLESKY = 3, SSOR = 4 };  // CHOLESKY: any factor
 enum Status { CONVERGED = 0, MAX_ITERATIONS = 1, BUDGET = 2, BREAKDOWN_MATRIX = 3, BREAKDOWN_PRECONDITIONER = 4, NOT_FINITE = 5,
               MAX_LINEARIZATIONS = 6 };  // of a step
+
+constexpr int ENOUGH = 20;
 
 struct SolveSettings {
     double tolerance;       // of |b|
@@ -89,9 +93,10 @@ struct Preconditioner {
     }
 };
 
-// work: 15 n doubles. x: start in, solution out. recycled: pairs of the last solves; correction: of the factor; or null.
+// work: 15 n doubles. x: start in, solution out. rests: the body does.
+// recycled: pairs of the last solves; correction: of the factor; or null.
 static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor, const SolveSettings& settings, double* x,
-                       double* work, Recycled* recycled = nullptr, Correction* correction = nullptr) {
+                       double* work, bool rests = false, Recycled* recycled = nullptr, Correction* correction = nullptr) {
     double start = now();
     int n = A.size();
     double *r = work, *z = r + n, *p = z + n, *q = p + n, *inverse = q + n, *scratch = inverse + 3 * n;
@@ -116,12 +121,13 @@ static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor,
     if (b2 == 0) { zero(); return finish(CONVERGED, 0, 0); }
     double goal = settings.tolerance * settings.tolerance * b2;
     double r2 = settings.warm_start ? residual(A, b, x, r) : b2;                 // 1. r = b - A x
+    if (rests && settings.warm_start) return finish(CONVERGED, r2, b2);
     if (!settings.warm_start || !(r2 < b2)) {
         zero();
         for (int i = 0; i < n; ++i) r[i] = b[i];
         r2 = b2;
     }
-    if (r2 <= goal) return finish(CONVERGED, r2, b2);
+    if (r2 <= goal || rests) return finish(CONVERGED, r2, b2);
 
     Preconditioner P{A, factor, out.kind, inverse, scratch, settings.omega, &recycling, turned, correction};
     P.prepare();
@@ -146,7 +152,7 @@ static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor,
         rz = zr;
         restart = false;
         if (out.iterations == settings.max_iterations) return finish(MAX_ITERATIONS, residual(A, b, x, r), b2);
-        if (P.kind == CHOLESKY && out.iterations == settings.max_iterations / 2 && !(r2 < quarter) && out.iterations > 0) {
+        if (P.kind == CHOLESKY && settings.max_iterations >= ENOUGH && out.iterations == settings.max_iterations / 2 && !(r2 < quarter)) {
             leave_factor();
             continue;
         }
@@ -156,7 +162,7 @@ static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor,
             switched = restart = true;
             continue;
         }
-        bool spent = settings.budget > 0 ? now() - start > settings.budget : out.iterations + 1 == -settings.budget;
+        bool spent = settings.budget > 0 ? out.iterations > 0 && now() - start > settings.budget : out.iterations + 1 == -settings.budget;
         if (spent) return finish(BUDGET, residual(A, b, x, r), b2);
 
         double pq = multiply(A, p, q);
