@@ -7,9 +7,9 @@ solve that begins with it and goes over to the other after as many iterations as
 probe at worst doubles one solve. A pure state machine over (kind, iterations, cost, reached); whoever drives it decides
 whether cost is seconds or, where runs must repeat exactly, bytes moved.
 
-A solve that is cut off before it converged (max_iterations, budget) is cheap for nothing. So what converges is preferred
-to what does not, whatever either costs; if neither does, the smaller cost of a decade of the residual decides. A probe
-of block Jacobi leaves enough of what is allowed for the factor to converge after it, or is not made.
+A solve that is cut off before it converged (max_iterations, budget) is cheap for nothing. So what converges is
+preferred to what does not, whatever either costs; if neither does, the smaller cost of a decade of the residual
+decides. A probe of block Jacobi leaves enough of what is allowed for the factor to converge after it, or is not made.
 """
 
 from collections.abc import Sequence
@@ -104,16 +104,21 @@ class Choice:
 
     def observe(
         self, kind: Kind, iterations: float, cost: float, asked: Kind | None = None,
-        factor: Made | None = None, waited: float = 0.0, reached: Reached = CONVERGED,
+        factor: Made | None = None, waited: float = 0.0, reached: Reached = CONVERGED, fallbacks: int = 0,
     ) -> None:  # fmt: skip
         """A solve was made that ended with `kind`. asked: the one it began with; what is reported late may be older
         than the settings made last (None: it is not). factor: None where it is not told; made -1: the loop had none.
-        waited: cost of the making of the factor that falls to each solve, as the steps wait for it."""
+        waited: cost of the making of the factor that falls to each solve, as the steps wait for it. fallbacks: 1 where
+        the factor was left in the solve."""
         if not iterations or (asked is Kind.CHOLESKY and kind is not asked and factor is not None and factor[1] < 0):
             return  # nothing was to be solved, or the factor asked for is still on its way: it says nothing
         if self._pending is not None and asked in (None, self.kind):
             self._end_probe(kind, _Mean.of(iterations, cost, reached), factor)
             return
+        if asked not in (None, kind):
+            if not fallbacks:
+                return  # of a probe that is over: partly one, partly the other
+            kind = Kind.CHOLESKY  # what it costs to ask for a factor that is left
         if kind not in self._means:
             return
         method, made = factor or (None, -1)
@@ -128,17 +133,19 @@ class Choice:
         mean.add(iterations, cost, reached)
         self._since += 1
         self._reference = self._reference or replace(mean)
+        if self._pending is not None or kind is not self.kind:
+            return  # reported late
         if self._has_factor and (self._since >= self._every or mean.harder_than(self._reference)):
             self._begin_probe(Kind.CHOLESKY if self.kind is Kind.BLOCK_JACOBI else Kind.BLOCK_JACOBI)
 
     def observe_steps(
         self, kinds: Sequence[int], iterations: Sequence[float], costs: Sequence[float], asked: Sequence[int],
-        lack: Sequence[float], used: Sequence[float], factors: Sequence[Made],
+        lack: Sequence[float], used: Sequence[float], fallbacks: Sequence[int], factors: Sequence[Made],
     ) -> None:  # fmt: skip
         """As `observe` of each of many solves."""
-        columns = zip(kinds, iterations, costs, asked, lack, used, factors, strict=True)
-        for kind, n, cost, began, short, share, factor in columns:
-            self.observe(KINDS[kind], n, cost, KINDS[began], factor, reached=Reached(short, share))
+        columns = zip(kinds, iterations, costs, asked, lack, used, fallbacks, factors, strict=True)
+        for kind, n, cost, began, short, share, left, factor in columns:
+            self.observe(KINDS[kind], n, cost, KINDS[began], factor, 0.0, Reached(short, share), left)
 
     def _begin_probe(self, other: Kind) -> None:
         if (limit := self._limit(other)) is None:

@@ -337,7 +337,7 @@ class Driver:
                 solves, waited = max(int(r["linearizations"]), 1), self._waited(t, factor[0])
                 t.choice.observe(
                     kind, iterations / solves, cost / solves, Kind(r["asked"]), factor, waited,
-                    Reached(float(lack), float(used)),
+                    Reached(float(lack), float(used)), int(r["fallbacks"]),
                 )  # fmt: skip
                 self._settle(t)
             if t.tries(factor[0]):
@@ -352,8 +352,9 @@ class Driver:
         if any(t.choice for t in self.tracks):
             lack, used = reached(r, self.solver)
             solves = np.maximum(r["linearizations"], 1)
-            each = (r["kind"], r["iterations"] / solves, r["solve"] / solves, r["asked"], lack, used, r["factor_step"])
-            columns = (column.T.tolist() for column in each)
+            begun = (r["kind"], r["iterations"] / solves, r["solve"] / solves, r["asked"])
+            ended = (lack, used, r["fallbacks"], r["factor_step"])
+            columns = (column.T.tolist() for column in (*begun, *ended))
             for k, (t, *rows, made) in enumerate(zip(self.tracks, *columns, strict=True)):
                 if t.choice is not None:
                     factors = [(t.method(step), step) for step in made]

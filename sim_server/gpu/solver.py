@@ -54,8 +54,8 @@ class Solver:
 
     ranges: nodes [first, last) of each body. arrays: host arrays by name (row_start, columns, values, b, y, warping,
     moving), solved for their twins. counter: device array (1,) of completed steps. capacity: steps whose results are
-    kept. planes: 1 for a preconditioner in float16, 2 for one of 22 bits. turns: for several linearizations a step, device
-    arrays `left` and `phase` (search.py).
+    kept. planes: 1 for a preconditioner in float16, 2 for one of 22 bits. turns: for several linearizations a step,
+    device arrays `left` and `phase` (search.py).
 
     bodies: host rows (BODY), one per body; whoever runs the loop uploads them, settings (the first SETTINGS bytes) and
     factor (the rest) apart. results: device ring (capacity, bodies) of RESULT. arrived: zero at launch.
