@@ -305,7 +305,7 @@ __device__ __forceinline__ void Solver::solve() {
                     give(1, (real)(0 * bb));  // NaN: the kernel `advance` takes the body back
                     return;
                 }
-                if (memory.rests && body.warm_start && bb > 0) {  // rounding is not solved for; the scene has what it starts from
+                if (memory.rests && bb > 0) {  // b is rounding; the scene has what it starts from: to stand still
                     out.residual = sqrt(r2 / bb);
                     return;
                 }
@@ -313,7 +313,7 @@ __device__ __forceinline__ void Solver::solve() {
                 if (!body.warm_start || !(r2 < bb)) { alpha = 0; r2 = bb; }
                 else fresh = true;
                 memory.quarter = r2 * sqrt(sqrt(memory.goal / r2));
-                if (r2 <= memory.goal || memory.rests) {
+                if (r2 <= memory.goal) {
                     if (alpha == 0) give(0, 0);  // else the scene has it already
                     out.residual = bb > 0 ? sqrt(r2 / bb) : 0;
                     return;

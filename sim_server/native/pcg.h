@@ -4,7 +4,7 @@
 //   - a step counts as solved only by its true residual |b - A x| <= tolerance |b|, computed at the end; where the recursive one was
 //     too good the iteration starts again from the true one;
 //   - it starts from the last solution where that is better than zero;
-//   - a body at rest, whose b is rounding (kernels/nodes.cu says when), keeps what it starts from: nothing is gained by solving for rounding;
+//   - of a body at rest, whose b is rounding (kernels/nodes.cu says when), x stays what it is at the start: to stand still;
 //   - p'Ap <= 0 and z'r <= 0 are looked for and named; a factor with z'r <= 0 is left for block Jacobi on the spot, and one that
 //     is not a quarter of the way (in decades of the residual) after half the iterations allowed, if these are ENOUGH, is left
 //     then: a useless factor costs iterations and never the answer. Not half of the way: the method speeds up, and an old factor
@@ -120,14 +120,14 @@ static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor,
     }
     if (b2 == 0) { zero(); return finish(CONVERGED, 0, 0); }
     double goal = settings.tolerance * settings.tolerance * b2;
+    if (rests) return finish(CONVERGED, residual(A, b, x, r), b2);
     double r2 = settings.warm_start ? residual(A, b, x, r) : b2;                 // 1. r = b - A x
-    if (rests && settings.warm_start) return finish(CONVERGED, r2, b2);
     if (!settings.warm_start || !(r2 < b2)) {
         zero();
         for (int i = 0; i < n; ++i) r[i] = b[i];
         r2 = b2;
     }
-    if (r2 <= goal || rests) return finish(CONVERGED, r2, b2);
+    if (r2 <= goal) return finish(CONVERGED, r2, b2);
 
     Preconditioner P{A, factor, out.kind, inverse, scratch, settings.omega, &recycling, turned, correction};
     P.prepare();

@@ -7,6 +7,7 @@ import pytest
 
 from sim_server.choice import EVERY, RARELY, Choice
 from sim_server.engine import Kind
+from sim_server.reached import Reached
 
 BJ, CH, NONE = Kind.BLOCK_JACOBI, Kind.CHOLESKY, Kind.NONE
 
@@ -163,3 +164,119 @@ def test_solves_without_iterations_and_of_other_kinds_do_no_harm():
     assert bench.choice.kind is CH
     bench.choice.observe(CH, 0, 0.0)
     assert bench.choice.kind in (BJ, CH)
+
+
+def cut_off(lack: float, used: float = 1.0) -> Reached:
+    """A solve that used up what it was allowed; lack: decades of the residual wanted by those gained."""
+    return Reached(lack, used)
+
+
+def tried(choice: Choice, before: Reached, found: Reached, cost: float) -> Kind:
+    """What is in use after the first factor came and was tried, whose solve cost so much; one of block Jacobi costs 1."""
+    for _ in range(10):
+        choice.observe(BJ, 10, 1.0, BJ, reached=before)
+    choice.factor_arrived()
+    assert choice.kind is CH
+    choice.observe(CH, 3, cost, CH, (None, 4), reached=found)
+    return choice.kind
+
+
+def test_a_solve_that_is_cut_off_is_not_cheap():
+    """Ten iterations of block Jacobi cost a tenth of what the factor takes, and gain a third of a decade."""
+    choice = Choice()
+    assert tried(choice, before=cut_off(17.0), found=Reached(0.0, 0.3), cost=10.0) is CH
+    for _ in range(3 * EVERY):  # and its probes change nothing
+        asked = choice.kind
+        if asked is BJ:
+            choice.observe(CH, choice.probe + 3, 11.0, BJ, (None, 4), reached=Reached(0.0, 0.9))
+        else:
+            choice.observe(CH, 3, 10.0, CH, (None, 4), reached=Reached(0.0, 0.3))
+        assert choice.kind is CH or choice.probe
+
+
+def test_a_factor_that_is_cut_off_is_no_gain_on_what_converges():
+    assert tried(Choice(), before=Reached(0.0, 0.9), found=cut_off(2.0), cost=0.1) is BJ
+
+
+@pytest.mark.parametrize(("cost", "kind"), [(1.5, CH), (3.5, BJ)])
+def test_where_nothing_converges_the_cost_of_a_decade_decides(cost, kind):
+    """Block Jacobi gains a sixth of what is wanted for 1, the factor half of it for `cost`."""
+    assert tried(Choice(), before=cut_off(6.0), found=cut_off(2.0), cost=cost) is kind
+
+
+def test_what_does_not_converge_sets_no_limit_to_a_probe():
+    choice = Choice()
+    for _ in range(10):
+        choice.observe(BJ, 10, 1.0, BJ, reached=cut_off(17.0))
+    choice.factor_arrived()
+    assert (choice.kind, choice.probe) == (CH, 0)
+
+
+@pytest.mark.parametrize(("used", "room"), [(0.01, 33), (0.3, 5), (0.7, None)])
+def test_a_probe_of_block_jacobi_leaves_the_factor_what_it_needs(used, room):
+    """Three iterations with the factor use `used` of what a solve is allowed; block Jacobi's cost a tenth of theirs."""
+    choice = Choice()
+    for _ in range(10):
+        choice.observe(BJ, 100, 100.0, BJ)
+    choice.factor_arrived()
+    kinds = set()
+    for _ in range(EVERY + 1):
+        choice.observe(CH, 3, 33.0, CH, (None, 4), reached=Reached(0.0, used))
+        if (kind := choice.kind) is BJ:
+            break
+        kinds.add(kind)
+    assert (kind is BJ) == (room is not None)
+    assert choice.probe == (room or 0)
+    assert room is None or room == 33 or room * used / 3 + used < 1
+
+
+def test_one_solve_cut_off_is_no_reason_to_change():
+    """The system may have held the server up for the whole budget of a step."""
+    bench = Bench(*HARD)
+    bench.run(10)
+    bench.choice.factor_arrived()
+    bench.run(20)
+    bench.choice.observe(CH, 1, 20.0, CH, (None, 4), reached=cut_off(3.0))
+    assert (bench.choice.kind, bench.choice.probe) == (CH, 0)
+    bench.choice.observe(CH, 1, 20.0, CH, (None, 4), reached=cut_off(3.0))
+    assert bench.choice.kind is BJ  # two in a row are
+
+
+def test_a_probe_waits_for_a_factor_that_is_still_on_its_way():
+    """The loop was asked to begin with it before it had it: that is no answer."""
+    bench = Bench(*HARD)
+    bench.run(10)
+    bench.choice.factor_arrived()
+    bench.choice.observe(BJ, 100, 100.0, CH, (None, -1))
+    assert bench.choice.kind is CH and bench.choice.probe
+    bench.choice.observe(CH, 5, 25.0, CH, (None, 4))
+    assert (bench.choice.kind, bench.choice.probe) == (CH, 0)
+
+
+def test_reports_from_before_a_probe_begin_no_other_one():
+    """A solve that the system held up begins a probe; those before it that are still to be reported are slow too."""
+    bench = Bench(*HARD)
+    bench.run(10)
+    bench.choice.factor_arrived()
+    bench.run(20)
+    bench.choice.observe(CH, 5, 1000.0, CH, (None, 4))
+    probe = bench.choice.probe
+    assert bench.choice.kind is BJ and probe
+    for _ in range(3):
+        bench.choice.observe(CH, 5, 1000.0, CH, (None, 4))
+        assert (bench.choice.kind, bench.choice.probe) == (BJ, probe)
+    bench.choice.observe(CH, probe + 5, 1000.0, BJ, (None, 4))  # the probe, given up
+    assert (bench.choice.kind, bench.choice.probe) == (CH, 0)
+    bench.choice.observe(CH, probe + 5, 1e9, BJ, (None, 4))  # one more step began before that was known
+    assert (bench.choice.kind, bench.choice.probe) == (CH, 0)
+
+
+def test_a_factor_that_is_always_left_is_not_kept():
+    bench = Bench(*HARD)
+    bench.run(10)
+    bench.choice.factor_arrived()
+    bench.run(20)
+    for _ in range(5):
+        if bench.choice.kind is CH:
+            bench.choice.observe(BJ, 350, 500.0, CH, (None, 4), fallbacks=1)
+    assert bench.choice.kind is BJ
