@@ -259,3 +259,23 @@ def test_a_ring_holds_whole_steps(bodies):
     assert (counts == bodies).all()
     assert steps.tolist() == list(range(1, len(steps) + 1))
     assert engine.loop.records_dropped == 20 * bodies - len(kept)
+
+
+def test_settings_made_within_a_step_hold_from_the_next_one():
+    """A step is solved with what it began with, and its record says so: in real time most are written within a step."""
+    sim = falling(preconditioner="block_jacobi", integrator={"linearizations": 3, "tolerance": 1e-12})
+    settings, first = sim.engine.settings(0), sim.engine._launch[0]
+    kernel = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int, ctypes.c_int)
+    original = kernel(first.kernel)
+
+    def write(params: int, begin: int, end: int) -> None:
+        settings.kind, settings.probe = int(Kind.CHOLESKY), 7  # as another thread would
+        original(params, begin, end)
+
+    replaced = kernel(write)
+    first.kernel = ctypes.cast(replaced, ctypes.c_void_p).value
+    sim.engine.run(2)
+    records = sim.engine.records()
+    assert (records["linearizations"] > 1).all()
+    assert records["asked"].tolist() == [Kind.BLOCK_JACOBI, Kind.CHOLESKY]
+    assert records["probe"].tolist() == [0, 7]

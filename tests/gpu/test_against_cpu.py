@@ -154,3 +154,62 @@ def test_a_useless_factor_is_left_for_block_jacobi():
     sim.engine.run(3)
     records = sim.engine.records()
     assert (records["fallbacks"] == 1).all() and (records["status"] == SolveStatus.CONVERGED).all()
+
+
+@pytest.mark.parametrize("linearizations", [1, 3])
+@pytest.mark.parametrize("far", [0, 1e6])
+def test_a_body_at_rest_costs_no_iteration(linearizations, far):
+    """On either device, and it stays where it is to the bit; a push wakes it."""
+    rest = ["object.beam.effects.rayleigh={mass=3,stiffness=0.02}", f"object.beam.pose={{translate=[{far},0,0]}}"]
+    rest += ["solver.preconditioner=block_jacobi", f"integrator.linearizations={linearizations}"]
+    for device in ("gpu", "cpu"):
+        sim = Simulation.load("deploy/scenes/beam.toml", ["object.beam.mesh.bar=[2, 2, 6]", *rest], device)
+        sim.engine.run(1500)
+        before = sim.fetch().x.copy()
+        sim.engine.records()
+        sim.engine.run(200)
+        records = sim.engine.records()
+        assert not records["iterations"].any() and (records["status"] == SolveStatus.CONVERGED).all()
+        assert np.array_equal(sim.fetch().x, before)
+        touch = sim.effects["touch"]
+        index = next(i for i, launch in enumerate(sim.engine.launches) if launch.name == "touch.apply")
+        touch.publish = lambda launch, engine=sim.engine, index=index: engine.replace(index, launch)
+        touch.push("me", "beam", (float(far), 0.5, 4.0), 0.3, (0.0, 1.0, 0.0), 0.1)
+        sim.engine.run(4)
+        assert sim.engine.records()["iterations"].all()
+
+
+def test_a_body_that_creeps_is_not_stopped():
+    """Overdamped, 1000 m away: as on the CPU, step for step."""
+    slow = ["object.beam.effects.rayleigh={mass=200}", "object.beam.pose={translate=[1e3,0,0]}"]
+    (on_gpu, g), (on_cpu, _) = both(["solver.preconditioner=block_jacobi", *slow], 400)
+    assert (g["iterations"] > 0).all()
+    assert np.abs(on_gpu.world.x - on_cpu.world.x).max() < 1e-6
+
+
+def test_a_factor_is_not_left_where_few_iterations_are_allowed():
+    """More allowed is better: medians of the residuals at 1, 2, 3 iterations."""
+    medians = []
+    for most in (1, 2, 3):
+        solver = ["solver.preconditioner=cholesky", "solver.update=lockstep-3", f"solver.max_iterations={most}"]
+        sim = Simulation.load("deploy/scenes/beam.toml", solver, "gpu")
+        records = Driver(sim).advance(60)[4:]
+        assert not records["fallbacks"].any()
+        medians.append(float(np.median(records["residual"])))
+    assert medians[0] > medians[1] > medians[2], medians
+
+
+def test_auto_takes_what_converges_within_the_iterations_allowed():
+    sim = Simulation.load("deploy/scenes/beam.toml", ["solver.update=lockstep-3", "solver.max_iterations=12"], "gpu")
+    records = Driver(sim).advance(80)
+    assert (records["status"][8:] == SolveStatus.CONVERGED).mean() > 0.95
+
+
+def test_a_record_tells_the_factor_that_was_there_for_a_probe():
+    """Also where the probe went over to block Jacobi; -1 only where the loop had none."""
+    sim = Simulation.load("deploy/scenes/beam.toml", ["solver.preconditioner=cholesky", "solver.update=never"], "gpu")
+    driver = Driver(sim)
+    driver.advance(1)
+    sim.engine.settings(0).probe = 1
+    records = driver.advance(3)
+    assert (records["kind"] == 2).all() and (records["asked"] == 3).all() and (records["factor_step"] == 0).all()

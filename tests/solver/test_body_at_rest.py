@@ -128,8 +128,8 @@ def test_what_rests_in_a_scene_waits_for_what_moves():
     assert (records["iterations"][records["body"] == 1] > 0).all()
 
 
-def test_a_scene_is_checked_for_it_once():
-    """Its extent is that of the body at rest, wherever it is placed."""
+def test_the_extent_is_that_of_the_body_before_its_pose():
+    """Wherever it is placed."""
     table = bar((4, 2, 2), (2, 1, 1), pose={"translate": [1e3, 0, 0]})
     sim = Simulation(scene(table))
     assert sim.system.extent == pytest.approx(np.full(sim.world.nodes, np.sqrt(6)))
