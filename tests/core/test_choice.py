@@ -172,7 +172,7 @@ def cut_off(lack: float, used: float = 1.0) -> Reached:
 
 
 def tried(choice: Choice, before: Reached, found: Reached, cost: float) -> Kind:
-    """What is in use after the first factor came and was tried, whose solve cost so much; one of block Jacobi costs 1."""
+    """What is in use after the first factor was tried, whose solve cost so much; one of block Jacobi costs 1."""
     for _ in range(10):
         choice.observe(BJ, 10, 1.0, BJ, reached=before)
     choice.factor_arrived()

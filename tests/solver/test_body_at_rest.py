@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A body at rest, whose right-hand side is rounding, is not solved for: it stays where it is, and wakes when it is moved."""
+"""A body at rest, whose right-hand side is rounding, is not solved for: it stays where it is until it is moved."""
 
 import numpy as np
 import pytest

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Solves that are cut off, by max_iterations or a budget of time: more allowed is never worse, and `auto` takes what gets
-furthest."""
+"""Solves cut off by max_iterations or a budget of time: more allowed is never worse; `auto` takes what gets furthest."""
 
 import itertools
 
