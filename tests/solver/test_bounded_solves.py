@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Solves cut off by max_iterations or a budget of time: more allowed is never worse; `auto` takes what gets furthest."""
+"""Solves cut off by max_iterations or a time budget: more allowed is never worse; `auto` takes what gets furthest."""
 
 import itertools
 
