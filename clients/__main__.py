@@ -20,6 +20,7 @@ from clients.point_option import AT_HELP, PointCommand, point
 from protocol.channels import DEFAULT_ENDPOINT, SERVER_NAME
 from protocol.endpoints import CONNECT
 from protocol.limits import ORPHANED_PUSH
+from protocol.printable import printable
 
 if TYPE_CHECKING:
     from clients.client import Client
@@ -440,7 +441,7 @@ def _opened(path: Path) -> Iterator:
         log = Log(path, progress)
     with log:
         for note in log.notes:
-            print(f"sim-client: {note}", file=sys.stderr)
+            print(f"sim-client: {printable(note)}", file=sys.stderr)
         yield log
 
 
@@ -450,10 +451,10 @@ def main() -> None:
     try:
         app(prog_name="sim-client")
     except BadInput as error:
-        print(f"sim-client: {error}", file=sys.stderr)
+        print(f"sim-client: {printable(str(error))}", file=sys.stderr)
         sys.exit(2)
     except ClientError as error:
-        print(f"sim-client: {error}", file=sys.stderr)
+        print(f"sim-client: {printable(str(error))}", file=sys.stderr)
         sys.exit(1)
     except KeyboardInterrupt:
         sys.exit(130)

@@ -16,6 +16,7 @@ from clients.replay import Replay, speed_of
 from clients.station import Station
 from clients.timeline import Timeline
 from protocol.channels import SERVER_NAME
+from protocol.printable import printable
 
 
 def republish(
@@ -31,7 +32,7 @@ def republish(
         timeline = Timeline(log, progress)
     with timeline:
         for note in timeline.notes:
-            print(f"sim-client: {note}", file=sys.stderr)
+            print(f"sim-client: {printable(note)}", file=sys.stderr)
         with Station(name, timeline.scene.server or SERVER_NAME, connect, listen) as station:
             replay = Replay(timeline, station, rate, begin, last)
             if not as_json:

@@ -56,7 +56,8 @@ def _objects(status: pb.Status) -> Table:
     table = Table("object", "nodes", "iter.", "mean", "residual", "status", "age/max", "precond.", **COMPACT)
     for found in status.objects:
         last = found.last
-        table.add_row(
+        _add(
+            table,
             found.object,
             str(found.nodes),
             str(last.iterations),
@@ -89,7 +90,7 @@ def _workers(status: pb.Status) -> Table | Text:
     for worker in status.workers:
         numbers = (worker.threads, worker.jobs, worker.failures, worker.refused)
         shared = "yes" if worker.shared_memory else "no"
-        table.add_row(worker.worker, worker.host, str(worker.pid), worker.library, *map(str, numbers), shared)
+        _add(table, worker.worker, worker.host, str(worker.pid), worker.library, *map(str, numbers), shared)
     return table
 
 
@@ -97,8 +98,13 @@ def _local(status: pb.Status) -> Table:
     table = Table("local worker", "state", "pid", "restarts", "last end", **COMPACT)
     for worker in status.local_workers:
         ended = _end(worker.exit_code) if worker.restarts or worker.state != "running" else "-"
-        table.add_row(worker.worker, worker.state, str(worker.pid or "-"), str(worker.restarts), ended)
+        _add(table, worker.worker, worker.state, str(worker.pid or "-"), str(worker.restarts), ended)
     return table
+
+
+def _add(table: Table, *cells: str) -> None:
+    """Add a row of plain texts: rich would take brackets in a string for markup, and fail on such as [/x]."""
+    table.add_row(*map(Text, cells))
 
 
 def _end(code: int) -> str:

@@ -12,6 +12,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from protocol.channels import PROTOCOL, check_name
 from protocol.messages_pb2 import Header
+from protocol.printable import make_printable
 from protocol.refused import Refused
 
 M = TypeVar("M", bound=Message)
@@ -35,13 +36,15 @@ def take(payload: Sized | None, limit: int, what: str) -> bytes:
 
 
 def parse(kind: type[M], payload: Sized | None, limit: int) -> M:
-    """A protobuf message of at most limit bytes."""
+    """A protobuf message of at most limit bytes, its texts made printable: they end up on terminals and in logs."""
     name = kind.DESCRIPTOR.name
     data = take(payload, limit, name)
     try:
-        return kind.FromString(data)
+        message = kind.FromString(data)
     except DecodeError as error:
         raise Refused(f"{name} of {len(data)} bytes is not a valid message", "malformed") from error
+    make_printable(message)
+    return message
 
 
 def check_header(

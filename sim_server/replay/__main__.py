@@ -19,6 +19,7 @@ def main() -> int:
     logging.basicConfig(level=logging.WARNING, format="replay: %(message)s")
 
     from protocol.log_chunks import BadLog
+    from protocol.printable import printable
     from sim_server.backend import CompileError
     from sim_server.compile_notice import compiling_told
     from sim_server.errors import DeviceLost, InputError
@@ -30,12 +31,12 @@ def main() -> int:
         with Recording(arguments.log) as recording, compiling_told(say):
             found = Replay(recording).run()
     except (BadLog, InputError, CompileError, DeviceLost) as error:
-        print(f"replay: {error}", file=sys.stderr)
+        print(f"replay: {printable(str(error))}", file=sys.stderr)
         return 2
     if arguments.json:
         print(json.dumps(found.plain()))
     else:
-        print("\n".join(found.lines()))
+        print("\n".join(map(printable, found.lines())))
     return 0 if found.same else 1
 
 

@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: MIT
+"""Text of others, made fit for a terminal: what it cannot show, or would obey, is shown as an escape sequence."""
+
+from functools import cache
+
+from google.protobuf.descriptor import Descriptor, FieldDescriptor
+from google.protobuf.message import Message
+
+DOCUMENTS = {"warpfactor.Scene.toml", "warpfactor.Scene.resolved"}  # files with lines of their own; nobody prints them
+
+
+def printable(text: str) -> str:
+    """The text with control characters, line breaks and invisible characters as \\x1b, \\n, \\u202e."""
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
+
+
+def make_printable(message: Message) -> None:
+    """Make every text of a message, and of those within it, printable; a DOCUMENT is left as it is."""
+    for name, repeated, nested in _fields(message.DESCRIPTOR):
+        value = getattr(message, name)
+        if not nested:
+            if repeated:
+                if not all(text.isprintable() for text in value):
+                    value[:] = [printable(text) for text in value]
+            elif not value.isprintable():
+                setattr(message, name, printable(value))
+        elif repeated:
+            for item in value:
+                make_printable(item)
+        elif message.HasField(name):
+            make_printable(value)
+
+
+@cache
+def _fields(kind: Descriptor) -> tuple[tuple[str, bool, bool], ...]:
+    """(name, repeated, message) of the fields that are texts or may hold some."""
+    text, message = FieldDescriptor.TYPE_STRING, FieldDescriptor.TYPE_MESSAGE
+    return tuple(
+        (field.name, field.is_repeated, field.type == message)
+        for field in kind.fields
+        if (field.type == text and field.full_name not in DOCUMENTS)
+        or (field.type == message and _fields(field.message_type))
+    )
