@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+LOOK_AGAIN = 1.0  # s between questions for tokens that were not told
 ROOM = 8  # a slot for an incomplete factor is larger than the last ones by one part in so many
 
 
@@ -58,6 +59,7 @@ class Dispatch:
         self._factors: list[Factor] = []
         self._failures: list[tuple[str, str]] = []
         self._arrivals = Arrivals(session, server)
+        self._look_due = 0.0
         self._take_in: dict[str, Callable[[zenoh.Sample], None]] = {
             "worker": self._take_hello,
             "pattern": self._take_pattern,
@@ -207,9 +209,18 @@ class Dispatch:
                 self._take_in[channel](sample)
             except Refused as refusal:
                 self._counters.refuse(refusal)
+        self._look_again()
         for flight in self._jobs.expire(self._clock()):
             self._counters.add("leases_over")
             self._fail(flight, "was not answered within its lease")
+
+    def _look_again(self) -> None:
+        """Ask for the tokens of workers that speak without one, now and then."""
+        now = self._clock()
+        if now >= self._look_due:
+            self._look_due = now + LOOK_AGAIN
+            if wanted := self._roster.without_token(now):
+                self._arrivals.ask_for_tokens(wanted)
 
     def _take_token(self, sample: zenoh.Sample) -> None:
         name = name_in("alive_worker", sample.key_expr, "worker")
@@ -218,7 +229,9 @@ class Dispatch:
 
     def _take_hello(self, sample: zenoh.Sample) -> None:
         data = take(sample.payload, CHANNELS["worker"].limit, "WorkerInfo")
-        name, new = self._roster.hello(sample.key_expr, data, self._clock())
+        name, new, lost = self._roster.hello(sample.key_expr, data, self._clock(), self._jobs.deadlines())
+        if lost:
+            self._leave(lost)
         if new:
             self._leave(name)  # what an earlier process of this name had in hand is lost
             info = self._roster.info(name)

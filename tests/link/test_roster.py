@@ -6,7 +6,7 @@ import pytest
 from protocol import PROTOCOL, Refused
 from protocol.channels import key
 from protocol.messages_pb2 import Header, WorkerInfo
-from sim_server.network.roster import WORKERS, Roster
+from sim_server.network.roster import TOKENS, WORKERS, Roster
 
 
 def hello(name: str = "w", sequence: int = 1, pid: int = 10) -> bytes:
@@ -22,7 +22,7 @@ def roster() -> Roster:
 def test_token_and_hello_make_a_worker_in_either_order(roster: Roster) -> None:
     roster.token("w", True)
     assert roster.fit(0.0, {}) == []
-    assert roster.hello(key("worker", worker="w"), hello(), 0.0) == ("w", True)
+    assert roster.hello(key("worker", worker="w"), hello(), 0.0) == ("w", True, "")
     roster.hello(key("worker", worker="x"), hello("x"), 0.0)
     assert roster.fit(0.0, {}) == ["w"]
     roster.token("x", True)
@@ -34,7 +34,7 @@ def test_silence_makes_unfit_unless_the_worker_is_busy(roster: Roster) -> None:
     roster.hello(key("worker", worker="w"), hello(), 0.0)
     assert roster.fit(2.0, {}) == ["w"] and roster.fit(2.1, {}) == []
     assert roster.fit(2.1, {"w": 5.0}) == ["w"]
-    assert roster.hello(key("worker", worker="w"), hello(sequence=2), 3.0) == ("w", False)
+    assert roster.hello(key("worker", worker="w"), hello(sequence=2), 3.0) == ("w", False, "")
     assert roster.fit(3.5, {}) == ["w"]
     roster.heard("w", 9.0)
     assert roster.fit(10.0, {}) == ["w"]
@@ -53,7 +53,7 @@ def test_another_process_takes_the_name_over_only_from_a_silent_one(roster: Rost
     roster.hello(where, hello(), 0.0)
     with pytest.raises(Refused, match="give each worker a name of its own"):
         roster.hello(where, hello(pid=11), 1.0)
-    assert roster.hello(where, hello(pid=11), 2.5) == ("w", True)
+    assert roster.hello(where, hello(pid=11), 2.5) == ("w", True, "")
 
 
 def test_old_and_repeated_heartbeats_are_refused(roster: Roster) -> None:
@@ -64,8 +64,68 @@ def test_old_and_repeated_heartbeats_are_refused(roster: Roster) -> None:
             roster.hello(where, hello(sequence=sequence), 1.0)
 
 
+def test_a_forged_heartbeat_with_a_huge_number_does_not_shut_the_worker_out(roster: Roster) -> None:
+    where = key("worker", worker="w")
+    roster.hello(where, hello(sequence=5), 0.0)
+    roster.hello(where, hello(sequence=2**63), 0.1)
+    roster.token("w", True)
+    for sequence in (6, 7, 8):
+        assert roster.hello(where, hello(sequence=sequence), 0.2 * sequence) == ("w", False, "")
+    assert roster.fit(3.5, {}) == ["w"]
+
+
+def join(roster: Roster, name: str, now: float = 0.0) -> tuple[str, bool, str]:
+    roster.token(name, True)
+    return roster.hello(key("worker", worker=name), hello(name), now)
+
+
 def test_their_number_is_bounded(roster: Roster) -> None:
     for k in range(WORKERS):
-        roster.hello(key("worker", worker=f"w{k}"), hello(f"w{k}"), 0.0)
-    with pytest.raises(Refused, match=f"{WORKERS} workers are known already"):
-        roster.hello(key("worker", worker="one-more"), hello("one-more"), 0.0)
+        join(roster, f"w{k}")
+    with pytest.raises(Refused, match=f"{WORKERS} workers are known already") as refused:
+        join(roster, "one-more")
+    assert refused.value.kind == "limit"
+    assert roster.token("w7", False)
+    assert join(roster, "one-more") == ("one-more", True, "")
+
+
+def test_who_has_no_token_or_is_silent_holds_no_place_against_a_worker_that_speaks(roster: Roster) -> None:
+    for k in range(WORKERS - 1):
+        join(roster, f"w{k}", 10.0 if k != 3 else 8.5)
+    roster.hello(key("worker", worker="ghost"), hello("ghost"), 10.0)
+    assert join(roster, "one", 10.0) == ("one", True, "ghost")
+    with pytest.raises(Refused):
+        join(roster, "two", 10.0)
+    assert join(roster, "two", 11.0) == ("two", True, "w3"), "silent for longest"
+    assert "w3" not in roster.fit(11.0, {}) and roster.info("w3") is None
+    roster.token("w5", False)
+    roster.hello(key("worker", worker="w3"), hello("w3", sequence=2), 11.0)
+    assert "w3" in roster.fit(11.0, {}), "its token was not forgotten"
+
+
+def test_a_busy_worker_may_be_silent_and_keeps_its_place(roster: Roster) -> None:
+    for k in range(WORKERS):
+        join(roster, f"w{k}", 10.0 if k else 0.0)
+    roster.token("new", True)
+    with pytest.raises(Refused):
+        roster.hello(key("worker", worker="new"), hello("new"), 10.0, {"w0": 60.0})
+
+
+def test_of_tokens_that_say_nothing_the_oldest_is_forgotten(roster: Roster) -> None:
+    join(roster, "real")
+    for k in range(TOKENS):
+        roster.token(f"fake{k}", True)
+    with pytest.raises(Refused, match="the oldest, 'fake0', is forgotten") as refused:
+        roster.token("late", True)
+    assert refused.value.kind == "limit"
+    assert roster.hello(key("worker", worker="late"), hello("late"), 0.0) == ("late", True, "")
+    assert roster.fit(0.0, {}) == ["real", "late"]
+
+
+def test_a_worker_that_speaks_without_a_token_is_looked_for(roster: Roster) -> None:
+    join(roster, "w")
+    roster.hello(key("worker", worker="x"), hello("x"), 0.0)
+    assert roster.without_token(1.0) == {"x"}
+    assert roster.without_token(2.5) == set(), "and is forgotten when it is silent"
+    roster.token("x", True)
+    assert roster.without_token(1.0) == set() and roster.fit(1.0, {}) == ["w", "x"]

@@ -214,7 +214,6 @@ def test_an_answer_of_the_last_epoch_is_refused(stage: tuple[Driver, HandWorker]
     ("changes", "kind"),
     [
         ({"header__incarnation": 3}, "incarnation"),
-        ({"header__sequence": 0}, "sequence"),
         ({"worker": "somebody"}, "worker"),
         ({"worker": "a/b"}, "malformed"),
         ({"host": "x" * 300}, "size"),
