@@ -7,7 +7,6 @@ import socket
 import threading
 import time
 from collections import Counter
-from dataclasses import dataclass
 from typing import Self
 
 import zenoh
@@ -16,8 +15,9 @@ from precond_worker.builders import can_build
 from precond_worker.errors import NameTaken
 from precond_worker.heartbeat import Heartbeat
 from precond_worker.mailbox import Mailbox
+from precond_worker.presence import Presence, ServerGone, ServersThere
 from protocol import FactorPattern, echo
-from protocol.channels import CHANNELS, PROTOCOL, check_name, key, name_in
+from protocol.channels import CHANNELS, PROTOCOL, check_name, key
 from protocol.check import check_header, parse
 from protocol.counters import Counters
 from protocol.messages_pb2 import Factor, Header, Scene, Topology, WorkerInfo
@@ -32,16 +32,9 @@ TIMEOUT = 5.0  # s for a topology
 SETTLED = 3.0  # s after the first hello in which a worker gives way to another of its name that joins too
 
 
-@dataclass(frozen=True)
-class ServerEvent:
-    """A life of the server began or ended."""
-
-    incarnation: int
-    alive: bool
-
-
 class Uplink:
-    """One worker of one server. mailbox holds what came: ServerEvent, or a sample with a matrix; it rings the bell.
+    """One worker of one server. mailbox holds what came: a sample with a matrix, or what was heard of the
+    server; it rings the bell.
 
     Raises NameTaken if another worker has that name. Two that join at the same instant see neither's token: of these
     one finds a NameTaken in its mailbox.
@@ -54,7 +47,7 @@ class Uplink:
         self.server, self.name = check_name(server, "server name"), check_name(name, "worker name")
         self.library = library
         self.counters = counters
-        self.mailbox: Mailbox[ServerEvent | zenoh.Sample | NameTaken] = Mailbox(256, bell)
+        self.mailbox: Mailbox[ServerGone | ServersThere | zenoh.Sample | NameTaken] = Mailbox(256, bell)
         self.slots = SlotMap()
         self.incarnation = 0  # of the server that this worker works for; 0: none
         self.shared_memory = False
@@ -67,12 +60,11 @@ class Uplink:
         # Subscribed first, announced last: the server sends as soon as it has heard of us.
         self._matrices = zs.declare_subscriber(key("matrix", server, worker=name), self.mailbox.put)
         self._token = zs.liveliness().declare_token(own)
-        self._servers = zs.liveliness().declare_subscriber(
-            key("alive_server", server), self._server_event, history=True
-        )
         self._settled = float("inf")  # when it is too late for another of this name [s, monotonic]
         self._others = zs.declare_subscriber(key("worker", server, worker=name), self._heard)
-        self._heartbeat = Heartbeat(self._say)
+        self._presence = Presence(zs, server, name, counters, self.mailbox.put, lambda: self._heartbeat.wake())
+        self._heartbeat = Heartbeat(self._beat)
+        self._presence.begin()
 
     def _claim(self, session: zenoh.Session, token: str) -> None:
         """Wait until a process that died with this name is forgotten, which takes as long as the lease of its link."""
@@ -95,29 +87,30 @@ class Uplink:
         if (info.host, info.pid) < (_host(), os.getpid()) and time.monotonic() < self._settled:
             self.mailbox.put(self._taken(f"another worker, process {info.pid} on {info.host},"))
 
-    def _server_event(self, sample: zenoh.Sample) -> None:
-        try:
-            incarnation = int(name_in("alive_server", sample.key_expr, "incarnation"), 16)
-        except ValueError as error:
-            self.counters.refuse(error if isinstance(error, Refused) else Refused(f"{sample.key_expr}: {error}"))
-            return
-        self.mailbox.put(ServerEvent(incarnation, sample.kind == zenoh.SampleKind.PUT))
+    def has_token(self, incarnation: int) -> bool:
+        """That life of the server is there. May wait for the answer of a router."""
+        return self._presence.has_token(incarnation)
 
     def follow(self, incarnation: int) -> None:
         """Work for this life of the server from now on; 0: for none. Tries its shared memory and says hello."""
-        self.incarnation = 0
+        self.incarnation = self._presence.serving = 0
         self.slots.clear()
         self.shared_memory = False
         if incarnation:
             obstacle = "switched off here"
             if self._session.shared_memory:
-                obstacle = echo.obstacle(self._session.zenoh, self.server, self.name, self.slots)
+                obstacle = echo.obstacle(self._session.zenoh, self.server, incarnation, self.name, self.slots)
             self.shared_memory = not obstacle
             if obstacle and self._session.shared_memory:
                 self.counters.warn("no_shared_memory", f"arrays travel as bytes: {obstacle}")
             self.incarnation = incarnation
+            self._presence.serving = incarnation
             self._settled = min(self._settled, time.monotonic() + SETTLED)
             self._heartbeat.wake()
+
+    def _beat(self) -> None:
+        self._presence.look()
+        self._say()
 
     def _say(self) -> None:
         if not self.incarnation:

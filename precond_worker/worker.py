@@ -3,7 +3,7 @@
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,8 @@ from precond_worker.builders import Builders
 from precond_worker.errors import DeviceUnusable, NameTaken
 from precond_worker.job import Job, accept
 from precond_worker.methods import Factorization
-from precond_worker.uplink import ServerEvent, Uplink
+from precond_worker.presence import ServerGone, ServersThere
+from precond_worker.uplink import Uplink
 from protocol import FactorPattern
 from protocol.check import array, checksum
 from protocol.messages_pb2 import Factor
@@ -68,23 +69,31 @@ class Worker:
             if isinstance(item, NameTaken):
                 raise item
             try:
-                if isinstance(item, ServerEvent):
-                    self._change_server(item)
+                if isinstance(item, ServerGone):
+                    self._leave_server(item.incarnation)
+                elif isinstance(item, ServersThere):
+                    self._choose_server(item.incarnations)
                 else:
                     self._enqueue(accept(item, self._uplink.name, self._uplink.incarnation))
             except Refused as refusal:
                 self._counters.refuse(refusal)
 
-    def _change_server(self, event: ServerEvent) -> None:
-        current = self._uplink.incarnation
-        if event.alive and event.incarnation != current:
-            self._forget()
-            self._uplink.follow(event.incarnation)
-            self._on_server(True)
-        elif not event.alive and event.incarnation == current:
+    def _leave_server(self, gone: int) -> None:
+        if gone == self._uplink.incarnation:
             self._forget()
             self._uplink.follow(0)
             self._on_server(False)
+
+    def _choose_server(self, there: Sequence[int]) -> None:
+        """Stay with the life of the server that is served while it answers; else take one that does and has a token."""
+        if self._uplink.incarnation in there:
+            return
+        for incarnation in there:
+            if self._uplink.has_token(incarnation):
+                self._forget()
+                self._uplink.follow(incarnation)
+                self._on_server(True)
+                return
 
     def _forget(self) -> None:
         self._counters.add("superseded", len(self._pending))

@@ -23,11 +23,11 @@ class Counters:
         with self._lock:
             self._counts[name] += amount
 
-    def refuse(self, refusal: Refused) -> None:
-        """Count a refused message under its kind; the first of a kind is logged."""
+    def refuse(self, refusal: Refused, sender: str = "") -> None:
+        """Count a refused message under its kind; the first of a kind (and of a sender, if one is given) is logged."""
         with self._lock:
             self.refusals[refusal.kind] += 1
-        self.warn(f"refused:{refusal.kind}", f"message refused: {refusal} (counted from now on)")
+        self.warn(f"refused:{refusal.kind}:{sender}", f"message refused: {refusal} (counted from now on)")
 
     def trouble(self, name: str, text: str) -> None:
         """Count trouble under a name; the first of it is logged."""

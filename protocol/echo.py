@@ -3,10 +3,15 @@
 
 The worker asks for the server's echo slot: its bytes must arrive by reference, and the same bytes must stand in the
 worker's own mapping of the segment. It then writes a number there and asks the server to read it.
+
+A question without a number asks who is there: servers answer it with their header alone, those of another wire version
+too, so that a worker learns which lives of its server answer, and why none does.
 """
 
+import contextlib
 import logging
 import secrets
+from collections.abc import Callable
 
 import numpy as np
 import zenoh
@@ -21,6 +26,7 @@ from protocol.slots import HEADER, Slot
 LANES = 64  # askers that may be at it at the same time
 NUMBERS = 2 * LANES  # of 8 bytes: the server's, then the worker's
 LIMIT = CHANNELS["echo"].limit
+ANSWERS = 64  # lives of a server that are told apart
 
 log = logging.getLogger(__name__)
 
@@ -34,12 +40,39 @@ def answer(slot: Slot, query: Echo, incarnation: int) -> tuple[Echo, zenoh.ZByte
     return Echo(header=header, slot=slot.message(), nonce=int(numbers[LANES + lane])), slot.payload
 
 
-def obstacle(session: zenoh.Session, server: str, worker: str, slots: SlotMap, timeout: float = 2.0) -> str:
-    """Worker: why shared memory cannot be used with this server; empty if it works both ways."""
+def who(
+    session: zenoh.Session, server: str, asker: str, answered: Callable[[dict[int, int]], None], timeout: float = 1.0
+) -> None:
+    """Ask which lives of a server are there; does not wait.
+
+    answered: is called in a thread of zenoh's with the wire version of each incarnation that answered in time.
+    """
+    found: dict[int, int] = {}
+
+    def take(reply: zenoh.Reply) -> None:
+        if reply.ok is not None and len(found) < ANSWERS:
+            with contextlib.suppress(Refused):
+                header = parse(Echo, reply.ok.attachment, LIMIT).header
+                found[header.incarnation] = header.protocol
+
+    session.get(
+        key("echo", server, worker=asker),
+        zenoh.handlers.Callback(take, lambda: answered(found)),
+        payload=Echo(header=Header(protocol=PROTOCOL)).SerializeToString(),
+        timeout=timeout,
+        target=zenoh.QueryTarget.ALL,
+        consolidation=zenoh.ConsolidationMode.NONE,  # their answers have one key: each counts
+    )
+
+
+def obstacle(
+    session: zenoh.Session, server: str, incarnation: int, worker: str, slots: SlotMap, timeout: float = 2.0
+) -> str:
+    """Worker: why shared memory cannot be used with this life of the server; empty if it works both ways."""
     lane = secrets.randbelow(LANES)
     try:
         nonce = secrets.randbits(63)
-        reply, payload = _ask(session, server, worker, lane, nonce, timeout)
+        reply, payload = _ask(session, server, incarnation, worker, lane, nonce, timeout)
         if not reply.HasField("slot"):
             return "the server offers none"
         if payload.as_shm() is None:
@@ -49,21 +82,30 @@ def obstacle(session: zenoh.Session, server: str, worker: str, slots: SlotMap, t
         if int(numbers[lane]) != nonce or int(sent[lane]) != nonce:
             return "the mapped segment does not show what the server wrote"
         numbers[LANES + lane] = nonce ^ 1
-        reply, _ = _ask(session, server, worker, lane, nonce, timeout)
+        reply, _ = _ask(session, server, incarnation, worker, lane, nonce, timeout)
         return "" if reply.nonce == nonce ^ 1 else "the server does not see what is written there"
     except (Refused, zenoh.ZError, ValueError) as error:
         return str(error)
 
 
 def _ask(
-    session: zenoh.Session, server: str, worker: str, lane: int, nonce: int, timeout: float
+    session: zenoh.Session, server: str, incarnation: int, worker: str, lane: int, nonce: int, timeout: float
 ) -> tuple[Echo, zenoh.ZBytes]:
     question = Echo(header=Header(protocol=PROTOCOL, sequence=lane), nonce=nonce)
     selector = key("echo", server, worker=worker)
-    for reply in session.get(selector, payload=question.SerializeToString(), timeout=timeout):
+    replies = session.get(
+        selector,
+        payload=question.SerializeToString(),
+        timeout=timeout,
+        target=zenoh.QueryTarget.ALL,
+        consolidation=zenoh.ConsolidationMode.NONE,
+    )
+    for reply in replies:
         if reply.ok is None:
             break
         message = parse(Echo, reply.ok.attachment, LIMIT)
+        if message.header.incarnation != incarnation:
+            continue  # another server of this name
         check_header(message)
         return message, reply.ok.payload
     raise Refused(f"the server did not answer on {selector} within {timeout} s", "malformed")

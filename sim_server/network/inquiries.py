@@ -8,7 +8,7 @@ from functools import partial
 import zenoh
 
 from protocol import echo
-from protocol.channels import CHANNELS, PROTOCOL, key
+from protocol.channels import CHANNELS, PROTOCOL, key, name_in
 from protocol.check import check_header, check_numbers, check_strings, parse
 from protocol.client_name import check_client
 from protocol.counters import Counters
@@ -23,6 +23,7 @@ from sim_server.network.waiting import Asked, Waiting
 log = logging.getLogger(__name__)
 
 ASKED = 256  # queries of a channel that may wait for its thread; beyond that the oldest goes unanswered
+OTHERS = 64  # workers of another wire version that are told of one by one
 CHANNELS_ASKED = ("command", "status", "scene", "topology", "echo")
 
 
@@ -45,6 +46,7 @@ class Inquiries:
         self._command_key = key("command", server)
         self._echo_prefix = key("echo", server, worker="*")[:-1]
         self._answers: dict[str, bytes] = {}
+        self._other_version: set[str] = set()  # workers
         self._waiting = Waiting(counters)
         self._done = self._stamped(Reply())
         self._queryables = {}
@@ -103,13 +105,26 @@ class Inquiries:
 
     def _echo(self, query: zenoh.Query) -> None:
         question = parse(Echo, query.payload, CHANNELS["echo"].limit)
-        check_header(question)
-        if self._echo_slot is None:
+        if question.header.protocol != PROTOCOL:
+            self._tell_of_version(query, question)
+        if self._echo_slot is None or not question.nonce or question.header.protocol != PROTOCOL:
             header = Header(protocol=PROTOCOL, incarnation=self._incarnation)
             query.reply(query.key_expr, b"", attachment=Echo(header=header).SerializeToString())
         else:
             reply, payload = echo.answer(self._echo_slot, question, self._incarnation)
             query.reply(query.key_expr, payload, attachment=reply.SerializeToString())
+
+    def _tell_of_version(self, query: zenoh.Query, question: Echo) -> None:
+        """Say once for each worker that it speaks another version; it is told by the header of the answer."""
+        worker = name_in("echo", query.key_expr, "worker")
+        refusal = Refused(
+            f"worker {worker} speaks protocol version {question.header.protocol}, this server version {PROTOCOL}: "
+            "it gets no jobs; install the same release of warpfactor on both sides",
+            "version",
+        )
+        if len(self._other_version) < OTHERS:
+            self._other_version.add(worker)
+        self._counters.refuse(refusal, worker if worker in self._other_version else "")
 
     def _send(self, query: zenoh.Query, data: bytes) -> None:
         try:

@@ -55,7 +55,7 @@ class Roster:
             oldest = next(iter(self._tokens))
             del self._tokens[oldest]
             raise Refused(
-                f"token of worker {name!r}: {TOKENS} others have said nothing yet; the oldest, {oldest!r}, is forgotten",
+                f"token of {name!r}: {TOKENS} others have said nothing yet; the oldest, {oldest!r}, is forgotten",
                 "limit",
             )
         return False

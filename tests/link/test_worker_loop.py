@@ -12,7 +12,7 @@ import pytest
 
 from precond_worker.errors import DeviceUnusable
 from precond_worker.mailbox import Mailbox
-from precond_worker.uplink import ServerEvent
+from precond_worker.presence import ServerGone, ServersThere
 from precond_worker.worker import Worker
 from protocol import PROTOCOL, FactorPattern, Refused
 from protocol.channels import key
@@ -64,6 +64,10 @@ class FakeUplink:
         self.answers: list[tuple[Factor, bytes]] = []
         self.patterns: list[tuple[str, int]] = []
         self.asked: list[tuple[str, int]] = []
+        self.without_token: set[int] = set()
+
+    def has_token(self, incarnation: int) -> bool:
+        return incarnation not in self.without_token
 
     def follow(self, incarnation: int) -> None:
         self.incarnation = incarnation
@@ -98,7 +102,7 @@ def uplink() -> FakeUplink:
 @pytest.fixture
 def worker(uplink: FakeUplink) -> Worker:
     worker = Worker(uplink, Diagonal)  # type: ignore[arg-type]
-    uplink.mailbox.put(ServerEvent(7, True))
+    uplink.mailbox.put(ServersThere((7,)))
     worker.step(0.0)
     return worker
 
@@ -177,8 +181,8 @@ def test_from_positions_the_worker_builds_the_matrix_itself(worker: Worker, upli
 def test_a_new_server_is_asked_for_its_scene_again(worker: Worker, uplink: FakeUplink, doubling: None) -> None:
     x = np.ones((2, 3))
     drain(worker, uplink, positions(1, x))
-    uplink.mailbox.put(ServerEvent(7, False))
-    uplink.mailbox.put(ServerEvent(7, True))
+    uplink.mailbox.put(ServerGone(7))
+    uplink.mailbox.put(ServersThere((7,)))
     worker.step(0.0)
     drain(worker, uplink, positions(2, x))
     assert Doubling.made == 2
@@ -257,7 +261,7 @@ class Failing(Diagonal):
 
 def test_too_little_memory_for_one_object_is_told_and_the_worker_lives_on(uplink: FakeUplink) -> None:
     worker = Worker(uplink, Failing)  # type: ignore[arg-type]
-    uplink.mailbox.put(ServerEvent(7, True))
+    uplink.mailbox.put(ServersThere((7,)))
     drain(worker, uplink, matrix(1), matrix(2, "liver"))
     (refused, _), (answered, _) = uplink.answers
     assert refused.header.object == "beam" and "needs 3.00 GiB" in refused.failure
@@ -268,7 +272,7 @@ def test_too_little_memory_for_one_object_is_told_and_the_worker_lives_on(uplink
 def test_a_device_that_fails_ends_the_worker_after_an_answer(uplink: FakeUplink) -> None:
     Failing.error = DeviceUnusable("the GPU failed: cudaErrorIllegalAddress")
     worker = Worker(uplink, Failing)  # type: ignore[arg-type]
-    uplink.mailbox.put(ServerEvent(7, True))
+    uplink.mailbox.put(ServersThere((7,)))
     with pytest.raises(DeviceUnusable):
         drain(worker, uplink, matrix(1))
     assert [answer.failure for answer, _ in uplink.answers] == ["the GPU failed: cudaErrorIllegalAddress"]
@@ -296,14 +300,27 @@ def test_what_is_not_for_it_is_dropped_and_counted(
 
 def test_a_new_server_means_new_analyses_and_old_work_is_dropped(worker: Worker, uplink: FakeUplink) -> None:
     drain(worker, uplink, matrix(1))
-    drain(worker, uplink, matrix(2), ServerEvent(8, True), matrix(3))  # type: ignore[arg-type]
+    drain(worker, uplink, matrix(2), ServersThere((8,)), matrix(3))  # type: ignore[arg-type]
     assert uplink.incarnation == 8
     assert [answer.job for answer, _ in uplink.answers] == [1]
     assert uplink.counters.superseded == 1 and uplink.counters.refusals == {"incarnation": 1}
-    drain(worker, uplink, ServerEvent(7, False))  # type: ignore[arg-type]
+    drain(worker, uplink, ServerGone(7))  # type: ignore[arg-type]
     assert uplink.incarnation == 8
-    drain(worker, uplink, ServerEvent(8, False))  # type: ignore[arg-type]
+    drain(worker, uplink, ServerGone(8))  # type: ignore[arg-type]
     assert uplink.incarnation == 0
+
+
+def test_it_stays_with_the_life_of_the_server_that_answers(worker: Worker, uplink: FakeUplink) -> None:
+    drain(worker, uplink, matrix(1))
+    drain(worker, uplink, ServersThere((9, 7)), matrix(2))  # type: ignore[arg-type]
+    assert uplink.incarnation == 7 and [answer.job for answer, _ in uplink.answers] == [1, 2]
+    drain(worker, uplink, ServerGone(9))  # type: ignore[arg-type]
+    assert uplink.incarnation == 7
+    uplink.without_token = {9}
+    drain(worker, uplink, ServersThere((9, 8)))  # type: ignore[arg-type]
+    assert uplink.incarnation == 8, "7 answers no more; 9 has no token"
+    drain(worker, uplink, ServersThere((9,)))  # type: ignore[arg-type]
+    assert uplink.incarnation == 8
 
 
 def test_a_full_mailbox_drops_the_oldest_and_counts() -> None:

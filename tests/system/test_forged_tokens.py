@@ -4,11 +4,12 @@
 import logging
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 import zenoh
 from hand_worker import HandWorker
-from link_helpers import Driver, chain, free_endpoint, light_worker
+from link_helpers import Driver, chain, free_endpoint, light_worker, process
 
 from protocol.channels import key
 from protocol.messages_pb2 import Header, WorkerInfo
@@ -105,3 +106,57 @@ def test_forged_heartbeats_do_not_shut_a_worker_out(stage: tuple[str, Driver, Fo
         driver.factor(BEAM, 2)
         driver.until(lambda: driver.link.workers()[0].jobs == 2, "heartbeats of the real one")
         assert driver.link.counters.refusals["sequence"] == 0
+
+
+FORGED = "00000000deadbeef"
+
+
+def test_a_forged_token_of_a_server_takes_no_worker_away(stage: tuple[str, Driver, Forger]) -> None:
+    endpoint, driver, forger = stage
+    with light_worker(endpoint, "real") as child:
+        driver.factor(BEAM, 1)
+        (token,) = forger.tokens("alive_server", [FORGED])
+        forger.tokens("alive_server", [f"{k:016x}" for k in range(1, 300)])
+        time.sleep(1.0)  # in which it would have followed the newest
+        driver.factor(BEAM, 2)
+        token.undeclare()
+        driver.factor(BEAM, 3)
+        assert child.poll() is None and driver.link.counters.jobs_lost == 0
+
+
+def test_a_worker_finds_the_server_among_forged_tokens_and_a_new_life_of_it_too() -> None:
+    """Everybody meets at a router, so that the forged tokens outlive the server."""
+    meeting, incarnations = free_endpoint(), set()
+    with open_session("server", listen=[meeting], shared_memory=False):
+        forger = Forger(meeting)
+        with forger.session, light_worker(meeting, "real") as child:
+            forger.tokens("alive_server", [f"{k:016x}" for k in range(1, 50)])
+            for life in range(2):
+                with ServerLink(listen=[free_endpoint()], connect=[meeting], shared_memory=False) as link:
+                    driver = Driver(link)
+                    link.announce(BEAM)
+                    driver.factor(BEAM, life + 1)
+                    forger.tokens("alive_server", [f"{100 + life:016x}"])
+                    driver.factor(BEAM, life + 2)
+                    incarnations.add(link.incarnation)
+            assert child.stdout is not None
+            assert [child.stdout.readline().strip() for _ in range(4)] == ["ready", "gone", "ready", "gone"]
+    assert len(incarnations) == 2
+
+
+def test_a_worker_of_another_version_is_told_and_the_server_says_so_once(
+    stage: tuple[str, Driver, Forger], caplog: pytest.LogCaptureFixture
+) -> None:
+    endpoint, driver, _ = stage
+    command = (str(Path(__file__).parent / "other_version.py"), "--connect", endpoint, "--name", "newer")
+    with caplog.at_level(logging.WARNING), process(*command) as child:
+        assert child.stderr is not None
+        line = child.stderr.readline()
+        assert "server sim speaks protocol version 1, this worker version 2: it is not served" in line
+        driver.until(lambda: driver.link.counters.refusals["version"] >= 3, "it to ask again")
+        assert driver.link.workers() == []
+        child.terminate()
+        out, err = child.communicate(timeout=30)
+        assert (out, err, child.returncode) == ("", "", 0)
+    told = [record.message for record in caplog.records if "worker newer speaks protocol version 2" in record.message]
+    assert len(told) == 1 and "this server version 1" in told[0]

@@ -1,0 +1,13 @@
+# SPDX-License-Identifier: MIT
+"""A worker of the next wire version; arguments as of precond-worker."""
+
+import sys
+
+import precond_worker.uplink  # noqa: F401  everything that knows the version
+from precond_worker.cli import main
+from protocol.channels import PROTOCOL
+
+for name, module in list(sys.modules.items()):
+    if name.partition(".")[0] in ("protocol", "precond_worker") and hasattr(module, "PROTOCOL"):
+        module.PROTOCOL = PROTOCOL + 1  # type: ignore[attr-defined]
+main()
