@@ -15,6 +15,7 @@ import zenoh
 from protocol import echo
 from protocol.channels import PROTOCOL, key, name_in
 from protocol.counters import Counters
+from protocol.messages_pb2 import Echo
 from protocol.refused import Refused
 
 SOON = 0.1  # s at least between two questions
@@ -89,14 +90,15 @@ class Presence:
             self._stirred, self._asked = False, now
             echo.who(self._session, self._server, self._worker, self._take)
 
-    def _take(self, found: dict[int, int]) -> None:
-        ours = tuple(incarnation for incarnation, version in found.items() if version == PROTOCOL)
+    def _take(self, found: dict[int, Echo]) -> None:
+        versions = {incarnation: answer.header.protocol for incarnation, answer in found.items()}
+        ours = tuple(incarnation for incarnation, version in versions.items() if version == PROTOCOL)
         if self.serving in ours:
             if not self._stirred:
                 self._answered = self.serving
         elif ours:
             self._heard(ServersThere(ours))
-        for incarnation, version in found.items():
+        for incarnation, version in versions.items():
             if version != PROTOCOL and incarnation not in self._told and len(self._told) < TOLD:
                 self._told.add(incarnation)
                 self._counters.warn(

@@ -26,6 +26,7 @@ from protocol.slots import HEADER, Slot
 LANES = 64  # askers that may be at it at the same time
 NUMBERS = 2 * LANES  # of 8 bytes: the server's, then the worker's
 LIMIT = CHANNELS["echo"].limit
+Answered = Callable[[dict[int, Echo]], None]
 ANSWERS = 64  # lives of a server that are told apart
 
 log = logging.getLogger(__name__)
@@ -40,20 +41,18 @@ def answer(slot: Slot, query: Echo, incarnation: int) -> tuple[Echo, zenoh.ZByte
     return Echo(header=header, slot=slot.message(), nonce=int(numbers[LANES + lane])), slot.payload
 
 
-def who(
-    session: zenoh.Session, server: str, asker: str, answered: Callable[[dict[int, int]], None], timeout: float = 1.0
-) -> None:
+def who(session: zenoh.Session, server: str, asker: str, answered: Answered, timeout: float = 1.0) -> None:
     """Ask which lives of a server are there; does not wait.
 
-    answered: is called in a thread of zenoh's with the wire version of each incarnation that answered in time.
+    answered: is called in a thread of zenoh's with what each incarnation said that answered in time.
     """
-    found: dict[int, int] = {}
+    found: dict[int, Echo] = {}
 
     def take(reply: zenoh.Reply) -> None:
         if reply.ok is not None and len(found) < ANSWERS:
             with contextlib.suppress(Refused):
-                header = parse(Echo, reply.ok.attachment, LIMIT).header
-                found[header.incarnation] = header.protocol
+                message = parse(Echo, reply.ok.attachment, LIMIT)
+                found[message.header.incarnation] = message
 
     session.get(
         key("echo", server, worker=asker),

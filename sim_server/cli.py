@@ -16,7 +16,7 @@ import typer
 
 from protocol.nvidia import nvidia_device
 from sim_server.compile_notice import compiling_told
-from sim_server.errors import DeviceError, DeviceLost, InputError
+from sim_server.errors import DeviceError, DeviceLost, InputError, NameTaken
 
 if TYPE_CHECKING:
     from sim_server.service import Service
@@ -104,6 +104,8 @@ def serve(
                 service.run()
             finally:
                 say(_summary(service))
+    except NameTaken as error:
+        _bad_input(str(error))
     except KeyboardInterrupt:
         raise typer.Exit(130) from None
     except Terminated:
@@ -232,6 +234,7 @@ def _wait_for_workers(service: "Service", supervisor: "Supervisor | None") -> No
     end = time.monotonic() + WORKERS_JOIN
     while supervisor is not None and not service.link.workers() and time.monotonic() < end:
         supervisor.look()
+        service.link.check_name()
         time.sleep(0.02)
 
 

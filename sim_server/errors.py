@@ -10,6 +10,10 @@ class InputError(Exception):
     """
 
 
+class NameTaken(InputError):
+    """Another server that this one is linked with has its name."""
+
+
 class DeviceError(InputError):
     """The device asked for is not there or not usable; the message says what to do."""
 

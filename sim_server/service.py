@@ -105,6 +105,7 @@ class Service:
         if time.monotonic() >= self._beside_due:
             self._beside_due = time.monotonic() + BESIDE
             self.beside()
+            self.link.check_name()
         self._carry_out()
         self._answer_halts()
         self._tell_status()

@@ -16,6 +16,7 @@ from protocol.messages_pb2 import Command, Echo, Header, Reply
 from protocol.refused import Refused
 from protocol.session import Session
 from protocol.slots import Slot
+from sim_server.network.claim import Claim
 from sim_server.network.newest import newest_moves
 from sim_server.network.outbox import Outbox
 from sim_server.network.waiting import Asked, Waiting
@@ -36,8 +37,10 @@ class Inquiries:
     """
 
     def __init__(
-        self, session: Session, server: str, incarnation: int, counters: Counters, slot: Slot | None, replies: Outbox
+        self, session: Session, server: str, incarnation: int, counters: Counters, slot: Slot | None, replies: Outbox,
+        claim: Claim,
     ):  # fmt: skip
+        self._claim = claim
         self._replies = replies
         self._server = server
         self._incarnation = incarnation
@@ -109,7 +112,9 @@ class Inquiries:
             self._tell_of_version(query, question)
         if self._echo_slot is None or not question.nonce or question.header.protocol != PROTOCOL:
             header = Header(protocol=PROTOCOL, incarnation=self._incarnation)
-            query.reply(query.key_expr, b"", attachment=Echo(header=header).SerializeToString())
+            query.reply(
+                query.key_expr, b"", attachment=Echo(header=header, settled=self._claim.settled).SerializeToString()
+            )
         else:
             reply, payload = echo.answer(self._echo_slot, question, self._incarnation)
             query.reply(query.key_expr, payload, attachment=reply.SerializeToString())

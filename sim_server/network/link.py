@@ -24,6 +24,7 @@ from protocol.messages_pb2 import Command, Header, LocalWorker, Reply, Scene, St
 from protocol.refused import Refused
 from protocol.session import open_session
 from protocol.slots import Slot, SlotPool, SlotsUnusable
+from sim_server.network.claim import Claim
 from sim_server.network.dispatch import Dispatch
 from sim_server.network.inquiries import Inquiries
 from sim_server.network.outbox import Outbox
@@ -43,7 +44,7 @@ class ServerLink:
 
     name: of the server in all keys. listen: endpoints, loopback if None. connect: other servers to be linked with.
     slots: bytes of shared memory for matrices and factors. silence: seconds without a heartbeat until a worker gets
-    no more jobs. Raises BadEndpoint or ConnectionFailed.
+    no more jobs. Raises BadEndpoint, ConnectionFailed or NameTaken.
     """
 
     def __init__(
@@ -64,6 +65,8 @@ class ServerLink:
         with ExitStack() as closing:
             self._session = open_session("server", listen=listen, connect=connect, shared_memory=shared_memory)
             closing.callback(self._session.close)
+            self._claim = Claim(self._session, self.name, self.incarnation, listen, connect)
+            closing.callback(self._claim.close)
             self._pool, echo_slot = self._make_slots(slots)
             if self._pool is not None:
                 closing.callback(self._pool.close)
@@ -80,12 +83,15 @@ class ServerLink:
         self._dispatch = Dispatch(
             session, self.name, self.incarnation, self._pool, self._jobs_out, self.counters, silence, clock
         )
-        self._inquiries = Inquiries(self._session, self.name, self.incarnation, self.counters, echo_slot, self._replies)
+        self._inquiries = Inquiries(
+            self._session, self.name, self.incarnation, self.counters, echo_slot, self._replies, self._claim
+        )
         self._publications = Publications(session, self.name, self._telemetry, self.counters)
         self._clients: set[str] = set()
         self._client_tokens = session.liveliness().declare_subscriber(
             key("alive_client", self.name), RingChannel(TOKENS), history=True
         )
+        self._claim.begin()
         # Last, since workers take it as the sign that everything else is there.
         self._token = session.liveliness().declare_token(
             key("alive_server", self.name, incarnation=f"{self.incarnation:016x}")
@@ -100,6 +106,10 @@ class ServerLink:
         except SlotsUnusable as problem:
             self.counters.warn("slots", f"shared memory is off, arrays travel as bytes: {problem}")
             return None, None
+
+    def check_name(self) -> None:
+        """Raise NameTaken if this server has to leave its name to another that started at the same time."""
+        self._claim.check()
 
     @property
     def shared_memory(self) -> bool:

@@ -81,7 +81,9 @@ def desk() -> Any:
     """Inquiries without a network: what is posted is sent at once."""
     session: Any = SimpleNamespace(zenoh=SimpleNamespace(declare_queryable=lambda *_: None), thread=lambda *_: None)
     replies: Any = SimpleNamespace(post=lambda send: send() or True)
-    return Inquiries(session, "sim", 5, Counters(logging.getLogger("test")), None, replies)
+    return Inquiries(
+        session, "sim", 5, Counters(logging.getLogger("test")), None, replies, SimpleNamespace(settled=True)
+    )
 
 
 def test_each_of_a_round_is_answered_once(desk: Inquiries) -> None:
