@@ -11,6 +11,7 @@ from typing import Annotated, NoReturn
 
 import typer
 
+from precond_worker.ending import end_now, end_with_any_thread, exhaustion
 from precond_worker.errors import DeviceUnusable, NameTaken
 from protocol.nvidia import nvidia_device
 
@@ -83,6 +84,7 @@ def work(
         os.environ[variable] = str(threads)
     logging.basicConfig(level=logging.INFO if verbose else logging.WARNING, format="%(name)s: %(message)s")
     signal.signal(signal.SIGTERM, _terminate)
+    end_with_any_thread()
     try:
         if exit_with_parent:
             from precond_worker.parent import end_with_parent
@@ -100,6 +102,10 @@ def work(
         raise typer.Exit(130) from None
     except Terminated:
         raise typer.Exit(0) from None
+    except BaseException as error:
+        if why := exhaustion(error):
+            end_now(why)
+        raise
 
 
 def _terminate(*_: object) -> None:

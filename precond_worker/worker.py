@@ -11,6 +11,7 @@ import zenoh
 from numpy.typing import NDArray
 
 from precond_worker.builders import Builders
+from precond_worker.ending import exhaustion
 from precond_worker.errors import DeviceUnusable, NameTaken
 from precond_worker.job import Job, accept
 from precond_worker.methods import Factorization
@@ -128,6 +129,9 @@ class Worker:
         except zenoh.ZError as error:
             self._counters.trouble("unsent", f"a factor was not sent: {error}")
         except Exception as error:
+            if why := exhaustion(error):  # a library half loaded stays so: another process may have more luck
+                self._answer(job, failure=why)
+                raise
             log.exception("factorization of %s failed", job.object)
             self._counters.add("failures")
             self._answer(job, failure=f"{type(error).__name__}: {error}")
