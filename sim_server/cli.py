@@ -99,7 +99,7 @@ def serve(
                 service, supervisor = _set_up(closing, options)
             _announce(say, service, scene, listen)
             _wait_for_workers(service, supervisor)
-            _describe_objects(say, service)
+            _describe_objects(say, service, listen)
             try:
                 service.run()
             finally:
@@ -215,8 +215,8 @@ def _announce(say, service: "Service", scene: Path, listen: list[str] | None) ->
     )
 
 
-def _describe_objects(say, service: "Service") -> None:  # type: ignore[no-untyped-def]
-    """Size and mass of each object: where a mesh in millimetres or a density in g/cm3 shows. Then notices."""
+def _describe_objects(say, service: "Service", listen: list[str] | None) -> None:  # type: ignore[no-untyped-def]
+    """Size and mass of each object: where a mesh in millimetres or a density in g/cm3 shows. Notices. Who makes no factors."""
     from sim_server.notices import notices
 
     world = service.simulation.world
@@ -226,7 +226,22 @@ def _describe_objects(say, service: "Service") -> None:  # type: ignore[no-untyp
     for line in notices(service.simulation):
         say(f"note: {line}")
     if service.driver.wants_factors and service.driver.free and not service.link.workers():
-        say("no worker yet: block Jacobi until one joins (precond-worker, or --workers 1)")
+        say(
+            "no worker is there, so nothing makes factors and solves use block Jacobi; start one in a second terminal, "
+            f"{_worker_command(service.link.name, listen)}, or this server with --workers 1"
+        )
+
+
+def _worker_command(name: str, listen: list[str] | None) -> str:
+    """How a worker for this server is started on this machine."""
+    from protocol.channels import DEFAULT_ENDPOINT, SERVER_NAME
+
+    words = ["precond-worker"]
+    if listen and listen[0] != DEFAULT_ENDPOINT:
+        words += ["--connect", *_reachable(listen)]
+    if name != SERVER_NAME:
+        words += ["--server", name]
+    return " ".join(words)
 
 
 def _wait_for_workers(service: "Service", supervisor: "Supervisor | None") -> None:

@@ -238,3 +238,31 @@ def test_it_says_what_did_not_converge_and_writes_over_nothing_but_logs(tmp_path
     result = run("sim_server", str(scene), *arguments, "--record", str(scene))
     assert result.returncode == 2 and "is no MCAP log" in result.stderr
     assert scene.read_text() == before
+
+
+@pytest.mark.parametrize(
+    ("settings", "told"),
+    [(["update=async"], True), (["update=lockstep-2"], False), (["preconditioner=block_jacobi"], False)],
+)  # fmt: skip
+def test_without_a_worker_it_says_once_that_nothing_makes_factors(
+    tmp_path: Path, settings: list[str], told: bool
+) -> None:
+    endpoint = free_endpoint()
+    options = [word for setting in settings for word in ("--set", f"solver.{setting}")]
+    done = run(
+        "sim_server",
+        str(beam(tmp_path)),
+        "--listen",
+        endpoint,
+        "--name",
+        "mine",
+        "--steps",
+        "3",
+        "--free-run",
+        *options,
+    )
+    assert done.returncode == 0, done.stderr
+    lines = [line for line in done.stdout.splitlines() if "nothing makes factors" in line]
+    assert len(lines) == told
+    if told:
+        assert f"precond-worker --connect {endpoint} --server mine, or this server with --workers 1" in lines[0]
