@@ -216,7 +216,7 @@ def _announce(say, service: "Service", scene: Path, listen: list[str] | None) ->
 
 
 def _describe_objects(say, service: "Service", listen: list[str] | None) -> None:  # type: ignore[no-untyped-def]
-    """Size and mass of each object: where a mesh in millimetres or a density in g/cm3 shows. Notices. Who makes no factors."""
+    """Size and mass of each object, where a mesh in millimetres or a density in g/cm3 shows; then notices."""
     from sim_server.notices import notices
 
     world = service.simulation.world
@@ -238,7 +238,7 @@ def _worker_command(name: str, listen: list[str] | None) -> str:
 
     words = ["precond-worker"]
     if listen and listen[0] != DEFAULT_ENDPOINT:
-        words += ["--connect", *_reachable(listen)]
+        words += [word for endpoint in _reachable(listen) for word in ("--connect", endpoint)]
     if name != SERVER_NAME:
         words += ["--server", name]
     return " ".join(words)
