@@ -14,7 +14,7 @@ from typing import Any, Literal, Self
 import zenoh
 
 from protocol import memlock
-from protocol.channels import DEFAULT_ENDPOINT
+from protocol.channels import DEFAULT_ENDPOINT, everything
 from protocol.endpoints import BadEndpoint, check_endpoint, usual_endpoints
 from protocol.hosts import unknown_hosts
 
@@ -43,11 +43,13 @@ def open_session(
     connect: Sequence[str] | None = None,
     shared_memory: bool = True,
     timeout: float = 2.0,
+    name: str | None = None,
 ) -> "Session":
     """Open a session: the server listens and passes messages on between clients, a client connects.
 
     listen (server) and connect (client, unless WARPFACTOR_CONNECT is set) default to loopback, port 7447. timeout:
-    seconds a client tries to connect.
+    seconds a client tries to connect. name: of the server whose keys these are; what is sent to it waits for no other
+    receiver.
     Raises BadEndpoint or ConnectionFailed.
     """
     server = role == "server"
@@ -61,6 +63,8 @@ def open_session(
     try:
         if server or len(connecting) == 1:
             config = _config(server, listening, connecting, shared_memory, timeout)
+            if name is not None:
+                _wait_for_nobody(config, name)
             return Session(zenoh.open(config), shared_memory)
         return Session(_first_that_answers(connecting, shared_memory, timeout), shared_memory)
     except zenoh.ZError as error:
@@ -125,6 +129,28 @@ def _config(server: bool, listen: list[str], connect: list[str], shared_memory: 
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
     return config
+
+
+def _wait_for_nobody(config: zenoh.Config, name: str) -> None:
+    """Patterns and factors that workers send to this server (and would wait for) are passed on to whoever else
+    subscribed to them only as far as that one reads.
+
+    Otherwise a subscriber of everything that stops reading holds up the thread that receives, for all. In a queue of
+    their own, since a message that waits locks the queue of its priority.
+    """
+    rule = {
+        "messages": ["put"],
+        "flows": ["ingress"],
+        "key_exprs": [everything(name)],
+        "qos": {"congestion_control": "block"},
+        "overwrite": {"congestion_control": "drop", "priority": "background"},
+    }
+    rules = json.loads(config.get_json("qos/network")) or []
+    config.insert_json5("qos/network", json.dumps([*rules, rule]))
+    queue = "transport/link/tx/queue"
+    config.insert_json5(f"{queue}/size/background", "16")  # batches of 64 KiB, made as they are needed
+    config.insert_json5(f"{queue}/congestion_control/drop/wait_before_drop", "5000")  # us
+    config.insert_json5(f"{queue}/congestion_control/drop/max_wait_before_drop_fragments", "250000")  # of a whole message
 
 
 def _reason(error: Exception) -> str:

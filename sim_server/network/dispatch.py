@@ -3,8 +3,9 @@
 
 import logging
 import threading
+import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import zenoh
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 LOOK_AGAIN = 1.0  # s between questions for tokens that were not told
+QUICK = 0.05  # s in which a link takes a job as bytes if it is fast; zenoh drops what is not taken within 0.25
 ROOM = 8  # a slot for an incomplete factor is larger than the last ones by one part in so many
 
 
@@ -56,6 +58,7 @@ class Dispatch:
         self._busy = threading.RLock()  # a status asks for the workers while the loop thread takes in a factor
         self._last_worker: dict[str, str] = {}  # of each object: it knows the pattern already
         self._free_since: dict[str, float] = {}  # by worker, when it last answered
+        self._quick: set[str] = set()  # workers without shared memory whose link takes a job at once
         self._factors: list[Factor] = []
         self._failures: list[tuple[str, str]] = []
         self._arrivals = Arrivals(session, server)
@@ -194,11 +197,23 @@ class Dispatch:
         payload = load(message, job.values, slot)
         name = key("matrix", self._server, worker=flight.worker, object=flight.object)
         attachment = message.SerializeToString()
-        return self._outbox.post(
-            lambda: self._session.put(
-                name, payload, attachment=attachment, congestion_control=zenoh.CongestionControl.BLOCK
-            )
+        return self._outbox.post(lambda: self._send(flight.worker, name, payload, attachment, slot is not None))
+
+    def _send(self, worker: str, name: str, payload: Any, attachment: bytes, shared: bool) -> None:
+        """Send a job, in the thread of the outbox. Where a link is full zenoh drops it (the lease then ends) or waits.
+
+        It waits only where it must: bytes over a link that is slow, as far as is known, are more than zenoh would hold.
+        While it waits for one receiver all others wait too, also for one that subscribed to everything and stopped
+        reading. In a queue of its own, since a message that waits locks the queue of its priority.
+        """
+        drop = shared or worker in self._quick
+        control = zenoh.CongestionControl.DROP if drop else zenoh.CongestionControl.BLOCK
+        begin = time.perf_counter()
+        self._session.put(
+            name, payload, attachment=attachment, congestion_control=control, priority=zenoh.Priority.BACKGROUND
         )
+        if not drop and time.perf_counter() - begin < QUICK:
+            self._quick.add(worker)
 
     # ---- in --------------------------------------------------------------------------------------------------
 

@@ -63,7 +63,9 @@ class ServerLink:
         self.counters = Counters(log)
         self.local_workers: Callable[[], list[LocalWorker]] = list  # those that this process supervises, for the status
         with ExitStack() as closing:
-            self._session = open_session("server", listen=listen, connect=connect, shared_memory=shared_memory)
+            self._session = open_session(
+                "server", listen=listen, connect=connect, shared_memory=shared_memory, name=self.name
+            )
             closing.callback(self._session.close)
             self._claim = Claim(self._session, self.name, self.incarnation, listen, connect)
             closing.callback(self._claim.close)
