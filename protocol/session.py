@@ -149,8 +149,8 @@ def _wait_for_nobody(config: zenoh.Config, name: str) -> None:
     config.insert_json5("qos/network", json.dumps([*rules, rule]))
     queue = "transport/link/tx/queue"
     config.insert_json5(f"{queue}/size/background", "16")  # batches of 64 KiB, made as they are needed
-    config.insert_json5(f"{queue}/congestion_control/drop/wait_before_drop", "5000")  # us
-    config.insert_json5(f"{queue}/congestion_control/drop/max_wait_before_drop_fragments", "250000")  # of a whole message
+    for wait, microseconds in (("wait_before_drop", 5000), ("max_wait_before_drop_fragments", 250_000)):
+        config.insert_json5(f"{queue}/congestion_control/drop/{wait}", str(microseconds))
 
 
 def _reason(error: Exception) -> str:

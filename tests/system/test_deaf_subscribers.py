@@ -61,12 +61,10 @@ def test_jobs_factors_heartbeats_and_answers_pass(count: int, shared: bool) -> N
             assert [reply.ok is not None for reply in client.zenoh.get(key("status"), timeout=10.0)] == [True]
 
         one_round()
-        beats = 0
         stopped(endpoint, count, closing)
-        for _ in range(ROUNDS):
+        for done in range(1, ROUNDS + 1):
             one_round()
-            beats += 1
-            hand.hello(jobs=beats)
-            driver.until(lambda: link.workers()[0].jobs == beats, "the heartbeat")
+            hand.hello(jobs=done)
+            driver.until(lambda done=done: link.workers()[0].jobs == done, "the heartbeat")
         assert link.counters.leases_over == 0
         assert all(reason.endswith("failed: none") for _, reason in driver.failures)
