@@ -48,6 +48,13 @@ class Copies:
         """Those whose copy is there, in the order in which they were asked for."""
         return sorted((t for t in tracks if t.wanted is not None and self.step(t) >= 0), key=lambda t: t.asked)
 
+    def will_do(self, t: Track) -> bool:
+        """What was copied is all that whoever takes it needs: a grab may have begun between the request and the copy,
+        and positions do not tell of its springs."""
+        assert t.wanted is not None
+        step = self.step(t)
+        return t.wanted.ndim == 3 or all(e.told_at(step) for e in self._simulation.effects.values())
+
     def discard(self, t: Track) -> None:
         """What was asked for goes to nobody."""
         assert t.wanted is not None

@@ -219,9 +219,13 @@ class Driver:
                 self.failed(name, reason)
 
     def _send_patiently(self, t: Track) -> bool:
-        """To a worker, waiting for an idle one; into this process where there is no worker at all. False: stopped."""
+        """To a worker, waiting for an idle one; into this process where there is no worker at all. False: stopped, or
+        what was copied will not do."""
         step = self._copies.step(t)
         assert t.wanted is not None
+        if not self._copies.will_do(t):
+            self._copies.discard(t)
+            return False
         job = self._job(t, step, t.wanted)
         asked = time.monotonic()
         while not (self.source.ready() and self.source.submit(job)):
@@ -314,7 +318,7 @@ class Driver:
     def _send(self, t: Track) -> None:
         step = self._copies.step(t)
         assert t.wanted is not None
-        if self.source.submit(self._job(t, step, t.wanted)):
+        if self._copies.will_do(t) and self.source.submit(self._job(t, step, t.wanted)):
             t.went_out(step)
             return
         self._copies.discard(t)

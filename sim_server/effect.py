@@ -49,6 +49,10 @@ class Effect:
         """What it adds to A follows from the scene, the mesh and the positions, so that others can build A too."""
         return True
 
+    def told_at(self, step: int) -> bool:
+        """The same of the A that was assembled after so many completed steps."""
+        return self.told
+
     def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
         """What adds the effect to system.b, .diagonal, .block, .sums and .mean. accumulate: to sums, others have."""
         return []

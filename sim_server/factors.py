@@ -96,10 +96,11 @@ class Inline:
         self._done.append(Factor(job.object, job.epoch, job.step, job.warp, analysis.pattern, values, *made))
         return True
 
-    def library(self, name: str) -> str:
-        """Library and version that factorizes the matrices of an object; of exact factors if it has had any."""
+    def library(self, name: str, method: Method | None = None) -> str:
+        """Library and version that makes factors of an object by a method; None: exact ones if it has had any."""
         exact = (name, EXACT) in self._analyses
-        return str(self._analysis(name, EXACT if exact else self._latest.get(name, EXACT)).library)
+        chosen = method or (EXACT if exact else self._latest.get(name, EXACT))
+        return str(self._analysis(name, chosen).library)
 
     def _analysis(self, name: str, method: Method) -> Any:
         from precond_worker.factorize import default_library

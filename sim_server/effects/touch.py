@@ -19,6 +19,7 @@ Usual ranges: max_force a few times the weight of the object (a 4000 kg beam wei
 of a grab near young times the size of the grabbed patch moves that patch without tearing it from its neighbours.
 """
 
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -40,6 +41,7 @@ from sim_server.world import Body, World
 SCOPE = "object"
 REACH = 1e3  # sizes of the object: how far from it a point, and from its point a target, may be
 STRONGEST = 1e18  # N, stiffness times the farthest target
+GIVEN = 1024  # changes of which it is remembered when the loop took them up
 
 
 class Params(Parameters):
@@ -96,6 +98,7 @@ class Touch(Effect):
         self._system: System | None = None
         self._applied: list[Interaction] = []
         self._begun: list[Interaction] = []  # the same, with the times at which they began as far as they are known
+        self._given: deque[tuple[Any, bool]] = deque(maxlen=GIVEN)  # what a loop tells of each change, and `told` of it
         self._together = False
         self._changed: dict[int, Interaction] | None = None  # by id: what the loop is to be given after `together`
         self._same: tuple[list[int], dict[str, Any]] | None = None  # ids, and what of a launch no move changes
@@ -183,6 +186,13 @@ class Touch(Effect):
         """Not while there are grabs: they are known here alone."""
         return not any(a.stiffness for a in self._applied)
 
+    def told_at(self, step: int) -> bool:
+        """There was no grab among what the loop had taken up by then, which may be other than it was given last."""
+        for binding, told in reversed(tuple(self._given)):
+            if binding is None or 0 <= binding.taken <= step:
+                return told
+        return len(self._given) < GIVEN  # else the beginning is not known any more
+
     @contextmanager
     def together(self) -> Iterator[None]:
         """Changes made within the block go to the loop at its end, as one: with many clients a launch for each command
@@ -198,7 +208,13 @@ class Touch(Effect):
         """Gives the loop what has changed."""
         if self._changed is not None:
             changed, self._changed = self._changed, None
-            self.publish(self._bind(list(changed.values())))
+            launch, told = self._bind(list(changed.values())), self.told
+            if not told:  # it counts already: the loop may take it up before `publish` returns
+                self._given.append((None, told))
+            binding = self.publish(launch)
+            if not told:
+                self._given.pop()
+            self._given.append((binding, told))
 
     @property
     def applied(self) -> list[Interaction]:

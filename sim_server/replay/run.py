@@ -211,9 +211,10 @@ class Replay:
         if then is None or (then.pattern, then.checksum) == (factor.pattern.id, checksum(factor.values)):
             return
         maker = f"{then.library or 'an unknown library'}, {then.threads} thread{'s' if then.threads != 1 else ''}"
-        here = self._inline.library(factor.object)
+        here = self._inline.library(factor.object, self.simulation.scene.solver.method_named(then.method))
         what = "values" if then.pattern == factor.pattern.id else "pattern"
-        self.compared.factor(factor.step, factor.object, f"other {what}; then {then.worker} ({maker}), now {here}")
+        now = f"here by {here}" if here != then.library else "here by the same library"
+        self.compared.factor(factor.step, factor.object, f"other {what}; made by {then.worker} ({maker}), {now}")
 
     def _settle(self, index: int, name: str, step: int) -> None:
         """Solver settings of one solve as they were."""

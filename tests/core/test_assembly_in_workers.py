@@ -2,6 +2,7 @@
 """A matrix built from a description and positions is the one that the server assembles; what cannot be, is refused."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from protocol.refused import Refused
 from sim_server import describe
 from sim_server.assembly import Assembly
 from sim_server.driver import Driver
+from sim_server.factors import Inline, Job
 from sim_server.scene.model import Scene
 from sim_server.simulation import Simulation
 from tests.scenes import bar, jittered_bar, mesh_file, scene, simulation
@@ -150,3 +152,47 @@ def test_a_grab_is_known_to_the_server_alone():
     assert touch.told, "a push does not enter the matrix"
     touch.grab("me", "bar", (2, 0, 0), 0.0, (3, 0, 0), 1e3, 10.0, 1e9)
     assert not touch.told
+
+
+class Builders(Inline):
+    """Workers that build matrices, in name; keeps what it is sent."""
+
+    def __init__(self, sim: Simulation):
+        super().__init__({b.name: sim.system.body_pattern(b.first, b.last) for b in sim.world.bodies})
+        self._assembly, self.jobs = Assembly(*described(sim)), []
+
+    def builds(self) -> bool:
+        return True
+
+    def submit(self, job: Job) -> bool:
+        self.jobs.append((job.step, job.positions))
+        values = self._assembly.matrix(job.values) if job.positions else job.values
+        return super().submit(replace(job, values=values))
+
+
+@pytest.mark.parametrize("update", ["async", "lockstep-1"])
+def test_positions_that_a_grab_overtook_go_to_nobody(update):
+    """The grab begins after positions were asked for and before the loop copies them: what is sent is the matrix."""
+    solver = {"preconditioner": "cholesky", "update": update, "build": "worker"}
+    sim = simulation(bar(touch={"max_force": 1e4}), **solver)
+    source = Builders(sim)
+    touch, driver = sim.effects["touch"], Driver(sim, source)
+    place = next(i for i, launch in enumerate(sim.engine.launches) if launch.name == "touch.apply")
+    touch.publish = lambda new: sim.engine.replace(place, new)
+    ask, begun, over = driver._copies.ask, [], []
+
+    def overtaken(t):
+        ask(t)
+        if sim.engine.step >= 4 and not begun:
+            begun.append(sim.engine.step)
+            touch.grab("me", "bar", (2, 0, 0), 0.0, (3, 0, 0), 1e3, 10.0, 1e9)
+        elif sim.engine.step >= 8 and not over:
+            over.append(sim.engine.step)
+            touch.release("me", 1)
+
+    driver._copies.ask = overtaken
+    driver.advance(16)
+    positions, matrices = ([step for step, alone in source.jobs if alone is kind] for kind in (True, False))
+    assert positions[0] < begun[0] and positions[-1] > over[0], "before and after"
+    assert [step for step in positions if begun[0] <= step < over[0]] == []
+    assert begun[0] < min(matrices) <= over[0]

@@ -12,12 +12,13 @@ from google.protobuf.message import Message
 from mcap.records import Channel
 from mcap.records import Message as McapMessage
 
+from clients.client import Client
 from protocol import messages_pb2 as pb
 from protocol.log_chunks import BadLog, ChunkFile
 from sim_server.mcap_file import McapFile
 from sim_server.replay.log import Recording
 from tests.system.link_helpers import PATIENCE
-from tests.system.server_process import Stage, beam, run, until
+from tests.system.server_process import Stage, beam, fresh, run, until
 
 pytestmark = pytest.mark.system
 
@@ -30,9 +31,33 @@ TYPES: dict[str, type[Message]] = {
 Change = Callable[[Any], bool]  # of a message in place; False: leave it out
 
 
-def recorded(folder: Path, solver: str = "", preconditioner: str = "cholesky", *options: str) -> Path:
-    """A log of a beam that is pushed, grabbed and moved about while a worker makes its factors. options: of the server
-    [default: on the CPU]."""
+def push_and_grab(client: Client) -> None:
+    """A push, a grab that is moved about, and a push during a pause."""
+    client.push("beam", at=(0.5, 0.5, 4), force=(100, 0, 0), duration=0.3)
+    with client.grab("beam", (1, 1, 4), stiffness=1e5, max_force=9000) as held:
+        for k in range(25):
+            held.move((1 + 0.02 * k, 1, 4))
+            time.sleep(0.01)
+        client.pause()
+        client.push("beam", at=(0, 0, 3), force=(0, 90, 0), duration=0.1)
+        client.resume()
+
+
+def grab_often(client: Client) -> None:
+    """Grabs that begin at odd moments and last a few steps."""
+    while fresh(client).step < STEPS * 3 // 4:
+        for k in range(5):
+            with client.grab("beam", (1, 1, 4), target=(1.01, 1, 4), stiffness=1e5, max_force=9000):
+                time.sleep(0.004 * k)
+            time.sleep(0.02 + 0.003 * k)
+
+
+def recorded(
+    folder: Path, solver: str = "", preconditioner: str = "cholesky", *options: str,
+    touch: Callable[[Client], None] = push_and_grab,
+) -> Path:  # fmt: skip
+    """A log of a beam that is touched while a worker makes its factors. options: of the server [default: on the
+    CPU]."""
     stage, log = Stage(folder), folder / "run.mcap"
     scene = beam(folder, solver=solver)
     scene.write_text(scene.read_text().replace('"cholesky"', f'"{preconditioner}"'))
@@ -40,14 +65,7 @@ def recorded(folder: Path, solver: str = "", preconditioner: str = "cholesky", *
         server = stage.server(scene, "--steps", str(STEPS), "--record", str(log), "--workers", "1", *(options or CPU))
         with stage.client() as client:
             until(lambda: client.status().step > 5, "the simulation runs")
-            client.push("beam", at=(0.5, 0.5, 4), force=(100, 0, 0), duration=0.3)
-            with client.grab("beam", (1, 1, 4), stiffness=1e5, max_force=9000) as held:
-                for k in range(25):
-                    held.move((1 + 0.02 * k, 1, 4))
-                    time.sleep(0.01)
-                client.pause()
-                client.push("beam", at=(0, 0, 3), force=(0, 90, 0), duration=0.1)
-                client.resume()
+            touch(client)
         assert server.wait() == 0, server.output()
     finally:
         stage.close()
@@ -225,6 +243,15 @@ def test_factors_of_positions_sent_ahead_and_recycled_directions_too(tmp_path: P
     assert replayed(log, 0)["same"]
     ahead = {f.ahead for f in messages(log, "factor")}
     assert 0.0 in ahead and max(ahead) > 0, "matrices while grabbed, positions otherwise"
+
+
+def test_grabs_that_begin_while_positions_are_on_their_way(tmp_path: Path) -> None:
+    """A factor of a step with a grab is made from the matrix, though positions were asked for before it began."""
+    log = recorded(tmp_path, 'build = "worker"', touch=grab_often)
+    begun = [t.step for t in messages(log, "touch") if any(i.kind == "grab" for i in t.interactions)]
+    assert len(begun) > 5
+    found = replayed(log, 0)
+    assert found["same"] and found["other_factor"] is None
 
 
 def test_solves_that_ran_out_of_time(tmp_path: Path) -> None:
