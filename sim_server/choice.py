@@ -102,6 +102,10 @@ class Choice:
         if first or (soon and self.kind is Kind.BLOCK_JACOBI and self._pending is None):
             self._begin_probe(Kind.CHOLESKY)
 
+    def factor_dropped(self) -> None:
+        """The factor is of no use: block Jacobi until another one comes, which is tried out."""
+        self.kind, self.probe, self._pending, self._has_factor = Kind.BLOCK_JACOBI, 0, None, False
+
     def observe(
         self, kind: Kind, iterations: float, cost: float, asked: Kind | None = None,
         factor: Made | None = None, waited: float = 0.0, reached: Reached = CONVERGED, fallbacks: int = 0,

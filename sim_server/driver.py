@@ -24,11 +24,12 @@ from numpy.typing import NDArray
 from protocol.factor import Factor
 from protocol.method import Method
 from sim_server.copies import Copies
+from sim_server.dropping import Dropping
 from sim_server.engine import Kind
-from sim_server.factors import FactorSource, Inline, Job
+from sim_server.factors import FactorSource, Inline, Job, Pool
 from sim_server.guard import Guard
 from sim_server.reached import Reached, reached
-from sim_server.schedule import oldest_possible, overdue_after, pays, pick
+from sim_server.schedule import Need, oldest_possible, overdue_after, pays, pick
 from sim_server.simulation import Simulation
 from sim_server.stock import Stock
 from sim_server.track import Track, observe_steps
@@ -72,6 +73,8 @@ class Driver:
         self._nobody_at = -1  # step at which nobody was left to be asked
         self._stock = Stock()
         self._copies = Copies(simulation, self.source)
+        self._pool = self.source if isinstance(self.source, Pool) else None
+        self._dropping = Dropping(self, self._pool)
         self._alone = False  # there was no worker for a matrix of lockstep
         self._warped = {t.body.name: t.body.index in simulation.warped for t in self.tracks}
         elsewhere = self.solver.build == "worker" or self.solver.recycle > 0  # built or kept: it goes by rotations
@@ -148,6 +151,7 @@ class Driver:
         self._nobody_at = -1
         matrix = self._copies.take_back(t, factor.step)
         if factor.step > t.newest and (why := self.guard.complaint(factor, matrix)):
+            self._dropping.refused(factor)
             self.failed(factor.object, f"that of {factor.worker} is not used: {why}")
             return
         if not t.came_in(factor, self.engine.step):
@@ -160,6 +164,7 @@ class Driver:
         if t.choice is not None:
             t.choice.factor_arrived(method)
             self._settle(t)
+        self._dropping.use_again(t)
 
     def failed(self, name: str, reason: str) -> None:
         """A job came to nothing; the object may be sent again. Told once per cause: the status counts them."""
@@ -169,10 +174,14 @@ class Driver:
         if t.choice is not None:
             t.choice.making.failed()
         self._nobody_at = -1
+        self.tell(t, reason)
+
+    def tell(self, t: Track, reason: str) -> None:
+        """Why a factor that there was or should have been is not used."""
         cause = re.sub(r"[0-9.e+-]*[0-9]", "#", reason)
         if cause not in t.causes and len(t.causes) < CAUSES:
             t.causes.add(cause)
-            log.warning("object %r: no factor: %s", name, reason)
+            log.warning("object %r: no factor: %s", t.body.name, reason)
 
     # --- lockstep -----------------------------------------------------------------------------------------------
 
@@ -260,6 +269,11 @@ class Driver:
     def pump_factors(self) -> None:
         """Takes up what came, sends what was copied, asks for the matrix of whoever needs it most."""
         self._take_up(self.source)
+        if self._pool is not None:
+            for name in self._pool.taken_back():
+                self._copies.take_back(self.by_name[name])
+                self.by_name[name].taken_back()
+                self._nobody_at = -1
         self._send_copies()
         step, waiting = self.engine.step, sum(t.wanted is not None for t in self.tracks)
         idle = max(min(int(self.source.ready()), COPIES) - waiting, 0)
@@ -267,7 +281,7 @@ class Driver:
         if places <= 0 or step == self._nobody_at:
             return
         overdue = max(self._overdue(), self.solver.update_floor_steps)
-        needs = [t.need(step) for t in self.tracks]
+        needs = self._needs(step)
         if self.kind == "adaptive":
             needs = [need for need in needs if pays(need, self.solver.update_threshold)]
         ahead = getattr(self.source, "ahead", lambda: 0)()  # the most urgent are left for faster workers
@@ -278,6 +292,15 @@ class Driver:
             self._copies.ask(t)
         if len(wanted) < places:
             self._nobody_at = step
+
+    def _needs(self, step: int) -> list[Need]:
+        """Of all bodies but those that are better left for another worker than the idle ones."""
+        needs = [t.need(step) for t in self.tracks]
+        if self._pool is not None:
+            reserved, setbacks = self._pool.reserved(), self._pool.setbacks()
+            if reserved or setbacks or any(need.failures for need in needs):
+                needs = [replace(n, failures=setbacks.get(n.object, 0)) for n in needs if n.object not in reserved]
+        return needs
 
     def _send_copies(self) -> None:
         """To idle workers, in the order in which they were asked for; others wait their turn while there is a stock."""
@@ -326,11 +349,15 @@ class Driver:
     # --- what the records say -----------------------------------------------------------------------------------
 
     def observe(self, records: NDArray[Any]) -> None:
-        """Sums up excess iterations and lets `auto` choose."""
+        """Sums up excess iterations, lets `auto` choose, drops factors that are no use."""
         floor, bodies = self.solver.update_floor_iterations, len(self.tracks)
         if not self.counted and len(records) >= max(bodies, TOGETHER) and len(records) % bodies == 0:
             self._observe_steps(records.reshape(-1, bodies))
-            return
+        else:
+            self._observe_each(records, floor)
+        self._dropping.judge(records)
+
+    def _observe_each(self, records: NDArray[Any], floor: int) -> None:
         for r in records:
             t, iterations, kind = self.tracks[r["body"]], int(r["iterations"]), Kind(r["kind"])
             cost = self._model(t, kind, iterations) if self.counted else float(r["solve"])

@@ -3,7 +3,7 @@
 
 import logging
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +52,31 @@ class FactorSource(Protocol):
 
     def failures(self) -> list[tuple[str, str]]:
         """Objects whose job came to nothing since the last call, and why."""
+        ...
+
+
+@runtime_checkable
+class Pool(FactorSource, Protocol):
+    """A source with several workers that are told apart."""
+
+    def taken_back(self) -> list[str]:
+        """Objects whose worker takes its time while another one is idle: they may be sent again at once."""
+        ...
+
+    def no_use(self, worker: str, object: str) -> None:
+        """A factor of a worker was refused, or solves had to leave it."""
+        ...
+
+    def of_use(self, worker: str, object: str) -> None:
+        """A solve was made with a factor of a worker."""
+        ...
+
+    def setbacks(self) -> dict[str, int]:
+        """By object, jobs in a row that came to nothing with the best of its workers."""
+        ...
+
+    def reserved(self) -> set[str]:
+        """Objects that are better left for a busy worker, since factors of the idle ones came to nothing."""
         ...
 
 

@@ -74,6 +74,8 @@ class Track:
         self.choice = Choice(methods) if methods else None
         self.decided = methods[0] if methods else None  # method of the factors in use, apart from trials
         self._methods: dict[int, Method] = {}  # of the last jobs, by step
+        self._makers: dict[int, str] = {}  # workers of the last factors, by step
+        self.dropped: tuple[int, int] | None = None  # the newest factor is no use: its step, kind of solves till then
         self._making: dict[str, Mean] = {}  # s, or operations, by name of the method
         self.warping: Warping | None = None  # warp = "auto"
         self.noted = self.made = -1  # steps, for a device that is told: noted last, or from when on; what frames go by
@@ -88,6 +90,10 @@ class Track:
         """How the factor of a step was made; None where that is not known any more."""
         return self._methods.get(step)
 
+    def maker(self, step: int) -> str:
+        """Who made the factor of a step; empty where that is not known any more."""
+        return self._makers.get(step, "")
+
     def tries(self, method: Method | None) -> bool:
         """A factor of this method is tried out: what solves with it take says nothing of those in use."""
         return method is not None and self.choice is not None and method != self.choice.making.decided
@@ -99,7 +105,7 @@ class Track:
 
     def age(self, step: int) -> int:
         """Steps since the matrix of the newest factor, -1 without one."""
-        return step - self.newest if self.newest >= 0 else -1
+        return step - self.newest if self.newest >= 0 and self.dropped is None else -1
 
     def need(self, step: int) -> Need:
         """What the scheduler is told."""
@@ -108,7 +114,7 @@ class Track:
             self.excess,
             None if self.sent is None else step - self.sent,
             self.in_flight or self.wanted is not None,
-            self.age(step) if self.newest >= 0 else None,
+            self.age(step) if self.age(step) >= 0 else None,
             1.0 if self.per_iteration.value is None else self.per_iteration.value,
             1.0 if self.seconds.value is None else self.seconds.value,
             self.failures,
@@ -138,12 +144,25 @@ class Track:
         if method := self.method(factor.step):
             self._making.setdefault(method.name, Mean()).add(made)
         self.newest = factor.step
+        self._makers[factor.step] = factor.worker
+        if len(self._makers) > METHODS:
+            del self._makers[next(iter(self._makers))]
         self.lost = 0.0  # what is known of the solves so far is of another factor
         self.excess = self.latest = self._usual.value or 0.0
         self.sent = factor.step if self.sent is None else self.sent  # one made elsewhere
         self.used += 1
         self.mended += bool(factor.remedy)
         return True
+
+    def drop(self, kind: int, reason: str) -> None:
+        """The newest factor is not used any more. kind: of the solves till now."""
+        self.dropped, self.refusal = (self.newest, kind), reason
+        self.failures += 1
+
+    def taken_back(self) -> None:
+        """Its job takes too long; it may be sent to another worker."""
+        self.in_flight = False
+        self.excess += self._owed
 
     def came_to_nothing(self, reason: str) -> None:
         """Its job failed; it may be sent again."""

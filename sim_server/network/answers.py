@@ -27,11 +27,7 @@ class Known:
     size: int  # degrees of freedom
     blocks: int
     patterns: dict[int, FactorPattern] = field(default_factory=dict)
-
-    @property
-    def nonzeros(self) -> int:
-        """Values of the largest factor to expect; 0 while no pattern is known."""
-        return max((pattern.nonzeros for pattern in self.patterns.values()), default=0)
+    largest: dict[str, int] = field(default_factory=dict)  # values of the largest factor so far, by method
 
 
 class Answers:
@@ -90,6 +86,8 @@ class Answers:
         slotted = message.HasField("slot")
         values = _from_slot(message, flight) if slotted else _from_payload(message, payload)
         check_values(values, pattern, message.checksum)
+        largest = self.known[flight.object].largest
+        largest[flight.method] = max(largest.get(flight.method, 0), pattern.nonzeros)
         return Factor(
             flight.object, flight.epoch, flight.step, flight.warp, pattern, values, flight.worker, message.seconds,
             message.remedy[:200],

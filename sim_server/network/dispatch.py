@@ -19,6 +19,7 @@ from protocol.refused import Refused
 from protocol.slots import Slot, SlotPool
 from sim_server.network.answers import Answers
 from sim_server.network.arrivals import Arrivals
+from sim_server.network.conduct import Conduct
 from sim_server.network.jobs import LATE, Flight, Jobs
 from sim_server.network.outbox import Outbox
 from sim_server.network.roster import Roster
@@ -55,6 +56,7 @@ class Dispatch:
         self._roster = Roster(incarnation, silence)
         self._jobs = Jobs(pool)
         self._speeds = Speeds()
+        self._conduct = Conduct()
         self._busy = threading.RLock()  # a status asks for the workers while the loop thread takes in a factor
         self._last_worker: dict[str, str] = {}  # of each object: it knows the pattern already
         self._free_since: dict[str, float] = {}  # by worker, when it last answered
@@ -76,6 +78,7 @@ class Dispatch:
             self._answers.announce(topology)
             self._jobs.forget(topology.header.object)
             self._speeds.forget_object(topology.header.object)
+            self._conduct.forget_object(topology.header.object)
 
     def ready(self) -> int:
         """How many are idle and can take a job."""
@@ -95,7 +98,7 @@ class Dispatch:
         """Workers that may be given work."""
         with self._busy:
             self._receive()
-            infos = (self._roster.info(name) for name in self._roster.fit(self._clock(), self._jobs.deadlines()))
+            infos = (self._roster.info(name) for name in self._fit())
             return [info for info in infos if info is not None]
 
     def builds(self) -> bool:
@@ -116,6 +119,39 @@ class Dispatch:
             failures, self._failures = self._failures, []
             return failures
 
+    def taken_back(self) -> list[str]:
+        """Objects whose worker takes its time while another one is idle: they may be sent again at once."""
+        with self._busy:
+            slow = self._jobs.pass_on(self._clock(), self._another)
+            self._counters.add("passed_on", len(slow))
+            return [flight.object for flight in slow]
+
+    def no_use(self, worker: str, object: str) -> None:
+        """A factor of a worker was refused, or solves had to leave it."""
+        with self._busy:
+            self._conduct.failed(worker, object, self._clock())
+
+    def of_use(self, worker: str, object: str) -> None:
+        """A solve was made with a factor of a worker."""
+        with self._busy:
+            self._conduct.helped(worker, object)
+
+    def setbacks(self) -> dict[str, int]:
+        """By object, jobs in a row that came to nothing with the best of its workers."""
+        with self._busy:
+            failing = self._conduct.failing
+            fit = self._fit() if failing else []
+            return {object: self._conduct.failures(fit, object) for object in failing}
+
+    def reserved(self) -> set[str]:
+        """Objects that are better left for a busy worker, since factors of the idle ones came to nothing."""
+        with self._busy:
+            failing = self._conduct.failing
+            if not failing:
+                return set()
+            idle, fit = self._idle(), self._fit()
+            return {object for object in failing if idle and not self._candidates(idle, fit, object)}
+
     # ---- out -------------------------------------------------------------------------------------------------
 
     def submit(self, job: "Job") -> bool:
@@ -132,11 +168,12 @@ class Dispatch:
             raise ValueError(f"job for {job.object}: values {job.values.shape}, allowed: float64 {shape}")
         self._receive()
         idle = [name for name in self._idle() if not job.positions or self._builds(name)]
+        idle = self._candidates(idle, self._fit(), job.object)
         if job.object in self._jobs.by_object or not idle:
             return False
         worker = self._choose(idle, job.object)
         matrix_slot, factor_slot = self._lend(worker, job)
-        lease, now = self._jobs.lease(job.object, known.blocks), self._clock()
+        lease, now = self._jobs.lease(job.object, worker), self._clock()
         flight = Flight(
             self._jobs.next_number(),
             job.object,
@@ -150,19 +187,36 @@ class Dispatch:
             factor_slot.generation if factor_slot else 0,
             tuple(slot for slot in (matrix_slot, factor_slot) if slot is not None),
             now,
+            now + self._jobs.alone(job.object, known.blocks),
+            job.method.name,
         )
         self._jobs.start(flight)
         if self._post(flight, job, lease, matrix_slot):
             self._last_worker[job.object] = worker
+            self._conduct.sent(worker, now)
             self._counters.add("jobs")
             self._counters.add("bytes_out", job.values.nbytes)
             return True
         self._jobs.cancel(flight)
         return False
 
+    def _fit(self) -> list[str]:
+        return self._roster.fit(self._clock(), self._jobs.deadlines())
+
     def _idle(self) -> list[str]:
-        fit = self._roster.fit(self._clock(), self._jobs.deadlines())
-        return [name for name in fit if name not in self._jobs.by_worker]
+        fit, now = self._fit(), self._clock()
+        idle = [name for name in fit if name not in self._jobs.by_worker]
+        return [name for name in idle if self._conduct.may_be_asked(name, fit, now)]
+
+    def _candidates(self, idle: list[str], fit: list[str], object: str) -> list[str]:
+        """Idle workers whose factors of the object are not no use; all of them if those of everybody are."""
+        now = self._clock()
+        good = [name for name in fit if not self._conduct.held(name, object, now)]
+        return [name for name in idle if name in good] if good else idle
+
+    def _another(self, flight: Flight) -> bool:
+        """Somebody else could take the object of a flight."""
+        return bool(self._candidates(self._idle(), self._fit(), flight.object))
 
     def _builds(self, worker: str) -> bool:
         info = self._roster.info(worker)
@@ -183,7 +237,7 @@ class Dispatch:
         info = self._roster.info(worker)
         if self._pool is None or info is None or not info.shared_memory or self._jobs.lateness(worker) >= LATE:
             return None, None
-        nonzeros = self._answers.known[job.object].nonzeros
+        nonzeros = self._answers.known[job.object].largest.get(job.method.name, 0)
         if job.method.name == "incomplete_cholesky":
             nonzeros += nonzeros // ROOM  # the next one may keep more
         matrix = self._pool.lend(job.values.nbytes)
@@ -227,6 +281,8 @@ class Dispatch:
         self._look_again()
         for flight in self._jobs.expire(self._clock()):
             self._counters.add("leases_over")
+            self._quick.discard(flight.worker)  # it may be that zenoh dropped it
+            self._conduct.failed(flight.worker, flight.object, self._clock())
             self._fail(flight, "was not answered within its lease")
 
     def _look_again(self) -> None:
@@ -257,6 +313,8 @@ class Dispatch:
     def _leave(self, name: str) -> None:
         flight = self._jobs.lost(name)
         self._speeds.forget_worker(name)
+        self._conduct.forget_worker(name)
+        self._quick.discard(name)
         self._free_since.pop(name, None)
         if flight is not None:
             self._counters.add("jobs_lost")
@@ -271,22 +329,29 @@ class Dispatch:
         now, seconds = self._clock(), None
         self._roster.heard(flight.worker, now)
         self._free_since[flight.worker] = now
+        self._conduct.answered(flight.worker)
+        if self._jobs.passed(flight):
+            return self._jobs.end(flight, None if message.failure else message.seconds)
         try:
             if message.failure:
                 self._counters.add("failures")
+                self._conduct.failed(flight.worker, flight.object, now)
                 return self._fail(flight, f"failed: {message.failure}")
             self._factors.append(self._answers.factor(message, sample.payload, flight))
             seconds = message.seconds
             self._speeds.note(flight.worker, flight.object, now - flight.sent, seconds)
         except Refused as refusal:
+            self._conduct.failed(flight.worker, flight.object, now)
             self._fail(flight, f"was refused: {refusal}")
             raise
         finally:
             self._jobs.end(flight, seconds)
         self._counters.add("factors")
         self._counters.add("bytes_in", self._factors[-1].values.nbytes)
+        room = flight.factor_slot.capacity if flight.factor_slot is not None else 0
+        fits = 0 < self._factors[-1].values.nbytes <= room  # an incomplete one may be larger than all before it
         self._count_bulk("matrix", flight, message.matrix_shared, bool(flight.slots))
-        self._count_bulk("factor", flight, message.HasField("slot"), flight.factor_slot is not None)
+        self._count_bulk("factor", flight, message.HasField("slot"), fits)
 
     def _count_bulk(self, what: str, flight: Flight, shared: bool, lent: bool) -> None:
         self._counters.add("bulk_shared" if shared else "bulk_copied")

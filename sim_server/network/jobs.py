@@ -4,6 +4,7 @@
 Pure bookkeeping, without a network or a clock of its own.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -11,10 +12,11 @@ from protocol.refused import Refused
 from protocol.slots import Slot
 
 SHORTEST = 2.0  # s
-LONGEST = 120.0  # s
+LONGEST = 120.0  # s; also for the first job of an object at a worker, which may compile, import and analyse for it
 DOUBLINGS = 8
 TIMES = 20  # a lease is so many times what the last factorization took
-UNKNOWN_PER_BLOCK = 1e-4  # s: the first lease of an object, analysis and all
+UNKNOWN_PER_BLOCK = 1e-4  # s that nobody else is asked for an object that no factor came of yet
+SOON = 0.5  # s that nobody else is asked, at least
 LATE = 2  # late jobs with which a worker may still be asked again through shared memory
 
 
@@ -40,6 +42,8 @@ class Flight:
     factor_generation: int = 0
     slots: tuple[Slot, ...] = ()
     sent: float = 0.0
+    alone: float = 0.0  # [s, monotonic] from when on another worker may be asked for the object
+    method: str = "cholesky"
 
 
 class Jobs:
@@ -50,8 +54,9 @@ class Jobs:
         self.by_object: dict[str, Flight] = {}
         self.by_worker: dict[str, Flight] = {}
         self._late: dict[str, list[Flight]] = {}
-        self._seconds: dict[str, float] = {}
-        self._patience: dict[str, int] = {}  # doublings of the lease after jobs of the object that were late
+        self._seconds: dict[str, dict[str, float]] = {}  # of the last factorization, by object and worker
+        self._patience: dict[tuple[str, str], int] = {}  # doublings of the lease after late jobs, by object and worker
+        self._passed: set[int] = set()  # jobs whose object may go to another worker before they are answered
         self._last = 0
 
     def next_number(self) -> int:
@@ -59,11 +64,17 @@ class Jobs:
         self._last += 1
         return self._last
 
-    def lease(self, object: str, blocks: int) -> float:
-        """How long [s] an answer is waited for; twice as long after each one that was late."""
-        known = self._seconds.get(object)
-        base = max(SHORTEST, TIMES * known if known is not None else UNKNOWN_PER_BLOCK * blocks)
-        return float(min(LONGEST, base * 2 ** self._patience.get(object, 0)))
+    def lease(self, object: str, worker: str) -> float:
+        """How long [s] an answer of the worker is waited for; twice as long after each one that was late."""
+        known = self._seconds.get(object, {}).get(worker)
+        if known is None:
+            return LONGEST
+        return float(min(LONGEST, max(SHORTEST, TIMES * known) * 2 ** self._patience.get((object, worker), 0)))
+
+    def alone(self, object: str, blocks: int) -> float:
+        """How long [s] nobody else is asked: by the fastest worker that is known, whoever has the job."""
+        known = min(self._seconds.get(object, {}).values(), default=None)
+        return max(SOON, TIMES * known) if known is not None else max(SHORTEST, UNKNOWN_PER_BLOCK * blocks)
 
     def start(self, flight: Flight) -> None:
         """The job is on its way."""
@@ -75,6 +86,19 @@ class Jobs:
         del self.by_object[flight.object], self.by_worker[flight.worker]
         self._give_back(flight)
 
+    def pass_on(self, now: float, able: Callable[[Flight], bool]) -> list[Flight]:
+        """Flights of which another worker may be asked, and is there (`able`): their objects may be sent again. Their
+        workers stay busy until they answer, which is worth nothing then but to know that they do."""
+        slow = [flight for flight in self.by_object.values() if now > flight.alone and able(flight)]
+        for flight in slow:
+            del self.by_object[flight.object]
+            self._passed.add(flight.number)
+        return slow
+
+    def passed(self, flight: Flight) -> bool:
+        """Its object was passed on."""
+        return flight.number in self._passed
+
     def lateness(self, worker: str) -> int:
         """Late jobs of a worker that it may still be busy with."""
         return len(self._late.get(worker, ()))
@@ -85,7 +109,7 @@ class Jobs:
         if flight is not None and flight.number == number:
             if epoch != flight.epoch:
                 raise Refused(f"Factor.header.epoch is {epoch}; allowed: {flight.epoch}, as in the matrix", "epoch")
-            if self.by_object.get(flight.object) is flight:
+            if self.by_object.get(flight.object) is flight or self.passed(flight):
                 return flight
             self.end(flight)
             raise Refused(f"Factor.job is {number} of an epoch of {flight.object} that is over", "epoch")
@@ -103,37 +127,46 @@ class Jobs:
             del self.by_object[flight.object]
         if self.by_worker.get(flight.worker) is flight:
             del self.by_worker[flight.worker]
+        self._passed.discard(flight.number)
         self._give_back(flight)
         self._release_late(flight.worker, flight.number)
         if seconds is not None:
-            self._seconds[flight.object] = seconds
-            self._patience.pop(flight.object, None)
+            self._seconds.setdefault(flight.object, {})[flight.worker] = seconds
+            self._patience.pop((flight.object, flight.worker), None)
 
     def expire(self, now: float) -> list[Flight]:
         """Flights whose lease ended: object and worker may be used again; the slots stay lent."""
         over = [flight for flight in self.by_worker.values() if now > flight.deadline]
         for flight in over:
             del self.by_worker[flight.worker]
+            self._passed.discard(flight.number)
+            pair = flight.object, flight.worker
+            self._patience[pair] = min(DOUBLINGS, self._patience.get(pair, 0) + 1)
             self._late.setdefault(flight.worker, []).append(flight)
         expired = [flight for flight in over if self.by_object.get(flight.object) is flight]
         for flight in expired:
             del self.by_object[flight.object]
-            self._patience[flight.object] = min(DOUBLINGS, self._patience.get(flight.object, 0) + 1)
         return expired
 
     def forget(self, object: str) -> None:
         """The object has a new epoch: what is in flight is worth nothing. Its worker stays busy until it answers."""
         self.by_object.pop(object, None)
         self._seconds.pop(object, None)
-        self._patience.pop(object, None)
+        for pair in [pair for pair in self._patience if pair[0] == object]:
+            del self._patience[pair]
 
     def lost(self, worker: str) -> Flight | None:
         """The worker is gone: all its slots come back; the job of a living object that was lost with it."""
         for old in self._late.pop(worker, []):
             self._give_back(old)
+        for seconds in self._seconds.values():
+            seconds.pop(worker, None)
+        for pair in [pair for pair in self._patience if pair[1] == worker]:
+            del self._patience[pair]
         flight = self.by_worker.pop(worker, None)
         if flight is None:
             return None
+        self._passed.discard(flight.number)
         self._give_back(flight)
         if self.by_object.get(flight.object) is not flight:
             return None

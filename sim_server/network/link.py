@@ -158,6 +158,26 @@ class ServerLink:
         """(object, reason) of jobs since the last call that will bring no factor: failed, refused, late or lost."""
         return self._dispatch.failures()
 
+    def taken_back(self) -> list[str]:
+        """Objects whose worker takes its time while another one is idle: they may be sent again at once."""
+        return self._dispatch.taken_back()
+
+    def no_use(self, worker: str, object: str) -> None:
+        """A factor of a worker was refused, or solves had to leave it."""
+        self._dispatch.no_use(worker, object)
+
+    def of_use(self, worker: str, object: str) -> None:
+        """A solve was made with a factor of a worker."""
+        self._dispatch.of_use(worker, object)
+
+    def setbacks(self) -> dict[str, int]:
+        """By object, jobs in a row that came to nothing with the best of its workers."""
+        return self._dispatch.setbacks()
+
+    def reserved(self) -> set[str]:
+        """Objects that are better left for a busy worker, since factors of the idle ones came to nothing."""
+        return self._dispatch.reserved()
+
     def workers(self) -> list[WorkerInfo]:
         """Workers that may be given work, as they last described themselves."""
         return self._dispatch.workers()

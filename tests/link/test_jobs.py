@@ -103,21 +103,49 @@ def test_an_old_epoch_that_runs_out_or_is_lost_is_no_failure_of_the_new(jobs: Jo
 
 
 def test_leases_follow_the_last_factorization_and_double_when_missed(jobs: Jobs) -> None:
-    assert jobs.lease("beam", 10) == SHORTEST
-    assert jobs.lease("beam", 100_000) == pytest.approx(10.0)
-    first = flight(jobs)
-    jobs.end(first, 0.4)
-    assert jobs.lease("beam", 10) == pytest.approx(8.0)
+    assert jobs.lease("beam", "w") == LONGEST, "whoever is asked first may have to compile"
+    jobs.end(flight(jobs), 0.4)
+    assert jobs.lease("beam", "w") == pytest.approx(8.0)
     for _ in range(2):
         flight(jobs, deadline=0.0)
         jobs.expire(1.0)
-    assert jobs.lease("beam", 10) == pytest.approx(32.0)
+    assert jobs.lease("beam", "w") == pytest.approx(32.0)
     for _ in range(20):
         flight(jobs, deadline=0.0)
         jobs.expire(1.0)
-    assert jobs.lease("beam", 10) == LONGEST
+    assert jobs.lease("beam", "w") == LONGEST
     jobs.end(flight(jobs), 0.1)
-    assert jobs.lease("beam", 10) == pytest.approx(2.0)
+    assert jobs.lease("beam", "w") == SHORTEST
+
+
+def test_who_is_late_costs_others_no_time(jobs: Jobs) -> None:
+    """Leases are of an object at a worker."""
+    jobs.end(flight(jobs, worker="good"), 0.4)
+    for _ in range(5):
+        flight(jobs, worker="bad", deadline=0.0)
+        jobs.expire(1.0)
+    assert jobs.lease("beam", "good") == pytest.approx(8.0)
+    jobs.end(flight(jobs, worker="slow"), 4.0)
+    assert (jobs.lease("beam", "good"), jobs.lease("beam", "slow")) == (pytest.approx(8.0), pytest.approx(80.0))
+    jobs.lost("good")
+    jobs.forget("beam")
+    assert jobs.lease("beam", "slow") == LONGEST
+
+
+def test_an_object_waits_for_a_slow_worker_only_while_there_is_no_other(jobs: Jobs, lender: Lender) -> None:
+    assert jobs.alone("beam", 10) == SHORTEST and jobs.alone("beam", 100_000) == pytest.approx(10.0)
+    jobs.end(flight(jobs, worker="good"), 0.4)
+    jobs.end(flight(jobs, worker="slow"), 40.0)
+    assert jobs.alone("beam", 10) == pytest.approx(8.0), "as long as the fastest might take"
+    slow = flight(jobs, worker="slow", deadline=99.0)  # alone until 0
+    assert jobs.pass_on(0.1, lambda flight: False) == [] and jobs.by_object == {"beam": slow}
+    assert jobs.pass_on(0.1, lambda flight: True) == [slow]
+    assert jobs.by_object == {} and jobs.by_worker == {"slow": slow}, "it is busy"
+    other = flight(jobs, worker="good", deadline=99.0)
+    assert jobs.answered(slow.number, "slow", 1) is slow and jobs.passed(slow)
+    jobs.end(slow, 50.0)
+    assert jobs.by_object == {"beam": other} and jobs.by_worker == {"good": other} and not jobs.passed(slow)
+    assert len(lender.back) == 3
 
 
 def test_a_job_that_was_never_sent_leaves_no_trace(jobs: Jobs, lender: Lender) -> None:

@@ -23,6 +23,7 @@ class HandWorker:
         self.session = open_session("client", connect=[endpoint], shared_memory=shared_memory)
         self.incarnation, self.name, self.sequence = incarnation, name, 0
         self.shared_memory = shared_memory
+        self._next: Any = None
         self.matrices = self.session.zenoh.declare_subscriber(key("matrix", worker=name), RingChannel(64))
         self.token = self.session.zenoh.liveliness().declare_token(key("alive_worker", worker=name))
 
@@ -40,12 +41,18 @@ class HandWorker:
         _change(info, changes)
         self.put("worker", info.SerializeToString(), worker=self.name)
 
+    def has_job(self) -> bool:
+        """One has arrived."""
+        if self._next is None:
+            self._next = self.matrices.try_recv()
+        return self._next is not None
+
     def receive(self) -> Matrix:
         """The next job."""
         end = time.monotonic() + PATIENCE
         while time.monotonic() < end:
-            sample = self.matrices.try_recv()
-            if sample is not None:
+            if self.has_job():
+                sample, self._next = self._next, None
                 self.payload = sample.payload
                 return Matrix.FromString(bytes(sample.attachment))
             time.sleep(0.002)

@@ -139,7 +139,7 @@ def test_a_late_worker_keeps_its_slots_and_its_answer_is_refused() -> None:
         job = hand.receive()
         lent = slots_lent(link)
         answer, values = hand.right_answer(job, chain(object="bar"))
-        now[0] += 10.0  # the lease is over
+        now[0] += 130.0  # the lease is over
         driver.until(lambda: driver.failures, "the lease to be over")
         assert "not answered within its lease" in driver.failures[0][1]
         assert slots_lent(link) == lent > 0
