@@ -20,7 +20,7 @@ from sim_server.track import Track
 if TYPE_CHECKING:
     from sim_server.driver import Driver
 
-LEFT = 3  # solves in a row that left a factor: it is dropped
+LEFT = 3  # solves in a row that left their factors, be they several: the one in use is dropped
 POLICIES = ("async", "adaptive", "lockstep")  # with which another factor comes
 
 
@@ -36,19 +36,19 @@ class Usefulness:
 
     def __init__(self) -> None:
         self._made = -1  # step of the factor that solves were made with last
-        self._left = 0  # solves in a row that left it
+        self._left = 0  # solves in a row that left theirs
         self._told: Finding | None = None
 
     def observe(self, made: int, left: bool, used: bool) -> Finding | None:
         """A solve began with the factor of step `made` that left it, or used it to the end. What is found is told
         once."""
         if made != self._made:
-            self._made, self._left, self._told = made, 0, None
+            self._made, self._told = made, None
         if left:
             self._left += 1
         elif used:
             self._left = 0
-        found = Finding.NO_USE if self._left >= LEFT else Finding.OF_USE if used and not left else self._told
+        found = Finding.NO_USE if left and self._left >= LEFT else Finding.OF_USE if used and not left else self._told
         told, self._told = self._told, found
         return found if found is not told else None
 
@@ -97,7 +97,7 @@ class Dropping:
         if made != t.newest or t.dropped is not None:
             return
         settings = driver.engine.settings(t.body.index)
-        t.drop(settings.kind, f"that of {worker} is not used any more: {LEFT} solves in a row had to leave it")
+        t.drop(settings.kind, f"that of {worker} is not used any more: {LEFT} solves in a row had to leave theirs")
         if t.choice is None:
             settings.kind = Kind.BLOCK_JACOBI
         else:

@@ -254,6 +254,15 @@ def test_grabs_that_begin_while_positions_are_on_their_way(tmp_path: Path) -> No
     assert found["same"] and found["other_factor"] is None
 
 
+def test_factors_that_were_dropped(tmp_path: Path) -> None:
+    """Few iterations and old factors without the warp: some are left again and again, and solves go on without."""
+    log = recorded(tmp_path, 'update = "lockstep-12"\nmax_iterations = 8\nwarp = false')
+    steps = messages(log, "step")
+    assert sum(s.fallbacks for s in steps) >= 3
+    assert any(s.preconditioner == "block_jacobi" and not s.asked and s.step > 60 for s in steps), "asked for as such"
+    assert replayed(log, 0)["same"]
+
+
 def test_solves_that_ran_out_of_time(tmp_path: Path) -> None:
     """Where a budget of wall time ended a solve is in its record."""
     log = recorded(tmp_path, "budget = 2e-5", "block_jacobi")
