@@ -11,6 +11,7 @@ from typing import Self
 
 import zenoh
 
+from precond_worker.again import Again
 from precond_worker.builders import can_build
 from precond_worker.errors import NameTaken
 from precond_worker.heartbeat import Heartbeat
@@ -60,6 +61,7 @@ class Uplink:
         # Subscribed first, announced last: the server sends as soon as it has heard of us.
         self._matrices = zs.declare_subscriber(key("matrix", server, worker=name), self.mailbox.put)
         self._token = zs.liveliness().declare_token(own)
+        self._again = Again()
         self._settled = float("inf")  # when it is too late for another of this name [s, monotonic]
         self._others = zs.declare_subscriber(key("worker", server, worker=name), self._heard)
         self._presence = Presence(zs, server, name, counters, self.mailbox.put, lambda: self._heartbeat.wake())
@@ -93,6 +95,7 @@ class Uplink:
 
     def follow(self, incarnation: int) -> None:
         """Work for this life of the server from now on; 0: for none. Tries its shared memory and says hello."""
+        self._again.stop()
         self.incarnation = self._presence.serving = 0
         self.slots.clear()
         self.shared_memory = False
@@ -103,6 +106,7 @@ class Uplink:
             self.shared_memory = not obstacle
             if obstacle and self._session.shared_memory:
                 self.counters.warn("no_shared_memory", f"arrays travel as bytes: {obstacle}")
+                self._again.ask(lambda: self._memory_works(incarnation), self._share_memory)
             self.incarnation = incarnation
             self._presence.serving = incarnation
             self._settled = min(self._settled, time.monotonic() + SETTLED)
@@ -111,6 +115,16 @@ class Uplink:
     def _beat(self) -> None:
         self._presence.look()
         self._say()
+
+    def _memory_works(self, incarnation: int) -> bool:
+        slots = SlotMap()
+        return not echo.obstacle(self._session.zenoh, self.server, incarnation, self.name, slots, timeout=1.0)
+
+    def _share_memory(self) -> None:
+        """What did not work when this life of the server was followed works now: it may have been busy."""
+        self.shared_memory = True
+        self.counters.warn("shared_memory_again", "shared memory works after all, arrays travel through it")
+        self._heartbeat.wake()
 
     def _say(self) -> None:
         if not self.incarnation:
@@ -178,6 +192,7 @@ class Uplink:
 
     def close(self) -> None:
         """End the heartbeat; the session is closed by its owner."""
+        self._again.close()
         self._heartbeat.close()
 
     def __enter__(self) -> Self:

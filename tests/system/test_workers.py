@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import zenoh
 from hand_worker import HandWorker
 from link_helpers import Driver, chain, dense, free_endpoint, light_worker, matrix, process, product
 
@@ -62,6 +63,29 @@ def test_a_worker_without_shared_memory_gets_bytes_and_that_is_said_once(caplog:
         assert (link.counters.bulk_shared, link.counters.bulk_copied) == (0, 12)
     warnings = [record.message for record in caplog.records if "arrays are copied" in record.message]
     assert len(warnings) == 1 and "worker one has no shared memory with us" in warnings[0]
+
+
+@shared
+def test_shared_memory_comes_back_after_a_server_that_was_too_busy_to_answer() -> None:
+    endpoint, asked = free_endpoint(), []
+    with ServerLink(listen=[endpoint]) as link:
+        answer = link._inquiries._echo
+
+        def busy(query: zenoh.Query) -> None:
+            asked.append(query)
+            if len(asked) > 2:
+                answer(query)
+
+        link._inquiries._echo = busy  # type: ignore[method-assign]
+        with light_worker(endpoint):
+            driver = Driver(link)
+            link.announce(BEAM)
+            check(driver, 1, 0.1)
+            assert not link.workers()[0].shared_memory and link.counters.bulk_shared == 0
+            driver.until(lambda: link.workers()[0].shared_memory, "the status to say so")
+            for step in range(2, 5):
+                check(driver, step, 0.1 * step)
+            assert link.counters.bulk_shared == 6 and len(asked) >= 4
 
 
 def test_a_server_without_shared_memory_sends_bytes() -> None:
