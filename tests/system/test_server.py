@@ -15,7 +15,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from clients.errors import BadInput
 from clients.log import Log
 from protocol import messages_pb2 as pb
-from tests.system.link_helpers import free_endpoint
+from tests.system.link_helpers import ROOT, free_endpoint
 from tests.system.server_process import Stage, alive, beam, fresh, run, until
 
 pytestmark = pytest.mark.system
@@ -69,6 +69,17 @@ def test_server_worker_client_and_log(stage: Stage, tmp_path: Path) -> None:
     assert (data["scalars/factor_age"][helped] >= 1).all()
     pushed = [step.step for step in logged(log, "/step/beam") if step.interactions]
     assert len(logged(log, "/interaction/beam")) == 1 and len(pushed) == 10, "0.2 s of push are ten steps"
+
+
+def test_a_healthy_run_says_nothing_alarming(stage: Stage) -> None:
+    """With `auto`, whose factors are of several methods and sizes."""
+    scene = ROOT / "deploy" / "scenes" / "beam.toml"
+    server = stage.server(scene, "--steps", "200", "--workers", "1", "--device", "cpu")
+    with stage.client() as client:
+        until(lambda: client.status().objects[0].factors_used > 5, "factors are taken up")
+    assert server.wait() == 0
+    alarming = ("a slot", "as bytes", "lease", "no factor", "refused", "counted from now on", "lost")
+    assert not [line for line in server.output().splitlines() if any(words in line for words in alarming)]
 
 
 def test_a_killed_worker_costs_no_step(stage: Stage, tmp_path: Path) -> None:
