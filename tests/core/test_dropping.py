@@ -143,3 +143,23 @@ def test_a_refused_factor_is_told() -> None:
     pattern = driver.inline._analysis("bar", driver.solver.method).pattern
     driver.adopt(Factor("bar", 1, 5, False, pattern, values, "w", 0.1, ""))
     assert source.told == [("no use", "w", "bar")]
+
+
+def test_a_loop_that_takes_the_next_one_later_goes_without_until_it_has(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on a GPU, where a factor is expanded beside the steps: solves would begin with the dropped one again."""
+    driver, source = run()
+    submit = source.submit
+    source.submit = lambda job: source.jobs == 0 and submit(job)
+    driver.advance(8)
+    track, settings = driver.tracks[0], driver.engine.settings(0)
+    dropped = track.newest
+    assert track.dropped == (dropped, Kind.CHOLESKY) and settings.kind == Kind.BLOCK_JACOBI
+    in_use = [dropped]
+    monkeypatch.setattr(driver.engine, "exact", False, raising=False)
+    monkeypatch.setattr(driver.engine, "factor_step", lambda body: in_use[0])
+    source.bad, source.submit = False, submit
+    records = driver.advance(6)
+    assert track.newest > dropped and (records["asked"] == Kind.BLOCK_JACOBI).all()
+    in_use[0] = track.newest
+    driver.advance(2)
+    assert track.dropped is None and settings.kind == Kind.CHOLESKY
