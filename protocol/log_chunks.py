@@ -22,14 +22,17 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Header, McapRecord, Message, Metadata
-from mcap.stream_reader import breakup_chunk
 from mcap.writer import MCAP0_MAGIC
 
 from protocol.channels import PROTOCOL
 
-RECORD_LIMIT = 1 << 30  # bytes of one record, compressed or not
+RECORD_LIMIT = 1 << 29  # bytes of one record, compressed or not; a mesh has half of it at most, on the wire
+CHUNK_RECORDS = 1 << 18  # of one chunk; ten times what fits into the 1 MiB that a recorder fills
+PIECE = 1 << 20  # bytes that are unpacked at a time
+_HEAD, _MESSAGE = struct.Struct("<BQ"), struct.Struct("<HIQQ")
+_READ = (Opcode.CHANNEL, Opcode.MESSAGE)
 PROFILE = "warpfactor"
-BROKEN = (McapError, struct.error, UnicodeDecodeError, ValueError, RuntimeError, zstandard.ZstdError)
+BROKEN = (McapError, struct.error, UnicodeDecodeError, ValueError, RuntimeError, EOFError, zstandard.ZstdError)
 
 
 class BadLog(ValueError):
@@ -139,17 +142,48 @@ def _unpack(chunk: Chunk) -> list[McapRecord]:
     size = chunk.uncompressed_size
     if size > RECORD_LIMIT:
         raise ValueError(f"a chunk of {size} bytes, at most {RECORD_LIMIT} are read")
-    if chunk.compression == "lz4":
-        data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
-    elif chunk.compression == "zstd":
-        data = zstandard.ZstdDecompressor().stream_reader(chunk.data).read(size + 1)
-    elif chunk.compression == "":
-        data = chunk.data
-    else:
-        raise ValueError(f"compression {chunk.compression!r} is not known")
+    data, at = bytearray(), 0
+    places: list[tuple[int, int, int]] = []  # type, first byte and length of each record
+    for piece in _pieces(chunk):  # looked at as they come, so that what is no chunk is never unpacked to its end
+        data += piece
+        if len(data) > size:
+            break
+        while at + _HEAD.size <= len(data):
+            opcode, length = _HEAD.unpack_from(data, at)
+            if opcode == 0 or at + _HEAD.size + length > size or len(places) == CHUNK_RECORDS:
+                raise ValueError(f"no records from byte {at} of a chunk on")
+            at += _HEAD.size
+            places.append((opcode, at, length))
+            at += length
     if len(data) != size:
         raise ValueError(f"{len(data)} bytes instead of {size}")
+    if at != size:
+        raise ValueError(f"no records from byte {at} of a chunk on")
     if chunk.uncompressed_crc not in (0, zlib.crc32(data)):
         raise ValueError("wrong checksum")
-    plain = Chunk("", data, chunk.message_end_time, chunk.message_start_time, 0, size)
-    return [record for record in breakup_chunk(plain) if isinstance(record, Channel | Message)]
+    return [_record(opcode, bytes(data[b : b + n])) for opcode, b, n in places if opcode in _READ]
+
+
+def _pieces(chunk: Chunk) -> Iterator[bytes]:
+    """The content of a chunk, PIECE bytes at a time, up to one byte more than it says."""
+    size = chunk.uncompressed_size
+    if chunk.compression == "":
+        yield chunk.data
+        return
+    if chunk.compression == "lz4":
+        stream = lz4.frame.LZ4FrameFile(BytesIO(chunk.data))
+    elif chunk.compression == "zstd":
+        stream = zstandard.ZstdDecompressor().stream_reader(chunk.data)
+    else:
+        raise ValueError(f"compression {chunk.compression!r} is not known")
+    done = 0
+    while done <= size and (piece := stream.read(min(PIECE, size + 1 - done))):
+        done += len(piece)
+        yield piece
+
+
+def _record(opcode: int, body: bytes) -> McapRecord:
+    if opcode == Opcode.CHANNEL:
+        return Channel.read(ReadDataStream(BytesIO(body)))
+    channel, sequence, log_time, publish_time = _MESSAGE.unpack_from(body)
+    return Message(channel, log_time, body[_MESSAGE.size :], publish_time, sequence)

@@ -125,7 +125,9 @@ class Recording:
             self._keep_of_object(topic, offset, number, record)
 
     def _keep_of_object(self, topic: str, offset: int, number: int, record: McapMessage) -> None:
-        _, kind, name = topic.split("/", 2)
+        _, kind, name = [*topic.split("/", 2), "", ""][:3]
+        if kind not in ("topology", "state", "interaction", "factor", "step") or not name:
+            raise Refused("a message of an unknown channel")
         found = self.objects.setdefault(name, Recorded())
         if kind == "topology":
             found.topology = pb.Topology.FromString(record.data)

@@ -30,7 +30,8 @@ def apply(override: str, table: dict[str, Any]) -> None:
         if not isinstance(below, dict):
             raise InputError(f"{'.'.join(parents[: depth + 1])} = {below!r} is no table, so it has no keys")
         place = below
-    given, there = value(text.strip()), place.get(last)
+    given = value(text.strip())
+    there: Any = place.get(last)
     if _tables(there) and not _tables(given):
         raise InputError(
             f"{last} is a list of {len(there)} regions in the scene, which one value would take the place of; allowed: "

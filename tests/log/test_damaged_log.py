@@ -4,13 +4,16 @@
 from __future__ import annotations
 
 import struct
+import tracemalloc
 import zlib
 from pathlib import Path
+from typing import Any
 
 import lz4.frame  # type: ignore[import-untyped]
 import numpy as np
 import pytest
 import zstandard
+from mcap.data_stream import RecordBuilder
 from mcap.records import Chunk
 from mcap.writer import Writer
 
@@ -168,6 +171,36 @@ def test_a_chunk_that_unpacks_to_more_than_it_says(compression: str) -> None:
     bomb.uncompressed_size = log_chunks.RECORD_LIMIT + 1
     with pytest.raises(ValueError, match="at most"):
         log_chunks._unpack(bomb)
+
+
+@pytest.mark.parametrize("compression", ["lz4", "zstd"])
+@pytest.mark.parametrize("content", ["zeros", "many empty records", "a record beyond the end"])
+def test_what_holds_no_records_is_not_unpacked_to_its_end(compression: str, content: str, tmp_path: Path) -> None:
+    """A chunk of 128 MiB in some kB: refused after its first part, the rest of the log is read."""
+    size = 1 << 27
+    first = {
+        "zeros": b"",
+        "many empty records": (b"\x03" + bytes(8)) * (log_chunks.CHUNK_RECORDS + 1),
+        "a record beyond the end": b"\x05" + struct.pack("<Q", 1 << 40),
+    }[content]
+    compressor: Any = lz4.frame.LZ4FrameCompressor() if compression == "lz4" else zstandard.ZstdCompressor().compressobj()
+    packed = compressor.begin() if compression == "lz4" else b""
+    for piece in (first, *[bytes(1 << 22)] * 32):
+        packed += compressor.compress(piece[: size - len(first)] if piece is not first else piece)
+    bomb = Chunk(compression, packed + compressor.flush(), 0, 0, 0, size + len(first))
+    builder = RecordBuilder()
+    bomb.write(builder)
+    good = record(tmp_path / "good.mcap", 3).read_bytes()
+    end = good.index(b"\x0f" + struct.pack("<Q", 4))  # DATA_END
+    path = tmp_path / "bomb.mcap"
+    path.write_bytes(good[:end] + builder.end() + good[end:])
+    tracemalloc.start()
+    with Log(path) as log:
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert [frame.step for frame in log.frames("beam")] == [0, 1, 2, 3]
+        assert len(log.notes) == 1 and "is damaged and left out (no records from byte" in log.notes[0]
+    assert peak < 48 << 20
 
 
 def test_dropped_frames_are_told(tmp_path: Path) -> None:
