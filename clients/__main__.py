@@ -3,9 +3,17 @@
 
 from __future__ import annotations
 
+import os
+import signal
+
+# Until main() has set its own: end at once, also in the middle of an import, without a traceback. What a parent lets
+# its children ignore stays ignored.
+if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    signal.signal(signal.SIGINT, lambda *_: os._exit(130))
+signal.signal(signal.SIGTERM, lambda *_: os._exit(143))
+
 import contextlib
 import json
-import signal
 import sys
 import time
 from collections.abc import Iterator
@@ -19,6 +27,8 @@ from clients.errors import BadInput, ClientError
 from clients.point_option import AT_HELP, PointCommand, point
 from protocol.channels import DEFAULT_ENDPOINT, SERVER_NAME
 from protocol.endpoints import CONNECT
+from protocol.exhausted import exhausted
+from protocol.interrupted import handle, leave
 from protocol.limits import ORPHANED_PUSH
 from protocol.printable import printable
 
@@ -447,7 +457,15 @@ def _opened(path: Path) -> Iterator:
 
 def main() -> None:
     """Exit codes: 0 done, 2 bad input, 1 anything else, 130 on Ctrl-C."""
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that viewers and sessions are closed
+    interrupted = False
+
+    def interrupt(*_: object) -> None:
+        nonlocal interrupted
+        interrupted = True
+        raise KeyboardInterrupt
+
+    handle(signal.SIGINT, interrupt)
+    handle(signal.SIGTERM, lambda *_: sys.exit(143))  # so that viewers and sessions are closed
     try:
         app(prog_name="sim-client")
     except BadInput as error:
@@ -456,8 +474,13 @@ def main() -> None:
     except ClientError as error:
         print(f"sim-client: {printable(str(error))}", file=sys.stderr)
         sys.exit(1)
-    except KeyboardInterrupt:
-        sys.exit(130)
+    except BaseException as error:
+        if interrupted:  # whatever became of it, an import that fails for instance
+            leave()
+        if not (text := exhausted(error)):
+            raise
+        print(f"sim-client: {text}", file=sys.stderr)
+        sys.exit(1)
 
 
 if __name__ == "__main__":

@@ -79,17 +79,21 @@ def show_log(log: Log, recording: rr.RecordingStream, coloring: Coloring) -> Non
 
 
 def save_rrd(log: Log, to: Path, coloring: Coloring) -> None:
-    """Writes the log as a file of the rerun viewer. Raises ClientError."""
+    """Writes the log as a file of the rerun viewer. Raises ClientError.
+
+    The file is written here, at once: where rerun writes it and the disk is full, it ends with a short file, or never.
+    """
     recording = _recording()
+    stream = recording.binary_stream()
     try:
         with written_whole(to) as part:
-            part.touch()  # rerun tells of a bad path only in its own log
-            recording.save(part)
+            part.touch()  # a bad path is told before the work
             show_log(log, recording, coloring)
-            recording.flush()
-            recording.disconnect()
+            part.write_bytes(stream.read() or b"")
     except OSError as error:
         raise ClientError(f"{to}: cannot be written: {error.strerror or error}") from None
+    finally:
+        recording.disconnect()
 
 
 def save_screenshot(log: Log, to: Path, coloring: Coloring) -> None:

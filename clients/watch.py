@@ -49,6 +49,8 @@ def _summary(status: pb.Status) -> Text:
         f"arrays through shared memory {status.bulk_shared}, "
         f"as bytes {status.bulk_copied}; clients {len(status.clients)}",
     ]
+    if status.recording_failure:
+        lines.append(f"no log any more: {status.recording_failure}")
     return Text("\n".join(lines))
 
 

@@ -83,7 +83,6 @@ def work(
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ[variable] = str(threads)
     logging.basicConfig(level=logging.INFO if verbose else logging.WARNING, format="%(name)s: %(message)s")
-    signal.signal(signal.SIGTERM, _terminate)
     end_with_any_thread()
     try:
         if exit_with_parent:
@@ -106,6 +105,14 @@ def work(
         if why := exhaustion(error):
             end_now(why)
         raise
+
+
+def _end_in_order() -> None:
+    """From now on Ctrl-C and SIGTERM close what is open; before, they end the program at once (__main__.py)."""
+    from protocol.interrupted import handle
+
+    handle(signal.SIGINT, signal.default_int_handler)
+    handle(signal.SIGTERM, _terminate)
 
 
 def _terminate(*_: object) -> None:
@@ -152,6 +159,7 @@ def _serve(connect: list[str], threads: int, name: str, servers: list[str], shar
     from protocol.counters import Counters
     from protocol.session import Session
 
+    _end_in_order()
     try:
         check_name(name, "--name")
         where = places(servers, connect)
@@ -200,4 +208,18 @@ def _bad_input(text: str) -> NoReturn:
 
 def main() -> None:
     """Entry point of the console script."""
-    app(prog_name="precond-worker")
+    try:
+        app(prog_name="precond-worker")
+    except SystemExit as ended:
+        if ended.code == 130:
+            from protocol.interrupted import leave
+
+            leave()
+        raise
+    except BaseException as error:
+        from protocol.exhausted import exhausted
+
+        if not (text := exhausted(error)):
+            raise
+        print(f"precond-worker: {text}", file=sys.stderr)
+        sys.exit(1)

@@ -29,8 +29,11 @@ def obstacle(pools: int = POOL_LIMIT) -> str:
     """Why shared memory pools of so many bytes cannot be used here; empty if they can."""
     if not os.access(SHM, os.W_OK | os.X_OK):
         return f"{SHM} is not writable"
-    limit, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
     needed = pools + METADATA
+    longest, _ = resource.getrlimit(resource.RLIMIT_FSIZE)  # it binds segments of shared memory, which are files
+    if longest != resource.RLIM_INFINITY and longest < needed:
+        return f"files may have {longest >> 10} KiB, {needed >> 10} KiB are needed (raise it with ulimit -f)"
+    limit, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
     if limit != resource.RLIM_INFINITY and limit < needed and not may_lock_anything():
         return f"the locked-memory limit is {limit >> 10} KiB, {needed >> 10} KiB are needed (raise it with ulimit -l)"
     return ""

@@ -185,8 +185,8 @@ class Session:
         close() waits for it: a thread found inside zenoh when the interpreter ends aborts the process.
         """
         thread = threading.Thread(target=run, name=name, daemon=True)
-        self._threads.append(thread)
         thread.start()
+        self._threads.append(thread)
 
     def close(self) -> None:
         """Close the session and wait for its threads; a second call does nothing."""

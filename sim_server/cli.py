@@ -83,12 +83,13 @@ def serve(
     """Simulate the objects of a scene, helped by preconditioner workers, open to clients."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     logging.basicConfig(level=logging.ERROR if quiet else logging.WARNING, format="sim-server: %(message)s")
-    signal.signal(signal.SIGTERM, _terminate)
     if device not in ("auto", "cpu", "gpu"):
         _bad_input(f"--device {device}: allowed are auto, cpu, gpu")
     if worker_device not in ("auto", "cpu", "gpu"):
         _bad_input(f"--worker-device {worker_device}: allowed are auto, cpu, gpu")
     say = (lambda text: None) if quiet else (lambda text: print(f"sim-server: {text}", flush=True))
+    service: Service | None = None
+    code = 0
     try:
         options = Options(
             scene, set_ or [], chosen(device, say), name, listen, connect, not no_shared_memory, record, steps,
@@ -107,12 +108,16 @@ def serve(
     except NameTaken as error:
         _bad_input(str(error))
     except KeyboardInterrupt:
-        raise typer.Exit(130) from None
+        code = 130
     except Terminated:
-        raise typer.Exit(0) from None
+        pass
     except DeviceLost as error:
         print(f"sim-server: {error}", file=sys.stderr)
-        raise typer.Exit(1) from None
+        code = 1
+    if service is not None and service.recorder is not None and service.recorder.failure:
+        print(f"sim-server: exit code 1: the log {record} ends before the run does", file=sys.stderr)
+        code = 1
+    raise typer.Exit(code)
 
 
 def chosen(device: str, say: Callable[[str], None]) -> str:
@@ -163,6 +168,7 @@ def _set_up(closing: ExitStack, o: Options) -> "tuple[Service, Supervisor | None
     from sim_server.simulation import Simulation
     from sim_server.supervisor import Supervisor
 
+    _end_in_order()
     try:
         simulation = Simulation.load(o.scene, o.overrides, o.device)
         link = closing.enter_context(ServerLink(o.name, o.listen, o.connect, shared_memory=o.shared_memory))
@@ -271,6 +277,14 @@ def _unconverged(service: "Service") -> str:
     return f"{sum(counts.values())} of {service.telemetry.solves} solves not converged ({why})"
 
 
+def _end_in_order() -> None:
+    """From now on Ctrl-C and SIGTERM close what is open; before, they end the program at once (__main__.py)."""
+    from protocol.interrupted import handle
+
+    handle(signal.SIGINT, signal.default_int_handler)
+    handle(signal.SIGTERM, _terminate)
+
+
 def _terminate(*_: object) -> None:
     raise Terminated
 
@@ -282,4 +296,18 @@ def _bad_input(text: str) -> NoReturn:
 
 def main() -> None:
     """Entry point of the console script."""
-    app(prog_name="sim-server")
+    try:
+        app(prog_name="sim-server")
+    except SystemExit as ended:
+        if ended.code == 130:
+            from protocol.interrupted import leave
+
+            leave()
+        raise
+    except BaseException as error:
+        from protocol.exhausted import exhausted
+
+        if not (text := exhausted(error)):
+            raise
+        print(f"sim-server: {text}", file=sys.stderr)
+        sys.exit(1)

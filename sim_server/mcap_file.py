@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import contextlib
+import errno
+import os
 from pathlib import Path
 
 from google.protobuf.message import Message
@@ -31,6 +33,7 @@ class McapFile:
             raise InputError(f"{path}: the file exists: remove it or choose another name for the log") from None
         except OSError as error:
             raise InputError(f"{path}: a log cannot be written there: {error.strerror}") from None
+        self._linked = os.fstat(self._stream.fileno()).st_nlink > 0  # there are file systems that do not count
         self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES, compression=COMPRESSIONS[compression])
         self._schemas: dict[type[Message], int] = {}
         self._channels: dict[str, int] = {}
@@ -47,19 +50,26 @@ class McapFile:
         self._writer.add_message(channel, log_time, data, publish_time, sequence)
 
     def flush(self) -> None:
-        """Ends the chunk in progress and hands everything to the operating system."""
+        """Ends the chunk in progress and hands everything to the operating system. Raises OSError."""
         self._writer.flush()
+        self._check_there()
 
     def finish(self, notes: dict[str, str]) -> None:
-        """Writes `notes` and the index, and closes."""
+        """Writes `notes` and the index, and closes. Raises OSError."""
         self._writer.add_metadata("recorder", notes)
         self._writer.finish()
+        self._check_there()
         self._stream.close()
 
     def abandon(self) -> None:
         """Closes without index after an error; what was flushed stays readable."""
         with contextlib.suppress(OSError, ValueError):
             self._stream.close()
+
+    def _check_there(self) -> None:
+        """Raises OSError if the file was removed: what is written to it is on no disk once it is closed."""
+        if self._linked and os.fstat(self._stream.fileno()).st_nlink == 0:
+            raise OSError(errno.ENOENT, "the file was removed or replaced")
 
     def _register(self, topic: str, kind: type[Message]) -> int:
         if kind not in self._schemas:

@@ -49,8 +49,8 @@ class Recorder:
 
     Feeding never waits unless asked to (`block=True`, for runs faster than real time). While more than FRAME_BYTES
     wait for the disk, states are dropped and counted in `dropped`; everything else is kept up to TOTAL_BYTES and
-    counted in `lost` beyond that. Both numbers are written at the end of the file. A disk error stops the
-    recording, is told once through `report` and kept in `failure`; feeding is then a no-op.
+    counted in `lost` beyond that. Both numbers are written at the end of the file. A disk error, or the file's
+    removal, stops the recording, is told once through `report` and kept in `failure`; feeding is then a no-op.
 
     Raises InputError if the file cannot be created, if it is there already and not to be overwritten, or for an
     unknown compression.
@@ -160,7 +160,8 @@ class Recorder:
         except Exception as error:  # whatever it is, the simulation goes on
             self._file.abandon()
             with self._changed:
-                self.failure = f"{self.path}: recording stopped after {self.written} records: {error}"
+                why = getattr(error, "strerror", None) or error
+                self.failure = f"{self.path}: recording stopped after {self.written} records: {why}"
                 self._waiting.clear()
                 self._changed.notify_all()
             self._report(self.failure)

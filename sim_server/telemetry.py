@@ -181,6 +181,7 @@ class Telemetry:
         dropped = loop.frames_dropped + (self.recorder.dropped if self.recorder else 0)
         status.frames_dropped, status.records_dropped = dropped, loop.records_dropped
         status.records_lost = self.recorder.lost if self.recorder else 0
+        status.recording_failure = self.recorder.failure[:400] if self.recorder else ""
         bound = self.driver.age_bound()
         for track in self.driver.tracks:
             body, window = track.body, self._window[track.body.index]

@@ -24,7 +24,8 @@ def status(recorder: SimpleNamespace | None) -> pb.Status:
 
 
 def test_the_status_counts_what_the_loop_dropped_and_what_the_log_lost():
-    found = status(SimpleNamespace(dropped=3, lost=7))
+    found = status(SimpleNamespace(dropped=3, lost=7, failure="/x.mcap: No space left on device"))
+    assert found.recording_failure == "/x.mcap: No space left on device" and not status(None).recording_failure
     assert (found.records_dropped, found.records_lost, found.frames_dropped) == (5, 7, 2 + 3)
     assert status(None).records_lost == 0
 
@@ -33,6 +34,9 @@ def test_the_client_shows_these_numbers():
     text = io.StringIO()
     Console(width=200, file=text).print(tables(pb.Status(frames_dropped=4, records_dropped=51, records_lost=62)))
     assert "dropped: frames 4, step records 51; lost to the log 62" in text.getvalue()
+    assert "no log any more" not in text.getvalue()
+    Console(width=200, file=text).print(tables(pb.Status(recording_failure="/x.mcap: No space left on device")))
+    assert "no log any more: /x.mcap: No space left on device" in text.getvalue()
 
 
 def test_the_client_shows_the_workers_that_the_server_supervises():

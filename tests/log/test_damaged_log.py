@@ -183,7 +183,8 @@ def test_what_holds_no_records_is_not_unpacked_to_its_end(compression: str, cont
         "many empty records": (b"\x03" + bytes(8)) * (log_chunks.CHUNK_RECORDS + 1),
         "a record beyond the end": b"\x05" + struct.pack("<Q", 1 << 40),
     }[content]
-    compressor: Any = lz4.frame.LZ4FrameCompressor() if compression == "lz4" else zstandard.ZstdCompressor().compressobj()
+    made = {"lz4": lz4.frame.LZ4FrameCompressor, "zstd": zstandard.ZstdCompressor().compressobj}
+    compressor: Any = made[compression]()
     packed = compressor.begin() if compression == "lz4" else b""
     for piece in (first, *[bytes(1 << 22)] * 32):
         packed += compressor.compress(piece[: size - len(first)] if piece is not first else piece)

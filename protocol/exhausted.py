@@ -1,0 +1,19 @@
+# SPDX-License-Identifier: MIT
+"""What a process ran out of, in a sentence instead of a traceback."""
+
+import errno
+
+FULL = (errno.ENOMEM, errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EMFILE, errno.ENFILE, errno.EAGAIN)
+
+
+def exhausted(error: BaseException) -> str:
+    """Memory, threads, files or disk: which of them ended a program; "" if it was something else."""
+    if isinstance(error, MemoryError):
+        return "out of memory"
+    if isinstance(error, OSError) and error.errno in FULL:
+        return f"{error.filename}: {error.strerror}" if error.filename else str(error.strerror)
+    if isinstance(error, RuntimeError) and "start new thread" in str(error):
+        return "no more threads can be started: memory or the number of threads is limited (ulimit -v, -u)"
+    if type(error).__name__ == "PanicException":  # of a library in Rust; the class has no name to import
+        return f"zenoh cannot go on: {' '.join(str(error).split())[:300]}"
+    return ""
