@@ -1,4 +1,5 @@
 # SPDX-License-Identifier: MIT
+# ruff: noqa: E402 (signals are looked after before anything else is imported)
 """The command sim-client."""
 
 from __future__ import annotations

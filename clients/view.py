@@ -84,7 +84,9 @@ def save_rrd(log: Log, to: Path, coloring: Coloring) -> None:
     The file is written here, at once: where rerun writes it and the disk is full, it ends with a short file, or never.
     """
     recording = _recording()
-    stream = recording.binary_stream()
+    import rerun as rr
+
+    stream = rr.binary_stream(recording)
     try:
         with written_whole(to) as part:
             part.touch()  # a bad path is told before the work

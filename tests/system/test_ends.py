@@ -63,8 +63,8 @@ def test_too_little_memory_is_one_line(tmp_path: Path) -> None:
 def test_a_full_disk_is_told_and_the_exit_code_is_1(pace: str, tmp_path: Path) -> None:
     """Files of 10 kB at most stand for it; the run itself goes on to its end."""
     scene, log = beam(tmp_path), tmp_path / "run.mcap"
-    arguments = (str(scene), "--listen", free_endpoint(), "--device", "cpu", "--steps", "60", pace, "--record", str(log))
-    done = ended("short_of.py", "RLIMIT_FSIZE", "10000", "sim_server", *arguments)
+    arguments = (str(scene), "--listen", free_endpoint(), "--device", "cpu", "--steps", "60", pace)
+    done = ended("short_of.py", "RLIMIT_FSIZE", "10000", "sim_server", *arguments, "--record", str(log))
     assert done.returncode == 1 and "Traceback" not in done.stderr, done.stderr
     assert "shared memory is off, arrays travel as bytes: files may have 9 KiB" in done.stderr
     assert done.stderr.count("recording stopped after") == 1 and "File too large" in done.stderr
@@ -99,7 +99,8 @@ def test_a_picture_file_on_a_full_disk_is_one_line(tmp_path: Path) -> None:
     with Log(log) as opened:
         assert opened.complete
     for limit in ("1000", "30000"):
-        done = ended("short_of.py", "RLIMIT_FSIZE", limit, "clients", "view", str(log), "--save", str(tmp_path / "x.rrd"))
+        picture = ("view", str(log), "--save", str(tmp_path / "x.rrd"))
+        done = ended("short_of.py", "RLIMIT_FSIZE", limit, "clients", *picture)
         assert done.returncode == 1
         assert done.stderr == f"sim-client: {tmp_path / 'x.rrd'}: cannot be written: File too large\n"
         assert sorted(p.name for p in tmp_path.iterdir()) == ["run.mcap"]
