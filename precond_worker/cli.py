@@ -11,8 +11,9 @@ from typing import Annotated, NoReturn
 
 import typer
 
-from precond_worker.ending import end_now, end_with_any_thread, exhaustion
+from precond_worker.ending import end_now, end_with_any_thread
 from precond_worker.errors import DeviceUnusable, NameTaken
+from protocol.exhausted import exhausted
 from protocol.nvidia import nvidia_device
 
 app = typer.Typer(pretty_exceptions_enable=False, rich_markup_mode=None)
@@ -102,7 +103,7 @@ def work(
     except Terminated:
         raise typer.Exit(0) from None
     except BaseException as error:
-        if why := exhaustion(error):
+        if why := exhausted(error):
             end_now(why)
         raise
 
@@ -217,8 +218,6 @@ def main() -> None:
             leave()
         raise
     except BaseException as error:
-        from protocol.exhausted import exhausted
-
         if not (text := exhausted(error)):
             raise
         print(f"precond-worker: {text}", file=sys.stderr)

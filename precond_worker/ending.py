@@ -1,27 +1,12 @@
 # SPDX-License-Identifier: MIT
 """A worker ends as a whole, with one line and code 1: one that has lost a thread looks alive and does nothing."""
 
-import errno
 import os
 import sys
 import threading
 from typing import Any, NoReturn
 
-UNLOADED = ("failed to map segment", "cannot allocate memory")  # of a library, as the loader says it
-
-
-def exhaustion(error: BaseException) -> str:
-    """What the machine, or a limit on this process, had no more of; empty if that is not what failed."""
-    if isinstance(error, MemoryError):
-        return f"out of memory{f': {error}' if str(error) else ''}"
-    no_memory = isinstance(error, OSError) and error.errno == errno.ENOMEM
-    if no_memory or (isinstance(error, ImportError) and any(words in str(error).lower() for words in UNLOADED)):
-        return f"out of memory: {error}"
-    if isinstance(error, RuntimeError) and "can't start new thread" in str(error):
-        return "out of memory or threads: can't start another thread"
-    if type(error).__name__ == "PanicException":  # of zenoh, which is written in Rust
-        return f"out of memory or threads, or a fault of zenoh: {error}"
-    return ""
+from protocol.exhausted import exhausted
 
 
 def end_with_any_thread() -> None:
@@ -34,13 +19,13 @@ def _thread_failed(failure: threading.ExceptHookArgs) -> None:
     if failure.exc_value is None or issubclass(failure.exc_type, SystemExit):
         return
     name = failure.thread.name if failure.thread is not None else "of an unknown name"
-    why = exhaustion(failure.exc_value) or f"{failure.exc_type.__name__}: {failure.exc_value}"
+    why = exhausted(failure.exc_value) or f"{failure.exc_type.__name__}: {failure.exc_value}"
     end_now(f"thread {name} failed: {why}")
 
 
 def _unraisable(failure: Any) -> None:
-    if failure.exc_value is not None and exhaustion(failure.exc_value):
-        end_now(exhaustion(failure.exc_value))
+    if failure.exc_value is not None and exhausted(failure.exc_value):
+        end_now(exhausted(failure.exc_value))
     sys.__unraisablehook__(failure)
 
 

@@ -11,7 +11,6 @@ import zenoh
 from numpy.typing import NDArray
 
 from precond_worker.builders import Builders
-from precond_worker.ending import exhaustion
 from precond_worker.errors import DeviceUnusable, NameTaken
 from precond_worker.job import Job, accept
 from precond_worker.methods import Factorization
@@ -19,6 +18,7 @@ from precond_worker.presence import ServerGone, ServersThere
 from precond_worker.uplink import Uplink
 from protocol import FactorPattern
 from protocol.check import array, checksum
+from protocol.exhausted import exhausted
 from protocol.messages_pb2 import Factor
 from protocol.method import Method
 from protocol.refused import Refused
@@ -129,7 +129,7 @@ class Worker:
         except zenoh.ZError as error:
             self._counters.trouble("unsent", f"a factor was not sent: {error}")
         except Exception as error:
-            if why := exhaustion(error):  # a library half loaded stays so: another process may have more luck
+            if why := exhausted(error):  # a library half loaded stays so: another process may have more luck
                 self._answer(job, failure=why)
                 raise
             log.exception("factorization of %s failed", job.object)

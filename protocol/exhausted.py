@@ -3,13 +3,16 @@
 
 import errno
 
+UNLOADED = ("failed to map segment", "cannot allocate memory")  # of a library, as the loader says it
 FULL = (errno.ENOMEM, errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EMFILE, errno.ENFILE, errno.EAGAIN)
 
 
 def exhausted(error: BaseException) -> str:
     """Memory, threads, files or disk: which of them ended a program; "" if it was something else."""
     if isinstance(error, MemoryError):
-        return "out of memory"
+        return f"out of memory{f': {error}' if str(error) else ''}"
+    if isinstance(error, ImportError) and any(words in str(error).lower() for words in UNLOADED):
+        return f"out of memory: {error}"
     if isinstance(error, OSError) and error.errno in FULL:
         return f"{error.filename}: {error.strerror}" if error.filename else str(error.strerror)
     if isinstance(error, RuntimeError) and "start new thread" in str(error):

@@ -32,7 +32,9 @@ PIECE = 1 << 20  # bytes that are unpacked at a time
 _HEAD, _MESSAGE = struct.Struct("<BQ"), struct.Struct("<HIQQ")
 _READ = (Opcode.CHANNEL, Opcode.MESSAGE)
 PROFILE = "warpfactor"
-BROKEN = (McapError, struct.error, UnicodeDecodeError, ValueError, RuntimeError, EOFError, zstandard.ZstdError)
+BROKEN = (
+    McapError, struct.error, UnicodeDecodeError, ValueError, RuntimeError, EOFError, OverflowError, zstandard.ZstdError,
+)  # fmt: skip
 
 
 class BadLog(ValueError):
@@ -53,6 +55,7 @@ class ChunkFile:
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     problems: list[str] = field(default_factory=list)
     complete: bool = False  # the end mark was seen: the writer closed the file
+    announced: int | None = None  # messages that the writer counted, where the file has its number
 
     @classmethod
     def open(cls, path: Path) -> ChunkFile:
@@ -74,6 +77,7 @@ class ChunkFile:
 
     def scan(self, progress: Callable[[int], None] = lambda _: None) -> Iterator[tuple[int, list[McapRecord]]]:
         """Yields (byte offset, records) of every readable chunk in file order; `progress` gets the offset reached."""
+        messages = 0
         for offset, opcode, body in self._records():
             progress(offset)
             try:
@@ -83,10 +87,13 @@ class ChunkFile:
                     record = Metadata.read(body)
                     self.metadata[record.name] = record.metadata
                 elif opcode == Opcode.CHUNK:
-                    chunk = Chunk.read(body)
-                    yield offset, _unpack(chunk)
+                    records = _unpack(Chunk.read(body))
+                    messages += sum(isinstance(record, Message) for record in records)
+                    yield offset, records
             except BROKEN as error:
                 self.problems.append(f"the block at byte {offset} is damaged and left out ({error})")
+        if not self.problems and self.announced not in (None, messages):
+            self.problems.append(f"{messages} messages were found, {self.announced} written: a block is damaged")
         progress(self.size)
 
     def check_origin(self) -> None:
@@ -116,6 +123,18 @@ class ChunkFile:
         _, length = struct.unpack("<BQ", self.stream.read(9))
         return _unpack(Chunk.read(ReadDataStream(BytesIO(self.stream.read(length)))))
 
+    def _statistics(self, offset: int) -> int | None:
+        """The number of messages in the summary that begins at `offset`, None without one."""
+        while offset + _HEAD.size <= self.size:
+            self.stream.seek(offset)
+            opcode, length = _HEAD.unpack(self.stream.read(_HEAD.size))
+            if opcode == Opcode.STATISTICS and length >= 8 and offset + _HEAD.size + 8 <= self.size:
+                return int.from_bytes(self.stream.read(8), "little")
+            if opcode in (0, Opcode.FOOTER) or length > RECORD_LIMIT:
+                return None
+            offset += _HEAD.size + length
+        return None
+
     def _records(self) -> Iterator[tuple[int, int, ReadDataStream]]:
         offset = len(MCAP0_MAGIC)
         while offset + 9 <= self.size:
@@ -123,6 +142,7 @@ class ChunkFile:
             opcode, length = struct.unpack("<BQ", self.stream.read(9))
             if opcode == Opcode.DATA_END:
                 self.complete = True
+                self.announced = self._statistics(offset + 9 + length)
                 return
             if opcode == 0 or length > RECORD_LIMIT:
                 self.problems.append(f"damaged at byte {offset}: nothing after that is read")

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from link_helpers import Driver, chain, free_endpoint, process
 
+from protocol.exhausted import exhausted
 from sim_server.network.link import ServerLink
 
 pytestmark = pytest.mark.system
@@ -18,7 +19,7 @@ SCRIPT = str(Path(__file__).parent / "failing_worker.py")
 @pytest.mark.parametrize(
     ("where", "line"),
     [
-        ("heartbeat", "thread heartbeat failed: out of memory or threads: can't start another thread; the worker ends"),
+        ("heartbeat", f"thread heartbeat failed: {exhausted(RuntimeError('start new thread'))}; the worker ends"),
         ("take_in", "out of memory; the worker ends"),
         ("loading", "out of memory: /lib/x.so: failed to map segment from shared object; the worker ends"),
     ],
