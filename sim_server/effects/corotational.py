@@ -49,6 +49,7 @@ from pydantic import Field, model_validator
 from sim_server.backend import Launch
 from sim_server.effect import Effect
 from sim_server.errors import InputError
+from sim_server.scene.integrator_options import Integrator
 from sim_server.scene.parameters import complaint
 from sim_server.scene.regions import Poisson, Regional, Young, region_values
 from sim_server.system import Stencil, System
@@ -63,13 +64,30 @@ class Params(Regional):
         default=None, description="Poisson's ratio [-], of every element whose region gives none"
     )
     rotation: Literal["polar", "qr"] = Field(default="polar", description="of the elements")
-    tangent: Literal["usual", "exact"] = Field(default="usual", description="whether it knows how rotations change")
+    tangent: Literal["usual", "exact"] | None = Field(
+        default=None,
+        description="whether it knows how rotations change; default: usual, or exact where the integrator needs it",
+    )
 
     @model_validator(mode="after")
     def _exact_is_polar(self) -> "Params":
         if self.tangent == "exact" and self.rotation != "polar":
             raise complaint('tangent = "exact" needs rotation = "polar": forces by qr have no energy to differentiate')
         return self
+
+    def under(self, integrator: Integrator) -> "Params":
+        """With the tangent filled in. Raises an error of validation for one with which the energy would grow."""
+        if integrator.needs_stiff_matrix and (self.tangent == "usual" or self.rotation == "qr"):
+            given, instead = ('rotation = "qr"', 'rotation = "polar"') if self.rotation == "qr" else (
+                'tangent = "usual"', 'tangent = "exact" (the default here)')  # fmt: skip
+            raise complaint(
+                f"{given} with integrator.scheme = {integrator.scheme!r} and linearizations = 1 gains energy without "
+                f"bound: under tension its matrix is softer than the forces are; write {instead}, or "
+                "integrator.linearizations = 2 or more"
+            )
+        if self.tangent is not None:
+            return self
+        return self.model_copy(update={"tangent": "exact" if integrator.needs_stiff_matrix else "usual"})
 
     @property
     def variant(self) -> str:

@@ -39,6 +39,11 @@ class Integrator(Parameters):
         return self
 
     @property
+    def needs_stiff_matrix(self) -> bool:
+        """The energy grows unless the stiffness in A is at least the slope of the forces (integrator.py)."""
+        return self.scheme in ("newmark", "bdf2") and self.linearizations == 1
+
+    @property
     def newmark(self) -> tuple[float, float]:
         """beta and gamma [-]."""
         return (0.25 if self.beta is None else self.beta, 0.5 if self.gamma is None else self.gamma)

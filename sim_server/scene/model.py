@@ -13,9 +13,11 @@ from pydantic import (
     PlainSerializer,
     PlainValidator,
     PrivateAttr,
+    ValidationError,
     ValidationInfo,
     model_validator,
 )
+from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from protocol.channels import check_name
 from protocol.refused import Refused
@@ -161,6 +163,21 @@ class Scene(Parameters):
                 f"solver.budget = {self.solver.budget:g} with integrator.linearizations = "
                 f"{self.integrator.linearizations}: a budget is for one solve a step; allowed: one of the two"
             )
+        return self
+
+    @model_validator(mode="after")
+    def _as_the_integrator_needs(self) -> "Scene":
+        """Effects whose parameters depend on the scheme of the scene have a method `under(integrator)`."""
+        errors: list[InitErrorDetails] = []
+        for index, o in enumerate(self.objects):
+            for name, params in o.effects.items():
+                try:
+                    o.effects[name] = params.under(self.integrator) if hasattr(params, "under") else params
+                except PydanticCustomError as error:
+                    place = ("object", index, "effects", name)
+                    errors.append(InitErrorDetails(type=error, loc=place, input={}))
+        if errors:
+            raise ValidationError.from_exception_data("Scene", errors)
         return self
 
     @property

@@ -86,7 +86,8 @@ def test_energy_never_rises_in_backward_euler(seed, linearizations):
 
 
 def test_newmark_keeps_the_energy_of_a_linear_motion_and_bdf2_takes_little():
-    """One mode at w h = 0.3, four periods: q' ends with the same energy; backward Euler has lost nearly all of it."""
+    """One mode at w h = 0.3, four periods: q' ends with the same energy; backward Euler has lost nearly all of it. At an
+    amplitude so small that compression, where the exact tangent is clamped, hardly counts."""
 
     def beam(dt: float, **integrator) -> Simulation:
         return simulation(
@@ -98,7 +99,7 @@ def test_newmark_keeps_the_energy_of_a_linear_motion_and_bdf2_takes_little():
     left = {}
     for scheme in SCHEMES:
         sim = beam(0.3 / w, scheme=scheme)
-        sim.world.x += 1e-6 * shape / np.abs(shape).max()
+        sim.world.x += 1e-7 * shape / np.abs(shape).max()
         before = energy(sim)
         history = []
         for _ in range(84):

@@ -53,8 +53,11 @@ def test_the_default_has_the_launches_of_backward_euler_alone():
     assert names[0] == "nodes.start" and names[-1] == "nodes.advance"
     assert sim.world.drift is sim.world.v and sim.world.ahead is sim.world.v
     assert sim.engine.begin == [] and not sim.engine.loop.newton
+    usual = simulation(bar(fixed="X < 0.01", tangent="usual"))
+    assert [launch.name for launch in usual.engine.launches] == names
+    exact = [launch.name for launch in simulation(bar(fixed="X < 0.01", tangent="exact")).engine.launches]
     other = simulation(bar(fixed="X < 0.01"), integrator={"scheme": "bdf2"})
-    assert [launch.name for launch in other.engine.launches] == ["schemes.inertia", *names[1:-1], "schemes.advance"]
+    assert [launch.name for launch in other.engine.launches] == ["schemes.inertia", *exact[1:-1], "schemes.advance"]
 
 
 def test_a_scheme_starts_from_the_state_that_it_finds():
