@@ -53,7 +53,7 @@ from sim_server.world import Body, World
 
 Reals = NDArray[np.float64]
 Values = Mapping[str, Reals]
-PROJECTIONS = {"none": 0, "clamp": 1, "absolute": 2}  # kernels/hyperelastic.cuh
+PROJECTIONS = {"none": 0, "clamp": 1, "absolute": 2, "stretches": 3}  # kernels/hyperelastic.cuh
 
 
 @dataclass(frozen=True)

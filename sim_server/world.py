@@ -61,7 +61,7 @@ class World:
     def __init__(self, scene: Scene, backend: Any = None):
         self.backend = backend or Cpu()
         self.dt = float(scene.dt)
-        self.projection = scene.solver.projection
+        self.projection = scene.projection
         self.bodies: list[Body] = []
         meshes = [(o, o.load_mesh()) for o in scene.objects]
         first = 0

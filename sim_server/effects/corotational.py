@@ -19,13 +19,15 @@ Rotation of an element:
 
 Both are exact for rigid motion and agree for small strains.
 
-Tangent: "usual" (default) as above. "exact" adds how R turns with x; in terms of F, with the eigenvectors u and
+Tangent: "usual" as above. "exact" adds how R turns with x; in terms of F, with the eigenvectors u and
 eigenvalues h (sums of two stretches) of tr(S) I - S, the twists t have the eigenvalues e of d2W/dF2::
 
     usual + sum e t t^T,   t = R [u]x / sqrt 2,   e = 2 mu + (lambda (tr S - 3) - 2 mu) 2 / h,  not below 0
 
 so Newton's iteration converges quadratically where no e is clamped (tension); where all are (compression) it is the
-usual one. For more work a step; it needs "polar".
+usual one. For more work a step (a fifth on a CPU); it needs "polar". "auto" (default) is "exact" in Newmark's scheme and
+BDF2 with one linearization, where the usual one, softer than the forces under tension, lets the energy grow without
+bound (integrator.py); "usual" otherwise.
 
 Large rotations are exact, strains are linear: good to about 10-20 % strain. `young` may be one value or a list of
 regions; in each region `where` is asked at the centroid of the element, at rest and before the pose; the first
@@ -64,9 +66,8 @@ class Params(Regional):
         default=None, description="Poisson's ratio [-], of every element whose region gives none"
     )
     rotation: Literal["polar", "qr"] = Field(default="polar", description="of the elements")
-    tangent: Literal["usual", "exact"] | None = Field(
-        default=None,
-        description="whether it knows how rotations change; default: usual, or exact where the integrator needs it",
+    tangent: Literal["auto", "usual", "exact"] = Field(
+        default="auto", description="whether it knows how rotations change; auto: where the integrator needs it"
     )
 
     @model_validator(mode="after")
@@ -76,7 +77,7 @@ class Params(Regional):
         return self
 
     def under(self, integrator: Integrator) -> "Params":
-        """With the tangent filled in. Raises an error of validation for one with which the energy would grow."""
+        """These, with one of the two tangents for auto. Raises a complaint about one with which the energy would grow."""
         if integrator.needs_stiff_matrix and (self.tangent == "usual" or self.rotation == "qr"):
             given, instead = ('rotation = "qr"', 'rotation = "polar"') if self.rotation == "qr" else (
                 'tangent = "usual"', 'tangent = "exact" (the default here)')  # fmt: skip
@@ -85,7 +86,7 @@ class Params(Regional):
                 f"bound: under tension its matrix is softer than the forces are; write {instead}, or "
                 "integrator.linearizations = 2 or more"
             )
-        if self.tangent is not None:
+        if self.tangent != "auto":
             return self
         return self.model_copy(update={"tangent": "exact" if integrator.needs_stiff_matrix else "usual"})
 

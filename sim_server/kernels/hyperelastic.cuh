@@ -123,7 +123,7 @@ template <class T> INLINE auto indefinite(const Blocks6<T>& B) {
 // twists and flips in the plane across axis k, and the matrix of the stretches, 00, 01, 02, 11, 12, 22.
 template <class T> struct Modes { T twist[3], flip[3], stretch[6]; };
 
-enum Projection { NONE = 0, CLAMP = 1, ABSOLUTE = 2 };
+enum Projection { NONE = 0, CLAMP = 1, ABSOLUTE = 2, STRETCHES = 3 };  // STRETCHES: absolute, but for twists and flips clamp
 
 // Whether the symmetric matrix 00, 01, 02, 11, 12, 22 has a negative eigenvalue, to rounding.
 template <class T> INLINE auto indefinite3(const T (&a)[6]) {
@@ -134,7 +134,12 @@ template <class T> INLINE auto indefinite3(const T (&a)[6]) {
 
 // What a projection adds to an eigenvalue.
 template <class T> INLINE T lifted(T eigenvalue, int projection) {
-    return eigenvalue < 0 ? (projection == ABSOLUTE ? -2 * eigenvalue : -eigenvalue) : T{};
+    return eigenvalue < 0 ? (projection == CLAMP ? -eigenvalue : -2 * eigenvalue) : T{};
+}
+
+// ... to that of a twist or a flip.
+template <class T> INLINE T lifted_twist(T eigenvalue, int projection) {
+    return lifted(eigenvalue, projection == STRETCHES ? CLAMP : projection);
 }
 
 // What it adds to the matrix of the stretches: sum of share_k v_k v_k^T; nothing where it stays as it is.
@@ -158,8 +163,8 @@ template <class T, class M> INLINE Lift3<T> stretch_lift(const T (&stretch)[6], 
 template <class T> INLINE void project(Modes<T>& m, int projection) {
     if (projection == NONE) return;
     UNROLL for (int k = 0; k < 3; ++k) {
-        m.twist[k] += lifted(m.twist[k], projection);
-        m.flip[k] += lifted(m.flip[k], projection);
+        m.twist[k] += lifted_twist(m.twist[k], projection);
+        m.flip[k] += lifted_twist(m.flip[k], projection);
     }
     Lift3<T> lift = stretch_lift(m.stretch, projection, m.stretch[0] == m.stretch[0]);
     UNROLL for (int k = 0; k < 3; ++k) {
@@ -183,7 +188,7 @@ INLINE void lift_modes(const Principal<T>& p, const Modes<T>& m, int projection,
     vec<T> y[4];
     UNROLL for (int a = 0; a < 3; ++a) {
         const vec<T> &u = p.u[(a + 1) % 3], &w = p.u[(a + 2) % 3], &r = p.v[(a + 1) % 3], &q = p.v[(a + 2) % 3];
-        T twist = where ? lifted(m.twist[a], projection) : T{}, flip = where ? lifted(m.flip[a], projection) : T{};
+        T twist = where ? lifted_twist(m.twist[a], projection) : T{}, flip = where ? lifted_twist(m.flip[a], projection) : T{};
         if (any(twist > 0)) {
             UNROLL for (int i = 1; i < 4; ++i) y[i] = dot(q, D[i]) * u - dot(r, D[i]) * w;
             add_mode(B, half * k * twist, y);

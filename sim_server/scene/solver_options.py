@@ -95,8 +95,8 @@ class Solver(Parameters):
     warp_level: int = Field(
         default=1, ge=1, le=2, description="neighbours that give a node its rotation where its elements have none"
     )
-    projection: Literal["clamp", "absolute", "none"] = Field(
-        default="clamp", description="what becomes of negative eigenvalues of an element's stiffness"
+    projection: Literal["auto", "stretches", "clamp", "absolute", "none"] = Field(
+        default="auto", description="what becomes of negative eigenvalues of an element's stiffness"
     )
     update: Annotated[Update, PlainValidator(_update), PlainSerializer(str)] = Update("async")
     precision: Precision = Field(

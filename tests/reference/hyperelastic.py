@@ -163,10 +163,17 @@ def tangent(W: Energy, F: Array) -> Array:
     return (H + H.T) / 2
 
 
-def projected(H: Array, projection: str) -> Array:
-    """Its eigenvalues clamped at 0, made absolute, or left."""
+def projected(H: Array, projection: str, F: Array) -> Array:
+    """Its eigenvalues clamped at 0, made absolute, or left. stretches: absolute for those of modes U diag(a) V^T, with
+    F = U diag(s) V^T, and clamped for the others; of isotropic laws."""
     values, vectors = np.linalg.eigh(H)
-    changed = {"none": values, "clamp": np.maximum(values, 0), "absolute": np.abs(values)}[projection]
+    if projection == "stretches" and values[0] < -1e-7 * values[-1]:
+        U, _, Vt = np.linalg.svd(F)
+        S = np.stack([np.outer(U[:, k], Vt[k]).ravel() for k in range(3)], axis=1)
+        T = np.linalg.svd(S)[0][:, 3:]
+        assert np.abs(S.T @ H @ T).max() < 1e-7 * np.abs(H).max()
+        return sum(B @ projected(B.T @ H @ B, how, F) @ B.T for B, how in ((S, "absolute"), (T, "clamp")))
+    changed = {"clamp": np.maximum(values, 0), "absolute": np.abs(values)}.get(projection, values)
     return (vectors * changed) @ vectors.T
 
 
@@ -179,6 +186,6 @@ def element(W: Energy, x: Array, X: Array, projection: str = "none") -> tuple[fl
     """Energy, forces (4, 3) and stiffness (12, 12) of a tetrahedron."""
     volume, D = gradients(X)
     F = x.T @ D
-    P, H = stress(W, F), projected(tangent(W, F), projection).reshape(3, 3, 3, 3)
+    P, H = stress(W, F), projected(tangent(W, F), projection, F).reshape(3, 3, 3, 3)
     K = volume * np.einsum("ap,ipjq,bq->aibj", D, H, D).reshape(12, 12)
     return volume * float(np.real(W(F))), -volume * D @ P.T, K

@@ -56,7 +56,7 @@ def test_defaults_and_resolved(tmp_path):
             "fill": 10.0,
             "warp": "auto",
             "warp_level": 1,
-            "projection": "clamp",
+            "projection": "auto",
             "update": "async",
             "precision": "float64",
             "factor_precision": "auto",
