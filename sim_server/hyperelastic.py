@@ -19,15 +19,25 @@ Six edge blocks are computed, K_ii = -sum_j K_ij; cof(F) D_i and F (D_i x D_j) a
 current edges. There is no inverse of C and no fourth-order tensor. D_i . D_j costs less to compute again than to load.
 
 `[solver] projection` makes the stiffness of every element positive semi-definite, which conjugate gradients and the
-factorization need: "clamp" (default) sets negative eigenvalues of d2W/dF2 to zero (Teran, Sifakis, Irving, Fedkiw
-2005), "absolute" takes their absolute values (Chen, Liu, Jacobson, Levin, Zheng 2024), "none" leaves them. Where L D
-L^T of the element's stiffness finds no negative pivot nothing is done; elsewhere what its negative eigenvalues lack is
-added, one mode after another, from the eigensystem by principal stretches s_i, in closed form (Smith, de Goes, Kim
-2019): in the plane of i and j, with k the third axis, ::
+factorization need: "clamp" sets negative eigenvalues of d2W/dF2 to zero (Teran, Sifakis, Irving, Fedkiw 2005),
+"absolute" takes their absolute values (Chen, Liu, Jacobson, Levin, Zheng 2024), "none" leaves them, "excess" does the
+first where they are small and the second where they are large (below). "auto" (default) is "excess" where a step makes
+one linearization, "clamp" with Newton-Raphson, whose line search keeps it from overshooting. Where L D L^T of the
+element's stiffness finds no negative pivot nothing is done; elsewhere what its negative eigenvalues lack is added, one
+mode after another, from the eigensystem by principal stretches s_i, in closed form (Smith, de Goes, Kim 2019): in the
+plane of i and j, with k the third axis, ::
 
     twist = 2 W_1 + 2 W_2 (s_k^2 + s_i s_j) + W_J s_k,   flip = 2 W_1 + 2 W_2 (s_k^2 - s_i s_j) - W_J s_k
 
 (no difference quotients, so nothing is lost where stretches meet) and the 3x3 matrix d2W/ds_i ds_j.
+
+"clamp" leaves some modes without stiffness: from states with many inverted elements, at Poisson's ratios of 0.45 and
+above, one linearization a step overshoots without end. "absolute" holds there, and is too stiff in ordinary motion,
+where moderate compression makes a twist a little negative (a swinging beam: half as much again of the error of the one
+linearization). "excess" makes of an eigenvalue e < 0 what |e| exceeds m by: m is the material's own stiffness of the
+mode, the mean of twist and flip, in which the terms of W_J cancel, and 0 for d2W/ds_i ds_j. So in ordinary motion it is
+"clamp", and where elements are crushed or turned over nearly "absolute". Laws without these modes (costa) have
+"absolute" in its place.
 
 Laws with ln J or a power of J are not defined at J <= 0. `inversion = "refuse"` (default) lets the solve end with the
 status not_finite and names the element; "regularize" goes on below J = `floor` with the parabola that each function of
@@ -53,7 +63,7 @@ from sim_server.world import Body, World
 
 Reals = NDArray[np.float64]
 Values = Mapping[str, Reals]
-PROJECTIONS = {"none": 0, "clamp": 1, "absolute": 2, "stretches": 3}  # kernels/hyperelastic.cuh
+PROJECTIONS = {"none": 0, "clamp": 1, "absolute": 2, "excess": 3}  # kernels/hyperelastic.cuh
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,10 @@ at what came out: there ahead = 0.
 Order: 1, 2 (gamma = 1/2), 2. One linearization keeps it only where K is the exact slope of the forces; the usual
 tangent of corotational elements is not, by as much as they are strained.
 
+Stability with one linearization: a mode of stiffness k with k' in its place in the matrix is stable in Newmark's scheme
+and BDF2 at every h if k' >= k, and grows if k' < k (backward Euler: if k' < k / 2). The usual tangent has k' < k under
+tension; the exact one leaves out what compression takes from k, as springs do, and projections add to it, so k' >= k.
+
 Sources: Newmark 1959; Hughes, The Finite Element Method, section 9.1; Hairer and Wanner, Solving Ordinary Differential
 Equations II, section V.1 (BDF2); Baraff and Witkin 1998 (one linearization).
 """

@@ -25,8 +25,8 @@ eigenvalues h (sums of two stretches) of tr(S) I - S, the twists t have the eige
     usual + sum e t t^T,   t = R [u]x / sqrt 2,   e = 2 mu + (lambda (tr S - 3) - 2 mu) 2 / h,  not below 0
 
 so Newton's iteration converges quadratically where no e is clamped (tension); where all are (compression) it is the
-usual one. For more work a step (a fifth on a CPU); it needs "polar". "auto" (default) is "exact" in Newmark's scheme and
-BDF2 with one linearization, where the usual one, softer than the forces under tension, lets the energy grow without
+usual one. For a quarter more work a step (on a CPU); it needs "polar". "auto" (default) is "exact" in Newmark's scheme
+and BDF2 with one linearization, where the usual one, softer than the forces under tension, lets the energy grow without
 bound (integrator.py); "usual" otherwise.
 
 Large rotations are exact, strains are linear: good to about 10-20 % strain. `young` may be one value or a list of
@@ -77,7 +77,7 @@ class Params(Regional):
         return self
 
     def under(self, integrator: Integrator) -> "Params":
-        """These, with one of the two tangents for auto. Raises a complaint about one with which the energy would grow."""
+        """These, with a tangent in place of auto. Raises a complaint about one with which the energy would grow."""
         if integrator.needs_stiff_matrix and (self.tangent == "usual" or self.rotation == "qr"):
             given, instead = ('rotation = "qr"', 'rotation = "polar"') if self.rotation == "qr" else (
                 'tangent = "usual"', 'tangent = "exact" (the default here)')  # fmt: skip

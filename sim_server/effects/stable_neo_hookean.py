@@ -14,8 +14,9 @@ to a point.
 Take it for scenes that press, twist or throw bodies about until elements turn over; where none do, neo_hookean resists
 compression more (its energy is infinite at J = 0, this one's is not).
 
-From states with many inverted elements, at poisson 0.45 and above, take several linearizations a step (`[integrator]`)
-or `[solver] projection = "absolute"`: one linearization with clamped eigenvalues overshoots there without end.
+From states with many inverted elements, at poisson 0.45 and above, one linearization a step with clamped eigenvalues
+overshoots without end; the default projection does not (hyperelastic.py). Without contact a body may come to rest
+folded through itself, no element inverted; several linearizations a step (`[integrator]`) bring more of them back.
 
 Usual ranges: young 1e3 Pa (brain, liver) to 1e7 Pa (rubber), poisson 0.3 to 0.49; from 0.49 on linear tetrahedra lock.
 

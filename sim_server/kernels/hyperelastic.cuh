@@ -123,7 +123,7 @@ template <class T> INLINE auto indefinite(const Blocks6<T>& B) {
 // twists and flips in the plane across axis k, and the matrix of the stretches, 00, 01, 02, 11, 12, 22.
 template <class T> struct Modes { T twist[3], flip[3], stretch[6]; };
 
-enum Projection { NONE = 0, CLAMP = 1, ABSOLUTE = 2, STRETCHES = 3 };  // STRETCHES: absolute, but for twists and flips clamp
+enum Projection { NONE = 0, CLAMP = 1, ABSOLUTE = 2, EXCESS = 3 };
 
 // Whether the symmetric matrix 00, 01, 02, 11, 12, 22 has a negative eigenvalue, to rounding.
 template <class T> INLINE auto indefinite3(const T (&a)[6]) {
@@ -137,9 +137,13 @@ template <class T> INLINE T lifted(T eigenvalue, int projection) {
     return eigenvalue < 0 ? (projection == CLAMP ? -eigenvalue : -2 * eigenvalue) : T{};
 }
 
-// ... to that of a twist or a flip.
-template <class T> INLINE T lifted_twist(T eigenvalue, int projection) {
-    return lifted(eigenvalue, projection == STRETCHES ? CLAMP : projection);
+// ... to that of a twist or a flip, the other one given. EXCESS: the material's own stiffness is their mean; compression takes that
+// much from one and gives it to the other, and only what it takes beyond the mean is made positive.
+template <class T> INLINE T lifted_twist(T eigenvalue, T other, int projection) {
+    if (projection != EXCESS) return lifted(eigenvalue, projection);
+    const entry<T> half = 0.5;
+    T mean = half * (eigenvalue + other), own = mean > 0 ? mean : T{}, beyond = -eigenvalue - own;
+    return eigenvalue < 0 ? -eigenvalue + (beyond > 0 ? beyond : T{}) : T{};
 }
 
 // What it adds to the matrix of the stretches: sum of share_k v_k v_k^T; nothing where it stays as it is.
@@ -163,8 +167,9 @@ template <class T, class M> INLINE Lift3<T> stretch_lift(const T (&stretch)[6], 
 template <class T> INLINE void project(Modes<T>& m, int projection) {
     if (projection == NONE) return;
     UNROLL for (int k = 0; k < 3; ++k) {
-        m.twist[k] += lifted_twist(m.twist[k], projection);
-        m.flip[k] += lifted_twist(m.flip[k], projection);
+        T twist = m.twist[k], flip = m.flip[k];
+        m.twist[k] += lifted_twist(twist, flip, projection);
+        m.flip[k] += lifted_twist(flip, twist, projection);
     }
     Lift3<T> lift = stretch_lift(m.stretch, projection, m.stretch[0] == m.stretch[0]);
     UNROLL for (int k = 0; k < 3; ++k) {
@@ -188,7 +193,8 @@ INLINE void lift_modes(const Principal<T>& p, const Modes<T>& m, int projection,
     vec<T> y[4];
     UNROLL for (int a = 0; a < 3; ++a) {
         const vec<T> &u = p.u[(a + 1) % 3], &w = p.u[(a + 2) % 3], &r = p.v[(a + 1) % 3], &q = p.v[(a + 2) % 3];
-        T twist = where ? lifted_twist(m.twist[a], projection) : T{}, flip = where ? lifted_twist(m.flip[a], projection) : T{};
+        T twist = where ? lifted_twist(m.twist[a], m.flip[a], projection) : T{};
+        T flip = where ? lifted_twist(m.flip[a], m.twist[a], projection) : T{};
         if (any(twist > 0)) {
             UNROLL for (int i = 1; i < 4; ++i) y[i] = dot(q, D[i]) * u - dot(r, D[i]) * w;
             add_mode(B, half * k * twist, y);

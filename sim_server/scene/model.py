@@ -181,12 +181,12 @@ class Scene(Parameters):
         return self
 
     @property
-    def projection(self) -> Literal["stretches", "clamp", "absolute", "none"]:
-        """solver.projection, chosen if "auto": stretches where nothing but the matrix keeps a step from overshooting."""
+    def projection(self) -> Literal["excess", "clamp", "absolute", "none"]:
+        """solver.projection, chosen if "auto": excess where nothing but the matrix keeps a step from overshooting."""
         if self.solver.projection != "auto":
             return self.solver.projection
         alone = self.integrator.linearizations == 1 and self.integrator.scheme != "quasi_static"
-        return "stretches" if alone else "clamp"
+        return "excess" if alone else "clamp"
 
     @property
     def path(self) -> Path:

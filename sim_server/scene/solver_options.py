@@ -95,7 +95,7 @@ class Solver(Parameters):
     warp_level: int = Field(
         default=1, ge=1, le=2, description="neighbours that give a node its rotation where its elements have none"
     )
-    projection: Literal["auto", "stretches", "clamp", "absolute", "none"] = Field(
+    projection: Literal["auto", "excess", "clamp", "absolute", "none"] = Field(
         default="auto", description="what becomes of negative eigenvalues of an element's stiffness"
     )
     update: Annotated[Update, PlainValidator(_update), PlainSerializer(str)] = Update("async")

@@ -13,7 +13,6 @@ from sim_server import describe
 from sim_server.assembly import Assembly
 from sim_server.driver import Driver
 from sim_server.factors import Inline, Job
-from sim_server.scene.model import Scene
 from sim_server.simulation import Simulation
 from tests.scenes import bar, jittered_bar, mesh_file, scene, simulation
 

@@ -127,14 +127,19 @@ SITUATIONS: dict[str, tuple[str, Made]] = {
 SPRINGLIKE = ("mass_spring", "st_venant_kirchhoff")  # at rest turned over, too
 VIOLENT = ("twisted", "shaken", "pressed flat", "stretched", "inside out", "pulled away")
 NEWTON = "integrator.linearizations=20"
-ABSOLUTE = 'solver.projection="absolute"'
+CLAMP = 'solver.projection="clamp"'
+OVERSHOOTS = (
+    ("pressed flat", "neo_hookean, regularized"), ("pressed flat", "stable_neo_hookean"), ("pressed flat", "costa"),
+    ("stretched", "neo_hookean"), ("stretched", "neo_hookean, regularized"), ("stretched", "veronda_westmann"),
+    ("inside out", "neo_hookean, regularized"),
+)  # fmt: skip
 EXACT = [name for name in MODELS if name not in ("mass_spring", "corotational", "corotational, qr")]
 
 TURNED_OVER = "Their mirror image is at rest, too, and so are shapes with elements turned over: it ends in one of them."
 NO_ENERGY = "Forces with rotations by QR are the slope of no energy: that of their strains may rise."
 OVERSHOT = (
     "One linearization a step with clamped eigenvalues overshoots from there without end, or through J = 0 where the "
-    "law ends. The statuses tell. See the same with absolute eigenvalues, and with Newton-Raphson."
+    "law ends. The statuses tell. The default and Newton-Raphson hold."
 )
 STIFFENS = "One linearization does not see how fast the law stiffens; with Newton-Raphson the energy never rises."
 STOPPED = (
@@ -149,7 +154,11 @@ DRAWN = (
     "At three times their length these fibres are exp(32) times as stiff as at rest: some solves on the way back from "
     "there do not converge, with factors of a state so far away."
 )
-BOUNDED = "Absolute eigenvalues make steps short where one linearization is no good: energy may rise, but not for long."
+BOUNDED = "Large negative eigenvalues made positive keep steps short: energy may rise, but not for long."
+FOLDED = (
+    "It comes to rest folded through itself, every J > 0 (there is no contact). With clamped eigenvalues it comes back "
+    "here, and flies apart on finer bars and from other starts."
+)
 NOT_UNIQUE = "Many elements turn over, where rotations are not unique: 20 linearizations often do not suffice."
 EXPECTED: dict[tuple[str, str], Table] = {
     ("stiffness 1e4", "fibres"): {"energy": 0.01, "note": STIFFENS},
@@ -168,15 +177,15 @@ EXPECTED: dict[tuple[str, str], Table] = {
     },
     ("pulled away", "veronda_westmann"): {"energy": 2, "note": STIFFENS},
     ("pulled away", "costa"): {"energy": 25, "note": STIFFENS},
+    ("pressed flat", "neo_hookean, regularized"): {"energy": 1e4, "note": BOUNDED},
+    ("inside out", "stable_neo_hookean"): {"rests": "still", "energy": 10, "note": FOLDED},
     **{
-        case: {"fails": True, "note": OVERSHOT}
+        case: {"energy": 10, "note": BOUNDED}
         for case in (
-            ("pressed flat", "neo_hookean, regularized"), ("pressed flat", "stable_neo_hookean"),
-            ("pressed flat", "costa"), ("stretched", "neo_hookean"), ("stretched", "neo_hookean, regularized"),
-            ("stretched", "veronda_westmann"), ("inside out", "neo_hookean, regularized"),
+            ("pressed flat", "stable_neo_hookean"), ("stretched", "neo_hookean"),
+            ("stretched", "neo_hookean, regularized"),
         )
     },
-    ("pressed flat, absolute", "neo_hookean, regularized"): {"energy": 1e4},
     ("pressed flat, Newton", "neo_hookean, regularized"): {"fails": True, "note": ON_THE_PARABOLA},
     ("stretched, Newton", "corotational, exact"): {"fails": True, "note": NOT_UNIQUE},
 }  # fmt: skip
@@ -207,16 +216,16 @@ def case_of(situation: str, name: str, newton: bool = False) -> Case:
     return replace(case, **EXPECTED.get((key, name), {}))
 
 
-def with_absolute(situation: str, name: str) -> Case:
-    """With one linearization a step, and absolute values of negative eigenvalues in place of zeros."""
+def with_clamp(situation: str, name: str) -> Case:
+    """With one linearization a step, and zeros in place of negative eigenvalues."""
     case = case_of(situation, name)
-    case = replace(case, name=f"{situation}, absolute: {name}", scene=(*case.scene, ABSOLUTE), fails=False, energy=10)
-    return replace(case, note=BOUNDED, **EXPECTED.get((f"{situation}, absolute", name), {}))
+    case = replace(case, name=f"{situation}, clamp: {name}", scene=(*case.scene, CLAMP), fails=True, note=OVERSHOT)
+    return replace(case, energy=1e-9)
 
 
 def cases() -> list[Case]:
-    """Each situation with each model; what is violent with Newton-Raphson, too, where K is the exact slope; and what
-    fails with absolute eigenvalues."""
+    """Each situation with each model; what is violent with Newton-Raphson, too, where K is the exact slope; and with
+    clamped eigenvalues what fails so."""
     found = []
     for situation in SITUATIONS:
         names = [n for n in MODELS if (situation, n) != ("nearly incompressible", "mass_spring")]  # has a ratio of 1/4
@@ -224,12 +233,14 @@ def cases() -> list[Case]:
         if situation in VIOLENT:
             also = [n for n in EXACT if situation != "inside out" or MODELS[n].defined]
             found += [case_of(situation, name, newton=True) for name in also]
-            found += [with_absolute(situation, name) for name in names if case_of(situation, name).fails]
+            found += [with_clamp(situation, name) for name in names if (situation, name) in OVERSHOOTS]
     return found
 
 
 MODEL_CASES = cases()
 ALSO = (
-    "shaken: st_venant_kirchhoff", "shaken: corotational, qr", "pressed flat: stable_neo_hookean", "inside out: fibres",
+    "shaken: st_venant_kirchhoff", "shaken: corotational, qr", "pressed flat: stable_neo_hookean",
+    "pressed flat, clamp: stable_neo_hookean", "stretched: neo_hookean", "inside out: fibres",
+    "twisted: veronda_westmann",
 )  # fmt: skip
 QUICK = [case for k, case in enumerate(MODEL_CASES) if k % 11 == 0 or case.name in ALSO]  # for CI

@@ -16,12 +16,12 @@ def nothing(sim: Simulation) -> None:
     """The pose of the scene, at rest."""
 
 
-def _placed(change: Callable[[Reals, np.random.Generator], Reals]) -> Start:
+def _placed(change: Callable[[Reals, np.random.Generator], Reals], seed: int = 0) -> Start:
     """New positions of the free nodes; fixed ones stay."""
 
     def start(sim: Simulation) -> None:
         free = sim.world.free > 0
-        sim.world.x[free] = change(sim.world.x, np.random.default_rng(0))[free]
+        sim.world.x[free] = change(sim.world.x, np.random.default_rng(seed))[free]
 
     return start
 
@@ -60,7 +60,12 @@ def flattened(*axes: int) -> Start:
     return _placed(flatten)
 
 
-random_in_box = _placed(lambda x, rng: rng.uniform(x.min(axis=0), x.max(axis=0), x.shape))
+def randomly_placed(seed: int) -> Start:
+    """All free nodes anywhere in the bounding box."""
+    return _placed(lambda x, rng: rng.uniform(x.min(axis=0), x.max(axis=0), x.shape), seed)
+
+
+random_in_box = randomly_placed(0)
 
 
 def stretched(factor: float) -> Start:

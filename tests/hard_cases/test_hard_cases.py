@@ -16,6 +16,7 @@ from sim_server.simulation import Simulation
 from tests.hard_cases.case import BAR, FREE_BAR, Case
 from tests.hard_cases.models import MODEL_CASES, MODELS, QUICK, SITUATIONS
 from tests.hard_cases.running import Outcome, broken, finer, run_case, unexpected
+from tests.hard_cases.seeds import FLOWN, INVERTED, SPLITS, fate
 from tests.hard_cases.slivers import THICKNESS, sliver_bar, smallest_dihedral
 from tests.hard_cases.starts import mirrored, spinning
 from tests.hard_cases.table import CASES
@@ -49,6 +50,13 @@ def test_every_effect_with_elements_is_a_model_of_the_hard_cases() -> None:
 def test_energy_that_rises_is_an_error_of_the_time_step(case: Case, tmp_path: Path) -> None:
     """What the notes of the table say of every case that is allowed to gain energy."""
     assert run_case(finer(case), tmp_path).rise < 0.5 * run_case(finer(case, times=1), tmp_path).rise
+
+
+@pytest.mark.parametrize("split", SPLITS)
+def test_stable_neo_hookean_from_anywhere_does_not_fly_apart(split: str) -> None:
+    """By default; with clamped eigenvalues most do. On finer bars, of more seeds: deploy/run bench hard_cases."""
+    ends = [fate("stable_neo_hookean", split, seed, cells=(2, 2, 8), steps=300) for seed in range(4)]
+    assert FLOWN not in ends and ends.count(INVERTED) <= 1, ends
 
 
 def test_names_of_the_table_differ() -> None:

@@ -86,8 +86,8 @@ def test_energy_never_rises_in_backward_euler(seed, linearizations):
 
 
 def test_newmark_keeps_the_energy_of_a_linear_motion_and_bdf2_takes_little():
-    """One mode at w h = 0.3, four periods: q' ends with the same energy; backward Euler has lost nearly all of it. At an
-    amplitude so small that compression, where the exact tangent is clamped, hardly counts."""
+    """One mode at w h = 0.3, four periods: q' ends with the same energy; backward Euler has lost nearly all of it. The
+    amplitude is so small that compression, where the exact tangent is clamped, hardly counts."""
 
     def beam(dt: float, **integrator) -> Simulation:
         return simulation(

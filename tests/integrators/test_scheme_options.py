@@ -7,7 +7,8 @@ import pytest
 from sim_server.errors import InputError
 from sim_server.scene import load
 from sim_server.scene.integrator_options import Integrator
-from tests.scenes import bar, simulation
+from sim_server.scene.model import Scene
+from tests.scenes import bar, scene, simulation
 
 SCENE = """dt = 0.01
 [[object]]
@@ -37,6 +38,43 @@ def test_mistakes_are_told(tmp_path, table):
     path.write_text(SCENE.format(table))
     with pytest.raises(InputError, match=r"scene bad.toml, .*" + BAD[table].replace("(", r"\(")):
         load(path)
+
+
+UNSTABLE = {"tangent": "usual"}, {"rotation": "qr"}
+
+
+@pytest.mark.parametrize("scheme", ["newmark", "bdf2"])
+@pytest.mark.parametrize("given", UNSTABLE, ids=str)
+def test_a_tangent_with_which_the_energy_grows_is_refused(tmp_path, scheme, given):
+    """By the name of the object that has it; with more linearizations, or another scheme, it may be had."""
+    (key, value), path = next(iter(given.items())), tmp_path / "two.toml"
+    body = '[[object]]\nname = "{}"\nmesh = {{ bar = [2, 1, 1], size = [2, 1, 1] }}\n'
+    elastic = "[object.effects]\ncorotational = {{ young = 1e5, poisson = 0.3{} }}\n"
+    bodies = body.format("good") + elastic.format("") + body.format("bad") + elastic.format(f', {key} = "{value}"')
+    path.write_text(f'dt = 0.01\n[integrator]\nscheme = "{scheme}"\n{bodies}')
+    words = rf"scene two.toml, object 'bad', effects.corotational: {key} = \"{value}\" with integrator.scheme = "
+    with pytest.raises(InputError, match=words + rf"'{scheme}' and linearizations = 1 gains energy .* 2 or more$"):
+        load(path)
+    for other in ("linearizations=2", "scheme=backward_euler", "scheme=quasi_static"):
+        made = load(path, [f"integrator.{other}"])
+        assert [o.effects["corotational"].tangent for o in made.objects] == ["usual", "usual"]
+
+
+@pytest.mark.parametrize("scheme", ["newmark", "bdf2"])
+def test_the_tangent_is_exact_where_it_must_be(scheme):
+    bodies = bar(name="a"), bar(name="b", tangent="exact"), bar(name="c", young=None)
+    made = scene(*bodies, integrator={"scheme": scheme})
+    assert [o.effects["corotational"].tangent for o in made.objects[:2]] == ["exact", "exact"]
+    assert Scene.model_validate(made.resolved()).resolved() == made.resolved()
+    newton = scene(*bodies, integrator={"scheme": scheme, "linearizations": 2})
+    assert [o.effects["corotational"].tangent for o in newton.objects[:2]] == ["usual", "exact"]
+
+
+def test_negative_eigenvalues_by_default():
+    """What is written holds; else what keeps a step with one linearization from overshooting."""
+    chosen = {"linearizations": 1}, {"scheme": "bdf2"}, {"linearizations": 2}, {"scheme": "quasi_static"}
+    assert [scene(bar(), integrator=i).projection for i in chosen] == ["excess", "excess", "clamp", "clamp"]
+    assert scene(bar(), projection="absolute", integrator={"linearizations": 2}).projection == "absolute"
 
 
 def test_a_gpu_has_room_for_so_many_trials():

@@ -143,7 +143,7 @@ def reference_system(sim: Simulation, law: Law, projection: str = "none") -> tup
     x, rest = sim.world.x, sim.world.rest
     energy, f, K = 0.0, np.zeros(x.size), np.zeros((x.size, x.size))
     energies = [law.W] if law.other is None else [law.W, law.other]  # each is projected by itself
-    if projection == "stretches" and law.name == "costa":  # not isotropic: its modes mix stretches and twists
+    if projection == "excess" and law.name == "costa":  # not isotropic: its modes mix stretches and twists
         projection = "absolute"
     for W, tet in ((W, tet) for W in energies for tet in elements(sim).elements):
         energy_e, f_e, K_e = reference.element(W, x[tet], rest[tet], projection)

@@ -164,17 +164,27 @@ def tangent(W: Energy, F: Array) -> Array:
 
 
 def projected(H: Array, projection: str, F: Array) -> Array:
-    """Its eigenvalues clamped at 0, made absolute, or left. stretches: absolute for those of modes U diag(a) V^T, with
-    F = U diag(s) V^T, and clamped for the others; of isotropic laws."""
+    """Its eigenvalues clamped at 0, made absolute, or left; excess: of isotropic laws, mode by mode, with F = U diag(s)
+    V^T: absolute for the modes U diag(a) V^T; of the others, two for each pair of axes, what exceeds their mean."""
     values, vectors = np.linalg.eigh(H)
-    if projection == "stretches" and values[0] < -1e-7 * values[-1]:
-        U, _, Vt = np.linalg.svd(F)
-        S = np.stack([np.outer(U[:, k], Vt[k]).ravel() for k in range(3)], axis=1)
-        T = np.linalg.svd(S)[0][:, 3:]
-        assert np.abs(S.T @ H @ T).max() < 1e-7 * np.abs(H).max()
-        return sum(B @ projected(B.T @ H @ B, how, F) @ B.T for B, how in ((S, "absolute"), (T, "clamp")))
+    if projection == "excess" and values[0] < -1e-7 * values[-1]:
+        return excess(H, F)
     changed = {"clamp": np.maximum(values, 0), "absolute": np.abs(values)}.get(projection, values)
     return (vectors * changed) @ vectors.T
+
+
+def excess(H: Array, F: Array) -> Array:
+    """See projected."""
+    U, _, Vt = np.linalg.svd(F)
+    S = np.stack([np.outer(U[:, k], Vt[k]).ravel() for k in range(3)], axis=1)
+    out = S @ projected(S.T @ H @ S, "absolute", F) @ S.T
+    for i, j in ((0, 1), (0, 2), (1, 2)):
+        T = np.stack([np.outer(U[:, i], Vt[j]).ravel(), np.outer(U[:, j], Vt[i]).ravel()], axis=1)
+        assert np.abs(H @ T - T @ (T.T @ H @ T)).max() < 1e-7 * np.abs(H).max()
+        values, vectors = np.linalg.eigh(T.T @ H @ T)
+        changed = np.where(values < 0, np.maximum(-values - max(values.mean(), 0), 0), values)
+        out += T @ (vectors * changed) @ vectors.T @ T.T
+    return out
 
 
 def gradients(X: Array) -> tuple[float, Array]:
