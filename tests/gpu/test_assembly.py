@@ -41,6 +41,7 @@ CASES = {  # scene, overrides, how far nodes are moved [m], cells being 0.2 m
     "neo_hookean, not projected": ("beam", law("neo_hookean", "none", **ELASTIC), 0.02),
     "neo_hookean, regularized": ("beam", law("neo_hookean", inversion='"regularize"', **ELASTIC), 0.1),
     "stable_neo_hookean, absolute": ("beam", law("stable_neo_hookean", "absolute", **ELASTIC), 0.05),
+    "stable_neo_hookean, excess": ("beam", law("stable_neo_hookean", "excess", **ELASTIC), 0.05),
     "mooney_rivlin": ("beam", law("mooney_rivlin", c1=5e4, c2=3e4, bulk=8e5), 0.02),
     "arruda_boyce": ("beam", law("arruda_boyce", shear=1e5, segments=5.0, bulk=8e5), 0.02),
     "veronda_westmann": ("beam", law("veronda_westmann", c1=3e4, c2=3.0, bulk=8e5), 0.02),
