@@ -50,7 +50,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Iterator[bytes]:
 
 
 def replayed(path: Path) -> tuple[int, list[str]]:
-    """Steps that were repeated, all of them the same, and notes, but not that other tests here compiled more kernels."""
+    """Steps that were repeated, all the same, and notes but for the one that other tests here compiled more kernels."""
     with Recording(path) as recording:
         found = Replay(recording).run()
         assert found.same, found.lines()
