@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Meshes and scalars of a run as rerun entities.
 
-/world/OBJECT holds the surface, /plots/QUANTITY/OBJECT a curve; timelines are `step` and `time` (simulated).
+/world/OBJECT holds the surface, /plots/QUANTITY/OBJECT a curve, /plots/energy/KIND/OBJECT curves of energies;
+timelines are `step` and `time` (simulated).
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from clients.colors import colors
 from clients.frames import Frame, Mesh
-from clients.scalars import Columns
+from clients.scalars import ENERGIES, Columns
 from clients.surface import Coloring, Surface, legend
 
 PLOTS = {  # entity below /plots -> title
@@ -21,6 +22,7 @@ PLOTS = {  # entity below /plots -> title
     "residual": "true residual, log10",
     "factor_age": "factor age [steps]",
     "step_time": "step time [ms]",
+    "energy": "energy [J]",
 }
 
 
@@ -74,6 +76,9 @@ class RerunScene:
         self._curve("iterations", name, scalars, scalars["iterations"], np.ones(len(age), bool))
         self._curve("residual", name, scalars, residual, np.isfinite(residual))
         self._curve("factor_age", name, scalars, age, age >= 0)
+        for energy in ENERGIES:
+            values = scalars[energy]
+            self._curve(f"energy/{energy.removesuffix('_energy')}", name, scalars, values, np.isfinite(values))
         if step_time:
             self._curve("step_time", "all", scalars, scalars["step_seconds"] * 1e3, np.ones(len(age), bool))
 

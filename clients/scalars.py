@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 
 import numpy as np
@@ -33,7 +34,13 @@ DTYPES: dict[str, str] = {
     "factor_age_bound": "i8",  # steps; -1: none known
     "linearizations": "i8",  # of Newton-Raphson; 0: the scene has one a step
     "nonlinear_residual": "f8",  # of the step's first |b|
+    "kinetic_energy": "f8",  # J; these five are NaN where the log does not tell
+    "elastic_energy": "f8",  # J; evaluated in some steps
+    "gravity_energy": "f8",  # J; zero at the origin
+    "work": "f8",  # J, of pushes and grabs since the start
+    "dissipated": "f8",  # J since the start
 }
+ENERGIES = ("kinetic_energy", "elastic_energy", "gravity_energy", "work", "dissipated")
 
 
 def status_name(value: int) -> str:
@@ -43,7 +50,13 @@ def status_name(value: int) -> str:
 
 def row(message: pb.ObjectStep) -> tuple:
     """Values of one step in the order of DTYPES."""
-    return tuple(status_name(message.status) if name == "status" else getattr(message, name) for name in DTYPES)
+    return tuple(_value(message, name) for name in DTYPES)
+
+
+def _value(message: pb.ObjectStep, name: str) -> object:
+    if name == "status":
+        return status_name(message.status)
+    return math.nan if name in ENERGIES and not message.HasField(name) else getattr(message, name)  # type: ignore[arg-type]
 
 
 def columns(rows: Iterable[tuple]) -> Columns:

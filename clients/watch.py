@@ -35,7 +35,7 @@ def tables(status: pb.Status) -> Group:
     """Summary, objects and workers; what the server makes of those that it supervises."""
     local = [_local(status)] if status.local_workers else []
     pace = [Text(status.pace, "bold red")] if status.pace else []
-    return Group(_summary(status), *pace, _objects(status), _workers(status), *local)
+    return Group(_summary(status), *pace, _objects(status), *_energies(status), _workers(status), *local)
 
 
 def _summary(status: pb.Status) -> Text:
@@ -65,7 +65,7 @@ def _objects(status: pb.Status) -> Table:
             str(last.iterations),
             f"{found.mean_iterations:.1f}",
             f"{last.residual:.1e}",
-            status_name(last.status),
+            _status(found),
             f"{_known(found.factor_age)}/{_known(found.factor_age_bound)}",
             last.preconditioner,
         )
@@ -83,6 +83,21 @@ def places(status: pb.Status) -> Table:
                 found.object, *(f"{a:.3g} … {b:.3g}" for a, b in spans), f"{tip.x:.3g} {tip.y:.3g} {tip.z:.3g}"
             )
     return table
+
+
+def _status(found: pb.ObjectStatus) -> Text:
+    away = found.last.status == pb.RUNAWAY
+    return Text("RUNAWAY", style="bold red") if away else Text(status_name(found.last.status))
+
+
+def _energies(status: pb.Status) -> list[Table]:
+    """Of the objects whose energy is known or that have run away; no table where there are none."""
+    shown = [o for o in status.objects if o.HasField("total_energy") or o.runaway_steps]
+    table = Table("object", "energy [J]", "kinetic [J]", "runaway steps", **COMPACT)
+    for found in shown:
+        total = f"{found.total_energy:.4g}" if found.HasField("total_energy") else "-"
+        table.add_row(found.object, total, f"{found.last.kinetic_energy:.4g}", str(found.runaway_steps or "-"))
+    return [table] if shown else []
 
 
 def _workers(status: pb.Status) -> Table | Text:

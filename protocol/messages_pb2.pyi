@@ -16,6 +16,7 @@ class SolveStatus(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     BREAKDOWN_PRECONDITIONER: _ClassVar[SolveStatus]
     NOT_FINITE: _ClassVar[SolveStatus]
     MAX_LINEARIZATIONS: _ClassVar[SolveStatus]
+    RUNAWAY: _ClassVar[SolveStatus]
 CONVERGED: SolveStatus
 MAX_ITERATIONS: SolveStatus
 BUDGET: SolveStatus
@@ -23,6 +24,7 @@ BREAKDOWN_MATRIX: SolveStatus
 BREAKDOWN_PRECONDITIONER: SolveStatus
 NOT_FINITE: SolveStatus
 MAX_LINEARIZATIONS: SolveStatus
+RUNAWAY: SolveStatus
 
 class Header(_message.Message):
     __slots__ = ("protocol", "incarnation", "object", "epoch", "sequence")
@@ -237,7 +239,7 @@ class Echo(_message.Message):
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., slot: _Optional[_Union[Slot, _Mapping]] = ..., nonce: _Optional[int] = ..., settled: _Optional[bool] = ...) -> None: ...
 
 class ObjectStep(_message.Message):
-    __slots__ = ("header", "step", "time", "iterations", "status", "residual", "factor_step", "factor_age", "preconditioner", "assemble_seconds", "solve_seconds", "integrate_seconds", "step_seconds", "late_seconds", "fallbacks", "excess", "interactions", "asked", "probe", "factor_age_bound", "cpu_seconds", "linearizations", "nonlinear_residual", "warping")
+    __slots__ = ("header", "step", "time", "iterations", "status", "residual", "factor_step", "factor_age", "preconditioner", "assemble_seconds", "solve_seconds", "integrate_seconds", "step_seconds", "late_seconds", "fallbacks", "excess", "interactions", "asked", "probe", "factor_age_bound", "cpu_seconds", "linearizations", "nonlinear_residual", "warping", "kinetic_energy", "elastic_energy", "gravity_energy", "work", "dissipated")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     STEP_FIELD_NUMBER: _ClassVar[int]
     TIME_FIELD_NUMBER: _ClassVar[int]
@@ -262,6 +264,11 @@ class ObjectStep(_message.Message):
     LINEARIZATIONS_FIELD_NUMBER: _ClassVar[int]
     NONLINEAR_RESIDUAL_FIELD_NUMBER: _ClassVar[int]
     WARPING_FIELD_NUMBER: _ClassVar[int]
+    KINETIC_ENERGY_FIELD_NUMBER: _ClassVar[int]
+    ELASTIC_ENERGY_FIELD_NUMBER: _ClassVar[int]
+    GRAVITY_ENERGY_FIELD_NUMBER: _ClassVar[int]
+    WORK_FIELD_NUMBER: _ClassVar[int]
+    DISSIPATED_FIELD_NUMBER: _ClassVar[int]
     header: Header
     step: int
     time: float
@@ -286,7 +293,12 @@ class ObjectStep(_message.Message):
     linearizations: int
     nonlinear_residual: float
     warping: int
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., time: _Optional[float] = ..., iterations: _Optional[int] = ..., status: _Optional[_Union[SolveStatus, str]] = ..., residual: _Optional[float] = ..., factor_step: _Optional[int] = ..., factor_age: _Optional[int] = ..., preconditioner: _Optional[str] = ..., assemble_seconds: _Optional[float] = ..., solve_seconds: _Optional[float] = ..., integrate_seconds: _Optional[float] = ..., step_seconds: _Optional[float] = ..., late_seconds: _Optional[float] = ..., fallbacks: _Optional[int] = ..., excess: _Optional[float] = ..., interactions: _Optional[_Iterable[_Union[Interaction, _Mapping]]] = ..., asked: _Optional[str] = ..., probe: _Optional[int] = ..., factor_age_bound: _Optional[int] = ..., cpu_seconds: _Optional[float] = ..., linearizations: _Optional[int] = ..., nonlinear_residual: _Optional[float] = ..., warping: _Optional[int] = ...) -> None: ...
+    kinetic_energy: float
+    elastic_energy: float
+    gravity_energy: float
+    work: float
+    dissipated: float
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., time: _Optional[float] = ..., iterations: _Optional[int] = ..., status: _Optional[_Union[SolveStatus, str]] = ..., residual: _Optional[float] = ..., factor_step: _Optional[int] = ..., factor_age: _Optional[int] = ..., preconditioner: _Optional[str] = ..., assemble_seconds: _Optional[float] = ..., solve_seconds: _Optional[float] = ..., integrate_seconds: _Optional[float] = ..., step_seconds: _Optional[float] = ..., late_seconds: _Optional[float] = ..., fallbacks: _Optional[int] = ..., excess: _Optional[float] = ..., interactions: _Optional[_Iterable[_Union[Interaction, _Mapping]]] = ..., asked: _Optional[str] = ..., probe: _Optional[int] = ..., factor_age_bound: _Optional[int] = ..., cpu_seconds: _Optional[float] = ..., linearizations: _Optional[int] = ..., nonlinear_residual: _Optional[float] = ..., warping: _Optional[int] = ..., kinetic_energy: _Optional[float] = ..., elastic_energy: _Optional[float] = ..., gravity_energy: _Optional[float] = ..., work: _Optional[float] = ..., dissipated: _Optional[float] = ...) -> None: ...
 
 class Steps(_message.Message):
     __slots__ = ("header", "steps")
@@ -427,7 +439,7 @@ class Reply(_message.Message):
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., error: _Optional[str] = ..., interaction: _Optional[_Union[Interaction, _Mapping]] = ..., status: _Optional[_Union[Status, _Mapping]] = ..., unchanged: _Optional[bool] = ...) -> None: ...
 
 class ObjectStatus(_message.Message):
-    __slots__ = ("object", "nodes", "tets", "last", "mean_iterations", "excess", "factors_used", "factors_refused", "in_flight", "factor_age", "factor_age_max", "factor_age_bound", "factors_mended", "refusal", "low", "high", "tip")
+    __slots__ = ("object", "nodes", "tets", "last", "mean_iterations", "excess", "factors_used", "factors_refused", "in_flight", "factor_age", "factor_age_max", "factor_age_bound", "factors_mended", "refusal", "low", "high", "tip", "runaway_steps", "total_energy")
     OBJECT_FIELD_NUMBER: _ClassVar[int]
     NODES_FIELD_NUMBER: _ClassVar[int]
     TETS_FIELD_NUMBER: _ClassVar[int]
@@ -445,6 +457,8 @@ class ObjectStatus(_message.Message):
     LOW_FIELD_NUMBER: _ClassVar[int]
     HIGH_FIELD_NUMBER: _ClassVar[int]
     TIP_FIELD_NUMBER: _ClassVar[int]
+    RUNAWAY_STEPS_FIELD_NUMBER: _ClassVar[int]
+    TOTAL_ENERGY_FIELD_NUMBER: _ClassVar[int]
     object: str
     nodes: int
     tets: int
@@ -462,7 +476,9 @@ class ObjectStatus(_message.Message):
     low: Vector
     high: Vector
     tip: Vector
-    def __init__(self, object: _Optional[str] = ..., nodes: _Optional[int] = ..., tets: _Optional[int] = ..., last: _Optional[_Union[ObjectStep, _Mapping]] = ..., mean_iterations: _Optional[float] = ..., excess: _Optional[float] = ..., factors_used: _Optional[int] = ..., factors_refused: _Optional[int] = ..., in_flight: _Optional[bool] = ..., factor_age: _Optional[int] = ..., factor_age_max: _Optional[int] = ..., factor_age_bound: _Optional[int] = ..., factors_mended: _Optional[int] = ..., refusal: _Optional[str] = ..., low: _Optional[_Union[Vector, _Mapping]] = ..., high: _Optional[_Union[Vector, _Mapping]] = ..., tip: _Optional[_Union[Vector, _Mapping]] = ...) -> None: ...
+    runaway_steps: int
+    total_energy: float
+    def __init__(self, object: _Optional[str] = ..., nodes: _Optional[int] = ..., tets: _Optional[int] = ..., last: _Optional[_Union[ObjectStep, _Mapping]] = ..., mean_iterations: _Optional[float] = ..., excess: _Optional[float] = ..., factors_used: _Optional[int] = ..., factors_refused: _Optional[int] = ..., in_flight: _Optional[bool] = ..., factor_age: _Optional[int] = ..., factor_age_max: _Optional[int] = ..., factor_age_bound: _Optional[int] = ..., factors_mended: _Optional[int] = ..., refusal: _Optional[str] = ..., low: _Optional[_Union[Vector, _Mapping]] = ..., high: _Optional[_Union[Vector, _Mapping]] = ..., tip: _Optional[_Union[Vector, _Mapping]] = ..., runaway_steps: _Optional[int] = ..., total_energy: _Optional[float] = ...) -> None: ...
 
 class LocalWorker(_message.Message):
     __slots__ = ("worker", "state", "pid", "restarts", "exit_code")

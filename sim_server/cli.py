@@ -264,7 +264,8 @@ def _summary(service: "Service") -> str:
     used = sum(t.used for t in service.driver.tracks)
     return (
         f"{service.engine.step} steps; last {len(service.telemetry.seconds)}: p50 {p50:.3f}, p99 {p99:.3f}, "
-        f"max {most:.3f} ms; {used} factors used, {service.engine.loop.late_steps} late steps; {_unconverged(service)}"
+        f"max {most:.3f} ms; {used} factors used, {service.engine.loop.late_steps} late steps; "
+        f"{_unconverged(service)}{_runaways(service)}"
     )
 
 
@@ -283,6 +284,12 @@ def _end_in_order() -> None:
 
     handle(signal.SIGINT, signal.default_int_handler)
     handle(signal.SIGTERM, _terminate)
+
+
+def _runaways(service: "Service") -> str:
+    """Which objects have run away; empty if none have."""
+    names = [service.simulation.world.bodies[body].name for body in sorted(service.telemetry.runaways)]
+    return f"; run away: {', '.join(names[:20])}" if names else ""
 
 
 def _terminate(*_: object) -> None:

@@ -21,6 +21,7 @@ class Commands:
         self.simulation, self.engine = simulation, simulation.engine
         self.accepted = accepted
         self.stopping = False
+        self.frozen: Callable[[str], bool] = lambda name: False  # objects that have run away and move no more
         if "touch" in simulation.effects:
             from sim_server.effects.touch import Touch
 
@@ -133,6 +134,8 @@ class Commands:
         return pb.Reply(interaction=message)
 
     def _touch(self, name: str = ""):  # type: ignore[no-untyped-def]
+        if name and self.frozen(name):
+            raise Refusal(f"object {name!r} has run away and is frozen: it takes no pushes or grabs any more")
         if "touch" not in self.simulation.effects:
             raise Refusal(
                 f"object {name!r} does not list the effect touch, so it takes no pushes or grabs; "

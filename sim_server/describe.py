@@ -2,6 +2,7 @@
 """The simulation in the words of the protocol: scene, topologies, states, step records."""
 
 import json
+import math
 import platform
 import time
 from collections.abc import Callable
@@ -110,6 +111,8 @@ def _factor_name(method: Method | None) -> dict[Kind, str]:
 
 def _step(names: list[str], kinds: dict[Kind, str], r: dict[str, Any]) -> pb.ObjectStep:
     made = r["factor_step"]
+    energies = {"kinetic_energy": r["kinetic"], "elastic_energy": r["elastic"], "gravity_energy": r["gravity"]}
+    energies |= {"work": r["work"], "dissipated": r["budget"] - r["kinetic"] - r["elastic"]}
     return pb.ObjectStep(
         header=pb.Header(object=names[r["body"]], epoch=1),
         step=r["step"],
@@ -132,6 +135,7 @@ def _step(names: list[str], kinds: dict[Kind, str], r: dict[str, Any]) -> pb.Obj
         linearizations=0 if r["nonlinear"] == -1 else r["linearizations"],
         nonlinear_residual=0.0 if r["nonlinear"] == -1 else r["nonlinear"],
         warping=r["warping"],
+        **{name: value for name, value in energies.items() if not math.isnan(value)},
     )
 
 

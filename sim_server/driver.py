@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import Factor
+from protocol.messages_pb2 import RUNAWAY
 from protocol.method import Method
 from sim_server.copies import Copies
 from sim_server.dropping import Dropping
@@ -114,9 +115,10 @@ class Driver:
 
     def step_with_fresh_factors(self) -> NDArray[Any]:
         """A step that waits for the factors of its own matrices, made in this process; returns its records."""
-        self._warping.note(self.tracks)
+        moving = [t for t in self.tracks if not t.frozen]
+        self._warping.note(moving)
         self.engine.assemble()
-        for t in self.tracks:
+        for t in moving:
             values = self._values(t.body)
             t.matrix = self.engine.step, values
             self.inline.submit(self._job(t, self.engine.step, values))
@@ -150,7 +152,7 @@ class Driver:
         t = self.by_name[factor.object]
         self._nobody_at = -1
         matrix = self._copies.take_back(t, factor.step)
-        if factor.step > t.newest and (why := self.guard.complaint(factor, matrix)):
+        if factor.step > t.newest and not t.frozen and (why := self.guard.complaint(factor, matrix)):
             self._dropping.refused(factor)
             self.failed(factor.object, f"that of {factor.worker} is not used: {why}")
             return
@@ -179,7 +181,7 @@ class Driver:
     def tell(self, t: Track, reason: str) -> None:
         """Why a factor that there was or should have been is not used."""
         cause = re.sub(r"[0-9.e+-]*[0-9]", "#", reason)
-        if cause not in t.causes and len(t.causes) < CAUSES:
+        if cause not in t.causes and len(t.causes) < CAUSES and not t.frozen:
             t.causes.add(cause)
             log.warning("object %r: no factor: %s", t.body.name, reason)
 
@@ -191,7 +193,7 @@ class Driver:
         for name, made in list(self._due.items()):
             if made + self.n == now:
                 self._await(name, made)
-        fresh = [t for t in self.tracks if t.body.name not in self._due]
+        fresh = [t for t in self.tracks if t.body.name not in self._due and not t.frozen]
         self._warping.note(fresh)
         for t in fresh:
             self._copies.ask(t)
@@ -294,8 +296,8 @@ class Driver:
             self._nobody_at = step
 
     def _needs(self, step: int) -> list[Need]:
-        """Of all bodies but those that are better left for another worker than the idle ones."""
-        needs = [t.need(step) for t in self.tracks]
+        """Of all bodies but frozen ones and those that are better left for another worker than the idle ones."""
+        needs = [t.need(step) for t in self.tracks if not t.frozen]
         if self._pool is not None:
             reserved, setbacks = self._pool.reserved(), self._pool.setbacks()
             if reserved or setbacks or any(need.failures for need in needs):
@@ -351,6 +353,9 @@ class Driver:
     def observe(self, records: NDArray[Any]) -> None:
         """Sums up excess iterations, lets `auto` choose, drops factors that are no use."""
         floor, bodies = self.solver.update_floor_iterations, len(self.tracks)
+        if self.simulation.energies.on_runaway == "freeze":
+            for body in np.unique(records["body"][records["status"] == RUNAWAY]):
+                self.tracks[body].frozen = True
         if not self.counted and len(records) >= max(bodies, TOGETHER) and len(records) % bodies == 0:
             self._observe_steps(records.reshape(-1, bodies))
         else:

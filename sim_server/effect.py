@@ -31,6 +31,18 @@ class Refusal:
         return f"element {self.element} has J = {self.J:.3g}, which {self.effect} does not define"
 
 
+@dataclass(frozen=True)
+class ElementEnergies:
+    """Potential energies of the elements of an effect, which `launch` leaves in energy (m,) [J].
+
+    owner (m,): index of the body of each element, ascending.
+    """
+
+    launch: Any
+    energy: NDArray[np.float64]
+    owner: NDArray[np.int64]
+
+
 class Effect:
     """Base of all effects. A file under effects/ has `build(world, listed) -> Effect`.
 
@@ -57,9 +69,20 @@ class Effect:
         """What adds the effect to system.b, .diagonal, .block, .sums and .mean. accumulate: to sums, others have."""
         return []
 
+    def energies(self) -> ElementEnergies | None:
+        """Potential energies of its elements, or None for an effect without any."""
+        return None
+
     def energy(self) -> float:
-        """Potential energy of the present state [J]; 0 for an effect without one."""
-        return 0.0
+        """Potential energy of the present state [J]; 0 for an effect without one.
+
+        NaN where an element has a deformation that its law does not define.
+        """
+        elements = self.energies()
+        if elements is None:
+            return 0.0
+        elements.launch()
+        return float(elements.launch.fetch("energy").sum(dtype=float))
 
     def refusals(self) -> list[Refusal]:
         """Elements that had a state which the effect does not define, by the time at which they had it first; that a

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from protocol.factor import FactorPattern
 from sim_server import layouts
 from sim_server.backend import Launch, native
+from sim_server.energy import Energies, NativeEnergies
 from sim_server.layouts import RECORD
 from sim_server.rings import Reports
 from sim_server.scene.integrator_options import Integrator
@@ -51,11 +52,13 @@ def _library() -> c.CDLL:
             "wf_precondition": (None, [loop, c.c_int32, p, p, p]),
         },
     )  # fmt: skip
-    sizes = (c.c_int32 * 8)()
+    sizes = (c.c_int32 * 11)()
     library.wf_sizes(sizes)
     newton = [c.sizeof(layouts.Newton), c.sizeof(layouts.Search)]
+    energy = [c.sizeof(layouts.Elastic), c.sizeof(layouts.Energies), layouts.BALANCE.itemsize]
     shared = (layouts.Launch, layouts.Body, layouts.Loop, layouts.Factor, layouts.Pattern)
-    layouts.check_sizes("native/loop.cpp", list(sizes), [*(c.sizeof(t) for t in shared), RECORD.itemsize, *newton])
+    ours = [*(c.sizeof(t) for t in shared), RECORD.itemsize, *newton, *energy]
+    layouts.check_sizes("native/loop.cpp", list(sizes), ours)
     return library
 
 
@@ -138,13 +141,14 @@ class Engine(Reports):
     """The loop over one system.
 
     assemble, integrate: the launches of a step, in order. ranges: nodes [first, last) of each body. newton: for several
-    linearizations a step. arrays: those of the system by name (row_start, columns, values, b, y, x, v, clock, warping,
-    moving).
+    linearizations a step. energies: of its bodies; None: steps are not watched. arrays: those of the system by name
+    (row_start, columns, values, b, y, x, v, clock, warping, moving).
     """
 
     def __init__(
         self, assemble: Sequence[Launch], integrate: Sequence[Launch], ranges: Sequence[tuple[int, int]], dt: float,
-        records: int = 8192, frames: int = 8, threads: int = 1, newton: Newton | None = None, **arrays: NDArray[Any],
+        records: int = 8192, frames: int = 8, threads: int = 1, newton: Newton | None = None,
+        energies: Energies | None = None, **arrays: NDArray[Any],
     ):  # fmt: skip
         self._native = _library()
         launches = [*assemble, *integrate]
@@ -173,6 +177,9 @@ class Engine(Reports):
             setattr(loop, name, arrays[name].ctypes.data)
         loop.work, loop.threads = self._work.ctypes.data, threads
         self._newton = newton and newton.attach(loop, self._launch)
+        self._energies = energies and NativeEnergies(energies)
+        if self._energies:
+            loop.energies = c.pointer(self._energies.native)
         self.begin: list[Launch] = []  # before the first step
 
     exact = True  # frames are reckoned from the very step of the factor, whenever it is taken up

@@ -53,7 +53,7 @@ from numpy.typing import NDArray
 from pydantic import Field, create_model
 
 from sim_server.backend import Launch
-from sim_server.effect import Effect, Refusal
+from sim_server.effect import Effect, ElementEnergies, Refusal
 from sim_server.effects.corotational import shape_gradients
 from sim_server.errors import InputError
 from sim_server.scene.parameters import Parameters, Positive
@@ -204,13 +204,13 @@ class Hyperelastic(Tetrahedra):
     def _floor(self) -> dict[str, Any]:
         return {"floor": self.floor} if self.law.regularizes else {}
 
-    def energy(self) -> float:
-        """sum V W [J]; NaN where an element has a deformation that the law does not define."""
-        self.world.backend.module(self.law.path).bind(
+    def energies(self) -> ElementEnergies:
+        """V W [J]; NaN where an element has a deformation that the law does not define."""
+        launch = self.world.backend.module(self.law.path).bind(
             "energy", len(self.elements), tets=self.elements, x=self.world.x, gradients=self.gradients,
             volume=self.volume, constants=self.constants, energy=self._energy, **self._floor(),
-        )()  # fmt: skip
-        return float(self.world.backend.fetch(self._energy).sum())
+        )  # fmt: skip
+        return ElementEnergies(launch, self._energy, self.owner)
 
     def refusals(self) -> list[Refusal]:
         found = self.world.backend.fetch(self.refused) if self.law.refuses else self.refused

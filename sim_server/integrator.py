@@ -70,16 +70,21 @@ class First:
 
 class Integrator:
     """The launches of a scheme. carried (n, 3) [m/s]: see above; beta (n,): damping of the stiffness at nodes [s];
-    before (n, 3) [m]: x when the step before began, to which a body goes back whose forces are no numbers."""
+    before (n, 3) [m]: x when the last step began, to which a body goes back whose forces are no numbers."""
 
     def __init__(self, scene: Scene, system: System):
         self.options, self.system, self.world = scene.integrator, system, system.world
         w = self.world
         self.carried = np.zeros((0 if w.plain else w.nodes, 3))
         self.beta = np.repeat(w.beta, [b.last - b.first for b in w.bodies]) if not w.plain else np.zeros(0)
-        self.before = w.x[: len(self.carried)].copy()
+        self.before = w.x.copy()
         w.backend.keep(self.carried, self.beta, self.before)
         self._parts, self._first = _coefficients(scene)
+
+    @property
+    def still(self) -> list[np.ndarray]:
+        """Arrays (n, 3) beside v that are 0 where nothing moves."""
+        return [] if self.world.plain else [self.world.ahead, self.world.drift, self.carried]
 
     def start(self) -> Launch:
         """b and A with the masses alone."""
@@ -96,7 +101,7 @@ class Integrator:
         """From the solution to the next state."""
         s, w = self.system, self.world
         if w.plain:
-            return s.advance()
+            return s.advance(self.before)
         return self._bind(
             "advance", rotation=s.rotation, y=s.y, beta=self.beta, reach=w.reach, carried=self.carried, ahead=w.ahead,
             drift=w.drift, dv=s.dv, v=w.v, x=w.x, before=self.before, **asdict(self._parts),

@@ -12,12 +12,14 @@ RECORD = np.dtype(
     [
         ("step", "i8"), ("factor_step", "i8"), ("time", "f8"), ("residual", "f8"), ("assemble", "f8"), ("solve", "f8"),
         ("integrate", "f8"), ("whole", "f8"), ("late", "f8"), ("begin", "f8"), ("cpu", "f8"), ("nonlinear", "f8"),
+        ("kinetic", "f8"), ("elastic", "f8"), ("gravity", "f8"), ("work", "f8"), ("budget", "f8"), ("stride", "f8"),
         ("body", "i4"), ("iterations", "i4"), ("status", "i4"), ("kind", "i4"), ("asked", "i4"), ("fallbacks", "i4"),
         ("bad_node", "i4"), ("probe", "i4"), ("linearizations", "i4"), ("warping", "i4"),
     ]
 )  # fmt: skip
 """One body, one step: what a loop reports. Seconds, except step numbers; `step` counts completed steps.
 
+kinetic, elastic, gravity, work and budget [J], stride [m]: kernels/balance.cuh. elastic: NaN unless it was wanted.
 On a GPU only the solve is timed apart: assemble and integrate are 0 there. whole is the step's time on the device.
 """
 
@@ -29,7 +31,8 @@ class Rings(c.Structure):
         ("dt", c.c_double), ("start_time", c.c_double), ("step", c.c_int64), ("records", c.c_void_p),
         ("record_capacity", c.c_int64), ("record_head", c.c_int64), ("record_tail", c.c_int64), ("frames", c.c_void_p),
         ("frame_steps", c.c_void_p), ("frame_capacity", c.c_int64), ("frame_every", c.c_int64),
-        ("frame_head", c.c_int64), ("frame_tail", c.c_int64), ("frames_dropped", c.c_int64),
+        ("energy_every", c.c_int64), ("frame_head", c.c_int64), ("frame_tail", c.c_int64),
+        ("frames_dropped", c.c_int64),
         ("records_dropped", c.c_int64), ("late_steps", c.c_int64), ("realtime", c.c_int32), ("patient", c.c_int32),
         ("stop", c.c_int32), ("pause", c.c_int32), ("deadline", c.c_double), ("late", c.c_double),
     ]  # fmt: skip
@@ -109,6 +112,28 @@ class Newton(c.Structure):
     ]  # fmt: skip
 
 
+class Elastic(c.Structure):
+    _fields_ = [("launch", Launch), ("energy", c.c_void_p), ("parts", c.c_void_p)]
+
+
+BALANCE = np.dtype(
+    [
+        *((n, "f8") for n in ("start", "mass", "diagonal", "floor", "limit")),
+        *((n, "f8") for n in ("kinetic", "elastic", "gravity", "work", "budget", "stride")),
+        ("phase", "i4"), ("found", "i4"),
+    ]
+)  # fmt: skip
+
+
+class Energies(c.Structure):
+    _fields_ = [
+        ("g", c.c_double * 3), ("mass", c.c_void_p), ("before", c.c_void_p), ("force", c.c_void_p),
+        ("spring", c.c_void_p), ("anchor", c.c_void_p), ("free", c.c_void_p), ("still", c.POINTER(c.c_void_p)),
+        ("elastic", c.POINTER(Elastic)), ("balance", c.c_void_p), ("left", c.c_void_p), ("stills", c.c_int32), ("elastics", c.c_int32),
+        ("on_runaway", c.c_int32), ("inertia", c.c_int32), ("begun", c.c_int32), ("unused", c.c_int32),
+    ]  # fmt: skip
+
+
 class Loop(c.Structure):
     _anonymous_ = ("rings",)
     _fields_ = [
@@ -116,8 +141,8 @@ class Loop(c.Structure):
         ("nodes", c.c_int32), ("body", c.POINTER(Body)), ("row_start", c.c_void_p), ("columns", c.c_void_p),
         ("values", c.c_void_p), ("b", c.c_void_p), ("y", c.c_void_p), ("x", c.c_void_p), ("v", c.c_void_p),
         ("work", c.c_void_p), ("newton", c.POINTER(Newton)), ("clock", c.c_void_p), ("warping", c.c_void_p),
-        ("moving", c.c_void_p),
-        ("threads", c.c_int32), ("unused", c.c_int32), ("assemble_begin", c.c_double),
+        ("moving", c.c_void_p), ("energies", c.POINTER(Energies)), ("threads", c.c_int32), ("unused", c.c_int32),
+        ("assemble_begin", c.c_double),
         ("assemble_seconds", c.c_double), ("cpu_begin", c.c_double), ("rings", Rings),
     ]  # fmt: skip
 

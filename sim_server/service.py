@@ -53,9 +53,10 @@ class Service:
         self.driver = Driver(simulation, link)
         self.telemetry = Telemetry(self.driver, link, recorder, patient=not realtime)
         self.commands = Commands(simulation, self._accepted)
+        self.commands.frozen = lambda name: name in self.driver.by_name and self.driver.by_name[name].frozen
         self.telemetry.commands = self.commands
         self.telemetry.trace = Trace(self.driver, link, recorder) if recorder else None
-        self.engine.loop.frame_every = self.telemetry.wanted_frames()
+        self._ask_loop()
         self._waiting: deque[NDArray[Any]] = deque()
         self._failure: BaseException | None = None
         self._asked: list[Callable[[pb.Reply], None]] = []  # those who want a fresh status
@@ -123,6 +124,7 @@ class Service:
             for command, reply in waiting:
                 if command.verb == "status":
                     self._asked.append(reply)
+                    self.telemetry.status_asked()
                     continue
                 answer = self.commands.carry_out(command)
                 if command.verb in ("pause", "stop") and not answer.error and len(self._halts) < HALTS:
@@ -187,13 +189,18 @@ class Service:
             records = np.concatenate(batches) if batches else np.zeros(0, self.engine.records_dtype)
         for line in self.telemetry.count(records):
             log.warning("%s", line)
-        for line in self.telemetry.bad_steps(records):
+        for line in [*self.telemetry.count_runaways(records), *self.telemetry.bad_steps(records)]:
             log.error("%s", line)
         if self.pace is not None and len(records):
             self.pace.note(records)
         self.telemetry.records(records)
         self.telemetry.frames()
+        self._ask_loop()
+
+    def _ask_loop(self) -> None:
+        """Has it make the frames and energies that somebody looks at."""
         self.engine.loop.frame_every = self.telemetry.wanted_frames()
+        self.engine.loop.energy_every = self.telemetry.wanted_energies()
 
     def _state(self) -> str:
         if self.commands.stopping:

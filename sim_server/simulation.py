@@ -16,6 +16,7 @@ import numpy as np
 from sim_server.backend import Cpu, Launch, ahead
 from sim_server.effect import Effect, Refusal
 from sim_server.effects import effect
+from sim_server.energy import Energies
 from sim_server.engine import Engine, Kind, Newton
 from sim_server.equilibrium import check_held
 from sim_server.errors import DeviceError, InputError
@@ -31,11 +32,13 @@ KINDS = {"none": Kind.NONE, "jacobi": Kind.JACOBI, "block_jacobi": Kind.BLOCK_JA
 class Simulation:
     """A scene on a device, "cpu" or "gpu". `engine.run(n)` makes n steps; when factors come is driver.py's business.
 
+    watched: whether bodies that run away are looked for at all; a log of a version that did not is repeated without.
+
     Raises InputError for a scene that cannot be built or a device that is not there.
     """
 
-    def __init__(self, scene: Scene, device: str = "cpu"):
-        self.scene = scene
+    def __init__(self, scene: Scene, device: str = "cpu", watched: bool = True):
+        self.scene, self._watched = scene, watched
         with _building(device):
             self._build(scene, device)
 
@@ -54,6 +57,9 @@ class Simulation:
         self.integrator = Integrator(scene, self.system)
         if not self.world.inertia:
             check_held(self.world, elements)
+        on_runaway = scene.solver.on_runaway if self._watched else None
+        still = [self.world.v, self.system.dv, *self.integrator.still]
+        self.energies = Energies(self.world, self.effects, self.integrator.before, still, on_runaway)
         assemble, integrate = self.launches()
         w, s = self.world, self.system
         arrays: dict[str, Any] = {"row_start": s.row_start, "columns": s.columns, "values": s.values}
@@ -72,7 +78,9 @@ class Simulation:
         else:
             newton = self.integrator.newton(assemble, list(self.effects.values()))
             threads = scene.solver.threads
-            self.engine = Engine(assemble, integrate, ranges, w.dt, threads=threads, newton=newton, **arrays)
+            self.engine = Engine(
+                assemble, integrate, ranges, w.dt, threads=threads, newton=newton, energies=self.energies, **arrays
+            )
         self.engine.begin = self.integrator.begin(assemble)
         for body in w.bodies:
             self._settle(body)

@@ -120,11 +120,19 @@ class System:
         )  # fmt: skip
         return [turn, assemble]
 
-    def advance(self) -> Launch:
-        """v += R y, x += h v: backward Euler."""
+    def advance(self, before: NDArray[np.float64]) -> Launch:
+        """v += R y, x += h v: backward Euler. before (n, 3): gets x as it was [m]."""
         w = self.world
         return self.world.backend.module("kernels/nodes.cu").bind(
-            "advance", w.nodes, rotation=self.rotation, y=self.y, h=w.dt, dv=self.dv, v=w.v, x=w.x
+            "advance",
+            w.nodes,
+            rotation=self.rotation,
+            y=self.y,
+            h=w.dt,
+            dv=self.dv,
+            v=w.v,
+            x=w.x,
+            before=before,
         )
 
     def turned(self, nodes: slice) -> float:

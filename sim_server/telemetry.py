@@ -25,6 +25,8 @@ STATUS_PERIOD = 1.0  # s
 LOOK_PERIOD = 0.02  # s between looks at whether somebody listens to states
 BATCH = 4096  # steps sent together at most
 WINDOW = 1000  # steps that percentiles are taken over
+ENERGY_STEPS = 20  # between elastic energies in real time: one costs up to a fifth of a step
+ENERGY_PERIOD = 3.0  # s for which they are evaluated after a client has asked for the status
 
 
 class Telemetry:
@@ -45,6 +47,12 @@ class Telemetry:
         self.solves = 0
         self.pace = ""  # why the run does not keep pace with the clock; empty: it does, or need not
         self.unconverged: Counter[str] = Counter()  # solves by status, of those that did not converge
+        self._energy: dict[
+            int, float
+        ] = {}  # kinetic + elastic + gravity by body, of the last step where it is known [J]
+        self.runaways: Counter[int] = Counter()  # steps by body
+        self._asked_until = 0.0
+        self._listened = False
         self._due = {"steps": 0.0, "state": 0.0, "status": 0.0, "look": 0.0}
         self._watched = False
         self._touched: dict[int, pb.Interaction] = {}
@@ -100,6 +108,8 @@ class Telemetry:
         self._last[present] = records[order[np.array(ends) - 1]]
         for body, begin, end in zip(present.tolist(), first.tolist(), ends, strict=True):
             self._window[body].extend(iterations[begin:end])
+        for r in records[np.isfinite(records["elastic"])]:
+            self._energy[int(r["body"])] = float(r["kinetic"] + r["elastic"] + r["gravity"])
 
     def _messages(self, records: NDArray[Any]) -> list[pb.ObjectStep]:
         """Those that somebody wants: to make one takes longer than all else that is done with a record."""
@@ -156,8 +166,19 @@ class Telemetry:
     def wanted_frames(self) -> int:
         """Steps between frames that the loop should copy out: 0 if nobody looks."""
         if self._period("look", LOOK_PERIOD):
-            self._watched = self.link.wants_state()
+            self._watched, self._listened = self.link.wants_state(), self.link.wants_steps()
         return self.every or (max(1, round(STATE_PERIOD / self.simulation.world.dt)) if self._watched else 0)
+
+    def status_asked(self) -> None:
+        """A client looks at the status, and so at energies."""
+        self._asked_until = time.monotonic() + ENERGY_PERIOD
+
+    def wanted_energies(self) -> int:
+        """Steps between those whose elastic energy the loop should evaluate: 0 if nobody looks. Call `wanted_frames`
+        before."""
+        if self.recorder and self.patient:
+            return self.every
+        return ENERGY_STEPS if self.recorder or self._listened or time.monotonic() < self._asked_until else 0
 
     def _record_frame(self, step: int, x: NDArray[np.float64], v: NDArray[np.float64]) -> None:
         assert self.recorder is not None
@@ -201,6 +222,8 @@ class Telemetry:
                     factor_age=track.age(status.step),
                     factor_age_max=track.age_max,
                     factor_age_bound=bound,
+                    runaway_steps=self.runaways[body.index],
+                    total_energy=self._energy.get(body.index),
                 )
             )
         if where:
@@ -226,7 +249,7 @@ class Telemetry:
     def count(self, records: NDArray[Any]) -> list[str]:
         """Counts statuses; one line for the first solve that did not converge."""
         self.solves += len(records)
-        failed = records[records["status"] != pb.CONVERGED]
+        failed = records[(records["status"] != pb.CONVERGED) & (records["status"] != pb.RUNAWAY)]
         if not len(failed):
             return []
         first = not self.unconverged
@@ -239,6 +262,22 @@ class Telemetry:
             f"object {name!r}, step {int(r['step'])}: not converged ({status}, residual {float(r['residual']):.1e}); "
             "further ones are counted"
         ]
+
+    def count_runaways(self, records: NDArray[Any]) -> list[str]:
+        """Counts steps of bodies that have run away; one line for each of them, with what showed it."""
+        away, lines = records[records["status"] == pb.RUNAWAY], []
+        for r in away[np.unique(away["body"], return_index=True)[1]]:
+            body = self.simulation.world.bodies[int(r["body"])]
+            if body.index not in self.runaways:
+                frozen = self.simulation.energies.on_runaway == "freeze"
+                then = "it is frozen where the step began" if frozen else "it goes on"
+                lines.append(
+                    f"object {body.name!r}, step {int(r['step'])}: runaway: {cause_of(r)}; {then} "
+                    f"(solver.on_runaway = {self.simulation.scene.solver.on_runaway!r}). A smaller dt, more "
+                    "linearizations or the scheme backward_euler may help"
+                )
+        self.runaways.update(away["body"].tolist())
+        return lines
 
     def bad_steps(self, records: NDArray[Any]) -> list[str]:
         """One line for each object whose solve met numbers that are not finite for the first time."""
@@ -256,3 +295,12 @@ class Telemetry:
                     "it goes back to where the step before began and rests there"
                 )
         return lines
+
+
+def cause_of(r: Any) -> str:
+    """What showed in a record (layouts.RECORD) that a body had run away."""
+    if not (np.isfinite(r["kinetic"]) and np.isfinite(r["gravity"])):
+        return "its positions or velocities are no finite numbers"
+    if r["kinetic"] > 2 * max(r["budget"], 0.0):
+        return f"kinetic energy {r['kinetic']:.3g} J, where start and loads account for {r['budget']:.3g} J"
+    return f"two of its nodes moved {r['stride']:.3g} m apart within a step"

@@ -54,6 +54,7 @@ class Track:
         self.in_use = -1  # its step
         self.sent: int | None = None  # step of the last matrix that went out
         self.in_flight = False
+        self.frozen = False  # it has run away and moves no more: needs no factors
         self.wanted: NDArray[np.float64] | None = None  # where the loop copies the matrix asked for
         self.matrix: tuple[int, NDArray[np.float64]] | None = None  # of the job in flight: step and what was sent
         self.asked = 0  # number of the request for it, among those of all bodies

@@ -49,7 +49,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from sim_server.backend import Launch
-from sim_server.effect import Effect
+from sim_server.effect import Effect, ElementEnergies
 from sim_server.errors import InputError
 from sim_server.scene.integrator_options import Integrator
 from sim_server.scene.parameters import complaint
@@ -152,15 +152,14 @@ class Corotational(Effect):
         """(m, 3, 3) rotations of the elements at the last step, from `turn`."""
         return rotation_matrices(self.world.backend.fetch(self.turn))
 
-    def energy(self) -> float:
-        """sum V (mu |S - I|^2 + lambda / 2 tr(S - I)^2) with S = R^T F [J]."""
-        energy = self._energy
+    def energies(self) -> ElementEnergies:
+        """V (mu |S - I|^2 + lambda / 2 tr(S - I)^2) with S = R^T F [J]."""
         text = "effects/corotational_qr.cu" if self.variant == "_qr" else "effects/corotational.cu"
-        self.world.backend.module(text).bind(
+        launch = self.world.backend.module(text).bind(
             "energy", len(self.elements), tets=self.elements, x=self.world.x, gradients=self.gradients, lame=self.lame,
-            energy=energy,
-        )()  # fmt: skip
-        return float(self.world.backend.fetch(energy).sum())
+            energy=self._energy,
+        )  # fmt: skip
+        return ElementEnergies(launch, self._energy, self.owner)
 
 
 def _constants(body: Body, params: Params) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -27,6 +27,7 @@ import numpy as np
 from pydantic import BeforeValidator, PlainSerializer
 
 from sim_server.backend import Launch
+from sim_server.effect import ElementEnergies
 from sim_server.errors import InputError
 from sim_server.hyperelastic import Constant, Law, Tetrahedra, constants_of
 from sim_server.scene.parameters import NotNegative, Positive, complaint
@@ -91,13 +92,13 @@ class Fibres(Tetrahedra):
         )  # fmt: skip
         return [elements, *self.gathers(system, stencil, accumulate)]
 
-    def energy(self) -> float:
-        """sum V W [J]."""
-        self.world.backend.module(TEXT).bind(
+    def energies(self) -> ElementEnergies:
+        """V W [J]."""
+        launch = self.world.backend.module(TEXT).bind(
             "energy", len(self.elements), tets=self.elements, x=self.world.x, gradients=self.gradients,
             volume=self.volume, constants=self.constants, directions=self.directions, energy=self._energy,
-        )()  # fmt: skip
-        return float(self.world.backend.fetch(self._energy).sum())
+        )  # fmt: skip
+        return ElementEnergies(launch, self._energy, self.owner)
 
 
 def build(world: World, listed: list[tuple[Body, Any]]) -> Fibres:

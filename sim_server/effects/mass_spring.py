@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 
 from sim_server.backend import Launch
-from sim_server.effect import Effect
+from sim_server.effect import Effect, ElementEnergies
 from sim_server.errors import InputError
 from sim_server.scene.parameters import File, Parameters, Positive, as_tuple, complaint
 from sim_server.scene.regions import Young, region_values
@@ -152,13 +152,13 @@ class MassSpring(Effect):
         )  # fmt: skip
         return [springs, gather, blocks]
 
-    def energy(self) -> float:
-        """sum k (l - l0)^2 / 2 [J]."""
-        self.world.backend.module("effects/mass_spring.cu").bind(
+    def energies(self) -> ElementEnergies:
+        """k (l - l0)^2 / 2 [J]."""
+        launch = self.world.backend.module("effects/mass_spring.cu").bind(
             "energy", len(self.elements), ends=self.elements, x=self.world.x, stiffness=self.stiffness,
             length=self.length, energy=self._energy,
-        )()  # fmt: skip
-        return float(self.world.backend.fetch(self._energy).sum())
+        )  # fmt: skip
+        return ElementEnergies(launch, self._energy, self.owner)
 
 
 def edge_springs(rest: Reals, tets: Ints, young: Reals) -> tuple[Ints, Reals, Reals]:

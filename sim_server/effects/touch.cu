@@ -11,7 +11,7 @@ struct Apply {
     const real* share;      // (interactions,) 1 / nodes of the interaction
     double* start;          // (interactions,) in, out: negative until its first step [s]
     const double* duration; // (interactions,) [s]
-    const real* force;      // (interactions, 3) push [N]
+    const real* push;       // (interactions, 3) [N]
     const real* target;     // (interactions, 3) of a grab [m]
     const real* stiffness;  // (interactions,) of a grab; 0: a push [N/m]
     const real* limit;      // (interactions,) largest force of a grab [N]
@@ -25,6 +25,9 @@ struct Apply {
     real reach;             // world.reach: dt in backward Euler [s]
     own<real> diagonal;     // (nodes, 1) in, out: += h reach k [kg]
     own<real> b;            // (nodes, 3) in, out: += h f - h reach k ahead [N s]
+    real* force;            // (nodes, 3) out: what pushes, and grabs at their limit, exert in this step [N]
+    real* spring;           // (nodes,) out: k of the grabs below their limit [N/m]
+    real* anchor;           // (nodes, 3) out: where the spring pulls to [m]
 };
 
 // A grab is a spring, implicit while it is below its limit and a constant force above. What it will be is reckoned at the end
@@ -34,6 +37,8 @@ MAILED_KERNEL(apply, Apply) {
     int node = p.node[i];
     vec3 x = load3(p.x, node), ahead = load3(p.ahead, node), b = load3(p.b, node);
     real diagonal = row_at<1>(p.diagonal, node, 0);
+    vec3 force = {}, anchored = {};
+    real springs = 0;
     real inertia = diagonal + (row_at<6>(p.block, node, 0) + row_at<6>(p.block, node, 3) + row_at<6>(p.block, node, 5)) / 3;
     for (int e = p.first[i]; e < p.first[i + 1]; ++e) {
         int k = p.entry[e];
@@ -42,20 +47,28 @@ MAILED_KERNEL(apply, Apply) {
         if (now + p.dt / 2 >= p.start[k] + p.duration[k]) continue;  // so many whole steps, whatever the rounding
         real share = p.share[k];
         if (p.stiffness[k] == 0) {
-            b = b + (p.h * share) * load3(p.force, k);
+            b = b + (p.h * share) * load3(p.push, k);
+            force = force + share * load3(p.push, k);
             continue;
         }
         real spring = share * p.stiffness[k], limit = share * p.limit[k];
-        vec3 pull = spring * (load3(p.target, k) + load3(p.offset, e) - x - p.reach * ahead);
+        vec3 goal = load3(p.target, k) + load3(p.offset, e);
+        vec3 pull = spring * (goal - x - p.reach * ahead);
         real size = sqrt(dot(pull, pull));
         if (size > limit * (1 + p.h * p.reach * spring / inertia)) {
             b = b + (p.h * limit / size) * pull;
+            force = force + (limit / size) * pull;
         } else {
             b = b + p.h * pull;
             diagonal += p.h * p.reach * spring;
+            springs += spring;
+            anchored = anchored + spring * (goal - x);
         }
     }
     if (p.free[node] == 0) return;
     store3(p.b, node, b);
     row_put<1>(p.diagonal, node, 0, diagonal);
+    store3(p.force, node, force);
+    put(p.spring, node, springs);
+    store3(p.anchor, node, springs > 0 ? x + (1 / springs) * anchored : x);
 }

@@ -89,7 +89,10 @@ class TouchError(ValueError):
 
 
 class Touch(Effect):
-    """All interactions of a scene. Changes go to the loop as a new launch, through `publish`."""
+    """All interactions of a scene. Changes go to the loop as a new launch, through `publish`.
+
+    force (n, 3) [N], spring (n,) [N/m], anchor (n, 3) [m]: what they exert on each node in a step.
+    """
 
     def __init__(self, world: World, listed: list[tuple[Body, Any]]):
         self.world = world
@@ -105,6 +108,8 @@ class Touch(Effect):
         self._launch: Launch | None = None  # in use, or about to be; it writes when each interaction began
         self._last_id = 0
         self._points: dict[str, Points] = {}
+        self.force, self.spring, self.anchor = np.zeros_like(world.x), np.zeros(world.nodes), np.zeros_like(world.x)
+        world.backend.keep(self.force, self.spring, self.anchor)
 
     def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
         self._system = system
@@ -335,7 +340,8 @@ class Touch(Effect):
         self._launch = w.backend.module("effects/touch.cu").bind(
             "apply", **self._same[1], start=_each(interactions, "start"), target=_each(interactions, "target"),
             clock=system.clock, x=w.x, ahead=w.ahead, free=w.free, block=system.block, dt=w.dt, h=w.impulse,
-            reach=w.reach, diagonal=system.diagonal, b=system.b,
+            reach=w.reach, diagonal=system.diagonal, b=system.b, force=self.force,
+            spring=self.spring, anchor=self.anchor,
         )  # fmt: skip
         self._applied = self._begun = interactions
         return self._launch
@@ -360,7 +366,8 @@ def _unmoved(interactions: list[Interaction]) -> dict[str, Any]:
         "n": len(touched), "node": touched.astype(np.int32), "first": np.append(first, len(nodes)).astype(np.int32),
         "entry": np.repeat(np.arange(n, dtype=np.int32), count)[order], "offset": np.ascontiguousarray(offset),
         "share": 1.0 / np.array(count, dtype=float),
-        **{value: _each(interactions, value) for value in ("duration", "force", "stiffness", "limit")},
+        **{value: _each(interactions, value) for value in ("duration", "stiffness", "limit")},
+        "push": _each(interactions, "force"),
     }  # fmt: skip
 
 

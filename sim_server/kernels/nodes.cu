@@ -155,6 +155,7 @@ struct Advance {
     real* dv;               // (n, 3) out: R y [m/s]
     real* v;                // (n, 3) in, out [m/s]
     real* x;                // (n, 3) in, out [m]
+    real* before;           // (n, 3) out: x when the step began [m]
 };
 
 // v += dv, x += h v (eq. 2). A body whose forces are no numbers has a y that is none (native/pcg.h): it goes back to where the
@@ -162,8 +163,10 @@ struct Advance {
 // itself again lets it go on.
 KERNEL(advance, Advance) {
     vec3 y = load3(p.y, i), dv = mul(as<number>(load9(p.rotation, i)), y), before = load3(p.v, i), v = before + dv, zero = {};
+    vec3 x = load3(p.x, i);
     auto refused = y.x != y.x, known = dot(before, zero) == 0;
     store3(p.dv, i, select(refused, zero, dv));
     store3(p.v, i, select(refused, zero, v));
-    store3(p.x, i, load3(p.x, i) + p.h * select(refused, select(known, -before, zero), v));
+    store3(p.x, i, x + p.h * select(refused, select(known, -before, zero), v));
+    store3(p.before, i, x);
 }

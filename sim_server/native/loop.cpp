@@ -4,6 +4,7 @@
 // go of Python's lock, so no Python code, network, worker or disk can delay a step.
 #include <cstring>
 
+#include "energy.h"
 #include "newton.h"
 #include "warping.h"
 
@@ -96,9 +97,7 @@ static int first_bad_node(const Loop& loop, const Body& body) {
     return -1;
 }
 
-extern "C" {
-
-void wf_assemble(Loop* loop) {
+static void assemble(Loop* loop) {
     double begin = now();
     Rings& rings = loop->rings;
     loop->cpu_begin = thread_time();
@@ -150,12 +149,14 @@ static void finish_step(Loop* loop) {
         Record& record = rings.records[(first + i) % rings.record_capacity];
         bool used = body.factor && (settings.kind == CHOLESKY || r.kind == CHOLESKY || r.fallbacks);
         record = Record{step, used ? body.factor->step : -1, rings.start_time + step * rings.dt, r.residual,
-                        loop->assemble_seconds, r.seconds, 0, 0, rings.late, loop->assemble_begin, 0, nonlinear, i, r.iterations,
+                        loop->assemble_seconds, r.seconds, 0, 0, rings.late, loop->assemble_begin, 0, nonlinear, NAN, NAN, NAN, NAN,
+                        NAN, NAN, i, r.iterations,
                         r.status, r.kind, settings.kind, r.fallbacks, r.status == NOT_FINITE ? first_bad_node(*loop, body) : -1,
                         settings.probe, linearizations, body.warping};
     }
     double solved = now();
     for (int i = loop->before; i < loop->launches; ++i) run(loop->launch[i], loop->threads);
+    if (loop->energies) account(*loop, energy_due(rings, step));
     double end = now(), cpu = thread_time() - loop->cpu_begin;
     ++rings.step;
     if (!keep) { rings.records_dropped += loop->bodies; }
@@ -165,16 +166,25 @@ static void finish_step(Loop* loop) {
             record.integrate = end - solved;
             record.whole = end - loop->assemble_begin - waited;  // with a factorization that the step waited for
             record.cpu = cpu;
+            if (loop->energies) note_energy(record, loop->energies->balance[i]);
         }
         rings.record_head.store(first + loop->bodies, std::memory_order_release);
     }
     write_frame(*loop);
 }
 
+extern "C" {
+
+void wf_assemble(Loop* loop) {
+    if (loop->energies) enter(*loop);
+    assemble(loop);
+}
+
 // A factor posted since `wf_assemble` is made from the matrix of this step, or the caller does not mind; likewise settings.
 void wf_solve(Loop* loop) {
     for (int i = 0; i < loop->bodies; ++i) take_orders(loop->body[i]);
     finish_step(loop);
+    if (loop->energies) leave(*loop);
 }
 
 int32_t wf_wait(Loop* loop) { return wait_until_due(loop->rings, [] { return false; }); }
@@ -182,10 +192,12 @@ int32_t wf_wait(Loop* loop) { return wait_until_due(loop->rings, [] { return fal
 // Runs until `steps` are done or `stop` is set; returns the steps done.
 int64_t wf_run(Loop* loop, int64_t steps) {
     int64_t done = 0;
+    if (loop->energies) enter(*loop);
     for (; done < steps && wf_wait(loop); ++done) {
-        wf_assemble(loop);
+        assemble(loop);
         finish_step(loop);
     }
+    if (loop->energies) leave(*loop);
     return done;
 }
 
@@ -211,6 +223,7 @@ void wf_precondition(Loop* loop, int32_t index, const double* r, double* z, doub
 int32_t wf_sizes(int32_t* sizes) {  // layouts, checked against the Python side
     sizes[0] = sizeof(Launch); sizes[1] = sizeof(Body); sizes[2] = sizeof(Loop); sizes[3] = sizeof(Factor);
     sizes[4] = sizeof(Pattern); sizes[5] = sizeof(Record); sizes[6] = sizeof(Newton); sizes[7] = sizeof(Search);
-    return 8;
+    sizes[8] = sizeof(Elastic); sizes[9] = sizeof(Energies); sizes[10] = sizeof(Balance);
+    return 11;
 }
 }

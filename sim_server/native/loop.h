@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: MIT
 // Memory of the simulation loop (loop.cpp). layouts.py holds the same layouts.
 #pragma once
+#include "balance.cuh"
 #include "pcg.h"
 #include "search.cuh"
 
@@ -47,6 +48,27 @@ struct Newton {                        // several linearizations a step (newton.
     Search* search;                    // (bodies,)
 };
 
+struct Elastic {                       // potential energies of the elements of an effect
+    Launch launch;
+    const double* energy;              // (items,) out [J]
+    const int32_t* parts;              // (bodies + 1,) items of each body
+};
+
+struct Energies {                      // energy.h
+    double gravity[3];                 // [m/s2]
+    const double* mass;                // (nodes,) [kg]
+    const double* before;              // (nodes, 3) x when the step began [m]
+    double *force, *spring, *anchor;   // of hands (effects/touch.cu); null: nothing can be touched
+    double* free;                      // (nodes,) 0 from when a body is frozen
+    double** still;                    // arrays (nodes, 3) that are 0 then
+    Elastic* elastic;
+    Balance* balance;                  // (bodies,)
+    double* left;                      // (2, nodes, 3) x and v when the loop was left
+    int32_t stills, elastics, on_runaway, inertia;
+    int32_t begun;                     // the energy before the first step is known
+    int32_t unused;
+};
+
 struct Loop {
     int32_t launches, before;          // launches; how many of them assemble (the others integrate)
     Launch* launch;
@@ -64,6 +86,7 @@ struct Loop {
     double* clock;                     // (1,) s, read by kernels
     int32_t* warping;                  // (bodies,) likewise
     int32_t* moving;                   // (bodies,) 0: the body rests (kernels/nodes.cu)
+    Energies* energies;                // or null
     int32_t threads;                   // of this process, for launches and bodies
     int32_t unused;
     double assemble_begin;

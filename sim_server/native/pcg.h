@@ -19,7 +19,7 @@
 
 enum Kind { NONE = 0, JACOBI = 1, BLOCK_JACOBI = 2, CHOLESKY = 3, SSOR = 4 };  // CHOLESKY: any factor
 enum Status { CONVERGED = 0, MAX_ITERATIONS = 1, BUDGET = 2, BREAKDOWN_MATRIX = 3, BREAKDOWN_PRECONDITIONER = 4, NOT_FINITE = 5,
-              MAX_LINEARIZATIONS = 6 };  // of a step
+              MAX_LINEARIZATIONS = 6, RUNAWAY = 7 };  // the last two of a step
 
 constexpr int ENOUGH = 20;
 

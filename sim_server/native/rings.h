@@ -15,6 +15,8 @@ struct Record {
     double assemble, solve, integrate, whole, late, begin;  // s; begin: steady clock
     double cpu;            // s of processor time of the thread, whole step
     double nonlinear;      // |b| at the end of the step over the first |b|; -1: not evaluated
+    double kinetic, elastic, gravity, work, budget;  // J (kernels/balance.cuh); elastic: NaN where it was not evaluated
+    double stride;         // m
     int32_t body, iterations, status, kind, asked, fallbacks, bad_node, probe, linearizations, warping;
 };
 
@@ -29,6 +31,7 @@ struct Rings {
     int64_t* frame_steps;
     int64_t frame_capacity;
     std::atomic<int64_t> frame_every;      // 0: none; set from outside as viewers come and go
+    std::atomic<int64_t> energy_every;     // likewise of steps whose elastic energy is evaluated
     std::atomic<int64_t> frame_head, frame_tail;
     std::atomic<int64_t> frames_dropped, records_dropped, late_steps;
     int32_t realtime;                      // keep pace with the wall clock
@@ -37,6 +40,12 @@ struct Rings {
     double deadline;                       // steady clock, of the next step; 0: now
     double late;                           // s that the step began after its deadline
 };
+
+// Is the elastic energy after so many steps wanted?
+static inline bool energy_due(const Rings& rings, int64_t step) {
+    const int64_t every = rings.energy_every.load(std::memory_order_relaxed);
+    return every > 0 && step % every == 0;
+}
 
 static inline double now() {
     return std::chrono::duration<double>(std::chrono::steady_clock::now().time_since_epoch()).count();

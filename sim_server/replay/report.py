@@ -14,7 +14,8 @@ from sim_server.engine import Kind
 from sim_server.replay.log import Recording
 
 Pair = tuple[NDArray[np.float64], NDArray[np.float64]]
-COMPARED = ("iterations", "residual", "status", "kind", "fallbacks", "factor_step", "linearizations")
+COMPARED = ("iterations", "residual", "status", "kind", "fallbacks", "factor_step", "linearizations", "kinetic", "work")
+TOLD_LATER = ("kinetic", "work")  # NaN in a log of a version that did not tell
 
 
 class Comparison:
@@ -48,7 +49,8 @@ class Comparison:
         """One step: records of the engine and rows of the log, one a body in order."""
         for record, row, name in zip(records, rows, self.recording.scene.objects, strict=True):
             self.solves_compared += 1
-            different = [n for n in COMPARED if not _same(record[n], row[n])]
+            told = [n for n in COMPARED if n not in TOLD_LATER or not math.isnan(row[n])]
+            different = [n for n in told if not _same(record[n], row[n])]
             if different:
                 self.solves_different += 1
                 detail = ", ".join(f"{n} {_shown(n, record[n])}, recorded {_shown(n, row[n])}" for n in different)
@@ -109,7 +111,7 @@ def _shown(name: str, value: Any) -> str:
         return pb.SolveStatus.Name(int(value)).lower()
     if name == "kind":
         return Kind(int(value)).name.lower()
-    return repr(float(value)) if name == "residual" else str(int(value))
+    return repr(float(value)) if name in ("residual", *TOLD_LATER) else str(int(value))
 
 
 def _farthest(a: NDArray[np.float64], b: NDArray[np.float64]) -> tuple[int, float]:

@@ -40,11 +40,12 @@ class Replay:
     def __init__(self, recording: Recording):
         self.recording = recording
         try:
-            scene = Scene.model_validate(json.loads(recording.scene.resolved))
+            table = json.loads(recording.scene.resolved)
+            scene, watched = Scene.model_validate(table), "on_runaway" in table.get("solver", {})
         except (ValidationError, ValueError) as error:
             raise BadLog(f"{recording.path}: the scene in the log cannot be built: {error}") from error
         try:
-            self.simulation = Simulation(scene, recording.device)
+            self.simulation = Simulation(scene, recording.device, watched)
         except DeviceError as error:
             raise BadLog(
                 f"{recording.path}: recorded on a GPU ({recording.scene.software}), and only one can run it again: "

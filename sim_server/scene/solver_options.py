@@ -65,6 +65,7 @@ def _warp(value: Any) -> bool | str:
 
 
 Precision = Literal["float64", "mixed", "float32"]
+OnRunaway = Literal["freeze", "go_on"]
 FactorPrecision = Literal["auto", "float16", "float32", "float64"]
 _ONLY: dict[str, dict[str, tuple[str, ...]]] = {  # what the devices have
     "preconditioner": {
@@ -106,6 +107,9 @@ class Solver(Parameters):
         default="auto", description="of the factor as applied; auto: float16 on a GPU, float32 on a CPU"
     )
     budget: float = Field(default=0.0, ge=0, description="wall time per solve [s]; 0 = none")
+    on_runaway: OnRunaway = Field(
+        default="freeze", description="what becomes of a body with more energy than it can have come by"
+    )
     threads: int = Field(default=1, ge=1, le=1024)
     warm_start: bool = Field(default=True, description="start from the last step's dv")
     recycle: int = Field(

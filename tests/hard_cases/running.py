@@ -18,7 +18,7 @@ from tests.hard_cases.case import Case, Hold
 
 Reals = NDArray[np.float64]
 STATUS = ("converged", "max_iterations", "budget", "breakdown_matrix", "breakdown_preconditioner", "not_finite",
-          "max_linearizations")  # fmt: skip
+          "max_linearizations", "runaway")  # fmt: skip
 
 
 @dataclass

@@ -1,0 +1,95 @@
+// SPDX-License-Identifier: MIT
+// The energy of a body from step to step, and when it is called a runaway: what both devices share (native/energy.h, gpu/tick.cu).
+//
+//     kinetic  sum m v.v / 2          gravity  -sum m g.x          work  of pushes and grabs since the start
+//     budget   kinetic + elastic + gravity before the first step, + work, - gravity now
+//
+// Elasticity and damping take from the budget and give nothing to it, so that kinetic <= budget but for errors of the time step. A
+// body runs away in the step in which
+//   - kinetic > SLACK max(budget, 0) + floor, or is no number. Over all scenes and hard cases of the tests kinetic / budget is at most
+//     1.13, and what grows without bound passes any factor soon. The floor is a body all of whose nodes move by 1e-3 of its size in
+//     a step: below it the budget may be rounding;
+//   - the steps of two of its nodes differ by more than LONG of its size along an axis, beyond what they differed by at the
+//     start. In the same cases it is at most 1.7, but where a body was thrown or spun. Without inertia there is this one alone.
+// Its size is the longer of its diagonals at rest and at the start.
+#pragma once
+#include "anywhere.cuh"
+
+constexpr double SLACK_OF_ENERGY = 2, LONG = 4, SLOW = 1e-3;
+
+enum OnRunaway { FREEZE = 0, GO_ON = 1, UNWATCHED = 2 };
+enum BalancePhase { WELL = 0, AWAY = 1, FROZEN = 2 };  // AWAY: in the last step, and it goes on
+
+struct Sums {  // over nodes
+    double kinetic = 0, gravity = 0, work = 0;
+    double low[3] = {1e300, 1e300, 1e300}, high[3] = {-1e300, -1e300, -1e300};  // of their steps [m]
+};
+
+struct Balance {      // of a body, after its last step [J]
+    double start;     // kinetic + elastic + gravity before the first step
+    double mass;      // [kg]
+    double diagonal;  // at rest [m]
+    double floor;     // of kinetic
+    double limit;     // of stride [m]
+    double kinetic, elastic, gravity, work, budget;
+    double stride;    // largest difference of two nodes' steps along an axis [m]
+    int phase;
+    int found;        // 1: in the last step it was found to run away; figures are then of the state that it came to
+};
+
+ANYWHERE double square(double a) { return a * a; }
+ANYWHERE bool is_finite(double a) { return a - a == 0; }
+
+template <class T>
+ANYWHERE void add_node(Sums& s, double mass, const T* x, const T* v, const double* step, const double* gravity) {
+    s.kinetic += 0.5 * mass * ((double)v[0] * v[0] + (double)v[1] * v[1] + (double)v[2] * v[2]);
+    s.gravity -= mass * (gravity[0] * x[0] + gravity[1] * x[1] + gravity[2] * x[2]);
+    for (int c = 0; c < 3; ++c) {
+        s.low[c] = step[c] < s.low[c] ? step[c] : s.low[c];
+        s.high[c] = step[c] > s.high[c] ? step[c] : s.high[c];
+    }
+}
+
+// Of a force that does not change and of a spring, along the straight way from `from`: exact.
+template <class T>
+ANYWHERE double work_on(const T* force, double spring, const T* anchor, const T* from, const double* step) {
+    double work = 0;
+    for (int c = 0; c < 3; ++c) work += (force[c] + spring * ((double)anchor[c] - from[c] - 0.5 * step[c])) * step[c];
+    return work;
+}
+
+ANYWHERE double stride_of(const Sums& s) {
+    double most = 0;
+    for (int c = 0; c < 3; ++c) most = s.high[c] - s.low[c] > most ? s.high[c] - s.low[c] : most;
+    return most;
+}
+
+// s: before the first step, with dt v for steps. size: diagonal at the start [m]. elastic and diagonal are there.
+ANYWHERE void start_balance(Balance& b, const Sums& s, double size, double dt, bool inertia) {
+    if (b.phase == FROZEN) return;
+    const double longest = size > b.diagonal ? size : b.diagonal;
+    b.kinetic = inertia ? s.kinetic : 0;
+    b.gravity = s.gravity;
+    b.work = 0;
+    b.start = b.budget = b.kinetic + b.elastic + b.gravity;
+    b.floor = 0.5 * b.mass * square(SLOW * longest / dt);
+    b.limit = LONG * longest + 2 * stride_of(s);
+    b.phase = WELL;
+}
+
+// After a step. True where the body is to be frozen now.
+ANYWHERE bool take_stock(Balance& b, const Sums& s, int on_runaway, bool inertia) {
+    b.kinetic = inertia ? s.kinetic : 0;
+    b.gravity = s.gravity;
+    b.work += b.phase == FROZEN ? 0 : s.work;
+    b.stride = stride_of(s);
+    b.found = 0;
+    b.budget = b.start + b.work - b.gravity;
+    if (b.phase == FROZEN) return false;
+    const double most = SLACK_OF_ENERGY * (b.budget > 0 ? b.budget : 0) + b.floor;
+    const bool known = b.budget == b.budget;  // else the start had no energy that the law defines
+    const bool away = !is_finite(s.kinetic) || !is_finite(s.gravity) || (known && b.kinetic > most) || b.stride > b.limit;
+    b.found = away && on_runaway != UNWATCHED;
+    b.phase = !b.found ? WELL : on_runaway == FREEZE ? FROZEN : AWAY;
+    return b.phase == FROZEN;
+}

@@ -1,0 +1,115 @@
+// SPDX-License-Identifier: MIT
+// The energy of each body after a step, and whether it has run away (kernels/balance.cuh). One pass over the nodes; the elastic
+// energy takes one over the elements and is made on demand alone.
+#pragma once
+#include <cstring>
+
+#include "loop.h"
+
+static void run(const Launch& l, int threads);
+
+// Sums over a body's nodes.
+static Sums sums_of(const Loop& loop, const Body& body) {
+    Energies& e = *loop.energies;
+    Sums s;
+    for (int i = body.first; i < body.last; ++i) {
+        const double *x = loop.x + 3 * i, *v = loop.v + 3 * i, *from = e.before + 3 * i;
+        const double step[3] = {x[0] - from[0], x[1] - from[1], x[2] - from[2]};
+        add_node(s, e.mass[i], x, v, step, e.gravity);
+        if (!e.force) continue;
+        double *force = e.force + 3 * i, *anchor = e.anchor + 3 * i, &spring = e.spring[i];
+        if (spring == 0 && force[0] == 0 && force[1] == 0 && force[2] == 0) continue;
+        s.work += work_on(force, spring, anchor, from, step);
+        force[0] = force[1] = force[2] = spring = 0;  // until something touches the node again
+    }
+    return s;
+}
+
+static void measure_elastic(Loop& loop) {
+    Energies& e = *loop.energies;
+    for (int i = 0; i < loop.bodies; ++i) e.balance[i].elastic = 0;
+    for (int k = 0; k < e.elastics; ++k) {
+        const Elastic& elastic = e.elastic[k];
+        run(elastic.launch, loop.threads);
+        for (int i = 0; i < loop.bodies; ++i)
+            for (int j = elastic.parts[i]; j < elastic.parts[i + 1]; ++j) e.balance[i].elastic += elastic.energy[j];
+    }
+}
+
+// Whether somebody has set the body's positions or velocities since the loop was left.
+static bool was_set(const Loop& loop, const Body& body) {
+    const int64_t at = 3 * (int64_t)body.first, bytes = sizeof(double) * 3 * (int64_t)(body.last - body.first);
+    const double* left = loop.energies->left;
+    return std::memcmp(left + at, loop.x + at, bytes) || std::memcmp(left + 3 * (int64_t)loop.nodes + at, loop.v + at, bytes);
+}
+
+static void begin_balance(const Loop& loop, const Body& body, Balance& balance) {
+    const Energies& e = *loop.energies;
+    const double dt = loop.rings.dt;
+    Sums s;
+    double low[3] = {INFINITY, INFINITY, INFINITY}, high[3] = {-INFINITY, -INFINITY, -INFINITY}, size = 0;
+    for (int i = body.first; i < body.last; ++i) {
+        const double *x = loop.x + 3 * i, *v = loop.v + 3 * i, step[3] = {dt * v[0], dt * v[1], dt * v[2]};
+        add_node(s, e.mass[i], x, v, step, e.gravity);
+        for (int c = 0; c < 3; ++c) {
+            low[c] = std::fmin(low[c], x[c]);
+            high[c] = std::fmax(high[c], x[c]);
+        }
+    }
+    for (int c = 0; c < 3; ++c) size += square(high[c] - low[c]);
+    start_balance(balance, s, std::sqrt(size), dt, e.inertia);
+}
+
+// Before the first step, and where the state was set: energy is reckoned from here on.
+static void enter(Loop& loop) {
+    Energies& e = *loop.energies;
+    bool measured = false;
+    for (int i = 0; i < loop.bodies; ++i) {
+        if (e.begun && !was_set(loop, loop.body[i])) continue;
+        if (!measured) measure_elastic(loop);
+        measured = true;
+        begin_balance(loop, loop.body[i], e.balance[i]);
+    }
+    e.begun = 1;
+}
+
+static void leave(const Loop& loop) {
+    const int64_t n = 3 * (int64_t)loop.nodes;
+    std::memcpy(loop.energies->left, loop.x, sizeof(double) * n);
+    std::memcpy(loop.energies->left + n, loop.v, sizeof(double) * n);
+}
+
+// Back to where the step began, and at rest from now on: as if all nodes were fixed.
+static void freeze(const Loop& loop, const Body& body) {
+    const Energies& e = *loop.energies;
+    const int64_t at = 3 * (int64_t)body.first, n = 3 * (int64_t)(body.last - body.first);
+    std::memcpy(loop.x + at, e.before + at, sizeof(double) * n);
+    for (int k = 0; k < e.stills; ++k) std::memset(e.still[k] + at, 0, sizeof(double) * n);
+    for (int i = body.first; i < body.last; ++i) e.free[i] = 0;
+}
+
+// After a step. elastic: the elastic energy is wanted.
+static void account(Loop& loop, bool elastic) {
+    Energies& e = *loop.energies;
+#pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) if (loop.threads > 1 && loop.bodies > 1)
+    for (int i = 0; i < loop.bodies; ++i) {
+        const bool frozen = take_stock(e.balance[i], sums_of(loop, loop.body[i]), e.on_runaway, e.inertia);
+        if (frozen) freeze(loop, loop.body[i]);
+    }
+    if (elastic) measure_elastic(loop);
+    for (int i = 0; i < loop.bodies; ++i)
+        if (!elastic || e.balance[i].found) e.balance[i].elastic = NAN;
+}
+
+static void note_energy(Record& record, const Balance& b) {
+    record.kinetic = b.kinetic;
+    record.elastic = b.elastic;
+    record.gravity = b.gravity;
+    record.work = b.work;
+    record.budget = b.budget;
+    record.stride = b.stride;
+    if (b.phase != WELL && record.status != NOT_FINITE) record.status = RUNAWAY;
+    if (b.phase != FROZEN || b.found) return;
+    record.factor_step = -1;  // there was nothing to solve
+    record.kind = record.asked;
+}
