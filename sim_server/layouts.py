@@ -129,7 +129,8 @@ class Energies(c.Structure):
     _fields_ = [
         ("g", c.c_double * 3), ("mass", c.c_void_p), ("before", c.c_void_p), ("force", c.c_void_p),
         ("spring", c.c_void_p), ("anchor", c.c_void_p), ("free", c.c_void_p), ("still", c.POINTER(c.c_void_p)),
-        ("elastic", c.POINTER(Elastic)), ("balance", c.c_void_p), ("left", c.c_void_p), ("stills", c.c_int32), ("elastics", c.c_int32),
+        ("elastic", c.POINTER(Elastic)), ("balance", c.c_void_p), ("left", c.c_void_p),
+        ("stills", c.c_int32), ("elastics", c.c_int32),
         ("on_runaway", c.c_int32), ("inertia", c.c_int32), ("begun", c.c_int32), ("unused", c.c_int32),
     ]  # fmt: skip
 

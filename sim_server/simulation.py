@@ -74,7 +74,10 @@ class Simulation:
             names = [b.name for b in w.bodies]
             planes = 2 if scene.solver.factor_precision == "float32" else 1
             more = self._more(assemble)
-            self.engine = GpuEngine(gpu, assemble, integrate, ranges, w.dt, names, planes=planes, more=more, **arrays)  # type: ignore[arg-type]
+            launches: tuple[Any, Any, Any] = assemble, integrate, more
+            self.engine = GpuEngine(
+                gpu, *launches[:2], ranges, w.dt, self.energies, names, planes=planes, more=launches[2], **arrays
+            )
         else:
             newton = self.integrator.newton(assemble, list(self.effects.values()))
             threads = scene.solver.threads

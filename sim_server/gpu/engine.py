@@ -14,12 +14,14 @@ from numpy.typing import NDArray
 
 from protocol.factor import FactorPattern
 from sim_server.backend import HERE
+from sim_server.energy import Energies
 from sim_server.engine import ADOPTED, HELD, MOVED, NOTED, Newton
 from sim_server.gpu.cuda import CudaDevice
-from sim_server.gpu.device import DeviceLaunch, Gpu
-from sim_server.gpu.fuse import End, Fused, fused
+from sim_server.gpu.device import DeviceLaunch, Gpu, processors
+from sim_server.gpu.energies import ACCOUNT, DeviceEnergies, lanes
+from sim_server.gpu.fuse import End, Fused, fused, shape
 from sim_server.gpu.intake import Intake
-from sim_server.gpu.layouts import FOUND, STAMP, Mail
+from sim_server.gpu.layouts import ENERGY, FOUND, STAMP, Mail
 from sim_server.gpu.loop import CAPACITY, MANY, DeviceLoop
 from sim_server.gpu.mailbox import Mailbox
 from sim_server.gpu.search import Search, Turns
@@ -30,7 +32,7 @@ TICK = np.dtype(
     [
         ("clock", "u8"), ("step", "u8"), ("dt", "f8"), ("arrived", "u8"), ("finished", "u8"), ("stamps", "u8"),
         ("results", "u8"), ("reports", "u8"), ("moving", "u8"), ("barriers", "i4"), ("capacity", "i4"),
-        ("words", "i4"), ("bodies", "i4"),
+        ("words", "i4"), ("bodies", "i4"), ("account", ACCOUNT),
     ]
 )  # fmt: skip
 
@@ -94,8 +96,9 @@ class GpuEngine(DeviceLoop):
 
     def __init__(
         self, gpu: Gpu, assemble: Sequence[DeviceLaunch], integrate: Sequence[DeviceLaunch],
-        ranges: Sequence[tuple[int, int]], dt: float, names: Sequence[str] = (), records: int = 8192, planes: int = 1,
-        more: tuple[Newton, Sequence[DeviceLaunch]] | None = None, **arrays: NDArray[Any],
+        ranges: Sequence[tuple[int, int]], dt: float, energies: Energies, names: Sequence[str] = (),
+        records: int = 8192, planes: int = 1, more: tuple[Newton, Sequence[DeviceLaunch]] | None = None,
+        **arrays: NDArray[Any],
     ):  # fmt: skip
         self.gpu, self.launches, self._arrays = gpu, [*assemble, *integrate], arrays
         self._fused = fused(assemble)
@@ -105,6 +108,8 @@ class GpuEngine(DeviceLoop):
         self._counter = cp.zeros(1, np.int64)
         self._stamps = device.pinned(CAPACITY * STAMP.itemsize)
         self._results = device.pinned(CAPACITY * RESULT.itemsize * bodies)
+        told = device.pinned(CAPACITY * ENERGY.itemsize * bodies)
+        self._energies = DeviceEnergies(gpu, energies, told, self._counter, dt)
         turns = Turns.of(gpu, bodies) if more else None
         self.solver = Solver(gpu, ranges, arrays, self._counter, CAPACITY, planes, turns or ())
         self._search, found = None, None
@@ -125,7 +130,7 @@ class GpuEngine(DeviceLoop):
             addresses["values"] = int(self._search.first_values.data.ptr)
         super().__init__(
             device, ranges, arrays["row_start"], dt, boxes, self._results, self._stamps, arrays["clock"],
-            records, twins["values"].dtype, found, **addresses,
+            records, twins["values"].dtype, found, told, **addresses,
         )  # fmt: skip
         self._warping.mailbox = self.mailboxes[-1]
         names = names or [f"body {k}" for k in range(bodies)]
@@ -136,6 +141,8 @@ class GpuEngine(DeviceLoop):
             self.mailboxes[bodies + k].post(whole[SETTINGS:])
         self.begin: list[DeviceLaunch] = []  # before the first step
         self._graphs: list[Any] = []
+        threads = shape("elements", integrate[0].items, processors()).threads
+        self._energies.params["lanes"] = lanes(threads, bodies)
         self._tick = self._end_of_step(dt)
         self._last = Fused(integrate, End((HERE / "gpu/tick.cu").read_text(), "Tick", self._tick))
         self._stamp = self._last.function("stamp")
@@ -155,6 +162,7 @@ class GpuEngine(DeviceLoop):
         tick["stamps"], tick["reports"] = self._stamps.ctypes.data, self._results.ctypes.data
         tick["dt"], tick["barriers"], tick["capacity"] = dt, len(self.solver.arrived), CAPACITY
         tick["words"], tick["bodies"] = len(self._ranges) * RESULT.itemsize // 8, len(self._ranges)
+        tick["account"] = self._energies.params
         return tick
 
     exact = False  # settings hold for batches of steps
@@ -167,11 +175,17 @@ class GpuEngine(DeviceLoop):
         return super().run(steps)
 
     def _make_ready(self) -> None:
-        """What a scheme makes of the state before the first step."""
+        """What a scheme makes of the state before the first step, and the energy that it has."""
         if self.begin and self.step == 0:
             for launch in self.begin:
                 launch()
-            self.gpu.cp.cuda.get_current_stream().synchronize()
+        if not self._energies.started:
+            self._energies.start()
+        self.gpu.cp.cuda.get_current_stream().synchronize()
+
+    def restart_energy(self) -> None:
+        """Has energy reckoned from the state at the beginning of the next step: for those who have set x or v."""
+        self._energies.started = False
 
     def _capture(self) -> None:
         many = self._search is None or self._search.rounds <= FEW
@@ -187,7 +201,12 @@ class GpuEngine(DeviceLoop):
                     for _ in range(steps):
                         self._one_step()
                     self._graphs.append(self._steps.end_capture())
-        self.use_graphs([int(graph.graphExec) if graph else 0 for graph in self._graphs])
+        with self._steps:
+            self._steps.begin_capture()
+            self._energies.launch()
+            elastic = self._steps.end_capture()
+        self.use_graphs([int(graph.graphExec) if graph else 0 for graph in self._graphs], int(elastic.graphExec))
+        self._graphs.append(elastic)  # lives as long as the others
 
     def _begin(self) -> None:
         """Notes the time: the device has had nothing to do until now."""

@@ -10,6 +10,10 @@ from sim_server.layouts import Rings
 p, i64 = c.c_void_p, c.c_int64
 DEPTH, PICTURES = 2, 4  # batches and frames under way at most
 STAMP = np.dtype([("begin", "i8"), ("end", "i8")])
+ENERGY = np.dtype(
+    [(n, "f8") for n in ("kinetic", "elastic", "gravity", "work", "budget", "stride")]
+    + [("phase", "i4"), ("found", "i4")]
+)
 FOUND = np.dtype([("nonlinear", "f8"), ("linearizations", "i4"), ("unused", "i4")])
 
 
@@ -56,7 +60,8 @@ class Loop(c.Structure):
         ("cuda", c.POINTER(Cuda)), ("context", p), ("stream", p), ("copies", p), ("graphs", p * 4), ("many", i64),
          ("mailbox", c.POINTER(Mailbox)), ("body", c.POINTER(Body)),
         ("mailboxes", c.c_int32), ("bodies", c.c_int32), ("results", p), ("stamps", p),
-        ("found", p), ("capacity", i64), ("batch", i64), ("values", c.c_uint64), ("staged", c.c_uint64),
+        ("found", p), ("energies", p), ("elastic", p), ("capacity", i64), ("batch", i64),
+        ("values", c.c_uint64), ("staged", c.c_uint64),
         ("matrices", p), ("snapped", p), ("home", p), ("x", c.c_uint64), ("v", c.c_uint64), ("pictures", c.c_uint64),
         ("frame_bytes", i64), ("clock", p), ("span", c.c_double), ("poll", c.c_double), ("step_seconds", c.c_double),
         ("idle", c.c_double), ("cpu", c.c_double), ("begun", i64), ("finished", i64), ("launched", i64),

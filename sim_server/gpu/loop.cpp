@@ -39,6 +39,7 @@ static bool open_batch(Loop& l) {
 static bool count(Loop& l, int64_t steps) {
     l.launched += steps;
     l.batches[l.begun % DEPTH].steps += steps;
+    if (energy_due(l.rings, l.launched)) CALL(graph_launch, l.elastic, l.stream);
     return begin_matrices(l) && begin_frame(l);
 }
 
@@ -53,6 +54,9 @@ static int64_t batch_size(Loop& l, int64_t left) {
     return std::max<int64_t>(1, std::min({size, left, l.batch - l.launched % l.batch}));  // so none goes over the end of the device's rings
 }
 
+// No step that is a multiple of `every` comes before the last of the next n.
+static bool none_within(const Loop& l, int64_t every, int64_t n) { return every <= 0 || every - l.launched % every >= n; }
+
 static bool launch_batch(Loop& l, int64_t steps) {
     if (!open_batch(l)) return false;
     if (l.begun == l.finished || done(l, l.batches[(l.begun - 1) % DEPTH].done)) {
@@ -60,8 +64,8 @@ static bool launch_batch(Loop& l, int64_t steps) {
         l.idle = now();
     }
     for (int64_t left = steps; left > 0;) {
-        int64_t every = l.rings.frame_every.load(), n = l.many;
-        bool undisturbed = every <= 0 || every - l.launched % every >= n;
+        int64_t n = l.many;
+        bool undisturbed = none_within(l, l.rings.frame_every.load(), n) && none_within(l, l.rings.energy_every.load(), n);
         bool wanted = l.asked.load(std::memory_order_relaxed) && l.matrix_step < 0;
         if (!l.graphs[0][1] || left < n || !undisturbed || wanted) n = 1;
         CALL(graph_launch, l.graphs[l.stalled][n > 1], l.stream);
@@ -84,11 +88,12 @@ static void report(Loop& l, const Batch& batch, int64_t k, double end, double cp
     for (int i = 0; keep && i < l.bodies; ++i) {
         const Result& r = results[i];
         const Found& found = l.found ? l.found[slot + i] : once;
-        rings.records[(head + i) % rings.record_capacity] =
-            Record{step, r.factor_step, rings.start_time + step * rings.dt, r.residual, 0, r.seconds, 0,
+        Record& record = rings.records[(head + i) % rings.record_capacity];
+        record = Record{step, r.factor_step, rings.start_time + step * rings.dt, r.residual, 0, r.seconds, 0,
                    1e-9 * (stamp.end - stamp.begin), k ? 0 : batch.late, end - 1e-9 * (last.end - stamp.begin), cpu,
-                   found.nonlinear, i, r.iterations, r.status, r.kind, r.asked, r.fallbacks, r.bad_node, r.probe,
+                   found.nonlinear, NAN, NAN, NAN, NAN, NAN, NAN, i, r.iterations, r.status, r.kind, r.asked, r.fallbacks, r.bad_node, r.probe,
                    found.linearizations, r.warping};
+        if (l.energies) note_energy(record, l.energies[slot + i]);
     }
     rings.step.store(step);
     *l.clock = rings.start_time + step * rings.dt;
@@ -161,9 +166,19 @@ int32_t wf_gpu_close(Loop* loop) {
 
 Mail* wf_gpu_post(Mailbox* box, Mail* mail) { return box->mail.exchange(mail); }
 
+// Of a body before the first step. sums: kinetic, gravity, longest difference of dt v [m], diagonal [m] at the start.
+void wf_gpu_start_balance(Balance* balance, const double* sums, double dt, int32_t inertia) {
+    Sums s = no_sums();
+    s.kinetic = sums[0];
+    s.gravity = sums[1];
+    s.low[0] = 0;
+    s.high[0] = sums[2];
+    start_balance(*balance, s, sums[3], dt, inertia);
+}
+
 int32_t wf_gpu_sizes(int32_t* sizes) {  // layouts, checked against the Python side
     int32_t ours[] = {sizeof(Cuda), sizeof(Mail), sizeof(Mailbox), sizeof(Result), sizeof(Stamp), sizeof(Found), sizeof(Body),
-                      sizeof(Loop), sizeof(Record)};
+                      sizeof(Loop), sizeof(Record), sizeof(Energy), sizeof(Balance)};
     std::memcpy(sizes, ours, sizeof ours);
     return sizeof ours / sizeof *ours;
 }

@@ -44,6 +44,11 @@ struct Result {                 // solve.cuh
 
 struct Found { double nonlinear; int32_t linearizations, unused; };  // search.cu
 
+struct Energy {                 // account.cuh
+    double kinetic, elastic, gravity, work, budget, stride;
+    int32_t phase, found;
+};
+
 struct Stamp { int64_t begin, end; };  // of a step, ns of the device's clock
 
 struct Body {
@@ -76,6 +81,8 @@ struct Loop {
     const Result* results;             // (capacity, bodies) pinned; the steps write there themselves
     const Stamp* stamps;               // (capacity,) likewise
     const Found* found;                // (capacity, bodies) likewise; null: one linearization a step
+    const Energy* energies;            // (capacity, bodies) likewise
+    void* elastic;                     // graph that adds the elastic energy of the last step to them
     int64_t capacity, batch;           // batch: most steps in one; divides the capacity
     Address values, staged;            // A of all bodies, and as much room beside
     char* matrices;                    // ... and on the host, pinned

@@ -55,8 +55,8 @@ class DeviceLoop(Reports):
 
     row_start: of A. ranges: nodes [first, last) of each body. mailboxes: (device address, bytes) of each.
     results, stamps: host memory (CAPACITY, bodies) of RESULT and (CAPACITY,) of STAMP that the steps write to. found:
-    likewise (CAPACITY, bodies) of FOUND; None: one linearization a step. clock: host array (1,). real: of values, x and
-    v on the device, whose addresses these are.
+    likewise (CAPACITY, bodies) of FOUND; None: one linearization a step. energies: likewise of ENERGY. clock:
+    host array (1,). real: of values, x and v on the device, whose addresses these are.
     """
 
     positions_later = True
@@ -64,7 +64,8 @@ class DeviceLoop(Reports):
     def __init__(
         self, device: Device, ranges: Sequence[tuple[int, int]], row_start: NDArray[Any], dt: float,
         mailboxes: Sequence[tuple[int, int]], results: NDArray[Any], stamps: NDArray[Any], clock: Reals,
-        records: int = 8192, real: Any = np.float64, found: NDArray[Any] | None = None, **addresses: int,
+        records: int = 8192, real: Any = np.float64, found: NDArray[Any] | None = None,
+        energies: NDArray[Any] | None = None, **addresses: int,
     ):  # fmt: skip
         self._device, self._ranges, bodies, nodes = device, ranges, len(ranges), len(row_start) - 1
         self._native = library()
@@ -94,7 +95,8 @@ class DeviceLoop(Reports):
         loop.pictures = device.memory(PICTURES * 2 * frame)
         loop.results, loop.stamps = results.ctypes.data, stamps.ctypes.data
         loop.found = None if found is None else found.ctypes.data
-        self._written = (results, stamps, clock, found)
+        loop.energies = None if energies is None else energies.ctypes.data
+        self._written = (results, stamps, clock, found, energies)
         self._pinned = self._events_and_memory(loop, sum(-(-size // 16) * 16 for _, size in mailboxes))
 
     def _events_and_memory(self, loop: layouts.Loop, upload: int) -> list[NDArray[np.uint8]]:
@@ -108,9 +110,10 @@ class DeviceLoop(Reports):
 
     # --- running ------------------------------------------------------------------------------------------------
 
-    def use_graphs(self, graphs: Sequence[int]) -> None:
-        """Handles of the graphs of one step and of MANY steps (0: none), then of the same with the time noted first."""
-        self.loop.graphs[:] = graphs
+    def use_graphs(self, graphs: Sequence[int], elastic: int) -> None:
+        """Handles of the graphs of one step and of MANY steps (0: none), then of the same with the time noted first; of
+        the graph that evaluates the elastic energy of the last step."""
+        self.loop.graphs[:], self.loop.elastic = graphs, elastic
 
     def run(self, steps: int) -> int:
         """Runs up to `steps` steps without Python; returns those done (fewer only after `stop`).

@@ -7,8 +7,8 @@ from typing import Any
 
 from sim_server.backend import native
 from sim_server.gpu import layouts
-from sim_server.gpu.layouts import FOUND, STAMP
-from sim_server.layouts import RECORD, check_sizes
+from sim_server.gpu.layouts import ENERGY, FOUND, STAMP
+from sim_server.layouts import BALANCE, RECORD, check_sizes
 
 
 @cache
@@ -21,16 +21,17 @@ def library() -> c.CDLL:
             "wf_gpu_run": (c.c_int64, [loop, c.c_int64]), "wf_gpu_wait": (c.c_int32, [loop]),
             "wf_gpu_open": (c.c_int32, [loop]), "wf_gpu_renew": (c.c_int32, [loop]),
             "wf_gpu_close": (c.c_int32, [loop]), "wf_gpu_post": (p, [c.POINTER(layouts.Mailbox), p]),
-            "wf_gpu_sizes": (c.c_int32, [p]),
+            "wf_gpu_start_balance": (None, [p, p, c.c_double, c.c_int32]), "wf_gpu_sizes": (c.c_int32, [p]),
         },
     )  # fmt: skip
-    sizes = (c.c_int32 * 9)()
+    sizes = (c.c_int32 * 11)()
     compiled.wf_gpu_sizes(sizes)
     from sim_server.gpu.solver import RESULT
 
     structures = (layouts.Cuda, layouts.Mail, layouts.Mailbox)
     ours = [*map(c.sizeof, structures), RESULT.itemsize, STAMP.itemsize, FOUND.itemsize]
-    check_sizes("gpu/loop.cpp", list(sizes), [*ours, c.sizeof(layouts.Body), c.sizeof(layouts.Loop), RECORD.itemsize])
+    ours += [c.sizeof(layouts.Body), c.sizeof(layouts.Loop), RECORD.itemsize, ENERGY.itemsize, BALANCE.itemsize]
+    check_sizes("gpu/loop.cpp", list(sizes), ours)
     return compiled
 
 

@@ -21,9 +21,11 @@ enum OnRunaway { FREEZE = 0, GO_ON = 1, UNWATCHED = 2 };
 enum BalancePhase { WELL = 0, AWAY = 1, FROZEN = 2 };  // AWAY: in the last step, and it goes on
 
 struct Sums {  // over nodes
-    double kinetic = 0, gravity = 0, work = 0;
-    double low[3] = {1e300, 1e300, 1e300}, high[3] = {-1e300, -1e300, -1e300};  // of their steps [m]
+    double kinetic, gravity, work;
+    double low[3], high[3];  // of their steps [m]
 };
+
+ANYWHERE Sums no_sums() { return {0, 0, 0, {1e300, 1e300, 1e300}, {-1e300, -1e300, -1e300}}; }
 
 struct Balance {      // of a body, after its last step [J]
     double start;     // kinetic + elastic + gravity before the first step

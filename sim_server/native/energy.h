@@ -11,7 +11,7 @@ static void run(const Launch& l, int threads);
 // Sums over a body's nodes.
 static Sums sums_of(const Loop& loop, const Body& body) {
     Energies& e = *loop.energies;
-    Sums s;
+    Sums s = no_sums();
     for (int i = body.first; i < body.last; ++i) {
         const double *x = loop.x + 3 * i, *v = loop.v + 3 * i, *from = e.before + 3 * i;
         const double step[3] = {x[0] - from[0], x[1] - from[1], x[2] - from[2]};
@@ -46,7 +46,7 @@ static bool was_set(const Loop& loop, const Body& body) {
 static void begin_balance(const Loop& loop, const Body& body, Balance& balance) {
     const Energies& e = *loop.energies;
     const double dt = loop.rings.dt;
-    Sums s;
+    Sums s = no_sums();
     double low[3] = {INFINITY, INFINITY, INFINITY}, high[3] = {-INFINITY, -INFINITY, -INFINITY}, size = 0;
     for (int i = body.first; i < body.last; ++i) {
         const double *x = loop.x + 3 * i, *v = loop.v + 3 * i, step[3] = {dt * v[0], dt * v[1], dt * v[2]};
@@ -99,17 +99,4 @@ static void account(Loop& loop, bool elastic) {
     if (elastic) measure_elastic(loop);
     for (int i = 0; i < loop.bodies; ++i)
         if (!elastic || e.balance[i].found) e.balance[i].elastic = NAN;
-}
-
-static void note_energy(Record& record, const Balance& b) {
-    record.kinetic = b.kinetic;
-    record.elastic = b.elastic;
-    record.gravity = b.gravity;
-    record.work = b.work;
-    record.budget = b.budget;
-    record.stride = b.stride;
-    if (b.phase != WELL && record.status != NOT_FINITE) record.status = RUNAWAY;
-    if (b.phase != FROZEN || b.found) return;
-    record.factor_step = -1;  // there was nothing to solve
-    record.kind = record.asked;
 }

@@ -7,6 +7,8 @@
 #include <cstdint>
 #include <ctime>
 
+#include "../kernels/balance.cuh"
+
 struct Record {
     int64_t step;          // steps completed
     int64_t factor_step;   // -1: no factor used
@@ -19,6 +21,22 @@ struct Record {
     double stride;         // m
     int32_t body, iterations, status, kind, asked, fallbacks, bad_node, probe, linearizations, warping;
 };
+
+constexpr int32_t STATUS_NOT_FINITE = 5, STATUS_RUNAWAY = 7;  // as in Status (pcg.h)
+
+// b: Balance or Energy of the body (kernels/balance.cuh).
+template <class B> static inline void note_energy(Record& record, const B& b) {
+    record.kinetic = b.kinetic;
+    record.elastic = b.elastic;
+    record.gravity = b.gravity;
+    record.work = b.work;
+    record.budget = b.budget;
+    record.stride = b.stride;
+    if (b.phase != WELL && record.status != STATUS_NOT_FINITE) record.status = STATUS_RUNAWAY;
+    if (b.phase != FROZEN || b.found) return;
+    record.factor_step = -1;  // there was nothing to solve
+    record.kind = record.asked;
+}
 
 struct Rings {
     double dt;

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_server.gpu import layouts
-from sim_server.gpu.layouts import STAMP
+from sim_server.gpu.layouts import ENERGY, STAMP
 from sim_server.gpu.loop import CAPACITY, MANY, DeviceLoop
 from sim_server.gpu.solver import RESULT
 
@@ -138,7 +138,8 @@ class FakeDevice:
 
 class FakeScene:
     """A loop over `bodies` bodies of two nodes with one block of A a node. Step k (from 0) leaves x = k + 1, v = -k,
-    A = k; the settings of a body (one int64) come back as its iterations, its factor (one int64) as its factor_step."""
+    A = k; the settings of a body (one int64) come back as its iterations, its factor (one int64) as its factor_step.
+    Its kinetic energy is k, its elastic one where it is evaluated 1001 + k."""
 
     def __init__(self, bodies: int = 1, records: int = 8192, real: str = "f8"):
         nodes = 2 * bodies
@@ -147,6 +148,7 @@ class FakeScene:
         self.settings, self.factor = np.zeros(bodies, np.int64), np.zeros(bodies, np.int64)
         self.argument = np.zeros(1, np.int64)
         self.results, self.stamps = np.zeros((CAPACITY, bodies), RESULT), np.zeros(CAPACITY, STAMP)
+        self.energies, self.phase = np.zeros((CAPACITY, bodies), ENERGY), 0
         self.clock, self.time, self.done = np.zeros(1), 0, 0
         self.seen: list[int] = []  # the argument in each step
         boxes = [(a.ctypes.data + 8 * k, 8) for a in (self.settings, self.factor) for k in range(bodies)]
@@ -154,17 +156,21 @@ class FakeScene:
         self.loop = DeviceLoop(
             device, [(2 * k, 2 * k + 2) for k in range(bodies)], np.arange(nodes + 1, dtype=np.int32), 0.5,
             [*boxes, (self.argument.ctypes.data, 8)], self.results, self.stamps, self.clock, records,
-            real, **addresses,
+            real, energies=self.energies, **addresses,
         )  # fmt: skip
         device.graphs = {7: lambda: self._steps(1), 8: lambda: self._steps(MANY)}
         device.graphs |= {9: lambda: self._steps(1, True), 10: lambda: self._steps(MANY, True)}
-        self.loop.use_graphs([7, 8, 9, 10])
+        device.graphs[11] = self._elastic
+        self.loop.use_graphs([7, 8, 9, 10], 11)
 
     def _steps(self, steps: int, stamp: bool = False) -> None:
         if stamp:
             self._stamp()
         for _ in range(steps):
             self._step()
+
+    def _elastic(self) -> None:
+        self.energies[(self.done - 1) % CAPACITY]["elastic"] = 1000 + self.done
 
     def _stamp(self) -> None:
         self.time += 1_000_000  # the device had nothing to do for a while
@@ -177,6 +183,8 @@ class FakeScene:
         row = self.results[slot]
         row["iterations"], row["factor_step"] = self.settings, self.factor
         row["residual"], row["seconds"], row["bad_node"] = 1e-7 * k, 1e-6, -1
+        told = self.energies[slot]
+        told["kinetic"], told["elastic"], told["work"], told["phase"] = k, np.nan, -k, self.phase
         self.x[:], self.v[:] = k + 1, -k
         self.time += 10 * (k + 1)
         self.stamps[slot]["end"] = self.time

@@ -233,7 +233,9 @@ def test_the_last_kernel_of_a_step_compiles_with_the_end_of_the_step(arch, name,
     end = fuse.End((PACKAGE / "gpu/tick.cu").read_text(), "Tick", np.zeros(()))
     text = tmp_path / "last.cu"
     text.write_text(fuse.Text([advance], fuse.Shape(32, 1), end).source)  # type: ignore[list-item]
-    code, said = nvrtc.compiled(library, text, [f"-arch={arch}", "-std=c++17", f"-I{backend.INCLUDE}"])
+    code, said = nvrtc.compiled(
+        library, text, [f"-arch={arch}", "-std=c++17", f"-I{backend.INCLUDE}", f"-I{PACKAGE / 'gpu'}"]
+    )
     assert len(code) > 1000 and not said, said
 
 

@@ -56,6 +56,36 @@ def test_what_a_search_has_come_to_is_reported_where_there_is_one():
     assert (records["linearizations"] == 1).all() and (records["nonlinear"] == -1).all()
 
 
+def test_the_elastic_energy_is_evaluated_after_the_steps_where_it_is_wanted():
+    scene = FakeScene(bodies=2)
+    scene.loop.run(2 * BATCH)
+    scene.loop.records()
+    scene.loop.loop.energy_every = 5
+    scene.loop.run(20 * BATCH)
+    records = scene.loop.records()
+    due = records["step"] % 5 == 0
+    assert due.sum() == 128 and (records["kinetic"] == records["step"] - 1).all()
+    assert (records["elastic"][due] == 1000 + records["step"][due]).all() and np.isnan(records["elastic"][~due]).all()
+    assert (records["work"] == 1 - records["step"]).all()
+    scene.loop.loop.energy_every = 0
+    scene.device.calls.clear()
+    scene.loop.run(10 * BATCH)
+    assert np.isnan(scene.loop.records()["elastic"]).all()
+    assert scene.device.calls.count("graph_launch") == 10 * 2  # and nothing else
+
+
+def test_what_the_device_has_frozen_is_told_as_a_runaway():
+    scene = FakeScene()
+    scene.loop.run(1)
+    scene.phase, scene.factor[0] = 2, 9
+    scene.loop.run(2)
+    scene.results["status"] = 5
+    scene.loop.run(1)
+    records = scene.loop.records()
+    assert records["status"].tolist() == [0, 7, 7, 5]  # not_finite says more
+    assert records["factor_step"].tolist() == [0, -1, -1, -1]
+
+
 def test_the_time_of_a_step_is_its_own_and_not_a_share_of_its_batch():
     scene = FakeScene()
     scene.loop.run(100)

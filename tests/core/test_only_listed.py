@@ -52,7 +52,7 @@ SCENES = {
     ),
     "another tangent": (
         "", 'corotational = { young = 1e5, poisson = 0.3, tangent = "exact" }\n', ["corotational"],
-        ["corotational_exact.cu", "corotational_exact_blocks.cu", "corotational_exact_nodes.cu"],
+        ["corotational.cu", "corotational_exact.cu", "corotational_exact_blocks.cu", "corotational_exact_nodes.cu"],
         ["corotational_exact.elements", "corotational_exact_nodes.gather", "corotational_exact_blocks.blocks"],
     ),
     "springs": (

@@ -129,7 +129,7 @@ def test_the_work_of_a_grab_that_moves_is_what_its_spring_gives(linearizations):
     spring = stiffness / len(grab.nodes)
     work = 0.0
     for step in range(30):
-        target = at + [0, 0.01 * step, 0.02 * np.sin(0.4 * step)]
+        target = at + np.array([0, 0.01 * step, 0.02 * np.sin(0.4 * step)])
         touch.move("me", grab.id, tuple(target))
         before = 0.5 * spring * ((target + grab.offset - sim.world.x[grab.nodes]) ** 2).sum()
         sim.engine.run(1)
