@@ -124,7 +124,6 @@ class Service:
             for command, reply in waiting:
                 if command.verb == "status":
                     self._asked.append(reply)
-                    self.telemetry.status_asked()
                     continue
                 answer = self.commands.carry_out(command)
                 if command.verb in ("pause", "stop") and not answer.error and len(self._halts) < HALTS:

@@ -26,7 +26,6 @@ LOOK_PERIOD = 0.02  # s between looks at whether somebody listens to states
 BATCH = 4096  # steps sent together at most
 WINDOW = 1000  # steps that percentiles are taken over
 ENERGY_STEPS = 20  # between elastic energies in real time: one costs up to a fifth of a step
-ENERGY_PERIOD = 3.0  # s for which they are evaluated after a client has asked for the status
 
 
 class Telemetry:
@@ -51,7 +50,6 @@ class Telemetry:
             int, float
         ] = {}  # kinetic + elastic + gravity by body, of the last step where it is known [J]
         self.runaways: Counter[int] = Counter()  # steps by body
-        self._asked_until = 0.0
         self._listened = False
         self._due = {"steps": 0.0, "state": 0.0, "status": 0.0, "look": 0.0}
         self._watched = False
@@ -166,19 +164,16 @@ class Telemetry:
     def wanted_frames(self) -> int:
         """Steps between frames that the loop should copy out: 0 if nobody looks."""
         if self._period("look", LOOK_PERIOD):
-            self._watched, self._listened = self.link.wants_state(), self.link.wants_steps()
+            self._watched = self.link.wants_state()
+            self._listened = self.link.wants_steps() or bool(self.link.clients())
         return self.every or (max(1, round(STATE_PERIOD / self.simulation.world.dt)) if self._watched else 0)
-
-    def status_asked(self) -> None:
-        """A client looks at the status, and so at energies."""
-        self._asked_until = time.monotonic() + ENERGY_PERIOD
 
     def wanted_energies(self) -> int:
         """Steps between those whose elastic energy the loop should evaluate: 0 if nobody looks. Call `wanted_frames`
         before."""
         if self.recorder and self.patient:
             return self.every
-        return ENERGY_STEPS if self.recorder or self._listened or time.monotonic() < self._asked_until else 0
+        return ENERGY_STEPS if self.recorder or self._listened else 0
 
     def _record_frame(self, step: int, x: NDArray[np.float64], v: NDArray[np.float64]) -> None:
         assert self.recorder is not None
