@@ -75,6 +75,8 @@ def object_step(name: str, step: int) -> pb.ObjectStep:
         step_seconds=4e-3,
         fallbacks=0,
         excess=0.5 * step,
+        **({"kinetic_energy": 10.0 * step, "gravity_energy": -1.0, "work": 0.5} if step > 1 else {}),
+        **({"elastic_energy": 3.0 + step, "dissipated": 0.25 * step} if step % 3 == 0 else {}),
     )
 
 

@@ -100,6 +100,10 @@ def test_rrd_curves(log: Log, tmp_path: Path) -> None:
     assert curve("residual/beam") == [(s.step, pytest.approx(np.log10(s.residual))) for s in steps]
     assert curve("factor_age/beam") == [(s.step, 2) for s in steps if s.factor_age >= 0]
     assert curve("step_time/all") == [(s.step, 4.0) for s in steps]
+    assert curve("energy/kinetic/beam") == [(s.step, 10.0 * s.step) for s in steps[1:]]
+    assert curve("energy/elastic/beam") == [(s.step, 3.0 + s.step) for s in steps if s.step % 3 == 0]
+    assert curve("energy/dissipated/beam") == [(s.step, 0.25 * s.step) for s in steps if s.step % 3 == 0]
+    assert len(curve("energy/work/beam")) == len(curve("energy/gravity/beam")) == len(steps) - 1
 
 
 def test_colors_have_one_scale_for_the_run(log: Log) -> None:

@@ -1,0 +1,64 @@
+// SPDX-License-Identifier: MIT
+// Thread blocks of CUDA as threads of the processor, one block after another: enough for texts that sum over warps and blocks.
+#pragma once
+#include <pthread.h>
+
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+#include <thread>
+#include <vector>
+
+#define __device__
+#define __global__
+#define __forceinline__ inline
+#define __shared__ static
+#define __align__(n) alignas(n)
+
+struct Dimension { int x; };
+static thread_local Dimension threadIdx;
+static Dimension blockIdx, blockDim, gridDim;
+static pthread_barrier_t block_barrier, warp_barrier[32];
+static uint64_t exchanged[32][32];
+
+static void __syncthreads() { pthread_barrier_wait(&block_barrier); }
+static void __threadfence() {}
+template <class T> static T __ldcg(const T* a) { return *a; }
+static double __longlong_as_double(long long bits) {
+    double a;
+    std::memcpy(&a, &bits, sizeof a);
+    return a;
+}
+static unsigned atomicAdd(unsigned* a, unsigned b) { return __sync_fetch_and_add(a, b); }
+
+// The value of another lane of the warp; all of them come here.
+template <class T> static T exchange(T value, int from) {
+    const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
+    uint64_t bits = 0;
+    std::memcpy(&bits, &value, sizeof value);
+    exchanged[warp][lane] = bits;
+    pthread_barrier_wait(&warp_barrier[warp]);
+    bits = exchanged[warp][from < 0 || from > 31 ? lane : from];
+    pthread_barrier_wait(&warp_barrier[warp]);
+    std::memcpy(&value, &bits, sizeof value);
+    return value;
+}
+template <class T> static T __shfl_up_sync(unsigned, T a, int by) { return exchange(a, threadIdx.x % 32 - by); }
+template <class T> static T __shfl_down_sync(unsigned, T a, int by) { return exchange(a, threadIdx.x % 32 + by); }
+template <class T> static T __shfl_xor_sync(unsigned, T a, int by) { return exchange(a, (threadIdx.x % 32) ^ by); }
+
+template <class Kernel> static void launch(int blocks, int threads, Kernel kernel) {
+    blockDim.x = threads;
+    gridDim.x = blocks;
+    pthread_barrier_init(&block_barrier, nullptr, threads);
+    for (int w = 0; w < threads / 32; ++w) pthread_barrier_init(&warp_barrier[w], nullptr, 32);
+    for (blockIdx.x = 0; blockIdx.x < blocks; ++blockIdx.x) {
+        std::vector<std::thread> all;
+        for (int t = 0; t < threads; ++t)
+            all.emplace_back([&, t] {
+                threadIdx.x = t;
+                kernel();
+            });
+        for (std::thread& one : all) one.join();
+    }
+}
