@@ -14,4 +14,5 @@ def put(sim: Simulation, array: NDArray[np.float64], value: ArrayLike) -> None:
     if backend.name == "gpu":
         twin = backend.twin(array)
         twin.set(array.astype(twin.dtype))
+        sim.engine.restart_energy()  # on a CPU the loop sees it by itself
         backend.cp.cuda.get_current_stream().synchronize()  # not the device: a capture may be under way

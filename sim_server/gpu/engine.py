@@ -176,12 +176,15 @@ class GpuEngine(DeviceLoop):
 
     def _make_ready(self) -> None:
         """What a scheme makes of the state before the first step, and the energy that it has."""
-        if self.begin and self.step == 0:
+        begins = bool(self.begin) and self.step == 0
+        if begins:
             for launch in self.begin:
                 launch()
         if not self._energies.started:
             self._energies.start()
-        self.gpu.cp.cuda.get_current_stream().synchronize()
+            begins = True
+        if begins:
+            self.gpu.cp.cuda.get_current_stream().synchronize()
 
     def restart_energy(self) -> None:
         """Has energy reckoned from the state at the beginning of the next step: for those who have set x or v."""

@@ -48,6 +48,9 @@ def test_npz_has_the_agreed_arrays(log: Log, tmp_path: Path) -> None:
         "factor_age_bound",
     ):
         assert arrays[f"scalars/{name}"].tolist() == [getattr(s, name) for s in steps], name
+    told = [s.elastic_energy if s.HasField("elastic_energy") else np.nan for s in steps]
+    np.testing.assert_array_equal(arrays["scalars/elastic_energy"], told)
+    assert np.isnan(told).sum() == 6 and np.isnan(arrays["scalars/kinetic_energy"]).tolist() == [True] + [False] * 8
     assert arrays["scalars/status"].tolist() == ["converged"] * 3 + ["max_iterations"] + ["converged"] * 5
     assert arrays["scalars/preconditioner"].tolist() == ["block_jacobi"] * 2 + ["cholesky"] * 7
     assert sorted(p.name for p in tmp_path.iterdir()) == ["beam.npz", "run.mcap"]
