@@ -61,6 +61,7 @@ def test_defaults_and_resolved(tmp_path):
             "precision": "float64",
             "factor_precision": "auto",
             "budget": 0.0,
+            "on_runaway": "freeze",
             "threads": 1,
             "warm_start": True,
             "recycle": 0,
