@@ -18,8 +18,8 @@ CODES: dict[OnRunaway | None, int] = {"freeze": 0, "go_on": 1, None: 2}  # None:
 class Energies:
     """What the loop needs to know of a scene for that.
 
-    before (n, 3): gets x when a step began [m]; still: arrays (n, 3) that are 0 in a body at rest. balance (bodies,) of
-    layouts.BALANCE: on a CPU what the loop works with.
+    gravity (3,) [m/s2]. before (n, 3): gets x when a step began [m]; still: arrays (n, 3) that are 0 in a body at rest.
+    balance (bodies,) of layouts.BALANCE: on a CPU what the loop works with.
     """
 
     def __init__(
@@ -27,7 +27,8 @@ class Energies:
         on_runaway: OnRunaway | None,
     ):  # fmt: skip
         self.world, self.before, self.still, self.on_runaway = world, before, still, on_runaway
-        self.gravity = tuple(getattr(effects.get("gravity"), "g", (0.0, 0.0, 0.0)))
+        self.gravity: NDArray[np.float64] = getattr(effects.get("gravity"), "g", np.zeros(3))
+        world.backend.keep(self.gravity)
         self.touch: Any = effects.get("touch")
         self.elastic: list[ElementEnergies] = [e for x in effects.values() if (e := x.energies()) is not None]
         self.balance = np.zeros(len(world.bodies), layouts.BALANCE)
@@ -53,8 +54,13 @@ class NativeEnergies:
             entry.energy, entry.parts = e.energy.ctypes.data, parts.ctypes.data
         self._still = (c.c_void_p * len(energies.still))(*(array.ctypes.data for array in energies.still))
         self.native = layouts.Energies()
-        self.native.g[:] = energies.gravity
-        arrays = {"mass": w.mass, "before": energies.before, "free": w.free, "balance": energies.balance}
+        arrays = {
+            "gravity": energies.gravity,
+            "mass": w.mass,
+            "before": energies.before,
+            "free": w.free,
+            "balance": energies.balance,
+        }
         if energies.touch is not None:
             arrays |= {name: getattr(energies.touch, name) for name in ("force", "spring", "anchor")}
         arrays["left"] = self._left = np.zeros((2, w.nodes, 3))

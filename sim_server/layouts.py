@@ -119,7 +119,7 @@ class Elastic(c.Structure):
 BALANCE = np.dtype(
     [
         *((n, "f8") for n in ("start", "mass", "diagonal", "floor", "limit")),
-        *((n, "f8") for n in ("kinetic", "elastic", "gravity", "work", "budget", "stride")),
+        *((n, "f8") for n in ("kinetic", "elastic", "gravity", "work", "budget", "fallen", "stride")),
         ("phase", "i4"), ("found", "i4"),
     ]
 )  # fmt: skip
@@ -127,7 +127,7 @@ BALANCE = np.dtype(
 
 class Energies(c.Structure):
     _fields_ = [
-        ("g", c.c_double * 3), ("mass", c.c_void_p), ("before", c.c_void_p), ("force", c.c_void_p),
+        ("gravity", c.c_void_p), ("mass", c.c_void_p), ("before", c.c_void_p), ("force", c.c_void_p),
         ("spring", c.c_void_p), ("anchor", c.c_void_p), ("free", c.c_void_p), ("still", c.POINTER(c.c_void_p)),
         ("elastic", c.POINTER(Elastic)), ("balance", c.c_void_p), ("left", c.c_void_p),
         ("stills", c.c_int32), ("elastics", c.c_int32),

@@ -7,7 +7,7 @@
 
 struct Motion { real *x, *v, *before, *dv, *ahead, *drift, *carried; };  // (n, 3) of the kernel's items, or null
 
-struct __align__(16) Partial { double kinetic, gravity, work; float low[3], high[3]; };
+struct __align__(16) Partial { double kinetic, gravity, fallen, work; float low[3], high[3]; };
 
 struct Energy {              // goes home beside Result
     double kinetic, elastic, gravity, work, budget, stride;
@@ -25,7 +25,7 @@ struct Account {
     Partial* partial;        // (n / 32 + bodies + 1,) of warp w and body b at w + b: both grow with the node
     Balance* balance;        // (bodies,)
     Energy* told;            // (capacity, bodies) on the host
-    double gravity[3];       // [m/s2]
+    const real* gravity;     // (3,) [m/s2]
     int bodies, on_runaway, inertia;
     int lanes;               // threads that share the sums of a body: a power of two, at most those of a thread block
 };
@@ -35,6 +35,7 @@ struct Account {
 __device__ __forceinline__ void add_sums(Sums& a, const Sums& b) {
     a.kinetic += b.kinetic;
     a.gravity += b.gravity;
+    a.fallen += b.fallen;
     a.work += b.work;
     for (int c = 0; c < 3; ++c) {
         a.low[c] = b.low[c] < a.low[c] ? b.low[c] : a.low[c];
@@ -51,6 +52,7 @@ template <bool ACROSS> __device__ __forceinline__ Sums sums_from(const Sums& s, 
     };
     o.kinetic = from(s.kinetic);
     o.gravity = from(s.gravity);
+    o.fallen = from(s.fallen);
     o.work = from(s.work);
     for (int c = 0; c < 3; ++c) {
         o.low[c] = from((float)s.low[c]);
@@ -86,6 +88,7 @@ __device__ void leave_sums(const Account& a, const Motion& m, int i, int n) {
     Partial& p = a.partial[i / 32 + body];
     p.kinetic = s.kinetic;
     p.gravity = s.gravity;
+    p.fallen = s.fallen;
     p.work = s.work;
     for (int c = 0; c < 3; ++c) {
         p.low[c] = s.low[c];
@@ -98,6 +101,7 @@ __device__ __forceinline__ Sums partial_at(const Account& a, int k) {
     Sums s = no_sums();
     s.kinetic = __ldcg(&p.kinetic);
     s.gravity = __ldcg(&p.gravity);
+    s.fallen = __ldcg(&p.fallen);
     s.work = __ldcg(&p.work);
     for (int c = 0; c < 3; ++c) {
         s.low[c] = __ldcg(&p.low[c]);

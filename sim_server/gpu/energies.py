@@ -4,7 +4,6 @@
 Everything but the elastic energy is summed up within the last kernel of a step (account.cuh).
 """
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -18,12 +17,13 @@ from sim_server.gpu.mailbox import library
 from sim_server.layouts import BALANCE
 
 WARP, THREADS = 32, 128  # threads; of a thread block of elastic.cu
-PARTIAL = np.dtype([("kinetic", "f8"), ("gravity", "f8"), ("work", "f8"), ("low", "f4", 3), ("high", "f4", 3)])
-POINTERS = ("body", "first", "mass", "force", "spring", "anchor", "free", "partial", "balance", "told")
-ACCOUNT = np.dtype(
-    [(n, "u8") for n in POINTERS] + [("gravity", "f8", 3)]
-    + [(n, "i4") for n in ("bodies", "on_runaway", "inertia", "lanes")]
-)  # fmt: skip
+PARTIAL = np.dtype(
+    [(n, "f8") for n in ("kinetic", "gravity", "fallen", "work")]
+    + [(n, "f4", 3) for n in ("low", "high")]
+    + [("pad", "f8")]
+)
+POINTERS = ("body", "first", "mass", "force", "spring", "anchor", "free", "partial", "balance", "told", "gravity")
+ACCOUNT = np.dtype([(n, "u8") for n in POINTERS] + [(n, "i4") for n in ("bodies", "on_runaway", "inertia", "lanes")])
 ELASTIC = np.dtype(
     [(n, "u8") for n in ("energy", "parts", "sum", "step", "balance", "told")]
     + [("capacity", "i4"), ("begins", "i4")]
@@ -53,14 +53,14 @@ class DeviceEnergies:
             "body": cp.asarray(np.repeat(np.arange(self._bodies, dtype=np.int32), np.diff(self._starts))),
             "first": cp.asarray(self._starts), "mass": gpu.twin(world.mass), "free": gpu.twin(world.free),
             "partial": cp.zeros((world.nodes // WARP + self._bodies + 1) * PARTIAL.itemsize, np.uint8),
-            "balance": self._balance,
+            "balance": self._balance, "gravity": gpu.twin(energies.gravity),
         }  # fmt: skip
         if energies.touch is not None:
             self._memory |= {n: gpu.twin(getattr(energies.touch, n)) for n in ("force", "spring", "anchor")}
         self.params = np.zeros((), ACCOUNT)
         for name, array in self._memory.items():
             self.params[name] = array.data.ptr
-        self.params["told"], self.params["gravity"] = told.ctypes.data, energies.gravity
+        self.params["told"] = told.ctypes.data
         self.params["bodies"], self.params["inertia"] = self._bodies, world.inertia
         self.params["on_runaway"] = CODES[energies.on_runaway]
         self._sum = cp.zeros(self._bodies)
@@ -113,9 +113,9 @@ class DeviceEnergies:
 
 
 def start_sums(
-    mass: NDArray[np.float64], x: NDArray[np.float64], v: NDArray[np.float64], gravity: Sequence[float], dt: float
+    mass: NDArray[np.float64], x: NDArray[np.float64], v: NDArray[np.float64], gravity: NDArray[np.float64], dt: float
 ) -> NDArray[np.float64]:
     """Kinetic energy and that of gravity [J], the largest difference of dt v along an axis and the diagonal [m]."""
     stride = float(dt * np.ptp(v, axis=0).max())
     diagonal = float(np.linalg.norm(np.ptp(x, axis=0)))
-    return np.array([0.5 * mass @ (v**2).sum(axis=1), -mass @ (x @ np.array(gravity)), stride, diagonal])
+    return np.array([0.5 * mass @ (v**2).sum(axis=1), -mass @ (x @ gravity), stride, diagonal])

@@ -2,7 +2,7 @@
 // The energy of a body from step to step, and when it is called a runaway: what both devices share (native/energy.h, gpu/tick.cu).
 //
 //     kinetic  sum m v.v / 2          gravity  -sum m g.x          work  of pushes and grabs since the start
-//     budget   kinetic + elastic + gravity before the first step, + work, - gravity now
+//     budget   kinetic + elastic before the first step, + work, + what gravity has done since, sum m g.dx (g may change)
 //
 // Elasticity and damping take from the budget and give nothing to it, so that kinetic <= budget but for errors of the time step. A
 // body runs away in the step in which
@@ -21,19 +21,20 @@ enum OnRunaway { FREEZE = 0, GO_ON = 1, UNWATCHED = 2 };
 enum BalancePhase { WELL = 0, AWAY = 1, FROZEN = 2 };  // AWAY: in the last step, and it goes on
 
 struct Sums {  // over nodes
-    double kinetic, gravity, work;
+    double kinetic, gravity, fallen, work;  // fallen: work of gravity
     double low[3], high[3];  // of their steps [m]
 };
 
-ANYWHERE Sums no_sums() { return {0, 0, 0, {1e300, 1e300, 1e300}, {-1e300, -1e300, -1e300}}; }
+ANYWHERE Sums no_sums() { return {0, 0, 0, 0, {1e300, 1e300, 1e300}, {-1e300, -1e300, -1e300}}; }
 
 struct Balance {      // of a body, after its last step [J]
-    double start;     // kinetic + elastic + gravity before the first step
+    double start;     // kinetic + elastic before the first step
     double mass;      // [kg]
     double diagonal;  // at rest [m]
     double floor;     // of kinetic
     double limit;     // of stride [m]
     double kinetic, elastic, gravity, work, budget;
+    double fallen;    // work of gravity
     double stride;    // largest difference of two nodes' steps along an axis [m]
     int phase;
     int found;        // 1: in the last step it was found to run away; figures are then of the state that it came to
@@ -43,9 +44,11 @@ ANYWHERE double square(double a) { return a * a; }
 ANYWHERE bool is_finite(double a) { return a - a == 0; }
 
 template <class T>
-ANYWHERE void add_node(Sums& s, double mass, const T* x, const T* v, const double* step, const double* gravity) {
+ANYWHERE void add_node(Sums& s, double mass, const T* x, const T* v, const double* step, const T* gravity) {
+    const double g[3] = {mass * gravity[0], mass * gravity[1], mass * gravity[2]};
     s.kinetic += 0.5 * mass * ((double)v[0] * v[0] + (double)v[1] * v[1] + (double)v[2] * v[2]);
-    s.gravity -= mass * (gravity[0] * x[0] + gravity[1] * x[1] + gravity[2] * x[2]);
+    s.gravity -= g[0] * x[0] + g[1] * x[1] + g[2] * x[2];
+    s.fallen += g[0] * step[0] + g[1] * step[1] + g[2] * step[2];
     for (int c = 0; c < 3; ++c) {
         s.low[c] = step[c] < s.low[c] ? step[c] : s.low[c];
         s.high[c] = step[c] > s.high[c] ? step[c] : s.high[c];
@@ -72,8 +75,8 @@ ANYWHERE void start_balance(Balance& b, const Sums& s, double size, double dt, b
     const double longest = size > b.diagonal ? size : b.diagonal;
     b.kinetic = inertia ? s.kinetic : 0;
     b.gravity = s.gravity;
-    b.work = 0;
-    b.start = b.budget = b.kinetic + b.elastic + b.gravity;
+    b.work = b.fallen = 0;
+    b.start = b.budget = b.kinetic + b.elastic;
     b.floor = 0.5 * b.mass * square(SLOW * longest / dt);
     b.limit = LONG * longest + 2 * stride_of(s);
     b.phase = WELL;
@@ -83,15 +86,19 @@ ANYWHERE void start_balance(Balance& b, const Sums& s, double size, double dt, b
 ANYWHERE bool take_stock(Balance& b, const Sums& s, int on_runaway, bool inertia) {
     b.kinetic = inertia ? s.kinetic : 0;
     b.gravity = s.gravity;
-    b.work += b.phase == FROZEN ? 0 : s.work;
     b.stride = stride_of(s);
     b.found = 0;
-    b.budget = b.start + b.work - b.gravity;
+    const double work = b.work + s.work, fallen = b.fallen + s.fallen;
+    b.budget = b.start + b.work + b.fallen;
     if (b.phase == FROZEN) return false;
+    b.budget = b.start + work + fallen;
     const double most = SLACK_OF_ENERGY * (b.budget > 0 ? b.budget : 0) + b.floor;
     const bool known = b.budget == b.budget;  // else the start had no energy that the law defines
     const bool away = !is_finite(s.kinetic) || !is_finite(s.gravity) || (known && b.kinetic > most) || b.stride > b.limit;
     b.found = away && on_runaway != UNWATCHED;
     b.phase = !b.found ? WELL : on_runaway == FREEZE ? FROZEN : AWAY;
-    return b.phase == FROZEN;
+    if (b.phase == FROZEN) return true;  // it goes back to where it was
+    b.work = work;
+    b.fallen = fallen;
+    return false;
 }

@@ -55,7 +55,7 @@ struct Elastic {                       // potential energies of the elements of 
 };
 
 struct Energies {                      // energy.h
-    double gravity[3];                 // [m/s2]
+    const double* gravity;             // (3,) [m/s2]
     const double* mass;                // (nodes,) [kg]
     const double* before;              // (nodes, 3) x when the step began [m]
     double *force, *spring, *anchor;   // of hands (effects/touch.cu); null: nothing can be touched

@@ -65,7 +65,7 @@ class Bodies:
         account = self.tick["account"]
         for name in ("body", "first", "mass", "force", "spring", "anchor", "free", "partial", "balance", "told"):
             account[name] = getattr(self, name).ctypes.data
-        account["gravity"], account["bodies"], account["inertia"] = G, len(sizes), 1
+        account["gravity"], account["bodies"], account["inertia"] = G.ctypes.data, len(sizes), 1
         account["on_runaway"], account["lanes"] = on_runaway, lanes(threads, len(sizes))
 
     def end_step(self, library: c.CDLL) -> None:
@@ -80,7 +80,8 @@ class Bodies:
         work = ((self.force[nodes] + k * (self.anchor[nodes] - 0.5 * (x + before))) * step).sum()
         gravity = -float(self.mass[nodes] @ (x @ G))
         kinetic = 0.5 * float(self.mass[nodes] @ (v**2).sum(axis=1))
-        found = {"kinetic": kinetic, "gravity": gravity, "work": float(work), "budget": 1e6 + float(work) - gravity}
+        fallen = float(self.mass[nodes] @ (step @ G))
+        found = {"kinetic": kinetic, "gravity": gravity, "work": float(work), "budget": 1e6 + float(work) + fallen}
         return found | {"stride": float(np.ptp(step, axis=0).max())}
 
 

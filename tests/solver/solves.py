@@ -45,6 +45,7 @@ def solve(sim: Simulation, start: NDArray | None = None, **settings: Any) -> tup
     x, v, dv = world.x.copy(), world.v.copy(), sim.system.dv.copy()
     sim.system.y[:] = 0 if start is None else start.reshape(-1, 3)
     sim.engine.records()
+    loop.energies = None  # b is anything
     sim.engine.solve()
     loop.step -= 1
     world.x[:], world.v[:], sim.system.dv[:] = x, v, dv
