@@ -108,7 +108,7 @@ def test_the_work_of_a_push_is_force_times_way(scheme, linearizations):
     integrator = {"scheme": scheme, "linearizations": linearizations, "tolerance": 1e-8}
     if scheme == "newmark":
         integrator |= {"beta": 0.36, "gamma": 0.7}
-    sim = watched(bar(young=2e4, fixed="X < 0.01", touch=touch), integrator=integrator, dt=0.01)
+    sim = watched(bar(young=2e4, fixed="X < 0.01", tangent="exact", touch=touch), integrator=integrator, dt=0.01)
     force, push, work = np.array([10.0, 300.0, -40.0]), touched(sim).push, 0.0
     taken = push("me", "bar", (2.0, 0.5, 0.5), 0.8, tuple(force), 0.1)
     for step in range(20):
