@@ -79,9 +79,7 @@ def places(status: pb.Status) -> Table:
         if found.HasField("low"):
             low, high, tip = found.low, found.high, found.tip
             spans = ((low.x, high.x), (low.y, high.y), (low.z, high.z))
-            table.add_row(
-                found.object, *(f"{a:.3g} … {b:.3g}" for a, b in spans), f"{tip.x:.3g} {tip.y:.3g} {tip.z:.3g}"
-            )
+            _add(table, found.object, *(f"{a:.3g} … {b:.3g}" for a, b in spans), f"{tip.x:.3g} {tip.y:.3g} {tip.z:.3g}")
     return table
 
 
@@ -96,7 +94,7 @@ def _energies(status: pb.Status) -> list[Table]:
     table = Table("object", "energy [J]", "kinetic [J]", "runaway steps", **COMPACT)
     for found in shown:
         total = f"{found.total_energy:.4g}" if found.HasField("total_energy") else "-"
-        table.add_row(found.object, total, f"{found.last.kinetic_energy:.4g}", str(found.runaway_steps or "-"))
+        _add(table, found.object, total, f"{found.last.kinetic_energy:.4g}", str(found.runaway_steps or "-"))
     return [table] if shown else []
 
 
@@ -119,9 +117,9 @@ def _local(status: pb.Status) -> Table:
     return table
 
 
-def _add(table: Table, *cells: str) -> None:
+def _add(table: Table, *cells: str | Text) -> None:
     """Add a row of plain texts: rich would take brackets in a string for markup, and fail on such as [/x]."""
-    table.add_row(*map(Text, cells))
+    table.add_row(*(Text(cell) if isinstance(cell, str) else cell for cell in cells))
 
 
 def _end(code: int) -> str:
