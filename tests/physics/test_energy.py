@@ -146,7 +146,7 @@ def test_the_work_of_a_grab_that_moves_is_what_its_spring_gives(linearizations):
 def test_a_grab_at_its_limit_works_with_its_limit():
     sim = watched(bar(young=2e4, fixed="X < 0.01", touch={"max_force": 50.0}), dt=0.01)
     at = np.array([2.0, 1.0, 1.0])
-    grab = touched(sim).grab("me", "bar", tuple(at), 0.0, (2.0, 1e6, 1.0), 1e3, 50.0, 10.0)
+    grab = touched(sim).grab("me", "bar", tuple(at), 0.0, (2.0, 2e3, 1.0), 1e3, 50.0, 10.0)
     sim.engine.run(8)
     way = sim.world.x[grab.nodes[0], 1] - at[1]  # the target is so far away that the pull is along y
     assert sim.engine.records()["work"][-1] == pytest.approx(50 * way, rel=1e-4) and way > 1e-3
