@@ -4,7 +4,7 @@
 #ifndef local
 #define local real
 #endif
-#include "account.cuh"
+#include "energy.cuh"
 
 struct Elastic {
     const local* energy;    // (elements,) [J]

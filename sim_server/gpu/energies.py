@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The energy of bodies on a GPU: its memory, the elastic energy on demand, and the start that all is reckoned from.
 
-Everything but the elastic energy is summed up within the last kernel of a step (account.cuh).
+Everything but the elastic energy is summed up after each step, beside the first kernel of the next one (account.cu).
 """
 
 from typing import Any
@@ -16,57 +16,64 @@ from sim_server.gpu.layouts import ENERGY
 from sim_server.gpu.mailbox import library
 from sim_server.layouts import BALANCE
 
-WARP, THREADS = 32, 128  # threads; of a thread block of elastic.cu
-PARTIAL = np.dtype(
-    [(n, "f8") for n in ("kinetic", "gravity", "fallen", "work")]
-    + [(n, "f4", 3) for n in ("low", "high")]
-    + [("pad", "f8")]
+THREADS = 128  # of a thread block of elastic.cu
+FEW_NODES, FEW_THREADS, MOST_THREADS = 4096, 256, 1024  # of a body, and of the thread block that sums over them
+STILL = 5  # arrays that are 0 in a body at rest, at most
+ACCOUNT = np.dtype(
+    [(n, "u8") for n in ("first", "mass", "before", "x", "v")]
+    + [("still", "u8", STILL)]
+    + [(n, "u8") for n in ("force", "spring", "anchor", "free", "gravity", "balance", "told", "step", "settled")]
+    + [(n, "i4") for n in ("bodies", "capacity", "on_runaway", "inertia")]
 )
-POINTERS = ("body", "first", "mass", "force", "spring", "anchor", "free", "partial", "balance", "told", "gravity")
-ACCOUNT = np.dtype([(n, "u8") for n in POINTERS] + [(n, "i4") for n in ("bodies", "on_runaway", "inertia", "lanes")])
 ELASTIC = np.dtype(
     [(n, "u8") for n in ("energy", "parts", "sum", "step", "balance", "told")]
     + [("capacity", "i4"), ("begins", "i4")]
 )  # fmt: skip
 
 
-def lanes(threads: int, bodies: int) -> int:
-    """Threads of a thread block that share the sums of a body: a power of two."""
-    return 1 << max(threads // bodies, 1).bit_length() - 1
-
-
 class DeviceEnergies:
     """Energies of a scene on the device.
 
-    told: host memory (capacity, bodies) of ENERGY that the steps write to. counter: device array (1,) of completed
-    steps. params: `account` of the last kernel of a step, but for `lanes`.
+    told: host memory (capacity, bodies) of ENERGY that the device writes to. counter: device array (1,) of completed
+    steps.
     """
 
     def __init__(self, gpu: Gpu, energies: Energies, told: NDArray[np.uint8], counter: Any, dt: float):
-        self._gpu, self._energies, self._dt = gpu, energies, dt
+        self._gpu, self._energies, self._dt, self._counter = gpu, energies, dt, counter
         cp, world = gpu.cp, energies.world
-        self._starts = np.array([*(b.first for b in world.bodies), world.nodes], np.int32)
-        self._bodies = len(world.bodies)
+        starts = np.array([*(b.first for b in world.bodies), world.nodes], np.int32)
+        self._bodies, self._capacity = len(world.bodies), told.nbytes // ENERGY.itemsize // len(world.bodies)
+        self._threads = FEW_THREADS if np.diff(starts).max() <= FEW_NODES else MOST_THREADS
         self.started = False
         self._balance = cp.asarray(np.frombuffer(energies.balance.tobytes(), np.uint8))
+        self._settled, self._sum = cp.zeros(self._bodies, np.int64), cp.zeros(self._bodies)
         self._memory: dict[str, Any] = {
-            "body": cp.asarray(np.repeat(np.arange(self._bodies, dtype=np.int32), np.diff(self._starts))),
-            "first": cp.asarray(self._starts), "mass": gpu.twin(world.mass), "free": gpu.twin(world.free),
-            "partial": cp.zeros((world.nodes // WARP + self._bodies + 1) * PARTIAL.itemsize, np.uint8),
-            "balance": self._balance, "gravity": gpu.twin(energies.gravity),
+            "first": cp.asarray(starts), "mass": gpu.twin(world.mass), "free": gpu.twin(world.free),
+            "before": gpu.twin(energies.before), "x": gpu.twin(world.x), "v": gpu.twin(world.v),
+            "gravity": gpu.twin(energies.gravity), "balance": self._balance, "step": counter, "settled": self._settled,
         }  # fmt: skip
         if energies.touch is not None:
             self._memory |= {n: gpu.twin(getattr(energies.touch, n)) for n in ("force", "spring", "anchor")}
-        self.params = np.zeros((), ACCOUNT)
+        self._params = np.zeros((), ACCOUNT)
         for name, array in self._memory.items():
-            self.params[name] = array.data.ptr
-        self.params["told"] = told.ctypes.data
-        self.params["bodies"], self.params["inertia"] = self._bodies, world.inertia
-        self.params["on_runaway"] = CODES[energies.on_runaway]
-        self._sum = cp.zeros(self._bodies)
-        self._launches = self._elastic(told, counter)
+            self._params[name] = array.data.ptr
+        still = [gpu.twin(array) for array in energies.still]
+        self._params["still"][: len(still)] = [array.data.ptr for array in still]
+        self._memory |= {f"still{k}": array for k, array in enumerate(still)}
+        self._params["told"], self._params["capacity"] = told.ctypes.data, self._capacity
+        self._params["bodies"], self._params["inertia"] = self._bodies, world.inertia
+        self._params["on_runaway"] = CODES[energies.on_runaway]
+        self._account, self._add = self._function("account"), self._function("elastic")
+        self._launches = self._elastic(told)
 
-    def _elastic(self, told: NDArray[np.uint8], counter: Any) -> list[tuple[Any, Any, NDArray[Any]]]:
+    def _function(self, name: str) -> Any:
+        module = self._gpu.cp.RawModule(
+            code=(HERE / f"gpu/{name}.cu").read_text(), options=(*options(self._gpu.types), f"-I{HERE / 'gpu'}"),
+            backend="nvrtc",
+        )  # fmt: skip
+        return compiled(f"{name}.cu", module, name)
+
+    def _elastic(self, told: NDArray[np.uint8]) -> list[tuple[Any, Any, NDArray[Any]]]:
         """(what evaluates the energies of the elements, its array, arguments of the sums over them) for each effect."""
         cp = self._gpu.cp
         found = [(e.launch, e.launch.arrays["energy"], self._energies.parts(e)) for e in self._energies.elastic]
@@ -76,31 +83,27 @@ class DeviceEnergies:
             params, kept = np.zeros((), ELASTIC), cp.asarray(parts)
             self._memory[f"parts{k}"] = kept
             params["energy"], params["parts"], params["sum"] = array.data.ptr, kept.data.ptr, self._sum.data.ptr
-            params["step"], params["balance"], params["told"] = (
-                counter.data.ptr,
-                self._balance.data.ptr,
-                told.ctypes.data,
-            )
-            params["capacity"], params["begins"] = told.nbytes // ENERGY.itemsize // self._bodies, k == 0
+            params["step"], params["balance"] = self._counter.data.ptr, self._balance.data.ptr
+            params["told"], params["capacity"], params["begins"] = told.ctypes.data, self._capacity, k == 0
             made.append((launch, array, params))
-        module = cp.RawModule(
-            code=(HERE / "gpu/elastic.cu").read_text(), options=(*options(self._gpu.types), f"-I{HERE / 'gpu'}"),
-            backend="nvrtc",
-        )  # fmt: skip
-        self._function = compiled("elastic.cu", module, "elastic")
         return made
 
-    def launch(self) -> None:
-        """Puts the evaluation of the elastic energy of the last step onto the current stream."""
+    def account(self) -> None:
+        """Puts the account of the last step onto the current stream; one that is settled already is left alone."""
+        self._account((self._bodies,), (self._threads,), (self._params,))
+
+    def elastic(self) -> None:
+        """Puts the evaluation of the elastic energy of the last step, which is settled, onto the current stream."""
         for launch, _, params in self._launches:
             if launch is not None:
                 launch()
-            self._function((self._bodies,), (THREADS,), (params,))
+            self._add((self._bodies,), (THREADS,), (params,))
 
     def start(self) -> None:
         """Reckons from the state that is on the device now, before the first step."""
         e, w = self._energies, self._energies.world
-        self.launch()
+        self.elastic()
+        self._settled[:] = self._counter
         x, v = (self._gpu.twin(array).get().astype(float) for array in (w.x, w.v))
         balance = np.frombuffer(self._balance.get().tobytes(), BALANCE).copy()
         balance["elastic"] = self._sum.get()

@@ -6,7 +6,7 @@ the device, so the native loop (loop.cpp) only launches graphs, moves mail and r
 graphs and puts settings, factors, arguments and requests into mailboxes.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,9 +17,9 @@ from sim_server.backend import HERE
 from sim_server.energy import Energies
 from sim_server.engine import ADOPTED, HELD, MOVED, NOTED, Newton
 from sim_server.gpu.cuda import CudaDevice
-from sim_server.gpu.device import DeviceLaunch, Gpu, processors
-from sim_server.gpu.energies import ACCOUNT, DeviceEnergies, lanes
-from sim_server.gpu.fuse import End, Fused, fused, shape
+from sim_server.gpu.device import DeviceLaunch, Gpu
+from sim_server.gpu.energies import DeviceEnergies
+from sim_server.gpu.fuse import DOMAINS, End, Fused, domain, fused
 from sim_server.gpu.intake import Intake
 from sim_server.gpu.layouts import ENERGY, FOUND, STAMP, Mail
 from sim_server.gpu.loop import CAPACITY, MANY, DeviceLoop
@@ -32,7 +32,7 @@ TICK = np.dtype(
     [
         ("clock", "u8"), ("step", "u8"), ("dt", "f8"), ("arrived", "u8"), ("finished", "u8"), ("stamps", "u8"),
         ("results", "u8"), ("reports", "u8"), ("moving", "u8"), ("barriers", "i4"), ("capacity", "i4"),
-        ("words", "i4"), ("bodies", "i4"), ("account", ACCOUNT),
+        ("words", "i4"), ("bodies", "i4"),
     ]
 )  # fmt: skip
 
@@ -101,10 +101,11 @@ class GpuEngine(DeviceLoop):
         **arrays: NDArray[Any],
     ):  # fmt: skip
         self.gpu, self.launches, self._arrays = gpu, [*assemble, *integrate], arrays
-        self._fused = fused(assemble)
+        self._fused, domains = fused(assemble), {domain(launch) for launch in assemble}
+        self._elements_first = "elements" in domains and domains <= set(DOMAINS)
         cp, bodies = gpu.cp, len(ranges)
         device = CudaDevice(cp)
-        self._steps = device.steps
+        self._steps, self._beside = device.steps, cp.cuda.Stream(non_blocking=True)
         self._counter = cp.zeros(1, np.int64)
         self._stamps = device.pinned(CAPACITY * STAMP.itemsize)
         self._results = device.pinned(CAPACITY * RESULT.itemsize * bodies)
@@ -141,8 +142,6 @@ class GpuEngine(DeviceLoop):
             self.mailboxes[bodies + k].post(whole[SETTINGS:])
         self.begin: list[DeviceLaunch] = []  # before the first step
         self._graphs: list[Any] = []
-        threads = shape("elements", integrate[0].items, processors()).threads
-        self._energies.params["lanes"] = lanes(threads, bodies)
         self._tick = self._end_of_step(dt)
         self._last = Fused(integrate, End((HERE / "gpu/tick.cu").read_text(), "Tick", self._tick))
         self._stamp = self._last.function("stamp")
@@ -162,7 +161,6 @@ class GpuEngine(DeviceLoop):
         tick["stamps"], tick["reports"] = self._stamps.ctypes.data, self._results.ctypes.data
         tick["dt"], tick["barriers"], tick["capacity"] = dt, len(self.solver.arrived), CAPACITY
         tick["words"], tick["bodies"] = len(self._ranges) * RESULT.itemsize // 8, len(self._ranges)
-        tick["account"] = self._energies.params
         return tick
 
     exact = False  # settings hold for batches of steps
@@ -204,22 +202,45 @@ class GpuEngine(DeviceLoop):
                     for _ in range(steps):
                         self._one_step()
                     self._graphs.append(self._steps.end_capture())
+        others = [self._captured(self._energies.account), self._captured(self._energies.elastic)]
+        handles = [int(graph.graphExec) if graph else 0 for graph in self._graphs]
+        self.use_graphs(handles, *(int(graph.graphExec) for graph in others))
+        self._graphs += others  # they live as long
+
+    def _captured(self, launch: Callable[[], None]) -> Any:
+        """The graph of what `launch` puts onto a stream."""
         with self._steps:
             self._steps.begin_capture()
-            self._energies.launch()
-            elastic = self._steps.end_capture()
-        self.use_graphs([int(graph.graphExec) if graph else 0 for graph in self._graphs], int(elastic.graphExec))
-        self._graphs.append(elastic)  # lives as long as the others
+            launch()
+            return self._steps.end_capture()
 
     def _begin(self) -> None:
         """Notes the time: the device has had nothing to do until now."""
         self._stamp((1,), (1,), (self._tick,))
 
     def _one_step(self) -> None:
-        """Everything a step puts onto the stream."""
-        for launch in self._fused:
+        """Everything a step puts onto the stream. The step before is settled beside the first kernel."""
+        first, *others = self._fused
+        self._account_beside(first)
+        for launch in others:
             launch()
         self._finish_step()
+
+    def _account_beside(self, first: Callable[[], None]) -> None:
+        """The account writes to what kernels over nodes work with: one over elements alone runs beside it. What that
+        makes of a body that is frozen meanwhile comes to nothing, as its nodes count as fixed from then on."""
+        if not self._elements_first:
+            self._energies.account()
+            first()
+            return
+        begun, settled = (self.gpu.cp.cuda.Event(disable_timing=True) for _ in range(2))
+        self._steps.record(begun)
+        self._beside.wait_event(begun)
+        first()
+        with self._beside:
+            self._energies.account()
+        self._beside.record(settled)
+        self._steps.wait_event(settled)
 
     def _finish_step(self) -> None:
         """Solve, integrate, count."""

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_server.backend import HERE, domain_of
+from sim_server.backend import domain_of
 from sim_server.gpu.device import DeviceLaunch, compiled, cupy, options, processors
 
 DOMAINS = ("elements", "nodes", "blocks")
@@ -48,17 +48,12 @@ def domain(launch: DeviceLaunch) -> str:
 
 
 class End(NamedTuple):
-    """What follows in each thread when its item is done: a text, its function of the same name as its struct in small
-    letters, and the struct's values.
-
-    The function gets these, a Motion of the launches' arrays named `motion` (null where there is none of the name), the
-    number of the item and how many there are.
-    """
+    """What follows when all items are done: a text, its function of the same name as its struct in small letters, and
+    the struct's values."""
 
     text: str
     struct: str
     params: NDArray[Any]
-    motion: tuple[str, ...] = ("x", "v", "before", "dv", "ahead", "drift", "carried")
 
 
 class Guard(NamedTuple):
@@ -91,9 +86,7 @@ class Fused:
         self._launches = list(launches)  # keeps their arrays
         text = Text(launches, self.shape, end, private, guard)
         self._arguments = (np.int32(self.items), *text.values, *([end.params] if end else []))
-        self._module = cupy().RawModule(
-            code=text.source, options=(*options(launches[0].types), f"-I{HERE / 'gpu'}"), backend="nvrtc"
-        )
+        self._module = cupy().RawModule(code=text.source, options=options(launches[0].types), backend="nvrtc")
         self._function = self.function("fused")
         self._ends = end is not None
 
@@ -141,8 +134,7 @@ class Text:
         if end:
             lines.append(end.text)
             self._parameters.append(f"const {end.struct} end")
-            arrays = ", ".join(self._named(name) for name in end.motion)
-            body_lines.append(f"{end.struct.lower()}(end, {{{arrays}}}, i, n);")
+            body_lines.append(f"{end.struct.lower()}(end);")
         heading = f'extern "C" __global__ void __launch_bounds__({shape.threads}) fused(int n'
         parameters = "".join(f", {p}" for p in self._parameters)
         first = GUARD if guard else []
@@ -204,11 +196,6 @@ class Text:
             self._parameters.append(f"{const}{kind}* __restrict__ {self._names[address]}")
             self.values.append(np.uint64(address))
         return self._names[address]
-
-    def _named(self, name: str) -> str:
-        """The argument that is the array of this name of one of the launches, or nullptr."""
-        found = [(x, f.kind) for x in self._launches for f in x.fields if f.name == name and not f.own]
-        return self._array(found[0][0], name, found[0][1]) if found else "nullptr"
 
     def _items(self) -> list[str]:
         """One item of each launch, by one thread."""

@@ -60,7 +60,7 @@ class Loop(c.Structure):
         ("cuda", c.POINTER(Cuda)), ("context", p), ("stream", p), ("copies", p), ("graphs", p * 4), ("many", i64),
          ("mailbox", c.POINTER(Mailbox)), ("body", c.POINTER(Body)),
         ("mailboxes", c.c_int32), ("bodies", c.c_int32), ("results", p), ("stamps", p),
-        ("found", p), ("energies", p), ("elastic", p), ("capacity", i64), ("batch", i64),
+        ("found", p), ("energies", p), ("account", p), ("elastic", p), ("capacity", i64), ("batch", i64),
         ("values", c.c_uint64), ("staged", c.c_uint64),
         ("matrices", p), ("snapped", p), ("home", p), ("x", c.c_uint64), ("v", c.c_uint64), ("pictures", c.c_uint64),
         ("frame_bytes", i64), ("clock", p), ("span", c.c_double), ("poll", c.c_double), ("step_seconds", c.c_double),

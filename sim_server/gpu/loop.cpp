@@ -39,11 +39,15 @@ static bool open_batch(Loop& l) {
 static bool count(Loop& l, int64_t steps) {
     l.launched += steps;
     l.batches[l.begun % DEPTH].steps += steps;
-    if (energy_due(l.rings, l.launched)) CALL(graph_launch, l.elastic, l.stream);
+    const int64_t every = l.rings.frame_every.load();
+    const bool energy = energy_due(l.rings, l.launched), frame = every > 0 && l.launched % every == 0;
+    if (energy || frame) CALL(graph_launch, l.account, l.stream);  // a frame shows what has run away put back
+    if (energy) CALL(graph_launch, l.elastic, l.stream);
     return begin_matrices(l) && begin_frame(l);
 }
 
 static bool close_batch(Loop& l) {
+    CALL(graph_launch, l.account, l.stream);  // of the last step; those before are settled beside the next one
     CALL(event_record, l.batches[l.begun % DEPTH].done, l.stream);
     ++l.begun;
     return true;

@@ -44,7 +44,7 @@ struct Result {                 // solve.cuh
 
 struct Found { double nonlinear; int32_t linearizations, unused; };  // search.cu
 
-struct Energy {                 // account.cuh
+struct Energy {                 // energy.cuh
     double kinetic, elastic, gravity, work, budget, stride;
     int32_t phase, found;
 };
@@ -82,7 +82,8 @@ struct Loop {
     const Stamp* stamps;               // (capacity,) likewise
     const Found* found;                // (capacity, bodies) likewise; null: one linearization a step
     const Energy* energies;            // (capacity, bodies) likewise
-    void* elastic;                     // graph that adds the elastic energy of the last step to them
+    void* account;                     // graph that has the energy of the last step told there, unless it has been
+    void* elastic;                     // graph that adds its elastic energy
     int64_t capacity, batch;           // batch: most steps in one; divides the capacity
     Address values, staged;            // A of all bodies, and as much room beside
     char* matrices;                    // ... and on the host, pinned

@@ -110,10 +110,10 @@ class DeviceLoop(Reports):
 
     # --- running ------------------------------------------------------------------------------------------------
 
-    def use_graphs(self, graphs: Sequence[int], elastic: int) -> None:
+    def use_graphs(self, graphs: Sequence[int], account: int, elastic: int) -> None:
         """Handles of the graphs of one step and of MANY steps (0: none), then of the same with the time noted first; of
-        the graph that evaluates the elastic energy of the last step."""
-        self.loop.graphs[:], self.loop.elastic = graphs, elastic
+        the graphs that tell the energy of the last step and evaluate its elastic energy."""
+        self.loop.graphs[:], self.loop.account, self.loop.elastic = graphs, account, elastic
 
     def run(self, steps: int) -> int:
         """Runs up to `steps` steps without Python; returns those done (fewer only after `stop`).

@@ -1,8 +1,7 @@
 // SPDX-License-Identifier: MIT
 // The end of a step, done by whichever thread block of its last kernel finishes last: one more step is completed, the barriers
-// of the next solve begin at zero, all bodies rest until their nodes say otherwise, the energy of the bodies is summed up
-// (account.cuh), and the results go to the host with the device's clock. fuse.py appends this to that kernel.
-#include "account.cuh"
+// of the next solve begin at zero, all bodies rest until their nodes say otherwise, and the results go to the host with the
+// device's clock. fuse.py appends this to that kernel.
 #include "clock.cuh"
 
 struct Tick {
@@ -17,18 +16,10 @@ struct Tick {
     long long* reports;        // likewise on the host
     int* moving;               // (bodies,)
     int barriers, capacity, words, bodies;
-    Account account;
 };
 
-#ifdef TICK_BYTES  // as engine.py and energies.py have them
-static_assert(sizeof(Tick) == TICK_BYTES && sizeof(Balance) == BALANCE_BYTES, "layouts of Tick or Balance differ");
-static_assert(sizeof(Energy) == ENERGY_BYTES && sizeof(Partial) == PARTIAL_BYTES, "layouts of Energy or Partial differ");
-#endif
-
-// i: item of this thread, of n.
-__device__ void tick(const Tick& t, const Motion& motion, int i, int n) {
+__device__ void tick(const Tick& t) {
     __shared__ bool last;
-    leave_sums(t.account, motion, i, n);
     __syncthreads();  // this thread block has done its items
     if (threadIdx.x == 0) {
         __threadfence();
@@ -40,7 +31,6 @@ __device__ void tick(const Tick& t, const Motion& motion, int i, int n) {
     for (int k = threadIdx.x; k < t.words; k += blockDim.x) t.reports[slot * t.words + k] = t.results[slot * t.words + k];
     for (int k = threadIdx.x; k < t.barriers; k += blockDim.x) t.arrived[k] = 0;
     for (int k = threadIdx.x; k < t.bodies; k += blockDim.x) t.moving[k] = 0;
-    settle_account(t.account, motion, slot);
     __syncthreads();
     if (threadIdx.x == 0) {
         long long now = nanoseconds();

@@ -32,8 +32,9 @@ template <class B> static inline void note_energy(Record& record, const B& b) {
     record.work = b.work;
     record.budget = b.budget;
     record.stride = b.stride;
-    if (b.phase != WELL && record.status != STATUS_NOT_FINITE) record.status = STATUS_RUNAWAY;
-    if (b.phase != FROZEN || b.found) return;
+    const bool rests = b.phase == FROZEN && !b.found;
+    if (b.phase != WELL && (rests || record.status != STATUS_NOT_FINITE)) record.status = STATUS_RUNAWAY;
+    if (!rests) return;
     record.factor_step = -1;  // there was nothing to solve
     record.kind = record.asked;
 }

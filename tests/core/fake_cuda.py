@@ -22,6 +22,8 @@ SIGNATURES = {
 }  # fmt: skip
 Work = Callable[[], None]
 
+ACCOUNT = 12  # handle of the graph
+
 
 class FakeDevice:
     """loop.Device. Nothing is done before somebody waits for it or asks often enough.
@@ -149,6 +151,7 @@ class FakeScene:
         self.argument = np.zeros(1, np.int64)
         self.results, self.stamps = np.zeros((CAPACITY, bodies), RESULT), np.zeros(CAPACITY, STAMP)
         self.energies, self.phase = np.zeros((CAPACITY, bodies), ENERGY), 0
+        self.found = 0
         self.clock, self.time, self.done = np.zeros(1), 0, 0
         self.seen: list[int] = []  # the argument in each step
         boxes = [(a.ctypes.data + 8 * k, 8) for a in (self.settings, self.factor) for k in range(bodies)]
@@ -161,7 +164,8 @@ class FakeScene:
         device.graphs = {7: lambda: self._steps(1), 8: lambda: self._steps(MANY)}
         device.graphs |= {9: lambda: self._steps(1, True), 10: lambda: self._steps(MANY, True)}
         device.graphs[11] = self._elastic
-        self.loop.use_graphs([7, 8, 9, 10], 11)
+        device.graphs[ACCOUNT] = lambda: None  # steps tell their energies themselves
+        self.loop.use_graphs([7, 8, 9, 10], ACCOUNT, 11)
 
     def _steps(self, steps: int, stamp: bool = False) -> None:
         if stamp:
@@ -185,6 +189,7 @@ class FakeScene:
         row["residual"], row["seconds"], row["bad_node"] = 1e-7 * k, 1e-6, -1
         told = self.energies[slot]
         told["kinetic"], told["elastic"], told["work"], told["phase"] = k, np.nan, -k, self.phase
+        told["found"] = self.found
         self.x[:], self.v[:] = k + 1, -k
         self.time += 10 * (k + 1)
         self.stamps[slot]["end"] = self.time

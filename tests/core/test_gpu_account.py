@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The end of a step on a GPU run by threads of the processor: sums of bodies over warps and blocks, and freezing."""
+"""The account of energy on a GPU run by threads of the processor: sums over the nodes of bodies, and freezing."""
 
 import ctypes as c
 import subprocess
@@ -9,31 +9,28 @@ import numpy as np
 import pytest
 
 from sim_server.backend import HERE, INCLUDE, compiler
-from sim_server.gpu.energies import PARTIAL, lanes
-from sim_server.gpu.engine import TICK
+from sim_server.gpu.energies import ACCOUNT
 from sim_server.gpu.layouts import ENERGY
 from sim_server.layouts import BALANCE
 
 G = np.array([0.3, -9.81, 2.0])
-MOTION = ("x", "v", "before", "dv", "ahead", "drift", "carried")
+STILL = ("v", "dv", "ahead", "drift", "carried")
+MOTION = ("x", "before", *STILL)
 TEXT = """
 #include "cuda_threads.h"
-#include "tick.cu"
-extern "C" void end_of_step(int blocks, int threads, const Tick* tick_, const Motion* motion, int n) {
-    launch(blocks, threads, [&] { tick(*tick_, *motion, blockIdx.x * blockDim.x + threadIdx.x, n); });
-}
+#include "account.cu"
+extern "C" void settle(int threads, const Account* a) { launch(a->bodies, threads, [&] { account(*a); }); }
 """
 
 
 @pytest.fixture(scope="module")
 def library(tmp_path_factory: pytest.TempPathFactory) -> c.CDLL:
     folder = tmp_path_factory.mktemp("account")
-    (folder / "clock.cuh").write_text("static long long nanoseconds() { return 5; }\n")  # that of the device is PTX
-    (folder / "end.cpp").write_text(TEXT)
+    (folder / "settle.cpp").write_text(TEXT)
     paths = [f"-I{p}" for p in (folder, Path(__file__).parent, HERE / "gpu", INCLUDE)]
     command = [compiler(), "-std=c++17", "-O1", "-shared", "-fPIC", "-pthread", "-Dreal=double", *paths]
-    subprocess.run([*command, str(folder / "end.cpp"), "-o", str(folder / "end.so")], check=True)
-    return c.CDLL(str(folder / "end.so"))
+    subprocess.run([*command, str(folder / "settle.cpp"), "-o", str(folder / "settle.so")], check=True)
+    return c.CDLL(str(folder / "settle.so"))
 
 
 class Bodies:
@@ -42,7 +39,6 @@ class Bodies:
     def __init__(self, sizes: list[int], threads: int, on_runaway: int = 0):
         rng, self.n, self.threads = np.random.default_rng(len(sizes)), sum(sizes), threads
         self.first = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int32)
-        self.body = np.repeat(np.arange(len(sizes), dtype=np.int32), sizes)
         shape = (self.n, 3)
         self.motion = {name: rng.normal(size=shape) for name in MOTION}
         self.motion["before"] = self.motion["x"] - 0.1 * rng.normal(size=shape)
@@ -53,25 +49,19 @@ class Bodies:
         self.balance = np.zeros(len(sizes), BALANCE)
         self.balance["start"], self.balance["limit"] = 1e6, 1e6
         self.told = np.zeros((4, len(sizes)), ENERGY)
-        self.partial = np.zeros(self.n // 32 + len(sizes) + 1, PARTIAL)
-        self.small = {
-            k: np.zeros(size, "i8") for k, size in (("clock", 1), ("step", 1), ("arrived", 1), ("finished", 1))
-        }
-        self.words = {k: np.zeros((4, 2), "i8") for k in ("stamps", "results", "reports")}
-        self.tick = np.zeros((), TICK)
-        for name, array in (self.small | self.words).items():
-            self.tick[name] = array.ctypes.data
-        self.tick["capacity"], self.tick["words"], self.tick["barriers"] = 4, 2, 1
-        account = self.tick["account"]
-        for name in ("body", "first", "mass", "force", "spring", "anchor", "free", "partial", "balance", "told"):
-            account[name] = getattr(self, name).ctypes.data
-        account["gravity"], account["bodies"], account["inertia"] = G.ctypes.data, len(sizes), 1
-        account["on_runaway"], account["lanes"] = on_runaway, lanes(threads, len(sizes))
+        self.step, self.settled = np.ones(1, "i8"), np.zeros(len(sizes), "i8")
+        self.gravity, self.account = G, np.zeros((), ACCOUNT)
+        names = ("mass", "force", "spring", "anchor", "free", "balance", "told", "step", "settled", "first", "gravity")
+        for name in names:
+            self.account[name] = getattr(self, name).ctypes.data
+        for name in ("x", "v", "before"):
+            self.account[name] = self.motion[name].ctypes.data
+        self.account["still"] = [self.motion[name].ctypes.data for name in STILL]
+        self.account["bodies"], self.account["capacity"], self.account["inertia"] = len(sizes), 4, 1
+        self.account["on_runaway"] = on_runaway
 
-    def end_step(self, library: c.CDLL) -> None:
-        pointers = (c.c_void_p * len(MOTION))(*(self.motion[name].ctypes.data for name in MOTION))
-        blocks = -(-self.n // self.threads)
-        library.end_of_step(blocks, self.threads, c.c_void_p(self.tick.ctypes.data), pointers, self.n)
+    def settle(self, library: c.CDLL) -> None:
+        library.settle(self.threads, c.c_void_p(self.account.ctypes.data))
 
     def expected(self, body: int) -> dict[str, float]:
         nodes = slice(self.first[body], self.first[body + 1])
@@ -93,17 +83,20 @@ def test_each_body_gets_the_sums_over_its_own_nodes(library, sizes, threads):
     bodies = Bodies(sizes, threads)
     expected = [bodies.expected(k) for k in range(len(sizes))]
     state = {name: array.copy() for name, array in bodies.motion.items()}
-    bodies.end_step(library)
+    bodies.settle(library)
     for k, found in enumerate(bodies.told[0]):
         for name, value in expected[k].items():
             assert found[name] == pytest.approx(value, rel=1e-6 if name == "stride" else 1e-11), (k, name)
         assert np.isnan(found["elastic"]) and found["phase"] == found["found"] == 0
     assert not bodies.force.any() and not bodies.spring.any()  # until something touches them again
     assert all(np.array_equal(array, bodies.motion[name]) for name, array in state.items()) and bodies.free.all()
-    assert bodies.small["step"][0] == 1 and bodies.small["finished"][0] == 0
+    assert (bodies.settled == 1).all()
     once = bodies.told[0].tobytes()
+    bodies.motion["v"][:] = 7
+    bodies.settle(library)  # a second time: of a step that is settled
+    assert bodies.told[0].tobytes() == once
     again = Bodies(sizes, threads)
-    again.end_step(library)
+    again.settle(library)
     assert again.told[0].tobytes() == once  # to the bit
 
 
@@ -116,7 +109,7 @@ def test_what_has_too_much_goes_back_and_rests_and_nothing_else(library, on_runa
     bodies.balance["limit"][1] = 1e-3
     bodies.motion["v"][wrong] = np.nan
     state = {name: array.copy() for name, array in bodies.motion.items()}
-    bodies.end_step(library)
+    bodies.settle(library)
     assert bodies.told[0]["found"].tolist() == ([1, 1, 1, 0] if on_runaway < 2 else [0] * 4)
     assert bodies.told[0]["phase"].tolist() == {0: [2, 2, 2, 0], 1: [1, 1, 1, 0], 2: [0] * 4}[on_runaway]
     for nodes in (fast, long, wrong):
@@ -126,7 +119,8 @@ def test_what_has_too_much_goes_back_and_rests_and_nothing_else(library, on_runa
             assert np.array_equal(bodies.motion["x"][nodes], state["before"][nodes]) and not bodies.free[nodes].any()
             assert not any(bodies.motion[n][nodes].any() for n in MOTION if n not in ("x", "before"))
     assert all(np.array_equal(state[n][well], bodies.motion[n][well]) for n in MOTION) and bodies.free[well].all()
-    bodies.end_step(library)
+    bodies.step[0] = 2
+    bodies.settle(library)
     if on_runaway == 0:
         assert bodies.told[1]["phase"].tolist() == [2, 2, 2, 0] and not bodies.told[1]["found"].any()
         assert not bodies.told[1]["kinetic"][:3].any()

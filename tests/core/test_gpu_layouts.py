@@ -9,8 +9,7 @@ import pytest
 from sim_server.backend import HERE
 from sim_server.gpu.device import PRECISIONS
 from sim_server.gpu.device import options as device_options
-from sim_server.gpu.energies import ELASTIC, PARTIAL, lanes
-from sim_server.gpu.engine import TICK
+from sim_server.gpu.energies import ACCOUNT, ELASTIC
 from sim_server.gpu.layouts import ENERGY, FOUND
 from sim_server.gpu.planned import PLAN
 from sim_server.gpu.search import LANES, SEARCH, SEARCHING, SPAN, STRETCH, bodies_of, stretches
@@ -90,17 +89,12 @@ def test_the_search_compiles_with_the_layouts_of_this_side_and_spills_no_registe
 def test_the_account_of_energy_compiles_with_the_layouts_of_this_side(precision, tmp_path):
     if (library := nvrtc.library()) is None:
         pytest.skip("needs the package nvidia-cuda-nvrtc")
-    sizes = {"TICK": TICK, "BALANCE": BALANCE, "ENERGY": ENERGY, "PARTIAL": PARTIAL, "ELASTIC": ELASTIC}
+    sizes = {"ACCOUNT": ACCOUNT, "BALANCE": BALANCE, "ENERGY": ENERGY, "ELASTIC": ELASTIC}
     options = [*device_options(PRECISIONS[precision]), f"-I{HERE / 'gpu'}", "-arch=sm_90"]
     options += [f"-D{name}_BYTES={layout.itemsize}" for name, layout in sizes.items()]
-    for name in ("tick", "elastic"):
+    for name in ("account", "elastic"):
         code, said = nvrtc.compiled(library, HERE / f"gpu/{name}.cu", options)
         assert code and not said, said
-
-
-def test_the_threads_of_a_block_are_shared_out_over_bodies():
-    found = [lanes(threads, bodies) for threads, bodies in ((32, 1), (128, 1), (128, 3), (64, 30), (32, 1000))]
-    assert found == [32, 128, 32, 2, 1]
 
 
 def test_the_nodes_of_a_body_are_shared_out_in_stretches():

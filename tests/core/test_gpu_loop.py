@@ -12,7 +12,7 @@ import pytest
 from sim_server.errors import DeviceLost
 from sim_server.gpu.layouts import FOUND
 from sim_server.gpu.loop import BATCH, CAPACITY, FRAMES
-from tests.core.fake_cuda import NOT_READY, FakeScene, number
+from tests.core.fake_cuda import ACCOUNT, NOT_READY, FakeScene, number
 
 
 def steps_ahead(scene: FakeScene) -> list[int]:
@@ -21,7 +21,8 @@ def steps_ahead(scene: FakeScene) -> list[int]:
     launch = scene.device._graph_launch
 
     def counted(graph: int, stream: int) -> int:
-        ahead.append(int(scene.loop.loop.launched) - scene.loop.step)
+        if graph != ACCOUNT:
+            ahead.append(int(scene.loop.loop.launched) - scene.loop.step)
         return launch(graph, stream)
 
     scene.device.set("graph_launch", counted)
@@ -71,7 +72,7 @@ def test_the_elastic_energy_is_evaluated_after_the_steps_where_it_is_wanted():
     scene.device.calls.clear()
     scene.loop.run(10 * BATCH)
     assert np.isnan(scene.loop.records()["elastic"]).all()
-    assert scene.device.calls.count("graph_launch") == 10 * 2  # and nothing else
+    assert scene.device.calls.count("graph_launch") == 10 * 3  # with the account of each batch, and nothing else
 
 
 def test_what_the_device_has_frozen_is_told_as_a_runaway():
@@ -82,8 +83,15 @@ def test_what_the_device_has_frozen_is_told_as_a_runaway():
     scene.results["status"] = 5
     scene.loop.run(1)
     records = scene.loop.records()
-    assert records["status"].tolist() == [0, 7, 7, 5]  # not_finite says more
+    assert records["status"].tolist() == [0, 7, 7, 7]
     assert records["factor_step"].tolist() == [0, -1, -1, -1]
+
+
+def test_a_body_that_runs_away_by_what_is_no_number_says_so():
+    scene = FakeScene()
+    scene.phase, scene.found, scene.results["status"] = 2, 1, 5
+    scene.loop.run(1)
+    assert scene.loop.records()["status"].tolist() == [5]  # not_finite says more
 
 
 def test_the_time_of_a_step_is_its_own_and_not_a_share_of_its_batch():
@@ -139,7 +147,7 @@ def test_the_clock_is_noted_first_where_the_device_had_nothing_to_do():
     launch = scene.device._graph_launch
     scene.device.set("graph_launch", lambda graph, stream: graphs.append(graph) or launch(graph, stream))
     scene.loop.run(3 * BATCH)
-    assert graphs == [10, 8, 8, 8, 8, 8]
+    assert [graph for graph in graphs if graph != ACCOUNT] == [10, 8, 8, 8, 8, 8] and graphs.count(ACCOUNT) == 3
 
 
 def test_few_launches_do_for_many_steps():
@@ -147,7 +155,7 @@ def test_few_launches_do_for_many_steps():
     scene.loop.run(BATCH)
     scene.device.calls.clear()
     scene.loop.run(10 * BATCH)
-    assert scene.device.calls.count("graph_launch") == 10 * 2  # of eight steps
+    assert scene.device.calls.count("graph_launch") == 10 * 3  # two of eight steps, one for the account of the last
 
 
 def test_mail_holds_from_the_next_batch_on_and_the_last_one_wins():

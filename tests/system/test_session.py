@@ -181,12 +181,16 @@ def test_too_little_lockable_memory_loses_nothing() -> None:
 
 
 def test_the_limit_counts_only_without_the_capability(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(memlock.resource, "getrlimit", lambda which: (8 << 20, 8 << 20))
+    limits = {memlock.resource.RLIMIT_MEMLOCK: 8 << 20}
+    unlimited = memlock.resource.RLIM_INFINITY
+    monkeypatch.setattr(memlock.resource, "getrlimit", lambda which: (limits.get(which, unlimited),) * 2)
     monkeypatch.setattr(memlock, "may_lock_anything", lambda: False)
     assert "locked-memory limit is 8192 KiB" in memlock.obstacle()
     assert memlock.obstacle() and not open_and_close(free_endpoint())
     monkeypatch.setattr(memlock, "may_lock_anything", lambda: True)
     assert memlock.obstacle() == ""
+    limits[memlock.resource.RLIMIT_FSIZE] = 8 << 20
+    assert "files may have 8192 KiB" in memlock.obstacle()
     monkeypatch.setattr(memlock, "SHM", Path("/nowhere"))
     assert "is not writable" in memlock.obstacle()
 
