@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: MIT
 // The energy of each body after a step, and whether it has run away (kernels/balance.cuh): a thread block for each body, which sums
-// over its nodes in a fixed order, decides, and freezes. It runs beside the first kernel of the next step, or after the last step
-// of a batch; a step that is settled already is left alone.
+// over its nodes in a fixed order, decides, and freezes. It runs beside the kernels that assemble the next step, or after the last
+// step of a batch; a step that is settled already is left alone.
 #include "energy.cuh"
 
 constexpr int STILL = 5, MOST_THREADS = 1024;
@@ -22,6 +22,7 @@ struct Account {
     Energy* told;            // (capacity, bodies) on the host
     const long long* step;   // (1,) completed
     long long* settled;      // (bodies,) step that was settled last
+    int* frozen;             // (bodies,) out: 1 from when it is frozen
     int bodies, capacity, on_runaway, inertia;
 };
 
@@ -110,5 +111,7 @@ extern "C" __global__ void __launch_bounds__(MOST_THREADS) account(const Account
         a.settled[body] = step;
     }
     __syncthreads();
-    if (away) freeze(a, body);
+    if (!away) return;
+    if (threadIdx.x == 0) a.frozen[body] = 1;
+    freeze(a, body);
 }

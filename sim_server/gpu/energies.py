@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The energy of bodies on a GPU: its memory, the elastic energy on demand, and the start that all is reckoned from.
 
-Everything but the elastic energy is summed up after each step, beside the first kernel of the next one (account.cu).
+Everything but the elastic energy is summed up after each step, beside the assembly of the next one (account.cu).
 """
 
 from typing import Any
@@ -22,7 +22,8 @@ STILL = 5  # arrays that are 0 in a body at rest, at most
 ACCOUNT = np.dtype(
     [(n, "u8") for n in ("first", "mass", "before", "x", "v")]
     + [("still", "u8", STILL)]
-    + [(n, "u8") for n in ("force", "spring", "anchor", "free", "gravity", "balance", "told", "step", "settled")]
+    + [(n, "u8") for n in ("force", "spring", "anchor", "free", "gravity", "balance", "told")]
+    + [(n, "u8") for n in ("step", "settled", "frozen")]
     + [(n, "i4") for n in ("bodies", "capacity", "on_runaway", "inertia")]
 )
 ELASTIC = np.dtype(
@@ -35,7 +36,8 @@ class DeviceEnergies:
     """Energies of a scene on the device.
 
     told: host memory (capacity, bodies) of ENERGY that the device writes to. counter: device array (1,) of completed
-    steps.
+    steps. frozen: device array (bodies,), 1 for bodies that are. forces: the account works with those that kernels over
+    nodes write.
     """
 
     def __init__(self, gpu: Gpu, energies: Energies, told: NDArray[np.uint8], counter: Any, dt: float):
@@ -47,10 +49,12 @@ class DeviceEnergies:
         self.started = False
         self._balance = cp.asarray(np.frombuffer(energies.balance.tobytes(), np.uint8))
         self._settled, self._sum = cp.zeros(self._bodies, np.int64), cp.zeros(self._bodies)
+        self.frozen, self.forces = cp.zeros(self._bodies, np.int32), energies.touch is not None
         self._memory: dict[str, Any] = {
             "first": cp.asarray(starts), "mass": gpu.twin(world.mass), "free": gpu.twin(world.free),
             "before": gpu.twin(energies.before), "x": gpu.twin(world.x), "v": gpu.twin(world.v),
             "gravity": gpu.twin(energies.gravity), "balance": self._balance, "step": counter, "settled": self._settled,
+            "frozen": self.frozen,
         }  # fmt: skip
         if energies.touch is not None:
             self._memory |= {n: gpu.twin(getattr(energies.touch, n)) for n in ("force", "spring", "anchor")}

@@ -112,7 +112,7 @@ class GpuEngine(DeviceLoop):
         told = device.pinned(CAPACITY * ENERGY.itemsize * bodies)
         self._energies = DeviceEnergies(gpu, energies, told, self._counter, dt)
         turns = Turns.of(gpu, bodies) if more else None
-        self.solver = Solver(gpu, ranges, arrays, self._counter, CAPACITY, planes, turns or ())
+        self.solver = Solver(gpu, ranges, arrays, self._counter, CAPACITY, self._energies.frozen, planes, turns or ())
         self._search, found = None, None
         if more and turns:
             found = device.pinned(CAPACITY * FOUND.itemsize * bodies)
@@ -219,24 +219,21 @@ class GpuEngine(DeviceLoop):
         self._stamp((1,), (1,), (self._tick,))
 
     def _one_step(self) -> None:
-        """Everything a step puts onto the stream. The step before is settled beside the first kernel."""
-        first, *others = self._fused
-        self._account_beside(first)
-        for launch in others:
+        """Everything a step puts onto the stream. The step before is settled beside the assembly: what that makes of a
+        body that is frozen meanwhile is not solved for. Where something writes forces that the account reads, it runs
+        beside kernels over elements alone."""
+        beside = len(self._fused) if not self._energies.forces else int(self._elements_first)
+        self._account_beside(self._fused[:beside])
+        for launch in self._fused[beside:]:
             launch()
         self._finish_step()
 
-    def _account_beside(self, first: Callable[[], None]) -> None:
-        """The account writes to what kernels over nodes work with: one over elements alone runs beside it. What that
-        makes of a body that is frozen meanwhile comes to nothing, as its nodes count as fixed from then on."""
-        if not self._elements_first:
-            self._energies.account()
-            first()
-            return
+    def _account_beside(self, launches: Sequence[Callable[[], None]]) -> None:
         begun, settled = (self.gpu.cp.cuda.Event(disable_timing=True) for _ in range(2))
         self._steps.record(begun)
         self._beside.wait_event(begun)
-        first()
+        for launch in launches:
+            launch()
         with self._beside:
             self._energies.account()
         self._beside.record(settled)

@@ -20,7 +20,7 @@ struct Memory {  // fixed shared memory of a thread block: what is the same in a
     real* d;         // (own, 3) scale of the own degrees of freedom, or null
     real* diagonal;  // (own, 9) inverses of the diagonal blocks
     double peak;     // largest scale
-    int next, bad, rests;
+    int next, bad, rests, frozen;
     double b2, goal, quarter, rz;  // of the iteration: all threads write the same
     Result out;
 };
@@ -298,6 +298,7 @@ __device__ __forceinline__ void Solver::solve() {
             if (!begun) {
                 begun = true;
                 memory.b2 = bb;
+                if (memory.frozen) { give(0, 0); return; }  // what was assembled is of a state that was put back meanwhile
                 if (!isfinite(bb)) {
                     out.status = NOT_FINITE;
                     out.residual = bb;
@@ -378,7 +379,7 @@ __device__ __forceinline__ void solve_body(const Solve& s, const Share& share) {
     __syncthreads();
     if (memory.body.plan)
         for (int i = threadIdx.x; i < (int)(sizeof(Plan) / 4); i += THREADS) ((int*)&memory.plan)[i] = ((const int*)memory.body.plan)[i];
-    if (threadIdx.x == 0) memory.rests = s.moving[k] == 0;
+    if (threadIdx.x == 0) { memory.rests = s.moving[k] == 0; memory.frozen = s.frozen[k]; }
     __syncthreads();
     const long long begin = nanoseconds();
     Solver solver = {s, {share.index, memory.body.blocks, s.exchanges[k], s.board + 8ll * s.grid * k, s.grid, memory.scratch, memory.totals,

@@ -50,9 +50,10 @@ class Bodies:
         self.balance["start"], self.balance["limit"] = 1e6, 1e6
         self.told = np.zeros((4, len(sizes)), ENERGY)
         self.step, self.settled = np.ones(1, "i8"), np.zeros(len(sizes), "i8")
+        self.frozen = np.zeros(len(sizes), "i4")
         self.gravity, self.account = G, np.zeros((), ACCOUNT)
         names = ("mass", "force", "spring", "anchor", "free", "balance", "told", "step", "settled", "first", "gravity")
-        for name in names:
+        for name in (*names, "frozen"):
             self.account[name] = getattr(self, name).ctypes.data
         for name in ("x", "v", "before"):
             self.account[name] = self.motion[name].ctypes.data
@@ -112,6 +113,7 @@ def test_what_has_too_much_goes_back_and_rests_and_nothing_else(library, on_runa
     bodies.settle(library)
     assert bodies.told[0]["found"].tolist() == ([1, 1, 1, 0] if on_runaway < 2 else [0] * 4)
     assert bodies.told[0]["phase"].tolist() == {0: [2, 2, 2, 0], 1: [1, 1, 1, 0], 2: [0] * 4}[on_runaway]
+    assert bodies.frozen.tolist() == [int(on_runaway == 0)] * 3 + [0]
     for nodes in (fast, long, wrong):
         same = [np.array_equal(state[n][nodes], bodies.motion[n][nodes], equal_nan=True) for n in MOTION]
         assert all(same) == (on_runaway > 0)
