@@ -17,6 +17,7 @@ class Mailbox(Generic[T]):
     def __init__(self, capacity: int, bell: threading.Event | None = None):
         self._bell = bell
         self._items: deque[T] = deque(maxlen=capacity)
+        self._in_hand = False  # what was taken is not dealt with yet
         self._arrived = threading.Condition()
         self.dropped = 0
 
@@ -36,4 +37,15 @@ class Mailbox(Generic[T]):
                 self._arrived.wait(timeout)
             items = list(self._items)
             self._items.clear()
+            self._in_hand = self._in_hand or bool(items)
             return items
+
+    def done(self) -> None:
+        """All that was taken so far is dealt with."""
+        self._in_hand = False
+
+    @property
+    def idle(self) -> bool:
+        """Nothing is here, and all that was taken is dealt with. From any thread."""
+        with self._arrived:
+            return not self._items and not self._in_hand

@@ -145,6 +145,7 @@ class Uplink:
                 bulk_shared=self.counters.bulk_shared,
                 bulk_copied=self.counters.bulk_copied,
                 builds=self._builds,
+                idle=self.mailbox.idle,
             )
             self._session.zenoh.put(key("worker", self.server, worker=self.name), info.SerializeToString())
 

@@ -62,7 +62,12 @@ class Worker:
         if not self._pending:
             return False
         self._do(self._pending.pop(next(iter(self._pending))))
+        self._done()
         return True
+
+    def _done(self) -> None:
+        if not self._pending:
+            self._uplink.mailbox.done()
 
     def take_in(self, timeout: float) -> None:
         """Take in what came; with nothing to do yet, wait up to timeout seconds for it."""
@@ -78,6 +83,7 @@ class Worker:
                     self._enqueue(accept(item, self._uplink.name, self._uplink.incarnation))
             except Refused as refusal:
                 self._counters.refuse(refusal)
+        self._done()
 
     def _leave_server(self, gone: int) -> None:
         if gone == self._uplink.incarnation:

@@ -195,7 +195,7 @@ class Factor(_message.Message):
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., warp: _Optional[bool] = ..., pattern: _Optional[int] = ..., dtype: _Optional[str] = ..., nonzeros: _Optional[int] = ..., checksum: _Optional[int] = ..., slot: _Optional[_Union[Slot, _Mapping]] = ..., worker: _Optional[str] = ..., seconds: _Optional[float] = ..., failure: _Optional[str] = ..., job: _Optional[int] = ..., matrix_shared: _Optional[bool] = ..., remedy: _Optional[str] = ...) -> None: ...
 
 class WorkerInfo(_message.Message):
-    __slots__ = ("header", "worker", "pid", "host", "library", "threads", "shared_memory", "jobs", "failures", "superseded", "refused", "bulk_shared", "bulk_copied", "builds")
+    __slots__ = ("header", "worker", "pid", "host", "library", "threads", "shared_memory", "jobs", "failures", "superseded", "refused", "bulk_shared", "bulk_copied", "builds", "idle")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     WORKER_FIELD_NUMBER: _ClassVar[int]
     PID_FIELD_NUMBER: _ClassVar[int]
@@ -210,6 +210,7 @@ class WorkerInfo(_message.Message):
     BULK_SHARED_FIELD_NUMBER: _ClassVar[int]
     BULK_COPIED_FIELD_NUMBER: _ClassVar[int]
     BUILDS_FIELD_NUMBER: _ClassVar[int]
+    IDLE_FIELD_NUMBER: _ClassVar[int]
     header: Header
     worker: str
     pid: int
@@ -224,7 +225,8 @@ class WorkerInfo(_message.Message):
     bulk_shared: int
     bulk_copied: int
     builds: bool
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., worker: _Optional[str] = ..., pid: _Optional[int] = ..., host: _Optional[str] = ..., library: _Optional[str] = ..., threads: _Optional[int] = ..., shared_memory: _Optional[bool] = ..., jobs: _Optional[int] = ..., failures: _Optional[int] = ..., superseded: _Optional[int] = ..., refused: _Optional[int] = ..., bulk_shared: _Optional[int] = ..., bulk_copied: _Optional[int] = ..., builds: _Optional[bool] = ...) -> None: ...
+    idle: bool
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., worker: _Optional[str] = ..., pid: _Optional[int] = ..., host: _Optional[str] = ..., library: _Optional[str] = ..., threads: _Optional[int] = ..., shared_memory: _Optional[bool] = ..., jobs: _Optional[int] = ..., failures: _Optional[int] = ..., superseded: _Optional[int] = ..., refused: _Optional[int] = ..., bulk_shared: _Optional[int] = ..., bulk_copied: _Optional[int] = ..., builds: _Optional[bool] = ..., idle: _Optional[bool] = ...) -> None: ...
 
 class Echo(_message.Message):
     __slots__ = ("header", "slot", "nonce", "settled")

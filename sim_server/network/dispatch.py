@@ -60,6 +60,7 @@ class Dispatch:
         self._busy = threading.RLock()  # a status asks for the workers while the loop thread takes in a factor
         self._last_worker: dict[str, str] = {}  # of each object: it knows the pattern already
         self._free_since: dict[str, float] = {}  # by worker, when it last answered
+        self._left: dict[str, tuple[int, float]] = {}  # by worker, the last job that left for it, and when
         self._quick: set[str] = set()  # workers without shared memory whose link takes a job at once
         self._factors: list[Factor] = []
         self._failures: list[tuple[str, str]] = []
@@ -189,6 +190,7 @@ class Dispatch:
             now,
             now + self._jobs.alone(job.object, known.blocks),
             job.method.name,
+            0 if matrix_slot else job.values.nbytes,
         )
         self._jobs.start(flight)
         if self._post(flight, job, lease, matrix_slot):
@@ -251,23 +253,24 @@ class Dispatch:
         payload = load(message, job.values, slot)
         name = key("matrix", self._server, worker=flight.worker, object=flight.object)
         attachment = message.SerializeToString()
-        return self._outbox.post(lambda: self._send(flight.worker, name, payload, attachment, slot is not None))
+        return self._outbox.post(lambda: self._send(flight, name, payload, attachment, slot is not None))
 
-    def _send(self, worker: str, name: str, payload: Any, attachment: bytes, shared: bool) -> None:
+    def _send(self, flight: Flight, name: str, payload: Any, attachment: bytes, shared: bool) -> None:
         """Send a job, in the thread of the outbox. Where a link is full zenoh drops it (the lease then ends) or waits.
 
         It waits only where it must: bytes over a link that is slow, as far as is known, are more than zenoh would hold.
         While it waits for one receiver all others wait too, also for one that subscribed to everything and stopped
         reading. In a queue of its own, since a message that waits locks the queue of its priority.
         """
-        drop = shared or worker in self._quick
+        drop = shared or flight.worker in self._quick
         control = zenoh.CongestionControl.DROP if drop else zenoh.CongestionControl.BLOCK
         begin = time.perf_counter()
         self._session.put(
             name, payload, attachment=attachment, congestion_control=control, priority=zenoh.Priority.BACKGROUND
         )
         if not drop and time.perf_counter() - begin < QUICK:
-            self._quick.add(worker)
+            self._quick.add(flight.worker)
+        self._left[flight.worker] = flight.number, self._clock()
 
     # ---- in --------------------------------------------------------------------------------------------------
 
@@ -281,9 +284,19 @@ class Dispatch:
         self._look_again()
         for flight in self._jobs.expire(self._clock()):
             self._counters.add("leases_over")
-            self._quick.discard(flight.worker)  # it may be that zenoh dropped it
-            self._conduct.failed(flight.worker, flight.object, self._clock())
-            self._fail(flight, "was not answered within its lease")
+            self._give_up(flight, "was not answered within its lease")
+        for flight in self._jobs.undelivered(self._left_at, self._roster.idle):
+            self._counters.add("jobs_lost")
+            self._give_up(flight, f"was lost: worker {flight.worker} says that it has no job")
+
+    def _left_at(self, flight: Flight) -> float:
+        number, when = self._left.get(flight.worker, (0, 0.0))
+        return when if number == flight.number else float("inf")
+
+    def _give_up(self, flight: Flight, why: str) -> None:
+        self._quick.discard(flight.worker)  # it may be that zenoh dropped it
+        self._conduct.failed(flight.worker, flight.object, self._clock())
+        self._fail(flight, why)
 
     def _look_again(self) -> None:
         """Ask for the tokens of workers that speak without one, now and then."""
@@ -315,6 +328,7 @@ class Dispatch:
         self._speeds.forget_worker(name)
         self._conduct.forget_worker(name)
         self._quick.discard(name)
+        self._left.pop(name, None)
         self._free_since.pop(name, None)
         if flight is not None:
             self._counters.add("jobs_lost")

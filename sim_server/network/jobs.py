@@ -16,6 +16,8 @@ LONGEST = 120.0  # s; also for the first job of an object at a worker, which may
 DOUBLINGS = 8
 TIMES = 20  # a lease is so many times what the last factorization took
 UNKNOWN_PER_BLOCK = 1e-4  # s that nobody else is asked for an object that no factor came of yet
+DELIVERED = 1.0  # s in which a job that left reaches a worker through shared memory; as bytes so much longer: ...
+BUFFERED, SLOWEST = 1 << 22, 1e6  # ... at most these bytes are still on their way, at so many bytes/s
 SOON = 0.5  # s that nobody else is asked, at least
 LATE = 2  # late jobs with which a worker may still be asked again through shared memory
 
@@ -44,6 +46,7 @@ class Flight:
     sent: float = 0.0
     alone: float = 0.0  # [s, monotonic] from when on another worker may be asked for the object
     method: str = "cholesky"
+    bytes: int = 0  # of its values, where they are in no slot
 
 
 class Jobs:
@@ -136,7 +139,28 @@ class Jobs:
 
     def expire(self, now: float) -> list[Flight]:
         """Flights whose lease ended: object and worker may be used again; the slots stay lent."""
-        over = [flight for flight in self.by_worker.values() if now > flight.deadline]
+        return self._given_up([flight for flight in self.by_worker.values() if now > flight.deadline])
+
+    def undelivered(
+        self, left: Callable[[Flight], float], idle: Callable[[str], tuple[float, float] | None]
+    ) -> list[Flight]:
+        """Flights that were lost on the way, as if their leases had ended: so says the worker that should have them.
+
+        left: when a job had left [s, monotonic]; idle: from when to when a worker has been saying that it has none.
+        """
+
+        def lost(flight: Flight) -> bool:
+            said = idle(flight.worker)
+            return said is not None and said[1] - max(said[0], left(flight)) > self.delivery(flight)
+
+        return self._given_up([flight for flight in self.by_worker.values() if lost(flight)])
+
+    def delivery(self, flight: Flight) -> float:
+        """How long [s] a job that has left may be on its way; twice as long after each one that was late."""
+        doublings = self._patience.get((flight.object, flight.worker), 0)
+        return float((DELIVERED + min(flight.bytes, BUFFERED) / SLOWEST) * 2**doublings)
+
+    def _given_up(self, over: list[Flight]) -> list[Flight]:
         for flight in over:
             del self.by_worker[flight.worker]
             self._passed.discard(flight.number)

@@ -16,6 +16,7 @@ from protocol.refused import Refused
 SILENCE = 2.0  # s without a heartbeat until a worker gets no more jobs
 WORKERS = 256  # known at the same time
 TOKENS = 1024  # of names that have said nothing yet
+GAP = 1.0  # s between heartbeats, beyond which they do not tell what was between them
 REPEATED = 5  # heartbeats, one second: sequence numbers further back are not repetitions
 
 
@@ -27,6 +28,7 @@ class Member:
     seen: float
     sequence: int
     token: bool
+    idle: tuple[float, float] | None = None  # first and last of the heartbeats in a row that said so [s, monotonic]
 
     def same_life(self, info: WorkerInfo) -> bool:
         """The hello comes from the process known by this name."""
@@ -89,8 +91,16 @@ class Roster:
         lost = self._make_room(name, now, patience or {}) if known is None else ""
         token = known.token if known is not None else name in self._tokens
         self._tokens.pop(name, None)
-        self._members[name] = Member(info, now, header.sequence, token)
+        idle = self._idle(known if same else None, info, now)
+        self._members[name] = Member(info, now, header.sequence, token, idle)
         return name, not same, lost
+
+    def _idle(self, known: Member | None, info: WorkerInfo, now: float) -> tuple[float, float] | None:
+        if not info.idle:
+            return None
+        if known is None or known.idle is None or now - known.idle[1] > GAP:
+            return now, now
+        return known.idle[0], now
 
     def _make_room(self, name: str, now: float, patience: Mapping[str, float]) -> str:
         """Who has lost its place to a new worker, empty if nobody; raises Refused if all are at work."""
@@ -119,6 +129,11 @@ class Roster:
     def _is_fit(self, name: str, now: float, patience: Mapping[str, float]) -> bool:
         member = self._members[name]
         return member.token and now <= max(member.seen + self._silence, patience.get(name, 0.0))
+
+    def idle(self, name: str) -> tuple[float, float] | None:
+        """From when to when [s, monotonic] a worker has been saying that it has nothing in hand, if it says so now."""
+        member = self._members.get(name)
+        return member.idle if member else None
 
     def without_token(self, now: float) -> set[str]:
         """Workers that speak although their token is not known: it may have been forgotten, or lost in a flood."""

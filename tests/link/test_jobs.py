@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: MIT
 """The books of jobs in flight, without a network."""
 
+from dataclasses import replace
+
 import pytest
 
 from protocol import Refused
-from sim_server.network.jobs import LONGEST, SHORTEST, Flight, Jobs
+from sim_server.network.jobs import DELIVERED, LONGEST, SHORTEST, Flight, Jobs
 
 
 class Lender:
@@ -151,3 +153,25 @@ def test_an_object_waits_for_a_slow_worker_only_while_there_is_no_other(jobs: Jo
 def test_a_job_that_was_never_sent_leaves_no_trace(jobs: Jobs, lender: Lender) -> None:
     jobs.cancel(flight(jobs))
     assert (jobs.by_object, jobs.by_worker, lender.back) == ({}, {}, ["slot 1"])
+
+
+def test_a_job_is_lost_when_its_worker_keeps_saying_that_it_has_none(jobs: Jobs, lender: Lender) -> None:
+    def undelivered(left: float, idle: tuple[float, float] | None) -> list[Flight]:
+        return jobs.undelivered(lambda flight: left, lambda worker: idle)
+
+    first = flight(jobs, deadline=LONGEST)
+    assert undelivered(5.0, None) == [], "it is busy"
+    assert undelivered(5.0, (0.0, 5.9)) == [], "it may be on its way"
+    assert undelivered(0.0, (5.0, 5.9)) == [], "it may have answered just now"
+    assert undelivered(float("inf"), (0.0, 99.0)) == [], "it has not left yet"
+    assert undelivered(5.0, (0.0, 6.1)) == [first]
+    assert (jobs.by_object, jobs.by_worker, jobs.lateness("w"), lender.back) == ({}, {}, 1, [])
+    again = flight(jobs, deadline=LONGEST)
+    assert undelivered(5.0, (0.0, 6.9)) == [] and undelivered(5.0, (0.0, 7.1)) == [again]
+
+
+def test_bytes_may_be_on_their_way_for_longer(jobs: Jobs) -> None:
+    some = flight(jobs)
+    assert jobs.delivery(some) == DELIVERED
+    assert jobs.delivery(replace(some, bytes=2_000_000)) == pytest.approx(DELIVERED + 2)
+    assert jobs.delivery(replace(some, bytes=1 << 30)) < DELIVERED + 5, "the rest had gone when it left"

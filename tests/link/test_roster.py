@@ -9,9 +9,9 @@ from protocol.messages_pb2 import Header, WorkerInfo
 from sim_server.network.roster import TOKENS, WORKERS, Roster
 
 
-def hello(name: str = "w", sequence: int = 1, pid: int = 10) -> bytes:
+def hello(name: str = "w", sequence: int = 1, pid: int = 10, idle: bool = False) -> bytes:
     header = Header(protocol=PROTOCOL, incarnation=7, sequence=sequence)
-    return WorkerInfo(header=header, worker=name, pid=pid, host="h").SerializeToString()
+    return WorkerInfo(header=header, worker=name, pid=pid, host="h", idle=idle).SerializeToString()
 
 
 @pytest.fixture
@@ -129,3 +129,19 @@ def test_a_worker_that_speaks_without_a_token_is_looked_for(roster: Roster) -> N
     assert roster.without_token(2.5) == set(), "and is forgotten when it is silent"
     roster.token("x", True)
     assert roster.without_token(1.0) == set() and roster.fit(1.0, {}) == ["w", "x"]
+
+
+def test_idle_is_who_says_so_in_every_heartbeat(roster: Roster) -> None:
+    where = key("worker", worker="w")
+
+    def said(sequence: int, now: float, idle: bool = True, pid: int = 10) -> tuple[float, float] | None:
+        roster.hello(where, hello(sequence=sequence, idle=idle, pid=pid), now)
+        return roster.idle("w")
+
+    assert roster.idle("w") is None
+    assert (said(1, 1.0), said(2, 1.2), said(3, 1.4)) == ((1.0, 1.0), (1.0, 1.2), (1.0, 1.4))
+    roster.heard("w", 2.0)
+    assert roster.idle("w") == (1.0, 1.4), "an answer says nothing of what is in hand"
+    assert (said(4, 1.6, idle=False), said(5, 1.8), said(6, 2.0)) == (None, (1.8, 1.8), (1.8, 2.0))
+    assert said(7, 3.5) == (3.5, 3.5), "nobody knows what it did meanwhile"
+    assert said(1, 9.0, pid=11) == (9.0, 9.0), "another life"

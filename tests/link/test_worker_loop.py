@@ -139,6 +139,35 @@ def test_a_matrix_is_answered_with_its_factor(worker: Worker, uplink: FakeUplink
     assert uplink.patterns == [("beam", 1)] and uplink.library == "diagonal"
 
 
+def test_it_is_idle_when_nothing_came_or_waits_or_is_at_work(uplink: FakeUplink) -> None:
+    seen: list[bool] = []
+
+    class Watched(Diagonal):
+        def factorize(self, values: np.ndarray, dtype: Any) -> np.ndarray:
+            seen.append(uplink.mailbox.idle)
+            return super().factorize(values, dtype)
+
+    worker = Worker(uplink, Watched)  # type: ignore[arg-type]
+    assert uplink.mailbox.idle
+    uplink.mailbox.put(ServersThere((7,)))
+    worker.step(0.0)
+    assert uplink.mailbox.idle
+    uplink.mailbox.put(matrix())
+    uplink.mailbox.put(matrix(2, object="bar"))
+    assert not uplink.mailbox.idle, "they came"
+    worker.take_in(0.0)
+    assert not uplink.mailbox.idle, "they wait"
+    worker.work()
+    assert not uplink.mailbox.idle and seen == [False], "the other one waits"
+    worker.work()
+    assert uplink.mailbox.idle and seen == [False, False] and len(uplink.answers) == 2
+    for lost in ((ServerGone(7), matrix(3)), (ServersThere((7,)), matrix(4, worker="x"))):
+        for item in lost:
+            uplink.mailbox.put(item)
+        worker.step(0.0)
+        assert uplink.mailbox.idle and len(uplink.answers) == 2, "what it refused it does not have"
+
+
 class Doubling:
     """Builds 2 (x + y + z) I for each of two nodes."""
 

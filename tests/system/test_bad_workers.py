@@ -89,6 +89,36 @@ def test_a_newcomer_that_is_slow_at_first_gets_more_jobs_once_it_has_answered() 
         assert stage.driver.failures == []
 
 
+def test_a_worker_that_says_that_it_has_no_job_gets_another_one() -> None:
+    """Its first job was lost, of which an answer may take minutes. It is busy with the second one."""
+    with ExitStack() as closing:
+        stage = Stage(closing)
+        only = stage.worker("only")
+
+        def says(idle: bool, seconds: float) -> None:
+            for _ in range(round(seconds / 0.2)):
+                stage.now += 0.2
+                only.hello(idle=idle)
+                stage.driver.until(
+                    lambda: stage.link.workers()[0].header.sequence == only.sequence, "the heartbeat to come"
+                )
+
+        says(True, 2.0)
+        assert stage.asked(1, only) is only
+        only.receive()
+        says(True, 0.8)
+        assert stage.driver.failures == [], "it may be on its way"
+        says(True, 0.6)
+        stage.driver.until(lambda: stage.driver.failures, "the loss to be seen")
+        why = "was lost: worker only says that it has no job"
+        assert stage.driver.failures == [("beam", f"factorization of beam at step 1 {why}")]
+        assert stage.link.counters.jobs_lost == 1
+        assert stage.asked(2, only) is only
+        says(False, 30.0)
+        stage.answers(only, 2)
+        assert len(stage.driver.failures) == 1 and stage.link.counters.refused == 0
+
+
 def test_the_jobs_of_who_fails_go_to_who_does_not() -> None:
     """Per worker: before, the object was held back for all, and the good worker with it."""
     with ExitStack() as closing:
