@@ -376,10 +376,10 @@ __device__ __forceinline__ void Solver::solve() {
 __device__ __forceinline__ void solve_body(const Solve& s, const Share& share) {
     const int k = share.body;
     for (int i = threadIdx.x; i < (int)(sizeof(Body) / 4); i += THREADS) ((int*)&memory.body)[i] = ((const int*)(s.bodies + k))[i];
+    if (threadIdx.x == THREADS - 1) { memory.rests = s.moving[k] == 0; memory.frozen = s.frozen[k]; }
     __syncthreads();
     if (memory.body.plan)
         for (int i = threadIdx.x; i < (int)(sizeof(Plan) / 4); i += THREADS) ((int*)&memory.plan)[i] = ((const int*)memory.body.plan)[i];
-    if (threadIdx.x == 0) { memory.rests = s.moving[k] == 0; memory.frozen = s.frozen[k]; }
     __syncthreads();
     const long long begin = nanoseconds();
     Solver solver = {s, {share.index, memory.body.blocks, s.exchanges[k], s.board + 8ll * s.grid * k, s.grid, memory.scratch, memory.totals,
