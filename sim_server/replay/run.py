@@ -2,8 +2,8 @@
 """A recorded run made again and compared with its log, bit by bit.
 
 Every step gets what the log says it had: the interactions as the loop had taken them up, for each solve the
-preconditioner asked for, and the factor that it used, made here from the same step's matrix. What is left (kernels,
-solver, factorization) is a pure function of these on one build.
+preconditioner asked for, and the factor that it used or reckoned frames from, made here from the same step's matrix.
+What is left (kernels, solver, factorization) is a pure function of these on one build.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from protocol import messages_pb2 as pb
@@ -54,11 +55,9 @@ class Replay:
         self.engine, self.bodies = self.simulation.engine, self.simulation.world.bodies
         self.compared = Comparison(recording)
         self._same_meshes()
-        self._needed: set[tuple[str, int]] = set()  # (object, step) of matrices whose factor some solve used
-        for body in self.bodies:
-            made = np.unique(self._rows(body.name)["factor_step"])
-            self._needed |= {(body.name, int(step)) for step in made[made >= 0]}
+        self._taken = {b.name: taken_up(self._rows(b.name), self.engine.exact) for b in self.bodies}
         self._last_use = self._last_uses()
+        self._needed = set(self._last_use)  # (object, step) of matrices whose factor the loop used
         self._factors: dict[tuple[str, int], Factor] = {}
         self._in_use: dict[str, int] = {}
         self._sets: dict[int, pb.TouchSet] = {t.step: t for t in recording.touch}
@@ -100,9 +99,8 @@ class Replay:
     def _last_uses(self) -> dict[tuple[str, int], int]:
         uses: dict[tuple[str, int], int] = {}
         for body in self.bodies:
-            for row in self._rows(body.name):
-                if row["factor_step"] >= 0:
-                    uses[body.name, int(row["factor_step"])] = int(row["step"])
+            for step, both in enumerate(self._taken[body.name].tolist()):
+                uses |= {(body.name, made): step for made in both if made >= 0}
         return uses
 
     def _same_meshes(self) -> None:
@@ -228,9 +226,9 @@ class Replay:
                 settings.adopt = bool(row["warping"] & ADOPTED)
 
     def _use_factor(self, index: int, name: str, step: int, fresh: bool) -> None:
-        """The factor of one solve. fresh: one made from the matrix of this very step; others were there before it."""
-        made = int(self._rows(name)[step]["factor_step"])
-        if made < 0 or fresh != (made == step):
+        """The factor of one step. fresh: one made from the matrix of this very step; others were there before it."""
+        made = int(self._taken[name][step, int(fresh)])
+        if made < 0:
             return
         if self._in_use.get(name) != made:
             factor = self._factors.get((name, made))
@@ -239,7 +237,7 @@ class Replay:
                 return
             self.engine.post_factor(index, factor.pattern, factor.values, made)
             self._in_use[name] = made
-        if self._last_use[name, made] == step + 1:
+        if self._last_use[name, made] == step:
             self._factors.pop((name, made), None)
 
     def _compare_frames(self, step: int) -> None:
@@ -253,6 +251,23 @@ class Replay:
                 raise BadLog(f"{self.recording.path}: step {step} of {body.name!r}: {error}") from error
             if frame is not None and len(frame[0]) == body.last - body.first:
                 self.compared.frame(step, body.name, frame, (world.x[body.nodes], world.v[body.nodes]))
+
+
+def taken_up(rows: Any, exact: bool) -> NDArray[np.int64]:
+    """Finds of which steps the factors were that a body's loop had, (steps, 2): before it assembled, and made from the
+    very step; -1: none that matters. rows: of a log (log.ROW), one a step.
+
+    A solve by block Jacobi names no factor, but an exact loop (Engine.exact) reckons frames from the one that it has
+    taken up all the same: then it is that of the step noted last (native/warping.h).
+    """
+    steps = np.arange(len(rows))
+    used, fresh = rows["factor_step"], rows["factor_step"] == steps
+    taken = np.stack([np.where(fresh, -1, used), np.where(fresh, used, -1)], axis=1)
+    if exact:
+        noted = np.maximum.accumulate(np.where(rows["warping"] & NOTED, steps, -1))
+        unnamed = np.flatnonzero((rows["warping"][1:] & ADOPTED != 0) & (taken[1:, 0] < 0)) + 1
+        taken[unnamed, 0] = noted[unnamed - 1]
+    return taken
 
 
 def _library(name: str) -> str:
