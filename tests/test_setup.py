@@ -33,7 +33,10 @@ def test_a_command_that_takes_long_says_how_far_it_is(tmp_path):
 
 
 def test_on_a_terminal_it_does_so_in_one_line(tmp_path):
-    ours, theirs = pty.openpty()
+    try:
+        ours, theirs = pty.openpty()
+    except OSError as error:  # a container without /dev/pts
+        pytest.skip(f"no pseudo-terminals here: {error}")
     bash(f"{SLOW}\nshown 'installing (apt-get)' {tmp_path / 'log'} slow", stderr=theirs)
     os.close(theirs)
     said = os.read(ours, 100_000).decode()
