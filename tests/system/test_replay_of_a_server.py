@@ -256,7 +256,7 @@ def test_grabs_that_begin_while_positions_are_on_their_way(tmp_path: Path) -> No
 
 def test_factors_that_were_dropped(tmp_path: Path) -> None:
     """Few iterations and old factors without the warp: some are left again and again, and solves go on without."""
-    log = recorded(tmp_path, 'update = "lockstep-25"\nmax_iterations = 20\nwarp = false\ntolerance = 1e-8')
+    log = recorded(tmp_path, 'update = "lockstep-25"\nmax_iterations = 20\nwarp = false\ntolerance = 1e-15')
     steps = messages(log, "step")
     assert sum(s.fallbacks for s in steps) >= 3
     assert any(s.preconditioner == "block_jacobi" and not s.asked and s.step > 60 for s in steps), "asked for as such"
