@@ -14,6 +14,7 @@ import typer
 from precond_worker.ending import end_now, end_with_any_thread
 from precond_worker.errors import DeviceUnusable, NameTaken
 from protocol.exhausted import exhausted
+from protocol.interrupted import handle, run_command
 from protocol.nvidia import nvidia_device
 
 app = typer.Typer(pretty_exceptions_enable=False, rich_markup_mode=None)
@@ -110,8 +111,6 @@ def work(
 
 def _end_in_order() -> None:
     """From now on Ctrl-C and SIGTERM close what is open; before, they end the program at once (__main__.py)."""
-    from protocol.interrupted import handle
-
     handle(signal.SIGINT, signal.default_int_handler)
     handle(signal.SIGTERM, _terminate)
 
@@ -209,16 +208,4 @@ def _bad_input(text: str) -> NoReturn:
 
 def main() -> None:
     """Entry point of the console script."""
-    try:
-        app(prog_name="precond-worker")
-    except SystemExit as ended:
-        if ended.code == 130:
-            from protocol.interrupted import leave
-
-            leave()
-        raise
-    except BaseException as error:
-        if not (text := exhausted(error)):
-            raise
-        print(f"precond-worker: {text}", file=sys.stderr)
-        sys.exit(1)
+    run_command(app, "precond-worker")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""How a program ends in good order when it is interrupted."""
+"""How a program ends in good order, when it is interrupted or has run out of something."""
 
 import contextlib
 import os
@@ -7,7 +7,9 @@ import signal
 import sys
 from collections.abc import Callable
 from types import FrameType
-from typing import NoReturn
+from typing import Any, NoReturn
+
+from protocol.exhausted import exhausted
 
 AGAIN = 0.01  # s until a signal that came in the middle of an import is looked at again
 
@@ -45,3 +47,18 @@ def leave(code: int = 130) -> NoReturn:
         with contextlib.suppress(OSError, ValueError):
             stream.flush()
     os._exit(code)
+
+
+def run_command(command: Callable[..., Any], name: str) -> None:
+    """Run the command line `name`; end with code 130 after Ctrl-C, with a line and code 1 when something ran out."""
+    try:
+        command(prog_name=name)
+    except SystemExit as ended:
+        if ended.code == 130:
+            leave()
+        raise
+    except BaseException as error:
+        if not (text := exhausted(error)):
+            raise
+        print(f"{name}: {text}", file=sys.stderr)
+        sys.exit(1)

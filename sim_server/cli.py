@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
+from protocol.interrupted import handle, run_command
 from protocol.nvidia import nvidia_device
 from sim_server.compile_notice import compiling_told
 from sim_server.errors import DeviceError, DeviceLost, InputError, NameTaken
@@ -280,8 +281,6 @@ def _unconverged(service: "Service") -> str:
 
 def _end_in_order() -> None:
     """From now on Ctrl-C and SIGTERM close what is open; before, they end the program at once (__main__.py)."""
-    from protocol.interrupted import handle
-
     handle(signal.SIGINT, signal.default_int_handler)
     handle(signal.SIGTERM, _terminate)
 
@@ -303,18 +302,4 @@ def _bad_input(text: str) -> NoReturn:
 
 def main() -> None:
     """Entry point of the console script."""
-    try:
-        app(prog_name="sim-server")
-    except SystemExit as ended:
-        if ended.code == 130:
-            from protocol.interrupted import leave
-
-            leave()
-        raise
-    except BaseException as error:
-        from protocol.exhausted import exhausted
-
-        if not (text := exhausted(error)):
-            raise
-        print(f"sim-server: {text}", file=sys.stderr)
-        sys.exit(1)
+    run_command(app, "sim-server")

@@ -46,9 +46,7 @@ class Telemetry:
         self.solves = 0
         self.pace = ""  # why the run does not keep pace with the clock; empty: it does, or need not
         self.unconverged: Counter[str] = Counter()  # solves by status, of those that did not converge
-        self._energy: dict[
-            int, float
-        ] = {}  # kinetic + elastic + gravity by body, of the last step where it is known [J]
+        self._energy: dict[int, float] = {}  # by body, kinetic + elastic + gravity of the last step with all three [J]
         self.runaways: Counter[int] = Counter()  # steps by body
         self._listened = False
         self._due = {"steps": 0.0, "state": 0.0, "status": 0.0, "look": 0.0}

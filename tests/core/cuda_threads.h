@@ -14,7 +14,6 @@
 #define __forceinline__ inline
 #define __launch_bounds__(n)
 #define __shared__ static
-#define __align__(n) alignas(n)
 
 struct Dimension { int x; };
 static thread_local Dimension threadIdx;
@@ -23,14 +22,11 @@ static pthread_barrier_t block_barrier, warp_barrier[32];
 static uint64_t exchanged[32][32];
 
 static void __syncthreads() { pthread_barrier_wait(&block_barrier); }
-static void __threadfence() {}
-template <class T> static T __ldcg(const T* a) { return *a; }
 static double __longlong_as_double(long long bits) {
     double a;
     std::memcpy(&a, &bits, sizeof a);
     return a;
 }
-static unsigned atomicAdd(unsigned* a, unsigned b) { return __sync_fetch_and_add(a, b); }
 
 // The value of another lane of the warp; all of them come here.
 template <class T> static T exchange(T value, int from) {
@@ -44,8 +40,6 @@ template <class T> static T exchange(T value, int from) {
     std::memcpy(&value, &bits, sizeof value);
     return value;
 }
-template <class T> static T __shfl_up_sync(unsigned, T a, int by) { return exchange(a, threadIdx.x % 32 - by); }
-template <class T> static T __shfl_down_sync(unsigned, T a, int by) { return exchange(a, threadIdx.x % 32 + by); }
 template <class T> static T __shfl_xor_sync(unsigned, T a, int by) { return exchange(a, (threadIdx.x % 32) ^ by); }
 
 template <class Kernel> static void launch(int blocks, int threads, Kernel kernel) {
