@@ -5,6 +5,7 @@
 #include <cstring>
 
 #include "../native/rings.h"
+#include "energy.cuh"
 
 typedef uint64_t Address;       // on the device
 
@@ -43,11 +44,6 @@ struct Result {                 // solve.cuh
 };
 
 struct Found { double nonlinear; int32_t linearizations, unused; };  // search.cu
-
-struct Energy {                 // energy.cuh
-    double kinetic, elastic, gravity, work, budget, stride;
-    int32_t phase, found;
-};
 
 struct Stamp { int64_t begin, end; };  // of a step, ns of the device's clock
 
