@@ -1,13 +1,22 @@
 // SPDX-License-Identifier: MIT
-// The energy of each body after a step, and whether it has run away (kernels/balance.cuh): a thread block for each body, which sums
-// over its nodes in a fixed order, decides, and freezes. It runs beside the kernels that assemble the next step, or after the last
-// step of a batch; a step that is settled already is left alone.
+// The energy of each body after a step, and whether it has run away (kernels/balance.cuh). Each thread block sums over a chunk of a
+// body's nodes; the one that finishes last of a body adds the chunks up in a fixed order, decides, and freezes. It runs as the first
+// thread blocks of the kernel over elements that begins the next step (fuse.py), or by itself after the last step of a batch; a step
+// that is settled already is left alone.
 #include "energy.cuh"
 
-constexpr int STILL = 5, MOST_THREADS = 1024;
+constexpr int STILL = 5, WARPS = 4;  // arrays that are 0 at rest; warps of a thread block, at most
+
+struct Chunk {
+    int body, begin, end;  // nodes
+    int first, chunks;     // of the body
+};
 
 struct Account {
     const int* first;        // (bodies + 1,) node of each body
+    const Chunk* chunk;      // (chunks,)
+    Sums* sums;              // (chunks,)
+    unsigned* arrived;       // (bodies,) chunks that are summed up; zero between launches
     const real* mass;        // (n,) [kg]
     const real* before;      // (n, 3) x when the step began [m]
     real* x;                 // (n, 3) [m]
@@ -22,13 +31,12 @@ struct Account {
     Energy* told;            // (capacity, bodies) on the host
     const long long* step;   // (1,) completed
     long long* settled;      // (bodies,) step that was settled last
-    int* frozen;             // (bodies,) out: 1 from when it is frozen
     int bodies, capacity, on_runaway, inertia;
 };
 
 #ifdef ACCOUNT_BYTES  // as energies.py has them
 static_assert(sizeof(Account) == ACCOUNT_BYTES && sizeof(Balance) == BALANCE_BYTES, "layouts of Account or Balance differ");
-static_assert(sizeof(Energy) == ENERGY_BYTES, "layouts of Energy differ");
+static_assert(sizeof(Energy) == ENERGY_BYTES && sizeof(Sums) == SUMS_BYTES && sizeof(Chunk) == CHUNK_BYTES, "layouts differ");
 #endif
 
 __device__ __forceinline__ void add_sums(Sums& a, const Sums& b) {
@@ -42,15 +50,30 @@ __device__ __forceinline__ void add_sums(Sums& a, const Sums& b) {
     }
 }
 
-__device__ __forceinline__ void add_one(const Account& a, int i, Sums& s) {
-    const real *x = a.x + 3ll * i, *from = a.before + 3ll * i;
-    const double step[3] = {(double)x[0] - from[0], (double)x[1] - from[1], (double)x[2] - from[2]};
-    add_node(s, a.mass[i], x, a.v + 3ll * i, step, a.gravity);
-    if (!a.force) return;
-    real *force = a.force + 3ll * i, *anchor = a.anchor + 3ll * i, &spring = a.spring[i];
-    if (spring == 0 && force[0] == 0 && force[1] == 0 && force[2] == 0) return;
-    s.work += work_on(force, spring, anchor, from, step);
-    force[0] = force[1] = force[2] = spring = 0;  // until something touches the node again
+// Of the nodes from `begin` on; those of this thread.
+__device__ __forceinline__ Sums sums_over(const Account& a, int begin, int end) {
+    Sums s = no_sums();
+#pragma unroll 4
+    for (int i = begin + threadIdx.x; i < end; i += blockDim.x) {
+        const real *x = a.x + 3ll * i, *from = a.before + 3ll * i;
+        const double step[3] = {(double)x[0] - from[0], (double)x[1] - from[1], (double)x[2] - from[2]};
+        add_node(s, a.mass[i], x, a.v + 3ll * i, step, a.gravity);
+    }
+    return s;
+}
+
+// Likewise the work of hands, whose forces are then 0 until something touches the nodes again.
+__device__ __forceinline__ double work_over(const Account& a, int begin, int end) {
+    double work = 0;
+    for (int i = begin + threadIdx.x; i < end; i += blockDim.x) {
+        real *force = a.force + 3ll * i, &spring = a.spring[i];
+        if (spring == 0 && force[0] == 0 && force[1] == 0 && force[2] == 0) continue;
+        const real *x = a.x + 3ll * i, *from = a.before + 3ll * i;
+        const double step[3] = {(double)x[0] - from[0], (double)x[1] - from[1], (double)x[2] - from[2]};
+        work += work_on(force, spring, a.anchor + 3ll * i, from, step);
+        force[0] = force[1] = force[2] = spring = 0;
+    }
+    return work;
 }
 
 // Those of the lane across.
@@ -91,27 +114,55 @@ __device__ void freeze(const Account& a, int body) {
     }
 }
 
-extern "C" __global__ void __launch_bounds__(MOST_THREADS) account(const Account a) {
-    __shared__ Sums warps[MOST_THREADS / 32];
-    __shared__ int away;
-    const int body = blockIdx.x;
-    const long long step = a.step[0];
-    if (a.settled[body] == step) return;
-    Sums s = no_sums();
-    for (int i = a.first[body] + threadIdx.x; i < a.first[body + 1]; i += blockDim.x) add_one(a, i, s);
+// Of all threads of the block; the first one has it. Threads add in an order that depends on their number alone.
+__device__ Sums sums_of_block(Sums s) {
+    __shared__ Sums warps[WARPS];
     for (int by = 16; by; by /= 2) add_sums(s, sums_across(s, by));
     if (threadIdx.x % 32 == 0) warps[threadIdx.x / 32] = s;
     __syncthreads();
-    if (threadIdx.x == 0) {
+    if (threadIdx.x == 0)
         for (int k = 1; k < (int)blockDim.x / 32; ++k) add_sums(s, warps[k]);
-        Balance b = a.balance[body];
-        away = take_stock(b, s, a.on_runaway, a.inertia);
-        a.balance[body] = b;
-        tell(a, b, body, step - 1);
-        a.settled[body] = step;
+    return s;
+}
+
+// Whether this thread block finishes last of its body's; s then has the sums over all chunks in the first thread.
+__device__ bool gather(const Account& a, const Chunk& chunk, int number, Sums& s) {
+    if (chunk.chunks == 1) return true;
+    __shared__ bool last;
+    if (threadIdx.x == 0) {
+        a.sums[number] = s;
+        __threadfence();
+        last = atomicAdd(a.arrived + chunk.body, 1u) == chunk.chunks - 1u;
     }
     __syncthreads();
-    if (!away) return;
-    if (threadIdx.x == 0) a.frozen[body] = 1;
-    freeze(a, body);
+    if (!last) return false;
+    __threadfence();
+    s = no_sums();
+    for (int k = threadIdx.x; k < chunk.chunks; k += blockDim.x) add_sums(s, a.sums[chunk.first + k]);
+    s = sums_of_block(s);
+    if (threadIdx.x == 0) a.arrived[chunk.body] = 0;
+    return true;
 }
+
+// By a thread block. What is read does not wait for anything that was read before but the chunk: it is done while others compute.
+__device__ void account_of(const Account& a, int number) {
+    __shared__ int away;
+    const Chunk chunk = a.chunk[number];
+    const long long step = a.step[0], settled = a.settled[chunk.body];
+    Balance b = a.balance[chunk.body];
+    Sums s = sums_over(a, chunk.begin, chunk.end);
+    if (settled == step) return;
+    if (a.force) s.work = work_over(a, chunk.begin, chunk.end);
+    s = sums_of_block(s);
+    if (!gather(a, chunk, number, s)) return;
+    if (threadIdx.x == 0) {
+        away = take_stock(b, s, a.on_runaway, a.inertia);
+        a.balance[chunk.body] = b;
+        tell(a, b, chunk.body, step - 1);
+        a.settled[chunk.body] = step;
+    }
+    __syncthreads();
+    if (away) freeze(a, chunk.body);
+}
+
+extern "C" __global__ void __launch_bounds__(32 * WARPS) account(const Account a) { account_of(a, blockIdx.x); }

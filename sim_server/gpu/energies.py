@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
 """The energy of bodies on a GPU: its memory, the elastic energy on demand, and the start that all is reckoned from.
 
-Everything but the elastic energy is summed up after each step, beside the assembly of the next one (account.cu).
+Everything but the elastic energy is summed up after each step, by thread blocks of the first kernel of the next one
+(account.cu).
 """
 
 from typing import Any
@@ -12,20 +13,23 @@ from numpy.typing import NDArray
 from sim_server.backend import HERE
 from sim_server.energy import CODES, Energies
 from sim_server.gpu.device import Gpu, compiled, options
+from sim_server.gpu.fuse import First
 from sim_server.gpu.layouts import ENERGY
 from sim_server.gpu.mailbox import library
 from sim_server.layouts import BALANCE
 
 THREADS = 128  # of a thread block of elastic.cu
-FEW_NODES, FEW_THREADS, MOST_THREADS = 4096, 256, 1024  # of a body, and of the thread block that sums over them
+NODES = 128  # that a thread block sums over
 STILL = 5  # arrays that are 0 in a body at rest, at most
+SUMS = 10  # double numbers in Sums (kernels/balance.cuh)
 ACCOUNT = np.dtype(
-    [(n, "u8") for n in ("first", "mass", "before", "x", "v")]
+    [(n, "u8") for n in ("first", "chunk", "sums", "arrived", "mass", "before", "x", "v")]
     + [("still", "u8", STILL)]
     + [(n, "u8") for n in ("force", "spring", "anchor", "free", "gravity", "balance", "told")]
-    + [(n, "u8") for n in ("step", "settled", "frozen")]
+    + [(n, "u8") for n in ("step", "settled")]
     + [(n, "i4") for n in ("bodies", "capacity", "on_runaway", "inertia")]
 )
+CHUNK = np.dtype([(n, "i4") for n in ("body", "begin", "end", "first", "chunks")])
 ELASTIC = np.dtype(
     [(n, "u8") for n in ("energy", "parts", "sum", "step", "balance", "told")]
     + [("capacity", "i4"), ("begins", "i4")]
@@ -36,8 +40,8 @@ class DeviceEnergies:
     """Energies of a scene on the device.
 
     told: host memory (capacity, bodies) of ENERGY that the device writes to. counter: device array (1,) of completed
-    steps. frozen: device array (bodies,), 1 for bodies that are. forces: the account works with those that kernels over
-    nodes write.
+    steps. first: the account of the last step as thread blocks of the kernel that begins the next one. threads: of its
+    thread blocks, wherever they run; sums depend on it.
     """
 
     def __init__(self, gpu: Gpu, energies: Energies, told: NDArray[np.uint8], counter: Any, dt: float):
@@ -45,16 +49,16 @@ class DeviceEnergies:
         cp, world = gpu.cp, energies.world
         starts = np.array([*(b.first for b in world.bodies), world.nodes], np.int32)
         self._bodies, self._capacity = len(world.bodies), told.nbytes // ENERGY.itemsize // len(world.bodies)
-        self._threads = FEW_THREADS if np.diff(starts).max() <= FEW_NODES else MOST_THREADS
-        self.started = False
+        self.threads, self.started = THREADS, False
+        chunk = chunked(starts, NODES)
         self._balance = cp.asarray(np.frombuffer(energies.balance.tobytes(), np.uint8))
         self._settled, self._sum = cp.zeros(self._bodies, np.int64), cp.zeros(self._bodies)
-        self.frozen, self.forces = cp.zeros(self._bodies, np.int32), energies.touch is not None
         self._memory: dict[str, Any] = {
-            "first": cp.asarray(starts), "mass": gpu.twin(world.mass), "free": gpu.twin(world.free),
-            "before": gpu.twin(energies.before), "x": gpu.twin(world.x), "v": gpu.twin(world.v),
-            "gravity": gpu.twin(energies.gravity), "balance": self._balance, "step": counter, "settled": self._settled,
-            "frozen": self.frozen,
+            "first": cp.asarray(starts), "chunk": cp.asarray(chunk.view(np.int32)),
+            "sums": cp.zeros((len(chunk), SUMS)), "arrived": cp.zeros(self._bodies, np.uint32),
+            "mass": gpu.twin(world.mass), "free": gpu.twin(world.free), "before": gpu.twin(energies.before),
+            "x": gpu.twin(world.x), "v": gpu.twin(world.v), "gravity": gpu.twin(energies.gravity),
+            "balance": self._balance, "step": counter, "settled": self._settled,
         }  # fmt: skip
         if energies.touch is not None:
             self._memory |= {n: gpu.twin(getattr(energies.touch, n)) for n in ("force", "spring", "anchor")}
@@ -67,12 +71,13 @@ class DeviceEnergies:
         self._params["told"], self._params["capacity"] = told.ctypes.data, self._capacity
         self._params["bodies"], self._params["inertia"] = self._bodies, world.inertia
         self._params["on_runaway"] = CODES[energies.on_runaway]
+        self.first = First(text("account"), "Account", self._params, len(chunk))
         self._account, self._add = self._function("account"), self._function("elastic")
         self._launches = self._elastic(told)
 
     def _function(self, name: str) -> Any:
         module = self._gpu.cp.RawModule(
-            code=(HERE / f"gpu/{name}.cu").read_text(), options=(*options(self._gpu.types), f"-I{HERE / 'gpu'}"),
+            code=text(name), options=(*options(self._gpu.types), f"-I{HERE / 'gpu'}"),
             backend="nvrtc",
         )  # fmt: skip
         return compiled(f"{name}.cu", module, name)
@@ -94,7 +99,7 @@ class DeviceEnergies:
 
     def account(self) -> None:
         """Puts the account of the last step onto the current stream; one that is settled already is left alone."""
-        self._account((self._bodies,), (self._threads,), (self._params,))
+        self._account((self.first.blocks,), (self.threads,), (self._params,))
 
     def elastic(self) -> None:
         """Puts the evaluation of the elastic energy of the last step, which is settled, onto the current stream."""
@@ -117,6 +122,22 @@ class DeviceEnergies:
             library().wf_gpu_start_balance(row.ctypes.data, sums.ctypes.data, self._dt, int(w.inertia))
         self._balance.set(np.frombuffer(balance.tobytes(), np.uint8))
         self.started = True
+
+
+def chunked(starts: NDArray[np.int32], nodes: int) -> NDArray[Any]:
+    """The nodes of bodies in chunks of so many (CHUNK). starts: (bodies + 1,) node of each body."""
+    counts = -(-np.diff(starts) // nodes)
+    chunks = np.zeros(counts.sum(), CHUNK)
+    body = chunks["body"] = np.repeat(np.arange(len(counts)), counts)
+    chunks["chunks"], chunks["first"] = counts[body], (np.cumsum(counts) - counts)[body]
+    chunks["begin"] = starts[body] + nodes * (np.arange(len(chunks)) - chunks["first"])
+    chunks["end"] = np.minimum(chunks["begin"] + nodes, starts[body + 1])
+    return chunks
+
+
+def text(name: str) -> str:
+    """Of gpu/<name>.cu."""
+    return (HERE / f"gpu/{name}.cu").read_text()
 
 
 def start_sums(

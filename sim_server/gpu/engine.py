@@ -101,18 +101,17 @@ class GpuEngine(DeviceLoop):
         **arrays: NDArray[Any],
     ):  # fmt: skip
         self.gpu, self.launches, self._arrays = gpu, [*assemble, *integrate], arrays
-        self._fused, domains = fused(assemble), {domain(launch) for launch in assemble}
-        self._elements_first = "elements" in domains and domains <= set(DOMAINS)
         cp, bodies = gpu.cp, len(ranges)
         device = CudaDevice(cp)
-        self._steps, self._beside = device.steps, cp.cuda.Stream(non_blocking=True)
+        self._steps = device.steps
         self._counter = cp.zeros(1, np.int64)
         self._stamps = device.pinned(CAPACITY * STAMP.itemsize)
         self._results = device.pinned(CAPACITY * RESULT.itemsize * bodies)
         told = device.pinned(CAPACITY * ENERGY.itemsize * bodies)
         self._energies = DeviceEnergies(gpu, energies, told, self._counter, dt)
+        self._fused = self._beginning(assemble)
         turns = Turns.of(gpu, bodies) if more else None
-        self.solver = Solver(gpu, ranges, arrays, self._counter, CAPACITY, self._energies.frozen, planes, turns or ())
+        self.solver = Solver(gpu, ranges, arrays, self._counter, CAPACITY, planes, turns or ())
         self._search, found = None, None
         if more and turns:
             found = device.pinned(CAPACITY * FOUND.itemsize * bodies)
@@ -218,26 +217,25 @@ class GpuEngine(DeviceLoop):
         """Notes the time: the device has had nothing to do until now."""
         self._stamp((1,), (1,), (self._tick,))
 
+    def _beginning(self, assemble: Sequence[DeviceLaunch]) -> list[Callable[[], None]]:
+        """What a step begins with: the account of the one before, and the assembly.
+
+        The account is part of a kernel over elements, since such kernels write nothing that it reads. What they make of
+        a body that is frozen meanwhile does not count: its nodes are fixed.
+        """
+        domains = {domain(launch) for launch in assemble}
+        elements = "elements" in domains and domains <= set(DOMAINS)
+        launches = fused(assemble, first=self._energies.first if elements else None)
+        if not elements:
+            return [self._energies.account, *launches]
+        self._energies.threads = launches[0].shape.threads
+        return launches
+
     def _one_step(self) -> None:
-        """Everything a step puts onto the stream. The step before is settled beside the assembly: what that makes of a
-        body that is frozen meanwhile is not solved for. Where something writes forces that the account reads, it runs
-        beside kernels over elements alone."""
-        beside = len(self._fused) if not self._energies.forces else int(self._elements_first)
-        self._account_beside(self._fused[:beside])
-        for launch in self._fused[beside:]:
+        """Everything a step puts onto the stream."""
+        for launch in self._fused:
             launch()
         self._finish_step()
-
-    def _account_beside(self, launches: Sequence[Callable[[], None]]) -> None:
-        begun, settled = (self.gpu.cp.cuda.Event(disable_timing=True) for _ in range(2))
-        self._steps.record(begun)
-        self._beside.wait_event(begun)
-        for launch in launches:
-            launch()
-        with self._beside:
-            self._energies.account()
-        self._beside.record(settled)
-        self._steps.wait_event(settled)
 
     def _finish_step(self) -> None:
         """Solve, integrate, count."""

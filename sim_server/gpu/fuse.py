@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_server.backend import domain_of
+from sim_server.backend import HERE, domain_of
 from sim_server.gpu.device import DeviceLaunch, compiled, cupy, options, processors
 
 DOMAINS = ("elements", "nodes", "blocks")
@@ -56,6 +56,16 @@ class End(NamedTuple):
     params: NDArray[Any]
 
 
+class First(NamedTuple):
+    """What further thread blocks do, before those of the items: a text, its function `<struct in small letters>_of` of
+    the struct's values and the number of the thread block, and how many blocks there are."""
+
+    text: str
+    struct: str
+    params: NDArray[Any]
+    blocks: int
+
+
 class Guard(NamedTuple):
     """Addresses of what says whether a launch of a step with several linearizations has anything to do (search.cu):
     left (1,), phase (bodies,), and the body of each item (items,), 0 where it is not known."""
@@ -67,8 +77,8 @@ class Guard(NamedTuple):
 
 GUARD = [
     "if (*left == 0) return;",
-    "if (body && !__syncthreads_or(threadIdx.x < BLOCK_ITEMS && blockIdx.x * BLOCK_ITEMS + threadIdx.x < n &&",
-    "                              phase[body[blockIdx.x * BLOCK_ITEMS + threadIdx.x]] != 2)) return;",
+    "if (body && !__syncthreads_or(threadIdx.x < BLOCK_ITEMS && block * BLOCK_ITEMS + threadIdx.x < n &&",
+    "                              phase[body[block * BLOCK_ITEMS + threadIdx.x]] != 2)) return;",
 ]
 
 
@@ -77,16 +87,17 @@ class Fused:
 
     def __init__(
         self, launches: Sequence[DeviceLaunch], end: End | None = None, private: frozenset[int] = frozenset(),
-        guard: Guard | None = None,
+        guard: Guard | None = None, first: First | None = None,
     ):  # fmt: skip
         self.name = "+".join(launch.name for launch in launches)
         self.items = next(launch.items for launch in launches if not launch.mailed)
         sums = any(launch.sums for launch in launches)
         self.shape = shape(domain(launches[0]) if sums else "elements", self.items, processors())
-        self._launches = list(launches)  # keeps their arrays
-        text = Text(launches, self.shape, end, private, guard)
-        self._arguments = (np.int32(self.items), *text.values, *([end.params] if end else []))
-        self._module = cupy().RawModule(code=text.source, options=options(launches[0].types), backend="nvrtc")
+        self._launches, self._before = list(launches), first.blocks if first else 0  # keeps their arrays
+        text = Text(launches, self.shape, end, private, guard, first)
+        self._arguments = (np.int32(self.items), *text.values, *(x.params for x in (end, first) if x))
+        flags = (*options(launches[0].types), f"-I{HERE / 'gpu'}")
+        self._module = cupy().RawModule(code=text.source, options=flags, backend="nvrtc")
         self._function = self.function("fused")
         self._ends = end is not None
 
@@ -98,7 +109,7 @@ class Fused:
         """Puts it onto the current stream."""
         if self.items or self._ends:
             blocks = max(1, -(-self.items * self.shape.lanes // self.shape.threads))
-            self._function((blocks,), (self.shape.threads,), self._arguments)
+            self._function((self._before + blocks,), (self.shape.threads,), self._arguments)
 
 
 class Text:
@@ -111,7 +122,7 @@ class Text:
 
     def __init__(
         self, launches: Sequence[DeviceLaunch], shape: Shape, end: End | None = None,
-        private: frozenset[int] = frozenset(), guard: Guard | None = None,
+        private: frozenset[int] = frozenset(), guard: Guard | None = None, first: First | None = None,
     ):  # fmt: skip
         self._launches, self._private = launches, private
         self.values: list[Any] = [np.uint64(address) for address in guard or ()]
@@ -135,10 +146,15 @@ class Text:
             lines.append(end.text)
             self._parameters.append(f"const {end.struct} end")
             body_lines.append(f"{end.struct.lower()}(end);")
+        opening = [f"const int block = (int)blockIdx.x - {first.blocks if first else 0};"]
+        if first:
+            lines.append(first.text)
+            self._parameters.append(f"const {first.struct} first")
+            opening.append(f"if (block < 0) {{ {first.struct.lower()}_of(first, blockIdx.x); return; }}")
         heading = f'extern "C" __global__ void __launch_bounds__({shape.threads}) fused(int n'
         parameters = "".join(f", {p}" for p in self._parameters)
-        first = GUARD if guard else []
-        lines += [f"{heading}{parameters}) {{", *first, *self._setup, *body_lines, "}"]
+        opening += GUARD if guard else []
+        lines += [f"{heading}{parameters}) {{", *opening, *self._setup, *body_lines, "}"]
         self.source = "\n".join(lines)
 
     def _each(self) -> Iterator[tuple[int, DeviceLaunch, str, str]]:
@@ -163,7 +179,7 @@ class Text:
             lines += [f"constexpr int SIZE{k} = padded({space}::{kernel}_sums, {shape.lanes});"]
             lines += [f"__shared__ local sums{k}[ROWS][SIZE{k} | 1];"]
         lines += [f"{{ const int slot = threadIdx.x / {shape.lanes}, lane = threadIdx.x % {shape.lanes};"]
-        lines += ["const int i = blockIdx.x * ROWS + slot;"]
+        lines += ["const int i = block * ROWS + slot;"]
         for k, space, kernel in sums:
             lines += [
                 f"{{ local sum[SIZE{k}];",
@@ -199,7 +215,7 @@ class Text:
 
     def _items(self) -> list[str]:
         """One item of each launch, by one thread."""
-        lines = ["const int i = blockIdx.x * BLOCK_ITEMS + threadIdx.x;", "if (threadIdx.x < BLOCK_ITEMS && i < n) {"]
+        lines = ["const int i = block * BLOCK_ITEMS + threadIdx.x;", "if (threadIdx.x < BLOCK_ITEMS && i < n) {"]
         rows: dict[int, str] = {}
         for k, launch, space, kernel in self._each():
             own = list(self._rows(launch, rows, lines))
@@ -232,15 +248,20 @@ class Text:
 
 
 def fused(
-    launches: Sequence[DeviceLaunch], guard: Callable[[Sequence[DeviceLaunch]], Guard] | None = None
+    launches: Sequence[DeviceLaunch],
+    guard: Callable[[Sequence[DeviceLaunch]], Guard] | None = None,
+    first: First | None = None,
 ) -> list[Any]:
-    """The launches in as few kernels as their domains allow. guard: makes that of those in one kernel."""
+    """The launches in as few kernels as their domains allow. guard: makes that of those in one kernel. first: what the
+    first kernel does besides."""
     if any(domain(launch) not in DOMAINS for launch in launches):
         return list(launches)
     together = [group for d in DOMAINS for group in _alike([x for x in launches if domain(x) == d])]
+    together = [group for group in together if group]
     return [
-        Fused(group, None, _private(group, launches), guard(group) if guard else None) for group in together if group
-    ]
+        Fused(group, None, _private(group, launches), guard(group) if guard else None, None if k else first)
+        for k, group in enumerate(together)
+    ]  # fmt: skip
 
 
 def _alike(launches: Sequence[DeviceLaunch]) -> list[list[DeviceLaunch]]:

@@ -20,7 +20,7 @@ struct Memory {  // fixed shared memory of a thread block: what is the same in a
     real* d;         // (own, 3) scale of the own degrees of freedom, or null
     real* diagonal;  // (own, 9) inverses of the diagonal blocks
     double peak;     // largest scale
-    int next, bad, rests, frozen;
+    int next, bad, rests;
     double b2, goal, quarter, rz;  // of the iteration: all threads write the same
     Result out;
 };
@@ -298,15 +298,8 @@ __device__ __forceinline__ void Solver::solve() {
             if (!begun) {
                 begun = true;
                 memory.b2 = bb;
-                if (memory.frozen) { give(0, 0); return; }  // what was assembled is of a state that was put back meanwhile
-                if (!isfinite(bb)) {
-                    out.status = NOT_FINITE;
-                    out.residual = bb;
-                    out.bad_node = first_bad_node();
-                    give(1, (real)(0 * bb));  // NaN: the kernel `advance` takes the body back
-                    return;
-                }
-                if (memory.rests && bb > 0) {  // b is rounding; the scene has what it starts from: to stand still
+                const bool refused = !isfinite(bb);
+                if (memory.rests && bb > 0 && !refused) {  // b is rounding; the scene has what it starts from: to stand still
                     out.residual = sqrt(r2 / bb);
                     return;
                 }
@@ -314,9 +307,13 @@ __device__ __forceinline__ void Solver::solve() {
                 if (!body.warm_start || !(r2 < bb)) { alpha = 0; r2 = bb; }
                 else fresh = true;
                 memory.quarter = r2 * sqrt(sqrt(memory.goal / r2));
-                if (r2 <= memory.goal) {
-                    if (alpha == 0) give(0, 0);  // else the scene has it already
-                    out.residual = bb > 0 ? sqrt(r2 / bb) : 0;
+                if (refused || r2 <= memory.goal) {
+                    if (refused) {
+                        out.status = NOT_FINITE;
+                        out.bad_node = first_bad_node();
+                    }
+                    if (alpha == 0) give(refused, (real)(0 * bb));  // NaN: `advance` takes the body back; else the scene has x
+                    out.residual = refused ? bb : bb > 0 ? sqrt(r2 / bb) : 0;
                     return;
                 }
             } else {
@@ -376,7 +373,7 @@ __device__ __forceinline__ void Solver::solve() {
 __device__ __forceinline__ void solve_body(const Solve& s, const Share& share) {
     const int k = share.body;
     for (int i = threadIdx.x; i < (int)(sizeof(Body) / 4); i += THREADS) ((int*)&memory.body)[i] = ((const int*)(s.bodies + k))[i];
-    if (threadIdx.x == THREADS - 1) { memory.rests = s.moving[k] == 0; memory.frozen = s.frozen[k]; }
+    if (threadIdx.x == THREADS - 1) memory.rests = s.moving[k] == 0;
     __syncthreads();
     if (memory.body.plan)
         for (int i = threadIdx.x; i < (int)(sizeof(Plan) / 4); i += THREADS) ((int*)&memory.plan)[i] = ((const int*)memory.body.plan)[i];

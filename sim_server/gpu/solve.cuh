@@ -98,7 +98,6 @@ struct Solve {
     Result* results;                 // (capacity, bodies)
     const int* warping;              // (bodies,) of the step under way (kernels/nodes.cu), for the results
     const int* moving;               // (bodies,) 0: the body rests (kernels/nodes.cu)
-    const int* frozen;               // (bodies,) 1: it has run away and stays where it is (account.cu)
     int nodes, shared;               // of the scene; bytes of dynamic shared memory
 };
 

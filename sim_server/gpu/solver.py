@@ -37,7 +37,7 @@ SOLVE = np.dtype(
         ("shares", "u8"), ("own_share", "u8"), ("halo", "u8"), ("seat", "u8"), ("halo_values", "u8"),
         ("halo_place", "u8"), ("own", "u8"), ("z", "u8"), ("diagonal", "u8"), ("board", "u8"), ("exchanges", "u8"),
         ("arrived", "u8"), ("step", "u8"), ("results", "u8"), ("warping", "u8"), ("moving", "u8"),
-        ("frozen", "u8"), ("nodes", "i4"), ("shared", "i4"),
+        ("nodes", "i4"), ("shared", "i4"),
     ]
 )  # fmt: skip
 
@@ -53,9 +53,9 @@ class Solver:
     """Solves the system of every body in one launch.
 
     ranges: nodes [first, last) of each body. arrays: host arrays by name (row_start, columns, values, b, y, warping,
-    moving), solved for their twins. counter: device array (1,) of completed steps; frozen: likewise (bodies,), 1 for
-    bodies that stay where they are. capacity: steps whose results are kept. planes: 1 for a preconditioner in float16,
-    2 for one of 22 bits. turns: for several linearizations a step, device arrays `left` and `phase` (search.py).
+    moving), solved for their twins. counter: device array (1,) of completed steps. capacity: steps whose results are
+    kept. planes: 1 for a preconditioner in float16, 2 for one of 22 bits. turns: for several linearizations a step,
+    device arrays `left` and `phase` (search.py).
 
     bodies: host rows (BODY), one per body; whoever runs the loop uploads them, settings (the first SETTINGS bytes) and
     factor (the rest) apart. results: device ring (capacity, bodies) of RESULT. arrived: zero at launch.
@@ -64,7 +64,7 @@ class Solver:
 
     def __init__(
         self, gpu: Gpu, ranges: Sequence[tuple[int, int]], arrays: Mapping[str, NDArray[Any]], counter: Any,
-        capacity: int, frozen: Any, planes: int = 1, turns: Sequence[Any] = (),
+        capacity: int, planes: int = 1, turns: Sequence[Any] = (),
     ):  # fmt: skip
         cp, processors = gpu.cp, gpu.properties["multiProcessorCount"]
         self.gpu, self.counter, self._capacity, self.planes, self._turns = gpu, counter, capacity, planes, turns
@@ -94,7 +94,6 @@ class Solver:
             "diagonal": cp.zeros(9 * total, self.real), "board": cp.zeros(16 * self.grid * len(ranges)),
             "exchanges": cp.ones(len(ranges), np.uint32),  # words that nobody has put are of exchange 0
             "arrived": self.arrived, "results": self.results, "step": counter,
-            "frozen": frozen,
         }  # fmt: skip
         fixed = 2048  # bytes of its own that a thread block needs, and the driver's
         self._shared = (gpu.properties["sharedMemPerMultiprocessor"] // blocks - fixed - 1024) // 16 * 16

@@ -131,9 +131,10 @@ KERNEL(turn, Turn) {
     put_row(p.rotation, i, p.n, R.m);
     mat3 Rt = as<number>(transposed(R));
     for (int m = 0; m < 6; ++m) k[m] = row_at<6>(p.block, i, m);
-    vec3 b = keep * mul(Rt, load3(p.b, i)), v = load3(p.v, i);
-    auto still = rests(p, i, b, v, (number)((k[0] + k[3] + k[5]) / 3));
-    vec3 y = keep * mul(Rt, select(still, -v, load3(p.dv, i)));
+    auto fixed = keep == 0;  // also all of a body that has run away, whatever was assembled of it
+    vec3 zero = {}, b = select(fixed, zero, mul(Rt, load3(p.b, i))), v = load3(p.v, i);
+    auto still = fixed | rests(p, i, b, v, (number)((k[0] + k[3] + k[5]) / 3));
+    vec3 y = select(fixed, zero, mul(Rt, select(still, -v, load3(p.dv, i))));
     put_row(p.b_material, i, p.n, {b.x, b.y, b.z});
     put_row(p.y, i, p.n, {y.x, y.y, y.z});
     mark(p.moving, at(p.body, i), !still);

@@ -3,6 +3,7 @@
 #pragma once
 #include <pthread.h>
 
+#include <atomic>
 #include <cmath>
 #include <cstdint>
 #include <cstring>
@@ -27,6 +28,9 @@ static double __longlong_as_double(long long bits) {
     std::memcpy(&a, &bits, sizeof a);
     return a;
 }
+
+static void __threadfence() { std::atomic_thread_fence(std::memory_order_seq_cst); }
+static unsigned atomicAdd(unsigned* a, unsigned by) { return __atomic_fetch_add(a, by, __ATOMIC_SEQ_CST); }
 
 // The value of another lane of the warp; all of them come here.
 template <class T> static T exchange(T value, int from) {

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sim_server.backend import HERE, INCLUDE, compiler
-from sim_server.gpu.energies import ACCOUNT
+from sim_server.gpu.energies import ACCOUNT, SUMS, chunked
 from sim_server.gpu.layouts import ENERGY
 from sim_server.layouts import BALANCE
 
@@ -19,7 +19,7 @@ MOTION = ("x", "before", *STILL)
 TEXT = """
 #include "cuda_threads.h"
 #include "account.cu"
-extern "C" void settle(int threads, const Account* a) { launch(a->bodies, threads, [&] { account(*a); }); }
+extern "C" void settle(int chunks, int threads, const Account* a) { launch(chunks, threads, [&] { account(*a); }); }
 """
 
 
@@ -34,9 +34,9 @@ def library(tmp_path_factory: pytest.TempPathFactory) -> c.CDLL:
 
 
 class Bodies:
-    """Random ones of so many nodes each, after a step from `before` to x."""
+    """Random ones of so many nodes each, after a step from `before` to x; `chunk` nodes make a thread block."""
 
-    def __init__(self, sizes: list[int], threads: int, on_runaway: int = 0):
+    def __init__(self, sizes: list[int], threads: int, on_runaway: int = 0, chunk: int = 40):
         rng, self.n, self.threads = np.random.default_rng(len(sizes)), sum(sizes), threads
         self.first = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int32)
         shape = (self.n, 3)
@@ -50,10 +50,11 @@ class Bodies:
         self.balance["start"], self.balance["limit"] = 1e6, 1e6
         self.told = np.zeros((4, len(sizes)), ENERGY)
         self.step, self.settled = np.ones(1, "i8"), np.zeros(len(sizes), "i8")
-        self.frozen = np.zeros(len(sizes), "i4")
+        self.chunk = chunked(self.first, chunk)
+        self.sums, self.arrived = np.full((len(self.chunk), SUMS), np.nan), np.zeros(len(sizes), "u4")
         self.gravity, self.account = G, np.zeros((), ACCOUNT)
         names = ("mass", "force", "spring", "anchor", "free", "balance", "told", "step", "settled", "first", "gravity")
-        for name in (*names, "frozen"):
+        for name in (*names, "chunk", "sums", "arrived"):
             self.account[name] = getattr(self, name).ctypes.data
         for name in ("x", "v", "before"):
             self.account[name] = self.motion[name].ctypes.data
@@ -62,7 +63,7 @@ class Bodies:
         self.account["on_runaway"] = on_runaway
 
     def settle(self, library: c.CDLL) -> None:
-        library.settle(self.threads, c.c_void_p(self.account.ctypes.data))
+        library.settle(len(self.chunk), self.threads, c.c_void_p(self.account.ctypes.data))
 
     def expected(self, body: int) -> dict[str, float]:
         nodes = slice(self.first[body], self.first[body + 1])
@@ -78,7 +79,7 @@ class Bodies:
 
 @pytest.mark.parametrize(
     ("sizes", "threads"),
-    [([1], 32), ([7, 60, 1, 1, 33, 64, 2], 32), ([40, 25], 64), ([300], 128), ([90, 130, 70], 128)],
+    [([1], 32), ([7, 60, 1, 1, 33, 64, 2], 32), ([40, 25], 64), ([300], 128), ([90, 130, 70], 128), ([1999], 32)],
 )
 def test_each_body_gets_the_sums_over_its_own_nodes(library, sizes, threads):
     bodies = Bodies(sizes, threads)
@@ -91,7 +92,7 @@ def test_each_body_gets_the_sums_over_its_own_nodes(library, sizes, threads):
         assert np.isnan(found["elastic"]) and found["phase"] == found["found"] == 0
     assert not bodies.force.any() and not bodies.spring.any()  # until something touches them again
     assert all(np.array_equal(array, bodies.motion[name]) for name, array in state.items()) and bodies.free.all()
-    assert (bodies.settled == 1).all()
+    assert (bodies.settled == 1).all() and not bodies.arrived.any()
     once = bodies.told[0].tobytes()
     bodies.motion["v"][:] = 7
     bodies.settle(library)  # a second time: of a step that is settled
@@ -113,7 +114,6 @@ def test_what_has_too_much_goes_back_and_rests_and_nothing_else(library, on_runa
     bodies.settle(library)
     assert bodies.told[0]["found"].tolist() == ([1, 1, 1, 0] if on_runaway < 2 else [0] * 4)
     assert bodies.told[0]["phase"].tolist() == {0: [2, 2, 2, 0], 1: [1, 1, 1, 0], 2: [0] * 4}[on_runaway]
-    assert bodies.frozen.tolist() == [int(on_runaway == 0)] * 3 + [0]
     for nodes in (fast, long, wrong):
         same = [np.array_equal(state[n][nodes], bodies.motion[n][nodes], equal_nan=True) for n in MOTION]
         assert all(same) == (on_runaway > 0)

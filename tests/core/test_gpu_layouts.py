@@ -9,7 +9,7 @@ import pytest
 from sim_server.backend import HERE
 from sim_server.gpu.device import PRECISIONS
 from sim_server.gpu.device import options as device_options
-from sim_server.gpu.energies import ACCOUNT, ELASTIC
+from sim_server.gpu.energies import ACCOUNT, CHUNK, ELASTIC, SUMS
 from sim_server.gpu.layouts import ENERGY, FOUND
 from sim_server.gpu.planned import PLAN
 from sim_server.gpu.search import LANES, SEARCH, SEARCHING, SPAN, STRETCH, bodies_of, stretches
@@ -92,6 +92,7 @@ def test_the_account_of_energy_compiles_with_the_layouts_of_this_side(precision,
     sizes = {"ACCOUNT": ACCOUNT, "BALANCE": BALANCE, "ENERGY": ENERGY, "ELASTIC": ELASTIC}
     options = [*device_options(PRECISIONS[precision]), f"-I{HERE / 'gpu'}", "-arch=sm_90"]
     options += [f"-D{name}_BYTES={layout.itemsize}" for name, layout in sizes.items()]
+    options += [f"-DCHUNK_BYTES={CHUNK.itemsize}", f"-DSUMS_BYTES={8 * SUMS}"]
     for name in ("account", "elastic"):
         code, said = nvrtc.compiled(library, HERE / f"gpu/{name}.cu", options)
         assert code and not said, said

@@ -87,7 +87,7 @@ def test_right_hand_sides_of_any_size(scale):
 
 
 def test_a_bad_number_is_named_wherever_it_is():
-    for node in (0, 300, 755):
+    for node in (36, 300, 755):  # none is fixed
         sim = Simulation.load("deploy/scenes/beam.toml", ["solver.preconditioner=block_jacobi"], "gpu")
         sim.engine.run(1)
         sim.engine.gpu.twin(sim.world.v)[node, 1] = np.nan
