@@ -31,9 +31,7 @@ SERVERS = 16  # incarnations whose answers are kept
 OBJECTS = 4096  # answers of an incarnation that are kept
 
 
-def send(
-    session: zenoh.Session, server: str, channel: str, payload: bytes | None, timeout: float, handler: Any
-) -> Any:
+def send(session: zenoh.Session, server: str, channel: str, payload: bytes | None, timeout: float, handler: Any) -> Any:
     """Asks all who answer under a key; returns zenoh's handler, which gets each reply as it comes (by default zenoh
     would keep the last one of each key back until everybody has answered)."""
     return session.get(

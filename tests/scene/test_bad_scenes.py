@@ -178,7 +178,9 @@ def test_mesh_files_are_found_beside_the_scene_and_checked(tmp_path, monkeypatch
     tet = np.array([[0, 2, 1, 3]])  # inverted
     (tmp_path / "scenes" / "meshes").mkdir(parents=True)
     meshio.write(tmp_path / "scenes" / "meshes" / "good.vtk", meshio.Mesh(corners[:4], [("tetra", tet)]))
-    meshio.write(tmp_path / "scenes" / "meshes" / "flat.vtk", meshio.Mesh(corners, [("tetra", np.array([[0, 1, 2, 4]]))]))
+    meshio.write(
+        tmp_path / "scenes" / "meshes" / "flat.vtk", meshio.Mesh(corners, [("tetra", np.array([[0, 1, 2, 4]]))])
+    )
     path = tmp_path / "scenes" / "file.toml"
     path.write_text(swap("bar = [2, 1, 1], size = [2, 1, 1]", 'file = "meshes/good.vtk"'))
     monkeypatch.chdir(tmp_path)

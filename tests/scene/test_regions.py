@@ -57,7 +57,7 @@ def test_constants_that_every_region_gives_need_not_stand_beside_them(tmp_path):
         'dt = 0.01\n[[object]]\nname = "a"\nmesh = { bar = [2, 1, 1], size = [2, 1, 1] }\n[object.effects]\n'
         'corotational = { young = [{ where = "X < 1", young = 1e4, poisson = -0.2 }, '
         "{ young = 2e4, poisson = 0.3 }] }\n"
-        'mooney_rivlin = { c1 = [{ c1 = 1e3, c2 = 2e3, bulk = 3e4 }] }\n'
+        "mooney_rivlin = { c1 = [{ c1 = 1e3, c2 = 2e3, bulk = 3e4 }] }\n"
         "fibres = { stiffness = [{ where = 'X < 1', stiffness = 1, direction = [1, 0, 0] }, "
         "{ stiffness = 1, direction = [0, 0, 2] }] }\n"
     )
