@@ -134,7 +134,6 @@ def _step(names: list[str], kinds: dict[Kind, str], r: dict[str, Any]) -> pb.Obj
         probe=r["probe"],
         linearizations=0 if r["nonlinear"] == -1 else r["linearizations"],
         nonlinear_residual=0.0 if r["nonlinear"] == -1 else r["nonlinear"],
-        warping=r["warping"],
         **{name: value for name, value in energies.items() if not math.isnan(value)},
     )
 

@@ -34,7 +34,6 @@ from sim_server.schedule import Need, oldest_possible, overdue_after, pays, pick
 from sim_server.simulation import Simulation
 from sim_server.stock import Stock
 from sim_server.track import Track, observe_steps
-from sim_server.warp_trials import WarpTrials
 from sim_server.world import Body
 
 log = logging.getLogger(__name__)
@@ -78,10 +77,6 @@ class Driver:
         self._dropping = Dropping(self, self._pool)
         self._alone = False  # there was no worker for a matrix of lockstep
         self._warped = {t.body.name: t.body.index in simulation.warped for t in self.tracks}
-        elsewhere = self.solver.build == "worker" or self.solver.recycle > 0  # built or kept: it goes by rotations
-        told = self.engine.exact or not self.free  # frames are reckoned from the very step of a factor
-        tried = self.solver.warp == "auto" and self.wants_factors and told and not elsewhere
-        self._warping = WarpTrials(simulation, self.tracks if tried else [], self.free)
         values = {t.body.name: simulation.system.body_values(t.body.first, t.body.last) for t in self.tracks}
         self._bytes = {name: 72.0 * len(v) for name, v in values.items()}  # of A: deterministic cost of an iteration
 
@@ -103,8 +98,6 @@ class Driver:
         else:
             if self.wants_factors and self.free:
                 self.pump_factors()
-            else:
-                self._warping.note([])
             self.engine.run(1)
         return self._observed()
 
@@ -116,7 +109,6 @@ class Driver:
     def step_with_fresh_factors(self) -> NDArray[Any]:
         """A step that waits for the factors of its own matrices, made in this process; returns its records."""
         moving = [t for t in self.tracks if not t.frozen]
-        self._warping.note(moving)
         self.engine.assemble()
         for t in moving:
             values = self._values(t.body)
@@ -194,7 +186,6 @@ class Driver:
             if made + self.n == now:
                 self._await(name, made)
         fresh = [t for t in self.tracks if t.body.name not in self._due and not t.frozen]
-        self._warping.note(fresh)
         for t in fresh:
             self._copies.ask(t)
         self.engine.run(1)
@@ -366,9 +357,9 @@ class Driver:
         for r in records:
             t, iterations, kind = self.tracks[r["body"]], int(r["iterations"]), Kind(r["kind"])
             cost = self._model(t, kind, iterations) if self.counted else float(r["solve"])
-            t.observe(r, max(floor, iterations) if self._warping.tried(t, r) else floor, cost)
-            factor = (t.method(int(r["factor_step"])), int(r["factor_step"]))
+            t.observe(r, floor, cost)
             if t.choice is not None:
+                factor = (t.method(int(r["factor_step"])), int(r["factor_step"]))
                 lack, used = reached(r, self.solver)
                 solves, waited = max(int(r["linearizations"]), 1), self._waited(t, factor[0])
                 t.choice.observe(
@@ -376,28 +367,20 @@ class Driver:
                     Reached(float(lack), float(used)), int(r["fallbacks"]),
                 )  # fmt: skip
                 self._settle(t)
-            if t.tries(factor[0]):
-                self._warping.wait(t)
-            else:
-                self._warping.observe(t, r)
 
     def _observe_steps(self, r: NDArray[Any]) -> None:
         """Of whole steps, (steps, bodies): where bodies are many, this is what decides how many factors they get."""
-        observe_steps(self.tracks, r, self.solver.update_floor_iterations, self._warping.tried_in(r))
-        others = np.zeros(r.shape, bool)  # with factors that are tried out
+        observe_steps(self.tracks, r, self.solver.update_floor_iterations)
         if any(t.choice for t in self.tracks):
             lack, used = reached(r, self.solver)
             solves = np.maximum(r["linearizations"], 1)
             begun = (r["kind"], r["iterations"] / solves, r["solve"] / solves, r["asked"])
             ended = (lack, used, r["fallbacks"], r["factor_step"])
             columns = (column.T.tolist() for column in (*begun, *ended))
-            for k, (t, *rows, made) in enumerate(zip(self.tracks, *columns, strict=True)):
+            for t, *rows, made in zip(self.tracks, *columns, strict=True):
                 if t.choice is not None:
-                    factors = [(t.method(step), step) for step in made]
-                    t.choice.observe_steps(*rows, factors)
+                    t.choice.observe_steps(*rows, [(t.method(step), step) for step in made])
                     self._settle(t)
-                    others[:, k] = [t.tries(method) for method, _ in factors]
-        self._warping.observe_steps(r, others)
 
     def _waited(self, t: Track, method: Method | None) -> float:
         """What falls to each solve of the making of a factor that a step waits for."""
@@ -416,6 +399,3 @@ class Driver:
         assert t.choice is not None
         native = self.engine.settings(t.body.index)
         native.kind, native.probe = t.choice.kind, t.choice.probe
-        if t.decided != (decided := t.choice.making.decided):
-            t.decided = decided
-            self._warping.begin_anew(t)

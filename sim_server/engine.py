@@ -24,8 +24,6 @@ from sim_server.rings import Reports
 from sim_server.scene.integrator_options import Integrator
 
 Reals = NDArray[np.float64]
-HELD, NOTED, MOVED, ADOPTED = 1, 2, 4, 8  # of the frames of a body in a step, kernels/nodes.cu
-NOTE_ALWAYS, NOTE_COPIES = 1, 2  # native/pcg.h
 HISTORY = 1024  # changes of the diagonal that are remembered, of each body
 
 
@@ -114,7 +112,7 @@ class Newton:
 
     options: of the scene, linearizations, trials, tolerance; reach [s]. parts: (bodies + 1,) items of each body, per
     assembling launch, or None where they are not told apart. arrays: rotation (n, 3, 3), mass (n,), beta (n,), ahead,
-    drift, carried (n, 3); on a GPU also settled (bodies,).
+    drift, carried (n, 3).
     """
 
     def __init__(
@@ -142,7 +140,7 @@ class Engine(Reports):
 
     assemble, integrate: the launches of a step, in order. ranges: nodes [first, last) of each body. newton: for several
     linearizations a step. energies: of its bodies; None: steps are not watched. arrays: those of the system by name
-    (row_start, columns, values, b, y, x, v, clock, warping, moving).
+    (row_start, columns, values, b, y, x, v, clock, moving).
     """
 
     def __init__(
@@ -161,7 +159,6 @@ class Engine(Reports):
         self._body = (layouts.Body * bodies)()
         for entry_body, (first, last) in zip(self._body, ranges, strict=True):
             entry_body.first, entry_body.last, entry_body.snapshot_step = first, last, -1
-            entry_body.noted = entry_body.made = -1
         self._work = np.zeros(45 * nodes)
         self._recycled: dict[int, Any] = {}
         self._corrections: dict[int, Any] = {}
@@ -173,7 +170,7 @@ class Engine(Reports):
         super().__init__(loop, bodies, dt, records, np.zeros((frames, 2, nodes, 3)))
         loop.launches, loop.before, loop.launch = len(launches), len(assemble), self._launch
         loop.bodies, loop.nodes, loop.body = bodies, nodes, self._body
-        for name in ("row_start", "columns", "values", "b", "y", "x", "v", "clock", "warping", "moving"):
+        for name in ("row_start", "columns", "values", "b", "y", "x", "v", "clock", "moving"):
             setattr(loop, name, arrays[name].ctypes.data)
         loop.work, loop.threads = self._work.ctypes.data, threads
         self._newton = newton and newton.attach(loop, self._launch)
@@ -182,7 +179,7 @@ class Engine(Reports):
             loop.energies = c.pointer(self._energies.native)
         self.begin: list[Launch] = []  # before the first step
 
-    exact = True  # frames are reckoned from the very step of the factor, whenever it is taken up
+    exact = True  # settings and factors hold from the very next solve on
 
     # --- running ------------------------------------------------------------------------------------------------
 

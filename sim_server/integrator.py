@@ -121,9 +121,8 @@ class Integrator:
         )
         return [self._bind("prepare", of_v=0.0, **state), *assemble, begin]
 
-    def newton(self, assemble: list[Launch], effects: list[Effect], **arrays: Any) -> Newton | None:
-        """What several linearizations a step need; None for one. assemble: the launches that make all but the first.
-        arrays: more of them."""
+    def newton(self, assemble: list[Launch], effects: list[Effect]) -> Newton | None:
+        """What several linearizations a step need; None for one. assemble: the launches of each of them."""
         w, s = self.world, self.system
         if self.options.linearizations == 1:
             return None
@@ -134,7 +133,7 @@ class Integrator:
         parts = [_parts(launch, starts, s.row, rows) for launch in assemble]
         return Newton(
             self.options, w.reach, parts, rotation=s.rotation, mass=mass, beta=self.beta, ahead=w.ahead, drift=w.drift,
-            carried=self.carried, **arrays,
+            carried=self.carried,
         )  # fmt: skip
 
     def _bind(self, kernel: str, **arguments: Any) -> Launch:

@@ -14,7 +14,7 @@ RECORD = np.dtype(
         ("integrate", "f8"), ("whole", "f8"), ("late", "f8"), ("begin", "f8"), ("cpu", "f8"), ("nonlinear", "f8"),
         ("kinetic", "f8"), ("elastic", "f8"), ("gravity", "f8"), ("work", "f8"), ("budget", "f8"), ("stride", "f8"),
         ("body", "i4"), ("iterations", "i4"), ("status", "i4"), ("kind", "i4"), ("asked", "i4"), ("fallbacks", "i4"),
-        ("bad_node", "i4"), ("probe", "i4"), ("linearizations", "i4"), ("warping", "i4"),
+        ("bad_node", "i4"), ("probe", "i4"), ("linearizations", "i4"), ("unused", "i4"),
     ]
 )  # fmt: skip
 """One body, one step: what a loop reports. Seconds, except step numbers; `step` counts completed steps.
@@ -55,8 +55,7 @@ class Factor(c.Structure):
 class Settings(c.Structure):
     _fields_ = [
         ("tolerance", c.c_double), ("budget", c.c_double), ("max_iterations", c.c_int32), ("kind", c.c_int32),
-        ("warm_start", c.c_int32), ("probe", c.c_int32), ("omega", c.c_double), ("hold", c.c_int32),
-        ("note", c.c_int32),
+        ("warm_start", c.c_int32), ("probe", c.c_int32), ("omega", c.c_double),
     ]  # fmt: skip
 
 
@@ -90,8 +89,7 @@ class Body(c.Structure):
     _fields_ = [
         ("first", c.c_int32), ("last", c.c_int32), ("settings", Settings), ("now", Settings), ("factor", c.c_void_p),
         ("mail", c.c_void_p), ("snapshot", c.c_void_p), ("snapshot_step", c.c_int64), ("ahead", c.c_double),
-        ("steps", c.c_int64), ("recycled", Recycled), ("correction", Correction), ("noted", c.c_int64),
-        ("made", c.c_int64), ("warping", c.c_int32), ("unused", c.c_int32),
+        ("steps", c.c_int64), ("recycled", Recycled), ("correction", Correction),
     ]  # fmt: skip
 
 
@@ -141,8 +139,8 @@ class Loop(c.Structure):
         ("launches", c.c_int32), ("before", c.c_int32), ("launch", c.POINTER(Launch)), ("bodies", c.c_int32),
         ("nodes", c.c_int32), ("body", c.POINTER(Body)), ("row_start", c.c_void_p), ("columns", c.c_void_p),
         ("values", c.c_void_p), ("b", c.c_void_p), ("y", c.c_void_p), ("x", c.c_void_p), ("v", c.c_void_p),
-        ("work", c.c_void_p), ("newton", c.POINTER(Newton)), ("clock", c.c_void_p), ("warping", c.c_void_p),
-        ("moving", c.c_void_p), ("energies", c.POINTER(Energies)), ("threads", c.c_int32), ("unused", c.c_int32),
+        ("work", c.c_void_p), ("newton", c.POINTER(Newton)), ("clock", c.c_void_p), ("moving", c.c_void_p),
+        ("energies", c.POINTER(Energies)), ("threads", c.c_int32), ("unused", c.c_int32),
         ("assemble_begin", c.c_double),
         ("assemble_seconds", c.c_double), ("cpu_begin", c.c_double), ("rings", Rings),
     ]  # fmt: skip

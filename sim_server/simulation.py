@@ -11,13 +11,11 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from sim_server.backend import Cpu, Launch, ahead
 from sim_server.effect import Effect, Refusal
 from sim_server.effects import effect
 from sim_server.energy import Energies
-from sim_server.engine import Engine, Kind, Newton
+from sim_server.engine import Engine, Kind
 from sim_server.equilibrium import check_held
 from sim_server.errors import DeviceError, InputError
 from sim_server.integrator import Integrator
@@ -54,6 +52,7 @@ class Simulation:
         matched = self._matched()
         self.shape = ShapeMatching(self.world, matched, scene.solver.warp_level) if matched else None
         self.warped = {body.index for body in self._rotated() + matched}  # whose solve is in the material frame
+        self.system.warped[:] = [body.index in self.warped for body in self.world.bodies]
         self.integrator = Integrator(scene, self.system)
         if not self.world.inertia:
             check_held(self.world, elements)
@@ -63,9 +62,9 @@ class Simulation:
         assemble, integrate = self.launches()
         w, s = self.world, self.system
         arrays: dict[str, Any] = {"row_start": s.row_start, "columns": s.columns, "values": s.values}
-        arrays |= {"b": s.b_material, "y": s.y, "x": w.x, "v": w.v, "clock": s.clock, "warping": s.warping}
-        arrays["moving"] = s.moving
+        arrays |= {"b": s.b_material, "y": s.y, "x": w.x, "v": w.v, "clock": s.clock, "moving": s.moving}
         ranges = [(b.first, b.last) for b in w.bodies]
+        newton = self.integrator.newton(assemble, list(self.effects.values()))
         self.engine: Any
         if device == "gpu":
             from sim_server.gpu.engine import GpuEngine
@@ -73,13 +72,11 @@ class Simulation:
             gpu: Any = w.backend
             names = [b.name for b in w.bodies]
             planes = 2 if scene.solver.factor_precision == "float32" else 1
-            more = self._more(assemble)
-            launches: tuple[Any, Any, Any] = assemble, integrate, more
+            launches: tuple[Any, Any] = assemble, integrate
             self.engine = GpuEngine(
-                gpu, *launches[:2], ranges, w.dt, self.energies, names, planes=planes, more=launches[2], **arrays
+                gpu, *launches, ranges, w.dt, self.energies, names, planes=planes, newton=newton, **arrays
             )
         else:
-            newton = self.integrator.newton(assemble, list(self.effects.values()))
             threads = scene.solver.threads
             self.engine = Engine(
                 assemble, integrate, ranges, w.dt, threads=threads, newton=newton, energies=self.energies, **arrays
@@ -120,27 +117,15 @@ class Simulation:
         assemble += system.finish()  # into the material frame (eq. 12 and 13)
         return assemble, [self.integrator.advance()]
 
-    def _more(self, assemble: list[Launch]) -> tuple[Newton, list[Launch]] | None:
-        """On a GPU, for further linearizations in a step: what they need, and what assembles it again."""
-        if self.scene.integrator.linearizations == 1:
-            return None
-        settled = np.zeros_like(self.system.warping)
-        self.world.backend.keep(settled)
-        finish = self.system.finish(settled)
-        again = [*assemble[: -len(finish)], *finish]
-        newton = self.integrator.newton(again, list(self.effects.values()), settled=settled)
-        assert newton is not None
-        return newton, again
-
     def _rotated(self) -> list[Body]:
         """Bodies whose rotations for the warp are those of elements."""
-        if self.scene.solver.warp is False:
+        if not self.scene.solver.warp:
             return []
         return [body for e in self.effects.values() for body in e.rotated]
 
     def _matched(self) -> list[Body]:
         """Bodies with elements none of which have rotations: theirs are matched shapes."""
-        if self.scene.solver.warp is False:
+        if not self.scene.solver.warp:
             return []
         rotated = {body.index for body in self._rotated()}
         return [b for b in self.world.bodies if b.index not in rotated and self.system.couples(b.first, b.last)]
@@ -154,7 +139,6 @@ class Simulation:
         if solver.woodbury and solver.wants_factors and "touch" in body.effects and isinstance(self.engine, Engine):
             double = solver.factor_precision == "float64"
             self.engine.correct(body.index, solver.woodbury, self.system.diagonal, double)
-        native.hold = int(body.index not in self.warped)  # in the frame that they begin with, the identity
         native.kind, native.omega = KINDS.get(solver.preconditioner, Kind.CHOLESKY), solver.omega
 
     def refusals(self) -> list[Refusal]:

@@ -42,8 +42,8 @@ class System:
 
     moving (bodies,): 1 where a step is to be solved, as some node does not rest (kernels/nodes.cu), set by `turn` and
     cleared by the loop. extent (n,): diagonal of the box around the node's body at rest [m]; gain (n,) [1/s].
-    rotation (n, 3, 3): frames of the nodes. warping (bodies,), used and noted (n, 8): by which they can be held and let
-    go (kernels/nodes.cu); the loop sets warping in each step.
+    rotation (n, 3, 3): frames of the nodes. warped (bodies,): 1 where they follow the nodes' rotations, 0 where they
+    stay the identity; set before the launches are made.
     """
 
     def __init__(self, world: World, elements: list[Ints]):
@@ -64,11 +64,10 @@ class System:
         self.body = np.repeat([b.index for b in world.bodies], [b.last - b.first for b in world.bodies]).astype(
             np.int32
         )
-        self.warping = np.zeros(len(world.bodies), np.int32)
+        self.warped = np.ones(len(world.bodies), np.int32)
         self.moving = np.zeros(len(world.bodies), np.int32)
         extents = np.array([np.linalg.norm(np.ptp(world.rest[b.nodes], axis=0)) for b in world.bodies])
         self.extent, self.gain = extents[self.body], 1 / (world.reach + world.beta[self.body])
-        self.used, self.noted = (np.tile([1.0, 0.0, 0.0, 0.0], (n, 2)) for _ in range(2))
         self.rotation = np.tile(np.eye(3), (n, 1, 1))
         self.b_material = np.zeros((n, 3))
         self.y = np.zeros((n, 3))
@@ -100,19 +99,15 @@ class System:
             mean=self.mean,
         )  # fmt: skip
 
-    def finish(self, warping: Ints | None = None) -> list[Launch]:
-        """Everything into the material frame: A' = R^T A R, b' = R^T b, and the start of the solve.
-
-        warping: another array than that of the loop.
-        """
+    def finish(self) -> list[Launch]:
+        """Everything into the material frame: A' = R^T A R, b' = R^T b, and the start of the solve."""
         w = self.world
         velocity = w.v if w.inertia else w.ahead  # without inertia that of the last step is no velocity to begin with
         turn = self.world.backend.module("kernels/nodes.cu").bind(
-            "turn", w.nodes, free=w.free, body=self.body, warping=self.warping if warping is None else warping,
-            place=self.own, mean=self.mean, b=self.b, diagonal=self.diagonal, block=self.block, dv=self.dv,
+            "turn", w.nodes, free=w.free, body=self.body, warped=self.warped, place=self.own,
+            mean=self.mean, b=self.b, diagonal=self.diagonal, block=self.block, dv=self.dv,
             x=w.x, v=velocity, extent=self.extent, gain=self.gain, h=w.dt, moving=self.moving,
-            used=self.used, noted=self.noted, rotation=self.rotation, b_material=self.b_material, y=self.y,
-            values=self.values,
+            rotation=self.rotation, b_material=self.b_material, y=self.y, values=self.values,
         )  # fmt: skip
         assemble = self.world.backend.module("kernels/assemble.cu").bind(
             "assemble", len(self.row), row=self.row, column=self.column, upper=self.upper, lower=self.lower,
@@ -134,18 +129,6 @@ class System:
             x=w.x,
             before=before,
         )
-
-    def turned(self, nodes: slice) -> float:
-        """Mean angle of frames from where they were when the factor in use was made [rad]."""
-        backend = self.world.backend
-        now, made = backend.fetch(self.rotation)[nodes], backend.fetch(self.used)[nodes, :4]
-        w, v = made[:, 0], made[:, 1:]
-        axial = np.stack(
-            [now[:, 2, 1] - now[:, 1, 2], now[:, 0, 2] - now[:, 2, 0], now[:, 1, 0] - now[:, 0, 1]], axis=1
-        )
-        along = np.einsum("ni,nij,nj->n", v, now, v) + w * np.einsum("ni,ni->n", v, axial)
-        trace = (w**2 - (v**2).sum(axis=1)) * np.trace(now, axis1=1, axis2=2) + 2 * along
-        return float(np.arccos(np.clip((trace - 1) / 2, -1, 1)).mean())
 
     def couples(self, first: int, last: int) -> bool:
         """Whether anything couples nodes of a body."""

@@ -11,7 +11,6 @@ from protocol.factor import Factor, FactorPattern
 from protocol.method import Method
 from sim_server.choice import Choice
 from sim_server.schedule import Need, excess
-from sim_server.warping import Warping
 from sim_server.world import Body
 
 MEMORY = 0.2  # weight of the newest value in running means
@@ -73,13 +72,10 @@ class Track:
         self.seconds = Mean()  # s, or operations, of a factorization
         self.per_iteration = Mean()  # s, or bytes
         self.choice = Choice(methods) if methods else None
-        self.decided = methods[0] if methods else None  # method of the factors in use, apart from trials
         self._methods: dict[int, Method] = {}  # of the last jobs, by step
         self._makers: dict[int, str] = {}  # workers of the last factors, by step
         self.dropped: tuple[int, int] | None = None  # the newest factor is no use: its step, kind of solves till then
         self._making: dict[str, Mean] = {}  # s, or operations, by name of the method
-        self.warping: Warping | None = None  # warp = "auto"
-        self.noted = self.made = -1  # steps, for a device that is told: noted last, or from when on; what frames go by
 
     def job(self, step: int, method: Method) -> None:
         """The matrix of a step is to be factorized."""
@@ -94,10 +90,6 @@ class Track:
     def maker(self, step: int) -> str:
         """Who made the factor of a step; empty where that is not known any more."""
         return self._makers.get(step, "")
-
-    def tries(self, method: Method | None) -> bool:
-        """A factor of this method is tried out: what solves with it take says nothing of those in use."""
-        return method is not None and self.choice is not None and method != self.choice.making.decided
 
     def making(self, method: Method) -> float:
         """What a factor costs to make."""
@@ -194,14 +186,13 @@ class Track:
         self.excess, self.latest = self.excess + above, float(above)
 
 
-def observe_steps(tracks: Sequence[Track], r: NDArray[Any], floor: int, tried: NDArray[np.bool_]) -> None:
-    """As Track.observe of each record of whole steps, (steps, bodies), in seconds. tried: solves without excess.
+def observe_steps(tracks: Sequence[Track], r: NDArray[Any], floor: int) -> None:
+    """As Track.observe of each record of whole steps, (steps, bodies), in seconds.
 
     A worker gets a job each time that the service thread comes round: with a thousand bodies this is what it waits for.
     """
     steps, made = len(r), r["factor_step"]
     above = np.maximum(r["iterations"] - floor * np.maximum(r["linearizations"], 1), 0)
-    above[tried] = 0
     weights = (1 - MEMORY) ** np.arange(steps - 1, -1, -1)
     each = r["solve"] / (r["iterations"] + 1)
     costs = weights @ each / weights.sum()

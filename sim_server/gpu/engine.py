@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from protocol.factor import FactorPattern
 from sim_server.backend import HERE
 from sim_server.energy import Energies
-from sim_server.engine import ADOPTED, HELD, MOVED, NOTED, Newton
+from sim_server.engine import Newton
 from sim_server.gpu.cuda import CudaDevice
 from sim_server.gpu.device import DeviceLaunch, Gpu
 from sim_server.gpu.energies import DeviceEnergies
@@ -37,49 +37,17 @@ TICK = np.dtype(
 )  # fmt: skip
 
 
-class Warping:
-    """How the frames of all bodies are (kernels/nodes.cu), (bodies,) on the device; what is set holds from the next
-    batch on. While both ADOPTED and NOTED are set, frames are held where they are and follow from there."""
-
-    def __init__(self, flags: NDArray[np.int32]):
-        self._flags = flags.copy()
-        self.mailbox: Mailbox | None = None
-
-    def __getitem__(self, place: tuple[int, int]) -> int:
-        """Of (body, bit): 0 or 1."""
-        body, bit = place
-        return int(self._flags[body] & bit != 0)
-
-    def __setitem__(self, place: tuple[int, int], value: int) -> None:
-        body, bit = place
-        if self[place] == bool(value):
-            return
-        self._flags[body] ^= bit
-        if bit == HELD and value:
-            self._flags[body] |= MOVED
-        assert self.mailbox is not None
-        self.mailbox.post(self._flags.tobytes())
-
-
-BITS = {"hold": HELD, "note": NOTED, "adopt": ADOPTED}
-
-
 class Settings:
     """Solver settings of a body; what is set holds from its next batch on."""
 
-    def __init__(self, row: NDArray[Any], mailbox: Mailbox, body: int, warping: Warping):
+    def __init__(self, row: NDArray[Any], mailbox: Mailbox):
         object.__setattr__(self, "_row", row)
         object.__setattr__(self, "_mailbox", mailbox)
-        object.__setattr__(self, "_body", body)
-        object.__setattr__(self, "_warping", warping)
 
     def __getattr__(self, name: str) -> Any:
-        return self._warping[self._body, BITS[name]] if name in BITS else self._row[name].item()
+        return self._row[name].item()
 
     def __setattr__(self, name: str, value: Any) -> None:
-        if name in BITS:
-            self._warping[self._body, BITS[name]] = value
-            return
         if name in ("budget", "omega") or self._row[name] == value:  # no budget of wall time and no SSOR on a GPU
             return
         self._row[name] = value
@@ -88,8 +56,8 @@ class Settings:
 
 class GpuEngine(DeviceLoop):
     """Arguments as engine.Engine's, launches from Gpu.module. names: of the bodies, for messages. planes: float16
-    numbers that make an entry of a preconditioner (solver.py). more: for several linearizations a step, what they need
-    and the launches that assemble it again (search.py).
+    numbers that make an entry of a preconditioner (solver.py). newton: for several linearizations a step, each of which
+    runs `assemble` again (search.py).
 
     Raises what Gpu.building translates.
     """
@@ -97,7 +65,7 @@ class GpuEngine(DeviceLoop):
     def __init__(
         self, gpu: Gpu, assemble: Sequence[DeviceLaunch], integrate: Sequence[DeviceLaunch],
         ranges: Sequence[tuple[int, int]], dt: float, energies: Energies, names: Sequence[str] = (),
-        records: int = 8192, planes: int = 1, more: tuple[Newton, Sequence[DeviceLaunch]] | None = None,
+        records: int = 8192, planes: int = 1, newton: Newton | None = None,
         **arrays: NDArray[Any],
     ):  # fmt: skip
         self.gpu, self.launches, self._arrays = gpu, [*assemble, *integrate], arrays
@@ -110,20 +78,17 @@ class GpuEngine(DeviceLoop):
         told = device.pinned(CAPACITY * ENERGY.itemsize * bodies)
         self._energies = DeviceEnergies(gpu, energies, told, self._counter, dt)
         self._fused = self._beginning(assemble)
-        turns = Turns.of(gpu, bodies) if more else None
+        turns = Turns.of(gpu, bodies) if newton else None
         self.solver = Solver(gpu, ranges, arrays, self._counter, CAPACITY, planes, turns or ())
         self._search, found = None, None
-        if more and turns:
+        if newton and turns:
             found = device.pinned(CAPACITY * FOUND.itemsize * bodies)
-            self._search = Search(gpu, *more, ranges, arrays, turns, self.solver, found)
+            self._search = Search(gpu, newton, assemble, ranges, arrays, turns, self.solver, found)
         row, first = BODY.itemsize, self.solver.bodies_device
         boxes = [(first + row * k, SETTINGS) for k in range(bodies)]
         boxes += [(first + row * k + SETTINGS, row - SETTINGS) for k in range(bodies)]
         self._mailed = {k: len(boxes) + i for i, k in enumerate(k for k, x in enumerate(self.launches) if x.mailed)}
         boxes += [(self.launches[k].mail_address, self.launches[k].params.nbytes) for k in self._mailed]
-        warping = gpu.twin(arrays["warping"])
-        boxes.append((int(warping.data.ptr), warping.nbytes))
-        self._warping = Warping(arrays["warping"])
         twins = {name: gpu.twin(arrays[name]) for name in ("values", "x", "v")}
         addresses = {name: int(twin.data.ptr) for name, twin in twins.items()}
         if self._search:
@@ -132,7 +97,6 @@ class GpuEngine(DeviceLoop):
             device, ranges, arrays["row_start"], dt, boxes, self._results, self._stamps, arrays["clock"],
             records, twins["values"].dtype, found, told, **addresses,
         )  # fmt: skip
-        self._warping.mailbox = self.mailboxes[-1]
         names = names or [f"body {k}" for k in range(bodies)]
         self._intake = Intake(gpu, self.solver, self, names, self.mailboxes[bodies : 2 * bodies])
         for k in range(bodies):
@@ -266,7 +230,7 @@ class GpuEngine(DeviceLoop):
     def settings(self, body: int) -> Settings:
         """Solver settings of a body."""
         row = self.solver.bodies[body : body + 1].reshape(())
-        return Settings(row, self.mailboxes[body], body, self._warping)
+        return Settings(row, self.mailboxes[body])
 
     def post_factor(self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int) -> None:
         """Has L expanded beside the steps; taken up between batches once that is done."""

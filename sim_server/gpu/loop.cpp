@@ -96,7 +96,7 @@ static void report(Loop& l, const Batch& batch, int64_t k, double end, double cp
         record = Record{step, r.factor_step, rings.start_time + step * rings.dt, r.residual, 0, r.seconds, 0,
                    1e-9 * (stamp.end - stamp.begin), k ? 0 : batch.late, end - 1e-9 * (last.end - stamp.begin), cpu,
                    found.nonlinear, NAN, NAN, NAN, NAN, NAN, NAN, i, r.iterations, r.status, r.kind, r.asked, r.fallbacks, r.bad_node, r.probe,
-                   found.linearizations, r.warping};
+                   found.linearizations, 0};
         if (l.energies) note_energy(record, l.energies[slot + i]);
     }
     rings.step.store(step);

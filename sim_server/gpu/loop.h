@@ -40,7 +40,7 @@ struct Mailbox {                // bytes on the device that are replaced between
 struct Result {                 // solve.cuh
     double residual, seconds;
     int64_t factor_step;
-    int32_t iterations, status, kind, asked, fallbacks, bad_node, probe, warping;
+    int32_t iterations, status, kind, asked, fallbacks, bad_node, probe, unused;
 };
 
 struct Found { double nonlinear; int32_t linearizations, unused; };  // search.cu

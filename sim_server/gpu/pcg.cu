@@ -387,7 +387,6 @@ __device__ __forceinline__ void solve_body(const Solve& s, const Share& share) {
         Result out = memory.out;
         out.seconds = 1e-9 * (nanoseconds() - begin);
         if (memory.body.plan && (out.asked == CHOLESKY || out.kind == CHOLESKY || out.fallbacks)) out.factor_step = memory.body.factor_step;
-        out.warping = s.warping[k];
         s.results[(s.step[0] % s.capacity) * s.count + k] = out;
         s.exchanges[k] = solver.team.number;  // all have read it before the first exchange
     }

@@ -14,7 +14,6 @@
 #endif
 
 constexpr int STRETCH = 32, LANES = 8, ALL_LANES = STRETCH * LANES;  // nodes of a thread block; threads of a node in `move`
-constexpr int NOTED = 2, ADOPTED = 8;                                // kernels/nodes.cu
 constexpr int NO_NODE = 0x7fffffff;
 #define WARP 0xffffffffu
 
@@ -31,8 +30,6 @@ struct Searching {
     int* phase;                 // (bodies,) of search, for the launches between
     int* left;                  // (1,) searches that are not over
     int* bad;                   // (bodies,) first node whose b is not finite
-    const int* warping;         // (bodies,) of the step
-    int* settled;               // (bodies,) out: what frames do when the step is assembled again: what was noted stays
     const Body* bodies;
     Result* results;            // (capacity, bodies) of the last solve; at the end of the step
     Found* found;               // (capacity, bodies) on the host
@@ -168,7 +165,6 @@ extern "C" __global__ void __launch_bounds__(STRETCH) open(const Searching p) {
     start_search(p.search[here.body], sqrt(sum[0]), EPSILON<local> * sqrt(sum[1]), p.bodies[here.body].kind);
     p.phase[here.body] = SOLVE;
     p.bad[here.body] = NO_NODE;
-    p.settled[here.body] = p.warping[here.body] & ~(NOTED | ADOPTED);
 }
 
 // To the next trial: along a new way where a system was solved, by a smaller part of the present one elsewhere.

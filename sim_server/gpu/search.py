@@ -3,7 +3,7 @@
 
 All trials that a scene allows are in the graph of a step, linearizations x (1 + trials) of them; launches that nobody
 needs any more return at once. The first assembly of a step is that of scenes with one linearization; the others are
-made by the same texts with a guard in front (fuse.Guard), and leave noted frames alone.
+made by the same texts with a guard in front (fuse.Guard).
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,7 +24,7 @@ STRETCH, LANES = 32, 8  # nodes of a thread block, threads of a node in `move`: 
 SPAN = np.dtype([("body", "i4"), ("first", "i4"), ("last", "i4"), ("unused", "i4")])
 SEARCH = np.dtype(SearchLayout)
 POINTERS = (
-    "stretch", "stretches", "partial", "done", "search", "phase", "left", "bad", "warping", "settled", "bodies",
+    "stretch", "stretches", "partial", "done", "search", "phase", "left", "bad", "bodies",
     "results", "found", "step", "arrived", "row_start", "columns", "values", "b", "y", "rotation", "mass", "beta", "x",
     "v", "ahead", "drift", "carried", "before", "gain", "way",
 )  # fmt: skip
@@ -74,9 +74,9 @@ def bodies_of(parts: Sequence[NDArray[np.int32] | None]) -> NDArray[np.int32] | 
 class Search:
     """The launches between the first assembly of a step and its end.
 
-    newton: what to search for, with `parts` of the launches in `again`, which assemble a step once more; they read
-    newton.settled for warping. ranges: nodes [first, last) of each body. arrays: host arrays by name (row_start,
-    columns, values, b, y, x, v, warping). found: host memory (capacity, bodies) of FOUND that the steps write to.
+    newton: what to search for, with `parts` of the launches in `again`, which assemble a step once more. ranges: nodes
+    [first, last) of each body. arrays: host arrays by name (row_start, columns, values, b, y, x, v). found: host memory
+    (capacity, bodies) of FOUND that the steps write to.
 
     first_values: A as the step's first linearization had it, which is what factors are made of.
     """
@@ -89,7 +89,7 @@ class Search:
         self._gpu, self._solver, self.rounds = gpu, solver, newton.options.rounds
         self._bodies: list[Any] = []  # of the items of each kernel
         self._again = self._guarded(newton, again, turns)
-        names = ("row_start", "columns", "values", "b", "y", "x", "v", "warping")
+        names = ("row_start", "columns", "values", "b", "y", "x", "v")
         host = {name: arrays[name] for name in names} | newton.arrays
         twins = {name: gpu.twin(array) for name, array in host.items()}
         spans, starts = stretches(np.array(ranges, np.int64))

@@ -70,7 +70,7 @@ struct Result {
     double residual;                 // true, relative
     double seconds;
     long long factor_step;           // -1: no factor used
-    int iterations, status, kind, asked, fallbacks, bad_node, probe, warping;
+    int iterations, status, kind, asked, fallbacks, bad_node, probe, unused;
 };
 
 struct Solve {
@@ -96,7 +96,6 @@ struct Solve {
     unsigned* arrived;               // (1,) zero at launch: next of the pool
     const long long* step;           // completed steps: where the result goes
     Result* results;                 // (capacity, bodies)
-    const int* warping;              // (bodies,) of the step under way (kernels/nodes.cu), for the results
     const int* moving;               // (bodies,) 0: the body rests (kernels/nodes.cu)
     int nodes, shared;               // of the scene; bytes of dynamic shared memory
 };

@@ -27,7 +27,7 @@ SETTINGS = BODY.fields["factor_step"][1]  # type: ignore[index]  # bytes of a ro
 RESULT = np.dtype(
     [
         ("residual", "f8"), ("seconds", "f8"), ("factor_step", "i8"), ("iterations", "i4"), ("status", "i4"),
-        ("kind", "i4"), ("asked", "i4"), ("fallbacks", "i4"), ("bad_node", "i4"), ("probe", "i4"), ("warping", "i4"),
+        ("kind", "i4"), ("asked", "i4"), ("fallbacks", "i4"), ("bad_node", "i4"), ("probe", "i4"), ("unused", "i4"),
     ]
 )  # fmt: skip
 SOLVE = np.dtype(
@@ -36,8 +36,7 @@ SOLVE = np.dtype(
         ("values", "u8"), ("b", "u8"), ("y", "u8"), ("order", "u8"), ("pooled", "i4"), ("grid", "i4"),
         ("shares", "u8"), ("own_share", "u8"), ("halo", "u8"), ("seat", "u8"), ("halo_values", "u8"),
         ("halo_place", "u8"), ("own", "u8"), ("z", "u8"), ("diagonal", "u8"), ("board", "u8"), ("exchanges", "u8"),
-        ("arrived", "u8"), ("step", "u8"), ("results", "u8"), ("warping", "u8"), ("moving", "u8"),
-        ("nodes", "i4"), ("shared", "i4"),
+        ("arrived", "u8"), ("step", "u8"), ("results", "u8"), ("moving", "u8"), ("nodes", "i4"), ("shared", "i4"),
     ]
 )  # fmt: skip
 
@@ -52,10 +51,10 @@ def threads_and_blocks(nodes: NDArray[np.int64], processors: int) -> tuple[int, 
 class Solver:
     """Solves the system of every body in one launch.
 
-    ranges: nodes [first, last) of each body. arrays: host arrays by name (row_start, columns, values, b, y, warping,
-    moving), solved for their twins. counter: device array (1,) of completed steps. capacity: steps whose results are
-    kept. planes: 1 for a preconditioner in float16, 2 for one of 22 bits. turns: for several linearizations a step,
-    device arrays `left` and `phase` (search.py).
+    ranges: nodes [first, last) of each body. arrays: host arrays by name (row_start, columns, values, b, y, moving),
+    solved for their twins. counter: device array (1,) of completed steps. capacity: steps whose results are kept.
+    planes: 1 for a preconditioner in float16, 2 for one of 22 bits. turns: for several linearizations a step, device
+    arrays `left` and `phase` (search.py).
 
     bodies: host rows (BODY), one per body; whoever runs the loop uploads them, settings (the first SETTINGS bytes) and
     factor (the rest) apart. results: device ring (capacity, bodies) of RESULT. arrived: zero at launch.
@@ -68,7 +67,7 @@ class Solver:
     ):  # fmt: skip
         cp, processors = gpu.cp, gpu.properties["multiProcessorCount"]
         self.gpu, self.counter, self._capacity, self.planes, self._turns = gpu, counter, capacity, planes, turns
-        self._twins = {name: gpu.twin(arrays[name]) for name in ("row_start", "values", "b", "y", "warping", "moving")}
+        self._twins = {name: gpu.twin(arrays[name]) for name in ("row_start", "values", "b", "y", "moving")}
         self.real = np.dtype(self._twins["values"].dtype)
         spans = np.array(ranges, np.int64)
         nodes = spans[:, 1] - spans[:, 0]

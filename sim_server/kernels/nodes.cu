@@ -25,7 +25,7 @@ struct Turn {
     int n;               // nodes
     const real* free;    // (n,) 1, or 0 at fixed nodes
     const int* body;     // (n,) of the node
-    const int* warping;  // (bodies,) sum of HELD, NOTED, MOVED, ADOPTED
+    const int* warped;   // (bodies,) 1 where frames follow the nodes' rotations, 0 where they stay the identity
     const int* place;    // (n,) of the node's own block in the full pattern
     own<local> mean;     // (n, 10) upper triangle of the sum of q q^T
     own<real> b;         // (n, 3) world frame [N s]
@@ -37,9 +37,7 @@ struct Turn {
     const real* extent;  // (n,) of the node's body [m]
     const real* gain;    // (n,) 1 / (c + beta), c world.reach, beta the Rayleigh damping of the stiffness [1/s]
     real h;              // time step [s]
-    local* used;         // (n, 8) in, out: Made of the factor in use
-    local* noted;        // (n, 8) in, out: Made of the step noted last
-    local* rotation;     // (n, 3, 3) out: frame of the node: its rotation from rest to now, unless it was held
+    local* rotation;     // (n, 3, 3) out: frame of the node: its rotation from rest to now, or the identity
     real* b_material;    // (n, 3) out: R^T b, 0 at fixed nodes
     real* y;             // (n, 3) out: where the solve starts: R^T dv, R^T (-v) where the node rests, 0 at fixed nodes
     int* moving;         // (bodies,) out: 1 where a node does not rest; else left as it is
@@ -56,57 +54,16 @@ INLINE local_mat3 sum_of_rotations(own<local> mean, index i) {
              2 * (xz - wy), 2 * (yz + wx), ww - xx - yy + zz}};
 }
 
-template <class T> INLINE quaternion<T> product(quaternion<T> a, quaternion<T> b) {
-    return {a.w * b.w - a.x * b.x - a.y * b.y - a.z * b.z, a.w * b.x + a.x * b.w + a.y * b.z - a.z * b.y,
-            a.w * b.y + a.y * b.w + a.z * b.x - a.x * b.z, a.w * b.z + a.z * b.w + a.x * b.y - a.y * b.x};
-}
-// Two of them weighted with w and 1 - w, w being 0 or 1.
-template <class T> INLINE quaternion<T> either(T w, quaternion<T> a, quaternion<T> b) {
-    T u = 1 - w;
-    return {w * a.w + u * b.w, w * a.x + u * b.x, w * a.y + u * b.y, w * a.z + u * b.z};
-}
-INLINE quaternion<local_number> quaternion_at(const local* a, index i, int k) {
-    return {row_at<8>(a, i, k), row_at<8>(a, i, k + 1), row_at<8>(a, i, k + 2), row_at<8>(a, i, k + 3)};
-}
-
-// What takes a factor made in a step from there to now: the node's frame in that step, and the quaternion from its rotation then to
-// that frame. While the rotations alone make the frames it is 1.
-struct Made {
-    quaternion<local_number> frame, offset;
-};
-INLINE Made made_at(const local* a, index i) { return {quaternion_at(a, i, 0), quaternion_at(a, i, 4)}; }
-INLINE void made_put(local* a, index i, const Made& m) {
-    const quaternion<local_number>*q = &m.frame, *c = &m.offset;
-    row_put<8>(a, i, 0, q->w); row_put<8>(a, i, 1, q->x); row_put<8>(a, i, 2, q->y); row_put<8>(a, i, 3, q->z);
-    row_put<8>(a, i, 4, c->w); row_put<8>(a, i, 5, c->x); row_put<8>(a, i, 6, c->y); row_put<8>(a, i, 7, c->z);
-}
-INLINE Made either(local_number w, const Made& a, const Made& b) { return {either(w, a.frame, b.frame), either(w, a.offset, b.offset)}; }
-
-// Frames of a body's nodes follow their rotations from where the factor was made, which is the warp, or are HELD there, which is
-// none; either way whatever they did before. NOTED: a matrix of this step may become a factor. ADOPTED: from this step on the factor
-// is that of the step noted last. MOVED: they have been held before, so that offsets are not 1.
-constexpr int HELD = 1, NOTED = 2, MOVED = 4, ADOPTED = 8;
-
-// Rotation of a node: the one nearest to the mean of its elements' (Courtecuisse et al. 2010, section 6).
+// Frame of a node: its rotation, the one nearest to the mean of its elements' (Courtecuisse et al. 2010, section 6), or the identity.
 INLINE local_mat3 frame_of(const Turn& p, index i) {
-    index warping = at(p.warping, at(p.body, i));
-    if (!any((warping & (HELD | NOTED | ADOPTED)) - HELD)) return rotation_matrix(quaternion_at(p.used, i, 0));
-    quaternion<local_number> r = nearest_quaternion(sum_of_rotations(p.mean, i)), frame = r;
-    if (any(warping & (HELD | NOTED | MOVED | ADOPTED))) {
-        local_number hold = (local_number)as_number(warping & HELD);
-        Made used = made_at(p.used, i);
-        if (any(warping & (NOTED | ADOPTED))) {
-            Made noted = made_at(p.noted, i);
-            used = either((local_number)as_number((warping & ADOPTED) / ADOPTED), noted, used);
-            made_put(p.used, i, used);
-            frame = either(hold, used.frame, product(r, used.offset));
-            Made now = {frame, either(hold, product({r.w, -r.x, -r.y, -r.z}, frame), used.offset)};
-            made_put(p.noted, i, either((local_number)as_number((warping & NOTED) / NOTED), now, noted));
-        } else {
-            frame = either(hold, used.frame, product(r, used.offset));
-        }
+    index warped = at(p.warped, at(p.body, i));
+    quaternion<local_number> rest = {local_number{} + 1, {}, {}, {}}, q = rest;
+    if (any(warped)) {
+        auto follows = (local_number)as_number(warped) > 0;
+        q = nearest_quaternion(sum_of_rotations(p.mean, i));
+        q = {follows ? q.w : rest.w, follows ? q.x : rest.x, follows ? q.y : rest.y, follows ? q.z : rest.z};
     }
-    return rotation_matrix(frame);
+    return rotation_matrix(q);
 }
 
 // A node rests if it moves in a step by less than its position is rounded, and b there is less than the rounding of the forces

@@ -6,7 +6,6 @@
 
 #include "energy.h"
 #include "newton.h"
-#include "warping.h"
 
 static_assert(NOT_FINITE == STATUS_NOT_FINITE && RUNAWAY == STATUS_RUNAWAY, "statuses of rings.h and pcg.h differ");
 
@@ -57,6 +56,17 @@ static void search_all(Loop& loop) {
     loop.assemble_seconds += now() - begin - solving;
 }
 
+static void take_factor(Body& body) {
+    if (const Factor* next = body.mail.exchange(nullptr)) body.factor = next;
+}
+
+// Settings and factor of a step, in this order: who asks for a factor's use has posted it before. What is written to the settings
+// later is for the next step, or a step would be recorded as asked for what it did not have.
+static void take_orders(Body& body) {
+    body.now = body.settings;
+    take_factor(body);
+}
+
 static void copy_for_worker(Loop& loop, Body& body) {
     double* target = body.snapshot.load(std::memory_order_acquire);
     if (!target) return;
@@ -104,7 +114,10 @@ static void assemble(Loop* loop) {
     Rings& rings = loop->rings;
     loop->cpu_begin = thread_time();
     loop->clock[0] = rings.start_time + rings.step * rings.dt;
-    for (int i = 0; i < loop->bodies; ++i) begin_frames(*loop, i);
+    for (int i = 0; i < loop->bodies; ++i) {
+        take_orders(loop->body[i]);
+        loop->moving[i] = 0;
+    }
     for (int i = 0; i < loop->before; ++i) {
         take_mail(loop->launch[i], rings.step);
         run(loop->launch[i], loop->threads);
@@ -112,9 +125,7 @@ static void assemble(Loop* loop) {
     for (int i = 0; i < loop->bodies; ++i) {
         Body& body = loop->body[i];
         note_changes(body.correction, rings.step, body.steps == 0);
-        bool noted = body.now.note != NOTE_COPIES || body.warping & NOTED;  // else it was asked for meanwhile
-        if (noted) copy_for_worker(*loop, body);
-        loop->warping[i] = body.warping & ~(NOTED | ADOPTED);  // further linearizations change nothing of that
+        copy_for_worker(*loop, body);
     }
     loop->assemble_begin = begin;
     loop->assemble_seconds = now() - begin;
@@ -154,7 +165,7 @@ static void finish_step(Loop* loop) {
                         loop->assemble_seconds, r.seconds, 0, 0, rings.late, loop->assemble_begin, 0, nonlinear, NAN, NAN, NAN, NAN,
                         NAN, NAN, i, r.iterations,
                         r.status, r.kind, settings.kind, r.fallbacks, r.status == NOT_FINITE ? first_bad_node(*loop, body) : -1,
-                        settings.probe, linearizations, body.warping};
+                        settings.probe, linearizations, 0};
     }
     double solved = now();
     for (int i = loop->before; i < loop->launches; ++i) run(loop->launch[i], loop->threads);

@@ -33,8 +33,6 @@ struct Body {
     int64_t steps;                      // solved so far
     Recycled recycled;
     Correction correction;
-    int64_t noted, made;                // steps, -1: none; noted last; of the factor that frames are reckoned from
-    int32_t warping, unused;            // of the step under way (warping.h)
 };
 
 struct Newton {                        // several linearizations a step (newton.h)
@@ -84,7 +82,6 @@ struct Loop {
     double* work;                      // 45 doubles a node
     Newton* newton;                    // null: one linearization a step
     double* clock;                     // (1,) s, read by kernels
-    int32_t* warping;                  // (bodies,) likewise
     int32_t* moving;                   // (bodies,) 0: the body rests (kernels/nodes.cu)
     Energies* energies;                // or null
     int32_t threads;                   // of this process, for launches and bodies

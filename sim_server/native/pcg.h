@@ -31,7 +31,6 @@ struct SolveSettings {
     int32_t warm_start;
     int32_t probe;          // > 0: after so many iterations go from block Jacobi to the factor, or the other way
     double omega;           // of SSOR
-    int32_t hold, note;     // of the body's frames (kernels/nodes.cu); note: 1 always, 2 when its matrix is copied
 };
 
 struct SolveResult {

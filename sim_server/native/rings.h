@@ -19,7 +19,7 @@ struct Record {
     double nonlinear;      // |b| at the end of the step over the first |b|; -1: not evaluated
     double kinetic, elastic, gravity, work, budget;  // J (kernels/balance.cuh); elastic: NaN where it was not evaluated
     double stride;         // m
-    int32_t body, iterations, status, kind, asked, fallbacks, bad_node, probe, linearizations, warping;
+    int32_t body, iterations, status, kind, asked, fallbacks, bad_node, probe, linearizations, unused;
 };
 
 constexpr int32_t STATUS_NOT_FINITE = 5, STATUS_RUNAWAY = 7;  // as in Status (pcg.h)

@@ -29,11 +29,11 @@ ROW = np.dtype(
     [
         ("step", "i8"), ("iterations", "i8"), ("status", "i8"), ("residual", "f8"), ("factor_step", "i8"),
         ("kind", "i8"), ("asked", "i8"), ("probe", "i8"), ("fallbacks", "i8"), ("linearizations", "i8"),
-        ("warping", "i8"), ("kinetic", "f8"), ("work", "f8"),
+        ("kinetic", "f8"), ("work", "f8"),
     ]
 )  # fmt: skip
 """What a solve was made with and what came of it, from an ObjectStep. Energies are NaN in older logs."""
-_PACK = struct.Struct("<qqqdqqqqqqqdd")
+_PACK = struct.Struct("<qqqdqqqqqqdd")
 _KINDS = {kind.name.lower(): int(kind) for kind in Kind} | dict.fromkeys(FACTORS, int(Kind.CHOLESKY))
 
 
@@ -154,7 +154,6 @@ class Recording:
                 s.probe,
                 s.fallbacks,
                 max(s.linearizations, 1),
-                s.warping,
                 s.kinetic_energy if s.HasField("kinetic_energy") else math.nan,
                 s.work if s.HasField("work") else math.nan,
             )

@@ -2,7 +2,7 @@
 """A recorded run made again and compared with its log, bit by bit.
 
 Every step gets what the log says it had: the interactions as the loop had taken them up, for each solve the
-preconditioner asked for, and the factor that it used or reckoned frames from, made here from the same step's matrix.
+preconditioner asked for, and the factor that it used, made here from the same step's matrix.
 What is left (kernels, solver, factorization) is a pure function of these on one build.
 """
 
@@ -23,7 +23,6 @@ from protocol.log_chunks import BadLog
 from protocol.refused import Refused
 from sim_server import describe
 from sim_server.assembly import Assembly
-from sim_server.engine import ADOPTED, HELD, NOTED
 from sim_server.errors import DeviceError
 from sim_server.factors import Inline, Job
 from sim_server.replay.log import Recording
@@ -42,6 +41,8 @@ class Replay:
         self.recording = recording
         try:
             table = json.loads(recording.scene.resolved)
+            if table.get("solver", {}).get("warp") == "auto":
+                raise BadLog(f'{recording.path}: recorded with warp = "auto", whose trials there are no more')
             scene, watched = Scene.model_validate(table), "on_runaway" in table.get("solver", {})
         except (ValidationError, ValueError) as error:
             raise BadLog(f"{recording.path}: the scene in the log cannot be built: {error}") from error
@@ -55,7 +56,7 @@ class Replay:
         self.engine, self.bodies = self.simulation.engine, self.simulation.world.bodies
         self.compared = Comparison(recording)
         self._same_meshes()
-        self._taken = {b.name: taken_up(self._rows(b.name), self.engine.exact) for b in self.bodies}
+        self._taken = {b.name: taken_up(self._rows(b.name)) for b in self.bodies}
         self._last_use = self._last_uses()
         self._needed = set(self._last_use)  # (object, step) of matrices whose factor the loop used
         self._factors: dict[tuple[str, int], Factor] = {}
@@ -220,10 +221,6 @@ class Replay:
         row, settings, solver = self._rows(name)[step], self.engine.settings(index), self.simulation.scene.solver
         settings.kind, settings.probe = int(row["asked"]), int(row["probe"])
         settings.budget = -float(row["iterations"] + 1) if row["status"] == pb.BUDGET and solver.budget else 0.0
-        if solver.warp == "auto" and index in self.simulation.warped:
-            settings.hold, settings.note = bool(row["warping"] & HELD), bool(row["warping"] & NOTED)
-            if not self.engine.exact:
-                settings.adopt = bool(row["warping"] & ADOPTED)
 
     def _use_factor(self, index: int, name: str, step: int, fresh: bool) -> None:
         """The factor of one step. fresh: one made from the matrix of this very step; others were there before it."""
@@ -253,21 +250,11 @@ class Replay:
                 self.compared.frame(step, body.name, frame, (world.x[body.nodes], world.v[body.nodes]))
 
 
-def taken_up(rows: Any, exact: bool) -> NDArray[np.int64]:
-    """Finds of which steps the factors were that a body's loop had, (steps, 2): before it assembled, and made from the
-    very step; -1: none that matters. rows: of a log (log.ROW), one a step.
-
-    A solve by block Jacobi names no factor, but an exact loop (Engine.exact) reckons frames from the one that it has
-    taken up all the same: then it is that of the step noted last (native/warping.h).
-    """
-    steps = np.arange(len(rows))
-    used, fresh = rows["factor_step"], rows["factor_step"] == steps
-    taken = np.stack([np.where(fresh, -1, used), np.where(fresh, used, -1)], axis=1)
-    if exact:
-        noted = np.maximum.accumulate(np.where(rows["warping"] & NOTED, steps, -1))
-        unnamed = np.flatnonzero((rows["warping"][1:] & ADOPTED != 0) & (taken[1:, 0] < 0)) + 1
-        taken[unnamed, 0] = noted[unnamed - 1]
-    return taken
+def taken_up(rows: Any) -> NDArray[np.int64]:
+    """Finds of which steps the factors were that a body's solves used, (steps, 2): taken up before the step assembled,
+    and made from the very step; -1: none. rows: of a log (log.ROW), one a step."""
+    used, fresh = rows["factor_step"], rows["factor_step"] == np.arange(len(rows))
+    return np.stack([np.where(fresh, -1, used), np.where(fresh, used, -1)], axis=1)
 
 
 def _library(name: str) -> str:

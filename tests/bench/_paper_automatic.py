@@ -27,7 +27,7 @@ def automatic(setting: Setting, tets: int, heterogeneous: bool) -> list[Row]:
 
 def _row(setting: Setting, beam: Beam, load: Load, tets: int) -> Row:
     steps, latency = min(setting.steps, STEPS.get(tets, setting.steps)), LATENCY[tets]
-    ways = {name: Way(name, "async", "auto" if name == "auto" else True, latency) for name in CHOICES[1:]}
+    ways = {name: Way(name, "async", True, latency) for name in CHOICES[1:]}
     found: dict[str, list[Run]] = {name: [] for name in CHOICES}
     for _ in range(setting.rounds):
         for name, way in {"block_jacobi": Way("block_jacobi"), **ways}.items():

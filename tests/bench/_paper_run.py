@@ -25,7 +25,7 @@ class Way:
 
     preconditioner: str
     update: str = "never"
-    warp: bool | str = False
+    warp: bool = False
     latency: int = 0  # async and adaptive: steps that the one worker takes for a factor
     extrapolate: float = 0.0  # s
     recycle: int = 0

@@ -59,7 +59,7 @@ class Setting:
             EXTRAPOLATED: Way("cholesky", lockstep, True, extrapolate=AHEAD * DT),
             RECYCLED: Way("cholesky", lockstep, True, recycle=PAIRS),
             "block Jacobi": Way("block_jacobi"),
-            "auto": Way("auto", lockstep, "auto"),
+            "auto": Way("auto", lockstep, True),
         }
         return {name: way for name, way in found.items() if device == "cpu" or not (way.extrapolate or way.recycle)}
 

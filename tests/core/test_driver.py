@@ -332,7 +332,7 @@ def test_adaptive_with_threshold_0_is_async():
 
 
 def test_what_was_lost_is_lost_to_the_factor_in_use():
-    driver, records = adaptive(-2.0, 60, update="adaptive", warp=True)  # without trials, which a factor has no part in
+    driver, records = adaptive(-2.0, 60, update="adaptive", warp=True)
     newest = records["factor_step"][-1]
     of_it = records[records["factor_step"] == newest]
     assert driver.tracks[0].lost == np.maximum(of_it["iterations"] - 3, 0).sum()

@@ -52,7 +52,7 @@ def small_ring(sim: Simulation, records: int) -> Engine:
     return Engine(
         assemble, integrate, [(b.first, b.last) for b in w.bodies], w.dt, records=records, frames=4,
         row_start=s.row_start, columns=s.columns, values=s.values, b=s.b_material, y=s.y, x=w.x, v=w.v, clock=s.clock,
-        warping=s.warping, moving=s.moving,
+        moving=s.moving,
     )  # fmt: skip
 
 

@@ -9,7 +9,7 @@ import pytest
 from protocol import messages_pb2 as pb
 from sim_server import describe
 from sim_server.driver import TOGETHER, Driver
-from sim_server.engine import HELD, Kind
+from sim_server.engine import Kind
 from sim_server.layouts import RECORD
 from sim_server.telemetry import Telemetry
 from tests.scenes import bar, simulation
@@ -22,13 +22,13 @@ def drivers(preconditioner: str) -> list[Driver]:
     found = []
     for _ in range(2):
         bodies = [bar(name=name, young=1e5, fixed="X < 0.01") for name in "abc"]
-        sim = simulation(*bodies, gravity=(0, -9.81, 0), preconditioner=preconditioner, update="async", warp="auto")
+        sim = simulation(*bodies, gravity=(0, -9.81, 0), preconditioner=preconditioner, update="async")
         found.append(Driver(sim, counted=False))
     return found
 
 
 def solves(rng: np.random.Generator, first: int, steps: int, kind: Kind = Kind.CHOLESKY) -> np.ndarray:
-    """Records (steps, bodies) as a loop gives them; a new factor now and then, a trial of the warp now and then."""
+    """Records (steps, bodies) as a loop gives them; a new factor now and then."""
     r = np.zeros((steps, BODIES), RECORD)
     r["step"] = first + np.arange(1, steps + 1)[:, None]
     r["body"] = np.arange(BODIES)
@@ -38,18 +38,16 @@ def solves(rng: np.random.Generator, first: int, steps: int, kind: Kind = Kind.C
     r["linearizations"] = 1
     r["kind"] = r["asked"] = np.where(rng.random(r.shape) < 0.8, kind, Kind.BLOCK_JACOBI)
     r["fallbacks"] = rng.random(r.shape) < 0.1
-    r["warping"] = np.where(r["step"] // 10 % 2 == 1, HELD, 0)
     return r
 
 
 def seen(driver: Driver) -> list[tuple]:
-    """What the scheduler, `auto` and the warp know."""
+    """What the scheduler and `auto` know."""
     out = []
     for t in driver.tracks:
         exact = (t.excess, t.latest, t.lost, t.in_use, t.age_max, t.refused)
         choice = () if t.choice is None else (t.choice.kind, t.choice.probe)
-        assert t.warping is not None
-        out.append((*exact, *choice, t.warping.hold, t.warping.decided, t.warping.lost, t.warping._all))
+        out.append((*exact, *choice))
     return out
 
 
@@ -66,8 +64,6 @@ def test_many_records_say_what_each_says(preconditioner, at_once):
         many.observe(r.ravel())
         for record in r.ravel():  # fewer than are summed up together
             one.observe(record.reshape(1))
-        if any(t.warping is not None and t.warping.trials for t in one.tracks):
-            break  # from here on it matters when a trial begins: one a round, or one a record
         assert seen(one) == seen(many)
         for a, b in zip(one.tracks, many.tracks, strict=True):
             assert a.per_iteration.value == pytest.approx(b.per_iteration.value, rel=1e-9)

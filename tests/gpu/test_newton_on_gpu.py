@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from protocol.messages_pb2 import SolveStatus
 from sim_server.driver import Driver
-from sim_server.engine import HELD
 from sim_server.errors import InputError
 from sim_server.gpu.engine import FEW
 from sim_server.scene import Scene
@@ -314,17 +313,6 @@ def test_a_push_moves_it_as_on_the_cpu():
 
     cpu, _ = both(make, 8, None, push)
     assert np.abs(cpu.x[3] - cpu.x[2])[:, 2].max() > 1e-3
-
-
-def test_held_frames():
-    """Noted in the first linearization alone; what holds holds in all of them."""
-    make = lambda: scene(MODELS["corotational"](), dt=0.05, gravity=GRAVITY, integrator=SEARCH, **TIGHT)  # noqa: E731
-
-    def hold(sim: Simulation, step: int) -> None:
-        sim.engine.settings(0).hold = int(step in (2, 3, 6))
-
-    cpu, gpu = both(make, 8, thrown((0.0, -2.0, 0.0)), hold)
-    assert ((gpu.records["warping"] & HELD) > 0).tolist() == ((cpu.records["warping"] & HELD) > 0).tolist()
 
 
 def test_the_matrix_that_is_copied_is_that_of_the_first_linearization():

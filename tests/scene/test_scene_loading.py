@@ -54,7 +54,7 @@ def test_defaults_and_resolved(tmp_path):
             "omega": 1.0,
             "drop_tolerance": 0.003,
             "fill": 10.0,
-            "warp": "auto",
+            "warp": True,
             "warp_level": 1,
             "projection": "auto",
             "update": "async",

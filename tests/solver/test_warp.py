@@ -54,6 +54,27 @@ def test_a_turned_body_needs_one_iteration_with_the_factor_of_the_unturned_one(a
     assert iterations[False] >= (2 if angle == 1 else 4)
 
 
+def test_frames_stay_the_identity_without_the_warp_and_where_nothing_tells_rotations():
+    """Bit by bit; the nodes of the bodies do not fill whole vector registers."""
+    posed = {"fixed": "X < 0.01", "pose": {"rotate": [40, 0, 70]}}
+    objects = [
+        bar((3, 2, 2), name="a", **posed),
+        bar((1, 1, 1), name="dust", young=None),
+        bar((5, 2, 1), name="c", **posed),
+    ]
+    for warp, followed in ((True, {0, 2}), (False, set())):
+        sim = simulation(*objects, gravity=(3.0, -9.81, 2.0), warp=warp)
+        sim.engine.run(3)
+        identity = [np.array_equal(R, np.tile(np.eye(3), (len(R), 1, 1))) for R in frames_of(sim)]
+        assert identity == [body not in followed for body in range(3)]
+        assert sim.warped == followed
+
+
+def frames_of(sim: Simulation) -> list[NDArray]:
+    """Of the nodes of each body, (n, 3, 3)."""
+    return [sim.system.rotation[body.nodes] for body in sim.world.bodies]
+
+
 def test_the_matrix_of_a_turned_body_is_the_same_in_the_material_frame():
     sim = free_body()
     A, b = system(sim)

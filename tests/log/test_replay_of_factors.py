@@ -1,16 +1,19 @@
 # SPDX-License-Identifier: MIT
-"""Factors that a loop takes up in a step whose solve uses none: frames are reckoned from them all the same, so a
-simulation made again from the log must take them up there, too."""
+"""Factors that a loop takes up in a step whose solve uses none: a simulation made again from the log uses them where
+the recorded one did."""
 
+import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from protocol import messages_pb2 as pb
+from protocol.log_chunks import BadLog
 from sim_server import describe
-from sim_server.engine import ADOPTED, HELD, MOVED, NOTE_ALWAYS, NOTE_COPIES, NOTED, Kind
+from sim_server.engine import Kind
 from sim_server.factors import Inline, Job
 from sim_server.recorder import Recorder
 from sim_server.replay.log import Recording
@@ -22,16 +25,16 @@ BEAM: dict[str, Any] = {"cells": (6, 2, 2), "size": (3, 1, 1), "young": 5e5, "po
 
 
 def beam(**solver: Any) -> Simulation:
-    """Bends under its weight; `auto` chooses solves and warp."""
-    wanted = {"preconditioner": "auto", "warp": "auto", "tolerance": 1e-8} | solver
+    """Bends under its weight; `auto` chooses solves."""
+    wanted = {"preconditioner": "auto", "tolerance": 1e-8} | solver
     return simulation(bar(**BEAM, pose={"rotate": [40, 0, 70]}), gravity=(3.0, -9.81, 2.0), **wanted)
 
 
 def run(sim: Simulation, plan: str) -> NDArray[Any]:
     """Steps in words of letters, as a loop that runs freely may happen to make them; their records.
 
-    f: a solve with the factor in use, j: by block Jacobi; h: held; c: the matrix of the step is copied; n: the factor
-    of the matrix copied last is handed over first; o: the step waits for a factor of its own matrix.
+    f: a solve with the factor in use, j: by block Jacobi; c: the matrix of the step is copied; n: the factor of the
+    matrix copied last is handed over first; o: the step waits for a factor of its own matrix.
     """
     engine, settings, records = sim.engine, sim.engine.settings(0), []
     inline = Inline({b.name: sim.system.body_pattern(b.first, b.last) for b in sim.world.bodies})
@@ -44,7 +47,6 @@ def run(sim: Simulation, plan: str) -> NDArray[Any]:
 
     for word in plan.split():
         settings.kind = Kind.CHOLESKY if "f" in word else Kind.BLOCK_JACOBI
-        settings.hold, settings.note = "h" in word, NOTE_ALWAYS if "o" in word else NOTE_COPIES
         if "n" in word:
             hand_over(engine.matrix_step(0), copy)
         if "c" in word:
@@ -62,7 +64,7 @@ def replayed(sim: Simulation, records: NDArray[Any], path: Path) -> Any:
     with Recorder(path) as recorder:
         recorder.scene(describe.scene(sim))
         recorder.topology(describe.topology(sim, sim.world.bodies[0]))
-        for made in np.flatnonzero(records["warping"] & NOTED):
+        for made in set(records["factor_step"].tolist()) - {-1}:
             recorder.factor(pb.FactorUse(header=pb.Header(object="bar", epoch=1), step=made, method="cholesky"))
         for step in describe.steps(sim, records):
             recorder.step(step)
@@ -72,13 +74,12 @@ def replayed(sim: Simulation, records: NDArray[Any], path: Path) -> Any:
         return Replay(recording).run()
 
 
-def test_a_factor_that_comes_while_block_jacobi_is_tried_in_held_frames(tmp_path: Path) -> None:
-    """Before the factor is used another matrix is copied, so that it is not the one of the step noted last then."""
+def test_a_factor_that_comes_while_block_jacobi_is_tried(tmp_path: Path) -> None:
+    """Before the factor is used another matrix is copied."""
     sim = beam()
-    records = run(sim, "j jc fn fh fc fh jhn jhc fh fh f f jn f f")
-    taken = records[records["warping"] & ADOPTED != 0]
-    assert taken["step"].tolist() == [3, 7, 13] and taken["factor_step"].tolist() == [1, -1, -1]
-    assert taken["warping"][1] & HELD and np.ptp(records["iterations"]) > 5
+    records = run(sim, "j jc fn f fc f jn jc f f f f jn f f")
+    assert records["factor_step"].tolist() == [-1, -1, 1, 1, 1, 1, -1, -1, 4, 4, 4, 4, -1, 7, 7]
+    assert np.ptp(records["iterations"]) > 5
     found = replayed(sim, records, tmp_path / "run.mcap")
     assert found.same, found.lines()
     assert (found.solves_compared, found.frames_compared) == (len(records), 1)
@@ -87,17 +88,31 @@ def test_a_factor_that_comes_while_block_jacobi_is_tried_in_held_frames(tmp_path
 def test_a_factor_that_is_never_used(tmp_path: Path) -> None:
     """The next one comes before block Jacobi has been left."""
     sim = beam()
-    records = run(sim, "jc fn f fc jhn jc jhn fh f fh")
+    records = run(sim, "jc fn f fc jn jc jn f f f")
     assert set(records["factor_step"].tolist()) == {-1, 0, 5}
     found = replayed(sim, records, tmp_path / "run.mcap")
     assert found.same, found.lines()
 
 
 def test_a_step_that_makes_its_own_factor_begins_with_the_one_before(tmp_path: Path) -> None:
-    """Whose frames it is held in, though no solve has used it."""
+    """Though no solve has used it."""
     sim = beam(update="every-1")
-    records = run(sim, "of f f oj ofh f oj oj ofh oj jh f")
-    own = records[records["warping"] == HELD | MOVED | NOTED | ADOPTED]
-    assert own["factor_step"].tolist() == (own["step"] - 1).tolist() == [4, 8]
+    records = run(sim, "of f f oj of f oj oj of oj j f")
+    assert records["factor_step"].tolist() == [0, 0, 0, -1, 4, 4, -1, -1, 8, -1, -1, 9]
     found = replayed(sim, records, tmp_path / "run.mcap")
     assert found.same, found.lines()
+
+
+def test_a_log_whose_warp_was_switched_by_trials_is_refused(tmp_path: Path) -> None:
+    """They ended with the version that recorded it, and what they switched is not read any more."""
+    sim = beam()
+    scene = describe.scene(sim)
+    table = json.loads(scene.resolved)
+    scene.resolved = json.dumps(table | {"solver": table["solver"] | {"warp": "auto"}})
+    with Recorder(tmp_path / "run.mcap") as recorder:
+        recorder.scene(scene)
+        recorder.topology(describe.topology(sim, sim.world.bodies[0]))
+        for step in describe.steps(sim, run(sim, "j j")):
+            recorder.step(step)
+    with Recording(tmp_path / "run.mcap") as recording, pytest.raises(BadLog, match='recorded with warp = "auto"'):
+        Replay(recording)
