@@ -25,7 +25,7 @@ from sim_server.simulation import Simulation
 
 # What a worker has for the settings of its server's device.
 HERE = {"precision": "float64", "factor_precision": "auto", "threads": 1, "budget": 0.0, "build": "server",
-        "extrapolate": 0.0, "recycle": 0, "woodbury": 0}  # fmt: skip
+        "extrapolate": 0.0, "woodbury": 0}  # fmt: skip
 
 
 class Assembly:

@@ -392,7 +392,6 @@ class Driver:
         other = matrix if kind == Kind.SSOR else 0.0
         if kind == Kind.CHOLESKY:
             other = 2.0 * self.engine.factor_bytes(t.body.index)
-            other += 48.0 * self.solver.recycle * (t.body.last - t.body.first)  # s and y, read twice
         return (iterations + 1) * (matrix + other)
 
     def _settle(self, t: Track) -> None:

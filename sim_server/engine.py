@@ -159,8 +159,7 @@ class Engine(Reports):
         self._body = (layouts.Body * bodies)()
         for entry_body, (first, last) in zip(self._body, ranges, strict=True):
             entry_body.first, entry_body.last, entry_body.snapshot_step = first, last, -1
-        self._work = np.zeros(45 * nodes)
-        self._recycled: dict[int, Any] = {}
+        self._work = np.zeros(27 * nodes)
         self._corrections: dict[int, Any] = {}
         self._arrays = arrays
         self._mail: list[Mailbox] = [Mailbox([]) for _ in ranges]
@@ -213,17 +212,6 @@ class Engine(Reports):
     def settings(self, body: int) -> layouts.Settings:
         """Solver settings of a body; what is set holds from its next solve on."""
         return self._body[body].settings
-
-    def recycle(self, body: int, pairs: int) -> None:
-        """Solves of the body with a factor are helped by so many directions of the solves before (native/recycle.h).
-
-        Before the first step only.
-        """
-        entry = self._body[body]
-        room = np.full((2 * pairs, 2, 3 * (entry.last - entry.first)), 0, np.float32), np.full(pairs, 0.0)
-        self._recycled[body] = room
-        entry.recycled.capacity = pairs
-        entry.recycled.pairs, entry.recycled.weight = (array.ctypes.data for array in room)
 
     def correct(self, body: int, nodes: int, diagonal: Reals, double: bool = False) -> None:
         """Factors of the body are corrected for what has come onto the diagonal since their matrix, or has left it, at

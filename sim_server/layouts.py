@@ -67,13 +67,6 @@ class Launch(c.Structure):
     _fields_ = [("kernel", c.c_void_p), ("binding", c.c_void_p), ("mail", c.c_void_p), ("parts", c.c_void_p)]
 
 
-class Recycled(c.Structure):
-    _fields_ = [
-        ("capacity", c.c_int32), ("unused", c.c_int32), ("stored", c.c_int64), ("pairs", c.c_void_p),
-        ("weight", c.c_void_p),
-    ]  # fmt: skip
-
-
 class Correction(c.Structure):
     _fields_ = [
         ("capacity", c.c_int32), ("history", c.c_int32), ("nodes", c.c_int32), ("count", c.c_int32),
@@ -89,7 +82,7 @@ class Body(c.Structure):
     _fields_ = [
         ("first", c.c_int32), ("last", c.c_int32), ("settings", Settings), ("now", Settings), ("factor", c.c_void_p),
         ("mail", c.c_void_p), ("snapshot", c.c_void_p), ("snapshot_step", c.c_int64), ("ahead", c.c_double),
-        ("steps", c.c_int64), ("recycled", Recycled), ("correction", Correction),
+        ("steps", c.c_int64), ("correction", Correction),
     ]  # fmt: skip
 
 

@@ -7,8 +7,6 @@ excess       the rule of Courtecuisse et al. 2010, section 4: each object sums u
              is what it is for; and sums are compared as they will be a few steps from now if the excess of the last
              solve goes on, so that an object that has just been seized need not add up its claim first
 round_robin  whoever was sent longest ago
-oldest       whoever has the oldest factor: a job that was lost does not cost its object the turn
-weighted     cost of that sum by time of a factorization, growing a little with each step waited
 
 Whatever the rule, an object whose last matrix is `overdue` goes first, so none starves.
 """
@@ -18,9 +16,8 @@ from dataclasses import dataclass
 from math import ceil, inf
 from typing import Literal
 
-Rule = Literal["excess", "round_robin", "oldest", "weighted"]
+Rule = Literal["excess", "round_robin"]
 
-AGEING = 0.02  # iterations that a step of waiting counts as (weighted): between equals it is 50 steps to an iteration
 AHEAD = 10.0  # steps for which the excess of the last solve is taken to go on
 DOUBLINGS = 10  # of the floor of an object whose jobs fail
 
@@ -57,11 +54,6 @@ def claim(need: Need) -> float:
     return need.excess + AHEAD * need.latest
 
 
-def gain(need: Need) -> float:
-    """What a new factor is worth for the time that it takes (weighted)."""
-    return (claim(need) + AGEING * (need.waited or 0)) * need.cost / max(need.service, 1e-12)
-
-
 def pays(need: Need, threshold: float = 1.0) -> bool:
     """adaptive: whether a new factor is worth its time now.
 
@@ -76,8 +68,6 @@ def pays(need: Need, threshold: float = 1.0) -> bool:
 _PRIORITY: dict[Rule, Callable[[Need], float]] = {
     "excess": claim,
     "round_robin": lambda need: need.waited or 0,
-    "oldest": lambda need: inf if need.age is None else need.age,
-    "weighted": gain,
 }
 
 

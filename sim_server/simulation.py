@@ -134,8 +134,6 @@ class Simulation:
         solver, native = self.scene.solver, self.engine.settings(body.index)
         native.tolerance, native.max_iterations = solver.tolerance, solver.max_iterations
         native.budget, native.warm_start = solver.budget, int(solver.warm_start)
-        if solver.recycle:
-            self.engine.recycle(body.index, solver.recycle)
         if solver.woodbury and solver.wants_factors and "touch" in body.effects and isinstance(self.engine, Engine):
             double = solver.factor_precision == "float64"
             self.engine.correct(body.index, solver.woodbury, self.system.diagonal, double)

@@ -155,7 +155,7 @@ static void finish_step(Loop* loop) {
         } else {
             BlockCsr A{body.first, body.last, loop->row_start, loop->columns, loop->values};
             r = pcg(A, loop->b + 3 * body.first, body.factor, settings, loop->y + 3 * body.first,
-                    loop->work + 45 * (int64_t)body.first, !loop->moving[i], &body.recycled, &body.correction);
+                    loop->work + 27 * (int64_t)body.first, !loop->moving[i], &body.correction);
         }
         ++body.steps;
         if (!keep) continue;
@@ -228,7 +228,7 @@ void wf_precondition(Loop* loop, int32_t index, const double* r, double* z, doub
     Body& body = loop->body[index];
     take_factor(body);
     BlockCsr A{body.first, body.last, loop->row_start, loop->columns, loop->values};
-    Preconditioner P{A, body.factor, CHOLESKY, nullptr, work, 1, nullptr, nullptr, &body.correction};
+    Preconditioner P{A, body.factor, CHOLESKY, nullptr, work, 1, &body.correction};
     P.prepare();
     P.apply(r, std::sqrt(dot(A.size(), r, r)), z);
 }

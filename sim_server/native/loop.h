@@ -31,7 +31,6 @@ struct Body {
     std::atomic<int64_t> snapshot_step; // step of the last copy made, -1: none
     double ahead;                       // s: below 0 the copy is of A, else of x + ahead v
     int64_t steps;                      // solved so far
-    Recycled recycled;
     Correction correction;
 };
 
@@ -79,7 +78,7 @@ struct Loop {
     double* y;                         // (nodes, 3) start in, solution out
     double* x;                         // (nodes, 3) for frames
     double* v;
-    double* work;                      // 45 doubles a node
+    double* work;                      // 27 doubles a node
     Newton* newton;                    // null: one linearization a step
     double* clock;                     // (1,) s, read by kernels
     int32_t* moving;                   // (bodies,) 0: the body rests (kernels/nodes.cu)

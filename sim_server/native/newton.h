@@ -74,11 +74,11 @@ static void solve(Loop& loop, int index) {
     if (search.phase != SOLVE) return;
     Room room(newton, body);
     const int64_t at = 3 * (int64_t)body.first;
-    double *y = loop.y + at, *work = loop.work + 45 * (int64_t)body.first, *turned = work, *product = work + room.n;
+    double *y = loop.y + at, *work = loop.work + 27 * (int64_t)body.first, *turned = work, *product = work + room.n;
     BlockCsr A{body.first, body.last, loop.row_start, loop.columns, loop.values};
     SolveSettings settings = body.now;
     settings.warm_start = settings.warm_start && search.linearizations == 0;  // the last step's is no guess for a correction
-    SolveResult r = pcg(A, loop.b + at, body.factor, settings, y, work, !loop.moving[index], &body.recycled, &body.correction);
+    SolveResult r = pcg(A, loop.b + at, body.factor, settings, y, work, !loop.moving[index], &body.correction);
     note_solve(search, r.residual, r.seconds, r.iterations, r.fallbacks, r.kind, r.status);
     if (search.phase == DONE) {
         for (int k = 0; k < room.n; ++k) room.gain[k] = gain_after(search, room.gain[k], room.way[k]);
@@ -101,7 +101,7 @@ static int judge(Loop& loop, int index) {
     if (search.phase != TRY) return search.phase;
     Room room(newton, body);
     const double* b = loop.b + 3 * (int64_t)body.first;
-    double* turned = loop.work + 45 * (int64_t)body.first;
+    double* turned = loop.work + 27 * (int64_t)body.first;
     turn(newton, body, true, room.way, turned);
     const int verdict = judge_trial(search, newton.most, norm(room.n, b), dot(room.n, turned, b));
     if (verdict == SHORTER) place(loop, body, search.scale);

@@ -13,7 +13,6 @@
 // An iteration is one application of A after the initial residual.
 #pragma once
 #include "block_csr.h"
-#include "recycle.h"
 #include "rings.h"
 #include "woodbury.h"
 
@@ -48,8 +47,6 @@ struct Preconditioner {
     double* inverse;  // (nodes, 9)
     void* work;       // 2 n doubles
     double omega;
-    const Recycling* recycling = nullptr;
-    double* turned = nullptr;  // n doubles, for those
     Correction* correction = nullptr;
     bool corrects = false;
 
@@ -59,18 +56,6 @@ struct Preconditioner {
     }
     // z = P^-1 r; returns z . r
     double apply(const double* r, double r_norm, double* z) {
-        int n = A.size();
-        if (kind == CHOLESKY && recycling && recycling->any()) {
-            for (int i = 0; i < n; ++i) turned[i] = r[i];
-            recycling->before(turned);
-            alone(turned, r_norm, z);
-            recycling->after(z);
-        } else {
-            alone(r, r_norm, z);
-        }
-        return dot(n, z, r);
-    }
-    void alone(const double* r, double r_norm, double* z) {
         int n = A.size();
         if (kind == CHOLESKY && factor->bytes == 4)
             with_factor<float>(r, r_norm, z);
@@ -82,6 +67,7 @@ struct Preconditioner {
             for (int i = 0; i < n; ++i) z[i] = r[i];
         else
             apply_diagonal(n / 3, inverse, r, z);
+        return dot(n, z, r);
     }
     template <class T>
     void with_factor(const double* r, double r_norm, double* z) {
@@ -92,19 +78,15 @@ struct Preconditioner {
     }
 };
 
-// work: 15 n doubles. x: start in, solution out. rests: the body does.
-// recycled: pairs of the last solves; correction: of the factor; or null.
+// work: 9 n doubles. x: start in, solution out. rests: the body does. correction: of the factor, or null.
 static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor, const SolveSettings& settings, double* x,
-                       double* work, bool rests = false, Recycled* recycled = nullptr, Correction* correction = nullptr) {
+                       double* work, bool rests = false, Correction* correction = nullptr) {
     double start = now();
     int n = A.size();
     double *r = work, *z = r + n, *p = z + n, *q = p + n, *inverse = q + n, *scratch = inverse + 3 * n;
-    double* turned = work + 14 * (int64_t)n;
     SolveResult out{0, 0, 0, CONVERGED, settings.kind, 0};
     if (out.kind == CHOLESKY && !factor) out.kind = BLOCK_JACOBI;
-    Recycling recycling(recycled, n);
     auto finish = [&](int status, double r2, double b2) {
-        recycling.close();
         out.status = status;
         out.residual = b2 > 0 ? std::sqrt(r2 / b2) : 0;
         out.seconds = now() - start;
@@ -128,14 +110,13 @@ static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor,
     }
     if (r2 <= goal) return finish(CONVERGED, r2, b2);
 
-    Preconditioner P{A, factor, out.kind, inverse, scratch, settings.omega, &recycling, turned, correction};
+    Preconditioner P{A, factor, out.kind, inverse, scratch, settings.omega, correction};
     P.prepare();
     double rz = 0, last_true = INFINITY, quarter = r2 * std::pow(goal / r2, 0.25);
     bool restart = true, switched = false;
     auto leave_factor = [&] {
         P.kind = out.kind = BLOCK_JACOBI;
         out.fallbacks = 1;
-        recycling.forget();
         P.prepare();
         r2 = residual(A, b, x, r);
         restart = true;
@@ -167,7 +148,6 @@ static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor,
         double pq = multiply(A, p, q);
         ++out.iterations;
         if (!(pq > 0)) return finish(BREAKDOWN_MATRIX, residual(A, b, x, r), b2);
-        if (P.kind == CHOLESKY) recycling.keep(p, q, pq);
         r2 = descend(n, rz / pq, p, q, x, r);                                    // 3. 4. 5.
         if (r2 > goal) continue;
         r2 = residual(A, b, x, r);

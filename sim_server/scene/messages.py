@@ -7,6 +7,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from sim_server.errors import InputError
+from sim_server.scene import deleted
 
 # Where pydantic's own words are about Python rather than about a scene file.
 WORDS = {
@@ -30,7 +31,8 @@ def readable(error: ValidationError, file: str, table: dict[str, Any]) -> InputE
 
 def _line(error: Any, table: dict[str, Any]) -> str:
     path = [part for part in error["loc"] if not str(part).startswith("<")]
-    message = _message(error)
+    key = ".".join(part for part in path if isinstance(part, str))
+    message = deleted.advice(key, error["input"]) or _message(error)
     if path == ["object"] and error["type"] == "missing":
         message = "a scene needs at least one [[object]]"
     elif path == ["object"] and isinstance(error["input"], dict):

@@ -110,9 +110,6 @@ class Solver(Parameters):
     )
     threads: int = Field(default=1, ge=1, le=1024)
     warm_start: bool = Field(default=True, description="start from the last step's dv")
-    recycle: int = Field(
-        default=0, ge=0, le=64, description="directions of the last solves that correct a factor grown old; 0: none"
-    )
     woodbury: int = Field(
         default=32, ge=0, le=64,
         description="on a CPU: factors are corrected for grabs begun or ended since, of at most so many nodes; 0: none",
@@ -186,8 +183,6 @@ class Solver(Parameters):
             raise InputError(
                 f'solver.extrapolate = {self.extrapolate:g}: must be 0 without build = "worker", and on a GPU'
             )
-        if device == "gpu" and self.recycle:
-            raise InputError(f"solver.recycle = {self.recycle}: must be 0 on a GPU")
         if device == "gpu" and self.budget:
             raise InputError(
                 f"solver.budget = {self.budget:g}: must be 0 on a GPU, which bounds a solve by max_iterations"

@@ -19,15 +19,14 @@ from tests.bench._schemes import SCENES
 SPEED = 0.5  # m/s, of the hand
 SETTLED = 18  # steps before it comes, about
 WAYS: dict[str, dict[str, Any]] = {
-    "stale": {"woodbury": 0}, "recycled": {"woodbury": 0, "recycle": 8}, "corrected": {"woodbury": 64},
-    "fresh": {"woodbury": 0, "update": "every-1"},
+    "stale": {"woodbury": 0}, "corrected": {"woodbury": 64}, "fresh": {"woodbury": 0, "update": "every-1"},
 }  # fmt: skip
 TIMED = ("stale", "corrected")
 WORDS = """\
 *nodes*: grabbed; *stiffness*: of the spring of each, what it adds to A by the mean diagonal of the nodes' own blocks.
 Iterations of the first solve and of all until a factor has the springs, or lacks them again. *stale*: the warped factor
-alone; *recycled*: `recycle = 8`; *corrected*: `woodbury` (sim_server/native/woodbury.h); *fresh*: a factor of each
-step's matrix. *ms*: processor time of these steps, assembly and all, the least of the rounds for each step."""
+alone; *corrected*: `woodbury` (sim_server/native/woodbury.h); *fresh*: a factor of each step's matrix. *ms*: processor
+time of these steps, assembly and all, the least of the rounds for each step."""
 
 
 @dataclass(frozen=True)

@@ -44,7 +44,7 @@ def ordered(table: str, rows: Sequence[Row]) -> list[Row]:
 def _section(report: Report, setting: Setting, device: str, tables: Tables) -> None:
     shown = {
         "table1": _table1, "publishing": _publishing, "table2": _table2, "table5": _table5, "automatic": _automatic,
-        "policies": _policies, "extrapolations": _extrapolations, "recycled": _recycled,
+        "policies": _policies, "extrapolations": _extrapolations,
     }  # fmt: skip
     for name, show in shown.items():
         if rows := tables.get(name):
@@ -115,11 +115,6 @@ def _extrapolations(report: Report, setting: Setting, name: str, rows: list[Row]
     told = words.EXTRAPOLATIONS.format(load=LOADS[2].name, steps=setting.steps)
     report.say(f"## Extrapolated states, {name}", told)
     report.table(rows, words.COLUMNS_OF_EXTRAPOLATIONS)
-
-
-def _recycled(report: Report, setting: Setting, name: str, rows: list[Row]) -> None:
-    report.say(f"## Recycled directions, {name}", words.RECYCLING.format(load=LOADS[2].name))
-    report.table(rows, words.COLUMNS_OF_RECYCLED)
 
 
 def _figure(report: Report, rows: list[Row]) -> None:

@@ -28,12 +28,10 @@ class Way:
     warp: bool = False
     latency: int = 0  # async and adaptive: steps that the one worker takes for a factor
     extrapolate: float = 0.0  # s
-    recycle: int = 0
 
     @property
     def solver(self) -> dict[str, Any]:
         table: dict[str, Any] = {"preconditioner": self.preconditioner, "update": self.update, "warp": self.warp}
-        table |= {"recycle": self.recycle} if self.recycle else {}
         return table | ({"build": "worker", "extrapolate": self.extrapolate} if self.extrapolate else {})
 
 
@@ -88,7 +86,6 @@ class Mean:
     step: float  # ms, without invert
     step_of_rounds: list[float]  # ms, of each round
     invert: float  # ms
-    cpu: float  # ms of processor time, median over the steps, least of the rounds
     factorize: float  # ms, nan: no factor was made
     unconverged: int
     factor_share: float  # of the steps, made with a factor
@@ -107,7 +104,6 @@ def mean(runs: list[Run]) -> Mean:
     return Mean(
         float(first.iterations.mean()), int(first.iterations.max()), time("solve"), time("step"),
         [float(r.step.mean()) for r in runs], time("invert"),
-        min(float(np.median(r.cpu)) for r in runs),
         float(np.median(made)) if made else float("nan"), sum(r.unconverged for r in runs),
         float(np.mean([kind == "cholesky" for kind in first.kinds])),
         len(first.factorize),

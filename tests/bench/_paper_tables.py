@@ -14,10 +14,9 @@ PRECONDITIONERS = ("none", "jacobi", "block_jacobi", "ssor", "ssor_factor", "cho
 
 
 Row = dict[str, Any]
-EXTRAPOLATED, RECYCLED = "async + warp, extrapolated", "async + warp, recycled"
-PAIRS = 8  # directions recycled (table 2)
+EXTRAPOLATED = "async + warp, extrapolated"
 AHEAD = 2  # steps that positions sent to a worker go ahead, at most (table 2)
-LATENCIES = (1, 3, 10)  # of the tables of extrapolations and of recycled directions
+LATENCIES = (1, 3, 10)  # of the table of extrapolations
 
 
 @dataclass(frozen=True)
@@ -48,7 +47,7 @@ class Setting:
         return {"tolerance": self.tolerance, "max_iterations": 20_000, "factor_precision": "float32"}
 
     def ways(self, device: str) -> dict[str, Way]:
-        """Columns of table 2: the paper's, then ours. A GPU neither extrapolates nor recycles."""
+        """Columns of table 2: the paper's, then ours. A GPU does not extrapolate."""
         lockstep = f"lockstep-{self.latency}"
         found = {
             "none": Way("none"),
@@ -57,11 +56,10 @@ class Setting:
             "async": Way("cholesky", lockstep),
             "async + warp": Way("cholesky", lockstep, True),
             EXTRAPOLATED: Way("cholesky", lockstep, True, extrapolate=AHEAD * DT),
-            RECYCLED: Way("cholesky", lockstep, True, recycle=PAIRS),
             "block Jacobi": Way("block_jacobi"),
             "auto": Way("auto", lockstep, True),
         }
-        return {name: way for name, way in found.items() if device == "cpu" or not (way.extrapolate or way.recycle)}
+        return {name: way for name, way in found.items() if device == "cpu" or not way.extrapolate}
 
 
 def measured(cases: dict[str, tuple[Beam, Load, Way]], setting: Setting, device: str) -> dict[str, Mean]:
@@ -142,20 +140,6 @@ def extrapolations(setting: Setting, device: str, name: str) -> list[Row]:
             row[what] = float(run(beam, LOADS[2], way, setting.steps, **setting.solver()).iterations.mean())
         rows.append(row)
     return rows
-
-
-def recycled(setting: Setting, device: str, name: str, latency: int) -> list[Row]:
-    """A row for each number of recycled directions: iterations and processor time."""
-    beam = _beam(setting, name)
-    ways = {pairs: Way("cholesky", f"lockstep-{latency}", True, recycle=pairs) for pairs in (0, 4, 8, 16, 24)}
-    found = measured({str(pairs): (beam, LOADS[2], way) for pairs, way in ways.items()}, setting, device)
-    return [
-        {"device": device, "beam": name, "latency": latency, "recycled": pairs,
-         "iterations": found[str(pairs)].iterations, "most iterations": found[str(pairs)].most,
-         "step CPU ms": found[str(pairs)].cpu, "unconverged": found[str(pairs)].unconverged,
-         "repeats": found[str(pairs)].repeats}
-        for pairs in ways
-    ]  # fmt: skip
 
 
 def policies(setting: Setting, device: str) -> list[Row]:

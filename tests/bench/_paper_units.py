@@ -21,7 +21,6 @@ KEYS = {  # what tells the rows of a table apart
     "table5": ("device", "updated", "preconditioner"),
     "policies": ("device", "update"),
     "extrapolations": ("device", "beam", "latency"),
-    "recycled": ("device", "beam", "latency", "recycled"),
     "figure4": ("scheme",),
 }
 
@@ -45,7 +44,7 @@ def _of_device(setting: Setting, device: str) -> list[Unit]:
     ]
     found.append(Unit("table5", device, 60, partial(tables.table5, setting, device)))
     found.append(Unit("policies", device, 20, partial(tables.policies, setting, device)))
-    if device == "gpu":  # positions of a GPU go out as they are, and nothing is recycled there
+    if device == "gpu":  # positions of a GPU go out as they are
         return found
     found += [
         Unit("extrapolations", f"{beam}, {device}", 25, partial(tables.extrapolations, setting, device, beam))
@@ -57,11 +56,6 @@ def _of_device(setting: Setting, device: str) -> list[Unit]:
         for tets in setting.sizes
         for bands in (False, True)
     ]  # fmt: skip
-    found += [
-        Unit("recycled", f"{beam}, {latency}, {device}", 20, partial(tables.recycled, setting, device, beam, latency))
-        for beam in ("corotational", "heterogeneous")
-        for latency in tables.LATENCIES
-    ]
     return found
 
 

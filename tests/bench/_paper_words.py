@@ -4,10 +4,10 @@
 from typing import Any
 
 from tests.bench._paper_beam import DAMPING, DENSITY, DT, LENGTH, LOADS, POISSON
-from tests.bench._paper_tables import AHEAD, EXTRAPOLATED, PAIRS, PRECONDITIONERS, RECYCLED, Setting, available
+from tests.bench._paper_tables import AHEAD, EXTRAPOLATED, PRECONDITIONERS, Setting, available
 
 CLOSE = 1.05  # within 5 % of the fastest
-OURS2 = ("async + warp", "auto", EXTRAPOLATED, RECYCLED)
+OURS2 = ("async + warp", "auto", EXTRAPOLATED)
 WITHIN = 10  # iterations that Cholesky and IC may take on the heterogeneous beam
 
 COLUMNS1 = ("tets", "condition", "factorize ms", "paper factorize ms", "latency", "iterations", "paper iterations",
@@ -47,10 +47,6 @@ iterations by t, under *{load}*, asynchronous with warp (lockstep), {steps} step
 the matrix to its factor, the latency."""
 
 COLUMNS_OF_EXTRAPOLATIONS = ("beam", "latency", "as it is", "1 step", "2 steps", "all of it")
-COLUMNS_OF_RECYCLED = ("beam", "latency", "recycled", "iterations", "most iterations", "step CPU ms")
-RECYCLING = """\
-Directions of the last solves correct the factor (sim_server/native/recycle.h): iterations and processor time of the
-simulation thread per step (median over the steps, least of the rounds), under *{load}*, asynchronous with warp."""
 
 
 def explained(setting: Setting) -> tuple[str, ...]:
@@ -67,10 +63,9 @@ is better than zero (the paper states neither). Factors are exact Cholesky ones 
 t + 2 D - 1, the first step has the factor of its own matrix. D is {setting.latency} in tables 2 and 5, about what the
 paper's table 1 says for 3000 tetrahedra. So iterations repeat to the digit (the rounds of this very run are
 compared); the time of a factorization is not in the step, as it is made elsewhere. *precomputed*: the factor of the
-first matrix for ever. *extrapolated*: build = "worker" with positions at most {AHEAD} steps ahead. *recycled*:
-recycle = {PAIRS}. Times are of assembly, solve and integration, means over the steps, each the median of
-{setting.rounds} rounds in which the schemes take turns. The paper's figures stand in brackets or in columns of their
-own.""",
+first matrix for ever. *extrapolated*: build = "worker" with positions at most {AHEAD} steps ahead. Times
+are of assembly, solve and integration, means over the steps, each the median of {setting.rounds} rounds in which the
+schemes take turns. The paper's figures stand in brackets or in columns of their own.""",
     )
 
 
@@ -97,7 +92,7 @@ def shown2(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 AIMS2 = f"""\
-Aims of table 2, row by row: async + warp (as it is, extrapolated or recycled) or auto within {100 * (CLOSE - 1):.0f} %
+Aims of table 2, row by row: async + warp (as it is or extrapolated) or auto within {100 * (CLOSE - 1):.0f} %
 of the fastest scheme, and async + warp or auto with no more iterations than the paper's async + warp. *times the
 fastest*: step time by that of the fastest scheme of the row, in brackets least and most of the rounds, each by the
 fastest of the same round."""

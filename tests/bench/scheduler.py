@@ -19,7 +19,7 @@ from tests.bench._pieces import Merged, Piece
 from tests.bench._virtual_workers import VirtualWorkers
 from tests.bench.report import Report, plots
 
-RULES = ("round_robin", "oldest", "weighted", "excess")
+RULES = ("round_robin", "excess")
 MANY = 32  # nodes of all hands of an object that its factor is corrected for
 CORRECTED = ", grabs corrected"  # solver.woodbury, as by default
 ORACLE, NEVER, EACH, BEST = "oracle", "no updates", "a worker for each object", "best order, found afterwards"
@@ -118,7 +118,7 @@ def picture(rows: list[dict[str, Any]], sizes: list[int], workers: list[int]) ->
     for column, count in enumerate(workers):
         for name in (NEVER, *RULES, EACH, *([BEST] if any(r["rule"] == BEST for r in rows) else [])):
             own = [r for r in rows if r["rule"] == name and (r["workers"] == count or name in (NEVER, EACH))]
-            style = {NEVER: ":", EACH: ":", BEST: "-.", "oldest": "--"}.get(name, "-")  # oldest lies on round_robin
+            style = {NEVER: ":", EACH: ":", BEST: "-."}.get(name, "-")
             along = [r["objects"] for r in own]
             axes[0, column].plot(along, [r["/ oracle"] for r in own], style, marker="o", ms=3, label=name)
             if name in RULES:
@@ -152,9 +152,9 @@ a factor is 2 steps old at best when it is taken up, and the counts below repeat
 each step's own matrix for every object; *no updates*: the first factor only; *{EACH}*: what asynchrony
 alone costs, with hardly anybody to share with; *{BEST}*: what the same workers could do at
 best (a search through the iterations of every matrix with every older factor, told beforehand what no rule can know:
-when and where hands take hold; resting objects as in the oracle's run; good to about half a percent). *oldest* differs
-from *round_robin* only where jobs are lost, and here none is. Ratios are of the iterations of all objects and steps;
-the resting ones, alike under every rule, draw them towards 1. Ages are of the factors used [steps].""",
+when and where hands take hold; resting objects as in the oracle's run; good to about half a percent). Ratios
+are of the iterations of all objects and steps; the resting ones, alike under every rule, draw them towards 1. Ages are
+of the factors used [steps].""",
         f"""\
 The floor of iterations is {setting.floor} here (default 3): a fresh float32 factor needs 1 or 2, so that what exceeds 2
 is what a new factor would save; with 3 an object dragged slowly looks satisfied at 3 iterations and turns go to those

@@ -255,9 +255,9 @@ def test_matrices_are_copied_into_the_same_memory_again():
     assert len(places) > 9 and len(set(places)) <= 2
 
 
-@pytest.mark.parametrize("rule", ["round_robin", "oldest", "weighted"])
+@pytest.mark.parametrize("rule", ["round_robin", "excess"])
 def test_the_scene_names_the_rule(rule):
-    """A shaken object beside three calm ones: only the rules that look at excess serve it more."""
+    """A shaken object beside three calm ones: only the rule that looks at excess serves it more."""
     sim = falling(
         *(bar((4, 2, 2), name=f"beam{k}", young=1e6, fixed="X < 0.01") for k in range(4)), update="async", schedule=rule
     )
@@ -266,16 +266,16 @@ def test_the_scene_names_the_rule(rule):
         sim.world.v[shaken.nodes] += rng.normal(size=(shaken.last - shaken.first, 3))
         driver.advance(1)
     used = [t.used for t in driver.tracks]
-    if rule == "weighted":
+    if rule == "excess":
         assert used[2] > 2 * max(used[:2] + used[3:])
     else:
         assert max(used) - min(used) <= 1
 
 
-@pytest.mark.parametrize(("rule", "rounds"), [("excess", 1.0), ("excess", 3.0), ("weighted", 2.0)])
-def test_ages_stay_within_the_bound_that_is_told(rule, rounds):
+@pytest.mark.parametrize("rounds", [1.0, 2.0, 3.0])
+def test_ages_stay_within_the_bound_that_is_told(rounds):
     bodies = [bar((4, 2, 2), name=f"beam{k}", young=1e6, fixed="X < 0.01") for k in range(5)]
-    sim = falling(*bodies, update="async", schedule=rule, schedule_rounds=rounds, update_floor_iterations=6)
+    sim = falling(*bodies, update="async", schedule_rounds=rounds, update_floor_iterations=6)
     driver, shaken, rng = Driver(sim, counted=True), sim.world.bodies[1:4], np.random.default_rng(0)
     for _ in range(80):
         for body in shaken:

@@ -7,7 +7,7 @@ from typing import get_args
 
 import pytest
 
-from sim_server.schedule import AGEING, Need, Rule, excess, oldest_possible, one_round, overdue_after, pays, pick
+from sim_server.schedule import Need, Rule, excess, oldest_possible, one_round, overdue_after, pays, pick
 
 NEW, BUSY = None, True
 RULES = get_args(Rule)
@@ -120,18 +120,8 @@ def need(object: str, **counters) -> Need:
 RULE_TABLE = {
     "round robin: sent longest ago": ("round_robin", [need("a", waited=5, excess=99), need("b", waited=9)], "ba"),
     "round robin: of equals the first": ("round_robin", [need("a"), need("b")], "ab"),
-    "oldest factor, though sent of late": ("oldest", [need("a", waited=9, age=9), need("b", waited=2, age=50)], "ba"),
-    "oldest: none at all is older than any": ("oldest", [need("a", age=500), need("b", age=None)], "ba"),
-    "oldest: of equals who waited longer": ("oldest", [need("a", waited=3), need("b", waited=4)], "ba"),
     "excess: the sum as it will be": ("excess", [need("a", excess=30), need("b", excess=15, latest=2.0)], "ba"),
     "excess: a larger sum all the same": ("excess", [need("a", excess=30), need("b", excess=5, latest=2.0)], "ab"),
-    "weighted: the same": ("weighted", [need("a", excess=30), need("b", excess=15, latest=2.0)], "ba"),
-    "weighted by the cost of an iteration": ("weighted", [need("a", excess=5), need("b", excess=3, cost=2.0)], "ba"),
-    "weighted by the time it takes": ("weighted", [need("a", excess=9, service=4.0), need("b", excess=3)], "ba"),
-    "weighted: nothing known of the time": ("weighted", [need("a", excess=1), need("b", excess=1, service=0.0)], "ba"),
-    "weighted: ageing": ("weighted", [need("a", excess=1), need("b", waited=11 + round(1 / AGEING))], "ba"),
-    "weighted: ageing is slow": ("weighted", [need("a", excess=1), need("b", waited=9 + round(1 / AGEING))], "ab"),
-    "weighted: excess without cost": ("weighted", [need("a", excess=7, cost=0.0), need("b", excess=1)], "ba"),
 }
 
 

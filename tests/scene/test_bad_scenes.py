@@ -104,7 +104,7 @@ def test_the_unchanged_scene_is_good(tmp_path):
         (swap("tolerance = 1e-6", "omega = 0"), "solver.omega = 0: must be greater than 0"),
         (swap("tolerance = 1e-6", "drop_tolerance = 1"), "solver.drop_tolerance = 1: must be less than 1"),
         (swap("tolerance = 1e-6", "fill = -1"), "solver.fill = -1: must be greater than or equal to 0"),
-        (swap("tolerance = 1e-6", 'schedule = "fair"'), "solver.schedule = 'fair': must be 'excess', 'round_robin', 'oldest' or 'weighted'"),
+        (swap("tolerance = 1e-6", 'schedule = "fair"'), "solver.schedule = 'fair': must be 'excess' or 'round_robin'"),
         (swap("tolerance = 1e-6", "schedule_rounds = 0.5"), "solver.schedule_rounds = 0.5: must be greater than or equal to 1"),
         (swap("tolerance = 1e-6", 'preconditioner = "ilu"'), "preconditioner = 'ilu': must be one of auto, none, jacobi"),
         (swap("tolerance = 1e-6", 'warp = "true"'), "solver.warp = 'true': must be true or false"),

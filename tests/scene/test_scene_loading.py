@@ -64,7 +64,6 @@ def test_defaults_and_resolved(tmp_path):
             "on_runaway": "freeze",
             "threads": 1,
             "warm_start": True,
-            "recycle": 0,
             "woodbury": 32,
             "build": "server",
             "extrapolate": 0.0,

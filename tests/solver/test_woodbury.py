@@ -189,7 +189,7 @@ def test_answers_are_the_same_and_come_sooner():
     assert same == counts and np.array_equal(again.world.x, sim.world.x)
 
 
-@pytest.mark.parametrize("solver", [{"recycle": 8}, {"preconditioner": "auto"}, {"warp": False}])
+@pytest.mark.parametrize("solver", [{"preconditioner": "auto"}, {"warp": False}])
 def test_beside_what_else_the_solver_does(solver):
     (plain, _), (sim, _) = in_motion((0, 0, 0), woodbury=0, tolerance=1e-9, **solver), in_motion(
         (0, 0, 0), tolerance=1e-9, **solver

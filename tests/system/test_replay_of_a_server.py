@@ -237,8 +237,8 @@ def test_the_automatic_preconditioner(tmp_path: Path) -> None:
     assert {f.method for f in factors} <= {"incomplete_cholesky", "cholesky"}
 
 
-def test_factors_of_positions_sent_ahead_and_recycled_directions_too(tmp_path: Path) -> None:
-    log = recorded(tmp_path, 'build = "worker"\nextrapolate = 0.02\nrecycle = 8')
+def test_factors_of_positions_sent_ahead(tmp_path: Path) -> None:
+    log = recorded(tmp_path, 'build = "worker"\nextrapolate = 0.02')
     assert replayed(log, 0)["same"]
     ahead = {f.ahead for f in messages(log, "factor")}
     assert 0.0 in ahead and max(ahead) > 0, "matrices while grabbed, positions otherwise"
