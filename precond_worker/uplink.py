@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: MIT
 """The worker's side of the network: which server lives, matrices in, patterns and factors out."""
 
-import logging
 import os
 import socket
 import threading
@@ -25,8 +24,6 @@ from protocol.messages_pb2 import Factor, Header, Scene, Topology, WorkerInfo
 from protocol.refused import Refused
 from protocol.session import LINK_LEASE, Session
 from protocol.slotmap import SlotMap
-
-log = logging.getLogger(__name__)
 
 BLOCK = zenoh.CongestionControl.BLOCK
 TIMEOUT = 5.0  # s for a topology

@@ -51,8 +51,3 @@ class Counters:
         if name.startswith("_"):
             raise AttributeError(name)
         return self._counts[name]
-
-    def as_dict(self) -> dict[str, int]:
-        """All counts; refusals as refused:KIND."""
-        with self._lock:
-            return dict(self._counts) | {f"refused:{kind}": n for kind, n in self.refusals.items()}

@@ -9,7 +9,6 @@ too, so that a worker learns which lives of its server answer, and why none does
 """
 
 import contextlib
-import logging
 import secrets
 from collections.abc import Callable
 
@@ -28,8 +27,6 @@ NUMBERS = 2 * LANES  # of 8 bytes: the server's, then the worker's
 LIMIT = CHANNELS["echo"].limit
 Answered = Callable[[dict[int, Echo]], None]
 ANSWERS = 64  # lives of a server that are told apart
-
-log = logging.getLogger(__name__)
 
 
 def answer(slot: Slot, query: Echo, incarnation: int) -> tuple[Echo, zenoh.ZBytes]:

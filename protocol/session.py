@@ -202,11 +202,6 @@ class Session:
                     thread.join(5.0)
             self._closed.set()
 
-    @property
-    def closed(self) -> bool:
-        """Closed by either side of the program."""
-        return self._closed.is_set()
-
     def __enter__(self) -> Self:
         return self
 

@@ -133,7 +133,7 @@ class SlotPool:
 
     @property
     def lent(self) -> int:
-        """Slots out at the moment."""
+        """Number of slots lent now. A probe for tests."""
         return len(self._lent)
 
     def lend(self, size: int) -> Slot | None:

@@ -69,11 +69,6 @@ class Copies:
         self._give_back(values)
         return values if made == step and values.ndim == 3 else None
 
-    @property
-    def spare(self) -> list[NDArray[np.float64]]:
-        """Memory that waits to be used again."""
-        return [copy for copies in self._spare.values() for copy in copies]
-
     def _room(self, shape: tuple[int, ...]) -> NDArray[np.float64]:
         spare = self._spare.setdefault(shape, [])
         return spare.pop() if spare else np.full(shape, 0.0)

@@ -91,7 +91,7 @@ class NativeFactor:
         self.native.step = step
 
     def apply(self, r: Reals) -> Reals:
-        """P^-1 r, (size,), outside of any step: for tests and measurements."""
+        """P^-1 r, (size,), outside of any step. A probe for tests and benchmarks."""
         r = np.ascontiguousarray(r, dtype=np.float64)
         z, work = np.empty_like(r), np.empty(2 * len(r))
         _library().wf_apply_factor(c.byref(self.native), r.ctypes.data, z.ctypes.data, work.ctypes.data)
@@ -238,12 +238,13 @@ class Engine(Reports):
             setattr(correction, name, array.ctypes.data)
 
     def corrected(self, body: int) -> int:
-        """Nodes at which the factor in use was corrected in the last solve with it (while the loop stands still)."""
+        """Number of nodes at which the last solve corrected the factor in use. A probe for tests; only while the loop
+        stands still."""
         return int(self._body[body].correction.used)
 
     def precondition(self, body: int, r: Reals) -> Reals:
-        """P^-1 r, (3 nodes of the body,), with its factor as the next solve has it: for tests. Needs a factor and an
-        assembled matrix; r must not be 0."""
+        """P^-1 r, (3 nodes of the body,), with its factor as the next solve has it. A probe for tests. Needs a factor
+        and an assembled matrix; r must not be 0."""
         r = np.ascontiguousarray(r, dtype=np.float64)
         z, work = np.empty_like(r), np.empty(2 * len(r))
         self._native.wf_precondition(c.byref(self.loop), body, r.ctypes.data, z.ctypes.data, work.ctypes.data)
@@ -313,10 +314,6 @@ class Engine(Reports):
     def matrix_step(self, body: int) -> int:
         """Step of the copy asked for last, -1 while it is not there. `step` counts the steps completed before it."""
         return int(self._body[body].snapshot_step)
-
-    def cancel_matrix(self, body: int) -> None:
-        """Forget the copy asked for (only while the loop stands still)."""
-        self._body[body].snapshot = None
 
     def replace(self, launch: int, new: Launch) -> layouts.Binding:
         """Gives a launch other arguments, from the next step on: the one after the result's `taken` steps, once it is

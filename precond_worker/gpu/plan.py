@@ -9,7 +9,6 @@ of memory, used in turn, hold all that is needed at a time.
 """
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,12 +71,6 @@ class Plan:
     def steps(self, level: int) -> int:
         """Steps of WIDTH columns in which the widest front of a level is eliminated."""
         return -(-int(self.own[self.fronts(level)].max()) // WIDTH)
-
-    @cached_property
-    def flops(self) -> float:
-        """Multiplications and additions of one factorization."""
-        k, m = self.own.astype(float), self.rows.astype(float)
-        return float((k * m**2 - k**2 * m + k**3 / 3).sum())
 
 
 def make_plan(tree: AssemblyTree, row_start: Index, columns: Index) -> Plan:

@@ -17,7 +17,6 @@ from sim_server.gpu.partition import COLUMNS, ROWS
 from sim_server.gpu.plan import Plan
 from sim_server.gpu.workspace import workspace
 
-BUFFERS = 3  # per body: in use, waiting to be taken up, being made
 HEAD = 16  # bytes in front of the values: the two addresses of a target
 # Of a kernel of expansion.cu: threads and bytes of shared memory of a group, groups in a small and in a large block.
 Groups = tuple[int, int, int, int]

@@ -180,8 +180,3 @@ class DeviceLoop(Reports):
             target = self._targets.pop(body)
             target[...] = data.view(self._real).reshape(target.shape)
         return step
-
-    def cancel_matrix(self, body: int) -> None:
-        """Forget the copy asked for (only while the loop stands still)."""
-        self._body[body].wanted = 0
-        self._targets.pop(body, None)

@@ -64,9 +64,8 @@ class Plan:
     slot_start (N + 1,), slots: the contributions that each packed position subtracts, in this order.
     chunk_start (blocks + 1,): of each block in the storage, which is sorted by block, phase, tile.
     place (nodes,): packed position of a node's first degree of freedom. column (N,): column of L, -1 for padding.
-    part (supernodes,): of each supernode. parts: of each part. thresholds: those that cut the tree.
-    size N, phases, blocks, groups P, contributions, chunks; x_area: entries of the largest; bytes of the matrices;
-    predicted: time of one application [us].
+    part (supernodes,): of each supernode. parts: of each part.
+    size N, phases, blocks, groups P, contributions, chunks; x_area: entries of the largest; bytes of the matrices.
     """
 
     segments: Int32
@@ -81,7 +80,6 @@ class Plan:
     column: Int32
     part: Int32
     parts: Parts
-    thresholds: tuple[int, ...]
     size: int
     phases: int
     blocks: int
@@ -90,7 +88,6 @@ class Plan:
     contributions: int
     chunks: int
     x_area: int
-    predicted: float
 
     @property
     def bytes(self) -> int:
@@ -119,8 +116,7 @@ def plan(
         if len(_plans) >= _KEPT:
             _plans.clear()
         tree = _tree(pattern)
-        thresholds, predicted = choose(tree, blocks, groups, planes, shared)
-        _plans[key] = lay_out(tree, thresholds, blocks, planes, predicted)
+        _plans[key] = lay_out(tree, choose(tree, blocks, groups, planes, shared), blocks, planes)
     return _plans[key]
 
 
@@ -129,7 +125,7 @@ def _tree(pattern: FactorPattern) -> Tree:
     return tree_of(pattern)
 
 
-def lay_out(tree: Tree, thresholds: tuple[int, ...], blocks: int, planes: int = 1, predicted: float = 0.0) -> Plan:
+def lay_out(tree: Tree, thresholds: tuple[int, ...], blocks: int, planes: int = 1) -> Plan:
     """The plan for given thresholds (partition.partition)."""
     cut = partition(tree, thresholds)
     parts, column, contributions = _packed(tree, cut)
@@ -141,8 +137,8 @@ def lay_out(tree: Tree, thresholds: tuple[int, ...], blocks: int, planes: int = 
     work = _shared_out(cut, parts, blocks, planes, _depth(parts, slot_start))
     return Plan(
         boundary=boundary, slot_start=slot_start, slots=slots, place=_places(tree.pattern, position), column=column,
-        part=cut.part.astype(np.int32), parts=parts, thresholds=thresholds, size=size, phases=2 * cut.groups - 1,
-        blocks=blocks, groups=cut.groups, planes=planes, contributions=contributions, predicted=predicted, **work,
+        part=cut.part.astype(np.int32), parts=parts, size=size, phases=2 * cut.groups - 1,
+        blocks=blocks, groups=cut.groups, planes=planes, contributions=contributions, **work,
     )  # fmt: skip
 
 

@@ -109,11 +109,9 @@ def candidates(tree: Tree, groups: int) -> Iterator[tuple[int, ...]]:
                 yield cut
 
 
-def choose(
-    tree: Tree, blocks: int, groups: int | None, planes: int, shared: int = SHARED_MEMORY
-) -> tuple[tuple[int, ...], float]:
-    """Thresholds and predicted time [us]: of each number of groups the best by estimate, improved one by one, of these
-    the best by prediction. groups: so many, or as many as the tree has."""
+def choose(tree: Tree, blocks: int, groups: int | None, planes: int, shared: int = SHARED_MEMORY) -> tuple[int, ...]:
+    """Thresholds: of each number of groups the best by estimate, improved one by one, of these the best by predicted
+    time. groups: so many, or as many as the tree has."""
     found: list[tuple[float, tuple[int, ...]]] = []
     for count in range(groups, 0, -1) if groups else range(1, MOST + 1):
         estimated = [(_estimate(tree, t, blocks, planes, shared), t) for t in candidates(tree, count)]
@@ -125,8 +123,7 @@ def choose(
         if not groups and best[0] > 1.5 * min(found)[0]:
             break  # more phases do not help any more
     near = [_improved(tree, pair, blocks, planes, shared) for pair in found if pair[0] < 1.3 * min(found)[0]]
-    time, thresholds = min((predict(partition(tree, t), blocks, planes, shared), t) for _, t in near)
-    return thresholds, time / 1000
+    return min((predict(partition(tree, t), blocks, planes, shared), t) for _, t in near)[1]
 
 
 def _improved(

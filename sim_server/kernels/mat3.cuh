@@ -41,9 +41,6 @@ template <class A> INLINE auto load9(A a, index i) {
     for (int k = 0; k < 9; ++k) s.m[k] = row_at<9>(a, i, k);
     return s;
 }
-template <class A, class T> INLINE void store9(A a, index i, const mat<T>& s) {
-    for (int k = 0; k < 9; ++k) row_put<9>(a, i, k, s.m[k]);
-}
 
 template <class T> INLINE vec<T> row(const mat<T>& a, int r) { return {a.m[3 * r], a.m[3 * r + 1], a.m[3 * r + 2]}; }
 template <class T> INLINE T trace(const mat<T>& a) { return a.m[0] + a.m[4] + a.m[8]; }

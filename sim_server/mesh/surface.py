@@ -14,11 +14,6 @@ def volumes(rest: NDArray[np.float64], tets: NDArray[np.integer]) -> NDArray[np.
     return np.einsum("ij,ij->i", np.cross(a, b), c) / 6.0
 
 
-def centroids(rest: NDArray[np.float64], tets: NDArray[np.integer]) -> NDArray[np.float64]:
-    """Centroids [m], (m, 3)."""
-    return rest[tets].mean(axis=1)
-
-
 def surface_triangles(tets: NDArray[np.integer]) -> NDArray[np.int32]:
     """The faces that belong to one tetrahedron only: int32 (t, 3), outward for positive volumes.
 

@@ -217,13 +217,14 @@ int64_t wf_run(Loop* loop, int64_t steps) {
 const Factor* wf_post_factor(Body* body, const Factor* factor) { return body->mail.exchange(factor); }
 Binding* wf_post_binding(Launch* launch, Binding* binding) { return launch->mail.exchange(binding); }
 
-// One application of a factor, for tests and measurements: z = P^-1 r.
+// One application of a factor, z = P^-1 r. A probe for tests and benchmarks.
 void wf_apply_factor(const Factor* factor, const double* r, double* z, double* work) {
     if (factor->bytes == 4) apply_factor(*factor->pattern, (const float*)factor->values, r, 1, z, (float*)work);
     else apply_factor(*factor->pattern, (const double*)factor->values, r, 1, z, work);
 }
 
-// The same of what a solve of a body with its factor would use now, corrected for changes of the diagonal. work: 2 n doubles.
+// The same of what a solve of a body with its factor would use now, corrected for changes of the diagonal. A probe for tests.
+// work: 2 n doubles.
 void wf_precondition(Loop* loop, int32_t index, const double* r, double* z, double* work) {
     Body& body = loop->body[index];
     take_factor(body);

@@ -20,7 +20,7 @@ from protocol import Factor
 from protocol.channels import PROTOCOL, SERVER_NAME, check_name, key, name_in
 from protocol.counters import Counters
 from protocol.memlock import POOL_LIMIT
-from protocol.messages_pb2 import Command, Header, LocalWorker, Reply, Scene, State, Status, Steps, Topology, WorkerInfo
+from protocol.messages_pb2 import Command, LocalWorker, Reply, Scene, State, Status, Steps, Topology, WorkerInfo
 from protocol.refused import Refused
 from protocol.session import open_session
 from protocol.slots import Slot, SlotPool, SlotsUnusable
@@ -117,10 +117,6 @@ class ServerLink:
     def shared_memory(self) -> bool:
         """Slots can be lent to workers on this host."""
         return self._pool is not None
-
-    def header(self, object: str = "", epoch: int = 0, sequence: int = 0) -> Header:
-        """Header of a message of this life of the server."""
-        return Header(protocol=PROTOCOL, incarnation=self.incarnation, object=object, epoch=epoch, sequence=sequence)
 
     def announce(self, topology: Topology) -> None:
         """A new epoch of an object, for everybody and for late joiners. Answers to older ones are refused."""

@@ -27,7 +27,8 @@ from sim_server.errors import DeviceError
 from sim_server.factors import Inline, Job
 from sim_server.replay.log import Recording
 from sim_server.replay.report import Comparison
-from sim_server.scene import Scene
+from sim_server.scene import Scene, deleted
+from sim_server.scene.messages import readable
 from sim_server.simulation import Simulation
 from sim_server.world import Body
 
@@ -40,11 +41,17 @@ class Replay:
     def __init__(self, recording: Recording):
         self.recording = recording
         try:
-            table = json.loads(recording.scene.resolved)
+            table = deleted.without(json.loads(recording.scene.resolved))
             if table.get("solver", {}).get("warp") == "auto":
-                raise BadLog(f'{recording.path}: recorded with warp = "auto", whose trials there are no more')
+                table["solver"]["warp"] = True
+                recording.notes.append(
+                    'recorded with warp = "auto", repeated with true: steps that were tried without may differ'
+                )
             scene, watched = Scene.model_validate(table), "on_runaway" in table.get("solver", {})
-        except (ValidationError, ValueError) as error:
+        except ValidationError as error:
+            reason = readable(error, f"in {recording.path.name}", table)
+            raise BadLog(f"{recording.path}: the scene in the log cannot be built: {reason}") from error
+        except ValueError as error:
             raise BadLog(f"{recording.path}: the scene in the log cannot be built: {error}") from error
         try:
             self.simulation = Simulation(scene, recording.device, watched)

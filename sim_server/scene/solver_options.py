@@ -4,7 +4,7 @@
 import re
 from typing import Annotated, Any, Literal, NamedTuple, get_args
 
-from pydantic import BeforeValidator, Field, PlainSerializer, PlainValidator
+from pydantic import Field, PlainSerializer, PlainValidator
 
 from protocol.method import Method
 from sim_server.errors import InputError
@@ -58,12 +58,6 @@ def _preconditioner(value: Any) -> str:
     raise complaint(f"must be one of {', '.join(PRECONDITIONERS)}")
 
 
-def _warp(value: Any) -> Any:
-    if value == "auto":
-        raise complaint('write true (the default) or false; there is no "auto" any more')
-    return value
-
-
 Precision = Literal["float64", "mixed", "float32"]
 OnRunaway = Literal["freeze", "go_on"]
 FactorPrecision = Literal["auto", "float16", "float32", "float64"]
@@ -90,7 +84,7 @@ class Solver(Parameters):
     fill: float = Field(
         default=10.0, ge=0, le=1e6, description="most blocks of a column of incomplete_cholesky, in A's; 0 = no bound"
     )
-    warp: Annotated[bool, BeforeValidator(_warp)] = Field(default=True, description="solve in the material frame")
+    warp: bool = Field(default=True, description="solve in the material frame")
     warp_level: int = Field(
         default=1, ge=1, le=2, description="neighbours that give a node its rotation where its elements have none"
     )

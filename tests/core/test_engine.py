@@ -119,11 +119,6 @@ def test_a_matrix_asked_for_is_that_of_the_next_step_and_comes_once():
     sim.engine.run(3)
     assert sim.engine.matrix_step(0) == 2
     assert not np.array_equal(target, sim.system.values)
-    sim.engine.request_matrix(0, target)
-    sim.engine.cancel_matrix(0)
-    target[:] = 0
-    sim.engine.run(1)
-    assert not target.any()
 
 
 def test_a_factor_is_taken_up_between_steps_and_the_last_one_wins():

@@ -313,10 +313,6 @@ def test_matrices_are_those_of_the_step_after_the_request_in_all_bodies(real):
     scene.loop.run(40)
     assert [scene.loop.matrix_step(k) for k in range(3)] == [20, -1, 20]
     assert all((t == 20).all() for t in targets)
-    scene.loop.request_matrix(0, targets[0])
-    scene.loop.cancel_matrix(0)
-    scene.loop.run(1)
-    assert (targets[0] == 20).all()
 
 
 @pytest.mark.parametrize("real", ["f4", "f8"])

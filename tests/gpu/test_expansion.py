@@ -85,7 +85,7 @@ def test_the_scale_ends_with_its_largest(gpu):
 
 
 def test_fifty_in_a_row_allocate_nothing_and_end_with_the_last(gpu):
-    from sim_server.gpu.expansion import BUFFERS, Expansion
+    from sim_server.gpu.expansion import Expansion
 
     shape, first = factor(SMALL)
     second = factor(SMALL, seed=5)[1]
@@ -93,19 +93,19 @@ def test_fifty_in_a_row_allocate_nothing_and_end_with_the_last(gpu):
     p = plan(shape, 16, 2)
     expansion = Expansion(gpu, shape, p)
     larger = Expansion(gpu, other[0], plan(other[0], 132, 1))  # moves the workspace that both use
-    targets, large = [expansion.target() for _ in range(BUFFERS)], larger.target()
+    targets, large = [expansion.target() for _ in range(3)], larger.target()
     expansion.expand(first, targets[0])
     larger.expand(other[1], large)
     pool = gpu.cp.get_default_memory_pool()
     used, held = pool.used_bytes(), pool.total_bytes()
     for k in range(50):
-        made = expansion.expand(second if k % 2 else first, targets[k % BUFFERS])
+        made = expansion.expand(second if k % 2 else first, targets[k % 3])
     made.event.synchronize()
     assert (pool.used_bytes(), pool.total_bytes()) == (used, held)
     for k in (48, 49):
         chunks, scale = expanded(gpu, shape, second if k % 2 else first, p)
-        assert np.array_equal(targets[k % BUFFERS].matrix.get(), chunks)
-        assert np.array_equal(targets[k % BUFFERS].scale.get(), scale)
+        assert np.array_equal(targets[k % 3].matrix.get(), chunks)
+        assert np.array_equal(targets[k % 3].scale.get(), scale)
 
 
 def test_another_expansion_may_make_the_workspace_grow(gpu):

@@ -103,4 +103,4 @@ def test_each_of_a_round_is_answered_once(desk: Inquiries) -> None:
     assert [bool(q.answers[0].error) for q in everybody] == [False] * 41 + [True] * 3
     assert wrong.answers[0].error == "Vector.x is nan; allowed: finite"
     assert not elsewhere.answers and elsewhere.dropped == 1
-    assert desk._counters.as_dict()["moves_replaced"] == 39 and desk._counters.refused == 3
+    assert desk._counters.moves_replaced == 39 and desk._counters.refused == 3

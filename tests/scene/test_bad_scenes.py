@@ -109,7 +109,6 @@ def test_the_unchanged_scene_is_good(tmp_path):
         (swap("tolerance = 1e-6", 'preconditioner = "ilu"'), "preconditioner = 'ilu': must be one of auto, none, jacobi"),
         (swap("tolerance = 1e-6", 'warp = "true"'), "solver.warp = 'true': must be true or false"),
         (swap("tolerance = 1e-6", "warp = 1"), "solver.warp = 1: must be true or false"),
-        (swap("tolerance = 1e-6", 'warp = "auto"'), "solver.warp = 'auto': write true (the default) or false"),
         (swap("tolerance = 1e-6", 'update = "every-0"'), 'solver.update = \'every-0\': must be "never", "async", "adaptive", "every-N"'),
         (swap("tolerance = 1e-6", 'update = "lockstep"'), "solver.update = 'lockstep'"),
         (swap("tolerance = 1e-6", 'factor_precision = "half"'), "factor_precision = 'half': must be 'auto', 'float16', 'float32' or 'float64'"),

@@ -9,7 +9,7 @@ import pytest
 
 from sim_server.errors import InputError
 from sim_server.mesh import bar, check, pose_matrix, posed
-from sim_server.mesh.surface import centroids, surface_triangles, volumes
+from sim_server.mesh.surface import surface_triangles, volumes
 
 
 def bar_by_loops(cells, size):
@@ -95,11 +95,6 @@ def test_surface_is_closed_outward_and_complete():
 def test_surface_of_one_tet():
     triangles = surface_triangles(np.array([[0, 1, 2, 3]]))
     assert triangles.tolist() == [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]
-
-
-def test_centroids():
-    rest = np.array([[0.0, 0, 0], [4, 0, 0], [0, 4, 0], [0, 0, 4]])
-    assert centroids(rest, np.array([[0, 1, 2, 3]])).tolist() == [[1, 1, 1]]
 
 
 @pytest.mark.parametrize(

@@ -53,3 +53,13 @@ def test_what_is_advised_is_what_scenes_have(key):
     table, name = key.rsplit(".", 1)
     known = Scene.model_fields[table].default.__class__.model_fields
     assert (name in known) == (key not in deleted.KEYS)
+
+
+@pytest.mark.parametrize("key", deleted.WITHOUT_EFFECT)
+def test_scenes_of_older_logs_lose_deleted_keys_without_effect(key):
+    table, name = key.rsplit(".", 1)
+    older = {"dt": 0.02, table: {"kept": 1, name: deleted.WITHOUT_EFFECT[key]}}
+    assert deleted.without(older) == {"dt": 0.02, table: {"kept": 1}}
+    at_work = {"dt": 0.02, table: {name: 8}}
+    assert deleted.without(at_work) == {"dt": 0.02, table: {name: 8}}, "is refused"
+    assert deleted.without({"dt": 0.02}) == {"dt": 0.02} and deleted.without([]) == []

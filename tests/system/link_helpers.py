@@ -117,7 +117,8 @@ class Driver:
             if result := condition():
                 return result
             time.sleep(0.002)
-        raise AssertionError(f"waited {PATIENCE} s for {what}; {self.link.counters.as_dict()}, {self.failures[-3:]}")
+        refusals = dict(self.link.counters.refusals)
+        raise AssertionError(f"waited {PATIENCE} s for {what}; {refusals}, {self.failures[-3:]}")
 
     def submit(self, topology: Topology, step: int, shift: float = 0.0, dtype: str = "float32") -> None:
         """Send a matrix of the object as soon as somebody is ready."""
