@@ -17,14 +17,14 @@ from protocol.counters import Counters
 from protocol.messages_pb2 import Topology, WorkerInfo
 from protocol.refused import Refused
 from protocol.slots import Slot, SlotPool
-from sim_server.network.answers import Answers
-from sim_server.network.arrivals import Arrivals
-from sim_server.network.conduct import Conduct
-from sim_server.network.jobs import LATE, Flight, Jobs
-from sim_server.network.outbox import Outbox
-from sim_server.network.roster import Roster
-from sim_server.network.shipment import load, matrix_message
-from sim_server.network.speeds import Speeds
+from sim_server.network.factor_decoder import Answers
+from sim_server.network.inbox import Arrivals
+from sim_server.network.job_message import load, matrix_message
+from sim_server.network.leases import LATE, Flight, Jobs
+from sim_server.network.send_queue import Outbox
+from sim_server.network.worker_registry import Roster
+from sim_server.network.worker_reliability import Conduct
+from sim_server.network.worker_timing import Speeds
 
 if TYPE_CHECKING:
     from sim_server.factors import Job

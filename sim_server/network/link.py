@@ -24,11 +24,11 @@ from protocol.messages_pb2 import Command, LocalWorker, Reply, Scene, State, Sta
 from protocol.refused import Refused
 from protocol.session import open_session
 from protocol.slots import Slot, SlotPool, SlotsUnusable
-from sim_server.network.claim import Claim
 from sim_server.network.dispatch import Dispatch
-from sim_server.network.inquiries import Inquiries
-from sim_server.network.outbox import Outbox
-from sim_server.network.publish import Publications
+from sim_server.network.name_claim import Claim
+from sim_server.network.publishers import Publications
+from sim_server.network.queryables import Inquiries
+from sim_server.network.send_queue import Outbox
 
 if TYPE_CHECKING:
     from sim_server.factors import Job

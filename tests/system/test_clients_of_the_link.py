@@ -26,8 +26,8 @@ from protocol.messages_pb2 import (
     Vector,
 )
 from protocol.session import open_session
+from sim_server.network.command_queue import WAITING
 from sim_server.network.link import ServerLink
-from sim_server.network.waiting import WAITING
 
 pytestmark = pytest.mark.system
 

@@ -15,7 +15,7 @@ from protocol.channels import key
 from protocol.messages_pb2 import Header, WorkerInfo
 from protocol.session import open_session
 from sim_server.network.link import ServerLink
-from sim_server.network.roster import TOKENS, WORKERS
+from sim_server.network.worker_registry import TOKENS, WORKERS
 
 pytestmark = pytest.mark.system
 

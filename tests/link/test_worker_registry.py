@@ -6,7 +6,7 @@ import pytest
 from protocol import PROTOCOL, Refused
 from protocol.channels import key
 from protocol.messages_pb2 import Header, WorkerInfo
-from sim_server.network.roster import TOKENS, WORKERS, Roster
+from sim_server.network.worker_registry import TOKENS, WORKERS, Roster
 
 
 def hello(name: str = "w", sequence: int = 1, pid: int = 10, idle: bool = False) -> bytes:

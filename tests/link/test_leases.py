@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from protocol import Refused
-from sim_server.network.jobs import DELIVERED, LONGEST, SHORTEST, Flight, Jobs
+from sim_server.network.leases import DELIVERED, LONGEST, SHORTEST, Flight, Jobs
 
 
 class Lender:

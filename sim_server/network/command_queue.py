@@ -8,7 +8,7 @@ from collections.abc import Callable, Hashable
 
 from protocol.counters import Counters
 from protocol.messages_pb2 import Command, Reply
-from sim_server.network.rates import Rates
+from sim_server.network.rate_limiter import Rates
 
 WAITING = 64  # commands that may wait for the simulation
 LATE = 1024  # moves that may wait for a token of their client, or for room

@@ -14,7 +14,7 @@ from protocol.messages_pb2 import Factor as FactorMessage
 from protocol.messages_pb2 import FactorPattern as PatternMessage
 from protocol.messages_pb2 import Topology
 from protocol.refused import Refused
-from sim_server.network.jobs import Flight
+from sim_server.network.leases import Flight
 
 PATTERNS = 4  # kept per object: one per library among its workers
 

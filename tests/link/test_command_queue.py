@@ -5,9 +5,9 @@ import logging
 
 from protocol.counters import Counters
 from protocol.messages_pb2 import Command, Interaction, Reply, Vector
-from sim_server.network import waiting as module
-from sim_server.network.rates import Bucket, Rates
-from sim_server.network.waiting import Waiting
+from sim_server.network import command_queue as module
+from sim_server.network.command_queue import Waiting
+from sim_server.network.rate_limiter import Bucket, Rates
 
 
 class Desk:

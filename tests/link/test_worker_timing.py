@@ -5,7 +5,7 @@ import math
 
 import pytest
 
-from sim_server.network.speeds import FIRST, HANGS, SLOWEST, Speeds
+from sim_server.network.worker_timing import FIRST, HANGS, SLOWEST, Speeds
 
 
 @pytest.fixture

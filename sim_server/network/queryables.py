@@ -16,10 +16,10 @@ from protocol.messages_pb2 import Command, Echo, Header, Reply
 from protocol.refused import Refused
 from protocol.session import Session
 from protocol.slots import Slot
-from sim_server.network.claim import Claim
-from sim_server.network.newest import newest_moves
-from sim_server.network.outbox import Outbox
-from sim_server.network.waiting import Asked, Waiting
+from sim_server.network.coalesce import newest_moves
+from sim_server.network.command_queue import Asked, Waiting
+from sim_server.network.name_claim import Claim
+from sim_server.network.send_queue import Outbox
 
 log = logging.getLogger(__name__)
 

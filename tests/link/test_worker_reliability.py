@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Who gets jobs at all: those who answer, newcomers a few at a time, and nobody whose factors come to nothing."""
 
-from sim_server.network.conduct import GAP, HOLD, MOST, Conduct
+from sim_server.network.worker_reliability import GAP, HOLD, MOST, Conduct
 
 
 def may_be_asked(conduct: Conduct, fit: list[str], now: float) -> list[str]:

@@ -9,7 +9,7 @@ import zenoh
 
 from protocol.channels import key
 from protocol.counters import Counters
-from sim_server.network.outbox import Outbox
+from sim_server.network.send_queue import Outbox
 
 
 class Publications:

@@ -12,8 +12,8 @@ from protocol.channels import key
 from protocol.counters import Counters
 from protocol.messages_pb2 import Command, Header, Interaction, Reply, Vector
 from protocol.refused import Refused
-from sim_server.network.inquiries import Inquiries
-from sim_server.network.newest import newest_moves
+from sim_server.network.coalesce import newest_moves
+from sim_server.network.queryables import Inquiries
 
 NAN = float("nan")
 

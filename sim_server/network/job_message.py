@@ -12,8 +12,8 @@ from protocol.check import checksum
 from protocol.messages_pb2 import Header, Matrix
 from protocol.method import Method
 from protocol.slots import Slot
-from sim_server.network.answers import Known
-from sim_server.network.jobs import Flight
+from sim_server.network.factor_decoder import Known
+from sim_server.network.leases import Flight
 
 
 def matrix_message(flight: Flight, known: Known, incarnation: int, lease: float, method: Method) -> Matrix:

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
-from sim_server.network.arrivals import Arrivals
+from sim_server.network.inbox import Arrivals
 
 
 class Ring:

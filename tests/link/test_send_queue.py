@@ -5,7 +5,7 @@ import threading
 
 import zenoh
 
-from sim_server.network.outbox import Outbox
+from sim_server.network.send_queue import Outbox
 
 
 def test_everything_is_sent_in_order_and_errors_stop_nothing() -> None:
