@@ -10,7 +10,7 @@ from protocol.refused import Refused
 Sender = TypeVar("Sender")
 
 
-class Sorted(NamedTuple, Generic[Sender]):
+class Coalesced(NamedTuple, Generic[Sender]):
     """taken: in the order of their arrival; refused: each with the reason; replaced: moves that newer ones overtook."""
 
     taken: list[tuple[Command, Sender]]
@@ -18,13 +18,13 @@ class Sorted(NamedTuple, Generic[Sender]):
     replaced: list[Sender]
 
 
-def newest_moves(asked: Sequence[tuple[Command, Sender]], check: Callable[[Command], None]) -> Sorted[Sender]:
+def coalesce_moves(asked: Sequence[tuple[Command, Sender]], check: Callable[[Command], None]) -> Coalesced[Sender]:
     """asked: parsed, in the order of their arrival, each with whom to answer. check: raises Refused.
 
     A move is passed over unchecked if a newer one of the same client and grab is well-formed. At 1 kHz a client moves
     more often than its grab is looked at, and the check is what costs most.
     """
-    found: Sorted[Sender] = Sorted([], [], [])
+    found: Coalesced[Sender] = Coalesced([], [], [])
     moved: set[tuple[str, int]] = set()
     for command, sender in reversed(asked):
         grab = (command.client, command.interaction.id) if command.verb == "move" else None

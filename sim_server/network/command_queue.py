@@ -8,7 +8,7 @@ from collections.abc import Callable, Hashable
 
 from protocol.counters import Counters
 from protocol.messages_pb2 import Command, Reply
-from sim_server.network.rate_limiter import Rates
+from sim_server.network.rate_limiter import RateLimiter
 
 WAITING = 64  # commands that may wait for the simulation
 LATE = 1024  # moves that may wait for a token of their client, or for room
@@ -16,10 +16,10 @@ LATE = 1024  # moves that may wait for a token of their client, or for room
 RATED = ("push", "grab", "move")
 
 ReplyFunction = Callable[[Reply], None]
-Asked = tuple[Command, ReplyFunction]
+PendingCommand = tuple[Command, ReplyFunction]
 
 
-class Waiting:
+class CommandQueue:
     """`offer` from the network's thread, `take` from the service thread; neither waits.
 
     A command over its client's rate, or that finds no room, is refused and counted (commands_refused). A move is not:
@@ -28,14 +28,14 @@ class Waiting:
     """
 
     def __init__(
-        self, counters: Counters, rates: Rates | None = None, room: int = WAITING,
+        self, counters: Counters, rates: RateLimiter | None = None, room: int = WAITING,
         clock: Callable[[], float] = time.monotonic,
     ):  # fmt: skip
         self._counters, self._room, self._clock = counters, room, clock
-        self._rates = Rates() if rates is None else rates
+        self._rates = RateLimiter() if rates is None else rates
         self._lock = threading.Lock()
-        self._queue: OrderedDict[Hashable, Asked] = OrderedDict()  # in the order of their arrival
-        self._late: OrderedDict[Hashable, Asked] = OrderedDict()  # moves that wait for a token or for room
+        self._queue: OrderedDict[Hashable, PendingCommand] = OrderedDict()  # in the order of their arrival
+        self._late: OrderedDict[Hashable, PendingCommand] = OrderedDict()  # moves that wait for a token or for room
 
     def offer(self, command: Command, reply: ReplyFunction) -> None:
         """Takes a command in, or answers it with the reason why not."""
@@ -48,7 +48,7 @@ class Waiting:
             self._counters.add("commands_refused")
             reply(Reply(error=refusal))
 
-    def take(self) -> list[Asked]:
+    def take(self) -> list[PendingCommand]:
         """All whose turn it is."""
         with self._lock:
             now = self._clock()

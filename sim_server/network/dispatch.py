@@ -17,14 +17,14 @@ from protocol.counters import Counters
 from protocol.messages_pb2 import Topology, WorkerInfo
 from protocol.refused import Refused
 from protocol.slots import Slot, SlotPool
-from sim_server.network.factor_decoder import Answers
-from sim_server.network.inbox import Arrivals
+from sim_server.network.factor_decoder import FactorDecoder
+from sim_server.network.inbox import Inbox
 from sim_server.network.job_message import load, matrix_message
-from sim_server.network.leases import LATE, Flight, Jobs
-from sim_server.network.send_queue import Outbox
-from sim_server.network.worker_registry import Roster
-from sim_server.network.worker_reliability import Conduct
-from sim_server.network.worker_timing import Speeds
+from sim_server.network.leases import LATE, InFlightJob, Leases
+from sim_server.network.send_queue import SendQueue
+from sim_server.network.worker_registry import WorkerRegistry
+from sim_server.network.worker_reliability import WorkerReliability
+from sim_server.network.worker_timing import WorkerTiming
 
 if TYPE_CHECKING:
     from sim_server.factors import Job
@@ -45,18 +45,18 @@ class Dispatch:
         server: str,
         incarnation: int,
         pool: SlotPool | None,
-        outbox: Outbox,
+        outbox: SendQueue,
         counters: Counters,
         silence: float,
         clock: Callable[[], float],
     ):
         self._session, self._server, self._incarnation = session, server, incarnation
         self._pool, self._outbox, self._counters, self._clock = pool, outbox, counters, clock
-        self._answers = Answers(incarnation)
-        self._roster = Roster(incarnation, silence)
-        self._jobs = Jobs(pool)
-        self._speeds = Speeds()
-        self._conduct = Conduct()
+        self._answers = FactorDecoder(incarnation)
+        self._roster = WorkerRegistry(incarnation, silence)
+        self._jobs = Leases(pool)
+        self._speeds = WorkerTiming()
+        self._conduct = WorkerReliability()
         self._busy = threading.RLock()  # a status asks for the workers while the loop thread takes in a factor
         self._last_worker: dict[str, str] = {}  # of each object: it knows the pattern already
         self._free_since: dict[str, float] = {}  # by worker, when it last answered
@@ -64,7 +64,7 @@ class Dispatch:
         self._quick: set[str] = set()  # workers without shared memory whose link takes a job at once
         self._factors: list[Factor] = []
         self._failures: list[tuple[str, str]] = []
-        self._arrivals = Arrivals(session, server)
+        self._arrivals = Inbox(session, server)
         self._look_due = 0.0
         self._take_in: dict[str, Callable[[zenoh.Sample], None]] = {
             "worker": self._take_hello,
@@ -175,7 +175,7 @@ class Dispatch:
         worker = self._choose(idle, job.object)
         matrix_slot, factor_slot = self._lend(worker, job)
         lease, now = self._jobs.lease(job.object, worker), self._clock()
-        flight = Flight(
+        flight = InFlightJob(
             self._jobs.next_number(),
             job.object,
             job.epoch,
@@ -216,7 +216,7 @@ class Dispatch:
         good = [name for name in fit if not self._conduct.held(name, object, now)]
         return [name for name in idle if name in good] if good else idle
 
-    def _another(self, flight: Flight) -> bool:
+    def _another(self, flight: InFlightJob) -> bool:
         """Somebody else could take the object of a flight."""
         return bool(self._candidates(self._idle(), self._fit(), flight.object))
 
@@ -248,14 +248,14 @@ class Dispatch:
             self._counters.trouble("slots_exhausted", "no slot of shared memory is left, an array travels as bytes")
         return matrix, factor
 
-    def _post(self, flight: Flight, job: "Job", lease: float, slot: Slot | None) -> bool:
+    def _post(self, flight: InFlightJob, job: "Job", lease: float, slot: Slot | None) -> bool:
         message = matrix_message(flight, self._answers.known[job.object], self._incarnation, lease, job.method)
         payload = load(message, job.values, slot)
         name = key("matrix", self._server, worker=flight.worker, object=flight.object)
         attachment = message.SerializeToString()
         return self._outbox.post(lambda: self._send(flight, name, payload, attachment, slot is not None))
 
-    def _send(self, flight: Flight, name: str, payload: Any, attachment: bytes, shared: bool) -> None:
+    def _send(self, flight: InFlightJob, name: str, payload: Any, attachment: bytes, shared: bool) -> None:
         """Send a job, in the thread of the outbox. Where a link is full zenoh drops it (the lease then ends) or waits.
 
         It waits only where it must: bytes over a link that is slow, as far as is known, are more than zenoh would hold.
@@ -289,11 +289,11 @@ class Dispatch:
             self._counters.add("jobs_lost")
             self._give_up(flight, f"was lost: worker {flight.worker} says that it has no job")
 
-    def _left_at(self, flight: Flight) -> float:
+    def _left_at(self, flight: InFlightJob) -> float:
         number, when = self._left.get(flight.worker, (0, 0.0))
         return when if number == flight.number else float("inf")
 
-    def _give_up(self, flight: Flight, why: str) -> None:
+    def _give_up(self, flight: InFlightJob, why: str) -> None:
         self._quick.discard(flight.worker)  # it may be that zenoh dropped it
         self._conduct.failed(flight.worker, flight.object, self._clock())
         self._fail(flight, why)
@@ -367,12 +367,12 @@ class Dispatch:
         self._count_bulk("matrix", flight, message.matrix_shared, bool(flight.slots))
         self._count_bulk("factor", flight, message.HasField("slot"), fits)
 
-    def _count_bulk(self, what: str, flight: Flight, shared: bool, lent: bool) -> None:
+    def _count_bulk(self, what: str, flight: InFlightJob, shared: bool, lent: bool) -> None:
         self._counters.add("bulk_shared" if shared else "bulk_copied")
         if lent and not shared:
             self._counters.trouble(
                 "slots_unused", f"a slot was lent to worker {flight.worker}, but its {what} travelled as bytes"
             )
 
-    def _fail(self, flight: Flight, why: str) -> None:
+    def _fail(self, flight: InFlightJob, why: str) -> None:
         self._failures.append((flight.object, f"factorization of {flight.object} at step {flight.step} {why}"))

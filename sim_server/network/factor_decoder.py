@@ -14,13 +14,13 @@ from protocol.messages_pb2 import Factor as FactorMessage
 from protocol.messages_pb2 import FactorPattern as PatternMessage
 from protocol.messages_pb2 import Topology
 from protocol.refused import Refused
-from sim_server.network.leases import Flight
+from sim_server.network.leases import InFlightJob
 
 PATTERNS = 4  # kept per object: one per library among its workers
 
 
 @dataclass
-class Known:
+class AnnouncedObject:
     """What the server knows of one object in its present epoch."""
 
     epoch: int
@@ -30,17 +30,17 @@ class Known:
     largest: dict[str, int] = field(default_factory=dict)  # values of the largest factor so far, by method
 
 
-class Answers:
+class FactorDecoder:
     """Checks of messages from workers against the objects that were announced."""
 
     def __init__(self, incarnation: int):
         self._incarnation = incarnation
-        self.known: dict[str, Known] = {}
+        self.known: dict[str, AnnouncedObject] = {}
 
     def announce(self, topology: Topology) -> None:
         """A new epoch of an object begins; patterns of the last one are forgotten."""
         header = topology.header
-        self.known[header.object] = Known(header.epoch, 3 * topology.nodes, len(topology.columns) // 4)
+        self.known[header.object] = AnnouncedObject(header.epoch, 3 * topology.nodes, len(topology.columns) // 4)
 
     def take_pattern(self, key: object, data: Sized) -> None:
         """A pattern that a worker found; raises Refused."""
@@ -68,7 +68,7 @@ class Answers:
             raise Refused(f"Factor.seconds is {message.seconds}; allowed: 0 or more", "malformed")
         return message
 
-    def factor(self, message: FactorMessage, payload: Sized, flight: Flight) -> Factor:
+    def factor(self, message: FactorMessage, payload: Sized, flight: InFlightJob) -> Factor:
         """The factor that answers a flight; raises Refused."""
         for name, value, wanted in (
             ("header.object", message.header.object, flight.object),
@@ -93,14 +93,14 @@ class Answers:
             message.remedy[:200],
         )  # fmt: skip
 
-    def _object(self, message: Any, key: object, channel: str) -> Known:
+    def _object(self, message: Any, key: object, channel: str) -> AnnouncedObject:
         header = check_header(message, incarnation=self._incarnation, object=self.known)
         if header.object != name_in(channel, key, "object"):
             raise Refused(f"{message.DESCRIPTOR.name}.header.object is {header.object!r}, its key is {key}", "object")
         return self.known[header.object]
 
 
-def _from_slot(message: FactorMessage, flight: Flight) -> NDArray[Any]:
+def _from_slot(message: FactorMessage, flight: InFlightJob) -> NDArray[Any]:
     """A copy of the values in the slot lent for this job: what is checked must not change any more."""
     slot = flight.factor_slot
     if slot is None:

@@ -17,7 +17,7 @@ RINGS = {"worker": 1024, "pattern": 64, "factor": 64}
 TOKENS = 4096
 
 
-class Arrivals:
+class Inbox:
     """Iterating gives (channel, sample) of all that arrived since the last time."""
 
     def __init__(self, session: zenoh.Session, server: str):

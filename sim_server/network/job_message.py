@@ -12,11 +12,13 @@ from protocol.check import checksum
 from protocol.messages_pb2 import Header, Matrix
 from protocol.method import Method
 from protocol.slots import Slot
-from sim_server.network.factor_decoder import Known
-from sim_server.network.leases import Flight
+from sim_server.network.factor_decoder import AnnouncedObject
+from sim_server.network.leases import InFlightJob
 
 
-def matrix_message(flight: Flight, known: Known, incarnation: int, lease: float, method: Method) -> Matrix:
+def matrix_message(
+    flight: InFlightJob, known: AnnouncedObject, incarnation: int, lease: float, method: Method
+) -> Matrix:
     """The message beside the values; checksum and matrix slot are filled in by load."""
     message = Matrix(
         header=Header(

@@ -22,14 +22,14 @@ SOON = 0.5  # s that nobody else is asked, at least
 LATE = 2  # late jobs with which a worker may still be asked again through shared memory
 
 
-class Lender(Protocol):
+class SlotAllocator(Protocol):
     """Where slots come from."""
 
     def give_back(self, slot: Slot) -> None: ...
 
 
 @dataclass(frozen=True)
-class Flight:
+class InFlightJob:
     """One job sent to one worker; deadline [s, monotonic] is the end of its lease, sent its beginning."""
 
     number: int
@@ -49,14 +49,14 @@ class Flight:
     bytes: int = 0  # of its values, where they are in no slot
 
 
-class Jobs:
+class Leases:
     """All flights. A late one stays known, its slots lent, until its worker answers it or a later one, or leaves."""
 
-    def __init__(self, lender: Lender | None):
+    def __init__(self, lender: SlotAllocator | None):
         self._lender = lender
-        self.by_object: dict[str, Flight] = {}
-        self.by_worker: dict[str, Flight] = {}
-        self._late: dict[str, list[Flight]] = {}
+        self.by_object: dict[str, InFlightJob] = {}
+        self.by_worker: dict[str, InFlightJob] = {}
+        self._late: dict[str, list[InFlightJob]] = {}
         self._seconds: dict[str, dict[str, float]] = {}  # of the last factorization, by object and worker
         self._patience: dict[tuple[str, str], int] = {}  # doublings of the lease after late jobs, by object and worker
         self._passed: set[int] = set()  # jobs whose object may go to another worker before they are answered
@@ -79,17 +79,17 @@ class Jobs:
         known = min(self._seconds.get(object, {}).values(), default=None)
         return max(SOON, TIMES * known) if known is not None else max(SHORTEST, UNKNOWN_PER_BLOCK * blocks)
 
-    def start(self, flight: Flight) -> None:
+    def start(self, flight: InFlightJob) -> None:
         """The job is on its way."""
         self.by_object[flight.object] = flight
         self.by_worker[flight.worker] = flight
 
-    def cancel(self, flight: Flight) -> None:
+    def cancel(self, flight: InFlightJob) -> None:
         """The job was never sent."""
         del self.by_object[flight.object], self.by_worker[flight.worker]
         self._give_back(flight)
 
-    def pass_on(self, now: float, able: Callable[[Flight], bool]) -> list[Flight]:
+    def pass_on(self, now: float, able: Callable[[InFlightJob], bool]) -> list[InFlightJob]:
         """Flights of which another worker may be asked, and is there (`able`): their objects may be sent again. Their
         workers stay busy until they answer, which is worth nothing then but to know that they do."""
         slow = [flight for flight in self.by_object.values() if now > flight.alone and able(flight)]
@@ -98,7 +98,7 @@ class Jobs:
             self._passed.add(flight.number)
         return slow
 
-    def passed(self, flight: Flight) -> bool:
+    def passed(self, flight: InFlightJob) -> bool:
         """Its object was passed on."""
         return flight.number in self._passed
 
@@ -106,7 +106,7 @@ class Jobs:
         """Late jobs of a worker that it may still be busy with."""
         return len(self._late.get(worker, ()))
 
-    def answered(self, number: int, worker: str, epoch: int) -> Flight:
+    def answered(self, number: int, worker: str, epoch: int) -> InFlightJob:
         """The flight that an answer belongs to, still in flight; raises Refused."""
         flight = self.by_worker.get(worker)
         if flight is not None and flight.number == number:
@@ -124,7 +124,7 @@ class Jobs:
             raise Refused(f"Factor.job is {number}, already answered or not for worker {worker}", "duplicate")
         raise Refused(f"Factor.job is {number}; allowed: a job in flight, at most {self._last}", "sequence")
 
-    def end(self, flight: Flight, seconds: float | None = None) -> None:
+    def end(self, flight: InFlightJob, seconds: float | None = None) -> None:
         """The worker has answered: the object and the worker are free, all slots up to this job come back."""
         if self.by_object.get(flight.object) is flight:
             del self.by_object[flight.object]
@@ -137,30 +137,30 @@ class Jobs:
             self._seconds.setdefault(flight.object, {})[flight.worker] = seconds
             self._patience.pop((flight.object, flight.worker), None)
 
-    def expire(self, now: float) -> list[Flight]:
+    def expire(self, now: float) -> list[InFlightJob]:
         """Flights whose lease ended: object and worker may be used again; the slots stay lent."""
         return self._given_up([flight for flight in self.by_worker.values() if now > flight.deadline])
 
     def undelivered(
-        self, left: Callable[[Flight], float], idle: Callable[[str], tuple[float, float] | None]
-    ) -> list[Flight]:
+        self, left: Callable[[InFlightJob], float], idle: Callable[[str], tuple[float, float] | None]
+    ) -> list[InFlightJob]:
         """Flights that were lost on the way, as if their leases had ended: so says the worker that should have them.
 
         left: when a job had left [s, monotonic]; idle: from when to when a worker has been saying that it has none.
         """
 
-        def lost(flight: Flight) -> bool:
+        def lost(flight: InFlightJob) -> bool:
             said = idle(flight.worker)
             return said is not None and said[1] - max(said[0], left(flight)) > self.delivery(flight)
 
         return self._given_up([flight for flight in self.by_worker.values() if lost(flight)])
 
-    def delivery(self, flight: Flight) -> float:
+    def delivery(self, flight: InFlightJob) -> float:
         """How long [s] a job that has left may be on its way; twice as long after each one that was late."""
         doublings = self._patience.get((flight.object, flight.worker), 0)
         return float((DELIVERED + min(flight.bytes, BUFFERED) / SLOWEST) * 2**doublings)
 
-    def _given_up(self, over: list[Flight]) -> list[Flight]:
+    def _given_up(self, over: list[InFlightJob]) -> list[InFlightJob]:
         for flight in over:
             del self.by_worker[flight.worker]
             self._passed.discard(flight.number)
@@ -179,7 +179,7 @@ class Jobs:
         for pair in [pair for pair in self._patience if pair[0] == object]:
             del self._patience[pair]
 
-    def lost(self, worker: str) -> Flight | None:
+    def lost(self, worker: str) -> InFlightJob | None:
         """The worker is gone: all its slots come back; the job of a living object that was lost with it."""
         for old in self._late.pop(worker, []):
             self._give_back(old)
@@ -208,7 +208,7 @@ class Jobs:
             late.remove(old)
             self._give_back(old)
 
-    def _give_back(self, flight: Flight) -> None:
+    def _give_back(self, flight: InFlightJob) -> None:
         if self._lender is not None:
             for slot in flight.slots:
                 self._lender.give_back(slot)

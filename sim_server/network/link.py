@@ -25,10 +25,10 @@ from protocol.refused import Refused
 from protocol.session import open_session
 from protocol.slots import Slot, SlotPool, SlotsUnusable
 from sim_server.network.dispatch import Dispatch
-from sim_server.network.name_claim import Claim
-from sim_server.network.publishers import Publications
-from sim_server.network.queryables import Inquiries
-from sim_server.network.send_queue import Outbox
+from sim_server.network.name_claim import NameClaim
+from sim_server.network.publishers import Publishers
+from sim_server.network.queryables import Queryables
+from sim_server.network.send_queue import SendQueue
 
 if TYPE_CHECKING:
     from sim_server.factors import Job
@@ -67,13 +67,13 @@ class ServerLink:
                 "server", listen=listen, connect=connect, shared_memory=shared_memory, name=self.name
             )
             closing.callback(self._session.close)
-            self._claim = Claim(self._session, self.name, self.incarnation, listen, connect)
+            self._claim = NameClaim(self._session, self.name, self.incarnation, listen, connect)
             closing.callback(self._claim.close)
             self._pool, echo_slot = self._make_slots(slots)
             if self._pool is not None:
                 closing.callback(self._pool.close)
-            self._jobs_out, self._telemetry = Outbox("jobs", 64), Outbox("telemetry", 64)
-            self._replies = Outbox("replies", REPLIES)
+            self._jobs_out, self._telemetry = SendQueue("jobs", 64), SendQueue("telemetry", 64)
+            self._replies = SendQueue("replies", REPLIES)
             closing.callback(self._replies.close, finish=True)
             closing.callback(self._telemetry.close)
             closing.callback(self._jobs_out.close)
@@ -85,10 +85,10 @@ class ServerLink:
         self._dispatch = Dispatch(
             session, self.name, self.incarnation, self._pool, self._jobs_out, self.counters, silence, clock
         )
-        self._inquiries = Inquiries(
+        self._inquiries = Queryables(
             self._session, self.name, self.incarnation, self.counters, echo_slot, self._replies, self._claim
         )
-        self._publications = Publications(session, self.name, self._telemetry, self.counters)
+        self._publications = Publishers(session, self.name, self._telemetry, self.counters)
         self._clients: set[str] = set()
         self._client_tokens = session.liveliness().declare_subscriber(
             key("alive_client", self.name), RingChannel(TOKENS), history=True

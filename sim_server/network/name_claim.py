@@ -27,7 +27,7 @@ SETTLED = 3.0  # s after which a server leaves no more; whoever comes later has 
 AGAIN = 0.5  # s between questions
 
 
-class Claim:
+class NameClaim:
     """Says whether a server may keep its name; raises NameTaken at once if it may not.
 
     listen, connect: as of ServerLink. Asks as a client of those that this server is linked with: a router tells one

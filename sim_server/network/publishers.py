@@ -9,13 +9,13 @@ import zenoh
 
 from protocol.channels import key
 from protocol.counters import Counters
-from sim_server.network.send_queue import Outbox
+from sim_server.network.send_queue import SendQueue
 
 
-class Publications:
+class Publishers:
     """Publishers of the server, declared as they are first used. A slow listener loses frames, never holds us up."""
 
-    def __init__(self, session: zenoh.Session, server: str, outbox: Outbox, counters: Counters):
+    def __init__(self, session: zenoh.Session, server: str, outbox: SendQueue, counters: Counters):
         self._session = session
         self._server = server
         self._outbox = outbox

@@ -16,10 +16,10 @@ from protocol.messages_pb2 import Command, Echo, Header, Reply
 from protocol.refused import Refused
 from protocol.session import Session
 from protocol.slots import Slot
-from sim_server.network.coalesce import newest_moves
-from sim_server.network.command_queue import Asked, Waiting
-from sim_server.network.name_claim import Claim
-from sim_server.network.send_queue import Outbox
+from sim_server.network.coalesce import coalesce_moves
+from sim_server.network.command_queue import CommandQueue, PendingCommand
+from sim_server.network.name_claim import NameClaim
+from sim_server.network.send_queue import SendQueue
 
 log = logging.getLogger(__name__)
 
@@ -28,7 +28,7 @@ OTHERS = 64  # workers of another wire version that are told of one by one
 CHANNELS_ASKED = ("command", "status", "scene", "topology", "echo")
 
 
-class Inquiries:
+class Queryables:
     """A queryable and a thread for each channel, so that a flood of commands holds up no other question.
 
     What was published under a key is answered at once; commands wait for the simulation, in bounded room (waiting.py),
@@ -37,8 +37,8 @@ class Inquiries:
     """
 
     def __init__(
-        self, session: Session, server: str, incarnation: int, counters: Counters, slot: Slot | None, replies: Outbox,
-        claim: Claim,
+        self, session: Session, server: str, incarnation: int, counters: Counters, slot: Slot | None, replies: SendQueue,
+        claim: NameClaim,
     ):  # fmt: skip
         self._claim = claim
         self._replies = replies
@@ -50,7 +50,7 @@ class Inquiries:
         self._echo_prefix = key("echo", server, worker="*")[:-1]
         self._answers: dict[str, bytes] = {}
         self._other_version: set[str] = set()  # workers
-        self._waiting = Waiting(counters)
+        self._waiting = CommandQueue(counters)
         self._done = self._stamped(Reply())
         self._queryables = {}
         for channel in CHANNELS_ASKED:
@@ -62,7 +62,7 @@ class Inquiries:
         """From now on a query of this key gets this answer."""
         self._answers[name] = answer
 
-    def commands(self) -> list[Asked]:
+    def commands(self) -> list[PendingCommand]:
         """Commands that came since the last call, each with the function that answers it."""
         return self._waiting.take()
 
@@ -146,7 +146,7 @@ class Inquiries:
                 asked.append((parse(Command, query.payload, CHANNELS["command"].limit), query))
             except Refused as refusal:
                 self._refuse(refusal, query)
-        found = newest_moves(asked, self._check)
+        found = coalesce_moves(asked, self._check)
         for reason, query in found.refused:
             self._refuse(reason, query)
         for query in found.replaced:

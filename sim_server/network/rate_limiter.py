@@ -9,7 +9,7 @@ CLIENTS = 256  # with a bucket of their own; those beyond share one
 
 
 @dataclass
-class Bucket:
+class TokenBucket:
     """Tokens that come in at `rate` a second, never more than `burst`; what is done takes one."""
 
     rate: float
@@ -35,7 +35,7 @@ class Bucket:
         self.filled = max(now, self.filled)
 
 
-class Rates:
+class RateLimiter:
     """A bucket for each client by the name it gives.
 
     A full bucket is forgotten when room is needed, which changes nothing for its client. Who invents names gets no more
@@ -44,14 +44,14 @@ class Rates:
 
     def __init__(self, rate: float = RATE, burst: float = BURST, clients: int = CLIENTS):
         self.rate, self.burst, self._clients = rate, burst, clients
-        self._own: dict[str, Bucket] = {}
-        self._shared: Bucket | None = None
+        self._own: dict[str, TokenBucket] = {}
+        self._shared: TokenBucket | None = None
 
     def take(self, client: str, now: float, debt: float = 0.0) -> bool:
         """Whether a command of this client may pass at `now` [s]."""
         return self._bucket(client, now).take(now, debt)
 
-    def _bucket(self, client: str, now: float) -> Bucket:
+    def _bucket(self, client: str, now: float) -> TokenBucket:
         if client not in self._own and len(self._own) >= self._clients:
             self._own = {name: bucket for name, bucket in self._own.items() if not bucket.full(now)}
         if client in self._own or len(self._own) < self._clients:
@@ -59,8 +59,8 @@ class Rates:
         self._shared = self._shared or self._new(now)
         return self._shared
 
-    def _new(self, now: float) -> Bucket:
-        return Bucket(self.rate, self.burst, self.burst, now)
+    def _new(self, now: float) -> TokenBucket:
+        return TokenBucket(self.rate, self.burst, self.burst, now)
 
     def __len__(self) -> int:
         return len(self._own)

@@ -13,7 +13,7 @@ log = logging.getLogger(__name__)
 Send = Callable[[], None]
 
 
-class Outbox:
+class SendQueue:
     """Runs posted sends one after another. What is posted under a name replaces what still waits under it."""
 
     def __init__(self, name: str, capacity: int):

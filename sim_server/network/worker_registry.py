@@ -21,7 +21,7 @@ REPEATED = 5  # heartbeats, one second: sequence numbers further back are not re
 
 
 @dataclass
-class Member:
+class RegisteredWorker:
     """A worker that said hello; seen: when it was heard of last [s, monotonic]."""
 
     info: WorkerInfo
@@ -35,14 +35,14 @@ class Member:
         return (self.info.pid, self.info.host) == (info.pid, info.host)
 
 
-class Roster:
+class WorkerRegistry:
     """Workers by name. Knows nothing of sockets: tokens and hellos are handed in."""
 
     def __init__(self, incarnation: int, silence: float = SILENCE):
         self._incarnation = incarnation
         self._silence = silence
         self._tokens: dict[str, None] = {}  # of names that have said nothing yet, oldest first
-        self._members: dict[str, Member] = {}
+        self._members: dict[str, RegisteredWorker] = {}
 
     def token(self, name: str, alive: bool) -> bool:
         """A liveliness token came or went; True if a worker left by it. Raises Refused if another is forgotten."""
@@ -92,10 +92,10 @@ class Roster:
         token = known.token if known is not None else name in self._tokens
         self._tokens.pop(name, None)
         idle = self._idle(known if same else None, info, now)
-        self._members[name] = Member(info, now, header.sequence, token, idle)
+        self._members[name] = RegisteredWorker(info, now, header.sequence, token, idle)
         return name, not same, lost
 
-    def _idle(self, known: Member | None, info: WorkerInfo, now: float) -> tuple[float, float] | None:
+    def _idle(self, known: RegisteredWorker | None, info: WorkerInfo, now: float) -> tuple[float, float] | None:
         if not info.idle:
             return None
         if known is None or known.idle is None or now - known.idle[1] > GAP:

@@ -12,7 +12,7 @@ HOLD = 0.1  # s without jobs of an object after the second in a row that came to
 MOST = 9  # doublings of that
 
 
-class Conduct:
+class WorkerReliability:
     """By worker. A job that came to nothing: no factor, or one that was refused or no use."""
 
     def __init__(self) -> None:

@@ -9,7 +9,7 @@ SLOWEST = 100.0  # bound of what is believed of a worker
 HANGS = 3.0  # times the expected time after which a busy worker is not waited for
 
 
-class Speeds:
+class WorkerTiming:
     """Times [s] by worker and object, and of each worker how many times slower it is than the best."""
 
     def __init__(self) -> None:

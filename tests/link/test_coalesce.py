@@ -12,8 +12,8 @@ from protocol.channels import key
 from protocol.counters import Counters
 from protocol.messages_pb2 import Command, Header, Interaction, Reply, Vector
 from protocol.refused import Refused
-from sim_server.network.coalesce import newest_moves
-from sim_server.network.queryables import Inquiries
+from sim_server.network.coalesce import coalesce_moves
+from sim_server.network.queryables import Queryables
 
 NAN = float("nan")
 
@@ -32,7 +32,7 @@ def sorted_out(*commands: Command) -> tuple[list[int], list[int], list[int], lis
         if given.interaction.target.x != given.interaction.target.x:
             raise Refused("NaN", "not_finite")
 
-    found = newest_moves([(c, n) for n, c in enumerate(commands)], check)
+    found = coalesce_moves([(c, n) for n, c in enumerate(commands)], check)
     return [n for _, n in found.taken], [n for _, n in found.refused], found.replaced, sorted(checked)
 
 
@@ -81,12 +81,12 @@ def desk() -> Any:
     """Inquiries without a network: what is posted is sent at once."""
     session: Any = SimpleNamespace(zenoh=SimpleNamespace(declare_queryable=lambda *_: None), thread=lambda *_: None)
     replies: Any = SimpleNamespace(post=lambda send: send() or True)
-    return Inquiries(
+    return Queryables(
         session, "sim", 5, Counters(logging.getLogger("test")), None, replies, SimpleNamespace(settled=True)
     )
 
 
-def test_each_of_a_round_is_answered_once(desk: Inquiries) -> None:
+def test_each_of_a_round_is_answered_once(desk: Queryables) -> None:
     moves = [Query(command("move", id=7, x=float(i)).SerializeToString()) for i in range(40)]
     push, old = Query(command("push").SerializeToString()), Query(command("push", protocol=99).SerializeToString())
     broken, elsewhere = Query(b"\xff\xff"), Query(b"", key("status", "sim"))

@@ -6,8 +6,8 @@ import logging
 from protocol.counters import Counters
 from protocol.messages_pb2 import Command, Interaction, Reply, Vector
 from sim_server.network import command_queue as module
-from sim_server.network.command_queue import Waiting
-from sim_server.network.rate_limiter import Bucket, Rates
+from sim_server.network.command_queue import CommandQueue
+from sim_server.network.rate_limiter import RateLimiter, TokenBucket
 
 
 class Desk:
@@ -15,7 +15,7 @@ class Desk:
 
     def __init__(self, rate: float = 10.0, burst: float = 3.0, room: int = 64):
         self.now, self.counters, self.replies = 0.0, Counters(logging.getLogger("test")), {}
-        self.waiting = Waiting(self.counters, Rates(rate, burst), room, lambda: self.now)
+        self.waiting = CommandQueue(self.counters, RateLimiter(rate, burst), room, lambda: self.now)
         self._count = 0
 
     def offer(self, verb: str, client: str = "anna", id: int = 0, x: float = 0.0) -> int:
@@ -40,7 +40,7 @@ class Desk:
 
 
 def test_a_bucket_gives_its_burst_and_then_its_rate() -> None:
-    bucket = Bucket(rate=10.0, burst=3.0, tokens=3.0, filled=100.0)
+    bucket = TokenBucket(rate=10.0, burst=3.0, tokens=3.0, filled=100.0)
     assert [bucket.take(100.0) for _ in range(5)] == [True, True, True, False, False]
     assert not bucket.take(100.09) and bucket.take(100.11)
     assert sum(bucket.take(101 + 0.001 * i) for i in range(2000)) in (22, 23), "two seconds at 10 a second, and 3"
@@ -49,18 +49,18 @@ def test_a_bucket_gives_its_burst_and_then_its_rate() -> None:
 
 
 def test_a_bucket_may_owe_so_much_and_no_more() -> None:
-    bucket = Bucket(rate=10.0, burst=3.0, tokens=0.0, filled=0.0)
+    bucket = TokenBucket(rate=10.0, burst=3.0, tokens=0.0, filled=0.0)
     assert [bucket.take(0.0, debt=2.0) for _ in range(3)] == [True, True, False]
     assert not bucket.take(0.25) and bucket.take(0.31)
 
 
 def test_a_clock_that_goes_back_gives_nothing() -> None:
-    bucket = Bucket(rate=10.0, burst=3.0, tokens=1.0, filled=50.0)
+    bucket = TokenBucket(rate=10.0, burst=3.0, tokens=1.0, filled=50.0)
     assert bucket.take(40.0) and not bucket.take(41.0)
 
 
 def test_clients_have_buckets_of_their_own_in_bounded_memory() -> None:
-    rates = Rates(rate=10.0, burst=2.0, clients=3)
+    rates = RateLimiter(rate=10.0, burst=2.0, clients=3)
     for name in ("a", "b", "c"):
         assert [rates.take(name, 0.0) for _ in range(3)] == [True, True, False]
     shared = sum(rates.take(f"invented-{i}", 0.0) for i in range(1000))

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
-from sim_server.network.inbox import Arrivals
+from sim_server.network.inbox import Inbox
 
 
 class Ring:
@@ -19,7 +19,7 @@ class Ring:
         return self.samples.pop(0) if self.samples else None
 
 
-def arrivals(**rings: Ring) -> Arrivals:
+def arrivals(**rings: Ring) -> Inbox:
     """With these rings instead of subscribers."""
     waiting = iter(rings.values())
 
@@ -29,7 +29,7 @@ def arrivals(**rings: Ring) -> Arrivals:
     session: Any = SimpleNamespace(
         declare_subscriber=declare, liveliness=lambda: SimpleNamespace(declare_subscriber=declare)
     )
-    return Arrivals(session, "sim")
+    return Inbox(session, "sim")
 
 
 def test_factors_are_taken_before_the_leaving_of_their_worker() -> None:

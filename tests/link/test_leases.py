@@ -6,10 +6,10 @@ from dataclasses import replace
 import pytest
 
 from protocol import Refused
-from sim_server.network.leases import DELIVERED, LONGEST, SHORTEST, Flight, Jobs
+from sim_server.network.leases import DELIVERED, LONGEST, SHORTEST, InFlightJob, Leases
 
 
-class Lender:
+class SlotAllocator:
     def __init__(self) -> None:
         self.back: list[object] = []
 
@@ -17,24 +17,24 @@ class Lender:
         self.back.append(slot)
 
 
-def flight(jobs: Jobs, object: str = "beam", worker: str = "w", deadline: float = 2.0, epoch: int = 1) -> Flight:
+def flight(jobs: Leases, object: str = "beam", worker: str = "w", deadline: float = 2.0, epoch: int = 1) -> InFlightJob:
     number = jobs.next_number()
-    started = Flight(number, object, epoch, 1, True, "float32", worker, deadline, slots=(f"slot {number}",))  # type: ignore[arg-type]
+    started = InFlightJob(number, object, epoch, 1, True, "float32", worker, deadline, slots=(f"slot {number}",))  # type: ignore[arg-type]
     jobs.start(started)
     return started
 
 
 @pytest.fixture
-def lender() -> Lender:
-    return Lender()
+def lender() -> SlotAllocator:
+    return SlotAllocator()
 
 
 @pytest.fixture
-def jobs(lender: Lender) -> Jobs:
-    return Jobs(lender)
+def jobs(lender: SlotAllocator) -> Leases:
+    return Leases(lender)
 
 
-def test_an_answer_frees_object_worker_and_slots(jobs: Jobs, lender: Lender) -> None:
+def test_an_answer_frees_object_worker_and_slots(jobs: Leases, lender: SlotAllocator) -> None:
     first = flight(jobs)
     assert jobs.answered(1, "w", 1) is first
     jobs.end(first, 0.5)
@@ -48,7 +48,7 @@ def test_an_answer_frees_object_worker_and_slots(jobs: Jobs, lender: Lender) -> 
     ("number", "worker", "epoch", "kind"),
     [(2, "w", 1, "sequence"), (0, "w", 1, "sequence"), (1, "x", 1, "duplicate"), (1, "w", 2, "epoch")],
 )
-def test_answers_to_nothing_leave_the_job_alone(jobs: Jobs, number: int, worker: str, epoch: int, kind: str) -> None:
+def test_answers_to_nothing_leave_the_job_alone(jobs: Leases, number: int, worker: str, epoch: int, kind: str) -> None:
     first = flight(jobs)
     with pytest.raises(Refused) as refused:
         jobs.answered(number, worker, epoch)
@@ -56,7 +56,7 @@ def test_answers_to_nothing_leave_the_job_alone(jobs: Jobs, number: int, worker:
     assert jobs.by_object == {"beam": first} and jobs.by_worker == {"w": first}
 
 
-def test_a_lease_that_ends_frees_object_and_worker_but_not_the_slots(jobs: Jobs, lender: Lender) -> None:
+def test_a_lease_that_ends_frees_object_and_worker_but_not_the_slots(jobs: Leases, lender: SlotAllocator) -> None:
     first = flight(jobs, deadline=2.0)
     assert jobs.expire(1.9) == []
     assert jobs.expire(2.1) == [first]
@@ -67,7 +67,7 @@ def test_a_lease_that_ends_frees_object_and_worker_but_not_the_slots(jobs: Jobs,
     assert lender.back == ["slot 1"] and jobs.lateness("w") == 0
 
 
-def test_an_answer_to_a_later_job_frees_the_slots_of_late_ones(jobs: Jobs, lender: Lender) -> None:
+def test_an_answer_to_a_later_job_frees_the_slots_of_late_ones(jobs: Leases, lender: SlotAllocator) -> None:
     flight(jobs, deadline=1.0)
     jobs.expire(2.0)
     second = flight(jobs, deadline=3.0)
@@ -75,7 +75,7 @@ def test_an_answer_to_a_later_job_frees_the_slots_of_late_ones(jobs: Jobs, lende
     assert sorted(map(str, lender.back)) == ["slot 1", "slot 2"]
 
 
-def test_leaving_frees_everything_of_the_worker(jobs: Jobs, lender: Lender) -> None:
+def test_leaving_frees_everything_of_the_worker(jobs: Leases, lender: SlotAllocator) -> None:
     flight(jobs, deadline=1.0)
     jobs.expire(2.0)
     second = flight(jobs, deadline=9.0)
@@ -85,7 +85,9 @@ def test_leaving_frees_everything_of_the_worker(jobs: Jobs, lender: Lender) -> N
     assert jobs.by_object == {"liver": other} and jobs.lost("w") is None
 
 
-def test_a_new_epoch_frees_the_object_at_once_and_the_worker_when_it_answers(jobs: Jobs, lender: Lender) -> None:
+def test_a_new_epoch_frees_the_object_at_once_and_the_worker_when_it_answers(
+    jobs: Leases, lender: SlotAllocator
+) -> None:
     flight(jobs)
     jobs.forget("beam")
     assert jobs.by_object == {} and "w" in jobs.by_worker
@@ -95,7 +97,7 @@ def test_a_new_epoch_frees_the_object_at_once_and_the_worker_when_it_answers(job
     assert jobs.by_worker == {} and lender.back == ["slot 1"]
 
 
-def test_an_old_epoch_that_runs_out_or_is_lost_is_no_failure_of_the_new(jobs: Jobs) -> None:
+def test_an_old_epoch_that_runs_out_or_is_lost_is_no_failure_of_the_new(jobs: Leases) -> None:
     flight(jobs, deadline=1.0)
     jobs.forget("beam")
     new = flight(jobs, worker="x", deadline=9.0, epoch=2)
@@ -104,7 +106,7 @@ def test_an_old_epoch_that_runs_out_or_is_lost_is_no_failure_of_the_new(jobs: Jo
     assert jobs.by_object == {"beam": new}
 
 
-def test_leases_follow_the_last_factorization_and_double_when_missed(jobs: Jobs) -> None:
+def test_leases_follow_the_last_factorization_and_double_when_missed(jobs: Leases) -> None:
     assert jobs.lease("beam", "w") == LONGEST, "whoever is asked first may have to compile"
     jobs.end(flight(jobs), 0.4)
     assert jobs.lease("beam", "w") == pytest.approx(8.0)
@@ -120,7 +122,7 @@ def test_leases_follow_the_last_factorization_and_double_when_missed(jobs: Jobs)
     assert jobs.lease("beam", "w") == SHORTEST
 
 
-def test_who_is_late_costs_others_no_time(jobs: Jobs) -> None:
+def test_who_is_late_costs_others_no_time(jobs: Leases) -> None:
     """Leases are of an object at a worker."""
     jobs.end(flight(jobs, worker="good"), 0.4)
     for _ in range(5):
@@ -134,7 +136,7 @@ def test_who_is_late_costs_others_no_time(jobs: Jobs) -> None:
     assert jobs.lease("beam", "slow") == LONGEST
 
 
-def test_an_object_waits_for_a_slow_worker_only_while_there_is_no_other(jobs: Jobs, lender: Lender) -> None:
+def test_an_object_waits_for_a_slow_worker_only_while_there_is_no_other(jobs: Leases, lender: SlotAllocator) -> None:
     assert jobs.alone("beam", 10) == SHORTEST and jobs.alone("beam", 100_000) == pytest.approx(10.0)
     jobs.end(flight(jobs, worker="good"), 0.4)
     jobs.end(flight(jobs, worker="slow"), 40.0)
@@ -150,13 +152,13 @@ def test_an_object_waits_for_a_slow_worker_only_while_there_is_no_other(jobs: Jo
     assert len(lender.back) == 3
 
 
-def test_a_job_that_was_never_sent_leaves_no_trace(jobs: Jobs, lender: Lender) -> None:
+def test_a_job_that_was_never_sent_leaves_no_trace(jobs: Leases, lender: SlotAllocator) -> None:
     jobs.cancel(flight(jobs))
     assert (jobs.by_object, jobs.by_worker, lender.back) == ({}, {}, ["slot 1"])
 
 
-def test_a_job_is_lost_when_its_worker_keeps_saying_that_it_has_none(jobs: Jobs, lender: Lender) -> None:
-    def undelivered(left: float, idle: tuple[float, float] | None) -> list[Flight]:
+def test_a_job_is_lost_when_its_worker_keeps_saying_that_it_has_none(jobs: Leases, lender: SlotAllocator) -> None:
+    def undelivered(left: float, idle: tuple[float, float] | None) -> list[InFlightJob]:
         return jobs.undelivered(lambda flight: left, lambda worker: idle)
 
     first = flight(jobs, deadline=LONGEST)
@@ -170,7 +172,7 @@ def test_a_job_is_lost_when_its_worker_keeps_saying_that_it_has_none(jobs: Jobs,
     assert undelivered(5.0, (0.0, 6.9)) == [] and undelivered(5.0, (0.0, 7.1)) == [again]
 
 
-def test_bytes_may_be_on_their_way_for_longer(jobs: Jobs) -> None:
+def test_bytes_may_be_on_their_way_for_longer(jobs: Leases) -> None:
     some = flight(jobs)
     assert jobs.delivery(some) == DELIVERED
     assert jobs.delivery(replace(some, bytes=2_000_000)) == pytest.approx(DELIVERED + 2)

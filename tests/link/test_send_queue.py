@@ -5,7 +5,7 @@ import threading
 
 import zenoh
 
-from sim_server.network.send_queue import Outbox
+from sim_server.network.send_queue import SendQueue
 
 
 def test_everything_is_sent_in_order_and_errors_stop_nothing() -> None:
@@ -14,7 +14,7 @@ def test_everything_is_sent_in_order_and_errors_stop_nothing() -> None:
     def fail() -> None:
         raise zenoh.ZError("gone")
 
-    outbox = Outbox("test", 10)
+    outbox = SendQueue("test", 10)
     outbox.post(lambda: sent.append(1))
     outbox.post(fail)
     outbox.post(lambda: sent.append(2))
@@ -33,7 +33,7 @@ def test_a_stuck_send_blocks_no_sender_and_newer_replaces_older() -> None:
         begun.set()
         stuck.wait(10)
 
-    outbox = Outbox("test", 3)
+    outbox = SendQueue("test", 3)
     outbox.post(block)
     assert begun.wait(10)
     assert outbox.post(lambda: sent.append("old"), "state")
@@ -50,7 +50,7 @@ def test_a_stuck_send_blocks_no_sender_and_newer_replaces_older() -> None:
 def test_closing_may_send_what_waits() -> None:
     sent: list[int] = []
     begun, go_on = threading.Event(), threading.Event()
-    outbox = Outbox("test", 10)
+    outbox = SendQueue("test", 10)
     outbox.post(lambda: (begun.set(), go_on.wait(5)))  # type: ignore[arg-type,return-value]
     begun.wait(5)
     for k in range(5):

@@ -6,7 +6,7 @@ import pytest
 from protocol import PROTOCOL, Refused
 from protocol.channels import key
 from protocol.messages_pb2 import Header, WorkerInfo
-from sim_server.network.worker_registry import TOKENS, WORKERS, Roster
+from sim_server.network.worker_registry import TOKENS, WORKERS, WorkerRegistry
 
 
 def hello(name: str = "w", sequence: int = 1, pid: int = 10, idle: bool = False) -> bytes:
@@ -15,11 +15,11 @@ def hello(name: str = "w", sequence: int = 1, pid: int = 10, idle: bool = False)
 
 
 @pytest.fixture
-def roster() -> Roster:
-    return Roster(7, silence=2.0)
+def roster() -> WorkerRegistry:
+    return WorkerRegistry(7, silence=2.0)
 
 
-def test_token_and_hello_make_a_worker_in_either_order(roster: Roster) -> None:
+def test_token_and_hello_make_a_worker_in_either_order(roster: WorkerRegistry) -> None:
     roster.token("w", True)
     assert roster.fit(0.0, {}) == []
     assert roster.hello(key("worker", worker="w"), hello(), 0.0) == ("w", True, "")
@@ -29,7 +29,7 @@ def test_token_and_hello_make_a_worker_in_either_order(roster: Roster) -> None:
     assert roster.fit(0.0, {}) == ["w", "x"]
 
 
-def test_silence_makes_unfit_unless_the_worker_is_busy(roster: Roster) -> None:
+def test_silence_makes_unfit_unless_the_worker_is_busy(roster: WorkerRegistry) -> None:
     roster.token("w", True)
     roster.hello(key("worker", worker="w"), hello(), 0.0)
     assert roster.fit(2.0, {}) == ["w"] and roster.fit(2.1, {}) == []
@@ -40,7 +40,7 @@ def test_silence_makes_unfit_unless_the_worker_is_busy(roster: Roster) -> None:
     assert roster.fit(10.0, {}) == ["w"]
 
 
-def test_a_worker_leaves_by_its_token(roster: Roster) -> None:
+def test_a_worker_leaves_by_its_token(roster: WorkerRegistry) -> None:
     roster.token("w", True)
     roster.hello(key("worker", worker="w"), hello(), 0.0)
     assert roster.token("w", False)
@@ -48,7 +48,7 @@ def test_a_worker_leaves_by_its_token(roster: Roster) -> None:
     assert not roster.token("w", False)
 
 
-def test_another_process_takes_the_name_over_only_from_a_silent_one(roster: Roster) -> None:
+def test_another_process_takes_the_name_over_only_from_a_silent_one(roster: WorkerRegistry) -> None:
     where = key("worker", worker="w")
     roster.hello(where, hello(), 0.0)
     with pytest.raises(Refused, match="give each worker a name of its own"):
@@ -56,7 +56,7 @@ def test_another_process_takes_the_name_over_only_from_a_silent_one(roster: Rost
     assert roster.hello(where, hello(pid=11), 2.5) == ("w", True, "")
 
 
-def test_old_and_repeated_heartbeats_are_refused(roster: Roster) -> None:
+def test_old_and_repeated_heartbeats_are_refused(roster: WorkerRegistry) -> None:
     where = key("worker", worker="w")
     roster.hello(where, hello(sequence=5), 0.0)
     for sequence in (5, 4):
@@ -64,7 +64,7 @@ def test_old_and_repeated_heartbeats_are_refused(roster: Roster) -> None:
             roster.hello(where, hello(sequence=sequence), 1.0)
 
 
-def test_a_forged_heartbeat_with_a_huge_number_does_not_shut_the_worker_out(roster: Roster) -> None:
+def test_a_forged_heartbeat_with_a_huge_number_does_not_shut_the_worker_out(roster: WorkerRegistry) -> None:
     where = key("worker", worker="w")
     roster.hello(where, hello(sequence=5), 0.0)
     roster.hello(where, hello(sequence=2**63), 0.1)
@@ -74,12 +74,12 @@ def test_a_forged_heartbeat_with_a_huge_number_does_not_shut_the_worker_out(rost
     assert roster.fit(3.5, {}) == ["w"]
 
 
-def join(roster: Roster, name: str, now: float = 0.0) -> tuple[str, bool, str]:
+def join(roster: WorkerRegistry, name: str, now: float = 0.0) -> tuple[str, bool, str]:
     roster.token(name, True)
     return roster.hello(key("worker", worker=name), hello(name), now)
 
 
-def test_their_number_is_bounded(roster: Roster) -> None:
+def test_their_number_is_bounded(roster: WorkerRegistry) -> None:
     for k in range(WORKERS):
         join(roster, f"w{k}")
     with pytest.raises(Refused, match=f"{WORKERS} workers are known already") as refused:
@@ -89,7 +89,7 @@ def test_their_number_is_bounded(roster: Roster) -> None:
     assert join(roster, "one-more") == ("one-more", True, "")
 
 
-def test_who_has_no_token_or_is_silent_holds_no_place_against_a_worker_that_speaks(roster: Roster) -> None:
+def test_who_has_no_token_or_is_silent_holds_no_place_against_a_worker_that_speaks(roster: WorkerRegistry) -> None:
     for k in range(WORKERS - 1):
         join(roster, f"w{k}", 10.0 if k != 3 else 8.5)
     roster.hello(key("worker", worker="ghost"), hello("ghost"), 10.0)
@@ -103,7 +103,7 @@ def test_who_has_no_token_or_is_silent_holds_no_place_against_a_worker_that_spea
     assert "w3" in roster.fit(11.0, {}), "its token was not forgotten"
 
 
-def test_a_busy_worker_may_be_silent_and_keeps_its_place(roster: Roster) -> None:
+def test_a_busy_worker_may_be_silent_and_keeps_its_place(roster: WorkerRegistry) -> None:
     for k in range(WORKERS):
         join(roster, f"w{k}", 10.0 if k else 0.0)
     roster.token("new", True)
@@ -111,7 +111,7 @@ def test_a_busy_worker_may_be_silent_and_keeps_its_place(roster: Roster) -> None
         roster.hello(key("worker", worker="new"), hello("new"), 10.0, {"w0": 60.0})
 
 
-def test_of_tokens_that_say_nothing_the_oldest_is_forgotten(roster: Roster) -> None:
+def test_of_tokens_that_say_nothing_the_oldest_is_forgotten(roster: WorkerRegistry) -> None:
     join(roster, "real")
     for k in range(TOKENS):
         roster.token(f"fake{k}", True)
@@ -122,7 +122,7 @@ def test_of_tokens_that_say_nothing_the_oldest_is_forgotten(roster: Roster) -> N
     assert roster.fit(0.0, {}) == ["real", "late"]
 
 
-def test_a_worker_that_speaks_without_a_token_is_looked_for(roster: Roster) -> None:
+def test_a_worker_that_speaks_without_a_token_is_looked_for(roster: WorkerRegistry) -> None:
     join(roster, "w")
     roster.hello(key("worker", worker="x"), hello("x"), 0.0)
     assert roster.without_token(1.0) == {"x"}
@@ -131,7 +131,7 @@ def test_a_worker_that_speaks_without_a_token_is_looked_for(roster: Roster) -> N
     assert roster.without_token(1.0) == set() and roster.fit(1.0, {}) == ["w", "x"]
 
 
-def test_idle_is_who_says_so_in_every_heartbeat(roster: Roster) -> None:
+def test_idle_is_who_says_so_in_every_heartbeat(roster: WorkerRegistry) -> None:
     where = key("worker", worker="w")
 
     def said(sequence: int, now: float, idle: bool = True, pid: int = 10) -> tuple[float, float] | None:

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: MIT
 """Who gets jobs at all: those who answer, newcomers a few at a time, and nobody whose factors come to nothing."""
 
-from sim_server.network.worker_reliability import GAP, HOLD, MOST, Conduct
+from sim_server.network.worker_reliability import GAP, HOLD, MOST, WorkerReliability
 
 
-def may_be_asked(conduct: Conduct, fit: list[str], now: float) -> list[str]:
+def may_be_asked(conduct: WorkerReliability, fit: list[str], now: float) -> list[str]:
     return [name for name in fit if conduct.may_be_asked(name, fit, now)]
 
 
 def test_while_nobody_has_answered_all_are_asked() -> None:
-    conduct, fit = Conduct(), ["a", "b", "c"]
+    conduct, fit = WorkerReliability(), ["a", "b", "c"]
     for name in fit:
         assert may_be_asked(conduct, fit, 0.0) == fit
         conduct.sent(name, 0.0)
@@ -17,7 +17,7 @@ def test_while_nobody_has_answered_all_are_asked() -> None:
 
 
 def test_beside_one_who_answers_newcomers_are_tried_one_at_a_time() -> None:
-    conduct = Conduct()
+    conduct = WorkerReliability()
     fakes = [f"fake{k}" for k in range(20)]
     fit = ["real", *fakes]
     conduct.sent("real", 0.0)
@@ -35,7 +35,7 @@ def test_beside_one_who_answers_newcomers_are_tried_one_at_a_time() -> None:
 
 
 def test_as_many_newcomers_are_tried_as_have_answered() -> None:
-    conduct, fit = Conduct(), [f"w{k}" for k in range(8)]
+    conduct, fit = WorkerReliability(), [f"w{k}" for k in range(8)]
     conduct.answered("w0")
     new, counts = fit[1:], []
     while new:
@@ -50,7 +50,7 @@ def test_as_many_newcomers_are_tried_as_have_answered() -> None:
 
 
 def test_who_sends_what_is_no_use_is_asked_less_and_less_of_that_object() -> None:
-    conduct = Conduct()
+    conduct = WorkerReliability()
     held = []
     for count in range(1, MOST + 3):
         conduct.failed("bad", "beam", 0.0)
@@ -66,7 +66,7 @@ def test_who_sends_what_is_no_use_is_asked_less_and_less_of_that_object() -> Non
 
 
 def test_those_who_left_and_objects_that_changed_are_forgotten() -> None:
-    conduct = Conduct()
+    conduct = WorkerReliability()
     conduct.answered("good")
     conduct.sent("new", 0.0)
     for worker in ("good", "new"):

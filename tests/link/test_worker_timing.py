@@ -5,13 +5,13 @@ import math
 
 import pytest
 
-from sim_server.network.worker_timing import FIRST, HANGS, SLOWEST, Speeds
+from sim_server.network.worker_timing import FIRST, HANGS, SLOWEST, WorkerTiming
 
 
 @pytest.fixture
-def speeds() -> Speeds:
+def speeds() -> WorkerTiming:
     """Two objects; the slow worker takes ten times as long as the fast one."""
-    speeds = Speeds()
+    speeds = WorkerTiming()
     for _ in range(5):
         for object, seconds in (("small", 0.1), ("large", 1.0)):
             speeds.note("fast", object, seconds)
@@ -19,7 +19,7 @@ def speeds() -> Speeds:
     return speeds
 
 
-def test_speeds_are_ratios_of_the_same_objects(speeds: Speeds) -> None:
+def test_speeds_are_ratios_of_the_same_objects(speeds: WorkerTiming) -> None:
     assert speeds.slowness("fast") == pytest.approx(1) and speeds.slowness("slow") == pytest.approx(10)
     assert speeds.expected("slow", "large") == pytest.approx(10)
     speeds.note("fast", "new", 0.2)
@@ -28,7 +28,7 @@ def test_speeds_are_ratios_of_the_same_objects(speeds: Speeds) -> None:
 
 
 def test_a_worker_alone_with_its_objects_is_compared_with_nobody() -> None:
-    speeds = Speeds()
+    speeds = WorkerTiming()
     for seconds in (9.0, 1.0, 5.0):
         speeds.note("alone", "beam", seconds)
     assert speeds.slowness("alone") == 1
@@ -36,7 +36,7 @@ def test_a_worker_alone_with_its_objects_is_compared_with_nobody() -> None:
 
 
 def test_what_is_believed_is_bounded() -> None:
-    speeds = Speeds()
+    speeds = WorkerTiming()
     speeds.note("a", "beam", 1e-6)
     speeds.note("b", "beam", 1e6)
     assert speeds.slowness("b") == SLOWEST
@@ -57,18 +57,18 @@ def test_what_is_believed_is_bounded() -> None:
     ],
 )
 def test_the_most_urgent_object_waits_for_a_faster_worker_about_to_be_free(
-    speeds: Speeds, idle: list[str], elapsed: float, ahead: int
+    speeds: WorkerTiming, idle: list[str], elapsed: float, ahead: int
 ) -> None:
     assert speeds.ahead([(worker, 0.1) for worker in idle], [("fast", "large", elapsed)]) == ahead
 
 
-def test_nobody_idles_longer_than_a_job_takes(speeds: Speeds) -> None:
+def test_nobody_idles_longer_than_a_job_takes(speeds: WorkerTiming) -> None:
     busy = [("fast", "large", 0.5)]
     assert speeds.ahead([("slow", 5.4)], busy) == 1
     assert speeds.ahead([("slow", 5.6)], busy) == 0
 
 
-def test_as_many_objects_are_left_as_there_are_faster_workers(speeds: Speeds) -> None:
+def test_as_many_objects_are_left_as_there_are_faster_workers(speeds: WorkerTiming) -> None:
     speeds.note("other", "small", 0.1)
     busy = [("fast", "small", 0.05), ("other", "small", 0.05), ("slow", "small", 0.05)]
     assert speeds.ahead([("slow2", 0.0)], busy) == 0, "of slow2 nothing is known: it counts as fast"
@@ -76,17 +76,17 @@ def test_as_many_objects_are_left_as_there_are_faster_workers(speeds: Speeds) ->
     assert speeds.ahead([("slow2", 0.0)], busy) == 2
 
 
-def test_those_who_left_are_forgotten(speeds: Speeds) -> None:
+def test_those_who_left_are_forgotten(speeds: WorkerTiming) -> None:
     speeds.forget_worker("slow")
     assert speeds.slowness("slow") == 1
     speeds.forget_object("large")
     assert speeds.expected("fast", "large") == 0
     assert speeds.ahead([("fast", 0.0)], [("fast", "small", math.inf)]) == 0
-    assert Speeds().ahead([("fast", 0.0)], [("slow", "small", 0.0)]) == 0
+    assert WorkerTiming().ahead([("fast", 0.0)], [("slow", "small", 0.0)]) == 0
 
 
 def test_an_analysis_counts_not() -> None:
-    speeds = Speeds()
+    speeds = WorkerTiming()
     speeds.note("w", "beam", 5.0, 0.5)
     assert speeds.expected("w", "beam") == 0.5
     speeds.note("w", "beam", 1.5, 0.5)
