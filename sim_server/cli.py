@@ -232,7 +232,7 @@ def _describe_objects(say, service: "Service", listen: list[str] | None) -> None
         say(f"  {body.name}: {body.last - body.first} nodes, {size} m, {world.mass[body.nodes].sum():.3g} kg")
     for line in notices(service.simulation):
         say(f"note: {line}")
-    if service.driver.wants_factors and service.driver.free and not service.link.workers():
+    if service.driver.wants_factors and service.driver.free and not service.link.dispatch.workers():
         say(
             "no worker is there, so nothing makes factors and solves use block Jacobi; start one in a second terminal, "
             f"{_worker_command(service.link.name, listen)}, or this server with --workers 1"
@@ -254,7 +254,7 @@ def _worker_command(name: str, listen: list[str] | None) -> str:
 def _wait_for_workers(service: "Service", supervisor: "Supervisor | None") -> None:
     """A run that was given workers starts when the first is there; it never waits for one afterwards."""
     end = time.monotonic() + WORKERS_JOIN
-    while supervisor is not None and not service.link.workers() and time.monotonic() < end:
+    while supervisor is not None and not service.link.dispatch.workers() and time.monotonic() < end:
         supervisor.look()
         service.link.check_name()
         time.sleep(0.02)

@@ -82,7 +82,7 @@ class Copies:
         if self._solver.build != "worker" or t.unbuilt >= UNBUILT:
             return False
         told = all(e.told for e in self._simulation.effects.values())
-        return told and getattr(self._source, "builds", lambda: False)()
+        return told and self._source.assembles_matrices()
 
     def _ahead(self, t: Track) -> float:
         """How far positions go ahead [s]: to when the factor is expected."""

@@ -27,7 +27,7 @@ from protocol.method import Method
 from sim_server.copies import Copies
 from sim_server.dropping import Dropping
 from sim_server.engine import Kind
-from sim_server.factors import FactorSource, Inline, Job, Pool
+from sim_server.factors import FactorSource, Inline, Job
 from sim_server.guard import Guard
 from sim_server.reached import Reached, reached
 from sim_server.schedule import Need, oldest_possible, overdue_after, pays, pick
@@ -73,8 +73,7 @@ class Driver:
         self._nobody_at = -1  # step at which nobody was left to be asked
         self._stock = Stock()
         self._copies = Copies(simulation, self.source)
-        self._pool = self.source if isinstance(self.source, Pool) else None
-        self._dropping = Dropping(self, self._pool)
+        self._dropping = Dropping(self, self.source)
         self._alone = False  # there was no worker for a matrix of lockstep
         self._warped = {t.body.name: t.body.index in simulation.warped for t in self.tracks}
         values = {t.body.name: simulation.system.body_values(t.body.first, t.body.last) for t in self.tracks}
@@ -262,14 +261,13 @@ class Driver:
     def pump_factors(self) -> None:
         """Takes up what came, sends what was copied, asks for the matrix of whoever needs it most."""
         self._take_up(self.source)
-        if self._pool is not None:
-            for name in self._pool.taken_back():
-                self._copies.take_back(self.by_name[name])
-                self.by_name[name].taken_back()
-                self._nobody_at = -1
+        for name in self.source.reassigned():
+            self._copies.take_back(self.by_name[name])
+            self.by_name[name].taken_back()
+            self._nobody_at = -1
         self._send_copies()
         step, waiting = self.engine.step, sum(t.wanted is not None for t in self.tracks)
-        idle = max(min(int(self.source.ready()), COPIES) - waiting, 0)
+        idle = max(min(self.source.ready(), COPIES) - waiting, 0)
         places = max(idle, self._stock.size - waiting)
         if places <= 0 or step == self._nobody_at:
             return
@@ -277,8 +275,8 @@ class Driver:
         needs = self._needs(step)
         if self.kind == "adaptive":
             needs = [need for need in needs if pays(need, self.solver.update_threshold)]
-        ahead = getattr(self.source, "ahead", lambda: 0)()  # the most urgent are left for faster workers
-        chosen = pick(needs, ahead + places, self.solver.update_floor_steps, self.solver.schedule, overdue)[ahead:]
+        left = self.source.faster_busy_workers()  # so many of the most urgent objects are left for them
+        chosen = pick(needs, left + places, self.solver.update_floor_steps, self.solver.schedule, overdue)[left:]
         tracks = [self.by_name[name] for name in chosen]
         wanted = tracks[:idle] + [t for t in tracks[idle:] if t.sent is None or t.excess > 0]  # in stock: who needs one
         for t in wanted:
@@ -289,16 +287,17 @@ class Driver:
     def _needs(self, step: int) -> list[Need]:
         """Of all bodies but frozen ones and those that are better left for another worker than the idle ones."""
         needs = [t.need(step) for t in self.tracks if not t.frozen]
-        if self._pool is not None:
-            reserved, setbacks = self._pool.reserved(), self._pool.setbacks()
-            if reserved or setbacks or any(need.failures for need in needs):
-                needs = [replace(n, failures=setbacks.get(n.object, 0)) for n in needs if n.object not in reserved]
+        failures = self.source.consecutive_failures()
+        if failures is not None:
+            reserved = self.source.reserved()
+            if reserved or failures or any(need.failures for need in needs):
+                needs = [replace(n, failures=failures.get(n.object, 0)) for n in needs if n.object not in reserved]
         return needs
 
     def _send_copies(self) -> None:
         """To idle workers, in the order in which they were asked for; others wait their turn while there is a stock."""
         copied = self._copies.made(self.tracks)
-        idle = int(self.source.ready()) if copied else 0
+        idle = self.source.ready() if copied else 0
         for t in copied:
             waited = self.engine.step - self._copies.step(t)
             if idle <= 0 and self._stock.size and waited <= KEPT:
@@ -316,7 +315,7 @@ class Driver:
         return [mean if t.latency.value is None else t.latency.value for t in self.tracks]
 
     def _workers(self) -> int:
-        return len(getattr(self.source, "workers", lambda: [1])())
+        return self.source.worker_count()
 
     def age_bound(self) -> int:
         """Oldest [steps] that a factor gets while all goes well, by what was measured so far; -1: no bound known."""

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from protocol.factor import Factor
 from sim_server.engine import Kind
-from sim_server.factors import Pool
+from sim_server.factors import FactorSource
 from sim_server.track import Track
 
 if TYPE_CHECKING:
@@ -54,10 +54,10 @@ class Usefulness:
 
 
 class Dropping:
-    """Of the bodies of one driver. pool: whose workers are told what their factors were worth."""
+    """Of the bodies of one driver. source: whose workers are told what their factors were worth."""
 
-    def __init__(self, driver: Driver, pool: Pool | None):
-        self._driver, self._pool = driver, pool
+    def __init__(self, driver: Driver, source: FactorSource):
+        self._driver, self._source = driver, source
         self._active = driver.kind in POLICIES
         self._usefulness = [Usefulness() for _ in driver.tracks]
         self._doubted: set[int] = set()  # bodies whose solves have left a factor, or whose workers have sent bad ones
@@ -65,8 +65,7 @@ class Dropping:
     def refused(self, factor: Factor) -> None:
         """A factor did not pass the guard."""
         self._doubted.add(self._driver.by_name[factor.object].body.index)
-        if self._pool is not None:
-            self._pool.no_use(factor.worker, factor.object)
+        self._source.factor_failed(factor.worker, factor.object)
 
     def judge(self, records: NDArray[Any]) -> None:
         """What the records say of factors. It costs nothing while no solve leaves one."""
@@ -80,8 +79,8 @@ class Dropping:
             found = self._usefulness[t.body.index].observe(made, left, r["kind"] == Kind.CHOLESKY)
             if found is Finding.NO_USE:
                 self._drop(t, made)
-            elif found is Finding.OF_USE and self._pool is not None:
-                self._pool.of_use(t.maker(made), t.body.name)
+            elif found is Finding.OF_USE:
+                self._source.factor_helped(t.maker(made), t.body.name)
         for index in self._doubted:
             self.use_again(self._driver.tracks[index])
 
@@ -92,8 +91,7 @@ class Dropping:
         records, and so logs, hold of each.
         """
         worker, driver = t.maker(made), self._driver
-        if self._pool is not None:
-            self._pool.no_use(worker, t.body.name)
+        self._source.factor_failed(worker, t.body.name)
         if made != t.newest or t.dropped is not None:
             return
         settings = driver.engine.settings(t.body.index)

@@ -1,15 +1,22 @@
 # SPDX-License-Identifier: MIT
-"""Where factors come from: one interface, for workers elsewhere (link.py) and for this process (here)."""
+"""The interface of everything that makes factors: remote workers (network/dispatch.py) or this process (Inline)."""
+
+from __future__ import annotations
 
 import logging
+from abc import abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from protocol.factor import Factor
 from protocol.method import Method
+from sim_server.arrays import Float64, Int32
+
+if TYPE_CHECKING:
+    from precond_worker.methods import Factorization
 
 log = logging.getLogger(__name__)
 
@@ -18,90 +25,109 @@ EXACT = Method()
 
 @dataclass(frozen=True)
 class Job:
-    """A matrix to factorize. values (blocks, 3, 3) float64, or positions (nodes, 3) [m] of which whoever takes the job
-    assembles it; read during `submit` only. dtype, method: of the factor wanted."""
+    """A matrix to factorize.
+
+    values: float64, blocks of the matrix (blocks, 3, 3), or positions (nodes, 3) [m] from which the worker assembles
+        it; read during `submit` only
+    warp: the matrix is in the material frame
+    dtype, method: of the factor to be made
+    """
 
     object: str
     epoch: int
     step: int
     warp: bool
-    values: NDArray[np.float64]
+    values: Float64
     dtype: str = "float32"
     method: Method = EXACT
 
     @property
     def positions(self) -> bool:
-        """Without the matrix."""
+        """True if `values` are positions and the worker assembles the matrix."""
         return self.values.ndim == 2
 
 
 class FactorSource(Protocol):
-    """Takes matrices, gives factors; nothing here waits."""
+    """Takes matrices and returns their factors. No method waits.
 
+    A source derives from this class and defines the four abstract methods. The others have bodies for a source that
+    is one worker in this process; a pool of workers replaces them.
+    """
+
+    @abstractmethod
     def ready(self) -> int:
-        """How many idle ones could take a job now."""
-        ...
+        """Number of jobs that idle workers could take now."""
 
+    @abstractmethod
     def submit(self, job: Job) -> bool:
-        """Hands a job over; False if it could not be taken."""
-        ...
+        """Hands a job over; False if no worker could take it."""
 
+    @abstractmethod
     def poll(self) -> list[Factor]:
-        """Factors that came since the last call."""
-        ...
+        """Returns the factors that arrived since the last call."""
 
+    @abstractmethod
     def failures(self) -> list[tuple[str, str]]:
-        """Objects whose job came to nothing since the last call, and why."""
-        ...
+        """Returns (object, reason) of the jobs that ended without a factor since the last call."""
 
+    def worker_count(self) -> int:
+        """Number of workers that may be given jobs, idle or busy."""
+        return 1
 
-@runtime_checkable
-class Pool(FactorSource, Protocol):
-    """A source with several workers that are told apart."""
+    def assembles_matrices(self) -> bool:
+        """True if there are workers and all of them can assemble matrices from positions."""
+        return False
 
-    def taken_back(self) -> list[str]:
-        """Objects whose worker takes its time while another one is idle: they may be sent again at once."""
-        ...
+    def faster_busy_workers(self) -> int:
+        """Number of busy workers that would finish one more job before the fastest idle one could: as many of the most
+        urgent objects are better left for them."""
+        return 0
 
-    def no_use(self, worker: str, object: str) -> None:
-        """A factor of a worker was refused, or solves had to leave it."""
-        ...
-
-    def of_use(self, worker: str, object: str) -> None:
-        """A solve was made with a factor of a worker."""
-        ...
-
-    def setbacks(self) -> dict[str, int]:
-        """By object, jobs in a row that came to nothing with the best of its workers."""
-        ...
+    def reassigned(self) -> list[str]:
+        """Objects whose job was taken from a slow worker since another one is idle; they may be submitted again."""
+        return []
 
     def reserved(self) -> set[str]:
-        """Objects that are better left for a busy worker, since factors of the idle ones came to nothing."""
-        ...
+        """Objects that are better left for a busy worker, since factors by the idle ones failed."""
+        return set()
+
+    def consecutive_failures(self) -> Mapping[str, int] | None:
+        """Jobs in a row that failed at the best worker of each object (0 where absent). None: the source does not tell
+        workers apart, and all failures of an object count."""
+        return None
+
+    def factor_failed(self, worker: str, object: str) -> None:
+        """Notes that a factor made by `worker` was rejected, or that solves had to abandon it."""
+        return
+
+    def factor_helped(self, worker: str, object: str) -> None:
+        """Notes that a solve converged with a factor made by `worker`."""
+        return
 
 
-class Inline:
-    """Factorizes in this process, during submit.
+class Inline(FactorSource):
+    """Factorizes in this process, during `submit`.
 
-    patterns: block pattern (row_start, columns) of each object. library: as in precond_worker.factorize.Analysis.
+    patterns: block pattern (row_start, columns) of the matrix of each object
+    library: as in precond_worker.factorize.Analysis
     """
 
     WORKER = "in process"
 
-    def __init__(self, patterns: dict[str, tuple[NDArray[np.int32], NDArray[np.int32]]], library: str = "auto"):
+    def __init__(self, patterns: dict[str, tuple[Int32, Int32]], library: str = "auto"):
         self._patterns, self._library = patterns, library
-        self._analyses: dict[tuple[str, Method], Any] = {}
+        self._analyses: dict[tuple[str, Method], Factorization] = {}
         self._latest: dict[str, Method] = {}
         self._warned = False
         self._done: list[Factor] = []
         self._failed: list[tuple[str, str]] = []
 
     def ready(self) -> int:
-        """One job at a time, always."""
+        """Returns 1: `submit` always takes a job."""
         return 1
 
     def submit(self, job: Job) -> bool:
-        """Factorizes now; the result waits for `poll`."""
+        """Factorizes the matrix and keeps the factor until `poll`."""
         from time import perf_counter
 
         from precond_worker.factorize import NotPositiveDefinite  # lazily: only in-process updates need a library
@@ -122,12 +148,13 @@ class Inline:
         return True
 
     def library(self, name: str, method: Method | None = None) -> str:
-        """Library and version that makes factors of an object by a method; None: exact ones if it has had any."""
+        """Name and version of the library that makes factors of an object by `method`. None: of its exact factors if it
+        has had any, else of its latest ones."""
         exact = (name, EXACT) in self._analyses
         chosen = method or (EXACT if exact else self._latest.get(name, EXACT))
         return str(self._analysis(name, chosen).library)
 
-    def _analysis(self, name: str, method: Method) -> Any:
+    def _analysis(self, name: str, method: Method) -> Factorization:
         from precond_worker.factorize import default_library
         from precond_worker.methods import prepared
 
@@ -140,11 +167,11 @@ class Inline:
         return self._analyses[name, method]
 
     def poll(self) -> list[Factor]:
-        """Factors made since the last call."""
+        """Returns the factors made since the last call."""
         done, self._done = self._done, []
         return done
 
     def failures(self) -> list[tuple[str, str]]:
-        """Matrices that were not positive definite."""
+        """Returns (object, reason) of matrices that could not be factorized since the last call."""
         failed, self._failed = self._failed, []
         return failed

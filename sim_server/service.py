@@ -50,7 +50,7 @@ class Service:
         self.simulation, self.link, self.recorder, self.steps = simulation, link, recorder, steps
         self.engine = simulation.engine
         self.engine.loop.realtime, self.engine.loop.patient = int(realtime), int(not realtime)
-        self.driver = Driver(simulation, link)
+        self.driver = Driver(simulation, link.dispatch)
         self.telemetry = Telemetry(self.driver, link, recorder, patient=not realtime)
         self.commands = Commands(simulation, self._accepted)
         self.commands.frozen = lambda name: name in self.driver.by_name and self.driver.by_name[name].frozen
@@ -173,7 +173,7 @@ class Service:
     def _advice(self) -> str:
         """What makes steps take less time, or lets them take it."""
         ways = ["a larger dt (--set dt=...)", "a coarser mesh"]
-        workers = len(self.link.workers())
+        workers = len(self.link.dispatch.workers())
         if self.driver.wants_factors and workers < len(self.driver.tracks):
             ways.append("more workers" if workers else "a worker (--workers 1)")
         if not self._on_gpu and nvidia_device():

@@ -78,7 +78,7 @@ class Trace:
             maker = pb.WorkerInfo(worker=factor.worker, library=self._driver.inline.library(factor.object), threads=1)
         else:
             if factor.worker not in self._workers:
-                self._workers.update({w.worker: w for w in self._link.workers()})
+                self._workers.update({w.worker: w for w in self._link.dispatch.workers()})
             maker = self._workers.get(factor.worker, pb.WorkerInfo(worker=factor.worker))
         exact = factor.method in ("", EXACT.name)
         library = maker.library if exact else "native"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Commands that came together, before they are looked at in full: of the moves of a grab the newest is enough."""
+"""Drops moves of a grab that newer ones replace, before commands are checked in full."""
 
 from collections.abc import Callable, Sequence
 from typing import Generic, NamedTuple, TypeVar
@@ -11,22 +11,30 @@ Sender = TypeVar("Sender")
 
 
 class Coalesced(NamedTuple, Generic[Sender]):
-    """taken: in the order of their arrival; refused: each with the reason; replaced: moves that newer ones overtook."""
+    """Commands that arrived together, sorted by what becomes of them.
 
-    taken: list[tuple[Command, Sender]]
+    accepted: in the order of arrival
+    refused: each with the reason
+    replaced: senders of moves that a newer move of the same grab replaces
+    """
+
+    accepted: list[tuple[Command, Sender]]
     refused: list[tuple[Refused, Sender]]
     replaced: list[Sender]
 
 
-def coalesce_moves(asked: Sequence[tuple[Command, Sender]], check: Callable[[Command], None]) -> Coalesced[Sender]:
-    """asked: parsed, in the order of their arrival, each with whom to answer. check: raises Refused.
+def coalesce_moves(received: Sequence[tuple[Command, Sender]], check: Callable[[Command], None]) -> Coalesced[Sender]:
+    """Checks commands, except moves that a newer well-formed move of the same client and grab replaces.
 
-    A move is passed over unchecked if a newer one of the same client and grab is well-formed. At 1 kHz a client moves
-    more often than its grab is looked at, and the check is what costs most.
+    A client may move at 1 kHz, more often than the simulation looks at its grab, and the check costs more than all
+    else that is done with a move.
+
+    received: parsed commands with their senders, in the order of arrival
+    check: raises Refused
     """
     found: Coalesced[Sender] = Coalesced([], [], [])
     moved: set[tuple[str, int]] = set()
-    for command, sender in reversed(asked):
+    for command, sender in reversed(received):
         grab = (command.client, command.interaction.id) if command.verb == "move" else None
         if grab in moved:
             found.replaced.append(sender)
@@ -38,6 +46,6 @@ def coalesce_moves(asked: Sequence[tuple[Command, Sender]], check: Callable[[Com
             continue
         if grab is not None:
             moved.add(grab)
-        found.taken.append((command, sender))
-    found.taken.reverse()
+        found.accepted.append((command, sender))
+    found.accepted.reverse()
     return found

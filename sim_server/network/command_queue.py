@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Commands between the network and the simulation: bounded, rated per client, the newest move of a grab alone."""
+"""The queue of commands between the network and the simulation: bounded, with a rate limit for each client."""
 
 import threading
 import time
@@ -10,35 +10,34 @@ from protocol.counters import Counters
 from protocol.messages_pb2 import Command, Reply
 from sim_server.network.rate_limiter import RateLimiter
 
-WAITING = 64  # commands that may wait for the simulation
-LATE = 1024  # moves that may wait for a token of their client, or for room
-# For the other verbs there is as much room again, and a client may owe a burst: it can always let go, pause and stop.
-RATED = ("push", "grab", "move")
+CAPACITY = 64  # commands with a rate limit that may wait; for the other verbs there is as much capacity again
+MAX_DEFERRED = 1024  # moves that may wait for a token of their client or for capacity
+LIMITED = ("push", "grab", "move")  # verbs; with the others a client may owe a burst: it can always let go and stop
 
 ReplyFunction = Callable[[Reply], None]
 PendingCommand = tuple[Command, ReplyFunction]
 
 
 class CommandQueue:
-    """`offer` from the network's thread, `take` from the service thread; neither waits.
+    """Takes commands from the network's threads (`put`) for the service thread (`take_all`); neither waits.
 
-    A command over its client's rate, or that finds no room, is refused and counted (commands_refused). A move is not:
-    the newest one of each grab is kept until its turn comes and answers for those before it (moves_replaced), so that
-    a hand that stops moving is where it stopped.
+    A command over the rate limit of its client, or beyond the capacity, is refused and counted (commands_refused). A
+    move is deferred instead: the newest move of each grab waits until the limit admits it and answers for those before
+    it (moves_replaced), so that a grab that stops moving ends where it stopped.
     """
 
     def __init__(
-        self, counters: Counters, rates: RateLimiter | None = None, room: int = WAITING,
+        self, counters: Counters, limiter: RateLimiter | None = None, capacity: int = CAPACITY,
         clock: Callable[[], float] = time.monotonic,
     ):  # fmt: skip
-        self._counters, self._room, self._clock = counters, room, clock
-        self._rates = RateLimiter() if rates is None else rates
+        self._counters, self._capacity, self._clock = counters, capacity, clock
+        self._limiter = RateLimiter() if limiter is None else limiter
         self._lock = threading.Lock()
-        self._queue: OrderedDict[Hashable, PendingCommand] = OrderedDict()  # in the order of their arrival
-        self._late: OrderedDict[Hashable, PendingCommand] = OrderedDict()  # moves that wait for a token or for room
+        self._queue: OrderedDict[Hashable, PendingCommand] = OrderedDict()  # in the order of arrival
+        self._deferred: OrderedDict[Hashable, PendingCommand] = OrderedDict()  # moves, in the order of arrival
 
-    def offer(self, command: Command, reply: ReplyFunction) -> None:
-        """Takes a command in, or answers it with the reason why not."""
+    def put(self, command: Command, reply: ReplyFunction) -> None:
+        """Queues a command, or answers it with the reason why it is refused."""
         with self._lock:
             replaced, refusal = self._place(command, reply)
         if replaced is not None:
@@ -48,38 +47,38 @@ class CommandQueue:
             self._counters.add("commands_refused")
             reply(Reply(error=refusal))
 
-    def take(self) -> list[PendingCommand]:
-        """All whose turn it is."""
+    def take_all(self) -> list[PendingCommand]:
+        """Removes and returns all queued commands, and the deferred moves that the limits admit now."""
         with self._lock:
             now = self._clock()
-            for key in list(self._late):
-                if len(self._queue) >= self._room:
+            for key in list(self._deferred):
+                if len(self._queue) >= self._capacity:
                     break
-                if self._rates.take(self._late[key][0].client, now):
-                    self._queue[key] = self._late.pop(key)
+                if self._limiter.allow(self._deferred[key][0].client, now):
+                    self._queue[key] = self._deferred.pop(key)
             taken = list(self._queue.values())
             self._queue.clear()
         return taken
 
     def _place(self, command: Command, reply: ReplyFunction) -> tuple[ReplyFunction | None, str]:
-        """Whom a newer move has replaced, and why the command is refused ("": it is not)."""
+        """Returns the reply function of the move that this one replaces, and the reason for a refusal ("": none)."""
         move = command.verb == "move"
         key: Hashable = (command.client, command.interaction.id) if move else object()
-        for waiting in (self._queue, self._late):
-            if key in waiting:
-                _, older = waiting[key]
-                waiting[key] = command, reply
+        for pending in (self._queue, self._deferred):
+            if key in pending:
+                _, older = pending[key]
+                pending[key] = command, reply
                 return older, ""
-        rated = command.verb in RATED
-        debt, room = (0.0, self._room) if rated else (self._rates.burst, 2 * self._room)
-        if len(self._queue) >= room:
-            refusal = f"the server is busy: {room} commands wait already"
-        elif not self._rates.take(command.client, self._clock(), debt):
-            refusal = f"client {command.client!r} sends too much: at most {self._rates.rate:g} commands a second"
+        limited = command.verb in LIMITED
+        debt, capacity = (0.0, self._capacity) if limited else (self._limiter.burst, 2 * self._capacity)
+        if len(self._queue) >= capacity:
+            refusal = f"the server is busy: {capacity} commands wait already"
+        elif not self._limiter.allow(command.client, self._clock(), debt):
+            refusal = f"client {command.client!r} sends too much: at most {self._limiter.rate:g} commands a second"
         else:
             self._queue[key] = command, reply
             return None, ""
-        if move and len(self._late) < LATE:
-            self._late[key] = command, reply
+        if move and len(self._deferred) < MAX_DEFERRED:
+            self._deferred[key] = command, reply
             return None, ""
         return None, refusal

@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Matrices out to workers, factors back: who gets a job, and what becomes of it."""
+"""Sends matrices to workers and takes in their factors: which worker gets a job, and what becomes of it."""
 
 import logging
 import threading
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import zenoh
@@ -17,27 +16,31 @@ from protocol.counters import Counters
 from protocol.messages_pb2 import Topology, WorkerInfo
 from protocol.refused import Refused
 from protocol.slots import Slot, SlotPool
+from sim_server.factors import FactorSource, Job
 from sim_server.network.factor_decoder import FactorDecoder
 from sim_server.network.inbox import Inbox
-from sim_server.network.job_message import load, matrix_message
-from sim_server.network.leases import LATE, InFlightJob, Leases
+from sim_server.network.job_message import add_values, matrix_message
+from sim_server.network.leases import MAX_EXPIRED, InFlightJob, Leases
 from sim_server.network.send_queue import SendQueue
 from sim_server.network.worker_registry import WorkerRegistry
 from sim_server.network.worker_reliability import WorkerReliability
 from sim_server.network.worker_timing import WorkerTiming
 
-if TYPE_CHECKING:
-    from sim_server.factors import Job
-
 log = logging.getLogger(__name__)
 
-LOOK_AGAIN = 1.0  # s between questions for tokens that were not told
-QUICK = 0.05  # s in which a link takes a job as bytes if it is fast; zenoh drops what is not taken within 0.25
-ROOM = 8  # a slot for an incomplete factor is larger than the last ones by one part in so many
+TOKEN_QUERY_INTERVAL = 1.0  # s between queries for tokens of workers that send heartbeats without one
+FAST_SEND = 0.05  # s in which a fast link takes a job as bytes; zenoh drops what is not taken within 0.25 s
+SLOT_MARGIN = 8  # the slot for an incomplete factor is larger than the largest factor so far by a SLOT_MARGIN-th
 
 
-class Dispatch:
-    """Jobs, workers and answers of one server. Methods may be called from any thread; none waits for the network."""
+class Dispatch(FactorSource):
+    """The remote workers of a server as a source of factors.
+
+    Methods may be called from any thread; none waits for the network.
+
+    silence: seconds without a heartbeat until a worker gets no more jobs
+    clock: monotonic time [s]
+    """
 
     def __init__(
         self,
@@ -45,334 +48,341 @@ class Dispatch:
         server: str,
         incarnation: int,
         pool: SlotPool | None,
-        outbox: SendQueue,
+        queue: SendQueue,
         counters: Counters,
         silence: float,
         clock: Callable[[], float],
     ):
         self._session, self._server, self._incarnation = session, server, incarnation
-        self._pool, self._outbox, self._counters, self._clock = pool, outbox, counters, clock
-        self._answers = FactorDecoder(incarnation)
-        self._roster = WorkerRegistry(incarnation, silence)
-        self._jobs = Leases(pool)
-        self._speeds = WorkerTiming()
-        self._conduct = WorkerReliability()
-        self._busy = threading.RLock()  # a status asks for the workers while the loop thread takes in a factor
-        self._last_worker: dict[str, str] = {}  # of each object: it knows the pattern already
-        self._free_since: dict[str, float] = {}  # by worker, when it last answered
-        self._left: dict[str, tuple[int, float]] = {}  # by worker, the last job that left for it, and when
-        self._quick: set[str] = set()  # workers without shared memory whose link takes a job at once
+        self._pool, self._queue, self._counters, self._clock = pool, queue, counters, clock
+        self._decoder = FactorDecoder(incarnation)
+        self._registry = WorkerRegistry(incarnation, silence)
+        self._leases = Leases(pool)
+        self._timing = WorkerTiming()
+        self._reliability = WorkerReliability()
+        self._lock = threading.RLock()  # a status lists the workers while the loop thread takes in a factor
+        self._last_worker: dict[str, str] = {}  # by object: the worker that knows its pattern already
+        self._free_since: dict[str, float] = {}  # by worker, time of its last answer
+        self._sent: dict[str, tuple[int, float]] = {}  # by worker: its last job that the network took, and when
+        self._fast_links: set[str] = set()  # workers without shared memory whose link takes a job at once
         self._factors: list[Factor] = []
         self._failures: list[tuple[str, str]] = []
-        self._arrivals = Inbox(session, server)
-        self._look_due = 0.0
-        self._take_in: dict[str, Callable[[zenoh.Sample], None]] = {
-            "worker": self._take_hello,
-            "pattern": self._take_pattern,
-            "factor": self._take_factor,
-            "alive_worker": self._take_token,
+        self._inbox = Inbox(session, server)
+        self._token_query_due = 0.0
+        self._on_message: dict[str, Callable[[zenoh.Sample], None]] = {
+            "worker": self._on_heartbeat,
+            "pattern": self._on_pattern,
+            "factor": self._on_factor,
+            "alive_worker": self._on_token,
         }
 
     def announce(self, topology: Topology) -> None:
-        """A new epoch of an object."""
-        with self._busy:
-            self._answers.announce(topology)
-            self._jobs.forget(topology.header.object)
-            self._speeds.forget_object(topology.header.object)
-            self._conduct.forget_object(topology.header.object)
+        """Begins a new epoch of an object; answers to jobs of the last one are refused."""
+        with self._lock:
+            self._decoder.announce(topology)
+            self._leases.forget_object(topology.header.object)
+            self._timing.forget_object(topology.header.object)
+            self._reliability.forget_object(topology.header.object)
+
+    def workers(self) -> list[WorkerInfo]:
+        """Returns the last heartbeats of the workers that may be given jobs."""
+        with self._lock:
+            self._receive()
+            infos = (self._registry.info(name) for name in self._available())
+            return [info for info in infos if info is not None]
 
     def ready(self) -> int:
-        """How many are idle and can take a job."""
-        with self._busy:
+        """Number of idle workers."""
+        with self._lock:
             self._receive()
             return len(self._idle())
 
-    def ahead(self) -> int:
-        """How many of the most urgent objects are left for faster workers that are about to be free."""
-        with self._busy:
-            now = self._clock()
-            idle = [(name, now - self._free_since.get(name, 0.0)) for name in self._idle()]
-            busy = [(f.worker, f.object, now - f.sent) for f in self._jobs.by_worker.values()]
-            return self._speeds.ahead(idle, busy)
-
-    def workers(self) -> list[WorkerInfo]:
-        """Workers that may be given work."""
-        with self._busy:
-            self._receive()
-            infos = (self._roster.info(name) for name in self._fit())
-            return [info for info in infos if info is not None]
-
-    def builds(self) -> bool:
-        """There are workers, and all of them can assemble matrices from positions."""
-        infos = self.workers()
-        return bool(infos) and all(info.builds for info in infos)
-
     def poll(self) -> list[Factor]:
-        """Good factors since the last call."""
-        with self._busy:
+        """Returns the factors that arrived and passed all checks since the last call."""
+        with self._lock:
             self._receive()
             factors, self._factors = self._factors, []
             return factors
 
     def failures(self) -> list[tuple[str, str]]:
-        """(object, reason) of jobs that ended without a factor since the last call."""
-        with self._busy:
+        """Returns (object, reason) of the jobs that failed, were refused, expired or were lost since the last call."""
+        with self._lock:
             failures, self._failures = self._failures, []
             return failures
 
-    def taken_back(self) -> list[str]:
-        """Objects whose worker takes its time while another one is idle: they may be sent again at once."""
-        with self._busy:
-            slow = self._jobs.pass_on(self._clock(), self._another)
+    def worker_count(self) -> int:
+        """Number of workers that may be given jobs, idle or busy."""
+        return len(self.workers())
+
+    def assembles_matrices(self) -> bool:
+        """True if there are workers and all of them can assemble matrices from positions."""
+        infos = self.workers()
+        return bool(infos) and all(info.builds for info in infos)
+
+    def faster_busy_workers(self) -> int:
+        """Number of busy workers that would finish one more job before the fastest idle one could."""
+        with self._lock:
+            now = self._clock()
+            idle = [(name, now - self._free_since.get(name, 0.0)) for name in self._idle()]
+            busy = [(job.worker, job.object, now - job.sent_at) for job in self._leases.by_worker.values()]
+            return self._timing.faster_busy_workers(idle, busy)
+
+    def reassigned(self) -> list[str]:
+        """Objects whose job was taken from a slow worker since another one is idle; they may be submitted again."""
+        with self._lock:
+            slow = self._leases.reassign(self._clock(), self._has_candidates)
             self._counters.add("passed_on", len(slow))
-            return [flight.object for flight in slow]
-
-    def no_use(self, worker: str, object: str) -> None:
-        """A factor of a worker was refused, or solves had to leave it."""
-        with self._busy:
-            self._conduct.failed(worker, object, self._clock())
-
-    def of_use(self, worker: str, object: str) -> None:
-        """A solve was made with a factor of a worker."""
-        with self._busy:
-            self._conduct.helped(worker, object)
-
-    def setbacks(self) -> dict[str, int]:
-        """By object, jobs in a row that came to nothing with the best of its workers."""
-        with self._busy:
-            failing = self._conduct.failing
-            fit = self._fit() if failing else []
-            return {object: self._conduct.failures(fit, object) for object in failing}
+            return [job.object for job in slow]
 
     def reserved(self) -> set[str]:
-        """Objects that are better left for a busy worker, since factors of the idle ones came to nothing."""
-        with self._busy:
-            failing = self._conduct.failing
+        """Objects that are better left for a busy worker, since factors by the idle ones failed."""
+        with self._lock:
+            failing = self._reliability.failing_objects
             if not failing:
                 return set()
-            idle, fit = self._idle(), self._fit()
-            return {object for object in failing if idle and not self._candidates(idle, fit, object)}
+            idle, available = self._idle(), self._available()
+            return {object for object in failing if idle and not self._candidates(idle, available, object)}
 
-    # ---- out -------------------------------------------------------------------------------------------------
+    def consecutive_failures(self) -> dict[str, int]:
+        """Jobs in a row that failed at the best worker of each object."""
+        with self._lock:
+            failing = self._reliability.failing_objects
+            available = self._available() if failing else []
+            return {object: self._reliability.consecutive_failures(available, object) for object in failing}
 
-    def submit(self, job: "Job") -> bool:
-        """Send a job to an idle worker; False if there is none or the object is in flight."""
-        with self._busy:
+    def factor_failed(self, worker: str, object: str) -> None:
+        """Notes that a factor made by `worker` was rejected, or that solves had to abandon it."""
+        with self._lock:
+            self._reliability.on_failure(worker, object, self._clock())
+
+    def factor_helped(self, worker: str, object: str) -> None:
+        """Notes that a solve converged with a factor made by `worker`."""
+        with self._lock:
+            self._reliability.on_success(worker, object)
+
+    # ---- jobs to workers -------------------------------------------------------------------------------------
+
+    def submit(self, job: Job) -> bool:
+        """Sends a job to an idle worker; False if there is none or the object has a job in flight."""
+        with self._lock:
             return self._submit(job)
 
-    def _submit(self, job: "Job") -> bool:
-        known = self._answers.known.get(job.object)
+    def _submit(self, job: Job) -> bool:
+        known = self._decoder.objects.get(job.object)
         if known is None or known.epoch != job.epoch:
             raise ValueError(f"job for {job.object} epoch {job.epoch}, which was not announced")
         shape = (known.size // 3, 3) if job.positions else (known.blocks, 3, 3)
         if job.values.shape != shape or job.values.dtype != np.float64:
             raise ValueError(f"job for {job.object}: values {job.values.shape}, allowed: float64 {shape}")
         self._receive()
-        idle = [name for name in self._idle() if not job.positions or self._builds(name)]
-        idle = self._candidates(idle, self._fit(), job.object)
-        if job.object in self._jobs.by_object or not idle:
+        idle = [name for name in self._idle() if not job.positions or self._assembles(name)]
+        idle = self._candidates(idle, self._available(), job.object)
+        if job.object in self._leases.by_object or not idle:
             return False
         worker = self._choose(idle, job.object)
-        matrix_slot, factor_slot = self._lend(worker, job)
-        lease, now = self._jobs.lease(job.object, worker), self._clock()
-        flight = InFlightJob(
-            self._jobs.next_number(),
+        matrix_slot, factor_slot = self._allocate_slots(worker, job)
+        lease, now = self._leases.lease(job.object, worker), self._clock()
+        in_flight = InFlightJob(
+            self._leases.next_number(),
             job.object,
             job.epoch,
             job.step,
             job.warp,
             np.dtype(job.dtype).name,
             worker,
-            now + lease,
-            factor_slot,
-            factor_slot.generation if factor_slot else 0,
-            tuple(slot for slot in (matrix_slot, factor_slot) if slot is not None),
-            now,
-            now + self._jobs.alone(job.object, known.blocks),
-            job.method.name,
-            0 if matrix_slot else job.values.nbytes,
+            deadline=now + lease,
+            factor_slot=factor_slot,
+            factor_generation=factor_slot.generation if factor_slot else 0,
+            slots=tuple(slot for slot in (matrix_slot, factor_slot) if slot is not None),
+            sent_at=now,
+            exclusive_until=now + self._leases.exclusive_period(job.object, known.blocks),
+            method=job.method.name,
+            payload_bytes=0 if matrix_slot else job.values.nbytes,
         )
-        self._jobs.start(flight)
-        if self._post(flight, job, lease, matrix_slot):
+        self._leases.start(in_flight)
+        if self._post(in_flight, job, lease, matrix_slot):
             self._last_worker[job.object] = worker
-            self._conduct.sent(worker, now)
+            self._reliability.on_sent(worker, now)
             self._counters.add("jobs")
             self._counters.add("bytes_out", job.values.nbytes)
             return True
-        self._jobs.cancel(flight)
+        self._leases.cancel(in_flight)
         return False
 
-    def _fit(self) -> list[str]:
-        return self._roster.fit(self._clock(), self._jobs.deadlines())
+    def _available(self) -> list[str]:
+        return self._registry.available(self._clock(), self._leases.deadlines())
 
     def _idle(self) -> list[str]:
-        fit, now = self._fit(), self._clock()
-        idle = [name for name in fit if name not in self._jobs.by_worker]
-        return [name for name in idle if self._conduct.may_be_asked(name, fit, now)]
+        available, now = self._available(), self._clock()
+        idle = [name for name in available if name not in self._leases.by_worker]
+        return [name for name in idle if self._reliability.may_get_job(name, available, now)]
 
-    def _candidates(self, idle: list[str], fit: list[str], object: str) -> list[str]:
-        """Idle workers whose factors of the object are not no use; all of them if those of everybody are."""
+    def _candidates(self, idle: list[str], available: list[str], object: str) -> list[str]:
+        """Idle workers that are not suspended for the object; all idle ones if all available workers are."""
         now = self._clock()
-        good = [name for name in fit if not self._conduct.held(name, object, now)]
+        good = [name for name in available if not self._reliability.is_suspended(name, object, now)]
         return [name for name in idle if name in good] if good else idle
 
-    def _another(self, flight: InFlightJob) -> bool:
-        """Somebody else could take the object of a flight."""
-        return bool(self._candidates(self._idle(), self._fit(), flight.object))
+    def _has_candidates(self, job: InFlightJob) -> bool:
+        """True if another worker could take the object of a job in flight."""
+        return bool(self._candidates(self._idle(), self._available(), job.object))
 
-    def _builds(self, worker: str) -> bool:
-        info = self._roster.info(worker)
+    def _assembles(self, worker: str) -> bool:
+        info = self._registry.info(worker)
         return info is not None and info.builds
 
     def _choose(self, idle: list[str], object: str) -> str:
-        """Nobody late if it can be helped; then the fastest; then who knows the object; then who did least."""
+        """Chooses the worker with the fewest expired jobs; then the fastest, the last of the object, the least used."""
 
         def rank(name: str) -> tuple[int, float, bool, int]:
-            info = self._roster.info(name)
-            late, expected = self._jobs.lateness(name), self._speeds.expected(name, object)
-            return late, expected, self._last_worker.get(object) != name, info.jobs if info else 0
+            info = self._registry.info(name)
+            expired, expected = self._leases.expired_count(name), self._timing.expected(name, object)
+            return expired, expected, self._last_worker.get(object) != name, info.jobs if info else 0
 
         return min(idle, key=rank)
 
-    def _lend(self, worker: str, job: "Job") -> tuple[Slot | None, Slot | None]:
-        """Slots for the matrix and its factor; None for what must travel as bytes."""
-        info = self._roster.info(worker)
-        if self._pool is None or info is None or not info.shared_memory or self._jobs.lateness(worker) >= LATE:
+    def _allocate_slots(self, worker: str, job: Job) -> tuple[Slot | None, Slot | None]:
+        """Allocates slots for the matrix and its factor; None for an array that must travel as bytes."""
+        info = self._registry.info(worker)
+        unfit = info is None or not info.shared_memory or self._leases.expired_count(worker) >= MAX_EXPIRED
+        if self._pool is None or unfit:
             return None, None
-        nonzeros = self._answers.known[job.object].largest.get(job.method.name, 0)
+        nonzeros = self._decoder.objects[job.object].largest.get(job.method.name, 0)
         if job.method.name == "incomplete_cholesky":
-            nonzeros += nonzeros // ROOM  # the next one may keep more
+            nonzeros += nonzeros // SLOT_MARGIN  # the next factor may keep more blocks
         matrix = self._pool.lend(job.values.nbytes)
         factor = self._pool.lend(nonzeros * np.dtype(job.dtype).itemsize) if nonzeros else None
         if matrix is None or (nonzeros and factor is None):
             self._counters.trouble("slots_exhausted", "no slot of shared memory is left, an array travels as bytes")
         return matrix, factor
 
-    def _post(self, flight: InFlightJob, job: "Job", lease: float, slot: Slot | None) -> bool:
-        message = matrix_message(flight, self._answers.known[job.object], self._incarnation, lease, job.method)
-        payload = load(message, job.values, slot)
-        name = key("matrix", self._server, worker=flight.worker, object=flight.object)
+    def _post(self, in_flight: InFlightJob, job: Job, lease: float, slot: Slot | None) -> bool:
+        known = self._decoder.objects[job.object]
+        message = matrix_message(in_flight, known, self._incarnation, lease, job.method)
+        payload = add_values(message, job.values, slot)
+        name = key("matrix", self._server, worker=in_flight.worker, object=in_flight.object)
         attachment = message.SerializeToString()
-        return self._outbox.post(lambda: self._send(flight, name, payload, attachment, slot is not None))
+        return self._queue.post(lambda: self._send(in_flight, name, payload, attachment, slot is not None))
 
-    def _send(self, flight: InFlightJob, name: str, payload: Any, attachment: bytes, shared: bool) -> None:
-        """Send a job, in the thread of the outbox. Where a link is full zenoh drops it (the lease then ends) or waits.
+    def _send(self, job: InFlightJob, name: str, payload: zenoh.ZBytes, attachment: bytes, shared: bool) -> None:
+        """Sends a job, in the thread of the send queue. If a link is full, zenoh drops the job or blocks.
 
-        It waits only where it must: bytes over a link that is slow, as far as is known, are more than zenoh would hold.
-        While it waits for one receiver all others wait too, also for one that subscribed to everything and stopped
-        reading. In a queue of its own, since a message that waits locks the queue of its priority.
+        A dropped job ends its lease. zenoh blocks only for bytes over a link that is not known to be fast, since a
+        slow link takes longer than zenoh would keep them. While it blocks for one receiver all others wait too, even
+        for a receiver that subscribed to everything and stopped reading. The priority is one of its own, since a
+        blocked message locks the queue of its priority.
         """
-        drop = shared or flight.worker in self._quick
+        drop = shared or job.worker in self._fast_links
         control = zenoh.CongestionControl.DROP if drop else zenoh.CongestionControl.BLOCK
         begin = time.perf_counter()
         self._session.put(
             name, payload, attachment=attachment, congestion_control=control, priority=zenoh.Priority.BACKGROUND
         )
-        if not drop and time.perf_counter() - begin < QUICK:
-            self._quick.add(flight.worker)
-        self._left[flight.worker] = flight.number, self._clock()
+        if not drop and time.perf_counter() - begin < FAST_SEND:
+            self._fast_links.add(job.worker)
+        self._sent[job.worker] = job.number, self._clock()
 
-    # ---- in --------------------------------------------------------------------------------------------------
+    # ---- messages from workers -------------------------------------------------------------------------------
 
     def _receive(self) -> None:
-        """Take in all that arrived; refuse what is wrong; end leases."""
-        for channel, sample in self._arrivals:
+        """Takes in all messages that arrived, refuses malformed ones, and ends leases."""
+        for channel, sample in self._inbox:
             try:
-                self._take_in[channel](sample)
+                self._on_message[channel](sample)
             except Refused as refusal:
                 self._counters.refuse(refusal)
-        self._look_again()
-        for flight in self._jobs.expire(self._clock()):
+        self._query_tokens()
+        for job in self._leases.expire(self._clock()):
             self._counters.add("leases_over")
-            self._give_up(flight, "was not answered within its lease")
-        for flight in self._jobs.undelivered(self._left_at, self._roster.idle):
+            self._on_expired(job, "was not answered within its lease")
+        for job in self._leases.expire_undelivered(self._sent_at, self._registry.idle_period):
             self._counters.add("jobs_lost")
-            self._give_up(flight, f"was lost: worker {flight.worker} says that it has no job")
+            self._on_expired(job, f"was lost: worker {job.worker} says that it has no job")
 
-    def _left_at(self, flight: InFlightJob) -> float:
-        number, when = self._left.get(flight.worker, (0, 0.0))
-        return when if number == flight.number else float("inf")
+    def _sent_at(self, job: InFlightJob) -> float:
+        number, when = self._sent.get(job.worker, (0, 0.0))
+        return when if number == job.number else float("inf")
 
-    def _give_up(self, flight: InFlightJob, why: str) -> None:
-        self._quick.discard(flight.worker)  # it may be that zenoh dropped it
-        self._conduct.failed(flight.worker, flight.object, self._clock())
-        self._fail(flight, why)
+    def _on_expired(self, job: InFlightJob, why: str) -> None:
+        self._fast_links.discard(job.worker)  # zenoh may have dropped the job
+        self._reliability.on_failure(job.worker, job.object, self._clock())
+        self._fail(job, why)
 
-    def _look_again(self) -> None:
-        """Ask for the tokens of workers that speak without one, now and then."""
+    def _query_tokens(self) -> None:
+        """Queries the tokens of workers that send heartbeats without one, at most once per TOKEN_QUERY_INTERVAL."""
         now = self._clock()
-        if now >= self._look_due:
-            self._look_due = now + LOOK_AGAIN
-            if wanted := self._roster.without_token(now):
-                self._arrivals.ask_for_tokens(wanted)
+        if now >= self._token_query_due:
+            self._token_query_due = now + TOKEN_QUERY_INTERVAL
+            if wanted := self._registry.without_token(now):
+                self._inbox.query_tokens(wanted)
 
-    def _take_token(self, sample: zenoh.Sample) -> None:
+    def _on_token(self, sample: zenoh.Sample) -> None:
         name = name_in("alive_worker", sample.key_expr, "worker")
-        if self._roster.token(name, sample.kind == zenoh.SampleKind.PUT):
-            self._leave(name)
+        if self._registry.set_token(name, sample.kind == zenoh.SampleKind.PUT):
+            self._remove_worker(name)
 
-    def _take_hello(self, sample: zenoh.Sample) -> None:
+    def _on_heartbeat(self, sample: zenoh.Sample) -> None:
         data = take(sample.payload, CHANNELS["worker"].limit, "WorkerInfo")
-        name, new, lost = self._roster.hello(sample.key_expr, data, self._clock(), self._jobs.deadlines())
-        if lost:
-            self._leave(lost)
+        name, new, removed = self._registry.heartbeat(sample.key_expr, data, self._clock(), self._leases.deadlines())
+        if removed:
+            self._remove_worker(removed)
         if new:
-            self._leave(name)  # what an earlier process of this name had in hand is lost
-            info = self._roster.info(name)
+            self._remove_worker(name)  # the jobs of an earlier process of this name are lost
+            info = self._registry.info(name)
             log.info("worker %s joined: %s", name, info.library if info else "")
             if info and self._pool is not None and not info.shared_memory:
                 self._counters.warn("worker_copies", f"worker {name} has no shared memory with us, arrays are copied")
 
-    def _leave(self, name: str) -> None:
-        flight = self._jobs.lost(name)
-        self._speeds.forget_worker(name)
-        self._conduct.forget_worker(name)
-        self._quick.discard(name)
-        self._left.pop(name, None)
+    def _remove_worker(self, name: str) -> None:
+        job = self._leases.remove_worker(name)
+        self._timing.forget_worker(name)
+        self._reliability.forget_worker(name)
+        self._fast_links.discard(name)
+        self._sent.pop(name, None)
         self._free_since.pop(name, None)
-        if flight is not None:
+        if job is not None:
             self._counters.add("jobs_lost")
-            self._fail(flight, f"was lost with worker {name}")
+            self._fail(job, f"was lost with worker {name}")
 
-    def _take_pattern(self, sample: zenoh.Sample) -> None:
-        self._answers.take_pattern(sample.key_expr, sample.payload)
+    def _on_pattern(self, sample: zenoh.Sample) -> None:
+        self._decoder.add_pattern(sample.key_expr, sample.payload)
 
-    def _take_factor(self, sample: zenoh.Sample) -> None:
-        message = self._answers.parse_factor(sample.key_expr, sample.attachment)
-        flight = self._jobs.answered(message.job, message.worker, message.header.epoch)
+    def _on_factor(self, sample: zenoh.Sample) -> None:
+        message = self._decoder.parse_factor(sample.key_expr, sample.attachment)
+        job = self._leases.match_answer(message.job, message.worker, message.header.epoch)
         now, seconds = self._clock(), None
-        self._roster.heard(flight.worker, now)
-        self._free_since[flight.worker] = now
-        self._conduct.answered(flight.worker)
-        if self._jobs.passed(flight):
-            return self._jobs.end(flight, None if message.failure else message.seconds)
+        self._registry.mark_seen(job.worker, now)
+        self._free_since[job.worker] = now
+        self._reliability.on_answer(job.worker)
+        if self._leases.is_reassigned(job):
+            return self._leases.finish(job, None if message.failure else message.seconds)
         try:
             if message.failure:
                 self._counters.add("failures")
-                self._conduct.failed(flight.worker, flight.object, now)
-                return self._fail(flight, f"failed: {message.failure}")
-            self._factors.append(self._answers.factor(message, sample.payload, flight))
+                self._reliability.on_failure(job.worker, job.object, now)
+                return self._fail(job, f"failed: {message.failure}")
+            self._factors.append(self._decoder.decode(message, sample.payload, job))
             seconds = message.seconds
-            self._speeds.note(flight.worker, flight.object, now - flight.sent, seconds)
+            self._timing.record(job.worker, job.object, now - job.sent_at, seconds)
         except Refused as refusal:
-            self._conduct.failed(flight.worker, flight.object, now)
-            self._fail(flight, f"was refused: {refusal}")
+            self._reliability.on_failure(job.worker, job.object, now)
+            self._fail(job, f"was refused: {refusal}")
             raise
         finally:
-            self._jobs.end(flight, seconds)
+            self._leases.finish(job, seconds)
         self._counters.add("factors")
         self._counters.add("bytes_in", self._factors[-1].values.nbytes)
-        room = flight.factor_slot.capacity if flight.factor_slot is not None else 0
-        fits = 0 < self._factors[-1].values.nbytes <= room  # an incomplete one may be larger than all before it
-        self._count_bulk("matrix", flight, message.matrix_shared, bool(flight.slots))
-        self._count_bulk("factor", flight, message.HasField("slot"), fits)
+        capacity = job.factor_slot.capacity if job.factor_slot is not None else 0
+        fits = 0 < self._factors[-1].values.nbytes <= capacity  # an incomplete factor may be the largest so far
+        self._count_bulk("matrix", job, message.matrix_shared, bool(job.slots))
+        self._count_bulk("factor", job, message.HasField("slot"), fits)
 
-    def _count_bulk(self, what: str, flight: InFlightJob, shared: bool, lent: bool) -> None:
+    def _count_bulk(self, what: str, job: InFlightJob, shared: bool, allocated: bool) -> None:
         self._counters.add("bulk_shared" if shared else "bulk_copied")
-        if lent and not shared:
+        if allocated and not shared:
             self._counters.trouble(
-                "slots_unused", f"a slot was lent to worker {flight.worker}, but its {what} travelled as bytes"
+                "slots_unused", f"a slot was lent to worker {job.worker}, but its {what} travelled as bytes"
             )
 
-    def _fail(self, flight: InFlightJob, why: str) -> None:
-        self._failures.append((flight.object, f"factorization of {flight.object} at step {flight.step} {why}"))
+    def _fail(self, job: InFlightJob, why: str) -> None:
+        self._failures.append((job.object, f"factorization of {job.object} at step {job.step} {why}"))

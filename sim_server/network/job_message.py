@@ -1,52 +1,56 @@
 # SPDX-License-Identifier: MIT
-"""A job as it travels: the message and the values, in a slot or as bytes."""
-
-from typing import Any
+"""Encodes a job for the network: a message, and the values in a slot of shared memory or as bytes."""
 
 import numpy as np
 import zenoh
-from numpy.typing import NDArray
 
 from protocol.channels import PROTOCOL
 from protocol.check import checksum
 from protocol.messages_pb2 import Header, Matrix
 from protocol.method import Method
 from protocol.slots import Slot
+from sim_server.arrays import Float64
 from sim_server.network.factor_decoder import AnnouncedObject
 from sim_server.network.leases import InFlightJob
 
 
-def matrix_message(
-    flight: InFlightJob, known: AnnouncedObject, incarnation: int, lease: float, method: Method
-) -> Matrix:
-    """The message beside the values; checksum and matrix slot are filled in by load."""
+def matrix_message(job: InFlightJob, known: AnnouncedObject, incarnation: int, lease: float, method: Method) -> Matrix:
+    """Returns the message of a job without checksum, matrix slot and nodes, which `add_values` fills in.
+
+    lease: time [s] that the worker has for its answer
+    """
     message = Matrix(
         header=Header(
             protocol=PROTOCOL,
             incarnation=incarnation,
-            object=flight.object,
-            epoch=flight.epoch,
-            sequence=flight.number,
+            object=job.object,
+            epoch=job.epoch,
+            sequence=job.number,
         ),
-        step=flight.step,
-        warp=flight.warp,
+        step=job.step,
+        warp=job.warp,
         blocks=known.blocks,
-        factor_dtype=flight.dtype,
+        factor_dtype=job.dtype,
         method=method.name,
         drop_tolerance=method.drop_tolerance,
         fill=method.fill,
         omega=method.omega,
         known_patterns=list(known.patterns),
         lease=lease,
-        worker=flight.worker,
+        worker=job.worker,
     )
-    if flight.factor_slot is not None:
-        message.factor_slot.CopyFrom(flight.factor_slot.message())
+    if job.factor_slot is not None:
+        message.factor_slot.CopyFrom(job.factor_slot.message())
     return message
 
 
-def load(message: Matrix, values: NDArray[np.float64], slot: Slot | None) -> Any:
-    """The payload: values (blocks, 3, 3) or positions (nodes, 3), copied into the slot or, without one, into bytes."""
+def add_values(message: Matrix, values: Float64, slot: Slot | None) -> zenoh.ZBytes:
+    """Copies the values into the slot, or into bytes without one, and describes them in the message.
+
+    values: blocks of the matrix (blocks, 3, 3) or positions (nodes, 3) [m]
+
+    Returns the payload to be sent.
+    """
     if values.ndim == 2:
         message.nodes = len(values)
     if slot is None:

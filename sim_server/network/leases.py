@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Jobs in flight: at most one per object and per worker, each with a lease, and the slots lent for them.
+"""Jobs in flight: at most one per object and per worker, each with a lease and the slots allocated for it.
 
-Pure bookkeeping, without a network or a clock of its own.
+Pure bookkeeping, without network or clock.
 """
 
 from collections.abc import Callable
@@ -11,26 +11,35 @@ from typing import Protocol
 from protocol.refused import Refused
 from protocol.slots import Slot
 
-SHORTEST = 2.0  # s
-LONGEST = 120.0  # s; also for the first job of an object at a worker, which may compile, import and analyse for it
-DOUBLINGS = 8
-TIMES = 20  # a lease is so many times what the last factorization took
-UNKNOWN_PER_BLOCK = 1e-4  # s that nobody else is asked for an object that no factor came of yet
-DELIVERED = 1.0  # s in which a job that left reaches a worker through shared memory; as bytes so much longer: ...
-BUFFERED, SLOWEST = 1 << 22, 1e6  # ... at most these bytes are still on their way, at so many bytes/s
-SOON = 0.5  # s that nobody else is asked, at least
-LATE = 2  # late jobs with which a worker may still be asked again through shared memory
+MIN_LEASE = 2.0  # s
+MAX_LEASE = 120.0  # s; also for the first job of an object at a worker, which may compile, import and analyse for it
+MAX_DOUBLINGS = 8  # of a lease
+LEASE_FACTOR = 20  # a lease is this multiple of the duration of the last factorization
+EXCLUSIVE_PER_BLOCK = 1e-4  # s per block of the matrix: exclusive period of an object without any factor yet
+MIN_EXCLUSIVE = 0.5  # s; least exclusive period of an object with a factor
+DELIVERY = 1.0  # s in which a job that was sent reaches its worker, without the time for bytes
+BUFFERED = 1 << 22  # bytes that may still be under way when a job was sent
+MIN_BANDWIDTH = 1e6  # bytes/s of the slowest link
+MAX_EXPIRED = 2  # expired jobs with which a worker still gets slots of shared memory
 
 
 class SlotAllocator(Protocol):
-    """Where slots come from."""
+    """The pool that slots go back to."""
 
-    def give_back(self, slot: Slot) -> None: ...
+    def give_back(self, slot: Slot) -> None:
+        """Frees a slot."""
 
 
 @dataclass(frozen=True)
 class InFlightJob:
-    """One job sent to one worker; deadline [s, monotonic] is the end of its lease, sent its beginning."""
+    """A job sent to one worker. Times are monotonic [s].
+
+    number: of the job, unique in the life of the server
+    sent_at, deadline: begin and end of its lease
+    exclusive_until: from then on another worker may be asked for the object
+    slots: shared memory allocated for the matrix and the factor
+    payload_bytes: size of the values if they are in no slot
+    """
 
     number: int
     object: str
@@ -43,172 +52,184 @@ class InFlightJob:
     factor_slot: Slot | None = None
     factor_generation: int = 0
     slots: tuple[Slot, ...] = ()
-    sent: float = 0.0
-    alone: float = 0.0  # [s, monotonic] from when on another worker may be asked for the object
+    sent_at: float = 0.0
+    exclusive_until: float = 0.0
     method: str = "cholesky"
-    bytes: int = 0  # of its values, where they are in no slot
+    payload_bytes: int = 0
 
 
 class Leases:
-    """All flights. A late one stays known, its slots lent, until its worker answers it or a later one, or leaves."""
+    """All jobs in flight, and jobs whose lease has expired.
 
-    def __init__(self, lender: SlotAllocator | None):
-        self._lender = lender
+    An expired job is kept with its slots until its worker answers it or a later job, or leaves: until then the worker
+    may still write to them.
+    """
+
+    def __init__(self, allocator: SlotAllocator | None):
+        self._allocator = allocator
         self.by_object: dict[str, InFlightJob] = {}
         self.by_worker: dict[str, InFlightJob] = {}
-        self._late: dict[str, list[InFlightJob]] = {}
-        self._seconds: dict[str, dict[str, float]] = {}  # of the last factorization, by object and worker
-        self._patience: dict[tuple[str, str], int] = {}  # doublings of the lease after late jobs, by object and worker
-        self._passed: set[int] = set()  # jobs whose object may go to another worker before they are answered
+        self._expired: dict[str, list[InFlightJob]] = {}  # by worker
+        self._seconds: dict[str, dict[str, float]] = {}  # duration of the last factorization, by object and worker
+        self._doublings: dict[tuple[str, str], int] = {}  # of the lease, after expired jobs, by object and worker
+        self._reassigned: set[int] = set()  # numbers of jobs whose object another worker may have
         self._last = 0
 
     def next_number(self) -> int:
-        """Number of the next job, growing by one."""
+        """Number of the next job, increasing by one."""
         self._last += 1
         return self._last
 
     def lease(self, object: str, worker: str) -> float:
-        """How long [s] an answer of the worker is waited for; twice as long after each one that was late."""
+        """Time [s] that the worker has for its answer; doubled after each job that expired."""
         known = self._seconds.get(object, {}).get(worker)
         if known is None:
-            return LONGEST
-        return float(min(LONGEST, max(SHORTEST, TIMES * known) * 2 ** self._patience.get((object, worker), 0)))
+            return MAX_LEASE
+        doublings = self._doublings.get((object, worker), 0)
+        return float(min(MAX_LEASE, max(MIN_LEASE, LEASE_FACTOR * known) * 2**doublings))
 
-    def alone(self, object: str, blocks: int) -> float:
-        """How long [s] nobody else is asked: by the fastest worker that is known, whoever has the job."""
+    def exclusive_period(self, object: str, blocks: int) -> float:
+        """Time [s] in which no other worker is asked for the object, by the duration at its fastest known worker."""
         known = min(self._seconds.get(object, {}).values(), default=None)
-        return max(SOON, TIMES * known) if known is not None else max(SHORTEST, UNKNOWN_PER_BLOCK * blocks)
+        if known is None:
+            return max(MIN_LEASE, EXCLUSIVE_PER_BLOCK * blocks)
+        return max(MIN_EXCLUSIVE, LEASE_FACTOR * known)
 
-    def start(self, flight: InFlightJob) -> None:
-        """The job is on its way."""
-        self.by_object[flight.object] = flight
-        self.by_worker[flight.worker] = flight
+    def start(self, job: InFlightJob) -> None:
+        """Adds a job that is being sent."""
+        self.by_object[job.object] = job
+        self.by_worker[job.worker] = job
 
-    def cancel(self, flight: InFlightJob) -> None:
-        """The job was never sent."""
-        del self.by_object[flight.object], self.by_worker[flight.worker]
-        self._give_back(flight)
+    def cancel(self, job: InFlightJob) -> None:
+        """Removes a job that was never sent."""
+        del self.by_object[job.object], self.by_worker[job.worker]
+        self._free_slots(job)
 
-    def pass_on(self, now: float, able: Callable[[InFlightJob], bool]) -> list[InFlightJob]:
-        """Flights of which another worker may be asked, and is there (`able`): their objects may be sent again. Their
-        workers stay busy until they answer, which is worth nothing then but to know that they do."""
-        slow = [flight for flight in self.by_object.values() if now > flight.alone and able(flight)]
-        for flight in slow:
-            del self.by_object[flight.object]
-            self._passed.add(flight.number)
+    def reassign(self, now: float, can_move: Callable[[InFlightJob], bool]) -> list[InFlightJob]:
+        """Frees the objects of jobs whose exclusive period is over, if another worker could take them (`can_move`).
+
+        Their workers stay busy until they answer; that answer is dropped.
+        """
+        slow = [job for job in self.by_object.values() if now > job.exclusive_until and can_move(job)]
+        for job in slow:
+            del self.by_object[job.object]
+            self._reassigned.add(job.number)
         return slow
 
-    def passed(self, flight: InFlightJob) -> bool:
-        """Its object was passed on."""
-        return flight.number in self._passed
+    def is_reassigned(self, job: InFlightJob) -> bool:
+        """True if the object of the job was freed by `reassign`."""
+        return job.number in self._reassigned
 
-    def lateness(self, worker: str) -> int:
-        """Late jobs of a worker that it may still be busy with."""
-        return len(self._late.get(worker, ()))
+    def expired_count(self, worker: str) -> int:
+        """Number of expired jobs that a worker may still be busy with."""
+        return len(self._expired.get(worker, ()))
 
-    def answered(self, number: int, worker: str, epoch: int) -> InFlightJob:
-        """The flight that an answer belongs to, still in flight; raises Refused."""
-        flight = self.by_worker.get(worker)
-        if flight is not None and flight.number == number:
-            if epoch != flight.epoch:
-                raise Refused(f"Factor.header.epoch is {epoch}; allowed: {flight.epoch}, as in the matrix", "epoch")
-            if self.by_object.get(flight.object) is flight or self.passed(flight):
-                return flight
-            self.end(flight)
-            raise Refused(f"Factor.job is {number} of an epoch of {flight.object} that is over", "epoch")
-        late = self._late.get(worker, [])
-        if any(old.number == number for old in late):
-            self._release_late(worker, number)
+    def match_answer(self, number: int, worker: str, epoch: int) -> InFlightJob:
+        """Finds the job in flight that an answer belongs to; raises Refused if there is none."""
+        job = self.by_worker.get(worker)
+        if job is not None and job.number == number:
+            if epoch != job.epoch:
+                raise Refused(f"Factor.header.epoch is {epoch}; allowed: {job.epoch}, as in the matrix", "epoch")
+            if self.by_object.get(job.object) is job or self.is_reassigned(job):
+                return job
+            self.finish(job)
+            raise Refused(f"Factor.job is {number} of an epoch of {job.object} that is over", "epoch")
+        if any(old.number == number for old in self._expired.get(worker, [])):
+            self._free_expired(worker, number)
             raise Refused(f"Factor.job is {number}, whose lease of worker {worker} is over", "late")
         if 0 < number <= self._last:
             raise Refused(f"Factor.job is {number}, already answered or not for worker {worker}", "duplicate")
         raise Refused(f"Factor.job is {number}; allowed: a job in flight, at most {self._last}", "sequence")
 
-    def end(self, flight: InFlightJob, seconds: float | None = None) -> None:
-        """The worker has answered: the object and the worker are free, all slots up to this job come back."""
-        if self.by_object.get(flight.object) is flight:
-            del self.by_object[flight.object]
-        if self.by_worker.get(flight.worker) is flight:
-            del self.by_worker[flight.worker]
-        self._passed.discard(flight.number)
-        self._give_back(flight)
-        self._release_late(flight.worker, flight.number)
+    def finish(self, job: InFlightJob, seconds: float | None = None) -> None:
+        """Removes a job that its worker has answered, and frees all slots of the worker up to this job.
+
+        seconds: duration of the factorization; None if it failed
+        """
+        if self.by_object.get(job.object) is job:
+            del self.by_object[job.object]
+        if self.by_worker.get(job.worker) is job:
+            del self.by_worker[job.worker]
+        self._reassigned.discard(job.number)
+        self._free_slots(job)
+        self._free_expired(job.worker, job.number)
         if seconds is not None:
-            self._seconds.setdefault(flight.object, {})[flight.worker] = seconds
-            self._patience.pop((flight.object, flight.worker), None)
+            self._seconds.setdefault(job.object, {})[job.worker] = seconds
+            self._doublings.pop((job.object, job.worker), None)
 
     def expire(self, now: float) -> list[InFlightJob]:
-        """Flights whose lease ended: object and worker may be used again; the slots stay lent."""
-        return self._given_up([flight for flight in self.by_worker.values() if now > flight.deadline])
+        """Ends the leases that are over: objects and workers are free again, the slots are not. Returns the jobs."""
+        return self._expire([job for job in self.by_worker.values() if now > job.deadline])
 
-    def undelivered(
-        self, left: Callable[[InFlightJob], float], idle: Callable[[str], tuple[float, float] | None]
+    def expire_undelivered(
+        self, sent_at: Callable[[InFlightJob], float], idle: Callable[[str], tuple[float, float] | None]
     ) -> list[InFlightJob]:
-        """Flights that were lost on the way, as if their leases had ended: so says the worker that should have them.
+        """Ends the leases of jobs that were lost on the way: their workers keep reporting that they have no job.
 
-        left: when a job had left [s, monotonic]; idle: from when to when a worker has been saying that it has none.
+        sent_at: time [s, monotonic] at which the network took a job
+        idle: first and last time [s, monotonic] at which a worker reported without a break that it has no job
         """
 
-        def lost(flight: InFlightJob) -> bool:
-            said = idle(flight.worker)
-            return said is not None and said[1] - max(said[0], left(flight)) > self.delivery(flight)
+        def lost(job: InFlightJob) -> bool:
+            period = idle(job.worker)
+            return period is not None and period[1] - max(period[0], sent_at(job)) > self.delivery_time(job)
 
-        return self._given_up([flight for flight in self.by_worker.values() if lost(flight)])
+        return self._expire([job for job in self.by_worker.values() if lost(job)])
 
-    def delivery(self, flight: InFlightJob) -> float:
-        """How long [s] a job that has left may be on its way; twice as long after each one that was late."""
-        doublings = self._patience.get((flight.object, flight.worker), 0)
-        return float((DELIVERED + min(flight.bytes, BUFFERED) / SLOWEST) * 2**doublings)
+    def delivery_time(self, job: InFlightJob) -> float:
+        """Time [s] that a job may need to reach its worker; doubled after each job that expired."""
+        doublings = self._doublings.get((job.object, job.worker), 0)
+        return float((DELIVERY + min(job.payload_bytes, BUFFERED) / MIN_BANDWIDTH) * 2**doublings)
 
-    def _given_up(self, over: list[InFlightJob]) -> list[InFlightJob]:
-        for flight in over:
-            del self.by_worker[flight.worker]
-            self._passed.discard(flight.number)
-            pair = flight.object, flight.worker
-            self._patience[pair] = min(DOUBLINGS, self._patience.get(pair, 0) + 1)
-            self._late.setdefault(flight.worker, []).append(flight)
-        expired = [flight for flight in over if self.by_object.get(flight.object) is flight]
-        for flight in expired:
-            del self.by_object[flight.object]
+    def _expire(self, over: list[InFlightJob]) -> list[InFlightJob]:
+        for job in over:
+            del self.by_worker[job.worker]
+            self._reassigned.discard(job.number)
+            pair = job.object, job.worker
+            self._doublings[pair] = min(MAX_DOUBLINGS, self._doublings.get(pair, 0) + 1)
+            self._expired.setdefault(job.worker, []).append(job)
+        expired = [job for job in over if self.by_object.get(job.object) is job]
+        for job in expired:
+            del self.by_object[job.object]
         return expired
 
-    def forget(self, object: str) -> None:
-        """The object has a new epoch: what is in flight is worth nothing. Its worker stays busy until it answers."""
+    def forget_object(self, object: str) -> None:
+        """Drops what is known of an object that has a new epoch. The worker of its job stays busy until it answers."""
         self.by_object.pop(object, None)
         self._seconds.pop(object, None)
-        for pair in [pair for pair in self._patience if pair[0] == object]:
-            del self._patience[pair]
+        for pair in [pair for pair in self._doublings if pair[0] == object]:
+            del self._doublings[pair]
 
-    def lost(self, worker: str) -> InFlightJob | None:
-        """The worker is gone: all its slots come back; the job of a living object that was lost with it."""
-        for old in self._late.pop(worker, []):
-            self._give_back(old)
+    def remove_worker(self, worker: str) -> InFlightJob | None:
+        """Frees all slots of a worker that left; returns its job if that is of the present epoch of its object."""
+        for old in self._expired.pop(worker, []):
+            self._free_slots(old)
         for seconds in self._seconds.values():
             seconds.pop(worker, None)
-        for pair in [pair for pair in self._patience if pair[1] == worker]:
-            del self._patience[pair]
-        flight = self.by_worker.pop(worker, None)
-        if flight is None:
+        for pair in [pair for pair in self._doublings if pair[1] == worker]:
+            del self._doublings[pair]
+        job = self.by_worker.pop(worker, None)
+        if job is None:
             return None
-        self._passed.discard(flight.number)
-        self._give_back(flight)
-        if self.by_object.get(flight.object) is not flight:
+        self._reassigned.discard(job.number)
+        self._free_slots(job)
+        if self.by_object.get(job.object) is not job:
             return None
-        del self.by_object[flight.object]
-        return flight
+        del self.by_object[job.object]
+        return job
 
     def deadlines(self) -> dict[str, float]:
-        """By worker, the end of the lease that it works under."""
-        return {worker: flight.deadline for worker, flight in self.by_worker.items()}
+        """End of the lease [s, monotonic] of each busy worker."""
+        return {worker: job.deadline for worker, job in self.by_worker.items()}
 
-    def _release_late(self, worker: str, number: int) -> None:
-        # A worker does its jobs one after another: having answered this one it writes to no earlier slot.
-        late = self._late.get(worker, [])
-        for old in [old for old in late if old.number <= number]:
-            late.remove(old)
-            self._give_back(old)
+    def _free_expired(self, worker: str, number: int) -> None:
+        # A worker does its jobs one after another: having answered this one it writes to no slot of an earlier one.
+        expired = self._expired.get(worker, [])
+        for old in [old for old in expired if old.number <= number]:
+            expired.remove(old)
+            self._free_slots(old)
 
-    def _give_back(self, flight: InFlightJob) -> None:
-        if self._lender is not None:
-            for slot in flight.slots:
-                self._lender.give_back(slot)
+    def _free_slots(self, job: InFlightJob) -> None:
+        if self._allocator is not None:
+            for slot in job.slots:
+                self._allocator.give_back(slot)

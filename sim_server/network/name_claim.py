@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""The name of a server among those that it is linked with: there is one server of a name.
+"""Ensures that a server is the only one of its name among the servers that it is linked with.
 
-Anybody on the network may declare the token of a server, and that of a dead one may outlive it by a moment. So a name
-is taken only if a server answers to it. It is asked for before this server shows itself, and, since two may start at
-the same instant and links are made in the background, for SETTLED seconds more.
+Anybody on the network may declare the token of a server, and the token of a dead server may outlive it by a moment. So
+a name is taken only if a server answers to it. It is queried before this server declares its own token, and, since two
+servers may start at the same instant and links are made in the background, for SETTLED seconds more.
 """
 
 import contextlib
@@ -22,16 +22,17 @@ from sim_server.errors import NameTaken
 
 log = logging.getLogger(__name__)
 
-LINKING = 0.5  # s to reach those that this server is to be linked with; without them it goes on
-SETTLED = 3.0  # s after which a server leaves no more; whoever comes later has to
-AGAIN = 0.5  # s between questions
+CONNECT_TIMEOUT = 0.5  # s to reach the servers that this one is to be linked with; it goes on without them
+SETTLED = 3.0  # s after which a server keeps its name against servers that start later
+QUERY_INTERVAL = 0.5  # s
 
 
 class NameClaim:
-    """Says whether a server may keep its name; raises NameTaken at once if it may not.
+    """Raises NameTaken if another server has the name, at once or in `check`.
 
-    listen, connect: as of ServerLink. Asks as a client of those that this server is linked with: a router tells one
-    server nothing of another.
+    Queries are sent by a client session to the servers in `connect`: a router does not forward them between servers.
+
+    listen, connect: as of ServerLink
     """
 
     def __init__(
@@ -41,28 +42,28 @@ class NameClaim:
         self._server, self._incarnation = server, incarnation
         self._where = ", ".join(connect or listen or [DEFAULT_ENDPOINT])
         self._session, self._client = session, None if not connect else _client(connect)
-        self._since = float("inf")  # when [s, monotonic] it was checked first: setting up may take long before that
-        self._asked = float("-inf")
-        self._met = False  # a token of another server of the name was seen
+        self._since = float("inf")  # time of the first check [s, monotonic]: setting up may take long before it
+        self._queried = float("-inf")  # time of the last query
+        self._token_seen = False  # of another server of the name
         self._taken = self._warned = False
-        if self._client is not None and self._ask_and_wait():
+        if self._client is not None and self._query_and_wait():
             self.close()
             raise self._error()
 
     @property
     def settled(self) -> bool:
-        """The name is this server's."""
+        """True once this server keeps its name for good."""
         return time.monotonic() - self._since > SETTLED
 
     @property
-    def _asking(self) -> zenoh.Session:
+    def _query_session(self) -> zenoh.Session:
         return (self._client or self._session).zenoh
 
-    def _ask(self, answered: echo.Answered) -> None:
-        with contextlib.suppress(zenoh.ZError):  # the link was cut: there is nobody to be told of
-            echo.who(self._asking, self._server, f"{self._incarnation:016x}", answered)
+    def _query(self, answered: echo.Answered) -> None:
+        with contextlib.suppress(zenoh.ZError):  # the link was cut
+            echo.who(self._query_session, self._server, f"{self._incarnation:016x}", answered)
 
-    def _ask_and_wait(self) -> dict[int, Echo]:
+    def _query_and_wait(self) -> dict[int, Echo]:
         answers: dict[int, Echo] = {}
         done = threading.Event()
 
@@ -70,34 +71,34 @@ class NameClaim:
             answers.update(found)
             done.set()
 
-        self._ask(answered)
+        self._query(answered)
         done.wait(2.0)
         return answers
 
-    def begin(self) -> None:
-        """The name is taken; hear of others that take it."""
+    def watch(self) -> None:
+        """Watches for tokens of other servers of the name, from before this server declares its own."""
         tokens = key("alive_server", self._server)
-        self._tokens = self._asking.liveliness().declare_subscriber(tokens, self._token, history=True)
+        self._tokens = self._query_session.liveliness().declare_subscriber(tokens, self._on_token, history=True)
 
-    def _token(self, sample: zenoh.Sample) -> None:
+    def _on_token(self, sample: zenoh.Sample) -> None:
         own = f"{self._incarnation:016x}"
         if sample.kind == zenoh.SampleKind.PUT and not str(sample.key_expr).endswith(own):
-            self._met = True
+            self._token_seen = True
 
     def check(self) -> None:
-        """Raise NameTaken if this server has to leave; ask again where that is not known yet."""
+        """Raises NameTaken if this server has to leave; queries again while that is not known."""
         if self._taken:
             raise self._error()
         now = time.monotonic()
         self._since = min(self._since, now)
-        if self._met and now - self._asked > AGAIN:
-            self._met, self._asked = not self.settled, now
-            self._ask(self._compare)
+        if self._token_seen and now - self._queried > QUERY_INTERVAL:
+            self._token_seen, self._queried = not self.settled, now
+            self._query(self._compare)
         if self._client is not None and now - self._since > 2 * SETTLED:
             self.close()
 
     def _compare(self, found: dict[int, Echo]) -> None:
-        """Of two that have just started the larger incarnation leaves; one that is settled stays."""
+        """Decides which server leaves: of two that have just started the larger incarnation; never a settled one."""
         for incarnation, other in found.items():
             if incarnation == self._incarnation:
                 continue
@@ -114,7 +115,7 @@ class NameClaim:
         )
 
     def close(self) -> None:
-        """Ask no more."""
+        """Ends the queries."""
         client, self._client = self._client, None
         if client is not None:
             client.close()
@@ -122,6 +123,6 @@ class NameClaim:
 
 def _client(connect: Sequence[str]) -> Session | None:
     try:
-        return open_session("client", connect=connect, shared_memory=False, timeout=LINKING)
+        return open_session("client", connect=connect, shared_memory=False, timeout=CONNECT_TIMEOUT)
     except ConnectionFailed:
         return None

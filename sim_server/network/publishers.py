@@ -1,43 +1,52 @@
 # SPDX-License-Identifier: MIT
-"""Publishing to whoever listens, at next to no cost when nobody does."""
+"""Publishes messages to subscribers; without any, a message costs next to nothing."""
 
 from collections import Counter
 from collections.abc import Callable
-from typing import Any
 
 import zenoh
 
 from protocol.channels import key
 from protocol.counters import Counters
+from protocol.messages_pb2 import State, Status, Steps
 from sim_server.network.send_queue import SendQueue
+
+Published = State | Status | Steps
 
 
 class Publishers:
-    """Publishers of the server, declared as they are first used. A slow listener loses frames, never holds us up."""
+    """The zenoh publishers of a server, declared at their first use. A slow subscriber loses messages.
 
-    def __init__(self, session: zenoh.Session, server: str, outbox: SendQueue, counters: Counters):
+    stamp: fills in the header of a message, given its sequence number
+    """
+
+    def __init__(
+        self, session: zenoh.Session, server: str, queue: SendQueue, counters: Counters,
+        stamp: Callable[[Published, int], None],
+    ):  # fmt: skip
         self._session = session
         self._server = server
-        self._outbox = outbox
+        self._queue = queue
         self._counters = counters
+        self._stamp = stamp
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._sequence: Counter[str] = Counter()
 
-    def wanted(self, channel: str, **names: str) -> bool:
-        """Somebody listens."""
+    def has_subscribers(self, channel: str, **names: str) -> bool:
+        """True if somebody subscribed to the channel. names: parts of its key, as of `key`."""
         return _matched(self._publisher(key(channel, self._server, **names)))
 
-    def put(self, channel: str, message: Any, stamp: Callable[[Any, int], None], **names: str) -> None:
-        """Send a message if somebody listens. A state replaces an older one that still waits to be sent."""
+    def put(self, channel: str, message: Published, **names: str) -> None:
+        """Sends a message if there are subscribers. A state or status replaces one that still waits to be sent."""
         name = key(channel, self._server, **names)
         publisher = self._publisher(name)
         if not _matched(publisher):
             return
         self._sequence[name] += 1
-        stamp(message, self._sequence[name])
+        self._stamp(message, self._sequence[name])
         data = message.SerializeToString()
         latest = name if channel in ("state", "status") else None
-        if not self._outbox.post(lambda: publisher.put(data), latest):
+        if not self._queue.post(lambda: publisher.put(data), latest):
             self._counters.add("frames_dropped")
 
     def _publisher(self, name: str) -> zenoh.Publisher:
@@ -49,5 +58,5 @@ class Publishers:
 
 
 def _matched(publisher: zenoh.Publisher) -> bool:
-    status: Any = publisher.matching_status  # a bool in zenoh's stubs, an object with a bool when it runs
+    status: object = publisher.matching_status  # a bool in zenoh's stubs, an object with a bool when it runs
     return bool(getattr(status, "matching", status))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Questions that others ask the server: status, scene, topology, shared memory, commands."""
+"""Answers the queries of clients and workers: status, scene, topology, shared memory probes, commands."""
 
 import logging
 from collections.abc import Callable
@@ -23,52 +23,54 @@ from sim_server.network.send_queue import SendQueue
 
 log = logging.getLogger(__name__)
 
-ASKED = 256  # queries of a channel that may wait for its thread; beyond that the oldest goes unanswered
-OTHERS = 64  # workers of another wire version that are told of one by one
-CHANNELS_ASKED = ("command", "status", "scene", "topology", "echo")
+MAX_QUERIES = 256  # queries of a channel that may wait for its thread; beyond that the oldest is dropped
+MAX_WARNED_WORKERS = 64  # workers of another wire version that are warned of one by one
+QUERYABLES = ("command", "status", "scene", "topology", "echo")  # channels
 
 
 class Queryables:
-    """A queryable and a thread for each channel, so that a flood of commands holds up no other question.
+    """A zenoh queryable and a thread for each channel, so that a flood of commands delays no other query.
 
-    What was published under a key is answered at once; commands wait for the simulation, in bounded room (waiting.py),
-    but for moves that newer ones have overtaken (newest.py). Their answers go through an outbox: zenoh waits where a
-    client does not read.
+    Queries for what was set by `set_answer` are answered at once. Commands wait for the simulation in a bounded queue
+    (command_queue.py), except moves that newer ones replace (coalesce.py). Their replies go through a send queue, since
+    zenoh blocks where a client does not read.
+
+    probe_slot: shared memory with which workers probe whether they can use it; None: there is none
     """
 
     def __init__(
-        self, session: Session, server: str, incarnation: int, counters: Counters, slot: Slot | None, replies: SendQueue,
-        claim: NameClaim,
+        self, session: Session, server: str, incarnation: int, counters: Counters, probe_slot: Slot | None,
+        replies: SendQueue, claim: NameClaim,
     ):  # fmt: skip
         self._claim = claim
         self._replies = replies
         self._server = server
         self._incarnation = incarnation
         self._counters = counters
-        self._echo_slot = slot
+        self._probe_slot = probe_slot
         self._command_key = key("command", server)
         self._echo_prefix = key("echo", server, worker="*")[:-1]
-        self._answers: dict[str, bytes] = {}
+        self._answers: dict[str, bytes] = {}  # by key
         self._other_version: set[str] = set()  # workers
-        self._waiting = CommandQueue(counters)
+        self._queue = CommandQueue(counters)
         self._done = self._stamped(Reply())
         self._queryables = {}
-        for channel in CHANNELS_ASKED:
-            ring: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(ASKED)
+        for channel in QUERYABLES:
+            ring: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(MAX_QUERIES)
             self._queryables[channel] = session.zenoh.declare_queryable(key(channel, server), ring)
-            session.thread(f"inquiries-{channel}", partial(self._run, channel))
+            session.thread(f"queryable-{channel}", partial(self._run, channel))
 
-    def offer(self, name: str, answer: bytes) -> None:
-        """From now on a query of this key gets this answer."""
+    def set_answer(self, name: str, answer: bytes) -> None:
+        """Sets the answer to queries of the key `name`."""
         self._answers[name] = answer
 
     def commands(self) -> list[PendingCommand]:
-        """Commands that came since the last call, each with the function that answers it."""
-        return self._waiting.take()
+        """Returns the commands that came since the last call, each with the function that answers it."""
+        return self._queue.take_all()
 
     def _run(self, channel: str) -> None:
         queryable, own = self._queryables[channel], zenoh.KeyExpr(key(channel, self._server))
-        together = ASKED if channel == "command" else 1
+        together = MAX_QUERIES if channel == "command" else 1
         while True:
             try:
                 queries = [queryable.recv()]
@@ -95,66 +97,58 @@ class Queryables:
                 self._counters.refuse(refusal)
                 query.drop()
         if commands:
-            self._commands(commands)
+            self._queue_commands(commands)
 
     def _serve(self, query: zenoh.Query, own: zenoh.KeyExpr) -> None:
         with query:
             if str(query.key_expr).startswith(self._echo_prefix):
-                return self._echo(query)
+                return self._answer_probe(query)
             for name, answer in list(self._answers.items()):
                 name_expr = zenoh.KeyExpr(name)
                 if own.intersects(name_expr) and query.key_expr.intersects(name_expr):
                     query.reply(name, answer)
 
-    def _echo(self, query: zenoh.Query) -> None:
+    def _answer_probe(self, query: zenoh.Query) -> None:
         question = parse(Echo, query.payload, CHANNELS["echo"].limit)
         if question.header.protocol != PROTOCOL:
-            self._tell_of_version(query, question)
-        if self._echo_slot is None or not question.nonce or question.header.protocol != PROTOCOL:
+            self._warn_of_version(query, question)
+        if self._probe_slot is None or not question.nonce or question.header.protocol != PROTOCOL:
             header = Header(protocol=PROTOCOL, incarnation=self._incarnation)
             query.reply(
                 query.key_expr, b"", attachment=Echo(header=header, settled=self._claim.settled).SerializeToString()
             )
         else:
-            reply, payload = echo.answer(self._echo_slot, question, self._incarnation)
+            reply, payload = echo.answer(self._probe_slot, question, self._incarnation)
             query.reply(query.key_expr, payload, attachment=reply.SerializeToString())
 
-    def _tell_of_version(self, query: zenoh.Query, question: Echo) -> None:
-        """Say once for each worker that it speaks another version; it is told by the header of the answer."""
+    def _warn_of_version(self, query: zenoh.Query, question: Echo) -> None:
+        """Warns once for each worker that speaks another version; the worker finds out by the header of the answer."""
         worker = name_in("echo", query.key_expr, "worker")
         refusal = Refused(
             f"worker {worker} speaks protocol version {question.header.protocol}, this server version {PROTOCOL}: "
             "it gets no jobs; install the same release of warpfactor on both sides",
             "version",
         )
-        if len(self._other_version) < OTHERS:
+        if len(self._other_version) < MAX_WARNED_WORKERS:
             self._other_version.add(worker)
         self._counters.refuse(refusal, worker if worker in self._other_version else "")
 
-    def _send(self, query: zenoh.Query, data: bytes) -> None:
-        try:
-            query.reply(self._command_key, data)
-        except zenoh.ZError as error:
-            log.debug("a command was not answered: %s", error)
-        finally:
-            query.drop()
-
-    def _commands(self, queries: list[zenoh.Query]) -> None:
-        asked = []
+    def _queue_commands(self, queries: list[zenoh.Query]) -> None:
+        received = []
         for query in queries:
             try:
-                asked.append((parse(Command, query.payload, CHANNELS["command"].limit), query))
+                received.append((parse(Command, query.payload, CHANNELS["command"].limit), query))
             except Refused as refusal:
                 self._refuse(refusal, query)
-        found = coalesce_moves(asked, self._check)
+        found = coalesce_moves(received, self._check)
         for reason, query in found.refused:
             self._refuse(reason, query)
         for query in found.replaced:
             self._post(query, self._done)
         if found.replaced:
             self._counters.add("moves_replaced", len(found.replaced))
-        for command, query in found.taken:
-            self._waiting.offer(command, self._replier(query))
+        for command, query in found.accepted:
+            self._queue.put(command, self._replier(query))
 
     def _check(self, command: Command) -> None:
         check_header(command, incarnation=self._incarnation if command.header.incarnation else None)
@@ -177,3 +171,11 @@ class Queryables:
     def _post(self, query: zenoh.Query, data: bytes) -> None:
         if not self._replies.post(lambda: self._send(query, data)):
             log.debug("a command was not answered: too many answers wait")
+
+    def _send(self, query: zenoh.Query, data: bytes) -> None:
+        try:
+            query.reply(self._command_key, data)
+        except zenoh.ZError as error:
+            log.debug("a command was not answered: %s", error)
+        finally:
+            query.drop()

@@ -1,24 +1,24 @@
 # SPDX-License-Identifier: MIT
-"""How many commands a client may send: a token bucket for each, in bounded memory."""
+"""Limits how many commands each client may send: one token bucket per client, in bounded memory."""
 
 from dataclasses import dataclass
 
-RATE = 200.0  # commands a second that each client may send for ever
-BURST = 100.0  # ... and at once after a rest
-CLIENTS = 256  # with a bucket of their own; those beyond share one
+RATE = 200.0  # commands per second that each client may send without end
+BURST = 100.0  # commands that a client may send at once after a rest
+CLIENTS = 256  # clients with a bucket of their own; all others share one
 
 
 @dataclass
 class TokenBucket:
-    """Tokens that come in at `rate` a second, never more than `burst`; what is done takes one."""
+    """Gains `rate` tokens per second up to `burst`; each command takes one."""
 
     rate: float
     burst: float
     tokens: float
-    filled: float  # s, when `tokens` was reckoned
+    filled: float  # time [s] at which `tokens` was computed
 
     def take(self, now: float, debt: float = 0.0) -> bool:
-        """Takes a token if there is one, or if no more than `debt` would be owed."""
+        """Takes a token; False if that would leave fewer than -debt."""
         self._fill(now)
         if self.tokens - 1 < -debt:
             return False
@@ -26,7 +26,7 @@ class TokenBucket:
         return True
 
     def full(self, now: float) -> bool:
-        """As good as new."""
+        """True if the bucket is in the state of a new one."""
         self._fill(now)
         return self.tokens >= self.burst
 
@@ -36,10 +36,10 @@ class TokenBucket:
 
 
 class RateLimiter:
-    """A bucket for each client by the name it gives.
+    """Holds a token bucket for each client, by the name that the client gives.
 
-    A full bucket is forgotten when room is needed, which changes nothing for its client. Who invents names gets no more
-    than CLIENTS buckets in all; zenoh's access rules keep such clients out.
+    Full buckets are dropped when CLIENTS is reached, which changes nothing for their clients. A client that invents
+    names gets no more than CLIENTS buckets in all; access rules of zenoh keep such clients out.
     """
 
     def __init__(self, rate: float = RATE, burst: float = BURST, clients: int = CLIENTS):
@@ -47,8 +47,8 @@ class RateLimiter:
         self._own: dict[str, TokenBucket] = {}
         self._shared: TokenBucket | None = None
 
-    def take(self, client: str, now: float, debt: float = 0.0) -> bool:
-        """Whether a command of this client may pass at `now` [s]."""
+    def allow(self, client: str, now: float, debt: float = 0.0) -> bool:
+        """Takes a token of the client at time `now` [s]; False if its command must not pass. debt: as of `take`."""
         return self._bucket(client, now).take(now, debt)
 
     def _bucket(self, client: str, now: float) -> TokenBucket:

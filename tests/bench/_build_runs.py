@@ -79,7 +79,7 @@ def measured(case: Case, steps: int) -> dict[str, Any]:
         link.announce(describe.topology(sim, sim.world.bodies[0]))
         workers = Supervisor(1, "bench", [endpoint], start=lambda command: started([*prefix, *command]))
         try:
-            until(link.workers)
+            until(link.dispatch.workers)
             return _row(case, _run(sim, link, steps, 1 if case.build == "none" else FIRST))
         finally:
             workers.close()
@@ -102,7 +102,7 @@ def until(condition: Callable[[], Any]) -> None:
 
 def _run(sim: Simulation, link: ServerLink, steps: int, first: int) -> Found:
     """The loop freely in a thread of its own, `pump` beside it."""
-    driver, found = Driver(sim, link, counted=False), Found(link)
+    driver, found = Driver(sim, link.dispatch, counted=False), Found(link)
 
     def adopted(factor: Factor) -> None:
         found.seconds.append(factor.seconds)

@@ -18,7 +18,7 @@ class BuildingInline(Inline):
         scene = describe.scene(simulation)
         self._assemblies = {b.name: Assembly(scene, describe.topology(simulation, b)) for b in bodies}
 
-    def builds(self) -> bool:
+    def assembles_matrices(self) -> bool:
         return True
 
     def submit(self, job: Job) -> bool:

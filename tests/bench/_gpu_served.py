@@ -109,11 +109,11 @@ class Served:
         found, sent, end = [], 0, time.monotonic() + seconds
         while time.monotonic() < end:
             found.append(self.engine.records())
-            self.link.poll(), self.link.failures()
+            self.link.dispatch.poll(), self.link.dispatch.failures()
             if wanted is not None and (step := self.engine.matrix_step(0)) >= 0:
-                sent += self.link.submit(Job("beam0", 1, step, True, wanted))
+                sent += self.link.dispatch.submit(Job("beam0", 1, step, True, wanted))
                 wanted = None
-            if on and wanted is None and self.link.ready():
+            if on and wanted is None and self.link.dispatch.ready():
                 wanted = np.empty_like(self.sim.system.values)
                 self.engine.request_matrix(0, wanted)
             time.sleep(NAP)

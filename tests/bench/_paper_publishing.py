@@ -52,7 +52,7 @@ class Published:
     def __post_init__(self) -> None:
         self.driver = Driver(self.sim, self.link, counted=False)
         self.driver.adopted = self._adopted
-        submit = self.link.submit
+        submit = self.link.dispatch.submit
 
         def noted(job: Job) -> bool:
             taken = submit(job)
@@ -60,7 +60,7 @@ class Published:
                 self.sent.add(job.step)
             return taken
 
-        self.link.submit = noted  # type: ignore[method-assign]
+        self.link.dispatch.submit = noted  # type: ignore[method-assign]
 
     def _adopted(self, factor: Factor) -> None:
         self.adopted[factor.step] = factor
@@ -126,7 +126,7 @@ def one_round(beam: Beam, setting: Setting, steps: int, cores: Cores) -> Pair:
 
         workers = Supervisor(1, "bench", [endpoint], start=start)
         try:
-            until(link.workers)
+            until(link.dispatch.workers)
             return _taking_turns(Published(sim, link, cores), twin, steps)
         finally:
             workers.close()

@@ -21,8 +21,8 @@ class VirtualWorkers(Inline):
         self._count, self._speed = workers, speed
         self._working: list[tuple[int, Factor]] = []
 
-    def workers(self) -> list[str]:
-        return [f"virtual{k}" for k in range(self._count)]
+    def worker_count(self) -> int:
+        return self._count
 
     def ready(self) -> int:
         return self._count - len(self._working)

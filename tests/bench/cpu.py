@@ -83,7 +83,7 @@ def with_worker(tets: int, steps: int) -> dict[str, Any]:
         link.announce(describe.topology(sim, sim.world.bodies[0]))
         workers = Supervisor(1, "bench", [endpoint])
         try:
-            while not link.workers():
+            while not link.dispatch.workers():
                 time.sleep(0.01)
             return collected(_loop(sim, link, steps))
         finally:
@@ -91,7 +91,7 @@ def with_worker(tets: int, steps: int) -> dict[str, Any]:
 
 
 def _loop(sim: Simulation, link: ServerLink, steps: int) -> NDArray[Any]:
-    driver, records = Driver(sim, link), []
+    driver, records = Driver(sim, link.dispatch), []
     loop = threading.Thread(target=sim.engine.run, args=(1 << 40,))
     loop.start()
     try:

@@ -84,7 +84,7 @@ class Run:
         for body in sim.world.bodies:
             self.link.announce(describe.topology(sim, body))
         self._supervisor = Supervisor(workers, "bench", [endpoint], ["--device", worker_device])
-        self.driver = Driver(sim, self.link)
+        self.driver = Driver(sim, self.link.dispatch)
         self._thread = threading.Thread(target=self._loop)
         self._ended = False
         self._failure: BaseException | None = None
@@ -118,7 +118,7 @@ class Run:
         It begins when every body has had a factor, or after `warm` seconds of steps.
         """
         end = time.monotonic() + PATIENCE
-        while len(self.link.workers()) < self.workers:
+        while len(self.link.dispatch.workers()) < self.workers:
             if time.monotonic() > end:
                 raise RuntimeError(f"{self.workers} workers have not joined within {PATIENCE:g} s")
             time.sleep(NAP)

@@ -161,7 +161,7 @@ class Builders(Inline):
         super().__init__({b.name: sim.system.body_pattern(b.first, b.last) for b in sim.world.bodies})
         self._assembly, self.jobs = Assembly(*described(sim)), []
 
-    def builds(self) -> bool:
+    def assembles_matrices(self) -> bool:
         return True
 
     def submit(self, job: Job) -> bool:

@@ -175,8 +175,8 @@ class Idle(Inline):
     def ready(self) -> int:
         return self.idle - len(self.sent)
 
-    def workers(self) -> list[int]:
-        return list(range(self.idle))
+    def worker_count(self) -> int:
+        return self.idle
 
     def submit(self, job: Job) -> bool:
         if self.ready() <= 0:
@@ -188,7 +188,7 @@ class Idle(Inline):
 class Building(Idle):
     """One idle worker that builds matrices; what it was sent fails."""
 
-    def builds(self) -> bool:
+    def assembles_matrices(self) -> bool:
         return True
 
     def submit(self, job: Job) -> bool:
@@ -517,8 +517,8 @@ class Unready(Inline):
         super().__init__(patterns_of(sim))
         self._engine, self._workers, self._asked = sim.engine, workers, 0
 
-    def workers(self) -> list[str]:
-        return self._workers
+    def worker_count(self) -> int:
+        return len(self._workers)
 
     def ready(self) -> bool:
         self._asked += 1

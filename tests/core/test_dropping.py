@@ -11,7 +11,7 @@ from protocol.factor import Factor
 from sim_server.driver import Driver
 from sim_server.dropping import LEFT, Finding, Usefulness
 from sim_server.engine import Kind
-from sim_server.factors import Inline, Job, Pool
+from sim_server.factors import Inline, Job
 from sim_server.simulation import Simulation
 from tests.scenes import bar, simulation
 
@@ -35,20 +35,14 @@ class Stiffened(Inline):
         rows = np.repeat(np.arange(nodes), np.diff(row_start))
         return super().submit(replace(job, values=job.values * (scale[rows] * scale[columns])[:, None, None]))
 
-    def no_use(self, worker: str, object: str) -> None:
+    def factor_failed(self, worker: str, object: str) -> None:
         self.told.append(("no use", worker, object))
 
-    def of_use(self, worker: str, object: str) -> None:
+    def factor_helped(self, worker: str, object: str) -> None:
         self.told.append(("of use", worker, object))
 
-    def setbacks(self) -> dict[str, int]:
+    def consecutive_failures(self) -> dict[str, int]:
         return {}
-
-    def reserved(self) -> set[str]:
-        return set()
-
-    def taken_back(self) -> list[str]:
-        return []
 
 
 def run(update: str = "async", **solver: object) -> tuple[Driver, Stiffened]:
@@ -56,7 +50,6 @@ def run(update: str = "async", **solver: object) -> tuple[Driver, Stiffened]:
     options = {"preconditioner": "cholesky", "max_iterations": 400, "update": update} | solver
     sim = simulation(beam, gravity=(0, -9.81, 0), **options)
     source = Stiffened(sim)
-    assert isinstance(source, Pool)
     return Driver(sim, source), source
 
 

@@ -64,9 +64,6 @@ class OneAtATime(Inline):
     def ready(self) -> int:
         return self.idle
 
-    def workers(self) -> list[int]:
-        return [1]
-
     def submit(self, job: Job) -> bool:
         if not self.idle:
             return False

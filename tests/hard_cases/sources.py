@@ -16,11 +16,11 @@ Values = NDArray[Any]
 Source = Callable[[Simulation], FactorSource]
 
 
-class Nobody:
+class Nobody(FactorSource):
     """No worker, ever."""
 
-    def ready(self) -> bool:
-        return False
+    def ready(self) -> int:
+        return 0
 
     def submit(self, job: Job) -> bool:
         return False

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Commands that came together: what is checked, what is passed over, who is answered what."""
+"""Commands that arrived together: which are checked, which are replaced, and how each is answered."""
 
 import logging
 from types import SimpleNamespace
@@ -33,7 +33,7 @@ def sorted_out(*commands: Command) -> tuple[list[int], list[int], list[int], lis
             raise Refused("NaN", "not_finite")
 
     found = coalesce_moves([(c, n) for n, c in enumerate(commands)], check)
-    return [n for _, n in found.taken], [n for _, n in found.refused], found.replaced, sorted(checked)
+    return [n for _, n in found.accepted], [n for _, n in found.refused], found.replaced, sorted(checked)
 
 
 def test_only_the_newest_move_of_a_grab_is_checked_and_taken() -> None:
@@ -77,8 +77,8 @@ class Query:
 
 
 @pytest.fixture
-def desk() -> Any:
-    """Inquiries without a network: what is posted is sent at once."""
+def queryables() -> Any:
+    """Queryables without a network: a posted reply is sent at once."""
     session: Any = SimpleNamespace(zenoh=SimpleNamespace(declare_queryable=lambda *_: None), thread=lambda *_: None)
     replies: Any = SimpleNamespace(post=lambda send: send() or True)
     return Queryables(
@@ -86,13 +86,13 @@ def desk() -> Any:
     )
 
 
-def test_each_of_a_round_is_answered_once(desk: Queryables) -> None:
+def test_each_of_a_round_is_answered_once(queryables: Queryables) -> None:
     moves = [Query(command("move", id=7, x=float(i)).SerializeToString()) for i in range(40)]
     push, old = Query(command("push").SerializeToString()), Query(command("push", protocol=99).SerializeToString())
     broken, elsewhere = Query(b"\xff\xff"), Query(b"", key("status", "sim"))
     wrong = Query(command("move", id=7, x=NAN).SerializeToString())
-    desk._serve_all([*moves[:20], push, broken, old, elsewhere, *moves[20:], wrong], None)  # type: ignore[arg-type, list-item]
-    taken = desk.commands()
+    queryables._serve_all([*moves[:20], push, broken, old, elsewhere, *moves[20:], wrong], None)  # type: ignore[arg-type, list-item]
+    taken = queryables.commands()
     assert [(c.verb, c.interaction.target.x) for c, _ in taken] == [("push", 0.0), ("move", 39.0)]
     assert not push.answers and not moves[-1].answers, "they are answered once they are carried out"
     for _, reply in taken:
@@ -103,4 +103,4 @@ def test_each_of_a_round_is_answered_once(desk: Queryables) -> None:
     assert [bool(q.answers[0].error) for q in everybody] == [False] * 41 + [True] * 3
     assert wrong.answers[0].error == "Vector.x is nan; allowed: finite"
     assert not elsewhere.answers and elsewhere.dropped == 1
-    assert desk._counters.moves_replaced == 39 and desk._counters.refused == 3
+    assert queryables._counters.moves_replaced == 39 and queryables._counters.refused == 3

@@ -1,25 +1,24 @@
 # SPDX-License-Identifier: MIT
-"""Commands that wait: rates of clients by a given clock, bounded room, the newest move of each grab."""
+"""The queue of commands: rate limits by a given clock, bounded capacity, the newest move of each grab."""
 
 import logging
 
 from protocol.counters import Counters
 from protocol.messages_pb2 import Command, Interaction, Reply, Vector
-from sim_server.network import command_queue as module
-from sim_server.network.command_queue import CommandQueue
+from sim_server.network.command_queue import MAX_DEFERRED, CommandQueue
 from sim_server.network.rate_limiter import RateLimiter, TokenBucket
 
 
-class Desk:
+class Harness:
     """A queue, its clock and the replies that came out of it."""
 
-    def __init__(self, rate: float = 10.0, burst: float = 3.0, room: int = 64):
+    def __init__(self, rate: float = 10.0, burst: float = 3.0, capacity: int = 64):
         self.now, self.counters, self.replies = 0.0, Counters(logging.getLogger("test")), {}
-        self.waiting = CommandQueue(self.counters, RateLimiter(rate, burst), room, lambda: self.now)
+        self.queue = CommandQueue(self.counters, RateLimiter(rate, burst), capacity, lambda: self.now)
         self._count = 0
 
-    def offer(self, verb: str, client: str = "anna", id: int = 0, x: float = 0.0) -> int:
-        """Number of the command; its reply is then found in `replies`."""
+    def put(self, verb: str, client: str = "anna", id: int = 0, x: float = 0.0) -> int:
+        """Puts a command; returns its number, under which `replies` will hold its reply."""
         self._count += 1
         number = self._count
 
@@ -28,12 +27,12 @@ class Desk:
             self.replies[number] = answer.error
 
         interaction = Interaction(id=id, target=Vector(x=x))
-        self.waiting.offer(Command(client=client, verb=verb, interaction=interaction), reply)
+        self.queue.put(Command(client=client, verb=verb, interaction=interaction), reply)
         return number
 
-    def taken(self) -> list[tuple[str, str, float]]:
-        """(verb, client, x of the target) of all whose turn it is; they are answered."""
-        found = self.waiting.take()
+    def take_all(self) -> list[tuple[str, str, float]]:
+        """Takes and answers all commands that may pass; returns (verb, client, x of the target) of each."""
+        found = self.queue.take_all()
         for _, reply in found:
             reply(Reply())
         return [(c.verb, c.client, c.interaction.target.x) for c, _ in found]
@@ -60,82 +59,82 @@ def test_a_clock_that_goes_back_gives_nothing() -> None:
 
 
 def test_clients_have_buckets_of_their_own_in_bounded_memory() -> None:
-    rates = RateLimiter(rate=10.0, burst=2.0, clients=3)
+    limiter = RateLimiter(rate=10.0, burst=2.0, clients=3)
     for name in ("a", "b", "c"):
-        assert [rates.take(name, 0.0) for _ in range(3)] == [True, True, False]
-    shared = sum(rates.take(f"invented-{i}", 0.0) for i in range(1000))
-    assert shared == 2 and len(rates) == 3, "names without a bucket share one"
-    assert rates.take("d", 10.0) and len(rates) <= 3, "full buckets make room"
-    assert [rates.take("a", 10.0) for _ in range(3)] == [True, True, False]
+        assert [limiter.allow(name, 0.0) for _ in range(3)] == [True, True, False]
+    shared = sum(limiter.allow(f"invented-{i}", 0.0) for i in range(1000))
+    assert shared == 2 and len(limiter) == 3, "names without a bucket share one"
+    assert limiter.allow("d", 10.0) and len(limiter) <= 3, "full buckets are dropped"
+    assert [limiter.allow("a", 10.0) for _ in range(3)] == [True, True, False]
 
 
 def test_what_is_over_the_rate_is_refused_and_counted() -> None:
-    desk = Desk(rate=10.0, burst=3.0)
-    numbers = [desk.offer("push") for _ in range(5)]
-    others = [desk.offer("push", "ben") for _ in range(2)]
-    assert len(desk.taken()) == 5
-    assert [desk.replies[n] == "" for n in numbers] == [True, True, True, False, False]
-    assert desk.replies[numbers[-1]] == "client 'anna' sends too much: at most 10 commands a second"
-    assert all(desk.replies[n] == "" for n in others), "one client's flood is not another's"
-    assert desk.counters.commands_refused == 2
-    desk.now = 0.2
-    desk.offer("grab"), desk.offer("grab"), desk.offer("grab")
-    assert len(desk.taken()) == 2 and desk.counters.commands_refused == 3
+    harness = Harness(rate=10.0, burst=3.0)
+    numbers = [harness.put("push") for _ in range(5)]
+    others = [harness.put("push", "ben") for _ in range(2)]
+    assert len(harness.take_all()) == 5
+    assert [harness.replies[n] == "" for n in numbers] == [True, True, True, False, False]
+    assert harness.replies[numbers[-1]] == "client 'anna' sends too much: at most 10 commands a second"
+    assert all(harness.replies[n] == "" for n in others), "one client's flood is not another's"
+    assert harness.counters.commands_refused == 2
+    harness.now = 0.2
+    harness.put("grab"), harness.put("grab"), harness.put("grab")
+    assert len(harness.take_all()) == 2 and harness.counters.commands_refused == 3
 
 
 def test_who_sends_too_much_can_still_let_go() -> None:
-    desk = Desk(rate=10.0, burst=3.0)
+    harness = Harness(rate=10.0, burst=3.0)
     for _ in range(10):
-        desk.offer("push")
-    assert [desk.replies.get(desk.offer("release")) for _ in range(4)][:3] == [None] * 3
-    assert [verb for verb, _, _ in desk.taken()] == ["push"] * 3 + ["release"] * 3
+        harness.put("push")
+    assert [harness.replies.get(harness.put("release")) for _ in range(4)][:3] == [None] * 3
+    assert [verb for verb, _, _ in harness.take_all()] == ["push"] * 3 + ["release"] * 3
 
 
 def test_the_newest_move_of_a_grab_is_the_one_that_counts() -> None:
-    desk = Desk()
-    moves = [desk.offer("move", id=7, x=float(i)) for i in range(50)]
-    other = desk.offer("move", id=8, x=-1.0)
-    assert desk.taken() == [("move", "anna", 49.0), ("move", "anna", -1.0)]
-    assert all(desk.replies[n] == "" for n in [*moves, other])
-    assert desk.counters.moves_replaced == 49 and desk.counters.commands_refused == 0
+    harness = Harness()
+    moves = [harness.put("move", id=7, x=float(i)) for i in range(50)]
+    other = harness.put("move", id=8, x=-1.0)
+    assert harness.take_all() == [("move", "anna", 49.0), ("move", "anna", -1.0)]
+    assert all(harness.replies[n] == "" for n in [*moves, other])
+    assert harness.counters.moves_replaced == 49 and harness.counters.commands_refused == 0
 
 
 def test_moves_of_equal_numbers_by_two_clients_are_two() -> None:
-    desk = Desk()
-    desk.offer("move", "anna", 7, 1.0), desk.offer("move", "ben", 7, 2.0)
-    assert desk.taken() == [("move", "anna", 1.0), ("move", "ben", 2.0)]
+    harness = Harness()
+    harness.put("move", "anna", 7, 1.0), harness.put("move", "ben", 7, 2.0)
+    assert harness.take_all() == [("move", "anna", 1.0), ("move", "ben", 2.0)]
 
 
 def test_the_last_move_over_the_rate_waits_and_is_not_lost() -> None:
-    desk = Desk(rate=10.0, burst=3.0)
+    harness = Harness(rate=10.0, burst=3.0)
     done = []
     for i in range(400):  # 1 kHz for 0.4 s
-        desk.now = 0.001 * i
-        desk.offer("move", id=7, x=float(i))
-        done += desk.taken()
+        harness.now = 0.001 * i
+        harness.put("move", id=7, x=float(i))
+        done += harness.take_all()
     assert 3 <= len(done) <= 8, "the rate holds"
-    desk.now = 0.6
-    assert desk.taken() == [("move", "anna", 399.0)], "where the hand stopped"
-    assert desk.taken() == [] and len(desk.replies) == 400 and set(desk.replies.values()) == {""}
-    assert desk.counters.commands_refused == 0 and desk.counters.moves_replaced == 400 - len(done) - 1
+    harness.now = 0.6
+    assert harness.take_all() == [("move", "anna", 399.0)], "where the hand stopped"
+    assert harness.take_all() == [] and len(harness.replies) == 400 and set(harness.replies.values()) == {""}
+    assert harness.counters.commands_refused == 0 and harness.counters.moves_replaced == 400 - len(done) - 1
 
 
 def test_a_full_queue_refuses_all_but_the_newest_moves() -> None:
-    desk = Desk(rate=1e6, burst=1e6, room=4)
-    kept = [desk.offer("push", f"c{i}") for i in range(4)]
-    surplus = desk.offer("push", "late")
-    moves = [desk.offer("move", "late", 1, float(i)) for i in range(3)]
-    assert desk.replies[surplus] == "the server is busy: 4 commands wait already"
-    held = [desk.offer("release", f"c{i}") for i in range(5)]
-    assert desk.replies[held[4]] == "the server is busy: 8 commands wait already"
-    assert len(desk.taken()) == 8, "there is room left to let go, pause and stop"
-    assert desk.taken() == [("move", "late", 2.0)]
-    assert all(desk.replies[n] == "" for n in [*kept, *moves])
+    harness = Harness(rate=1e6, burst=1e6, capacity=4)
+    kept = [harness.put("push", f"c{i}") for i in range(4)]
+    surplus = harness.put("push", "late")
+    moves = [harness.put("move", "late", 1, float(i)) for i in range(3)]
+    assert harness.replies[surplus] == "the server is busy: 4 commands wait already"
+    held = [harness.put("release", f"c{i}") for i in range(5)]
+    assert harness.replies[held[4]] == "the server is busy: 8 commands wait already"
+    assert len(harness.take_all()) == 8, "there is capacity left to let go, pause and stop"
+    assert harness.take_all() == [("move", "late", 2.0)]
+    assert all(harness.replies[n] == "" for n in [*kept, *moves])
 
 
 def test_moves_that_wait_are_bounded_too() -> None:
-    desk = Desk(rate=1e-3, burst=1.0)
-    numbers = [desk.offer("move", id=i) for i in range(3 * module.LATE)]
-    refused = [n for n in numbers if desk.replies.get(n)]
-    assert len(refused) == 2 * module.LATE - 1 == desk.counters.commands_refused
-    assert len(desk.taken()) == 1
+    harness = Harness(rate=1e-3, burst=1.0)
+    numbers = [harness.put("move", id=i) for i in range(3 * MAX_DEFERRED)]
+    refused = [n for n in numbers if harness.replies.get(n)]
+    assert len(refused) == 2 * MAX_DEFERRED - 1 == harness.counters.commands_refused
+    assert len(harness.take_all()) == 1

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The order in which what arrived is taken."""
+"""The order in which messages of workers are read."""
 
 from collections.abc import Callable
 from types import SimpleNamespace
@@ -9,7 +9,7 @@ from sim_server.network.inbox import Inbox
 
 
 class Ring:
-    """What lies in it; `looked` is called each time that somebody looks."""
+    """A ring of messages; `looked` is called before each read."""
 
     def __init__(self, *samples: str, looked: Callable[[], None] = lambda: None):
         self.samples, self.looked = list(samples), looked
@@ -19,12 +19,12 @@ class Ring:
         return self.samples.pop(0) if self.samples else None
 
 
-def arrivals(**rings: Ring) -> Inbox:
-    """With these rings instead of subscribers."""
-    waiting = iter(rings.values())
+def inbox(**rings: Ring) -> Inbox:
+    """An inbox with these rings instead of subscribers."""
+    given = iter(rings.values())
 
     def declare(*_: Any, **__: Any) -> Ring:
-        return next(waiting)
+        return next(given)
 
     session: Any = SimpleNamespace(
         declare_subscriber=declare, liveliness=lambda: SimpleNamespace(declare_subscriber=declare)
@@ -33,7 +33,7 @@ def arrivals(**rings: Ring) -> Inbox:
 
 
 def test_factors_are_taken_before_the_leaving_of_their_worker() -> None:
-    found = list(arrivals(worker=Ring("w"), pattern=Ring("p"), factor=Ring("f"), alive=Ring("gone")))
+    found = list(inbox(worker=Ring("w"), pattern=Ring("p"), factor=Ring("f"), alive=Ring("gone")))
     assert found == [("worker", "w"), ("pattern", "p"), ("factor", "f"), ("alive_worker", "gone")]
 
 
@@ -46,5 +46,5 @@ def test_a_pattern_that_comes_while_factors_are_taken_is_not_late() -> None:
             patterns.samples.append("of the second")
 
     factors = Ring("first", "second", looked=arrive)
-    found = list(arrivals(worker=Ring(), pattern=patterns, factor=factors, alive=Ring()))
+    found = list(inbox(worker=Ring(), pattern=patterns, factor=factors, alive=Ring()))
     assert found == [("factor", "first"), ("pattern", "of the second"), ("factor", "second")]

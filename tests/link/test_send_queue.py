@@ -14,15 +14,15 @@ def test_everything_is_sent_in_order_and_errors_stop_nothing() -> None:
     def fail() -> None:
         raise zenoh.ZError("gone")
 
-    outbox = SendQueue("test", 10)
-    outbox.post(lambda: sent.append(1))
-    outbox.post(fail)
-    outbox.post(lambda: sent.append(2))
-    outbox.post(done.set)
+    queue = SendQueue("test", 10)
+    queue.post(lambda: sent.append(1))
+    queue.post(fail)
+    queue.post(lambda: sent.append(2))
+    queue.post(done.set)
     assert done.wait(10)
     assert sent == [1, 2]
-    outbox.close()
-    assert not outbox.post(lambda: sent.append(3))
+    queue.close()
+    assert not queue.post(lambda: sent.append(3))
 
 
 def test_a_stuck_send_blocks_no_sender_and_newer_replaces_older() -> None:
@@ -33,28 +33,28 @@ def test_a_stuck_send_blocks_no_sender_and_newer_replaces_older() -> None:
         begun.set()
         stuck.wait(10)
 
-    outbox = SendQueue("test", 3)
-    outbox.post(block)
+    queue = SendQueue("test", 3)
+    queue.post(block)
     assert begun.wait(10)
-    assert outbox.post(lambda: sent.append("old"), "state")
-    assert not outbox.post(lambda: sent.append("new"), "state")  # the older one was dropped
-    assert outbox.post(lambda: sent.append("other"))
-    assert outbox.post(done.set)
-    assert not outbox.post(lambda: sent.append("too many"))
+    assert queue.post(lambda: sent.append("old"), "state")
+    assert not queue.post(lambda: sent.append("new"), "state")  # the older one was dropped
+    assert queue.post(lambda: sent.append("other"))
+    assert queue.post(done.set)
+    assert not queue.post(lambda: sent.append("too many"))
     stuck.set()
     assert done.wait(10)
     assert sent == ["new", "other"]
-    outbox.close()
+    queue.close()
 
 
 def test_closing_may_send_what_waits() -> None:
     sent: list[int] = []
     begun, go_on = threading.Event(), threading.Event()
-    outbox = SendQueue("test", 10)
-    outbox.post(lambda: (begun.set(), go_on.wait(5)))  # type: ignore[arg-type,return-value]
+    queue = SendQueue("test", 10)
+    queue.post(lambda: (begun.set(), go_on.wait(5)))  # type: ignore[arg-type,return-value]
     begun.wait(5)
     for k in range(5):
-        outbox.post(lambda k=k: sent.append(k))  # type: ignore[misc]
+        queue.post(lambda k=k: sent.append(k))  # type: ignore[misc]
     threading.Timer(0.05, go_on.set).start()
-    outbox.close(timeout=5, finish=True)
-    assert sent == list(range(5)) and not outbox.post(lambda: None)
+    queue.close(timeout=5, finish=True)
+    assert sent == list(range(5)) and not queue.post(lambda: None)

@@ -1,80 +1,82 @@
 # SPDX-License-Identifier: MIT
-"""Who gets jobs at all: those who answer, newcomers a few at a time, and nobody whose factors come to nothing."""
+"""Which workers may get jobs: those that answer, a few new ones at a time, none whose factors fail."""
 
-from sim_server.network.worker_reliability import GAP, HOLD, MOST, WorkerReliability
+from sim_server.network.worker_reliability import FIRST_ANSWER, MAX_SUSPENSION_DOUBLINGS, SUSPENSION, WorkerReliability
 
 
-def may_be_asked(conduct: WorkerReliability, fit: list[str], now: float) -> list[str]:
-    return [name for name in fit if conduct.may_be_asked(name, fit, now)]
+def may_get_job(reliability: WorkerReliability, available: list[str], now: float) -> list[str]:
+    return [name for name in available if reliability.may_get_job(name, available, now)]
 
 
 def test_while_nobody_has_answered_all_are_asked() -> None:
-    conduct, fit = WorkerReliability(), ["a", "b", "c"]
-    for name in fit:
-        assert may_be_asked(conduct, fit, 0.0) == fit
-        conduct.sent(name, 0.0)
-    assert may_be_asked(conduct, fit, 100.0) == fit, "there is nobody better"
+    reliability, available = WorkerReliability(), ["a", "b", "c"]
+    for name in available:
+        assert may_get_job(reliability, available, 0.0) == available
+        reliability.on_sent(name, 0.0)
+    assert may_get_job(reliability, available, 100.0) == available, "there is nobody better"
 
 
 def test_beside_one_who_answers_newcomers_are_tried_one_at_a_time() -> None:
-    conduct = WorkerReliability()
+    reliability = WorkerReliability()
     fakes = [f"fake{k}" for k in range(20)]
-    fit = ["real", *fakes]
-    conduct.sent("real", 0.0)
-    conduct.answered("real")
+    available = ["real", *fakes]
+    reliability.on_sent("real", 0.0)
+    reliability.on_answer("real")
     asked = 0
     for tenth in range(3000):
         now = 0.1 * tenth
         for name in fakes:
-            if conduct.may_be_asked(name, fit, now):
-                conduct.sent(name, now)
+            if reliability.may_get_job(name, available, now):
+                reliability.on_sent(name, now)
                 asked += 1
-        assert "real" in may_be_asked(conduct, fit, now)
+        assert "real" in may_get_job(reliability, available, now)
     assert 1 <= asked <= 5, "each that does not answer doubles the time to the next"
-    assert len(may_be_asked(conduct, fit, 0.1 + GAP * 2**9)) == 1 + len(fakes) - asked
+    assert len(may_get_job(reliability, available, 0.1 + FIRST_ANSWER * 2**9)) == 1 + len(fakes) - asked
 
 
 def test_as_many_newcomers_are_tried_as_have_answered() -> None:
-    conduct, fit = WorkerReliability(), [f"w{k}" for k in range(8)]
-    conduct.answered("w0")
-    new, counts = fit[1:], []
+    reliability, available = WorkerReliability(), [f"w{k}" for k in range(8)]
+    reliability.on_answer("w0")
+    new, counts = available[1:], []
     while new:
         tried = []
-        while new and conduct.may_be_asked(new[0], fit, 0.0):
-            conduct.sent(new[0], 0.0)
+        while new and reliability.may_get_job(new[0], available, 0.0):
+            reliability.on_sent(new[0], 0.0)
             tried.append(new.pop(0))
         counts.append(len(tried))
         for name in tried:
-            conduct.answered(name)
+            reliability.on_answer(name)
     assert counts == [1, 2, 4]
 
 
 def test_who_sends_what_is_no_use_is_asked_less_and_less_of_that_object() -> None:
-    conduct = WorkerReliability()
-    held = []
-    for count in range(1, MOST + 3):
-        conduct.failed("bad", "beam", 0.0)
-        length = HOLD * 2 ** min(count, MOST)
-        assert conduct.held("bad", "beam", 0.99 * length) and not conduct.held("bad", "beam", 1.01 * length)
-        held.append(length)
-    assert held == sorted(held) and held[-1] < 60
-    assert not conduct.held("good", "beam", 0.0) and not conduct.held("bad", "liver", 0.0)
-    assert conduct.failures(["bad", "good"], "beam") == 0, "while one of them is good the object is not held back"
-    assert conduct.failures(["bad"], "beam") == MOST + 2 and conduct.failing == {"beam"}
-    conduct.helped("bad", "beam")
-    assert not conduct.held("bad", "beam", 0.0) and not conduct.failing
+    reliability = WorkerReliability()
+    lengths = []
+    for count in range(1, MAX_SUSPENSION_DOUBLINGS + 3):
+        reliability.on_failure("bad", "beam", 0.0)
+        length = SUSPENSION * 2 ** min(count, MAX_SUSPENSION_DOUBLINGS)
+        assert reliability.is_suspended("bad", "beam", 0.99 * length)
+        assert not reliability.is_suspended("bad", "beam", 1.01 * length)
+        lengths.append(length)
+    assert lengths == sorted(lengths) and lengths[-1] < 60
+    assert not reliability.is_suspended("good", "beam", 0.0) and not reliability.is_suspended("bad", "liver", 0.0)
+    assert reliability.consecutive_failures(["bad", "good"], "beam") == 0, "one of them is good"
+    assert reliability.consecutive_failures(["bad"], "beam") == MAX_SUSPENSION_DOUBLINGS + 2
+    assert reliability.failing_objects == {"beam"}
+    reliability.on_success("bad", "beam")
+    assert not reliability.is_suspended("bad", "beam", 0.0) and not reliability.failing_objects
 
 
 def test_those_who_left_and_objects_that_changed_are_forgotten() -> None:
-    conduct = WorkerReliability()
-    conduct.answered("good")
-    conduct.sent("new", 0.0)
+    reliability = WorkerReliability()
+    reliability.on_answer("good")
+    reliability.on_sent("new", 0.0)
     for worker in ("good", "new"):
-        conduct.failed(worker, "beam", 0.0)
-    conduct.forget_worker("new")
-    assert conduct.may_be_asked("new", ["good", "new"], 0.0) and not conduct.held("new", "beam", 0.0)
-    conduct.forget_object("beam")
-    assert not conduct.failing
-    conduct.forget_worker("good")
-    conduct.sent("new", 0.0)
-    assert conduct.may_be_asked("new", ["good", "new"], 0.0), "nobody is known any more"
+        reliability.on_failure(worker, "beam", 0.0)
+    reliability.forget_worker("new")
+    assert reliability.may_get_job("new", ["good", "new"], 0.0) and not reliability.is_suspended("new", "beam", 0.0)
+    reliability.forget_object("beam")
+    assert not reliability.failing_objects
+    reliability.forget_worker("good")
+    reliability.on_sent("new", 0.0)
+    assert reliability.may_get_job("new", ["good", "new"], 0.0), "nobody is known any more"

@@ -51,7 +51,7 @@ class Building(Inline):
         self.assemblies = {b.name: Assembly(told, describe.topology(sim, b)) for b in sim.world.bodies}
         self.built = 0
 
-    def builds(self) -> bool:
+    def assembles_matrices(self) -> bool:
         """Positions will do."""
         return True
 

@@ -106,8 +106,8 @@ class Driver:
 
     def turn(self) -> None:
         """What the service thread does again and again."""
-        self.factors += self.link.poll()
-        self.failures += self.link.failures()
+        self.factors += self.link.dispatch.poll()
+        self.failures += self.link.dispatch.failures()
 
     def until(self, condition: Callable[[], Any], what: str) -> Any:
         """Turn until the condition holds, and return what it returned."""
@@ -124,7 +124,7 @@ class Driver:
         """Send a matrix of the object as soon as somebody is ready."""
         header = topology.header
         job = Job(header.object, header.epoch, step, True, matrix(topology, shift), dtype)
-        self.until(lambda: self.link.ready() and self.link.submit(job), "a worker that is ready")
+        self.until(lambda: self.link.dispatch.ready() and self.link.dispatch.submit(job), "a worker that is ready")
 
     def factor(self, topology: Topology, step: int, shift: float = 0.0, dtype: str = "float32") -> Factor:
         """Submit and wait for the factor."""

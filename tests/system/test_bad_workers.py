@@ -28,10 +28,10 @@ class Stage:
         self.link.announce(BEAM)
 
     def worker(self, name: str) -> HandWorker:
-        known = len(self.link.workers())
+        known = len(self.link.dispatch.workers())
         hand = self.closing.enter_context(HandWorker(self.endpoint, self.link.incarnation, name))
         hand.hello()
-        self.driver.until(lambda: len(self.link.workers()) > known, name)
+        self.driver.until(lambda: len(self.link.dispatch.workers()) > known, name)
         return hand
 
     def asked(self, step: int, *workers: HandWorker) -> HandWorker:
@@ -64,7 +64,7 @@ def test_who_keeps_his_jobs_gets_one_and_the_others_go_to_who_answers() -> None:
                 hand.receive()
                 kept += 1
                 stage.now += 0.6
-                stage.driver.until(lambda: stage.link.taken_back() == ["beam"], "the object to be free again")
+                stage.driver.until(lambda: stage.link.dispatch.reassigned() == ["beam"], "the object to be free again")
             stage.now += 0.1
         assert kept <= 2 and answered > 150
         assert stage.driver.failures == [] and stage.link.counters.leases_over == 0
@@ -80,11 +80,11 @@ def test_a_newcomer_that_is_slow_at_first_gets_more_jobs_once_it_has_answered() 
         assert stage.asked(2, real, new) is new, "it is tried"
         late = new.receive()
         stage.now += 50.0  # it compiles
-        stage.driver.until(lambda: stage.link.taken_back() == ["beam"], "the object to be free again")
+        stage.driver.until(lambda: stage.link.dispatch.reassigned() == ["beam"], "the object to be free again")
         assert stage.asked(3, real, new) is real
         stage.answers(real, 3)
         new.answer(*new.right_answer(late, BEAM))
-        stage.driver.until(lambda: stage.link.ready() == 2, "both")
+        stage.driver.until(lambda: stage.link.dispatch.ready() == 2, "both")
         assert [f.step for f in stage.driver.factors] == [1, 3] and stage.link.counters.refused == 0
         assert stage.driver.failures == []
 
@@ -100,7 +100,7 @@ def test_a_worker_that_says_that_it_has_no_job_gets_another_one() -> None:
                 stage.now += 0.2
                 only.hello(idle=idle)
                 stage.driver.until(
-                    lambda: stage.link.workers()[0].header.sequence == only.sequence, "the heartbeat to come"
+                    lambda: stage.link.dispatch.workers()[0].header.sequence == only.sequence, "the heartbeat to come"
                 )
 
         says(True, 2.0)
@@ -137,7 +137,7 @@ def test_the_jobs_of_who_fails_go_to_who_does_not() -> None:
                 failed = len(stage.driver.failures)
                 bad.answer(answer, values)
                 stage.driver.until(lambda failed=failed: len(stage.driver.failures) > failed, "the refusal")
-            assert stage.link.setbacks() in ({}, {"beam": 0}), "there is a good one"
+            assert stage.link.dispatch.consecutive_failures() in ({}, {"beam": 0}), "there is a good one"
             stage.now += 0.05
         assert got["good"] > 50
 
@@ -147,15 +147,15 @@ def test_an_object_waits_for_the_good_worker_rather_than_going_to_the_bad() -> N
         stage = Stage(closing)
         good, bad = stage.worker("good"), stage.worker("bad")
         for _ in range(3):
-            stage.link.no_use("bad", "beam")
+            stage.link.dispatch.factor_failed("bad", "beam")
         stage.link.announce(chain(object="bar"))
-        stage.driver.until(lambda: stage.link.ready() == 2, "both")
+        stage.driver.until(lambda: stage.link.dispatch.ready() == 2, "both")
         assert stage.asked(1, good, bad) is good
-        assert stage.link.reserved() == {"beam"}, "in hand of the good one, and nothing for the bad"
+        assert stage.link.dispatch.reserved() == {"beam"}, "in hand of the good one, and nothing for the bad"
         stage.answers(good, 1)
-        assert stage.link.reserved() == set()
-        stage.link.of_use("bad", "beam")
-        assert stage.link.setbacks() == {}
+        assert stage.link.dispatch.reserved() == set()
+        stage.link.dispatch.factor_helped("bad", "beam")
+        assert stage.link.dispatch.consecutive_failures() == {}
 
 
 def test_if_all_fail_all_are_asked_less_and_less() -> None:
@@ -163,6 +163,6 @@ def test_if_all_fail_all_are_asked_less_and_less() -> None:
         stage = Stage(closing)
         for name in ("one", "two"):
             stage.worker(name)
-            stage.link.no_use(name, "beam")
-        stage.link.no_use("two", "beam")
-        assert stage.link.setbacks() == {"beam": 1} and stage.link.reserved() == set()
+            stage.link.dispatch.factor_failed(name, "beam")
+        stage.link.dispatch.factor_failed("two", "beam")
+        assert stage.link.dispatch.consecutive_failures() == {"beam": 1} and stage.link.dispatch.reserved() == set()

@@ -30,11 +30,11 @@ def test_the_same_factor_as_of_the_matrix_sent() -> None:
         driver = Driver(link)
         link.set_scene(describe.scene(sim))
         link.announce(describe.topology(sim, sim.world.bodies[0]))
-        driver.until(link.builds, "a worker that builds")
+        driver.until(link.dispatch.assembles_matrices, "a worker that builds")
         factors = []
         for step, values in ((1, sim.system.values), (2, sim.world.x), (3, sim.system.values), (4, sim.world.x)):
             job = Job("bar", 1, step, True, values.copy(), "float64")
-            driver.until(lambda job=job: link.ready() and link.submit(job), "a worker that is ready")
+            driver.until(lambda job=job: link.dispatch.ready() and link.dispatch.submit(job), "a worker that is ready")
             factors.append(driver.until(lambda: driver.factors.pop() if driver.factors else None, "a factor"))
         assert not driver.failures
     assert [f.step for f in factors] == [1, 2, 3, 4]
@@ -50,7 +50,7 @@ def test_a_run_with_positions_alone_repeats_the_run_with_matrices() -> None:
         with ServerLink(listen=[endpoint]) as link, process("-m", "precond_worker", "--connect", endpoint):
             link.set_scene(describe.scene(sim))
             link.announce(describe.topology(sim, sim.world.bodies[0]))
-            Driver(link).until(link.workers, "a worker")
+            Driver(link).until(link.dispatch.workers, "a worker")
             records = Loop(sim, link).advance(15)
             sent.append(link.counters.bytes_out / link.counters.jobs)
             ends.append((records["iterations"].tolist(), sim.world.x.tobytes()))
@@ -66,7 +66,7 @@ def test_while_something_is_grabbed_the_matrix_is_sent() -> None:
     with ServerLink(listen=[endpoint]) as link, process("-m", "precond_worker", "--connect", endpoint):
         link.set_scene(describe.scene(sim))
         link.announce(describe.topology(sim, sim.world.bodies[0]))
-        Driver(link).until(link.workers, "a worker")
+        Driver(link).until(link.dispatch.workers, "a worker")
         loop = Loop(sim, link)
         held = touch.grab("me", "bar", (4, 1, 1), 0.0, (2, 3, 0), 1e4, 0.0, 1e9)  # type: ignore[attr-defined]
         loop.advance(5)

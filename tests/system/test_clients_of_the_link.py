@@ -26,7 +26,7 @@ from protocol.messages_pb2 import (
     Vector,
 )
 from protocol.session import open_session
-from sim_server.network.command_queue import WAITING
+from sim_server.network.command_queue import CAPACITY
 from sim_server.network.link import ServerLink
 
 pytestmark = pytest.mark.system
@@ -118,7 +118,7 @@ def test_bad_commands_are_answered_with_what_is_wrong(
 def test_more_commands_than_can_wait_are_turned_away(stage: tuple[Driver, zenoh.Session]) -> None:
     driver, session = stage
     command = Command(header=Header(protocol=PROTOCOL), verb="push").SerializeToString()
-    waiting = [ask(session, key("command"), command) for _ in range(WAITING)]
+    waiting = [ask(session, key("command"), command) for _ in range(CAPACITY)]
     surplus = Reply.FromString(*answers(ask(session, key("command"), command)))
     assert "the server is busy" in surplus.error
     for _, reply in driver.until(lambda: driver.link.commands(), "the commands"):

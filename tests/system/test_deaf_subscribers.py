@@ -48,12 +48,12 @@ def test_jobs_factors_heartbeats_and_answers_pass(count: int, shared: bool) -> N
         link.announce(LARGE)
         link.publish_status(Status(step=1))
         hand.hello()
-        driver.until(link.ready, "the worker")
+        driver.until(link.dispatch.ready, "the worker")
         job = Job("beam", 1, 1, True, matrix(LARGE))
         bulk = np.zeros(1 << 17).tobytes()
 
         def one_round() -> None:
-            driver.until(lambda: link.ready() and link.submit(job), "a worker that is ready")
+            driver.until(lambda: link.dispatch.ready() and link.dispatch.submit(job), "a worker that is ready")
             asked, seen = hand.receive(), len(driver.failures)
             header = hand.header("beam", 1)
             hand.answer(Factor(header=header, worker="hand", job=asked.header.sequence, failure="none"), bulk)
@@ -65,6 +65,6 @@ def test_jobs_factors_heartbeats_and_answers_pass(count: int, shared: bool) -> N
         for done in range(1, ROUNDS + 1):
             one_round()
             hand.hello(jobs=done)
-            driver.until(lambda done=done: link.workers()[0].jobs == done, "the heartbeat")
+            driver.until(lambda done=done: link.dispatch.workers()[0].jobs == done, "the heartbeat")
         assert link.counters.leases_over == 0
         assert all(reason.endswith("failed: none") for _, reason in driver.failures)

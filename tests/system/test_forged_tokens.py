@@ -52,7 +52,7 @@ def stage() -> Iterator[tuple[str, Driver, Forger]]:
 
 
 def known_tokens(driver: Driver) -> int:
-    return len(driver.link._dispatch._roster._tokens)
+    return len(driver.link.dispatch._registry._tokens)
 
 
 def test_a_worker_joins_behind_more_idle_tokens_than_are_kept(
@@ -64,7 +64,7 @@ def test_a_worker_joins_behind_more_idle_tokens_than_are_kept(
         driver.until(lambda: driver.link.counters.refusals["limit"] >= 50, "the limit")
         with light_worker(endpoint, "real"):
             driver.factor(BEAM, 1)
-            assert [worker.worker for worker in driver.link.workers()] == ["real"]
+            assert [worker.worker for worker in driver.link.dispatch.workers()] == ["real"]
             for token in tokens:
                 token.undeclare()
             driver.until(lambda: known_tokens(driver) == 0, "the fakes to leave")
@@ -91,20 +91,20 @@ def test_a_token_that_was_forgotten_is_asked_for_when_its_worker_speaks(stage: t
         def ready() -> int:
             hand.hello()
             time.sleep(0.05)
-            return driver.link.ready()
+            return driver.link.dispatch.ready()
 
         driver.until(ready, "the worker")
-        assert [worker.worker for worker in driver.link.workers()] == ["hand"]
+        assert [worker.worker for worker in driver.link.dispatch.workers()] == ["hand"]
 
 
 def test_forged_heartbeats_do_not_shut_a_worker_out(stage: tuple[str, Driver, Forger]) -> None:
     endpoint, driver, forger = stage
     with light_worker(endpoint, "real") as child:
         driver.factor(BEAM, 1)
-        host = driver.link.workers()[0].host
+        host = driver.link.dispatch.workers()[0].host
         forger.hello(driver.link.incarnation, "real", 2**63, child.pid, host)
         driver.factor(BEAM, 2)
-        driver.until(lambda: driver.link.workers()[0].jobs == 2, "heartbeats of the real one")
+        driver.until(lambda: driver.link.dispatch.workers()[0].jobs == 2, "heartbeats of the real one")
         assert driver.link.counters.refusals["sequence"] == 0
 
 
@@ -154,7 +154,7 @@ def test_a_worker_of_another_version_is_told_and_the_server_says_so_once(
         line = child.stderr.readline()
         assert "server sim speaks protocol version 1, this worker version 2: it is not served" in line
         driver.until(lambda: driver.link.counters.refusals["version"] >= 3, "it to ask again")
-        assert driver.link.workers() == []
+        assert driver.link.dispatch.workers() == []
         child.terminate()
         out, err = child.communicate(timeout=30)
         assert (out, err, child.returncode) == ("", "", 0)

@@ -52,7 +52,7 @@ def test_factors_that_are_no_good_are_refused_and_right_ones_are_used(caplog: py
         HandWorker(endpoint, link.incarnation) as hand,
         caplog.at_level(logging.WARNING),
     ):
-        driver = Driver(sim, link)
+        driver = Driver(sim, link.dispatch)
         link.announce(topology)
         hand.hello()
         track = driver.tracks[0]

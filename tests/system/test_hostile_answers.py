@@ -29,7 +29,7 @@ def stage() -> Iterator[tuple[Driver, HandWorker]]:
         driver = Driver(link)
         link.announce(BEAM)
         hand.hello()
-        driver.until(link.ready, "the worker")
+        driver.until(link.dispatch.ready, "the worker")
         yield driver, hand
 
 
@@ -203,7 +203,7 @@ def test_an_answer_of_the_last_epoch_is_refused(stage: tuple[Driver, HandWorker]
     hand.answer(answer, values)
     driver.until(refused(driver, "epoch", before + 1), "the refusal")
     assert not [f for f in driver.factors if f.object == "cut"]
-    driver.until(driver.link.ready, "the worker to be free again")
+    driver.until(driver.link.dispatch.ready, "the worker to be free again")
     assert driver.link.counters.leases_over == 0  # freed by its answer, though that was worth nothing
     driver.submit(chain(5, "cut", 2), 2)
     hand.answer(*hand.right_answer(hand.receive(), chain(5, "cut", 2)))
@@ -226,7 +226,7 @@ def test_wrong_hellos_are_refused(stage: tuple[Driver, HandWorker], changes: dic
     hand.hello()
     hand.hello(**changes)
     driver.until(refused(driver, kind, before + 1), kind)
-    assert [info.worker for info in driver.link.workers()] == ["hand"]
+    assert [info.worker for info in driver.link.dispatch.workers()] == ["hand"]
     good_round(driver, hand, next(STEPS))
 
 
@@ -240,7 +240,7 @@ def test_a_hello_without_a_token_makes_no_worker(stage: tuple[Driver, HandWorker
         hand.sequence -= 1
         hand.hello()  # in order behind the ghost's
         driver.until(refused(driver, "sequence", before + 1), "the ghost's hello to be taken in")
-    assert [info.worker for info in driver.link.workers()] == ["hand"]
+    assert [info.worker for info in driver.link.dispatch.workers()] == ["hand"]
 
 
 def test_wrong_patterns_are_refused(stage: tuple[Driver, HandWorker]) -> None:
@@ -286,4 +286,4 @@ def test_a_job_that_does_not_fit_what_was_announced_is_a_programming_error(stage
         (Job("beam", 1, 1, True, matrix(BEAM)[1:]), "allowed: float64"),
     ):
         with pytest.raises(ValueError, match=text):
-            driver.link.submit(job)
+            driver.link.dispatch.submit(job)

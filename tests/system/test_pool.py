@@ -42,7 +42,7 @@ def test_two_servers_share_one_worker() -> None:
     ):
         for k in range(5):
             assert factors(first, 5, 1, k + 1) == factors(second, 6, 1, k + 1) == {"shared"}
-        pids = {driver.link.workers()[0].pid for driver in (first, second)}
+        pids = {driver.link.dispatch.workers()[0].pid for driver in (first, second)}
         assert pids == {child.pid}
         for driver in (first, second):
             assert driver.link.counters.refused == 0 and driver.failures == []
@@ -72,7 +72,7 @@ def test_every_server_of_a_router_is_found_also_those_to_come() -> None:
             assert factors(early, 5, 3, 20) == {"shared"}, "one of its servers left"
         with servers(("early", free_endpoint()), connect=[router]) as (again,):
             assert factors(again, 5, 3) == {"shared"}, "a server came back with another incarnation"
-            assert again.link.workers()[0].pid == child.pid
+            assert again.link.dispatch.workers()[0].pid == child.pid
 
 
 def test_workers_at_the_router_and_at_the_server_itself_both_work() -> None:
@@ -82,14 +82,14 @@ def test_workers_at_the_router_and_at_the_server_itself_both_work() -> None:
         for topology in topologies:
             sim.link.announce(topology)
         with worker("--connect", router, name="far"), worker("--connect", own, name="near"):
-            sim.until(lambda: len(sim.link.workers()) == 2, "both workers")
+            sim.until(lambda: len(sim.link.dispatch.workers()) == 2, "both workers")
             step = 0
             while {factor.worker for factor in sim.factors} != {"far", "near"}:
                 step += 1
                 assert step < 100
                 for topology in topologies:
                     sim.submit(topology, step)
-        sim.until(lambda: not sim.link.workers(), "both to leave")
+        sim.until(lambda: not sim.link.dispatch.workers(), "both to leave")
 
 
 def test_a_server_that_is_not_there_holds_up_no_other() -> None:
@@ -124,7 +124,7 @@ def test_a_faster_worker_gets_the_object_when_both_are_idle() -> None:
         light_worker(endpoint, "slow", "slow=0.2"),
         light_worker(endpoint, "fast"),
     ):
-        sim.until(lambda: len(sim.link.workers()) == 2, "both workers")
+        sim.until(lambda: len(sim.link.dispatch.workers()) == 2, "both workers")
         for topology in (chain(5, "a"), chain(6, "b")):
             sim.link.announce(topology)
         step = 0
@@ -133,8 +133,8 @@ def test_a_faster_worker_gets_the_object_when_both_are_idle() -> None:
             assert step < 100
             for object, nodes in (("a", 5), ("b", 6)) if step % 2 else (("b", 6), ("a", 5)):
                 sim.submit(chain(nodes, object), step)
-        sim.until(lambda: sim.link.ready() == 2, "both to be idle")
+        sim.until(lambda: sim.link.dispatch.ready() == 2, "both to be idle")
         sim.factors.clear()
         for k in range(5):
             assert sim.factor(chain(5, "a"), 1000 + k).worker == "fast"
-            sim.until(lambda: sim.link.ready() == 2, "both to be idle")
+            sim.until(lambda: sim.link.dispatch.ready() == 2, "both to be idle")

@@ -148,7 +148,7 @@ def test_what_nobody_takes_blocks_nobody() -> None:
         assert [Status.FromString(bytes(reply.ok.payload)).scene for reply in replies if reply.ok] == ["asleep"]
         driver = Driver(link)
         link.announce(chain())
-        driver.until(link.ready, "the worker")
+        driver.until(link.dispatch.ready, "the worker")
         assert 0 < link.counters.refused <= 2500
         driver.submit(chain(), 1)
         hand.answer(*hand.right_answer(hand.receive(), chain()))
@@ -173,7 +173,7 @@ def test_too_little_lockable_memory_loses_nothing() -> None:
         for step in range(1, 11):
             factor = driver.factor(topology, step, 0.1 * step)
             assert np.allclose(product(factor), dense(topology, matrix(topology, 0.1 * step)), atol=1e-4)
-        assert not link.workers()[0].shared_memory
+        assert not link.dispatch.workers()[0].shared_memory
         assert link.counters.refused == 0 and link.counters.leases_over == 0
         child.terminate()
         _, errors = child.communicate(timeout=20)
@@ -212,7 +212,7 @@ def test_no_memory_left_for_slots_means_bytes() -> None:
             factor = driver.factor(topology, step, 0.1 * step)
             assert np.allclose(product(factor), dense(topology, matrix(topology, 0.1 * step)), atol=1e-4)
         assert link.counters.slots_exhausted >= 1
-        assert link.workers()[0].shared_memory
+        assert link.dispatch.workers()[0].shared_memory
 
 
 def test_closing_twice_and_publishing_late_do_no_harm() -> None:

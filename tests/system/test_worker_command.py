@@ -114,7 +114,7 @@ def test_of_two_of_one_name_that_join_at_the_same_instant_one_leaves() -> None:
             left, stays = (one, other) if one.poll() is not None else (other, one)
             assert left.stderr is not None and left.returncode == 2
             assert "of server sim is called twin; --name gives this one its own" in left.stderr.read()
-            while [worker.pid for worker in link.workers()] != [stays.pid]:
+            while [worker.pid for worker in link.dispatch.workers()] != [stays.pid]:
                 assert time.monotonic() < end, "the other one is not taken"
                 time.sleep(0.05)
             assert stays.poll() is None

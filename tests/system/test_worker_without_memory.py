@@ -39,7 +39,7 @@ def test_it_ends_with_one_line(where: str, line: str) -> None:
         _, err = child.communicate(timeout=30)
         assert child.returncode == 1
         assert err == f"precond-worker: {line}\n"
-        driver.until(lambda: not link.workers(), "it to be gone")
+        driver.until(lambda: not link.dispatch.workers(), "it to be gone")
 
 
 def test_under_a_limit_of_memory_it_serves_or_ends_but_does_not_stay_half_alive() -> None:
@@ -52,7 +52,7 @@ def test_under_a_limit_of_memory_it_serves_or_ends_but_does_not_stay_half_alive(
         ) as child,
     ):  # fmt: skip
         driver = Driver(link)
-        driver.until(lambda: link.workers() or child.poll() is not None, "it to serve or to end")
+        driver.until(lambda: link.dispatch.workers() or child.poll() is not None, "it to serve or to end")
         if child.poll() is not None:
             _, err = child.communicate(timeout=30)
             assert child.returncode != 0 and err and "Traceback" not in err

@@ -40,8 +40,8 @@ def test_matrices_and_factors_go_through_shared_memory() -> None:
         link.announce(BEAM)
         for step in range(1, 6):
             check(driver, step, 0.1 * step, "float32" if step % 2 else "float64")
-        driver.until(lambda: link.workers() and link.workers()[0].bulk_shared >= 5, "a heartbeat")
-        worker = link.workers()[0]
+        driver.until(lambda: link.dispatch.workers() and link.dispatch.workers()[0].bulk_shared >= 5, "a heartbeat")
+        worker = link.dispatch.workers()[0]
         assert worker.shared_memory
         # As the receivers saw it: every matrix, and every factor but the first, whose size nobody knew.
         assert (worker.bulk_shared, worker.bulk_copied) == (5, 0)
@@ -60,7 +60,7 @@ def test_a_worker_without_shared_memory_gets_bytes_and_that_is_said_once(caplog:
                 for step in range(1, 4):
                     driver.factors.clear()
                     check(driver, step, 0.1 * step)
-            driver.until(lambda: not link.workers(), "the worker to leave")
+            driver.until(lambda: not link.dispatch.workers(), "the worker to leave")
         assert (link.counters.bulk_shared, link.counters.bulk_copied) == (0, 12)
     warnings = [record.message for record in caplog.records if "arrays are copied" in record.message]
     assert len(warnings) == 1 and "worker one has no shared memory with us" in warnings[0]
@@ -70,7 +70,7 @@ def test_a_worker_without_shared_memory_gets_bytes_and_that_is_said_once(caplog:
 def test_shared_memory_comes_back_after_a_server_that_was_too_busy_to_answer() -> None:
     endpoint, asked = free_endpoint(), []
     with ServerLink(listen=[endpoint]) as link:
-        answer = link._inquiries._echo
+        answer = link._queryables._answer_probe
 
         def busy(query: zenoh.Query) -> None:
             if query.payload is not None and pb.Echo.FromString(bytes(query.payload)).nonce:
@@ -79,13 +79,13 @@ def test_shared_memory_comes_back_after_a_server_that_was_too_busy_to_answer() -
                     return
             answer(query)
 
-        link._inquiries._echo = busy  # type: ignore[method-assign]
+        link._queryables._answer_probe = busy  # type: ignore[method-assign]
         with light_worker(endpoint):
             driver = Driver(link)
             link.announce(BEAM)
             check(driver, 1, 0.1)
-            assert not link.workers()[0].shared_memory and link.counters.bulk_shared == 0
-            driver.until(lambda: link.workers()[0].shared_memory, "the status to say so")
+            assert not link.dispatch.workers()[0].shared_memory and link.counters.bulk_shared == 0
+            driver.until(lambda: link.dispatch.workers()[0].shared_memory, "the status to say so")
             for step in range(2, 5):
                 check(driver, step, 0.1 * step)
             assert link.counters.bulk_shared == 6 and len(asked) >= 4
@@ -98,7 +98,7 @@ def test_a_server_without_shared_memory_sends_bytes() -> None:
         link.announce(BEAM)
         for step in range(1, 4):
             check(driver, step, 0.1 * step)
-        assert not link.workers()[0].shared_memory
+        assert not link.dispatch.workers()[0].shared_memory
         assert (link.counters.bulk_shared, link.counters.bulk_copied) == (0, 6)
 
 
@@ -114,14 +114,14 @@ def test_killed_with_a_job_in_hand_and_started_again() -> None:
         link.announce(BEAM)
         with light_worker(endpoint, "mortal", "slow=0.01"):
             check(driver, 1, 0.0)
-        driver.until(lambda: not link.workers(), "the worker to leave")
+        driver.until(lambda: not link.dispatch.workers(), "the worker to leave")
         with light_worker(endpoint, "mortal", "slow=1000") as child:
             driver.submit(BEAM, 2)
-            driver.until(lambda: link.workers()[0].jobs == 1, "the job to be in hand")
+            driver.until(lambda: link.dispatch.workers()[0].jobs == 1, "the job to be in hand")
             os.kill(child.pid, signal.SIGKILL)
             driver.until(lambda: driver.failures, "the loss to be seen")
             assert driver.failures == [("beam", "factorization of beam at step 2 was lost with worker mortal")]
-            assert link.workers() == [] and not link.ready()
+            assert link.dispatch.workers() == [] and not link.dispatch.ready()
             assert slots_lent(link) == 0
         with light_worker(endpoint, "mortal"):
             check(driver, 3, 0.3)
@@ -136,7 +136,7 @@ def test_an_object_whose_worker_died_goes_to_another() -> None:
         with light_worker(endpoint, "hung", "slow=1000") as hung:
             driver.submit(BEAM, 1)
             with light_worker(endpoint, "good"):
-                driver.until(lambda: len(link.workers()) == 2, "two workers")
+                driver.until(lambda: len(link.dispatch.workers()) == 2, "two workers")
                 os.kill(hung.pid, signal.SIGKILL)
                 driver.until(lambda: driver.failures, "the loss to be seen")
                 check(driver, 2, 0.2)
@@ -152,13 +152,13 @@ def test_a_late_worker_keeps_its_slots_and_its_answer_is_refused() -> None:
     ):
         driver = Driver(link)
         link.announce(BEAM)
-        driver.until(link.ready, "the other worker")
+        driver.until(link.dispatch.ready, "the other worker")
         check(driver, 1, 0.0)
-        driver.until(lambda: link.workers()[0].jobs == 1, "a heartbeat")
+        driver.until(lambda: link.dispatch.workers()[0].jobs == 1, "a heartbeat")
         now[0] += 1.5
         hand.shared_memory = True  # it claims so, to be lent slots
         hand.hello()
-        driver.until(lambda: len(link.workers()) == 2, "both workers")
+        driver.until(lambda: len(link.dispatch.workers()) == 2, "both workers")
         driver.submit(chain(object="beam"), 2)  # goes to who knows the object, so occupy that one first
         driver.until(lambda: [f for f in driver.factors if f.step == 2], "the factor of step 2")
         link.announce(chain(object="bar"))
@@ -175,7 +175,7 @@ def test_a_late_worker_keeps_its_slots_and_its_answer_is_refused() -> None:
         assert slots_lent(link) == 0
         assert not [f for f in driver.factors if f.object == "bar"]
         hand.hello()
-        driver.until(lambda: len(link.workers()) == 2, "both workers again")
+        driver.until(lambda: len(link.dispatch.workers()) == 2, "both workers again")
         driver.submit(chain(object="bar"), 2)
 
 
@@ -232,7 +232,7 @@ def test_the_server_starts_again_under_a_living_worker() -> None:
                 link.announce(topology)
                 factor = driver.factor(topology, 1, 0.1)
                 assert np.allclose(product(factor), dense(topology, matrix(topology, 0.1)), atol=1e-5)
-                pids.add(link.workers()[0].pid)
+                pids.add(link.dispatch.workers()[0].pid)
         assert len(incarnations) == 3 and pids == {child.pid}
 
 
@@ -243,9 +243,9 @@ def test_a_worker_that_stops_answering_gets_no_more_jobs_and_may_come_back() -> 
         link.announce(BEAM)
         check(driver, 1, 0.0)
         os.kill(child.pid, signal.SIGSTOP)
-        driver.until(lambda: not link.workers() and not link.ready(), "the silence to be noticed")
+        driver.until(lambda: not link.dispatch.workers() and not link.dispatch.ready(), "the silence to be noticed")
         os.kill(child.pid, signal.SIGCONT)
-        driver.until(link.ready, "the worker to be back")
+        driver.until(link.dispatch.ready, "the worker to be back")
         check(driver, 2, 0.2)
 
 
@@ -281,7 +281,7 @@ def test_several_workers_and_objects() -> None:
         driver = Driver(link)
         for topology in topologies.values():
             link.announce(topology)
-        driver.until(lambda: len(link.workers()) == 2, "both workers")
+        driver.until(lambda: len(link.dispatch.workers()) == 2, "both workers")
         for step in range(1, 4):
             for topology in topologies.values():
                 driver.submit(topology, step, 0.1 * step)
@@ -323,7 +323,7 @@ def test_fifty_workers_one_after_another_leak_nothing() -> None:
                     driver.submit(BEAM, 1000 + life)
                 used |= segments_of(str(child.pid))
                 os.kill(child.pid, signal.SIGKILL if life % 2 else signal.SIGTERM)
-            driver.until(lambda: not link.workers(), "the worker to leave")
+            driver.until(lambda: not link.dispatch.workers(), "the worker to leave")
             driver.until(lambda: slots_lent(link) == 0, "its slots")
             locked.append(locked_kib())
         # The first lives make the slots that the others use again.
@@ -341,7 +341,7 @@ def test_time_passes_for_leases_only_while_somebody_looks() -> None:
         link.announce(BEAM)
         check(driver, 1, 0.0)
         time.sleep(1.0)
-        assert [worker.worker for worker in link.workers()] == ["light"]
+        assert [worker.worker for worker in link.dispatch.workers()] == ["light"]
         check(driver, 2, 0.0)
 
 
@@ -360,4 +360,4 @@ def test_the_real_worker_factorizes() -> None:
         assert line.startswith("precond-worker real ready: ") and endpoint in line
         child.send_signal(signal.SIGTERM)
         assert child.wait(20) == 0
-        driver.until(lambda: not link.workers(), "the worker to leave")
+        driver.until(lambda: not link.dispatch.workers(), "the worker to leave")
