@@ -21,7 +21,7 @@ from sim_server.backend import Launch, native
 from sim_server.energy import Energies, NativeEnergies
 from sim_server.layouts import RECORD
 from sim_server.rings import Reports
-from sim_server.scene.integrator_options import Integrator
+from sim_server.scene.integrator_options import IntegratorOptions
 
 Reals = NDArray[np.float64]
 HISTORY = 1024  # changes of the diagonal that are remembered, of each body
@@ -116,7 +116,8 @@ class Newton:
     """
 
     def __init__(
-        self, options: Integrator, reach: float, parts: Sequence[NDArray[np.int32] | None], **arrays: NDArray[Any]
+        self, options: IntegratorOptions, reach: float, parts: Sequence[NDArray[np.int32] | None],
+        **arrays: NDArray[Any],
     ):  # fmt: skip
         self.options, self.reach, self.parts, self.arrays = options, reach, parts, arrays
 

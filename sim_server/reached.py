@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol import messages_pb2 as pb
-from sim_server.scene.solver_options import Solver
+from sim_server.scene.solver_options import SolverOptions
 
 LEAST = 0.01  # decades: what gained less is not told from what gained nothing
 
@@ -24,7 +24,7 @@ class Reached(NamedTuple):
 CONVERGED = Reached(0.0, 0.0)
 
 
-def reached(records: NDArray[Any], solver: Solver) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def reached(records: NDArray[Any], solver: SolverOptions) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """lack and used of solves (records of a loop, of any shape). In a step with several linear solves the largest
     residual counts, and the mean use; that its own equation is not solved is no fault of theirs."""
     solves = np.maximum(records["linearizations"], 1)

@@ -14,9 +14,8 @@ Whatever the rule, an object whose last matrix is `overdue` goes first, so none 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from math import ceil, inf
-from typing import Literal
 
-Rule = Literal["excess", "round_robin"]
+from sim_server.scene.solver_options import Rule
 
 AHEAD = 10.0  # steps for which the excess of the last solve is taken to go on
 DOUBLINGS = 10  # of the floor of an object whose jobs fail

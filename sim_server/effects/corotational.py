@@ -51,7 +51,7 @@ from pydantic import Field, model_validator
 from sim_server.backend import Launch
 from sim_server.effect import Effect, ElementEnergies
 from sim_server.errors import InputError
-from sim_server.scene.integrator_options import Integrator
+from sim_server.scene.integrator_options import IntegratorOptions
 from sim_server.scene.parameters import complaint
 from sim_server.scene.regions import Poisson, Regional, Young, region_values
 from sim_server.system import Stencil, System
@@ -76,7 +76,7 @@ class Params(Regional):
             raise complaint('tangent = "exact" needs rotation = "polar": forces by qr have no energy to differentiate')
         return self
 
-    def under(self, integrator: Integrator) -> "Params":
+    def under(self, integrator: IntegratorOptions) -> "Params":
         """These, with a tangent in place of auto. Raises a complaint about one with which the energy would grow."""
         if integrator.needs_stiff_matrix and (self.tangent == "usual" or self.rotation == "qr"):
             given, instead = ('rotation = "qr"', 'rotation = "polar"') if self.rotation == "qr" else (

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""A recorded run made again and compared with its log."""
+"""Repeats a recorded run and compares it with its log."""

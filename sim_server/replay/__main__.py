@@ -10,7 +10,7 @@ from functools import partial
 
 
 def main() -> int:
-    """Runs the log again and reports."""
+    """Repeats the run of a log and reports what differs; returns the exit code."""
     parser = argparse.ArgumentParser(prog="python -m sim_server.replay", description="Run a log again and compare.")
     parser.add_argument("log", metavar="LOG.mcap", help="A run recorded by sim-server --record")
     parser.add_argument("--json", action="store_true", help="For programs")

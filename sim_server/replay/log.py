@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""A log as a replay needs it: scene, step records and where the frames lie, up to the first gap.
+"""Reads a log for a replay: scene, step records and the places of frames, up to the first gap.
 
-Read twice: once here, for what each solve used; frames then one by one as the replay reaches them.
+A log is read twice: once for what each solve used, and then frame by frame as the replay reaches them.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from protocol import messages_pb2 as pb
 from protocol.check import array
 from protocol.log_chunks import BadLog, ChunkFile
 from protocol.refused import Refused
+from sim_server.arrays import Float64
 from sim_server.engine import Kind
 from sim_server.scene.solver_options import FACTORS
 
@@ -32,34 +33,44 @@ ROW = np.dtype(
         ("kinetic", "f8"), ("work", "f8"),
     ]
 )  # fmt: skip
-"""What a solve was made with and what came of it, from an ObjectStep. Energies are NaN in older logs."""
+"""Input and result of a solve, from an ObjectStep. Energies are NaN in logs of versions that did not record them."""
 _PACK = struct.Struct("<qqqdqqqqqqdd")
 _KINDS = {kind.name.lower(): int(kind) for kind in Kind} | dict.fromkeys(FACTORS, int(Kind.CHOLESKY))
 
 
 @dataclass
-class Recorded:
-    """One object. frames: (offset of the chunk, number in it) by step."""
+class RecordedObject:
+    """What a log holds of one object.
+
+    packed: step records in the order of the log, packed; empty once `rows` is made
+    frames: (offset of the chunk, number of the record in it) by step
+    factors: by the step whose matrix they were made from
+    rows: of type ROW; rows[k] is of step k + 1
+    """
 
     topology: pb.Topology | None = None
     packed: bytearray = field(default_factory=bytearray)
     frames: dict[int, tuple[int, int]] = field(default_factory=dict)
-    factors: dict[int, pb.FactorUse] = field(default_factory=dict)  # by the step they were made from
-    rows: NDArray = field(default_factory=lambda: np.zeros(0, ROW))  # rows[k] is of step k + 1
+    factors: dict[int, pb.FactorUse] = field(default_factory=dict)
+    rows: NDArray = field(default_factory=lambda: np.zeros(0, ROW))
 
 
 class Recording:
-    """Reads a log. `steps`: how far it can be repeated; `notes`: what ended it there and what is missing.
+    """A log to be repeated.
 
-    Raises BadLog if it is none, one of another protocol version, or one that cannot be repeated at all.
+    Raises BadLog if the file is no log, is of another protocol version, or cannot be repeated at all.
+
+    steps: last step that can be repeated
+    notes: why the replay ends there, and what is missing in the log
+    touched: the run had pushes or grabs
     """
 
     def __init__(self, path: str | Path, progress: Callable[[int], None] = lambda _: None):
         self.path = Path(path)
         self.scene = pb.Scene()
-        self.objects: dict[str, Recorded] = {}
+        self.objects: dict[str, RecordedObject] = {}
         self.touch: list[pb.TouchSet] = []
-        self.touched = False  # by pushes or grabs
+        self.touched = False
         self.notes: list[str] = []
         self._file = ChunkFile.open(self.path)
         self._topics: dict[int, str] = {}
@@ -85,11 +96,11 @@ class Recording:
 
     @property
     def device(self) -> str:
-        """That the run was made on, "cpu" or "gpu"."""
+        """Device of the recorded run, "cpu" or "gpu"."""
         return self.scene.device or ("cpu" if ", cpu," in self.scene.software else "gpu")  # old logs tell in `software`
 
-    def frame(self, name: str, step: int) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-        """x and v (nodes, 3) of an object after a step; None if the log holds no such frame."""
+    def frame(self, name: str, step: int) -> tuple[Float64, Float64] | None:
+        """Returns x [m] and v [m/s], (nodes, 3), of an object after a step; None if the log has no such frame."""
         place = self.objects[name].frames.get(step)
         if place is None:
             return None
@@ -129,7 +140,7 @@ class Recording:
         _, kind, name = [*topic.split("/", 2), "", ""][:3]
         if kind not in ("topology", "state", "interaction", "factor", "step") or not name:
             raise Refused("a message of an unknown channel")
-        found = self.objects.setdefault(name, Recorded())
+        found = self.objects.setdefault(name, RecordedObject())
         if kind == "topology":
             found.topology = pb.Topology.FromString(record.data)
         elif kind == "state":
@@ -159,10 +170,10 @@ class Recording:
             )
 
     def _complete(self) -> int:
-        """Sorts the rows; returns the last step up to which all objects have all of theirs."""
+        """Sorts the rows; returns the last step up to which no object lacks a row."""
         last, most, gap = [], 0, ""
         for name in self.scene.objects:
-            found = self.objects.setdefault(name, Recorded())
+            found = self.objects.setdefault(name, RecordedObject())
             rows = np.sort(np.frombuffer(bytes(found.packed), ROW), order="step")
             found.packed = bytearray()
             whole = len(rows)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a replay found: the first divergence from the log, the largest one, and how much was compared."""
+"""Result of a replay: the first divergence from the log, the largest one, and how much was compared."""
 
 from __future__ import annotations
 
@@ -10,54 +10,60 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol import messages_pb2 as pb
+from sim_server.arrays import Float64
 from sim_server.engine import Kind
 from sim_server.replay.log import Recording
 
-Pair = tuple[NDArray[np.float64], NDArray[np.float64]]
+Pair = tuple[Float64, Float64]
 COMPARED = ("iterations", "residual", "status", "kind", "fallbacks", "factor_step", "linearizations", "kinetic", "work")
-TOLD_LATER = ("kinetic", "work")  # NaN in a log of a version that did not tell
+OPTIONAL = ("kinetic", "work")  # NaN in logs of versions that did not record them
 
 
 class Comparison:
-    """Collects; `same` once nothing differed in a single bit."""
+    """Collects the differences between a replay and its log.
+
+    first: step, object, kind and details of the first difference
+    largest: step, object, node and distance [m] of the largest difference of positions
+    other_factor: step, object and details of the first factor that is not the recorded one
+    """
 
     def __init__(self, recording: Recording):
         self.recording = recording
         self.notes = list(recording.notes)
-        self.first: dict[str, Any] | None = None  # step, object, what, detail; of what differed first
-        self.largest: dict[str, Any] | None = None  # step, object, node, distance [m]
-        self.other_factor: dict[str, Any] | None = None  # step, object, detail: the first that is not the recorded one
+        self.first: dict[str, Any] | None = None
+        self.largest: dict[str, Any] | None = None
+        self.other_factor: dict[str, Any] | None = None
         self.solves_compared = self.solves_different = 0
         self.frames_compared = self.frames_different = 0
 
     @property
     def same(self) -> bool:
-        """No divergence."""
+        """True if nothing compared so far differed in a single bit."""
         return self.first is None
 
     def diverged(self, step: int, name: str, what: str, detail: str) -> None:
-        """Something differs; only the first is told."""
+        """Notes a difference; only the first is kept."""
         if self.first is None:
             self.first = {"step": step, "object": name, "what": what, "detail": detail}
 
     def factor(self, step: int, name: str, detail: str) -> None:
-        """A factor is not the recorded one. No divergence by itself: what it was used for shows that."""
+        """Notes a factor that is not the recorded one. That is no divergence yet: the solves that use it will show one."""
         if self.other_factor is None:
             self.other_factor = {"step": step, "object": name, "detail": detail}
 
     def solves(self, records: NDArray[Any], rows: list[Any]) -> None:
-        """One step: records of the engine and rows of the log, one a body in order."""
+        """Compares one step: records of the engine with rows of the log, one for each body, in order."""
         for record, row, name in zip(records, rows, self.recording.scene.objects, strict=True):
             self.solves_compared += 1
-            told = [n for n in COMPARED if n not in TOLD_LATER or not math.isnan(row[n])]
-            different = [n for n in told if not _same(record[n], row[n])]
+            recorded = [n for n in COMPARED if n not in OPTIONAL or not math.isnan(row[n])]
+            different = [n for n in recorded if not _same(record[n], row[n])]
             if different:
                 self.solves_different += 1
                 detail = ", ".join(f"{n} {_shown(n, record[n])}, recorded {_shown(n, row[n])}" for n in different)
                 self.diverged(int(row["step"]), name, "solve", detail)
 
     def frame(self, step: int, name: str, recorded: Pair, now: Pair) -> None:
-        """Positions and velocities (nodes, 3) of one object after a step."""
+        """Compares positions and velocities (nodes, 3) of one object after a step."""
         self.frames_compared += 1
         if all(a.tobytes() == b.tobytes() for a, b in zip(recorded, now, strict=True)):
             return
@@ -69,7 +75,7 @@ class Comparison:
             self.largest = {"step": step, "object": name, "node": node, "distance": distance}
 
     def lines(self) -> list[str]:
-        """For people."""
+        """Returns the result as text."""
         steps, counts = self.recording.steps, f"{self.solves_compared} solves, {self.frames_compared} frames"
         lines = [f"note: {note}" for note in self.notes]
         if self.other_factor:
@@ -92,7 +98,7 @@ class Comparison:
         ]
 
     def plain(self) -> dict[str, Any]:
-        """For programs."""
+        """Returns the result as JSON types."""
         largest = self.largest and {**self.largest, "distance": _finite(self.largest["distance"])}
         return {
             "same": self.same, "steps": self.recording.steps, "first": self.first, "largest": largest,
@@ -111,10 +117,10 @@ def _shown(name: str, value: Any) -> str:
         return pb.SolveStatus.Name(int(value)).lower()
     if name == "kind":
         return Kind(int(value)).name.lower()
-    return repr(float(value)) if name in ("residual", *TOLD_LATER) else str(int(value))
+    return repr(float(value)) if name in ("residual", *OPTIONAL) else str(int(value))
 
 
-def _farthest(a: NDArray[np.float64], b: NDArray[np.float64]) -> tuple[int, float]:
+def _farthest(a: Float64, b: Float64) -> tuple[int, float]:
     distance = np.linalg.norm(a - b, axis=1)
     node = int(distance.argmax())
     return node, float(distance[node])

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""A recorded run made again and compared with its log, bit by bit.
+"""Repeats a recorded run and compares it with its log, bit by bit.
 
-Every step gets what the log says it had: the interactions as the loop had taken them up, for each solve the
+Every step gets the input that the log has of it: the interactions as the loop had taken them up, for each solve the
 preconditioner asked for, and the factor that it used, made here from the same step's matrix.
 What is left (kernels, solver, factorization) is a pure function of these on one build.
 """
@@ -22,6 +22,7 @@ from protocol.factor import Factor
 from protocol.log_chunks import BadLog
 from protocol.refused import Refused
 from sim_server import describe
+from sim_server.arrays import Float64
 from sim_server.assembly import Assembly
 from sim_server.errors import DeviceError
 from sim_server.factors import Inline, Job
@@ -36,7 +37,7 @@ MESH = ("nodes", "tets", "row_start", "columns", "fixed")
 
 
 class Replay:
-    """One recording, run again. Raises BadLog if its scene cannot be built as it was."""
+    """Repeats one recording. Raises BadLog if its scene cannot be built as it was."""
 
     def __init__(self, recording: Recording):
         self.recording = recording
@@ -68,10 +69,10 @@ class Replay:
         self._needed = set(self._last_use)  # (object, step) of matrices whose factor the loop used
         self._factors: dict[tuple[str, int], Factor] = {}
         self._in_use: dict[str, int] = {}
-        self._sets: dict[int, pb.TouchSet] = {t.step: t for t in recording.touch}
-        self._held: dict[int, tuple[Any, Any]] = {}  # nodes and offsets of interactions by id
+        self._touch_sets: dict[int, pb.TouchSet] = {t.step: t for t in recording.touch}
+        self._nodes: dict[int, tuple[Any, Any]] = {}  # nodes and offsets of interactions, by id
         self._inline = self._library()
-        self._ahead: dict[str, Any] = {}  # positions that went out instead of the matrix and are not its, by body
+        self._positions: dict[str, Float64] = {}  # sent instead of a matrix, and not those of its step, by body
         self._assemblies: dict[str, Assembly] = {}
         if self.simulation.world.backend.build() != recording.scene.build and recording.scene.build:
             self.compared.notes.append(
@@ -83,14 +84,14 @@ class Replay:
             touch.publish = lambda launch: self.engine.replace(index, launch)
 
     def run(self, progress: Callable[[int], None] = lambda _: None) -> Comparison:
-        """Repeats all steps and compares; `progress` gets the steps done."""
+        """Repeats all steps and compares them; calls `progress` with the number of steps done."""
         self._compare_frames(0)
         for step in range(self.recording.steps):
-            self._touch(step)
+            self._restore_interactions(step)
             for body in self.bodies:
-                self._settle(body.index, body.name, step)
+                self._apply_settings(body.index, body.name, step)
                 self._use_factor(body.index, body.name, step, fresh=False)
-            self._ask(step)
+            self._request_positions(step)
             self.engine.assemble()
             self._make_factors(step)
             for body in self.bodies:
@@ -128,7 +129,7 @@ class Replay:
                 )
 
     def _library(self) -> Inline:
-        """Factorizes with the library that the log names, if it is here."""
+        """Returns a source of factors that uses the library named in the log, if it is installed."""
         system = self.simulation.system
         made = [f for o in self.recording.objects.values() for f in o.factors.values()]
         recorded = {f.library for f in made if f.library} - {"native"}  # which is everywhere
@@ -142,17 +143,17 @@ class Replay:
             )
         return Inline({b.name: system.body_pattern(b.first, b.last) for b in self.bodies}, choice)
 
-    # --- what a step had ----------------------------------------------------------------------------------------
+    # --- input of a step ----------------------------------------------------------------------------------------
 
-    def _touch(self, step: int) -> None:
-        """The interactions that the loop took up at this step."""
-        if step not in self._sets:
+    def _restore_interactions(self, step: int) -> None:
+        """Sets the interactions that the loop took up at this step."""
+        if step not in self._touch_sets:
             return
         touch: Any = self.simulation.effects.get("touch")
         if touch is None:
             raise BadLog(f"{self.recording.path}: pushes or grabs in a scene that takes none")
         try:
-            touch.restore([self._interaction(m) for m in self._sets[step].interactions])
+            touch.restore([self._interaction(m) for m in self._touch_sets[step].interactions])
         except Refused as error:
             raise BadLog(f"{self.recording.path}: interactions of step {step}: {error}") from error
 
@@ -163,45 +164,45 @@ class Replay:
             nodes = array(m.held, np.int32, (m.nodes,), "Interaction.held")
             check_range(nodes, 0, self.simulation.world.nodes, "Interaction.held")
             offsets = array(m.offsets, np.float64, (m.nodes, 3), "Interaction.offsets", finite=True)
-            self._held[m.id] = (nodes.astype(np.int32), offsets.astype(np.float64))
-        if m.id not in self._held:
+            self._nodes[m.id] = (nodes.astype(np.int32), offsets.astype(np.float64))
+        if m.id not in self._nodes:
             raise Refused(f"the nodes of interaction {m.id} are not in the log")
-        nodes, offsets = self._held[m.id]
+        nodes, offsets = self._nodes[m.id]
         point, force, target = ((v.x, v.y, v.z) for v in (m.point, m.force, m.target))
         return Interaction(
             m.id, m.client, m.object, point, m.radius, nodes, offsets, m.duration, force, target, m.stiffness,
             m.max_force, m.start,
         )  # fmt: skip
 
-    def _ask(self, step: int) -> None:
-        """For positions ahead, where a factor was made of such."""
-        self._ahead.clear()
+    def _request_positions(self, step: int) -> None:
+        """Requests extrapolated positions for the factors of this step that were made from such."""
+        self._positions.clear()
         for body in self.bodies:
             use = self.recording.objects[body.name].factors.get(step)
             if use is not None and use.ahead > 0 and (body.name, step) in self._needed:
-                self._ahead[body.name] = np.empty((body.last - body.first, 3))
-                self.engine.request_positions(body.index, self._ahead[body.name], use.ahead)
+                self._positions[body.name] = np.empty((body.last - body.first, 3))
+                self.engine.request_positions(body.index, self._positions[body.name], use.ahead)
 
     def _make_factors(self, step: int) -> None:
-        """Of this step, and of the last one where positions went out at its end."""
+        """Makes the factors of this step, and those of the last one whose positions were sent at its end."""
         for body in self.bodies:
             for made in (step - 1, step):
                 use = self.recording.objects[body.name].factors.get(made)
                 later = use is not None and use.later
                 if (body.name, made) in self._needed and later == (made < step):
                     if later:
-                        self._ahead[body.name] = self.simulation.fetch().x[body.nodes].copy()
+                        self._positions[body.name] = self.simulation.fetch().x[body.nodes].copy()
                     self._submit(body, made)
         self._collect(step)
 
     def _submit(self, body: Body, made: int) -> None:
         warped = body.index in self.simulation.warped
         values, solver = self.simulation.system.body_values(body.first, body.last), self.simulation.scene.solver
-        if body.name in self._ahead:
+        if body.name in self._positions:
             if body.name not in self._assemblies:
                 topology = describe.topology(self.simulation, body)
                 self._assemblies[body.name] = Assembly(describe.scene(self.simulation), topology)
-            values = self._assemblies[body.name].matrix(self._ahead[body.name])
+            values = self._assemblies[body.name].matrix(self._positions[body.name])
         use = self.recording.objects[body.name].factors.get(made)
         method = solver.method_named(use.method if use is not None else "")
         self._inline.submit(Job(body.name, 1, made, warped, values, solver.factor_dtype, method))
@@ -223,14 +224,14 @@ class Replay:
         now = f"here by {here}" if here != then.library else "here by the same library"
         self.compared.factor(factor.step, factor.object, f"other {what}; made by {then.worker} ({maker}), {now}")
 
-    def _settle(self, index: int, name: str, step: int) -> None:
-        """Solver settings of one solve as they were."""
+    def _apply_settings(self, index: int, name: str, step: int) -> None:
+        """Sets the solver settings of one solve as they were."""
         row, settings, solver = self._rows(name)[step], self.engine.settings(index), self.simulation.scene.solver
         settings.kind, settings.probe = int(row["asked"]), int(row["probe"])
         settings.budget = -float(row["iterations"] + 1) if row["status"] == pb.BUDGET and solver.budget else 0.0
 
     def _use_factor(self, index: int, name: str, step: int, fresh: bool) -> None:
-        """The factor of one step. fresh: one made from the matrix of this very step; others were there before it."""
+        """Posts the factor that a step used. fresh: the one made from the matrix of this step; else one made before."""
         made = int(self._taken[name][step, int(fresh)])
         if made < 0:
             return
@@ -265,7 +266,7 @@ def taken_up(rows: Any) -> NDArray[np.int64]:
 
 
 def _library(name: str) -> str:
-    """What Analysis is asked for to get the library that a log names: "cholmod 3.0.14", "NVIDIA H200, float64"."""
+    """Option of Analysis for a library as named in a log, such as "cholmod 3.0.14" or "NVIDIA H200, float64"."""
     gpu = next((f"gpu-{kind}" for kind in ("float32", "float64") if name.endswith(f", {kind}")), "")
     return gpu or next((known for known in ("cholmod", "superlu") if name.split()[0] == known), "auto")
 

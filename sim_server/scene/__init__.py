@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The scene: a TOML file with KEY=VALUE overrides, checked, with defaults filled in.
+"""Loads scenes: TOML files with KEY=VALUE overrides, validated, with defaults filled in.
 
 `load` reports everything that is wrong at once, as one InputError. It imports the effects that the scene lists and no
 others.
@@ -21,9 +21,9 @@ __all__ = ["Scene", "SceneObject", "load"]
 
 
 def load(path: str | Path, overrides: Sequence[str] = ()) -> Scene:
-    """The scene in the TOML file `path`, with KEY=VALUE `overrides` applied, checked.
+    """Returns the validated scene in the TOML file `path` with KEY=VALUE `overrides` applied.
 
-    Raises InputError with one line per error found.
+    Raises InputError with one line for each error.
     """
     path = Path(path)
     text = _text(path)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The effect tables of a scene: names looked up, the listed modules imported, their parameters validated."""
+"""Validates the effect tables of a scene: imports the effects that are listed and checks their parameters."""
 
 from typing import Any
 
@@ -16,10 +16,13 @@ BELONGS = {
 
 
 def checked_effects(scope: str, table: Any, context: Any = None) -> dict[str, BaseModel]:
-    """Validated parameters of each effect in `table`, in the order of the file.
+    """Returns the validated parameters of each effect in `table`, in the order of the file.
 
-    context: of the validation, with its `folder`. An effect is a table, or `true` for its defaults; one that is `false`
-    is absent. Raises ValidationError with every error in the table, each with its place.
+    An effect is a table, or `true` for its defaults; one that is `false` is absent. Raises ValidationError with every
+    error in the table, each with its place.
+
+    scope: "scene" or "object", where the table stands
+    context: of the validation, with the `folder` of the scene file
     """
     if not isinstance(table, dict):
         raise complaint("must be a table of effects, as { gravity = true }")
@@ -58,7 +61,7 @@ def _error(message: str, value: Any) -> ValidationError:
 
 
 def _moved(error: Any, name: str) -> InitErrorDetails:
-    """The same error, its place told from the table of effects."""
+    """Returns the same error with its place relative to the table of effects."""
     return InitErrorDetails(
         type=complaint(error["msg"], error["type"]), loc=(name, *error["loc"]), input=error["input"]
     )

@@ -8,24 +8,24 @@ from pydantic import Field, model_validator
 from sim_server.errors import InputError
 from sim_server.scene.parameters import Parameters, complaint
 
-ROUNDS = 1024  # of a step on a GPU, whose graph has them all
+MAX_STATES = 1024  # tried in a step on a GPU, whose graph of launches holds them all
 SchemeName = Literal["backward_euler", "newmark", "bdf2", "quasi_static"]
 
 
-class Integrator(Parameters):
-    """How a step goes from one state to the next, and how often it linearizes."""
+class IntegratorOptions(Parameters):
+    """The scheme of time integration, and the linearizations and line search of a step."""
 
     scheme: SchemeName = "backward_euler"
-    beta: float | None = Field(default=None, gt=0, le=1, description="of Newmark's scheme [-]; 1/4 if left out")
-    gamma: float | None = Field(default=None, ge=0.5, le=1, description="of Newmark's scheme [-]; 1/2 if left out")
+    beta: float | None = Field(default=None, gt=0, le=1, description="of Newmark's scheme [-]; default 1/4")
+    gamma: float | None = Field(default=None, ge=0.5, le=1, description="of Newmark's scheme [-]; default 1/2")
     linearizations: int = Field(default=1, ge=1, le=1000, description="most of them in a step; above 1: Newton-Raphson")
     tolerance: float = Field(
-        default=1e-4, gt=0, lt=1, description="of Newton-Raphson: nonlinear residual over the step's first |b|"
+        default=1e-4, gt=0, lt=1, description="of Newton-Raphson: nonlinear residual over the first |b| of the step"
     )
-    trials: int = Field(default=8, ge=0, le=100, description="of shorter ways in a line search, at most; 0: none")
+    trials: int = Field(default=8, ge=0, le=100, description="most shorter steps that a line search tries; 0: none")
 
     @model_validator(mode="after")
-    def _stable(self) -> "Integrator":
+    def _stable(self) -> "IntegratorOptions":
         if self.scheme != "newmark":
             if given := [name for name in ("beta", "gamma") if getattr(self, name) is not None]:
                 raise complaint(f"{' and '.join(given)} belong to scheme newmark, not to {self.scheme}")
@@ -40,22 +40,22 @@ class Integrator(Parameters):
 
     @property
     def needs_stiff_matrix(self) -> bool:
-        """The energy grows unless the stiffness in A is at least the slope of the forces (integrator.py)."""
+        """True if the energy grows unless the stiffness in A is at least the slope of the forces (integrator.py)."""
         return self.scheme in ("newmark", "bdf2") and self.linearizations == 1
 
     @property
     def newmark(self) -> tuple[float, float]:
-        """beta and gamma [-]."""
+        """Newmark's beta and gamma [-]."""
         return (0.25 if self.beta is None else self.beta, 0.5 if self.gamma is None else self.gamma)
 
     def impulse(self, dt: float) -> float:
-        """What forces are multiplied by to become a change of momentum [s]."""
+        """Coefficient i [s] of the forces in M (v' - V) = i f (integrator.py)."""
         if self.scheme == "newmark":
             return self.newmark[1] * dt
         return 2 * dt / 3 if self.scheme == "bdf2" else dt
 
     def reach(self, dt: float) -> float:
-        """dx / dv at the end of the step [s]."""
+        """Derivative c = dx / dv [s] of positions by velocities at the end of the step (integrator.py)."""
         if self.scheme == "newmark":
             beta, gamma = self.newmark
             return beta * dt / gamma
@@ -63,13 +63,13 @@ class Integrator(Parameters):
 
     @property
     def rounds(self) -> int:
-        """Trials that a step has, at most."""
+        """Largest number of states that a step tries: each linearization and the shorter steps of its line search."""
         return self.linearizations * (1 + self.trials)
 
     def check_device(self, device: str) -> None:
-        """Raises InputError for what the device ("cpu" or "gpu") does not have."""
-        if device == "gpu" and self.linearizations > 1 and self.rounds > ROUNDS:
+        """Raises InputError for options that the device ("cpu" or "gpu") does not have."""
+        if device == "gpu" and self.linearizations > 1 and self.rounds > MAX_STATES:
             raise InputError(
                 f"integrator.linearizations = {self.linearizations} with trials = {self.trials}: a step on a GPU holds "
-                f"them all, {self.rounds}; allowed: linearizations * (1 + trials) up to {ROUNDS}"
+                f"them all, {self.rounds}; allowed: linearizations * (1 + trials) up to {MAX_STATES}"
             )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Validation errors in words: file, object, key = value, what is allowed; one line each."""
+"""Turns validation errors into messages, one line each: file, object, key = value, allowed values."""
 
 import re
 from typing import Any
@@ -9,8 +9,8 @@ from pydantic import ValidationError
 from sim_server.errors import InputError
 from sim_server.scene import deleted
 
-# Where pydantic's own words are about Python rather than about a scene file.
-WORDS = {
+# Messages of error types for which pydantic's own are about Python rather than about a scene file.
+MESSAGES = {
     "missing": "missing",
     "float_type": "must be a number",
     "int_type": "must be a whole number",
@@ -21,11 +21,11 @@ WORDS = {
     "model_type": "must be a table",
     "model_attributes_type": "must be a table",
 }
-LONGEST = 80  # characters of a value in a message
+MAX_VALUE = 80  # characters of a value in a message
 
 
 def readable(error: ValidationError, file: str, table: dict[str, Any]) -> InputError:
-    """One InputError for all of `error`, met while validating `table` read from `file`."""
+    """Returns one InputError for all errors of `error`, found in `table` as read from `file`."""
     return InputError("\n".join(f"scene {file}, {_line(e, table)}" for e in error.errors(include_url=False)))
 
 
@@ -48,7 +48,7 @@ def _message(error: Any) -> str:
         expected = error["msg"].removeprefix("Input should be ")
         return "must be " + expected.replace("True", "true").replace("False", "false")
     words = re.sub(r"^(Input|Tuple|List|String) should", "must", error["msg"])
-    return WORDS.get(error["type"], words.replace(" after validation", ""))
+    return MESSAGES.get(error["type"], words.replace(" after validation", ""))
 
 
 def _place(path: list[str | int], table: dict[str, Any]) -> str:
@@ -65,7 +65,7 @@ def _object(index: int, table: dict[str, Any]) -> str:
 
 
 def _dotted(path: list[str | int]) -> str:
-    """a.b[2].c; arrays are counted from 1, as people do."""
+    """Returns a path as text, such as a.b[2].c; elements of arrays are counted from 1."""
     text = ""
     for part in path:
         text += f"[{part + 1}]" if isinstance(part, int) else f".{part}"
@@ -74,4 +74,4 @@ def _dotted(path: list[str | int]) -> str:
 
 def _toml(value: Any) -> str:
     text = str(value).lower() if isinstance(value, bool) else repr(value)
-    return text if len(text) <= LONGEST else text[:LONGEST] + "..."
+    return text if len(text) <= MAX_VALUE else text[:MAX_VALUE] + "..."

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The tables of a scene file, checked, with defaults filled in. How a file becomes one: scene.py."""
+"""The tables of a scene file as pydantic models. `load` in __init__.py reads a file."""
 
 from dataclasses import replace
 from functools import partial
@@ -24,27 +24,29 @@ from protocol.refused import Refused
 from sim_server.errors import InputError
 from sim_server.mesh import Mesh, bar, check, read
 from sim_server.scene.effect_tables import checked_effects
-from sim_server.scene.integrator_options import Integrator
+from sim_server.scene.integrator_options import IntegratorOptions
 from sim_server.scene.parameters import Count, Counts, File, Parameters, Positive, Sizes, Vector, complaint
-from sim_server.scene.solver_options import Solver
+from sim_server.scene.solver_options import SolverOptions
 
 
 class Pose(Parameters):
-    """Where the object stands: turned about the fixed axes x, then y, then z, then moved."""
+    """Pose of an object: rotation about the fixed axes x, then y, then z, followed by a translation."""
 
     rotate: Vector = Field(default=(0.0, 0.0, 0.0), description="angles [degrees]")
     translate: Vector = Field(default=(0.0, 0.0, 0.0), description="[m]")
 
 
 class MeshSource(Parameters):
-    """{ bar = cells, size = m } or { file = path }."""
+    """Source of a mesh: { bar = cells, size = m } or { file = path }."""
 
     bar: Counts | None = Field(default=None, description="cells along x, y, z; each is split into 6 tetrahedra")
     size: Sizes | None = Field(default=None, description="size of the bar along x, y, z [m]")
     split: Literal["kuhn", "mirrored"] | None = Field(
-        default=None, description="of the cells of a bar: kuhn (default), or mirrored, which bends without twist"
+        default=None, description="split of the cells of a bar: kuhn (default), or mirrored, which bends without twist"
     )
-    scale: Positive | None = Field(default=None, description="of a file's coordinates: 0.001 for a mesh in mm")
+    scale: Positive | None = Field(
+        default=None, description="scale of the coordinates in a file: 0.001 for a mesh in mm"
+    )
     file: File | None = Field(default=None, description="a file that meshio reads")
 
     @model_validator(mode="after")
@@ -67,7 +69,7 @@ def _object_name(name: str) -> str:
 
 
 def _effects(scope: str) -> tuple[PlainValidator, PlainSerializer]:
-    """A table of effects of one scope; it dumps as it was validated, one table per effect."""
+    """Returns the validator and the serializer of a table of effects of one scope."""
     return PlainValidator(partial(_effects_of, scope)), PlainSerializer(_dumped_effects)
 
 
@@ -95,7 +97,7 @@ class SceneObject(Parameters):
     _given: Mesh | None = PrivateAttr(None)
 
     def use_mesh(self, mesh: Mesh) -> None:
-        """Instead of the one that `mesh` names."""
+        """Sets the mesh to be used instead of the one that `mesh` names."""
         self._given = mesh
 
     @model_validator(mode="before")
@@ -112,7 +114,7 @@ class SceneObject(Parameters):
         return self
 
     def load_mesh(self) -> Mesh:
-        """The checked mesh at rest, before the pose. Raises InputError naming the object."""
+        """Returns the checked mesh at rest, before the pose. Raises InputError that names the object."""
         if self._given is not None:
             return self._given
         source = self.mesh
@@ -126,10 +128,12 @@ class SceneObject(Parameters):
             raise InputError(f"object {self.name!r}: {error}") from error
 
 
-class Record(Parameters):
-    """What a log holds."""
+class RecordOptions(Parameters):
+    """The [record] table: what a log holds."""
 
-    every: Count = Field(default=1, description="a state frame each k-th step; per-step scalars are always recorded")
+    every: Count = Field(
+        default=1, description="steps from one state frame to the next; per-step scalars are always recorded"
+    )
     compression: Literal["lz4", "zstd", "none"] = "lz4"
 
 
@@ -143,14 +147,14 @@ def _some_objects(objects: list[SceneObject]) -> list[SceneObject]:
 
 
 class Scene(Parameters):
-    """A whole scene file. `resolved()` is a valid scene again."""
+    """A whole scene file."""
 
     dt: Positive = Field(description="time step [s]")
     name: Annotated[str, Field(min_length=1, max_length=200)]
     effects: Annotated[dict[str, BaseModel], *_effects("scene")] = Field(default_factory=dict)
-    integrator: Integrator = Integrator()
-    solver: Solver = Solver()
-    record: Record = Record()
+    integrator: IntegratorOptions = IntegratorOptions()
+    solver: SolverOptions = SolverOptions()
+    record: RecordOptions = RecordOptions()
     objects: Annotated[list[SceneObject], AfterValidator(_some_objects)] = Field(alias="object")
 
     _path: Path = PrivateAttr(Path())
@@ -167,7 +171,7 @@ class Scene(Parameters):
 
     @model_validator(mode="after")
     def _as_the_integrator_needs(self) -> "Scene":
-        """Effects whose parameters depend on the scheme of the scene have a method `under(integrator)`."""
+        """Adapts effects whose parameters depend on the scheme: they have a method `under(integrator)`."""
         errors: list[InitErrorDetails] = []
         for index, o in enumerate(self.objects):
             for name, params in o.effects.items():
@@ -182,11 +186,11 @@ class Scene(Parameters):
 
     @property
     def projection(self) -> Literal["excess", "clamp", "absolute", "none"]:
-        """solver.projection, chosen if "auto": excess where nothing but the matrix keeps a step from overshooting."""
+        """solver.projection; for "auto": excess if only the matrix keeps a step from overshooting, else clamp."""
         if self.solver.projection != "auto":
             return self.solver.projection
-        alone = self.integrator.linearizations == 1 and self.integrator.scheme != "quasi_static"
-        return "excess" if alone else "clamp"
+        single = self.integrator.linearizations == 1 and self.integrator.scheme != "quasi_static"
+        return "excess" if single else "clamp"
 
     @property
     def path(self) -> Path:
@@ -199,5 +203,5 @@ class Scene(Parameters):
         return self._text
 
     def resolved(self) -> dict[str, Any]:
-        """The scene with defaults filled in, of JSON types only, with the keys of a scene file."""
+        """Returns the scene with defaults, as JSON types with the keys of a scene file: a valid scene again."""
         return self.model_dump(mode="json", by_alias=True, exclude_none=True)

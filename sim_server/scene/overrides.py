@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""KEY=VALUE overrides of a scene: ``--set solver.tolerance=1e-8`` on the command line."""
+"""Applies KEY=VALUE overrides to a scene: ``--set solver.tolerance=1e-8`` on the command line."""
 
 import re
 import tomllib
@@ -10,10 +10,10 @@ from sim_server.scene.parameters import nearest
 
 
 def apply(override: str, table: dict[str, Any]) -> None:
-    """Set one value of a parsed scene: ``solver.tolerance=1e-8``, ``object.NAME.effects.corotational.young=1e6``.
+    """Sets one value of a parsed scene: ``solver.tolerance=1e-8``, ``object.NAME.effects.corotational.young=1e6``.
 
-    Tables on the way are made if they are missing, so an override may list an effect; whether the key exists is left
-    to the validation. Raises InputError for an unknown object or a key below something that is no table.
+    Missing tables on the way are created, so that an override may list an effect. The validation of the scene finds
+    unknown keys. Raises InputError for an unknown object or a key below a value that is no table.
     """
     key, equals, text = override.partition("=")
     key = key.strip()
@@ -45,7 +45,7 @@ def _tables(value: Any) -> bool:
 
 
 def _object(key: str, table: dict[str, Any]) -> tuple[dict[str, Any], str]:
-    """The object's table and the key inside it. Names may hold dots, so the longest name that fits wins."""
+    """Returns the table of an object and the key inside it. Names may hold dots, so the longest matching name wins."""
     entries = table.get("object")
     entries = [e for e in entries if isinstance(e, dict)] if isinstance(entries, list) else []
     named = {e["name"]: e for e in entries if isinstance(e.get("name"), str)}
@@ -58,7 +58,7 @@ def _object(key: str, table: dict[str, Any]) -> tuple[dict[str, Any], str]:
 
 
 def value(text: str) -> Any:
-    """`text` as a TOML value; a bare word that is not TOML is a string."""
+    """Parses `text` as a TOML value; a bare word that is not TOML is a string."""
     try:
         parsed = tomllib.loads(f"value = {text}")
     except (tomllib.TOMLDecodeError, RecursionError) as error:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Base of everything that is read from a scene file: strict types, no unknown keys, finite numbers.
+"""Base class of all tables of a scene file: strict types, no unknown keys, finite numbers.
 
 The tables of a scene and the `Params` of each effect derive from `Parameters`, so that one wrong key or value is
 reported in the same words everywhere, together with the keys that exist.
@@ -28,7 +28,7 @@ from sim_server.scene import where
 
 
 class Parameters(BaseModel):
-    """A table of a scene file. TOML types are taken as they are: "1" is no number and 1 is no boolean."""
+    """A table of a scene file. Types are strict: "1" is no number and 1 is no boolean."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
@@ -51,19 +51,19 @@ def _with_known_keys(error: Any, known: list[str]) -> InitErrorDetails:
 
 
 def complaint(message: str, kind: str = "refused") -> PydanticCustomError:
-    """An error of a validator; its message stands in the report as it is, after the place and the value."""
+    """Returns an error for a validator to raise; the report shows its message unchanged, after place and value."""
     return PydanticCustomError(kind, "{message}", {"message": message})  # type: ignore[arg-type]
 
 
 def nearest(word: str, known: list[str], what: str) -> str:
-    """The end of a message about an unknown word: the nearest known ones, then all."""
-    near = get_close_matches(word, known, n=3, cutoff=0.6)
-    guess = f"; did you mean {' or '.join(repr(n) for n in near)}?" if near else ""
+    """Returns the end of a message about an unknown word: the most similar known ones, then all."""
+    similar = get_close_matches(word, known, n=3, cutoff=0.6)
+    guess = f"; did you mean {' or '.join(repr(n) for n in similar)}?" if similar else ""
     return f"{guess} (known {what}: {', '.join(sorted(known))})"
 
 
 def as_tuple(value: Any) -> Any:
-    """An array of TOML as the tuple that it stands for."""
+    """Converts an array of TOML to a tuple; other values stay as they are."""
     return tuple(value) if isinstance(value, list) else value
 
 

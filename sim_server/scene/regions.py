@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: MIT
-"""Material constants that differ from region to region of an object, chosen per element by its centroid."""
+"""Material constants by region of an object; the region of an element is found by its centroid."""
 
 import logging
 from collections.abc import Mapping
 from typing import Annotated, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import AfterValidator, Discriminator, Field, Tag, ValidationError, create_model, model_validator
 from pydantic_core import InitErrorDetails
 from pydantic_core.core_schema import ValidatorFunctionWrapHandler
 
+from sim_server.arrays import Float64
 from sim_server.errors import InputError
 from sim_server.scene import where
 from sim_server.scene.parameters import Parameters, Positive, Where, complaint
@@ -20,23 +20,23 @@ log = logging.getLogger(__name__)
 Poisson = Annotated[float, Field(gt=-1, lt=0.5)]  # positive definite in between; below 0: auxetic
 
 
-class Place(Parameters):
-    """Elements whose centroid satisfies `where`, or all that are left if there is none."""
+class Selection(Parameters):
+    """Selects the elements whose centroid satisfies `where`, or all remaining ones without it."""
 
     where: Where | None = Field(default=None, description="an expression in X, Y, Z, the rest coordinates [m]")
 
 
-class Region(Place):
-    """A place with the constants of linear elasticity."""
+class Region(Selection):
+    """Selected elements and their constants of linear elasticity."""
 
     young: Positive = Field(description="Young's modulus [Pa]")
-    poisson: Poisson | None = Field(default=None, description="Poisson's ratio [-]; default: that of the object")
+    poisson: Poisson | None = Field(default=None, description="Poisson's ratio [-]; default: the one of the object")
 
 
 class Regional(Parameters):
     """Constants of a material. The first field may be a list of regions.
 
-    A field behind it whose default is None is required, unless every region gives it.
+    A later field whose default is None is required, unless every region gives it.
     """
 
     @model_validator(mode="wrap")
@@ -45,7 +45,7 @@ class Regional(Parameters):
         made = validate(table)
         first, *others = cls.model_fields
         regions = getattr(made, first)
-        regions = regions if isinstance(regions, list) and isinstance(regions[0], Place) else [made]
+        regions = regions if isinstance(regions, list) and isinstance(regions[0], Selection) else [made]
         missing = [
             name
             for name in others
@@ -59,7 +59,7 @@ class Regional(Parameters):
         return made
 
 
-def _last_takes_the_rest(regions: list[Place]) -> list[Place]:
+def _last_takes_the_rest(regions: list[Selection]) -> list[Selection]:
     if not regions:
         raise complaint("must have at least one region { where = ..., young = ... }")
     for i, region in enumerate(regions[:-1]):
@@ -69,7 +69,7 @@ def _last_takes_the_rest(regions: list[Place]) -> list[Place]:
 
 
 def _is_list_of_tables(value: Any) -> str:
-    tables = isinstance(value, list) and (not value or isinstance(value[0], (dict, Place)))
+    tables = isinstance(value, list) and (not value or isinstance(value[0], (dict, Selection)))
     return "<regions>" if tables else "<value>"
 
 
@@ -86,15 +86,16 @@ Young = Annotated[
 
 
 def by_region(kinds: Mapping[str, Any]) -> Any:
-    """Type of a law's first constant, which may be a list of regions instead of one value.
+    """Returns the type of the first constant of a law, which may be a list of regions instead of one value.
 
-    kinds: the types of all its constants by name. In each region the first one is required; those not given there are
-    the object's (see Regional).
+    In each region the first constant is required; others not given there are the ones of the object (see Regional).
+
+    kinds: types of all constants of the law, by name
     """
     first, *others = kinds
     fields: dict[str, Any] = {first: (kinds[first], Field(...))}
     fields |= {name: (kinds[name] | None, None) for name in others}
-    region = create_model(f"Region of {first}", __base__=Place, **fields)
+    region = create_model(f"Region of {first}", __base__=Selection, **fields)
     return Annotated[
         Annotated[kinds[first], Tag("<value>")]
         | Annotated[list[region], AfterValidator(_last_takes_the_rest), Tag("<regions>")],  # type: ignore[valid-type]
@@ -102,22 +103,23 @@ def by_region(kinds: Mapping[str, Any]) -> Any:
     ]
 
 
-def constants_by_region(
-    constants: Mapping[str, Any], points: NDArray[np.float64], unit: str = ""
-) -> dict[str, NDArray[np.float64]]:
-    """Each constant of each element by name: (m,), or (m, 3) for vectors.
+def constants_by_region(constants: Mapping[str, Any], points: Float64, unit: str = "") -> dict[str, Float64]:
+    """Returns each constant of each element by name: (m,), or (m, 3) for vectors.
+
+    Raises InputError for an element in no region.
 
     constants: by name as in the scene; the first may be a list of regions, of which the first that holds at the
-    centroid wins. points: centroids at rest, before the pose [m], (m, 3). unit: of the first, for messages. Raises
-    InputError for an element in no region.
+        centroid wins
+    points: centroids at rest, before the pose [m], (m, 3)
+    unit: of the first constant, for messages
     """
     first, *others = constants
     regions = constants[first]
     if not isinstance(regions, list):
         return {name: _everywhere(value, len(points)) for name, value in constants.items()}
-    # None: given in each region, whose values then replace those of the first
-    beside = {n: getattr(regions[0], n) if constants[n] is None else constants[n] for n in others}
-    chosen = {name: _everywhere(value, len(points)) for name, value in beside.items()}
+    # A constant that is None is given in each region, whose values replace the ones of the first region below.
+    chosen_others = {n: getattr(regions[0], n) if constants[n] is None else constants[n] for n in others}
+    chosen = {name: _everywhere(value, len(points)) for name, value in chosen_others.items()}
     chosen = {first: np.zeros((len(points), *np.shape(getattr(regions[0], first)))), **chosen}
     left = np.ones(len(points), dtype=bool)
     for i, region in enumerate(regions):
@@ -140,13 +142,11 @@ def constants_by_region(
     return chosen
 
 
-def _everywhere(value: Any, elements: int) -> NDArray[np.float64]:
+def _everywhere(value: Any, elements: int) -> Float64:
     return np.broadcast_to(np.asarray(value, float), (elements, *np.shape(value))).copy()
 
 
-def region_values(
-    young: float | list[Region], poisson: float | None, points: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Young's modulus [Pa] and Poisson's ratio of each element: two arrays (m,); see constants_by_region."""
+def region_values(young: float | list[Region], poisson: float | None, points: Float64) -> tuple[Float64, Float64]:
+    """Returns Young's modulus [Pa] and Poisson's ratio [-] of each element, (m,) each; see constants_by_region."""
     found = constants_by_region({"young": young, "poisson": poisson}, points, "Pa")
     return found["young"], found["poisson"]

@@ -9,23 +9,23 @@ from pydantic import Field, PlainSerializer, PlainValidator
 from protocol.method import Method
 from sim_server.errors import InputError
 from sim_server.scene.parameters import Parameters, complaint
-from sim_server.schedule import Rule
 
 Preconditioner = Literal[
     "auto", "none", "jacobi", "block_jacobi", "ssor", "ssor_factor", "incomplete_cholesky", "cholesky"
 ]
 PRECONDITIONERS: tuple[str, ...] = get_args(Preconditioner)
-FACTORS = ("cholesky", "incomplete_cholesky", "ssor_factor")  # made elsewhere, from an older matrix
-CPU_ONLY = ("ssor", "ssor_factor", "incomplete_cholesky")  # sweeps and sparse solves follow one row after another
+FACTORS = ("cholesky", "incomplete_cholesky", "ssor_factor")  # made by workers, from an older matrix
+CPU_ONLY = ("ssor", "ssor_factor", "incomplete_cholesky")  # sweeps and sparse solves are sequential
 
 
 class Update(NamedTuple):
-    """When a factor is renewed: kind and n (0 for never and async).
+    """The update policy of factors: kind, and n for every and lockstep.
 
-    never: made once, from the first matrix. every: made at each n-th step, the step waiting for it.
-    async: made beside the simulation, adopted when it comes. adaptive: as async, but only when the iterations lost to
-    an old factor have cost as much as a new one. lockstep: as async, but adopted exactly n steps after the step that
-    its matrix is from; deterministic.
+    never: one factor, made from the first matrix
+    every: a factor at each n-th step, which waits for it
+    async: made while the simulation runs, used once it is there
+    adaptive: as async, but only when the iterations lost to an old factor have cost as much as a new one
+    lockstep: as async, but used exactly n steps after the step of its matrix; deterministic
     """
 
     kind: Literal["never", "every", "async", "adaptive", "lockstep"]
@@ -33,7 +33,7 @@ class Update(NamedTuple):
 
     @property
     def free(self) -> bool:
-        """Nothing ever waits for a factor: the loop runs by itself."""
+        """True if no step waits for a factor."""
         return self.kind in ("async", "adaptive")
 
     def __str__(self) -> str:
@@ -58,10 +58,11 @@ def _preconditioner(value: Any) -> str:
     raise complaint(f"must be one of {', '.join(PRECONDITIONERS)}")
 
 
+Rule = Literal["excess", "round_robin"]
 Precision = Literal["float64", "mixed", "float32"]
 OnRunaway = Literal["freeze", "go_on"]
 FactorPrecision = Literal["auto", "float16", "float32", "float64"]
-_ONLY: dict[str, dict[str, tuple[str, ...]]] = {  # what the devices have
+_ALLOWED: dict[str, dict[str, tuple[str, ...]]] = {  # values by option and device
     "preconditioner": {
         "cpu": PRECONDITIONERS,
         "gpu": tuple(p for p in PRECONDITIONERS if p not in CPU_ONLY),
@@ -71,25 +72,27 @@ _ONLY: dict[str, dict[str, tuple[str, ...]]] = {  # what the devices have
 }
 
 
-class Solver(Parameters):
-    """How each step's linear system is solved."""
+class SolverOptions(Parameters):
+    """Options of the solution of the linear system of a step, and of the updates of its preconditioner."""
 
-    tolerance: float = Field(default=1e-6, gt=0, lt=1, description="of the true residual: |b - A dv| <= tolerance |b|")
+    tolerance: float = Field(
+        default=1e-6, gt=0, lt=1, description="bound of the true residual: |b - A dv| <= tolerance |b|"
+    )
     max_iterations: int = Field(default=500, ge=1, le=1_000_000)
     preconditioner: Annotated[Preconditioner, PlainValidator(_preconditioner)] = "auto"
     omega: float = Field(default=1.0, gt=0, lt=2, description="relaxation of ssor and ssor_factor")
     drop_tolerance: float = Field(
-        default=0.003, ge=0, lt=1, description="of a row's norm; incomplete_cholesky leaves out smaller blocks of L"
+        default=0.003, ge=0, lt=1, description="incomplete_cholesky drops blocks of L below this times a row's norm"
     )
     fill: float = Field(
-        default=10.0, ge=0, le=1e6, description="most blocks of a column of incomplete_cholesky, in A's; 0 = no bound"
+        default=10.0, ge=0, le=1e6, description="incomplete_cholesky: most blocks in a column, over A's; 0 = no bound"
     )
     warp: bool = Field(default=True, description="solve in the material frame")
     warp_level: int = Field(
-        default=1, ge=1, le=2, description="neighbours that give a node its rotation where its elements have none"
+        default=1, ge=1, le=2, description="rings of neighbours that rotate a node whose elements have no rotation"
     )
     projection: Literal["auto", "excess", "clamp", "absolute", "none"] = Field(
-        default="auto", description="what becomes of negative eigenvalues of an element's stiffness"
+        default="auto", description="treatment of negative eigenvalues of the stiffness of an element"
     )
     update: Annotated[Update, PlainValidator(_update), PlainSerializer(str)] = Update("async")
     precision: Precision = Field(
@@ -100,20 +103,20 @@ class Solver(Parameters):
     )
     budget: float = Field(default=0.0, ge=0, description="wall time per solve [s]; 0 = none")
     on_runaway: OnRunaway = Field(
-        default="freeze", description="what becomes of a body with more energy than it can have come by"
+        default="freeze", description="treatment of a body with more energy than accounted for"
     )
     threads: int = Field(default=1, ge=1, le=1024)
     warm_start: bool = Field(default=True, description="start from the last step's dv")
     woodbury: int = Field(
         default=32, ge=0, le=64,
-        description="on a CPU: factors are corrected for grabs begun or ended since, of at most so many nodes; 0: none",
+        description="on a CPU: correct factors for grabs begun or ended since, of at most this many nodes; 0: off",
     )  # fmt: skip
     build: Literal["server", "worker"] = Field(
-        default="server", description="who assembles the matrices to factorize; worker: it is sent positions"
+        default="server", description="where the matrices to factorize are assembled; worker: positions are sent"
     )
     extrapolate: float = Field(
         default=0.0, ge=0, le=10,
-        description="build = worker: positions go out as x + v t, t what a factor is expected to take, at most so [s]",
+        description="build = worker: x + v t is sent, t the expected time until the factor is used, at most this [s]",
     )  # fmt: skip
     update_floor_iterations: int = Field(
         default=3, ge=0, le=1_000_000, description="iterations above this count as excess"
@@ -123,21 +126,21 @@ class Solver(Parameters):
     )
     update_threshold: float = Field(
         default=1.0, ge=0, le=1e6,
-        description="adaptive: excess iterations must have cost so many times what a factorization takes",
+        description="adaptive: excess iterations must have cost this multiple of the time of a factorization",
     )  # fmt: skip
-    schedule: Rule = Field(default="excess", description="whose matrix is factorized next")
+    schedule: Rule = Field(default="excess", description="rule by which the next object to be factorized is chosen")
     schedule_rounds: float = Field(
-        default=8.0, ge=1, le=1e6, description="an object goes next after so many rounds, whatever the rule"
+        default=8.0, ge=1, le=1e6, description="an object goes next after this many rounds, under any rule"
     )
 
     @property
     def wants_factors(self) -> bool:
-        """Matrices go out to be factorized."""
+        """True if matrices are sent to be factorized."""
         return self.preconditioner == "auto" or self.preconditioner in FACTORS
 
     @property
     def method(self) -> Method:
-        """What is made of a matrix; "auto": unless it chooses another of its `choices`."""
+        """The method by which factors are made; with "auto", the default of its `choices`."""
         if self.preconditioner == "incomplete_cholesky":
             return self._incomplete
         return Method("ssor", omega=self.omega) if self.preconditioner == "ssor_factor" else Method()
@@ -147,9 +150,10 @@ class Solver(Parameters):
         return Method("incomplete_cholesky", drop_tolerance=self.drop_tolerance, fill=self.fill)
 
     def choices(self, device: str) -> tuple[Method, ...]:
-        """Methods that "auto" may choose from on a device, the one to begin with first; empty without "auto".
+        """Methods that "auto" may choose from on a device, the first one to begin with; empty without "auto".
 
-        The incomplete factor is the first to come. It is for CPUs, and one that is made once and for ever is exact.
+        The incomplete factor comes first since it is made fastest. On a GPU, and where one factor is made for the whole
+        run, only the exact factor is used.
         """
         if self.preconditioner != "auto":
             return ()
@@ -157,18 +161,18 @@ class Solver(Parameters):
         return (Method(),) if exact else (self._incomplete, Method())
 
     def method_named(self, name: str) -> Method:
-        """That of a factor in a log; "": the scene's."""
+        """The method of a factor in a log, by name; "": the one of the scene."""
         known = {m.name: m for m in (Method(), self._incomplete)}
         return self.method if self.preconditioner != "auto" else known.get(name, Method())
 
     @property
     def factor_dtype(self) -> Literal["float32", "float64"]:
-        """Of the values of L on the wire; what is applied is made from them."""
+        """Type of the values of L as sent; the applied factor is made from them."""
         return "float64" if self.factor_precision == "float64" else "float32"
 
     def check_device(self, device: str) -> None:
-        """Raises InputError for what the device ("cpu" or "gpu") does not have."""
-        for field, allowed in _ONLY.items():
+        """Raises InputError for options that the device ("cpu" or "gpu") does not have."""
+        for field, allowed in _ALLOWED.items():
             value = getattr(self, field)
             if value not in allowed[device]:
                 words = ", ".join(repr(a) for a in allowed[device])

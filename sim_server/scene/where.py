@@ -2,8 +2,8 @@
 """Safe expressions that select nodes or elements by rest position, such as ``X < 0.01 and abs(Y - 1) <= 0.5``.
 
 X, Y, Z are rest coordinates [m], before the pose. The text is parsed with `ast`, checked against a whitelist and
-evaluated over arrays; nothing of it is ever executed by Python. `and` and `or` look at their right side only where
-the left side has not decided yet, as in Python, so ``X > 0 and 1/X < 3`` is safe at X = 0.
+evaluated over arrays; Python never executes it. `and` and `or` evaluate their right side only where the left side has
+not decided yet, as in Python, so ``X > 0 and 1/X < 3`` is safe at X = 0.
 """
 
 import ast
@@ -16,14 +16,15 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_server.arrays import Float64
 from sim_server.errors import InputError
 
 ALLOWED = (
     "allowed: the rest coordinates X, Y, Z [m], numbers, + - * / **, comparisons (< <= > >= == !=, also chained), "
     "and, or, not, parentheses, abs(a), sqrt(a), min(a, b, ...), max(a, b, ...), true"
 )
-LONGEST = 1000  # characters
-DEEPEST = 40  # levels of the syntax tree; bounds the recursion here and in ast.unparse
+MAX_LENGTH = 1000  # characters
+MAX_DEPTH = 40  # levels of the syntax tree; bounds the recursion here and in ast.unparse
 
 Kind = Literal["number", "truth"]
 AXES = {"X": 0, "Y": 1, "Z": 2}
@@ -48,8 +49,8 @@ UNARY: dict[str, Callable] = {"abs": np.abs, "sqrt": np.sqrt}
 FOLDED: dict[str, Callable] = {"min": np.minimum, "max": np.maximum}
 
 
-def mask(expression: str, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Where `expression` holds: bool (n,) for `points` (n, 3) [m].
+def mask(expression: str, points: Float64) -> NDArray[np.bool_]:
+    """Evaluates `expression` at `points` (n, 3) [m]; returns bool (n,).
 
     Raises InputError if the text is not allowed, or if a value in it is not finite at some point.
     """
@@ -60,15 +61,15 @@ def mask(expression: str, points: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def parse(expression: str) -> ast.expr:
-    """The checked syntax tree of `expression`; raises InputError that says what is wrong and what is allowed."""
-    if len(expression) > LONGEST:
-        raise InputError(f"longer than {LONGEST} characters; {ALLOWED}")
+    """Returns the checked syntax tree of `expression`; raises InputError that says what is wrong and allowed."""
+    if len(expression) > MAX_LENGTH:
+        raise InputError(f"longer than {MAX_LENGTH} characters; {ALLOWED}")
     try:
         tree = ast.parse(" ".join(expression.split()), mode="eval").body
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
         raise InputError(f"cannot be read ({_reason(error)}); {ALLOWED}") from None
-    if _depth(tree) > DEEPEST:
-        raise InputError(f"nested more than {DEEPEST} levels deep; {ALLOWED}")
+    if _depth(tree) > MAX_DEPTH:
+        raise InputError(f"nested more than {MAX_DEPTH} levels deep; {ALLOWED}")
     try:
         _expect(tree, "truth")
     except InputError as error:
@@ -84,7 +85,7 @@ def _depth(tree: ast.AST) -> int:
 
 
 def shortened(text: str, longest: int = 80) -> str:
-    """`text` quoted for a message, cut after `longest` characters."""
+    """Quotes `text` for a message, cut after `longest` characters."""
     return repr(text if len(text) <= longest else text[:longest] + "...")
 
 
@@ -100,7 +101,7 @@ def _expect(node: ast.expr, kind: Kind) -> None:
 
 
 def _kind(node: ast.expr) -> Kind:
-    """What a whitelisted node yields; its children are checked on the way."""
+    """Returns the kind of value of a whitelisted node; checks its children on the way."""
     match node:
         case ast.BoolOp(values=values):
             return _checked("truth", values, "truth")
@@ -156,7 +157,7 @@ def _check_number(value: int | float) -> None:
         raise InputError("a number is too large for 64-bit floats")
 
 
-def _truth(node: ast.expr, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _truth(node: ast.expr, points: Float64) -> NDArray[np.bool_]:
     match node:
         case ast.BoolOp(op=op, values=[first, *rest]):
             held = _truth(first, points)
@@ -173,7 +174,7 @@ def _truth(node: ast.expr, points: NDArray[np.float64]) -> NDArray[np.bool_]:
     return np.ones(len(points), dtype=bool)  # true
 
 
-def _number(node: ast.expr, points: NDArray[np.float64]) -> NDArray[np.float64]:
+def _number(node: ast.expr, points: Float64) -> Float64:
     match node:
         case ast.Name(id=name):
             return points[:, AXES[name]]
@@ -188,7 +189,7 @@ def _number(node: ast.expr, points: NDArray[np.float64]) -> NDArray[np.float64]:
     return values
 
 
-def _computed(node: ast.expr, points: NDArray[np.float64]) -> NDArray[np.float64]:
+def _computed(node: ast.expr, points: Float64) -> Float64:
     match node:
         case ast.BinOp(left=left, op=op, right=right):
             return ARITHMETIC[type(op)](_number(left, points), _number(right, points))

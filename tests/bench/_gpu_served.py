@@ -60,7 +60,7 @@ class Served:
         self.link.announce(describe.topology(self.sim, body))
         arguments = ("--device", "gpu") if self._worker == "gpu" else ()
         self._supervisor = Supervisor(1, "bench", [self._endpoint], arguments)
-        self.driver = Driver(self.sim, self.link)
+        self.driver = Driver(self.sim, self.link.dispatch)
         self.engine.loop.stop = 0
         self._thread = threading.Thread(target=self._loop)
         self._thread.start()

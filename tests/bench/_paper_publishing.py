@@ -50,7 +50,7 @@ class Published:
     sent: set[int] = field(default_factory=set)
 
     def __post_init__(self) -> None:
-        self.driver = Driver(self.sim, self.link, counted=False)
+        self.driver = Driver(self.sim, self.link.dispatch, counted=False)
         self.driver.adopted = self._adopted
         submit = self.link.dispatch.submit
 

@@ -7,7 +7,8 @@ from typing import get_args
 
 import pytest
 
-from sim_server.schedule import Need, Rule, excess, oldest_possible, one_round, overdue_after, pays, pick
+from sim_server.scene.solver_options import Rule
+from sim_server.schedule import Need, excess, oldest_possible, one_round, overdue_after, pays, pick
 
 NEW, BUSY = None, True
 RULES = get_args(Rule)

@@ -6,7 +6,7 @@ import pytest
 
 from sim_server.errors import InputError
 from sim_server.scene import load
-from sim_server.scene.integrator_options import Integrator
+from sim_server.scene.integrator_options import IntegratorOptions
 from sim_server.scene.model import Scene
 from tests.scenes import bar, scene, simulation
 
@@ -78,11 +78,11 @@ def test_negative_eigenvalues_by_default():
 
 
 def test_a_gpu_has_room_for_so_many_trials():
-    Integrator(scheme="bdf2", trials=100).check_device("gpu")
-    Integrator(linearizations=113).check_device("gpu")
-    Integrator(linearizations=300).check_device("cpu")
+    IntegratorOptions(scheme="bdf2", trials=100).check_device("gpu")
+    IntegratorOptions(linearizations=113).check_device("gpu")
+    IntegratorOptions(linearizations=300).check_device("cpu")
     with pytest.raises(InputError, match=r"linearizations = 114 with trials = 8: .* 1026; allowed: .* up to 1024"):
-        Integrator(linearizations=114).check_device("gpu")
+        IntegratorOptions(linearizations=114).check_device("gpu")
 
 
 def test_the_default_has_the_launches_of_backward_euler_alone():

@@ -4,7 +4,7 @@
 import pytest
 
 from sim_server.errors import InputError
-from sim_server.scene.solver_options import Solver
+from sim_server.scene.solver_options import SolverOptions
 from tests.scenes import bar, simulation
 
 WRONG = {
@@ -21,7 +21,7 @@ WRONG = {
 @pytest.mark.parametrize(("given", "message"), WRONG.items(), ids=" ".join)
 def test_what_a_device_does_not_have_is_named(given, message):
     field, value, device = given
-    solver = Solver.model_validate({field: value})
+    solver = SolverOptions.model_validate({field: value})
     with pytest.raises(InputError, match=message):
         solver.check_device(device)
     solver.check_device("gpu" if device == "cpu" else "cpu")
@@ -36,11 +36,11 @@ def test_a_simulation_asks():
     ("precision", "wire"), [("auto", "float32"), ("float16", "float32"), ("float32", "float32"), ("float64", "float64")]
 )
 def test_values_of_l_travel_as(precision, wire):
-    assert Solver(factor_precision=precision).factor_dtype == wire
+    assert SolverOptions(factor_precision=precision).factor_dtype == wire
 
 
 def test_a_budget_of_wall_time_is_for_cpus():
-    solver = Solver(budget=1e-3)
+    solver = SolverOptions(budget=1e-3)
     solver.check_device("cpu")
     with pytest.raises(InputError, match=r"solver\.budget = 0\.001: must be 0 on a GPU"):
         solver.check_device("gpu")

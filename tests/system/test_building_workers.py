@@ -51,7 +51,7 @@ def test_a_run_with_positions_alone_repeats_the_run_with_matrices() -> None:
             link.set_scene(describe.scene(sim))
             link.announce(describe.topology(sim, sim.world.bodies[0]))
             Driver(link).until(link.dispatch.workers, "a worker")
-            records = Loop(sim, link).advance(15)
+            records = Loop(sim, link.dispatch).advance(15)
             sent.append(link.counters.bytes_out / link.counters.jobs)
             ends.append((records["iterations"].tolist(), sim.world.x.tobytes()))
     assert ends[0] == ends[1]
@@ -67,7 +67,7 @@ def test_while_something_is_grabbed_the_matrix_is_sent() -> None:
         link.set_scene(describe.scene(sim))
         link.announce(describe.topology(sim, sim.world.bodies[0]))
         Driver(link).until(link.dispatch.workers, "a worker")
-        loop = Loop(sim, link)
+        loop = Loop(sim, link.dispatch)
         held = touch.grab("me", "bar", (4, 1, 1), 0.0, (2, 3, 0), 1e4, 0.0, 1e9)  # type: ignore[attr-defined]
         loop.advance(5)
         blocks, jobs = 72 * len(sim.system.columns), link.counters.jobs
