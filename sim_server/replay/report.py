@@ -47,7 +47,7 @@ class Comparison:
             self.first = {"step": step, "object": name, "what": what, "detail": detail}
 
     def factor(self, step: int, name: str, detail: str) -> None:
-        """Notes a factor that is not the recorded one. That is no divergence yet: the solves that use it will show one."""
+        """Notes a factor that is not the recorded one. No divergence by itself: the solves that use it show that."""
         if self.other_factor is None:
             self.other_factor = {"step": step, "object": name, "detail": detail}
 
