@@ -20,8 +20,8 @@ from sim_server import layouts
 from sim_server.backend import Launch, native
 from sim_server.energy import Energies, NativeEnergies
 from sim_server.layouts import RECORD
+from sim_server.newton import Newton
 from sim_server.rings import Reports
-from sim_server.scene.integrator_options import IntegratorOptions
 
 Reals = NDArray[np.float64]
 HISTORY = 1024  # changes of the diagonal that are remembered, of each body
@@ -107,33 +107,22 @@ class Mailbox:
     in_use: NativeFactor | None = None  # as far as the mailbox has told
 
 
-class Newton:
-    """What the search for the state at the end of a step (kernels/search.cuh) needs, and its memory on a CPU.
+class _NativeNewton:
+    """The input of Newton-Raphson and its memory, attached to a loop and its launches."""
 
-    options: of the scene, linearizations, trials, tolerance; reach [s]. parts: (bodies + 1,) items of each body, per
-    assembling launch, or None where they are not told apart. arrays: rotation (n, 3, 3), mass (n,), beta (n,), ahead,
-    drift, carried (n, 3).
-    """
-
-    def __init__(
-        self, options: IntegratorOptions, reach: float, parts: Sequence[NDArray[np.int32] | None],
-        **arrays: NDArray[Any],
-    ):  # fmt: skip
-        self.options, self.reach, self.parts, self.arrays = options, reach, parts, arrays
-
-    def attach(self, loop: layouts.Loop, launches: Any) -> "Newton":
-        """To a loop of the CPU and its launches."""
-        self._room = np.zeros((18, len(self.arrays["mass"])))
+    def __init__(self, newton: Newton, loop: layouts.Loop, launches: Any):
+        self._room = np.zeros((18, len(newton.arrays["mass"])))
         self._search = (layouts.Search * loop.bodies)()
-        options = self.options
-        self.native = layouts.Newton(options.linearizations, options.trials, options.tolerance, self.reach)
-        for name, array in {**self.arrays, "room": self._room}.items():
+        self._arrays = newton.arrays
+        options = newton.options
+        self.native = layouts.Newton(options.linearizations, options.trials, options.tolerance, newton.reach)
+        for name, array in {**newton.arrays, "room": self._room}.items():
             setattr(self.native, name, array.ctypes.data)
         self.native.search = self._search
         loop.newton = c.pointer(self.native)
-        for launch, part in zip(launches, self.parts, strict=False):
+        self._parts = newton.parts
+        for launch, part in zip(launches, newton.parts, strict=False):
             launch.parts = None if part is None else part.ctypes.data
-        return self
 
 
 class Engine(Reports):
@@ -173,7 +162,7 @@ class Engine(Reports):
         for name in ("row_start", "columns", "values", "b", "y", "x", "v", "clock", "moving"):
             setattr(loop, name, arrays[name].ctypes.data)
         loop.work, loop.threads = self._work.ctypes.data, threads
-        self._newton = newton and newton.attach(loop, self._launch)
+        self._newton = newton and _NativeNewton(newton, loop, self._launch)
         self._energies = energies and NativeEnergies(energies)
         if self._energies:
             loop.energies = c.pointer(self._energies.native)

@@ -40,7 +40,7 @@ import numpy as np
 
 from sim_server.backend import Launch
 from sim_server.effect import Effect
-from sim_server.engine import Newton
+from sim_server.newton import Newton
 from sim_server.scene import Scene
 from sim_server.system import Ints, System
 

@@ -41,3 +41,13 @@ def test_directions(package: str) -> None:
                 ours = module.split(".")[0] in ALLOWED
                 exempt = (package, module) in EXCEPTIONS and node not in tree.body
                 assert not ours or exempt or module.split(".")[0] in ALLOWED[package], f"{path} imports {module}"
+
+
+def test_scenes_know_nothing_of_what_is_built_from_them() -> None:
+    """Options stand where they are parsed. The registry of effects is looked up by name, effects themselves later."""
+    allowed = ("sim_server.arrays", "sim_server.effects", "sim_server.errors", "sim_server.mesh", "sim_server.scene")
+    for path in (ROOT / "sim_server" / "scene").glob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("sim_server"):
+                modules = [f"{node.module}.{alias.name}" for alias in node.names]
+                assert all(m.startswith(allowed) for m in modules), f"{path} imports {modules}"

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from protocol.factor import FactorPattern
 from sim_server.backend import HERE
 from sim_server.energy import Energies
-from sim_server.engine import Newton
 from sim_server.gpu.cuda import CudaDevice
 from sim_server.gpu.device import DeviceLaunch, Gpu
 from sim_server.gpu.energies import DeviceEnergies
@@ -26,6 +25,7 @@ from sim_server.gpu.loop import CAPACITY, MANY, DeviceLoop
 from sim_server.gpu.mailbox import Mailbox
 from sim_server.gpu.search import Search, Turns
 from sim_server.gpu.solver import BODY, RESULT, SETTINGS, Solver
+from sim_server.newton import Newton
 
 FEW = 16  # trials in a step up to which MANY steps make one graph
 TICK = np.dtype(

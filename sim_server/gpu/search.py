@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_server.backend import HERE
-from sim_server.engine import Newton
 from sim_server.gpu.device import DeviceLaunch, Gpu, compiled, options
 from sim_server.gpu.fuse import Guard, fused
 from sim_server.gpu.layouts import FOUND
 from sim_server.gpu.solver import Solver
 from sim_server.layouts import Search as SearchLayout
+from sim_server.newton import Newton
 
 STRETCH, LANES = 32, 8  # nodes of a thread block, threads of a node in `move`: search.cu
 SPAN = np.dtype([("body", "i4"), ("first", "i4"), ("last", "i4"), ("unused", "i4")])

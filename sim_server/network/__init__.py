@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""The server on the network: jobs for workers, their answers, what is published, what clients ask. Face: link.py."""
+"""The server on the network: link.py (session, published messages, commands) and dispatch.py (jobs and factors)."""
