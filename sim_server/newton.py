@@ -16,7 +16,7 @@ class Newton:
     options: of the scene
     reach: derivative dx / dv [s] of positions by velocities at the end of the step
     parts: (bodies + 1,) first item of each body in each assembling launch; None if a launch does not tell bodies apart
-    arrays: rotation (n, 3, 3), mass (n,), beta (n,), ahead, drift, carried (n, 3); on a GPU also settled (bodies,)
+    arrays: rotation (n, 3, 3), mass (n,), beta (n,), ahead, drift, carried (n, 3)
     """
 
     def __init__(

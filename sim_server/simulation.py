@@ -19,7 +19,6 @@ from sim_server.engine import Engine, Kind
 from sim_server.equilibrium import check_held
 from sim_server.errors import DeviceError, InputError
 from sim_server.integrator import Integrator
-from sim_server.newton import Newton
 from sim_server.scene import Scene, load
 from sim_server.shape import ShapeMatching
 from sim_server.system import System
