@@ -6,8 +6,8 @@ import socket
 
 import pytest
 
-from tests.bench._fault_net import FAR, Cable, Unavailable, command
-from tests.bench._fault_relay import BACKLOG, Way
+from tests.bench.faults.net import FAR, Cable, Unavailable, command
+from tests.bench.faults.relay import BACKLOG, Way
 
 FREE = {"loss": 0.0, "delay": 0.0, "rate": 0.0}
 

@@ -13,14 +13,15 @@ import pytest
 
 from sim_server.scene import load
 from sim_server.simulation import Simulation
-from tests.bench import _gpu_bytes as moved
-from tests.bench import _gpu_page as page
-from tests.bench import gpu, pages
-from tests.bench._gpu_others import lower
-from tests.bench._gpu_problem import BARS, MATERIALS, Problem
-from tests.bench._gpu_rows import row
-from tests.bench._gpu_served import row as served_row
-from tests.bench._gpu_steps import STEPS, Beams, rounds
+from tests.bench.gpu import __main__ as gpu
+from tests.bench.gpu import page
+from tests.bench.gpu import traffic as moved
+from tests.bench.gpu.others import lower
+from tests.bench.gpu.problem import BARS, MATERIALS, Problem
+from tests.bench.gpu.rows import row
+from tests.bench.gpu.served import row as served_row
+from tests.bench.gpu.steps import STEPS, Beams, rounds
+from tests.bench.harness import pages
 
 ROOT = Path(__file__).resolve().parents[2]
 DEVICE = {
@@ -130,8 +131,8 @@ def test_pieces_become_one_page(found: tuple[Beams, Any], tmp_path: Path) -> Non
 
 
 def test_without_a_gpu_one_line_and_code_2(tmp_path: Path) -> None:
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "CUDA_VISIBLE_DEVICES": ""}
-    command = [sys.executable, "tests/bench/gpu.py", "--out", str(tmp_path)]
+    environment = {**os.environ, "CUDA_VISIBLE_DEVICES": ""}
+    command = [sys.executable, "-m", "tests.bench.gpu", "--out", str(tmp_path)]
     result = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=60)
     assert result.returncode == 2 and result.stdout == ""
     assert result.stderr.startswith("bench gpu: ") and result.stderr.count("\n") == 1

@@ -10,9 +10,9 @@ import pytest
 
 from sim_server import backend
 from sim_server.gpu.device import PRECISIONS, options
-from tests.bench import _models as models
-from tests.bench import _models_time as timing
-from tests.bench import models as bench
+from tests.bench.models import __main__ as bench
+from tests.bench.models import parts as models
+from tests.bench.models import timing
 from tests.core import nvrtc
 
 
@@ -59,7 +59,7 @@ def test_the_yardstick_compiles_for_gpus(law: str, tmp_path: Path) -> None:
         pytest.skip("needs the package nvidia-cuda-nvrtc")
     text = tmp_path / "generic.cu"
     here = timing.HERE
-    text.write_text(backend.read_text(f"{here}_generic_elements.cu+{here}_generic_{law}.cuh")[1])
+    text.write_text(backend.read_text(f"{here}generic_elements.cu+{here}generic_{law}.cuh")[1])
     for types in PRECISIONS.values():
         code, said = nvrtc.compiled(library, text, ["-arch=sm_90", *options(types)])
         assert len(code) > 1000 and not said, said

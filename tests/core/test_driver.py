@@ -20,8 +20,8 @@ from sim_server.factors import Inline, Job
 from sim_server.layouts import RECORD
 from sim_server.simulation import Simulation
 from sim_server.track import flops
-from tests.bench._virtual_workers import VirtualWorkers
 from tests.scenes import bar, factor_of, simulation
+from tests.support.virtual_workers import VirtualWorkers
 
 
 def falling(*bodies: dict, **solver) -> Simulation:

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from tests.bench._fault_stage import Progress, Stage, measured
+from tests.support.stage import Progress, Stage, measured
 
 pytestmark = pytest.mark.system
 

@@ -18,8 +18,8 @@ import numpy as np
 import typer
 
 from sim_server.simulation import Simulation
-from tests.bench._schemes import SCENES, Run, Scheme, run
-from tests.bench.report import Report, plots
+from tests.bench.harness.report import Report, plots
+from tests.bench.harness.schemes import SCENES, Run, Scheme, run
 
 REFERENCE = Scheme("reference", ("preconditioner=block_jacobi",))
 FRESH = ("preconditioner=cholesky", "update=every-1", "factor_precision=float64")

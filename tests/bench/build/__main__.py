@@ -11,9 +11,9 @@ from typing import Annotated, Any
 
 import typer
 
-from tests.bench._build_runs import BYTES, CELLS, GIGABIT, SHARED, Case, copies, measured
-from tests.bench._fault_net import Cable, Unavailable
-from tests.bench.report import Report, plots
+from tests.bench.build.runs import BYTES, CELLS, GIGABIT, SHARED, Case, copies, measured
+from tests.bench.faults.net import Cable, Unavailable
+from tests.bench.harness.report import Report, plots
 
 EXPLAINED = """\
 SOFA's bending beam (deploy/scenes/sofa_beam.toml), the loop running freely, one worker process, async: the next job

@@ -17,9 +17,9 @@ from sim_server.driver import Driver
 from sim_server.network.link import ServerLink
 from sim_server.simulation import Simulation
 from sim_server.supervisor import Supervisor
-from tests.bench._fault_net import ADDRESS, Cable
-from tests.bench._schemes import SCENES
-from tests.bench.report import ROOT
+from tests.bench.faults.net import ADDRESS, Cable
+from tests.bench.harness.schemes import SCENES
+from tests.bench.harness.report import ROOT
 from tests.ports import free_port
 
 CELLS = {540: (3, 3, 10), 3000: (5, 5, 20), 24000: (10, 10, 40)}  # of sofa_beam.toml

@@ -27,8 +27,8 @@ from sim_server.driver import Driver
 from sim_server.network.link import ServerLink
 from sim_server.simulation import Simulation
 from sim_server.supervisor import Supervisor
-from tests.bench._scipy_step import ScipyStep
-from tests.bench.report import ROOT, Report, plots
+from tests.bench.cpu.scipy_step import ScipyStep
+from tests.bench.harness.report import ROOT, Report, plots
 
 SCENE = ROOT / "deploy" / "scenes" / "sofa_beam.toml"
 CELLS = {540: (3, 3, 10), 3000: (5, 5, 20), 7350: (7, 7, 25), 24000: (10, 10, 40)}

@@ -19,10 +19,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from tests.bench import _faults_page as page
-from tests.bench._fault_net import ADDRESS, Cable, Unavailable
-from tests.bench._fault_stage import Progress, Stage, measured
-from tests.bench._pieces import Limit, Merged, Piece, arguments_of_pieces, say, shown
+from tests.bench.faults import page
+from tests.bench.faults.net import ADDRESS, Cable, Unavailable
+from tests.bench.harness.pieces import Limit, Merged, Piece, arguments_of_pieces, say, shown
+from tests.support.stage import Progress, Stage, measured
 
 TITLE = "What faults cost"
 SETTLE = 50  # steps before a fault, after the first factor

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """A network namespace at the end of a cable that can be cut, made to lose, to delay or to be slow. Needs root.
 
-The cable is a process of ours between two tun devices (_fault_relay.py): it wants nothing of the kernel but these.
+The cable is a process of ours between two tun devices (relay.py): it wants nothing of the kernel but these.
 """
 
 import json
@@ -54,7 +54,7 @@ class Cable:
         return self
 
     def _begin(self) -> None:
-        words = [sys.executable, "-m", "tests.bench._fault_relay", FAR, NEAR, FAR]
+        words = [sys.executable, "-m", "tests.bench.faults.relay", FAR, NEAR, FAR]
         pipe = subprocess.PIPE
         self._relay = subprocess.Popen(words, stdin=pipe, stdout=pipe, stderr=pipe, text=True)
         assert self._relay.stdout is not None

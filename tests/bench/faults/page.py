@@ -3,8 +3,8 @@
 
 from typing import Any
 
-from tests.bench._fault_stage import DT
-from tests.bench.report import Report
+from tests.bench.harness.report import Report
+from tests.support.stage import DT
 
 Row = dict[str, Any]
 QUIET_THERE = "quiet, over a network"

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The inside of a cable between two network namespaces: a process that hands packets on, late, or not at all.
 
-    python -m tests.bench._fault_relay NAMESPACE NEAR FAR
+    python -m tests.bench.faults.relay NAMESPACE NEAR FAR
 
 Makes a device NEAR here and FAR in the namespace, says `ready`, and reads what the cable is like from lines of JSON:
 loss (part of the packets), delay [s] and rate [bytes/s, 0: any], of each way. Ends with its input.

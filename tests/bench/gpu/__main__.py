@@ -18,9 +18,9 @@ from pathlib import Path
 from typing import Any
 
 from sim_server.errors import DeviceError
-from tests.bench import _gpu_page as page
-from tests.bench._gpu_problem import BARS, BATCHES, MATERIALS, Problem
-from tests.bench.report import Report
+from tests.bench.gpu import page
+from tests.bench.gpu.problem import BARS, BATCHES, MATERIALS, Problem
+from tests.bench.harness.report import Report
 
 SECTIONS = ("steps", "batches", "others", "served")
 ROUNDS = {540: 20, 3000: 20, 7350: 20, 24_000: 12, 98_304: 6, 405_600: 3, 1_029_000: 2}
@@ -46,9 +46,9 @@ TITLE = "A step on a GPU"
 
 def beams(problem: Problem, o: argparse.Namespace, external: bool) -> tuple[Rows, Rows]:
     """Row of one scene, rows of others on its last matrix."""
-    from tests.bench._gpu_others import compared
-    from tests.bench._gpu_rows import row
-    from tests.bench._gpu_steps import Beams, rounds
+    from tests.bench.gpu.others import compared
+    from tests.bench.gpu.rows import row
+    from tests.bench.gpu.steps import Beams, rounds
 
     begin = time.perf_counter()
     scene = Beams(problem, o.library, overrides=tuple(o.set))
@@ -68,10 +68,10 @@ def beams(problem: Problem, o: argparse.Namespace, external: bool) -> tuple[Rows
 
 def measure(o: argparse.Namespace) -> dict[str, Rows]:
     """All sections asked for, and what the device is."""
-    from tests.bench._gpu_cudss import version
-    from tests.bench._gpu_device import described
-    from tests.bench._gpu_served import SIZES
-    from tests.bench._gpu_served import measure as served
+    from tests.bench.gpu.cudss import version
+    from tests.bench.gpu.device import described
+    from tests.bench.gpu.served import SIZES
+    from tests.bench.gpu.served import measure as served
 
     data: dict[str, Any] = {name: [] for name in page.KEYS}
     data["device"] = described() | {"cuDSS": version()}

@@ -9,8 +9,8 @@ import numpy as np
 from scipy.sparse import csr_matrix, tril
 
 from sim_server.gpu.device import cupy
-from tests.bench._gpu_device import timed
-from tests.bench._gpu_steps import Sample
+from tests.bench.gpu.device import timed
+from tests.bench.gpu.steps import Sample
 
 ABSENT = "cuDSS: not installed (pip install 'nvmath-python[cu13]')"
 

@@ -3,8 +3,8 @@
 
 from typing import Any
 
-from tests.bench._gpu_problem import AIMS, MATERIALS
-from tests.bench.report import Report, plots
+from tests.bench.gpu.problem import AIMS, MATERIALS
+from tests.bench.harness.report import Report, plots
 
 Row = dict[str, Any]
 OURS = {"us p50": ("factor", "C0"), "CG us": ("CG", "C1"), "block Jacobi us": ("block Jacobi", "C2")}

@@ -16,10 +16,10 @@ from scipy.sparse import csc_matrix, csr_matrix
 
 from protocol import FactorPattern
 from sim_server.gpu.device import cupy
-from tests.bench import _gpu_cudss as cudss
-from tests.bench._gpu_cusparse import LOWER, UPPER, Product, Triangle, device_csr
-from tests.bench._gpu_device import timed, timed_in_graph
-from tests.bench._gpu_steps import Sample
+from tests.bench.gpu import cudss
+from tests.bench.gpu.cusparse import LOWER, UPPER, Product, Triangle, device_csr
+from tests.bench.gpu.device import timed, timed_in_graph
+from tests.bench.gpu.steps import Sample
 
 LARGEST = {  # tets; beyond them these take memory or minutes, and are out anyway
     "cuSPARSE L, then its transpose": 24_000,

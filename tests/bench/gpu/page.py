@@ -3,9 +3,9 @@
 
 from typing import Any
 
-from tests.bench._gpu_figure import figure
-from tests.bench._gpu_problem import AIMS, MATERIALS
-from tests.bench.report import Report
+from tests.bench.gpu.figure import figure
+from tests.bench.gpu.problem import AIMS, MATERIALS
+from tests.bench.harness.report import Report
 
 Row = dict[str, Any]
 Data = dict[str, Any]

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tests.bench import _gpu_bytes as moved
-from tests.bench._gpu_steps import WITHOUT, Beams, Found
+from tests.bench.gpu import traffic as moved
+from tests.bench.gpu.steps import WITHOUT, Beams, Found
 
 Row = dict[str, Any]
 

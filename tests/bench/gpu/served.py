@@ -25,7 +25,7 @@ from sim_server.network.link import ServerLink
 from sim_server.service import NAP
 from sim_server.simulation import Simulation
 from sim_server.supervisor import Supervisor
-from tests.bench._gpu_problem import Problem
+from tests.bench.gpu.problem import Problem
 from tests.state import put
 
 SWING = 100  # steps until the beam is put back

@@ -19,8 +19,8 @@ from precond_worker.factorize import Analysis
 from protocol import FactorPattern
 from sim_server.engine import Kind
 from sim_server.simulation import Simulation
-from tests.bench import _gpu_bytes as moved
-from tests.bench._gpu_problem import Problem
+from tests.bench.gpu import traffic as moved
+from tests.bench.gpu.problem import Problem
 
 STEPS = 16  # of a round, and the age of the factor at its end
 WITHOUT = {Kind.NONE: "CG", Kind.BLOCK_JACOBI: "block Jacobi"}

@@ -10,14 +10,12 @@ import time
 from pathlib import Path
 from statistics import median
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-
 from precond_worker.errors import DeviceUnusable
 from precond_worker.factorize import LIBRARIES, Analysis
 from sim_server.simulation import Simulation
-from tests.bench._gpu_problem import BARS
+from tests.bench.gpu.problem import BARS
 
-SCENE = Path(__file__).resolve().parents[2] / "deploy/scenes/beam.toml"
+SCENE = Path(__file__).resolve().parents[3] / "deploy/scenes/beam.toml"
 
 
 def measured(tets: int, library: str, times: int) -> str:

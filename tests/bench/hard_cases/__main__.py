@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from tests.bench.report import Report, plots
+from tests.bench.harness.report import Report, plots
 from tests.hard_cases.case import Case
 from tests.hard_cases.models import MODEL_CASES, MODELS, QUICK, SITUATIONS
 from tests.hard_cases.running import Outcome, broken, finer, run_case, unexpected

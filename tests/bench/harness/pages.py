@@ -10,7 +10,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-from tests.bench.report import ROOT, table
+from tests.bench.harness.report import ROOT, table
 
 FIRST = ("cpu", "gpu", "models", "paper", "figure4", "warp", "preconditioners", "build")
 PAGES = (*FIRST, "verification", "accuracy", "hard_cases", "scheduler", "scaling", "faults")

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from tests.bench.report import Report, plain
+from tests.bench.harness.report import Report, plain
 
 Row = dict[str, Any]
 

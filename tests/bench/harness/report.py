@@ -26,7 +26,7 @@ import numpy as np
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 PACKAGES = ("warpfactor", "numpy", "scipy", "scikit-sparse", "eclipse-zenoh")
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from protocol import messages_pb2 as pb
 from sim_server.driver import Driver
 from sim_server.simulation import Simulation
-from tests.bench.report import ROOT
+from tests.bench.harness.report import ROOT
 from tests.ports import free_port
 
 Reals = NDArray[np.float64]

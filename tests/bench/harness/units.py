@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from tests.bench._pieces import Limit, Piece, Row, say
+from tests.bench.harness.pieces import Limit, Piece, Row, say
 
 
 @dataclass(frozen=True)

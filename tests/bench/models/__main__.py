@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import Any
 
 from sim_server.errors import DeviceError
-from tests.bench import _models as models
-from tests.bench import _models_time as timing
-from tests.bench._gpu_problem import BARS
-from tests.bench._pieces import Merged
-from tests.bench.report import Report, plots
+from tests.bench.gpu.problem import BARS
+from tests.bench.harness.pieces import Merged
+from tests.bench.harness.report import Report, plots
+from tests.bench.models import parts as models
+from tests.bench.models import timing
 
 SIZES = (3000, 24_000, 98_304)
 DEVICES = ("cpu", "gpu")
@@ -45,8 +45,8 @@ GENERIC = (
     "Elements' kernels alone, stretched, without projection; both texts compiled by the same compiler with the same "
     "flags, both leave the same numbers (difference: of the largest, between the two). 9x9: dW/dF and d2W/dF2 as 9 and "
     "81 numbers, then blocks by contraction with the gradients of the shape functions "
-    "(tests/bench/_generic_elements.cu). Six edges: those that MJED computes, the corners' own by translation; all "
-    "blocks: as a stiffness matrix of 12x12 has them."
+    "(tests/bench/models/generic_elements.cu). Six edges: those that MJED computes, the corners' own by translation; "
+    "all blocks: as a stiffness matrix of 12x12 has them."
 )
 
 
@@ -74,7 +74,7 @@ def _said(row: Row) -> Row:
 def _described(device: str, data: Data, quick: bool) -> float:
     """GB/s of a copy; adds what the device is."""
     if device == "gpu":
-        from tests.bench._gpu_device import described
+        from tests.bench.gpu.device import described
 
         found = described()
         what, speed = f"{found['gpu']}, driver {found['driver']}, CUDA {found['CUDA']}", 1e3 * found["copy TB/s"]

@@ -13,7 +13,7 @@ from sim_server.effect import Effect
 from sim_server.effects import effect, known_effects
 from sim_server.scene.model import Scene
 from sim_server.simulation import Simulation
-from tests.bench._gpu_problem import BARS
+from tests.bench.gpu.problem import BARS
 
 BULK = 3e6  # Pa
 TABLES: dict[

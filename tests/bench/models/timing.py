@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from tests.bench._gpu_problem import BARS
-from tests.bench._models import PARTS, Model, megabytes, model, part, states
-from tests.bench.report import best_of
+from tests.bench.gpu.problem import BARS
+from tests.bench.harness.report import best_of
+from tests.bench.models.parts import PARTS, Model, megabytes, model, part, states
 
-HERE = "../tests/bench/"  # from the package, where kernel texts are looked up
+HERE = "../tests/bench/models/"  # from the package, where kernel texts are looked up
 LAWS = ("neo_hookean", "st_venant_kirchhoff")  # measured against 9x9
 GENERIC = {"six edges": "elements", "all blocks": "all_blocks"}  # and their kernels
 
@@ -41,7 +41,7 @@ def on_cpu(calls: Sequence[Callable[[], Any]], seconds: float) -> list[float]:
 
 def on_gpu(calls: Sequence[Callable[[], Any]], seconds: float) -> list[float]:
     """us of each among its like in a graph, the least of three."""
-    from tests.bench._gpu_device import timed, timed_in_graph
+    from tests.bench.gpu.device import timed, timed_in_graph
 
     counts = [max(3, min(200, int(1e6 * seconds / len(calls) / timed(call, 3)))) for call in calls]
     rounds = [[timed_in_graph(call, n) for call, n in zip(calls, counts, strict=True)] for _ in range(3)]
@@ -99,7 +99,7 @@ def generic(made: Model, kernel: str) -> Any:
     """The launch of the yardstick for the elements of a model, with arrays of its own for what it leaves."""
     e: Any = made.effect
     w = made.simulation.world
-    module = w.backend.module(f"{HERE}_generic_elements.cu+{HERE}_generic_{made.name}.cuh")
+    module = w.backend.module(f"{HERE}generic_elements.cu+{HERE}generic_{made.name}.cuh")
     return module.bind(
         kernel, len(e.elements), tets=e.elements, x=w.x, v=w.drift, gradients=e.gradients, volume=e.volume,
         constants=e.constants, stiffening=w.stiffening[e.owner], h=w.impulse, corners=np.zeros_like(e.corners),

@@ -14,11 +14,11 @@ or under taskset.
 import argparse
 from typing import Any
 
-from tests.bench import _paper_page as page
-from tests.bench._paper_tables import Setting
-from tests.bench._paper_units import KEYS, units
-from tests.bench._pieces import Limit, Merged, Piece, arguments_of_pieces
-from tests.bench._units import arguments_of_units, asked_for, chosen, measure
+from tests.bench.harness.pieces import Limit, Merged, Piece, arguments_of_pieces
+from tests.bench.harness.units import arguments_of_units, asked_for, chosen, measure
+from tests.bench.paper import page
+from tests.bench.paper.tables import Setting
+from tests.bench.paper.units import KEYS, units
 
 TITLE = "The tables of Courtecuisse et al. 2010"
 MEASURED = ("steps", "rounds", "latency", "tolerance")  # arguments of a setting

@@ -7,10 +7,10 @@ operations. So iterations repeat to the digit, and a factor that is sooner made 
 
 import numpy as np
 
-from tests.bench._paper_beam import COROTATIONAL, LOADS, Beam, Load, calibrated
-from tests.bench._paper_figures import HETEROGENEOUS
-from tests.bench._paper_run import Run, Way, run
-from tests.bench._paper_tables import Row, Setting
+from tests.bench.paper.beam import COROTATIONAL, LOADS, Beam, Load, calibrated
+from tests.bench.paper.figures import HETEROGENEOUS
+from tests.bench.paper.run import Run, Way, run
+from tests.bench.paper.tables import Row, Setting
 
 LATENCY = {540: 6, 3000: 8, 7350: 12, 24000: 18}  # steps that an exact factor takes (table 1, own latency)
 STEPS = {24000: 100}  # at most

@@ -6,14 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from tests.bench import _paper_words as words
-from tests.bench import figure4
-from tests.bench._paper_beam import BANDS, LOADS
-from tests.bench._paper_publishing import STRETCH
-from tests.bench._paper_tables import Row, Setting
-from tests.bench._paper_units import KEYS
-from tests.bench._schemes import Run
-from tests.bench.report import Report
+from tests.bench.figure4 import figure as figure4
+from tests.bench.harness.report import Report
+from tests.bench.harness.schemes import Run
+from tests.bench.paper import words
+from tests.bench.paper.beam import BANDS, LOADS
+from tests.bench.paper.publishing import STRETCH
+from tests.bench.paper.tables import Row, Setting
+from tests.bench.paper.units import KEYS
 
 Tables = dict[str, list[Row]]
 

@@ -23,10 +23,10 @@ from sim_server.factors import Job
 from sim_server.network.link import ServerLink
 from sim_server.simulation import Simulation
 from sim_server.supervisor import Supervisor
-from tests.bench._build_runs import started, until
-from tests.bench._cores import Cores
-from tests.bench._paper_beam import COROTATIONAL, LOADS, Beam, calibrated
-from tests.bench._paper_tables import Row, Setting
+from tests.bench.build.runs import started, until
+from tests.bench.harness.cores import Cores
+from tests.bench.paper.beam import COROTATIONAL, LOADS, Beam, calibrated
+from tests.bench.paper.tables import Row, Setting
 from tests.ports import free_port
 
 STRETCH = 50  # steps in turn

@@ -12,9 +12,9 @@ from sim_server.driver import Driver
 from sim_server.engine import Kind
 from sim_server.simulation import Simulation
 from sim_server.track import flops
-from tests.bench._building import BuildingInline
-from tests.bench._paper_beam import Beam, Load
-from tests.bench._virtual_workers import VirtualWorkers
+from tests.bench.paper.beam import Beam, Load
+from tests.bench.paper.building import BuildingInline
+from tests.support.virtual_workers import VirtualWorkers
 
 Reals = NDArray[np.float64]
 

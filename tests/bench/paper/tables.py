@@ -6,9 +6,9 @@ from math import ceil
 from typing import Any
 
 from sim_server.scene import solver_options
-from tests.bench._paper_beam import CELLS, COROTATIONAL, DT, LOADS, MODELS, QUICK, Beam, Load, Model, calibrated
-from tests.bench._paper_figures import CONDITION, HETEROGENEOUS, TABLE1, TABLE2, TABLE5
-from tests.bench._paper_run import Mean, Way, mean, run
+from tests.bench.paper.beam import CELLS, COROTATIONAL, DT, LOADS, MODELS, QUICK, Beam, Load, Model, calibrated
+from tests.bench.paper.figures import CONDITION, HETEROGENEOUS, TABLE1, TABLE2, TABLE5
+from tests.bench.paper.run import Mean, Way, mean, run
 
 PRECONDITIONERS = ("none", "jacobi", "block_jacobi", "ssor", "ssor_factor", "cholesky", "incomplete_cholesky")
 

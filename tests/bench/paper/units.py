@@ -4,14 +4,14 @@
 from collections.abc import Sequence
 from functools import partial
 
-from tests.bench import _paper_tables as tables
-from tests.bench import figure4
-from tests.bench._paper_automatic import automatic
-from tests.bench._paper_beam import LOADS, MODELS
-from tests.bench._paper_publishing import publishing
-from tests.bench._paper_tables import Row, Setting
-from tests.bench._schemes import SCENES, run
-from tests.bench._units import Unit
+from tests.bench.figure4 import figure as figure4
+from tests.bench.harness.schemes import SCENES, run
+from tests.bench.harness.units import Unit
+from tests.bench.paper import tables
+from tests.bench.paper.automatic import automatic
+from tests.bench.paper.beam import LOADS, MODELS
+from tests.bench.paper.publishing import publishing
+from tests.bench.paper.tables import Row, Setting
 
 KEYS = {  # what tells the rows of a table apart
     "table1": ("device", "tets"),

@@ -3,8 +3,8 @@
 
 from typing import Any
 
-from tests.bench._paper_beam import DAMPING, DENSITY, DT, LENGTH, LOADS, POISSON
-from tests.bench._paper_tables import AHEAD, EXTRAPOLATED, PRECONDITIONERS, Setting, available
+from tests.bench.paper.beam import DAMPING, DENSITY, DT, LENGTH, LOADS, POISSON
+from tests.bench.paper.tables import AHEAD, EXTRAPOLATED, PRECONDITIONERS, Setting, available
 
 CLOSE = 1.05  # within 5 % of the fastest
 OURS2 = ("async + warp", "auto", EXTRAPOLATED)

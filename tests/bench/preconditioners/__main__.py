@@ -3,7 +3,7 @@
 
 The heterogeneous beam of deploy/scenes, let go from horizontal, at two sizes. Factors are as old as they would be from
 a worker (lockstep, the deterministic twin of async), in the material frame. And what grabs cost that a factor does not
-know, with and without the correction (_grabs.py).
+know, with and without the correction (grabs.py).
 """
 
 from dataclasses import dataclass, field
@@ -17,10 +17,10 @@ from protocol.factor import Factor, FactorPattern
 from sim_server.driver import Driver
 from sim_server.guard import Guard
 from sim_server.simulation import Simulation
-from tests.bench._grabs import WAYS, Hand, grab_row, short
-from tests.bench._grabs import WORDS as WORDS_OF_GRABS
-from tests.bench._schemes import SCENES
-from tests.bench.report import Report, best_of, plots
+from tests.bench.harness.report import Report, best_of, plots
+from tests.bench.harness.schemes import SCENES
+from tests.bench.preconditioners.grabs import WAYS, Hand, grab_row, short
+from tests.bench.preconditioners.grabs import WORDS as WORDS_OF_GRABS
 
 SIZES = {3150: (5, 5, 21), 24000: (10, 10, 40)}  # cells by number of tetrahedra
 NAMES = ("none", "jacobi", "block_jacobi", "ssor", "ssor_factor", "incomplete_cholesky", "cholesky")

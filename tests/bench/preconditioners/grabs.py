@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from sim_server.driver import Driver
 from sim_server.effects.touch import Interaction, Touch
 from sim_server.simulation import Simulation
-from tests.bench._schemes import SCENES
+from tests.bench.harness.schemes import SCENES
 
 SPEED = 0.5  # m/s, of the hand
 SETTLED = 18  # steps before it comes, about

@@ -32,8 +32,8 @@ from sim_server.network.link import ServerLink
 from sim_server.service import NAP
 from sim_server.simulation import Simulation
 from sim_server.supervisor import Supervisor
-from tests.bench import _scaling_page as page
-from tests.bench._pieces import Limit, Merged, Piece, arguments_of_pieces, say, shown
+from tests.bench.harness.pieces import Limit, Merged, Piece, arguments_of_pieces, say, shown
+from tests.bench.scaling import page
 from tests.state import put
 
 OBJECTS, WORKERS = (1, 4, 16, 64, 256, 1024), (1, 2, 4)

@@ -3,7 +3,7 @@
 
 from typing import Any
 
-from tests.bench.report import Report, plots
+from tests.bench.harness.report import Report, plots
 
 Row = dict[str, Any]
 KEYS = ("objects", "server", "workers", "workers on")  # what tells rows apart

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from sim_server.driver import Driver
 from sim_server.factors import Job
 from sim_server.simulation import Simulation
-from tests.bench._clairvoyant import Clairvoyant
-from tests.bench._few_wild import APART, Load, is_wild, scene
-from tests.bench._pieces import Merged, Piece
-from tests.bench._virtual_workers import VirtualWorkers
-from tests.bench.report import Report, plots
+from tests.bench.harness.pieces import Merged, Piece
+from tests.bench.harness.report import Report, plots
+from tests.bench.scheduler.clairvoyant import Clairvoyant
+from tests.bench.scheduler.few_wild import APART, Load, is_wild, scene
+from tests.support.virtual_workers import VirtualWorkers
 
 RULES = ("round_robin", "excess")
 MANY = 32  # nodes of all hands of an object that its factor is corrected for

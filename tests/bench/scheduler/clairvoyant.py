@@ -19,8 +19,8 @@ from sim_server.driver import Driver
 from sim_server.engine import NativeFactor
 from sim_server.factors import Job
 from sim_server.simulation import Simulation
-from tests.bench._few_wild import Load, is_wild, scene
-from tests.bench._virtual_workers import VirtualWorkers
+from tests.bench.scheduler.few_wild import Load, is_wild, scene
+from tests.support.virtual_workers import VirtualWorkers
 
 WIDTH = 100  # states that are kept from step to step
 CHOICES = 40  # of jobs to begin in one step

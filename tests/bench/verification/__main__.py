@@ -8,11 +8,9 @@ from typing import Annotated, Any
 
 import typer
 
-from tests.bench import _verify_laws as laws
-from tests.bench import _verify_motion as motion
-from tests.bench import _verify_static as static
-from tests.bench._verify_row import Row
-from tests.bench.report import Report, plots
+from tests.bench.harness.report import Report, plots
+from tests.bench.verification import laws, motion, static
+from tests.bench.verification.row import Row
 
 ABOUT = """\
 Each line is computed when this page is made, by the simulation as it runs (CPU, float64).

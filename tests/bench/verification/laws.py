@@ -9,7 +9,7 @@ import numpy as np
 from scipy.optimize import brentq, minimize_scalar
 
 from sim_server.simulation import Simulation
-from tests.bench._verify_row import Row, absolute, relative
+from tests.bench.verification.row import Row, absolute, relative
 from tests.physics.laws import (
     ELASTIC,
     LAWS,

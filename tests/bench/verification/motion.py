@@ -7,7 +7,7 @@ import numpy as np
 
 from sim_server.driver import Driver
 from sim_server.simulation import Simulation
-from tests.bench._verify_row import Row, absolute, relative
+from tests.bench.verification.row import Row, absolute, relative
 from tests.integrators.test_conserved import SCHEMES, TIGHT, energy, spin
 from tests.integrators.test_time_order import ORDER, orders
 from tests.physics.test_cantilever import lowest_mode

@@ -10,8 +10,8 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from sim_server.mesh import bar as bar_mesh
-from tests.bench._verify_loads import push, raised, settle, statics
-from tests.bench._verify_row import Row, absolute, relative
+from tests.bench.verification.loads import push, raised, settle, statics
+from tests.bench.verification.row import Row, absolute, relative
 from tests.physics.test_cantilever import AREA, DENSITY, INERTIA, LENGTH, YOUNG, cantilever, lowest_mode
 
 Reals = NDArray[np.float64]

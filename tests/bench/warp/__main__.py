@@ -18,11 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_server.driver import Driver
-from tests.bench._paper_beam import CELLS, LOADS, MODELS, QUICK, Beam, Load, Model, calibrated
-from tests.bench._paper_figures import CONDITION
-from tests.bench._pieces import Limit, Merged, Piece, Row, arguments_of_pieces
-from tests.bench._units import Unit, arguments_of_units, asked_for, chosen, measure
-from tests.bench.report import Report, plots
+from tests.bench.harness.pieces import Limit, Merged, Piece, Row, arguments_of_pieces
+from tests.bench.harness.report import Report, plots
+from tests.bench.harness.units import Unit, arguments_of_units, asked_for, chosen, measure
+from tests.bench.paper.beam import CELLS, LOADS, MODELS, QUICK, Beam, Load, Model, calibrated
+from tests.bench.paper.figures import CONDITION
 
 TITLE = "The warp off and on"
 KEYS = ("load", "model", "update")  # what tells rows apart
