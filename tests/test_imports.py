@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Imports go one way: everybody imports protocol, and nobody anybody else."""
+"""Imports go one way: everybody imports protocol, and nobody anybody else; tests of the product import no bench."""
 
 import ast
 from pathlib import Path
@@ -26,6 +26,16 @@ EXCEPTIONS = {
 }
 
 
+def imported(node: ast.AST, path: Path) -> list[str]:
+    """Names of the modules that a statement imports; `from a import b` imports a."""
+    if isinstance(node, ast.Import):
+        return [alias.name for alias in node.names]
+    if not isinstance(node, ast.ImportFrom):
+        return []
+    assert node.level == 0, f"{path}: relative import"
+    return [node.module or ""]
+
+
 @pytest.mark.parametrize("package", ALLOWED)
 def test_directions(package: str) -> None:
     files = list((ROOT / package).rglob("*.py"))
@@ -33,11 +43,7 @@ def test_directions(package: str) -> None:
     for path in files:
         tree = ast.parse(path.read_text())
         for node in ast.walk(tree):
-            modules = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
-            if isinstance(node, ast.ImportFrom):
-                modules = [node.module or ""]
-                assert node.level == 0, f"{path}: relative import"
-            for module in modules:
+            for module in imported(node, path):
                 ours = module.split(".")[0] in ALLOWED
                 exempt = (package, module) in EXCEPTIONS and node not in tree.body
                 assert not ours or exempt or module.split(".")[0] in ALLOWED[package], f"{path} imports {module}"
@@ -51,3 +57,14 @@ def test_scenes_know_nothing_of_what_is_built_from_them() -> None:
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("sim_server"):
                 modules = [f"{node.module}.{alias.name}" for alias in node.names]
                 assert all(m.startswith(allowed) for m in modules), f"{path} imports {modules}"
+
+
+def test_tests_of_the_product_import_no_bench() -> None:
+    """What both need is in tests/support."""
+    benches = [ROOT / "tests" / name for name in ("bench", "bench_smoke")]
+    files = [p for p in (ROOT / "tests").rglob("*.py") if not any(p.is_relative_to(folder) for folder in benches)]
+    assert ROOT / "tests/support/virtual_workers.py" in files
+    for path in files:
+        for node in ast.walk(ast.parse(path.read_text())):
+            for module in imported(node, path):
+                assert not f"{module}.".startswith(("tests.bench.", "tests.bench_smoke.")), f"{path} imports {module}"
