@@ -66,5 +66,7 @@ def test_tests_of_the_product_import_no_bench() -> None:
     assert ROOT / "tests/support/virtual_workers.py" in files
     for path in files:
         for node in ast.walk(ast.parse(path.read_text())):
-            for module in imported(node, path):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.ImportFrom) else []
+            modules = imported(node, path)
+            for module in [*modules, *(f"{modules[0]}.{name}" for name in names)]:
                 assert not f"{module}.".startswith(("tests.bench.", "tests.bench_smoke.")), f"{path} imports {module}"

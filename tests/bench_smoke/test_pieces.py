@@ -48,14 +48,14 @@ def fault(name: str, device: str = "cpu", **more: Any) -> dict[str, Any]:
 def test_storms_of_several_pieces_are_one_and_what_ran_somewhere_is_not_skipped() -> None:
     first = {"rows": [fault("quiet"), fault("storm", missed=1, iterations=3.0)], "skipped": {"cut": "no root"}}
     second = {"rows": [fault("storm", steps=300, **{"step max ms": 7.0}), fault("quiet", "gpu"), fault("cut")]}
-    rows, _, skipped = faults_page.merged([first, second, {"rows": [], "skipped": {"slow": "no netem"}}])
+    rows, _, skipped = faults_page.merged([first, second, {"rows": [], "skipped": {"stop": "no worker"}}])
     assert [(r["server"], r["fault"]) for r in rows] == [
         ("cpu", "quiet"), ("cpu", "storm"), ("cpu", "cut"), ("gpu", "quiet")
     ]  # fmt: skip
     storm = rows[1]
     assert (storm["steps"], storm["missed"], storm["step max ms"]) == (400, 1, 7.0)
     assert storm["iterations"] == pytest.approx(2.25)
-    assert skipped == {"slow": "no netem"}
+    assert skipped == {"stop": "no worker"}
     assert faults_page.with_penalties(rows[:2])[1]["iterations, times quiet"] == pytest.approx(1.125)
 
 

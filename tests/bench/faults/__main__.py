@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What faults cost: workers killed, stopped and started again, networks cut, lossy and slow, hostile and slow clients.
+"""What faults cost: workers killed, stopped and started again, networks cut, hostile and slow clients.
 
     deploy/run bench faults                      a few seconds of each
     deploy/run bench faults --minutes 10 --lives 100 --cut 30
@@ -115,37 +115,22 @@ def python(text: str) -> list[str]:
     return [sys.executable, "-c", text]
 
 
-def while_it_lasts(begin: Callable[[], None], seconds: float | None, end: Callable[[], None]) -> Fault:
-    """Something that is wrong with the cable for a while; None: as long as --cut says."""
+def cut(cable: Cable) -> Fault:
+    """No packet passes for as long as --cut says."""
 
     def fault(stage: Stage, progress: Progress, o: argparse.Namespace) -> int:
-        begin()
-        progress.pause(o.cut if seconds is None else seconds)
-        end()
+        cable.cut(True)
+        progress.pause(o.cut)
+        cable.cut(False)
         return progress.step
 
     return fault
 
 
-def cut(cable: Cable) -> Fault:
-    """No packet passes for a while."""
-    return while_it_lasts(lambda: cable.cut(True), None, lambda: cable.cut(False))
-
-
-def lossy(cable: Cable) -> Fault:
-    """Half of all packets are lost, for 5 s."""
-    return while_it_lasts(lambda: cable.lose(50), 5.0, cable.mend)
-
-
-def slow(cable: Cable) -> Fault:
-    """100 ms in each direction, for 5 s."""
-    return while_it_lasts(lambda: cable.delay(100), 5.0, cable.mend)
-
-
 HERE: dict[str, Fault] = {
     "quiet": quiet, "kill": kill, "stop": stop, "storm": storm, "sleeper": sleeper, "flood": flood,
 }  # fmt: skip
-THERE: dict[str, Callable[[Cable], Fault]] = {"cut": cut, "lossy": lossy, "slow": slow}
+THERE: dict[str, Callable[[Cable], Fault]] = {"cut": cut}
 
 
 def of_worker(o: argparse.Namespace) -> list[str]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A network namespace at the end of a cable that can be cut, made to lose, to delay or to be slow. Needs root.
+"""A network namespace at the end of a cable that can be cut or made slow. Needs root.
 
 The cable is a process of ours between two tun devices (relay.py): it wants nothing of the kernel but these.
 """
@@ -62,30 +62,18 @@ class Cable:
             said = self._relay.communicate()[1].strip().splitlines()
             raise Unavailable(f"no tun device: {said[-1] if said else 'no message'}")
 
-    def _is_like(self, loss: float = 0.0, delay: float = 0.0, rate: float = 0.0) -> None:
+    def _is_like(self, is_cut: bool = False, rate: float = 0.0) -> None:
         assert self._relay is not None and self._relay.stdin is not None
-        self._relay.stdin.write(json.dumps({"loss": loss, "delay": delay, "rate": rate}) + "\n")
+        self._relay.stdin.write(json.dumps({"is_cut": is_cut, "rate": rate}) + "\n")
         self._relay.stdin.flush()
 
     def cut(self, is_cut: bool) -> None:
         """No packet passes; or all do again."""
-        self._is_like(loss=float(is_cut))
-
-    def lose(self, percent: int) -> None:
-        """So many of a hundred packets in either direction."""
-        self._is_like(loss=percent / 100)
-
-    def delay(self, milliseconds: int) -> None:
-        """Each way."""
-        self._is_like(delay=milliseconds / 1000)
+        self._is_like(is_cut=is_cut)
 
     def pace(self, megabits: int) -> None:
         """At most so many a second each way."""
         self._is_like(rate=megabits * 1e6 / 8)
-
-    def mend(self) -> None:
-        """No loss and no delay any more."""
-        self._is_like()
 
     def close(self) -> None:
         """The namespace goes, and the cable with it."""

@@ -17,10 +17,8 @@ WHAT = {
     "flood": "garbage on all channels of workers",
     QUIET_THERE: "nothing; the worker gets bytes through a cable",
     "cut": "network between server and worker cut",
-    "lossy": "50 % of the packets lost for 5 s",
-    "slow": "100 ms of delay each way for 5 s",
 }
-THERE = (QUIET_THERE, "cut", "lossy", "slow")
+THERE = (QUIET_THERE, "cut")
 COLUMNS = (
     "what", "steps", "missed", "not converged", "step p50 ms", "step max ms", "step CPU max ms", "latest start ms",
     "late steps", "iterations", "iterations, times quiet", "oldest factor", "next factor s",

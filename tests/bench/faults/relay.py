@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""The inside of a cable between two network namespaces: a process that hands packets on, late, or not at all.
+"""The inside of a cable between two network namespaces: a process that hands packets on, slowly or not at all.
 
     python -m tests.bench.faults.relay NAMESPACE NEAR FAR
 
 Makes a device NEAR here and FAR in the namespace, says `ready`, and reads what the cable is like from lines of JSON:
-loss (part of the packets), delay [s] and rate [bytes/s, 0: any], of each way. Ends with its input.
+is_cut and rate [bytes/s, 0: any], of each way. Ends with its input.
 """
 
 import contextlib
@@ -12,7 +12,6 @@ import ctypes
 import fcntl
 import json
 import os
-import random
 import selectors
 import struct
 import sys
@@ -54,7 +53,7 @@ class Way:
         self._under_way: deque[tuple[float, bytes]] = deque()
         self._free = 0.0  # when the last packet has left
 
-    def take(self, loss: float, delay: float, rate: float) -> None:
+    def take(self, is_cut: bool, rate: float) -> None:
         """Reads all packets that are there."""
         while True:
             try:
@@ -63,10 +62,10 @@ class Way:
                 return
             now = time.monotonic()
             begin = max(now, self._free)
-            if random.random() < loss or begin - now > BACKLOG:
+            if is_cut or begin - now > BACKLOG:
                 continue
             self._free = begin + (len(packet) / rate if rate else 0.0)
-            self._under_way.append((self._free + delay, packet))
+            self._under_way.append((self._free, packet))
 
     def give(self) -> float | None:
         """Writes those that have arrived; seconds until the next one does."""
@@ -83,7 +82,7 @@ class Way:
 def relay(near: int, far: int) -> None:
     """Until the standard input ends."""
     ways = (Way(near, far), Way(far, near))
-    like = {"loss": 0.0, "delay": 0.0, "rate": 0.0}
+    like = {"is_cut": False, "rate": 0.0}
     selector = selectors.DefaultSelector()
     for way in ways:
         selector.register(way.source, selectors.EVENT_READ, way)

@@ -72,7 +72,6 @@ def _publishing(report: Report, setting: Setting, name: str, rows: list[Row]) ->
     told = words.PUBLISHING.format(load=LOADS[1].name, cores=cores, stretch=STRETCH)
     report.say(f"## Asynchronous steps and what publishing costs, {name}", told)
     report.table(rows, words.COLUMNS_OF_PUBLISHING)
-    report.say(words.verdict_of_publishing(rows))
 
 
 def _table2(report: Report, setting: Setting, name: str, rows: list[Row]) -> None:
@@ -84,9 +83,7 @@ def _table2(report: Report, setting: Setting, name: str, rows: list[Row]) -> Non
         "iterations and ms per step, in brackets the paper's.",
     )
     report.table(words.shown2(rows))
-    report.say(words.AIMS2)
-    report.table(words.aims2(rows))
-    report.say(words.verdict2(rows))
+    report.say(words.AIM2)
 
 
 def _table5(report: Report, setting: Setting, name: str, rows: list[Row]) -> None:
@@ -97,13 +94,12 @@ def _table5(report: Report, setting: Setting, name: str, rows: list[Row]) -> Non
         f"{rows[0]['condition']:.0f}; *{LOADS[1].name}*. *invert*: what a step waits for.",
     )
     report.table(rows, words.COLUMNS5)
-    report.say(words.verdict5(rows))
+    report.say(words.AIM5)
 
 
 def _automatic(report: Report, setting: Setting, name: str, rows: list[Row]) -> None:
     report.say(f'## preconditioner = "auto" and what it chooses from, {name}', words.AUTOMATIC)
     report.table(rows, [key for key in rows[0] if key not in ("device", "unconverged", "repeats")])
-    report.say(words.verdict_of_automatic(rows))
 
 
 def _policies(report: Report, setting: Setting, name: str, rows: list[Row]) -> None:

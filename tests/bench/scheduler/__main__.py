@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: MIT
 """Whose matrix is factorized next: the rules of the scheduler where a few objects are dragged about and most rest."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,15 +14,13 @@ from sim_server.factors import Job
 from sim_server.simulation import Simulation
 from tests.bench.harness.pieces import Merged, Piece
 from tests.bench.harness.report import Report, plots
-from tests.bench.scheduler.clairvoyant import Clairvoyant
 from tests.bench.scheduler.few_wild import APART, Load, is_wild, scene
 from tests.support.virtual_workers import VirtualWorkers
 
 RULES = ("round_robin", "excess")
 MANY = 32  # nodes of all hands of an object that its factor is corrected for
 CORRECTED = ", grabs corrected"  # solver.woodbury, as by default
-ORACLE, NEVER, EACH, BEST = "oracle", "no updates", "a worker for each object", "best order, found afterwards"
-AIMS = (("/ round robin", "round robin's", 0.7), ("/ oracle", "the oracle's", 1.3))
+ORACLE, NEVER, EACH = "oracle", "no updates", "a worker for each object"
 COLUMNS = ("objects", "wild", "workers", "rule", "iterations", "/ round robin", "/ oracle", "/ no updates",
            "wild, mean", "rest, mean", "p50", "p99", "age, mean", "age, max", "age, bound", "factors")  # fmt: skip
 
@@ -84,7 +81,7 @@ def _figures(iterations: NDArray[Any], age: NDArray[Any], wild: NDArray[np.bool_
     }
 
 
-def compared(objects: int, workers: list[int], setting: Setting, clairvoyant: bool) -> list[dict[str, Any]]:
+def compared(objects: int, workers: list[int], setting: Setting) -> list[dict[str, Any]]:
     """The rows of one number of objects, with ratios."""
     rows = [
         run(objects, 0, ORACLE, setting, update="every-1"),
@@ -96,10 +93,6 @@ def compared(objects: int, workers: list[int], setting: Setting, clairvoyant: bo
         rows.append(run(objects, count, "excess, default floor", setting, update_floor_iterations=3))
         for rule in ("round_robin", "excess"):
             rows.append(run(objects, count, rule + CORRECTED, setting, schedule=rule, woodbury=MANY))
-    if clairvoyant:
-        found = Clairvoyant(objects, setting.steps, setting.warm, setting.hold, setting.speed, setting.seed)
-        few = {"objects": objects, "wild": rows[0]["wild"], "rule": BEST}
-        rows += [{**few, "workers": count, "iterations": found.best(count)} for count in workers]
     total = {(row["rule"], row["workers"]): row["iterations"] for row in rows}
     for row in rows:
         row["/ oracle"] = row["iterations"] / total[ORACLE, 0]
@@ -116,9 +109,9 @@ def picture(rows: list[dict[str, Any]], sizes: list[int], workers: list[int]) ->
     figure, axes = plt.subplots(2, len(workers), figsize=(4 * len(workers), 8), sharex=True, sharey="row",
                                 layout="constrained", squeeze=False)  # fmt: skip
     for column, count in enumerate(workers):
-        for name in (NEVER, *RULES, EACH, *([BEST] if any(r["rule"] == BEST for r in rows) else [])):
+        for name in (NEVER, *RULES, EACH):
             own = [r for r in rows if r["rule"] == name and (r["workers"] == count or name in (NEVER, EACH))]
-            style = {NEVER: ":", EACH: ":", BEST: "-."}.get(name, "-")
+            style = {NEVER: ":", EACH: ":"}.get(name, "-")
             along = [r["objects"] for r in own]
             axes[0, column].plot(along, [r["/ oracle"] for r in own], style, marker="o", ms=3, label=name)
             if name in RULES:
@@ -150,11 +143,8 @@ Workers are virtual: one takes as many steps for a factor as its operations need
 3 steps for the three sizes), one matrix at a time; a matrix is copied in the step after its worker became idle. So
 a factor is 2 steps old at best when it is taken up, and the counts below repeat to the digit. *oracle*: a factor of
 each step's own matrix for every object; *no updates*: the first factor only; *{EACH}*: what asynchrony
-alone costs, with hardly anybody to share with; *{BEST}*: what the same workers could do at
-best (a search through the iterations of every matrix with every older factor, told beforehand what no rule can know:
-when and where hands take hold; resting objects as in the oracle's run; good to about half a percent). Ratios
-are of the iterations of all objects and steps; the resting ones, alike under every rule, draw them towards 1. Ages are
-of the factors used [steps].""",
+alone costs, with hardly anybody to share with. Ratios are of the iterations of all objects and steps;
+the resting ones, alike under every rule, draw them towards 1. Ages are of the factors used [steps].""",
         f"""\
 The floor of iterations is {setting.floor} here (default 3): a fresh float32 factor needs 1 or 2, so that what exceeds 2
 is what a new factor would save; with 3 an object dragged slowly looks satisfied at 3 iterations and turns go to those
@@ -165,62 +155,14 @@ Factors are not corrected for the hands' springs (woodbury = 0): so the rules ha
     )
 
 
-def _turn(row: dict[str, Any], setting: Setting) -> float:
-    """Steps in which the workers would serve each wild object once, at the pace they had."""
-    return row["wild"] * setting.steps / row["factors"]
-
-
-def _at_best(row: dict[str, Any] | None) -> str:
-    if row is None:
-        return ""
-    ratios = f"{row['/ oracle']:.2f} of the oracle's and {row['/ round robin']:.2f} of round robin's"
-    return f"The best order, found afterwards, makes {ratios}. "
-
-
-def _span(values: Iterable[float]) -> str:
-    found = sorted(values)
-    return f"{found[0]:.2f} to {found[-1]:.2f}" if found else "–"
-
-
-def _verdict(rows: list[dict[str, Any]], setting: Setting) -> list[str]:
-    """Where the aims are met, and what stands in the way elsewhere."""
-    each = {row["objects"]: row for row in rows if row["rule"] == EACH}
-    turns = {(row["objects"], row["workers"]): row for row in rows if row["rule"] == "round_robin"}
-    found = {(row["objects"], row["workers"]): row for row in rows if row["rule"] == BEST}
-    lines = ["Aims: *excess* at most 0.7 of round robin's iterations and at most 1.3 of the oracle's.", ""]
-    for row in (r for r in rows if r["rule"] == "excess"):
-        other, best = turns[row["objects"], row["workers"]], each[row["objects"]]
-        missed = [f"{row[key]:.2f} of {of}" for key, of, most in AIMS if row[key] > most]
-        where = f"- {row['objects']} objects, {row['workers']} worker{'s' * (row['workers'] > 1)}:"
-        if not missed:
-            lines.append(f"{where} both met ({row['/ round robin']:.2f} and {row['/ oracle']:.2f}).")
-            continue
-        ratio = best["iterations"] / other["iterations"]
-        lines.append(
-            f"{where} {', '.join(missed)}. {_at_best(found.get((row['objects'], row['workers'])))}A worker for each "
-            f"object would make {best['/ oracle']:.2f} of the oracle's and {ratio:.2f} of round robin's (whose oldest "
-            f"factor is {other['age, max']} steps old); serving nobody else, the workers would come round to each wild "
-            f"object in {_turn(row, setting):.3g} steps."
-        )
-    told = [r for r in rows if r.get("age, bound") is not None and r["workers"]]
-    longer = [r for r in told if r["age, bound"] < setting.warm + setting.steps]
-    kept = sum(r["age, max"] <= r["age, bound"] for r in longer)
-    corrected = [r for r in rows if r["rule"] == "excess" + CORRECTED]
-    near = sum(r["/ oracle"] <= AIMS[1][2] for r in corrected)
-    return [
-        "\n".join(lines),
-        f"With grabs corrected *excess* is within {AIMS[1][2]} of the oracle in {near} of {len(corrected)} cases, and "
-        f"{_span(r['/ round robin'] for r in corrected)} of round robin, which then is "
-        f"{_span(r['/ oracle'] for r in rows if r['rule'] == 'round_robin' + CORRECTED)} of the oracle.",
-        f"""\
-Where the best order or a worker for each object misses an aim too, no rule can meet it: asynchrony itself stands in the
-way (a factor at least 2 steps old against a fresh one each step), the workers are too few, or round robin's turns are
-short already. The rest is foresight: hands take hold elsewhere each {setting.hold} steps, and until its next factor an
-object solves against a spring that its factor does not know; a rule learns of it when iterations rise, and then a
-worker may be busy. Where round robin needs more than no updates, its factors hold springs that are gone besides lacking
-those that are there; the first factor holds none.""",
-        f"Bound of age that the server tells: kept in {kept} of the {len(longer)} runs that were longer than it.",
-    ]
+WHY = """\
+Aims: *excess* at most 0.7 of round robin's iterations and at most 1.3 of the oracle's. Where a worker for each object
+misses an aim too, no rule can meet it: asynchrony itself stands in the way (a factor at least 2 steps old against a
+fresh one each step), the workers are too few, or round robin's turns are short already. The best order of jobs, told
+beforehand when and where hands take hold, was searched for once and hardly beats a worker for each object. The rest is
+foresight: until its next factor an object solves against a spring that its factor does not know; a rule learns of it
+when iterations rise, and then a worker may be busy. Where round robin needs more than no updates, its factors hold
+springs that are gone besides lacking those that are there; the first factor holds none."""
 
 
 def _numbers(text: str) -> list[int]:
@@ -243,9 +185,6 @@ def main(
     ] = 3e5,
     floor: Annotated[int, typer.Option(min=0, help="Iterations above which there is excess")] = 2,
     seed: Annotated[int, typer.Option(help="Of where the hands take hold")] = 0,
-    clairvoyant: Annotated[
-        int, typer.Option(min=0, help="Also search the best order of jobs, of up to so many objects (64: minutes)")
-    ] = 0,
     quick: Annotated[bool, typer.Option("--quick", help="A small smoke run")] = False,
     merge: Annotated[
         list[Path] | None, typer.Option(metavar="JSON", help="Only make one page of these results; may be repeated")
@@ -266,7 +205,7 @@ def main(
     report = Piece("scheduler", title, {"objects": sizes, "workers": counts, **vars(setting)}, out, quick)
     rows = []
     for size in sizes:
-        rows += compared(size, counts, setting, size <= clairvoyant)
+        rows += compared(size, counts, setting)
         report.data["rows"] = rows
         report.keep()
         print(f"{size} objects done", flush=True)
@@ -279,7 +218,7 @@ def write(report: Report, rows: list[dict[str, Any]], setting: Setting) -> None:
     counts = sorted({row["workers"] for row in rows if row["rule"] in RULES})
     report.say(*_explained(setting))
     report.figure(picture(rows, sizes, counts), "scheduler.png", "Iterations and the oldest factor under each rule.")
-    report.say(*_verdict(rows, setting))
+    report.say(WHY)
     report.table([{**row, "workers": row["workers"] or None} for row in rows], COLUMNS)
     report.data["rows"] = rows
     report.write()
