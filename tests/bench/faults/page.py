@@ -40,6 +40,7 @@ LARGEST = (
 def write(report: Report, rows: list[Row], lives: list[Row], skipped: dict[str, str]) -> None:
     """Page and JSON."""
     report.data.update(rows=rows, lives=lives, skipped=skipped)
+    report.remember(rows, ("server", "workers on", "fault"), ("missed", "late steps", "iterations"))
     report.say(SETTING)
     for pair in dict.fromkeys((r["server"], r["workers on"]) for r in rows):
         mine = [r for r in rows if (r["server"], r["workers on"]) == pair]

@@ -59,6 +59,7 @@ def main(
     report.table(rows)
     report.say(order(rows, latency))
     report.data["rows"] = rows
+    report.remember(rows, ("scheme",), ("iterations, mean", "step p50 [ms]"))
     report.data["runs"] = {
         name: {"iterations": [r.iterations for r in runs], "seconds": [r.seconds for r in runs],
                "age": [r.age for r in runs]}

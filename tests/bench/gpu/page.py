@@ -69,6 +69,8 @@ def _order(key: tuple[Any, ...]) -> tuple[Any, ...]:
 def write(report: Report, data: Data) -> None:
     """Everything, in the order of interest."""
     report.data |= data
+    usual = [row for row in data["steps"] if row["material"] == MATERIALS[0] and not row["settings"]]
+    report.remember(usual, ("tets", "beams"), ("us p50", "iterations"))
     report.say(_device(data["device"]), PROBLEM)
     if data["steps"]:
         _steps(report, data)

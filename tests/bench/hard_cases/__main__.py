@@ -169,9 +169,13 @@ def main(
     report.say(SEEDS_ABOUT.format(seeds=1 if quick else 16))
     report.table(seeded)
     report.data["rows"], report.data["models"], report.data["seeds"] = rows, model_rows, seeded
-    report.data["iterations"] = {case.name: outcome.iterations for case, outcome in results + of_models}
+    both = results + of_models
+    total = {"cases": len(both), "that do not hold": sum(bool(broken(*pair)) for pair in both),
+             "iterations of a step": float(np.mean([out.iterations.mean() for _, out in both]))}  # fmt: skip
+    report.remember([total], (), tuple(total))
+    report.data["iterations"] = {case.name: outcome.iterations for case, outcome in both}
     report.write()
-    if any(unexpected(case, outcome) for case, outcome in results + of_models):
+    if any(unexpected(case, outcome) for case, outcome in both):
         raise typer.Exit(1)
 
 

@@ -23,6 +23,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from tests.bench.harness import history
+
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
@@ -60,9 +62,10 @@ def calibration(quick: bool = False) -> dict[str, float]:
 
 def _first_line(command: list[str]) -> str:
     try:
-        return subprocess.run(command, capture_output=True, text=True, cwd=ROOT).stdout.strip().split("\n")[0]
+        result = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
     except OSError:
         return ""
+    return "" if result.returncode else result.stdout.strip().split("\n")[0]
 
 
 def _version(package: str) -> str:
@@ -73,7 +76,7 @@ def _version(package: str) -> str:
 
 
 def machine() -> dict[str, Any]:
-    """Processor, cores, governor, load, operating system."""
+    """Processor, cores, first GPU (empty without one), governor, load, operating system."""
     try:
         cpu = next(line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name"))
     except (OSError, StopIteration):
@@ -82,6 +85,7 @@ def machine() -> dict[str, Any]:
     return {
         "cpu": cpu.split(":")[-1].strip(),
         "cores": os.cpu_count(),
+        "gpu": _first_line(["nvidia-smi", "--query-gpu=name", "--format=csv,noheader"]),
         "governor": governor.read_text().strip() if governor.exists() else "unknown",
         "load": round(os.getloadavg()[0], 2),
         "system": f"{platform.system()} {platform.release()}",
@@ -137,9 +141,11 @@ class Report:
 
     def __init__(self, name: str, title: str, arguments: dict[str, Any], out: Path | None = None, quick: bool = False):
         self.name, self.title, self.arguments, self.quick = name, title, arguments, quick
+        self.out = out
         self.folder = out or ROOT / "out" / "bench" / name
         self.folder.mkdir(parents=True, exist_ok=True)
         self.data: dict[str, Any] = {}
+        self.key_figures: dict[str, float] = {}
         self._body: list[str] = []
         self._started = datetime.datetime.now().astimezone()
         self._machine, self._commit, self._before = machine(), commit(), calibration(quick)
@@ -156,6 +162,10 @@ class Report:
         """Saves a picture beside the Markdown and shows it there."""
         figure.savefig(self.folder / file, dpi=110)
         self._body.append(f"![{caption}]({file})\n\n{caption}")
+
+    def remember(self, rows: Sequence[dict[str, Any]], names: Sequence[str], values: Sequence[str]) -> None:
+        """Adds key figures to the line that `write` adds to the history (see history.figures)."""
+        self.key_figures |= history.figures(rows, names, values)
 
     def head(self) -> dict[str, Any]:
         """Where, when and with what, as at the start."""
@@ -187,8 +197,11 @@ class Report:
         return "\n\n".join([lines[0], lines[1], "\n".join(lines[2:]), *self._body]) + "\n"
 
     def write(self) -> Path:
-        """NAME.md and NAME.json; returns the folder."""
+        """NAME.md and NAME.json; returns the folder. A whole run into its usual folder adds a line to the history."""
         header = self.header()
+        if self.key_figures and self.out is None and not self.quick:
+            arguments = plain(self.arguments)
+            history.append(history.entry(self.name, header, arguments, self.key_figures), history.FILE)
         (self.folder / f"{self.name}.md").write_text(self.markdown(header))
         self.save(header)
         print(f"written: {self.folder}/{self.name}.md, .json and pictures", flush=True)

@@ -87,6 +87,9 @@ def _described(device: str, data: Data, quick: bool) -> float:
 def write(report: Report, data: Data) -> None:
     """The page."""
     report.data |= data
+    largest = max(r["tets"] for r in data["models"])
+    usual = [r for r in data["models"] if (r["tets"], r["precision"]) == (largest, "float64")]
+    report.remember(usual, ("device", "tets", "model"), ("us",))
     report.say(SETUP, BYTES)
     report.table(data["devices"])
     if left_out := models.missing():

@@ -22,6 +22,9 @@ def write(report: Report, setting: Setting, tables: Tables) -> None:
     """Page, picture and JSON. tables: rows by the name of their table."""
     report.data |= {name: rows for name, rows in tables.items() if rows}
     report.say(*words.explained(setting))
+    report.remember(tables.get("table1", []), ("device", "tets"), ("iterations", "step ms"))
+    warped = [row for row in tables.get("table2", []) if row["scheme"] == "async + warp"]
+    report.remember(warped, ("device", "load", "model"), ("iterations", "step ms"))
     for device in ("cpu", "gpu"):
         mine = {name: [row for row in rows if row.get("device") == device] for name, rows in tables.items()}
         if any(mine.values()):

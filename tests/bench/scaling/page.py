@@ -22,6 +22,7 @@ def write(report: Report, rows: list[Row]) -> None:
     """Page, pictures and JSON."""
     rows = sorted(rows, key=lambda r: (r["objects"], r["workers"], r["server"], r["workers on"]))
     report.data["rows"] = rows
+    report.remember(rows, KEYS, ("object-steps/s", "age p50, steps"))
     report.say(SETTING)
     if len(_pairs(rows)) > 1:
         report.say("## Side by side")

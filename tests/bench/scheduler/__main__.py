@@ -219,6 +219,7 @@ def write(report: Report, rows: list[dict[str, Any]], setting: Setting) -> None:
     report.say(*_explained(setting))
     report.figure(picture(rows, sizes, counts), "scheduler.png", "Iterations and the oldest factor under each rule.")
     report.say(WHY)
+    report.remember([r for r in rows if r["rule"] == "excess"], ("objects", "workers"), ("iterations", "age, max"))
     report.table([{**row, "workers": row["workers"] or None} for row in rows], COLUMNS)
     report.data["rows"] = rows
     report.write()

@@ -69,6 +69,8 @@ def main(
     failed = [row.case for row in rows if not row.holds]
     report.say(ABOUT)
     report.table([row.cells() for row in rows])
+    total = {"cases": len(rows), "that fail": len(failed), "sum of errors": sum(row.error for row in rows)}
+    report.remember([total], (), tuple(total))
     report.data["rows"] = [vars(row) | {"holds": row.holds} for row in rows]
     report.data["curves"] = {label: {"cells": m, "errors": e} for label, (m, e) in curves.items()}
     report.figure(picture(curves), "verification.png", "Errors on finer meshes: locking, and orders in space.")

@@ -141,6 +141,7 @@ def page(report: Report, rows: list[Row]) -> None:
     report.figure(picture(rows), "warp.png", "Iterations with the warp off, by those with it on.")
     report.table(rows, [key for key in rows[0] if key not in ("unconverged", "repeats")])
     report.data["rows"] = rows
+    report.remember([r for r in rows if r["model"] == MODELS[0].name], ("load", "update"), ("on", "on [ms]"))
     report.write()
 
 
