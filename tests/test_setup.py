@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.system
 SETUP = Path(__file__).parents[1] / "deploy" / "setup.sh"
 SLOW = 'slow() { for name in a b c; do echo "Unpacking lib$name ..."; sleep 0.7; done; }'
 

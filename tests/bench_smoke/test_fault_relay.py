@@ -62,6 +62,7 @@ def test_a_slow_cable_keeps_what_fits_and_drops_the_rest(way):
     assert 1 <= len(way._under_way) <= 2
 
 
+@pytest.mark.system
 def test_a_namespace_at_the_end_of_a_cable():
     """Where root may make one."""
     try:

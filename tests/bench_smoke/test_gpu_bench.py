@@ -130,6 +130,7 @@ def test_pieces_become_one_page(found: tuple[Beams, Any], tmp_path: Path) -> Non
     assert "| 512 beams of 540 | **1 ms** |" in readme
 
 
+@pytest.mark.system
 def test_without_a_gpu_one_line_and_code_2(tmp_path: Path) -> None:
     environment = {**os.environ, "CUDA_VISIBLE_DEVICES": ""}
     command = [sys.executable, "-m", "tests.bench.gpu", "--out", str(tmp_path)]

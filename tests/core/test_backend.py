@@ -191,6 +191,7 @@ def test_every_text_of_the_package_compiles_without_warnings(path, tmp_path):
         assert result.returncode == 0, result.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arch", ["sm_80", "sm_90"])
 @pytest.mark.parametrize("path", GPU_TEXTS)
 def test_every_text_of_the_package_compiles_for_gpus(path, arch, tmp_path):
@@ -285,6 +286,7 @@ BLOCKS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("real", "local"), [("double", "double"), ("double", "float"), ("float", "float")])
 @pytest.mark.parametrize(
     "group",

@@ -174,6 +174,7 @@ def test_progress_is_told_within_and_not_after(tmp_path, capsys):
     assert capsys.readouterr().err == ""  # stderr is no terminal: no bar
 
 
+@pytest.mark.slow
 def test_a_first_run_says_what_it_waits_for_and_a_second_does_not(tmp_path):
     """With a compiler that does not optimize, for time. Without an NVIDIA device neither says a word of GPUs."""
     (tmp_path / "scene.toml").write_text(SCENE)

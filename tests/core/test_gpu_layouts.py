@@ -52,6 +52,7 @@ def test_both_sides_agree(name: str, layout: np.dtype) -> None:
     assert fields(name) == ours
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("threads", "blocks", "more"), [(256, 1, []), (128, 2, []), (64, 4, []), (64, 4, ["-DSEARCHED"])]
 )

@@ -22,11 +22,13 @@ from tests.hard_cases.starts import mirrored, spinning
 from tests.hard_cases.table import CASES
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 def test_hard_case(case: Case, tmp_path: Path) -> None:
     assert broken(case, run_case(case, tmp_path)) == []
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # numbers without end are what some of them are about
 @pytest.mark.parametrize("case", QUICK, ids=lambda case: case.name)
 def test_models(case: Case, tmp_path: Path) -> None:
@@ -46,6 +48,7 @@ def test_every_effect_with_elements_is_a_model_of_the_hard_cases() -> None:
     assert {model.effect for model in MODELS.values()} == set(known_effects()) - others
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", [c for c in CASES if c.energy > 1e-6], ids=lambda case: case.name)
 def test_energy_that_rises_is_an_error_of_the_time_step(case: Case, tmp_path: Path) -> None:
     """What the notes of the table say of every case that is allowed to gain energy."""

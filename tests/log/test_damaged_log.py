@@ -43,6 +43,7 @@ def whole(tmp_path: Path) -> bytes:
     return path.read_bytes()
 
 
+@pytest.mark.slow
 def test_cut_anywhere_reads_as_far_as_it_goes(whole: bytes, tmp_path: Path) -> None:
     path = tmp_path / "cut.mcap"
     counts = []
@@ -65,6 +66,7 @@ def test_cut_anywhere_reads_as_far_as_it_goes(whole: bytes, tmp_path: Path) -> N
     assert counts == sorted(counts) and counts[-1] == 40 and set(counts) >= {0, 5, 20, 35}
 
 
+@pytest.mark.slow
 def test_flipped_bytes_never_raise_anything_else(whole: bytes, tmp_path: Path) -> None:
     path = tmp_path / "flipped.mcap"
     random = np.random.default_rng(3)
@@ -173,6 +175,7 @@ def test_a_chunk_that_unpacks_to_more_than_it_says(compression: str) -> None:
         log_chunks._unpack(bomb)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("compression", ["lz4", "zstd"])
 @pytest.mark.parametrize("content", ["zeros", "many empty records", "a record beyond the end"])
 def test_what_holds_no_records_is_not_unpacked_to_its_end(compression: str, content: str, tmp_path: Path) -> None:

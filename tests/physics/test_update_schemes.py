@@ -31,6 +31,7 @@ def mean() -> dict[str, float]:
     }
 
 
+@pytest.mark.slow
 def test_warp_makes_an_old_factor_young(mean: dict[str, float]) -> None:
     assert mean["async+warp"] <= 0.6 * mean["async"]
     assert mean["async+warp"] <= 0.1 * mean["cg"]

@@ -177,6 +177,8 @@ def main(
     arguments = {"steps": steps, "rounds": rounds, "latency": latency, "processes": processes, "tolerances": tolerances}
     report = Report("accuracy", "What accuracy costs in time", arguments, out, quick)
     points = measure(report, schemes(latency, processes), tolerances, steps, rounds, mesh)
+    if not all(error > 0 for point in points for error in point.worst):
+        raise SystemExit("bench accuracy: no error at all: a method was its own reference")
     report.say(ERRORS, _times(latency, processes))
     report.figure(diagram(points), "accuracy.png", "Work against precision; bars: range of medians over the rounds.")
     for beam in BEAMS:
