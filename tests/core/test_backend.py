@@ -181,6 +181,7 @@ GPU_TEXTS = [path for path in GPU_TEXTS if path != FRAME] + [f"{FRAME}+{law}" fo
 TEXTS = [path for path in GPU_TEXTS if not path.startswith("gpu/")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", TEXTS)
 def test_every_text_of_the_package_compiles_without_warnings(path, tmp_path):
     """In both precisions; -Wall is on, and a warning is an error here."""

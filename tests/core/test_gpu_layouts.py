@@ -73,6 +73,7 @@ def test_thread_blocks_take_all_registers():
         assert (threads, blocks) in ((256, 1), (128, 2), (64, 4)) and threads * blocks == 256
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arch", ["sm_80", "sm_90"])
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_the_search_compiles_with_the_layouts_of_this_side_and_spills_no_registers(precision, arch):

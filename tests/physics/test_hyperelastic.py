@@ -57,6 +57,7 @@ def test_the_stiffness_is_minus_the_slope_of_the_forces(tmp_path, law, size):
     assert error_of_stiffness(sim) < 1e-5
 
 
+@pytest.mark.slow
 @every_state
 @pytest.mark.parametrize("projection", ["clamp", "absolute", "excess"])
 def test_projected_stiffness_is_that_of_the_reference_and_semidefinite(tmp_path, law, size, projection):

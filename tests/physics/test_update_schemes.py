@@ -8,6 +8,7 @@ import pytest
 from sim_server.driver import Driver
 from sim_server.simulation import Simulation
 
+pytestmark = pytest.mark.slow
 BEAM = Path(__file__).resolve().parents[2] / "deploy" / "scenes" / "beam.toml"
 STEPS, LATENCY = 150, 30
 
@@ -31,7 +32,6 @@ def mean() -> dict[str, float]:
     }
 
 
-@pytest.mark.slow
 def test_warp_makes_an_old_factor_young(mean: dict[str, float]) -> None:
     assert mean["async+warp"] <= 0.6 * mean["async"]
     assert mean["async+warp"] <= 0.1 * mean["cg"]

@@ -115,6 +115,7 @@ def test_other_words_are_refused(choice, text, capsys):
     assert text in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arch", ["sm_80", "sm_90"])
 @pytest.mark.parametrize(("real", "value"), [("double", "float"), ("float", "float")])
 def test_the_kernels_compile_for_gpus(arch, real, value):
