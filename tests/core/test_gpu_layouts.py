@@ -68,9 +68,23 @@ def test_the_solver_spills_no_registers(threads, blocks, more):
 
 
 def test_thread_blocks_take_all_registers():
-    for bodies, nodes in ((1, 720), (400, 720), (1000, 160)):
-        threads, blocks = threads_and_blocks(np.full(bodies, nodes), 132)
-        assert (threads, blocks) in ((256, 1), (128, 2), (64, 4)) and threads * blocks == 256
+    """256 threads a multiprocessor, in more blocks where there are more bodies than blocks, most where these are small."""
+    found = {
+        (bodies, nodes): threads_and_blocks(np.full(bodies, nodes), 132)
+        for bodies, nodes in (
+            (1, 720),
+            (124, 720),
+            (125, 720),
+            (264, 160),
+            (265, 160),
+            (400, 720),
+            (1000, 299),
+            (1000, 300),
+        )
+    }
+    assert {pair for (bodies, _), pair in found.items() if bodies <= 124} == {(256, 1)}
+    assert {key for key, pair in found.items() if pair == (128, 2)} == {(125, 720), (264, 160), (400, 720), (1000, 300)}
+    assert {key for key, pair in found.items() if pair == (64, 4)} == {(265, 160), (1000, 299)}
 
 
 @pytest.mark.slow

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a scene does not list costs nothing: it is not imported, compiled, launched or allocated."""
+"""What a scene does not list is neither compiled nor launched, and not imported unless a listed effect needs it."""
 
 import json
 import subprocess

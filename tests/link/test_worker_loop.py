@@ -259,8 +259,13 @@ def test_another_method_is_another_analysis(worker: Worker, uplink: FakeUplink) 
 def test_a_pattern_that_the_server_knows_is_not_sent_again(worker: Worker, uplink: FakeUplink) -> None:
     drain(worker, uplink, matrix(1))
     known = uplink.answers[0][0].pattern
-    drain(worker, uplink, matrix(2, known_patterns=[known]), matrix(3))
-    assert len(uplink.patterns) == 1 + 1  # the third job says that the server forgot it
+    sent = []
+    for number, patterns in enumerate(([known], [], [known + 1, known]), start=2):
+        before = len(uplink.patterns)
+        drain(worker, uplink, matrix(number, known_patterns=patterns))
+        sent.append(len(uplink.patterns) - before)
+    assert [answer.job for answer, _ in uplink.answers] == [1, 2, 3, 4]
+    assert sent == [0, 1, 0], "the third job says that the server forgot it"
 
 
 def test_what_cannot_be_factorized_is_answered_with_the_reason(worker: Worker, uplink: FakeUplink) -> None:

@@ -11,6 +11,7 @@ from sim_server import engine as engine_module
 from sim_server.driver import Driver
 from sim_server.effects.touch import Interaction, Touch
 from sim_server.engine import NativeFactor
+from sim_server.errors import InputError
 from sim_server.simulation import Simulation
 from tests.scenes import bar, factor_of, rotation, simulation
 
@@ -269,8 +270,13 @@ def test_bodies_that_cannot_be_touched_and_the_option_off_take_no_room():
 
 
 def test_a_gpu_leaves_it_out():
-    """No word of refusal, as it is on by default."""
-    touched()[0].scene.solver.check_device("gpu")
+    """No word of refusal, as it is on by default; what a scene asks for in vain is refused."""
+    default = touched()[0].scene.solver
+    assert default.woodbury > 0
+    default.check_device("gpu")
+    for option, value in (("preconditioner", "ssor"), ("factor_precision", "float64"), ("budget", 1.0)):
+        with pytest.raises(InputError, match=f"solver.{option}"):
+            default.model_copy(update={option: value}).check_device("gpu")
 
 
 def test_factors_posted_again_at_the_same_steps_are_corrected_alike():

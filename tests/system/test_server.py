@@ -97,6 +97,15 @@ def test_a_killed_worker_costs_no_step(stage: Stage, tmp_path: Path) -> None:
         refused = state()[1].factors_refused
         os.kill(worker.process.pid, signal.SIGSTOP)  # what it has now, or gets, it will not answer
         stopped = state()[0]
+        steps_of_a_job: dict[tuple[int, int], list[int]] = {}
+
+        def goes_on() -> bool:
+            step, found = state()
+            if found.in_flight:
+                steps_of_a_job.setdefault((found.factors_used, found.factors_refused), []).append(step)
+            return any(steps[-1] > steps[0] + 10 for steps in steps_of_a_job.values())
+
+        until(goes_on, "steps go on while nobody answers the job in flight")
         until(lambda: state()[0] > stopped + 10, "what was on the way has come")
         until(lambda: state()[1].in_flight or state()[1].factors_refused > refused, "it has a matrix, or had one")
         worker.kill()

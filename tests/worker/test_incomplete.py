@@ -147,17 +147,18 @@ def test_a_matrix_that_is_not_positive_definite_is_shifted(graph, tolerance, dep
     assert analysis.remedy == ""
 
 
-def test_the_shift_is_the_least_of_its_doublings():
-    """L L^T is the shifted matrix, and half the shift is too little."""
+@pytest.mark.parametrize("taken", [0.6, 0.65, 0.7, 0.8, 0.9])
+def test_the_shift_is_the_least_of_its_triplings(taken):
+    """L L^T is the shifted matrix, and a third of the shift is too little."""
     values, own = spd(*BAR, seed=12), diagonal_blocks(*BAR)
-    values[own] -= 0.7 * values[own]
+    values[own] -= taken * values[own]
     norm = np.repeat(node_norms(BAR[0], values), 3)
     matrix = dense_matrix(*BAR, values)
     analysis = prepared(*BAR, incomplete())
     product = in_place(analysis, analysis.factorize(values, np.float64))
     shift = float(analysis.remedy.split()[-1])
     assert np.abs(product - matrix - shift * np.diag(norm)).max() < 1e-12 * np.abs(product).max()
-    assert np.linalg.eigvalsh(matrix + 0.5 * shift * np.diag(norm))[0] < 0
+    assert np.linalg.eigvalsh(matrix + shift / 3 * np.diag(norm))[0] < 0
 
 
 def test_ssor_needs_positive_diagonal_blocks():
