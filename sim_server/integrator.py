@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """What a step does before the effects and after the solve, by the scheme of the scene.
 
-All schemes are, with f the forces, M the lumped masses and h the time step,
+Symbols: docs/notation.md. All schemes are, with f the forces, M the lumped masses and h the time step,
 
     x' = X + c v',    M (v' - V) = i f(x', v')         (a prime: at the end of the step)
 

@@ -51,7 +51,7 @@ class World:
     projection: of the elements' stiffness, the scene's choice;
     backend: where kernels run, Cpu or gpu.device.Gpu.
 
-    What effects need of the integrator (formulas: integrator.py) instead of dt and v:
+    Symbols: docs/notation.md. What effects need of the integrator (formulas: integrator.py) instead of dt and v:
     impulse [s]: times a force is what goes into b. reach [s]: x moves by reach (ahead + dv) until the end of the step,
     dv the solution. ahead (n, 3) [m/s]. drift (n, 3) [m/s]: (reach ahead + beta v) / (reach + beta), what elements take
     for the velocity, so that stiffening * (K drift) holds motion and damping. inertia: False in a quasi-static scene.
