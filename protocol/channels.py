@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Every channel in one table: key, message, sender, rate, size limits, logged or not, purpose."""
+"""Every channel in one table: key, message, sender, rate, size limits, purpose. docs/protocol.md shows it."""
 
 import re
 from dataclasses import dataclass
@@ -24,33 +24,28 @@ class Channel:
     rate: str
     limit: int
     bulk: int
-    logged: bool
     purpose: str
 
 
 # A message with bulk travels as attachment, the array as payload or in a slot of shared memory.
 CHANNELS: dict[str, Channel] = {
-    "status": Channel("status", "Status", "server", "1 Hz, queryable", MIB, 0, True, "health of the whole scene"),
-    "scene": Channel("scene", "Scene", "server", "queryable", 4 * MIB, 0, True, "what is being simulated"),
+    "status": Channel("status", "Status", "server", "1 Hz, queryable", MIB, 0, "health of the whole scene"),
+    "scene": Channel("scene", "Scene", "server", "queryable", 4 * MIB, 0, "what is being simulated"),
     "topology": Channel(
-        "topology/{object}", "Topology", "server", "once per epoch, queryable", 256 * MIB, 0, True, "mesh, pattern of A"
+        "topology/{object}", "Topology", "server", "once per epoch, queryable", 256 * MIB, 0, "mesh, pattern of A"
     ),
-    "matrix": Channel(
-        "matrix/{worker}/{object}", "Matrix", "server", "one in flight per object", 64 * KIB, GIB, False, "job"
-    ),
-    "pattern": Channel(
-        "pattern/{object}", "FactorPattern", "worker", "when it is new", 256 * MIB, 0, False, "pattern of L"
-    ),
-    "factor": Channel("factor/{object}", "Factor", "worker", "one per matrix", 64 * KIB, GIB, False, "values of L"),
-    "worker": Channel("worker/{worker}", "WorkerInfo", "worker", "5 Hz", 16 * KIB, 0, False, "hello, then heartbeat"),
-    "echo": Channel("echo/{worker}", "Echo", "worker", "query, at join", 4 * KIB, 0, False, "does shared memory work?"),
-    "steps": Channel("steps", "Steps", "server", "20 Hz batches", 8 * MIB, 0, True, "iterations, residuals, times"),
-    "state": Channel("state/{object}", "State", "server", "at most 30 Hz", 256 * MIB, 0, True, "positions, velocities"),
-    "command": Channel("command", "Command", "client", "query", 64 * KIB, 0, True, "push, grab, cut, pause, ..."),
-    "reply": Channel("command", "Reply", "server", "per command", MIB, 0, False, "what became of a command"),
-    "alive_server": Channel("alive/server/{incarnation}", "", "server", "liveliness", 0, 0, False, "the server lives"),
-    "alive_worker": Channel("alive/worker/{worker}", "", "worker", "liveliness", 0, 0, False, "a worker lives"),
-    "alive_client": Channel("alive/client/{client}", "", "client", "liveliness", 0, 0, False, "a client lives"),
+    "matrix": Channel("matrix/{worker}/{object}", "Matrix", "server", "one in flight per object", 64 * KIB, GIB, "job"),
+    "pattern": Channel("pattern/{object}", "FactorPattern", "worker", "when it is new", 256 * MIB, 0, "pattern of L"),
+    "factor": Channel("factor/{object}", "Factor", "worker", "one per matrix", 64 * KIB, GIB, "values of L"),
+    "worker": Channel("worker/{worker}", "WorkerInfo", "worker", "5 Hz", 16 * KIB, 0, "hello, then heartbeat"),
+    "echo": Channel("echo/{worker}", "Echo", "worker", "query, at join", 4 * KIB, 0, "does shared memory work?"),
+    "steps": Channel("steps", "Steps", "server", "20 Hz batches", 8 * MIB, 0, "iterations, residuals, times"),
+    "state": Channel("state/{object}", "State", "server", "at most 30 Hz", 256 * MIB, 0, "positions, velocities"),
+    "command": Channel("command", "Command", "client", "query", 64 * KIB, 0, "push, grab, pause, ..."),
+    "reply": Channel("command", "Reply", "server", "per command", MIB, 0, "what became of a command"),
+    "alive_server": Channel("alive/server/{incarnation}", "", "server", "liveliness", 0, 0, "the server lives"),
+    "alive_worker": Channel("alive/worker/{worker}", "", "worker", "liveliness", 0, 0, "a worker lives"),
+    "alive_client": Channel("alive/client/{client}", "", "client", "liveliness", 0, 0, "a client lives"),
 }
 
 _NAME = re.compile(r"[A-Za-z0-9_.-]{1,64}")

@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: MIT
+"""docs/protocol.md has the channels of protocol/channels.py, and docs name the limits that the code has."""
+
+import re
+
+import pytest
+
+from protocol import memlock
+from protocol.channels import CHANNELS, PROTOCOL, Channel
+from sim_server import cli, recorder
+from sim_server.mesh import MOST_TETS
+from sim_server.network import jobs, rates, roster, waiting
+from sim_server.scene import integrator_options, where
+from tests.docs.figures import DOCS, table_under
+
+UNITS = ((1 << 30, "GiB"), (1 << 20, "MiB"), (1 << 10, "KiB"))
+NAMES = {"object": "O", "worker": "W", "client": "CLIENT", "incarnation": "INCARNATION"}
+
+
+def size(count: int) -> str:
+    unit, name = next((u, n) for u, n in UNITS if count >= u)
+    return f"{count // unit} {name}"
+
+
+def row_of(channel: Channel) -> tuple[str, ...]:
+    """What the page says of a channel."""
+    key = re.sub(r"{(\w+)}", lambda m: NAMES[m[1]], channel.key)
+    limit = " + ".join(size(count) for count in (channel.limit, channel.bulk) if count)
+    return f"`{key}`", channel.message, channel.sender, channel.rate, limit
+
+
+def test_channels() -> None:
+    rows = table_under((DOCS / "protocol.md").read_text(), "The protocol")
+    said = [tuple(row[c] for c in ("key under `warpfactor/NAME/`", "message", "from", "when", "limit")) for row in rows]
+    assert sorted(said) == sorted(row_of(channel) for channel in CHANNELS.values())
+
+
+@pytest.mark.parametrize(
+    ("page", "sentence"),
+    [
+        ("protocol.md", f"The protocol version is {PROTOCOL}."),
+        ("protocol.md", f"Each of up to {rates.CLIENTS} clients may send {rates.RATE:g} commands a second"),
+        ("protocol.md", f"and {rates.BURST:g} at once after a rest"),
+        ("protocol.md", f"most {waiting.WAITING} commands wait"),
+        ("protocol.md", f"while fewer than {waiting.LATE} wait"),
+        ("protocol.md", f"Of workers {roster.WORKERS} are known at a time"),
+        ("protocol.md", f"of names that have a token and say nothing {roster.TOKENS};"),
+        ("protocol.md", f"{jobs.TIMES} times what the last factorization of that object took"),
+        ("protocol.md", f"({jobs.SHORTEST:g} s at least)"),
+        ("protocol.md", f"has {jobs.LONGEST:g} s."),
+        ("protocol.md", f"({jobs.SHORTEST:g} to {jobs.LONGEST:g} s,"),
+        ("protocol.md", f"`ulimit -l` of {(memlock.POOL_LIMIT + memlock.METADATA) >> 10:,} KiB"),
+        ("scenes.md", f"in at most {where.LONGEST} characters and {where.DEEPEST} levels"),
+        ("scenes.md", f"{MOST_TETS:,} tetrahedra in all"),
+        ("use.md", f"above {recorder.FRAME_BYTES >> 20} MiB"),
+        ("use.md", f"above {recorder.TOTAL_BYTES >> 20} MiB all records"),
+        ("use.md", f"up to {cli.WORKERS_JOIN:g} s"),
+        ("gpu.md", f"{CHANNELS['factor'].bulk >> 30} GiB"),
+        ("scenes.md", f"is at most {integrator_options.ROUNDS}"),
+    ],
+)
+def test_limits(page: str, sentence: str) -> None:
+    assert sentence in " ".join((DOCS / page).read_text().split())
