@@ -28,7 +28,7 @@ def _launch() -> Any:
 
 def _options(command: Any) -> list[TyperOption]:
     general = {"--help", "--version", "--install-completion", "--show-completion"}
-    return [p for p in command.params if isinstance(p, TyperOption) and not general & set(p.opts)]
+    return [p for p in command.params if isinstance(p, TyperOption) and not p.hidden and not general & set(p.opts)]
 
 
 def _default(option: TyperOption) -> set[str]:
