@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.core import nvrtc
 from tests.docs.figures import ROOT
 
 TEXT = (ROOT / "CONTRIBUTING.md").read_text()
@@ -29,3 +30,13 @@ def test_the_effect_runs(tmp_path: Path) -> None:
     run = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert run.returncode == 0, run.stdout + run.stderr
     assert "1 passed" in run.stdout
+
+
+def test_its_kernel_compiles_for_a_gpu(tmp_path: Path) -> None:
+    if (library := nvrtc.library()) is None:
+        pytest.skip("needs the package nvidia-cuda-nvrtc")
+    (kernel,) = re.findall(r"^```cpp\n(.*?)^```", TEXT, re.MULTILINE | re.DOTALL)
+    (tmp_path / "foundation.cu").write_text(kernel)
+    options = ["-std=c++17", f"-I{ROOT / 'sim_server' / 'kernels'}", "-arch=sm_90"]
+    code, said = nvrtc.compiled(library, tmp_path / "foundation.cu", options)
+    assert code, said
