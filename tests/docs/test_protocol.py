@@ -9,7 +9,7 @@ from protocol import memlock
 from protocol.channels import CHANNELS, PROTOCOL, Channel
 from sim_server import cli, recorder
 from sim_server.mesh import MOST_TETS
-from sim_server.network import jobs, rates, roster, waiting
+from sim_server.network import command_queue, leases, rate_limiter, worker_registry
 from sim_server.scene import integrator_options, where
 from tests.docs.figures import DOCS, table_under
 
@@ -39,24 +39,27 @@ def test_channels() -> None:
     ("page", "sentence"),
     [
         ("protocol.md", f"The protocol version is {PROTOCOL}."),
-        ("protocol.md", f"Each of up to {rates.CLIENTS} clients may send {rates.RATE:g} commands a second"),
-        ("protocol.md", f"and {rates.BURST:g} at once after a rest"),
-        ("protocol.md", f"most {waiting.WAITING} commands wait"),
-        ("protocol.md", f"while fewer than {waiting.LATE} wait"),
-        ("protocol.md", f"Of workers {roster.WORKERS} are known at a time"),
-        ("protocol.md", f"of names that have a token and say nothing {roster.TOKENS};"),
-        ("protocol.md", f"{jobs.TIMES} times what the last factorization of that object took"),
-        ("protocol.md", f"({jobs.SHORTEST:g} s at least)"),
-        ("protocol.md", f"has {jobs.LONGEST:g} s."),
-        ("protocol.md", f"({jobs.SHORTEST:g} to {jobs.LONGEST:g} s,"),
+        (
+            "protocol.md",
+            f"Each of up to {rate_limiter.CLIENTS} clients may send {rate_limiter.RATE:g} commands a second",
+        ),
+        ("protocol.md", f"and {rate_limiter.BURST:g} at once after a rest"),
+        ("protocol.md", f"most {command_queue.CAPACITY} commands wait"),
+        ("protocol.md", f"while fewer than {command_queue.MAX_DEFERRED} wait"),
+        ("protocol.md", f"Of workers {worker_registry.WORKERS} are known at a time"),
+        ("protocol.md", f"of names that have a token and say nothing {worker_registry.TOKENS};"),
+        ("protocol.md", f"{leases.LEASE_FACTOR} times what the last factorization of that object took"),
+        ("protocol.md", f"({leases.MIN_LEASE:g} s at least)"),
+        ("protocol.md", f"has {leases.MAX_LEASE:g} s."),
+        ("protocol.md", f"({leases.MIN_LEASE:g} to {leases.MAX_LEASE:g} s,"),
         ("protocol.md", f"`ulimit -l` of {(memlock.POOL_LIMIT + memlock.METADATA) >> 10:,} KiB"),
-        ("scenes.md", f"in at most {where.LONGEST} characters and {where.DEEPEST} levels"),
+        ("scenes.md", f"in at most {where.MAX_LENGTH} characters and {where.MAX_DEPTH} levels"),
         ("scenes.md", f"{MOST_TETS:,} tetrahedra in all"),
         ("use.md", f"above {recorder.FRAME_BYTES >> 20} MiB"),
         ("use.md", f"above {recorder.TOTAL_BYTES >> 20} MiB all records"),
         ("use.md", f"up to {cli.WORKERS_JOIN:g} s"),
         ("gpu.md", f"{CHANNELS['factor'].bulk >> 30} GiB"),
-        ("scenes.md", f"is at most {integrator_options.ROUNDS}"),
+        ("scenes.md", f"is at most {integrator_options.MAX_STATES}"),
     ],
 )
 def test_limits(page: str, sentence: str) -> None:

@@ -10,9 +10,9 @@ from annotated_types import Ge, Gt, Le, Lt, MaxLen, MinLen
 from pydantic.fields import FieldInfo
 
 from sim_server import effects
-from sim_server.scene.integrator_options import Integrator
-from sim_server.scene.model import MeshSource, Pose, Record, Scene, SceneObject
-from sim_server.scene.solver_options import PRECONDITIONERS, Solver
+from sim_server.scene.integrator_options import IntegratorOptions
+from sim_server.scene.model import MeshSource, Pose, RecordOptions, Scene, SceneObject
+from sim_server.scene.solver_options import PRECONDITIONERS, SolverOptions
 from tests.docs.figures import DOCS, Row, table_under
 
 TEXT = (DOCS / "scenes.md").read_text()
@@ -117,9 +117,9 @@ def rows_of(heading: str) -> dict[str, Row]:
     ("heading", "fields"),
     [
         ("The scene", {k: f for k, f in Scene.model_fields.items() if k in ("dt", "name")}),
-        ("[integrator]", Integrator.model_fields),
-        ("[solver]", Solver.model_fields),
-        ("[record]", Record.model_fields),
+        ("[integrator]", IntegratorOptions.model_fields),
+        ("[solver]", SolverOptions.model_fields),
+        ("[record]", RecordOptions.model_fields),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
