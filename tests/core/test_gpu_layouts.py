@@ -68,7 +68,7 @@ def test_the_solver_spills_no_registers(threads, blocks, more):
 
 
 def test_thread_blocks_take_all_registers():
-    """256 threads a multiprocessor, in more blocks where there are more bodies than blocks, most where these are small."""
+    """256 threads a multiprocessor: in more blocks where there are more bodies, in most where these are small."""
     found = {
         (bodies, nodes): threads_and_blocks(np.full(bodies, nodes), 132)
         for bodies, nodes in (
