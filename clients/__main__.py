@@ -1,20 +1,16 @@
 # SPDX-License-Identifier: MIT
-# ruff: noqa: E402 (signals are looked after before anything else is imported)
+# ruff: noqa: E402 (signal handlers are set before anything else is imported)
 """The command sim-client."""
 
 from __future__ import annotations
 
-import os
-import signal
+from protocol.process.early_signals import end_at_once
 
-# Until main() has set its own: end at once, also in the middle of an import, without a traceback. What a parent lets
-# its children ignore stays ignored.
-if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-    signal.signal(signal.SIGINT, lambda *_: os._exit(130))
-signal.signal(signal.SIGTERM, lambda *_: os._exit(143))
+end_at_once(terminated=143)  # until main() sets its own handlers
 
 import contextlib
 import json
+import signal
 import sys
 import time
 from collections.abc import Iterator
@@ -27,16 +23,17 @@ import typer
 from clients.errors import BadInput, ClientError
 from clients.point_option import AT_HELP, PointCommand, point
 from protocol.channels import DEFAULT_ENDPOINT, SERVER_NAME
-from protocol.endpoints import CONNECT
-from protocol.exhausted import exhausted
-from protocol.interrupted import handle, leave
-from protocol.limits import ORPHANED_PUSH
+from protocol.network.endpoints import CONNECT
 from protocol.printable import printable
+from protocol.process.command_line import Program, handle, leave
+from protocol.process.exhausted import exhausted
+from protocol.push_limits import ORPHANED_PUSH
 
 if TYPE_CHECKING:
     from clients.client import Client
     from protocol import messages_pb2 as pb
 
+PROGRAM = Program("sim-client")
 app = typer.Typer(
     name="sim-client",
     help="Look at a running sim-server, push its bodies about, view and export its logs.",
@@ -69,19 +66,9 @@ class Color(StrEnum):
     von_mises = "von_mises"
 
 
-def _version(asked: bool) -> None:
-    if asked:
-        from protocol.version import version
-
-        print(f"sim-client {version()}")
-        raise typer.Exit
-
-
 @app.callback()
 def client(
-    version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Say which version this is, and end.")
-    ] = False,
+    version: Annotated[bool, PROGRAM.version_option()] = False,
 ) -> None:
     """Look at a running sim-server, push its bodies about, view and export its logs."""
 
@@ -101,12 +88,12 @@ def status(
       sim-client status --connect tcp/192.168.1.5:7447
     """
     from clients.client import Client
-    from clients.plain import plain
+    from clients.to_json import to_json
 
     with Client(server, connect) as client:
         found = client.status(fresh=True)
     if as_json:
-        print(json.dumps(plain(found)))
+        print(json.dumps(to_json(found)))
         return
     from rich.console import Console
 
@@ -117,7 +104,7 @@ def status(
 
 @app.command()
 def watch(
-    count: Annotated[int, typer.Option(min=0, help="End after so many looks; 0 = never.")] = 0,
+    count: Annotated[int, typer.Option(min=0, help="End after N readings; 0 = never.")] = 0,
     connect: Connect = None,
     server: Server = SERVER_NAME,
 ) -> None:
@@ -139,7 +126,7 @@ def push(
     object: Object,
     force: Annotated[Triple, typer.Option(metavar="FX FY FZ", help="Force in all, N.")],
     at: At = "tip",
-    radius: Annotated[float, typer.Option(help="Nodes so far around are pushed, m; 0 = the nearest free one.")] = 0.0,
+    radius: Annotated[float, typer.Option(help="Nodes this near are pushed, m; 0 = the nearest free one.")] = 0.0,
     duration: Annotated[float, typer.Option(help="For how long, s of simulation.")] = 0.1,
     connect: Connect = None,
     server: Server = SERVER_NAME,
@@ -173,7 +160,7 @@ def grab(
     object: Object,
     to: Annotated[Triple, typer.Option(metavar="X Y Z", help="Where to pull it on a straight line, m.")],
     at: At = "tip",
-    radius: Annotated[float, typer.Option(help="Nodes so far around are held, m; 0 = the nearest free one.")] = 0.0,
+    radius: Annotated[float, typer.Option(help="Nodes this near are held, m; 0 = the nearest free one.")] = 0.0,
     stiffness: Annotated[float, typer.Option(help="Of the spring that pulls, N/m.")] = 1000.0,
     max_force: Annotated[float, typer.Option(help="That the spring never exceeds, N.")] = 100.0,
     duration: Annotated[float, typer.Option(help="How long the pull takes, s of wall clock.")] = 1.0,
@@ -204,7 +191,7 @@ def grab(
 
 
 def _await_end(client: Client, push: pb.Interaction) -> None:
-    """Waits until a push is over, or takes it back on Ctrl-C."""
+    """Waits until a push is over; releases it on Ctrl-C."""
     from protocol import messages_pb2 as pb
 
     try:
@@ -217,7 +204,7 @@ def _await_end(client: Client, push: pb.Interaction) -> None:
 
 
 def _command(verb: str, connect: Connect, server: str, as_json: bool) -> None:
-    """Sends a command that needs nothing but its verb, and says what happened."""
+    """Sends a command that is only a verb, and prints the outcome."""
     from clients.client import Client
 
     with Client(server, connect) as client:
@@ -289,7 +276,7 @@ def view(
     """
     if live == (log is not None):
         raise BadInput("view: give either a log or --live")
-    from clients import view as viewing
+    from clients.viewer import view as viewing
 
     if live:
         if save or screenshot:
@@ -325,7 +312,7 @@ def export(
       sim-client export run.mcap --object beam --to beam.csv
       sim-client export run.mcap --object beam --to beam.vtu --frame all
     """
-    from clients.export import export as write
+    from clients.log.export import export as write
     from clients.progress import progress_bar
 
     with _opened(log) as opened:
@@ -352,10 +339,10 @@ def load(
     connect: Elsewhere = None,
     server: Server = SERVER_NAME,
 ) -> None:
-    """Load a server and report what its steps, workers and clients make of it.
+    """Load a server with bodies and clients, and report its steps, workers and commands.
 
-    Starts a server with a scene of its own, which the same seed draws again. With --connect it loads one that runs
-    already: objects, tets, workers and device are what they are there.
+    Starts a server with a scene drawn from the seed. With --connect it loads a running one, whose objects, tets,
+    workers and device it takes as they are.
 
     \b
     Examples:
@@ -363,11 +350,12 @@ def load(
       sim-client load --objects 4 --clients 50 --rate 1000 --out out/load
       sim-client load --connect tcp/127.0.0.1:7447 --clients 20 --rate 200 --seconds 10 --json
     """
-    from clients import load as loading
+    from clients.load_test.options import LoadOptions, span
+    from clients.load_test.run import run
 
-    asked = loading.Load(
+    options = LoadOptions(
         objects,
-        loading.span(tets),
+        span(tets),
         clients,
         rate,
         seconds,
@@ -379,9 +367,9 @@ def load(
         server,
         quiet,
     )
-    found = loading.run(asked)
+    found = run(options)
     if out is not None:
-        from clients.load_plots import draw
+        from clients.load_test.plots import draw
 
         (out / "load.json").write_text(json.dumps(found, indent=1) + "\n")
         (out / "load.png").write_bytes(draw(found))
@@ -390,7 +378,7 @@ def load(
         return
     from rich.console import Console
 
-    from clients.load_report import tables
+    from clients.load_test.report import tables
 
     Console().print(tables(found))
 
@@ -423,7 +411,7 @@ def replay(
       sim-client replay run.mcap --name old --connect tcp/127.0.0.1:7447
       sim-client replay run.mcap --simulate
     """
-    from clients import replay_command
+    from clients.replay import command as replay_command
 
     if not simulate:
         replay_command.republish(log, speed, loop, begin, end, name, connect, listen, as_json)
@@ -443,8 +431,8 @@ def _coordinates(point: pb.Vector) -> str:
 
 @contextlib.contextmanager
 def _opened(path: Path) -> Iterator:
-    """A log, with its gaps told on stderr."""
-    from clients.log import Log
+    """Opens a log and prints its gaps on stderr."""
+    from clients.log.reader import Log
     from clients.progress import progress_bar
 
     size = path.stat().st_size if path.is_file() else 0
@@ -476,7 +464,7 @@ def main() -> None:
         print(f"sim-client: {printable(str(error))}", file=sys.stderr)
         sys.exit(1)
     except BaseException as error:
-        if interrupted:  # whatever became of it, an import that fails for instance
+        if interrupted:  # the interrupt may have become another error, e.g. of an import
             leave()
         if not (text := exhausted(error)):
             raise

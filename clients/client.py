@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The library for remote users of a running server: look, push, grab, pause."""
+"""The client library: read the state of a running server, push and grab its objects, pause it."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from typing import Self, TypeVar
 import zenoh
 from google.protobuf.message import Message
 
-from clients.asking import Asking, read
-from clients.asking import send as send_query
 from clients.errors import BadInput, ClientError
-from clients.frames import Mesh, mesh_of
 from clients.grab import Grab
+from clients.log.frames import Mesh, mesh_of
+from clients.queries import Queries, read
+from clients.queries import send as send_query
 from clients.subscriptions import States, Steps
-from protocol import PROTOCOL, Refused
 from protocol import messages_pb2 as pb
-from protocol.channels import ROOT, SERVER_NAME, check_name, key
+from protocol.channels import PROTOCOL, ROOT, SERVER_NAME, check_name, key
 from protocol.client_name import new_client
-from protocol.endpoints import BadEndpoint, usual_endpoints
-from protocol.session import ConnectionFailed, UnknownHost, open_session
+from protocol.network.endpoints import BadEndpoint, usual_endpoints
+from protocol.network.session import ConnectionFailed, UnknownHost, open_session
+from protocol.refused import Refused
 
 M = TypeVar("M", bound=Message)
 Point = Sequence[float]
@@ -56,7 +56,7 @@ class Client:
         except ConnectionFailed:
             raise self._no_server() from None
         try:
-            self._asking = Asking(self._session.zenoh, name, self._where)
+            self._queries = Queries(self._session.zenoh, name, self._where)
             self._token = self._session.zenoh.liveliness().declare_token(key("alive_client", name, client=self.id))
             self.status()
         except BaseException:
@@ -64,9 +64,9 @@ class Client:
             raise
 
     def status(self, fresh: bool = False) -> pb.Status:
-        """The server's health, at most a second old.
+        """Returns the server's health, at most a second old.
 
-        fresh: of now, and with where the objects are, unless the server has no time for that.
+        fresh: of this moment, with the positions of the objects, unless the server has no time for that.
         """
         if fresh:
             with contextlib.suppress(BadInput, ClientError):
@@ -77,14 +77,14 @@ class Client:
         return found[0]
 
     def scene(self) -> pb.Scene:
-        """What is simulated, with the text of the scene file."""
+        """Returns what is simulated, with the text of the scene file."""
         found = self._query("scene", pb.Scene)
         if not found:
             raise ClientError(f"server {self.name!r} has not announced its scene")
         return found[0]
 
     def meshes(self) -> dict[str, Mesh]:
-        """The present mesh of every object."""
+        """Returns the present mesh of every object."""
         objects = {name for scene in self._query("scene", pb.Scene) for name in scene.objects}
         found = self._query(
             "topology", pb.Topology, complete=lambda all: bool(objects) and objects <= {t.header.object for t in all}
@@ -97,7 +97,7 @@ class Client:
     def push(
         self, object: str, at: Point | str, force: Point, radius: float = 0.0, duration: float = 0.1
     ) -> pb.Interaction:
-        """Pushes the nodes of `object` within `radius` [m] of `at` [m] with `force` [N] in all for `duration` [s].
+        """Pushes the nodes of `object` within `radius` [m] of `at` [m] with a total `force` [N] for `duration` [s].
 
         at: coordinates, or a named point of the object: tip (the free node farthest from what is fixed), top, bottom,
         left, right, front, back. radius 0 takes the nearest free node. Returns the interaction as the server took it.
@@ -123,8 +123,8 @@ class Client:
     ) -> Grab:
         """Holds the nodes of `object` around `at` [m] by a spring to `target` (first `at` itself) that can be moved.
 
-        at: coordinates or a named point, as of a push; `interaction.point` of the handle tells where that is.
-        stiffness [N/m] of the spring, max_force [N] that it never exceeds. The handle releases as a context manager.
+        at: coordinates or a named point, as of a push; `interaction.point` of the handle holds its coordinates.
+        stiffness [N/m] and largest force max_force [N] of the spring. The handle is a context manager that releases.
         """
         wanted = pb.Interaction(
             object=object,
@@ -139,27 +139,27 @@ class Client:
         return Grab(self.command, self.command("grab", wanted).interaction)
 
     def pause(self) -> pb.Reply:
-        """Halts the simulation. The answer comes when the step under way has ended; its status tells which that was."""
+        """Pauses the simulation. The reply comes after the present step; its status has the number of that step."""
         return self.command("pause")
 
     def resume(self) -> pb.Reply:
-        """Lets it go on; status of the answer: from which step."""
+        """Resumes the simulation; the status of the reply has the step."""
         return self.command("resume")
 
     def stop(self) -> pb.Reply:
-        """Ends the server, which then closes its log; status of the answer: after how many steps."""
+        """Ends the server, which then closes its log; the status of the reply has the number of steps."""
         return self.command("stop")
 
     def states(self, objects: Sequence[str] | None = None) -> States:
-        """Frames of the named objects (all by default) from now on, the newest of each alone."""
+        """Subscribes to frames of the named objects (all by default); only the newest of each is kept."""
         return States(self._session.zenoh, self.name, list(objects or self.scene().objects))
 
     def steps(self) -> Steps:
-        """Per-step scalars of all objects from now on; a reader that falls behind loses the oldest."""
+        """Subscribes to the scalars per step of all objects; a reader that falls behind loses the oldest."""
         return Steps(self._session.zenoh, self.name)
 
     def command(self, verb: str, interaction: pb.Interaction | None = None) -> pb.Reply:
-        """Sends a command and waits for the answer. Raises BadInput if the server refuses it."""
+        """Sends a command and waits for the reply. Raises BadInput if the server refuses it."""
         found = self._query("command", pb.Reply, self._command(verb, interaction))
         if not found:
             raise self._no_server()
@@ -171,26 +171,26 @@ class Client:
         self, verb: str, interaction: pb.Interaction | None = None,
         answered: Callable[[pb.Reply | None], None] = lambda reply: None,
     ) -> None:  # fmt: skip
-        """Sends a command and does not wait: for a hand that moves a grab 1000 times a second.
+        """Sends a command without waiting for the reply, e.g. to move a grab 1000 times a second.
 
-        answered: gets the reply, or None if there came none in time, in a thread of its own.
+        answered: is called with the reply, or None at the time-out, in a thread of zenoh's.
         """
-        others: list[pb.Reply] = []  # of another incarnation: the server may have been started again
-        told: list[bool] = []
+        others: list[pb.Reply] = []  # of another incarnation, as the server may have been restarted
+        done_once: list[bool] = []
 
         def take(reply: zenoh.Reply) -> None:
-            if reply.ok is None or told:
+            if reply.ok is None or done_once:
                 return
             with contextlib.suppress(Refused):
                 message = read(reply, "command", pb.Reply)
-                if message.header.incarnation == self._asking.incarnation:
-                    told.append(True)
+                if message.header.incarnation == self._queries.incarnation:
+                    done_once.append(True)
                     answered(message)
                 elif not others:
                     others.append(message)
 
         def done() -> None:
-            if not told:
+            if not done_once:
                 answered(others[0] if others else None)
 
         try:
@@ -222,7 +222,7 @@ class Client:
         self, channel: str, kind: type[M], payload: bytes | None = None,
         complete: Callable[[list[M]], bool] = bool,
     ) -> list[M]:  # fmt: skip
-        return self._asking.ask(channel, kind, payload, self._timeout, complete)
+        return self._queries.ask(channel, kind, payload, self._timeout, complete)
 
     def _no_server(self) -> ClientError:
         others = self._servers() if hasattr(self, "_session") else []
@@ -236,7 +236,7 @@ class Client:
 
 
 def _begin(wanted: pb.Interaction, at: Point | str) -> None:
-    """Where the interaction begins: a named point or coordinates."""
+    """Sets where the interaction begins: at a named point or at coordinates."""
     if isinstance(at, str):
         wanted.at = at
     else:
@@ -244,7 +244,7 @@ def _begin(wanted: pb.Interaction, at: Point | str) -> None:
 
 
 def vector(values: Point, what: str) -> pb.Vector:
-    """Three finite numbers as a message. Raises BadInput."""
+    """Returns three finite numbers as a message. Raises BadInput."""
     numbers = list(values)
     if len(numbers) != 3 or not all(math.isfinite(value) for value in numbers):
         raise BadInput(f"--{what} {' '.join(map(str, numbers))}: allowed are three finite numbers")
@@ -252,7 +252,7 @@ def vector(values: Point, what: str) -> pb.Vector:
 
 
 def number(value: float, what: str, positive: bool = False) -> float:
-    """A finite number that is not negative. Raises BadInput."""
+    """Returns a finite number that is not negative, or is positive. Raises BadInput."""
     if not math.isfinite(value) or value < 0 or (positive and value == 0):
         raise BadInput(f"--{what} {value}: allowed is a finite number {'above 0' if positive else 'of at least 0'}")
     return value

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A grab that is held: moved, then released, also when the code around it fails."""
+"""The handle of a grab: moves it and releases it, also when the code around it fails."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Send = Callable[[str, pb.Interaction], pb.Reply]
 
 
 class Grab:
-    """Handle of a grab, from Client.grab. `interaction` is what the server took: id, number of nodes."""
+    """Handle of a grab, from Client.grab. `interaction`: the grab as the server accepted it, with id and nodes."""
 
     def __init__(self, send: Send, interaction: pb.Interaction) -> None:
         self._send = send
@@ -22,14 +22,14 @@ class Grab:
         self.released = False
 
     def move(self, target: Sequence[float]) -> None:
-        """Pulls the spring's far end to `target` [m]."""
+        """Moves the far end of the spring to `target` [m]."""
         x, y, z = target
         wanted = self._reference()
         wanted.target.CopyFrom(pb.Vector(x=x, y=y, z=z))
         self._send("move", wanted)
 
     def release(self) -> None:
-        """Lets go; a second call does nothing."""
+        """Releases the grab; a second call does nothing."""
         if not self.released:
             self.released = True
             self._send("release", self._reference())
@@ -38,7 +38,7 @@ class Grab:
         return self
 
     def __exit__(self, kind: object, *_: object) -> None:
-        # After an error the first message matters, and the server lets go by itself when this client is gone.
+        # After an error the first message matters, and the server releases the grab itself when this client is gone.
         with contextlib.suppress(*((BadInput, ClientError) if kind else ())):
             self.release()
 

@@ -21,7 +21,7 @@ class PointCommand(TyperCommand):
     """A command whose option --at may be followed by one word or three numbers."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Makes one word of the three."""
+        """Joins the three numbers after --at to one word, then parses as typer does."""
         joined: list[str] = []
         while args:
             joined.append(args.pop(0))
@@ -33,7 +33,7 @@ class PointCommand(TyperCommand):
 
 
 def point(text: str) -> str | tuple[float, float, float]:
-    """Coordinates, or the name of a point, which the server knows. Raises BadInput."""
+    """Parses coordinates, or the name of a point, which the server resolves. Raises BadInput."""
     words = text.replace(",", " ").split()
     if len(words) == 1 and not _NUMBER.match(words[0]):
         return words[0]

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def progress_bar(title: str, total: float) -> Iterator[Callable[[float], None]]:
-    """Gives a function that takes how much of `total` is done; the bar goes to stderr and vanishes at the end."""
+    """Yields a function that shows how much of `total` is done; the bar is on stderr and is removed at the end."""
     if not sys.stderr.isatty():
         yield lambda done: None
         return

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a server sends by itself, received so that a slow reader gets the newest and never a backlog."""
+"""Subscriptions to the states and steps of a server: a slow reader gets the newest and never a backlog."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ import logging
 
 import zenoh
 
-from clients.frames import Frame, frame_of
-from protocol import Refused
+from clients.log.frames import Frame, frame_of
 from protocol import messages_pb2 as pb
 from protocol.channels import CHANNELS, key
-from protocol.check import check_header, parse
+from protocol.refused import Refused
+from protocol.validate import check_header, parse
 
-BATCHES = 64  # of steps that a reader may be behind, about 3 s
+BATCHES = 64  # batches of steps that are kept, about 3 s
 
 log = logging.getLogger(__name__)
 
 
 class States:
-    """Newest frame of each object. One ring of one sample per object: none can push another out."""
+    """The newest frame of each object, in a ring of one sample per object."""
 
     def __init__(self, session: zenoh.Session, server: str, objects: list[str]) -> None:
         self._rings = {
@@ -28,7 +28,7 @@ class States:
         }
 
     def newest(self) -> list[Frame]:
-        """One frame per object that has a new one since the last call; never waits."""
+        """Returns the frames that came since the last call, one per object at most; never waits."""
         frames = []
         for name, ring in self._rings.items():
             sample = ring.try_recv()
@@ -44,13 +44,13 @@ class States:
 
 
 class Steps:
-    """Batches of per-step scalars."""
+    """Batches of scalars per step."""
 
     def __init__(self, session: zenoh.Session, server: str) -> None:
         self._ring = session.declare_subscriber(key("steps", server), zenoh.handlers.RingChannel(BATCHES))
 
     def new(self) -> list[pb.ObjectStep]:
-        """All steps that came since the last call, oldest first; never waits."""
+        """Returns the steps that came since the last call, oldest first; never waits."""
         steps: list[pb.ObjectStep] = []
         while (sample := self._ring.try_recv()) is not None:
             try:

@@ -14,10 +14,10 @@ from rich.table import Table
 from rich.text import Text
 
 from clients.client import Client
-from clients.scalars import status_name
+from clients.log.scalars import status_name
 from protocol import messages_pb2 as pb
 
-PERIOD = 0.5  # s between two looks
+PERIOD = 0.5  # s between two readings
 COMPACT: dict[str, Any] = {"box": SIMPLE_HEAD, "padding": (0, 1), "pad_edge": False}  # fits 80 columns
 
 
@@ -32,7 +32,7 @@ def watch(client: Client, count: int = 0) -> None:
 
 
 def tables(status: pb.Status) -> Group:
-    """Summary, objects and workers; what the server makes of those that it supervises."""
+    """Tables of a status: summary, objects, workers, and the local workers that the server supervises."""
     local = [_local(status)] if status.local_workers else []
     pace = [Text(status.pace, "bold red")] if status.pace else []
     return Group(_summary(status), *pace, _objects(status), *_energies(status), _workers(status), *local)
@@ -73,7 +73,7 @@ def _objects(status: pb.Status) -> Table:
 
 
 def places(status: pb.Status) -> Table:
-    """Where the objects are."""
+    """Table of the extents and tips of the objects."""
     table = Table("object", "x", "y", "z [m]", "tip", **COMPACT)
     for found in status.objects:
         if found.HasField("low"):
@@ -89,7 +89,7 @@ def _status(found: pb.ObjectStatus) -> Text:
 
 
 def _energies(status: pb.Status) -> list[Table]:
-    """Of the objects whose energy is known or that have run away; no table where there are none."""
+    """Table of the objects whose energy is known or that have run away; empty without such objects."""
     shown = [o for o in status.objects if o.HasField("total_energy") or o.runaway_steps]
     table = Table("object", "energy [J]", "kinetic [J]", "runaway steps", **COMPACT)
     for found in shown:
@@ -118,12 +118,12 @@ def _local(status: pb.Status) -> Table:
 
 
 def _add(table: Table, *cells: str | Text) -> None:
-    """Add a row of plain texts: rich would take brackets in a string for markup, and fail on such as [/x]."""
+    """Adds a row of plain texts: rich would take brackets in a string for markup, and fail on such as [/x]."""
     table.add_row(*(Text(cell) if isinstance(cell, str) else cell for cell in cells))
 
 
 def _end(code: int) -> str:
-    """Of a process: its exit code, or the signal that ended it."""
+    """Names the exit code of a process, or the signal that ended it."""
     if code >= 0:
         return f"exit {code}"
     try:

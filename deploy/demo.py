@@ -31,13 +31,13 @@ console = Console()
 
 
 def tool(package: str, *arguments: str) -> list[str]:
-    """Command line of one of our programs."""
+    """Returns the command line of one of the programs."""
     return [sys.executable, "-m", package, *arguments]
 
 
 @contextmanager
-def told(what: str) -> Iterator[None]:
-    """Says what goes on and how long it has been: in a line that vanishes on a terminal, elsewhere once before."""
+def shown(what: str) -> Iterator[None]:
+    """Prints what is being done and for how long: on a terminal in a line that is removed, elsewhere once before."""
     if not console.is_terminal:
         console.print(f"{what} ...")
         yield
@@ -49,15 +49,15 @@ def told(what: str) -> Iterator[None]:
 
 
 def sim_client(what: str, *arguments: str) -> None:
-    """Runs sim-client, which must succeed; what: it does."""
-    with told(what):
+    """Runs sim-client, which must succeed. what: shown meanwhile."""
+    with shown(what):
         result = subprocess.run(tool("clients", *arguments), capture_output=True, text=True, cwd=ROOT)
     if result.returncode:
         raise SystemExit(f"sim-client {' '.join(arguments)} failed:\n{result.stdout}{result.stderr}")
 
 
 def connected(server: "subprocess.Popen[bytes]") -> Client:
-    """A client of the server, once it is up."""
+    """Returns a client of the server, once it is up."""
     while True:
         try:
             return Client(connect=[ENDPOINT])
@@ -67,7 +67,7 @@ def connected(server: "subprocess.Popen[bytes]") -> Client:
 
 
 def play(server: "subprocess.Popen[bytes]") -> None:
-    """Pushes the free end sideways, later grabs it and lets go; shows how far the run is."""
+    """Pushes the free end sideways, later grabs and releases it; shows the progress of the run."""
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}"))
     with connected(server) as client, Progress(*columns, TimeRemainingColumn(), console=console) as progress:
         task = progress.add_task("simulating in real time", total=STEPS)
@@ -92,7 +92,7 @@ def play(server: "subprocess.Popen[bytes]") -> None:
 
 
 def summary(arrays: Path) -> Table:
-    """What the log says about the run."""
+    """Makes a table of the run from its log."""
     data = np.load(arrays)
     iterations, age = data["scalars/iterations"], data["scalars/factor_age"]
     milliseconds, residual = 1e3 * data["scalars/step_seconds"], data["scalars/residual"]
@@ -111,7 +111,7 @@ def summary(arrays: Path) -> Table:
 
 
 def main() -> int:
-    """Exit code: the server's."""
+    """Runs the demonstration; returns the exit code of the server."""
     OUT.mkdir(parents=True, exist_ok=True)
     log = OUT / "beam.mcap"
     console.print("a beam in real time: a server, a worker, a client that pushes and grabs it")

@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""Starts several servers and a pool of workers that they share, from one scene whose objects are dealt out by size.
+"""Starts several servers and a pool of workers that they share, for one scene whose objects are distributed by size.
 
-Objects do not interact, so each may live on any server. Servers are called sim-0, sim-1, ... and listen on one port
-after another; every worker serves all of them, a job of each in turn. Several GPUs are dealt out, one for each process:
-first to servers, then to workers, then again from the first. Ctrl-C stops everything.
+Objects do not interact, so that each may be on any server. Servers are called sim-0, sim-1, ... and listen on
+consecutive ports; every worker serves all of them, a job of each in turn. Of several GPUs each process gets one, in
+turn, first the servers, then the workers. Ctrl-C stops everything.
 """
 
 import json
 import os
-import signal
 import subprocess
 import sys
 import tempfile
@@ -16,15 +15,17 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any
 
 import typer
 
-from protocol.endpoints import BadEndpoint, check_endpoint
+from protocol.network.endpoints import BadEndpoint, check_endpoint, on_this_machine
+from protocol.process.command_line import Program, Terminated, end_in_order
 from sim_server.errors import InputError
 from sim_server.scene import Scene, load
 from sim_server.supervisor import Supervisor, worker_process
 
+PROGRAM = Program("launch")
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
 EPILOG = """\b
@@ -40,52 +41,50 @@ Examples:
         asks the second of them
 """
 
-PATIENCE = 5.0  # s for a server to end when told
+END_TIMEOUT = 5.0  # s for a server to end after SIGTERM
 VISIBLE = "CUDA_VISIBLE_DEVICES"
-
-
-class Terminated(BaseException):
-    """SIGTERM: leave in good order."""
 
 
 @dataclass(frozen=True)
 class Part:
-    """What one server simulates: objects by their place in the scene, and their tetrahedra in all."""
+    """What one server simulates: indices of objects in the scene, and the number of their tetrahedra."""
 
     objects: tuple[int, ...]
     tets: int
 
 
-def deal(tets: Sequence[int], servers: int) -> list[Part]:
-    """Objects of so many tetrahedra to at most `servers` servers, none without: the largest first, each to the server
-    that has least. The order within a server is that of the scene."""
-    hands: list[list[int]] = [[] for _ in range(min(servers, len(tets)))]
-    loads = [0] * len(hands)
+def distribute(tets: Sequence[int], servers: int) -> list[Part]:
+    """Distributes objects of `tets` tetrahedra to at most `servers` servers, none of which is empty.
+
+    The largest object is first, each goes to the server that has least. Within a server the order is that of the scene.
+    """
+    groups: list[list[int]] = [[] for _ in range(min(servers, len(tets)))]
+    loads = [0] * len(groups)
     for index in sorted(range(len(tets)), key=lambda i: (-tets[i], i)):
-        least = min(range(len(hands)), key=lambda k: (loads[k], len(hands[k])))
-        hands[least].append(index)
+        least = min(range(len(groups)), key=lambda k: (loads[k], len(groups[k])))
+        groups[least].append(index)
         loads[least] += tets[index]
-    return [Part(tuple(sorted(hand)), load) for hand, load in zip(hands, loads, strict=True)]
+    return [Part(tuple(sorted(group)), load) for group, load in zip(groups, loads, strict=True)]
 
 
 def toml(value: Any) -> str:
-    """A value of JSON types in TOML, on one line; TOML has no null, so that such entries are left out."""
+    """Writes a value of JSON types in TOML, on one line, without entries that are null, which TOML does not have."""
     if isinstance(value, dict):
         return "{ " + ", ".join(f"{json.dumps(k)} = {toml(v)}" for k, v in value.items() if v is not None) + " }"
     if isinstance(value, list):
         return "[" + ", ".join(map(toml, value)) + "]"
-    return str(value) if isinstance(value, float) else json.dumps(value)  # str: inf and nan too are TOML's
+    return str(value) if isinstance(value, float) else json.dumps(value)  # str writes inf and nan as TOML does
 
 
 def part_of(scene: Scene, part: Part) -> str:
-    """The scene file of a part."""
+    """Writes the scene file of a part."""
     table = scene.resolved()
     table["object"] = [table["object"][index] for index in part.objects]
     return "".join(f"{key} = {toml(value)}\n" for key, value in table.items())
 
 
 def installed_gpus() -> int:
-    """GPUs that nvidia-smi lists; 0 where it does not run."""
+    """Returns the number of GPUs that nvidia-smi lists; 0 where it does not run."""
     try:
         listed = subprocess.run(["nvidia-smi", "-L"], capture_output=True, text=True, timeout=20)
     except (OSError, subprocess.SubprocessError):
@@ -93,26 +92,26 @@ def installed_gpus() -> int:
     return sum(line.startswith("GPU ") for line in listed.stdout.splitlines()) if listed.returncode == 0 else 0
 
 
-def gpu_pool(environment: Mapping[str, str]) -> list[str]:
-    """Names of the GPUs that may be used, as CUDA_VISIBLE_DEVICES has them: those it lists already, else all."""
+def usable_gpus(environment: Mapping[str, str]) -> list[str]:
+    """Returns the GPUs that may be used, as in CUDA_VISIBLE_DEVICES: those that it lists if it is set, else all."""
     listed = environment.get(VISIBLE)
     if listed is None:
         return [str(k) for k in range(installed_gpus())]
     names = [name.strip() for name in listed.split(",")]
     unusable = (k for k, name in enumerate(names) if not name or name.startswith("-"))
-    return names[: next(unusable, len(names))]  # CUDA takes none from the first bad one on
+    return names[: next(unusable, len(names))]  # CUDA ignores those from the first malformed one on
 
 
-def deal_gpus(pool: Sequence[str], servers: int, workers: int) -> tuple[list[str | None], list[str | None]]:
-    """The GPU of each server and of each worker in turn; None: as it is, where there is nothing to choose from."""
+def distribute_gpus(pool: Sequence[str], servers: int, workers: int) -> tuple[list[str | None], list[str | None]]:
+    """Returns the GPU of each server and of each worker in turn; None where there is no choice."""
     if len(pool) < 2:
         return [None] * servers, [None] * workers
     dealt: list[str | None] = [pool[k % len(pool)] for k in range(servers + workers)]
     return dealt[:servers], dealt[servers:]
 
 
-def seeing(gpu: str | None) -> dict[str, str] | None:
-    """Environment of a process that sees this GPU alone; None: ours."""
+def environment_with(gpu: str | None) -> dict[str, str] | None:
+    """Returns the environment of a process that sees this GPU only; None: that of this process."""
     return None if gpu is None else {**os.environ, VISIBLE: gpu}
 
 
@@ -124,14 +123,14 @@ class Fleet:
         self._folder = tempfile.TemporaryDirectory(prefix="warpfactor-")
         self.names = [f"sim-{k}" for k in range(len(parts))]
         self.listen = [f"tcp/{host}:{port + k}" for k in range(len(parts))]
-        self.endpoints = [e.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:") for e in self.listen]
+        self.endpoints = [on_this_machine(endpoint) for endpoint in self.listen]
         self.gpus: list[str | None] = [None] * len(parts)  # of the servers
         self.worker_gpus: dict[str, str | None] = {}
         self.servers: list[subprocess.Popen[bytes]] = []
         self.workers: Supervisor | None = None
 
     def start(self, workers: int, server_options: Sequence[str], worker_options: Sequence[str]) -> None:
-        """The servers, then the workers, which wait for them."""
+        """Starts the servers, then the workers, which wait for them."""
         for name, listen, part, gpu in zip(self.names, self.listen, self._parts, self.gpus, strict=True):
             path = Path(self._folder.name) / f"{name}.toml"
             path.write_text(part_of(self._scene, part))
@@ -139,25 +138,25 @@ class Fleet:
             command = [sys.executable, "-m", "sim_server", str(path), "--name", name, "--listen", listen]
             out = sys.stderr if self._quiet else None
             command += [*record, *server_options]
-            self.servers.append(subprocess.Popen(command, stdout=out, env=seeing(gpu)))
+            self.servers.append(subprocess.Popen(command, stdout=out, env=environment_with(gpu)))
         if workers:
             first, *others = [f"{n}@{e}" for n, e in zip(self.names, self.endpoints, strict=True)]
             also = [word for server in others for word in ("--server", server)]
             self.workers = Supervisor(workers, first, [], [*also, *worker_options], start=self._start_worker)
 
     def _start_worker(self, command: Sequence[str]) -> "subprocess.Popen[bytes]":
-        """Again on the GPU it had."""
-        return worker_process(command, seeing(self.worker_gpus.get(command[command.index("--name") + 1])))
+        """Starts a worker, on the same GPU each time."""
+        return worker_process(command, environment_with(self.worker_gpus.get(command[command.index("--name") + 1])))
 
     def use_gpus(self, pool: Sequence[str], servers: bool, workers: int) -> None:
-        """Before `start`: deals these out to the servers, or not, and to so many workers."""
+        """Distributes GPUs to the servers, if `servers`, and to `workers` workers. Before `start`."""
         count = len(self._parts)
-        mine, others = deal_gpus(pool, count * servers, workers)
+        mine, others = distribute_gpus(pool, count * servers, workers)
         self.gpus = mine or [None] * count
         self.worker_gpus = {f"local-{k + 1}": gpu for k, gpu in enumerate(others)}
 
     def describe(self) -> dict[str, Any]:
-        """What was started, for JSON."""
+        """Returns what was started, for JSON."""
         names = [o.name for o in self._scene.objects]
         servers = [
             {
@@ -180,7 +179,7 @@ class Fleet:
         }
 
     def wait(self) -> int:
-        """Until all servers are done, or one failed: its exit code."""
+        """Waits until all servers have ended, or one failed; returns its exit code."""
         while True:
             codes = [process.poll() for process in self.servers]
             if failed := [code for code in codes if code]:
@@ -192,11 +191,11 @@ class Fleet:
             time.sleep(0.05)
 
     def close(self) -> None:
-        """SIGTERM, which ends a log well; SIGKILL for who does not listen."""
+        """Ends all processes by SIGTERM, which completes logs; after END_TIMEOUT by SIGKILL."""
         for process in self.servers:
             if process.poll() is None:
                 process.terminate()
-        end = time.monotonic() + PATIENCE
+        end = time.monotonic() + END_TIMEOUT
         for process in self.servers:
             try:
                 process.wait(max(0.01, end - time.monotonic()))
@@ -224,7 +223,7 @@ def launch(
     device: Annotated[str, typer.Option(metavar="auto|cpu|gpu", help="Of the servers")] = "auto",
     worker_device: Annotated[str, typer.Option(metavar="auto|cpu|gpu", help="Of the workers")] = "cpu",
     threads: Annotated[int, typer.Option(metavar="T", min=1, help="Of each worker")] = 1,
-    steps: Annotated[int | None, typer.Option(metavar="N", min=1, help="Stop after so many steps")] = None,
+    steps: Annotated[int | None, typer.Option(metavar="N", min=1, help="Stop after N steps")] = None,
     realtime: Annotated[bool, typer.Option("--realtime/--free-run", help="Keep pace with the clock or not")] = True,
     record: Annotated[Path | None, typer.Option(metavar="FOLDER", help="Write a log of each server there")] = None,
     set_: Annotated[
@@ -232,22 +231,22 @@ def launch(
     ] = None,
     json_: Annotated[bool, typer.Option("--json", help="Print what was started as JSON on one line")] = False,
 ) -> None:
-    """Start N servers and M workers from one scene; its objects are dealt out by size."""
-    signal.signal(signal.SIGTERM, _terminate)
+    """Start N servers and M workers from one scene; its objects are distributed by size."""
+    end_in_order()
     try:
         whole = load(scene, set_ or [])
-        parts = deal([len(o.load_mesh().tets) for o in whole.objects], servers)
+        parts = distribute([len(o.load_mesh().tets) for o in whole.objects], servers)
         check_endpoint(f"tcp/{host}:{port + len(parts) - 1}", listen=True)
         if record:
             record.mkdir(parents=True, exist_ok=True)
     except (InputError, BadEndpoint, OSError) as error:
-        _bad_input(str(error))
+        PROGRAM.bad_input(str(error))
     for_servers = ["--device", device, "--realtime" if realtime else "--free-run"]
     for_servers += ["--steps", str(steps)] if steps else []
     try:
         with Fleet(whole, parts, host, port, record, json_) as fleet:
             if "gpu" in (device, worker_device):
-                fleet.use_gpus(gpu_pool(os.environ), device == "gpu", workers if worker_device == "gpu" else 0)
+                fleet.use_gpus(usable_gpus(os.environ), device == "gpu", workers if worker_device == "gpu" else 0)
             fleet.start(workers, for_servers, ["--device", worker_device, "--threads", str(threads)])
             say(fleet.describe(), servers, json_)
             raise typer.Exit(fleet.wait())
@@ -258,7 +257,7 @@ def launch(
 
 
 def say(started: dict[str, Any], asked: int, as_json: bool) -> None:
-    """What runs where."""
+    """Prints which process runs where."""
     if as_json:
         print(json.dumps(started), flush=True)
         return
@@ -274,17 +273,8 @@ def say(started: dict[str, Any], asked: int, as_json: bool) -> None:
 
 
 def on_gpu(process: dict[str, Any]) -> str:
-    """For people."""
+    """Words the GPU of a process; empty if it has none of its own."""
     return "" if process["gpu"] is None else f", GPU {process['gpu']}"
-
-
-def _terminate(*_: object) -> None:
-    raise Terminated
-
-
-def _bad_input(text: str) -> NoReturn:
-    print(f"launch: {text}", file=sys.stderr)
-    raise typer.Exit(2)
 
 
 if __name__ == "__main__":

@@ -3,20 +3,20 @@
 
 import logging
 import os
-import signal
 import socket
 import sys
 from threading import Event
-from typing import Annotated, NoReturn
+from typing import Annotated
 
 import typer
 
 from precond_worker.ending import end_now, end_with_any_thread
 from precond_worker.errors import DeviceUnusable, NameTaken
-from protocol.exhausted import exhausted
-from protocol.interrupted import handle, run_command
-from protocol.nvidia import nvidia_device
+from protocol.process.command_line import Program, Terminated, end_in_order
+from protocol.process.exhausted import exhausted
+from protocol.process.nvidia import nvidia_device
 
+PROGRAM = Program("precond-worker")
 app = typer.Typer(pretty_exceptions_enable=False, rich_markup_mode=None)
 
 EPILOG = """\b
@@ -36,18 +36,6 @@ Examples:
 """
 
 
-def _version(asked: bool) -> None:
-    if asked:
-        from protocol.version import version
-
-        print(f"precond-worker {version()}")
-        raise typer.Exit
-
-
-class Terminated(BaseException):
-    """SIGTERM: leave in good order."""
-
-
 @app.command(epilog=EPILOG)
 def work(
     connect: Annotated[
@@ -60,10 +48,11 @@ def work(
     device: Annotated[
         str, typer.Option(metavar="auto|cpu|gpu", help="What factorizes; auto: an NVIDIA GPU if it is usable")
     ] = "cpu",
-    arithmetic: Annotated[
+    precision: Annotated[
         str,
         typer.Option(metavar="auto|float32|float64", help="On the GPU; auto: float32 where float64 is slow"),
     ] = "auto",
+    arithmetic: Annotated[str | None, typer.Option("--arithmetic", hidden=True)] = None,
     threads: Annotated[int, typer.Option(metavar="N", min=1, max=1024, help="Threads of the linear algebra")] = 1,
     name: Annotated[str, typer.Option(metavar="NAME", help="Name, unique on its server [default: HOST-PID]")] = "",
     server: Annotated[
@@ -77,25 +66,26 @@ def work(
         bool, typer.Option("--exit-with-parent", help="End when the parent process ends")
     ] = False,
     verbose: Annotated[bool, typer.Option("--verbose", help="Say more on standard error")] = False,
-    version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Say which version this is, and end")
-    ] = False,
+    version: Annotated[bool, PROGRAM.version_option()] = False,
 ) -> None:
     """Factorize the matrices of a simulation server, until SIGTERM or Ctrl-C."""
+    if arithmetic is not None:
+        print(f"{PROGRAM.name}: --arithmetic is called --precision now", file=sys.stderr)
+        precision = arithmetic
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ[variable] = str(threads)
     logging.basicConfig(level=logging.INFO if verbose else logging.WARNING, format="%(name)s: %(message)s")
     end_with_any_thread()
     try:
         if exit_with_parent:
-            from precond_worker.parent import end_with_parent
+            from precond_worker.die_with_parent import die_with_parent
 
-            end_with_parent()
-        library = _library(device, arithmetic)
+            die_with_parent()
+        library = _library(device, precision)
         servers = ["sim"] if server is None else server
         _serve(connect or [], threads, name or _default_name(), servers, not no_shared_memory, library)
     except NameTaken as error:
-        _bad_input(str(error))
+        PROGRAM.bad_input(str(error))
     except DeviceUnusable as error:
         print(f"precond-worker: {error}", file=sys.stderr)
         raise typer.Exit(1) from None
@@ -109,27 +99,17 @@ def work(
         raise
 
 
-def _end_in_order() -> None:
-    """From now on Ctrl-C and SIGTERM close what is open; before, they end the program at once (__main__.py)."""
-    handle(signal.SIGINT, signal.default_int_handler)
-    handle(signal.SIGTERM, _terminate)
-
-
-def _terminate(*_: object) -> None:
-    raise Terminated
-
-
 def _default_name() -> str:
     host = "".join(c if c.isascii() and (c.isalnum() or c in "_.-") else "-" for c in socket.gethostname())
     return f"{host[:50]}-{os.getpid()}"
 
 
-def _library(device: str, arithmetic: str) -> str:
-    """What Analysis is to use; ends the program if that cannot work here."""
+def _library(device: str, precision: str) -> str:
+    """Returns the library for Analysis; ends the program if it cannot work here."""
     if device not in ("auto", "cpu", "gpu"):
-        _bad_input(f"--device {device}: allowed are auto, cpu, gpu")
-    if arithmetic not in ("auto", "float32", "float64"):
-        _bad_input(f"--arithmetic {arithmetic}: allowed are auto, float32, float64")
+        PROGRAM.bad_input(f"--device {device}: allowed are auto, cpu, gpu")
+    if precision not in ("auto", "float32", "float64"):
+        PROGRAM.bad_input(f"--precision {precision}: allowed are auto, float32, float64")
     if device == "cpu":
         return "auto"
     if device == "auto" and not nvidia_device():
@@ -137,63 +117,65 @@ def _library(device: str, arithmetic: str) -> str:
     from precond_worker.gpu.device import try_out
 
     try:
-        try_out(arithmetic)
+        try_out(precision)
     except DeviceUnusable as error:
         if device == "gpu":
-            _bad_input(f"--device gpu: {error}")
+            PROGRAM.bad_input(f"--device gpu: {error}")
         print(f"precond-worker: --device auto takes the CPU: {error}", file=sys.stderr, flush=True)
         return "auto"
-    return "gpu" if arithmetic == "auto" else f"gpu-{arithmetic}"
+    return "gpu" if precision == "auto" else f"gpu-{precision}"
 
 
 def _serve(connect: list[str], threads: int, name: str, servers: list[str], shared_memory: bool, library: str) -> None:
     from functools import partial
 
-    from precond_worker.block_columns import prepare
-    from precond_worker.methods import prepared
-    from precond_worker.places import Place, places
-    from precond_worker.serving import Serving
-    from precond_worker.uplink import Uplink
+    from precond_worker.factorization.block_columns import compile_ahead
+    from precond_worker.factorization.registry import make_factorization
+    from precond_worker.main_loop import MainLoop
+    from precond_worker.network.server_addresses import ServerAddress, server_addresses
+    from precond_worker.network.server_connection import ServerConnection
     from precond_worker.worker import Worker
     from protocol.channels import check_name
     from protocol.counters import Counters
-    from protocol.session import Session
+    from protocol.network.session import Session
 
-    _end_in_order()
+    end_in_order()
     try:
         check_name(name, "--name")
-        where = places(servers, connect)
+        where = server_addresses(servers, connect)
     except ValueError as error:  # BadEndpoint or Refused
-        _bad_input(str(error))
+        PROGRAM.bad_input(str(error))
     shown = _shown(library)
-    prepare()
+    compile_ahead()
 
-    def uplink(session: Session, server: str, bell: Event) -> Uplink:
-        return Uplink(session, server, name, threads, shown, Counters(logging.getLogger("precond_worker")), bell)
+    def connection(session: Session, server: str, wake: Event) -> ServerConnection:
+        return ServerConnection(
+            session, server, name, threads, shown, Counters(logging.getLogger("precond_worker")), wake
+        )
 
-    def worker(up: Uplink, place: Place) -> Worker:
+    def worker(connected: ServerConnection, address: ServerAddress) -> Worker:
         def on_server(found: bool) -> None:
-            server = f"server {up.server} at {place}"
+            server = f"server {connected.server} at {address}"
             if found:
                 count = f"{threads} thread{'s' if threads > 1 else ''}"
-                memory = "shared memory" if up.shared_memory else "no shared memory"
+                memory = "shared memory" if connected.shared_memory else "no shared memory"
                 print(f"precond-worker {name} ready: {shown}, {count}, {memory}, {server}", flush=True)
             else:
                 print(f"precond-worker {name}: {server} is gone, waiting for it", file=sys.stderr, flush=True)
 
-        return Worker(up, partial(prepared, library=library), on_server)
+        return Worker(connected, partial(make_factorization, library=library), on_server)
 
-    with Serving(where, shared_memory, uplink, worker) as serving:
+    with MainLoop(where, shared_memory, connection, worker) as serving:
         serving.run()
 
 
 def _shown(library: str) -> str:
-    """What the worker says that it works with. On the CPU without CHOLMOD it also says what that costs."""
+    """Names the library that is used. On the CPU without CHOLMOD it also prints what that costs."""
     if library.startswith("gpu"):
-        from precond_worker.gpu.library import title
+        from precond_worker.gpu.gpu_factorization import title
 
         return title(library.removeprefix("gpu").removeprefix("-") or "auto")
-    from precond_worker.factorize import default_library
+    from precond_worker.factorization.factorize import default_library
 
     name, remark = default_library()
     if remark:
@@ -201,11 +183,6 @@ def _shown(library: str) -> str:
     return name
 
 
-def _bad_input(text: str) -> NoReturn:
-    print(f"precond-worker: {text}", file=sys.stderr)
-    raise typer.Exit(2)
-
-
 def main() -> None:
     """Entry point of the console script."""
-    run_command(app, "precond-worker")
+    PROGRAM.run(app)

@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: MIT
-"""A worker ends as a whole, with one line and code 1: one that has lost a thread looks alive and does nothing."""
+"""Ends the worker with one line and code 1 when a thread fails: without it the worker would look alive."""
 
 import os
 import sys
 import threading
 from typing import Any, NoReturn
 
-from protocol.exhausted import exhausted
+from protocol.process.exhausted import exhausted
 
 
 def end_with_any_thread() -> None:
-    """From now on the process ends when a thread ends by an exception, or has no memory to begin."""
+    """From now on the process ends when a thread ends by an exception, or cannot start for lack of memory."""
     threading.excepthook = _thread_failed
     sys.unraisablehook = _unraisable
 
@@ -30,6 +30,6 @@ def _unraisable(failure: Any) -> None:
 
 
 def end_now(why: str) -> NoReturn:
-    """End without closing anything, which may need what there is no more of; the server sees the link go."""
+    """Ends without closing anything, which may need memory; the server sees that the link is gone."""
     os.write(2, f"precond-worker: {' '.join(why.split())[:500]}; the worker ends\n".encode(errors="replace"))
     os._exit(1)

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""Why a matrix has no factor."""
+"""Errors of factorizations and of the worker."""
 
 
 class NotPositiveDefinite(ValueError):
-    """The matrix has no Cholesky factor in the precision asked for.
+    """The matrix has no Cholesky factor in the requested precision.
 
-    column: first column of L whose pivot failed, -1 if that is not known.
+    column: first column of L whose pivot failed, -1 if unknown.
     """
 
     def __init__(self, text: str, column: int = -1):
@@ -14,7 +14,7 @@ class NotPositiveDefinite(ValueError):
 
 
 class OutOfRange(NotPositiveDefinite):
-    """There is a factor, but its numbers do not fit into the precision asked for."""
+    """The factor exists, but its numbers are out of the range of the requested type."""
 
 
 class NameTaken(RuntimeError):
@@ -22,4 +22,4 @@ class NameTaken(RuntimeError):
 
 
 class DeviceUnusable(RuntimeError):
-    """There is no GPU to work on, and why."""
+    """No GPU can be used; the text says why."""

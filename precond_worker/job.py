@@ -1,27 +1,27 @@
 # SPDX-License-Identifier: MIT
-"""A matrix that arrived, checked before anything is computed from it."""
+"""A job: a matrix or positions that were received, and checked before use."""
 
 from dataclasses import dataclass
 from math import prod
 
 import numpy as np
 import zenoh
-from numpy.typing import NDArray
 
+from precond_worker.arrays import Float64
 from protocol.channels import CHANNELS, name_in
-from protocol.check import array, check_header, check_strings, checksum, parse, take
 from protocol.messages_pb2 import Matrix
 from protocol.method import Method
 from protocol.refused import Refused
-from protocol.slotmap import SlotMap
-from protocol.slots import HEADER
+from protocol.shared_memory.pool import HEADER
+from protocol.shared_memory.view import SlotMap
+from protocol.validate import array, check_header, check_strings, checksum, parse, take
 
 DTYPES = ("float32", "float64")
 
 
 @dataclass(frozen=True)
 class Job:
-    """message: what the server asked for; shared: the values came by reference."""
+    """message: of the server; shared: the values came by reference."""
 
     message: Matrix
     payload: zenoh.ZBytes
@@ -35,16 +35,16 @@ class Job:
 
     @property
     def positions(self) -> bool:
-        """The payload holds positions instead of a matrix."""
+        """True if the payload holds positions instead of a matrix."""
         return self.message.nodes > 0
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Of the values."""
+        """Shape of the values."""
         return (self.message.nodes, 3) if self.positions else (self.message.blocks, 3, 3)
 
-    def values(self, slots: SlotMap) -> NDArray[np.float64]:
-        """(blocks, 3, 3) or positions (nodes, 3), in place where they are in shared memory; raises Refused."""
+    def values(self, slots: SlotMap) -> Float64:
+        """Returns blocks (blocks, 3, 3) or positions (nodes, 3), in place if in shared memory; raises Refused."""
         count = prod(self.shape)
         if self.shared:
             values = slots.array(self.message.matrix_slot, np.float64, count)
@@ -56,13 +56,13 @@ class Job:
 
     def _copied(self) -> bytes:
         data = take(self.payload, CHANNELS["matrix"].bulk, "Matrix payload")
-        if self.message.HasField("matrix_slot"):  # the whole slot, as one without shared memory gets it
+        if self.message.HasField("matrix_slot"):  # a reader without shared memory gets the whole slot
             return data[HEADER : HEADER + 8 * prod(self.shape)]
         return data
 
 
 def accept(sample: zenoh.Sample, worker: str, incarnation: int) -> Job:
-    """The job in a sample; raises Refused."""
+    """Checks a sample and returns its job; raises Refused."""
     message = parse(Matrix, sample.attachment, CHANNELS["matrix"].limit)
     header = check_header(message, incarnation=incarnation)
     check_strings(message, 256)

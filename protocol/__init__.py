@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What server, workers and clients agree on: keys, messages, limits, checks and shared memory."""
+"""What server, workers and clients agree on: keys, messages, limits, checks and shared memory.
 
-from protocol.channels import PROTOCOL
-from protocol.factor import Factor, FactorPattern
-from protocol.refused import Refused
-
-__all__ = ["PROTOCOL", "Factor", "FactorPattern", "Refused"]
+Nothing is imported here: a program that begins may set its signal handlers first (process/early_signals.py).
+"""

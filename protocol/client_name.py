@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Names of clients that nobody else can use: a name is a digest of a secret, which travels with each command.
+"""Names of clients that nobody else can use: a name is a digest of a secret, which is sent with each command.
 
-Names stand in the status and in liveliness tokens, where everybody reads them; the secret reaches the server alone. The
-server needs no memory to check it, and whoever comes first has no advantage.
+Names are public, in the status and in liveliness tokens; the secret is sent to the server alone, which checks it
+without state.
 """
 
 import hashlib
@@ -17,13 +17,13 @@ _DIGEST = re.compile(rf"client-[0-9a-f]{{{_DIGITS}}}")
 
 
 def new_client() -> tuple[str, bytes]:
-    """A name and the secret that belongs to it."""
+    """Returns a new name and its secret."""
     secret = secrets.token_bytes(SECRET_BYTES)
     return _name(secret), secret
 
 
 def check_client(name: str, secret: bytes) -> None:
-    """Raises Refused if the name is a digest, but not of this secret. Other names (older clients) are anybody's."""
+    """Raises Refused if the name is a digest, but not of this secret. Names of older clients are not checked."""
     if _DIGEST.fullmatch(name) and (len(secret) != SECRET_BYTES or name != _name(secret)):
         text = f"Command.secret does not belong to client {name!r}; allowed: the one that made this name"
         raise Refused(text, "secret")

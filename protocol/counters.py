@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Counts of what a link did and dropped, with one warning for each kind of trouble."""
+"""Counters of a link, with one warning for each kind of failure."""
 
 import logging
 import threading
@@ -9,7 +9,7 @@ from protocol.refused import Refused
 
 
 class Counters:
-    """Safe to use from several threads. Attributes not yet counted read as 0."""
+    """Counters by name, read as attributes; 0 where nothing was counted. Safe to use from several threads."""
 
     def __init__(self, logger: logging.Logger):
         self._logger = logger
@@ -19,23 +19,23 @@ class Counters:
         self.refusals: Counter[str] = Counter()
 
     def add(self, name: str, amount: int = 1) -> None:
-        """Count something that is no trouble."""
+        """Adds to a counter."""
         with self._lock:
             self._counts[name] += amount
 
     def refuse(self, refusal: Refused, sender: str = "") -> None:
-        """Count a refused message under its kind; the first of a kind (and of a sender, if one is given) is logged."""
+        """Counts a refused message by its kind; the first one of a kind (and of a sender, if given) is logged."""
         with self._lock:
             self.refusals[refusal.kind] += 1
         self.warn(f"refused:{refusal.kind}:{sender}", f"message refused: {refusal} (counted from now on)")
 
     def trouble(self, name: str, text: str) -> None:
-        """Count trouble under a name; the first of it is logged."""
+        """Counts a failure by name; the first one is logged."""
         self.add(name)
         self.warn(name, f"{text} (counted from now on)")
 
     def warn(self, kind: str, text: str) -> None:
-        """Log a warning, once for each kind."""
+        """Logs a warning, once for each kind."""
         with self._lock:
             first = kind not in self._warned
             self._warned.add(kind)

@@ -10,10 +10,10 @@ import xxhash
 from numpy.typing import NDArray
 
 from protocol.channels import CHANNELS
-from protocol.check import all_finite, array, check_range, checksum
 from protocol.messages_pb2 import FactorPattern as PatternMessage
 from protocol.messages_pb2 import Header
 from protocol.refused import Refused
+from protocol.validate import all_finite, array, check_range, checksum
 
 __all__ = ["Factor", "FactorPattern", "Refused", "check_values", "pattern_id"]
 
@@ -22,7 +22,7 @@ Int64 = NDArray[np.int64]
 
 
 def pattern_id(permutation: Int32, super_start: Int32, row_start: Int64, rows: Int32) -> int:
-    """xxh3_64 of the four arrays in this order."""
+    """Returns xxh3_64 of the four arrays in this order."""
     digest = xxhash.xxh3_64()
     for values in (permutation, super_start, row_start, rows):
         digest.update(np.ascontiguousarray(values).tobytes())
@@ -31,11 +31,11 @@ def pattern_id(permutation: Int32, super_start: Int32, row_start: Int64, rows: I
 
 @dataclass(frozen=True, eq=False)
 class FactorPattern:
-    """Where the values of L stand. Column by column, each from its diagonal down.
+    """The pattern of L. Values are stored column by column, each from its diagonal down.
 
     permutation (n,): row i of L is degree of freedom permutation[i].
     super_start (s + 1,): first column of each supernode.
-    row_start (s + 1,): where its row list begins in rows; its own columns first, then the rows below, ascending.
+    row_start (s + 1,): start of its row list in rows; its own columns first, then the rows below, ascending.
     Column k of the supernode with columns c0..c1 and row list R has the entries of rows R[k - c0:].
     """
 
@@ -47,7 +47,7 @@ class FactorPattern:
 
     @classmethod
     def build(cls, permutation: Any, super_start: Any, row_start: Any, rows: Any) -> "FactorPattern":
-        """Pattern of arrays in any integer type, its id computed and its structure checked."""
+        """Makes a pattern of arrays of any integer type, computes its id and checks it."""
         p, s = np.ascontiguousarray(permutation, np.int32), np.ascontiguousarray(super_start, np.int32)
         r, w = np.ascontiguousarray(row_start, np.int64), np.ascontiguousarray(rows, np.int32)
         pattern = cls(pattern_id(p, s, r, w), p, s, r, w)
@@ -56,18 +56,18 @@ class FactorPattern:
 
     @property
     def size(self) -> int:
-        """Degrees of freedom."""
+        """Number of degrees of freedom."""
         return len(self.permutation)
 
     @cached_property
     def nonzeros(self) -> int:
-        """Stored values."""
+        """Number of stored values."""
         width, height = np.diff(self.super_start).astype(np.int64), np.diff(self.row_start)
         return int((width * height - width * (width - 1) // 2).sum())
 
     @cached_property
     def diagonal(self) -> Int64:
-        """(n,) where the diagonal value of each column stands among the values."""
+        """Index of the diagonal value of each column among the values, (n,)."""
         width = np.diff(self.super_start).astype(np.int64)
         within = np.arange(self.size) - np.repeat(self.super_start[:-1].astype(np.int64), width)
         length = np.repeat(np.diff(self.row_start), width) - within  # entries of each column
@@ -112,12 +112,12 @@ class FactorPattern:
         if not np.array_equal(self.rows[np.repeat(shift, width) + columns], columns):
             raise Refused("FactorPattern.rows: a row list does not begin with its supernode's columns", "pattern")
         ascends = np.diff(self.rows) > 0
-        ascends[self.row_start[1:-1] - 1] = True  # from one supernode to the next anything goes
+        ascends[self.row_start[1:-1] - 1] = True  # not checked from one supernode to the next
         if not ascends.all():
             raise Refused("FactorPattern.rows: a row list does not ascend strictly", "pattern")
 
     def message(self, header: Header) -> PatternMessage:
-        """The pattern as it travels."""
+        """Returns the pattern as a message."""
         return PatternMessage(
             header=header,
             id=self.id,
@@ -132,7 +132,7 @@ class FactorPattern:
 
     @classmethod
     def from_message(cls, message: PatternMessage) -> "FactorPattern":
-        """Pattern out of an untrusted message, checked; raises Refused."""
+        """Checks an untrusted message and returns its pattern; raises Refused."""
         n, s = message.size, message.supernodes
         pattern = cls(
             message.id,

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Reading an MCAP file that may be cut off, damaged or hostile: chunk by chunk, every size checked before use.
+"""Reads an MCAP file that may be cut off, damaged or hostile: chunk by chunk, every size checked before use.
 
-The readers of the mcap package want the index at the end of the file, or raise at the first broken byte; a log whose
-server was killed has no index, and everything up to the last complete chunk is good.
+The readers of the mcap package need the index at the end of the file, or raise at the first damaged byte; a log whose
+server was killed has no index, and everything up to the last complete chunk can be read.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, Self
 
 import lz4.frame  # type: ignore[import-untyped]
 import zstandard
@@ -26,9 +26,9 @@ from mcap.writer import MCAP0_MAGIC
 
 from protocol.channels import PROTOCOL
 
-RECORD_LIMIT = 1 << 29  # bytes of one record, compressed or not; a mesh has half of it at most, on the wire
-CHUNK_RECORDS = 1 << 18  # of one chunk; ten times what fits into the 1 MiB that a recorder fills
-PIECE = 1 << 20  # bytes that are unpacked at a time
+RECORD_LIMIT = 1 << 29  # bytes of one record, compressed or not; twice the limit of a mesh on the wire
+CHUNK_RECORDS = 1 << 18  # records of one chunk; ten times those of the 1 MiB that a recorder fills
+PIECE = 1 << 20  # bytes unpacked at a time
 _HEAD, _MESSAGE = struct.Struct("<BQ"), struct.Struct("<HIQQ")
 _READ = (Opcode.CHANNEL, Opcode.MESSAGE)
 PROFILE = "warpfactor"
@@ -38,7 +38,7 @@ BROKEN = (
 
 
 class BadLog(ValueError):
-    """No log, or one of another protocol version; the text names the file."""
+    """The file is no log, or one of another protocol version; the text names the file."""
 
 
 @dataclass
@@ -55,10 +55,11 @@ class ChunkFile:
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     problems: list[str] = field(default_factory=list)
     complete: bool = False  # the end mark was seen: the writer closed the file
-    announced: int | None = None  # messages that the writer counted, where the file has its number
+    announced: int | None = None  # number of messages according to the writer
 
     @classmethod
-    def open(cls, path: Path) -> ChunkFile:
+    def open(cls, path: Path) -> Self:
+        """Opens a file. Raises BadLog if there is none, or it is no MCAP file."""
         try:
             stream = path.open("rb")
             size = os.fstat(stream.fileno()).st_size
@@ -110,7 +111,7 @@ class ChunkFile:
             raise BadLog(f"{self.path}: a log of protocol version {version}; this program reads version {PROTOCOL}")
 
     def notes(self) -> list[str]:
-        """What a reader should know about gaps, one sentence each, after `scan`."""
+        """Returns one sentence for each gap, after `scan`."""
         notes = [f"{self.path}: {problem}" for problem in self.problems]
         for name, count in self.metadata.get("recorder", {}).items():
             if count != "0":
@@ -118,13 +119,13 @@ class ChunkFile:
         return notes
 
     def chunk(self, offset: int) -> list[McapRecord]:
-        """Records of the chunk at `offset`, one that `scan` has yielded."""
+        """Returns the records of the chunk at `offset`, one that `scan` has yielded."""
         self.stream.seek(offset)
         _, length = struct.unpack("<BQ", self.stream.read(9))
         return _unpack(Chunk.read(ReadDataStream(BytesIO(self.stream.read(length)))))
 
     def _statistics(self, offset: int) -> int | None:
-        """The number of messages in the summary that begins at `offset`, None without one."""
+        """Returns the number of messages in the summary that begins at `offset`; None without a summary."""
         while offset + _HEAD.size <= self.size:
             self.stream.seek(offset)
             opcode, length = _HEAD.unpack(self.stream.read(_HEAD.size))
@@ -158,13 +159,13 @@ class ChunkFile:
 
 
 def _unpack(chunk: Chunk) -> list[McapRecord]:
-    """Channels and messages of a chunk after size and checksum were found right; raises one of BROKEN."""
+    """Checks size and checksum of a chunk and returns its channels and messages; raises one of BROKEN."""
     size = chunk.uncompressed_size
     if size > RECORD_LIMIT:
         raise ValueError(f"a chunk of {size} bytes, at most {RECORD_LIMIT} are read")
     data, at = bytearray(), 0
     places: list[tuple[int, int, int]] = []  # type, first byte and length of each record
-    for piece in _pieces(chunk):  # looked at as they come, so that what is no chunk is never unpacked to its end
+    for piece in _pieces(chunk):  # parsed piece by piece, so that a malformed chunk is not unpacked to its end
         data += piece
         if len(data) > size:
             break
@@ -185,7 +186,7 @@ def _unpack(chunk: Chunk) -> list[McapRecord]:
 
 
 def _pieces(chunk: Chunk) -> Iterator[bytes]:
-    """The content of a chunk, PIECE bytes at a time, up to one byte more than it says."""
+    """Yields the content of a chunk, PIECE bytes at a time, up to one byte more than its stated size."""
     size = chunk.uncompressed_size
     if chunk.compression == "":
         yield chunk.data

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What is to be made of a matrix: the factor that a worker sends back."""
+"""Methods of factorization: which factor a worker makes of a matrix."""
 
 import math
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ class Method:
     omega: float = 1.0
 
     def check(self) -> "Method":
-        """Itself; raises Refused unless every number is one that the method takes."""
+        """Returns the method itself; raises Refused if a number is out of the range of the method."""
         if self.name not in METHODS:
             raise Refused(f"Matrix.method is {self.name!r}; allowed: {', '.join(METHODS)}", "malformed")
         if self.name == "incomplete_cholesky":

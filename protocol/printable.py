@@ -1,23 +1,23 @@
 # SPDX-License-Identifier: MIT
-"""Text of others, made fit for a terminal: what it cannot show, or would obey, is shown as an escape sequence."""
+"""Untrusted text made printable: control and invisible characters become escape sequences."""
 
 from functools import cache
 
 from google.protobuf.descriptor import Descriptor, FieldDescriptor
 from google.protobuf.message import Message
 
-DOCUMENTS = {"warpfactor.Scene.toml", "warpfactor.Scene.resolved"}  # files with lines of their own; nobody prints them
+DOCUMENTS = {"warpfactor.Scene.toml", "warpfactor.Scene.resolved"}  # files of several lines, which are never printed
 
 
 def printable(text: str) -> str:
-    """The text with control characters, line breaks and invisible characters as \\x1b, \\n, \\u202e."""
+    """Returns the text with control characters, line breaks and invisible characters as \\x1b, \\n, \\u202e."""
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
 
 
 def make_printable(message: Message) -> None:
-    """Make every text of a message, and of those within it, printable; a DOCUMENT is left as it is."""
+    """Makes every text of a message, and of messages in it, printable, except DOCUMENTS."""
     for name, repeated, nested in _fields(message.DESCRIPTOR):
         value = getattr(message, name)
         if not nested:
@@ -35,7 +35,7 @@ def make_printable(message: Message) -> None:
 
 @cache
 def _fields(kind: Descriptor) -> tuple[tuple[str, bool, bool], ...]:
-    """(name, repeated, message) of the fields that are texts or may hold some."""
+    """Returns (name, repeated, message) of the fields that are or contain texts."""
     text, message = FieldDescriptor.TYPE_STRING, FieldDescriptor.TYPE_MESSAGE
     return tuple(
         (field.name, field.is_repeated, field.type == message)

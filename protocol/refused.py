@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The one way to say that a received message must be dropped."""
+"""The error of a received message that must be dropped."""
 
 from protocol.printable import printable
 
@@ -7,7 +7,7 @@ from protocol.printable import printable
 class Refused(ValueError):
     """A message that must be dropped; the text names message, field, value and what is allowed.
 
-    kind is one of a few words (see below) under which receivers count refusals:
+    kind: by which receivers count refusals, one of
     malformed, version, incarnation, object, epoch, sequence, size, shape, not_finite, not_positive, checksum,
     pattern, slot, late, duplicate, worker, limit, secret. Keys and values of the message are shown printable.
     """

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from protocol.check import all_finite, array, check_range
 from protocol.messages_pb2 import Scene as SceneMessage
 from protocol.messages_pb2 import Topology
 from protocol.refused import Refused
+from protocol.validate import all_finite, array, check_range
 from sim_server.errors import InputError
 from sim_server.mesh import Mesh, check
 from sim_server.scene.model import Scene

@@ -3,19 +3,18 @@
 
 import logging
 import os
-import signal
 import sys
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from protocol.interrupted import handle, run_command
-from protocol.nvidia import nvidia_device
+from protocol.process.command_line import Program, Terminated, end_in_order
+from protocol.process.nvidia import nvidia_device
 from sim_server.compile_notice import compiling_told
 from sim_server.errors import DeviceError, DeviceLost, InputError, NameTaken
 
@@ -23,6 +22,7 @@ if TYPE_CHECKING:
     from sim_server.service import Service
     from sim_server.supervisor import Supervisor
 
+PROGRAM = Program("sim-server")
 app = typer.Typer(pretty_exceptions_enable=False, rich_markup_mode=None)
 
 EPILOG = """\b
@@ -40,25 +40,13 @@ Examples:
 WORKERS_JOIN = 15.0  # s to wait for the first local worker before the simulation starts
 
 
-def _version(asked: bool) -> None:
-    if asked:
-        from protocol.version import version
-
-        print(f"sim-server {version()}")
-        raise typer.Exit
-
-
-class Terminated(BaseException):
-    """SIGTERM: leave in good order."""
-
-
 @app.command(epilog=EPILOG)
 def serve(
     scene: Annotated[Path, typer.Argument(metavar="SCENE.toml", help="What to simulate")],
     device: Annotated[
         str, typer.Option(metavar="auto|cpu|gpu", help="Where; auto: the GPU if there is a usable one, else the CPU")
     ] = "auto",
-    steps: Annotated[int | None, typer.Option(metavar="N", min=1, help="Stop after so many steps")] = None,
+    steps: Annotated[int | None, typer.Option(metavar="N", min=1, help="Stop after N steps")] = None,
     realtime: Annotated[
         bool, typer.Option("--realtime/--free-run", help="Keep pace with the clock, or as fast as it goes")
     ] = True,
@@ -77,17 +65,15 @@ def serve(
     name: Annotated[str, typer.Option(metavar="NAME", help="Name of this server in all keys")] = "sim",
     no_shared_memory: Annotated[bool, typer.Option("--no-shared-memory", help="Send arrays as bytes")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing but errors")] = False,
-    version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Say which version this is, and end")
-    ] = False,
+    version: Annotated[bool, PROGRAM.version_option()] = False,
 ) -> None:
     """Simulate the objects of a scene, helped by preconditioner workers, open to clients."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     logging.basicConfig(level=logging.ERROR if quiet else logging.WARNING, format="sim-server: %(message)s")
     if device not in ("auto", "cpu", "gpu"):
-        _bad_input(f"--device {device}: allowed are auto, cpu, gpu")
+        PROGRAM.bad_input(f"--device {device}: allowed are auto, cpu, gpu")
     if worker_device not in ("auto", "cpu", "gpu"):
-        _bad_input(f"--worker-device {worker_device}: allowed are auto, cpu, gpu")
+        PROGRAM.bad_input(f"--worker-device {worker_device}: allowed are auto, cpu, gpu")
     say = (lambda text: None) if quiet else (lambda text: print(f"sim-server: {text}", flush=True))
     service: Service | None = None
     code = 0
@@ -107,7 +93,7 @@ def serve(
             finally:
                 say(_summary(service))
     except NameTaken as error:
-        _bad_input(str(error))
+        PROGRAM.bad_input(str(error))
     except KeyboardInterrupt:
         code = 130
     except Terminated:
@@ -158,10 +144,10 @@ class Options:
 def _set_up(closing: ExitStack, o: Options) -> "tuple[Service, Supervisor | None]":
     """Everything that can fail on bad input, before the simulation starts."""
     from protocol.channels import DEFAULT_ENDPOINT
-    from protocol.endpoints import BadEndpoint
-    from protocol.exposure import unrestricted
+    from protocol.network.endpoints import BadEndpoint, on_this_machine
+    from protocol.network.exposure import unrestricted
+    from protocol.network.session import AddressInUse, ConnectionFailed
     from protocol.refused import Refused
-    from protocol.session import AddressInUse, ConnectionFailed
     from sim_server.backend import CompileError
     from sim_server.network.link import ServerLink
     from sim_server.recorder import Recorder
@@ -169,7 +155,7 @@ def _set_up(closing: ExitStack, o: Options) -> "tuple[Service, Supervisor | None
     from sim_server.simulation import Simulation
     from sim_server.supervisor import Supervisor
 
-    _end_in_order()
+    end_in_order()
     try:
         simulation = Simulation.load(o.scene, o.overrides, o.device)
         link = closing.enter_context(ServerLink(o.name, o.listen, o.connect, shared_memory=o.shared_memory))
@@ -180,9 +166,9 @@ def _set_up(closing: ExitStack, o: Options) -> "tuple[Service, Supervisor | None
             recorder = closing.enter_context(Recorder(o.record, compression, overwrite=True, report=logging.error))
         service = Service(simulation, link, recorder, o.steps, o.realtime)
     except AddressInUse as error:
-        _bad_input(f"{error}; is another sim-server there? --listen tcp/127.0.0.1:7448 takes another port")
+        PROGRAM.bad_input(f"{error}; is another sim-server there? --listen tcp/127.0.0.1:7448 takes another port")
     except (InputError, BadEndpoint, ConnectionFailed, Refused, CompileError) as error:
-        _bad_input(str(error))
+        PROGRAM.bad_input(str(error))
     for endpoint in unrestricted(o.listen or []):
         logging.warning(
             "--listen %s: anybody who reaches it may stop this server, and push, grab and pause; "
@@ -190,8 +176,8 @@ def _set_up(closing: ExitStack, o: Options) -> "tuple[Service, Supervisor | None
         )  # fmt: skip
     supervisor = None
     if o.workers:
-        reachable = _reachable(o.listen or [DEFAULT_ENDPOINT])
-        supervisor = Supervisor(o.workers, o.name, reachable, ["--device", o.worker_device])
+        endpoint = on_this_machine((o.listen or [DEFAULT_ENDPOINT])[0])
+        supervisor = Supervisor(o.workers, o.name, [endpoint], ["--device", o.worker_device])
         closing.callback(supervisor.close)
         service.beside, link.local_workers = supervisor.look, supervisor.report
     return service, supervisor
@@ -203,11 +189,6 @@ def _only_over_logs(path: Path) -> None:
         with path.open("rb") as file:
             if file.read(8) != b"\x89MCAP0\r\n":
                 raise InputError(f"--record {path}: this file exists and is no MCAP log; it is left as it is")
-
-
-def _reachable(listen: list[str]) -> list[str]:
-    """How a process of this machine reaches a server that listens there."""
-    return [e.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:") for e in listen[:1]]
 
 
 def _announce(say, service: "Service", scene: Path, listen: list[str] | None) -> None:  # type: ignore[no-untyped-def]
@@ -242,10 +223,11 @@ def _describe_objects(say, service: "Service", listen: list[str] | None) -> None
 def _worker_command(name: str, listen: list[str] | None) -> str:
     """How a worker for this server is started on this machine."""
     from protocol.channels import DEFAULT_ENDPOINT, SERVER_NAME
+    from protocol.network.endpoints import on_this_machine
 
     words = ["precond-worker"]
     if listen and listen[0] != DEFAULT_ENDPOINT:
-        words += [word for endpoint in _reachable(listen) for word in ("--connect", endpoint)]
+        words += ["--connect", on_this_machine(listen[0])]
     if name != SERVER_NAME:
         words += ["--server", name]
     return " ".join(words)
@@ -279,27 +261,12 @@ def _unconverged(service: "Service") -> str:
     return f"{sum(counts.values())} of {service.telemetry.solves} solves not converged ({why})"
 
 
-def _end_in_order() -> None:
-    """From now on Ctrl-C and SIGTERM close what is open; before, they end the program at once (__main__.py)."""
-    handle(signal.SIGINT, signal.default_int_handler)
-    handle(signal.SIGTERM, _terminate)
-
-
 def _runaways(service: "Service") -> str:
     """Which objects have run away; empty if none have."""
     names = [service.simulation.world.bodies[body].name for body in sorted(service.telemetry.runaways)]
     return f"; run away: {', '.join(names[:20])}" if names else ""
 
 
-def _terminate(*_: object) -> None:
-    raise Terminated
-
-
-def _bad_input(text: str) -> NoReturn:
-    print(f"sim-server: {text}", file=sys.stderr)
-    raise typer.Exit(2)
-
-
 def main() -> None:
     """Entry point of the console script."""
-    run_command(app, "sim-server")
+    PROGRAM.run(app)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 
 from protocol import messages_pb2 as pb
-from protocol.limits import LONGEST_PUSH
+from protocol.push_limits import LONGEST_PUSH
 from sim_server.simulation import Simulation
 
 

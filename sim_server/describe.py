@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from protocol import messages_pb2 as pb
 from protocol.method import Method
-from protocol.version import version
+from protocol.process.version import version
 from sim_server.backend import Cpu
 from sim_server.engine import Kind
 from sim_server.mesh import posed

@@ -16,7 +16,7 @@ from protocol.method import Method
 from sim_server.arrays import Float64, Int32
 
 if TYPE_CHECKING:
-    from precond_worker.methods import Factorization
+    from precond_worker.factorization.registry import Factorization
 
 log = logging.getLogger(__name__)
 
@@ -109,7 +109,7 @@ class Inline(FactorSource):
     """Factorizes in this process, during `submit`.
 
     patterns: block pattern (row_start, columns) of the matrix of each object
-    library: as in precond_worker.factorize.Analysis
+    library: as in precond_worker.factorization.factorize.Analysis
     """
 
     WORKER = "in process"
@@ -130,7 +130,9 @@ class Inline(FactorSource):
         """Factorizes the matrix and keeps the factor until `poll`."""
         from time import perf_counter
 
-        from precond_worker.factorize import NotPositiveDefinite  # lazily: only in-process updates need a library
+        from precond_worker.factorization.factorize import (
+            NotPositiveDefinite,  # lazily: only in-process updates need a library
+        )
 
         if job.positions:
             self._failed.append((job.object, "positions without a worker that could build the matrix"))
@@ -155,15 +157,15 @@ class Inline(FactorSource):
         return str(self._analysis(name, chosen).library)
 
     def _analysis(self, name: str, method: Method) -> Factorization:
-        from precond_worker.factorize import default_library
-        from precond_worker.methods import prepared
+        from precond_worker.factorization.factorize import default_library
+        from precond_worker.factorization.registry import make_factorization
 
         self._latest[name] = method
         if (name, method) not in self._analyses:
             if method == EXACT and not self._warned and (message := default_library()[1]):
                 self._warned = True
                 log.warning("%s", message)
-            self._analyses[name, method] = prepared(*self._patterns[name], method, self._library)
+            self._analyses[name, method] = make_factorization(*self._patterns[name], method, self._library)
         return self._analyses[name, method]
 
     def poll(self) -> list[Factor]:

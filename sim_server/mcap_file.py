@@ -13,7 +13,7 @@ from mcap.well_known import MessageEncoding
 from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import register_schema
 
-from protocol import PROTOCOL
+from protocol.channels import PROTOCOL
 from sim_server.errors import InputError
 
 CHUNK_BYTES = 1 << 20

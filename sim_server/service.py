@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol import messages_pb2 as pb
-from protocol.nvidia import nvidia_device
+from protocol.process.nvidia import nvidia_device
 from sim_server.commands import Commands
 from sim_server.driver import Driver
 from sim_server.network.link import ServerLink

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from protocol import messages_pb2 as pb
-from protocol.check import checksum
 from protocol.factor import Factor
+from protocol.validate import checksum
 from sim_server.commands import interaction_message
 from sim_server.driver import Driver
 from sim_server.factors import EXACT

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from protocol import PROTOCOL
 from protocol import messages_pb2 as pb
+from protocol.channels import PROTOCOL
 
 REST = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]], np.float64)
 TETS = np.array([[0, 1, 2, 3], [1, 2, 3, 4]], np.int32)

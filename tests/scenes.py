@@ -8,7 +8,7 @@ import meshio
 import numpy as np
 from numpy.typing import NDArray
 
-from precond_worker.factorize import Analysis
+from precond_worker.factorization.factorize import Analysis
 from protocol.factor import FactorPattern
 from sim_server.effects.corotational import Corotational
 from sim_server.mesh import bar as bar_mesh

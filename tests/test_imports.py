@@ -16,8 +16,8 @@ ALLOWED = {
 # Imported when they are needed: the server may factorize in its own process, a replay makes
 # factors as its workers did, a worker compiles as the server does and may assemble the matrix itself.
 EXCEPTIONS = {
-    ("sim_server", "precond_worker.factorize"),
-    ("sim_server", "precond_worker.methods"),
+    ("sim_server", "precond_worker.factorization.factorize"),
+    ("sim_server", "precond_worker.factorization.registry"),
     ("sim_server", "precond_worker.errors"),
     ("sim_server", "precond_worker.gpu.device"),
     ("precond_worker", "sim_server.backend"),

@@ -12,15 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from precond_worker.blocks import BLOCK, degrees_of_freedom, inverse_permutation
-from precond_worker.elimination import Elimination, postorder
-from precond_worker.supernodes import Panel, fundamental
-
-Int = NDArray[np.int64]
+from precond_worker.arrays import Int64
+from precond_worker.symbolic.blocks import BLOCK, degrees_of_freedom, inverse_permutation
+from precond_worker.symbolic.elimination import Elimination, postorder
+from precond_worker.symbolic.supernodes import Panel, fundamental_supernodes
 
 WIDTH = 64  # degrees of freedom that the kernels eliminate in one step (multifrontal.cu)
-ZEROS = 0.05  # fronts join if the joint one holds at most this share of explicit zeros ...
-ZEROS_IN_ONE_STEP = 0.5  # ... or this one while it is eliminated in a single step
+ZEROS = 0.05  # largest share of explicit zeros of a merged front
+ZEROS_IN_ONE_STEP = 0.5  # the same, of a front that is eliminated in a single step
 
 
 @dataclass(frozen=True)
@@ -33,19 +32,19 @@ class AssemblyTree:
     below_start  (f + 1,), below: rows under each front's own columns, ascending
     """
 
-    order: Int
-    first: Int
-    parent: Int
-    below_start: Int
-    below: Int
+    order: Int64
+    first: Int64
+    parent: Int64
+    below_start: Int64
+    below: Int64
 
     @property
-    def own(self) -> Int:
-        """Columns that each front eliminates, (f,)."""
+    def own(self) -> Int64:
+        """Number of columns that each front eliminates, (f,)."""
         return np.diff(self.first)
 
     def pattern_arrays(self) -> dict[str, NDArray[np.integer]]:
-        """Arrays of protocol.factor.FactorPattern, in degrees of freedom."""
+        """Returns the arrays of a protocol.factor.FactorPattern, in degrees of freedom."""
         height = self.own + np.diff(self.below_start)
         start = np.concatenate([[0], np.cumsum(height)])
         rows = np.empty(start[-1], np.int64)
@@ -62,8 +61,8 @@ class AssemblyTree:
 
 
 def assembly_tree(tree: Elimination) -> AssemblyTree:
-    """Fronts for an elimination tree of nodes."""
-    panels = fundamental(tree)
+    """Returns the fronts for an elimination tree of nodes."""
+    panels = fundamental_supernodes(tree)
     owner, parent = merged(panels, parents(panels, tree))
     heads = np.flatnonzero(owner == np.arange(len(panels)))  # the topmost panel of each front: its rows are the front's
     width = np.array([panel.width for panel in panels]) // BLOCK
@@ -85,24 +84,25 @@ def assembly_tree(tree: Elimination) -> AssemblyTree:
     return AssemblyTree(tree.order[order], first, parent_of, below_start, _sorted(below, len(place)))
 
 
-def _sorted(lists: list[Int], nodes: int) -> Int:
-    """Concatenation of the lists, each ascending."""
+def _sorted(lists: list[Int64], nodes: int) -> Int64:
+    """Concatenates the lists, each sorted."""
     flat = np.concatenate(lists).astype(np.int64)
     which = np.repeat(np.arange(len(lists)), [len(rows) for rows in lists])
     return np.sort(which * nodes + flat) - which * nodes
 
 
-def parents(panels: list[Panel], tree: Elimination) -> Int:
-    """Parent panel of each panel, -1 at a root."""
+def parents(panels: list[Panel], tree: Elimination) -> Int64:
+    """Returns the parent of each panel, -1 at a root."""
     panel_of = np.repeat(np.arange(len(panels)), [panel.last - panel.first + 1 for panel in panels])
     column = tree.parent[[panel.last for panel in panels]]
     return np.where(column >= 0, panel_of[column], -1)
 
 
-def merged(panels: list[Panel], parent: Int) -> tuple[Int, Int]:
-    """For each panel the topmost panel of the front that it is in, and its parent in the tree.
+def merged(panels: list[Panel], parent: Int64) -> tuple[Int64, Int64]:
+    """Returns, for each panel, the topmost panel of its front, and its parent in the tree.
 
-    From the leaves up, each front takes in those of its children that cost few zeros, those with the most rows first.
+    From the leaves up, each front is merged with those of its children that add few zeros, those with the most rows
+    first.
     """
     width, height = [p.width for p in panels], [p.height for p in panels]
     zeros = [p.zeros for p in panels]
@@ -129,7 +129,7 @@ def merged(panels: list[Panel], parent: Int) -> tuple[Int, Int]:
 def _joint(
     width: list[int], height: list[int], zeros: list[int], child: int, top: int
 ) -> tuple[int, int, int] | None:  # fmt: skip
-    """Width, height and explicit zeros of two fronts as one; None if that holds too many zeros."""
+    """Returns width, height and explicit zeros of two merged fronts; None if these are too many zeros."""
     added = width[child] * (height[top] + width[child] - height[child])
     joint = Panel(0, 0, width[child] + width[top], width[child] + height[top], zeros[child] + zeros[top] + added)
     share = joint.zeros / joint.size

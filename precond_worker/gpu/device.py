@@ -1,22 +1,22 @@
 # SPDX-License-Identifier: MIT
-"""The NVIDIA GPU of a worker: found, and its kernels compiled, or said in one line why not."""
+"""The NVIDIA GPU of a worker and its kernels; errors say in one line why it cannot be used."""
 
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 from precond_worker.errors import DeviceUnusable
-from protocol.extras import to_install
+from protocol.process.extras import to_install
 
 SOURCE = Path(__file__).with_name("multifrontal.cu")
-ARITHMETIC = ("auto", "float32", "float64")
-KERNELS = ("reset", "look", "assemble", "factor", "panel", "update", "store")
+PRECISIONS = ("auto", "float32", "float64")
+KERNELS = ("reset", "check_finite", "assemble", "factor", "panel", "update", "store")
 _C_TYPES = {"float32": "float", "float64": "double"}
 
 
 @cache
 def cupy() -> Any:
-    """The cupy package with a device behind it; raises DeviceUnusable."""
+    """Imports cupy and checks that there is a device; raises DeviceUnusable."""
     try:
         import cupy as cp
     except ImportError as error:
@@ -32,26 +32,26 @@ def cupy() -> Any:
 
 
 def name() -> str:
-    """Of the device, such as "NVIDIA H200"; raises DeviceUnusable."""
+    """Returns the name of the device, e.g. "NVIDIA H200"; raises DeviceUnusable."""
     cp = cupy()
     return str(cp.cuda.runtime.getDeviceProperties(cp.cuda.Device().id)["name"].decode())
 
 
 @cache
-def best_arithmetic() -> str:
-    """float64 where it costs a GPU at most twice the time of float32, as on those for data centres."""
+def best_precision() -> str:
+    """Returns float64 if it takes the GPU at most twice the time of float32, as on those for data centres."""
     cp = cupy()
     return "float64" if cp.cuda.Device().attributes["SingleToDoublePrecisionPerfRatio"] <= 2 else "float32"
 
 
 @cache
-def kernels(arithmetic: str, stored: str) -> dict[str, Any]:
-    """The kernels by name; stored: type of the values of L. Compiled by NVRTC at the first call, kept on disk by CuPy.
+def kernels(precision: str, stored: str) -> dict[str, Any]:
+    """Compiles the kernels by NVRTC and returns them by name; CuPy caches them. stored: type of the values of L.
 
     Raises DeviceUnusable with what the compiler says.
     """
     cp = cupy()
-    options = ("-std=c++17", f"-Dreal={_C_TYPES[arithmetic]}", f"-DValue={_C_TYPES[stored]}")
+    options = ("-std=c++17", f"-Dreal={_C_TYPES[precision]}", f"-DValue={_C_TYPES[stored]}")
     try:
         module = cp.RawModule(code=SOURCE.read_text(), options=options, backend="nvrtc")
         return {kernel: module.get_function(kernel) for kernel in KERNELS}
@@ -63,9 +63,9 @@ def _first_line(error: BaseException) -> str:
     return (str(error).strip().splitlines() or [type(error).__name__])[0]
 
 
-def try_out(arithmetic: str = "auto") -> str:
-    """Name of the device if it can do what it is for; raises DeviceUnusable."""
-    if arithmetic not in ARITHMETIC:
-        raise ValueError(f"GPU arithmetic {arithmetic!r}, allowed: {', '.join(ARITHMETIC)}")
-    kernels(best_arithmetic() if arithmetic == "auto" else arithmetic, "float32")
+def try_out(precision: str = "auto") -> str:
+    """Compiles the kernels and returns the name of the device; raises DeviceUnusable."""
+    if precision not in PRECISIONS:
+        raise ValueError(f"GPU precision {precision!r}, allowed: {', '.join(PRECISIONS)}")
+    kernels(best_precision() if precision == "auto" else precision, "float32")
     return name()

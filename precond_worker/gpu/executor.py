@@ -1,23 +1,24 @@
 # SPDX-License-Identifier: MIT
-"""A plan on the device: its tables and its memory, made once, and all launches of a factorization as one CUDA graph."""
+"""A plan on the device: its tables and memory, and all launches of a factorization as one CUDA graph."""
 
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from precond_worker.arrays import Float64, Int32
 from precond_worker.errors import DeviceUnusable
 from precond_worker.gpu.device import cupy, kernels
-from precond_worker.gpu.plan import Plan
-from precond_worker.gpu.tables import Launch, front_table, launches
+from precond_worker.gpu.plan import MultifrontalPlan
+from precond_worker.gpu.tables import KernelLaunch, front_table, launch_list
 
-THREADS = {"assemble": 192, "store": 192}  # of a block; 128 in the others (multifrontal.cu)
+THREADS = {"assemble": 192, "store": 192}  # per block; 128 in the other kernels (multifrontal.cu)
 NONE = np.iinfo(np.int32).max
 GIB = 2**30
 
 
 class Outcome(NamedTuple):
-    """Columns of L where it failed (-1: nowhere), and whether the matrix held something other than numbers."""
+    """First columns of L that failed (-1: none), and whether the matrix held NaN or infinity."""
 
     pivot: int
     range: int
@@ -27,15 +28,15 @@ class Outcome(NamedTuple):
 class Executor:
     """Factorizes matrices of one plan in memory of its own.
 
-    arithmetic, stored: "float32" or "float64", of the fronts and of L. Raises MemoryError if the device has not enough
-    left, saying how much that is.
+    precision, stored: "float32" or "float64", of the fronts and of L. Raises MemoryError, with the
+    number of bytes, if the device has too little memory.
     """
 
-    def __init__(self, plan: Plan, arithmetic: str, stored: str):
-        self._cp, self._plan, self.arithmetic = cupy(), plan, arithmetic
-        self._kernels = kernels(arithmetic, stored)
+    def __init__(self, plan: MultifrontalPlan, precision: str, stored: str):
+        self._cp, self._plan, self.precision = cupy(), plan, precision
+        self._kernels = kernels(precision, stored)
         self._stored = np.dtype(stored)
-        self._list, starts = launches(plan)
+        self._list, starts = launch_list(plan)
         self._reserve(starts)
         self.stream = self._cp.cuda.Stream(non_blocking=True)
         with self.stream:
@@ -44,15 +45,15 @@ class Executor:
                 self._launch_all()
             finally:
                 self._graph = self.stream.end_capture()
-        self._cp.cuda.Device().synchronize()  # the tables went up on another stream
+        self._cp.cuda.Device().synchronize()  # the tables were sent on another stream
 
     @property
     def bytes(self) -> int:
-        """Device memory of the large arrays."""
-        fronts = sum(self._plan.half) * np.dtype(self.arithmetic).itemsize
+        """Device memory of the large arrays, in bytes."""
+        fronts = sum(self._plan.half) * np.dtype(self.precision).itemsize
         return fronts + self._plan.nonzeros * self._stored.itemsize + 72 * self._plan.blocks
 
-    def _reserve(self, starts: NDArray[np.int32]) -> None:
+    def _reserve(self, starts: Int32) -> None:
         cp, plan = self._cp, self._plan
         memory = cp.get_default_memory_pool()
         free, total = cp.cuda.runtime.memGetInfo()
@@ -61,7 +62,7 @@ class Executor:
         if self.bytes > free:
             raise MemoryError(f"GPU memory: {sizes}")
         try:
-            self._halves = [cp.empty(max(size, 1), self.arithmetic) for size in plan.half]
+            self._halves = [cp.empty(max(size, 1), self.precision) for size in plan.half]
             self._values = cp.empty(plan.nonzeros, self._stored)
             self._blocks = cp.empty(9 * plan.blocks, np.float64)
             self._status = cp.zeros(3, np.int32)
@@ -83,7 +84,7 @@ class Executor:
             raise MemoryError(f"GPU memory: {sizes} ({error})") from error
 
     def _pinned(self, count: int, dtype: np.dtype[Any]) -> NDArray[Any]:
-        """An array in memory that the device reaches by itself; from CuPy's pool, to which it returns when dropped."""
+        """Allocates an array in page-locked memory of CuPy's pool, to which it returns when dropped."""
         memory = self._cp.cuda.alloc_pinned_memory(max(count * dtype.itemsize, 1))
         return np.frombuffer(memory, dtype, count)
 
@@ -92,12 +93,12 @@ class Executor:
         count = np.int64(self._blocks.size)
         self._kernels["reset"]((1,), (1,), (status,))
         blocks = max(1, min(1024, self._blocks.size // 1024))
-        self._kernels["look"]((blocks,), (256,), (self._blocks, count, status))
+        self._kernels["check_finite"]((blocks,), (256,), (self._blocks, count, status))
         for launch in self._list:
             threads = THREADS.get(launch.kernel, 128)
             self._kernels[launch.kernel]((launch.blocks,), (threads,), self._arguments(launch))
 
-    def _arguments(self, launch: Launch) -> tuple[Any, ...]:
+    def _arguments(self, launch: KernelLaunch) -> tuple[Any, ...]:
         tables, status = self._tables, self._status
         here, there = self._halves[launch.level % 2], self._halves[1 - launch.level % 2]
         fronts = np.uint64(tables["fronts"].data.ptr + 64 * int(self._plan.level_start[launch.level]))
@@ -114,21 +115,21 @@ class Executor:
             "store": (fronts, start, count, here, self._values, status),
         }[launch.kernel]
 
-    def run(self, matrix: NDArray[np.float64]) -> tuple[NDArray[Any], Outcome]:
-        """Values of L, (nonzeros,), of block values (blocks, 3, 3). The array is the caller's to keep.
+    def run(self, matrix: Float64) -> tuple[NDArray[Any], Outcome]:
+        """Returns the values of L, (nonzeros,), of block values (blocks, 3, 3), in an array of their own.
 
-        Raises DeviceUnusable if the device fails: nothing can be done with it in this process any more.
+        Raises DeviceUnusable if the device fails; this process cannot use it any more.
         """
         np.copyto(self._sent, matrix.reshape(-1))
         values = self._pinned(self._plan.nonzeros, self._stored)
         try:
-            self._send_launch_fetch(values)
+            self._send_launch_receive(values)
         except self._cp.cuda.runtime.CUDARuntimeError as error:
             raise DeviceUnusable(f"the GPU failed: {error}") from error
         pivot, range_, infinite = (-1 if c == NONE else int(c) for c in self._outcome)
         return values, Outcome(pivot, range_, bool(infinite))
 
-    def _send_launch_fetch(self, values: NDArray[Any]) -> None:
+    def _send_launch_receive(self, values: NDArray[Any]) -> None:
         self._copy(self._blocks.data.ptr, self._sent.ctypes.data, self._sent.nbytes)
         self._graph.launch(self.stream)
         self._copy(self._outcome.ctypes.data, self._status.data.ptr, self._outcome.nbytes)

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: MIT
-// Multifrontal Cholesky factorization of many fronts at a time (plan.py says what a front is, numeric.py launches).
+// Multifrontal Cholesky factorization of many fronts at a time (plan.py defines fronts, executor.py launches).
 //
 // All fronts of a level are eliminated together, WIDTH columns a step, in two launches: `panel` divides the rows under
 // the diagonal block by it, `update` subtracts the products of those rows from the rest, in tiles of 64 x 64, and goes
@@ -21,7 +21,7 @@ const int PITCH = 64 + 4;  // reals from one such column to the next: a warp's r
 #define WARP (int(threadIdx.x) / 32)
 
 struct Front {
-    Long at, value, child, map, split;  // see Plan
+    Long at, value, child, map, split;  // see MultifrontalPlan
     int own, rows, stride, column;
     int children, unused;
 };
@@ -36,7 +36,7 @@ extern "C" __global__ void reset(Status* status) { *status = Status{0x7fffffff, 
 
 template <class T> __device__ bool finite(T v) { return v - v == 0; }
 
-extern "C" __global__ void look(const double* blocks, Long count, Status* status) {
+extern "C" __global__ void check_finite(const double* blocks, Long count, Status* status) {
     for (Long i = blockIdx.x * (Long)blockDim.x + threadIdx.x; i < count; i += (Long)gridDim.x * blockDim.x)
         if (!finite(blocks[i])) status->infinite = 1;
 }

@@ -1,30 +1,27 @@
 # SPDX-License-Identifier: MIT
-"""Everything the numeric phase needs to know, made once per topology: where fronts lie, what is added where, and when.
+"""The plan of the numeric phase, made once per topology: where fronts lie in memory, what is added to each, and when.
 
-A front is a dense symmetric matrix, of which the lower triangle counts, stored column by column with a stride: the
-columns that it eliminates first, then those of its rows below. It begins as the sum of its entries of A and of the
+A front is a dense symmetric matrix, of which the lower triangle is stored column by column with a stride: first the
+columns that it eliminates, then those of its rows below. It is assembled as the sum of its entries of A and of the
 update matrices (the rows and columns below) of its children; eliminating its own columns leaves columns of L and its
-own update matrix. Fronts of one level need nothing of each other; each lies one level under its parent, so two halves
-of memory, used in turn, hold all that is needed at a time.
+update matrix. Fronts of one level are independent; each is one level below its parent, so that two halves of memory,
+used in turn, hold all fronts that are needed at a time.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from precond_worker.blocks import BLOCK, Index, inverse_permutation, rows_of
+from precond_worker.arrays import Int32, Int64
 from precond_worker.gpu.assembly_tree import WIDTH, AssemblyTree
-
-Int32 = NDArray[np.int32]
-Int64 = NDArray[np.int64]
+from precond_worker.symbolic.blocks import BLOCK, inverse_permutation, rows_of
 
 CHUNK = 2  # nodes whose columns one thread block assembles (multifrontal.cu)
 ALIGN = 8  # entries: columns of a front begin at multiples
 
 
 @dataclass(frozen=True)
-class Plan:
+class MultifrontalPlan:
     """Fronts are numbered by level, leaves first, those with many own columns first in each.
 
     level_start  (levels + 1,): first front of each level
@@ -61,20 +58,20 @@ class Plan:
 
     @property
     def levels(self) -> int:
-        """How many levels."""
+        """Number of levels."""
         return len(self.level_start) - 1
 
     def fronts(self, level: int) -> slice:
-        """The fronts of a level."""
+        """Returns the fronts of a level."""
         return slice(int(self.level_start[level]), int(self.level_start[level + 1]))
 
     def steps(self, level: int) -> int:
-        """Steps of WIDTH columns in which the widest front of a level is eliminated."""
+        """Returns the number of steps of WIDTH columns that eliminate the widest front of a level."""
         return -(-int(self.own[self.fronts(level)].max()) // WIDTH)
 
 
-def make_plan(tree: AssemblyTree, row_start: Index, columns: Index) -> Plan:
-    """Plan for matrices of a block pattern (blocks.py) whose fronts these are."""
+def make_plan(tree: AssemblyTree, row_start: Int32, columns: Int32) -> MultifrontalPlan:
+    """Makes the plan of a tree of fronts, for matrices of a block pattern (symbolic/blocks.py)."""
     level = levels(tree)
     own = tree.own
     height = own + np.diff(tree.below_start)
@@ -90,7 +87,7 @@ def make_plan(tree: AssemblyTree, row_start: Index, columns: Index) -> Plan:
     map_start, map_ = _regrouped(tree.below_start, maps, order)
     split_start, split = _splits(tree, height, maps, order)
     entry_start, block, row = _entries(tree, row_start, columns)
-    return Plan(
+    return MultifrontalPlan(
         level_start, k[order], m[order], stride, at, BLOCK * tree.first[order], value[order], child_start, child,
         map_start, map_.astype(np.int32), split_start, split, entry_start, block, row, half, len(columns),
         int(value[-1]),
@@ -98,7 +95,7 @@ def make_plan(tree: AssemblyTree, row_start: Index, columns: Index) -> Plan:
 
 
 def levels(tree: AssemblyTree) -> Int64:
-    """Level of each front, (f,): its parent's less one; of a root the length of the longest path down."""
+    """Returns the level of each front, (f,): its parent's less one; of a root its height."""
     parent = tree.parent.tolist()
     level = [0] * len(parent)
     for front, up in enumerate(parent):  # heights
@@ -111,7 +108,7 @@ def levels(tree: AssemblyTree) -> Int64:
 
 
 def _places(sizes: Int64, level_start: Int64) -> tuple[Int64, tuple[int, int]]:
-    """First entry of each front in its half, and what either half has to hold."""
+    """Returns the first entry of each front in its half, and the sizes of the halves."""
     end = np.cumsum(sizes)
     at = end - sizes
     before = at[level_start[:-1]]
@@ -120,7 +117,7 @@ def _places(sizes: Int64, level_start: Int64) -> tuple[Int64, tuple[int, int]]:
 
 
 def _children(parent: Int64, order: Int64, number: Int64) -> tuple[Int64, Int64]:
-    """Children of each front in the order of their columns, fronts numbered anew."""
+    """Returns the children of each front in the order of their columns, with new numbers of fronts."""
     has = np.flatnonzero(parent >= 0)
     by_parent = has[np.argsort(number[parent[has]], kind="stable")]
     counts = np.bincount(number[parent[has]], minlength=len(order))
@@ -128,13 +125,13 @@ def _children(parent: Int64, order: Int64, number: Int64) -> tuple[Int64, Int64]
 
 
 def _maps(tree: AssemblyTree) -> Int64:
-    """For each row below a front its place in the parent's front, in the order of tree.below."""
+    """Returns, for each row below a front, its position in the parent's front, in the order of tree.below."""
     fronts = np.repeat(np.arange(len(tree.parent)), np.diff(tree.below_start))
     return _place(tree, tree.parent[fronts], tree.below)
 
 
 def _place(tree: AssemblyTree, front: Int64, row: Int64) -> Int64:
-    """Where a row stands in a front's list of rows: own columns first, then those below."""
+    """Returns the position of a row in the rows of a front: own columns first, then those below."""
     nodes = len(tree.order)
     keys = np.repeat(np.arange(len(tree.parent)), np.diff(tree.below_start)) * nodes + tree.below
     below = np.searchsorted(keys, front * nodes + row) - tree.below_start[front] + tree.own[front]
@@ -142,7 +139,7 @@ def _place(tree: AssemblyTree, front: Int64, row: Int64) -> Int64:
 
 
 def _regrouped(start: Int64, values: Int64, order: Int64) -> tuple[Int64, Int64]:
-    """Lists of fronts in another order of the fronts: where each begins, and all of them."""
+    """Permutes lists of fronts; returns their starts and values."""
     length = np.diff(start)[order]
     new = np.concatenate([[0], np.cumsum(length)])
     source = np.repeat(start[order] - new[:-1], length) + np.arange(new[-1])
@@ -150,7 +147,7 @@ def _regrouped(start: Int64, values: Int64, order: Int64) -> tuple[Int64, Int64]
 
 
 def _splits(tree: AssemblyTree, height: Int64, maps: Int64, order: Int64) -> tuple[Int64, Int32]:
-    """Where in each front's map the chunks of its parent begin; a root has none."""
+    """Returns where the chunks of its parent begin in each front's map; a root has none."""
     chunks = np.where(tree.parent >= 0, -(-height[tree.parent] // CHUNK) + 1, 0)
     start = np.concatenate([[0], np.cumsum(chunks)])
     front = np.repeat(np.arange(len(chunks)), chunks)
@@ -161,8 +158,8 @@ def _splits(tree: AssemblyTree, height: Int64, maps: Int64, order: Int64) -> tup
     return start[:-1][order], found.astype(np.int32)
 
 
-def _entries(tree: AssemblyTree, row_start: Index, columns: Index) -> tuple[Int64, Int32, Int32]:
-    """Blocks of A by column. Of two mirrored ones that in the row of the node eliminated later, as on the CPU."""
+def _entries(tree: AssemblyTree, row_start: Int32, columns: Int32) -> tuple[Int64, Int32, Int32]:
+    """Returns the blocks of A by column; of two mirrored ones that in the row eliminated later, as on the CPU."""
     rank = inverse_permutation(tree.order)
     row, column = rank[rows_of(row_start)], rank[columns]
     block = np.flatnonzero(row >= column)

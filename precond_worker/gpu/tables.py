@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""Which thread block of a launch works on which front: for each launch, where the blocks of each front begin."""
+"""The kernel launches of a factorization, and for each launch the first thread block of each front."""
 
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from precond_worker.arrays import Int32, Int64
 from precond_worker.gpu.assembly_tree import WIDTH
-from precond_worker.gpu.plan import CHUNK, Int64, Plan
+from precond_worker.gpu.plan import CHUNK, MultifrontalPlan
 
 TILE = 64
 FRONT = np.dtype(
@@ -16,8 +17,8 @@ FRONT = np.dtype(
 )  # struct Front in multifrontal.cu
 
 
-class Launch(NamedTuple):
-    """kernel: its name; level, step: of what; table: where its starts begin among all; fronts, blocks: how many."""
+class KernelLaunch(NamedTuple):
+    """kernel: name; level, step: of the fronts; table: offset of its starts; fronts, blocks: their numbers."""
 
     kernel: str
     level: int
@@ -27,8 +28,8 @@ class Launch(NamedTuple):
     blocks: int
 
 
-def front_table(plan: Plan) -> NDArray[np.void]:
-    """The fronts as the kernels read them, (f,)."""
+def front_table(plan: MultifrontalPlan) -> NDArray[np.void]:
+    """Returns the fronts as the kernels read them, (f,)."""
     table = np.zeros(len(plan.own), FRONT)
     table["at"], table["value"], table["own"], table["rows"] = plan.at, plan.value, plan.own, plan.rows
     table["child"], table["map"], table["split"] = plan.child_start[:-1], plan.map_start[:-1], plan.split_start
@@ -37,12 +38,12 @@ def front_table(plan: Plan) -> NDArray[np.void]:
     return table
 
 
-def launches(plan: Plan) -> tuple[list[Launch], NDArray[np.int32]]:
-    """All launches of a factorization in their order, and the starts that they read.
+def launch_list(plan: MultifrontalPlan) -> tuple[list[KernelLaunch], Int32]:
+    """Returns the launches of a factorization in their order, and the starts that they read.
 
-    Of a level: assemble, the first diagonal blocks, then panel and update step by step, and L to where it is sent from.
+    Per level: assembly, the first diagonal blocks, then panel and update step by step, and the copy of L (store).
     """
-    result: list[Launch] = []
+    result: list[KernelLaunch] = []
     tables: list[Int64] = []
     filled = 0
 
@@ -51,16 +52,16 @@ def launches(plan: Plan) -> tuple[list[Launch], NDArray[np.int32]]:
         start = np.concatenate([[0], np.cumsum(counts)])
         if start[-1] == 0:
             return
-        result.append(Launch(kernel, level, step, filled, len(counts), int(start[-1])))
+        result.append(KernelLaunch(kernel, level, step, filled, len(counts), int(start[-1])))
         tables.append(start)
         filled += len(start)
 
     for level in range(plan.levels):
         own, rows = plan.own[plan.fronts(level)], plan.rows[plan.fronts(level)]
         add("assemble", level, 0, -(-rows // (3 * CHUNK)))
-        result.append(Launch("factor", level, 0, 0, len(own), len(own)))
+        result.append(KernelLaunch("factor", level, 0, 0, len(own), len(own)))
         for step in range(plan.steps(level)):
-            active = own > WIDTH * step  # the first few: they are sorted
+            active = own > WIDTH * step  # the first ones, as they are sorted
             below = (rows - np.minimum(own, WIDTH * (step + 1)))[active]
             tiles = -(-below // TILE)
             add("panel", level, step, tiles)

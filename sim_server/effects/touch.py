@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from protocol.limits import ORPHANED_PUSH
+from protocol.push_limits import ORPHANED_PUSH
 from sim_server.backend import Launch
 from sim_server.effect import Effect
 from sim_server.points import Points, shown

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.extras import to_install
+from protocol.process.extras import to_install
 from sim_server.backend import HERE, INCLUDE, Argument, CompileError, arguments_of, build_id, domain_of, read_text
 from sim_server.compiling import compilers
 from sim_server.errors import DeviceError

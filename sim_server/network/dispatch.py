@@ -9,13 +9,13 @@ from collections.abc import Callable
 import numpy as np
 import zenoh
 
-from protocol import Factor
 from protocol.channels import CHANNELS, key, name_in
-from protocol.check import take
 from protocol.counters import Counters
+from protocol.factor import Factor
 from protocol.messages_pb2 import Topology, WorkerInfo
 from protocol.refused import Refused
-from protocol.slots import Slot, SlotPool
+from protocol.shared_memory.pool import Slot, SlotPool
+from protocol.validate import take
 from sim_server.factors import FactorSource, Job
 from sim_server.network.factor_decoder import FactorDecoder
 from sim_server.network.inbox import Inbox

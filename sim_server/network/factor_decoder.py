@@ -6,12 +6,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from protocol.channels import CHANNELS, name_in
-from protocol.check import Sized, array, check_header, check_numbers, check_strings, parse, take
 from protocol.factor import Factor, FactorPattern, check_values
 from protocol.messages_pb2 import Factor as FactorMessage
 from protocol.messages_pb2 import FactorPattern as PatternMessage
 from protocol.messages_pb2 import Topology
 from protocol.refused import Refused
+from protocol.validate import Sized, array, check_header, check_numbers, check_strings, parse, take
 from sim_server.arrays import Float32, Float64
 from sim_server.network.leases import InFlightJob
 

@@ -5,10 +5,10 @@ import numpy as np
 import zenoh
 
 from protocol.channels import PROTOCOL
-from protocol.check import checksum
 from protocol.messages_pb2 import Header, Matrix
 from protocol.method import Method
-from protocol.slots import Slot
+from protocol.shared_memory.pool import Slot
+from protocol.validate import checksum
 from sim_server.arrays import Float64
 from sim_server.network.factor_decoder import AnnouncedObject
 from sim_server.network.leases import InFlightJob

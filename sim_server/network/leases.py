@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from protocol.refused import Refused
-from protocol.slots import Slot
+from protocol.shared_memory.pool import Slot
 
 MIN_LEASE = 2.0  # s
 MAX_LEASE = 120.0  # s; also for the first job of an object at a worker, which may compile, import and analyse for it

@@ -17,11 +17,11 @@ from zenoh.handlers import RingChannel
 
 from protocol.channels import PROTOCOL, SERVER_NAME, check_name, key, name_in
 from protocol.counters import Counters
-from protocol.memlock import POOL_LIMIT
 from protocol.messages_pb2 import Command, LocalWorker, Reply, Scene, State, Status, Steps, Topology
+from protocol.network.session import open_session
 from protocol.refused import Refused
-from protocol.session import open_session
-from protocol.slots import Slot, SlotPool, SlotsUnusable
+from protocol.shared_memory.limits import POOL_LIMIT
+from protocol.shared_memory.pool import Slot, SlotPool, SlotsUnusable
 from sim_server.network.dispatch import Dispatch
 from sim_server.network.name_claim import NameClaim
 from sim_server.network.publishers import Publishers

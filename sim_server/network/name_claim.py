@@ -14,10 +14,10 @@ from collections.abc import Sequence
 
 import zenoh
 
-from protocol import echo
 from protocol.channels import DEFAULT_ENDPOINT, key
 from protocol.messages_pb2 import Echo
-from protocol.session import ConnectionFailed, Session, open_session
+from protocol.network.session import ConnectionFailed, Session, open_session
+from protocol.shared_memory import probe as shm_probe
 from sim_server.errors import NameTaken
 
 log = logging.getLogger(__name__)
@@ -59,9 +59,9 @@ class NameClaim:
     def _query_session(self) -> zenoh.Session:
         return (self._client or self._session).zenoh
 
-    def _query(self, answered: echo.Answered) -> None:
+    def _query(self, answered: shm_probe.Answered) -> None:
         with contextlib.suppress(zenoh.ZError):  # the link was cut
-            echo.who(self._query_session, self._server, f"{self._incarnation:016x}", answered)
+            shm_probe.who(self._query_session, self._server, f"{self._incarnation:016x}", answered)
 
     def _query_and_wait(self) -> dict[int, Echo]:
         answers: dict[int, Echo] = {}

@@ -7,15 +7,15 @@ from functools import partial
 
 import zenoh
 
-from protocol import echo
 from protocol.channels import CHANNELS, PROTOCOL, key, name_in
-from protocol.check import check_header, check_numbers, check_strings, parse
 from protocol.client_name import check_client
 from protocol.counters import Counters
 from protocol.messages_pb2 import Command, Echo, Header, Reply
+from protocol.network.session import Session
 from protocol.refused import Refused
-from protocol.session import Session
-from protocol.slots import Slot
+from protocol.shared_memory import probe as shm_probe
+from protocol.shared_memory.pool import Slot
+from protocol.validate import check_header, check_numbers, check_strings, parse
 from sim_server.network.coalesce import coalesce_moves
 from sim_server.network.command_queue import CommandQueue, PendingCommand
 from sim_server.network.name_claim import NameClaim
@@ -118,7 +118,7 @@ class Queryables:
                 query.key_expr, b"", attachment=Echo(header=header, settled=self._claim.settled).SerializeToString()
             )
         else:
-            reply, payload = echo.answer(self._probe_slot, question, self._incarnation)
+            reply, payload = shm_probe.answer(self._probe_slot, question, self._incarnation)
             query.reply(query.key_expr, payload, attachment=reply.SerializeToString())
 
     def _warn_of_version(self, query: zenoh.Query, question: Echo) -> None:

@@ -9,9 +9,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from protocol.channels import CHANNELS, check_name, name_in
-from protocol.check import check_header, check_strings, parse
 from protocol.messages_pb2 import WorkerInfo
 from protocol.refused import Refused
+from protocol.validate import check_header, check_strings, parse
 
 SILENCE = 2.0  # s without a heartbeat until a worker gets no more jobs
 WORKERS = 256  # most workers

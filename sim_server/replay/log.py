@@ -14,14 +14,13 @@ from pathlib import Path
 
 import numpy as np
 from google.protobuf.message import DecodeError
-from mcap.records import Channel, McapRecord
-from mcap.records import Message as McapMessage
 from numpy.typing import NDArray
 
 from protocol import messages_pb2 as pb
-from protocol.check import array
-from protocol.log_chunks import BadLog, ChunkFile
+from protocol.log_chunks import BadLog
+from protocol.log_file import LogFile, LogMessage, Position
 from protocol.refused import Refused
+from protocol.validate import array
 from sim_server.arrays import Float64
 from sim_server.engine import Kind
 from sim_server.scene.solver_options import FACTORS
@@ -43,14 +42,14 @@ class RecordedObject:
     """What a log holds of one object.
 
     packed: step records in the order of the log, packed; empty once `rows` is made
-    frames: (offset of the chunk, number of the record in it) by step
+    frames: position in the file by step
     factors: by the step whose matrix they were made from
     rows: of type ROW; rows[k] is of step k + 1
     """
 
     topology: pb.Topology | None = None
     packed: bytearray = field(default_factory=bytearray)
-    frames: dict[int, tuple[int, int]] = field(default_factory=dict)
+    frames: dict[int, Position] = field(default_factory=dict)
     factors: dict[int, pb.FactorUse] = field(default_factory=dict)
     rows: NDArray = field(default_factory=lambda: np.zeros(0, ROW))
 
@@ -72,19 +71,14 @@ class Recording:
         self.touch: list[pb.TouchSet] = []
         self.touched = False
         self.notes: list[str] = []
-        self._file = ChunkFile.open(self.path)
-        self._topics: dict[int, str] = {}
-        self._cached: tuple[int, list[McapRecord]] = (-1, [])
+        self._file = LogFile.open(self.path)
         malformed: list[str] = []
         try:
-            for offset, records in self._file.scan(progress):
-                self._file.check_origin()
-                for number, record in enumerate(records):
-                    try:
-                        self._keep(offset, number, record)
-                    except (DecodeError, Refused, KeyError, struct.error) as error:
-                        malformed.append(str(error))
-            self._file.check_origin()
+            for message in self._file.messages(progress):
+                try:
+                    self._keep(message)
+                except (DecodeError, Refused, KeyError, struct.error) as error:
+                    malformed.append(str(error))
             self.notes += self._file.notes()
             if malformed:
                 self.notes.append(f"{self.path}: {len(malformed)} malformed messages left out, first: {malformed[0]}")
@@ -101,15 +95,10 @@ class Recording:
 
     def frame(self, name: str, step: int) -> tuple[Float64, Float64] | None:
         """Returns x [m] and v [m/s], (nodes, 3), of an object after a step; None if the log has no such frame."""
-        place = self.objects[name].frames.get(step)
-        if place is None:
+        position = self.objects[name].frames.get(step)
+        if position is None:
             return None
-        offset, number = place
-        if self._cached[0] != offset:
-            self._cached = (offset, self._file.chunk(offset))
-        record = self._cached[1][number]
-        assert isinstance(record, McapMessage)
-        state = pb.State.FromString(record.data)
+        state = pb.State.FromString(self._file.data(position))
         shape = (state.nodes, 3)
         return array(state.x, np.float64, shape, "State.x"), array(state.v, np.float64, shape, "State.v")
 
@@ -123,35 +112,30 @@ class Recording:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _keep(self, offset: int, number: int, record: McapRecord) -> None:
-        if isinstance(record, Channel):
-            self._topics[record.id] = record.topic
-            return
-        assert isinstance(record, McapMessage)
-        topic = self._topics.get(record.channel_id, "")
-        if topic == "/scene":
-            self.scene = pb.Scene.FromString(record.data)
-        elif topic == "/touch":
-            self.touch.append(pb.TouchSet.FromString(record.data))
+    def _keep(self, message: LogMessage) -> None:
+        if message.topic == "/scene":
+            self.scene = pb.Scene.FromString(message.data)
+        elif message.topic == "/touch":
+            self.touch.append(pb.TouchSet.FromString(message.data))
         else:
-            self._keep_of_object(topic, offset, number, record)
+            self._keep_of_object(message)
 
-    def _keep_of_object(self, topic: str, offset: int, number: int, record: McapMessage) -> None:
-        _, kind, name = [*topic.split("/", 2), "", ""][:3]
-        if kind not in ("topology", "state", "interaction", "factor", "step") or not name:
+    def _keep_of_object(self, message: LogMessage) -> None:
+        kind, data = message.kind, message.data
+        if kind not in ("topology", "state", "interaction", "factor", "step") or not message.object:
             raise Refused("a message of an unknown channel")
-        found = self.objects.setdefault(name, RecordedObject())
+        found = self.objects.setdefault(message.object, RecordedObject())
         if kind == "topology":
-            found.topology = pb.Topology.FromString(record.data)
+            found.topology = pb.Topology.FromString(data)
         elif kind == "state":
-            found.frames[pb.State.FromString(record.data).step] = (offset, number)
+            found.frames[pb.State.FromString(data).step] = message.position
         elif kind == "interaction":
             self.touched = True
         elif kind == "factor":
-            factor = pb.FactorUse.FromString(record.data)
+            factor = pb.FactorUse.FromString(data)
             found.factors[factor.step] = factor
         elif kind == "step":
-            s = pb.ObjectStep.FromString(record.data)
+            s = pb.ObjectStep.FromString(data)
             kind_used = _KINDS[s.preconditioner]
             asked = _KINDS[s.asked] if s.asked else kind_used
             found.packed += _PACK.pack(

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from protocol import messages_pb2 as pb
-from protocol.check import array, check_range, checksum
 from protocol.factor import Factor
 from protocol.log_chunks import BadLog
 from protocol.refused import Refused
+from protocol.validate import array, check_range, checksum
 from sim_server import describe
 from sim_server.arrays import Float64
 from sim_server.assembly import Assembly

@@ -11,7 +11,7 @@ import zenoh
 
 from protocol import messages_pb2 as pb
 from protocol.channels import everything, key
-from protocol.session import open_session
+from protocol.network.session import open_session
 from tests.ports import free_port
 from tests.sample_run import DT, header, object_step, scene, state, topology
 

@@ -12,8 +12,8 @@ import pytest
 
 from clients.client import Client
 from clients.errors import BadInput, ClientError
-from protocol import PROTOCOL
 from protocol import messages_pb2 as pb
+from protocol.channels import PROTOCOL
 from tests.clients.fake_server import FakeServer
 from tests.sample_run import REST, object_step, positions
 

@@ -117,7 +117,7 @@ def test_the_server_of_the_environment(server: FakeServer) -> None:
         ("clients", "sim-client pu", {"push"}),
         ("clients", "sim-client push --ra", {"--radius"}),
         ("sim_server", "sim-server --wor", {"--workers", "--worker-device"}),
-        ("precond_worker", "precond-worker --arith", {"--arithmetic"}),
+        ("precond_worker", "precond-worker --prec", {"--precision"}),
     ],
 )
 def test_completion(package: str, words: str, found: set[str]) -> None:

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from clients.errors import BadInput, ClientError
-from clients.export import export
-from clients.log import Log
+from clients.log.export import export
+from clients.log.reader import Log
 from sim_server.recorder import Recorder
 from tests.sample_run import DT, REST, TETS, object_step, positions, record, state, topology, velocities
 

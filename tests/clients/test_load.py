@@ -17,10 +17,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from clients import load_scene
 from clients.errors import BadInput, ClientError
-from clients.frames import Mesh
-from clients.load import Load, free_end, plan, span
+from clients.load_test import scene
+from clients.load_test.options import LoadOptions, span
+from clients.load_test.run import free_end, plan
+from clients.log.frames import Mesh
 from protocol import messages_pb2 as pb
 from tests.scenes import scene as sample
 
@@ -32,13 +33,13 @@ ASKED: dict[str, Any] = {
 
 
 def test_the_same_seed_gives_the_same_scene_and_another_another() -> None:
-    one = load_scene.scene(20, (200, 3000), 7)
-    assert one == load_scene.scene(20, (200, 3000), 7) != load_scene.scene(20, (200, 3000), 8)
+    one = scene.scene_text(20, (200, 3000), 7)
+    assert one == scene.scene_text(20, (200, 3000), 7) != scene.scene_text(20, (200, 3000), 8)
     assert one.isascii(), "the same bytes in every encoding"
 
 
 def test_bodies_have_the_sizes_asked_for_and_names_of_their_own() -> None:
-    table = tomllib.loads(load_scene.scene(60, (200, 3000), 3))
+    table = tomllib.loads(scene.scene_text(60, (200, 3000), 3))
     bars = [found["mesh"]["bar"] for found in table["object"]]
     tets = [6 * a * b * c for a, b, c in bars]
     assert len({found["name"] for found in table["object"]}) == 60
@@ -54,13 +55,13 @@ def test_the_server_reads_such_a_scene(objects: int, tmp_path: Path) -> None:
     from sim_server.scene import load
 
     path = tmp_path / "load.toml"
-    path.write_text(load_scene.scene(objects, (24, 300), 5))
+    path.write_text(scene.scene_text(objects, (24, 300), 5))
     assert len(load(path).objects) == objects
 
 
 @pytest.mark.parametrize("tets", [6, 24, 200, 540, 3000, 24_000])
 def test_a_bar_of_about_so_many_tetrahedra(tets: int) -> None:
-    a, b = load_scene.cells(tets)
+    a, b = scene.cells(tets)
     assert 6 * a * a * b == pytest.approx(tets, rel=0.3)
 
 
@@ -91,7 +92,7 @@ def test_bad_spans(text: str) -> None:
 )
 def test_what_cannot_be_asked_for(change: dict[str, Any], said: str) -> None:
     with pytest.raises(BadInput, match=said):
-        Load(**(ASKED | change))
+        LoadOptions(**(ASKED | change))
 
 
 def mesh(name: str) -> Mesh:
@@ -157,7 +158,7 @@ def test_a_short_run(tmp_path: Path) -> None:
     found = json.loads(out)
     assert "keep" in found["verdict"] and "steps late" in found["verdict"]
     assert found == json.loads((tmp_path / "load.json").read_text())
-    assert (tmp_path / "load.toml").read_text() == load_scene.scene(2, (24, 96), 1)
+    assert (tmp_path / "load.toml").read_text() == scene.scene_text(2, (24, 96), 1)
     assert (tmp_path / "load.png").read_bytes().startswith(b"\x89PNG") and (tmp_path / "load.mcap").stat().st_size
     steps, commands = found["steps"], found["clients"]["commands"]
     assert steps["count"] > 10 and 0 < steps["ms_p50"] <= steps["ms_p99"] <= steps["ms_max"]

@@ -4,8 +4,8 @@
 import numpy as np
 import pytest
 
-from clients.load_verdict import verdict
-from clients.scalars import Columns
+from clients.load_test.verdict import verdict
+from clients.log.scalars import Columns
 from protocol import messages_pb2 as pb
 
 DT, COUNT = 0.02, 500

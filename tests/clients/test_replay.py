@@ -16,9 +16,9 @@ import pytest
 
 from clients.client import Client
 from clients.errors import BadInput, ClientError
-from clients.replay import Replay, speed_of
-from clients.station import Station
-from clients.timeline import Timeline
+from clients.replay.player import Player, speed_of
+from clients.replay.replay_server import ReplayServer
+from clients.replay.timeline import Timeline
 from protocol import messages_pb2 as pb
 from tests.clients.fake_server import FakeServer
 from tests.sample_run import object_step, positions, record, topology, velocities
@@ -34,7 +34,7 @@ def log(tmp_path: Path) -> Path:
     return record(tmp_path / "run.mcap", STEPS, NAMES)
 
 
-class FakeStation:
+class FakeReplayServer:
     """Notes what a replay does."""
 
     def __init__(self) -> None:
@@ -63,23 +63,23 @@ class FakeStation:
         return [m.step for c, o, m in self.sent if c == "state" and o == name]  # type: ignore[attr-defined]
 
 
-def played(log: Path, **options: float) -> FakeStation:
-    station = FakeStation()
+def played(log: Path, **options: float) -> FakeReplayServer:
+    server = FakeReplayServer()
     with Timeline(log) as timeline:
-        Replay(timeline, station, math.inf, **options).play()  # type: ignore[arg-type]
-    return station
+        Player(timeline, server, math.inf, **options).play()  # type: ignore[arg-type]
+    return server
 
 
 def test_everything_is_sent_in_order(log: Path) -> None:
-    station = played(log)
-    assert sorted(station.steps()) == sorted((n, s) for n in NAMES for s in range(1, STEPS + 1))
+    server = played(log)
+    assert sorted(server.steps()) == sorted((n, s) for n in NAMES for s in range(1, STEPS + 1))
     for name in NAMES:
-        assert [s for n, s in station.steps() if n == name] == list(range(1, STEPS + 1))
-        assert station.states(name) == list(range(STEPS + 1))
-        assert station.offered["topology", name] == topology(name)
-    states = [m for c, o, m in station.sent if (c, o) == ("state", "beam")]
+        assert [s for n, s in server.steps() if n == name] == list(range(1, STEPS + 1))
+        assert server.states(name) == list(range(STEPS + 1))
+        assert server.offered["topology", name] == topology(name)
+    states = [m for c, o, m in server.sent if (c, o) == ("state", "beam")]
     assert states[7].x == positions(7).tobytes() and states[7].v == velocities(7).tobytes()  # type: ignore[attr-defined]
-    status = station.offered["status", ""]
+    status = server.offered["status", ""]
     assert isinstance(status, pb.Status)
     assert (status.state, status.step, status.objects[1].last.iterations) == (
         "stopping", STEPS, object_step("liver", STEPS).iterations,
@@ -88,22 +88,22 @@ def test_everything_is_sent_in_order(log: Path) -> None:
 
 
 def test_a_part_is_sent_with_its_meshes(log: Path) -> None:
-    station = played(log, begin=0.2, end=0.3)
-    assert station.states("beam") == [10, 11, 12, 13, 14, 15]
-    assert [s for n, s in station.steps() if n == "beam"] == [10, 11, 12, 13, 14, 15]
-    assert ("topology", "liver") in station.offered
+    server = played(log, begin=0.2, end=0.3)
+    assert server.states("beam") == [10, 11, 12, 13, 14, 15]
+    assert [s for n, s in server.steps() if n == "beam"] == [10, 11, 12, 13, 14, 15]
+    assert ("topology", "liver") in server.offered
     with Timeline(log) as timeline, pytest.raises(BadInput, match=r"--from 9 .*holds 0 to 0\.6 s"):
-        Replay(timeline, FakeStation(), 1.0, begin=9.0)  # type: ignore[arg-type]
+        Player(timeline, FakeReplayServer(), 1.0, begin=9.0)  # type: ignore[arg-type]
 
 
 def test_commands_pause_stop_and_are_refused(log: Path) -> None:
-    station = FakeStation()
-    station.asked = [("push", None), ("pause", None), ("resume", None), ("stop", None)]
+    server = FakeReplayServer()
+    server.asked = [("push", None), ("pause", None), ("resume", None), ("stop", None)]
     with Timeline(log) as timeline:
-        replay = Replay(timeline, station, math.inf)  # type: ignore[arg-type]
+        replay = Player(timeline, server, math.inf)  # type: ignore[arg-type]
         replay.play(loop=True)  # ends by the command alone
-    assert ["push" in r.error for r in station.replies] == [True, False, False, False]
-    assert replay.stopping and station.states("beam") == []
+    assert ["push" in r.error for r in server.replies] == [True, False, False, False]
+    assert replay.stopping and server.states("beam") == []
 
 
 def test_a_log_cut_off_is_played_as_far_as_it_goes(log: Path, tmp_path: Path) -> None:
@@ -112,8 +112,8 @@ def test_a_log_cut_off_is_played_as_far_as_it_goes(log: Path, tmp_path: Path) ->
     record(tmp_path / "long.mcap", 4000, ("beam",), "none")
     whole = (tmp_path / "long.mcap").read_bytes()
     cut.write_bytes(whole[: len(whole) * 2 // 3])
-    station = played(cut)
-    sent = station.states("beam")
+    server = played(cut)
+    sent = server.states("beam")
     assert 1000 < len(sent) < 4000 and sent == list(range(len(sent)))
     with Timeline(cut) as timeline:
         assert "without an end mark" in timeline.notes[0]
@@ -133,15 +133,15 @@ def test_names() -> None:
     """A name that a live server has is refused if asked for, and gets a suffix if not."""
     with FakeServer() as server:
         with pytest.raises(ClientError, match=r"live server 'sim' is at .*--name"):
-            Station("sim", "sim", [server.endpoint], None)
-        with Station(None, "sim", [server.endpoint], None) as station:
-            assert station.name == "sim-replay"
-            with Station(None, "sim", [server.endpoint], None) as another:
+            ReplayServer("sim", "sim", [server.endpoint], None)
+        with ReplayServer(None, "sim", [server.endpoint], None) as one:
+            assert one.name == "sim-replay"
+            with ReplayServer(None, "sim", [server.endpoint], None) as another:
                 assert another.name == "sim-replay-2"
-        with Station("mine", "sim", [server.endpoint], None) as station:
-            assert station.name == "mine"
+        with ReplayServer("mine", "sim", [server.endpoint], None) as named:
+            assert named.name == "mine"
         with pytest.raises(BadInput, match="server name"):
-            Station("no/name", "sim", [server.endpoint], None)
+            ReplayServer("no/name", "sim", [server.endpoint], None)
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from clients.client import Client
 from clients.errors import ClientError
 from protocol import messages_pb2 as pb
 from protocol.channels import everything, key
-from protocol.session import open_session
+from protocol.network.session import open_session
 from tests.clients.fake_server import FakeServer
 from tests.sample_run import header
 

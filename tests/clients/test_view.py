@@ -14,14 +14,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from clients import view
 from clients.client import Client
-from clients.colors import colors
 from clients.errors import BadInput, ClientError
-from clients.frames import mesh_of
-from clients.log import Log
-from clients.screenshot import has_vulkan_driver
-from clients.surface import Surface
+from clients.log.frames import mesh_of
+from clients.log.reader import Log
+from clients.viewer import view
+from clients.viewer.colors import colors
+from clients.viewer.screenshot import has_vulkan_driver
+from clients.viewer.surface import Surface
 from sim_server.recorder import Recorder
 from tests.clients.fake_server import FakeServer
 from tests.sample_run import (
@@ -219,7 +219,7 @@ def test_the_suffix_says_what_the_file_holds(
     file = BytesIO()
     image.new("RGBA", (40, 30), (200, 30, 60, 255)).save(file, "PNG")
     monkeypatch.setattr(view, "has_vulkan_driver", lambda: False)
-    monkeypatch.setattr("clients.picture.draw", lambda *_: file.getvalue())
+    monkeypatch.setattr("clients.viewer.snapshot_plot.draw", lambda *_: file.getvalue())
     with Log(record_bent(tmp_path / "run.mcap")) as log:
         view.save_screenshot(log, tmp_path / name, "displacement")
     assert (tmp_path / name).read_bytes().startswith(begins)
@@ -271,7 +271,7 @@ class _Switch:
 def test_live_frames_and_curves(tmp_path: Path) -> None:
     """What a running server publishes ends up in the recording, with colours that grow with the data."""
     rr = pytest.importorskip("rerun")
-    from clients.rerun_scene import RerunScene
+    from clients.viewer.rerun_scene import RerunScene
 
     recording = rr.RecordingStream("test")
     recording.save(tmp_path / "live.rrd")

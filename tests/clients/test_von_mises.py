@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from clients.von_mises import StressField
+from clients.log.von_mises import StressField
 from tests.sample_run import REST, TETS
 
 YOUNG, POISSON = 2e5, 0.3

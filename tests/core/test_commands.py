@@ -4,7 +4,7 @@
 import pytest
 
 from protocol import messages_pb2 as pb
-from protocol.limits import LONGEST_PUSH
+from protocol.push_limits import LONGEST_PUSH
 from sim_server.commands import Commands
 from tests.scenes import bar, simulation
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from precond_worker.methods import prepared
+from precond_worker.factorization.registry import make_factorization
 from protocol.factor import Factor
 from protocol.method import Method
 from sim_server.driver import Driver
@@ -27,7 +27,7 @@ def guard_of(sim: Simulation) -> tuple[Guard, NDArray]:
 
 def made(sim: Simulation, method: Method | None = None, dtype: type = np.float32) -> Factor:
     body = sim.world.bodies[0]
-    analysis = prepared(*sim.system.body_pattern(body.first, body.last), method)
+    analysis = make_factorization(*sim.system.body_pattern(body.first, body.last), method)
     values = analysis.factorize(sim.system.body_values(body.first, body.last), dtype)
     return Factor(body.name, 1, 0, True, analysis.pattern, values, "w", 0.1)
 
@@ -199,7 +199,7 @@ def test_the_copy_of_a_matrix_is_kept_until_its_factor_came(monkeypatch):
 
 def made_of(driver: Driver, values: NDArray) -> NDArray:
     body = driver.simulation.world.bodies[0]
-    analysis = prepared(*driver.simulation.system.body_pattern(body.first, body.last))
+    analysis = make_factorization(*driver.simulation.system.body_pattern(body.first, body.last))
     return analysis.factorize(values, np.float32)
 
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from protocol.limits import ORPHANED_PUSH
+from protocol.push_limits import ORPHANED_PUSH
 from sim_server.effects.touch import Touch, TouchError
 from sim_server.simulation import Simulation
 from tests.scenes import bar, simulation

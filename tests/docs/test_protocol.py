@@ -5,8 +5,8 @@ import re
 
 import pytest
 
-from protocol import memlock
 from protocol.channels import CHANNELS, PROTOCOL, Channel
+from protocol.shared_memory import limits
 from sim_server import cli, recorder
 from sim_server.mesh import MOST_TETS
 from sim_server.network import command_queue, leases, rate_limiter, worker_registry
@@ -52,7 +52,7 @@ def test_channels() -> None:
         ("protocol.md", f"({leases.MIN_LEASE:g} s at least)"),
         ("protocol.md", f"has {leases.MAX_LEASE:g} s."),
         ("protocol.md", f"({leases.MIN_LEASE:g} to {leases.MAX_LEASE:g} s,"),
-        ("protocol.md", f"`ulimit -l` of {(memlock.POOL_LIMIT + memlock.METADATA) >> 10:,} KiB"),
+        ("protocol.md", f"`ulimit -l` of {(limits.POOL_LIMIT + limits.METADATA) >> 10:,} KiB"),
         ("scenes.md", f"in at most {where.MAX_LENGTH} characters and {where.MAX_DEPTH} levels"),
         ("scenes.md", f"{MOST_TETS:,} tetrahedra in all"),
         ("use.md", f"above {recorder.FRAME_BYTES >> 20} MiB"),

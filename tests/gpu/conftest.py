@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from protocol.nvidia import nvidia_device
+from protocol.process.nvidia import nvidia_device
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from precond_worker.factorize import Analysis
+from precond_worker.factorization.factorize import Analysis
 from sim_server.gpu.plan import plan
 from tests.reference.partitioned import Application, stored
 from tests.solver.solves import applied

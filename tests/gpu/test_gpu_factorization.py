@@ -6,8 +6,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.sparse import bsr_matrix, csc_matrix
 
-from precond_worker.factorize import Analysis, NotPositiveDefinite
-from protocol import FactorPattern
+from precond_worker.factorization.factorize import Analysis, NotPositiveDefinite
+from protocol.factor import FactorPattern
 from sim_server.simulation import Simulation
 from tests.reference import supernodal
 from tests.worker.block_matrices import GRAPHS as COMMON

@@ -7,8 +7,7 @@ from typing import Any
 
 import pytest
 
-from protocol import PROTOCOL
-from protocol.channels import key
+from protocol.channels import PROTOCOL, key
 from protocol.counters import Counters
 from protocol.messages_pb2 import Command, Header, Interaction, Reply, Vector
 from protocol.refused import Refused

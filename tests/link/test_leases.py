@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from protocol import Refused
+from protocol.refused import Refused
 from sim_server.network.leases import DELIVERY, MAX_LEASE, MIN_LEASE, InFlightJob, Leases
 
 

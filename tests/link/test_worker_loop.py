@@ -11,16 +11,17 @@ import numpy as np
 import pytest
 
 from precond_worker.errors import DeviceUnusable
-from precond_worker.mailbox import Mailbox
-from precond_worker.presence import ServerGone, ServersThere
+from precond_worker.network.presence import ServerGone, ServersThere
+from precond_worker.network.receive_queue import ReceiveQueue
 from precond_worker.worker import Worker
-from protocol import PROTOCOL, FactorPattern, Refused
-from protocol.channels import key
-from protocol.check import check_header, checksum
+from protocol.channels import PROTOCOL, key
 from protocol.counters import Counters
+from protocol.factor import FactorPattern
 from protocol.messages_pb2 import Factor, Header, Matrix, Scene, Topology
 from protocol.method import Method
-from protocol.slotmap import SlotMap
+from protocol.refused import Refused
+from protocol.shared_memory.view import SlotMap
+from protocol.validate import check_header, checksum
 
 
 class Payload(bytes):
@@ -53,13 +54,13 @@ class Diagonal:
         return np.sqrt(diagonal).astype(dtype)
 
 
-class FakeUplink:
+class FakeConnection:
     """The network as the worker sees it; answers and patterns pile up here."""
 
     def __init__(self) -> None:
         self.name, self.incarnation, self.library = "w", 0, ""
         self.counters = Counters(logging.getLogger("test"))
-        self.mailbox: Mailbox[Any] = Mailbox(8)
+        self.received: ReceiveQueue[Any] = ReceiveQueue(8)
         self.slots = SlotMap()
         self.answers: list[tuple[Factor, bytes]] = []
         self.patterns: list[tuple[str, int]] = []
@@ -95,14 +96,14 @@ class FakeUplink:
 
 
 @pytest.fixture
-def uplink() -> FakeUplink:
-    return FakeUplink()
+def connection() -> FakeConnection:
+    return FakeConnection()
 
 
 @pytest.fixture
-def worker(uplink: FakeUplink) -> Worker:
-    worker = Worker(uplink, Diagonal)  # type: ignore[arg-type]
-    uplink.mailbox.put(ServersThere((7,)))
+def worker(connection: FakeConnection) -> Worker:
+    worker = Worker(connection, Diagonal)  # type: ignore[arg-type]
+    connection.received.put(ServersThere((7,)))
     worker.step(0.0)
     return worker
 
@@ -122,50 +123,50 @@ def matrix(number: int = 1, object: str = "beam", epoch: int = 1, scale: float =
     return Sample(Matrix(**(fields | changes)), values)
 
 
-def drain(worker: Worker, uplink: FakeUplink, *samples: Sample) -> None:
+def drain(worker: Worker, connection: FakeConnection, *samples: Sample) -> None:
     for sample in samples:
-        uplink.mailbox.put(sample)
+        connection.received.put(sample)
     for _ in range(len(samples) + 1):
         worker.step(0.0)
 
 
-def test_a_matrix_is_answered_with_its_factor(worker: Worker, uplink: FakeUplink) -> None:
-    drain(worker, uplink, matrix())
-    ((answer, data),) = uplink.answers
+def test_a_matrix_is_answered_with_its_factor(worker: Worker, connection: FakeConnection) -> None:
+    drain(worker, connection, matrix())
+    ((answer, data),) = connection.answers
     check_header(answer, incarnation=7, object="beam", epoch=1)
     assert np.array_equal(np.frombuffer(data, np.float32), np.full(6, 2.0))
     assert (answer.step, answer.job, answer.worker, answer.dtype, answer.failure) == (10, 1, "w", "float32", "")
     assert answer.checksum == checksum(data) and answer.nonzeros == 6
-    assert uplink.patterns == [("beam", 1)] and uplink.library == "diagonal"
+    assert connection.patterns == [("beam", 1)] and connection.library == "diagonal"
 
 
-def test_it_is_idle_when_nothing_came_or_waits_or_is_at_work(uplink: FakeUplink) -> None:
+def test_it_is_idle_when_nothing_came_or_waits_or_is_at_work(connection: FakeConnection) -> None:
     seen: list[bool] = []
 
     class Watched(Diagonal):
         def factorize(self, values: np.ndarray, dtype: Any) -> np.ndarray:
-            seen.append(uplink.mailbox.idle)
+            seen.append(connection.received.idle)
             return super().factorize(values, dtype)
 
-    worker = Worker(uplink, Watched)  # type: ignore[arg-type]
-    assert uplink.mailbox.idle
-    uplink.mailbox.put(ServersThere((7,)))
+    worker = Worker(connection, Watched)  # type: ignore[arg-type]
+    assert connection.received.idle
+    connection.received.put(ServersThere((7,)))
     worker.step(0.0)
-    assert uplink.mailbox.idle
-    uplink.mailbox.put(matrix())
-    uplink.mailbox.put(matrix(2, object="bar"))
-    assert not uplink.mailbox.idle, "they came"
+    assert connection.received.idle
+    connection.received.put(matrix())
+    connection.received.put(matrix(2, object="bar"))
+    assert not connection.received.idle, "they came"
     worker.take_in(0.0)
-    assert not uplink.mailbox.idle, "they wait"
+    assert not connection.received.idle, "they wait"
     worker.work()
-    assert not uplink.mailbox.idle and seen == [False], "the other one waits"
+    assert not connection.received.idle and seen == [False], "the other one waits"
     worker.work()
-    assert uplink.mailbox.idle and seen == [False, False] and len(uplink.answers) == 2
+    assert connection.received.idle and seen == [False, False] and len(connection.answers) == 2
     for lost in ((ServerGone(7), matrix(3)), (ServersThere((7,)), matrix(4, worker="x"))):
         for item in lost:
-            uplink.mailbox.put(item)
+            connection.received.put(item)
         worker.step(0.0)
-        assert uplink.mailbox.idle and len(uplink.answers) == 2, "what it refused it does not have"
+        assert connection.received.idle and len(connection.answers) == 2, "what it refused it does not have"
 
 
 class Doubling:
@@ -196,84 +197,86 @@ def doubling(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "sim_server.assembly", SimpleNamespace(Assembly=Doubling))
 
 
-def test_from_positions_the_worker_builds_the_matrix_itself(worker: Worker, uplink: FakeUplink, doubling: None) -> None:
+def test_from_positions_the_worker_builds_the_matrix_itself(
+    worker: Worker, connection: FakeConnection, doubling: None
+) -> None:
     x = np.array([[1.0, 2, 5], [0, 1, 1]])
-    drain(worker, uplink, positions(1, x))
-    drain(worker, uplink, positions(2, 2 * x))
-    assert [answer.failure for answer, _ in uplink.answers] == ["", ""]
-    assert np.frombuffer(uplink.answers[0][1], np.float32).tolist() == [4, 4, 4, 2, 2, 2]
-    assert (Doubling.made, uplink.asked.count(("scene", 0))) == (1, 1), "the description is asked for once"
-    drain(worker, uplink, matrix(3, scale=9.0))
-    assert np.frombuffer(uplink.answers[2][1], np.float32).tolist() == [3] * 6
+    drain(worker, connection, positions(1, x))
+    drain(worker, connection, positions(2, 2 * x))
+    assert [answer.failure for answer, _ in connection.answers] == ["", ""]
+    assert np.frombuffer(connection.answers[0][1], np.float32).tolist() == [4, 4, 4, 2, 2, 2]
+    assert (Doubling.made, connection.asked.count(("scene", 0))) == (1, 1), "the description is asked for once"
+    drain(worker, connection, matrix(3, scale=9.0))
+    assert np.frombuffer(connection.answers[2][1], np.float32).tolist() == [3] * 6
 
 
-def test_a_new_server_is_asked_for_its_scene_again(worker: Worker, uplink: FakeUplink, doubling: None) -> None:
+def test_a_new_server_is_asked_for_its_scene_again(worker: Worker, connection: FakeConnection, doubling: None) -> None:
     x = np.ones((2, 3))
-    drain(worker, uplink, positions(1, x))
-    uplink.mailbox.put(ServerGone(7))
-    uplink.mailbox.put(ServersThere((7,)))
+    drain(worker, connection, positions(1, x))
+    connection.received.put(ServerGone(7))
+    connection.received.put(ServersThere((7,)))
     worker.step(0.0)
-    drain(worker, uplink, positions(2, x))
+    drain(worker, connection, positions(2, x))
     assert Doubling.made == 2
 
 
 @pytest.mark.parametrize(("change", "words"), [({"checksum": 1}, "checksum"), ({"nodes": 3}, "positions|bytes")])
 def test_bad_positions_are_answered_with_the_reason(
-    worker: Worker, uplink: FakeUplink, doubling: None, change: dict, words: str
+    worker: Worker, connection: FakeConnection, doubling: None, change: dict, words: str
 ) -> None:
-    drain(worker, uplink, positions(1, np.ones((2, 3)), **change))
-    assert re.search(words, uplink.answers[0][0].failure)
+    drain(worker, connection, positions(1, np.ones((2, 3)), **change))
+    assert re.search(words, connection.answers[0][0].failure)
 
 
-def test_a_scene_that_cannot_be_built_is_answered_with_the_reason(worker: Worker, uplink: FakeUplink) -> None:
-    drain(worker, uplink, positions(1, np.ones((2, 3))))
-    assert "Topology.rest" in uplink.answers[0][0].failure
+def test_a_scene_that_cannot_be_built_is_answered_with_the_reason(worker: Worker, connection: FakeConnection) -> None:
+    drain(worker, connection, positions(1, np.ones((2, 3))))
+    assert "Topology.rest" in connection.answers[0][0].failure
 
 
-def test_the_newest_matrix_of_an_object_wins(worker: Worker, uplink: FakeUplink) -> None:
-    drain(worker, uplink, matrix(1), matrix(2, "liver"), matrix(3), matrix(4), matrix(2))
-    assert [(answer.header.object, answer.job) for answer, _ in uplink.answers] == [("beam", 4), ("liver", 2)]
-    assert uplink.counters.superseded == 3
+def test_the_newest_matrix_of_an_object_wins(worker: Worker, connection: FakeConnection) -> None:
+    drain(worker, connection, matrix(1), matrix(2, "liver"), matrix(3), matrix(4), matrix(2))
+    assert [(answer.header.object, answer.job) for answer, _ in connection.answers] == [("beam", 4), ("liver", 2)]
+    assert connection.counters.superseded == 3
 
 
-def test_the_symbolic_phase_is_done_once_per_epoch(worker: Worker, uplink: FakeUplink) -> None:
+def test_the_symbolic_phase_is_done_once_per_epoch(worker: Worker, connection: FakeConnection) -> None:
     for number, epoch in enumerate((1, 1, 2, 2), start=1):
-        drain(worker, uplink, matrix(number, epoch=epoch))
-    assert uplink.asked == [("beam", 1), ("beam", 2)]
-    assert len(uplink.answers) == 4
+        drain(worker, connection, matrix(number, epoch=epoch))
+    assert connection.asked == [("beam", 1), ("beam", 2)]
+    assert len(connection.answers) == 4
 
 
-def test_another_method_is_another_analysis(worker: Worker, uplink: FakeUplink) -> None:
+def test_another_method_is_another_analysis(worker: Worker, connection: FakeConnection) -> None:
     made = []
     worker._analyse = lambda *given: made.append(Diagonal(*given)) or made[-1]  # type: ignore[func-returns-value]
     asked = {"method": "incomplete_cholesky", "drop_tolerance": 0.25, "fill": 3.0, "omega": 1.0}
     for number, changes in enumerate(({}, asked, asked, asked | {"fill": 4.0}), start=1):
-        drain(worker, uplink, matrix(number, **changes))
+        drain(worker, connection, matrix(number, **changes))
     assert [m.method.name for m in made] == ["cholesky", "incomplete_cholesky", "incomplete_cholesky"]
     assert made[1].method == Method("incomplete_cholesky", drop_tolerance=0.25, fill=3.0)
     made[2].remedy = "diagonal shifted by 1"
-    drain(worker, uplink, matrix(5, **asked | {"fill": 4.0}))
-    assert [answer.remedy for answer, _ in uplink.answers] == ["", "", "", "", "diagonal shifted by 1"]
+    drain(worker, connection, matrix(5, **asked | {"fill": 4.0}))
+    assert [answer.remedy for answer, _ in connection.answers] == ["", "", "", "", "diagonal shifted by 1"]
 
 
-def test_a_pattern_that_the_server_knows_is_not_sent_again(worker: Worker, uplink: FakeUplink) -> None:
-    drain(worker, uplink, matrix(1))
-    known = uplink.answers[0][0].pattern
+def test_a_pattern_that_the_server_knows_is_not_sent_again(worker: Worker, connection: FakeConnection) -> None:
+    drain(worker, connection, matrix(1))
+    known = connection.answers[0][0].pattern
     sent = []
     for number, patterns in enumerate(([known], [], [known + 1, known]), start=2):
-        before = len(uplink.patterns)
-        drain(worker, uplink, matrix(number, known_patterns=patterns))
-        sent.append(len(uplink.patterns) - before)
-    assert [answer.job for answer, _ in uplink.answers] == [1, 2, 3, 4]
+        before = len(connection.patterns)
+        drain(worker, connection, matrix(number, known_patterns=patterns))
+        sent.append(len(connection.patterns) - before)
+    assert [answer.job for answer, _ in connection.answers] == [1, 2, 3, 4]
     assert sent == [0, 1, 0], "the third job says that the server forgot it"
 
 
-def test_what_cannot_be_factorized_is_answered_with_the_reason(worker: Worker, uplink: FakeUplink) -> None:
-    drain(worker, uplink, matrix(1, scale=-1.0))
-    drain(worker, uplink, matrix(2, checksum=5))
-    drain(worker, uplink, matrix(3, "unknown"))
-    drain(worker, uplink, matrix(4, blocks=3))
-    reasons = [answer.failure for answer, data in uplink.answers if data == b""]
+def test_what_cannot_be_factorized_is_answered_with_the_reason(worker: Worker, connection: FakeConnection) -> None:
+    drain(worker, connection, matrix(1, scale=-1.0))
+    drain(worker, connection, matrix(2, checksum=5))
+    drain(worker, connection, matrix(3, "unknown"))
+    drain(worker, connection, matrix(4, blocks=3))
+    reasons = [answer.failure for answer, data in connection.answers if data == b""]
     assert len(reasons) == 4
     for reason, text in zip(
         reasons, ("positive definite", "checksum", "no topology", "Matrix.blocks is 3"), strict=True
@@ -293,23 +296,23 @@ class Failing(Diagonal):
         return super().factorize(values, dtype)
 
 
-def test_too_little_memory_for_one_object_is_told_and_the_worker_lives_on(uplink: FakeUplink) -> None:
-    worker = Worker(uplink, Failing)  # type: ignore[arg-type]
-    uplink.mailbox.put(ServersThere((7,)))
-    drain(worker, uplink, matrix(1), matrix(2, "liver"))
-    (refused, _), (answered, _) = uplink.answers
+def test_too_little_memory_for_one_object_is_told_and_the_worker_lives_on(connection: FakeConnection) -> None:
+    worker = Worker(connection, Failing)  # type: ignore[arg-type]
+    connection.received.put(ServersThere((7,)))
+    drain(worker, connection, matrix(1), matrix(2, "liver"))
+    (refused, _), (answered, _) = connection.answers
     assert refused.header.object == "beam" and "needs 3.00 GiB" in refused.failure
     assert answered.header.object == "liver" and not answered.failure
-    assert (uplink.counters.failures, uplink.counters.jobs) == (1, 2)
+    assert (connection.counters.failures, connection.counters.jobs) == (1, 2)
 
 
-def test_a_device_that_fails_ends_the_worker_after_an_answer(uplink: FakeUplink) -> None:
+def test_a_device_that_fails_ends_the_worker_after_an_answer(connection: FakeConnection) -> None:
     Failing.error = DeviceUnusable("the GPU failed: cudaErrorIllegalAddress")
-    worker = Worker(uplink, Failing)  # type: ignore[arg-type]
-    uplink.mailbox.put(ServersThere((7,)))
+    worker = Worker(connection, Failing)  # type: ignore[arg-type]
+    connection.received.put(ServersThere((7,)))
     with pytest.raises(DeviceUnusable):
-        drain(worker, uplink, matrix(1))
-    assert [answer.failure for answer, _ in uplink.answers] == ["the GPU failed: cudaErrorIllegalAddress"]
+        drain(worker, connection, matrix(1))
+    assert [answer.failure for answer, _ in connection.answers] == ["the GPU failed: cudaErrorIllegalAddress"]
 
 
 @pytest.mark.parametrize(
@@ -325,41 +328,41 @@ def test_a_device_that_fails_ends_the_worker_after_an_answer(uplink: FakeUplink)
     ],
 )
 def test_what_is_not_for_it_is_dropped_and_counted(
-    worker: Worker, uplink: FakeUplink, changes: dict[str, Any], kind: str
+    worker: Worker, connection: FakeConnection, changes: dict[str, Any], kind: str
 ) -> None:
-    drain(worker, uplink, matrix(1, **changes), matrix(2))
-    assert uplink.counters.refusals == {kind: 1}
-    assert [answer.job for answer, _ in uplink.answers] == [2]
+    drain(worker, connection, matrix(1, **changes), matrix(2))
+    assert connection.counters.refusals == {kind: 1}
+    assert [answer.job for answer, _ in connection.answers] == [2]
 
 
-def test_a_new_server_means_new_analyses_and_old_work_is_dropped(worker: Worker, uplink: FakeUplink) -> None:
-    drain(worker, uplink, matrix(1))
-    drain(worker, uplink, matrix(2), ServersThere((8,)), matrix(3))  # type: ignore[arg-type]
-    assert uplink.incarnation == 8
-    assert [answer.job for answer, _ in uplink.answers] == [1]
-    assert uplink.counters.superseded == 1 and uplink.counters.refusals == {"incarnation": 1}
-    drain(worker, uplink, ServerGone(7))  # type: ignore[arg-type]
-    assert uplink.incarnation == 8
-    drain(worker, uplink, ServerGone(8))  # type: ignore[arg-type]
-    assert uplink.incarnation == 0
+def test_a_new_server_means_new_analyses_and_old_work_is_dropped(worker: Worker, connection: FakeConnection) -> None:
+    drain(worker, connection, matrix(1))
+    drain(worker, connection, matrix(2), ServersThere((8,)), matrix(3))  # type: ignore[arg-type]
+    assert connection.incarnation == 8
+    assert [answer.job for answer, _ in connection.answers] == [1]
+    assert connection.counters.superseded == 1 and connection.counters.refusals == {"incarnation": 1}
+    drain(worker, connection, ServerGone(7))  # type: ignore[arg-type]
+    assert connection.incarnation == 8
+    drain(worker, connection, ServerGone(8))  # type: ignore[arg-type]
+    assert connection.incarnation == 0
 
 
-def test_it_stays_with_the_life_of_the_server_that_answers(worker: Worker, uplink: FakeUplink) -> None:
-    drain(worker, uplink, matrix(1))
-    drain(worker, uplink, ServersThere((9, 7)), matrix(2))  # type: ignore[arg-type]
-    assert uplink.incarnation == 7 and [answer.job for answer, _ in uplink.answers] == [1, 2]
-    drain(worker, uplink, ServerGone(9))  # type: ignore[arg-type]
-    assert uplink.incarnation == 7
-    uplink.without_token = {9}
-    drain(worker, uplink, ServersThere((9, 8)))  # type: ignore[arg-type]
-    assert uplink.incarnation == 8, "7 answers no more; 9 has no token"
-    drain(worker, uplink, ServersThere((9,)))  # type: ignore[arg-type]
-    assert uplink.incarnation == 8
+def test_it_stays_with_the_life_of_the_server_that_answers(worker: Worker, connection: FakeConnection) -> None:
+    drain(worker, connection, matrix(1))
+    drain(worker, connection, ServersThere((9, 7)), matrix(2))  # type: ignore[arg-type]
+    assert connection.incarnation == 7 and [answer.job for answer, _ in connection.answers] == [1, 2]
+    drain(worker, connection, ServerGone(9))  # type: ignore[arg-type]
+    assert connection.incarnation == 7
+    connection.without_token = {9}
+    drain(worker, connection, ServersThere((9, 8)))  # type: ignore[arg-type]
+    assert connection.incarnation == 8, "7 answers no more; 9 has no token"
+    drain(worker, connection, ServersThere((9,)))  # type: ignore[arg-type]
+    assert connection.incarnation == 8
 
 
 def test_a_full_mailbox_drops_the_oldest_and_counts() -> None:
-    mailbox: Mailbox[int] = Mailbox(3)
+    received: ReceiveQueue[int] = ReceiveQueue(3)
     for number in range(5):
-        mailbox.put(number)
-    assert mailbox.take(0.0) == [2, 3, 4] and mailbox.dropped == 2
-    assert mailbox.take(0.0) == []
+        received.put(number)
+    assert received.take(0.0) == [2, 3, 4] and received.dropped == 2
+    assert received.take(0.0) == []

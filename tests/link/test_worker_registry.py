@@ -3,9 +3,9 @@
 
 import pytest
 
-from protocol import PROTOCOL, Refused
-from protocol.channels import key
+from protocol.channels import PROTOCOL, key
 from protocol.messages_pb2 import Header, WorkerInfo
+from protocol.refused import Refused
 from sim_server.network.worker_registry import TOKENS, WORKERS, WorkerRegistry
 
 

@@ -18,8 +18,9 @@ from mcap.records import Chunk
 from mcap.writer import Writer
 
 from clients.errors import BadInput
-from clients.log import Log
-from protocol import PROTOCOL, log_chunks
+from clients.log.reader import Log
+from protocol import log_chunks
+from protocol.channels import PROTOCOL
 from sim_server.mcap_file import McapFile
 from tests.sample_run import object_step, positions, record, state, topology
 

@@ -16,7 +16,7 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from clients.errors import BadInput
-from clients.log import Log
+from clients.log.reader import Log
 from protocol import messages_pb2 as pb
 from sim_server.errors import InputError
 from sim_server.recorder import Recorder

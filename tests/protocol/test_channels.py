@@ -3,8 +3,9 @@
 
 import pytest
 
-from protocol import Refused, messages_pb2
+from protocol import messages_pb2
 from protocol.channels import CHANNELS, check_name, everything, key, name_in
+from protocol.refused import Refused
 
 
 def test_every_row_names_a_message_of_the_schema_and_a_limit() -> None:

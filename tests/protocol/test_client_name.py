@@ -3,9 +3,9 @@
 
 import pytest
 
-from protocol import Refused
 from protocol.channels import check_name
 from protocol.client_name import check_client, new_client
+from protocol.refused import Refused
 
 
 def test_a_name_goes_with_its_secret_and_with_no_other() -> None:

@@ -3,9 +3,9 @@
 
 import pytest
 
-from precond_worker.places import Place, places
+from precond_worker.network.server_addresses import ServerAddress, server_addresses
 from protocol.channels import DEFAULT_ENDPOINT
-from protocol.endpoints import CONNECT, BadEndpoint, check_endpoint, usual_endpoints
+from protocol.network.endpoints import CONNECT, BadEndpoint, check_endpoint, on_this_machine, usual_endpoints
 
 
 @pytest.mark.parametrize(
@@ -32,6 +32,19 @@ def test_bad_ones_say_what_is_allowed(endpoint: str) -> None:
         check_endpoint(endpoint)
 
 
+@pytest.mark.parametrize(
+    ("listen", "reached"),
+    [
+        ("tcp/0.0.0.0:7447", "tcp/127.0.0.1:7447"),
+        ("tcp/[::]:7447", "tcp/[::1]:7447"),
+        ("tcp/10.0.0.0:7447", "tcp/10.0.0.0:7447"),
+        ("unixsock-stream//run/sim.sock", "unixsock-stream//run/sim.sock"),
+    ],
+)
+def test_who_listens_everywhere_is_reached_by_loopback(listen: str, reached: str) -> None:
+    assert on_this_machine(listen) == reached
+
+
 def test_any_free_port_may_be_listened_on() -> None:
     assert check_endpoint("tcp/127.0.0.1:0", listen=True)
 
@@ -52,7 +65,7 @@ def test_endpoints_of_the_environment(text: str | None, expected: list[str], mon
     if text is not None:
         monkeypatch.setenv(CONNECT, text)
     assert usual_endpoints() == expected
-    assert places(["sim"], []) == [Place(tuple(expected), ("sim",))]
+    assert server_addresses(["sim"], []) == [ServerAddress(tuple(expected), ("sim",))]
 
 
 def test_a_bad_endpoint_of_the_environment_names_the_variable(monkeypatch: pytest.MonkeyPatch) -> None:

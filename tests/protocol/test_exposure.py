@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from protocol.exposure import unrestricted
-from protocol.hosts import beyond_loopback, unknown_hosts
-from protocol.session import EXTRA_CONFIG
+from protocol.network.exposure import unrestricted
+from protocol.network.hosts import beyond_loopback, unknown_hosts
+from protocol.network.session import EXTRA_CONFIG
 
 OPEN = ["tcp/0.0.0.0:7447", "tcp/[::]:7447", "udp/192.0.2.7:1", "tls/0.0.0.0:7447"]
 CLOSED = ["tcp/127.0.0.1:7447", "tcp/127.1.2.3:7447", "tcp/[::1]:7447", "tcp/localhost:0", "unixsock-stream//run/x"]

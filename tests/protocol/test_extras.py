@@ -9,8 +9,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from protocol import extras, nvidia
-from protocol.extras import to_install
+from protocol.process import extras, nvidia
+from protocol.process.extras import to_install
 
 ROOT = Path(__file__).parents[2]
 

@@ -4,10 +4,10 @@
 import numpy as np
 import pytest
 
-from protocol import FactorPattern, Refused
-from protocol.factor import check_values, pattern_id
+from protocol.factor import FactorPattern, check_values, pattern_id
 from protocol.messages_pb2 import FactorPattern as PatternMessage
 from protocol.messages_pb2 import Header
+from protocol.refused import Refused
 
 # L of 5 columns in supernodes {0, 1}, {2}, {3, 4}:
 #   column 0: rows 0 1 3; column 1: rows 1 3; column 2: rows 2 4; column 3: rows 3 4; column 4: row 4

@@ -4,9 +4,9 @@
 import pytest
 
 from protocol import messages_pb2 as pb
-from protocol.check import parse
 from protocol.printable import printable
 from protocol.refused import Refused
+from protocol.validate import parse
 
 EVIL = "\x1b]0;PWNED\x07\x1b[31m red\r\nsim-server: all is well\x7f\u202e\x9b2J\u2028"
 

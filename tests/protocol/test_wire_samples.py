@@ -7,8 +7,9 @@ import pytest
 from google.protobuf.unknown_fields import UnknownFieldSet
 from wire_samples import sample, types
 
-from protocol import Refused, messages_pb2
-from protocol.check import check_header, check_numbers, check_strings, parse
+from protocol import messages_pb2
+from protocol.refused import Refused
+from protocol.validate import check_header, check_numbers, check_strings, parse
 
 LINES = (Path(__file__).parent / "wire_samples.txt").read_text().splitlines()
 FROZEN = {name: bytes.fromhex(data) for name, data in (line.split() for line in LINES)}

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from precond_worker.gpu.assembly_tree import WIDTH
-from precond_worker.gpu.plan import CHUNK, Plan
-from precond_worker.gpu.tables import TILE, launches
+from precond_worker.gpu.plan import CHUNK, MultifrontalPlan
+from precond_worker.gpu.tables import TILE, launch_list
 
 Reals = NDArray[np.float64]
 
@@ -18,7 +18,7 @@ Reals = NDArray[np.float64]
 class Machine:
     """Memory of one factorization: halves of fronts, blocks (blocks, 3, 3) of A, values (nonzeros,) of L."""
 
-    def __init__(self, plan: Plan, blocks: Reals):
+    def __init__(self, plan: MultifrontalPlan, blocks: Reals):
         self.plan, self.blocks = plan, blocks
         self.halves = [np.full(size, np.nan) for size in plan.half]
         self.values = np.full(plan.nonzeros, np.nan)
@@ -93,10 +93,10 @@ class Machine:
         return WIDTH * step, min(WIDTH * (step + 1), own)
 
 
-def factorize(plan: Plan, blocks: Reals) -> Reals:
+def factorize(plan: MultifrontalPlan, blocks: Reals) -> Reals:
     """Values of L in the order of the pattern, (nonzeros,), of block values (blocks, 3, 3)."""
     machine = Machine(plan, blocks)
-    listed, starts = launches(plan)
+    listed, starts = launch_list(plan)
     level = -1
     for launch in listed:
         if launch.level != level:

@@ -26,7 +26,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol import FactorPattern
+from protocol.factor import FactorPattern
 
 
 def columns(pattern: FactorPattern, values: NDArray[np.floating]) -> Iterator[tuple[NDArray, NDArray]]:

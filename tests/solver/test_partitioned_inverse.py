@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from precond_worker.factorize import Analysis
+from precond_worker.factorization.factorize import Analysis
 from protocol.factor import FactorPattern
 from sim_server.gpu.batches import layout
 from sim_server.gpu.partition import tree_of

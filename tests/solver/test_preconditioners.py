@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from precond_worker.methods import prepared
+from precond_worker.factorization.registry import make_factorization
 from protocol.method import Method
 from sim_server.engine import Kind
 from sim_server.simulation import Simulation
@@ -32,7 +32,7 @@ def posted(sim: Simulation, method: Method, source: Simulation | None = None, dt
 
 def made(sim: Simulation, method: Method, dtype: type = np.float64):
     b = sim.world.bodies[0]
-    analysis = prepared(*sim.system.body_pattern(b.first, b.last), method)
+    analysis = make_factorization(*sim.system.body_pattern(b.first, b.last), method)
     values = analysis.factorize(sim.system.body_values(b.first, b.last), dtype)
     analysis.pattern.check()
     return analysis.pattern, values

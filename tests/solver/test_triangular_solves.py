@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.sparse.linalg import spsolve
 
-from precond_worker.factorize import Analysis
+from precond_worker.factorization.factorize import Analysis
 from protocol.factor import FactorPattern
 from tests.reference import supernodal
 from tests.scenes import bar, factor_of, simulation

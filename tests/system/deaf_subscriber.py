@@ -6,7 +6,7 @@ import time
 
 import zenoh
 
-from protocol.session import open_session
+from protocol.network.session import open_session
 
 
 def main() -> None:

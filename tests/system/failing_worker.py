@@ -4,7 +4,7 @@
 import sys
 
 from precond_worker.cli import main
-from precond_worker.uplink import Uplink
+from precond_worker.network.server_connection import ServerConnection
 from precond_worker.worker import Worker
 
 WHERE = sys.argv.pop(1)
@@ -18,7 +18,7 @@ def fail(error: BaseException):
 
 
 def fail_once_served(say):
-    def instead(self: Uplink) -> None:
+    def instead(self: ServerConnection) -> None:
         say(self)
         if self.incarnation:
             raise RuntimeError("can't start new thread")
@@ -27,7 +27,7 @@ def fail_once_served(say):
 
 
 if WHERE == "heartbeat":
-    Uplink._say = fail_once_served(Uplink._say)
+    ServerConnection._say = fail_once_served(ServerConnection._say)
 elif WHERE == "take_in":
     Worker._choose_server = fail(MemoryError())
 else:

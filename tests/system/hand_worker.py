@@ -9,11 +9,10 @@ import zenoh
 from link_helpers import PATIENCE, DenseAnalysis
 from zenoh.handlers import RingChannel
 
-from protocol import PROTOCOL
-from protocol.channels import key
-from protocol.check import checksum
+from protocol.channels import PROTOCOL, key
 from protocol.messages_pb2 import Factor, Header, Matrix, Topology, WorkerInfo
-from protocol.session import open_session
+from protocol.network.session import open_session
+from protocol.validate import checksum
 
 
 class HandWorker:

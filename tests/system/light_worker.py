@@ -7,8 +7,8 @@ import time
 
 from link_helpers import DenseAnalysis
 
-from precond_worker.joining import join
-from precond_worker.uplink import Uplink
+from precond_worker.network.connect import connect_session
+from precond_worker.network.server_connection import ServerConnection
 from precond_worker.worker import Worker
 from protocol.counters import Counters
 
@@ -28,10 +28,10 @@ def main() -> None:
             SlowAnalysis.seconds = float(option[5:])
     logging.basicConfig(level=logging.WARNING)
     with (
-        join([endpoint], "no-shm" not in options) as session,
-        Uplink(session, "sim", name, 1, "dense", Counters(logging.getLogger("worker"))) as uplink,
+        connect_session([endpoint], "no-shm" not in options) as session,
+        ServerConnection(session, "sim", name, 1, "dense", Counters(logging.getLogger("worker"))) as connection,
     ):
-        Worker(uplink, SlowAnalysis, lambda found: print("ready" if found else "gone", flush=True)).run()
+        Worker(connection, SlowAnalysis, lambda found: print("ready" if found else "gone", flush=True)).run()
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol import Factor, FactorPattern
+from protocol.factor import Factor, FactorPattern
 from protocol.messages_pb2 import Header, Topology
 from protocol.method import Method
 from sim_server.factors import Job

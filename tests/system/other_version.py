@@ -3,7 +3,7 @@
 
 import sys
 
-import precond_worker.uplink  # noqa: F401  everything that knows the version
+import precond_worker.network.server_connection  # noqa: F401  everything that knows the version
 from precond_worker.cli import main
 from protocol.channels import PROTOCOL
 

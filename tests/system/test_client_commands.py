@@ -12,11 +12,10 @@ import pytest
 
 from clients.client import Client
 from clients.errors import BadInput, ClientError
-from protocol import PROTOCOL
 from protocol import messages_pb2 as pb
-from protocol.channels import key
-from protocol.limits import ORPHANED_PUSH
-from protocol.session import open_session
+from protocol.channels import PROTOCOL, key
+from protocol.network.session import open_session
+from protocol.push_limits import ORPHANED_PUSH
 from tests.system.link_helpers import PATIENCE, free_endpoint
 from tests.system.server_process import Stage, beam, fresh, run, until
 from tests.system.test_server import logged

@@ -10,8 +10,7 @@ import zenoh
 from link_helpers import Driver, chain, free_endpoint
 from zenoh.handlers import RingChannel
 
-from protocol import PROTOCOL
-from protocol.channels import key
+from protocol.channels import PROTOCOL, key
 from protocol.messages_pb2 import (
     Command,
     Header,
@@ -25,7 +24,7 @@ from protocol.messages_pb2 import (
     Topology,
     Vector,
 )
-from protocol.session import open_session
+from protocol.network.session import open_session
 from sim_server.network.command_queue import CAPACITY
 from sim_server.network.link import ServerLink
 

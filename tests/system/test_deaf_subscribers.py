@@ -11,10 +11,10 @@ import pytest
 from hand_worker import HandWorker
 from link_helpers import Driver, chain, free_endpoint, matrix, process
 
-from protocol import memlock
 from protocol.channels import key
 from protocol.messages_pb2 import Factor, Status
-from protocol.session import open_session
+from protocol.network.session import open_session
+from protocol.shared_memory import limits as shm_limits
 from sim_server.factors import Job
 from sim_server.network.link import ServerLink
 
@@ -35,8 +35,8 @@ def stopped(endpoint: str, count: int, closing: ExitStack) -> None:
 
 @pytest.mark.parametrize(("count", "shared"), [(1, True), (5, True), (5, False)])
 def test_jobs_factors_heartbeats_and_answers_pass(count: int, shared: bool) -> None:
-    if shared and memlock.obstacle():
-        pytest.skip(f"no shared memory here: {memlock.obstacle()}")
+    if shared and shm_limits.obstacle():
+        pytest.skip(f"no shared memory here: {shm_limits.obstacle()}")
     endpoint = free_endpoint()
     with (
         ServerLink(listen=[endpoint], shared_memory=shared, silence=60) as link,

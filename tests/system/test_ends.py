@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from clients.log import Log
+from clients.log.reader import Log
 from tests.sample_run import record
 from tests.system.link_helpers import PATIENCE, ROOT, free_endpoint
 from tests.system.server_process import Stage, beam, fresh, until

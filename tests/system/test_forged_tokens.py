@@ -13,7 +13,7 @@ from link_helpers import Driver, chain, free_endpoint, light_worker, process
 
 from protocol.channels import key
 from protocol.messages_pb2 import Header, WorkerInfo
-from protocol.session import open_session
+from protocol.network.session import open_session
 from sim_server.network.link import ServerLink
 from sim_server.network.worker_registry import TOKENS, WORKERS
 

@@ -9,8 +9,8 @@ import pytest
 from hand_worker import HandWorker
 from link_helpers import DenseAnalysis, free_endpoint
 
-from protocol.check import checksum
 from protocol.messages_pb2 import Factor, Topology
+from protocol.validate import checksum
 from sim_server import describe
 from sim_server.driver import Driver
 from sim_server.network.link import ServerLink

@@ -61,7 +61,7 @@ def with_field(**changes: object) -> Wrong:
 
 def with_values(edit: Callable[[np.ndarray], np.ndarray | bytes], *, checksum: bool = True) -> Wrong:
     def wrong(hand: HandWorker, job: Matrix, answer: Factor, values: np.ndarray) -> None:
-        from protocol.check import checksum as sum_of
+        from protocol.validate import checksum as sum_of
 
         edited = edit(values.copy())
         if checksum:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""deploy/launch.py: objects dealt out by size, and real servers with a worker that they share."""
+"""deploy/launch.py: objects distributed by size, and real servers with a worker that they share."""
 
 import importlib.util
 import json
@@ -65,7 +65,7 @@ def scene(folder: Path, cells: Sequence[int]) -> Path:
     ],
 )
 def test_objects_are_dealt_out_by_size(tets: list[int], servers: int, expected: list[tuple[int, ...]]) -> None:
-    parts = module().deal(tets, servers)
+    parts = module().distribute(tets, servers)
     assert [part.objects for part in parts] == expected
     assert [part.tets for part in parts] == [sum(tets[i] for i in part.objects) for part in parts]
 
@@ -90,7 +90,7 @@ def test_a_part_is_a_scene_with_its_objects_as_they_were(tmp_path: Path) -> None
 def test_gpus_are_those_that_the_user_lets_be_seen(visible: str | None, expected: list[str], monkeypatch: Any) -> None:
     launch = module()
     monkeypatch.setattr(launch, "installed_gpus", lambda: 3)
-    assert launch.gpu_pool({} if visible is None else {"CUDA_VISIBLE_DEVICES": visible}) == expected
+    assert launch.usable_gpus({} if visible is None else {"CUDA_VISIBLE_DEVICES": visible}) == expected
 
 
 @pytest.mark.parametrize(
@@ -123,7 +123,7 @@ def test_gpus_are_counted_where_there_are_any(
     ],
 )
 def test_gpus_go_round(pool: list[str], servers: int, workers: int, expected: Any) -> None:
-    assert module().deal_gpus(pool, servers, workers) == expected
+    assert module().distribute_gpus(pool, servers, workers) == expected
 
 
 def test_each_process_sees_its_gpu_alone(tmp_path: Path, monkeypatch: Any) -> None:
@@ -142,7 +142,7 @@ def test_each_process_sees_its_gpu_alone(tmp_path: Path, monkeypatch: Any) -> No
         (["0"], [("sim-0", None), ("sim-1", None), ("local-1", None), ("local-2", None), ("local-2", None)]),
     ):
         seen.clear()
-        with launch.Fleet(whole, launch.deal([1, 1], 2), "127.0.0.1", 7447, None, True) as fleet:
+        with launch.Fleet(whole, launch.distribute([1, 1], 2), "127.0.0.1", 7447, None, True) as fleet:
             fleet.use_gpus(pool, True, 2)
             fleet.start(2, ["--device", "gpu"], ["--device", "gpu"])
             fleet.workers._start(fleet.workers.workers[1])

@@ -15,9 +15,9 @@ import pytest
 
 from clients.client import Client
 from clients.errors import BadInput
-from clients.load import plan
-from clients.load_processes import Drivers
-from clients.log import Log
+from clients.load_test.processes import ClientProcesses
+from clients.load_test.run import plan
+from clients.log.reader import Log
 from protocol import messages_pb2 as pb
 from tests.system.link_helpers import ROOT
 from tests.system.server_process import Stage, beam, fresh, until
@@ -36,9 +36,9 @@ def stage(tmp_path: Path) -> Iterator[Stage]:
 def flood(stage: Stage, client: Client, clients: int, rate: float, seconds: float) -> list[dict[str, Any]]:
     """What became of the commands of each of so many clients."""
     plans = plan(client.scene(), client.meshes(), clients, rate, seed=1)
-    with Drivers(plans, "sim", [stage.endpoint], seconds) as drivers:
-        drivers.begin()
-        return drivers.reports()
+    with ClientProcesses(plans, "sim", [stage.endpoint], seconds) as processes:
+        processes.begin()
+        return processes.reports()
 
 
 def test_twenty_clients_that_send_too_much(stage: Stage, tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 from link_helpers import Driver, chain, free_endpoint, light_worker, process
 
-from protocol.session import open_session
+from protocol.network.session import open_session
 from sim_server.network.link import ServerLink
 
 pytestmark = pytest.mark.system

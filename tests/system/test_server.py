@@ -13,7 +13,7 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from clients.errors import BadInput
-from clients.log import Log
+from clients.log.reader import Log
 from protocol import messages_pb2 as pb
 from tests.system.link_helpers import ROOT, free_endpoint
 from tests.system.server_process import Stage, alive, beam, fresh, run, until

@@ -10,7 +10,7 @@ from link_helpers import PATIENCE, Driver, chain, free_endpoint, light_worker
 from server_process import Process, Stage, beam, fresh, until
 
 from protocol.channels import key
-from protocol.session import open_session
+from protocol.network.session import open_session
 from sim_server.errors import NameTaken
 from sim_server.network.link import ServerLink
 

@@ -12,18 +12,18 @@ import zenoh
 from hand_worker import HandWorker
 from link_helpers import ROOT, Driver, chain, dense, free_endpoint, light_worker, matrix, process, product
 
-from protocol import memlock
 from protocol.channels import DEFAULT_ENDPOINT, key
-from protocol.endpoints import BadEndpoint
 from protocol.messages_pb2 import Status
-from protocol.session import EXTRA_CONFIG, ConnectionFailed, open_session
+from protocol.network.endpoints import BadEndpoint
+from protocol.network.session import EXTRA_CONFIG, ConnectionFailed, open_session
+from protocol.shared_memory import limits as shm_limits
 from sim_server.network.link import ServerLink
 
 pytestmark = pytest.mark.system
 
 UNCAUGHT = """
 import sys, time
-from protocol.session import open_session
+from protocol.network.session import open_session
 session = open_session("server", listen=[sys.argv[1]])
 subscriber = session.zenoh.declare_subscriber("a/*", lambda sample: None)
 queryable = session.zenoh.declare_queryable("b/*", lambda query: None)
@@ -181,18 +181,18 @@ def test_too_little_lockable_memory_loses_nothing() -> None:
 
 
 def test_the_limit_counts_only_without_the_capability(monkeypatch: pytest.MonkeyPatch) -> None:
-    limits = {memlock.resource.RLIMIT_MEMLOCK: 8 << 20}
-    unlimited = memlock.resource.RLIM_INFINITY
-    monkeypatch.setattr(memlock.resource, "getrlimit", lambda which: (limits.get(which, unlimited),) * 2)
-    monkeypatch.setattr(memlock, "may_lock_anything", lambda: False)
-    assert "locked-memory limit is 8192 KiB" in memlock.obstacle()
-    assert memlock.obstacle() and not open_and_close(free_endpoint())
-    monkeypatch.setattr(memlock, "may_lock_anything", lambda: True)
-    assert memlock.obstacle() == ""
-    limits[memlock.resource.RLIMIT_FSIZE] = 8 << 20
-    assert "files may have 8192 KiB" in memlock.obstacle()
-    monkeypatch.setattr(memlock, "SHM", Path("/nowhere"))
-    assert "is not writable" in memlock.obstacle()
+    limits = {shm_limits.resource.RLIMIT_MEMLOCK: 8 << 20}
+    unlimited = shm_limits.resource.RLIM_INFINITY
+    monkeypatch.setattr(shm_limits.resource, "getrlimit", lambda which: (limits.get(which, unlimited),) * 2)
+    monkeypatch.setattr(shm_limits, "may_lock_anything", lambda: False)
+    assert "locked-memory limit is 8192 KiB" in shm_limits.obstacle()
+    assert shm_limits.obstacle() and not open_and_close(free_endpoint())
+    monkeypatch.setattr(shm_limits, "may_lock_anything", lambda: True)
+    assert shm_limits.obstacle() == ""
+    limits[shm_limits.resource.RLIMIT_FSIZE] = 8 << 20
+    assert "files may have 8192 KiB" in shm_limits.obstacle()
+    monkeypatch.setattr(shm_limits, "SHM", Path("/nowhere"))
+    assert "is not writable" in shm_limits.obstacle()
 
 
 def open_and_close(endpoint: str) -> bool:
@@ -203,7 +203,7 @@ def open_and_close(endpoint: str) -> bool:
 
 def test_no_memory_left_for_slots_means_bytes() -> None:
     endpoint, topology = free_endpoint(), chain(40)
-    if memlock.obstacle():
+    if shm_limits.obstacle():
         pytest.skip("no shared memory here")
     with ServerLink(listen=[endpoint], slots=33_000) as link, light_worker(endpoint):
         driver = Driver(link)

@@ -47,7 +47,9 @@ def test_help_shows_examples() -> None:
         (["--threads", "many"], "--threads"),
         (["--nonsense"], "--nonsense"),
         (["--device", "tpu"], "--device tpu: allowed are auto, cpu, gpu"),
-        (["--device", "gpu", "--arithmetic", "float16"], "--arithmetic float16: allowed are auto, float32, float64"),
+        (["--device", "gpu", "--precision", "float16"], "--precision float16: allowed are auto, float32, float64"),
+        (["--device", "gpu", "--arithmetic", "float16"], "--arithmetic is called --precision now"),
+        (["--device", "gpu", "--arithmetic", "float16"], "--precision float16: allowed are auto, float32"),
     ],
 )
 def test_bad_input_is_one_clear_message(arguments: list[str], text: str) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from link_helpers import Driver, chain, free_endpoint, process
 
-from protocol.exhausted import exhausted
+from protocol.process.exhausted import exhausted
 from sim_server.network.link import ServerLink
 
 pytestmark = pytest.mark.system

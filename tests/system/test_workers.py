@@ -15,12 +15,12 @@ import zenoh
 from hand_worker import HandWorker
 from link_helpers import Driver, chain, dense, free_endpoint, light_worker, matrix, process, product
 
-from protocol import memlock
 from protocol import messages_pb2 as pb
+from protocol.shared_memory import limits as shm_limits
 from sim_server.network.link import ServerLink
 
 pytestmark = pytest.mark.system
-shared = pytest.mark.skipif(bool(memlock.obstacle()), reason=f"no shared memory here: {memlock.obstacle()}")
+shared = pytest.mark.skipif(bool(shm_limits.obstacle()), reason=f"no shared memory here: {shm_limits.obstacle()}")
 
 BEAM = chain()
 
@@ -193,7 +193,7 @@ def test_a_late_write_into_a_slot_lent_again_is_noticed() -> None:
         answer, values = hand.right_answer(hand.receive(), BEAM)
         hand.answer(answer, values)
         driver.until(lambda: driver.factors, "the first factor, as bytes")
-        from protocol.slotmap import SlotMap
+        from protocol.shared_memory.view import SlotMap
 
         slots = SlotMap()
 
@@ -303,7 +303,7 @@ def segments_of(process: str) -> set[str]:
     found: set[str] = set()
     for maps in Path("/proc").glob(f"{process}/maps"):
         with contextlib.suppress(OSError):
-            found.update(re.findall(rf"{memlock.SHM}/(\d+\.zenoh)", maps.read_text()))
+            found.update(re.findall(rf"{shm_limits.SHM}/(\d+\.zenoh)", maps.read_text()))
     return found
 
 
@@ -329,7 +329,7 @@ def test_fifty_workers_one_after_another_leak_nothing() -> None:
         # The first lives make the slots that the others use again.
         assert locked[-1] <= locked[3], locked
     assert len(used) >= 50, "each life had one of its own"
-    left = {path.name for path in memlock.SHM.glob("*.zenoh")} & used - segments_of("[0-9]*")
+    left = {path.name for path in shm_limits.SHM.glob("*.zenoh")} & used - segments_of("[0-9]*")
     assert len(left) <= 1  # zenoh sweeps up after the dead when the next process starts
 
 

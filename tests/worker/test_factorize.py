@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from precond_worker.factorize import CHOICE, Analysis, NotPositiveDefinite, default_library
-from protocol.extras import to_install
+from precond_worker.factorization.factorize import CHOICE, Analysis, NotPositiveDefinite, default_library
+from protocol.process.extras import to_install
 from tests.reference import supernodal
 from tests.worker.block_matrices import bar_edges, dense_matrix, diagonal_blocks, pattern, spd
 
@@ -238,7 +238,7 @@ def test_without_scikit_sparse_superlu_is_the_default(monkeypatch):
     assert Analysis(*graph).library == "superlu"
     monkeypatch.setenv(CHOICE, "cholmod")
     assert default_library() == ("cholmod", "")
-    monkeypatch.delitem(sys.modules, "precond_worker.cholmod", raising=False)
+    monkeypatch.delitem(sys.modules, "precond_worker.factorization.cholmod", raising=False)
     with pytest.raises(ImportError):
         Analysis(*graph)
 

@@ -8,7 +8,7 @@ import pytest
 
 from precond_worker import cli
 from precond_worker.errors import DeviceUnusable
-from precond_worker.factorize import Analysis
+from precond_worker.factorization.factorize import Analysis
 from precond_worker.gpu import device
 from tests.core import nvrtc
 from tests.worker.block_matrices import pattern
@@ -44,10 +44,10 @@ def installed(count: int | Exception = 1, compiler: Exception | None = None) -> 
 @pytest.fixture(autouse=True)
 def forgotten():
     """What an earlier test has found out about the device."""
-    for cached in (device.cupy, device.kernels, device.best_arithmetic):
+    for cached in (device.cupy, device.kernels, device.best_precision):
         cached.cache_clear()
     yield
-    for cached in (device.cupy, device.kernels, device.best_arithmetic):
+    for cached in (device.cupy, device.kernels, device.best_precision):
         cached.cache_clear()
 
 
@@ -105,7 +105,7 @@ def test_the_worker_takes_the_gpu_where_there_is_one(monkeypatch, capsys):
     ("choice", "text"),
     [
         (("tpu", "auto"), "--device tpu: allowed are auto, cpu, gpu"),
-        (("gpu", "float16"), "--arithmetic float16: allowed are auto, float32, float64"),
+        (("gpu", "float16"), "--precision float16: allowed are auto, float32, float64"),
     ],
 )
 def test_other_words_are_refused(choice, text, capsys):

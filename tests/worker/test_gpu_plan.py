@@ -7,20 +7,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from precond_worker.elimination import eliminate
-from precond_worker.factorize import Analysis
+from precond_worker.factorization.factorize import Analysis
 from precond_worker.gpu.assembly_tree import WIDTH, AssemblyTree, assembly_tree
-from precond_worker.gpu.plan import Plan, levels, make_plan
-from precond_worker.ordering import order_nodes
-from precond_worker.supernodes import fundamental, partition
-from protocol import FactorPattern
+from precond_worker.gpu.plan import MultifrontalPlan, levels, make_plan
+from precond_worker.symbolic.elimination import eliminate
+from precond_worker.symbolic.ordering import order_nodes
+from precond_worker.symbolic.supernodes import fundamental_supernodes, relaxed_supernodes
+from protocol.factor import FactorPattern
 from tests.reference import multifrontal, supernodal
 from tests.worker.block_matrices import GRAPHS, dense_matrix, pattern, spd
 
 graphs = pytest.mark.parametrize("graph", GRAPHS.values(), ids=GRAPHS.keys())
 
 
-def made(graph: tuple[NDArray, NDArray]) -> tuple[AssemblyTree, FactorPattern, Plan]:
+def made(graph: tuple[NDArray, NDArray]) -> tuple[AssemblyTree, FactorPattern, MultifrontalPlan]:
     tree = assembly_tree(eliminate(*graph, order_nodes(*graph)))
     return tree, FactorPattern.build(**tree.pattern_arrays()), make_plan(tree, *graph)
 
@@ -67,7 +67,7 @@ def test_fronts_are_fewer_than_supernodes_and_keep_the_fill(graph):
     order = order_nodes(*graph)
     elimination = eliminate(*graph, order)
     tree, factor_pattern, _ = made(graph)
-    assert len(tree.parent) <= len(fundamental(elimination))
+    assert len(tree.parent) <= len(fundamental_supernodes(elimination))
     again = eliminate(*graph, tree.order)
     assert again.count.sum() == elimination.count.sum(), "the order of the merged tree has the same fill"
     assert factor_pattern.nonzeros <= 2 * 9 * elimination.count.sum()
@@ -78,7 +78,7 @@ def test_small_fronts_join_across_siblings():
     graph = GRAPHS["bar"]
     elimination = eliminate(*graph, order_nodes(*graph))
     tree, _, plan = made(graph)
-    assert len(tree.parent) < 0.7 * len(partition(elimination))
+    assert len(tree.parent) < 0.7 * len(relaxed_supernodes(elimination))
     assert (np.diff(plan.child_start) >= 2).any()
     assert not np.array_equal(tree.order, elimination.order)
     assert (tree.own * 3 > WIDTH).any(), "and some are eliminated in several steps"

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from precond_worker.blocks import node_norms
 from precond_worker.errors import NotPositiveDefinite
-from precond_worker.methods import prepared
-from protocol import Refused
+from precond_worker.factorization.registry import make_factorization
+from precond_worker.symbolic.blocks import node_norms
 from protocol.method import Method
+from protocol.refused import Refused
 from tests.reference import supernodal
 from tests.scenes import random_rotations
 from tests.worker.block_matrices import GRAPHS, dense_matrix, diagonal_blocks, spd
@@ -39,7 +39,7 @@ def coupled(matrix: NDArray) -> NDArray[np.bool_]:
 @graphs
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_with_nothing_dropped_it_is_the_matrix(graph, dtype):
-    analysis, values = prepared(*graph, incomplete()), spd(*graph, seed=1)
+    analysis, values = make_factorization(*graph, incomplete()), spd(*graph, seed=1)
     matrix = dense_matrix(*graph, values)
     made = analysis.factorize(values, dtype)
     analysis.pattern.check()
@@ -51,7 +51,7 @@ def test_with_nothing_dropped_it_is_the_matrix(graph, dtype):
 @graphs
 @pytest.mark.parametrize("omega", [0.7, 1.0, 1.6])
 def test_ssor_is_its_formula_on_the_pattern_of_the_matrix(graph, omega):
-    analysis, values = prepared(*graph, Method("ssor", omega=omega)), spd(*graph, seed=2)
+    analysis, values = make_factorization(*graph, Method("ssor", omega=omega)), spd(*graph, seed=2)
     matrix = dense_matrix(*graph, values)
     own = np.arange(len(matrix)) // 3
     D = np.where(own[:, None] == own, matrix, 0) / omega
@@ -70,7 +70,7 @@ def test_more_dropped_is_less_kept_and_further_off():
     values = spd(*BAR, seed=4)
     matrix, sizes, errors = dense_matrix(*BAR, values), [], []
     for tolerance in (0.0, 0.001, 0.01, 0.05, 0.3):
-        analysis = prepared(*BAR, incomplete(tolerance))
+        analysis = make_factorization(*BAR, incomplete(tolerance))
         made = analysis.factorize(values, np.float64)
         sizes.append(len(made))
         errors.append(np.linalg.norm(in_place(analysis, made) - matrix))
@@ -80,7 +80,7 @@ def test_more_dropped_is_less_kept_and_further_off():
 
 def test_what_is_kept_is_above_the_tolerance_of_its_row():
     tolerance, values = 0.05, spd(*BAR, seed=5)
-    analysis = prepared(*BAR, incomplete(tolerance))
+    analysis = make_factorization(*BAR, incomplete(tolerance))
     made = analysis.factorize(values, np.float64)
     lower = supernodal.lower(analysis.pattern, made)
     nodes = len(lower) // 3
@@ -96,7 +96,7 @@ def test_what_is_kept_is_above_the_tolerance_of_its_row():
 @pytest.mark.parametrize("fill", [0.3, 1.0, 2.0])
 def test_fill_bounds_every_column(fill):
     values, nodes = spd(*BAR, seed=6), len(BAR[0]) - 1
-    analysis = prepared(*BAR, incomplete(0.0, fill))
+    analysis = make_factorization(*BAR, incomplete(0.0, fill))
     analysis.factorize(values, np.float64)
     below = np.diff(analysis.pattern.row_start) // 3 - 1
     most = int(np.ceil(fill * (len(BAR[1]) - nodes) / 2 / nodes))
@@ -108,7 +108,7 @@ def test_neither_units_nor_rotations_of_nodes_change_what_is_kept():
     values, (start, columns) = spd(*BAR, seed=7), BAR
     rows, R = np.repeat(np.arange(len(start) - 1), np.diff(start)), random_rotations(len(start) - 1, seed=8)
     turned = np.einsum("bij,bjk,blk->bil", R[rows], values, R[columns])
-    analysis = prepared(*BAR, incomplete(0.02))
+    analysis = make_factorization(*BAR, incomplete(0.02))
     product = in_place(analysis, analysis.factorize(values, np.float64))
     pattern = analysis.pattern
     scaled = in_place(analysis, analysis.factorize(1e-9 * values, np.float64))
@@ -123,13 +123,13 @@ def test_neither_units_nor_rotations_of_nodes_change_what_is_kept():
 
 def test_the_same_values_give_the_same_bits_whatever_came_before():
     one, other = spd(*BAR, seed=9), spd(*BAR, seed=10, zeros=0.5)
-    analysis = prepared(*BAR, incomplete(0.02))
+    analysis = make_factorization(*BAR, incomplete(0.02))
     first, pattern = analysis.factorize(one, np.float32), analysis.pattern.id
     analysis.factorize(other, np.float32)
     assert analysis.pattern.id != pattern  # what is kept follows the matrix
     assert analysis.factorize(one, np.float32).tobytes() == first.tobytes()
     assert analysis.pattern.id == pattern
-    assert prepared(*BAR, incomplete(0.02)).factorize(one, np.float32).tobytes() == first.tobytes()
+    assert make_factorization(*BAR, incomplete(0.02)).factorize(one, np.float32).tobytes() == first.tobytes()
 
 
 @graphs
@@ -138,7 +138,7 @@ def test_the_same_values_give_the_same_bits_whatever_came_before():
 def test_a_matrix_that_is_not_positive_definite_is_shifted(graph, tolerance, depth):
     values = spd(*graph, seed=11)
     values[diagonal_blocks(*graph)] -= depth * np.linalg.eigvalsh(dense_matrix(*graph, values))[-1] * np.eye(3)
-    analysis = prepared(*graph, incomplete(tolerance))
+    analysis = make_factorization(*graph, incomplete(tolerance))
     made = analysis.factorize(values, np.float64)
     assert np.isfinite(made).all() and (made[analysis.pattern.diagonal] > 0).all()
     if np.linalg.eigvalsh(dense_matrix(*graph, values))[0] < 0 and tolerance == 0:
@@ -154,7 +154,7 @@ def test_the_shift_is_the_least_of_its_triplings(taken):
     values[own] -= taken * values[own]
     norm = np.repeat(node_norms(BAR[0], values), 3)
     matrix = dense_matrix(*BAR, values)
-    analysis = prepared(*BAR, incomplete())
+    analysis = make_factorization(*BAR, incomplete())
     product = in_place(analysis, analysis.factorize(values, np.float64))
     shift = float(analysis.remedy.split()[-1])
     assert np.abs(product - matrix - shift * np.diag(norm)).max() < 1e-12 * np.abs(product).max()
@@ -165,12 +165,12 @@ def test_ssor_needs_positive_diagonal_blocks():
     values = spd(*BAR, seed=13)
     values[diagonal_blocks(*BAR)[40]] *= -1
     with pytest.raises(NotPositiveDefinite, match="diagonal block of node 40 is not positive definite"):
-        prepared(*BAR, Method("ssor")).factorize(values, np.float64)
+        make_factorization(*BAR, Method("ssor")).factorize(values, np.float64)
 
 
 @pytest.mark.parametrize("method", [incomplete(0.01), Method("ssor")], ids=lambda m: m.name)
 def test_wrong_matrices_are_refused_and_the_next_one_is_fine(method):
-    analysis, values = prepared(*BAR, method), spd(*BAR, seed=14)
+    analysis, values = make_factorization(*BAR, method), spd(*BAR, seed=14)
     bad = values.copy()
     bad[5, 1, 1] = np.nan
     for wrong, words in ((bad, "NaN or infinity"), (values[:-1], "allowed"), (0 * values, "node")):
@@ -195,4 +195,4 @@ def test_wrong_matrices_are_refused_and_the_next_one_is_fine(method):
 )  # fmt: skip
 def test_a_method_out_of_range_is_refused(method, words):
     with pytest.raises(Refused, match=words.replace("(", r"\(")):
-        prepared(*BAR, method)
+        make_factorization(*BAR, method)

@@ -8,11 +8,11 @@ import pytest
 from numpy.typing import NDArray
 from scipy.sparse import csc_matrix
 
-from precond_worker import ordering
-from precond_worker.elimination import eliminate, postorder
-from precond_worker.factorize import Analysis
-from precond_worker.packing import Packer
-from precond_worker.supernodes import ZEROS_BY_WIDTH, fundamental, partition
+from precond_worker.factorization.factorize import Analysis
+from precond_worker.factorization.to_supernodal import Packer
+from precond_worker.symbolic import ordering
+from precond_worker.symbolic.elimination import eliminate, postorder
+from precond_worker.symbolic.supernodes import ZEROS_BY_WIDTH, fundamental_supernodes, relaxed_supernodes
 from tests.reference import supernodal
 from tests.worker.block_matrices import bar_edges, dense_matrix, pattern, spd
 
@@ -61,10 +61,10 @@ def test_postorder_puts_the_heaviest_child_next_to_its_parent():
 
 def test_panels_cover_the_columns_and_hold_few_zeros():
     tree = eliminate(*BAR, ordering.order_nodes(*BAR))
-    panels = partition(tree)
+    panels = relaxed_supernodes(tree)
     assert [panel.first for panel in panels[1:]] == [panel.last + 1 for panel in panels[:-1]]
     assert (panels[0].first, panels[-1].last) == (0, len(tree.order) - 1)
-    assert len(panels) < len(fundamental(tree))
+    assert len(panels) < len(fundamental_supernodes(tree))
     exact = 9 * tree.count - 3
     for panel in panels:
         assert panel.zeros == panel.size - exact[panel.first : panel.last + 1].sum()

@@ -36,7 +36,7 @@ Fault = Callable[[Stage, Progress, argparse.Namespace], int | None]
 HOSTILE = """
 import os, sys, time
 from protocol.channels import key
-from protocol.session import open_session
+from protocol.network.session import open_session
 with open_session("client", connect=[sys.argv[1]], shared_memory=False) as session:
     end, junk, count = time.monotonic() + float(sys.argv[2]), os.urandom(1 << 20), 0
     while time.monotonic() < end:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csc_matrix, csr_matrix
 
-from protocol import FactorPattern
+from protocol.factor import FactorPattern
 from sim_server.gpu.device import cupy
 from tests.bench.gpu import cudss
 from tests.bench.gpu.cusparse import LOWER, UPPER, Product, Triangle, device_csr

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import bsr_array
 
-from precond_worker.factorize import Analysis
-from protocol import FactorPattern
+from precond_worker.factorization.factorize import Analysis
+from protocol.factor import FactorPattern
 from sim_server.engine import Kind
 from sim_server.simulation import Simulation
 from tests.bench.gpu import traffic as moved

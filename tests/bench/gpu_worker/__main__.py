@@ -11,7 +11,7 @@ from pathlib import Path
 from statistics import median
 
 from precond_worker.errors import DeviceUnusable
-from precond_worker.factorize import LIBRARIES, Analysis
+from precond_worker.factorization.factorize import LIBRARIES, Analysis
 from sim_server.simulation import Simulation
 from tests.bench.gpu.problem import BARS
 

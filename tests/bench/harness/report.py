@@ -94,7 +94,7 @@ def machine() -> dict[str, Any]:
 
 def versions() -> dict[str, str]:
     """Of Python, the packages that count, the factorization library and the compiler."""
-    from precond_worker.factorize import default_library
+    from precond_worker.factorization.factorize import default_library
     from sim_server.backend import compiler
 
     found = {"python": platform.python_version(), **{p: _version(p) for p in PACKAGES}}

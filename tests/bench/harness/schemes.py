@@ -65,7 +65,7 @@ def run(scene: Path, scheme: Scheme, steps: int, more: tuple[str, ...] = (), fol
 
 def _in_processes(scene: Path, scheme: Scheme, steps: int, more: tuple[str, ...], folder: Path) -> Run:
     """sim-server with one local worker, read back from its log."""
-    from clients.log import Log
+    from clients.log.reader import Log
 
     path = folder / "run.mcap"
     command = [sys.executable, "-m", "sim_server", str(scene), "--steps", str(steps), "--workers", "1"]

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from precond_worker.factorize import Analysis
+from precond_worker.factorization.factorize import Analysis
 from sim_server.driver import Driver
 from sim_server.engine import Kind
 from sim_server.simulation import Simulation

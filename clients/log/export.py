@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: MIT
+"""Exports a log: .npz (frames and scalars of an object), .csv (scalars per step), .vtu (ParaView)."""
+
+from __future__ import annotations
+
+import csv
+import zipfile
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clients.errors import BadInput, ClientError
+from clients.log.atomic_file import atomic_file
+from clients.log.export_vtu import write_vtu
+from clients.log.reader import Log
+
+FORMATS = (".npz", ".csv", ".vtu")
+
+
+def export(
+    log: Log,
+    name: str,
+    to: Path,
+    frame: str = "last",
+    epoch: int | None = None,
+    progress: Callable[[int], None] = lambda _: None,
+) -> list[Path]:
+    """Writes the records of object `name` in the format that the suffix of `to` says. Returns the files.
+
+    frame: "last", "all" or a frame number (negative from the end), for .vtu. epoch: for .npz, which has one mesh.
+    Raises BadInput for a bad name, suffix or frame, ClientError if the file cannot be written.
+    """
+    log.object_log(name)
+    if to.suffix not in FORMATS:
+        raise BadInput(f"--to {to}: the suffix {to.suffix!r} is not one of {', '.join(FORMATS)}")
+    try:
+        if to.suffix == ".npz":
+            write_npz(log, name, to, epoch, progress)
+        elif to.suffix == ".csv":
+            write_csv(log, name, to)
+        else:
+            return write_vtu(log, name, to, frame, progress)
+    except OSError as error:
+        raise ClientError(f"{to}: cannot be written: {error.strerror or error}") from None
+    return [to]
+
+
+def write_npz(
+    log: Log, name: str, to: Path, epoch: int | None = None, progress: Callable[[int], None] = lambda _: None
+) -> None:
+    """Writes step (k,), time (k,) [s], x (k, n, 3) [m], v (k, n, 3) [m/s], tets (m, 4) and scalars/NAME.
+
+    Frames are streamed into the archive, so that a log larger than memory can be exported.
+    """
+    chosen = _frames_of_epoch(log, name, epoch)
+    mesh = log.mesh(name, chosen[0][1]) if chosen else None
+    k, n = len(chosen), len(mesh.rest) if mesh else 0
+    with atomic_file(to) as part, zipfile.ZipFile(part, "w", zipfile.ZIP_STORED) as archive:
+        times = np.empty(k)
+
+        def positions() -> Iterator[NDArray]:
+            for row, (index, _) in enumerate(chosen):
+                found = log.frame(name, index)
+                times[row] = found.time
+                progress(row)
+                yield found.x
+
+        _stream(archive, "x", (k, n, 3), positions())
+        _stream(archive, "v", (k, n, 3), (log.frame(name, index).v for index, _ in chosen))
+        _add(archive, "time", times)
+        _add(archive, "step", np.array([log.object_log(name).frames[index][0] for index, _ in chosen], np.int64))
+        _add(archive, "tets", mesh.tets if mesh else np.empty((0, 4), np.int32))
+        for scalar, values in log.scalars(name).items():
+            _add(archive, f"scalars/{scalar}", values)
+
+
+def write_csv(log: Log, name: str, to: Path) -> None:
+    """Writes a row per step and a column per scalar; floats in the shortest form that reads back exactly."""
+    scalars = log.scalars(name)
+    with atomic_file(to) as part, part.open("w", newline="") as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(scalars)
+        writer.writerows(zip(*(values.tolist() for values in scalars.values()), strict=True))
+
+
+def _frames_of_epoch(log: Log, name: str, epoch: int | None) -> list[tuple[int, int]]:
+    """Returns (frame number, epoch) of the frames to export, all of one epoch."""
+    epochs = log.object_log(name).epochs
+    found = sorted(set(epochs))
+    if epoch is None and len(found) > 1:
+        raise BadInput(
+            f"{log.path}: {name!r} changed its mesh; choose one with --epoch, of {', '.join(map(str, found))}"
+        )
+    if epoch is not None and epoch not in found:
+        raise BadInput(f"--epoch {epoch}: frames of {name!r} were recorded of {', '.join(map(str, found)) or 'none'}")
+    return [(index, e) for index, e in enumerate(epochs) if epoch in (None, e)]
+
+
+def _stream(archive: zipfile.ZipFile, name: str, shape: tuple[int, ...], rows: Iterable[NDArray]) -> None:
+    with archive.open(f"{name}.npy", "w", force_zip64=True) as stream:
+        header = {"descr": "<f8", "fortran_order": False, "shape": shape}
+        np.lib.format.write_array_header_1_0(stream, header)  # type: ignore[arg-type]
+        for values in rows:
+            stream.write(np.ascontiguousarray(values, "<f8").data)
+
+
+def _add(archive: zipfile.ZipFile, name: str, values: NDArray) -> None:
+    with archive.open(f"{name}.npy", "w", force_zip64=True) as stream:
+        np.lib.format.write_array(stream, np.asanyarray(values), allow_pickle=False)

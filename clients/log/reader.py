@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: MIT
+"""A recorded run: scene, meshes, frames, per-step scalars, interactions.
+
+A log that was cut off or damaged is read as far as it goes; `notes` says what is missing. Frames stay on disk and are
+decoded when asked for, so a log may be larger than memory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from google.protobuf.message import DecodeError
+
+from clients.errors import BadInput
+from clients.log.bad_log import bad_log_is_bad_input
+from clients.log.frames import Frame, Mesh, frame_of, mesh_of
+from clients.log.scalars import Columns, columns, row
+from protocol import messages_pb2 as pb
+from protocol.log_file import LogFile, LogMessage, Position
+from protocol.refused import Refused
+
+
+@dataclass
+class ObjectLog:
+    """The records of one object."""
+
+    name: str
+    meshes: dict[int, Mesh] = field(default_factory=dict)  # by epoch
+    frames: list[tuple[int, int, Position]] = field(default_factory=list)  # (step, epoch, where the frame lies)
+    rows: list[tuple] = field(default_factory=list)
+    interactions: list[tuple[float, pb.Interaction]] = field(default_factory=list)  # (time [s], push or grab)
+
+    @property
+    def epochs(self) -> list[int]:
+        """Topology epoch of each frame."""
+        return [epoch for _, epoch, _ in self.frames]
+
+
+class Log:
+    """Opens and scans a log. Raises BadInput if it is none, or one of another protocol version.
+
+    >>> with Log("run.mcap") as log:
+    ...     for frame in log.frames("beam"):
+    ...         print(frame.step, frame.x.shape)
+    """
+
+    def __init__(self, path: str | Path, progress: Callable[[int], None] = lambda _: None) -> None:
+        self.path = Path(path)
+        self.scene: pb.Scene | None = None
+        self.objects: dict[str, ObjectLog] = {}
+        self._malformed: list[str] = []
+        with bad_log_is_bad_input():
+            self._file = LogFile.open(self.path)
+            try:
+                for message in self._file.messages(progress):
+                    self._keep(message)
+            except BaseException:
+                self.close()
+                raise
+        for found in self.objects.values():
+            found.frames.sort()
+
+    @property
+    def complete(self) -> bool:
+        """True if the file was closed by its writer and every block of it could be read."""
+        return self._file.complete and not self._file.problems and not self._malformed
+
+    @property
+    def notes(self) -> list[str]:
+        """One sentence for each gap; empty for a complete log."""
+        notes = self._file.notes()
+        if self._malformed:
+            notes.append(
+                f"{self.path}: {len(self._malformed)} malformed messages left out, first: {self._malformed[0]}"
+            )
+        return notes
+
+    def object_log(self, name: str) -> ObjectLog:
+        """Returns the records of an object. Raises BadInput that names the objects of the log."""
+        if name not in self.objects:
+            known = ", ".join(sorted(self.objects)) or "none"
+            raise BadInput(f"{self.path}: no object {name!r}; objects in the log: {known}")
+        return self.objects[name]
+
+    def mesh(self, name: str, epoch: int) -> Mesh:
+        """Returns the mesh of an object in an epoch. Raises BadInput if it is not in the log."""
+        meshes = self.object_log(name).meshes
+        if epoch not in meshes:
+            raise BadInput(f"{self.path}: the mesh of object {name!r}, epoch {epoch}, is not in the log")
+        return meshes[epoch]
+
+    def scalars(self, name: str) -> Columns:
+        """Returns the scalars per step, ascending in step: arrays (k,) by the names in scalars.py."""
+        return columns(self.object_log(name).rows)
+
+    def frame(self, name: str, index: int) -> Frame:
+        """Returns frame `index` in the order of steps, negative from the end. Raises BadInput if there is none."""
+        frames = self.object_log(name).frames
+        if not -len(frames) <= index < len(frames):
+            raise BadInput(f"{self.path}: no frame {index} of object {name!r}; {len(frames)} frames were recorded")
+        frame = frame_of(pb.State.FromString(self._file.data(frames[index][2])))
+        mesh = self.object_log(name).meshes.get(frame.epoch)
+        if mesh is not None and len(mesh.rest) != len(frame.x):
+            raise BadInput(
+                f"{self.path}: step {frame.step} of {name!r} has {len(frame.x)} nodes, its mesh has {len(mesh.rest)}"
+            )
+        return frame
+
+    def frames(self, name: str) -> Iterator[Frame]:
+        """Yields the frames of an object in the order of steps, decoded one by one."""
+        return (self.frame(name, index) for index in range(len(self.object_log(name).frames)))
+
+    def close(self) -> None:
+        self._file.close()
+
+    def __enter__(self) -> Log:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _keep(self, message: LogMessage) -> None:
+        try:
+            self._decode(message)
+        except (Refused, DecodeError) as error:
+            self._malformed.append(f"{message.topic}: {error}")
+
+    def _decode(self, message: LogMessage) -> None:
+        if message.topic == "/scene":
+            self.scene = pb.Scene.FromString(message.data)
+            return
+        if message.topic == "/touch":
+            return  # for replays that simulate
+        if message.kind not in ("topology", "state", "step", "interaction", "factor") or not message.object:
+            raise Refused("a message of an unknown channel")
+        found = self.objects.setdefault(message.object, ObjectLog(message.object))
+        if message.kind == "topology":
+            mesh = mesh_of(pb.Topology.FromString(message.data))
+            found.meshes[mesh.epoch] = mesh
+        elif message.kind == "state":
+            frame = frame_of(pb.State.FromString(message.data))
+            found.frames.append((frame.step, frame.epoch, message.position))
+        elif message.kind == "step":
+            found.rows.append(row(pb.ObjectStep.FromString(message.data)))
+        elif message.kind == "interaction":
+            found.interactions.append((message.time / 1e9, pb.Interaction.FromString(message.data)))

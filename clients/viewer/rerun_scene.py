@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: MIT
+"""Meshes and scalars of a run as rerun entities.
+
+/world/OBJECT holds the surface, /plots/QUANTITY/OBJECT a curve, /plots/energy/KIND/OBJECT curves of energies;
+timelines are `step` and `time` (simulated).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from numpy.typing import NDArray
+
+from clients.log.frames import Frame, Mesh
+from clients.log.scalars import ENERGIES, Columns
+from clients.viewer.colors import colors
+from clients.viewer.surface import Coloring, Surface, legend
+
+PLOTS = {  # entity below /plots -> title
+    "iterations": "PCG iterations",
+    "residual": "true residual, log10",
+    "factor_age": "factor age [steps]",
+    "step_time": "step time [ms]",
+    "energy": "energy [J]",
+}
+
+
+class RerunScene:
+    """Logs frames and steps to a recording. `top`: value of the last colour; with `grow` it follows the data."""
+
+    def __init__(self, recording: rr.RecordingStream, coloring: Coloring, top: float = 0.0, grow: bool = False) -> None:
+        self._recording = recording
+        self._coloring: Coloring = coloring
+        self._surfaces: dict[tuple[str, int], Surface] = {}
+        self._shown: dict[str, int] = {}  # object -> epoch whose triangles were logged last
+        self._top, self._grow = top, grow
+        self._low = np.full(3, np.inf)
+        self._high = np.full(3, -np.inf)
+        recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Y_UP, static=True)
+        self._log_legend()
+
+    def surface(self, mesh: Mesh) -> Surface:
+        """Returns the surface of a mesh, made at the first call."""
+        key = (mesh.object, mesh.epoch)
+        if key not in self._surfaces:
+            self._surfaces[key] = Surface(mesh, self._coloring)
+        return self._surfaces[key]
+
+    def frame(self, frame: Frame, mesh: Mesh) -> bool:
+        """Logs positions, normals and colours, and new triangles. Returns False for NaN, which is not shown."""
+        if not np.isfinite(frame.x).all():
+            return False
+        surface = self.surface(mesh)
+        if not len(surface.nodes):
+            return True
+        points, values = surface.points(frame.x), surface.values(frame.x)
+        self._extend(points, values)
+        self._recording.set_time("step", sequence=frame.step)
+        self._recording.set_time("time", duration=frame.time)
+        triangles = surface.triangles if self._shown.get(frame.object) != frame.epoch else None
+        self._shown[frame.object] = frame.epoch
+        shape = rr.Mesh3D.from_fields(
+            vertex_positions=points,
+            vertex_normals=surface.normals(points),
+            vertex_colors=colors(values, self._top),
+            triangle_indices=triangles,
+        )
+        self._recording.log(_entity("world", frame.object), shape)
+        return True
+
+    def steps(self, name: str, scalars: Columns, step_time: bool) -> None:
+        """Logs scalars per step (k,) as curves. step_time: also the step time, which all objects share."""
+        age = scalars["factor_age"]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            residual = np.log10(np.maximum(scalars["residual"], 1e-17))
+        self._curve("iterations", name, scalars, scalars["iterations"], np.ones(len(age), bool))
+        self._curve("residual", name, scalars, residual, np.isfinite(residual))
+        self._curve("factor_age", name, scalars, age, age >= 0)
+        for energy in ENERGIES:
+            values = scalars[energy]
+            self._curve(f"energy/{energy.removesuffix('_energy')}", name, scalars, values, np.isfinite(values))
+        if step_time:
+            self._curve("step_time", "all", scalars, scalars["step_seconds"] * 1e3, np.ones(len(age), bool))
+
+    def blueprint(self) -> rrb.Blueprint:
+        """Returns the layout: bodies on the left, all in view, and a plot per quantity on the right."""
+        center, reach = np.zeros(3), 1.0
+        if np.isfinite(self._low).all():
+            center = (self._low + self._high) / 2
+            reach = float(np.linalg.norm(self._high - self._low)) or 1.0
+        eye = rrb.EyeControls3D(
+            position=center + reach * np.array([0.35, 0.35, 1.1]), look_target=center, eye_up=(0.0, 1.0, 0.0)
+        )
+        bodies = rrb.Vertical(
+            rrb.Spatial3DView(origin="/world", name="bodies", eye_controls=eye),
+            rrb.TextDocumentView(origin="/legend", name="colour"),
+            row_shares=[8, 1],
+        )
+        plots = rrb.Vertical(
+            *(rrb.TimeSeriesView(origin=f"/plots/{quantity}", name=title) for quantity, title in PLOTS.items())
+        )
+        return rrb.Blueprint(
+            rrb.Horizontal(bodies, plots, column_shares=[3, 2]),
+            rrb.TopPanel(state="hidden"),
+            rrb.BlueprintPanel(state="hidden"),
+            rrb.SelectionPanel(state="hidden"),
+            rrb.TimePanel(state="collapsed", timeline="time"),
+            auto_views=False,
+        )
+
+    def _extend(self, points: NDArray, values: NDArray) -> None:
+        self._low, self._high = np.minimum(self._low, points.min(axis=0)), np.maximum(self._high, points.max(axis=0))
+        if self._grow and values.max() > self._top:
+            self._top = float(values.max())
+            self._log_legend()
+
+    def _log_legend(self) -> None:
+        self._recording.log("legend", rr.TextDocument(legend(self._coloring, self._top)), static=True)
+
+    def _curve(self, quantity: str, name: str, scalars: Columns, values: NDArray, used: NDArray) -> None:
+        if used.any():
+            self._recording.send_columns(
+                _entity(f"plots/{quantity}", name),
+                [
+                    rr.TimeColumn("step", sequence=scalars["step"][used]),
+                    rr.TimeColumn("time", duration=scalars["time"][used]),
+                ],
+                rr.Scalars.columns(scalars=values[used].astype(np.float64)),
+            )
+
+
+def _entity(parent: str, name: str) -> str:
+    return f"{parent}/{rr.escape_entity_path_part(name)}"

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: MIT
+"""Cholesky factors of one object: the symbolic phase once per topology, the numeric phase once per matrix."""
+
+import os
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike, NDArray
+
+from precond_worker.arrays import Float64, Int32
+from precond_worker.errors import NotPositiveDefinite
+from precond_worker.symbolic.blocks import BLOCK, checked_pattern
+from protocol.factor import FactorPattern
+from protocol.process.extras import to_install
+
+__all__ = ["CHOICE", "LIBRARIES", "Analysis", "NotPositiveDefinite", "default_library"]
+
+CHOICE = "WARPFACTOR_FACTORIZATION"  # environment: cholmod or superlu
+LIBRARIES = ("auto", "cholmod", "superlu", "gpu", "gpu-float32", "gpu-float64")
+SUPERLU_COST = "SciPy's SuperLU factorizes instead of CHOLMOD, 2 to 3 times slower, so factors are older by as much"
+
+
+class Library(Protocol):
+    """Makes the factors: CpuFactorization or GpuFactorization."""
+
+    name: str
+    pattern: FactorPattern
+
+    def factorize(
+        self, matrix: Float64, dtype: np.dtype[np.floating], out: NDArray[np.floating] | None
+    ) -> NDArray[np.floating]: ...
+
+    def modified_ldl(
+        self, matrix: Float64, dtype: np.dtype[np.floating], growth: float
+    ) -> tuple[NDArray[np.floating], int]: ...
+
+
+class Analysis:
+    """Factors of matrices with one block pattern.
+
+    pattern: supernodal pattern of L, the same for every matrix and (given the same METIS) every machine; one for
+        the libraries of the CPU and another, with larger supernodes, for GPUs
+    library: "cholmod 3.0.14", "superlu" or the name of the GPU with the precision used, "NVIDIA H200, float64"
+
+    The matrix is taken to be symmetric: of mirrored entries one is read (permuted_csc.lower_triangle). Not for use by
+    several threads at once. The BLAS of CHOLMOD may start threads: results repeat with OPENBLAS_NUM_THREADS=1, else
+    they may differ in the last digits from run to run.
+    """
+
+    def __init__(self, row_start: ArrayLike, columns: ArrayLike, library: str = "auto"):
+        """row_start (nodes + 1,), columns (blocks,): block rows, both triangles, columns ascending.
+
+        library: one of LIBRARIES; auto: CHOLMOD, or SuperLU without it. Raises ValueError for a
+        malformed pattern, ImportError if the library is not installed, errors.DeviceUnusable without a GPU.
+        """
+        start, column = checked_pattern(row_start, columns)
+        self._blocks = len(column)
+        self._library = open_library(library, start, column)
+        self.library, self.pattern = self._library.name, self._library.pattern
+
+    def factorize(
+        self, values: ArrayLike, dtype: DTypeLike = np.float32, out: NDArray[np.floating] | None = None
+    ) -> NDArray[np.floating]:
+        """Returns the values of L in the order of the pattern, (pattern.nonzeros,), float32 or float64.
+
+        values: float64 (blocks, 3, 3). out: array to write to, of which the type is taken. Arithmetic is in float64 (in
+        float32 on GPUs that are slow at it); the same values give the same factor, bit by bit. Raises ValueError for
+        values of another shape or not finite, NotPositiveDefinite, MemoryError; the object stays usable.
+        """
+        matrix = np.ascontiguousarray(values, np.float64)
+        if matrix.shape != (self._blocks, BLOCK, BLOCK):
+            raise ValueError(f"matrix: values of shape {matrix.shape}, allowed: ({self._blocks}, {BLOCK}, {BLOCK})")
+        kind: np.dtype[Any] = np.dtype(dtype) if out is None else out.dtype
+        if kind not in (np.float32, np.float64):
+            raise ValueError(f"factor: dtype {kind}, allowed: float32, float64")
+        if out is not None and out.shape != (self.pattern.nonzeros,):
+            raise ValueError(f"factor: out of shape {out.shape}, allowed: ({self.pattern.nonzeros},)")
+        try:
+            return self._library.factorize(matrix, kind, out)
+        except NotPositiveDefinite as error:
+            raise type(error)(self._where(error), error.column) from None
+
+    def modified_ldl(self, matrix: Float64, dtype: DTypeLike, growth: float) -> tuple[NDArray[np.floating], int]:
+        """Returns the values of L |D|^1/2 of a matrix that is not positive definite, and the number of negative pivots.
+
+        Raises NotPositiveDefinite if there is no such factor, or it is more than `growth` times the matrix.
+        """
+        kind: np.dtype[Any] = np.dtype(dtype)
+        return self._library.modified_ldl(matrix, kind, growth)
+
+    def _where(self, error: NotPositiveDefinite) -> str:
+        if error.column < 0:
+            return f"matrix: not positive definite ({error})"
+        node, axis = divmod(int(self.pattern.permutation[error.column]), BLOCK)
+        return f"matrix: not positive definite ({error} at node {node}, axis {'xyz'[axis]})"
+
+
+def open_library(library: str, row_start: Int32, columns: Int32) -> Library:
+    """Returns the library for a checked pattern."""
+    if library not in LIBRARIES:
+        raise ValueError(f"factorization library {library!r}, allowed: {', '.join(LIBRARIES)}")
+    if library.startswith("gpu"):
+        from precond_worker.gpu.gpu_factorization import GpuFactorization
+
+        return GpuFactorization(row_start, columns, library.removeprefix("gpu").removeprefix("-") or "auto")
+    from precond_worker.factorization.cpu_factorization import CpuFactorization
+
+    return CpuFactorization(row_start, columns, default_library()[0] if library == "auto" else library)
+
+
+def default_library() -> tuple[str, str]:
+    """Returns what "auto" stands for, and what that costs, in one line (empty: nothing).
+
+    The environment variable WARPFACTOR_FACTORIZATION forces one of them; raises ValueError if it names another.
+    """
+    forced = os.environ.get(CHOICE, "")
+    if forced not in ("", "cholmod", "superlu"):
+        raise ValueError(f"{CHOICE}={forced}, allowed: cholmod, superlu")
+    if forced == "superlu":
+        return "superlu", f"{CHOICE}=superlu: {SUPERLU_COST}"
+    try:
+        import sksparse.cholmod  # noqa: F401
+    except ImportError as error:
+        if not forced:
+            needed = f"{to_install('cholmod')} builds it on Debian's libsuitesparse-dev"
+            return "superlu", f"no scikit-sparse ({error}): {SUPERLU_COST}. {needed}"
+    return "cholmod", ""

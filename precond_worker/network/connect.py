@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: MIT
+"""Sessions to servers, opened as soon as the servers are there."""
+
+import sys
+import threading
+from collections import deque
+from collections.abc import Iterator, Sequence
+
+from precond_worker.network.server_addresses import ServerAddress
+from protocol.network.session import ConnectionFailed, Session, open_session
+
+TIMEOUT = 1.0  # s of one attempt
+
+
+def connect_session(connect: Sequence[str], shared_memory: bool, ended: threading.Event | None = None) -> Session:
+    """Opens a session to the server; retries until it is there, and prints the first failure. Raises BadEndpoint.
+
+    ended: set to give up, which raises the last ConnectionFailed.
+    """
+    reported = False
+    while True:
+        try:
+            return open_session("client", connect=connect, shared_memory=shared_memory, timeout=TIMEOUT)
+        except ConnectionFailed as failure:
+            if ended is not None and ended.wait(0.05):
+                raise
+            if not reported:
+                print(f"precond-worker: {failure}; trying until the server is there", file=sys.stderr, flush=True)
+            reported = True
+
+
+class Connector:
+    """Connects to several addresses at once, each in a thread of its own; sets `wake` when one is reached."""
+
+    def __init__(self, addresses: Sequence[ServerAddress], shared_memory: bool, wake: threading.Event):
+        self._shared_memory, self._wake = shared_memory, wake
+        self._ended = threading.Event()
+        self._reached: deque[tuple[ServerAddress, Session]] = deque()
+        self._sessions: list[Session] = []
+        self._threads = [threading.Thread(target=self._connect, args=(address,), daemon=True) for address in addresses]
+        for thread in self._threads:
+            thread.start()
+
+    def _connect(self, address: ServerAddress) -> None:
+        try:
+            session = connect_session(address.endpoints, self._shared_memory, self._ended)
+        except ConnectionFailed:
+            return
+        self._sessions.append(session)
+        self._reached.append((address, session))
+        self._wake.set()
+
+    def reached(self) -> Iterator[tuple[ServerAddress, Session]]:
+        """Yields the addresses reached since the last call, with their sessions."""
+        while self._reached:
+            yield self._reached.popleft()
+
+    def close(self) -> None:
+        """Stops the attempts and closes the sessions."""
+        self._ended.set()
+        for thread in self._threads:
+            thread.join(TIMEOUT + 2)
+        for session in self._sessions:
+            session.close()

@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: MIT
+"""Endpoints as users give them: tcp/127.0.0.1:7447, tls/host:7447, unixsock-stream//run/sim.sock."""
+
+import os
+import re
+
+from protocol.channels import DEFAULT_ENDPOINT
+
+NETWORK = ("tcp", "udp", "tls", "quic", "ws")
+LOCAL = ("unixsock-stream",)
+CONNECT = "WARPFACTOR_CONNECT"  # endpoints of the server, where none is given on the command line
+_ADDRESS = re.compile(r"(\[[0-9A-Fa-f:.%\w]+\]|[^:\s/\[\]]+):(\d{1,5})")
+
+
+class BadEndpoint(ValueError):
+    """An endpoint that cannot be used; the text says what is allowed."""
+
+
+def check_endpoint(endpoint: str, *, listen: bool = False) -> str:
+    """Returns the endpoint itself; raises BadEndpoint. Port 0 (any free one) is only for listening."""
+    protocol, _, rest = endpoint.partition("/")
+    address = re.split(r"[?#]", rest, maxsplit=1)[0]
+    if protocol in LOCAL and address:
+        return endpoint
+    match = _ADDRESS.fullmatch(address)
+    low = 0 if listen else 1
+    if protocol not in NETWORK or match is None or not low <= int(match.group(2)) <= 65535:
+        raise BadEndpoint(
+            f"endpoint {endpoint!r} cannot be used; allowed: PROTOCOL/HOST:PORT with PROTOCOL one of "
+            f"{', '.join(NETWORK)} and PORT {low} to 65535, or unixsock-stream/PATH; for example {DEFAULT_ENDPOINT}"
+        )
+    return endpoint
+
+
+def usual_endpoints() -> list[str]:
+    """Returns where workers and clients connect by default. Raises BadEndpoint."""
+    found = re.split(r"[,\s]+", os.environ.get(CONNECT, "").strip(", \t\n"))
+    try:
+        return [check_endpoint(endpoint) for endpoint in found if endpoint] or [DEFAULT_ENDPOINT]
+    except BadEndpoint as error:
+        raise BadEndpoint(f"{CONNECT}: {error}") from None
+
+
+def on_this_machine(endpoint: str) -> str:
+    """Returns the endpoint by which a process of this machine reaches who listens on `endpoint`."""
+    return endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
+
+
+def host_of(endpoint: str) -> str:
+    """Returns the host name or address of an endpoint; empty if it has none (a path)."""
+    protocol, _, rest = endpoint.partition("/")
+    match = _ADDRESS.fullmatch(re.split(r"[?#]", rest, maxsplit=1)[0])
+    return match.group(1).strip("[]") if match and protocol not in LOCAL else ""

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""Arrays that server and workers on one host exchange by reference."""

@@ -1,0 +1,187 @@
+# SPDX-License-Identifier: MIT
+"""Slots of shared memory that the server owns and lends to its workers.
+
+A slot is one zenoh shared memory buffer in a segment of its own, mapped a second time so that NumPy writes it without
+a copy; zenoh then sends it by reference. As the server owns every slot, a worker that dies leaks nothing. Each slot
+begins with a header of 64 bytes with its generation, which grows each time it is lent.
+"""
+
+import mmap
+import os
+import secrets
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zenoh
+from numpy.typing import DTypeLike, NDArray
+from zenoh import shm
+
+from protocol.messages_pb2 import Slot as SlotMessage
+from protocol.shared_memory import limits as shm_limits
+
+HEADER = 64  # bytes; keeps the data aligned to a cache line
+CACHE_LINE = shm.AllocAlignment(6)
+MARK = 32  # bytes of the random mark by which a buffer is found in its segment
+OVERHEAD = 1 << 16  # bytes of a segment for zenoh's own data
+SMALLEST = 1 << 14  # bytes
+RESERVE = 32 << 20  # bytes of /dev/shm left to others
+
+
+class SlotsUnusable(Exception):
+    """Shared memory does not work here; the text says why."""
+
+
+class Slot:
+    """One buffer. payload: as zenoh sends it. offset, capacity: of the data behind the header, in bytes."""
+
+    def __init__(self, capacity: int):
+        try:
+            provider = shm.ShmProvider.default_backend((capacity + HEADER + OVERHEAD, CACHE_LINE))
+            buffer = provider.alloc((capacity + HEADER, CACHE_LINE))
+        except zenoh.ZError as error:
+            raise SlotsUnusable(f"no shared memory segment of {capacity} bytes: {error}") from error
+        mark = secrets.token_bytes(MARK)
+        buffer[0:MARK] = mark
+        self.segment, memory, start = _find(mark, capacity + HEADER)
+        self._provider = provider  # the segment lives as long as this
+        self.payload = zenoh.ZBytes(buffer)
+        self.capacity = capacity
+        self.offset = start + HEADER
+        self._bytes = np.frombuffer(memory, np.uint8, capacity + HEADER, start)
+        self._generation = self._bytes[:8].view(np.uint64)
+        self.generation = 0
+
+    def lend(self) -> None:
+        """Begins a new generation, by which late writes of an earlier borrower are recognized."""
+        self.generation += 1
+        self._generation[0] = self.generation
+
+    def array(self, dtype: DTypeLike, count: int) -> NDArray[Any]:
+        """Returns the first `count` values of the slot, in place."""
+        kind = np.dtype(dtype)
+        return self._bytes[HEADER : HEADER + count * kind.itemsize].view(kind)
+
+    def message(self) -> SlotMessage:
+        """Describes the slot for a borrower on this host."""
+        return SlotMessage(segment=self.segment, offset=self.offset, capacity=self.capacity, generation=self.generation)
+
+
+def _find(mark: bytes, size: int) -> tuple[str, mmap.mmap, int]:
+    """Finds the segment of this process that holds the mark; returns its name, a mapping of it and the offset."""
+    for path in _own_segments():
+        try:
+            fd = os.open(path, os.O_RDWR | os.O_CLOEXEC)
+        except OSError:
+            continue
+        try:
+            if os.fstat(fd).st_size < size:
+                continue
+            memory = mmap.mmap(fd, 0)
+        finally:
+            os.close(fd)
+        start = memory.find(mark)
+        if 0 <= start <= len(memory) - size:
+            return path.name, memory, start
+        memory.close()
+    raise SlotsUnusable("a shared memory buffer of zenoh was not found under /dev/shm; its layout may have changed")
+
+
+def _own_segments() -> Iterator[Path]:
+    """Yields the segments of zenoh that this process maps, newest first."""
+    words = (line.split() for line in Path("/proc/self/maps").read_text().splitlines())
+    names = {
+        parts[-1] for parts in words if parts[-1].startswith(f"{shm_limits.SHM}/") and parts[-1].endswith(".zenoh")
+    }
+    return iter(sorted(map(Path, names), key=_changed, reverse=True))
+
+
+def _changed(path: Path) -> int:
+    """Returns when a file was last written [ns]; 0 if it is gone, as a segment that is still mapped may be."""
+    try:
+        return path.stat().st_mtime_ns
+    except OSError:
+        return 0
+
+
+class SlotPool:
+    """Slots to lend, made when needed and used again. limit: bytes of all slots."""
+
+    def __init__(self, limit: int = shm_limits.POOL_LIMIT):
+        self.limit = limit
+        self._free: list[Slot] = []
+        self._lent: dict[int, Slot] = {}
+        self._live: set[Slot] = set()
+        self._probe()
+
+    def _probe(self) -> None:
+        """Raises SlotsUnusable unless zenoh sends what NumPy writes."""
+        slot = self.lend(1024)
+        if slot is None:
+            raise SlotsUnusable("/dev/shm is full")
+        values = slot.array(np.uint8, 1024)
+        values[:] = np.frombuffer(secrets.token_bytes(1024), np.uint8)
+        if slot.payload.to_bytes()[HEADER : HEADER + 1024] != values.tobytes():
+            raise SlotsUnusable(
+                "zenoh does not see what is written into its shared memory; its layout may have changed"
+            )
+        self.give_back(slot)
+
+    @property
+    def bytes(self) -> int:
+        """Bytes of all slots, lent or free."""
+        return sum(slot.capacity for slot in self._live)
+
+    @property
+    def lent(self) -> int:
+        """Number of slots lent now. A probe for tests."""
+        return len(self._lent)
+
+    def lend(self, size: int) -> Slot | None:
+        """Lends a slot for `size` bytes, in a new generation; returns None if there is no memory for it."""
+        fitting = [slot for slot in self._free if size <= slot.capacity <= 4 * max(size, SMALLEST)]
+        slot = min(fitting, key=lambda slot: slot.capacity, default=None)
+        if slot is not None:
+            self._free.remove(slot)
+        else:
+            slot = self._make(_rounded(size))
+        if slot is not None:
+            slot.lend()
+            self._lent[id(slot)] = slot
+        return slot
+
+    def give_back(self, slot: Slot) -> None:
+        """Takes a slot back; a slot that is not lent is ignored."""
+        if self._lent.pop(id(slot), None) is not None:
+            self._free.append(slot)
+
+    def _make(self, capacity: int) -> Slot | None:
+        while self._free and not self._fits(capacity):
+            self._live.discard(self._free.pop(0))  # the longest unused; its segment is freed with it
+        if not self._fits(capacity):
+            return None
+        try:
+            slot = Slot(capacity)
+        except SlotsUnusable:
+            if not self._live:
+                raise
+            return None
+        self._live.add(slot)
+        return slot
+
+    def _fits(self, capacity: int) -> bool:
+        return self.bytes + capacity <= self.limit and capacity + RESERVE <= shm_limits.free_bytes()
+
+    def close(self) -> None:
+        """Drops every slot; the segments are removed from /dev/shm."""
+        self._free.clear()
+        self._lent.clear()
+        self._live.clear()
+
+
+def _rounded(size: int) -> int:
+    """The next of 1, 1.25, 1.5 or 1.75 times a power of two, so that objects of much the same size share slots."""
+    size = max(size, SMALLEST)
+    quarter = 1 << (size.bit_length() - 3)
+    return -(-size // quarter) * quarter

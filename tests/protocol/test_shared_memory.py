@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: MIT
+"""Slots of shared memory, seen by zenoh, by their owner and by a borrower."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from protocol.messages_pb2 import Slot as SlotMessage
+from protocol.refused import Refused
+from protocol.shared_memory import limits as shm_limits
+from protocol.shared_memory.pool import HEADER, Slot, SlotPool
+from protocol.shared_memory.view import SlotMap
+
+pytestmark = pytest.mark.skipif(bool(shm_limits.obstacle()), reason=f"no shared memory here: {shm_limits.obstacle()}")
+
+
+@pytest.fixture
+def pool():
+    pool = SlotPool(limit=8 << 20)
+    yield pool
+    pool.close()
+
+
+def test_what_numpy_writes_is_what_zenoh_sends_and_a_borrower_reads(pool: SlotPool) -> None:
+    slot = pool.lend(8000)
+    assert slot is not None
+    values = slot.array(np.float64, 1000)
+    values[:] = np.arange(1000)
+    assert slot.payload.to_bytes()[HEADER : HEADER + 8000] == values.tobytes()
+    borrower = SlotMap()
+    seen = borrower.array(slot.message(), np.float64, 1000)
+    assert np.array_equal(seen, values)
+    seen[7] = -1
+    assert values[7] == -1
+    assert slot.message().offset % 64 == 0
+
+
+def test_a_slot_is_used_again_in_a_new_generation(pool: SlotPool) -> None:
+    first = pool.lend(100_000)
+    assert first is not None
+    late, borrower = first.message(), SlotMap()
+    assert borrower.is_current(late)
+    pool.give_back(first)
+    again = pool.lend(99_000)
+    assert again is first and again.message().generation == late.generation + 1
+    assert not borrower.is_current(late) and borrower.is_current(again.message())
+
+
+def test_a_slot_given_back_twice_is_lent_once(pool: SlotPool) -> None:
+    slot = pool.lend(100_000)
+    assert slot is not None
+    pool.give_back(slot)
+    pool.give_back(slot)
+    one, other = pool.lend(100_000), pool.lend(100_000)
+    assert one is slot and other is not slot
+    assert pool.lent == 2
+
+
+def test_the_limit_holds_and_free_slots_make_room(pool: SlotPool) -> None:
+    big = pool.lend(5 << 20)
+    assert big is not None and pool.lend(5 << 20) is None
+    segment = shm_limits.SHM / big.segment
+    assert segment.exists()
+    pool.give_back(big)
+    del big
+    other = pool.lend(7 << 20)
+    assert other is not None and pool.bytes <= 8 << 20
+    assert not segment.exists()
+
+
+def test_closing_removes_the_segments() -> None:
+    pool = SlotPool()
+    slot = pool.lend(1 << 20)
+    assert slot is not None
+    segment = shm_limits.SHM / slot.segment
+    del slot
+    pool.close()
+    assert not segment.exists()
+
+
+def test_no_slot_where_dev_shm_is_full(monkeypatch: pytest.MonkeyPatch, pool: SlotPool) -> None:
+    monkeypatch.setattr(shm_limits, "free_bytes", lambda: 0)
+    assert pool.lend(1 << 20) is None
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"segment": "../etc/passwd"}, "allowed: digits and .zenoh"),
+        ({"segment": "/etc/passwd"}, "allowed: digits and .zenoh"),
+        ({"segment": ""}, "allowed: digits and .zenoh"),
+        ({"segment": "1234567890123.zenoh"}, "cannot be opened"),
+        ({"offset": 0}, "Slot.offset is 0"),
+        ({"offset": 1 << 60}, "Slot.offset is"),
+        ({"offset": 1091}, "a multiple of 8"),
+        ({"capacity": 1 << 60}, "Slot.offset is"),
+        ({"capacity": 100}, "Slot.capacity is 100 bytes; needed: 8000"),
+    ],
+)
+def test_a_borrower_believes_no_description(pool: SlotPool, changes: dict[str, object], text: str) -> None:
+    slot = pool.lend(8000)
+    assert slot is not None
+    message = slot.message()
+    for field, value in changes.items():
+        setattr(message, field, value)
+    with pytest.raises(Refused, match=text):
+        SlotMap().array(message, np.float64, 1000)
+
+
+def test_a_borrower_follows_no_link() -> None:
+    link = shm_limits.SHM / "999999999999999999999999.zenoh"
+    link.symlink_to(Path("/etc/passwd"))
+    try:
+        with pytest.raises(Refused, match="cannot be opened"):
+            SlotMap().array(SlotMessage(segment=link.name, offset=64, capacity=64), np.uint8, 8)
+    finally:
+        link.unlink(missing_ok=True)  # zenoh may have swept it up, in a process of another test
+
+
+def test_every_slot_is_its_own(pool: SlotPool) -> None:
+    slots = [pool.lend(20_000) for _ in range(5)]
+    for number, slot in enumerate(slots):
+        assert isinstance(slot, Slot)
+        slot.array(np.int64, 2500)[:] = number
+    assert [int(slot.array(np.int64, 2500).sum()) for slot in slots if slot] == [2500 * k for k in range(5)]
