@@ -23,7 +23,7 @@ from protocol.network.endpoints import BadEndpoint, check_endpoint, on_this_mach
 from protocol.process.command_line import Program, Terminated, end_in_order
 from sim_server.errors import InputError
 from sim_server.scene import Scene, load
-from sim_server.supervisor import Supervisor, worker_process
+from sim_server.service.supervisor import Supervisor, worker_process
 
 PROGRAM = Program("launch")
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)

@@ -65,7 +65,7 @@ have_venv() { python_runs 'import ensurepip, venv'; }
 have_python_headers() {
     python_runs 'import os, sysconfig as s; os.stat(os.path.join(s.get_path("include"), "Python.h"))'
 }
-have_compiler() { have "${CXX:-g++}" || have g++ || have clang++; }  # what sim_server/backend.py looks for
+have_compiler() { have "${CXX:-g++}" || have g++ || have clang++; }  # what sim_server/backends/compiler.py looks for
 have_suitesparse() { [ -n "${SUITESPARSE_INCLUDE_DIR:-}" ] || [ -e /usr/include/suitesparse/cholmod.h ]; }
 have_openblas() { compgen -G '/usr/lib/*/libopenblas.so.0' >/dev/null || ! have apt-get; }
 have_software_vulkan() { compgen -G '/usr/share/vulkan/icd.d/lvp_icd*.json' >/dev/null; }

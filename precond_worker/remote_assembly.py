@@ -16,7 +16,7 @@ class Source(Protocol):
 
 
 class Assembler(Protocol):
-    """Assembles the matrices of one object (sim_server.assembly.Assembly)."""
+    """Assembles the matrices of one object (sim_server.updates.worker_assembly.Assembly)."""
 
     def matrix(self, x: Float64) -> Float64: ...
 
@@ -37,7 +37,7 @@ class Assemblers:
         """Returns the assembler of an object. Raises Refused if its matrix cannot be assembled here."""
         known = self._known.get(object)
         if known is None or known[0] != epoch:
-            from sim_server.assembly import Assembly  # lazily: only positions need the server's code
+            from sim_server.updates.worker_assembly import Assembly  # lazily: only positions need the server's code
 
             built = Assembly(self._source.scene(), self._source.topology(object, epoch))
             known = self._known[object] = (epoch, built)

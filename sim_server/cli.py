@@ -15,12 +15,12 @@ import typer
 
 from protocol.process.command_line import Program, Terminated, end_in_order
 from protocol.process.nvidia import nvidia_device
-from sim_server.compile_notice import compiling_told
 from sim_server.errors import DeviceError, DeviceLost, InputError, NameTaken
+from sim_server.service.compile_notice import compiling_told
 
 if TYPE_CHECKING:
-    from sim_server.service import Service
-    from sim_server.supervisor import Supervisor
+    from sim_server.service.service import Service
+    from sim_server.service.supervisor import Supervisor
 
 PROGRAM = Program("sim-server")
 app = typer.Typer(pretty_exceptions_enable=False, rich_markup_mode=None)
@@ -113,7 +113,7 @@ def chosen(device: str, say: Callable[[str], None]) -> str:
         return device
     if not nvidia_device():
         return "cpu"
-    from sim_server.gpu.device import cupy
+    from sim_server.backends.gpu.device import cupy
 
     try:
         cupy()
@@ -148,12 +148,12 @@ def _set_up(closing: ExitStack, o: Options) -> "tuple[Service, Supervisor | None
     from protocol.network.exposure import unrestricted
     from protocol.network.session import AddressInUse, ConnectionFailed
     from protocol.refused import Refused
-    from sim_server.backend import CompileError
+    from sim_server.backends.compiler import CompileError
     from sim_server.network.link import ServerLink
-    from sim_server.recorder import Recorder
-    from sim_server.service import Service
+    from sim_server.recording.recorder import Recorder
+    from sim_server.service.service import Service
+    from sim_server.service.supervisor import Supervisor
     from sim_server.simulation import Simulation
-    from sim_server.supervisor import Supervisor
 
     end_in_order()
     try:
@@ -205,7 +205,7 @@ def _announce(say, service: "Service", scene: Path, listen: list[str] | None) ->
 
 def _describe_objects(say, service: "Service", listen: list[str] | None) -> None:  # type: ignore[no-untyped-def]
     """Size and mass of each object, where a mesh in millimetres or a density in g/cm3 shows; then notices."""
-    from sim_server.notices import notices
+    from sim_server.service.notices import notices
 
     world = service.simulation.world
     for body in world.bodies[:20]:

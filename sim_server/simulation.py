@@ -11,24 +11,24 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
-from sim_server.backend import Cpu, Launch, ahead
-from sim_server.effect import Effect, Refusal
+from sim_server.backends.compiler import Cpu, Launch, ahead
+from sim_server.backends.cpu.engine import Engine, Kind
 from sim_server.effects import effect
-from sim_server.energy import Energies
-from sim_server.engine import Engine, Kind
-from sim_server.equilibrium import check_held
+from sim_server.effects._base import Effect, Refusal
 from sim_server.errors import DeviceError, InputError
-from sim_server.integrator import Integrator
+from sim_server.mechanics.energy import Energies
+from sim_server.mechanics.integrator import Integrator
+from sim_server.mechanics.shape_matching import ShapeMatching
+from sim_server.mechanics.static_check import check_held
+from sim_server.mechanics.system import System
+from sim_server.mechanics.world import Body, World
 from sim_server.scene import Scene, load
-from sim_server.shape import ShapeMatching
-from sim_server.system import System
-from sim_server.world import Body, World
 
 KINDS = {"none": Kind.NONE, "jacobi": Kind.JACOBI, "block_jacobi": Kind.BLOCK_JACOBI, "ssor": Kind.SSOR}
 
 
 class Simulation:
-    """A scene on a device, "cpu" or "gpu". `engine.run(n)` makes n steps; when factors come is driver.py's business.
+    """A scene on a device, "cpu" or "gpu". `engine.run(n)` makes n steps; when factors come is policy.py's business.
 
     watched: whether bodies that run away are looked for at all; a log of a version that did not is repeated without.
 
@@ -43,8 +43,10 @@ class Simulation:
     def _build(self, scene: Scene, device: str) -> None:
         scene.solver.check_device(device)
         scene.integrator.check_device(device)
-        loop = "gpu/loop.cpp" if device == "gpu" else "native/loop.cpp"  # takes longest to compile
-        ahead(loop, *(["native/judge.cpp"] if scene.solver.wants_factors else []))
+        loop = (
+            "backends/gpu/loop.cpp" if device == "gpu" else "backends/cpu/native/loop.cpp"
+        )  # takes longest to compile
+        ahead(loop, *(["backends/cpu/native/factor_check.cpp"] if scene.solver.wants_factors else []))
         self.world = World(scene, _backend(device, scene.solver.precision))
         self.effects = build_effects(scene, self.world)
         elements = [e.elements for e in self.effects.values() if e.elements is not None]
@@ -67,7 +69,7 @@ class Simulation:
         newton = self.integrator.newton(assemble, list(self.effects.values()))
         self.engine: Any
         if device == "gpu":
-            from sim_server.gpu.engine import GpuEngine
+            from sim_server.backends.gpu.engine import GpuEngine
 
             gpu: Any = w.backend
             names = [b.name for b in w.bodies]
@@ -166,7 +168,7 @@ class Simulation:
 
 def _building(device: str) -> AbstractContextManager[None]:
     if device == "gpu":
-        from sim_server.gpu.device import building
+        from sim_server.backends.gpu.device import building
 
         return building()
     return nullcontext()
@@ -174,7 +176,7 @@ def _building(device: str) -> AbstractContextManager[None]:
 
 def _backend(device: str, precision: str) -> Any:
     if device == "gpu":
-        from sim_server.gpu.device import Gpu
+        from sim_server.backends.gpu.device import Gpu
 
         return Gpu(precision)
     return Cpu()

@@ -88,7 +88,7 @@ def push(name: str) -> pb.Interaction:
 
 def record(path: Path, steps: int, names: tuple[str, ...] = ("beam",), compression: str = "lz4") -> Path:
     """Records frames 0..steps and steps 1..steps of every object."""
-    from sim_server.recorder import Recorder
+    from sim_server.recording.recorder import Recorder
 
     with Recorder(path, compression) as recorder:  # type: ignore[arg-type]
         recorder.scene(scene(list(names)))

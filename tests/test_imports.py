@@ -20,9 +20,9 @@ EXCEPTIONS = {
     ("sim_server", "precond_worker.factorization.registry"),
     ("sim_server", "precond_worker.errors"),
     ("sim_server", "precond_worker.gpu.device"),
-    ("precond_worker", "sim_server.backend"),
-    ("precond_worker", "sim_server.compiling"),
-    ("precond_worker", "sim_server.assembly"),
+    ("precond_worker", "sim_server.backends.compiler"),
+    ("precond_worker", "sim_server.backends.build_pool"),
+    ("precond_worker", "sim_server.updates.worker_assembly"),
 }
 
 

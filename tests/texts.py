@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from sim_server import backend
+from sim_server.backends import compiler
 
 
 @contextmanager
-def compiled(text: str, folder: Path) -> Iterator[dict[str, backend.Module]]:
+def compiled(text: str, folder: Path) -> Iterator[dict[str, compiler.Module]]:
     """A module of the text in double and in single precision."""
     (folder / "text.cu").write_text(text)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(backend, "HERE", folder)
-        yield {real: backend.Module("text.cu", real) for real in ("double", "float")}
+        patch.setattr(compiler, "HERE", folder)
+        yield {real: compiler.Module("text.cu", real) for real in ("double", "float")}

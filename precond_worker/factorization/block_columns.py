@@ -31,8 +31,8 @@ class _Lower(c.Structure):
 
 @cache
 def _library() -> c.CDLL:
-    """Compiled at the first call; raises sim_server.backend.CompileError without a C++ compiler."""
-    from sim_server.backend import build  # lazily: complete factors need no compiler
+    """Compiled at the first call; raises sim_server.backends.compiler.CompileError without a C++ compiler."""
+    from sim_server.backends.compiler import build  # lazily: complete factors need no compiler
 
     library, p, lower = c.CDLL(str(build(SOURCE, stepping=False))), c.c_void_p, c.POINTER(_Lower)
     signatures: dict[str, tuple[Any, list[Any]]] = {
@@ -50,7 +50,7 @@ def _library() -> c.CDLL:
 def compile_ahead() -> None:
     """Compiles before a server waits for the first factor. If that fails, the jobs that need the code say why."""
     try:
-        from sim_server.compiling import CompileError
+        from sim_server.backends.build_pool import CompileError
     except ImportError:  # the server is not installed here
         return
     with contextlib.suppress(CompileError):

@@ -11,7 +11,7 @@ The chains lock at the stretch sqrt(N). At small strains the shear modulus is so
 2 sum_i i a_i 3^(i-1) / N^(i-1) times it (1.09 at N = 8), and the bulk modulus is `bulk`. `shear` may be a list of
 regions { where, shear, segments, bulk }.
 
-Powers and logarithm of J are not defined at J <= 0: see `inversion` in hyperelastic.py.
+Powers and logarithm of J are not defined at J <= 0: see `inversion` in _hyperelastic.py.
 
 Usual ranges: rubber shear 0.2 to 1 MPa with segments 5 to 50 (Treloar's natural rubber: 0.27 MPa, 26.5); soft tissue
 shear 100 Pa to 10 kPa with segments 2 to 10; bulk 10 to 100 times the shear modulus.
@@ -24,9 +24,9 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from sim_server.hyperelastic import Constant, Hyperelastic, Law, Reals, Values, of_shear_and_bulk
+from sim_server.effects._hyperelastic import Constant, Hyperelastic, Law, Reals, Values, of_shear_and_bulk
+from sim_server.mechanics.world import Body, World
 from sim_server.scene.parameters import Positive
-from sim_server.world import Body, World
 
 SCOPE = "object"
 SERIES = (1 / 2, 1 / 20, 11 / 1050, 19 / 7000, 519 / 673750)

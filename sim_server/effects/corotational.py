@@ -48,14 +48,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from sim_server.backend import Launch
-from sim_server.effect import Effect, ElementEnergies
+from sim_server.backends.compiler import Launch
+from sim_server.effects._base import Effect, ElementEnergies
 from sim_server.errors import InputError
+from sim_server.mechanics.system import Stencil, System
+from sim_server.mechanics.world import Body, World
 from sim_server.scene.integrator_options import IntegratorOptions
 from sim_server.scene.parameters import complaint
 from sim_server.scene.regions import Poisson, Regional, Young, region_values
-from sim_server.system import Stencil, System
-from sim_server.world import Body, World
 
 SCOPE = "object"
 

@@ -27,10 +27,10 @@ from typing import Any
 
 import numpy as np
 
+from sim_server.effects._hyperelastic import Constant, Hyperelastic, Law, Reals, Values
 from sim_server.errors import InputError
-from sim_server.hyperelastic import Constant, Hyperelastic, Law, Reals, Values
+from sim_server.mechanics.world import Body, World
 from sim_server.scene.parameters import NotNegative, Positive, Vector
-from sim_server.world import Body, World
 
 SCOPE = "object"
 PAIRS = ("ff", "fs", "fn", "ss", "sn", "nn")

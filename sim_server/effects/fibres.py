@@ -26,13 +26,13 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BeforeValidator, PlainSerializer
 
-from sim_server.backend import Launch
-from sim_server.effect import ElementEnergies
+from sim_server.backends.compiler import Launch
+from sim_server.effects._base import ElementEnergies
+from sim_server.effects._hyperelastic import Constant, Law, Tetrahedra, constants_of
 from sim_server.errors import InputError
-from sim_server.hyperelastic import Constant, Law, Tetrahedra, constants_of
+from sim_server.mechanics.system import Stencil, System
+from sim_server.mechanics.world import Body, World
 from sim_server.scene.parameters import NotNegative, Positive, complaint
-from sim_server.system import Stencil, System
-from sim_server.world import Body, World
 
 SCOPE = "object"
 

@@ -18,11 +18,11 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from sim_server.effect import Effect
+from sim_server.effects._base import Effect
 from sim_server.errors import InputError
+from sim_server.mechanics.world import Body, World
 from sim_server.scene import where
 from sim_server.scene.parameters import Parameters, Where
-from sim_server.world import Body, World
 
 SCOPE = "object"
 

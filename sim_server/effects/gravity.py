@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from sim_server.backend import Launch
-from sim_server.effect import Effect
+from sim_server.backends.compiler import Launch
+from sim_server.effects._base import Effect
+from sim_server.mechanics.system import Stencil, System
+from sim_server.mechanics.world import Body, World
 from sim_server.scene.parameters import Parameters, Vector
-from sim_server.system import Stencil, System
-from sim_server.world import Body, World
 
 SCOPE = "scene"
 

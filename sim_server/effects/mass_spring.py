@@ -34,13 +34,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 
-from sim_server.backend import Launch
-from sim_server.effect import Effect, ElementEnergies
+from sim_server.backends.compiler import Launch
+from sim_server.effects._base import Effect, ElementEnergies
 from sim_server.errors import InputError
+from sim_server.mechanics.system import Stencil, System
+from sim_server.mechanics.world import Body, World
 from sim_server.scene.parameters import File, Parameters, Positive, as_tuple, complaint
 from sim_server.scene.regions import Young, region_values
-from sim_server.system import Stencil, System
-from sim_server.world import Body, World
 
 SCOPE = "object"
 POISSON = 0.25  # of every network of springs without preferred directions

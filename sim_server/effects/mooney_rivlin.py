@@ -8,7 +8,7 @@ With J = det F, C = F^T F, I1 = tr C and I2 = (I1^2 - tr C^2) / 2::
 At small strains its shear modulus is 2 (c1 + c2) and its bulk modulus `bulk`; c2 = 0 is the Neo-Hookean solid with
 shape and volume apart. `c1` may be a list of regions { where, c1, c2, bulk }.
 
-Powers and logarithm of J are not defined at J <= 0: see `inversion` in hyperelastic.py.
+Powers and logarithm of J are not defined at J <= 0: see `inversion` in _hyperelastic.py.
 
 Usual ranges: rubber c1 = 0.1 to 0.5 MPa and c2 = 0 to 0.2 MPa (the ratio c2 / c1 from 0 to 1), liver and kidney c1 and
 c2 of some 100 to 1000 Pa; bulk from 10 times the shear modulus (a Poisson's ratio of 0.45) to 100 times (0.495); linear
@@ -20,9 +20,9 @@ IV, 1948; with the isochoric invariants of Holzapfel, Nonlinear Solid Mechanics,
 
 from typing import Any
 
-from sim_server.hyperelastic import Constant, Hyperelastic, Law, of_shear_and_bulk
+from sim_server.effects._hyperelastic import Constant, Hyperelastic, Law, of_shear_and_bulk
+from sim_server.mechanics.world import Body, World
 from sim_server.scene.parameters import NotNegative, Positive
-from sim_server.world import Body, World
 
 SCOPE = "object"
 LAW = Law(

@@ -12,7 +12,7 @@ lambda = E nu / ((1 + nu) (1 - 2 nu)) and mu = E / (2 (1 + nu)): at small strain
 
 poisson below 0 is refused: lambda ln^2 J with a negative lambda has no lower bound.
 
-ln J is not defined at J <= 0: see `inversion` in hyperelastic.py. For scenes that turn elements inside out,
+ln J is not defined at J <= 0: see `inversion` in _hyperelastic.py. For scenes that turn elements inside out,
 stable_neo_hookean costs the same and is defined everywhere.
 
 Usual ranges: young 1e3 Pa (brain, liver) to 1e7 Pa (rubber), poisson 0.3 to 0.49; from 0.49 on linear tetrahedra lock.
@@ -25,9 +25,9 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, Field
 
-from sim_server.hyperelastic import Hyperelastic, Law, lame, young_and_poisson, young_and_poisson_of
+from sim_server.effects._hyperelastic import Hyperelastic, Law, lame, young_and_poisson, young_and_poisson_of
+from sim_server.mechanics.world import Body, World
 from sim_server.scene.parameters import complaint
-from sim_server.world import Body, World
 
 SCOPE = "object"
 

@@ -25,10 +25,10 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BeforeValidator
 
+from sim_server.effects._hyperelastic import Constant, Hyperelastic, Law, Reals, Values, of_shear_and_bulk
 from sim_server.errors import InputError
-from sim_server.hyperelastic import Constant, Hyperelastic, Law, Reals, Values, of_shear_and_bulk
+from sim_server.mechanics.world import Body, World
 from sim_server.scene.parameters import Positive, complaint
-from sim_server.world import Body, World
 
 SCOPE = "object"
 TERMS = 3

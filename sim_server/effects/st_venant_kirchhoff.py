@@ -22,8 +22,8 @@ Source: Ciarlet, Mathematical Elasticity I, 1988, section 4.4; Bonet and Wood 20
 
 from typing import Any
 
-from sim_server.hyperelastic import YOUNG_AND_POISSON, Hyperelastic, Law, lame, young_and_poisson
-from sim_server.world import Body, World
+from sim_server.effects._hyperelastic import YOUNG_AND_POISSON, Hyperelastic, Law, lame, young_and_poisson
+from sim_server.mechanics.world import Body, World
 
 SCOPE = "object"
 LAW = Law(

@@ -15,7 +15,7 @@ Take it for scenes that press, twist or throw bodies about until elements turn o
 compression more (its energy is infinite at J = 0, this one's is not).
 
 From states with many inverted elements, at poisson 0.45 and above, one linearization a step with clamped eigenvalues
-overshoots without end; the default projection does not (hyperelastic.py). Without contact a body may come to rest
+overshoots without end; the default projection does not (_hyperelastic.py). Without contact a body may come to rest
 folded through itself, no element inverted; several linearizations a step (`[integrator]`) bring more of them back.
 
 Usual ranges: young 1e3 Pa (brain, liver) to 1e7 Pa (rubber), poisson 0.3 to 0.49; from 0.49 on linear tetrahedra lock.
@@ -29,8 +29,16 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from sim_server.hyperelastic import Hyperelastic, Law, Reals, Values, lame, young_and_poisson, young_and_poisson_of
-from sim_server.world import Body, World
+from sim_server.effects._hyperelastic import (
+    Hyperelastic,
+    Law,
+    Reals,
+    Values,
+    lame,
+    young_and_poisson,
+    young_and_poisson_of,
+)
+from sim_server.mechanics.world import Body, World
 
 SCOPE = "object"
 

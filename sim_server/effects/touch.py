@@ -31,12 +31,12 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from protocol.push_limits import ORPHANED_PUSH
-from sim_server.backend import Launch
-from sim_server.effect import Effect
-from sim_server.points import Points, shown
+from sim_server.backends.compiler import Launch
+from sim_server.effects._base import Effect
+from sim_server.mechanics.system import Stencil, System
+from sim_server.mechanics.world import Body, World
 from sim_server.scene.parameters import Parameters
-from sim_server.system import Stencil, System
-from sim_server.world import Body, World
+from sim_server.service.points import Points, shown
 
 SCOPE = "object"
 REACH = 1e3  # sizes of the object: how far from it a point, and from its point a target, may be

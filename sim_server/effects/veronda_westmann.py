@@ -8,7 +8,7 @@ With J = det F, C = F^T F, I1 = tr C and I2 = (I1^2 - tr C^2) / 2::
 At small strains its shear modulus is c1 c2 and its bulk modulus `bulk`; c2 says from what strain on it stiffens (about
 1 / sqrt(c2)). `c1` may be a list of regions { where, c1, c2, bulk }.
 
-Powers and logarithm of J are not defined at J <= 0: see `inversion` in hyperelastic.py. The exponential grows fast: at
+Powers and logarithm of J are not defined at J <= 0: see `inversion` in _hyperelastic.py. The exponential grows fast: at
 c2 = 10 and three times the length it is exp(40); a force that is no finite number ends the solve with not_finite.
 
 Usual ranges: c1 = 1 Pa to 5 kPa, c2 = 1 to 20, bulk 10 to 100 times c1 c2.
@@ -19,9 +19,9 @@ Source: Veronda and Westmann, Mechanical characterization of skin - finite defor
 
 from typing import Any
 
-from sim_server.hyperelastic import Constant, Hyperelastic, Law, of_shear_and_bulk
+from sim_server.effects._hyperelastic import Constant, Hyperelastic, Law, of_shear_and_bulk
+from sim_server.mechanics.world import Body, World
 from sim_server.scene.parameters import Positive
-from sim_server.world import Body, World
 
 SCOPE = "object"
 LAW = Law(

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: MIT
-// The energy of a body from step to step, and when it is called a runaway: what both devices share (native/energy.h, gpu/tick.cu).
+// The energy of a body from step to step, and when it is called a runaway: what both devices share (backends/cpu/native/energy.h, backends/gpu/step_epilogue.cu).
 //
 //     kinetic  sum m v.v / 2          gravity  -sum m g.x          work  of pushes and grabs since the start
 //     budget   kinetic + elastic before the first step, + work, + what gravity has done since, sum m g.dx (g may change)

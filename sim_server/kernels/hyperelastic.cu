@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: MIT
-// Tetrahedra of a law W(I1, I2, J), by MJED (formulas: sim_server/hyperelastic.py). LAW is its text, effects/<law>.cuh.
+// Tetrahedra of a law W(I1, I2, J), by MJED (formulas: sim_server/effects/_hyperelastic.py). LAW is its text, effects/<law>.cuh.
 #define WIDE
 #include "hyperelastic.cuh"
 #include "invariants.cuh"

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: MIT
-// What the laws of hyperelastic tetrahedra share (formulas: sim_server/hyperelastic.py).
+// What the laws of hyperelastic tetrahedra share (formulas: sim_server/effects/_hyperelastic.py).
 #pragma once
 #include "eigen9.cuh"
 #include "svd3.cuh"

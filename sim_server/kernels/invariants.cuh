@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: MIT
-// Isotropic laws by the invariants I1 = tr C, I2 = (tr^2 C - tr C^2) / 2 and J = det F (formulas: sim_server/hyperelastic.py).
+// Isotropic laws by the invariants I1 = tr C, I2 = (tr^2 C - tr C^2) / 2 and J = det F (formulas: sim_server/effects/_hyperelastic.py).
 #pragma once
 #include "hyperelastic.cuh"
 

@@ -10,14 +10,14 @@
 // `real` is the type of the state and of the system, `local` that of an element's own arithmetic and of what it hands on; a
 // GPU may have float there beside double (`local_number` beside `number`).
 // `own<T>` is an array (n, k) whose rows only their items touch, from launch to launch of a domain: where launches are put
-// together (gpu/fuse.py) such a row stays in registers.
+// together (backends/gpu/kernel_fusion.py) such a row stays in registers.
 // SUM_KERNEL(name, Params, N) is for items that sum N locals over a list of entries p.start[i] .. p.start[i + 1]: the text has
 // name_add(p, i, k, sum) for entry k and name_put(p, i, sum) for what becomes of the sum; a GPU may share the entries of an
-// item between threads (gpu/fuse.py), so name_add reads nothing that items of its own domain write.
+// item between threads (backends/gpu/kernel_fusion.py), so name_add reads nothing that items of its own domain write.
 // MAILED_KERNEL is the same for a launch whose arguments are replaced while the simulation runs: on a GPU it reads them from
 // device memory and takes any number of items.
 // at(a, i) reads any items, at_items(a, i) those of the kernel itself: neighbours in memory.
-// Structs hold 4-byte ints, reals and pointers; the Python side reads their layout from this very text (backend.py), so that
+// Structs hold 4-byte ints, reals and pointers; the Python side reads their layout from this very text (compiler.py), so that
 // names and order stand nowhere else.
 #pragma once
 

@@ -116,7 +116,7 @@ struct Advance {
     real* before;           // (n, 3) out: x when the step began [m]
 };
 
-// v += dv, x += h v (eq. 2). A body whose forces are no numbers has a y that is none (native/pcg.h): it goes back to where the
+// v += dv, x += h v (eq. 2). A body whose forces are no numbers has a y that is none (backends/cpu/native/pcg.h): it goes back to where the
 // step before began, from which the forces were known, and rests there. So no energy comes in, and what does not press it through
 // itself again lets it go on.
 KERNEL(advance, Advance) {

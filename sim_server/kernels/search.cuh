@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: MIT
-// Newton-Raphson within a step, for each body by itself (sim_server/integrator.py has the equations): what both devices share of
-// it; native/newton.h and gpu/search.cu go through a body's nodes. What a body's velocity gains in the step is searched for: gain
+// Newton-Raphson within a step, for each body by itself (sim_server/mechanics/integrator.py has the equations): what both devices share of
+// it; backends/cpu/native/newton.h and backends/gpu/newton.cu go through a body's nodes. What a body's velocity gains in the step is searched for: gain
 // (nodes, 3), from which all of the state follows,
 //     v = v0 + gain,   x = x0 + reach (ahead0 + gain),   ahead = 0,   carried = carried0 - gain,
 // so that what the launches assemble at a trial is the nonlinear residual b there and the matrix A of the next linearization.
@@ -10,7 +10,7 @@
 //     body what minimizes along a straight way is a short step.
 //   - The first way begins at the state before the step, gain = -ahead0, and its first trial is what one linearization gives.
 //   - The search is over when |b| <= tolerance |b of the step's first linearization|, or when b is rounding.
-// Who includes this has Status (native/pcg.h, gpu/solve.cuh).
+// Who includes this has Status (backends/cpu/native/pcg.h, backends/gpu/pcg_structs.cuh).
 #pragma once
 #include "anywhere.cuh"
 
@@ -115,7 +115,7 @@ ANYWHERE int judge_trial(Search& s, const Limits& most, double norm, double slop
 }
 
 // A component of the gain after a verdict. Where there is no state but the first it is no number, and nor is y: the kernel `advance`
-// takes the body back, as after one linearization (native/pcg.h).
+// takes the body back, as after one linearization (backends/cpu/native/pcg.h).
 ANYWHERE double gain_after(const Search& s, double gain, double way) {
     if (s.verdict == LOST && s.linearizations <= 1) return 0 * s.norm;  // |b| is infinite or no number
     return s.verdict == TAKEN ? gain + s.scale * way : gain;

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: MIT
-// Rotations of nodes by shape matching (formulas: shape.py), for bodies whose elements have none of their own.
+// Rotations of nodes by shape matching (formulas: shape_matching.py), for bodies whose elements have none of their own.
 #include "mat3.cuh"
 #include "together.cuh"
 

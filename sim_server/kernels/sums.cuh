@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: MIT
-// What gpu/fuse.py needs of the threads of a warp. GPU only.
+// What backends/gpu/kernel_fusion.py needs of the threads of a warp. GPU only.
 #pragma once
 #include "kernel.h"
 

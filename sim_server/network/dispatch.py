@@ -16,7 +16,6 @@ from protocol.messages_pb2 import Topology, WorkerInfo
 from protocol.refused import Refused
 from protocol.shared_memory.pool import Slot, SlotPool
 from protocol.validate import take
-from sim_server.factors import FactorSource, Job
 from sim_server.network.factor_decoder import FactorDecoder
 from sim_server.network.inbox import Inbox
 from sim_server.network.job_message import add_values, matrix_message
@@ -25,6 +24,7 @@ from sim_server.network.send_queue import SendQueue
 from sim_server.network.worker_registry import WorkerRegistry
 from sim_server.network.worker_reliability import WorkerReliability
 from sim_server.network.worker_timing import WorkerTiming
+from sim_server.updates.factor_source import FactorSource, Job
 
 log = logging.getLogger(__name__)
 

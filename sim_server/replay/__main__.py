@@ -20,11 +20,11 @@ def main() -> int:
 
     from protocol.log_chunks import BadLog
     from protocol.printable import printable
-    from sim_server.backend import CompileError
-    from sim_server.compile_notice import compiling_told
+    from sim_server.backends.compiler import CompileError
     from sim_server.errors import DeviceLost, InputError
     from sim_server.replay.log import Recording
     from sim_server.replay.run import Replay
+    from sim_server.service.compile_notice import compiling_told
 
     try:
         say = partial(print, "replay:", file=sys.stderr, flush=True)

@@ -21,17 +21,17 @@ from protocol.factor import Factor
 from protocol.log_chunks import BadLog
 from protocol.refused import Refused
 from protocol.validate import array, check_range, checksum
-from sim_server import describe
 from sim_server.arrays import Float64
-from sim_server.assembly import Assembly
 from sim_server.errors import DeviceError
-from sim_server.factors import Inline, Job
+from sim_server.mechanics.world import Body
+from sim_server.recording import messages as describe
 from sim_server.replay.log import Recording
 from sim_server.replay.report import Comparison
 from sim_server.scene import Scene, deleted
 from sim_server.scene.messages import readable
 from sim_server.simulation import Simulation
-from sim_server.world import Body
+from sim_server.updates.factor_source import Inline, Job
+from sim_server.updates.worker_assembly import Assembly
 
 MESH = ("nodes", "tets", "row_start", "columns", "fixed")
 

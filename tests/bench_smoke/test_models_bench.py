@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sim_server import backend
-from sim_server.gpu.device import PRECISIONS, options
+from sim_server.backends import compiler
+from sim_server.backends.gpu.device import PRECISIONS, options
 from tests.bench.models import __main__ as bench
 from tests.bench.models import parts as models
 from tests.bench.models import timing
-from tests.core import nvrtc
+from tests.support import nvrtc
 
 
 def test_every_model_of_the_registry_is_measured() -> None:
@@ -50,7 +50,7 @@ def test_the_yardstick_compiles_for_gpus(law: str, tmp_path: Path) -> None:
         pytest.skip("needs the package nvidia-cuda-nvrtc")
     text = tmp_path / "generic.cu"
     here = timing.HERE
-    text.write_text(backend.read_text(f"{here}generic_elements.cu+{here}generic_{law}.cuh")[1])
+    text.write_text(compiler.read_text(f"{here}generic_elements.cu+{here}generic_{law}.cuh")[1])
     for types in PRECISIONS.values():
         code, said = nvrtc.compiled(library, text, ["-arch=sm_90", *options(types)])
         assert len(code) > 1000 and not said, said

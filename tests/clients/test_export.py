@@ -14,7 +14,7 @@ import pytest
 from clients.errors import BadInput, ClientError
 from clients.log.export import export
 from clients.log.reader import Log
-from sim_server.recorder import Recorder
+from sim_server.recording.recorder import Recorder
 from tests.sample_run import DT, REST, TETS, object_step, positions, record, state, topology, velocities
 
 STEPS = 9

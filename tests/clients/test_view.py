@@ -22,7 +22,7 @@ from clients.viewer import view
 from clients.viewer.colors import colors
 from clients.viewer.screenshot import has_vulkan_driver
 from clients.viewer.surface import Surface
-from sim_server.recorder import Recorder
+from sim_server.recording.recorder import Recorder
 from tests.clients.fake_server import FakeServer
 from tests.sample_run import (
     DT,

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.core import nvrtc
 from tests.docs.figures import ROOT
+from tests.support import nvrtc
 
 TEXT = (ROOT / "CONTRIBUTING.md").read_text()
 

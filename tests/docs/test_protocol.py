@@ -7,9 +7,10 @@ import pytest
 
 from protocol.channels import CHANNELS, PROTOCOL, Channel
 from protocol.shared_memory import limits
-from sim_server import cli, recorder
+from sim_server import cli
 from sim_server.mesh import MOST_TETS
 from sim_server.network import command_queue, leases, rate_limiter, worker_registry
+from sim_server.recording import recorder
 from sim_server.scene import integrator_options, where
 from tests.docs.figures import DOCS, table_under
 

@@ -19,8 +19,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 @pytest.fixture(autouse=True)
 def gpu():
+    from sim_server.backends.gpu.device import cupy
     from sim_server.errors import DeviceError
-    from sim_server.gpu.device import cupy
 
     try:
         cupy()

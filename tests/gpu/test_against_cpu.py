@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 from protocol.messages_pb2 import SolveStatus
-from sim_server.driver import Driver
-from sim_server.factors import Job
-from sim_server.gpu.solver import RESULT
+from sim_server.backends.gpu.solver import RESULT
 from sim_server.simulation import Simulation
+from sim_server.updates.factor_source import Job
+from sim_server.updates.policy import Driver
 
 pytestmark = pytest.mark.gpu
 

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from protocol.messages_pb2 import SolveStatus
-from sim_server.driver import Driver
 from sim_server.errors import DeviceError
-from sim_server.factors import Job
+from sim_server.service.telemetry import Telemetry
 from sim_server.simulation import Simulation
-from sim_server.telemetry import Telemetry
+from sim_server.updates.factor_source import Job
+from sim_server.updates.policy import Driver
 
 pytestmark = pytest.mark.gpu
 SCENE = "deploy/scenes/beam.toml"
@@ -23,7 +23,7 @@ JACOBI = "solver.preconditioner=block_jacobi"
 
 @pytest.fixture(autouse=True)
 def cp():
-    from sim_server.gpu.device import cupy
+    from sim_server.backends.gpu.device import cupy
 
     try:
         package = cupy()

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from precond_worker.factorization.factorize import Analysis
-from sim_server.gpu.plan import plan
+from sim_server.backends.gpu.inverse.plan import plan
 from tests.reference.partitioned import Application, stored
 from tests.solver.solves import applied
 from tests.worker.block_matrices import bar_edges, pattern, spd
@@ -16,8 +16,8 @@ SMALL, MIDDLE = (3, 3, 10), (5, 5, 20)  # cells of a bar
 
 @pytest.fixture(scope="module")
 def gpu():
+    from sim_server.backends.gpu.device import Gpu
     from sim_server.errors import DeviceError
-    from sim_server.gpu.device import Gpu
 
     try:
         return Gpu()
@@ -35,7 +35,7 @@ def factor(cells, seed=0):
 
 def expanded(gpu, shape, values, p, multiprocessors=None):
     """Chunks and scale, on the host."""
-    from sim_server.gpu.expansion import Expansion
+    from sim_server.backends.gpu.inverse.build_inverse import Expansion
 
     expansion = Expansion(gpu, shape, p)
     target = expansion.target()
@@ -85,7 +85,7 @@ def test_the_scale_ends_with_its_largest(gpu):
 
 
 def test_fifty_in_a_row_allocate_nothing_and_end_with_the_last(gpu):
-    from sim_server.gpu.expansion import Expansion
+    from sim_server.backends.gpu.inverse.build_inverse import Expansion
 
     shape, first = factor(SMALL)
     second = factor(SMALL, seed=5)[1]
@@ -109,7 +109,7 @@ def test_fifty_in_a_row_allocate_nothing_and_end_with_the_last(gpu):
 
 
 def test_another_expansion_may_make_the_workspace_grow(gpu):
-    from sim_server.gpu.expansion import Expansion
+    from sim_server.backends.gpu.inverse.build_inverse import Expansion
 
     shape, values = factor(SMALL)
     expansion = Expansion(gpu, shape, plan(shape, 16, 2))

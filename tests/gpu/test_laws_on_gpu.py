@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from protocol.messages_pb2 import SolveStatus
-from sim_server.driver import Driver
 from sim_server.simulation import Simulation
+from sim_server.updates.policy import Driver
 from tests.gpu.test_assembly import CASES
 from tests.physics.laws import determinants
 

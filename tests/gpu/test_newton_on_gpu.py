@@ -14,11 +14,11 @@ import pytest
 from numpy.typing import NDArray
 
 from protocol.messages_pb2 import SolveStatus
-from sim_server.driver import Driver
+from sim_server.backends.gpu.engine import FEW
 from sim_server.errors import InputError
-from sim_server.gpu.engine import FEW
 from sim_server.scene import Scene
 from sim_server.simulation import Simulation
+from sim_server.updates.policy import Driver
 from tests.scenes import bar, scene
 from tests.state import put
 

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import Factor
-from sim_server.factors import FactorSource, Inline, Job
 from sim_server.simulation import Simulation
+from sim_server.updates.factor_source import FactorSource, Inline, Job
 
 Values = NDArray[Any]
 Source = Callable[[Simulation], FactorSource]

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import pytest
 
-from sim_server.supervisor import BACK_OFF, BUDGET, PERIOD, Supervisor
+from sim_server.service.supervisor import BACK_OFF, BUDGET, PERIOD, Supervisor
 
 
 class Process:

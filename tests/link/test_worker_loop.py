@@ -194,7 +194,7 @@ def positions(number: int, x: np.ndarray, **changes: Any) -> Sample:
 @pytest.fixture
 def doubling(monkeypatch: pytest.MonkeyPatch) -> None:
     Doubling.made = 0
-    monkeypatch.setitem(sys.modules, "sim_server.assembly", SimpleNamespace(Assembly=Doubling))
+    monkeypatch.setitem(sys.modules, "sim_server.updates.worker_assembly", SimpleNamespace(Assembly=Doubling))
 
 
 def test_from_positions_the_worker_builds_the_matrix_itself(

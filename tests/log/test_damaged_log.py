@@ -21,7 +21,7 @@ from clients.errors import BadInput
 from clients.log.reader import Log
 from protocol import log_chunks
 from protocol.channels import PROTOCOL
-from sim_server.mcap_file import McapFile
+from sim_server.recording.mcap_file import McapFile
 from tests.sample_run import object_step, positions, record, state, topology
 
 
@@ -130,7 +130,7 @@ def test_foreign_mcap_file(tmp_path: Path) -> None:
 
 
 def test_another_protocol_version(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sim_server.mcap_file.PROTOCOL", PROTOCOL + 41)
+    monkeypatch.setattr("sim_server.recording.mcap_file.PROTOCOL", PROTOCOL + 41)
     path = record(tmp_path / "new.mcap", 1)
     with pytest.raises(BadInput, match=f"protocol version {PROTOCOL + 41}; this program reads version {PROTOCOL}"):
         Log(path)

@@ -11,7 +11,7 @@ from mcap.records import Message as McapMessage
 
 from protocol import messages_pb2 as pb
 from protocol.log_chunks import BadLog, ChunkFile
-from sim_server.mcap_file import McapFile
+from sim_server.recording.mcap_file import McapFile
 from sim_server.replay.log import Recording
 from sim_server.replay.run import Replay
 from tests.system.link_helpers import free_endpoint

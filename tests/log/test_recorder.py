@@ -19,7 +19,7 @@ from clients.errors import BadInput
 from clients.log.reader import Log
 from protocol import messages_pb2 as pb
 from sim_server.errors import InputError
-from sim_server.recorder import Recorder
+from sim_server.recording.recorder import Recorder
 from tests.sample_run import DT, REST, TETS, object_step, positions, push, record, scene, state, topology, velocities
 
 
@@ -120,7 +120,7 @@ class _StuckFile:
 @pytest.fixture
 def stuck(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> _StuckFile:
     file = _StuckFile()
-    monkeypatch.setattr("sim_server.recorder.McapFile", lambda *_: file)
+    monkeypatch.setattr("sim_server.recording.recorder.McapFile", lambda *_: file)
     return file
 
 
@@ -172,7 +172,7 @@ def test_a_state_that_blew_up_is_recorded(tmp_path: Path) -> None:
 
 CHILD = """
 import sys, time
-from sim_server.recorder import Recorder
+from sim_server.recording.recorder import Recorder
 from tests.sample_run import *
 recorder = Recorder(sys.argv[1])
 recorder.scene(scene(["beam"]))

@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol import messages_pb2 as pb
-from sim_server import describe
-from sim_server.engine import Kind
-from sim_server.factors import Inline, Job
-from sim_server.recorder import Recorder
+from sim_server.backends.cpu.engine import Kind
+from sim_server.recording import messages as describe
+from sim_server.recording.recorder import Recorder
 from sim_server.replay.log import Recording
 from sim_server.replay.run import Replay
 from sim_server.simulation import Simulation
+from sim_server.updates.factor_source import Inline, Job
 from tests.scenes import bar, simulation
 
 BEAM: dict[str, Any] = {"cells": (6, 2, 2), "size": (3, 1, 1), "young": 5e5, "poisson": 0.4, "fixed": "X < 0.01"}

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sim_server.backend import module
-from sim_server.hyperelastic import PROJECTIONS
+from sim_server.backends.compiler import module
+from sim_server.effects._hyperelastic import PROJECTIONS
 from tests.physics.laws import LAWS, Law, deform, odd_bar
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from protocol.messages_pb2 import SolveStatus
-from sim_server.driver import Driver
+from sim_server.updates.policy import Driver
 from tests.hard_cases.starts import Start, flattened, mirrored, random_in_box
 from tests.physics.laws import LAWS, deform, determinants, law_bar, stiffness
 

@@ -9,10 +9,10 @@ import pytest
 from numpy.typing import NDArray
 
 from protocol import messages_pb2 as pb
-from sim_server.backend import module
-from sim_server.driver import Driver
+from sim_server.backends.compiler import module
+from sim_server.service.telemetry import Telemetry
 from sim_server.simulation import Simulation
-from sim_server.telemetry import Telemetry
+from sim_server.updates.policy import Driver
 from tests.scenes import bar, simulation
 
 WILD = {"neo_hookean": {"young": 1e6, "poisson": 0.45, "inversion": "regularize"}, "fixed": {"where": "X < 0.01"}}

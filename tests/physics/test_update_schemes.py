@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from sim_server.driver import Driver
 from sim_server.simulation import Simulation
+from sim_server.updates.policy import Driver
 
 pytestmark = pytest.mark.slow
 BEAM = Path(__file__).resolve().parents[2] / "deploy" / "scenes" / "beam.toml"

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dtrtri
 
 from protocol.factor import FactorPattern
-from sim_server.gpu.batches import EDGE, Batch, Layout
-from sim_server.gpu.plan import FORM, GATHER, READ, WRITE, Plan
+from sim_server.backends.gpu.inverse.expansion_batches import EDGE, Batch, Layout
+from sim_server.backends.gpu.inverse.plan import FORM, GATHER, READ, WRITE, Plan
 from tests.reference.supernodal import lower
 
 Reals = NDArray[np.float64]
@@ -157,7 +157,7 @@ class Application:
 
 
 def by_tasks(layout: Layout, values: NDArray, plan: Plan) -> tuple[NDArray, Reals]:
-    """Chunks in float64 and scale as the kernels of expansion.cu make them, task by task. NaN where nobody writes."""
+    """Chunks in float64 and scale as build_inverse.cu makes them, task by task. NaN where nobody writes."""
     chunks, scale = np.full((plan.chunks, ROWS, COLUMNS), np.nan), np.zeros(plan.size + 1)
     for batch in layout.batches:
         memory = np.full(layout.room // 4, np.nan)

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from sim_server.system import Stencil, System
+from sim_server.mechanics.system import Stencil, System
 from tests.scenes import bar, jittered_bar, mesh_file, simulation
 
 GRAVITY = (0.0, -9.81, 0.0)

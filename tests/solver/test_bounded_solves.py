@@ -6,9 +6,9 @@ import itertools
 import numpy as np
 import pytest
 
-from sim_server.driver import Driver
-from sim_server.engine import Kind
+from sim_server.backends.cpu.engine import Kind
 from sim_server.simulation import Simulation
+from sim_server.updates.policy import Driver
 from tests.scenes import bar, simulation
 from tests.solver.solves import bent, solve
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""gpu/plan.py and what is made for it: applied in NumPy as the GPU applies it, against the matrix itself."""
+"""gpu/inverse/plan.py and what is made for it: applied in NumPy as the GPU applies it, against the matrix itself."""
 
 import itertools
 from types import SimpleNamespace
@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from precond_worker.factorization.factorize import Analysis
 from protocol.factor import FactorPattern
-from sim_server.gpu.batches import layout
-from sim_server.gpu.partition import tree_of
-from sim_server.gpu.plan import FORM, GATHER, READ, WRITE, Plan, lay_out, plan
+from sim_server.backends.gpu.inverse.expansion_batches import layout
+from sim_server.backends.gpu.inverse.partition import tree_of
+from sim_server.backends.gpu.inverse.plan import FORM, GATHER, READ, WRITE, Plan, lay_out, plan
 from tests.reference.partitioned import Application, by_tasks, stored
 from tests.reference.supernodal import columns
 from tests.scenes import bar, factor_of, simulation

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""native/pcg.h through the loop against the textbook's conjugate gradients, iterate by iterate."""
+"""backends/cpu/native/pcg.h through the loop against the textbook's conjugate gradients, iterate by iterate."""
 
 import numpy as np
 import pytest
 from scipy.sparse.linalg import spsolve
 
-from sim_server.engine import Kind
+from sim_server.backends.cpu.engine import Kind
 from tests.reference.pcg import block_jacobi, jacobi, pcg
 from tests.scenes import factor_of
 from tests.solver.solves import applied, bent, solve, stops, system, true_residual

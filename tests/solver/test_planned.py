@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""gpu/planned.py: the lists that the kernel reads, applied in NumPy as it applies them."""
+"""backends/gpu/inverse/device_plan.py: the lists that the kernel reads, applied in NumPy as it applies them."""
 
 from types import SimpleNamespace
 
@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sim_server.gpu import plan as plans
-from sim_server.gpu.partition import tree_of
-from sim_server.gpu.plan import lay_out, plan
-from sim_server.gpu.planned import Planned
-from sim_server.gpu.shares import busiest, first_shares, halo, shared_out, shares
+from sim_server.backends.gpu.inverse import plan as plans
+from sim_server.backends.gpu.inverse.device_plan import Planned
+from sim_server.backends.gpu.inverse.partition import tree_of
+from sim_server.backends.gpu.inverse.plan import lay_out, plan
+from sim_server.backends.gpu.row_partition import busiest, first_shares, halo, shared_out, shares
 from tests.reference.partitioned import stored
 from tests.solver.test_partitioned_inverse import GRAPHS, graphs, system
 
@@ -28,7 +28,7 @@ class HostGpu:
 
 
 def applied(planned: Planned, chunks: NDArray, scale: NDArray, r: NDArray) -> NDArray:
-    """z of r, by phases and thread blocks: apply.cuh without its words."""
+    """z of r, by phases and thread blocks: partitioned_inverse.cuh without its words."""
     p = planned.plan
     a = {name: array.host for name, array in planned._arrays.items()}
     at = (a["place"][:, None] + np.arange(3)).ravel()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Rotations of nodes where elements have none: shape matching over neighbours (shape.py).
+"""Rotations of nodes where elements have none: shape matching over neighbours (shape_matching.py).
 
 The exact properties of the warp hold for it as for the mean of element rotations. Iterations found in the falling beam
 of test_warp_in_motion.py, lockstep-10: element rotations 3.4, neighbours of level 1 3.6, of level 2 3.8, no warp 10.2.
@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sim_server.driver import Driver
-from sim_server.engine import Kind
+from sim_server.backends.cpu.engine import Kind
+from sim_server.mechanics.shape_matching import neighbours
 from sim_server.mesh import pose_matrix
-from sim_server.shape import neighbours
 from sim_server.simulation import Simulation
+from sim_server.updates.policy import Driver
 from tests.scenes import bar, factor_of, rotation, scene, simulation
 from tests.solver.solves import solve
 

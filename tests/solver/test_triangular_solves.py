@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""native/supernodal.h: z = P^T L^-T L^-1 P r, against the plain reference and SciPy."""
+"""backends/cpu/native/supernodal.h: z = P^T L^-T L^-1 P r, against the plain reference and SciPy."""
 
 import itertools
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Grabs that a factor's matrix did not have: the Woodbury correction of the factor (native/woodbury.h)."""
+"""Grabs that a factor's matrix did not have: the Woodbury correction of the factor (backends/cpu/native/woodbury.h)."""
 
 from typing import Any
 
@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sim_server import engine as engine_module
-from sim_server.driver import Driver
+from sim_server.backends.cpu import engine as engine_module
+from sim_server.backends.cpu.engine import NativeFactor
 from sim_server.effects.touch import Interaction, Touch
-from sim_server.engine import NativeFactor
 from sim_server.errors import InputError
 from sim_server.simulation import Simulation
+from sim_server.updates.policy import Driver
 from tests.scenes import bar, factor_of, rotation, simulation
 
 END = np.array([2.0, 1.0, 0.5])

@@ -5,9 +5,9 @@ from collections.abc import Callable
 from math import ceil
 
 from protocol.factor import Factor
-from sim_server.factors import Inline, Job
 from sim_server.simulation import Simulation
-from sim_server.track import flops
+from sim_server.updates.factor_source import Inline, Job
+from sim_server.updates.stats import flops
 
 
 class VirtualWorkers(Inline):

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from protocol.factor import Factor, FactorPattern
 from protocol.messages_pb2 import Header, Topology
 from protocol.method import Method
-from sim_server.factors import Job
 from sim_server.network.link import ServerLink
+from sim_server.updates.factor_source import Job
 from tests.ports import free_port
 
 ROOT = Path(__file__).parents[2]

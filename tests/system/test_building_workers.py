@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 from link_helpers import Driver, free_endpoint, process
 
-from sim_server import describe
-from sim_server.driver import Driver as Loop
-from sim_server.factors import Job
 from sim_server.network.link import ServerLink
+from sim_server.recording import messages as describe
 from sim_server.simulation import Simulation
+from sim_server.updates.factor_source import Job
+from sim_server.updates.policy import Driver as Loop
 from tests.scenes import bar, simulation
 
 pytestmark = pytest.mark.system

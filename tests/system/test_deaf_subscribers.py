@@ -15,8 +15,8 @@ from protocol.channels import key
 from protocol.messages_pb2 import Factor, Status
 from protocol.network.session import open_session
 from protocol.shared_memory import limits as shm_limits
-from sim_server.factors import Job
 from sim_server.network.link import ServerLink
+from sim_server.updates.factor_source import Job
 
 pytestmark = pytest.mark.system
 

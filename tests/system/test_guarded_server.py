@@ -11,9 +11,9 @@ from link_helpers import DenseAnalysis, free_endpoint
 
 from protocol.messages_pb2 import Factor, Topology
 from protocol.validate import checksum
-from sim_server import describe
-from sim_server.driver import Driver
 from sim_server.network.link import ServerLink
+from sim_server.recording import messages as describe
+from sim_server.updates.policy import Driver
 from tests.scenes import bar, simulation
 
 pytestmark = pytest.mark.system

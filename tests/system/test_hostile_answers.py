@@ -11,8 +11,8 @@ from hand_worker import HandWorker, change
 from link_helpers import DenseAnalysis, Driver, chain, dense, free_endpoint, matrix, product
 
 from protocol.messages_pb2 import Factor, FactorPattern, Matrix
-from sim_server.factors import Job
 from sim_server.network.link import ServerLink
+from sim_server.updates.factor_source import Job
 
 pytestmark = pytest.mark.system
 

@@ -15,7 +15,7 @@ from mcap.records import Message as McapMessage
 from clients.client import Client
 from protocol import messages_pb2 as pb
 from protocol.log_chunks import BadLog, ChunkFile
-from sim_server.mcap_file import McapFile
+from sim_server.recording.mcap_file import McapFile
 from sim_server.replay.log import Recording
 from tests.system.link_helpers import PATIENCE
 from tests.system.server_process import Stage, beam, fresh, run, until

@@ -10,7 +10,7 @@ from precond_worker import cli
 from precond_worker.errors import DeviceUnusable
 from precond_worker.factorization.factorize import Analysis
 from precond_worker.gpu import device
-from tests.core import nvrtc
+from tests.support import nvrtc
 from tests.worker.block_matrices import pattern
 
 

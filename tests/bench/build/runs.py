@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import Factor
-from sim_server import describe
-from sim_server.driver import Driver
+from sim_server.recording import messages as describe
+from sim_server.updates.policy import Driver
 from sim_server.network.link import ServerLink
 from sim_server.simulation import Simulation
-from sim_server.supervisor import Supervisor
+from sim_server.service.supervisor import Supervisor
 from tests.bench.faults.net import ADDRESS, Cable
 from tests.bench.harness.schemes import SCENES
 from tests.bench.harness.report import ROOT

@@ -22,11 +22,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_server import describe
-from sim_server.driver import Driver
 from sim_server.network.link import ServerLink
+from sim_server.recording import messages as describe
+from sim_server.service.supervisor import Supervisor
 from sim_server.simulation import Simulation
-from sim_server.supervisor import Supervisor
+from sim_server.updates.policy import Driver
 from tests.bench.cpu.scipy_step import ScipyStep
 from tests.bench.harness.report import ROOT, Report, plots
 

@@ -234,8 +234,8 @@ def main() -> None:
         return
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that processes and namespaces go too
     if "gpu" in (o.device, o.worker_device):
+        from sim_server.backends.gpu.device import cupy
         from sim_server.errors import DeviceError
-        from sim_server.gpu.device import cupy
 
         try:
             cupy()

@@ -147,7 +147,7 @@ def main() -> None:
         merge(o.merge, o.out)
         return
     try:
-        from sim_server.gpu.device import cupy
+        from sim_server.backends.gpu.device import cupy
 
         cupy()
     except DeviceError as error:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csr_matrix, tril
 
-from sim_server.gpu.device import cupy
+from sim_server.backends.gpu.device import cupy
 from tests.bench.gpu.device import timed
 from tests.bench.gpu.steps import Sample
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csr_matrix
 
-from sim_server.gpu.device import cupy
+from sim_server.backends.gpu.device import cupy
 
 FILL_MODE, LOWER, UPPER = 0, 0, 1  # of cuSPARSE
 

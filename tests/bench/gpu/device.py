@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from sim_server.gpu.device import cupy
+from sim_server.backends.gpu.device import cupy
 
 BARRIER = r"""
 extern "C" __global__ void barriers(unsigned* arrived, double* partial, double* out, int count) {

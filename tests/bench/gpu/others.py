@@ -15,7 +15,7 @@ import numpy as np
 from scipy.sparse import csc_matrix, csr_matrix
 
 from protocol.factor import FactorPattern
-from sim_server.gpu.device import cupy
+from sim_server.backends.gpu.device import cupy
 from tests.bench.gpu import cudss
 from tests.bench.gpu.cusparse import LOWER, UPPER, Product, Triangle, device_csr
 from tests.bench.gpu.device import timed, timed_in_graph

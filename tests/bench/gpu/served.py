@@ -18,13 +18,13 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_server import describe
-from sim_server.driver import Driver
-from sim_server.factors import Job
 from sim_server.network.link import ServerLink
-from sim_server.service import NAP
+from sim_server.recording import messages as describe
+from sim_server.service.service import NAP
+from sim_server.service.supervisor import Supervisor
 from sim_server.simulation import Simulation
-from sim_server.supervisor import Supervisor
+from sim_server.updates.factor_source import Job
+from sim_server.updates.policy import Driver
 from tests.bench.gpu.problem import Problem
 from tests.state import put
 

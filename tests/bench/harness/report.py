@@ -95,7 +95,7 @@ def machine() -> dict[str, Any]:
 def versions() -> dict[str, str]:
     """Of Python, the packages that count, the factorization library and the compiler."""
     from precond_worker.factorization.factorize import default_library
-    from sim_server.backend import compiler
+    from sim_server.backends.compiler import compiler
 
     found = {"python": platform.python_version(), **{p: _version(p) for p in PACKAGES}}
     return {**found, "factorization": default_library()[0], "compiler": _first_line([compiler(), "--version"])}

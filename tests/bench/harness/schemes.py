@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol import messages_pb2 as pb
-from sim_server.driver import Driver
 from sim_server.simulation import Simulation
+from sim_server.updates.policy import Driver
 from tests.bench.harness.report import ROOT
 from tests.ports import free_port
 

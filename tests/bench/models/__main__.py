@@ -165,7 +165,7 @@ def options() -> argparse.Namespace:
 
 
 def _gpu() -> bool:
-    from sim_server.gpu.device import cupy
+    from sim_server.backends.gpu.device import cupy
 
     try:
         cupy()

@@ -72,7 +72,7 @@ def _by_part(launches: Sequence[Any]) -> dict[str, list[Any]]:
 
 def _fused(launches: Sequence[Any]) -> dict[str, list[Any]]:
     """Those of nodes and of blocks, whatever parts they have, count as sums."""
-    from sim_server.gpu.fuse import fused
+    from sim_server.backends.gpu.kernel_fusion import fused
 
     kernels: dict[str, list[Any]] = {p: [] for p in PARTS}
     for kernel in fused(launches):

@@ -3,10 +3,10 @@
 
 from dataclasses import replace
 
-from sim_server import describe
-from sim_server.assembly import Assembly
-from sim_server.factors import Inline, Job
+from sim_server.recording import messages as describe
 from sim_server.simulation import Simulation
+from sim_server.updates.factor_source import Inline, Job
+from sim_server.updates.worker_assembly import Assembly
 
 
 class BuildingInline(Inline):

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from precond_worker.factorization.factorize import Analysis
-from sim_server.driver import Driver
-from sim_server.engine import Kind
+from sim_server.backends.cpu.engine import Kind
 from sim_server.simulation import Simulation
-from sim_server.track import flops
+from sim_server.updates.policy import Driver
+from sim_server.updates.stats import flops
 from tests.bench.paper.beam import Beam, Load
 from tests.bench.paper.building import BuildingInline
 from tests.support.virtual_workers import VirtualWorkers

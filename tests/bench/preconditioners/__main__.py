@@ -14,9 +14,9 @@ import numpy as np
 import typer
 
 from protocol.factor import Factor, FactorPattern
-from sim_server.driver import Driver
-from sim_server.guard import Guard
 from sim_server.simulation import Simulation
+from sim_server.updates.factor_check import Guard
+from sim_server.updates.policy import Driver
 from tests.bench.harness.report import Report, best_of, plots
 from tests.bench.harness.schemes import SCENES
 from tests.bench.preconditioners.grabs import WAYS, Hand, grab_row, short

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_server.driver import Driver
 from sim_server.effects.touch import Interaction, Touch
 from sim_server.simulation import Simulation
+from sim_server.updates.policy import Driver
 from tests.bench.harness.schemes import SCENES
 
 SPEED = 0.5  # m/s, of the hand
@@ -25,7 +25,7 @@ TIMED = ("stale", "corrected")
 WORDS = """\
 *nodes*: grabbed; *stiffness*: of the spring of each, what it adds to A by the mean diagonal of the nodes' own blocks.
 Iterations of the first solve and of all until a factor has the springs, or lacks them again. *stale*: the warped factor
-alone; *corrected*: `woodbury` (sim_server/native/woodbury.h); *fresh*: a factor of each step's matrix. *ms*: processor
+alone; *corrected*: `woodbury` (native/woodbury.h); *fresh*: a factor of each step's matrix. *ms*: processor
 time of these steps, assembly and all, the least of the rounds for each step."""
 
 

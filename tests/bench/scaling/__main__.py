@@ -25,13 +25,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_server import describe
-from sim_server.driver import Driver
 from sim_server.errors import DeviceError
 from sim_server.network.link import ServerLink
-from sim_server.service import NAP
+from sim_server.recording import messages as describe
+from sim_server.service.service import NAP
+from sim_server.service.supervisor import Supervisor
 from sim_server.simulation import Simulation
-from sim_server.supervisor import Supervisor
+from sim_server.updates.policy import Driver
 from tests.bench.harness.pieces import Limit, Merged, Piece, arguments_of_pieces, say, shown
 from tests.bench.scaling import page
 from tests.state import put
@@ -187,7 +187,7 @@ def usable(devices: list[str]) -> list[str]:
     """Those of this machine; says why the others are skipped."""
     if "gpu" not in devices:
         return devices
-    from sim_server.gpu.device import cupy
+    from sim_server.backends.gpu.device import cupy
 
     try:
         cupy()

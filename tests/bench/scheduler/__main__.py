@@ -9,9 +9,9 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from sim_server.driver import Driver
-from sim_server.factors import Job
 from sim_server.simulation import Simulation
+from sim_server.updates.factor_source import Job
+from sim_server.updates.policy import Driver
 from tests.bench.harness.pieces import Merged, Piece
 from tests.bench.harness.report import Report, plots
 from tests.bench.scheduler.few_wild import APART, Load, is_wild, scene

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from sim_server.effects.touch import Interaction, Touch
+from sim_server.mechanics.world import Body
 from sim_server.scene.model import Scene
 from sim_server.simulation import Simulation
-from sim_server.world import Body
 
 SIZES = ((4, 2, 2), (6, 3, 2), (6, 3, 3))  # cells: 96, 216, 324 tetrahedra
 LENGTH, DT = 3.0, 0.02  # m, s

@@ -9,9 +9,9 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_server.driver import Driver
 from sim_server.effects.touch import Interaction, Touch
 from sim_server.simulation import Simulation
+from sim_server.updates.policy import Driver
 from tests.scenes import bar, mesh_file, simulation
 
 Reals = NDArray[np.float64]

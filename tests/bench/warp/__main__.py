@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_server.driver import Driver
+from sim_server.updates.policy import Driver
 from tests.bench.harness.pieces import Limit, Merged, Piece, Row, arguments_of_pieces
 from tests.bench.harness.report import Report, plots
 from tests.bench.harness.units import Unit, arguments_of_units, asked_for, chosen, measure

@@ -1,0 +1,319 @@
+# SPDX-License-Identifier: MIT
+"""The native simulation loop as seen from Python: its memory, its mailboxes and what it reports.
+
+`Engine.run` lets go of Python's lock for as long as it runs. Everything else here only puts things into mailboxes or
+reads what the loop has left in its rings, and may be called from another thread meanwhile. Layouts: structs.py.
+"""
+
+import ctypes as c
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol.factor import FactorPattern
+from sim_server.backends.compiler import Launch, native
+from sim_server.backends.cpu import structs
+from sim_server.backends.cpu.structs import RECORD
+from sim_server.backends.ring_buffers import Reports
+from sim_server.mechanics.energy import Energies, NativeEnergies
+from sim_server.mechanics.newton import Newton
+
+Reals = NDArray[np.float64]
+HISTORY = 1024  # changes of the diagonal that are remembered, of each body
+
+
+class Kind(IntEnum):
+    """Preconditioners that the loop can apply."""
+
+    NONE = 0
+    JACOBI = 1
+    BLOCK_JACOBI = 2
+    CHOLESKY = 3  # and any other factor
+    SSOR = 4  # by sweeps over the present matrix
+
+
+@cache
+def _library() -> c.CDLL:
+    loop, p = c.POINTER(structs.Loop), c.c_void_p
+    library = native(
+        "backends/cpu/native/loop.cpp",
+        {
+            "wf_assemble": (None, [loop]), "wf_solve": (None, [loop]), "wf_run": (c.c_int64, [loop, c.c_int64]),
+            "wf_wait": (c.c_int32, [loop]),
+            "wf_post_factor": (p, [c.POINTER(structs.Body), p]), "wf_post_binding": (p, [c.POINTER(structs.Launch), p]),
+            "wf_apply_factor": (None, [c.POINTER(structs.Factor), p, p, p]), "wf_sizes": (c.c_int32, [p]),
+            "wf_precondition": (None, [loop, c.c_int32, p, p, p]),
+        },
+    )  # fmt: skip
+    sizes = (c.c_int32 * 11)()
+    library.wf_sizes(sizes)
+    newton = [c.sizeof(structs.Newton), c.sizeof(structs.Search)]
+    energy = [c.sizeof(structs.Elastic), c.sizeof(structs.Energies), structs.BALANCE.itemsize]
+    shared = (structs.Launch, structs.Body, structs.Loop, structs.Factor, structs.Pattern)
+    ours = [*(c.sizeof(t) for t in shared), RECORD.itemsize, *newton, *energy]
+    structs.check_sizes("backends/cpu/native/loop.cpp", list(sizes), ours)
+    return library
+
+
+class NativeFactor:
+    """A factor in memory that native code can apply: to the given values, which are not copied."""
+
+    def __init__(self, pattern: FactorPattern, values: NDArray[Any], step: int = -1):
+        self.pattern = pattern
+        self.values = values
+        width, height = np.diff(pattern.super_start).astype(np.int64), np.diff(pattern.row_start)
+        sizes = width * height - width * (width - 1) // 2
+        self._value_start = np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64)
+        self._pattern = structs.Pattern(
+            pattern.size, len(width), pattern.permutation.ctypes.data, pattern.super_start.ctypes.data,
+            pattern.row_start.ctypes.data, pattern.rows.ctypes.data, self._value_start.ctypes.data,
+        )  # fmt: skip
+        self.native = structs.Factor(c.pointer(self._pattern), values.ctypes.data, step, values.itemsize, 0)
+
+    @classmethod
+    def empty(cls, pattern: FactorPattern, dtype: np.dtype | type) -> "NativeFactor":
+        """Room for a factor, to be filled."""
+        return cls(pattern, np.zeros(pattern.nonzeros, dtype))
+
+    @property
+    def address(self) -> int:
+        """What mailboxes hold."""
+        return c.addressof(self.native)
+
+    def fill(self, values: NDArray[Any], step: int) -> None:
+        """Copies the values of L made from the matrix of `step`."""
+        self.values[:] = values
+        self.native.step = step
+
+    def apply(self, r: Reals) -> Reals:
+        """P^-1 r, (size,), outside of any step. A probe for tests and benchmarks."""
+        r = np.ascontiguousarray(r, dtype=np.float64)
+        z, work = np.empty_like(r), np.empty(2 * len(r))
+        _library().wf_apply_factor(c.byref(self.native), r.ctypes.data, z.ctypes.data, work.ctypes.data)
+        return z
+
+
+@dataclass
+class Mailbox:
+    """Factor buffers of a body, two of them: one in use, the other waiting or to be filled."""
+
+    buffers: list[NativeFactor]
+    waiting: NativeFactor | None = None  # as posted last
+    in_use: NativeFactor | None = None  # as far as the mailbox has told
+
+
+class _NativeNewton:
+    """The input of Newton-Raphson and its memory, attached to a loop and its launches."""
+
+    def __init__(self, newton: Newton, loop: structs.Loop, launches: Any):
+        self._room = np.zeros((18, len(newton.arrays["mass"])))
+        self._search = (structs.Search * loop.bodies)()
+        self._arrays = newton.arrays
+        options = newton.options
+        self.native = structs.Newton(options.linearizations, options.trials, options.tolerance, newton.reach)
+        for name, array in {**newton.arrays, "room": self._room}.items():
+            setattr(self.native, name, array.ctypes.data)
+        self.native.search = self._search
+        loop.newton = c.pointer(self.native)
+        self._parts = newton.parts
+        for launch, part in zip(launches, newton.parts, strict=False):
+            launch.parts = None if part is None else part.ctypes.data
+
+
+class Engine(Reports):
+    """The loop over one system.
+
+    assemble, integrate: the launches of a step, in order. ranges: nodes [first, last) of each body. newton: for several
+    linearizations a step. energies: of its bodies; None: steps are not watched. arrays: those of the system by name
+    (row_start, columns, values, b, y, x, v, clock, moving).
+    """
+
+    def __init__(
+        self, assemble: Sequence[Launch], integrate: Sequence[Launch], ranges: Sequence[tuple[int, int]], dt: float,
+        records: int = 8192, frames: int = 8, threads: int = 1, newton: Newton | None = None,
+        energies: Energies | None = None, **arrays: NDArray[Any],
+    ):  # fmt: skip
+        self._native = _library()
+        launches = [*assemble, *integrate]
+        nodes, bodies = len(arrays["x"]), len(ranges)
+        self.launches = launches
+        self._bindings = [structs.Binding(c.addressof(x.params), x.items, 0, -1) for x in launches]
+        self._launch = (structs.Launch * max(len(launches), 1))()
+        for entry, launch, binding in zip(self._launch, launches, self._bindings, strict=False):
+            entry.kernel, entry.binding = launch.function, c.addressof(binding)
+        self._body = (structs.Body * bodies)()
+        for entry_body, (first, last) in zip(self._body, ranges, strict=True):
+            entry_body.first, entry_body.last, entry_body.snapshot_step = first, last, -1
+        self._work = np.zeros(27 * nodes)
+        self._corrections: dict[int, Any] = {}
+        self._arrays = arrays
+        self._mail: list[Mailbox] = [Mailbox([]) for _ in ranges]
+        self._copies: list[Reals | None] = [None] * bodies
+        self._posted: dict[int, Any] = {}
+        loop = structs.Loop()
+        super().__init__(loop, bodies, dt, records, np.zeros((frames, 2, nodes, 3)))
+        loop.launches, loop.before, loop.launch = len(launches), len(assemble), self._launch
+        loop.bodies, loop.nodes, loop.body = bodies, nodes, self._body
+        for name in ("row_start", "columns", "values", "b", "y", "x", "v", "clock", "moving"):
+            setattr(loop, name, arrays[name].ctypes.data)
+        loop.work, loop.threads = self._work.ctypes.data, threads
+        self._newton = newton and _NativeNewton(newton, loop, self._launch)
+        self._energies = energies and NativeEnergies(energies)
+        if self._energies:
+            loop.energies = c.pointer(self._energies.native)
+        self.begin: list[Launch] = []  # before the first step
+
+    exact = True  # settings and factors hold from the very next solve on
+
+    # --- running ------------------------------------------------------------------------------------------------
+
+    def run(self, steps: int) -> int:
+        """Runs up to `steps` steps without Python; returns those done (fewer only after `stop`)."""
+        self._begin()
+        return int(self._native.wf_run(c.byref(self.loop), steps))
+
+    def assemble(self) -> None:
+        """First half of one step: the system matrix and right-hand side."""
+        self._begin()
+        self._native.wf_assemble(c.byref(self.loop))
+
+    def solve(self) -> None:
+        """Second half: solve, integrate, report."""
+        self._native.wf_solve(c.byref(self.loop))
+
+    def _begin(self) -> None:
+        """What a scheme makes of the state before the first step."""
+        if self.step == 0:
+            for launch in self.begin:
+                launch()
+
+    def wait(self) -> bool:
+        """Sleeps until the next step is due (real time) and while paused, as `run` does before each step.
+
+        False if the loop is to stop.
+        """
+        return bool(self._native.wf_wait(c.byref(self.loop)))
+
+    def settings(self, body: int) -> structs.Settings:
+        """Solver settings of a body; what is set holds from its next solve on."""
+        return self._body[body].settings
+
+    def correct(self, body: int, nodes: int, diagonal: Reals, double: bool = False) -> None:
+        """Factors of the body are corrected for what has come onto the diagonal since their matrix, or has left it, at
+        so many nodes at most (backends/cpu/native/woodbury.h).
+
+        nodes: 1 to 64. diagonal: (nodes of the scene,) [kg], as assembled. double: also factors in float64. Before the
+        first step only.
+        """
+        assert 1 <= nodes <= 64, "MOST in backends/cpu/native/woodbury.h"
+        entry = self._body[body]
+        count, width = entry.last - entry.first, -(-3 * nodes // 8) * 8
+        room: dict[str, NDArray[Any]] = {
+            "last": np.full(count, 0.0), "then": np.full(count, 0.0), "change": np.full((HISTORY, 3), 0.0),
+            "node": np.full(nodes, 0, np.int32), "supernode": np.full(3 * count, 0, np.int32),
+            "marked": np.full(3 * count, 0, np.uint8), "delta": np.full(nodes, 0.0),
+            "small": np.full(4 * width**2 + 2 * width, 0.0),
+            "columns": np.zeros((3 * count, width), np.float64 if double else np.float32),  # touched by the first grab
+            "diagonal": diagonal[entry.first : entry.last],
+        }  # fmt: skip
+        self._corrections[body] = room
+        correction = entry.correction
+        correction.capacity, correction.history, correction.nodes, correction.forgotten = nodes, HISTORY, count, -1
+        for name, array in room.items():
+            setattr(correction, name, array.ctypes.data)
+
+    def corrected(self, body: int) -> int:
+        """Number of nodes at which the last solve corrected the factor in use. A probe for tests; only while the loop
+        stands still."""
+        return int(self._body[body].correction.used)
+
+    def precondition(self, body: int, r: Reals) -> Reals:
+        """P^-1 r, (3 nodes of the body,), with its factor as the next solve has it. A probe for tests. Needs a factor
+        and an assembled matrix; r must not be 0."""
+        r = np.ascontiguousarray(r, dtype=np.float64)
+        z, work = np.empty_like(r), np.empty(2 * len(r))
+        self._native.wf_precondition(c.byref(self.loop), body, r.ctypes.data, z.ctypes.data, work.ctypes.data)
+        return z
+
+    # --- mailboxes ----------------------------------------------------------------------------------------------
+
+    def post_factor(self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int) -> None:
+        """Copies a factor into a free buffer; the loop takes it up before its next solve of the body."""
+        buffer = self._free_buffer(body, pattern, values.dtype)
+        buffer.fill(values, step)
+        self._mail[body].waiting = buffer
+        self._native.wf_post_factor(c.byref(self._body[body]), buffer.address)
+
+    def settle_factors(self) -> None:
+        """Sees to it that the next solve uses what was posted; here it does so anyway."""
+
+    def _free_buffer(self, body: int, pattern: FactorPattern, dtype: np.dtype) -> NativeFactor:
+        """One that the loop does not have. What still waits is taken back, since a newer one is coming.
+
+        Which one the loop has follows from what the mailbox gives back. Its own pointer would not do: between taking
+        a factor out of the mailbox and noting it there the loop has both.
+        """
+        mail = self._mail[body]
+        taken_back = self._native.wf_post_factor(c.byref(self._body[body]), None)
+        if not taken_back and mail.waiting is not None:
+            mail.in_use = mail.waiting
+        mail.waiting = None
+        for i, buffer in enumerate(mail.buffers):
+            if buffer is mail.in_use:
+                continue
+            if buffer.pattern is not pattern or buffer.values.dtype != dtype:
+                mail.buffers[i] = NativeFactor.empty(pattern, dtype)
+            return mail.buffers[i]
+        mail.buffers.append(NativeFactor.empty(pattern, dtype))
+        return mail.buffers[-1]
+
+    def factor_step(self, body: int) -> int:
+        """Step of the factor in use, -1 without one."""
+        address = self._body[body].factor
+        return int(c.cast(address, c.POINTER(structs.Factor)).contents.step) if address else -1
+
+    def factor_bytes(self, body: int) -> int:
+        """What an application reads of the factor posted last, values and rows; 0 while there is none."""
+        mail = self._mail[body]
+        newest = mail.waiting or mail.in_use
+        return newest.values.nbytes + newest.pattern.rows.nbytes if newest else 0
+
+    def request_matrix(self, body: int, target: Reals) -> None:
+        """The loop copies the values of A into `target` once they are next assembled."""
+        self._request(body, target, -1.0)
+
+    def request_positions(self, body: int, target: Reals, ahead: float = 0.0) -> None:
+        """The loop copies x + ahead v, (nodes, 3), into `target` when it next assembles; ahead: 0 or more [s].
+
+        In all else like `request_matrix`; each replaces what the other asked for.
+        """
+        self._request(body, target, ahead)
+
+    def _request(self, body: int, target: Reals, ahead: float) -> None:
+        entry = self._body[body]
+        entry.snapshot = None  # or the loop might take one request for the other
+        self._copies[body] = target
+        entry.snapshot_step, entry.ahead = -1, ahead
+        entry.snapshot = target.ctypes.data
+
+    def matrix_step(self, body: int) -> int:
+        """Step of the copy asked for last, -1 while it is not there. `step` counts the steps completed before it."""
+        return int(self._body[body].snapshot_step)
+
+    def replace(self, launch: int, new: Launch) -> structs.Binding:
+        """Gives a launch other arguments, from the next step on: the one after the result's `taken` steps, once it is
+        not below 0."""
+        binding = structs.Binding(c.addressof(new.params), new.items, 0, -1)
+        displaced = self._native.wf_post_binding(c.byref(self._launch[launch]), c.addressof(binding))
+        kept = self._posted.setdefault(launch, [])  # in use, waiting
+        if displaced:
+            kept.pop()  # it was never taken up; what is in use must live on
+        else:
+            del kept[:-1]  # the last one was taken up, so those before are done with
+        kept.append((binding, new))
+        return binding

@@ -1,0 +1,243 @@
+// SPDX-License-Identifier: MIT
+// The simulation loop. It runs the launches of a step, solves each body, and exchanges data with the rest of the server only
+// through mailboxes: an atomic pointer or flag each, looked at between solves, never waited for. The caller (ctypes) has let
+// go of Python's lock, so no Python code, network, worker or disk can delay a step.
+#include <cstring>
+
+#include "energy.h"
+#include "newton.h"
+
+static_assert(NOT_FINITE == STATUS_NOT_FINITE && RUNAWAY == STATUS_RUNAWAY, "statuses of ring_buffers.h and pcg.h differ");
+
+static void take_mail(Launch& l, int64_t step) {
+    if (Binding* next = l.mail.exchange(nullptr)) {
+        l.binding = next;
+        next->taken = step;
+    }
+}
+
+static void run(const Launch& l, int threads) {
+    const int64_t items = l.binding->items, grain = 512;
+    int parts = (int)(items / grain < threads ? items / grain : threads);
+    if (parts < 2) {
+        if (items > 0) l.kernel(l.binding->params, 0, (int)items);
+        return;
+    }
+#pragma omp parallel for num_threads(parts) schedule(static, 1)
+    for (int k = 0; k < parts; ++k) l.kernel(l.binding->params, (int)(items * k / parts), (int)(items * (k + 1) / parts));
+}
+
+// The same for the bodies whose search is not over: arguments stay as they are within a step. What is not told apart by bodies
+// runs for all; the next step begins all over.
+static void run_for_those_left(const Loop& loop, const Launch& l) {
+    const Search* search = loop.newton->search;
+    int left = 0;
+    for (int i = 0; i < loop.bodies; ++i) left += search[i].phase != DONE;
+    if (!l.parts || left == loop.bodies) { run(l, loop.threads); return; }
+#pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) if (loop.threads > 1 && left > 1)
+    for (int i = 0; i < loop.bodies; ++i)
+        if (search[i].phase != DONE && l.parts[i] < l.parts[i + 1]) l.kernel(l.binding->params, l.parts[i], l.parts[i + 1]);
+}
+
+// Linearizes, solves and tries until every body has what it is to have; then y is its whole change of velocity.
+static void search_all(Loop& loop) {
+    double begin = now(), solving = 0;
+    for (bool left = true; left;) {
+        double t = now();
+#pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) if (loop.threads > 1 && loop.bodies > 1)
+        for (int i = 0; i < loop.bodies; ++i) solve(loop, i);
+        solving += now() - t;
+        for (int i = 0; i < loop.before; ++i) run_for_those_left(loop, loop.launch[i]);
+        left = false;
+#pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) reduction(|| : left) if (loop.threads > 1 && loop.bodies > 1)
+        for (int i = 0; i < loop.bodies; ++i) left = judge(loop, i) != DONE || left;
+    }
+    for (int i = 0; i < loop.bodies; ++i) end_search(loop, i);
+    loop.assemble_seconds += now() - begin - solving;
+}
+
+static void take_factor(Body& body) {
+    if (const Factor* next = body.mail.exchange(nullptr)) body.factor = next;
+}
+
+// Settings and factor of a step, in this order: who asks for a factor's use has posted it before. What is written to the settings
+// later is for the next step, or a step would be recorded as asked for what it did not have.
+static void take_orders(Body& body) {
+    body.now = body.settings;
+    take_factor(body);
+}
+
+static void copy_for_worker(Loop& loop, Body& body) {
+    double* target = body.snapshot.load(std::memory_order_acquire);
+    if (!target) return;
+    if (body.ahead < 0) {
+        int64_t begin = loop.row_start[body.first], end = loop.row_start[body.last];
+        std::memcpy(target, loop.values + 9 * begin, 9 * sizeof(double) * (end - begin));
+    } else {
+        for (int64_t k = 3 * (int64_t)body.first; k < 3 * (int64_t)body.last; ++k)
+            *target++ = loop.x[k] + body.ahead * loop.v[k];
+    }
+    body.snapshot.store(nullptr, std::memory_order_relaxed);
+    body.snapshot_step.store(loop.rings.step, std::memory_order_release);
+}
+
+static bool room_for_frame(Rings& rings) {
+    while (rings.frame_head.load() - rings.frame_tail.load(std::memory_order_acquire) >= rings.frame_capacity) {
+        if (!rings.patient || rings.stop.load()) return false;
+        nap(2e-4);
+    }
+    return true;
+}
+
+static void write_frame(Loop& loop) {
+    Rings& rings = loop.rings;
+    const int64_t every = rings.frame_every.load();  // once: it may become 0 meanwhile
+    if (every <= 0 || rings.step % every) return;
+    if (!room_for_frame(rings)) { ++rings.frames_dropped; return; }
+    int64_t slot = rings.frame_head.load() % rings.frame_capacity, size = 3 * (int64_t)loop.nodes;
+    double* frame = rings.frames + 2 * size * slot;
+    std::memcpy(frame, loop.x, sizeof(double) * size);
+    std::memcpy(frame + size, loop.v, sizeof(double) * size);
+    rings.frame_steps[slot] = rings.step;
+    rings.frame_head.fetch_add(1, std::memory_order_release);
+}
+
+static int first_bad_node(const Loop& loop, const Body& body) {
+    for (int i = body.first; i < body.last; ++i)
+        for (int k = 0; k < 3; ++k)
+            if (!std::isfinite(loop.b[3 * i + k])) return i - body.first;
+    return -1;
+}
+
+static void assemble(Loop* loop) {
+    double begin = now();
+    Rings& rings = loop->rings;
+    loop->cpu_begin = thread_time();
+    loop->clock[0] = rings.start_time + rings.step * rings.dt;
+    for (int i = 0; i < loop->bodies; ++i) {
+        take_orders(loop->body[i]);
+        loop->moving[i] = 0;
+    }
+    for (int i = 0; i < loop->before; ++i) {
+        take_mail(loop->launch[i], rings.step);
+        run(loop->launch[i], loop->threads);
+    }
+    for (int i = 0; i < loop->bodies; ++i) {
+        Body& body = loop->body[i];
+        note_changes(body.correction, rings.step, body.steps == 0);
+        copy_for_worker(*loop, body);
+    }
+    loop->assemble_begin = begin;
+    loop->assemble_seconds = now() - begin;
+}
+
+static void finish_step(Loop* loop) {
+    Rings& rings = loop->rings;
+    int64_t first = rings.record_head.load(), step = rings.step + 1;
+    double entered = now();
+    bool keep = room_for_records(rings, loop->bodies, [] {});
+    double waited = now() - entered;  // no part of the step
+    if (loop->newton) {
+        for (int i = 0; i < loop->bodies; ++i) begin_search(*loop, i);
+        search_all(*loop);
+    }
+#pragma omp parallel for num_threads(loop->threads) schedule(dynamic, 1) if (loop->threads > 1 && loop->bodies > 1)
+    for (int i = 0; i < loop->bodies; ++i) {
+        Body& body = loop->body[i];
+        const SolveSettings& settings = body.now;
+        int linearizations = 1;
+        double nonlinear = -1;
+        SolveResult r;
+        if (loop->newton) {
+            r = found(loop->newton->search[i]);
+            linearizations = std::max(1, loop->newton->search[i].linearizations);
+            nonlinear = remaining(loop->newton->search[i]);
+        } else {
+            BlockCsr A{body.first, body.last, loop->row_start, loop->columns, loop->values};
+            r = pcg(A, loop->b + 3 * body.first, body.factor, settings, loop->y + 3 * body.first,
+                    loop->work + 27 * (int64_t)body.first, !loop->moving[i], &body.correction);
+        }
+        ++body.steps;
+        if (!keep) continue;
+        Record& record = rings.records[(first + i) % rings.record_capacity];
+        bool used = body.factor && (settings.kind == CHOLESKY || r.kind == CHOLESKY || r.fallbacks);
+        record = Record{step, used ? body.factor->step : -1, rings.start_time + step * rings.dt, r.residual,
+                        loop->assemble_seconds, r.seconds, 0, 0, rings.late, loop->assemble_begin, 0, nonlinear, NAN, NAN, NAN, NAN,
+                        NAN, NAN, i, r.iterations,
+                        r.status, r.kind, settings.kind, r.fallbacks, r.status == NOT_FINITE ? first_bad_node(*loop, body) : -1,
+                        settings.probe, linearizations, 0};
+    }
+    double solved = now();
+    for (int i = loop->before; i < loop->launches; ++i) run(loop->launch[i], loop->threads);
+    if (loop->energies) account(*loop, energy_due(rings, step));
+    double end = now(), cpu = thread_time() - loop->cpu_begin;
+    ++rings.step;
+    if (!keep) { rings.records_dropped += loop->bodies; }
+    else {
+        for (int i = 0; i < loop->bodies; ++i) {
+            Record& record = rings.records[(first + i) % rings.record_capacity];
+            record.integrate = end - solved;
+            record.whole = end - loop->assemble_begin - waited;  // with a factorization that the step waited for
+            record.cpu = cpu;
+            if (loop->energies) note_energy(record, loop->energies->balance[i]);
+        }
+        rings.record_head.store(first + loop->bodies, std::memory_order_release);
+    }
+    write_frame(*loop);
+}
+
+extern "C" {
+
+void wf_assemble(Loop* loop) {
+    if (loop->energies) enter(*loop);
+    assemble(loop);
+}
+
+// A factor posted since `wf_assemble` is made from the matrix of this step, or the caller does not mind; likewise settings.
+void wf_solve(Loop* loop) {
+    for (int i = 0; i < loop->bodies; ++i) take_orders(loop->body[i]);
+    finish_step(loop);
+    if (loop->energies) leave(*loop);
+}
+
+int32_t wf_wait(Loop* loop) { return wait_until_due(loop->rings, [] { return false; }); }
+
+// Runs until `steps` are done or `stop` is set; returns the steps done.
+int64_t wf_run(Loop* loop, int64_t steps) {
+    int64_t done = 0;
+    if (loop->energies) enter(*loop);
+    for (; done < steps && wf_wait(loop); ++done) {
+        assemble(loop);
+        finish_step(loop);
+    }
+    if (loop->energies) leave(*loop);
+    return done;
+}
+
+const Factor* wf_post_factor(Body* body, const Factor* factor) { return body->mail.exchange(factor); }
+Binding* wf_post_binding(Launch* launch, Binding* binding) { return launch->mail.exchange(binding); }
+
+// One application of a factor, z = P^-1 r. A probe for tests and benchmarks.
+void wf_apply_factor(const Factor* factor, const double* r, double* z, double* work) {
+    if (factor->bytes == 4) apply_factor(*factor->pattern, (const float*)factor->values, r, 1, z, (float*)work);
+    else apply_factor(*factor->pattern, (const double*)factor->values, r, 1, z, work);
+}
+
+// The same of what a solve of a body with its factor would use now, corrected for changes of the diagonal. A probe for tests.
+// work: 2 n doubles.
+void wf_precondition(Loop* loop, int32_t index, const double* r, double* z, double* work) {
+    Body& body = loop->body[index];
+    take_factor(body);
+    BlockCsr A{body.first, body.last, loop->row_start, loop->columns, loop->values};
+    Preconditioner P{A, body.factor, CHOLESKY, nullptr, work, 1, &body.correction};
+    P.prepare();
+    P.apply(r, std::sqrt(dot(A.size(), r, r)), z);
+}
+
+int32_t wf_sizes(int32_t* sizes) {  // layouts, checked against the Python side
+    sizes[0] = sizeof(Launch); sizes[1] = sizeof(Body); sizes[2] = sizeof(Loop); sizes[3] = sizeof(Factor);
+    sizes[4] = sizeof(Pattern); sizes[5] = sizeof(Record); sizes[6] = sizeof(Newton); sizes[7] = sizeof(Search);
+    sizes[8] = sizeof(Elastic); sizes[9] = sizeof(Energies); sizes[10] = sizeof(Balance);
+    return 11;
+}
+}

@@ -1,0 +1,92 @@
+// SPDX-License-Identifier: MIT
+// Memory of the simulation loop (loop.cpp). structs.py holds the same layouts.
+#pragma once
+#include "balance.cuh"
+#include "pcg.h"
+#include "search.cuh"
+
+typedef void (*Kernel)(const void* params, int begin, int end);
+
+struct Binding {           // arguments of a launch, replaceable between steps
+    const void* params;
+    int32_t items;
+    int32_t unused;
+    int64_t taken;   // steps completed when the loop took it up, -1: it has not
+};
+
+struct Launch {
+    Kernel kernel;
+    Binding* binding;
+    std::atomic<Binding*> mail;   // the next one, or null
+    const int32_t* parts;         // (bodies + 1,) items of each body, or null: not told apart
+};
+
+struct Body {
+    int32_t first, last;                // nodes
+    SolveSettings settings;             // as wanted, written from outside at any time
+    SolveSettings now;                  // of the step under way
+    const Factor* factor;               // in use
+    std::atomic<const Factor*> mail;    // a newer one, or null
+    std::atomic<double*> snapshot;      // where to copy the values of A, or the positions, or null
+    std::atomic<int64_t> snapshot_step; // step of the last copy made, -1: none
+    double ahead;                       // s: below 0 the copy is of A, else of x + ahead v
+    int64_t steps;                      // solved so far
+    Correction correction;
+};
+
+struct Newton {                        // several linearizations a step (newton.h)
+    Limits most;
+    double reach;                      // dx / dv [s]
+    const double* rotation;            // (nodes, 3, 3)
+    const double* mass;                // (nodes,) in A [kg]
+    const double* beta;                // (nodes,) [s]
+    double *ahead, *drift, *carried;   // (nodes, 3) [m/s]
+    double* room;                      // 18 doubles a node
+    Search* search;                    // (bodies,)
+};
+
+struct Elastic {                       // potential energies of the elements of an effect
+    Launch launch;
+    const double* energy;              // (items,) out [J]
+    const int32_t* parts;              // (bodies + 1,) items of each body
+};
+
+struct Energies {                      // energy.h
+    const double* gravity;             // (3,) [m/s2]
+    const double* mass;                // (nodes,) [kg]
+    const double* before;              // (nodes, 3) x when the step began [m]
+    double *force, *spring, *anchor;   // of hands (effects/touch.cu); null: nothing can be touched
+    double* free;                      // (nodes,) 0 from when a body is frozen
+    double** still;                    // arrays (nodes, 3) that are 0 then
+    Elastic* elastic;
+    Balance* balance;                  // (bodies,)
+    double* left;                      // (2, nodes, 3) x and v when the loop was left
+    int32_t stills, elastics, on_runaway, inertia;
+    int32_t begun;                     // the energy before the first step is known
+    int32_t unused;
+};
+
+struct Loop {
+    int32_t launches, before;          // launches; how many of them assemble (the others integrate)
+    Launch* launch;
+    int32_t bodies, nodes;
+    Body* body;
+    const int32_t* row_start;
+    const int32_t* columns;
+    const double* values;
+    const double* b;                   // (nodes, 3) right-hand side in the material frame
+    double* y;                         // (nodes, 3) start in, solution out
+    double* x;                         // (nodes, 3) for frames
+    double* v;
+    double* work;                      // 27 doubles a node
+    Newton* newton;                    // null: one linearization a step
+    double* clock;                     // (1,) s, read by kernels
+    int32_t* moving;                   // (bodies,) 0: the body rests (kernels/nodes.cu)
+    Energies* energies;                // or null
+    int32_t threads;                   // of this process, for launches and bodies
+    int32_t unused;
+    double assemble_begin;
+    double assemble_seconds;
+    double cpu_begin;
+    Rings rings;
+};

@@ -1,0 +1,159 @@
+// SPDX-License-Identifier: MIT
+// Preconditioned conjugate gradients for one body, numbered after Saad, Iterative Methods for Sparse Linear Systems, 2nd
+// edition, algorithm 9.1. What differs from the book:
+//   - a step counts as solved only by its true residual |b - A x| <= tolerance |b|, computed at the end; where the recursive one was
+//     too good the iteration starts again from the true one;
+//   - it starts from the last solution where that is better than zero;
+//   - of a body at rest, whose b is rounding (kernels/nodes.cu says when), x stays what it is at the start: to stand still;
+//   - p'Ap <= 0 and z'r <= 0 are looked for and named; a factor with z'r <= 0 is left for block Jacobi on the spot, and one that
+//     is not a quarter of the way (in decades of the residual) after half the iterations allowed, if these are ENOUGH, is left
+//     then: a useless factor costs iterations and never the answer. Not half of the way: the method speeds up, and an old factor
+//     would be left that still gets there. Of few iterations the first ones tell nothing, and block Jacobi makes nothing of the rest;
+//   - a budget of time makes one iteration at least: zero would leave a body without its forces;
+// An iteration is one application of A after the initial residual.
+#pragma once
+#include "bsr.h"
+#include "ring_buffers.h"
+#include "woodbury.h"
+
+enum Kind { NONE = 0, JACOBI = 1, BLOCK_JACOBI = 2, CHOLESKY = 3, SSOR = 4 };  // CHOLESKY: any factor
+enum Status { CONVERGED = 0, MAX_ITERATIONS = 1, BUDGET = 2, BREAKDOWN_MATRIX = 3, BREAKDOWN_PRECONDITIONER = 4, NOT_FINITE = 5,
+              MAX_LINEARIZATIONS = 6, RUNAWAY = 7 };  // the last two of a step
+
+constexpr int ENOUGH = 20;
+
+struct SolveSettings {
+    double tolerance;       // of |b|
+    double budget;          // s of wall time, 0: none; below 0: ends after -budget - 1 iterations (replays)
+    int32_t max_iterations;
+    int32_t kind;           // Kind wanted; CHOLESKY without a factor is BLOCK_JACOBI
+    int32_t warm_start;
+    int32_t probe;          // > 0: after so many iterations go from block Jacobi to the factor, or the other way
+    double omega;           // of SSOR
+};
+
+struct SolveResult {
+    double residual;        // true, relative
+    double seconds;
+    int32_t iterations, status;
+    int32_t kind;           // used at the end
+    int32_t fallbacks;      // 1: the factor was left in this solve
+};
+
+struct Preconditioner {
+    const BlockCsr& A;
+    const Factor* factor;
+    int kind;
+    double* inverse;  // (nodes, 9)
+    void* work;       // 2 n doubles
+    double omega;
+    Correction* correction = nullptr;
+    bool corrects = false;
+
+    void prepare() {
+        corrects = kind == CHOLESKY && correction && correction->capacity && Corrected{*correction, A, *factor}.prepare();
+        if (kind == JACOBI || kind == BLOCK_JACOBI || kind == SSOR) invert_diagonal(A, kind != JACOBI, inverse);
+    }
+    // z = P^-1 r; returns z . r
+    double apply(const double* r, double r_norm, double* z) {
+        int n = A.size();
+        if (kind == CHOLESKY && factor->bytes == 4)
+            with_factor<float>(r, r_norm, z);
+        else if (kind == CHOLESKY)
+            with_factor<double>(r, r_norm, z);
+        else if (kind == SSOR)
+            apply_ssor(A, inverse, omega, r, z);
+        else if (kind == NONE)
+            for (int i = 0; i < n; ++i) z[i] = r[i];
+        else
+            apply_diagonal(n / 3, inverse, r, z);
+        return dot(n, z, r);
+    }
+    template <class T>
+    void with_factor(const double* r, double r_norm, double* z) {
+        const T* values = (const T*)factor->values;
+        auto correct = [&](T* y) { Corrected{*correction, A, *factor}.between(y); };
+        if (corrects) apply_factor(*factor->pattern, values, r, 1 / r_norm, z, (T*)work, correct);
+        else apply_factor(*factor->pattern, values, r, 1 / r_norm, z, (T*)work);
+    }
+};
+
+// work: 9 n doubles. x: start in, solution out. rests: the body does. correction: of the factor, or null.
+static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor, const SolveSettings& settings, double* x,
+                       double* work, bool rests = false, Correction* correction = nullptr) {
+    double start = now();
+    int n = A.size();
+    double *r = work, *z = r + n, *p = z + n, *q = p + n, *inverse = q + n, *scratch = inverse + 3 * n;
+    SolveResult out{0, 0, 0, CONVERGED, settings.kind, 0};
+    if (out.kind == CHOLESKY && !factor) out.kind = BLOCK_JACOBI;
+    auto finish = [&](int status, double r2, double b2) {
+        out.status = status;
+        out.residual = b2 > 0 ? std::sqrt(r2 / b2) : 0;
+        out.seconds = now() - start;
+        return out;
+    };
+    auto zero = [&] { for (int i = 0; i < n; ++i) x[i] = 0; };
+
+    double b2 = dot(n, b, b);
+    if (!std::isfinite(b2)) {
+        for (int i = 0; i < n; ++i) x[i] = NAN;  // the kernel `advance` takes the body back
+        return finish(NOT_FINITE, b2, 1);
+    }
+    if (b2 == 0) { zero(); return finish(CONVERGED, 0, 0); }
+    double goal = settings.tolerance * settings.tolerance * b2;
+    if (rests) return finish(CONVERGED, residual(A, b, x, r), b2);
+    double r2 = settings.warm_start ? residual(A, b, x, r) : b2;                 // 1. r = b - A x
+    if (!settings.warm_start || !(r2 < b2)) {
+        zero();
+        for (int i = 0; i < n; ++i) r[i] = b[i];
+        r2 = b2;
+    }
+    if (r2 <= goal) return finish(CONVERGED, r2, b2);
+
+    Preconditioner P{A, factor, out.kind, inverse, scratch, settings.omega, correction};
+    P.prepare();
+    double rz = 0, last_true = INFINITY, quarter = r2 * std::pow(goal / r2, 0.25);
+    bool restart = true, switched = false;
+    auto leave_factor = [&] {
+        P.kind = out.kind = BLOCK_JACOBI;
+        out.fallbacks = 1;
+        P.prepare();
+        r2 = residual(A, b, x, r);
+        restart = true;
+    };
+    for (;;) {
+        double zr = P.apply(r, std::sqrt(r2), z);                                // 1. 6. z = P^-1 r
+        if (!(zr > 0 && zr < INFINITY)) {                                        // also NaN
+            if (P.kind != CHOLESKY) return finish(BREAKDOWN_PRECONDITIONER, residual(A, b, x, r), b2);
+            leave_factor();
+            continue;
+        }
+        conjugate(n, restart ? 0 : zr / rz, z, p);                               // 7. 8. p = z + beta p
+        rz = zr;
+        restart = false;
+        if (out.iterations == settings.max_iterations) return finish(MAX_ITERATIONS, residual(A, b, x, r), b2);
+        if (P.kind == CHOLESKY && settings.max_iterations >= ENOUGH && out.iterations == settings.max_iterations / 2 && !(r2 < quarter)) {
+            leave_factor();
+            continue;
+        }
+        if (out.iterations == settings.probe && settings.probe > 0 && factor && (P.kind == BLOCK_JACOBI || P.kind == CHOLESKY) && !switched) {
+            P.kind = out.kind = P.kind == CHOLESKY ? BLOCK_JACOBI : CHOLESKY;
+            P.prepare();
+            switched = restart = true;
+            continue;
+        }
+        bool spent = settings.budget > 0 ? out.iterations > 0 && now() - start > settings.budget : out.iterations + 1 == -settings.budget;
+        if (spent) return finish(BUDGET, residual(A, b, x, r), b2);
+
+        double pq = multiply(A, p, q);
+        ++out.iterations;
+        if (!(pq > 0)) return finish(BREAKDOWN_MATRIX, residual(A, b, x, r), b2);
+        r2 = descend(n, rz / pq, p, q, x, r);                                    // 3. 4. 5.
+        if (r2 > goal) continue;
+        r2 = residual(A, b, x, r);
+        if (r2 <= goal) return finish(CONVERGED, r2, b2);
+        if (!(r2 < 0.25 * last_true)) return finish(MAX_ITERATIONS, r2, b2);     // rounding is reached: more does not help
+        last_true = r2;
+        restart = true;
+    }
+}

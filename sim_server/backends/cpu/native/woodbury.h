@@ -1,0 +1,322 @@
+// SPDX-License-Identifier: MIT
+// What has come onto the diagonal of A, or left it, since the matrix of the factor in use: grabs of clients (effects/touch.py) set
+// in from one step to the next, and their stiff springs are missing from a factor until one comes that was made with them.
+// With U the columns of the identity at the nodes concerned and C the difference of their diagonals,
+//     (P + U C U')^-1 = L^-T (I - V W V') L^-1,    V = L^-1 U,  W = (C^-1 + V'V)^-1,
+// the formula of Sherman, Morrison and Woodbury between the two triangular solves. V has entries only in the supernodes on the
+// ways from these nodes to the root, so that it costs a few applications of the factor to make. With V'V = K K' and
+// G = I + K'C K,  W = C - C K G^-1 K'C  whatever the sign of C and also where it is 0; what results is positive definite
+// exactly if G is. A number times the identity is the same in all frames, so the warp makes no difference.
+//
+// Which matrices had what is told by a list of changes, read backwards from now to the step of the factor; a factor made
+// with the spring is not corrected for it. (Hager, Updating the inverse of a matrix, SIAM Review 31, 1989.)
+#pragma once
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+
+#include "bsr.h"
+#include "supernodal.h"
+
+struct Factor {
+    const Pattern* pattern;
+    const void* values;
+    int64_t step;      // of the matrix it was made from
+    int32_t bytes;     // of a value: 4 or 8
+    int32_t unused;
+};
+
+struct Change {        // of the diagonal of a node
+    int64_t step;      // whose matrix is the first with the new value
+    double before;     // the old one [kg]
+    int32_t node, unused;
+};
+
+struct Correction {
+    int32_t capacity;       // nodes that are corrected at once; 0: off
+    int32_t history;        // changes that are remembered
+    int32_t nodes;          // of the body
+    int32_t count;          // nodes of V; 0: none is made
+    int32_t supernodes;     // of V
+    int32_t usable;         // W is there and what it makes is positive definite
+    int32_t used, unused;   // nodes corrected in the last solve with a factor
+    int64_t changes;        // so far
+    int64_t forgotten;      // step of the newest change that is not remembered any more
+    int64_t step;           // of the factor that `then` and V are for
+    const Factor* factor;   // likewise
+    const double* diagonal; // (nodes,) of A as assembled now [kg]
+    double *last, *then;    // (nodes,) of the last step; of the matrix of the factor in use
+    Change* change;         // (history,) the ring
+    int32_t* node;          // (capacity,) of V
+    int32_t* supernode;     // (3 nodes,) of V, ascending
+    uint8_t* marked;        // (3 nodes,)
+    double* delta;          // (capacity,) as W was made with [kg]
+    double* small;          // 4 width^2 + 2 width
+    void* columns;          // (3 nodes, width) V, in the values' type, only rows of its supernodes
+};
+
+constexpr double NOTHING = 0.004;              // of the node's own block: so much is no change
+constexpr double WEAK = 0.2, WEAK_EACH = 0.02;  // likewise, all changes together and their mean: less is left to the iteration
+constexpr double STIFF = 1e5;   // likewise: more is corrected as so much, which leaves one cluster of eigenvalues and no rounding;
+                                // of more that has gone 1e-4 stays
+constexpr double LEAST = 1e-6;  // pivot of G
+
+// Columns of V, filled up with zeros to a whole number of vectors.
+inline int width_of(int nodes) { return (3 * nodes + 7) / 8 * 8; }
+
+// K of a = K K', lower, in place; false if a pivot is below `least`.
+static bool cholesky(double* a, int d, int stride, double least) {
+    for (int i = 0; i < d; ++i) {
+        for (int j = 0; j <= i; ++j) {
+            double s = a[i * stride + j];
+            for (int k = 0; k < j; ++k) s -= a[i * stride + k] * a[j * stride + k];
+            if (j < i) a[i * stride + j] = s / a[j * stride + j];
+            else if (!(s > least)) return false;
+            else a[i * stride + i] = std::sqrt(s);
+        }
+    }
+    return true;
+}
+
+// Rows of many right-hand sides at once: y = L^-1 y within a panel, and what it takes from the rows below.
+template <class T>
+static void forward_rows(const Panel<T>& L, const int32_t* rows, int width, T* y) {
+    const T* own = y + (int64_t)rows[0] * width;
+    for (int r = 0; r < L.height; ++r) {
+        T* row = y + (int64_t)rows[r] * width;
+        const int end = std::min(r, L.columns);
+        for (int k = 0; k < end; ++k) {
+            const T l = L.column(k)[r], *x = own + (int64_t)k * width;
+#pragma omp simd
+            for (int j = 0; j < width; ++j) row[j] -= l * x[j];
+        }
+        if (r < L.columns) {
+            const T inverse = 1 / L.column(r)[r];
+            for (int j = 0; j < width; ++j) row[j] *= inverse;
+        }
+    }
+}
+
+// Uses a Correction in a solve. Made anew for each; nothing is allocated.
+struct Corrected {
+    Correction& c;
+    const BlockCsr& A;
+    const Factor& factor;
+
+    const Pattern& pattern() const { return *factor.pattern; }
+    int width() const { return width_of(c.count); }
+    double *gram() const { return c.small; }
+    double *inner() const { return c.small + (int64_t)width() * width(); }
+
+    // Sees to it that W is that of now; true if there is something to correct.
+    bool prepare() {
+        if (c.factor != &factor || c.step != factor.step) take_factor();
+        c.used = 0;
+        if (!choose()) return false;
+        bool same = true;
+        for (int k = 0; k < c.count; ++k) {
+            double delta = bounded(c.node[k]);
+            same = same && delta == c.delta[k];
+            c.delta[k] = delta;
+        }
+        if (!same) c.usable = make_inner();
+        if (c.usable) c.used = c.count;
+        return c.usable;
+    }
+
+    // y = L^-1 r  ->  (I - V W V') y
+    template <class T>
+    void between(T* y) const {
+        const int w = width(), d = 3 * c.count;
+        const T* columns = (const T*)c.columns;
+        double *t = c.small + 4 * (int64_t)w * w, *u = t + w;
+        T* rounded = (T*)u;
+        for (int j = 0; j < w; ++j) t[j] = 0;
+        over_rows([&](int row) {
+            const T *v = columns + (int64_t)row * w, f = y[row];
+#pragma omp simd
+            for (int j = 0; j < w; ++j) t[j] += (double)v[j] * f;
+        });
+        const double* W = inner();
+        for (int i = 0; i < w; ++i) {
+            double s = 0;
+            for (int j = 0; i < d && j < d; ++j) s += W[i * w + j] * t[j];
+            rounded[i] = (T)s;
+        }
+        over_rows([&](int row) {
+            const T* v = columns + (int64_t)row * w;
+            T s = 0;
+#pragma omp simd reduction(+ : s)
+            for (int j = 0; j < w; ++j) s += v[j] * rounded[j];
+            y[row] -= s;
+        });
+    }
+
+private:
+    template <class F>
+    void over_rows(F f) const {
+        for (int k = 0; k < c.supernodes; ++k) {
+            const int s = c.supernode[k];
+            for (int row = pattern().super_start[s]; row < pattern().super_start[s + 1]; ++row) f(row);
+        }
+    }
+
+    // The diagonal of its matrix: that of now, changes since then taken back. Where some of them are forgotten nothing is
+    // corrected until the next factor.
+    void take_factor() {
+        c.factor = &factor;
+        c.step = factor.step;
+        c.count = c.usable = 0;
+        std::copy(c.last, c.last + c.nodes, c.then);
+        for (int64_t k = c.changes; k > std::max<int64_t>(0, c.changes - c.history); --k) {
+            const Change& change = c.change[(k - 1) % c.history];
+            if (change.step <= factor.step) break;
+            c.then[change.node] = change.before;
+        }
+        if (c.forgotten > factor.step) std::copy(c.diagonal, c.diagonal + c.nodes, c.then), c.count = -1;
+    }
+
+    const double* block(int node) const {
+        int k = A.row_start[A.first + node];
+        while (A.columns[k] != A.first + node) ++k;
+        return A.values + 9 * (int64_t)k;
+    }
+    double own(int node) const { const double* a = block(node); return (a[0] + a[4] + a[8]) / 3; }
+
+    double bounded(int node) const {
+        const double delta = c.diagonal[node] - c.then[node], rest = own(node) - std::fmax(delta, 0);
+        const double most = STIFF * std::ldexp(1.0, std::ilogb(rest));  // the same from step to step
+        return delta > most ? most : delta < -most ? delta - 1e-4 * delta : delta;
+    }
+
+    // The nodes of V; those that it has stay while no others are needed, as springs that are at their limit come and go.
+    // False: more than fit, or too little to be worth it.
+    bool choose() {
+        if (c.count < 0) return false;
+        int changed = 0, others = 0, chosen[MOST];
+        double together = 0;
+        for (int i = 0; i < c.nodes; ++i) {
+            const double delta = c.diagonal[i] - c.then[i];
+            if (delta == 0) continue;
+            const double share = std::fabs(delta) / (own(i) - std::fmax(delta, 0));
+            if (!(share > NOTHING)) continue;
+            together += share;
+            others += std::find(c.node, c.node + c.count, i) == c.node + c.count;
+            if (changed < c.capacity) chosen[changed] = i;
+            ++changed;
+        }
+        if (changed > c.capacity || together < WEAK || together < WEAK_EACH * changed) return false;
+        if (others) {
+            std::copy(chosen, chosen + changed, c.node);
+            c.count = changed;
+            std::fill(c.delta, c.delta + changed, NAN);
+            if (factor.bytes == 4) make_columns<float>();
+            else make_columns<double>();
+        }
+        return true;
+    }
+
+    // Supernodes that L^-1 U reaches, ascending.
+    void reach() {
+        const Pattern& p = pattern();
+        const int32_t* end = p.super_start + p.supernodes + 1;
+        auto of = [&](int row) { return (int)(std::upper_bound(p.super_start, end, row) - p.super_start) - 1; };
+        std::fill(c.marked, c.marked + p.supernodes, 0);
+        for (int i = 0; i < p.size; ++i)
+            if (std::find(c.node, c.node + c.count, p.permutation[i] / 3) != c.node + c.count) c.marked[of(i)] = 1;
+        c.supernodes = 0;
+        for (int s = 0; s < p.supernodes; ++s) {
+            if (!c.marked[s]) continue;
+            c.supernode[c.supernodes++] = s;
+            for (int64_t k = p.row_start[s] + p.super_start[s + 1] - p.super_start[s]; k < p.row_start[s + 1]; ++k)
+                c.marked[of(p.rows[k])] = 1;
+        }
+    }
+
+    template <class T>
+    void make_columns() {
+        const Pattern& p = pattern();
+        const int w = width();
+        T* V = (T*)c.columns;
+        reach();
+        over_rows([&](int row) {
+            T* v = V + (int64_t)row * w;
+            std::fill(v, v + w, T(0));
+            const int dof = p.permutation[row], k = (int)(std::find(c.node, c.node + c.count, dof / 3) - c.node);
+            if (k < c.count) v[3 * k + dof % 3] = 1;
+        });
+        for (int k = 0; k < c.supernodes; ++k) {
+            const int s = c.supernode[k];
+            const int64_t start = p.row_start[s];
+            Panel<T> L{(const T*)factor.values + p.value_start[s], p.super_start[s + 1] - p.super_start[s],
+                       (int)(p.row_start[s + 1] - start)};
+            forward_rows(L, p.rows + start, w, V);
+        }
+        double* S = gram();
+        std::fill(S, S + (int64_t)w * w, 0.0);
+        over_rows([&](int row) {
+            const T* v = V + (int64_t)row * w;
+            for (int i = 0; i < 3 * c.count; ++i) {
+                const double f = v[i];
+                const int end = (i + 8) / 8 * 8;  // the lower triangle, in whole vectors
+#pragma omp simd
+                for (int j = 0; j < end; ++j) S[i * w + j] += f * v[j];
+            }
+        });
+    }
+
+    // W from V'V and C.
+    bool make_inner() {
+        const int w = width(), d = 3 * c.count;
+        double *W = inner(), *K = W + (int64_t)w * w, *G = K + (int64_t)w * w;
+        auto C = [&](int i) { return c.delta[i / 3]; };
+        std::copy(gram(), gram() + (int64_t)w * w, K);
+        if (!cholesky(K, d, w, 0)) return false;
+        for (int i = 0; i < d; ++i)
+            for (int j = 0; j < i; ++j) K[j * w + i] = 0;
+        std::fill(G, G + (int64_t)w * w, 0.0);
+        for (int i = 0; i < d; ++i) {
+            G[i * w + i] += 1;
+            for (int a = 0; a <= i; ++a) {
+                const double f = C(i) * K[i * w + a];
+                for (int b = 0; b <= i; ++b) G[a * w + b] += f * K[i * w + b];
+            }
+        }
+        if (!cholesky(G, d, w, LEAST)) return false;
+        // K <- B = M^-1 K' C with G = M M', row after row; then W = C - B' B
+        for (int i = 0; i < d; ++i)
+            for (int j = 0; j < i; ++j) std::swap(K[i * w + j], K[j * w + i]);
+        for (int i = 0; i < d; ++i) {
+            for (int j = 0; j < d; ++j) K[i * w + j] *= C(j);
+            for (int k = 0; k < i; ++k) {
+                const double f = G[i * w + k];
+                for (int j = 0; j < d; ++j) K[i * w + j] -= f * K[k * w + j];
+            }
+            for (int j = 0; j < d; ++j) K[i * w + j] /= G[i * w + i];
+        }
+        std::fill(W, W + (int64_t)w * w, 0.0);
+        for (int i = 0; i < d; ++i) W[i * w + i] = C(i);
+        for (int k = 0; k < d; ++k)
+            for (int i = 0; i < d; ++i) {
+                const double f = K[k * w + i];
+                for (int j = 0; j < d; ++j) W[i * w + j] -= f * K[k * w + j];
+            }
+        return true;
+    }
+
+    static constexpr int MOST = 64;
+};
+
+// After the launches of a step: notes what has changed on the diagonal.
+static void note_changes(Correction& c, int64_t step, bool first) {
+    if (c.capacity == 0) return;
+    if (first) std::copy(c.diagonal, c.diagonal + c.nodes, c.last);
+    for (int i = 0; i < c.nodes; ++i) {
+        if (c.diagonal[i] == c.last[i]) continue;
+        Change& change = c.change[c.changes % c.history];
+        if (c.changes >= c.history) c.forgotten = change.step;
+        ++c.changes;
+        change = Change{step, c.last[i], i, 0};
+        c.last[i] = c.diagonal[i];
+    }
+}

@@ -1,0 +1,273 @@
+# SPDX-License-Identifier: MIT
+"""An NVIDIA GPU: its arrays, and the kernel texts compiled for it by NVRTC.
+
+Host arrays keep their names: `twin` gives the device array that stands for one, made and filled at the first call. So
+the code that lists the launches of a step is the same on both devices.
+"""
+
+import hashlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol.process.extras import to_install
+from sim_server.backends.build_pool import compilers
+from sim_server.backends.compiler import (
+    HERE,
+    INCLUDE,
+    Argument,
+    CompileError,
+    arguments_of,
+    build_id,
+    domain_of,
+    read_text,
+)
+from sim_server.errors import DeviceError
+
+LEAST = 80  # compute capability times 10: the solver multiplies by matrix instructions that came with it
+MAILED = 4096  # threads of a launch whose number of items may change
+
+
+@cache
+def cupy() -> Any:
+    """The cupy package, imported when a GPU is asked for; raises DeviceError."""
+    try:
+        import cupy as cp
+    except ImportError as error:
+        raise DeviceError(f"no GPU: CuPy is not usable ({error}); {to_install('gpu')}") from error
+    try:
+        count = cp.cuda.runtime.getDeviceCount()
+    except cp.cuda.runtime.CUDARuntimeError as error:
+        raise DeviceError(_no_device(error)) from error
+    if count == 0:
+        raise DeviceError("no GPU: CuPy sees no NVIDIA device (is CUDA_VISIBLE_DEVICES empty?)")
+    if int(capability := cp.cuda.Device().compute_capability) < LEAST:
+        raise DeviceError(
+            f"no GPU: this one has compute capability {int(capability) / 10:g}, allowed: {LEAST / 10:g} and above"
+        )
+    return cp
+
+
+def _no_device(error: Exception) -> str:
+    text = str(error)
+    if "InsufficientDriver" in text:
+        return (
+            f"no GPU: there is no NVIDIA driver, or it is too old for this CuPy ({text}); nvidia-smi shows it. "
+            "Update the driver, or install the CuPy of its CUDA version (for 12: pip install 'cupy-cuda12x[ctk]')"
+        )
+    if "NoDevice" in text:
+        return f"no GPU: CuPy sees no NVIDIA device ({text}); see nvidia-smi and CUDA_VISIBLE_DEVICES"
+    return f"no GPU: the NVIDIA driver does not answer ({text}); see nvidia-smi"
+
+
+def no_memory_left(error: Exception) -> bool:
+    """The GPU (or page-locked host memory) has no room for what was asked for."""
+    cp = cupy()
+    out = isinstance(error, cp.cuda.memory.OutOfMemoryError)
+    return out or (isinstance(error, cp.cuda.runtime.CUDARuntimeError) and "MemoryAllocation" in str(error))
+
+
+@contextmanager
+def building() -> Iterator[None]:
+    """While a scene is put onto the GPU: too little memory becomes a DeviceError that says what to do."""
+    try:
+        yield
+    except Exception as error:
+        if not no_memory_left(error):
+            raise
+        free, total = cupy().cuda.runtime.memGetInfo()
+        raise DeviceError(
+            f"the scene does not fit into the memory of the GPU: {error}; {free / 1e9:.2f} of {total / 1e9:.2f} GB are "
+            "free. Fewer or smaller objects need less, or --device cpu"
+        ) from error
+
+
+def compiled(name: str, module: Any, kernel: str) -> Any:
+    """A kernel of a text; raises CompileError with the first error of the compiler."""
+    try:
+        with compilers.counted():
+            return module.get_function(kernel)
+    except cupy().cuda.compiler.CompileException as error:
+        lines = str(error).splitlines()
+        first = next((line for line in lines if "error" in line), lines[0] if lines else "no message")
+        raise CompileError(f"{name} does not compile for this GPU: {first.strip()}") from error
+
+
+@cache
+def processors() -> int:
+    """Multiprocessors of the device."""
+    return int(cupy().cuda.Device().attributes["MultiProcessorCount"])
+
+
+@cache
+def digest(*suffixes: str) -> str:
+    """Of all texts of this package whose names end so."""
+    found = sorted(p for p in HERE.rglob("*") if p.suffix in suffixes)
+    return hashlib.sha256(b"".join(path.read_bytes() for path in found)).hexdigest()[:16]
+
+
+def texts() -> str:
+    """Of all headers, in an option: CuPy keeps compiled kernels by their own text and options alone."""
+    return "-DTEXTS=x" + digest(".h", ".cuh")
+
+
+def shape(threads: int) -> tuple[tuple[int], tuple[int]]:
+    """Grid and thread blocks for so many threads: small blocks spread a small launch over more processors."""
+    block = next((b for b in (32, 64) if threads <= 16 * b * processors()), 128)
+    return (max(1, -(-threads // block)),), (block,)
+
+
+class DeviceLaunch:
+    """One kernel with its arguments on the device. mailed: they lie in device memory and may be replaced."""
+
+    def __init__(
+        self, name: str, function: Any, params: NDArray[Any], items: int, mailed: bool, arrays: dict[str, Any]
+    ):  # fmt: skip
+        self.name, self.items, self.mailed, self.arrays = name, items, mailed, arrays
+        self._function, self.params = function, params
+        self.text = self.struct = ""  # where it comes from
+        self.types: dict[str, str] = {}  # what its reals are
+        self.fields: list[Argument] = []
+        self.sums = False  # its items sum over lists
+        self._mail = cupy().asarray(params.reshape(1).view(np.uint8)) if mailed else None
+
+    def __call__(self) -> None:
+        """Puts it onto the current stream."""
+        argument = self._mail if self.mailed else self.params
+        if self.items or self.mailed:
+            self._function(*shape(MAILED if self.mailed else self.items), (argument,))
+
+    def fetch(self, name: str) -> NDArray[Any]:
+        """One of its arrays as kernels have left it, copied."""
+        return self.arrays[name].get()
+
+    @property
+    def domain(self) -> str:
+        """What its items are."""
+        return domain_of(self.text, self.struct)
+
+    @property
+    def mail_address(self) -> int:
+        """Where the arguments of a mailed launch lie."""
+        assert self._mail is not None
+        return int(self._mail.data.ptr)
+
+
+class DeviceModule:
+    """A kernel text compiled by NVRTC; raises CompileError."""
+
+    def __init__(self, path: str, gpu: "Gpu", real: str = "double", cooperative: bool = False, local: str = ""):
+        self._gpu = gpu
+        self.name, self._text = read_text(path)
+        self._types = {"real": real, "local": local or real}
+        self._module = cupy().RawModule(
+            code=self._text,
+            options=options(self._types),
+            backend="nvrtc",
+            enable_cooperative_groups=cooperative,
+        )
+
+    def function(self, kernel: str) -> Any:
+        """A kernel by name."""
+        return compiled(f"{self.name}.cu", self._module, kernel)
+
+    def bind(self, kernel: str, n: int, **arguments: Any) -> DeviceLaunch:
+        """As backend.Module.bind, with the twins of the arrays."""
+        fields, struct, form = arguments_of(
+            self._text, kernel, self.name, self._types, {"n": n, **arguments}, converts=True
+        )
+        mailed = form == "MAILED_"
+        params = np.zeros((), dtype=_layout(fields))
+        twins = {}
+        for field, value in fields:
+            if field.dtype is not None:
+                twins[field.name] = self._gpu.twin(value, keep=not mailed, dtype=field.dtype)
+                value = twins[field.name].data.ptr
+            params[field.name] = value
+        launch = DeviceLaunch(f"{self.name}.{kernel}", self.function(kernel), params, n, mailed, twins)
+        launch.text, launch.struct, launch.sums = self._text, struct, form == "SUM_"
+        launch.types = self._types
+        launch.fields = [field for field, _ in fields]
+        return launch
+
+
+def _layout(fields: list[tuple[Argument, Any]]) -> np.dtype:
+    types = {"int": "i4", "double": "f8", "float": "f4"}
+    return np.dtype([(f.name, "u8" if f.dtype is not None else types[f.kind]) for f, _ in fields], align=True)
+
+
+def own_headers() -> tuple[str, ...]:
+    """For the compiler: where texts of this folder find their headers."""
+    return f"-I{HERE / 'backends/gpu'}", f"-I{HERE / 'backends/gpu/inverse'}"
+
+
+def options(types: dict[str, str]) -> tuple[str, ...]:
+    """For the compiler; types: what `real` and `local` stand for."""
+    return ("-std=c++17", f"-I{INCLUDE}", *(f"-D{name}={kind}" for name, kind in types.items()), texts())
+
+
+PRECISIONS = {
+    "float64": {"real": "double", "local": "double"},
+    "mixed": {"real": "double", "local": "float"},
+    "float32": {"real": "float", "local": "float"},
+}
+"""What kernel texts call the reals of state and system, and those of elements (kernels/kernel.h)."""
+
+
+class Gpu:
+    """The current CUDA device. precision: of the kernels, a key of PRECISIONS; host arrays are float64 in any case."""
+
+    name = "gpu"
+
+    def __init__(self, precision: str = "float64") -> None:
+        self.cp = cupy()
+        self.precision, self.types = precision, PRECISIONS[precision]
+        self._real = np.dtype("f4" if self.types["real"] == "float" else "f8")
+        self._twins: dict[int, tuple[NDArray[Any], Any]] = {}
+        self._kept: dict[int, tuple[NDArray[Any], np.dtype | None]] = {}  # keeping an array keeps its id its own
+        self._modules: dict[str, DeviceModule] = {}
+        self.properties = self.cp.cuda.runtime.getDeviceProperties(self.cp.cuda.Device().id)
+
+    def twin(self, host: NDArray[Any], keep: bool = True, dtype: np.dtype | None = None) -> Any:
+        """The device array of a host array. keep: the same one from now on; else of a new one just a copy.
+
+        dtype: of its entries; None: what it has been kept with, else `real` for float64.
+        """
+        if id(host) in self._twins:
+            known = self._twins[id(host)][1]
+            if dtype not in (None, known.dtype):
+                raise TypeError(f"an array of {host.shape} is {known.dtype} on the GPU and cannot be {dtype} too")
+            return known
+        kept = self._kept.get(id(host))
+        dtype = dtype or (kept and kept[1]) or (self._real if host.dtype == np.float64 else host.dtype)
+        copy = self.cp.asarray(host.astype(dtype, copy=False))
+        if keep or kept:
+            self._twins[id(host)] = (host, copy)
+        return copy
+
+    def keep(self, *hosts: NDArray[Any], exact: bool = False) -> None:
+        """Arrays that stay for the whole run: one twin each, made when it is first asked for. exact: in their type."""
+        for host in hosts:
+            self._kept.setdefault(id(host), (host, host.dtype if exact else None))
+
+    def fetch(self, host: NDArray[Any]) -> NDArray[Any]:
+        """The array with what kernels have made of its twin."""
+        if id(host) in self._twins:
+            host[...] = self.twin(host).get()
+        return host
+
+    def build(self) -> str:
+        """What a run depends on beside its scene: equal ones repeat it bit for bit."""
+        runtime = self.cp.cuda.runtime.runtimeGetVersion()
+        parts = [build_id(), digest(".cu", ".cuh", ".h"), self.properties["name"].decode(), str(runtime)]
+        return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:24]
+
+    def module(self, path: str) -> DeviceModule:
+        """A kernel text, compiled once."""
+        if path not in self._modules:
+            self._modules[path] = DeviceModule(path, self, self.types["real"], local=self.types["local"])
+        return self._modules[path]

@@ -1,0 +1,168 @@
+// SPDX-License-Identifier: MIT
+// The energy of each body after a step, and whether it has run away (kernels/balance.cuh). Each thread block sums over a chunk of a
+// body's nodes; the one that finishes last of a body adds the chunks up in a fixed order, decides, and freezes. It runs as the first
+// thread blocks of the kernel over elements that begins the next step (kernel_fusion.py), or by itself after the last step of a batch; a step
+// that is settled already is left alone.
+#include "energy_record.cuh"
+
+constexpr int STILL = 5, WARPS = 4;  // arrays that are 0 at rest; warps of a thread block, at most
+
+struct Chunk {
+    int body, begin, end;  // nodes
+    int first, chunks;     // of the body
+};
+
+struct Account {
+    const int* first;        // (bodies + 1,) node of each body
+    const Chunk* chunk;      // (chunks,)
+    Sums* sums;              // (chunks,)
+    unsigned* arrived;       // (bodies,) chunks that are summed up; zero between launches
+    const real* mass;        // (n,) [kg]
+    const real* before;      // (n, 3) x when the step began [m]
+    real* x;                 // (n, 3) [m]
+    const real* v;           // (n, 3) [m/s]
+    real* still[STILL];      // (n, 3) each, or null: v and what else is 0 in a body at rest
+    real* force;             // (n, 3) of hands (effects/touch.cu); null: nothing can be touched
+    real* spring;            // (n,)
+    real* anchor;            // (n, 3)
+    real* free;              // (n,) 0 from when a body is frozen
+    const real* gravity;     // (3,) [m/s2]
+    Balance* balance;        // (bodies,)
+    Energy* told;            // (capacity, bodies) on the host
+    const long long* step;   // (1,) completed
+    long long* settled;      // (bodies,) step that was settled last
+    int bodies, capacity, on_runaway, inertia;
+};
+
+#ifdef ACCOUNT_BYTES  // as energies.py has them
+static_assert(sizeof(Account) == ACCOUNT_BYTES && sizeof(Balance) == BALANCE_BYTES, "layouts of Account or Balance differ");
+static_assert(sizeof(Energy) == ENERGY_BYTES && sizeof(Sums) == SUMS_BYTES && sizeof(Chunk) == CHUNK_BYTES, "layouts differ");
+#endif
+
+__device__ __forceinline__ void add_sums(Sums& a, const Sums& b) {
+    a.kinetic += b.kinetic;
+    a.gravity += b.gravity;
+    a.fallen += b.fallen;
+    a.work += b.work;
+    for (int c = 0; c < 3; ++c) {
+        a.low[c] = b.low[c] < a.low[c] ? b.low[c] : a.low[c];
+        a.high[c] = b.high[c] > a.high[c] ? b.high[c] : a.high[c];
+    }
+}
+
+// Of the nodes from `begin` on; those of this thread.
+__device__ __forceinline__ Sums sums_over(const Account& a, int begin, int end) {
+    Sums s = no_sums();
+#pragma unroll 4
+    for (int i = begin + threadIdx.x; i < end; i += blockDim.x) {
+        const real *x = a.x + 3ll * i, *from = a.before + 3ll * i;
+        const double step[3] = {(double)x[0] - from[0], (double)x[1] - from[1], (double)x[2] - from[2]};
+        add_node(s, a.mass[i], x, a.v + 3ll * i, step, a.gravity);
+    }
+    return s;
+}
+
+// Likewise the work of hands, whose forces are then 0 until something touches the nodes again.
+__device__ __forceinline__ double work_over(const Account& a, int begin, int end) {
+    double work = 0;
+    for (int i = begin + threadIdx.x; i < end; i += blockDim.x) {
+        real *force = a.force + 3ll * i, &spring = a.spring[i];
+        if (spring == 0 && force[0] == 0 && force[1] == 0 && force[2] == 0) continue;
+        const real *x = a.x + 3ll * i, *from = a.before + 3ll * i;
+        const double step[3] = {(double)x[0] - from[0], (double)x[1] - from[1], (double)x[2] - from[2]};
+        work += work_on(force, spring, a.anchor + 3ll * i, from, step);
+        force[0] = force[1] = force[2] = spring = 0;
+    }
+    return work;
+}
+
+// Those of the lane across.
+__device__ __forceinline__ Sums sums_across(const Sums& s, int by) {
+    Sums o;
+    o.kinetic = __shfl_xor_sync(EVERYBODY, s.kinetic, by);
+    o.gravity = __shfl_xor_sync(EVERYBODY, s.gravity, by);
+    o.fallen = __shfl_xor_sync(EVERYBODY, s.fallen, by);
+    o.work = __shfl_xor_sync(EVERYBODY, s.work, by);
+    for (int c = 0; c < 3; ++c) {
+        o.low[c] = __shfl_xor_sync(EVERYBODY, s.low[c], by);
+        o.high[c] = __shfl_xor_sync(EVERYBODY, s.high[c], by);
+    }
+    return o;
+}
+
+__device__ void tell(const Account& a, const Balance& b, int body, long long done) {
+    Energy& e = a.told[done % a.capacity * a.bodies + body];
+    e.kinetic = b.kinetic;
+    e.elastic = __longlong_as_double(0x7ff8000000000000ll);  // not evaluated
+    e.gravity = b.gravity;
+    e.work = b.work;
+    e.budget = b.budget;
+    e.stride = b.stride;
+    e.phase = b.phase;
+    e.found = b.found;
+}
+
+// Back to where the step began, and at rest from now on: as if all nodes were fixed.
+__device__ void freeze(const Account& a, int body) {
+    for (int i = a.first[body] + threadIdx.x; i < a.first[body + 1]; i += blockDim.x) {
+        a.free[i] = 0;
+        for (long long k = 3ll * i; k < 3ll * i + 3; ++k) {
+            a.x[k] = a.before[k];
+            for (real* array : a.still)
+                if (array) array[k] = 0;
+        }
+    }
+}
+
+// Of all threads of the block; the first one has it. Threads add in an order that depends on their number alone.
+__device__ Sums sums_of_block(Sums s) {
+    __shared__ Sums warps[WARPS];
+    for (int by = 16; by; by /= 2) add_sums(s, sums_across(s, by));
+    if (threadIdx.x % 32 == 0) warps[threadIdx.x / 32] = s;
+    __syncthreads();
+    if (threadIdx.x == 0)
+        for (int k = 1; k < (int)blockDim.x / 32; ++k) add_sums(s, warps[k]);
+    return s;
+}
+
+// Whether this thread block finishes last of its body's; s then has the sums over all chunks in the first thread.
+__device__ bool gather(const Account& a, const Chunk& chunk, int number, Sums& s) {
+    if (chunk.chunks == 1) return true;
+    __shared__ bool last;
+    if (threadIdx.x == 0) {
+        a.sums[number] = s;
+        __threadfence();
+        last = atomicAdd(a.arrived + chunk.body, 1u) == chunk.chunks - 1u;
+    }
+    __syncthreads();
+    if (!last) return false;
+    __threadfence();
+    s = no_sums();
+    for (int k = threadIdx.x; k < chunk.chunks; k += blockDim.x) add_sums(s, a.sums[chunk.first + k]);
+    s = sums_of_block(s);
+    if (threadIdx.x == 0) a.arrived[chunk.body] = 0;
+    return true;
+}
+
+// By a thread block. What is read does not wait for anything that was read before but the chunk: it is done while others compute.
+__device__ void account_of(const Account& a, int number) {
+    __shared__ int away;
+    const Chunk chunk = a.chunk[number];
+    const long long step = a.step[0], settled = a.settled[chunk.body];
+    Balance b = a.balance[chunk.body];
+    Sums s = sums_over(a, chunk.begin, chunk.end);
+    if (settled == step) return;
+    if (a.force) s.work = work_over(a, chunk.begin, chunk.end);
+    s = sums_of_block(s);
+    if (!gather(a, chunk, number, s)) return;
+    if (threadIdx.x == 0) {
+        away = take_stock(b, s, a.on_runaway, a.inertia);
+        a.balance[chunk.body] = b;
+        tell(a, b, chunk.body, step - 1);
+        a.settled[chunk.body] = step;
+    }
+    __syncthreads();
+    if (away) freeze(a, chunk.body);
+}
+
+extern "C" __global__ void __launch_bounds__(32 * WARPS) account(const Account a) { account_of(a, blockIdx.x); }

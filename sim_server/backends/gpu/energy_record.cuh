@@ -1,0 +1,11 @@
+// SPDX-License-Identifier: MIT
+// What the host is told of the energy of a body (energy_balance.cu, elastic_energy.cu).
+#pragma once
+#include "balance.cuh"
+
+struct Energy {  // beside Result
+    double kinetic, elastic, gravity, work, budget, stride;
+    int phase, found;
+};
+
+#define EVERYBODY 0xffffffffu  // all threads of a warp

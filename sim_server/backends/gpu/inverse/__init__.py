@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""A factor as a partitioned inverse on a GPU."""

@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: MIT
+"""A plan (plan.py) as the kernel reads it, on the device. Layouts: pcg_structs.cuh."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_server.backends.gpu.device import Gpu
+from sim_server.backends.gpu.inverse.plan import Plan
+
+DUMMY = 32  # entries behind the packed vectors, where padding points
+TILE_SUMS = 64  # partitioned_inverse.cuh
+ROUND = 6  # what a product costs besides its chunks, in chunks
+
+PLAN = np.dtype(
+    [
+        ("phases", "i4"), ("blocks", "i4"), ("groups", "i4"), ("size", "i4"), ("parts", "u8"), ("lists", "u8"),
+        ("pieces", "u8"), ("tiles", "u8"), ("index", "u8"), ("target", "u8"), ("place", "u8"),
+        ("entries", "i4"), ("unused", "i4"),
+    ]
+)  # fmt: skip
+
+
+def room(plan: Plan) -> int:
+    """Bytes of shared memory that a thread block must have: the vector of a phase in two float16, sums of tiles."""
+    return 4 * plan.x_area + 64 * TILE_SUMS + 48
+
+
+def by_block(start: NDArray[Any], phases: int, blocks: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Lists kept by phase and block, wanted by block and phase: where each begins then, and which items follow."""
+    order = np.arange(phases * blocks).reshape(phases, blocks).T.ravel()
+    start = start.astype(np.int64)
+    length = np.diff(start)[order]
+    new = np.concatenate([[0], np.cumsum(length)])
+    items = np.arange(new[-1]) - np.repeat(new[:-1] - start[:-1][order], length)
+    return new, items
+
+
+def pieces(plan: Plan) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+    """Segments cut into 32 entries each: where those of each list begin, and (kind, from, to, 2 valid + keep)."""
+    segments = plan.segments.astype(np.int64)
+    count = segments[:, 2] // 32
+    ends = np.concatenate([[0], np.cumsum(count)])
+    which = np.repeat(np.arange(len(segments)), count)
+    step = 32 * (np.arange(ends[-1]) - ends[:-1][which])
+    kind, begin, to = segments[which, 0], segments[which, 1] + step, segments[which, 3] + step
+    used = np.zeros((2, max(len(plan.boundary), plan.size) // 32), np.int64)  # entries that are not padding, of 32
+    used[0, : plan.size // 32] = (plan.column.reshape(-1, 32) >= 0).sum(axis=1)
+    used[1, : len(plan.boundary) // 32] = (plan.boundary.reshape(-1, 32) < plan.size).sum(axis=1)
+    valid = used[(kind & 3) // 2, begin // 32]
+    return ends[plan.segment_start], np.stack([kind & 3, begin, to, 2 * valid + (kind >> 2 & 1)], 1).astype(np.int32)
+
+
+def index(plan: Plan, cut: NDArray[np.int32]) -> NDArray[np.int64]:
+    """(pieces, 32): where each entry stands, or its contributions. Raises ValueError if there are too many."""
+    entry = cut[:, 1, None].astype(np.int64) + np.arange(32)
+    formed = (cut[:, 0] == 0)[:, None]
+    start = plan.slot_start.astype(np.int64)
+    many = np.diff(start)
+    if len(many) and (many.max() > 255 or start[-1] >= 1 << 24):
+        raise ValueError(
+            f"FactorPattern: {start[-1]} couplings of parts, {many.max()} to a row; "
+            f"allowed on a GPU: {(1 << 24) - 1}, 255"
+        )
+    position = np.where(formed, entry, 0)
+    slots = start[position] | many[position] << 24
+    boundary = np.append(plan.boundary, 0)
+    return np.where(
+        formed, slots, np.where((cut[:, 0] == 2)[:, None], boundary[np.where(formed, 0, entry) % len(boundary)], entry)
+    )
+
+
+def doubled(tiles: NDArray[Any], start: NDArray[Any], planes: int) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+    """Tiles of 8 rows taken together where the next eight rows follow, (k, 8): chunk, x, chunks, out, rows, 0, 0, 0."""
+    chunk, x, chunks, out = tiles.T.astype(np.int64)
+    follows = np.zeros(len(tiles), bool)  # the one before, in the same list
+    follows[1:] = (x[1:] == x[:-1]) & (out[1:] == out[:-1] + 8) & (chunk[1:] == chunk[:-1] + planes * chunks[:-1])
+    follows[start[:-1][start[:-1] < len(tiles)]] = False
+    run = np.maximum.accumulate(np.where(follows, 0, np.arange(len(tiles))))
+    second = (np.arange(len(tiles)) - run) % 2 == 1
+    found = np.zeros((len(tiles), 8), np.int32)
+    found[:, :4] = tiles
+    found[:, 4] = 8 + 8 * np.append(second[1:], False)
+    kept = np.concatenate([[0], np.cumsum(~second)])
+    return found[~second], kept[start]
+
+
+def splits(tiles: NDArray[Any], start: NDArray[Any], warps: int) -> NDArray[np.int32]:
+    """Warps that share each tile of a list, (lists,): few tiles would leave most warps idle."""
+    count = np.diff(start)
+    total = np.concatenate([[0], np.cumsum(tiles[:, 2].astype(np.int64))])
+    mean = (total[start[1:]] - total[start[:-1]]) / np.maximum(count, 1)
+    best, least = np.ones(len(count), np.int32), np.full(len(count), np.inf)
+    for parts in range(1, warps + 1):
+        rounds = -(-count * parts // warps)
+        cost = rounds * (np.ceil(mean / parts) + ROUND)
+        fits = (count * parts <= TILE_SUMS) & (16 * count <= 32 * warps) if parts > 1 else np.ones(len(count), bool)
+        better = fits & (cost < least)
+        best[better], least[better] = parts, cost[better]
+    return best
+
+
+def parts(piece_start: NDArray[Any], tile_start: NDArray[Any], plan: Plan) -> NDArray[np.int64]:
+    """(blocks, 8) what each thread block has: first and count of pieces, tiles, chunks."""
+    found = np.zeros((plan.blocks, 8), np.int64)
+    for k, start in enumerate((piece_start[:: plan.phases], tile_start[:: plan.phases], plan.chunk_start)):
+        found[:, 2 * k], found[:, 2 * k + 1] = start[:-1], np.diff(start)
+    return found
+
+
+def lists(
+    piece_start: NDArray[Any], tile_start: NDArray[Any], split: NDArray[Any], formed: NDArray[Any]
+) -> NDArray[np.int64]:
+    """(blocks, 4 phases + 2): where the pieces of each phase begin, and its tiles, in a block's own; the splits; the
+    first piece that is not formed. formed (pieces,): whether a piece is; those of a phase come first."""
+    blocks, phases = split.shape
+    at = phases * np.arange(blocks)[:, None] + np.arange(phases + 1)
+    own = [start[at] - start[at[:, :1]] for start in (piece_start, tile_start)]
+    total = np.concatenate([[0], np.cumsum(formed)])[piece_start]
+    return np.hstack([*own, split, own[0][:, :-1] + np.diff(total[at], axis=1)])
+
+
+class Planned:
+    """A plan on the device, with the vectors that an application of it needs made by `vectors`."""
+
+    def __init__(self, gpu: Gpu, plan: Plan, warps: int):
+        self.gpu, self.plan = gpu, plan
+        self.bytes = int(plan.chunks) * 512
+        piece_start, cut = pieces(plan)
+        piece_start, piece_order = by_block(piece_start, plan.phases, plan.blocks)
+        tile_start, tile_order = by_block(plan.tile_start, plan.phases, plan.blocks)
+        tiles, tile_start = doubled(plan.tiles[tile_order], tile_start, plan.planes)
+        split = splits(tiles, tile_start, warps).reshape(plan.blocks, plan.phases)
+        target = np.full(plan.contributions + DUMMY, len(plan.slots), np.int32)
+        target[plan.slots] = np.arange(len(plan.slots), dtype=np.int32)
+        self._given = len(plan.slots) + DUMMY
+        arrays: dict[str, NDArray[Any]] = {
+            "parts": parts(piece_start, tile_start, plan),
+            "lists": lists(piece_start, tile_start, split, cut[piece_order, 0] == 0), "pieces": cut[piece_order],
+            "index": index(plan, cut[piece_order]), "tiles": tiles,
+            "target": target, "place": plan.place,
+        }  # fmt: skip
+        self._arrays = {
+            name: gpu.cp.asarray(array.astype(np.int64).astype(np.uint32).view(np.int32))
+            for name, array in arrays.items()
+        }
+        params = np.zeros((), PLAN)
+        params["phases"], params["blocks"], params["groups"] = plan.phases, plan.blocks, plan.groups
+        params["size"], params["entries"] = plan.size, plan.x_area
+        for name, array in self._arrays.items():
+            params[name] = array.data.ptr
+        self._params = gpu.cp.asarray(params.reshape(1).view(np.uint8))
+        self.address = int(self._params.data.ptr)
+
+    def vectors(self) -> dict[str, Any]:
+        """Those of one body, in words (block_group.cuh) of no exchange."""
+        zeros, n = self.gpu.cp.zeros, self.plan.size + DUMMY
+        return {
+            "residual": zeros(2 * n), "product": zeros(n), "z": zeros(n), "formed": zeros(n), "solved": zeros(n),
+            "given": zeros(self._given),
+        }  # fmt: skip

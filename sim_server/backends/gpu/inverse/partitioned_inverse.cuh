@@ -1,0 +1,363 @@
+// SPDX-License-Identifier: MIT
+// z = P^-1 r by an inverse in parts (plan.py): 2 P - 1 phases of dense products in float16 with float32 sums.
+//
+// A product of 16 rows x 32 columns is two matrix instructions. The vector is their right factor, split into two columns of
+// float16 (value = high + low / 2048): 22 bits of it count, nearly as many as float32 has. So a warp needs five instructions
+// for 1024 bytes of matrix, and memory is the only limit.
+#pragma once
+#include "block_group.cuh"
+
+#define LOW 2048.0f
+#ifndef CHUNKS_AT_ONCE
+#define CHUNKS_AT_ONCE 4
+#endif
+#define TILE_SUMS 64  // jobs of a phase that share tiles, at most
+#define LISTS 32768   // bytes of a list that is worth its place in shared memory
+#define FEW 3         // pieces that a warp brings together at a time
+#define MANY 8        // 2304 entries in one trip through L2 with 8 warps
+
+struct Vector { unsigned short *high, *low; };  // of a phase, in shared memory
+
+__device__ __forceinline__ unsigned short half_of(float v) {
+    unsigned short h;
+    asm("cvt.rn.f16.f32 %0, %1;" : "=h"(h) : "f"(v));
+    return h;
+}
+__device__ __forceinline__ float of_half(unsigned short h) {
+    float v;
+    asm("cvt.f32.f16 %0, %1;" : "=f"(v) : "h"(h));
+    return v;
+}
+
+__device__ __forceinline__ void put_halves(const Vector& to, int i, float v) {
+    v = fminf(fmaxf(v, -6e4f), 6e4f);
+    unsigned short high = half_of(v);
+    to.high[i] = high;
+    to.low[i] = half_of((v - of_half(high)) * LOW);
+}
+
+__device__ __forceinline__ unsigned shared_address(const void* p) { return (unsigned)__cvta_generic_to_shared(p); }
+
+// 16 bytes of shared memory if they are wanted, else zeros, without a branch.
+__device__ __forceinline__ uint4 shared_load(unsigned from, bool wanted) {
+    uint4 v;
+    asm volatile(
+        "{.reg .pred p; setp.ne.s32 p, %5, 0; mov.b32 %0, 0; mov.b32 %1, 0; mov.b32 %2, 0; mov.b32 %3, 0;\n"
+        "@p ld.shared.v4.u32 {%0, %1, %2, %3}, [%4];}"
+        : "=r"(v.x), "=r"(v.y), "=r"(v.z), "=r"(v.w) : "r"(from), "r"((int)wanted));
+    return v;
+}
+
+// sum += a b: a of 16 rows x 16 columns, b of 16 x 8, of which two columns are meant.
+__device__ __forceinline__ void multiply_add(float sum[4], unsigned a0, unsigned a1, unsigned a2, unsigned a3, unsigned b0, unsigned b1) {
+#if __CUDA_ARCH__ >= 800
+    asm("mma.sync.aligned.m16n8k16.row.col.f32.f16.f16.f32 {%0, %1, %2, %3}, {%4, %5, %6, %7}, {%8, %9}, {%0, %1, %2, %3};"
+        : "+f"(sum[0]), "+f"(sum[1]), "+f"(sum[2]), "+f"(sum[3])
+        : "r"(a0), "r"(a1), "r"(a2), "r"(a3), "r"(b0), "r"(b1));
+#endif
+}
+
+// Where d r is found before the update by alpha of this application, or after it, and the numbers of the exchanges.
+struct Residual {
+    const Word<float>* r;
+    unsigned r_number, q_number;
+    float alpha;
+};
+
+struct Inverse {
+    const Plan* plan;             // in shared memory
+    const uint4* matrix;          // chunks of this block, of which `near` are in shared memory
+    uint4* kept;
+    int begin, near, planes;
+    const float* scale;
+    Word<float> *residual, *product, *z, *formed, *solved, *given;
+    Vector vector;
+    float* tile_sums;             // (TILE_SUMS, 16)
+    const int* lists;             // of the phases: first piece (phases + 1), first tile (phases + 1), warps that share a tile,
+                                  // first piece that is not formed here
+    const Piece* pieces;
+    const int* where;             // (pieces, 32) Plan.index
+    const Tile* tiles;
+    int size, phases, groups;
+
+    // A list into shared memory if it is short: loads after a barrier miss L1.
+    template <class T>
+    static __device__ __forceinline__ const T* brought(const T* list, int count, Arena& arena) {
+        T* to = count * sizeof(T) <= LISTS ? arena.take<T>(count) : nullptr;
+        if (!to) return list;
+        for (int k = threadIdx.x; k < count * (int)sizeof(T) / 4; k += THREADS) copy_async((int*)to + k, (const int*)list + k, 4);
+        return to;
+    }
+
+    // What nothing can stand in for (Solver.planned sees to it that it fits).
+    __device__ __forceinline__ void reserve(const Plan* shared_plan, Arena& arena) {
+        vector.high = arena.take<unsigned short>(shared_plan->entries);
+        vector.low = arena.take<unsigned short>(shared_plan->entries);
+        tile_sums = arena.take<float>(16 * TILE_SUMS);
+    }
+
+    __device__ __forceinline__ void set_up(const Body& body, const Plan* shared_plan, int index, Arena& arena) {
+        plan = shared_plan;
+        size = plan->size; phases = plan->phases; groups = plan->groups;
+        scale = body.scale; planes = body.planes;
+        residual = body.residual; product = body.product; z = body.z;
+        formed = body.formed; solved = body.solved; given = body.given;
+        const Part part = plan->parts[index];
+        lists = brought(plan->lists + index * (4 * phases + 2), 4 * phases + 2, arena);
+        pieces = brought(plan->pieces + part.piece, part.pieces, arena);
+        where = brought(plan->index + 32ll * part.piece, 32 * part.pieces, arena);
+        tiles = brought(plan->tiles + part.tile, part.tiles, arena);
+        begin = part.chunk;
+        matrix = body.matrix + 32ll * begin;
+        near = (int)((arena.end - arena.next) / 512);  // as many chunks as fit into what is left of shared memory
+        near = near < part.chunks ? near : part.chunks;
+        kept = arena.take<uint4>(32ll * near);
+        copies_begin();
+    }
+
+    __device__ __forceinline__ void fetch() const {
+        for (int k = threadIdx.x; k < 32 * near; k += THREADS) copy_async(kept + k, matrix + k, 16);
+        copies_begin();
+    }
+
+    // Brings together the vector of a phase: what this block forms, then what others do. No branches between loads: they
+    // travel together.
+    __device__ __forceinline__ void gather(int phase, const Residual& from, unsigned number, float unit) const {
+        const int warp = threadIdx.x / 32, first = lists[phase], last = lists[phase + 1];
+        const int middle = phase < groups ? lists[3 * phases + 2 + phase] : first, formed_here = middle - first;
+        if (phase == 0) {
+            if (formed_here <= FEW * WARPS) residual_pieces<FEW>(first + warp, middle, from, number, unit);
+            else for (int k = first + warp; k < middle; k += MANY * WARPS) residual_pieces<MANY>(k, middle, from, number, unit);
+        } else if (formed_here > FEW * WARPS) {
+            for (int k = first + warp; k < middle; k += 2 * WARPS) reduced_pieces<2, 6>(k, middle, from, number, unit);
+        } else if (formed_here > WARPS) {
+            reduced_pieces<FEW, 4>(first + warp, middle, from, number, unit);
+        } else {
+            reduced_pieces<1, 12>(first + warp, middle, from, number, unit);
+        }
+        if (last - middle <= FEW * WARPS) solved_pieces<FEW>(middle + warp, last, number, unit);
+        else for (int k = middle + warp; k < last; k += MANY * WARPS) solved_pieces<MANY>(k, last, number, unit);
+    }
+
+    // Of the first phase: nothing has contributed yet.
+    template <int N>
+    __device__ __forceinline__ void residual_pieces(int at, int last, const Residual& from, unsigned number, float unit) const {
+        if (at >= last) return;
+        const int lane = threadIdx.x % 32;
+        Word<float> r[N], q[N];
+        float rk[N], qk[N];
+        bool all;
+        unsigned spins = 0;
+        do {
+#pragma unroll
+            for (int k = 0; k < N; ++k) {
+                const int i = pieces[min(at + k * WARPS, last - 1)].from + lane;
+                r[k] = from.r[i].seen();
+                q[k] = product[i].seen();
+            }
+            all = true;
+#pragma unroll
+            for (int k = 0; k < N; ++k) {
+                const bool valid = lane < pieces[min(at + k * WARPS, last - 1)].keep >> 1;
+                all &= (r[k].is(rk[k], from.r_number) & (q[k].is(qk[k], from.q_number) | from.alpha == 0)) | !valid;
+                rk[k] = valid ? rk[k] : 0;
+                qk[k] = valid && from.alpha != 0 ? qk[k] : 0;
+            }
+        } while (again(!all, spins));
+#pragma unroll
+        for (int k = 0; k < N; ++k)
+            if (at + k * WARPS < last) put(pieces[at + k * WARPS], rk[k] - from.alpha * qk[k], number, unit);
+    }
+
+    __device__ __forceinline__ void put(const Piece& piece, float v, unsigned number, float unit) const {
+        const int lane = threadIdx.x % 32;
+        put_halves(vector, piece.to + lane, unit * v);
+        if (piece.keep & 1) formed[piece.from + lane].put(v, number);
+    }
+
+    // Of the phases up to the top: what has been contributed comes off.
+    template <int N, int M>
+    __device__ __forceinline__ void reduced_pieces(int at, int last, const Residual& from, unsigned number, float unit) const {
+        if (at >= last) return;
+        const int lane = threadIdx.x % 32;
+        int low[N], high[N], most = 0;
+        Word<float> r[N];
+        float v[N];
+#pragma unroll
+        for (int k = 0; k < N; ++k) {
+            const int p = min(at + k * WARPS, last - 1);
+            const unsigned slots = where[32 * p + lane];
+            low[k] = slots & 0xffffff;
+            high[k] = low[k] + (slots >> 24);
+            r[k] = from.r[pieces[p].from + lane].seen();
+            v[k] = 0;
+        }
+#pragma unroll
+        for (int k = 0; k < N; ++k) most = max(most, high[k] - low[k]);
+        for (int m = 0; m < most; m += M) {
+            Word<float> c[N][M];
+            float ck[N][M];
+            bool all;
+            unsigned spins = 0;
+            do {
+#pragma unroll
+                for (int k = 0; k < N; ++k)
+#pragma unroll
+                    for (int j = 0; j < M; ++j) c[k][j] = given[min(low[k] + m + j, max(high[k] - 1, 0))].seen();
+                all = true;
+#pragma unroll
+                for (int k = 0; k < N; ++k)
+#pragma unroll
+                    for (int j = 0; j < M; ++j) all &= c[k][j].is(ck[k][j], number) | (low[k] + m + j >= high[k]);
+            } while (again(!all, spins));
+#pragma unroll
+            for (int k = 0; k < N; ++k)
+#pragma unroll
+                for (int j = 0; j < M; ++j) v[k] -= low[k] + m + j < high[k] ? ck[k][j] : 0;
+        }
+#pragma unroll
+        for (int k = 0; k < N; ++k) {
+            if (at + k * WARPS >= last) continue;
+            const Piece& piece = pieces[at + k * WARPS];
+            const bool valid = lane < piece.keep >> 1;
+            float rk = 0;
+            for (unsigned spins = 0; again(valid && !r[k].is(rk, from.r_number), spins);) r[k] = from.r[piece.from + lane].seen();
+            put(piece, valid ? rk + v[k] : 0, number, unit);
+        }
+    }
+
+    // What has been formed, on the way to the top or in this phase by another block, and what is solved.
+    template <int N>
+    __device__ __forceinline__ void solved_pieces(int at, int last, unsigned number, float unit) const {
+        if (at >= last) return;
+        const int lane = threadIdx.x % 32;
+        const Word<float>* word[N];
+        Word<float> w[N];
+        float v[N];
+        bool all;
+#pragma unroll
+        for (int k = 0; k < N; ++k) {
+            const int p = min(at + k * WARPS, last - 1);
+            word[k] = (pieces[p].kind == 1 ? formed : solved) + where[32 * p + lane];
+        }
+        unsigned spins = 0;
+        do {
+#pragma unroll
+            for (int k = 0; k < N; ++k) w[k] = word[k]->seen();
+            all = true;
+#pragma unroll
+            for (int k = 0; k < N; ++k) {
+                const bool valid = lane < pieces[min(at + k * WARPS, last - 1)].keep >> 1;
+                all &= w[k].is(v[k], number) | !valid;
+                v[k] = valid ? v[k] : 0;
+            }
+        } while (again(!all, spins));
+#pragma unroll
+        for (int k = 0; k < N; ++k)
+            if (at + k * WARPS < last) put_halves(vector, pieces[at + k * WARPS].to + lane, unit * v[k]);
+    }
+
+    // Sums over chunks [from, to) of this block's storage, and over those `second` further on, of the next eight rows; the
+    // vector begins at `x`.
+    template <bool NEAR>
+    __device__ __forceinline__ void accumulate(int from, int to, int second, int x, float sum[2][4]) const {
+        const int lane = threadIdx.x % 32;
+        const unsigned half = shared_address((lane & 4 ? vector.low : vector.high) + x + 8 * (lane % 4)), a = shared_address(kept + lane);
+        const uint4* far = matrix + lane;
+        for (int at = from; at < to; at += CHUNKS_AT_ONCE) {
+            uint4 m[CHUNKS_AT_ONCE], n[CHUNKS_AT_ONCE], v[CHUNKS_AT_ONCE];
+#pragma unroll
+            for (int k = 0; k < CHUNKS_AT_ONCE; ++k) {
+                const int c = min(at + k, to - 1);
+                m[k] = NEAR ? shared_load(a + 512 * c, true) : __ldg(far + 32ll * c);
+                n[k] = NEAR ? shared_load(a + 512 * (c + second), second > 0) : second ? __ldg(far + 32ll * (c + second)) : make_uint4(0, 0, 0, 0);
+                v[k] = shared_load(half + 64 * (c - from), lane < 8 && at + k < to);
+            }
+#pragma unroll
+            for (int k = 0; k < CHUNKS_AT_ONCE; ++k) {
+                multiply_add(sum[0], m[k].x, n[k].x, m[k].y, n[k].y, v[k].x, v[k].y);
+                multiply_add(sum[1], m[k].z, n[k].z, m[k].w, n[k].w, v[k].z, v[k].w);
+            }
+        }
+    }
+
+    // Row `lane` (of sixteen) of a tile's product over its chunks [low, high), in lanes 0 to 15.
+    __device__ __forceinline__ float product_of(const Tile& tile, int low, int high) const {
+        const int lane = threadIdx.x % 32, second = tile.rows > 8 ? tile.chunks * planes : 0, x = tile.x;
+        float total = 0, weight = 1;
+        for (int plane = 0; plane < planes; ++plane, weight /= LOW) {
+            float sum[2][4] = {};
+            const int from = tile.chunk - begin + plane * tile.chunks + low, to = from + high - low;
+            const int kept_to = near - second, middle = to < kept_to ? to : from > kept_to ? from : kept_to;
+            accumulate<true>(from, middle, second, x + 32 * low, sum);
+            accumulate<false>(middle, to, second, x + 32 * (low + middle - from), sum);
+            const float upper = sum[0][0] + sum[1][0] + (sum[0][1] + sum[1][1]) / LOW;  // lane 4 r: row r
+            const float lower = sum[0][2] + sum[1][2] + (sum[0][3] + sum[1][3]) / LOW;  // and row r + 8
+            const float one = __shfl_sync(ALL, upper, 4 * (lane % 8)), two = __shfl_sync(ALL, lower, 4 * (lane % 8));
+            total += weight * (lane & 8 ? two : one);
+        }
+        return total;
+    }
+
+    // The products of a phase; returns this thread's part of z . r. unit: what the vector was multiplied by.
+    __device__ __forceinline__ double multiply(int phase, const Residual& from, unsigned number, float unit) const {
+        const int lane = threadIdx.x % 32, warp = threadIdx.x / 32;
+        const int first = lists[phases + 1 + phase], count = lists[phases + 2 + phase] - first;
+        const int parts = lists[2 * phases + 2 + phase];
+        const bool forward = phase < groups - 1;
+        const float back = 1 / unit;
+        double zr = 0;
+        int i = 0;
+        float d = 0;
+        Word<float> r, q;  // of d r, for z . r
+        auto look_up = [&](const Tile& tile, int row) {  // before the product: these loads take as long
+            i = tile.out + row;
+            if (forward) {
+                i = plan->target[i];
+                return;
+            }
+            d = scale[i];
+            r = from.r[i].seen();
+            if (from.alpha != 0) q = product[i].seen();
+        };
+        auto finish = [&](float value) {
+            if (forward) {
+                given[i].put(value, number);
+                return;
+            }
+            solved[i].put(value, number);
+            z[i].put(d * value, number);
+            if (d == 0) return;  // padding
+            float ri, qi = 0;
+            for (unsigned spins = 0; again(!r.is(ri, from.r_number), spins);) r = from.r[i].seen();
+            if (from.alpha != 0)
+                for (unsigned spins = 0; again(!q.is(qi, from.q_number), spins);) q = product[i].seen();
+            zr += (double)value * (ri - from.alpha * qi);
+        };
+        const int row = threadIdx.x;
+        bool here = row < 16 * count;
+        if (parts > 1 && here) {
+            here = row % 16 < tiles[first + row / 16].rows;
+            if (here) look_up(tiles[first + row / 16], row % 16);
+        }
+        for (int job = warp; job < count * parts; job += WARPS) {
+            __syncwarp();  // some lanes may still be at what they finish
+            const int at = parts > 1 ? job / parts : job, part = job - at * parts;
+            const Tile tile = tiles[first + at];
+            if (parts == 1 && lane < tile.rows) look_up(tile, lane);
+            const float value = product_of(tile, tile.chunks * part / parts, tile.chunks * (part + 1) / parts);
+            if (lane >= tile.rows) continue;
+            if (parts > 1) tile_sums[16 * job + lane] = value;
+            else finish(back * value);
+        }
+        if (parts > 1) {
+            __syncthreads();
+            if (here) {
+                float value = 0;
+                for (int k = 0; k < parts; ++k) value += tile_sums[16 * (row / 16 * parts + k) + row % 16];
+                finish(back * value);
+            }
+        }
+        return zr;
+    }
+};

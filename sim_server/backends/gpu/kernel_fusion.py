@@ -1,0 +1,282 @@
+# SPDX-License-Identifier: MIT
+"""Launches of one domain put together into one kernel: a step of many small launches is mostly the gaps between them.
+
+A launch says in its text what its items are (`int n;  // nodes`). Items of a domain touch only what is their own, and
+read other domains in the order elements, nodes, blocks; so all launches of a domain may run one after another in the
+thread that has the item, and arrays that they alone share (`own<T>`) stay in its registers.
+
+Sums over lists come first: `lanes` threads of an item share its entries and leave the sum in shared memory. Then one
+thread per item does the rest, so that the threads of a warp all have one. A launch whose arguments may be replaced
+finds out for each item whether it is among its own (`node`, ascending).
+"""
+
+import re
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_server.backends.compiler import domain_of
+from sim_server.backends.gpu.device import DeviceLaunch, compiled, cupy, options, own_headers, processors
+
+DOMAINS = ("elements", "nodes", "blocks")
+
+
+class Shape(NamedTuple):
+    """Threads of a thread block, and how many of them share the sums of an item."""
+
+    threads: int
+    lanes: int
+
+
+SHAPES = {  # up to so many items per multiprocessor; few items are spread over many multiprocessors
+    "elements": {64: Shape(32, 1), 256: Shape(64, 1), 1 << 30: Shape(128, 1)},
+    "nodes": {16: Shape(64, 16), 256: Shape(128, 8), 1 << 30: Shape(128, 4)},
+    "blocks": {64: Shape(128, 8), 160: Shape(128, 4), 1 << 30: Shape(128, 2)},
+}
+
+
+def shape(name: str, items: int, multiprocessors: int) -> Shape:
+    """For so many items of a domain."""
+    return next(s for most, s in SHAPES[name].items() if items <= most * multiprocessors)
+
+
+def domain(launch: DeviceLaunch) -> str:
+    """What its items are: the first word behind `int n;` in its struct."""
+    return domain_of(launch.text, launch.struct)
+
+
+class End(NamedTuple):
+    """What follows when all items are done: a text, its function of the same name as its struct in small letters, and
+    the struct's values."""
+
+    text: str
+    struct: str
+    params: NDArray[Any]
+
+
+class First(NamedTuple):
+    """What further thread blocks do, before those of the items: a text, its function `<struct in small letters>_of` of
+    the struct's values and the number of the thread block, and how many blocks there are."""
+
+    text: str
+    struct: str
+    params: NDArray[Any]
+    blocks: int
+
+
+class Guard(NamedTuple):
+    """Addresses of what says whether a launch of a step with several linearizations has anything to do (newton.cu):
+    left (1,), phase (bodies,), and the body of each item (items,), 0 where it is not known."""
+
+    left: int
+    phase: int
+    body: int
+
+
+GUARD = [
+    "if (*left == 0) return;",
+    "if (body && !__syncthreads_or(threadIdx.x < BLOCK_ITEMS && block * BLOCK_ITEMS + threadIdx.x < n &&",
+    "                              phase[body[block * BLOCK_ITEMS + threadIdx.x]] != 2)) return;",
+]
+
+
+class Fused:
+    """Several launches over the same items as one. private: addresses of arrays that need no memory (`own`)."""
+
+    def __init__(
+        self, launches: Sequence[DeviceLaunch], end: End | None = None, private: frozenset[int] = frozenset(),
+        guard: Guard | None = None, first: First | None = None,
+    ):  # fmt: skip
+        self.name = "+".join(launch.name for launch in launches)
+        self.items = next(launch.items for launch in launches if not launch.mailed)
+        sums = any(launch.sums for launch in launches)
+        self.shape = shape(domain(launches[0]) if sums else "elements", self.items, processors())
+        self._launches, self._before = list(launches), first.blocks if first else 0  # keeps their arrays
+        text = Text(launches, self.shape, end, private, guard, first)
+        self._arguments = (np.int32(self.items), *text.values, *(x.params for x in (end, first) if x))
+        flags = (*options(launches[0].types), *own_headers())
+        self._module = cupy().RawModule(code=text.source, options=flags, backend="nvrtc")
+        self._function = self.function("fused")
+        self._ends = end is not None
+
+    def function(self, kernel: str) -> Any:
+        """A kernel of the whole text."""
+        return compiled(self.name, self._module, kernel)
+
+    def __call__(self) -> None:
+        """Puts it onto the current stream."""
+        if self.items or self._ends:
+            blocks = max(1, -(-self.items * self.shape.lanes // self.shape.threads))
+            self._function((self._before + blocks,), (self.shape.threads,), self._arguments)
+
+
+class Text:
+    """The kernel `fused` of some launches: its source, and the values of its arguments after the number of items.
+
+    Each array is one argument, whatever launches have it, and no other overlaps it: that tells the compiler what it
+    may keep in registers from one launch to the next. private: addresses of arrays that need no memory at all. guard:
+    thread blocks without an item of a body whose search is not over return at once.
+    """
+
+    def __init__(
+        self, launches: Sequence[DeviceLaunch], shape: Shape, end: End | None = None,
+        private: frozenset[int] = frozenset(), guard: Guard | None = None, first: First | None = None,
+    ):  # fmt: skip
+        self._launches, self._private = launches, private
+        self.values: list[Any] = [np.uint64(address) for address in guard or ()]
+        self._parameters = [f"const int* __restrict__ {name}" for name in guard._fields] if guard else []
+        self._setup: list[str] = []
+        self._names: dict[int, str] = {}
+        texts = {launch.text: f"text{k}" for k, launch in enumerate(launches)}
+        self._spaces = [texts[launch.text] for launch in launches]
+        self._written = {
+            launch.arrays[f.name].data.ptr
+            for launch in launches for f in launch.fields if f.dtype is not None and not f.constant
+        }  # fmt: skip
+        lines = ["#define ITEMS_ONLY", f"#define BLOCK_ITEMS {shape.threads // shape.lanes}"]
+        headers = [h for text in texts for h in re.findall(r'^#include "[^"]+"', text, re.MULTILINE)]
+        lines += dict.fromkeys([*headers, '#include "sums.cuh"'])  # outside of the texts' namespaces, once
+        for text, name in texts.items():
+            body = re.sub(r"^#(include|define WIDE).*$", "", text, flags=re.MULTILINE)
+            lines += [f"namespace {name} {{", body, "}"]
+        body_lines = [*self._sums(shape), *self._items()]
+        if end:
+            lines.append(end.text)
+            self._parameters.append(f"const {end.struct} end")
+            body_lines.append(f"{end.struct.lower()}(end);")
+        opening = [f"const int block = (int)blockIdx.x - {first.blocks if first else 0};"]
+        if first:
+            lines.append(first.text)
+            self._parameters.append(f"const {first.struct} first")
+            opening.append(f"if (block < 0) {{ {first.struct.lower()}_of(first, blockIdx.x); return; }}")
+        heading = f'extern "C" __global__ void __launch_bounds__({shape.threads}) fused(int n'
+        parameters = "".join(f", {p}" for p in self._parameters)
+        opening += GUARD if guard else []
+        lines += [f"{heading}{parameters}) {{", *opening, *self._setup, *body_lines, "}"]
+        self.source = "\n".join(lines)
+
+    def _each(self) -> Iterator[tuple[int, DeviceLaunch, str, str]]:
+        for k, (launch, space) in enumerate(zip(self._launches, self._spaces, strict=True)):
+            yield k, launch, space, launch.name.split(".")[1]
+
+    def _sums(self, shape: Shape) -> list[str]:
+        """Sets the arguments up and sums over the lists."""
+        for k, launch, space, _ in self._each():
+            if launch.mailed:
+                self._parameters.append(f"const {space}::{launch.struct}* mail{k}")
+                self.values.append(np.uint64(launch.mail_address))
+                self._setup.append(f"const int touched{k} = mail{k}->n;")
+            else:
+                self._setup += [f"{space}::{launch.struct} p{k};", f"p{k}.n = n;"]
+                self._setup += self._members(k, launch)
+        sums = [(k, space, kernel) for k, launch, space, kernel in self._each() if launch.sums]
+        if not sums:
+            return []
+        lines = ["constexpr int ROWS = BLOCK_ITEMS;"]
+        for k, space, kernel in sums:
+            lines += [f"constexpr int SIZE{k} = padded({space}::{kernel}_sums, {shape.lanes});"]
+            lines += [f"__shared__ local sums{k}[ROWS][SIZE{k} | 1];"]
+        lines += [f"{{ const int slot = threadIdx.x / {shape.lanes}, lane = threadIdx.x % {shape.lanes};"]
+        lines += ["const int i = block * ROWS + slot;"]
+        for k, space, kernel in sums:
+            lines += [
+                f"{{ local sum[SIZE{k}];",
+                f"for (int m = 0; m < SIZE{k}; ++m) sum[m] = 0;",
+                f"if (i < n) for (int k = p{k}.start[i] + lane, end = p{k}.start[i + 1]; k < end; k += {shape.lanes})",
+                f"    {space}::{kernel}_add(p{k}, i, k, sum);",
+                f"share_sum<SIZE{k}, {shape.lanes}>(sum, lane, sums{k}[slot]); }}",
+            ]
+        return [*lines, "}", "__syncthreads();"]
+
+    def _members(self, k: int, launch: DeviceLaunch) -> Iterator[str]:
+        for f in launch.fields[1:]:
+            if f.dtype is None:
+                self._parameters.append(f"{f.kind} p{k}_{f.name}")
+                kind = {"int": np.int32, "float": np.float32, "double": np.float64}[f.kind]
+                self.values.append(kind(launch.params[f.name]))
+                yield f"p{k}.{f.name} = p{k}_{f.name};"
+            elif not f.own:
+                yield f"p{k}.{f.name} = {self._array(launch, f.name, f.kind)};"
+
+    def _array(self, launch: DeviceLaunch, name: str, kind: str) -> str:
+        """The argument of the kernel that is this array."""
+        array = launch.arrays[name]
+        address = int(array.data.ptr)
+        if array.size == 0:
+            return "nullptr"
+        if address not in self._names:
+            self._names[address] = f"a{len(self._names)}"
+            const = "" if address in self._written else "const "
+            self._parameters.append(f"{const}{kind}* __restrict__ {self._names[address]}")
+            self.values.append(np.uint64(address))
+        return self._names[address]
+
+    def _items(self) -> list[str]:
+        """One item of each launch, by one thread."""
+        lines = ["const int i = block * BLOCK_ITEMS + threadIdx.x;", "if (threadIdx.x < BLOCK_ITEMS && i < n) {"]
+        rows: dict[int, str] = {}
+        for k, launch, space, kernel in self._each():
+            own = list(self._rows(launch, rows, lines))
+            if launch.mailed:
+                lines += [
+                    f"if (touched{k}) {{ const int here = place(mail{k}->node, touched{k}, i);",
+                    f"    if (here >= 0) {{ {space}::{launch.struct} p{k} = *mail{k};",
+                    *(f"        p{k}.{name}.item = {row};" for name, row in own),
+                    f"        {space}::{kernel}_item(p{k}, here); }} }}",
+                ]
+                continue
+            lines += [f"p{k}.{name}.item = {row};" for name, row in own]
+            last = f"_put(p{k}, i, sums{k}[threadIdx.x])" if launch.sums else f"_item(p{k}, i)"
+            lines.append(f"{space}::{kernel}{last};")
+        return [*lines, "}"]
+
+    def _rows(self, launch: DeviceLaunch, rows: dict[int, str], lines: list[str]) -> Iterator[tuple[str, str]]:
+        """Where the item's rows of the arrays of its own are, by member."""
+        for f in (f for f in launch.fields if f.own):
+            array = launch.arrays[f.name]
+            address = int(array.data.ptr)
+            width = int(np.prod(array.shape[1:]))
+            if address not in rows:
+                if address in self._private:
+                    rows[address] = f"row{len(rows)}"
+                    lines.append(f"{f.kind} {rows[address]}[{width}];")
+                else:
+                    rows[address] = f"{self._array(launch, f.name, f.kind)} + {width} * (long long)i"
+            yield f.name, rows[address]
+
+
+def fused(
+    launches: Sequence[DeviceLaunch],
+    guard: Callable[[Sequence[DeviceLaunch]], Guard] | None = None,
+    first: First | None = None,
+) -> list[Any]:
+    """The launches in as few kernels as their domains allow. guard: makes that of those in one kernel. first: what the
+    first kernel does besides."""
+    if any(domain(launch) not in DOMAINS for launch in launches):
+        return list(launches)
+    together = [group for d in DOMAINS for group in _alike([x for x in launches if domain(x) == d])]
+    together = [group for group in together if group]
+    return [
+        Fused(group, None, _private(group, launches), guard(group) if guard else None, None if k else first)
+        for k, group in enumerate(together)
+    ]  # fmt: skip
+
+
+def _alike(launches: Sequence[DeviceLaunch]) -> list[list[DeviceLaunch]]:
+    """Those of one domain by number of items: the elements of one effect are not those of another."""
+    counts = {x.items: None for x in launches if not x.mailed}
+    return [[x for x in launches if x.mailed or x.items == n] for n in counts]
+
+
+def _private(group: Sequence[DeviceLaunch], launches: Sequence[DeviceLaunch]) -> frozenset[int]:
+    """Addresses of the arrays that are `own` to all launches that have them, all of this group."""
+    owned: set[int] = set()
+    others: set[int] = set()
+    for launch in launches:
+        inside = any(launch is x for x in group)
+        for f in launch.fields:
+            if f.dtype is not None:
+                (owned if f.own and inside else others).add(int(launch.arrays[f.name].data.ptr))
+    return frozenset(owned - others)

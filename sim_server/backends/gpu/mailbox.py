@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: MIT
+"""The compiled GPU loop (loop.cpp), and its mailboxes."""
+
+import ctypes as c
+from functools import cache
+from typing import Any
+
+from sim_server.backends.compiler import native
+from sim_server.backends.cpu.structs import BALANCE, RECORD, check_sizes
+from sim_server.backends.gpu import structs
+from sim_server.backends.gpu.structs import ENERGY, FOUND, STAMP
+
+
+@cache
+def library() -> c.CDLL:
+    """The compiled loop."""
+    loop, p = c.POINTER(structs.Loop), c.c_void_p
+    compiled = native(
+        "backends/gpu/loop.cpp",
+        {
+            "wf_gpu_run": (c.c_int64, [loop, c.c_int64]), "wf_gpu_wait": (c.c_int32, [loop]),
+            "wf_gpu_open": (c.c_int32, [loop]), "wf_gpu_renew": (c.c_int32, [loop]),
+            "wf_gpu_close": (c.c_int32, [loop]), "wf_gpu_post": (p, [c.POINTER(structs.Mailbox), p]),
+            "wf_gpu_start_balance": (None, [p, p, c.c_double, c.c_int32]), "wf_gpu_sizes": (c.c_int32, [p]),
+        },
+    )  # fmt: skip
+    sizes = (c.c_int32 * 11)()
+    compiled.wf_gpu_sizes(sizes)
+    from sim_server.backends.gpu.solver import RESULT
+
+    structures = (structs.Cuda, structs.Mail, structs.Mailbox)
+    ours = [*map(c.sizeof, structures), RESULT.itemsize, STAMP.itemsize, FOUND.itemsize]
+    ours += [c.sizeof(structs.Body), c.sizeof(structs.Loop), RECORD.itemsize, ENERGY.itemsize, BALANCE.itemsize]
+    check_sizes("backends/gpu/loop.cpp", list(sizes), ours)
+    return compiled
+
+
+class Mailbox:
+    """Bytes on the device that are replaced between batches. Old mail and what it leads to is kept until it is out of
+    use."""
+
+    def __init__(self, loop: Any, box: structs.Mailbox):
+        self._loop, self._box, self.number = loop, box, 0
+        self._kept: list[Any] = []  # in use, waiting
+        self._leaving: list[tuple[int, Any]] = []  # (free once so many steps are completed, what)
+
+    def post(self, data: bytes, keep: Any = None, event: int | None = None) -> structs.Mail:
+        """Replaces the bytes from the next batch on (once the event is done). keep: what the bytes point to.
+
+        They hold from the step after the result's `taken` steps, once it is not below 0.
+        """
+        assert len(data) == self._box.size
+        self.number += 1
+        memory = c.create_string_buffer(data, len(data))
+        mail = structs.Mail(c.addressof(memory), event, self.number, -1)
+        displaced = library().wf_gpu_post(c.byref(self._box), c.addressof(mail))
+        self._leaving = [(step, what) for step, what in self._leaving if step > self._loop.step]
+        if displaced:
+            self._kept.pop()  # it was never taken up; what is in use must live on
+        elif len(self._kept) > 1:  # the last one was taken up: those before are done with after what is under way
+            self._leaving.append((int(self._loop.launched), self._kept[:-1]))
+            del self._kept[:-1]
+        self._kept.append((memory, mail, keep))
+        return mail
+
+    def withdraw(self) -> bool:
+        """Takes back what the loop has not looked at; only while it stands still. True if something came back."""
+        back = bool(library().wf_gpu_post(c.byref(self._box), None)) or bool(self._box.held)
+        self._box.held = None
+        if back:
+            self._kept.pop()
+        return back
+
+    @property
+    def taken(self) -> bool:
+        """What was posted last is on its way to the device."""
+        return bool(self._box.taken == self.number)

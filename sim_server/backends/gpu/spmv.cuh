@@ -1,0 +1,260 @@
+// SPDX-License-Identifier: MIT
+// The rows of A that a thread block has, with the vectors that are its own. A block keeps the values of every node that its
+// rows read ("halo", its own nodes first), so that a search direction is formed where it is used and never sent.
+#pragma once
+#include "block_group.cuh"
+#include "invert3.cuh"
+
+#define TOGETHER 3                   // rows of a warp at a time
+#define SLAB_ROWS 4                  // ... of a slab
+#define SLAB (SLAB_ROWS * WARPS)     // rows that come into shared memory at a time where not all fit, in turns into ...
+#define SLABS 2                      // ... so many places
+#define SLAB_BLOCKS (17 * SLAB)      // of A, at most; a slab with more is read where it is
+
+struct Rows {
+    int begin, own, halo;           // own nodes [begin, begin + own) of the body; nodes read
+    const int* nodes;               // (halo,) of the body
+    real* values;                   // (halo, 3) of the vector that A multiplies
+    int* place;                     // (halo,) where the next one is read
+    real *x, *r, *q;                // (own, 3)
+    real* scale;                    // (own, 3) of the inverse, or null
+    const int* row_start;           // (own + 1,), less `base`
+    const int* columns;             // places in halo
+    const real* blocks;
+    int base;
+    bool near;                      // A is in shared memory
+    int slabs;                      // place of (SLABS, SLAB_BYTES) of shared memory that A passes through, or -1
+    int near_values, near_blocks, near_columns;  // places, where they are near
+
+    // What is used most comes first. inverted: there is an inverse.
+    __device__ __forceinline__ void set_up(const Solve& s, const Body& body, const Share& share, Arena& arena, bool inverted) {
+        begin = share.begin; own = share.own; halo = share.halo;
+        nodes = s.halo + share.halo_first;
+        values = arena.take<real>(3 * halo);
+        near_values = place_of(values);
+        if (!values) values = s.halo_values + 3ll * share.halo_first;
+        place = arena.take<int>(halo);
+        if (!place) place = s.halo_place + share.halo_first;
+        const long long row = body.first + begin, all = 3ll * s.nodes;
+        bring(s, (int)row, share, arena, (inverted ? 12 : 9) * own * (int)sizeof(real) + 64);
+        scale = inverted ? arena.take<real>(3 * own) : nullptr;
+        r = taken(arena, s.own + 3 * row + all);
+        q = taken(arena, s.own + 3 * row + 2 * all);
+        x = taken(arena, s.own + 3 * row);
+        int* list = arena.take<int>(halo);
+        if (!list) return;
+        for (int k = threadIdx.x; k < halo; k += THREADS) copy_async(list + k, nodes + k, 4);
+        nodes = list;
+        copies_begin();
+    }
+    __device__ __forceinline__ real* taken(Arena& arena, real* instead) const {
+        real* found = arena.take<real>(3 * own);
+        return found ? found : instead;
+    }
+
+    // Copies the own rows of A into shared memory if they fit beside `others` bytes: loads after a barrier miss L1.
+    __device__ __forceinline__ void bring(const Solve& s, int row, const Share& share, Arena& arena, int others) {
+        const int count = share.blocks;
+        base = share.block_first;
+        row_start = s.row_start + row;
+        columns = s.seat + base;
+        blocks = s.values + 9ll * base;
+        slabs = -1;
+        Arena before = arena;
+        real* v = arena.take<real>(9 * count);
+        int *c = arena.take<int>(count), *start = arena.take<int>(own + 1);
+        near = v && c && start && near_values >= 0 && arena.end - arena.next >= others;
+        near_blocks = place_of(v);
+        near_columns = place_of(c);
+        if (!near) {
+            arena = before;
+            start = arena.take<int>(own + 1);
+            if (start && near_values >= 0) slabs = place_of(arena.take<char>(SLABS * SLAB_BYTES));
+        }
+        if (start)
+            for (int k = threadIdx.x; k <= own; k += THREADS) copy_async(start + k, row_start + k, 4);
+        if (near) {
+            for (int k = threadIdx.x; k < 9 * count; k += THREADS) copy_async(v + k, blocks + k, sizeof(real));
+            for (int k = threadIdx.x; k < count; k += THREADS) copy_async(c + k, columns + k, 4);
+            blocks = v; columns = c;
+        }
+        copies_begin();
+        if (slabs >= 0)
+            for (int k = 0; k < SLABS - 1; ++k) ask(k, row_start);
+        if (start) row_start = start;
+    }
+
+    static constexpr int VALUE_BYTES = SLAB_BLOCKS * 9 * (int)sizeof(real) + 16, SLAB_BYTES = VALUE_BYTES + 4 * SLAB_BLOCKS + 16;
+
+    struct Slab { int low, high, first, count; };  // rows, and their blocks of A as places in `blocks`
+
+    __device__ __forceinline__ Slab slab(int k, const int* starts) const {
+        const int low = min(k * SLAB, own), high = min(low + SLAB, own);
+        return {low, high, starts[low] - base, starts[high] - starts[low]};
+    }
+
+    // Brings a slab into its place: from the 16 bytes on in which it begins.
+    __device__ __forceinline__ void ask(int k, const int* starts) const {
+        const Slab s = slab(k, starts);
+        char* to = dynamic + slabs + k % SLABS * SLAB_BYTES;
+        if (s.count <= SLAB_BLOCKS && s.count > 0) {
+            all_of(to, blocks + 9ll * s.first, 9 * (int)sizeof(real) * s.count);
+            all_of(to + VALUE_BYTES, columns + s.first, 4 * s.count);
+        }
+        copies_begin();
+    }
+    static __device__ __forceinline__ void all_of(char* to, const void* from, int bytes) {
+        const int skipped = (int)((unsigned long long)from & 15);
+        const char* begin = (const char*)from - skipped;
+        for (int k = 16 * threadIdx.x; k < skipped + bytes; k += 16 * THREADS) copy_async(to + k, begin + k, 16);
+    }
+
+    // q = A values for the own nodes. done(node, c, q): entry c of a node's, called by as many lanes as there are.
+    template <class Done>
+    __device__ __forceinline__ void multiply(Done done) const {
+        if (slabs >= 0) through_slabs(done);
+        else if (!near) some_rows<TOGETHER, false>(done);
+        else if (own <= WARPS) some_rows<1, true>(done);
+        else some_rows<TOGETHER, true>(done);
+    }
+
+    template <int N, bool NEAR, class Done>
+    __device__ __forceinline__ void some_rows(Done done) const {
+        for (int first = threadIdx.x / 32; first < own; first += N * WARPS) {
+            real sum[N];
+            if (NEAR) of_near<N>(first, own, base, near_blocks, near_columns, sum);
+            else of_far<N>(first, own, sum);
+            finish<N>(first, own, sum, done);
+        }
+    }
+
+    // A passes through shared memory; the first slabs of the next product come beside what is between. Whole rounds of slabs,
+    // so that each finds its place.
+    template <class Done>
+    __device__ __forceinline__ void through_slabs(Done done) const {
+        const int count = (own + SLABS * SLAB - 1) / (SLABS * SLAB) * SLABS;
+        for (int k = 0; k < count; ++k) {
+            copies_end<SLABS - 2>();
+            __syncthreads();  // all have this one, and nobody reads the one before any more
+            const int next = k + SLABS - 1;
+            ask(next < count ? next : next - count, row_start);
+            const Slab s = slab(k, row_start);
+            const int first = s.low + (int)threadIdx.x / 32;
+            if (first >= s.high) continue;
+            if (s.count > SLAB_BLOCKS) {
+                for (int row = first; row < s.high; row += TOGETHER * WARPS) {
+                    real sum[TOGETHER];
+                    of_far<TOGETHER>(row, s.high, sum);
+                    finish<TOGETHER>(row, s.high, sum, done);
+                }
+                continue;
+            }
+            const int here = slabs + k % SLABS * SLAB_BYTES;
+            const int a = here + (int)((unsigned long long)(blocks + 9ll * s.first) & 15);
+            const int c = here + VALUE_BYTES + (int)((unsigned long long)(columns + s.first) & 15);
+            real sum[SLAB_ROWS];
+            of_near<SLAB_ROWS>(first, s.high, base + s.first, a, c, sum);
+            finish<SLAB_ROWS>(first, s.high, sum, done);
+        }
+    }
+
+    // Hands on the sums of rows first, first + WARPS, ...: lane 3 n + c has entry c of the n-th.
+    template <int N, class Done>
+    static __device__ __forceinline__ void finish(int first, int end, const real sum[N], Done done) {
+        const int lane = threadIdx.x % 32, n = lane / 3, c = lane - 3 * n;
+        real mine = sum[0];
+        if (N > 1) {
+            mine = __shfl_sync(ALL, sum[0], c);
+#pragma unroll
+            for (int k = 1; k < N; ++k) {
+                const real other = __shfl_sync(ALL, sum[k], c);
+                mine = n == k ? other : mine;
+            }
+        }
+        if (lane < 3 * N && first + n * WARPS < end) done(first + n * WARPS, c, mine);
+    }
+
+    // Eight blocks of a row at a time: lane 3 e + r has row r of block e. The sums end in lanes 0, 1, 2. Rows of up to 16 blocks
+    // go without a branch, so that the warp's rows overlap. a_at, c_at: places of values and columns from the
+    // block on that is `origin`-th.
+    template <int N>
+    __device__ __forceinline__ void of_near(int first, int end, int origin, int a_at, int c_at, real sum[N]) const {
+        const real *a_of = shared_at<real>(a_at), *v_of = shared_at<real>(near_values);
+        const int* c_of = shared_at<int>(c_at);
+        const int lane = threadIdx.x % 32, entry = lane / 3, r = lane - 3 * entry;
+#pragma unroll
+        for (int n = 0; n < N; ++n) {
+            const int node = min(first + n * WARPS, end - 1), low = row_start[node] - origin, high = row_start[node + 1] - origin;
+            sum[n] = 0;
+#pragma unroll
+            for (int e = 0; e < 16; e += 8) {
+                const int k = low + e + entry, there = min(k, high - 1);
+                const real *a = a_of + 9 * there + 3 * r, *v = v_of + 3 * c_of[there];
+                const real product = a[0] * v[0] + a[1] * v[1] + a[2] * v[2];
+                sum[n] += lane < 24 && k < high ? product : 0;
+            }
+            for (int k = low + 16 + entry; k < high && lane < 24; k += 8) {
+                const real *a = a_of + 9 * k + 3 * r, *v = v_of + 3 * c_of[k];
+                sum[n] += a[0] * v[0] + a[1] * v[1] + a[2] * v[2];
+            }
+        }
+        for (int k = 12; k >= 3; k >>= 1)
+#pragma unroll
+            for (int n = 0; n < N; ++n) sum[n] += __shfl_down_sync(ALL, sum[n], k);
+    }
+
+    // Three at a time: lane 9 e + 3 r + c has entry (r, c) of block e, so that A is read in order.
+    template <int N>
+    __device__ __forceinline__ void of_far(int first, int end, real sum[N]) const {
+        const int lane = threadIdx.x % 32, entry = lane / 9, c = lane % 3;
+#pragma unroll
+        for (int n = 0; n < N; ++n) {
+            const int node = min(first + n * WARPS, end - 1), low = row_start[node] - base, high = row_start[node + 1] - base;
+            sum[n] = 0;
+#pragma unroll
+            for (int e = 0; e < 15; e += 3) {
+                const int k = low + e + entry, there = min(k, high - 1);
+                const real product = blocks[9ll * there + lane % 9] * values[3 * __ldg(columns + there) + c];
+                sum[n] += lane < 27 && k < high ? product : 0;
+            }
+            for (int k = low + 15 + entry; k < high && lane < 27; k += 3)
+                sum[n] += blocks[9ll * k + lane % 9] * values[3 * __ldg(columns + k) + c];
+        }
+#pragma unroll
+        for (int n = 0; n < N; ++n) {
+            sum[n] += __shfl_down_sync(ALL, sum[n], 9) + __shfl_down_sync(ALL, sum[n], 18);  // lanes 0 to 8: entry (r, c)
+            sum[n] += __shfl_down_sync(ALL, sum[n], 1) + __shfl_down_sync(ALL, sum[n], 2);   // lanes 0, 3, 6: row r
+            sum[n] = __shfl_sync(ALL, sum[n], lane < 3 ? 3 * lane : 0);
+        }
+    }
+
+    // The values that A multiplies: those of exchange `number` + beta what they are.
+    template <class T>
+    __device__ __forceinline__ void form(const Word<T>* from, unsigned number, real beta) const {
+        for (int first = threadIdx.x; first < 3 * halo; first += 3 * THREADS) {
+            Word<T> seen[3];
+            T got[3];
+            int at[3];
+            bool all;
+#pragma unroll
+            for (int n = 0; n < 3; ++n) {
+                const int k = min(first + n * THREADS, 3 * halo - 1);
+                at[n] = place[k / 3] + k % 3;
+            }
+            unsigned spins = 0;
+            do {  // no branch between the loads: they travel together
+#pragma unroll
+                for (int n = 0; n < 3; ++n) seen[n] = from[at[n]].seen();
+                all = true;
+#pragma unroll
+                for (int n = 0; n < 3; ++n) all &= seen[n].is(got[n], number);
+            } while (again(!all, spins));
+#pragma unroll
+            for (int n = 0; n < 3; ++n) {
+                const int k = first + n * THREADS;
+                if (k < 3 * halo) values[k] = beta != 0 ? got[n] + beta * values[k] : got[n];
+            }
+        }
+        __syncthreads();
+    }
+};

@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: MIT
+"""What an effect is to the simulation: elements that couple nodes, and launches that add to the system of a step."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_server.backends.compiler import Launch
+from sim_server.mechanics.system import Stencil, System
+from sim_server.mechanics.world import Body, World
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """An element whose deformation its law does not define: the first time [s] at which it was found, and its J.
+
+    element: its number in the object's mesh.
+    """
+
+    effect: str
+    body: int
+    element: int
+    time: float
+    J: float
+
+    def __str__(self) -> str:
+        return f"element {self.element} has J = {self.J:.3g}, which {self.effect} does not define"
+
+
+@dataclass(frozen=True)
+class ElementEnergies:
+    """Potential energies of the elements of an effect, which `launch` leaves in energy (m,) [J].
+
+    owner (m,): index of the body of each element, ascending.
+    """
+
+    launch: Any
+    energy: NDArray[np.float64]
+    owner: NDArray[np.int64]
+
+
+class Effect:
+    """Base of all effects. A file under effects/ has `build(world, listed) -> Effect`.
+
+    elements (m, c): node numbers (of the scene) of the elements whose c = 2 or 4 corners the effect couples, or None.
+    rotated: the bodies whose elements have rotations, which go into system.mean for the warp; other bodies' nodes get
+    theirs by shape matching. elastic: by body index, Young's modulus [Pa] and Poisson's ratio of its
+    elements, (m,) each, for viewers.
+    """
+
+    elements: NDArray[np.int32] | None = None
+    rotated: tuple[Body, ...] = ()
+    elastic: Mapping[int, tuple[NDArray[np.float64], NDArray[np.float64]]] = MappingProxyType({})
+
+    @property
+    def told(self) -> bool:
+        """What it adds to A follows from the scene, the mesh and the positions, so that others can build A too."""
+        return True
+
+    def told_at(self, step: int) -> bool:
+        """The same of the A that was assembled after so many completed steps."""
+        return self.told
+
+    def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
+        """What adds the effect to system.b, .diagonal, .block, .sums and .mean. accumulate: to sums, others have."""
+        return []
+
+    def energies(self) -> ElementEnergies | None:
+        """Potential energies of its elements, or None for an effect without any."""
+        return None
+
+    def energy(self) -> float:
+        """Potential energy of the present state [J]; 0 for an effect without one.
+
+        NaN where an element has a deformation that its law does not define.
+        """
+        elements = self.energies()
+        if elements is None:
+            return 0.0
+        elements.launch()
+        return float(elements.launch.fetch("energy").sum(dtype=float))
+
+    def refusals(self) -> list[Refusal]:
+        """Elements that had a state which the effect does not define, by the time at which they had it first; that a
+        line search tried it is enough.
+
+        The solver finds their forces not finite (status not_finite) and leaves the velocity as it was.
+        """
+        return []
+
+
+class Build(Protocol):
+    """Of an effect's module. listed: the bodies that have it, each with its parameters (scene effects: all bodies).
+
+    Where parameters have a `variant`, bodies that differ in it are not built together: each variant has other kernels.
+    """
+
+    def __call__(self, world: World, listed: list[tuple[Body, Any]]) -> Effect: ...
+
+
+def per_node(world: World, listed: list[tuple[Body, Any]], value: str) -> NDArray[np.float64]:
+    """(nodes,) with the parameter `value` of each listed body at its nodes, 0 elsewhere."""
+    out = np.zeros(world.nodes)
+    for body, params in listed:
+        out[body.nodes] = getattr(params, value)
+    return out

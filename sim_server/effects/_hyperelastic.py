@@ -1,0 +1,249 @@
+# SPDX-License-Identifier: MIT
+"""Hyperelastic tetrahedra: what the laws under effects/ share (st_venant_kirchhoff, neo_hookean, ...).
+
+Multiplicative Jacobian Energy Decomposition (Marchesseau, Heimann, Chatelin, Willinger, Delingette, MICCAI 2010; Prog.
+Biophys. Mol. Biol. 103, 2010), with derivatives by invariants in place of its sums of products. With corners Q_i, rest
+volume V, rest gradients D_i of the shape functions, F = sum_i Q_i (x) D_i and C = F^T F, a law is an energy density
+W(I1, I2, J) [J/m3] and its first and second derivatives W_p, W_pq. The gradients of the invariants at the corners
+are ::
+
+    a1_i = 2 F D_i,   a2_i = 2 (I1 - F F^T) F D_i,   aJ_i = cof(F) D_i
+
+and force and stiffness of an element are ::
+
+    f_i = -V sum_p W_p ap_i
+    K_ij = V { sum_pq W_pq ap_i aq_j^T + 2 W_1 (D_i . D_j) I - W_J [F (D_i x D_j)]x
+               + 2 W_2 [(I1 D_i . D_j - g_i . g_j) I + 2 g_i g_j^T - g_j g_i^T - (D_i . D_j) F F^T] },   g_i = F D_i
+
+Six edge blocks are computed, K_ii = -sum_j K_ij; cof(F) D_i and F (D_i x D_j) are products and differences of the
+current edges. There is no inverse of C and no fourth-order tensor. D_i . D_j costs less to compute again than to load.
+
+`[solver] projection` makes the stiffness of every element positive semi-definite, which conjugate gradients and the
+factorization need: "clamp" sets negative eigenvalues of d2W/dF2 to zero (Teran, Sifakis, Irving, Fedkiw 2005),
+"absolute" takes their absolute values (Chen, Liu, Jacobson, Levin, Zheng 2024), "none" leaves them, "excess" does the
+first where they are small and the second where they are large (below). "auto" (default) is "excess" where a step makes
+one linearization, "clamp" with Newton-Raphson, whose line search keeps it from overshooting. Where L D L^T of the
+element's stiffness finds no negative pivot nothing is done; elsewhere what its negative eigenvalues lack is added, one
+mode after another, from the eigensystem by principal stretches s_i, in closed form (Smith, de Goes, Kim 2019): in the
+plane of i and j, with k the third axis, ::
+
+    twist = 2 W_1 + 2 W_2 (s_k^2 + s_i s_j) + W_J s_k,   flip = 2 W_1 + 2 W_2 (s_k^2 - s_i s_j) - W_J s_k
+
+(no difference quotients, so nothing is lost where stretches meet) and the 3x3 matrix d2W/ds_i ds_j.
+
+"clamp" leaves some modes without stiffness: from states with many inverted elements, at Poisson's ratios of 0.45 and
+above, one linearization a step overshoots without end. "absolute" holds there, and is too stiff in ordinary motion,
+where moderate compression makes a twist a little negative (a swinging beam: half as much again of the error of the one
+linearization). "excess" makes of an eigenvalue e < 0 what |e| exceeds m by: m is the material's own stiffness of the
+mode, the mean of twist and flip, in which the terms of W_J cancel, and 0 for d2W/ds_i ds_j. So in ordinary motion it is
+"clamp", and where elements are crushed or turned over nearly "absolute". Laws without these modes (costa) have
+"absolute" in its place.
+
+Laws with ln J or a power of J are not defined at J <= 0. `inversion = "refuse"` (default) lets the solve end with the
+status not_finite and names the element; "regularize" goes on below J = `floor` with the parabola that each function of
+J has there, so that W stays twice continuously differentiable and pushes an inverted element back.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, create_model
+
+from sim_server.backends.compiler import Launch
+from sim_server.effects._base import Effect, ElementEnergies, Refusal
+from sim_server.effects.corotational import shape_gradients
+from sim_server.errors import InputError
+from sim_server.mechanics.system import Stencil, System
+from sim_server.mechanics.world import Body, World
+from sim_server.scene.parameters import Parameters, Positive
+from sim_server.scene.regions import Poisson, Regional, by_region, constants_by_region
+
+Reals = NDArray[np.float64]
+Values = Mapping[str, Reals]
+PROJECTIONS = {"none": 0, "clamp": 1, "absolute": 2, "excess": 3}  # kernels/hyperelastic.cuh
+
+
+@dataclass(frozen=True)
+class Constant:
+    """A material constant in the scene: its type, and its unit and meaning. default: None where it is required."""
+
+    name: str
+    kind: Any
+    text: str
+    default: Any = None
+    unit: str = "Pa"
+
+
+Inversion = Literal["refuse", "regularize"]
+Floor = Annotated[float, Field(gt=0, lt=1)]
+INVERSION: dict[str, Any] = {
+    "inversion": (Inversion, Field(default="refuse", description="what becomes of elements with J <= 0")),
+    "floor": (Floor, Field(default=0.2, description="J below which the law goes on as a parabola, if regularized [-]")),
+}
+
+
+@dataclass(frozen=True)
+class Law:
+    """A law: the name of its effect, its constants, and what the kernels get of them.
+
+    pack: values of the constants, (m,) each -> (k, m) in the order of the kernel text. elastic: the Young's modulus
+    [Pa] and Poisson's ratio that it has at small strains. axes: (m, 3, 3) material axes in columns, or None. text:
+    path of the kernel text. refuses: J <= 0 is not defined. regularizes: the text takes a floor of J, and where the
+    law refuses the scene may ask for it.
+    """
+
+    name: str
+    constants: Sequence[Constant]
+    pack: Callable[[Values], Sequence[Reals]]
+    elastic: Callable[[Values], tuple[Reals, Reals]] | None = None
+    axes: Callable[[Values], Reals] | None = None
+    text: str = ""
+    refuses: bool = True
+    regularizes: bool = True
+
+    @property
+    def path(self) -> str:
+        """Of the kernel text, as backend.read_text takes it."""
+        return self.text or f"kernels/hyperelastic.cu+effects/{self.name}.cuh"
+
+    def parameters(self) -> type[Parameters]:
+        """The table of the effect in a scene."""
+        kinds = {c.name: c.kind for c in self.constants}
+        fields: dict[str, Any] = {}
+        for c in self.constants:
+            if c is self.constants[0]:
+                fields[c.name] = (by_region(kinds), Field(description=c.text))
+            else:  # None: required, unless every region gives it
+                kind = c.kind | None if c.default is None else c.kind
+                fields[c.name] = (kind, Field(default=c.default, description=c.text))
+        extra = INVERSION if self.refuses and self.regularizes else {}
+        return create_model(f"Params of {self.name}", __base__=Regional, **fields, **extra)
+
+
+def constants_of(law: Law, body: Body, params: Any) -> Values:
+    """Values of the constants in each element of a body; raises InputError."""
+    given = {c.name: getattr(params, c.name) for c in law.constants}
+    try:
+        return constants_by_region(given, body.centroids, law.constants[0].unit)
+    except InputError as error:
+        raise InputError(f"object {body.name!r}, effect {law.name}: {error}") from error
+
+
+class Tetrahedra(Effect):
+    """Elements of all bodies that list a law, in the order of their first nodes, and what they leave for the system.
+
+    elements (m, 4); owner (m,): index of the body; number (m,): in its mesh. What a step makes of them: corners
+    (4, m, 9) and edges (6, m, 9), as kernels/hyperelastic.cuh leaves them.
+    """
+
+    def __init__(self, world: World, listed: list[tuple[Body, Any]]):
+        self.world = world
+        tets = np.concatenate([body.tets for body, _ in listed])
+        self.order = np.argsort(tets.min(axis=1), kind="stable")  # neighbours in memory, whatever the mesh's order
+        self.elements: NDArray[np.int32] = np.ascontiguousarray(tets[self.order])
+        m = len(self.elements)
+        counts = [len(body.mesh.tets) for body, _ in listed]
+        self.owner = np.repeat([body.index for body, _ in listed], counts)[self.order]
+        self.number = np.concatenate([np.arange(n) for n in counts])[self.order]
+        self.volume, gradients = shape_gradients(world.rest, self.elements)
+        self.gradients = np.ascontiguousarray(gradients.reshape(-1, 9).T)
+        self.corners, self.edges = np.zeros((4, m, 9)), np.zeros((6, m, 9))
+        self._energy = np.zeros(m)
+
+    def _of_a_step(self) -> dict[str, Any]:
+        """What the integrator asks for: factors of force and tangent, and the field that the tangent is applied to."""
+        w = self.world
+        return {"h": w.impulse, "stiffening": w.stiffening[self.owner], "v": w.drift}
+
+    def gathers(self, system: System, stencil: Stencil, accumulate: bool) -> list[Launch]:
+        """What collects corners and edges into the system."""
+        w, m = self.world, len(self.elements)
+        gather = w.backend.module("kernels/corner_rows.cu").bind(
+            "gather", w.nodes, elements=m, start=stencil.corner_start, slots=stencil.corners, rows=self.corners,
+            b=system.b, block=system.block,
+        )  # fmt: skip
+        blocks = w.backend.module("kernels/edge_rows.cu").bind(
+            "blocks", len(system.row), elements=m, accumulate=int(accumulate), start=stencil.pair_start,
+            pairs=stencil.pairs, edges=self.edges, sums=system.sums,
+        )  # fmt: skip
+        return [gather, blocks]
+
+
+class Hyperelastic(Tetrahedra):
+    """Elements of one law. constants (k, m), floor (m,): as its kernel text has them."""
+
+    def __init__(self, world: World, listed: list[tuple[Body, Any]], law: Law):
+        super().__init__(world, listed)
+        self.law = law
+        values = [constants_of(law, body, params) for body, params in listed]
+        self.constants = np.concatenate([np.stack(law.pack(v)) for v in values], axis=1)[:, self.order].copy()
+        if law.elastic is not None:
+            self.elastic = {body.index: law.elastic(v) for (body, _), v in zip(listed, values, strict=True)}
+        if law.axes is not None:
+            axes = np.concatenate([law.axes(v) for v in values])[self.order]
+            rows = self.gradients.T.reshape(-1, 3, 3) @ axes
+            self.gradients = np.ascontiguousarray(rows.reshape(-1, 9).T)
+        floors = [getattr(p, "floor", 0.0) if getattr(p, "inversion", "") == "regularize" else 0.0 for _, p in listed]
+        self.floor = np.repeat(floors, [len(body.mesh.tets) for body, _ in listed])[self.order]
+        self.refused = np.tile([-1.0, 0.0], (len(self.elements), 1))
+
+    def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
+        assert stencil is not None
+        w = self.world
+        elements = w.backend.module(self.law.path).bind(
+            "elements", len(self.elements), projection=PROJECTIONS[w.projection], tets=self.elements, x=w.x,
+            gradients=self.gradients, volume=self.volume, constants=self.constants,
+            clock=system.clock, refused=self.refused, corners=self.corners, edges=self.edges, **self._floor(),
+            **self._of_a_step(),
+        )  # fmt: skip
+        return [elements, *self.gathers(system, stencil, accumulate)]
+
+    def _floor(self) -> dict[str, Any]:
+        return {"floor": self.floor} if self.law.regularizes else {}
+
+    def energies(self) -> ElementEnergies:
+        """V W [J]; NaN where an element has a deformation that the law does not define."""
+        launch = self.world.backend.module(self.law.path).bind(
+            "energy", len(self.elements), tets=self.elements, x=self.world.x, gradients=self.gradients,
+            volume=self.volume, constants=self.constants, energy=self._energy, **self._floor(),
+        )  # fmt: skip
+        return ElementEnergies(launch, self._energy, self.owner)
+
+    def refusals(self) -> list[Refusal]:
+        found = self.world.backend.fetch(self.refused) if self.law.refuses else self.refused
+        here = np.flatnonzero(found[:, 0] >= 0)
+        here = here[np.lexsort((self.number[here], found[here, 0]))]
+        return [
+            Refusal(self.law.name, int(self.owner[e]), int(self.number[e]), float(found[e, 0]), float(found[e, 1]))
+            for e in here
+        ]
+
+
+def young_and_poisson_of(poisson: Any = Poisson) -> tuple[Constant, Constant]:
+    """The constants of a law that is Hooke's at small strains. poisson: type of Poisson's ratio, with its bounds."""
+    return (
+        Constant("young", Positive, "Young's modulus at small strains [Pa], or a list of regions"),
+        Constant("poisson", poisson, "Poisson's ratio at small strains [-], of every element whose region gives none"),
+    )
+
+
+YOUNG_AND_POISSON = young_and_poisson_of()
+
+
+def lame(values: Values) -> list[Reals]:
+    """lambda and mu [Pa] of `young` and `poisson`."""
+    young, poisson = values["young"], values["poisson"]
+    return [young * poisson / ((1 + poisson) * (1 - 2 * poisson)), young / (2 * (1 + poisson))]
+
+
+def young_and_poisson(values: Values) -> tuple[Reals, Reals]:
+    """As they stand in the scene."""
+    return values["young"], values["poisson"]
+
+
+def of_shear_and_bulk(shear: Reals, bulk: Reals) -> tuple[Reals, Reals]:
+    """Young's modulus [Pa] and Poisson's ratio of a material with these moduli [Pa]."""
+    return 9 * bulk * shear / (3 * bulk + shear), (3 * bulk - 2 * shear) / (2 * (3 * bulk + shear))

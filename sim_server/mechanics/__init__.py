@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""Bodies, their linear system, time integration and energy."""

@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: MIT
+"""Whether a scene without inertia has an equilibrium: what nothing holds would make its matrix singular."""
+
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_server.errors import InputError
+from sim_server.mechanics.world import Body, World
+
+Ints = NDArray[np.int32]
+FLAT = 1e-9  # width of what counts as a line, over its length
+
+
+def check_held(world: World, elements: list[Ints]) -> None:
+    """Raises InputError naming the object if nodes of it could move without resistance.
+
+    elements: per effect, (m, c) node numbers. Tetrahedra that hang together by faces are one piece; it is held by three
+    nodes that are not on one line, fixed or of pieces that are held. Springs: what they connect is taken for one piece,
+    so a mechanism of springs is not found here.
+    """
+    for body in world.bodies:
+        pieces = [p for e in elements for p in _pieces(e[(e[:, 0] >= body.first) & (e[:, 0] < body.last)])]
+        loose = _loose(world, body, pieces)
+        if len(loose):
+            fixed = int((world.free[body.nodes] == 0).sum())
+            raise InputError(
+                f"object {body.name!r}: integrator.scheme = 'quasi_static' needs every part held; its {fixed} fixed "
+                f"nodes leave {len(loose)} of {body.last - body.first} nodes loose, first {int(loose[0]) - body.first} "
+                "(needed: an elastic effect, and the effect fixed on three or more nodes that are not on one line)"
+            )
+
+
+def _loose(world: World, body: Body, pieces: list[Ints]) -> NDArray[np.int64]:
+    """Nodes of the scene that belong to the body and are not held, ascending."""
+    held = world.free == 0
+    left = pieces
+    while found := [p for p in left if _hold(world.rest[p[held[p]]])]:
+        for p in found:
+            held[p] = True
+        left = [p for p in left if not held[p].all()]
+    return body.first + np.flatnonzero(~held[body.nodes])
+
+
+def _hold(points: NDArray[np.float64]) -> bool:
+    """Three of them are not on one line."""
+    if len(points) < 3:
+        return False
+    sizes = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return bool(sizes[1] > FLAT * sizes[0])
+
+
+def _pieces(elements: Ints) -> list[Ints]:
+    """Nodes of each set of elements that hang together by faces (four corners) or corners (two)."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    m, c = elements.shape
+    if m == 0:
+        return []
+    shared = [elements[:, list(s)] for s in combinations(range(c), c - 1)]
+    keys = np.sort(np.concatenate(shared), axis=1)
+    _, number = np.unique(keys, axis=0, return_inverse=True)
+    edges = (np.tile(np.arange(m), c), m + number.ravel())
+    graph = coo_array((np.ones(len(edges[0]), np.int8), edges), shape=(m + number.max() + 1,) * 2)
+    _, label = connected_components(graph, directed=False)
+    order = np.argsort(label[:m], kind="stable")
+    split = np.flatnonzero(np.diff(label[:m][order])) + 1
+    return [np.unique(elements[part]) for part in np.split(order, split)]

@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: MIT
+"""The linear system of a step: arrays of A' and b', their pattern, and who adds what where.
+
+A is block CSR with 3x3 blocks over all nodes of the scene, both triangles, columns ascending; bodies do not couple, so
+a body's blocks are one range of it. Rows of fixed nodes hold their diagonal block alone (the identity). Effects add to
+    b (n, 3) [N s], diagonal (n,) [kg], block (n, 6) [kg]: upper triangle of the nodes' own blocks,
+    sums (blocks above the diagonal, 3, 3) [kg] and mean (n, 10): of the rotations' products of quaternions,
+all in the world frame; `turn` and `assemble` then take b and A into the material frame, where the solve happens
+(kernels/nodes.cu, kernels/assemble.cu).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_server.backends.compiler import Launch
+from sim_server.mechanics.world import World
+
+Ints = NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class Stencil:
+    """Where the elements of an effect stand in the system.
+
+    An element has c corners, 2 (a spring) or 4 (a tetrahedron).
+    corner_start (nodes + 1,), corners: slots c e + a of the elements at each node.
+    pair_start (blocks above the diagonal + 1,), pairs (k,): c^2 e + c a + b, the corners of e that couple in a block.
+    """
+
+    corner_start: Ints
+    corners: Ints
+    pair_start: Ints
+    pairs: Ints
+
+
+class System:
+    """Pattern and arrays of A' and b' for a world and the elements of its effects.
+
+    elements: per effect, (m, c) node numbers of the elements that couple their corners, c = 2 or 4.
+
+    moving (bodies,): 1 where a step is to be solved, as some node does not rest (kernels/nodes.cu), set by `turn` and
+    cleared by the loop. extent (n,): diagonal of the box around the node's body at rest [m]; gain (n,) [1/s].
+    rotation (n, 3, 3): frames of the nodes. warped (bodies,): 1 where they follow the nodes' rotations, 0 where they
+    stay the identity; set before the launches are made.
+    """
+
+    def __init__(self, world: World, elements: list[Ints]):
+        n = world.nodes
+        self.world = world
+        couplings = [_couplings(e, world.free, n) for e in elements]
+        above = np.unique(np.concatenate([np.zeros(0, np.int64), *(keys for keys, _ in couplings)]))
+        self.row, self.column = (part.astype(np.int32) for part in np.divmod(above, n))
+        self._number(n)
+        self.stencils = [_stencil(e, c, n, above) for e, c in zip(elements, couplings, strict=True)]
+
+        self.sums = np.zeros((len(above), 3, 3))
+        self.values = np.zeros((len(self.columns), 3, 3))
+        self.diagonal = np.zeros(n)
+        self.block = np.zeros((n, 6))
+        self.b = np.zeros((n, 3))
+        self.mean = np.zeros((n, 10))
+        self.body = np.repeat([b.index for b in world.bodies], [b.last - b.first for b in world.bodies]).astype(
+            np.int32
+        )
+        self.warped = np.ones(len(world.bodies), np.int32)
+        self.moving = np.zeros(len(world.bodies), np.int32)
+        extents = np.array([np.linalg.norm(np.ptp(world.rest[b.nodes], axis=0)) for b in world.bodies])
+        self.extent, self.gain = extents[self.body], 1 / (world.reach + world.beta[self.body])
+        self.rotation = np.tile(np.eye(3), (n, 1, 1))
+        self.b_material = np.zeros((n, 3))
+        self.y = np.zeros((n, 3))
+        self.dv = np.zeros((n, 3))
+        self.clock = np.zeros(1)
+        world.backend.keep(self.clock, exact=True)
+        world.backend.keep(*(a for o in (world, self) for a in vars(o).values() if isinstance(a, np.ndarray)))
+
+    def _number(self, n: int) -> None:
+        """Places in block CSR of the blocks above the diagonal, of their transposes and of the nodes' own."""
+        below = np.argsort(self.column, kind="stable")  # row after row of the lower triangle, columns ascending
+        lower = np.bincount(self.column, minlength=n)
+        upper = np.bincount(self.row, minlength=n)
+        start = np.concatenate([[0], np.cumsum(lower + 1 + upper)])
+        own = start[:-1] + lower
+        self.row_start: Ints = start.astype(np.int32)
+        self.own: Ints = own.astype(np.int32)
+        self.upper: Ints = _runs(self.row, own + 1, upper)
+        self.lower: Ints = np.empty_like(self.upper)
+        self.lower[below] = _runs(self.column[below], start[:-1], lower)
+        self.columns: Ints = np.empty(start[-1], dtype=np.int32)
+        self.columns[self.own] = np.arange(n, dtype=np.int32)
+        self.columns[self.upper], self.columns[self.lower] = self.column, self.row
+
+    def start(self, mass: NDArray[np.float64]) -> Launch:
+        """b = 0, diagonal = mass (n,) [kg]."""
+        return self.world.backend.module("kernels/nodes.cu").bind(
+            "start", self.world.nodes, mass=mass, diagonal=self.diagonal, b=self.b, block=self.block,
+            mean=self.mean,
+        )  # fmt: skip
+
+    def finish(self) -> list[Launch]:
+        """Everything into the material frame: A' = R^T A R, b' = R^T b, and the start of the solve."""
+        w = self.world
+        velocity = w.v if w.inertia else w.ahead  # without inertia that of the last step is no velocity to begin with
+        turn = self.world.backend.module("kernels/nodes.cu").bind(
+            "turn", w.nodes, free=w.free, body=self.body, warped=self.warped, place=self.own,
+            mean=self.mean, b=self.b, diagonal=self.diagonal, block=self.block, dv=self.dv,
+            x=w.x, v=velocity, extent=self.extent, gain=self.gain, h=w.dt, moving=self.moving,
+            rotation=self.rotation, b_material=self.b_material, y=self.y, values=self.values,
+        )  # fmt: skip
+        assemble = self.world.backend.module("kernels/assemble.cu").bind(
+            "assemble", len(self.row), row=self.row, column=self.column, upper=self.upper, lower=self.lower,
+            sums=self.sums, rotation=self.rotation, values=self.values,
+        )  # fmt: skip
+        return [turn, assemble]
+
+    def advance(self, before: NDArray[np.float64]) -> Launch:
+        """v += R y, x += h v: backward Euler. before (n, 3): gets x as it was [m]."""
+        w = self.world
+        return self.world.backend.module("kernels/nodes.cu").bind(
+            "advance",
+            w.nodes,
+            rotation=self.rotation,
+            y=self.y,
+            h=w.dt,
+            dv=self.dv,
+            v=w.v,
+            x=w.x,
+            before=before,
+        )
+
+    def couples(self, first: int, last: int) -> bool:
+        """Whether anything couples nodes of a body."""
+        return bool(self.row_start[last] - self.row_start[first] > last - first)
+
+    def body_pattern(self, first: int, last: int) -> tuple[Ints, Ints]:
+        """row_start and columns of one body, numbered from 0."""
+        start = self.row_start[first : last + 1]
+        return (start - start[0]).astype(np.int32), (self.columns[start[0] : start[-1]] - first).astype(np.int32)
+
+    def body_values(self, first: int, last: int) -> NDArray[np.float64]:
+        """View of the blocks of one body, (blocks, 3, 3)."""
+        return self.values[self.row_start[first] : self.row_start[last]]
+
+
+def _runs(group: Ints, begin: NDArray[np.int64], count: NDArray[np.int64]) -> Ints:
+    """Consecutive places for the members of each group, counted from begin[group]; groups ascend."""
+    first = np.cumsum(count) - count
+    return (np.arange(len(group)) - first[group] + begin[group]).astype(np.int32)
+
+
+def _couplings(elements: Ints, free: NDArray[np.float64], n: int) -> tuple[NDArray[np.int64], Ints]:
+    """Key row * n + column and pair c c e + c a + b of every coupling above the diagonal between free corners."""
+    keys, pairs = [], []
+    corners = elements.shape[1]
+    element = corners**2 * np.arange(len(elements), dtype=np.int32)
+    for a in range(corners):
+        for b in range(corners):
+            i, j = elements[:, a], elements[:, b]
+            here = (i < j) & (free[i] > 0) & (free[j] > 0)
+            keys.append(i[here].astype(np.int64) * n + j[here])
+            pairs.append((element + np.int32(corners * a + b))[here])
+    return np.concatenate(keys), np.concatenate(pairs)
+
+
+def _stencil(elements: Ints, couplings: tuple[NDArray[np.int64], Ints], n: int, above: NDArray[np.int64]) -> Stencil:
+    corners = np.argsort(elements.ravel(), kind="stable").astype(np.int32)
+    corner_start = np.concatenate([[0], np.cumsum(np.bincount(elements.ravel(), minlength=n))]).astype(np.int32)
+    keys, pairs = couplings
+    order = np.lexsort((pairs, keys))
+    pair_start = np.searchsorted(keys[order], np.append(above, np.int64(n) * n)).astype(np.int32)
+    return Stencil(corner_start, corners, pair_start, pairs[order])

@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: MIT
+"""The objects of a scene, one after another in the same arrays, so that one launch serves all of them."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_server.backends.compiler import Cpu
+from sim_server.errors import InputError
+from sim_server.mesh import Mesh, posed
+from sim_server.mesh.surface import volumes
+from sim_server.scene import Scene, SceneObject
+
+Reals = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Body:
+    """One object's share of the arrays: nodes [first, last)."""
+
+    index: int
+    name: str
+    mesh: Mesh
+    first: int
+    last: int
+    effects: dict[str, Any]
+
+    @property
+    def nodes(self) -> slice:
+        """Its rows in every nodal array."""
+        return slice(self.first, self.last)
+
+    @property
+    def tets(self) -> NDArray[np.int32]:
+        """(m, 4) in node numbers of the scene."""
+        return self.mesh.tets + np.int32(self.first)
+
+    @property
+    def centroids(self) -> Reals:
+        """(m, 3) of the elements at rest, before the pose [m]."""
+        return self.mesh.rest[self.mesh.tets].mean(axis=1)
+
+
+class World:
+    """State and node data of a scene.
+
+    rest (n, 3): before the pose [m]; x (n, 3): positions [m]; v (n, 3): velocities [m/s]; mass (n,): lumped [kg];
+    free (n,): 1, or 0 at fixed nodes; beta (bodies,): Rayleigh damping of the stiffness [s]; dt: time step [s];
+    projection: of the elements' stiffness, the scene's choice;
+    backend: where kernels run, Cpu or gpu.device.Gpu.
+
+    Symbols: docs/notation.md. What effects need of the integrator (formulas: integrator.py) instead of dt and v:
+    impulse [s]: times a force is what goes into b. reach [s]: x moves by reach (ahead + dv) until the end of the step,
+    dv the solution. ahead (n, 3) [m/s]. drift (n, 3) [m/s]: (reach ahead + beta v) / (reach + beta), what elements take
+    for the velocity, so that stiffening * (K drift) holds motion and damping. inertia: False in a quasi-static scene.
+    In backward Euler impulse = reach = dt, ahead and drift are v.
+    """
+
+    def __init__(self, scene: Scene, backend: Any = None):
+        self.backend = backend or Cpu()
+        self.dt = float(scene.dt)
+        self.projection = scene.projection
+        self.bodies: list[Body] = []
+        meshes = [(o, o.load_mesh()) for o in scene.objects]
+        first = 0
+        for o, mesh in meshes:
+            self.bodies.append(Body(len(self.bodies), o.name, mesh, first, first + len(mesh.rest), dict(o.effects)))
+            first += len(mesh.rest)
+        self.rest = np.concatenate([mesh.rest for _, mesh in meshes])
+        self.x = np.concatenate([posed(mesh.rest, o.pose.rotate, o.pose.translate) for o, mesh in meshes])
+        self.v = np.zeros_like(self.x)
+        self.mass = np.concatenate([_lumped(o, mesh) for o, mesh in meshes])
+        self.free = np.ones(first)
+        self.beta = np.zeros(len(self.bodies))
+        integrator = scene.integrator
+        self.impulse, self.reach = integrator.impulse(self.dt), integrator.reach(self.dt)
+        self.inertia = integrator.scheme != "quasi_static"
+        self.plain = integrator.scheme == "backward_euler" and integrator.linearizations == 1
+        self.ahead = self.v if self.plain else np.zeros_like(self.v)
+        self.drift = self.v if self.plain else np.zeros_like(self.v)
+
+    @property
+    def stiffening(self) -> Reals:
+        """impulse (reach + beta) of each body [s2]: times K is what goes into A."""
+        return self.impulse * (self.reach + self.beta)
+
+    @property
+    def nodes(self) -> int:
+        """Of all bodies."""
+        return len(self.rest)
+
+    def body(self, name: str) -> Body:
+        """By name; raises KeyError."""
+        for body in self.bodies:
+            if body.name == name:
+                return body
+        raise KeyError(f"no object {name!r}; there are {', '.join(b.name for b in self.bodies)}")
+
+    def with_effect(self, name: str) -> list[tuple[Body, Any]]:
+        """The bodies that list the effect, with its parameters."""
+        return [(b, b.effects[name]) for b in self.bodies if name in b.effects]
+
+
+def _lumped(o: SceneObject, mesh: Mesh) -> Reals:
+    """Nodal masses [kg], (n,): a quarter of each adjacent element's, or all equal."""
+    volume = volumes(mesh.rest, mesh.tets)
+    total = o.mass if o.mass is not None else (o.density or 0) * volume.sum()
+    if not np.isfinite(total):
+        raise InputError(f"object {o.name!r}: its mass is not finite")
+    if o.masses == "equal":
+        return np.full(len(mesh.rest), total / len(mesh.rest))
+    share = np.repeat(total * volume / volume.sum() / 4, 4)
+    return np.bincount(mesh.tets.ravel(), weights=share, minlength=len(mesh.rest)).astype(np.float64)

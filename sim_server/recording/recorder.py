@@ -1,0 +1,199 @@
+# SPDX-License-Identifier: MIT
+"""The log: every message of the run, self-describing, in one MCAP file.
+
+The caller only serializes and appends to a queue; one thread compresses and writes. The file is a sequence of
+complete chunks at most FLUSH_SECONDS old, so what a `kill -9` leaves behind is readable up to the last flush.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from google.protobuf.message import Message
+
+from protocol import messages_pb2 as pb
+from sim_server.recording.mcap_file import McapFile
+
+FLUSH_SECONDS = 1.0  # oldest record that a crash may lose
+FRAME_BYTES = 64 << 20  # waiting for the disk, all kinds together: above this, frames are dropped ...
+TOTAL_BYTES = 256 << 20  # ... and above this, everything
+
+Compression = Literal["lz4", "zstd", "none"]
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class _Record:
+    topic: str
+    kind: type[Message]
+    log_time: int  # ns of simulation
+    publish_time: int  # ns of Unix time
+    sequence: int
+    data: bytes
+
+
+class Recorder:
+    """Writes scene, topologies, states, steps and interactions to an MCAP file from a thread of its own.
+
+    Messages are stored under /scene, /topology/OBJECT, /state/OBJECT, /step/OBJECT, /interaction/OBJECT, /touch and
+    /factor/OBJECT with `log_time` = simulation time and `publish_time` = wall clock, both in ns.
+
+    Feeding never waits unless asked to (`block=True`, for runs faster than real time). While more than FRAME_BYTES
+    wait for the disk, states are dropped and counted in `dropped`; everything else is kept up to TOTAL_BYTES and
+    counted in `lost` beyond that. Both numbers are written at the end of the file. A disk error, or the file's
+    removal, stops the recording, is told once through `report` and kept in `failure`; feeding is then a no-op.
+
+    Raises InputError if the file cannot be created, if it is there already and not to be overwritten, or for an
+    unknown compression.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        compression: Compression = "lz4",
+        *,
+        overwrite: bool = False,
+        report: Callable[[str], None] = log.error,
+        frame_bytes: int = FRAME_BYTES,
+        total_bytes: int = TOTAL_BYTES,
+    ) -> None:
+        self.path = Path(path)
+        self.dropped = 0  # frames
+        self.lost = 0  # records of other kinds
+        self.written = 0  # records handed to the file
+        self.failure = ""
+        self._report = report
+        self._frame_bytes, self._total_bytes = frame_bytes, total_bytes
+        self._waiting: deque[_Record] = deque()
+        self._waiting_bytes = 0
+        self._time = 0  # ns of simulation, newest seen; stamps what has no time of its own
+        self._closing = False
+        self._changed = threading.Condition()
+        self._file = McapFile(self.path, compression, overwrite)
+        self._thread = threading.Thread(target=self._write_all, name="recorder", daemon=True)
+        self._thread.start()
+
+    def scene(self, message: pb.Scene, block: bool = False) -> None:
+        self._feed("/scene", message, 0, 0, block)
+
+    def topology(self, message: pb.Topology, block: bool = False) -> None:
+        self._feed(f"/topology/{message.header.object}", message, self._time, message.header.epoch, block)
+
+    def state(self, message: pb.State, block: bool = False) -> None:
+        """Appends a frame; the only kind that is dropped when the disk falls behind."""
+        self._feed(f"/state/{message.header.object}", message, self._stamp(message.time), message.step, block)
+
+    def step(self, message: pb.ObjectStep, block: bool = False) -> None:
+        self._feed(f"/step/{message.header.object}", message, self._stamp(message.time), message.step, block)
+
+    def interaction(self, message: pb.Interaction, time: float, block: bool = False) -> None:
+        """Appends a push or grab that took effect at `time` [s of simulation]."""
+        self._feed(f"/interaction/{message.object}", message, self._stamp(time), message.id, block)
+
+    def touch_set(self, message: pb.TouchSet, time: float, block: bool = False) -> None:
+        """Appends the interactions that the loop works with from `time` [s of simulation] on."""
+        self._feed("/touch", message, self._stamp(time), message.step, block)
+
+    def factor(self, message: pb.FactorUse, block: bool = False) -> None:
+        """Appends what is known of a factor that was handed to the loop."""
+        self._feed(f"/factor/{message.header.object}", message, self._time, message.step, block)
+
+    def close(self) -> None:
+        """Writes what waits and the index of the file; may be called again."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify_all()
+        self._thread.join()
+
+    def __enter__(self) -> Recorder:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _stamp(self, seconds: float) -> int:
+        if math.isfinite(seconds) and 0 <= seconds < 1e10:  # a solve that blew up must not stop the log
+            self._time = round(seconds * 1e9)
+        return self._time
+
+    def _feed(self, topic: str, message: Message, log_time: int, sequence: int, block: bool) -> None:
+        record = _Record(
+            topic, type(message), log_time, time.time_ns(), sequence & 0xFFFFFFFF, message.SerializeToString()
+        )
+        limit = self._frame_bytes if isinstance(message, pb.State) else self._total_bytes
+        with self._changed:
+            if block:
+                self._changed.wait_for(lambda: self._room(record, self._frame_bytes) or self.failure or self._closing)
+            if self._closing or self.failure:
+                return
+            if not block and not self._room(record, limit):
+                self._count(record)
+                return
+            self._waiting.append(record)
+            self._waiting_bytes += len(record.data)
+            self._changed.notify_all()
+
+    def _room(self, record: _Record, limit: int) -> bool:
+        return not self._waiting or self._waiting_bytes + len(record.data) <= limit
+
+    def _count(self, record: _Record) -> None:
+        if record.kind is pb.State:
+            self.dropped += 1
+            return
+        self.lost += 1
+        if self.lost == 1:
+            self._report(f"{self.path}: the disk is too slow, {self._total_bytes >> 20} MiB wait: records are lost")
+
+    def _write_all(self) -> None:
+        try:
+            self._write_until_closed()
+            self._file.finish({"frames_dropped": str(self.dropped), "records_lost": str(self.lost)})
+        except Exception as error:  # whatever it is, the simulation goes on
+            self._file.abandon()
+            with self._changed:
+                why = getattr(error, "strerror", None) or error
+                self.failure = f"{self.path}: recording stopped after {self.written} records: {why}"
+                self._waiting.clear()
+                self._changed.notify_all()
+            self._report(self.failure)
+
+    def _write_until_closed(self) -> None:
+        flushed = time.monotonic()
+        unflushed = False
+        while True:
+            due = flushed + FLUSH_SECONDS - time.monotonic() if unflushed else None
+            batch, closing = self._take(due)
+            for record in batch:
+                self._file.write(
+                    record.topic, record.kind, record.log_time, record.publish_time, record.sequence, record.data
+                )
+                self.written += 1
+            unflushed = unflushed or bool(batch)
+            if unflushed and time.monotonic() - flushed >= FLUSH_SECONDS:
+                self._file.flush()
+                flushed, unflushed = time.monotonic(), False
+            if closing and not batch:
+                return
+
+    def _take(self, timeout: float | None) -> tuple[list[_Record], bool]:
+        with self._changed:
+            self._changed.wait_for(
+                lambda: self._waiting or self._closing, timeout if timeout is None else max(timeout, 0)
+            )
+            batch: list[_Record] = []
+            size = 0
+            while self._waiting and size < 1 << 20:  # a chunk at most, so that the flush stays on time
+                batch.append(self._waiting.popleft())
+                size += len(batch[-1].data)
+            self._waiting_bytes -= size
+            self._changed.notify_all()
+            return batch, self._closing

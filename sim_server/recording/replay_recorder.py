@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: MIT
+"""What a log holds beside records and frames so that the run can be repeated bit by bit (replay.py).
+
+The loop decides at which step a push, a move or a release takes effect, as it looks into its mailbox; so the whole list
+of interactions is written as the loop took it up, with that step. Of factors the log tells what each was made from and
+by whom; the step records say which one a solve used.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from protocol import messages_pb2 as pb
+from protocol.factor import Factor
+from protocol.validate import checksum
+from sim_server.network.link import ServerLink
+from sim_server.recording.recorder import Recorder
+from sim_server.service.commands import interaction_message
+from sim_server.updates.factor_source import EXACT
+from sim_server.updates.policy import Driver
+
+if TYPE_CHECKING:
+    from sim_server.effects.touch import Interaction
+
+
+class Trace:
+    """Listens to driver and touch; `write` before the records of steps that it may concern."""
+
+    def __init__(self, driver: Driver, link: ServerLink, recorder: Recorder):
+        self._driver, self._link, self._recorder = driver, link, recorder
+        self._factors: deque[Factor] = deque()  # appended by whoever adopts, maybe the loop's thread
+        self._bindings: deque[tuple[Any, list[Interaction]]] = deque()
+        self._shown: set[int] = set()  # ids whose nodes the log holds
+        self._workers: dict[str, pb.WorkerInfo] = {}
+        driver.adopted = self._factors.append
+        touch: Any = driver.simulation.effects.get("touch")
+        if touch is not None:
+            publish = touch.publish
+
+            def published(launch: Any) -> Any:
+                binding = publish(launch)
+                if binding is not None:  # a loop that tells when it takes one up
+                    self._bindings.append((binding, touch.applied))
+                return binding
+
+            touch.publish = published
+
+    def write(self, block: bool) -> None:
+        """Everything taken up since the last call; a log cut off after a record holds what the record rests on."""
+        for _ in range(len(self._factors)):
+            self._recorder.factor(self._factor(self._factors.popleft()), block)
+        taken = [i for i, (binding, _) in enumerate(self._bindings) if binding.taken >= 0]
+        for i in range(taken[-1] + 1 if taken else 0):
+            binding, interactions = self._bindings.popleft()
+            if i in taken:  # the others were replaced before the loop saw them
+                self._recorder.touch_set(self._touch_set(binding.taken, interactions), self._dt * binding.taken, block)
+
+    @property
+    def _dt(self) -> float:
+        return float(self._driver.simulation.world.dt)
+
+    def _touch_set(self, step: int, interactions: list[Interaction]) -> pb.TouchSet:
+        messages = []
+        for a in interactions:
+            message = interaction_message(a)
+            if a.id not in self._shown:
+                self._shown.add(a.id)
+                message.held = a.nodes.astype("<i4").tobytes()
+                message.offsets = np.ascontiguousarray(a.offset, "<f8").tobytes()
+            messages.append(message)
+        return pb.TouchSet(step=step, interactions=messages)
+
+    def _factor(self, factor: Factor) -> pb.FactorUse:
+        if factor.worker == self._driver.inline.WORKER:
+            maker = pb.WorkerInfo(worker=factor.worker, library=self._driver.inline.library(factor.object), threads=1)
+        else:
+            if factor.worker not in self._workers:
+                self._workers.update({w.worker: w for w in self._link.dispatch.workers()})
+            maker = self._workers.get(factor.worker, pb.WorkerInfo(worker=factor.worker))
+        exact = factor.method in ("", EXACT.name)
+        library = maker.library if exact else "native"
+        return pb.FactorUse(
+            header=pb.Header(object=factor.object, epoch=factor.epoch), step=factor.step, pattern=factor.pattern.id,
+            checksum=checksum(factor.values), dtype=factor.values.dtype.name, worker=factor.worker,
+            library=library, threads=maker.threads, seconds=factor.seconds, remedy=factor.remedy,
+            method=factor.method, ahead=factor.ahead, later=factor.later,
+        )  # fmt: skip

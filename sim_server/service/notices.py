@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: MIT
+"""What a scene may well have, and its author may not have meant: a line when it is loaded, no error."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from sim_server.mechanics.world import Body
+from sim_server.simulation import Simulation
+
+NEARLY_INCOMPRESSIBLE = 0.4999  # Poisson's ratio; beyond it solves were seen to miss their tolerance
+NAMED = 3  # objects named in a line
+
+
+def notices(simulation: Simulation) -> list[str]:
+    """At most two lines: bodies that fall apart or fall freely, and materials that are nearly incompressible.
+
+    A body falls if gravity acts on it and no fixed node is connected with it by elements, whether or not it can be
+    touched: a grab may hold it, but only once somebody has caught it. In a quasi-static scene such a body is refused.
+    """
+    return [line for line in (_loose(simulation), _incompressible(simulation)) if line]
+
+
+def _loose(simulation: Simulation) -> str:
+    world, gravity = simulation.world, simulation.effects.get("gravity")
+    pulled = world.inertia and gravity is not None and bool(np.any(gravity.g))  # type: ignore[attr-defined]
+    part, elastic = _parts(simulation)
+    held = np.isin(part, part[world.free == 0])
+    apart, falling, partly = [], [], []
+    for body in world.bodies:
+        loose = int((~held[body.nodes]).sum())
+        if not elastic[body.nodes].any():
+            apart.append(body)
+        elif pulled and loose == body.last - body.first:
+            falling.append(body)
+        elif pulled and loose:
+            partly.append(body)
+    said = [f"{_names(apart)} without elasticity: each node moves by itself"] if apart else []
+    said += [f"{_names(falling)} without fixed nodes: in free fall under gravity"] if falling else []
+    said += [f"{_names(partly)} with parts that no element connects to a fixed node: these fall"] if partly else []
+    return "; ".join(said)
+
+
+def _parts(simulation: Simulation) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
+    """Number of the connected part of each node, and whether the node belongs to an element, (nodes,) each."""
+    n = simulation.world.nodes
+    elements = [e.elements for e in simulation.effects.values() if e.elements is not None]
+    ends = [e[:, [0, k]] for e in elements for k in range(1, e.shape[1])]
+    pairs = np.concatenate([np.zeros((0, 2), np.int32), *ends])
+    graph = coo_array((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
+    _, part = connected_components(graph, directed=False)
+    elastic = np.zeros(n, dtype=bool)
+    elastic[pairs] = True
+    return part, elastic
+
+
+def _incompressible(simulation: Simulation) -> str:
+    found = [(b, p) for e in simulation.effects.values() for b, (_, p) in e.elastic.items()]
+    above = {b: float(p.max()) for b, p in found if p.max() > NEARLY_INCOMPRESSIBLE}
+    if not above:
+        return ""
+    bodies = [simulation.world.bodies[b] for b in sorted(above)]
+    return (
+        f"{_names(bodies)} with a Poisson's ratio of {max(above.values()):.10g}: above {NEARLY_INCOMPRESSIBLE} solves "
+        "may not reach their tolerance, and linear tetrahedra lock"
+    )
+
+
+def _names(bodies: list[Body]) -> str:
+    more = f" and {len(bodies) - NAMED} more" if len(bodies) > NAMED else ""
+    return "object" + "s" * (len(bodies) > 1) + " " + ", ".join(repr(b.name) for b in bodies[:NAMED]) + more

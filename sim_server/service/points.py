@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: MIT
+"""Where an object is while it moves: the box around it, and points of it that have names.
+
+tip: the free node farthest from the fixed ones (from the middle of the object if nothing is fixed), in the shape at
+rest, so that it is the same node throughout. right, left, top, bottom, front, back: the free node that is now farthest
+along +x, -x, +y, -y, +z, -z.
+"""
+
+from collections.abc import Sequence
+from functools import cached_property
+from math import hypot
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_server.mechanics.world import Body, Reals, World
+
+SIDES = {"right": (0, 1), "left": (0, -1), "top": (1, 1), "bottom": (1, -1), "front": (2, 1), "back": (2, -1)}
+NAMES = ("tip", *SIDES)
+
+Point = tuple[float, float, float]
+
+
+class Points:
+    """Of one body. `now` gets its positions from the device; the other methods tell of those."""
+
+    def __init__(self, world: World, body: Body):
+        self.body = body
+        self._world = world
+        self._x: Reals = np.zeros((0, 3))
+        self.free: NDArray[np.bool_] = world.free[body.nodes] > 0
+        self.size = float(np.linalg.norm(np.ptp(body.mesh.rest, axis=0)))  # m, diagonal of the box at rest
+
+    def now(self, x: Reals | None = None) -> Reals:
+        """Copies the positions of its nodes [m], (nodes, 3). x: of all nodes of the scene, if fetched already."""
+        fetched = self._world.backend.fetch(self._world.x) if x is None else x
+        self._x = fetched[self.body.nodes].copy()
+        return self._x
+
+    def box(self) -> tuple[Point, Point]:
+        """Lowest and highest coordinates [m]."""
+        return _point(self._x.min(axis=0)), _point(self._x.max(axis=0))
+
+    def where(self) -> str:
+        """The box in words."""
+        low, high = self.box()
+        spans = ", ".join(f"{c} from {a:.4g} to {b:.4g}" for c, a, b in zip("xyz", low, high, strict=True))
+        return f"{self.body.name!r} now fills {spans} m"
+
+    def distance(self, point: Point) -> float:
+        """Of a point from the box [m]; 0 within."""
+        low, high = self.box()
+        return hypot(*(max(a - p, p - b, 0.0) for a, p, b in zip(low, point, high, strict=True)))
+
+    def named(self, name: str) -> Point:
+        """Where a named point is now [m]. Raises ValueError."""
+        if name not in NAMES:
+            raise ValueError(f"no point {name[:80]!r}; known: {', '.join(NAMES)}, or give coordinates")
+        x = self.now()
+        if name == "tip":
+            return self.tip()
+        axis, sign = SIDES[name]
+        return _point(x[int(np.where(self.free, sign * x[:, axis], -np.inf).argmax())])
+
+    def tip(self) -> Point:
+        """Where the tip is [m]."""
+        return _point(self._x[self._tip])
+
+    @cached_property
+    def _tip(self) -> int:
+        """Number of the tip among the nodes of the body."""
+        rest, free = self.body.mesh.rest, self.free
+        if free.all():
+            distance = np.linalg.norm(rest - rest.mean(axis=0), axis=1)
+        else:
+            from scipy.spatial import cKDTree
+
+            distance, _ = cKDTree(rest[~free]).query(rest)
+        return int(np.where(free, distance, -np.inf).argmax())
+
+
+def shown(point: Sequence[float] | Reals) -> str:
+    """Coordinates in short."""
+    return "(" + ", ".join(f"{float(c):.4g}" for c in point) + ")"
+
+
+def _point(values: Reals) -> Point:
+    x, y, z = values.tolist()
+    return x, y, z

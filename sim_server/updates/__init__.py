@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""When factors are made, of which matrix, and which of them are used."""

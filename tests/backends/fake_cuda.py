@@ -1,0 +1,202 @@
+# SPDX-License-Identifier: MIT
+"""A GPU made of NumPy for the native GPU loop: work is put off as a real one does it, so that order mistakes show."""
+
+import ctypes as c
+from collections import deque
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_server.backends.gpu import structs
+from sim_server.backends.gpu.loop import CAPACITY, MANY, DeviceLoop
+from sim_server.backends.gpu.solver import RESULT
+from sim_server.backends.gpu.structs import ENERGY, STAMP
+
+NOT_READY = 600
+p, size, u64 = c.c_void_p, c.c_size_t, c.c_uint64
+SIGNATURES = {
+    "context_set": [p], "graph_launch": [p, p], "to_device": [u64, p, size, p], "to_host": [p, u64, size, p],
+    "on_device": [u64, u64, size, p], "event_record": [p, p], "event_query": [p], "event_wait": [p],
+    "stream_wait": [p, p, c.c_uint32],
+}  # fmt: skip
+Work = Callable[[], None]
+
+ACCOUNT = 12  # handle of the graph
+
+
+class FakeDevice:
+    """loop.Device. Nothing is done before somebody waits for it or asks often enough.
+
+    calls: names of the functions in the order of the calls. fail: a function that answers with an error. pieces: of
+    work that are done when somebody asks.
+    """
+
+    context, stream, copies = 1, 2, 3
+
+    def __init__(self) -> None:
+        self.calls: list[str] = []
+        self.fail, self.pieces = "", 4
+        self.graphs: dict[int, Work] = {}
+        self._queues: dict[int, deque[tuple[str, int | Work]]] = {self.stream: deque(), self.copies: deque()}
+        self._recorded: dict[int, int] = {}  # by event: records asked for, of which so many are
+        self._done: dict[int, int] = {}
+        self._events, self._kept = 100, []
+        self._functions: dict[str, object] = {}
+        self.functions = structs.Cuda()
+        for name in SIGNATURES:
+            self.set(name, getattr(self, "_" + name))
+
+    def set(self, name: str, function: Callable[..., int]) -> None:
+        """Another function of the driver in place of what stands here."""
+        self._functions[name] = made = c.CFUNCTYPE(c.c_int32, *SIGNATURES[name])(function)
+        setattr(self.functions, name, c.cast(made, p).value)
+
+    def pinned(self, size: int) -> NDArray[np.uint8]:
+        return np.zeros(size, np.uint8)
+
+    def memory(self, size: int) -> int:
+        self._kept.append(np.zeros(size, np.uint8))
+        return int(self._kept[-1].ctypes.data)
+
+    def event(self) -> int:
+        self._events += 1
+        return self._events
+
+    def error(self, code: int) -> str:
+        return f"fake error {code}"
+
+    def _put(self, name: str, stream: int, work: Work) -> int:
+        self.calls.append(name)
+        if name == self.fail:
+            return 700
+        self._queues[stream].append(("work", work))
+        return 0
+
+    def _context_set(self, context: int) -> int:
+        assert context == self.context
+        return 0
+
+    def _graph_launch(self, graph: int, stream: int) -> int:
+        return self._put("graph_launch", stream, self.graphs[graph])
+
+    def _to_device(self, to: int, source: int, count: int, stream: int) -> int:
+        return self._put("to_device", stream, lambda: c.memmove(to, source, count))  # type: ignore[arg-type,return-value]
+
+    def _to_host(self, to: int, source: int, count: int, stream: int) -> int:
+        return self._put("to_host", stream, lambda: c.memmove(to, source, count))  # type: ignore[arg-type,return-value]
+
+    def _on_device(self, to: int, source: int, count: int, stream: int) -> int:
+        return self._put("on_device", stream, lambda: c.memmove(to, source, count))  # type: ignore[arg-type,return-value]
+
+    def _event_record(self, event: int, stream: int) -> int:
+        self._recorded[event] = self._recorded.get(event, 0) + 1
+        count = self._recorded[event]
+        return self._put("event_record", stream, lambda: self._done.__setitem__(event, count))
+
+    def _stream_wait(self, stream: int, event: int, flags: int) -> int:
+        self.calls.append("stream_wait")
+        self._queues[stream].append(("wait", event))
+        return 0
+
+    def is_done(self, event: int) -> bool:
+        """Everything before its last record has been done."""
+        return self._done.get(event, 0) >= self._recorded.get(event, 1 << 30)
+
+    def record(self, event: int) -> None:
+        """As if a stream of somebody else had come so far."""
+        self._recorded[event] = self._done[event] = 1
+
+    def _event_query(self, event: int) -> int:
+        self.calls.append("event_query")
+        if self.fail == "event_query":
+            return 700
+        for _ in range(self.pieces):
+            if not self.is_done(event):
+                self._one(self.stream) or self._one(self.copies)
+        return 0 if self.is_done(event) else NOT_READY
+
+    def _event_wait(self, event: int) -> int:
+        self.calls.append("event_wait")
+        if self.fail == "event_wait":
+            return 700
+        while not self.is_done(event):
+            assert self._one(self.stream) or self._one(self.copies), "nothing would ever end this wait"
+        return 0
+
+    def _one(self, stream: int) -> bool:
+        """Does one piece of work of a stream, if it may."""
+        queue = self._queues[stream]
+        while queue:
+            kind, what = queue[0]
+            if kind == "wait" and not self.is_done(what):  # type: ignore[arg-type]
+                return False
+            queue.popleft()
+            if kind == "work":
+                what()  # type: ignore[operator]
+                return True
+        return False
+
+
+class FakeScene:
+    """A loop over `bodies` bodies of two nodes with one block of A a node. Step k (from 0) leaves x = k + 1, v = -k,
+    A = k; the settings of a body (one int64) come back as its iterations, its factor (one int64) as its factor_step.
+    Its kinetic energy is k, its elastic one where it is evaluated 1001 + k."""
+
+    def __init__(self, bodies: int = 1, records: int = 8192, real: str = "f8"):
+        nodes = 2 * bodies
+        self.device = device = FakeDevice()
+        self.x, self.v, self.values = (np.zeros((nodes, *rest), real) for rest in ((3,), (3,), (3, 3)))
+        self.settings, self.factor = np.zeros(bodies, np.int64), np.zeros(bodies, np.int64)
+        self.argument = np.zeros(1, np.int64)
+        self.results, self.stamps = np.zeros((CAPACITY, bodies), RESULT), np.zeros(CAPACITY, STAMP)
+        self.energies, self.phase = np.zeros((CAPACITY, bodies), ENERGY), 0
+        self.found = 0
+        self.clock, self.time, self.done = np.zeros(1), 0, 0
+        self.seen: list[int] = []  # the argument in each step
+        boxes = [(a.ctypes.data + 8 * k, 8) for a in (self.settings, self.factor) for k in range(bodies)]
+        addresses = {n: getattr(self, n).ctypes.data for n in ("x", "v", "values")}
+        self.loop = DeviceLoop(
+            device, [(2 * k, 2 * k + 2) for k in range(bodies)], np.arange(nodes + 1, dtype=np.int32), 0.5,
+            [*boxes, (self.argument.ctypes.data, 8)], self.results, self.stamps, self.clock, records,
+            real, energies=self.energies, **addresses,
+        )  # fmt: skip
+        device.graphs = {7: lambda: self._steps(1), 8: lambda: self._steps(MANY)}
+        device.graphs |= {9: lambda: self._steps(1, True), 10: lambda: self._steps(MANY, True)}
+        device.graphs[11] = self._elastic
+        device.graphs[ACCOUNT] = lambda: None  # steps tell their energies themselves
+        self.loop.use_graphs([7, 8, 9, 10], ACCOUNT, 11)
+
+    def _steps(self, steps: int, stamp: bool = False) -> None:
+        if stamp:
+            self._stamp()
+        for _ in range(steps):
+            self._step()
+
+    def _elastic(self) -> None:
+        self.energies[(self.done - 1) % CAPACITY]["elastic"] = 1000 + self.done
+
+    def _stamp(self) -> None:
+        self.time += 1_000_000  # the device had nothing to do for a while
+        self.stamps[self.done % CAPACITY]["begin"] = self.time
+
+    def _step(self) -> None:
+        k, slot = self.done, self.done % CAPACITY
+        self.seen.append(int(self.argument[0]))
+        self.values[:] = k
+        row = self.results[slot]
+        row["iterations"], row["factor_step"] = self.settings, self.factor
+        row["residual"], row["seconds"], row["bad_node"] = 1e-7 * k, 1e-6, -1
+        told = self.energies[slot]
+        told["kinetic"], told["elastic"], told["work"], told["phase"] = k, np.nan, -k, self.phase
+        told["found"] = self.found
+        self.x[:], self.v[:] = k + 1, -k
+        self.time += 10 * (k + 1)
+        self.stamps[slot]["end"] = self.time
+        self.stamps[(slot + 1) % CAPACITY]["begin"] = self.time
+        self.done += 1
+
+
+def number(value: int) -> bytes:
+    """As a mailbox of FakeScene takes it."""
+    return np.int64(value).tobytes()

@@ -1,0 +1,344 @@
+# SPDX-License-Identifier: MIT
+"""Kernel texts: compiled with a cache, their errors shown, their arguments checked."""
+
+import ctypes
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from sim_server.backends import compiler as backend
+from sim_server.backends.gpu import kernel_fusion
+from sim_server.backends.gpu.device import PRECISIONS
+from sim_server.backends.gpu.device import options as device_options
+from tests.support import nvrtc
+
+PUSH = """#include "kernel.h"
+struct Push {
+    int n;            // items
+    const real* v;    // (n,)
+    real* x;          // (n,) in, out
+    const int* twist; // (n,)
+    real h;
+};
+KERNEL(push, Push) { p.x[i] += p.h * p.v[i] * p.twist[i]; }
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch) -> Path:
+    """Kernel texts of a test's own, with the package's headers and an empty cache."""
+    texts = tmp_path / "texts"
+    texts.mkdir()
+    (texts / "push.cu").write_text(PUSH)
+    monkeypatch.setattr(backend, "HERE", texts)
+    monkeypatch.setenv("WARPFACTOR_CACHE", str(tmp_path / "cache"))
+    return texts
+
+
+def arguments(n: int = 5, real: str = "f8") -> dict:
+    return {"v": np.ones(n, real), "x": np.zeros(n, real), "twist": np.arange(n, dtype=np.int32), "h": 0.5}
+
+
+def libraries(folder: Path) -> set[str]:
+    return {p.name for p in (folder.parent / "cache").iterdir()}
+
+
+@pytest.mark.parametrize(("real", "dtype"), [("double", "f8"), ("float", "f4")])
+def test_a_text_is_compiled_bound_and_run(folder, real, dtype):
+    given = arguments(real=dtype)
+    launch = backend.Module("push.cu", real).bind("push", 5, **given)
+    launch()
+    launch()
+    np.testing.assert_array_equal(given["x"], [0, 1, 2, 3, 4])
+    assert given["x"].dtype == dtype
+    assert (launch.name, launch.items) == ("push.push", 5)
+
+
+def test_a_cache_that_cannot_be_made_is_named(folder, monkeypatch, tmp_path):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("WARPFACTOR_CACHE", str(tmp_path / "file" / "cache"))
+    with pytest.raises(backend.CompileError, match=r"kept in .*file/cache: Not a directory; WARPFACTOR"):
+        backend.Module("push.cu").address("push")
+
+
+def test_nothing_is_compiled_twice(folder):
+    backend.Module("push.cu").address("push")
+    first = libraries(folder)
+    assert len(first) == 1
+    assert next(iter(first)).startswith("push-")
+    stamp = next((folder.parent / "cache").iterdir()).stat().st_mtime_ns
+    backend.Module("push.cu").address("push")
+    assert libraries(folder) == first
+    assert next((folder.parent / "cache").iterdir()).stat().st_mtime_ns == stamp
+
+
+def test_the_cache_knows_text_headers_flags_and_precision(folder, monkeypatch):
+    source = folder / "push.cu"
+    (folder / "mine.cuh").write_text("#define FACTOR 2\n")
+    source.write_text(PUSH.replace('"kernel.h"', '"kernel.h"\n#include "mine.cuh"').replace("p.h *", "FACTOR * p.h *"))
+
+    def result() -> float:
+        given = arguments()
+        backend.Module("push.cu").bind("push", 5, **given)()
+        return given["x"][1]
+
+    assert result() == 1.0
+    (folder / "mine.cuh").write_text("#define FACTOR 6\n")
+    assert result() == 3.0  # a header alone was edited
+    assert len(libraries(folder)) == 2
+    source.write_text(source.read_text().replace("* p.twist", "* 10 * p.twist"))
+    assert result() == 30.0
+    assert len(libraries(folder)) == 3
+    monkeypatch.setattr(backend, "FLAGS", [*backend.FLAGS, "-DUNUSED"])
+    assert result() == 30.0
+    assert len(libraries(folder)) == 4
+    backend.Module("push.cu", "float").address("push")
+    assert len(libraries(folder)) == 5
+    (folder / "mine.cuh").write_text("#define FACTOR 2\n")
+    source.write_text(PUSH)
+    assert result() == 0.5
+
+
+def test_a_text_that_does_not_compile_says_why_and_leaves_nothing(folder):
+    (folder / "push.cu").write_text(PUSH.replace("p.h", "p.nonsense"))
+    with pytest.raises(backend.CompileError, match=r"push\.cu did not compile:[\s\S]*nonsense"):
+        backend.Module("push.cu").address("push")
+    assert not any(name.endswith(".so") for name in libraries(folder))
+
+
+def test_without_a_compiler_the_message_says_what_to_do(folder, monkeypatch):
+    backend.compiler.cache_clear()
+    monkeypatch.setenv("PATH", str(folder))
+    monkeypatch.delenv("CXX", raising=False)
+    try:
+        with pytest.raises(backend.CompileError, match=r"no C\+\+ compiler found .*apt-get install g\+\+"):
+            backend.compiler()
+    finally:
+        backend.compiler.cache_clear()
+
+
+WRONG = {
+    "missing": ({"h": None}, "takes"),
+    "unknown": ({"extra": 1.0}, "takes"),
+    "single precision": ({"x": np.zeros(5, np.float32)}, "x must be a contiguous array of float64"),
+    "wide integers": ({"twist": np.arange(5)}, "twist must be a contiguous array of int32"),
+    "not contiguous": ({"v": np.ones(10)[::2]}, "v must be a contiguous array of float64"),
+    "column major": ({"v": np.asfortranarray(np.ones((5, 2)))}, "v must be a contiguous array of float64"),
+    "a list": ({"v": [1.0] * 5}, "v must be a contiguous array of float64"),
+    "a number": ({"x": 3.0}, "x must be a contiguous array of float64"),
+    "an array for a number": ({"h": np.ones(5)}, "array"),
+    "a word for a number": ({"h": "fast"}, "real number|float"),
+}
+
+
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory) -> str:
+    """A cache for tests that do not look at it: the first compiles."""
+    return str(tmp_path_factory.mktemp("kept"))
+
+
+@pytest.mark.parametrize(("change", "message"), WRONG.values(), ids=WRONG.keys())
+def test_arguments_that_do_not_fit_are_refused(folder, kept, monkeypatch, change, message):
+    monkeypatch.setenv("WARPFACTOR_CACHE", kept)
+    given = {k: v for k, v in (arguments() | change).items() if v is not None}
+    with pytest.raises(TypeError, match=message):
+        backend.Module("push.cu").bind("push", 5, **given)
+
+
+def test_kernels_and_members_that_cannot_be_found_are_named(folder):
+    module = backend.Module("push.cu")
+    with pytest.raises(backend.CompileError, match=r"no kernel pull in push\.cu"):
+        module.bind("pull", 5, **arguments())
+    (folder / "odd.cu").write_text(PUSH.replace("real h;", "real h[3];"))
+    (folder / "odd.cu").write_text((folder / "odd.cu").read_text().replace("p.h *", "p.h[0] *"))
+    with pytest.raises(backend.CompileError, match=r"struct Push: cannot read the member 'real h\[3\];'"):
+        backend.Module("odd.cu").bind("push", 5, **arguments())
+
+
+def test_layouts_are_those_of_the_compiler(folder):
+    """Ints, reals and pointers in any order: the compiler pads as ctypes does."""
+    body = "int n; real a; int k; const real* v; int m; real b; real* out;".replace("; ", ";\n    ")
+    text = f'#include "kernel.h"\nstruct Odd {{\n    {body}\n}};\n'
+    text += "KERNEL(odd, Odd) { p.out[i] = p.a + 10 * p.k + 100 * p.v[i] + 1000 * p.m + 10000 * p.b; }\n"
+    (folder / "odd.cu").write_text(text)
+    for real, dtype in (("double", "f8"), ("float", "f4")):
+        out = np.zeros(3, dtype)
+        launch = backend.Module("odd.cu", real).bind("odd", 3, a=1.0, k=2, v=np.full(3, 3, dtype), m=4, b=5.0, out=out)
+        launch()
+        assert (out == 54321).all()
+        assert ctypes.sizeof(launch.params) in (40, 48, 56)
+
+
+PACKAGE = backend.HERE
+LAWS = sorted(p.relative_to(PACKAGE).as_posix() for p in PACKAGE.glob("effects/*.cuh"))
+FRAME = "kernels/hyperelastic.cu"  # of the laws: no text by itself
+GPU_TEXTS = sorted(p.relative_to(PACKAGE).as_posix() for p in PACKAGE.rglob("*.cu"))
+GPU_TEXTS = [path for path in GPU_TEXTS if path != FRAME] + [f"{FRAME}+{law}" for law in LAWS]
+TEXTS = [path for path in GPU_TEXTS if not path.startswith("gpu/")]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", TEXTS)
+def test_every_text_of_the_package_compiles_without_warnings(path, tmp_path):
+    """In both precisions; -Wall is on, and a warning is an error here."""
+    for real in ("double", "float"):
+        command = [backend.compiler(), *backend.FLAGS, "-Werror", "-fsyntax-only", f"-Dreal={real}", "-x", "c++"]
+        command += [f"-I{backend.INCLUDE}", "-"]
+        result = subprocess.run(command, input=backend.read_text(path)[1], capture_output=True, text=True)
+        assert result.returncode == 0, result.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("arch", ["sm_80", "sm_90"])
+@pytest.mark.parametrize("path", GPU_TEXTS)
+def test_every_text_of_the_package_compiles_for_gpus(path, arch, tmp_path):
+    """By NVRTC, which needs no GPU and no driver; what it says counts as a failure too."""
+    if (library := nvrtc.library()) is None:
+        pytest.skip("needs the package nvidia-cuda-nvrtc")
+    own = path.startswith("gpu/")
+    for name, types in PRECISIONS.items():
+        if name == "mixed" and own and "local*" not in backend.read_text(path)[1]:
+            continue  # the same: they know no elements
+        options = nvrtc.arch(arch, "max" if own else "mid")
+        options += [*device_options(types), f"-I{PACKAGE / 'backends/gpu'}"]  # as they are compiled there
+        text = tmp_path / "text.cu"
+        text.write_text(backend.read_text(path)[1])
+        code, said = nvrtc.compiled(library, text, options)
+        assert len(code) > 1000 and not said, said
+
+
+def test_the_gpu_compiler_names_an_error(tmp_path):
+    if (library := nvrtc.library()) is None:
+        pytest.skip("needs the package nvidia-cuda-nvrtc")
+    text = tmp_path / "wrong.cu"
+    text.write_text('#include "kernel.h"\nINLINE number f() { return missing; }\n')
+    code, said = nvrtc.compiled(library, text, ["-arch=sm_90", f"-I{backend.INCLUDE}"])
+    assert not code and "missing" in said
+
+
+def test_a_process_without_kernels_compiles_none(tmp_path):
+    code = "import sim_server.scene, sim_server.simulation, sim_server.backends.compiler as b; print(b.compiled)"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=PACKAGE.parent)
+    assert run.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("name", ["nodes", "schemes"])
+@pytest.mark.parametrize("arch", ["sm_80", "sm_90"])
+def test_the_last_kernel_of_a_step_compiles_with_the_end_of_the_step(arch, name, tmp_path):
+    if (library := nvrtc.library()) is None:
+        pytest.skip("needs the package nvidia-cuda-nvrtc")
+    advance = _launch(f"kernels/{name}.cu", "Advance", f"{name}.advance")
+    end = kernel_fusion.End((PACKAGE / "backends/gpu/step_epilogue.cu").read_text(), "Tick", np.zeros(()))
+    text = tmp_path / "last.cu"
+    text.write_text(kernel_fusion.Text([advance], kernel_fusion.Shape(32, 1), end).source)  # type: ignore[list-item]
+    code, said = nvrtc.compiled(
+        library, text, [f"-arch={arch}", "-std=c++17", f"-I{backend.INCLUDE}", f"-I{PACKAGE / 'backends/gpu'}"]
+    )
+    assert len(code) > 1000 and not said, said
+
+
+def _launch(path: str, struct: str, name: str, mailed: bool = False) -> SimpleNamespace:
+    """What fusing reads of a DeviceLaunch, its arrays by name at addresses of their own."""
+    text = backend.read_text(path)[1]
+    fields = backend._members(text, struct, {"real": "double", "local": "double"})
+    arrays = {
+        f.name: SimpleNamespace(data=SimpleNamespace(ptr=hash(f.name) & 0xFFFFF00), shape=(9, 3), size=27)
+        for f in fields if f.dtype is not None
+    }  # fmt: skip
+    params = np.zeros((), [(f.name, "u8" if f.dtype is not None else "f8") for f in fields])
+    sums = f"SUM_KERNEL({name.split('.')[1]}," in text
+    return SimpleNamespace(
+        text=text, struct=struct, name=name, sums=sums, mailed=mailed, fields=fields, arrays=arrays, params=params,
+        mail_address=64, items=9,
+    )  # fmt: skip
+
+
+NODES = [
+    ("kernels/nodes.cu", "Start", "nodes.start"),
+    ("effects/corotational_nodes.cu", "Gather", "corotational_nodes.gather"),
+    ("effects/corotational_exact_nodes.cu", "Gather", "corotational_exact_nodes.gather"),
+    ("effects/mass_spring_nodes.cu", "Gather", "mass_spring_nodes.gather"),
+    ("effects/touch.cu", "Apply", "touch.apply", True), ("effects/gravity.cu", "Gravity", "gravity.gravity"),
+    ("kernels/corner_rows.cu", "Gather", "corner_rows.gather"), ("kernels/shape.cu", "Shape", "shape.shape"),
+    ("kernels/nodes.cu", "Turn", "nodes.turn"),
+]  # fmt: skip
+ELEMENTS = [
+    ("effects/corotational.cu", "Elements", "corotational.elements"),
+    ("effects/corotational_qr.cu", "Elements", "corotational_qr.elements"),
+    ("effects/corotational_exact.cu", "Elements", "corotational_exact.elements"),
+    ("effects/mass_spring.cu", "Springs", "mass_spring.springs"),
+]  # fmt: skip
+LAW_ELEMENTS = [
+    (f"{FRAME}+effects/neo_hookean.cuh", "Elements", "neo_hookean.elements"),
+    (f"{FRAME}+effects/mooney_rivlin.cuh", "Elements", "mooney_rivlin.elements"),
+    ("effects/fibres.cu", "Elements", "fibres.elements"),
+]
+OTHER_SCHEME = [("kernels/schemes.cu", "Inertia", "schemes.inertia"), *NODES[1:]]
+BLOCKS = [
+    ("effects/corotational_blocks.cu", "Blocks", "corotational_blocks.blocks"),
+    ("effects/corotational_exact_blocks.cu", "Blocks", "corotational_exact_blocks.blocks"),
+    ("effects/mass_spring_blocks.cu", "Blocks", "mass_spring_blocks.blocks"),
+    ("kernels/edge_rows.cu", "Blocks", "edge_rows.blocks"),
+    ("kernels/assemble.cu", "Assemble", "assemble.assemble"),
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("real", "local"), [("double", "double"), ("double", "float"), ("float", "float")])
+@pytest.mark.parametrize(
+    "group",
+    [NODES, OTHER_SCHEME, BLOCKS, ELEMENTS, LAW_ELEMENTS],
+    ids=["nodes", "other scheme", "blocks", "elements", "laws"],
+)
+def test_launches_put_together_compile_in_every_precision(group, real, local, tmp_path):
+    """With rows in registers, and one argument for each array whatever launches have it."""
+    if (library := nvrtc.library()) is None:
+        pytest.skip("needs the package nvidia-cuda-nvrtc")
+    launches = [_launch(*given) for given in group]
+    for launch, (path, struct, *_) in zip(launches, group, strict=True):
+        launch.fields = backend._members(backend.read_text(path)[1], struct, {"real": real, "local": local})
+    private = kernel_fusion._private(launches, launches)  # type: ignore[arg-type]
+    shape = kernel_fusion.Shape(64, 4)
+    made = kernel_fusion.Text(launches, shape, None, private)  # type: ignore[arg-type]
+    assert (group in (ELEMENTS, LAW_ELEMENTS) or private) and made.source.count("[3];") >= len(private)
+    text = tmp_path / "together.cu"
+    text.write_text(made.source)
+    options = ["-arch=sm_90", "-std=c++17", f"-Dreal={real}", f"-Dlocal={local}", f"-I{backend.INCLUDE}"]
+    code, said = nvrtc.compiled(library, text, options)
+    assert len(code) > 1000 and not said, said
+
+
+@pytest.mark.parametrize("group", [OTHER_SCHEME, BLOCKS], ids=["nodes", "blocks"])
+def test_what_lets_further_linearizations_return_comes_in_front_and_changes_nothing_else(group, tmp_path):
+    if (library := nvrtc.library()) is None:
+        pytest.skip("needs the package nvidia-cuda-nvrtc")
+    launches = [_launch(*given) for given in group]
+    private = kernel_fusion._private(launches, launches)  # type: ignore[arg-type]
+    plain, guarded = (
+        kernel_fusion.Text(launches, kernel_fusion.Shape(64, 4), None, private, guard)  # type: ignore[arg-type]
+        for guard in (None, kernel_fusion.Guard(64, 128, 192))
+    )
+    before, after = plain.source.split("fused(int n"), guarded.source.split("fused(int n")
+    arguments = ", const int* __restrict__ left, const int* __restrict__ phase, const int* __restrict__ body"
+    assert "".join(["\n", *(f"{line}\n" for line in kernel_fusion.GUARD)]) in after[1]
+    assert after[1].replace(arguments, "").replace("\n".join(kernel_fusion.GUARD) + "\n", "") == before[1]
+    assert before[0] == after[0] and guarded.values == [64, 128, 192, *plain.values]
+    text = tmp_path / "guarded.cu"
+    text.write_text(guarded.source)
+    options = ["-arch=sm_90", "-std=c++17", "-Dreal=double", "-Dlocal=double", f"-I{backend.INCLUDE}"]
+    code, said = nvrtc.compiled(library, text, options)
+    assert len(code) > 1000 and not said, said
+
+
+def test_elements_of_effects_of_different_numbers_are_not_put_together():
+    def launch(name: str, items: int, mailed: bool = False) -> SimpleNamespace:
+        return SimpleNamespace(name=name, items=items, mailed=mailed)
+
+    tetrahedra, springs, also = launch("tetrahedra", 6), launch("springs", 19), launch("also tetrahedra", 6)
+    assert kernel_fusion._alike([tetrahedra, springs, also]) == [[tetrahedra, also], [springs]]  # type: ignore[list-item]
+    start, touch = launch("start", 5), launch("touch", 2, mailed=True)
+    assert kernel_fusion._alike([start, touch]) == [[start, touch]]  # type: ignore[list-item]

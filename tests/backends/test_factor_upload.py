@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: MIT
+"""Factors on their way into the GPU loop: two targets, none written while it may be read, no memory for one."""
+
+import logging
+from types import SimpleNamespace
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from sim_server.backends.compiler import CompileError
+from sim_server.backends.gpu import factor_upload as module
+from sim_server.backends.gpu.factor_upload import Intake
+from tests.backends.fake_cuda import FakeScene
+
+
+class Event:
+    """Of an expansion under way; the test says when it is done."""
+
+    def __init__(self, scene: FakeScene):
+        self._device, self.ptr = scene.device, scene.device.event()
+        scene.device._recorded[self.ptr] = 1
+
+    def synchronize(self) -> None:
+        self._device.record(self.ptr)
+
+
+class Expanded(NamedTuple):
+    target: list[int]
+    event: Event
+
+
+class NoMemory(MemoryError):
+    """As CuPy raises it."""
+
+
+class Maker:
+    """Stands for the solver and what makes its factors: a target is a list that holds the value it was filled with."""
+
+    def __init__(self, scene: FakeScene):
+        self.scene = scene
+        self.bodies = np.zeros(1, [("setting", "i8"), ("factor", "i8")])
+        self.targets: list[list[int]] = []
+        self.events: list[Event] = []
+        self.fail: Exception | None = None
+
+    def expansion(self, body: int, pattern: SimpleNamespace) -> "Maker":
+        if isinstance(self.fail, ValueError):
+            raise self.fail
+        return self
+
+    def target(self) -> list[int]:
+        self.targets.append([])
+        return self.targets[-1]
+
+    spared = None
+
+    def expand(self, values: np.ndarray, target: list[int], multiprocessors: int | None = None) -> Expanded:
+        if self.fail:
+            raise self.fail
+        target[:] = [int(values[0])]
+        self.events.append(Event(self.scene))
+        return Expanded(target, self.events[-1])
+
+    def use(self, body: int, pattern: SimpleNamespace, expanded: Expanded, step: int) -> None:
+        self.bodies["factor"] = expanded.target[0]
+
+
+PATTERN = SimpleNamespace(id=1)
+
+
+@pytest.fixture
+def parts(monkeypatch):
+    monkeypatch.setattr(module, "SETTINGS", 8)
+    monkeypatch.setattr(module, "no_memory_left", lambda error: isinstance(error, NoMemory))
+    scene = FakeScene()
+    maker = Maker(scene)
+    stream = SimpleNamespace(synchronize=lambda: None)
+    gpu = SimpleNamespace(cp=SimpleNamespace(cuda=SimpleNamespace(get_current_stream=lambda: stream)))
+    return scene, maker, Intake(gpu, maker, scene.loop, ["beam"], scene.loop.mailboxes[1:2])
+
+
+def post(intake: Intake, value: int) -> None:
+    intake.post(0, PATTERN, np.array([value]), value)
+
+
+def used(scene: FakeScene) -> list[int]:
+    return scene.loop.records()["factor_step"].tolist()
+
+
+def test_a_factor_is_used_when_it_is_made(parts):
+    scene, maker, intake = parts
+    post(intake, 5)
+    scene.loop.run(1)
+    assert intake.step(0) == -1
+    maker.events[0].synchronize()
+    scene.loop.run(1)
+    assert intake.step(0) == 5
+    assert used(scene) == [0, 5]
+
+
+def test_what_comes_too_early_waits_and_the_newest_wins(parts):
+    scene, maker, intake = parts
+    for value in (5, 6, 7):
+        post(intake, value)
+    assert [t[0] for t in maker.targets] == [5]
+    maker.events[0].synchronize()
+    scene.loop.run(1)
+    intake.advance()
+    assert [t[0] for t in maker.targets] == [5, 7]
+    maker.events[1].synchronize()
+    scene.loop.run(1)
+    assert used(scene) == [5, 7]
+    assert intake.step(0) == 7
+
+
+def test_two_targets_do_and_the_one_in_use_is_never_written_to(parts):
+    scene, maker, intake = parts
+    for value in range(1, 40):
+        post(intake, value)
+        maker.events[-1].synchronize()
+        if value % 3 == 0:
+            scene.loop.run(1)
+            intake.advance()
+            in_use = intake._tracks[0].in_use
+            assert in_use.target[0] == scene.factor[0] == intake.step(0)
+    assert len(maker.targets) == 2
+
+
+def test_what_was_launched_with_a_factor_ends_before_its_target_is_written_again(parts):
+    scene, maker, intake = parts
+    post(intake, 1)
+    intake.settle()
+    scene.loop.run(1)
+    post(intake, 2)
+    intake.settle()
+    scene.loop.run(1)
+    assert intake.step(0) == 2
+    scene.loop.loop.launched += 1  # as if a step were under way
+    track = intake._tracks[0]
+    track.leaving = (track.in_use, int(scene.loop.loop.launched))
+    post(intake, 3)
+    assert [t[0] for t in maker.targets] == [1, 2]
+    scene.loop.loop.launched -= 1
+    track.leaving = (track.in_use, scene.loop.step)
+    intake.advance()
+    assert [t[0] for t in maker.targets] == [3, 2]
+
+
+def test_settled_means_used_by_the_next_step_even_if_others_wait(parts):
+    scene, maker, intake = parts
+    for value in (5, 6, 7):
+        post(intake, value)
+    intake.settle()
+    scene.loop.run(1)
+    assert used(scene) == [7]
+    assert len(maker.targets) <= 2
+
+
+@pytest.mark.parametrize(
+    "error", [ValueError("not by nodes"), NoMemory("Out of memory allocating 5,000 bytes"), CompileError("x.cu(3): no")]
+)
+def test_a_factor_that_does_not_fit_leaves_what_is_there_and_is_told_once(parts, caplog, error):
+    scene, maker, intake = parts
+    post(intake, 5)
+    intake.settle()
+    maker.fail = error
+    with caplog.at_level(logging.WARNING):
+        for value in (6, 7, 8):
+            scene.loop.run(1)
+            post(intake, value)
+            intake.settle()
+    assert used(scene) == [5, 5, 5]
+    assert intake.step(0) == 5
+    assert len(caplog.records) == 1
+    assert "object 'beam'" in caplog.text and str(error) in caplog.text and "the factor that it has" in caplog.text
+    maker.fail = None
+    post(intake, 9)
+    intake.settle()
+    scene.loop.run(1)
+    assert used(scene) == [9]
+
+
+def test_other_errors_are_not_hidden(parts):
+    _, maker, intake = parts
+    maker.fail = RuntimeError("broken")
+    with pytest.raises(RuntimeError, match="broken"):
+        post(intake, 5)

@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: MIT
+"""The account of energy on a GPU run by threads of the processor: sums over the nodes of bodies, and freezing."""
+
+import ctypes as c
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sim_server.backends.compiler import HERE, INCLUDE, compiler
+from sim_server.backends.cpu.structs import BALANCE
+from sim_server.backends.gpu.energies import ACCOUNT, SUMS, chunked
+from sim_server.backends.gpu.structs import ENERGY
+
+G = np.array([0.3, -9.81, 2.0])
+STILL = ("v", "dv", "ahead", "drift", "carried")
+MOTION = ("x", "before", *STILL)
+TEXT = """
+#include "cuda_threads.h"
+#include "energy_balance.cu"
+extern "C" void settle(int chunks, int threads, const Account* a) { launch(chunks, threads, [&] { account(*a); }); }
+"""
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory: pytest.TempPathFactory) -> c.CDLL:
+    folder = tmp_path_factory.mktemp("account")
+    (folder / "settle.cpp").write_text(TEXT)
+    paths = [f"-I{p}" for p in (folder, Path(__file__).parent, HERE / "backends/gpu", INCLUDE)]
+    command = [compiler(), "-std=c++17", "-O1", "-shared", "-fPIC", "-pthread", "-Dreal=double", *paths]
+    subprocess.run([*command, str(folder / "settle.cpp"), "-o", str(folder / "settle.so")], check=True)
+    return c.CDLL(str(folder / "settle.so"))
+
+
+class Bodies:
+    """Random ones of so many nodes each, after a step from `before` to x; `chunk` nodes make a thread block."""
+
+    def __init__(self, sizes: list[int], threads: int, on_runaway: int = 0, chunk: int = 40):
+        rng, self.n, self.threads = np.random.default_rng(len(sizes)), sum(sizes), threads
+        self.first = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int32)
+        shape = (self.n, 3)
+        self.motion = {name: rng.normal(size=shape) for name in MOTION}
+        self.motion["before"] = self.motion["x"] - 0.1 * rng.normal(size=shape)
+        self.mass, self.free = rng.uniform(1, 2, self.n), np.ones(self.n)
+        touched = rng.random(self.n) < 0.3
+        self.force = rng.normal(size=shape) * touched[:, None]
+        self.spring, self.anchor = rng.uniform(0, 5, self.n) * touched, rng.normal(size=shape)
+        self.balance = np.zeros(len(sizes), BALANCE)
+        self.balance["start"], self.balance["limit"] = 1e6, 1e6
+        self.told = np.zeros((4, len(sizes)), ENERGY)
+        self.step, self.settled = np.ones(1, "i8"), np.zeros(len(sizes), "i8")
+        self.chunk = chunked(self.first, chunk)
+        self.sums, self.arrived = np.full((len(self.chunk), SUMS), np.nan), np.zeros(len(sizes), "u4")
+        self.gravity, self.account = G, np.zeros((), ACCOUNT)
+        names = ("mass", "force", "spring", "anchor", "free", "balance", "told", "step", "settled", "first", "gravity")
+        for name in (*names, "chunk", "sums", "arrived"):
+            self.account[name] = getattr(self, name).ctypes.data
+        for name in ("x", "v", "before"):
+            self.account[name] = self.motion[name].ctypes.data
+        self.account["still"] = [self.motion[name].ctypes.data for name in STILL]
+        self.account["bodies"], self.account["capacity"], self.account["inertia"] = len(sizes), 4, 1
+        self.account["on_runaway"] = on_runaway
+
+    def settle(self, library: c.CDLL) -> None:
+        library.settle(len(self.chunk), self.threads, c.c_void_p(self.account.ctypes.data))
+
+    def expected(self, body: int) -> dict[str, float]:
+        nodes = slice(self.first[body], self.first[body + 1])
+        x, v, before = (self.motion[name][nodes] for name in ("x", "v", "before"))
+        step, k = x - before, self.spring[nodes, None]
+        work = ((self.force[nodes] + k * (self.anchor[nodes] - 0.5 * (x + before))) * step).sum()
+        gravity = -float(self.mass[nodes] @ (x @ G))
+        kinetic = 0.5 * float(self.mass[nodes] @ (v**2).sum(axis=1))
+        fallen = float(self.mass[nodes] @ (step @ G))
+        found = {"kinetic": kinetic, "gravity": gravity, "work": float(work), "budget": 1e6 + float(work) + fallen}
+        return found | {"stride": float(np.ptp(step, axis=0).max())}
+
+
+@pytest.mark.parametrize(
+    ("sizes", "threads"),
+    [([1], 32), ([7, 60, 1, 1, 33, 64, 2], 32), ([40, 25], 64), ([300], 128), ([90, 130, 70], 128), ([1999], 32)],
+)
+def test_each_body_gets_the_sums_over_its_own_nodes(library, sizes, threads):
+    bodies = Bodies(sizes, threads)
+    expected = [bodies.expected(k) for k in range(len(sizes))]
+    state = {name: array.copy() for name, array in bodies.motion.items()}
+    bodies.settle(library)
+    for k, found in enumerate(bodies.told[0]):
+        for name, value in expected[k].items():
+            assert found[name] == pytest.approx(value, rel=1e-6 if name == "stride" else 1e-11), (k, name)
+        assert np.isnan(found["elastic"]) and found["phase"] == found["found"] == 0
+    assert not bodies.force.any() and not bodies.spring.any()  # until something touches them again
+    assert all(np.array_equal(array, bodies.motion[name]) for name, array in state.items()) and bodies.free.all()
+    assert (bodies.settled == 1).all() and not bodies.arrived.any()
+    once = bodies.told[0].tobytes()
+    bodies.motion["v"][:] = 7
+    bodies.settle(library)  # a second time: of a step that is settled
+    assert bodies.told[0].tobytes() == once
+    again = Bodies(sizes, threads)
+    again.settle(library)
+    assert again.told[0].tobytes() == once  # to the bit
+
+
+@pytest.mark.parametrize("on_runaway", [0, 1, 2])
+def test_what_has_too_much_goes_back_and_rests_and_nothing_else(library, on_runaway):
+    sizes, threads = [40, 50, 3, 33], 64
+    bodies = Bodies(sizes, threads, on_runaway)
+    fast, long, wrong, well = (slice(a, b) for a, b in zip(bodies.first, bodies.first[1:], strict=False))
+    bodies.motion["v"][fast] *= 1e4
+    bodies.balance["limit"][1] = 1e-3
+    bodies.motion["v"][wrong] = np.nan
+    state = {name: array.copy() for name, array in bodies.motion.items()}
+    bodies.settle(library)
+    assert bodies.told[0]["found"].tolist() == ([1, 1, 1, 0] if on_runaway < 2 else [0] * 4)
+    assert bodies.told[0]["phase"].tolist() == {0: [2, 2, 2, 0], 1: [1, 1, 1, 0], 2: [0] * 4}[on_runaway]
+    for nodes in (fast, long, wrong):
+        same = [np.array_equal(state[n][nodes], bodies.motion[n][nodes], equal_nan=True) for n in MOTION]
+        assert all(same) == (on_runaway > 0)
+        if on_runaway == 0:
+            assert np.array_equal(bodies.motion["x"][nodes], state["before"][nodes]) and not bodies.free[nodes].any()
+            assert not any(bodies.motion[n][nodes].any() for n in MOTION if n not in ("x", "before"))
+    assert all(np.array_equal(state[n][well], bodies.motion[n][well]) for n in MOTION) and bodies.free[well].all()
+    bodies.step[0] = 2
+    bodies.settle(library)
+    if on_runaway == 0:
+        assert bodies.told[1]["phase"].tolist() == [2, 2, 2, 0] and not bodies.told[1]["found"].any()
+        assert not bodies.told[1]["kinetic"][:3].any()

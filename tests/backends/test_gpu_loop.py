@@ -1,0 +1,395 @@
+# SPDX-License-Identifier: MIT
+"""The native GPU loop on a GPU made of NumPy: batches, mailboxes, frames, matrices, errors."""
+
+import gc
+import threading
+import time
+import weakref
+
+import numpy as np
+import pytest
+
+from sim_server.backends.gpu.loop import BATCH, CAPACITY, FRAMES
+from sim_server.backends.gpu.structs import FOUND
+from sim_server.errors import DeviceLost
+from tests.backends.fake_cuda import ACCOUNT, NOT_READY, FakeScene, number
+
+
+def steps_ahead(scene: FakeScene) -> list[int]:
+    """Steps launched before each of its batches was reported, beyond those reported by then."""
+    ahead: list[int] = []
+    launch = scene.device._graph_launch
+
+    def counted(graph: int, stream: int) -> int:
+        if graph != ACCOUNT:
+            ahead.append(int(scene.loop.loop.launched) - scene.loop.step)
+        return launch(graph, stream)
+
+    scene.device.set("graph_launch", counted)
+    return ahead
+
+
+def test_every_step_is_reported_once_and_in_order():
+    scene = FakeScene(bodies=2)
+    assert scene.loop.run(300) == 300  # the device's rings go round several times
+    records = scene.loop.records()
+    assert records["step"].tolist() == np.repeat(np.arange(1, 301), 2).tolist()
+    assert records["body"].tolist() == [0, 1] * 300
+    np.testing.assert_allclose(records["residual"], 1e-7 * (records["step"] - 1))
+    np.testing.assert_allclose(records["time"], 0.5 * records["step"])
+    assert (records["solve"] == 1e-6).all()
+    assert scene.done == scene.loop.step == 300
+    assert scene.clock[0] == 150.0
+
+
+def test_what_a_search_has_come_to_is_reported_where_there_is_one():
+    once, often = FakeScene(bodies=2), FakeScene(bodies=2)
+    found = np.zeros((CAPACITY, 2), FOUND)
+    found["linearizations"], found["nonlinear"] = np.arange(2 * CAPACITY).reshape(-1, 2), 0.5
+    often.loop.loop.found = found.ctypes.data
+    for scene in (once, often):
+        scene.loop.run(100)
+    records = often.loop.records()
+    slot = (records["step"] - 1) % CAPACITY
+    assert records["linearizations"].tolist() == (2 * slot + records["body"]).tolist()
+    assert (records["nonlinear"] == 0.5).all()
+    records = once.loop.records()
+    assert (records["linearizations"] == 1).all() and (records["nonlinear"] == -1).all()
+
+
+def test_the_elastic_energy_is_evaluated_after_the_steps_where_it_is_wanted():
+    scene = FakeScene(bodies=2)
+    scene.loop.run(2 * BATCH)
+    scene.loop.records()
+    scene.loop.loop.energy_every = 5
+    scene.loop.run(20 * BATCH)
+    records = scene.loop.records()
+    due = records["step"] % 5 == 0
+    assert due.sum() == 128 and (records["kinetic"] == records["step"] - 1).all()
+    assert (records["elastic"][due] == 1000 + records["step"][due]).all() and np.isnan(records["elastic"][~due]).all()
+    assert (records["work"] == 1 - records["step"]).all()
+    scene.loop.loop.energy_every = 0
+    scene.device.calls.clear()
+    scene.loop.run(10 * BATCH)
+    assert np.isnan(scene.loop.records()["elastic"]).all()
+    assert scene.device.calls.count("graph_launch") == 10 * 3  # with the account of each batch, and nothing else
+
+
+def test_what_the_device_has_frozen_is_told_as_a_runaway():
+    scene = FakeScene()
+    scene.loop.run(1)
+    scene.phase, scene.factor[0] = 2, 9
+    scene.loop.run(2)
+    scene.results["status"] = 5
+    scene.loop.run(1)
+    records = scene.loop.records()
+    assert records["status"].tolist() == [0, 7, 7, 7]
+    assert records["factor_step"].tolist() == [0, -1, -1, -1]
+
+
+def test_a_body_that_runs_away_by_what_is_no_number_says_so():
+    scene = FakeScene()
+    scene.phase, scene.found, scene.results["status"] = 2, 1, 5
+    scene.loop.run(1)
+    assert scene.loop.records()["status"].tolist() == [5]  # not_finite says more
+
+
+def test_the_time_of_a_step_is_its_own_and_not_a_share_of_its_batch():
+    scene = FakeScene()
+    scene.loop.run(100)
+    records = scene.loop.records()
+    np.testing.assert_allclose(records["whole"], 1e-8 * records["step"], rtol=1e-9)
+    assert (records["cpu"] > 0).all()
+
+
+def test_the_next_batch_is_under_way_before_the_last_one_is_reported():
+    scene = FakeScene()
+    scene.loop.run(BATCH)
+    ahead = steps_ahead(scene)
+    scene.loop.run(8 * BATCH)
+    assert max(ahead[:2]) < BATCH  # nothing to be ahead of
+    assert min(ahead[2:]) >= BATCH
+    assert max(ahead) < 2 * BATCH
+
+
+def test_in_real_time_no_step_is_begun_before_the_last_one_is_reported():
+    scene = FakeScene()
+    scene.loop.loop.realtime, scene.loop.loop.dt = 1, 1e-4
+    ahead = steps_ahead(scene)
+    scene.loop.run(6)
+    assert ahead == [0] * 6
+
+
+def test_a_step_whose_wait_lasted_too_long_began_late():
+    scene = FakeScene()
+    loop = scene.loop.loop
+    loop.realtime, loop.dt, loop.frame_every = 1, 0.02, 1
+    query, asked = scene.device._event_query, []
+
+    def slow(event: int) -> int:
+        if event != loop.picture[1].arrived or len(asked) > 3:
+            return query(event)
+        asked.append(event)
+        if len(asked) == 3:  # while the next step is waited for: before that it is looked for once or twice
+            time.sleep(max(loop.deadline + 1.2 * loop.dt - time.monotonic(), 0))
+        return NOT_READY
+
+    scene.device.set("event_query", slow)
+    scene.loop.run(5)
+    assert len(asked) > 3 and scene.loop.records()["late"].max() > loop.dt and loop.late_steps >= 1
+
+
+def test_the_clock_is_noted_first_where_the_device_had_nothing_to_do():
+    scene = FakeScene()
+    scene.loop.run(BATCH)
+    scene.device.pieces = 1  # slow enough to be busy
+    graphs: list[int] = []
+    launch = scene.device._graph_launch
+    scene.device.set("graph_launch", lambda graph, stream: graphs.append(graph) or launch(graph, stream))
+    scene.loop.run(3 * BATCH)
+    assert [graph for graph in graphs if graph != ACCOUNT] == [10, 8, 8, 8, 8, 8] and graphs.count(ACCOUNT) == 3
+
+
+def test_few_launches_do_for_many_steps():
+    scene = FakeScene()
+    scene.loop.run(BATCH)
+    scene.device.calls.clear()
+    scene.loop.run(10 * BATCH)
+    assert scene.device.calls.count("graph_launch") == 10 * 3  # two of eight steps, one for the account of the last
+
+
+def test_mail_holds_from_the_next_batch_on_and_the_last_one_wins():
+    scene = FakeScene()
+    box = scene.loop.mailboxes[0]
+    for value in (3, 4, 5):
+        box.post(number(value))
+    assert not box.taken
+    scene.loop.run(2)
+    assert box.taken
+    box.post(number(6))
+    scene.loop.run(1)
+    assert scene.loop.records()["iterations"].tolist() == [5, 5, 6]
+
+
+def test_mail_says_from_which_step_on_it_holds():
+    """As logs need it to repeat a run: the arguments of step k + 1 are those with the largest `taken` up to k."""
+    scene = FakeScene()
+    box, posted = scene.loop.mailboxes[-1], []
+    for value in range(1, 41):
+        posted.append((box.post(number(value)), value))
+        if value % 3:  # the others are replaced before the loop sees them
+            scene.loop.run(value % 7 + 1)
+    scene.loop.run(BATCH)
+    taken = {mail.taken: value for mail, value in posted if mail.taken >= 0}
+    assert [mail.taken < 0 for mail, _ in posted] == [value % 3 == 0 for _, value in posted]
+    held = [max(step for step in taken if step <= k) for k in range(scene.done)]
+    assert scene.seen == [taken[step] for step in held]
+
+
+def test_arguments_that_come_while_others_have_run_hold_from_the_next_step_on():
+    scene = FakeScene()
+    scene.loop.run(3)
+    scene.loop._open()
+    late, settings = scene.loop.mailboxes[-1].post(number(8)), scene.loop.mailboxes[0].post(number(4))
+    scene.loop._renew()
+    assert settings.taken == 3 and late.taken == -1
+    scene.device._graph_launch(7, scene.device.stream)
+    scene.loop._close()
+    scene.loop.run(1)
+    assert late.taken == 4 and scene.seen == [0, 0, 0, 0, 8]
+    assert scene.loop.records()["iterations"].tolist() == [0, 0, 0, 4, 4]
+
+
+def test_a_factor_is_used_once_its_event_is_done():
+    scene = FakeScene()
+    event, box = scene.device.event(), scene.loop.mailboxes[1]
+    scene.device._recorded[event] = 1  # under way
+    box.post(number(9), event=event)
+    scene.loop.run(2)
+    assert not box.taken
+    scene.device.record(event)
+    scene.loop.run(1)
+    assert box.taken
+    assert scene.loop.records()["factor_step"].tolist() == [0, 0, 9]
+
+
+def test_what_was_not_taken_can_be_withdrawn():
+    scene = FakeScene()
+    event, box = scene.device.event(), scene.loop.mailboxes[1]
+    scene.device._recorded[event] = 1
+    box.post(number(9), event=event)
+    scene.loop.run(1)  # the loop holds it, but does not use it
+    assert box.withdraw()
+    scene.device.record(event)
+    box.post(number(10))
+    scene.loop.run(1)
+    assert not box.withdraw()
+    assert scene.loop.records()["factor_step"].tolist() == [0, 10]
+
+
+class Held:
+    """What mail points to."""
+
+
+def test_what_mail_points_to_lives_until_the_device_is_done_with_it():
+    scene = FakeScene()
+    box = scene.loop.mailboxes[-1]
+
+    def post(value: int) -> weakref.ref:
+        what = Held()
+        box.post(number(value), keep=what)
+        return weakref.ref(what)
+
+    in_use = post(1)
+    scene.loop.run(1)
+    waiting = [post(k) for k in range(2, 22)]
+    gc.collect()
+    assert in_use() is not None
+    assert sum(w() is not None for w in waiting) == 1
+    scene.loop.run(3)
+    post(50)
+    scene.loop.run(1)
+    post(51)
+    gc.collect()
+    assert in_use() is None
+    assert scene.seen == [1, 21, 21, 21, 50]
+
+
+@pytest.mark.parametrize("real", ["f4", "f8"])
+def test_frames_are_the_states_of_their_steps(real):
+    scene = FakeScene(real=real)
+    scene.loop.loop.frame_every = 3
+    scene.loop.run(14)
+    frames = scene.loop.frames()
+    assert [step for step, _, _ in frames] == [3, 6, 9, 12]
+    for step, x, v in frames:
+        assert (x == step).all()
+        assert (v == 1 - step).all()
+        assert x.dtype == v.dtype == np.float64
+    assert scene.loop.frames() == []
+
+
+def test_frames_that_nobody_fetches_are_dropped_and_counted():
+    scene = FakeScene()
+    scene.loop.loop.frame_every = 1
+    assert scene.loop.run(50) == 50
+    assert [step for step, _, _ in scene.loop.frames()] == list(range(1, FRAMES + 1))
+    assert scene.loop.loop.frames_dropped == 50 - FRAMES
+
+
+def test_a_patient_loop_waits_for_its_reader():
+    scene = FakeScene(records=10)
+    scene.loop.loop.patient = scene.loop.loop.frame_every = 1
+    thread = threading.Thread(target=scene.loop.run, args=(200,))
+    thread.start()
+    steps: list[int] = []
+    frames: list[tuple[int, float]] = []
+    alive = True
+    while alive:
+        alive = thread.is_alive()  # once more after its end
+        steps += scene.loop.records()["step"].tolist()
+        frames += [(step, float(x[0, 0])) for step, x, _ in scene.loop.frames()]
+    assert steps == list(range(1, 201))
+    assert frames == [(k, k) for k in range(1, 201)]
+    assert scene.loop.loop.records_dropped == scene.loop.loop.frames_dropped == 0
+
+
+def test_records_that_nobody_fetches_are_dropped_by_whole_steps_and_counted():
+    scene = FakeScene(bodies=3, records=13)
+    scene.loop.run(40)
+    kept = scene.loop.records()
+    assert kept["step"].tolist() == np.repeat(np.arange(1, 5), 3).tolist()
+    assert len(kept) + scene.loop.loop.records_dropped == 120
+
+
+@pytest.mark.parametrize("real", ["f4", "f8"])
+def test_matrices_are_those_of_the_step_after_the_request_in_all_bodies(real):
+    scene = FakeScene(bodies=3, real=real)
+    scene.loop.run(20)
+    targets = [np.full((2, 3, 3), np.nan) for _ in range(2)]
+    scene.loop.request_matrix(0, targets[0])
+    scene.loop.request_matrix(2, targets[1])
+    assert scene.loop.matrix_step(0) == scene.loop.matrix_step(2) == -1
+    scene.loop.run(40)
+    assert [scene.loop.matrix_step(k) for k in range(3)] == [20, -1, 20]
+    assert all((t == 20).all() for t in targets)
+
+
+@pytest.mark.parametrize("real", ["f4", "f8"])
+def test_positions_are_those_at_the_end_of_the_step_beside_matrices_of_other_bodies(real):
+    scene = FakeScene(bodies=3, real=real)
+    scene.loop.run(20)
+    positions, matrix = np.full((2, 3), np.nan), np.full((2, 3, 3), np.nan)
+    scene.loop.request_positions(1, positions)
+    scene.loop.request_matrix(2, matrix)
+    scene.loop.run(40)
+    assert [scene.loop.matrix_step(k) for k in range(3)] == [-1, 20, 20]
+    assert (matrix == 20).all()
+    assert (positions == 21).all()
+    with pytest.raises(ValueError, match="ahead"):
+        scene.loop.request_positions(1, positions, 0.1)
+
+
+def test_a_matrix_asked_for_while_it_runs_is_whole():
+    """Its copy is made aside: the steps that follow do not reach it."""
+    scene = FakeScene()
+    scene.loop.run(1)
+    thread = threading.Thread(target=scene.loop.run, args=(4000,))
+    thread.start()
+    found = []
+    target = np.zeros((2, 3, 3))
+    while thread.is_alive():
+        scene.loop.request_matrix(0, target)
+        while scene.loop.matrix_step(0) < 0 and thread.is_alive():
+            scene.loop.records()
+        if (step := scene.loop.matrix_step(0)) >= 0:
+            found.append((step, target.min(), target.max()))
+    assert found
+    assert all(step == low == high for step, low, high in found)
+    assert [step for step, _, _ in found] == sorted({step for step, _, _ in found})
+
+
+def test_a_pause_ends_what_is_under_way_and_resumes():
+    scene = FakeScene()
+    done: list[int] = []
+    scene.loop.loop.pause = 1
+    thread = threading.Thread(target=lambda: done.append(scene.loop.run(30)))
+    thread.start()
+    thread.join(0.05)
+    assert thread.is_alive()
+    assert scene.loop.step == scene.loop.loop.launched == 0
+    scene.loop.loop.pause = 0
+    thread.join(20)
+    assert done == [30]
+    scene.loop.loop.stop = 1
+    assert scene.loop.run(5) == 0
+
+
+@pytest.mark.parametrize("call", ["graph_launch", "event_query", "event_record"])
+def test_a_device_that_fails_is_told_with_the_call_that_failed(call):
+    scene = FakeScene()
+    scene.loop.run(3)
+    scene.device.fail = call
+    with pytest.raises(DeviceLost, match=rf"the GPU failed at step 3: {call}: fake error 700"):
+        scene.loop.run(3)
+
+
+def test_half_a_step_by_hand_is_a_step():
+    scene = FakeScene()
+    target = np.zeros((2, 3, 3))
+    scene.loop.request_matrix(0, target)
+    scene.loop._open()
+    scene.loop.mailboxes[0].post(number(4))
+    scene.device._event_wait(_recorded(scene))  # the caller waits for the first half
+    scene.loop._renew()
+    scene.device._graph_launch(7, scene.device.stream)
+    scene.loop._close()
+    assert scene.loop.records()[["step", "iterations"]].tolist() == [(1, 4)]
+    assert scene.loop.matrix_step(0) == 0
+    assert scene.loop.run(2) == 2
+
+
+def _recorded(scene: FakeScene) -> int:
+    event = scene.device.event()
+    scene.device._event_record(event, scene.device.stream)
+    return event

@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: MIT
+"""What the status says of records that nobody got, and how the client shows it."""
+
+import io
+from types import SimpleNamespace
+
+from rich.console import Console
+
+from clients.watch import tables
+from protocol import messages_pb2 as pb
+from sim_server.service.telemetry import Telemetry
+from sim_server.updates.policy import Driver
+from tests.scenes import bar, simulation
+
+
+def status(recorder: SimpleNamespace | None) -> pb.Status:
+    """Of a run whose loop and log have lost something."""
+    sim, found = simulation(bar(young=1e5), gravity=(0, -9.81, 0)), []
+    link = SimpleNamespace(publish_status=found.append)
+    telemetry = Telemetry(Driver(sim), link, recorder, patient=False)  # type: ignore[arg-type]
+    sim.engine.loop.records_dropped, sim.engine.loop.frames_dropped = 5, 2
+    telemetry.publish_status("running")
+    return found[0]
+
+
+def test_the_status_counts_what_the_loop_dropped_and_what_the_log_lost():
+    found = status(SimpleNamespace(dropped=3, lost=7, failure="/x.mcap: No space left on device"))
+    assert found.recording_failure == "/x.mcap: No space left on device" and not status(None).recording_failure
+    assert (found.records_dropped, found.records_lost, found.frames_dropped) == (5, 7, 2 + 3)
+    assert status(None).records_lost == 0
+
+
+def test_the_client_shows_these_numbers():
+    text = io.StringIO()
+    Console(width=200, file=text).print(tables(pb.Status(frames_dropped=4, records_dropped=51, records_lost=62)))
+    assert "dropped: frames 4, step records 51; lost to the log 62" in text.getvalue()
+    assert "no log any more" not in text.getvalue()
+    Console(width=200, file=text).print(tables(pb.Status(recording_failure="/x.mcap: No space left on device")))
+    assert "no log any more: /x.mcap: No space left on device" in text.getvalue()
+
+
+def test_the_client_shows_the_workers_that_the_server_supervises():
+    workers = [
+        pb.LocalWorker(worker="local-1", state="running", pid=71),
+        pb.LocalWorker(worker="local-2", state="restarting", pid=72, restarts=3, exit_code=-9),
+        pb.LocalWorker(worker="local-3", state="given up", pid=73, restarts=5, exit_code=1),
+    ]
+    text = io.StringIO()
+    Console(width=80, file=text).print(tables(pb.Status(local_workers=workers)))
+    rows = {line.split()[0]: line.split()[1:] for line in text.getvalue().splitlines() if "local-" in line}
+    assert rows["local-1"] == ["running", "71", "0", "-"]
+    assert rows["local-2"] == ["restarting", "72", "3", "SIGKILL"]
+    assert rows["local-3"] == ["given", "up", "73", "5", "exit", "1"]
+    bare = io.StringIO()
+    Console(width=80, file=bare).print(tables(pb.Status()))
+    assert "local" not in bare.getvalue()
+
+
+def test_the_status_and_the_log_tell_the_age_of_factors_and_its_bound():
+    """The log as it is written: each step carries the bound that held then."""
+    bodies = [bar(name=name, young=1e5, fixed="X < 0.01") for name in ("a", "b", "c")]
+    sim = simulation(*bodies, gravity=(0, -9.81, 0), preconditioner="cholesky", schedule_rounds=2.0)
+    found, logged = [], []
+    link = SimpleNamespace(publish_status=found.append, wants_steps=lambda: False)
+    recorder = SimpleNamespace(dropped=0, lost=0, failure="", step=lambda message, block: logged.append(message))
+    driver = Driver(sim)
+    telemetry = Telemetry(driver, link, recorder, patient=False)  # type: ignore[arg-type]
+    telemetry.publish_status("running")
+    assert [(o.factor_age, o.factor_age_max, o.factor_age_bound) for o in found[0].objects] == [(-1, -1, -1)] * 3
+    for _ in range(40):
+        telemetry.records(driver.advance(1))
+    telemetry.publish_status("running")
+    bound = driver.age_bound()
+    assert 0 < bound < 40
+    for status, track in zip(found[1].objects, driver.tracks, strict=True):
+        steps = [s for s in logged if s.header.object == status.object]
+        assert status.factor_age == 40 - track.newest > 0
+        assert status.factor_age_max == max(s.factor_age for s in steps) <= bound == status.factor_age_bound
+        assert {s.factor_age_bound for s in steps[:1]} == {-1} and steps[-1].factor_age_bound == bound
+
+
+def test_the_client_shows_the_age_and_its_bound():
+    text = io.StringIO()
+    ages = {"liver": (12, 345), "beam": (0, -1)}
+    last = pb.ObjectStep(preconditioner="block_jacobi")
+    objects = [pb.ObjectStatus(object=o, last=last, factor_age=a, factor_age_bound=b) for o, (a, b) in ages.items()]
+    Console(width=80, file=text).print(tables(pb.Status(objects=objects)))
+    rows = {words[0]: words[-2:] for line in text.getvalue().splitlines() if (words := line.split())}
+    assert (rows["liver"], rows["beam"]) == (["12/345", "block_jacobi"], ["0/-", "block_jacobi"])

@@ -1,0 +1,213 @@
+# SPDX-License-Identifier: MIT
+"""Factors that are no good are refused before they are used, counted and told once; the one in use stays."""
+
+import dataclasses
+import logging
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from precond_worker.factorization.registry import make_factorization
+from protocol.factor import Factor
+from protocol.method import Method
+from sim_server.simulation import Simulation
+from sim_server.updates.factor_check import Guard
+from sim_server.updates.factor_source import Inline, Job
+from sim_server.updates.policy import Driver
+from tests.scenes import bar, simulation
+from tests.solver.solves import bent, system
+
+
+def guard_of(sim: Simulation) -> tuple[Guard, NDArray]:
+    body = sim.world.bodies[0]
+    pattern = sim.system.body_pattern(body.first, body.last)
+    return Guard({body.name: pattern}), np.ascontiguousarray(sim.system.body_values(body.first, body.last))
+
+
+def made(sim: Simulation, method: Method | None = None, dtype: type = np.float32) -> Factor:
+    body = sim.world.bodies[0]
+    analysis = make_factorization(*sim.system.body_pattern(body.first, body.last), method)
+    values = analysis.factorize(sim.system.body_values(body.first, body.last), dtype)
+    return Factor(body.name, 1, 0, True, analysis.pattern, values, "w", 0.1)
+
+
+def changed(factor: Factor, how: str) -> Factor:
+    values, random = factor.values.copy(), np.random.default_rng(3)
+    own = factor.pattern.diagonal
+    if how == "nan":
+        values[len(values) // 2] = np.nan
+    elif how == "infinite":
+        values[len(values) // 3] = np.inf
+    elif how == "zero pivot":
+        values[own[-1]] = 0
+    elif how == "identity":
+        values[:] = 0
+        values[own] = 1
+    elif how == "random":
+        values[:] = random.normal(size=len(values))
+        values[own] = np.abs(values[own])
+    elif how == "shuffled":
+        random.shuffle(values)
+        values[own] = np.abs(values[own])
+    elif how == "some flipped":
+        values[random.random(len(values)) < 0.02] *= -1000
+    elif how == "one pivot tiny":
+        values[own[-1]] *= 1e-12
+    return dataclasses.replace(factor, values=values)
+
+
+GOOD = [
+    Method(), Method("incomplete_cholesky"), Method("incomplete_cholesky", drop_tolerance=0.005),
+    Method("incomplete_cholesky", drop_tolerance=0.1), Method("ssor"), Method("ssor", omega=1.5),
+]  # fmt: skip
+BAD = ["nan", "infinite", "zero pivot", "identity", "random", "shuffled", "some flipped", "one pivot tiny"]
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("method", GOOD, ids=lambda m: f"{m.name} {m.drop_tolerance} {m.omega}")
+@pytest.mark.parametrize("seed", [0, 1])
+def test_good_ones_pass(method, dtype, seed):
+    sim = bent(seed)
+    guard, matrix = guard_of(sim)
+    factor = made(sim, method, dtype)
+    for scale in (1.0, 1e6, 1e-6):  # the scale of a preconditioner does not matter
+        scaled = dataclasses.replace(factor, values=factor.values * dtype(scale))
+        assert guard.complaint(scaled, matrix) == ""
+    assert guard.complaint(factor, None) == ""
+
+
+@pytest.mark.parametrize("how", BAD)
+@pytest.mark.parametrize("method", GOOD[:1] + GOOD[2:3], ids=lambda m: m.name)
+def test_bad_ones_do_not(how, method):
+    sim = bent()
+    guard, matrix = guard_of(sim)
+    words = guard.complaint(changed(made(sim, method), how), matrix)
+    assert "not positive definite or not finite" in words or "worse than block Jacobi" in words
+    if how == "identity":
+        assert "worse than block Jacobi" in words
+    if how in ("nan", "infinite", "zero pivot"):
+        assert "not finite" in words
+        assert "not finite" in guard.complaint(changed(made(sim, method), how), None)
+
+
+def test_of_another_size():
+    sim, other = bent(), simulation(bar((3, 2, 2), name="bar"))
+    other.engine.assemble()
+    guard, matrix = guard_of(sim)
+    assert "its size is 108, that of the object 162" in guard.complaint(made(other), matrix)
+    factor = made(sim)
+    cut = dataclasses.replace(factor, values=factor.values[:-1])
+    assert f"it has {len(cut.values)} values" in guard.complaint(cut, matrix)
+
+
+def test_the_energy_that_an_iteration_takes_off():
+    """The figures in the complaint are those of one step of conjugate gradients in NumPy."""
+    sim = bent()
+    guard, matrix = guard_of(sim)
+    A = system(sim)[0].toarray()
+    r = np.random.default_rng(0).standard_normal(len(A))
+    own = np.arange(len(A)) // 3
+    blocks = np.where(own[:, None] == own, A, 0)
+
+    def taken_off(P: NDArray) -> float:
+        z = np.linalg.solve(P, r)
+        e = np.linalg.solve(A, r)
+        x = (z @ r) / (z @ A @ z) * z
+        return float(e @ A @ e - (e - x) @ A @ (e - x))
+
+    pattern = (len(sim.system.row_start) - 1, *sim.system.body_pattern(0, len(sim.system.row_start) - 1))
+    for factor, P in ((made(sim, dtype=np.float64), A), (changed(made(sim), "identity"), np.eye(len(A)))):
+        zr, reached, block_jacobi = guard._judge(factor, *pattern, matrix)
+        assert zr == pytest.approx(r @ np.linalg.solve(P, r), rel=1e-6)
+        assert reached == pytest.approx(taken_off(P), rel=1e-6)
+        assert block_jacobi == pytest.approx(taken_off(blocks), rel=1e-9)
+
+
+class Tampering(Inline):
+    """Makes factors, some of which are spoilt on the way."""
+
+    bad: dict[int, str]
+
+    def poll(self):
+        return [changed(f, self.bad[f.step]) if f.step in self.bad else f for f in super().poll()]
+
+
+def driven(update: str, bad: dict[int, str]) -> Driver:
+    sim = simulation(
+        bar((4, 2, 2), young=1e6, fixed="X < 0.01"), gravity=(0, -9.81, 0), preconditioner="cholesky", update=update,
+        max_iterations=2000,
+    )  # fmt: skip
+    source = Tampering({b.name: sim.system.body_pattern(b.first, b.last) for b in sim.world.bodies})
+    source.bad = bad
+    driver = Driver(sim, source)
+    driver.inline = source
+    return driver
+
+
+def test_a_bad_one_is_refused_and_the_old_one_stays(caplog):
+    driver = driven("lockstep-2", {2: "identity", 6: "nan", 8: "identity"})
+    adopted: list[int] = []
+    driver.adopted = lambda factor: adopted.append(factor.step)
+    with caplog.at_level(logging.WARNING):
+        records = driver.advance(15)
+    assert records["factor_step"].tolist() == [-1, -1, 0, 0, 0, 0, 4, 4, 4, 4, 4, 4, 10, 10, 12]
+    assert adopted == [0, 4, 10, 12]
+    assert (records["status"] == 0).all() and (records["fallbacks"] == 0).all()
+    track = driver.tracks[0]
+    assert (track.used, track.refused) == (4, 3)
+    assert "worse than block Jacobi" in track.refusal
+    told = [r.getMessage() for r in caplog.records]
+    assert len(told) == 2, "each cause once"
+    assert "object 'bar': no factor: that of in process is not used: worse than block Jacobi" in told[0]
+    assert "not positive definite or not finite (z.r = nan" in told[1]
+
+
+@pytest.mark.parametrize("update", ["never", "every-1", "async"])
+def test_with_none_but_bad_ones_it_is_block_jacobi(update):
+    plain = simulation(
+        bar((4, 2, 2), young=1e6, fixed="X < 0.01"), gravity=(0, -9.81, 0), preconditioner="block_jacobi",
+        max_iterations=2000,
+    )  # fmt: skip
+    plain.engine.run(10)
+    driver = driven(update, dict.fromkeys(range(20), "random"))
+    records = driver.advance(10)
+    assert (records["factor_step"] == -1).all()
+    assert driver.tracks[0].refused >= 1 and driver.tracks[0].used == 0
+    assert np.array_equal(driver.simulation.world.x, plain.world.x)
+
+
+def test_the_copy_of_a_matrix_is_kept_until_its_factor_came(monkeypatch):
+    """It is what the factor is judged by; then its memory serves again, so that none is added in the long run."""
+    driver = driven("async", {})
+    seen: list[tuple[int, bool]] = []
+    places: set[int] = set()
+    complaint = driver.guard.complaint
+
+    def looked(factor: Factor, matrix: NDArray | None) -> str:
+        values = matrix if matrix is not None else np.zeros(1)
+        fresh = made_of(driver, values) if matrix is not None else None
+        places.add(values.ctypes.data)
+        seen.append((factor.step, fresh is not None and np.array_equal(fresh, factor.values)))
+        return complaint(factor, matrix)
+
+    monkeypatch.setattr(driver.guard, "complaint", looked)
+    driver.advance(20)
+    assert len(seen) > 5 and all(same for _, same in seen)
+    assert len(places) <= 2
+
+
+def made_of(driver: Driver, values: NDArray) -> NDArray:
+    body = driver.simulation.world.bodies[0]
+    analysis = make_factorization(*driver.simulation.system.body_pattern(body.first, body.last))
+    return analysis.factorize(values, np.float32)
+
+
+def test_a_job_that_fails_again_and_again_is_told_once(caplog):
+    driver = driven("async", {})
+    submit = driver.inline.submit
+    driver.inline.submit = lambda job: submit(Job(job.object, 1, job.step, True, np.nan * job.values))  # type: ignore[method-assign]
+    with caplog.at_level(logging.WARNING):
+        driver.advance(40)
+    assert driver.tracks[0].refused > 2
+    assert len(caplog.records) == 1

@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: MIT
+"""Matrices copied ahead where workers factorize many within one step."""
+
+import time
+
+import pytest
+
+from sim_server.updates.factor_source import Inline, Job
+from sim_server.updates.policy import KEPT, Driver
+from sim_server.updates.prefetch import MOST, TRANSFER, Stock
+from tests.scenes import bar
+from tests.updates.test_policy import falling, patterns_of
+
+
+def paced(period: float, steps: int = 20) -> Stock:
+    """After so many steps of equal length [s]."""
+    stock = Stock()
+    for step in range(steps):
+        stock.paced(step, step * period)
+    return stock
+
+
+@pytest.mark.parametrize(
+    ("period", "service", "workers", "size"),
+    [
+        (1.0, 0.004, 1, 200),
+        (1.0, 0.004, 2, MOST),
+        (0.02, 0.004, 1, 4),
+        (0.02, 0.004, 0, 0),
+        (0.001, 0.05, 4, 0),
+        (0.02, 0.5, 3, 0),
+    ],
+)
+def test_as_many_as_workers_can_take_within_a_step(period, service, workers, size):
+    stock = paced(period)
+    stock.reckon([service, None, service], workers)
+    assert stock.size == pytest.approx(size, abs=1)
+    assert TRANSFER < 0.002
+
+
+def test_nothing_is_known_before_the_first_steps_and_factors():
+    stock = Stock()
+    stock.reckon([0.001], 4)
+    assert stock.size == 0
+    stock = paced(1.0)
+    stock.reckon([None, None], 4)
+    assert stock.size == 0
+
+
+def test_the_pace_is_told_once_a_step():
+    stock = Stock()
+    assert [stock.paced(step, now) for step, now in ((0, 0.0), (0, 0.5), (2, 1.0), (2, 1.1), (3, 1.5))] == [
+        False, False, True, False, True,
+    ]  # fmt: skip
+
+
+class OneAtATime(Inline):
+    """A worker that takes one job whenever it is let; the order of what it was sent."""
+
+    def __init__(self, patterns):
+        super().__init__(patterns)
+        self.idle, self.order = 1, []
+
+    def ready(self) -> int:
+        return self.idle
+
+    def submit(self, job: Job) -> bool:
+        if not self.idle:
+            return False
+        self.idle = 0
+        self.order.append((job.object, job.step))
+        return super().submit(job)
+
+
+def stocked(size: int) -> tuple[Driver, OneAtATime]:
+    sim = falling(*(bar(name=f"beam{k}", young=1e6, fixed="X < 0.01") for k in range(6)), update="async")
+    source = OneAtATime(patterns_of(sim))
+    driver = Driver(sim, source)
+    driver._stock.size = size
+    return driver, source
+
+
+def test_copies_in_stock_go_to_the_worker_as_it_becomes_idle():
+    driver, source = stocked(4)
+    driver.pump_factors()
+    driver.engine.run(1)
+    for _ in range(4):
+        source.idle = 1
+        driver.pump_factors()
+    assert source.order == [(f"beam{k}", 0) for k in range(4)], "all of one step, in the order of need"
+
+
+def test_without_a_stock_there_is_one_for_each_idle_worker():
+    driver, source = stocked(0)
+    driver.pump_factors()
+    driver.engine.run(1)
+    for _ in range(4):
+        source.idle = 1
+        driver.pump_factors()
+    assert source.order == [("beam0", 0)]
+
+
+def test_copies_that_wait_too_long_are_given_up():
+    driver, source = stocked(4)
+    driver.pump_factors()
+    driver.engine.run(1)
+    source.idle = 0
+    driver.engine.run(KEPT + 1)
+    driver._stock.size = 4
+    driver.pump_factors()
+    source.idle = 1
+    driver.engine.run(1)
+    driver.pump_factors()
+    assert all(step > 0 for _, step in source.order) and source.order
+
+
+def test_what_has_a_factor_and_needs_none_is_not_kept_in_stock():
+    driver, source = stocked(6)
+    for _ in range(30):
+        driver.pump_factors()
+        driver.engine.run(1)
+        driver.engine.records()  # unseen: nobody's excess grows
+        source.idle = 1
+    sent = [name for name, _ in source.order]
+    assert set(sent) == {f"beam{k}" for k in range(6)}, "who had none got one, and then those idle workers are given"
+    driver.pump_factors()
+    assert sum(t.wanted is not None for t in driver.tracks) <= 1
+
+
+def test_counted_runs_have_no_stock():
+    sim = falling(bar(name="beam", young=1e6, fixed="X < 0.01"), update="async")
+    driver = Driver(sim, counted=True)
+    for _ in range(5):
+        driver.engine.run(1)
+        driver.pump()
+        time.sleep(0.01)
+    assert driver._stock.size == 0

@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: MIT
+"""Whose matrix goes next, and what a solve adds to its object's sum: tables of pure functions."""
+
+import dataclasses
+import math
+from typing import get_args
+
+import pytest
+
+from sim_server.scene.solver_options import Rule
+from sim_server.updates.scheduler import Need, excess, oldest_possible, one_round, overdue_after, pays, pick
+
+NEW, BUSY = None, True
+RULES = get_args(Rule)
+
+
+def needs(*rows: tuple) -> list[Need]:
+    """Rows (object, excess, waited, in flight)."""
+    return [Need(*row) for row in rows]
+
+
+@pytest.mark.parametrize(
+    ("iterations", "floor", "expected"), [(0, 3, 0), (3, 3, 0), (4, 3, 1), (100, 3, 97), (5, 0, 5), (2, 10, 0)]
+)
+def test_excess(iterations, floor, expected):
+    assert excess(iterations, floor) == expected
+
+
+# lost, cost of an iteration, of a factorization, age of the factor, threshold, on trial
+PAYS = {
+    "nothing lost": (0, 1, 9, 5, 1, False, False),
+    "less than a factorization": (8, 1, 9, 5, 1, False, False),
+    "as much": (9, 1, 9, 5, 1, False, True),
+    "dear iterations": (3, 3, 9, 5, 1, False, True),
+    "cheap iterations": (9, 0.5, 9, 5, 1, False, False),
+    "a higher threshold": (9, 1, 9, 5, 2, False, False),
+    "a lower one": (5, 1, 9, 5, 0.5, False, True),
+    "threshold 0 is async": (0, 1, 9, 5, 0, False, True),
+    "no factor yet": (0, 1, 9, None, 1, False, True),
+    "to be tried out": (0, 1, 9, 5, 1, True, True),
+}
+
+
+@pytest.mark.parametrize("case", PAYS.values(), ids=PAYS.keys())
+def test_pays(case):
+    lost, cost, service, age, threshold, trial, expected = case
+    assert pays(Need("a", 0, 7, False, age, cost, service, lost=lost, trial=trial), threshold) is expected
+
+
+def test_what_pays_makes_the_least_sum_of_lost_iterations_and_factorizations():
+    """Iterations that grow by a each step: renewing when it pays against renewing each T steps, for every T."""
+    grows, cost, service, steps = 0.7, 2.0, 150.0, 5000
+
+    def total(renew) -> float:
+        age, lost, spent = 0, 0.0, 0.0
+        for _ in range(steps):
+            age, lost = age + 1, lost + grows * age
+            spent += grows * age * cost
+            if renew(age, lost):
+                age, lost, spent = 0, 0.0, spent + service
+        return spent
+
+    best = min(total(lambda age, lost, every=every: age >= every) for every in range(1, 200))
+    found = total(lambda age, lost: pays(Need("a", 0, age, False, age, cost, service, lost=lost)))
+    assert found < 1.02 * best
+
+
+TABLE = {
+    "nothing": ([], 1, 1, []),
+    "one": ([("a", 0, 5, False)], 1, 1, ["a"]),
+    "no place": ([("a", 9, 5, False)], 0, 1, []),
+    "a negative number of places": ([("a", 9, 5, False)], -1, 1, []),
+    "largest excess": ([("a", 1, 5, False), ("b", 3, 5, False), ("c", 2, 5, False)], 1, 1, ["b"]),
+    "two places": ([("a", 1, 5, False), ("b", 3, 5, False), ("c", 2, 5, False)], 2, 1, ["b", "c"]),
+    "more places than objects": ([("a", 1, 5, False), ("b", 3, 5, False)], 7, 1, ["b", "a"]),
+    "without a factor first": ([("a", 99, 50, False), ("b", 0, NEW, False)], 2, 1, ["b", "a"]),
+    "both without, by excess": ([("a", 1, NEW, False), ("b", 2, NEW, False)], 2, 1, ["b", "a"]),
+    "in flight is left out": ([("a", 9, 5, BUSY), ("b", 1, 5, False)], 2, 1, ["b"]),
+    "in flight without a factor": ([("a", 9, NEW, BUSY)], 1, 1, []),
+    "floor of steps": ([("a", 9, 3, False), ("b", 1, 4, False)], 2, 4, ["b"]),
+    "floor of steps does not hold back the first": ([("a", 0, NEW, False)], 1, 100, ["a"]),
+    "equal excess, who waited longer": ([("a", 2, 5, False), ("b", 2, 9, False)], 1, 1, ["b"]),
+    "all equal, in order": ([("a", 2, 5, False), ("b", 2, 5, False)], 2, 1, ["a", "b"]),
+    "no excess at all, who waited longer": ([("a", 0, 1, False), ("b", 0, 30, False)], 1, 1, ["b"]),
+}
+
+
+@pytest.mark.parametrize(("rows", "places", "floor", "expected"), TABLE.values(), ids=TABLE.keys())
+def test_pick(rows, places, floor, expected):
+    assert pick(needs(*rows), places, floor) == expected
+
+
+def test_everybody_gets_a_turn():
+    """With equal needs a single place goes round: whoever was sent has waited least."""
+    waited: dict[str, int | None] = dict.fromkeys("abc")
+    order = []
+    for _ in range(9):
+        chosen = pick(needs(*((name, 1.0, w, False) for name, w in waited.items())), 1)[0]
+        order.append(chosen)
+        waited = {name: None if w is None else w + 1 for name, w in waited.items()}
+        waited[chosen] = 1
+    assert "".join(order) == "abcabcabc"
+
+
+def test_the_busy_do_not_starve_the_calm():
+    """The rule of the paper goes by excess alone; a calm object comes as soon as its sum is the largest."""
+    sums, order = {"shaken": 0.0, "calm": 0.0}, []
+    for _ in range(60):
+        sums["shaken"] += 20
+        sums["calm"] += 1
+        chosen = pick(needs(*((name, s, 5, False) for name, s in sums.items())), 1)[0]
+        sums[chosen] = 0
+        order.append(chosen)
+    assert order.count("calm") == 2
+
+
+def need(object: str, **counters) -> Need:
+    return Need(**({"object": object, "excess": 0.0, "waited": 10, "in_flight": False, "age": 12} | counters))
+
+
+RULE_TABLE = {
+    "round robin: sent longest ago": ("round_robin", [need("a", waited=5, excess=99), need("b", waited=9)], "ba"),
+    "round robin: of equals the first": ("round_robin", [need("a"), need("b")], "ab"),
+    "excess: the sum as it will be": ("excess", [need("a", excess=30), need("b", excess=15, latest=2.0)], "ba"),
+    "excess: a larger sum all the same": ("excess", [need("a", excess=30), need("b", excess=5, latest=2.0)], "ab"),
+}
+
+
+@pytest.mark.parametrize(("rule", "rows", "expected"), RULE_TABLE.values(), ids=RULE_TABLE.keys())
+def test_rules(rule, rows, expected):
+    assert "".join(pick(rows, 9, rule=rule)) == expected
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_whatever_the_rule(rule):
+    """First those never sent, then the overdue, longest first; those in flight or just served are left out."""
+    rows = [need("wild", excess=1e9, waited=3, age=1000), need("late", waited=40), need("later", waited=41),
+            need("new", waited=None, age=None), need("busy", excess=1e9, waited=90, in_flight=True),
+            need("just", excess=1e9, waited=1, age=2000)]  # fmt: skip
+    assert pick(rows, 9, floor_steps=2, rule=rule, overdue=40) == ["new", "later", "late", "wild"]
+    assert pick(rows, 2, floor_steps=2, rule=rule, overdue=40) == ["new", "later"]
+
+
+@pytest.mark.parametrize(
+    ("failures", "waited", "ready"),
+    [(0, 3, True), (1, 5, False), (1, 6, True), (2, 11, False), (99, 3 * 2**10 - 1, False), (99, 3 * 2**10, True)],
+)
+def test_an_object_whose_jobs_fail_is_asked_less_and_less_often(failures, waited, ready):
+    assert bool(pick([need("a", waited=waited, failures=failures)], 1, floor_steps=3)) is ready
+
+
+def test_bounds_of_the_age():
+    assert one_round([1, 2, 3], 2) == 3
+    assert overdue_after(8, [1, 2, 3], 2) == 24
+    assert oldest_possible(24, [1, 2, 3], 2) == 24 + 3 + 2 * 3 + 2
+    assert overdue_after(8, [1.0], 0) == math.inf  # nobody serves: nobody is overdue before another
+    assert oldest_possible(math.inf, [1.0], 0) == oldest_possible(8, [], 1) == -1
+
+
+def oldest_seen(rule: Rule, services: list[int], wild: dict[int, float], workers: int, rounds: float) -> int:
+    """Largest age of a factor in 3000 steps of a server with such objects, whose factors take so many steps each."""
+    rows = [need(str(k), waited=0, age=0, service=float(s)) for k, s in enumerate(services)]
+    done: dict[int, int] = {}  # object: step at which its factor comes
+    seen, overdue = 0, overdue_after(rounds, services, workers)
+    for step in range(3000):
+        for k in [k for k, at in done.items() if at <= step]:
+            rows[k] = dataclasses.replace(rows[k], in_flight=False, age=rows[k].waited)
+            del done[k]
+        seen = max(seen, *(row.age or 0 for row in rows))
+        for name in pick(rows, workers - len(done), rule=rule, overdue=overdue):
+            k = int(name)
+            done[k] = step + services[k]
+            rows[k] = dataclasses.replace(rows[k], in_flight=True, waited=0, excess=0.0)
+        rows = [dataclasses.replace(row, waited=(row.waited or 0) + 1, age=(row.age or 0) + 1,
+                                    excess=row.excess + wild.get(k, 0)) for k, row in enumerate(rows)]  # fmt: skip
+    return seen
+
+
+@pytest.mark.parametrize("workers", [1, 3])
+@pytest.mark.parametrize("rounds", [1, 4])
+@pytest.mark.parametrize("rule", RULES)
+def test_nobody_starves(rule, rounds, workers):
+    """Three of twelve need all that the workers can do; the others are served within the bound all the same."""
+    services = [1, 2, 5, 9] * 3
+    bound = oldest_possible(overdue_after(rounds, services, workers), services, workers)
+    seen = oldest_seen(rule, services, {0: 50.0, 5: 80.0, 6: 100.0}, workers, rounds)
+    assert 0 < seen <= bound
+
+
+def test_without_a_bound_the_calm_would_starve():
+    """What test_nobody_starves guards against does happen otherwise."""
+    assert oldest_seen("excess", [1, 2, 5], {0: 50.0, 1: 80.0}, 1, math.inf) > 2900
