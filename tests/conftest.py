@@ -9,7 +9,7 @@ import pytest
 # Folders and files of tests that one process runs, when there are several: servers and workers in real time have the
 # rest of the machine to themselves and one other process of tests; there is one GPU.
 TOGETHER = {
-    "tests/bench_smoke/test_benches.py": "real time",
+    "tests/bench_smoke/test_benches_with_workers.py": "real time",
     "tests/clients/": "real time",
     "tests/faults/": "real time",
     "tests/gpu/": "GPU",

@@ -1,67 +1,28 @@
 # SPDX-License-Identifier: MIT
 """Each benchmark starts, at a small size, and writes what it says it writes. What it finds is said by its page."""
 
-import json
-import math
-import subprocess
-import sys
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests.bench_smoke import test_benches_with_workers as with_workers
+from tests.bench_smoke.quickly import ROOT, writes_its_report
+
 PAPER = ("table1", "table2 bend, springs", "table5", "policies", "extrapolations", "automatic", "figure4", "publishing")
 BENCHES = {
-    "accuracy": ["--no-processes"], "build": [], "cpu": [], "faults": [], "figure4": [], "hard_cases": [],
-    "models": ["--devices", "cpu"], "paper": ["--device", "cpu", "--only", *PAPER], "preconditioners": [],
-    "scaling": [], "scheduler": [], "verification": [], "warp": [],
+    "accuracy": ["--no-processes"], "hard_cases": [], "models": ["--devices", "cpu"],
+    "paper": ["--device", "cpu", "--only", *PAPER], "preconditioners": [], "scheduler": [], "verification": [],
+    "warp": [],
 }  # fmt: skip
-UNKNOWN = ("age", "next factor")  # may be unknown in any bench
-UNKNOWN_IN = {"cpu": ("iterations", "residual", "wall")}  # of a step that is not ours
-pytestmark = [pytest.mark.system, pytest.mark.slow]
 
 
-def bench(name: str, out: Path, *arguments: str) -> dict[str, Any]:
-    """What `python -m tests.bench.NAME --quick` writes as JSON; its other files are in `out` too."""
-    command = [sys.executable, "-m", f"tests.bench.{name}", "--quick", "--out", str(out), *arguments]
-    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=110)
-    assert result.returncode == 0, result.stdout + result.stderr
-    assert "FAILED" not in result.stdout
-    return json.loads((out / f"{name}.json").read_text())
-
-
-def leaves(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
-    """(path, value) of everything in parsed JSON that is no list or table."""
-    if isinstance(value, dict):
-        for name, inner in value.items():
-            yield from leaves(inner, f"{key}.{name}")
-    elif isinstance(value, list):
-        for inner in value:
-            yield from leaves(inner, key)
-    else:
-        yield key, value
-
-
+@pytest.mark.slow
+@pytest.mark.system
 @pytest.mark.parametrize("name", BENCHES)
 def test_bench_writes_its_report(name: str, tmp_path: Path) -> None:
-    content = bench(name, tmp_path, *BENCHES[name])
-    numbers = [v for _, v in leaves(content["data"]) if isinstance(v, int | float)]
-    assert len(numbers) > 20 and all(math.isfinite(v) for v in numbers)
-    missing = {key for key, v in leaves(content["data"]) if v is None}
-    assert all(any(word in key for word in (*UNKNOWN, *UNKNOWN_IN.get(name, ()))) for key in missing), missing
-
-    header = content["header"]
-    assert {"date", "commit", "machine", "versions", "calibration"} <= set(header)
-    assert all(v > 0 for _, v in leaves(header["calibration"]))
-    text = (tmp_path / f"{name}.md").read_text()
-    assert header["machine"]["cpu"] in text
-    if name != "faults":
-        assert f"]({name}.png)" in text
-        assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+    writes_its_report(name, tmp_path, *BENCHES[name])
 
 
 def test_every_bench_is_started() -> None:
     there = {path.parent.name for path in (ROOT / "tests/bench").glob("*/__main__.py")}
-    assert there - {"gpu", "gpu_worker"} == set(BENCHES)
+    assert there - {"gpu", "gpu_worker"} == {*BENCHES, *with_workers.BENCHES}

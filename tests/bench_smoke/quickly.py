@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: MIT
+"""A benchmark at its small size, in a process of its own, and what each must write."""
+
+import json
+import math
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[2]
+UNKNOWN = ("age", "next factor")  # may be unknown in any bench
+UNKNOWN_IN = {"cpu": ("iterations", "residual", "wall")}  # of a step that is not ours
+
+
+def bench(name: str, out: Path, *arguments: str) -> dict[str, Any]:
+    """What `python -m tests.bench.NAME --quick` writes as JSON; its other files are in `out` too."""
+    command = [sys.executable, "-m", f"tests.bench.{name}", "--quick", "--out", str(out), *arguments]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=110)
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert "FAILED" not in result.stdout
+    return json.loads((out / f"{name}.json").read_text())
+
+
+def leaves(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
+    """(path, value) of everything in parsed JSON that is no list or table."""
+    if isinstance(value, dict):
+        for name, inner in value.items():
+            yield from leaves(inner, f"{key}.{name}")
+    elif isinstance(value, list):
+        for inner in value:
+            yield from leaves(inner, key)
+    else:
+        yield key, value
+
+
+def writes_its_report(name: str, out: Path, *arguments: str) -> None:
+    """Runs it; finite numbers, a head, a text and a picture must be there. How long anything took is not looked at."""
+    content = bench(name, out, *arguments)
+    numbers = [v for _, v in leaves(content["data"]) if isinstance(v, int | float)]
+    assert len(numbers) > 20 and all(math.isfinite(v) for v in numbers)
+    missing = {key for key, v in leaves(content["data"]) if v is None}
+    assert all(any(word in key for word in (*UNKNOWN, *UNKNOWN_IN.get(name, ()))) for key in missing), missing
+
+    header = content["header"]
+    assert {"date", "commit", "machine", "versions", "calibration"} <= set(header)
+    assert all(v > 0 for _, v in leaves(header["calibration"]))
+    text = (out / f"{name}.md").read_text()
+    assert header["machine"]["cpu"] in text
+    if name != "faults":
+        assert f"]({name}.png)" in text
+        assert (out / f"{name}.png").read_bytes().startswith(b"\x89PNG")

@@ -1,0 +1,16 @@
+# SPDX-License-Identifier: MIT
+"""The benchmarks that start servers and workers do so at a small size, and write what they say they write."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.bench_smoke.quickly import writes_its_report
+
+BENCHES = ("build", "cpu", "faults", "figure4", "scaling")
+pytestmark = [pytest.mark.system, pytest.mark.slow]
+
+
+@pytest.mark.parametrize("name", BENCHES)
+def test_bench_writes_its_report(name: str, tmp_path: Path) -> None:
+    writes_its_report(name, tmp_path)
