@@ -17,7 +17,7 @@ from sim_server.simulation import Simulation
 sim = Simulation.load(sys.argv[1])
 sim.engine.run(2)
 print(json.dumps({
-    "effects": sorted(m.split(".")[-1] for m in sys.modules if m.startswith("sim_server.effects.")),
+    "effects": sorted(m.split(".")[-1] for m in sys.modules if m.startswith("sim_server.effects.") and "._" not in m),
     "compiled": sorted(compiled),
     "launches": [launch.name for launch in sim.engine.launches],
     "others": sorted(m for m in sys.modules if m.split(".")[0] in

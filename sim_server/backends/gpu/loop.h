@@ -4,7 +4,7 @@
 #include <cstdio>
 #include <cstring>
 
-#include "../native/rings.h"
+#include "../cpu/native/ring_buffers.h"
 #include "energy_record.cuh"
 
 typedef uint64_t Address;       // on the device

@@ -7,7 +7,7 @@
 #include <cstdint>
 #include <ctime>
 
-#include "../kernels/balance.cuh"
+#include "balance.cuh"
 
 struct Record {
     int64_t step;          // steps completed
