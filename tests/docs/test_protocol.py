@@ -6,6 +6,7 @@ import re
 import pytest
 
 from protocol.channels import CHANNELS, PROTOCOL, Channel
+from protocol.push_limits import LONGEST_PUSH
 from protocol.shared_memory import limits
 from sim_server import cli
 from sim_server.mesh import MOST_TETS
@@ -53,6 +54,8 @@ def test_channels() -> None:
         ("protocol.md", f"({leases.MIN_LEASE:g} s at least)"),
         ("protocol.md", f"has {leases.MAX_LEASE:g} s."),
         ("protocol.md", f"({leases.MIN_LEASE:g} to {leases.MAX_LEASE:g} s,"),
+        ("protocol.md", f"no new jobs after {worker_registry.SILENCE:g} s;"),
+        ("protocol.md", f"at most {LONGEST_PUSH:g} s of simulation"),
         ("protocol.md", f"`ulimit -l` of {(limits.POOL_LIMIT + limits.METADATA) >> 10:,} KiB"),
         ("scenes.md", f"in at most {where.MAX_LENGTH} characters and {where.MAX_DEPTH} levels"),
         ("scenes.md", f"{MOST_TETS:,} tetrahedra in all"),
