@@ -3,8 +3,9 @@
 // the fill (Saad, Iterative Methods for Sparse Linear Systems, 2nd edition, section 10.8; the linked lists of columns are those
 // of Jones and Plassmann 1995), and the factor of the SSOR preconditioner, which has the pattern of A.
 //
-// A block L_ij with |L_ij|_F <= tolerance sqrt(|A_ii|_F) is dropped: row i of L has the norm of A_ii^1/2, so what is dropped
-// depends neither on units nor on the nodes' rotations. Columns come out in the order of protocol/factor.py, a node a supernode.
+// A block L_ij with |L_ij|_F <= tolerance sqrt(|A_ii|_F) is dropped: row i of L has the norm of A_ii^1/2, so that the dropped
+// blocks depend neither on units nor on rotations of the nodes. Columns are in the order of protocol/factor.py; each node is a
+// supernode.
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
@@ -20,7 +21,7 @@ struct Lower {              // block columns of the lower triangle of P A P^T, t
 
 struct Block { double a[9]; };  // row by row
 
-struct Made {
+struct SparseFactor {
     std::vector<int64_t> start;  // (nodes + 1,) into row and block; columns without their diagonal
     std::vector<int32_t> row;
     std::vector<Block> block, diagonal;  // L_ij; the lower triangles L_jj
@@ -69,7 +70,7 @@ static void subtract(double* w, const double* a, const double* b) {
         for (int j = 0; j < 3; ++j) w[i + j] -= a[i] * b[3 * j] + a[i + 1] * b[3 * j + 1] + a[i + 2] * b[3 * j + 2];
 }
 
-static void reset(const Lower& A, Made& L) {
+static void reset(const Lower& A, SparseFactor& L) {
     const size_t n = A.nodes;
     L.start.assign(1, 0);
     L.row.clear();
@@ -83,8 +84,8 @@ static void reset(const Lower& A, Made& L) {
     L.norm.resize(n);
 }
 
-// Of each node the norm of its largest block, which in a positive definite matrix is its own.
-static void measure(const Lower& A, const double* values, Made& L) {
+// Computes the norm of the largest block of each node, which in a positive definite matrix is its diagonal block.
+static void measure(const Lower& A, const double* values, SparseFactor& L) {
     std::fill(L.norm.begin(), L.norm.end(), 0.0);
     for (int j = 0; j < A.nodes; ++j)
         for (int p = A.start[j]; p < A.start[j + 1]; ++p) {
@@ -94,16 +95,16 @@ static void measure(const Lower& A, const double* values, Made& L) {
         }
 }
 
-// Column k goes to the list of the column that it is to be subtracted from next.
-static void link(Made& L, int k) {
+// Adds column k to the list of the column that it is subtracted from next.
+static void link(SparseFactor& L, int k) {
     if (L.at[k] == L.start[k + 1]) return;
     int j = L.row[L.at[k]];
     L.next[k] = L.head[j];
     L.head[j] = k;
 }
 
-// Column j of A less what is eliminated: the diagonal block in L.w[j], the rows of the others in L.touched.
-static void form(const Lower& A, const double* values, double shift, Made& L, int j) {
+// Computes column j of A minus the eliminated columns: the diagonal block in L.w[j], the rows of the others in L.touched.
+static void form(const Lower& A, const double* values, double shift, SparseFactor& L, int j) {
     L.touched.clear();
     for (int p = A.start[j]; p < A.start[j + 1]; ++p) {
         int i = A.row[p];
@@ -129,8 +130,8 @@ static void form(const Lower& A, const double* values, double shift, Made& L, in
     }
 }
 
-// Divides the column and keeps what is large: at most `most` blocks.
-static void keep(Made& L, int j, double tolerance, int64_t most) {
+// Divides the column by its diagonal block and keeps its largest blocks, at most `most`.
+static void keep(SparseFactor& L, int j, double tolerance, int64_t most) {
     std::vector<int32_t>& rows = L.touched;
     L.weight.resize(L.norm.size());
     size_t kept = 0;
@@ -157,16 +158,16 @@ static void keep(Made& L, int j, double tolerance, int64_t most) {
 
 extern "C" {
 
-Made* ic_new() { return new Made; }
-void ic_delete(Made* made) { delete made; }
+SparseFactor* ic_new() { return new SparseFactor; }
+void ic_delete(SparseFactor* factor) { delete factor; }
 
 // Factorizes A with shift |A_j| / sqrt(3) added to its diagonal, where |A_j| is the norm of the largest block of node j.
 // fill: bound of the blocks of a column over the mean number in A, 0: none; least_pivot: of a node, over its norm.
 // Returns -1, or the column where it broke down.
 int32_t ic_factorize(const Lower* lower, const double* values, double shift, double tolerance, double fill, double least_pivot,
-                     Made* made) {
+                     SparseFactor* factor) {
     const Lower& A = *lower;
-    Made& L = *made;
+    SparseFactor& L = *factor;
     reset(A, L);
     measure(A, values, L);
     const double column = (A.start[A.nodes] - A.nodes) / (double)A.nodes;
@@ -181,10 +182,10 @@ int32_t ic_factorize(const Lower* lower, const double* values, double shift, dou
     return -1;
 }
 
-// sqrt(w / (2 - w)) (D / w + L) C^-T with C C^T = D / w and w = omega: its product with its transpose is SSOR's P.
-int32_t ic_ssor(const Lower* lower, const double* values, double omega, Made* made) {
+// Makes F = sqrt(w / (2 - w)) (D / w + L) C^-T with C C^T = D / w and w = omega: F F^T is the P of SSOR.
+int32_t ic_ssor(const Lower* lower, const double* values, double omega, SparseFactor* factor) {
     const Lower& A = *lower;
-    Made& L = *made;
+    SparseFactor& L = *factor;
     reset(A, L);
     const double scale = std::sqrt(omega / (2 - omega));
     for (int j = 0; j < A.nodes; ++j) {
@@ -206,17 +207,17 @@ int32_t ic_ssor(const Lower* lower, const double* values, double omega, Made* ma
     return -1;
 }
 
-int64_t ic_blocks(const Made* made) { return (int64_t)made->row.size(); }
+int64_t ic_blocks(const SparseFactor* factor) { return (int64_t)factor->row.size(); }
 
 // starts (nodes + 1,), rows (blocks,): columns without their diagonal.
-void ic_pattern(const Made* made, int64_t* starts, int32_t* rows) {
-    std::copy(made->start.begin(), made->start.end(), starts);
-    std::copy(made->row.begin(), made->row.end(), rows);
+void ic_pattern(const SparseFactor* factor, int64_t* starts, int32_t* rows) {
+    std::copy(factor->start.begin(), factor->start.end(), starts);
+    std::copy(factor->row.begin(), factor->row.end(), rows);
 }
 
-// Values column by column, each from its diagonal down, a node's three columns one after another.
-void ic_values(const Made* made, double* out) {
-    const Made& L = *made;
+// Writes the values column by column, each from its diagonal down, the three columns of a node in turn.
+void ic_values(const SparseFactor* factor, double* out) {
+    const SparseFactor& L = *factor;
     for (size_t j = 0; j < L.diagonal.size(); ++j)
         for (int c = 0; c < 3; ++c) {
             for (int r = c; r < 3; ++r) *out++ = L.diagonal[j].a[3 * r + c];
