@@ -15,22 +15,19 @@ from protocol.log_chunks import ChunkFile
 CHUNKS = 8  # kept unpacked, about 1 MiB each
 
 
-class Position(NamedTuple):
-    """Where a message lies: offset of its chunk [bytes], and its number among the records of the chunk."""
-
-    offset: int
-    number: int
-
-
 class LogMessage(NamedTuple):
-    """A message of the topic /KIND or /KIND/OBJECT, not decoded."""
+    """A message of the topic /KIND or /KIND/OBJECT, not decoded.
+
+    offset: of its chunk [bytes]. number: of the message among the records of the chunk.
+    """
 
     topic: str
     kind: str
     object: str
     time: int  # ns
     data: bytes
-    position: Position
+    offset: int
+    number: int
 
 
 @dataclass
@@ -53,17 +50,17 @@ class LogFile(ChunkFile):
                     topics[record.id] = record.topic, kind, name
                 elif isinstance(record, Message):
                     topic = topics.get(record.channel_id, ("", "", ""))
-                    yield LogMessage(*topic, record.log_time, record.data, Position(offset, number))
+                    yield LogMessage(*topic, record.log_time, record.data, offset, number)
         self.check_origin()
 
-    def data(self, position: Position) -> bytes:
+    def data(self, offset: int, number: int) -> bytes:
         """Returns the data of a message that `messages` has yielded."""
-        if position.offset not in self._chunks:
+        if offset not in self._chunks:
             while len(self._chunks) >= CHUNKS:
                 self._chunks.popitem(last=False)
-            self._chunks[position.offset] = self.chunk(position.offset)
-        self._chunks.move_to_end(position.offset)
-        record = self._chunks[position.offset][position.number]
+            self._chunks[offset] = self.chunk(offset)
+        self._chunks.move_to_end(offset)
+        record = self._chunks[offset][number]
         assert isinstance(record, Message)
         return record.data
 

@@ -18,7 +18,7 @@ from clients.log.bad_log import bad_log_is_bad_input
 from clients.log.frames import Frame, Mesh, frame_of, mesh_of
 from clients.log.scalars import Columns, columns, row
 from protocol import messages_pb2 as pb
-from protocol.log_file import LogFile, LogMessage, Position
+from protocol.log_file import LogFile, LogMessage
 from protocol.refused import Refused
 
 
@@ -28,14 +28,14 @@ class ObjectLog:
 
     name: str
     meshes: dict[int, Mesh] = field(default_factory=dict)  # by epoch
-    frames: list[tuple[int, int, Position]] = field(default_factory=list)  # (step, epoch, where the frame lies)
+    frames: list[tuple[int, int, int, int]] = field(default_factory=list)  # (step, epoch, offset, number)
     rows: list[tuple] = field(default_factory=list)
     interactions: list[tuple[float, pb.Interaction]] = field(default_factory=list)  # (time [s], push or grab)
 
     @property
     def epochs(self) -> list[int]:
         """Topology epoch of each frame."""
-        return [epoch for _, epoch, _ in self.frames]
+        return [epoch for _, epoch, _, _ in self.frames]
 
 
 class Log:
@@ -100,7 +100,7 @@ class Log:
         frames = self.object_log(name).frames
         if not -len(frames) <= index < len(frames):
             raise BadInput(f"{self.path}: no frame {index} of object {name!r}; {len(frames)} frames were recorded")
-        frame = frame_of(pb.State.FromString(self._file.data(frames[index][2])))
+        frame = frame_of(pb.State.FromString(self._file.data(*frames[index][2:])))
         mesh = self.object_log(name).meshes.get(frame.epoch)
         if mesh is not None and len(mesh.rest) != len(frame.x):
             raise BadInput(
@@ -141,7 +141,7 @@ class Log:
             found.meshes[mesh.epoch] = mesh
         elif message.kind == "state":
             frame = frame_of(pb.State.FromString(message.data))
-            found.frames.append((frame.step, frame.epoch, message.position))
+            found.frames.append((frame.step, frame.epoch, message.offset, message.number))
         elif message.kind == "step":
             found.rows.append(row(pb.ObjectStep.FromString(message.data)))
         elif message.kind == "interaction":

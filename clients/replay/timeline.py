@@ -16,7 +16,7 @@ from google.protobuf.message import DecodeError, Message
 from clients.errors import BadInput
 from clients.log.bad_log import bad_log_is_bad_input
 from protocol import messages_pb2 as pb
-from protocol.log_file import LogFile, Position
+from protocol.log_file import LogFile
 
 KINDS: list[tuple[str, type[Message]]] = [("topology", pb.Topology), ("step", pb.ObjectStep), ("state", pb.State)]
 PLACE = np.dtype([("time", "i8"), ("kind", "i4"), ("number", "i4"), ("offset", "i8"), ("object", "i8")])
@@ -57,7 +57,7 @@ class Timeline:
         times = places["time"] / 1e9
         wanted = ((times >= begin) | (places["kind"] == 0)) & (times <= end)
         for place in places[wanted]:
-            data = self._file.data(Position(int(place["offset"]), int(place["number"])))
+            data = self._file.data(int(place["offset"]), int(place["number"]))
             try:
                 message = KINDS[place["kind"]][1].FromString(data)
             except DecodeError:
@@ -80,13 +80,11 @@ class Timeline:
         numbers: dict[str, int] = {}  # of the objects
         found = bytearray()
         for message in self._file.messages(progress):
-            if message.kind == "scene":
-                self.scene = _scene(self.path, message.data)
-            elif message.kind in kinds and message.object:
-                number = numbers.setdefault(message.object, len(numbers))
-                found += _PACK.pack(
-                    message.time, kinds[message.kind], message.position.number, message.position.offset, number
-                )
+            _, kind, name, time, data, offset, number = message
+            if kind == "scene":
+                self.scene = _scene(self.path, data)
+            elif kind in kinds and name:
+                found += _PACK.pack(time, kinds[kind], number, offset, numbers.setdefault(name, len(numbers)))
         self.objects = list(numbers)
         table = np.frombuffer(bytes(found), PLACE)
         return table[np.lexsort((np.arange(len(table)), table["kind"], table["time"]))]

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from protocol import messages_pb2 as pb
 from protocol.log_chunks import BadLog
-from protocol.log_file import LogFile, LogMessage, Position
+from protocol.log_file import LogFile, LogMessage
 from protocol.refused import Refused
 from protocol.validate import array
 from sim_server.arrays import Float64
@@ -42,14 +42,14 @@ class RecordedObject:
     """What a log holds of one object.
 
     packed: step records in the order of the log, packed; empty once `rows` is made
-    frames: position in the file by step
+    frames: (offset, number) of each (log_file.py), by step
     factors: by the step whose matrix they were made from
     rows: of type ROW; rows[k] is of step k + 1
     """
 
     topology: pb.Topology | None = None
     packed: bytearray = field(default_factory=bytearray)
-    frames: dict[int, Position] = field(default_factory=dict)
+    frames: dict[int, tuple[int, int]] = field(default_factory=dict)
     factors: dict[int, pb.FactorUse] = field(default_factory=dict)
     rows: NDArray = field(default_factory=lambda: np.zeros(0, ROW))
 
@@ -98,7 +98,7 @@ class Recording:
         position = self.objects[name].frames.get(step)
         if position is None:
             return None
-        state = pb.State.FromString(self._file.data(position))
+        state = pb.State.FromString(self._file.data(*position))
         shape = (state.nodes, 3)
         return array(state.x, np.float64, shape, "State.x"), array(state.v, np.float64, shape, "State.v")
 
@@ -128,7 +128,7 @@ class Recording:
         if kind == "topology":
             found.topology = pb.Topology.FromString(data)
         elif kind == "state":
-            found.frames[pb.State.FromString(data).step] = message.position
+            found.frames[pb.State.FromString(data).step] = message.offset, message.number
         elif kind == "interaction":
             self.touched = True
         elif kind == "factor":
