@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from sim_server.backends.gpu import structs
 from sim_server.backends.gpu.loop import CAPACITY, MANY, DeviceLoop
-from sim_server.backends.gpu.solver import RESULT
-from sim_server.backends.gpu.structs import ENERGY, STAMP
+from sim_server.backends.gpu.solver import PCG_RESULT
+from sim_server.backends.gpu.structs import ENERGY_RECORD, STEP_TIMESTAMP
 
 NOT_READY = 600
 p, size, u64 = c.c_void_p, c.c_size_t, c.c_uint64
@@ -22,11 +22,11 @@ SIGNATURES = {
 }  # fmt: skip
 Work = Callable[[], None]
 
-ACCOUNT = 12  # handle of the graph
+BALANCE_GRAPH = 12  # handle of the graph
 
 
 class FakeDevice:
-    """loop.Device. Nothing is done before somebody waits for it or asks often enough.
+    """loop.LoopDevice. Nothing is done before somebody waits for it or asks often enough.
 
     calls: names of the functions in the order of the calls. fail: a function that answers with an error. pieces: of
     work that are done when somebody asks.
@@ -43,7 +43,7 @@ class FakeDevice:
         self._done: dict[int, int] = {}
         self._events, self._kept = 100, []
         self._functions: dict[str, object] = {}
-        self.functions = structs.Cuda()
+        self.functions = structs.CudaDriver()
         for name in SIGNATURES:
             self.set(name, getattr(self, "_" + name))
 
@@ -149,8 +149,8 @@ class FakeScene:
         self.x, self.v, self.values = (np.zeros((nodes, *rest), real) for rest in ((3,), (3,), (3, 3)))
         self.settings, self.factor = np.zeros(bodies, np.int64), np.zeros(bodies, np.int64)
         self.argument = np.zeros(1, np.int64)
-        self.results, self.stamps = np.zeros((CAPACITY, bodies), RESULT), np.zeros(CAPACITY, STAMP)
-        self.energies, self.phase = np.zeros((CAPACITY, bodies), ENERGY), 0
+        self.results, self.stamps = np.zeros((CAPACITY, bodies), PCG_RESULT), np.zeros(CAPACITY, STEP_TIMESTAMP)
+        self.energies, self.phase = np.zeros((CAPACITY, bodies), ENERGY_RECORD), 0
         self.found = 0
         self.clock, self.time, self.done = np.zeros(1), 0, 0
         self.seen: list[int] = []  # the argument in each step
@@ -164,8 +164,8 @@ class FakeScene:
         device.graphs = {7: lambda: self._steps(1), 8: lambda: self._steps(MANY)}
         device.graphs |= {9: lambda: self._steps(1, True), 10: lambda: self._steps(MANY, True)}
         device.graphs[11] = self._elastic
-        device.graphs[ACCOUNT] = lambda: None  # steps tell their energies themselves
-        self.loop.use_graphs([7, 8, 9, 10], ACCOUNT, 11)
+        device.graphs[BALANCE_GRAPH] = lambda: None  # steps tell their energies themselves
+        self.loop.use_graphs([7, 8, 9, 10], BALANCE_GRAPH, 11)
 
     def _steps(self, steps: int, stamp: bool = False) -> None:
         if stamp:

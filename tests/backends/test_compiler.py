@@ -232,9 +232,11 @@ def test_the_last_kernel_of_a_step_compiles_with_the_end_of_the_step(arch, name,
     if (library := nvrtc.library()) is None:
         pytest.skip("needs the package nvidia-cuda-nvrtc")
     advance = _launch(f"kernels/{name}.cu", "Advance", f"{name}.advance")
-    end = kernel_fusion.End((PACKAGE / "backends/gpu/step_epilogue.cu").read_text(), "Tick", np.zeros(()))
+    end = kernel_fusion.Epilogue(
+        (PACKAGE / "backends/gpu/step_epilogue.cu").read_text(), "StepEpilogue", "finish_step", np.zeros(())
+    )
     text = tmp_path / "last.cu"
-    text.write_text(kernel_fusion.Text([advance], kernel_fusion.Shape(32, 1), end).source)  # type: ignore[list-item]
+    text.write_text(kernel_fusion.FusedSource([advance], kernel_fusion.BlockShape(32, 1), end).source)  # type: ignore[list-item]
     code, said = nvrtc.compiled(
         library, text, [f"-arch={arch}", "-std=c++17", f"-I{backend.INCLUDE}", f"-I{PACKAGE / 'backends/gpu'}"]
     )
@@ -302,8 +304,8 @@ def test_launches_put_together_compile_in_every_precision(group, real, local, tm
     for launch, (path, struct, *_) in zip(launches, group, strict=True):
         launch.fields = backend._members(backend.read_text(path)[1], struct, {"real": real, "local": local})
     private = kernel_fusion._private(launches, launches)  # type: ignore[arg-type]
-    shape = kernel_fusion.Shape(64, 4)
-    made = kernel_fusion.Text(launches, shape, None, private)  # type: ignore[arg-type]
+    shape = kernel_fusion.BlockShape(64, 4)
+    made = kernel_fusion.FusedSource(launches, shape, None, private)  # type: ignore[arg-type]
     assert (group in (ELEMENTS, LAW_ELEMENTS) or private) and made.source.count("[3];") >= len(private)
     text = tmp_path / "together.cu"
     text.write_text(made.source)
@@ -319,13 +321,13 @@ def test_what_lets_further_linearizations_return_comes_in_front_and_changes_noth
     launches = [_launch(*given) for given in group]
     private = kernel_fusion._private(launches, launches)  # type: ignore[arg-type]
     plain, guarded = (
-        kernel_fusion.Text(launches, kernel_fusion.Shape(64, 4), None, private, guard)  # type: ignore[arg-type]
-        for guard in (None, kernel_fusion.Guard(64, 128, 192))
+        kernel_fusion.FusedSource(launches, kernel_fusion.BlockShape(64, 4), None, private, guard)  # type: ignore[arg-type]
+        for guard in (None, kernel_fusion.PhaseGuard(64, 128, 192))
     )
     before, after = plain.source.split("fused(int n"), guarded.source.split("fused(int n")
     arguments = ", const int* __restrict__ left, const int* __restrict__ phase, const int* __restrict__ body"
-    assert "".join(["\n", *(f"{line}\n" for line in kernel_fusion.GUARD)]) in after[1]
-    assert after[1].replace(arguments, "").replace("\n".join(kernel_fusion.GUARD) + "\n", "") == before[1]
+    assert "".join(["\n", *(f"{line}\n" for line in kernel_fusion.PHASE_GUARD)]) in after[1]
+    assert after[1].replace(arguments, "").replace("\n".join(kernel_fusion.PHASE_GUARD) + "\n", "") == before[1]
     assert before[0] == after[0] and guarded.values == [64, 128, 192, *plain.values]
     text = tmp_path / "guarded.cu"
     text.write_text(guarded.source)

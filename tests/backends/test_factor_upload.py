@@ -10,7 +10,7 @@ import pytest
 
 from sim_server.backends.compiler import CompileError
 from sim_server.backends.gpu import factor_upload as module
-from sim_server.backends.gpu.factor_upload import Intake
+from sim_server.backends.gpu.factor_upload import FactorUpload
 from tests.backends.fake_cuda import FakeScene
 
 
@@ -25,7 +25,7 @@ class Event:
         self._device.record(self.ptr)
 
 
-class Expanded(NamedTuple):
+class PartitionedInverse(NamedTuple):
     target: list[int]
     event: Event
 
@@ -55,14 +55,14 @@ class Maker:
 
     spared = None
 
-    def expand(self, values: np.ndarray, target: list[int], multiprocessors: int | None = None) -> Expanded:
+    def expand(self, values: np.ndarray, target: list[int], multiprocessors: int | None = None) -> PartitionedInverse:
         if self.fail:
             raise self.fail
         target[:] = [int(values[0])]
         self.events.append(Event(self.scene))
-        return Expanded(target, self.events[-1])
+        return PartitionedInverse(target, self.events[-1])
 
-    def use(self, body: int, pattern: SimpleNamespace, expanded: Expanded, step: int) -> None:
+    def use(self, body: int, pattern: SimpleNamespace, expanded: PartitionedInverse, step: int) -> None:
         self.bodies["factor"] = expanded.target[0]
 
 
@@ -71,16 +71,16 @@ PATTERN = SimpleNamespace(id=1)
 
 @pytest.fixture
 def parts(monkeypatch):
-    monkeypatch.setattr(module, "SETTINGS", 8)
+    monkeypatch.setattr(module, "SETTINGS_BYTES", 8)
     monkeypatch.setattr(module, "no_memory_left", lambda error: isinstance(error, NoMemory))
     scene = FakeScene()
     maker = Maker(scene)
     stream = SimpleNamespace(synchronize=lambda: None)
     gpu = SimpleNamespace(cp=SimpleNamespace(cuda=SimpleNamespace(get_current_stream=lambda: stream)))
-    return scene, maker, Intake(gpu, maker, scene.loop, ["beam"], scene.loop.mailboxes[1:2])
+    return scene, maker, FactorUpload(gpu, maker, scene.loop, ["beam"], scene.loop.mailboxes[1:2])
 
 
-def post(intake: Intake, value: int) -> None:
+def post(intake: FactorUpload, value: int) -> None:
     intake.post(0, PATTERN, np.array([value]), value)
 
 

@@ -10,8 +10,8 @@ import pytest
 
 from sim_server.backends.compiler import HERE, INCLUDE, compiler
 from sim_server.backends.cpu.structs import BALANCE
-from sim_server.backends.gpu.energies import ACCOUNT, SUMS, chunked
-from sim_server.backends.gpu.structs import ENERGY
+from sim_server.backends.gpu.energies import ENERGY_BALANCE, SUMS, chunked
+from sim_server.backends.gpu.structs import ENERGY_RECORD
 
 G = np.array([0.3, -9.81, 2.0])
 STILL = ("v", "dv", "ahead", "drift", "carried")
@@ -19,7 +19,9 @@ MOTION = ("x", "before", *STILL)
 TEXT = """
 #include "cuda_threads.h"
 #include "energy_balance.cu"
-extern "C" void settle(int chunks, int threads, const Account* a) { launch(chunks, threads, [&] { account(*a); }); }
+extern "C" void settle(int chunks, int threads, const EnergyBalance* a) {
+    launch(chunks, threads, [&] { energy_balance(*a); });
+}
 """
 
 
@@ -38,7 +40,7 @@ class Bodies:
 
     def __init__(self, sizes: list[int], threads: int, on_runaway: int = 0, chunk: int = 40):
         rng, self.n, self.threads = np.random.default_rng(len(sizes)), sum(sizes), threads
-        self.first = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int32)
+        self.first_node = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int32)
         shape = (self.n, 3)
         self.motion = {name: rng.normal(size=shape) for name in MOTION}
         self.motion["before"] = self.motion["x"] - 0.1 * rng.normal(size=shape)
@@ -48,25 +50,37 @@ class Bodies:
         self.spring, self.anchor = rng.uniform(0, 5, self.n) * touched, rng.normal(size=shape)
         self.balance = np.zeros(len(sizes), BALANCE)
         self.balance["start"], self.balance["limit"] = 1e6, 1e6
-        self.told = np.zeros((4, len(sizes)), ENERGY)
-        self.step, self.settled = np.ones(1, "i8"), np.zeros(len(sizes), "i8")
-        self.chunk = chunked(self.first, chunk)
-        self.sums, self.arrived = np.full((len(self.chunk), SUMS), np.nan), np.zeros(len(sizes), "u4")
-        self.gravity, self.account = G, np.zeros((), ACCOUNT)
-        names = ("mass", "force", "spring", "anchor", "free", "balance", "told", "step", "settled", "first", "gravity")
-        for name in (*names, "chunk", "sums", "arrived"):
-            self.account[name] = getattr(self, name).ctypes.data
+        self.records = np.zeros((4, len(sizes)), ENERGY_RECORD)
+        self.step, self.settled_step = np.ones(1, "i8"), np.zeros(len(sizes), "i8")
+        self.chunks = chunked(self.first_node, chunk)
+        self.sums, self.finished_chunks = np.full((len(self.chunks), SUMS), np.nan), np.zeros(len(sizes), "u4")
+        self.gravity, self.params = G, np.zeros((), ENERGY_BALANCE)
+        names = (
+            "mass",
+            "force",
+            "spring",
+            "anchor",
+            "free",
+            "balance",
+            "records",
+            "step",
+            "settled_step",
+            "first_node",
+            "gravity",
+        )
+        for name in (*names, "chunks", "sums", "finished_chunks"):
+            self.params[name] = getattr(self, name).ctypes.data
         for name in ("x", "v", "before"):
-            self.account[name] = self.motion[name].ctypes.data
-        self.account["still"] = [self.motion[name].ctypes.data for name in STILL]
-        self.account["bodies"], self.account["capacity"], self.account["inertia"] = len(sizes), 4, 1
-        self.account["on_runaway"] = on_runaway
+            self.params[name] = self.motion[name].ctypes.data
+        self.params["still"] = [self.motion[name].ctypes.data for name in STILL]
+        self.params["bodies"], self.params["capacity"], self.params["inertia"] = len(sizes), 4, 1
+        self.params["on_runaway"] = on_runaway
 
     def settle(self, library: c.CDLL) -> None:
-        library.settle(len(self.chunk), self.threads, c.c_void_p(self.account.ctypes.data))
+        library.settle(len(self.chunks), self.threads, c.c_void_p(self.params.ctypes.data))
 
     def expected(self, body: int) -> dict[str, float]:
-        nodes = slice(self.first[body], self.first[body + 1])
+        nodes = slice(self.first_node[body], self.first_node[body + 1])
         x, v, before = (self.motion[name][nodes] for name in ("x", "v", "before"))
         step, k = x - before, self.spring[nodes, None]
         work = ((self.force[nodes] + k * (self.anchor[nodes] - 0.5 * (x + before))) * step).sum()
@@ -86,34 +100,34 @@ def test_each_body_gets_the_sums_over_its_own_nodes(library, sizes, threads):
     expected = [bodies.expected(k) for k in range(len(sizes))]
     state = {name: array.copy() for name, array in bodies.motion.items()}
     bodies.settle(library)
-    for k, found in enumerate(bodies.told[0]):
+    for k, found in enumerate(bodies.records[0]):
         for name, value in expected[k].items():
             assert found[name] == pytest.approx(value, rel=1e-6 if name == "stride" else 1e-11), (k, name)
         assert np.isnan(found["elastic"]) and found["phase"] == found["found"] == 0
     assert not bodies.force.any() and not bodies.spring.any()  # until something touches them again
     assert all(np.array_equal(array, bodies.motion[name]) for name, array in state.items()) and bodies.free.all()
-    assert (bodies.settled == 1).all() and not bodies.arrived.any()
-    once = bodies.told[0].tobytes()
+    assert (bodies.settled_step == 1).all() and not bodies.finished_chunks.any()
+    once = bodies.records[0].tobytes()
     bodies.motion["v"][:] = 7
     bodies.settle(library)  # a second time: of a step that is settled
-    assert bodies.told[0].tobytes() == once
+    assert bodies.records[0].tobytes() == once
     again = Bodies(sizes, threads)
     again.settle(library)
-    assert again.told[0].tobytes() == once  # to the bit
+    assert again.records[0].tobytes() == once  # to the bit
 
 
 @pytest.mark.parametrize("on_runaway", [0, 1, 2])
 def test_what_has_too_much_goes_back_and_rests_and_nothing_else(library, on_runaway):
     sizes, threads = [40, 50, 3, 33], 64
     bodies = Bodies(sizes, threads, on_runaway)
-    fast, long, wrong, well = (slice(a, b) for a, b in zip(bodies.first, bodies.first[1:], strict=False))
+    fast, long, wrong, well = (slice(a, b) for a, b in zip(bodies.first_node, bodies.first_node[1:], strict=False))
     bodies.motion["v"][fast] *= 1e4
     bodies.balance["limit"][1] = 1e-3
     bodies.motion["v"][wrong] = np.nan
     state = {name: array.copy() for name, array in bodies.motion.items()}
     bodies.settle(library)
-    assert bodies.told[0]["found"].tolist() == ([1, 1, 1, 0] if on_runaway < 2 else [0] * 4)
-    assert bodies.told[0]["phase"].tolist() == {0: [2, 2, 2, 0], 1: [1, 1, 1, 0], 2: [0] * 4}[on_runaway]
+    assert bodies.records[0]["found"].tolist() == ([1, 1, 1, 0] if on_runaway < 2 else [0] * 4)
+    assert bodies.records[0]["phase"].tolist() == {0: [2, 2, 2, 0], 1: [1, 1, 1, 0], 2: [0] * 4}[on_runaway]
     for nodes in (fast, long, wrong):
         same = [np.array_equal(state[n][nodes], bodies.motion[n][nodes], equal_nan=True) for n in MOTION]
         assert all(same) == (on_runaway > 0)
@@ -124,5 +138,5 @@ def test_what_has_too_much_goes_back_and_rests_and_nothing_else(library, on_runa
     bodies.step[0] = 2
     bodies.settle(library)
     if on_runaway == 0:
-        assert bodies.told[1]["phase"].tolist() == [2, 2, 2, 0] and not bodies.told[1]["found"].any()
-        assert not bodies.told[1]["kinetic"][:3].any()
+        assert bodies.records[1]["phase"].tolist() == [2, 2, 2, 0] and not bodies.records[1]["found"].any()
+        assert not bodies.records[1]["kinetic"][:3].any()

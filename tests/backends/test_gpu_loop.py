@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from sim_server.backends.gpu.loop import BATCH, CAPACITY, FRAMES
-from sim_server.backends.gpu.structs import FOUND
+from sim_server.backends.gpu.structs import NEWTON_RESULT
 from sim_server.errors import DeviceLost
-from tests.backends.fake_cuda import ACCOUNT, NOT_READY, FakeScene, number
+from tests.backends.fake_cuda import BALANCE_GRAPH, NOT_READY, FakeScene, number
 
 
 def steps_ahead(scene: FakeScene) -> list[int]:
@@ -21,7 +21,7 @@ def steps_ahead(scene: FakeScene) -> list[int]:
     launch = scene.device._graph_launch
 
     def counted(graph: int, stream: int) -> int:
-        if graph != ACCOUNT:
+        if graph != BALANCE_GRAPH:
             ahead.append(int(scene.loop.loop.launched) - scene.loop.step)
         return launch(graph, stream)
 
@@ -44,9 +44,9 @@ def test_every_step_is_reported_once_and_in_order():
 
 def test_what_a_search_has_come_to_is_reported_where_there_is_one():
     once, often = FakeScene(bodies=2), FakeScene(bodies=2)
-    found = np.zeros((CAPACITY, 2), FOUND)
+    found = np.zeros((CAPACITY, 2), NEWTON_RESULT)
     found["linearizations"], found["nonlinear"] = np.arange(2 * CAPACITY).reshape(-1, 2), 0.5
-    often.loop.loop.found = found.ctypes.data
+    often.loop.loop.newton_results = found.ctypes.data
     for scene in (once, often):
         scene.loop.run(100)
     records = often.loop.records()
@@ -127,7 +127,7 @@ def test_a_step_whose_wait_lasted_too_long_began_late():
     query, asked = scene.device._event_query, []
 
     def slow(event: int) -> int:
-        if event != loop.picture[1].arrived or len(asked) > 3:
+        if event != loop.frame_copies[1].arrived or len(asked) > 3:
             return query(event)
         asked.append(event)
         if len(asked) == 3:  # while the next step is waited for: before that it is looked for once or twice
@@ -147,7 +147,9 @@ def test_the_clock_is_noted_first_where_the_device_had_nothing_to_do():
     launch = scene.device._graph_launch
     scene.device.set("graph_launch", lambda graph, stream: graphs.append(graph) or launch(graph, stream))
     scene.loop.run(3 * BATCH)
-    assert [graph for graph in graphs if graph != ACCOUNT] == [10, 8, 8, 8, 8, 8] and graphs.count(ACCOUNT) == 3
+    assert [graph for graph in graphs if graph != BALANCE_GRAPH] == [10, 8, 8, 8, 8, 8] and graphs.count(
+        BALANCE_GRAPH
+    ) == 3
 
 
 def test_few_launches_do_for_many_steps():

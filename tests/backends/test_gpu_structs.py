@@ -10,12 +10,20 @@ from sim_server.backends.compiler import HERE
 from sim_server.backends.cpu.structs import BALANCE
 from sim_server.backends.gpu.device import PRECISIONS, own_headers
 from sim_server.backends.gpu.device import options as device_options
-from sim_server.backends.gpu.energies import ACCOUNT, CHUNK, ELASTIC, SUMS
-from sim_server.backends.gpu.inverse.device_plan import PLAN
-from sim_server.backends.gpu.newton import LANES, SEARCH, SEARCHING, SPAN, STRETCH, bodies_of, stretches
-from sim_server.backends.gpu.row_partition import SHARE
-from sim_server.backends.gpu.solver import BODY, RESULT, SOLVE, threads_and_blocks
-from sim_server.backends.gpu.structs import ENERGY, FOUND
+from sim_server.backends.gpu.energies import ELASTIC_ENERGY, ENERGY_BALANCE, NODE_CHUNK, SUMS
+from sim_server.backends.gpu.inverse.device_plan import DEVICE_PLAN
+from sim_server.backends.gpu.newton import (
+    BLOCK_NODES,
+    LANES,
+    NEWTON_ARGUMENTS,
+    NODE_RANGE,
+    SEARCH,
+    bodies_of,
+    node_ranges,
+)
+from sim_server.backends.gpu.row_partition import ROW_RANGE
+from sim_server.backends.gpu.solver import PCG_ARGUMENTS, PCG_BODY, PCG_RESULT, threads_and_blocks
+from sim_server.backends.gpu.structs import ENERGY_RECORD, NEWTON_RESULT
 from tests.support import nvrtc
 
 SIZES = {"int": 4, "unsigned": 4, "float": 4, "double": 8, "long long": 8}
@@ -45,8 +53,9 @@ def fields(name: str) -> list[tuple[str, int]]:
 @pytest.mark.parametrize(
     ("name", "layout"),
     [
-        ("Plan", PLAN), ("Body", BODY), ("Result", RESULT), ("Solve", SOLVE), ("Share", SHARE), ("Stretch", SPAN),
-        ("Found", FOUND), ("Search", SEARCH), ("Searching", SEARCHING),
+        ("DevicePlan", DEVICE_PLAN), ("PcgBody", PCG_BODY), ("PcgResult", PCG_RESULT), ("PcgArguments", PCG_ARGUMENTS),
+        ("RowRange", ROW_RANGE), ("NodeRange", NODE_RANGE),
+        ("NewtonResult", NEWTON_RESULT), ("Search", SEARCH), ("NewtonArguments", NEWTON_ARGUMENTS),
     ],
 )  # fmt: skip
 def test_both_sides_agree(name: str, layout: np.dtype) -> None:
@@ -57,7 +66,7 @@ def test_both_sides_agree(name: str, layout: np.dtype) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("threads", "blocks", "more"), [(256, 1, []), (128, 2, []), (64, 4, []), (64, 4, ["-DSEARCHED"])]
+    ("threads", "blocks", "more"), [(256, 1, []), (128, 2, []), (64, 4, []), (64, 4, ["-DNEWTON_PHASES"])]
 )
 def test_the_solver_spills_no_registers(threads, blocks, more):
     """What does not fit into registers would cost a trip through L2 in each phase: it did, and doubled the time."""
@@ -96,7 +105,12 @@ def test_thread_blocks_take_all_registers():
 def test_the_search_compiles_with_the_layouts_of_this_side_and_spills_no_registers(precision, arch):
     if (library := nvrtc.library()) is None:
         pytest.skip("needs the package nvidia-cuda-nvrtc")
-    sizes = {"SEARCHING": SEARCHING, "SEARCH": SEARCH, "STRETCH": SPAN, "FOUND": FOUND}
+    sizes = {
+        "NEWTON_ARGUMENTS": NEWTON_ARGUMENTS,
+        "SEARCH": SEARCH,
+        "NODE_RANGE": NODE_RANGE,
+        "NEWTON_RESULT": NEWTON_RESULT,
+    }
     options = [
         *device_options(PRECISIONS[precision]),
         *own_headers(),
@@ -113,10 +127,15 @@ def test_the_search_compiles_with_the_layouts_of_this_side_and_spills_no_registe
 def test_the_account_of_energy_compiles_with_the_layouts_of_this_side(precision, tmp_path):
     if (library := nvrtc.library()) is None:
         pytest.skip("needs the package nvidia-cuda-nvrtc")
-    sizes = {"ACCOUNT": ACCOUNT, "BALANCE": BALANCE, "ENERGY": ENERGY, "ELASTIC": ELASTIC}
+    sizes = {
+        "ENERGY_BALANCE": ENERGY_BALANCE,
+        "BALANCE": BALANCE,
+        "ENERGY_RECORD": ENERGY_RECORD,
+        "ELASTIC_ENERGY": ELASTIC_ENERGY,
+    }
     options = [*device_options(PRECISIONS[precision]), *own_headers(), "-arch=sm_90"]
     options += [f"-D{name}_BYTES={layout.itemsize}" for name, layout in sizes.items()]
-    options += [f"-DCHUNK_BYTES={CHUNK.itemsize}", f"-DSUMS_BYTES={8 * SUMS}"]
+    options += [f"-DNODE_CHUNK_BYTES={NODE_CHUNK.itemsize}", f"-DSUMS_BYTES={8 * SUMS}"]
     for name in ("energy_balance", "elastic_energy"):
         code, said = nvrtc.compiled(library, HERE / f"backends/gpu/{name}.cu", options)
         assert code and not said, said
@@ -124,12 +143,12 @@ def test_the_account_of_energy_compiles_with_the_layouts_of_this_side(precision,
 
 def test_the_nodes_of_a_body_are_shared_out_in_stretches():
     text = (HERE / "backends/gpu/newton.cu").read_text()
-    assert f"STRETCH = {STRETCH}, LANES = {LANES}," in text
-    found, start = stretches(np.array([[0, 1], [1, 1 + 2 * STRETCH], [1 + 2 * STRETCH, 5 + 3 * STRETCH]]))
+    assert f"BLOCK_NODES = {BLOCK_NODES}, LANES = {LANES}," in text
+    found, start = node_ranges(np.array([[0, 1], [1, 1 + 2 * BLOCK_NODES], [1 + 2 * BLOCK_NODES, 5 + 3 * BLOCK_NODES]]))
     assert start.tolist() == [0, 1, 3, 5]
     assert found["body"].tolist() == [0, 1, 1, 2, 2]
     nodes = [n for row in found for n in range(row["first"], row["last"])]
-    assert nodes == list(range(5 + 3 * STRETCH)) and (found["last"] - found["first"]).max() == STRETCH
+    assert nodes == list(range(5 + 3 * BLOCK_NODES)) and (found["last"] - found["first"]).max() == BLOCK_NODES
 
 
 def test_the_body_of_each_item_is_known_where_all_launches_agree():

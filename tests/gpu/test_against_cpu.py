@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from protocol.messages_pb2 import SolveStatus
-from sim_server.backends.gpu.solver import RESULT
+from sim_server.backends.gpu.solver import PCG_RESULT
 from sim_server.simulation import Simulation
 from sim_server.updates.factor_source import Job
 from sim_server.updates.policy import Driver
@@ -72,7 +72,7 @@ def test_a_start_near_the_solution_is_no_trouble(precision, nearness):
         sim.engine.solver.launch()
         stream.synchronize()
     step = int(sim.engine._counter.get()[0])
-    results = sim.engine.solver.results.get().view(RESULT)
+    results = sim.engine.solver.results.get().view(PCG_RESULT)
     last = results[step % (len(results))]
     assert last["status"] == SolveStatus.CONVERGED and last["residual"] <= 1e-11
     assert last["fallbacks"] == 0 and last["iterations"] <= 6

@@ -35,9 +35,9 @@ def factor(cells, seed=0):
 
 def expanded(gpu, shape, values, p, multiprocessors=None):
     """Chunks and scale, on the host."""
-    from sim_server.backends.gpu.inverse.build_inverse import Expansion
+    from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder
 
-    expansion = Expansion(gpu, shape, p)
+    expansion = InverseBuilder(gpu, shape, p)
     target = expansion.target()
     made = expansion.expand(values, target, multiprocessors)
     made.event.synchronize()
@@ -85,14 +85,14 @@ def test_the_scale_ends_with_its_largest(gpu):
 
 
 def test_fifty_in_a_row_allocate_nothing_and_end_with_the_last(gpu):
-    from sim_server.backends.gpu.inverse.build_inverse import Expansion
+    from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder
 
     shape, first = factor(SMALL)
     second = factor(SMALL, seed=5)[1]
     other = factor(MIDDLE)
     p = plan(shape, 16, 2)
-    expansion = Expansion(gpu, shape, p)
-    larger = Expansion(gpu, other[0], plan(other[0], 132, 1))  # moves the workspace that both use
+    expansion = InverseBuilder(gpu, shape, p)
+    larger = InverseBuilder(gpu, other[0], plan(other[0], 132, 1))  # moves the workspace that both use
     targets, large = [expansion.target() for _ in range(3)], larger.target()
     expansion.expand(first, targets[0])
     larger.expand(other[1], large)
@@ -109,10 +109,10 @@ def test_fifty_in_a_row_allocate_nothing_and_end_with_the_last(gpu):
 
 
 def test_another_expansion_may_make_the_workspace_grow(gpu):
-    from sim_server.backends.gpu.inverse.build_inverse import Expansion
+    from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder
 
     shape, values = factor(SMALL)
-    expansion = Expansion(gpu, shape, plan(shape, 16, 2))
+    expansion = InverseBuilder(gpu, shape, plan(shape, 16, 2))
     target = expansion.target()
     expansion.expand(values, target).event.synchronize()
     before = target.matrix.get()

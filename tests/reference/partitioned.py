@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dtrtri
 
 from protocol.factor import FactorPattern
-from sim_server.backends.gpu.inverse.expansion_batches import EDGE, Batch, Layout
+from sim_server.backends.gpu.inverse.expansion_batches import EDGE, BuildBatch, WorkspaceLayout
 from sim_server.backends.gpu.inverse.plan import FORM, GATHER, READ, WRITE, Plan
 from tests.reference.supernodal import lower
 
@@ -156,7 +156,7 @@ class Application:
         return self.scale[start : start + count] * self.r[start : start + count] - contributions
 
 
-def by_tasks(layout: Layout, values: NDArray, plan: Plan) -> tuple[NDArray, Reals]:
+def by_tasks(layout: WorkspaceLayout, values: NDArray, plan: Plan) -> tuple[NDArray, Reals]:
     """Chunks in float64 and scale as build_inverse.cu makes them, task by task. NaN where nobody writes."""
     chunks, scale = np.full((plan.chunks, ROWS, COLUMNS), np.nan), np.zeros(plan.size + 1)
     for batch in layout.batches:
@@ -187,7 +187,7 @@ def _tile(i: int) -> slice:
     return slice(i * EDGE, (i + 1) * EDGE)
 
 
-def _inverted(layout: Layout, batch: Batch, memory: Reals) -> None:
+def _inverted(layout: WorkspaceLayout, batch: BuildBatch, memory: Reals) -> None:
     for p, i, _, _ in batch.diagonal:
         part = layout.parts[p]
         block, real = _whole(part, memory)[_tile(i), _tile(i)], min(EDGE, int(part["v"]) - i * EDGE)
@@ -204,7 +204,9 @@ def _inverted(layout: Layout, batch: Batch, memory: Reals) -> None:
             g[_tile(i), _tile(j)] = -g[_tile(i), depth] @ t[depth, _tile(j)]
 
 
-def _finished(layout: Layout, batch: Batch, memory: Reals, plan: Plan, scale: Reals, chunks: NDArray) -> None:
+def _finished(
+    layout: WorkspaceLayout, batch: BuildBatch, memory: Reals, plan: Plan, scale: Reals, chunks: NDArray
+) -> None:
     for p, i, j, _ in batch.finish:
         part, g = layout.parts[p], _whole(layout.parts[p], memory)
         v, b, start, inside = int(part["v"]), int(part["b"]), int(part["start"]), int(part["pitch_t"])

@@ -8,10 +8,10 @@ import pytest
 from numpy.typing import NDArray
 
 from sim_server.backends.gpu.inverse import plan as plans
-from sim_server.backends.gpu.inverse.device_plan import Planned
+from sim_server.backends.gpu.inverse.device_plan import DevicePlan
 from sim_server.backends.gpu.inverse.partition import tree_of
 from sim_server.backends.gpu.inverse.plan import lay_out, plan
-from sim_server.backends.gpu.row_partition import busiest, first_shares, halo, shared_out, shares
+from sim_server.backends.gpu.row_partition import assign_blocks, assignment, busiest, halo, initial_ranges
 from tests.reference.partitioned import stored
 from tests.solver.test_partitioned_inverse import GRAPHS, graphs, system
 
@@ -27,31 +27,31 @@ class HostGpu:
             return SimpleNamespace(data=SimpleNamespace(ptr=1), host=array)
 
 
-def applied(planned: Planned, chunks: NDArray, scale: NDArray, r: NDArray) -> NDArray:
+def applied(uploaded: DevicePlan, chunks: NDArray, scale: NDArray, r: NDArray) -> NDArray:
     """z of r, by phases and thread blocks: partitioned_inverse.cuh without its words."""
-    p = planned.plan
-    a = {name: array.host for name, array in planned._arrays.items()}
+    p = uploaded.plan
+    a = {name: array.host for name, array in uploaded._arrays.items()}
     at = (a["place"][:, None] + np.arange(3)).ravel()
     residual = np.zeros(p.size + 32)
     residual[at] = scale[at] * r
     formed, solved = np.full(p.size + 32, np.nan), np.zeros(p.size + 32)
-    given = np.full(len(p.slots) + 32, np.nan)
+    contributed = np.full(len(p.slots) + 32, np.nan)
     for phase in range(p.phases):
         forward, puts = phase < p.groups - 1, {}
         for forming, block in [(True, b) for b in range(p.blocks)] + [(False, b) for b in range(p.blocks)]:
-            part, lists = a["parts"][block], a["lists"][block]
-            own_pieces = a["pieces"][part[0] : part[0] + part[1]]
+            part, lists = a["block_ranges"][block], a["lists"][block]
+            own_segments = a["segments"][part[0] : part[0] + part[1]]
             where = a["index"][part[0] : part[0] + part[1]]
             x = np.full(p.x_area, np.nan)
             middle = lists[3 * p.phases + 2 + phase] if phase < p.groups else lists[phase]
             for k in range(lists[phase], middle if forming else lists[phase + 1]):
-                kind, begin, to, keep = own_pieces[k]
+                kind, begin, to, keep = own_segments[k]
                 valid = np.arange(32) < keep >> 1
                 assert (kind == 0) == (k < middle)
                 if kind == 0:
                     v = residual[begin : begin + 32].copy()
                     low, many = where[k] & 0xFFFFFF, where[k].view(np.uint32) >> 24
-                    v -= [given[first : first + count].sum() for first, count in zip(low, many, strict=True)]
+                    v -= [contributed[first : first + count].sum() for first, count in zip(low, many, strict=True)]
                     if keep & 1:
                         formed[begin : begin + 32] = np.where(valid, v, 0)
                 else:
@@ -70,7 +70,7 @@ def applied(planned: Planned, chunks: NDArray, scale: NDArray, r: NDArray) -> ND
                     puts |= dict(zip(out + 8 * eight + np.arange(8), value, strict=True))
         for i, v in puts.items():
             if forward:
-                given[a["target"][i]] = v
+                contributed[a["target"][i]] = v
             else:
                 solved[i] = v
     return scale[:-1][at] * solved[at]
@@ -88,33 +88,33 @@ def test_the_kernels_lists_apply_the_inverse(graph, blocks, trips, monkeypatch):
         thresholds = tuple(sizes[k * len(sizes) // groups] for k in range(1, groups))
         p = lay_out(tree, thresholds, blocks)
         chunks, scale = stored(s.pattern, s.factor, p, np.float64)
-        z = applied(Planned(HostGpu, p, 8), chunks, scale, s.r)  # type: ignore[arg-type]
+        z = applied(DevicePlan(HostGpu, p, 8), chunks, scale, s.r)  # type: ignore[arg-type]
         assert np.linalg.norm(z - s.z) <= 1e-11 * np.linalg.norm(s.z)
 
 
 def test_tiles_of_one_warp_each_and_of_several():
     s = system(GRAPHS["bar"])
     for blocks, warps in ((1, 2), (16, 8), (132, 8)):
-        planned = Planned(HostGpu, plan(s.pattern, blocks), warps)  # type: ignore[arg-type]
-        lists = planned._arrays["lists"].host
-        phases = planned.plan.phases
+        uploaded = DevicePlan(HostGpu, plan(s.pattern, blocks), warps)  # type: ignore[arg-type]
+        lists = uploaded._arrays["lists"].host
+        phases = uploaded.plan.phases
         count, split = np.diff(lists[:, phases + 1 : 2 * phases + 2]), lists[:, 2 * phases + 2 : 3 * phases + 2]
         shared = split > 1
         assert (count * split <= 64)[shared].all() and (16 * count <= 32 * warps)[shared].all()
 
 
 def test_thread_blocks_are_shared_out_by_size():
-    few = shares(np.array([4840, 720, 160]), 124)
+    few = assignment(np.array([4840, 720, 160]), 124)
     assert few.pooled == 0 and few.blocks.sum() <= 124 and (few.blocks >= 1).all()
     assert few.blocks[0] > few.blocks[1] > few.blocks[2]
     assert few.first.tolist() == [0, few.blocks[0], few.blocks[0] + few.blocks[1]]
-    many = shares(np.r_[np.full(300, 160), 20000], 124)
+    many = assignment(np.r_[np.full(300, 160), 20000], 124)
     assert many.pooled == 300 and many.order[0] == 300 and many.blocks[300] > 8
     assert many.blocks[300] < 124, "some are left for the others"
-    alike = shares(np.full(1024, 720), 248)
+    alike = assignment(np.full(1024, 720), 248)
     assert alike.pooled == 1024 and (alike.first == -1).all()
-    assert shares(np.full(16, 720), 124).blocks.tolist() == [7] * 16, "an eighth for some would help nobody"
-    assert shares(np.array([4, 4]), 124).blocks.tolist() == [1, 1]
+    assert assignment(np.full(16, 720), 124).blocks.tolist() == [7] * 16, "an eighth for some would help nobody"
+    assert assignment(np.array([4, 4]), 124).blocks.tolist() == [1, 1]
 
 
 @pytest.mark.parametrize(
@@ -122,9 +122,9 @@ def test_thread_blocks_are_shared_out_by_size():
 )
 def test_multiprocessors_are_spared_unless_others_would_idle(bodies, blocks, spared):
     nodes = np.full(bodies, 720)
-    given, grid = shared_out(nodes, 132, blocks)
+    contributed, grid = assign_blocks(nodes, 132, blocks)
     assert grid == blocks * (132 - spared)
-    assert busiest(nodes, given, grid) <= busiest(nodes, shares(nodes, blocks * 124), blocks * 124)
+    assert busiest(nodes, contributed, grid) <= busiest(nodes, assignment(nodes, blocks * 124), blocks * 124)
 
 
 @pytest.mark.parametrize("counts", [[1], [3], [7, 2]])
@@ -138,15 +138,15 @@ def test_each_thread_block_knows_the_nodes_that_its_rows_read(counts):
     ranges = np.stack([offset[:-1], offset[1:]], axis=1)
     seen = halo(ranges, np.array(counts), row_start, columns)
     rows = 0
-    for share in seen.shares:
-        low = ranges[share["body"], 0]
-        nodes = seen.nodes[share["halo_first"] :][: share["halo"]] + low
-        own = low + share["begin"] + np.arange(share["own"])
-        blocks = slice(share["block_first"], share["block_first"] + share["blocks"])
-        assert nodes[: share["own"]].tolist() == own.tolist() and len(set(nodes.tolist())) == len(nodes)
+    for row_range in seen.ranges:
+        low = ranges[row_range["body"], 0]
+        nodes = seen.nodes[row_range["halo_first"] :][: row_range["halo"]] + low
+        own = low + row_range["begin"] + np.arange(row_range["own"])
+        blocks = slice(row_range["block_first"], row_range["block_first"] + row_range["blocks"])
+        assert nodes[: row_range["own"]].tolist() == own.tolist() and len(set(nodes.tolist())) == len(nodes)
         assert (nodes[seen.local[blocks]] == columns[blocks]).all()
-        rows += share["own"]
+        rows += row_range["own"]
     assert rows == offset[-1]
-    given = shares(np.array(sizes), 12)
-    table = first_shares(given, halo(ranges, given.blocks, row_start, columns), 12)
-    assert sorted(table[table >= 0].tolist()) == list(range(given.blocks.sum()))
+    contributed = assignment(np.array(sizes), 12)
+    table = initial_ranges(contributed, halo(ranges, contributed.blocks, row_start, columns), 12)
+    assert sorted(table[table >= 0].tolist()) == list(range(contributed.blocks.sum()))

@@ -15,9 +15,9 @@
 #define AT_ONCE 5  // words that a thread asks for at a time: 160 thread blocks, or 2560 entries of a vector, in one trip
 #endif
 
-extern __shared__ __align__(16) char dynamic[];
+extern __shared__ __align__(16) char shared_memory[];
 
-// Shared memory given out once per body. Null where it does not fit: then global memory stands in.
+// Shared memory allocated once per body. Null where it does not fit: then global memory stands in.
 struct Arena {
     char* next;
     char* end;
@@ -31,10 +31,10 @@ struct Arena {
     }
 };
 
-// Place of what an arena gave. Through `dynamic + place` it is read as shared memory, which a pointer kept in memory is not.
-__device__ __forceinline__ int place_of(const void* taken) { return taken ? (int)((const char*)taken - dynamic) : -1; }
+// Place of what an arena gave. Through `shared_memory + place` it is read as shared memory, which a pointer kept in memory is not.
+__device__ __forceinline__ int place_of(const void* taken) { return taken ? (int)((const char*)taken - shared_memory) : -1; }
 template <class T>
-__device__ __forceinline__ const T* shared_at(int place) { return (const T*)(dynamic + place); }
+__device__ __forceinline__ const T* shared_at(int place) { return (const T*)(shared_memory + place); }
 
 __device__ __forceinline__ void copy_async(void* shared, const void* global, int bytes) {
     unsigned to = (unsigned)__cvta_generic_to_shared(shared);
@@ -49,57 +49,57 @@ __device__ __forceinline__ void copies_end() { asm volatile("cp.async.wait_group
 // What goes from one thread block to another goes in words of 8 bytes, half of them the value (or half of a double) and half
 // the number of the exchange: a reader sees by itself whether a value is there yet. So there is no barrier, no fence, and one
 // trip through L2 instead of four. 8 bytes are written and read in one piece; ordering between words is not needed.
-template <class T> struct Word;
-template <> struct Word<float> {
+template <class T> struct FlagWord;
+template <> struct FlagWord<float> {
     unsigned long long bits;
     __device__ __forceinline__ void put(float v, unsigned number) {
         const unsigned long long w = (unsigned long long)number << 32 | __float_as_uint(v);
         asm volatile("st.relaxed.gpu.global.u64 [%0], %1;" ::"l"(this), "l"(w) : "memory");
     }
-    __device__ __forceinline__ Word<float> seen() const {  // as it is now
-        Word<float> w;
+    __device__ __forceinline__ FlagWord<float> load() const {  // as it is now
+        FlagWord<float> w;
         asm volatile("ld.relaxed.gpu.global.u64 %0, [%1];" : "=l"(w.bits) : "l"(this));
         return w;
     }
-    __device__ __forceinline__ bool is(float& v, unsigned number) const {
+    __device__ __forceinline__ bool unpack(float& v, unsigned number) const {
         v = __uint_as_float((unsigned)bits);
         return (unsigned)(bits >> 32) == number;
     }
-    __device__ __forceinline__ bool get(float& v, unsigned number) const { return seen().is(v, number); }
+    __device__ __forceinline__ bool get(float& v, unsigned number) const { return load().unpack(v, number); }
 };
-template <> struct __align__(16) Word<double> {
+template <> struct __align__(16) FlagWord<double> {
     unsigned long long high, low;
     __device__ __forceinline__ void put(double v, unsigned number) {
         const unsigned long long bits = __double_as_longlong(v), tag = (unsigned long long)number << 32;
         asm volatile("st.relaxed.gpu.global.v2.u64 [%0], {%1, %2};" ::"l"(this), "l"(tag | bits >> 32), "l"(tag | (bits & 0xffffffffull))
                      : "memory");
     }
-    __device__ __forceinline__ Word<double> seen() const {
-        Word<double> w;
+    __device__ __forceinline__ FlagWord<double> load() const {
+        FlagWord<double> w;
         asm volatile("ld.relaxed.gpu.global.v2.u64 {%0, %1}, [%2];" : "=l"(w.high), "=l"(w.low) : "l"(this));
         return w;
     }
-    __device__ __forceinline__ bool is(double& v, unsigned number) const {
+    __device__ __forceinline__ bool unpack(double& v, unsigned number) const {
         v = __longlong_as_double(high << 32 | (low & 0xffffffffull));
         return (unsigned)(high >> 32) == number && (unsigned)(low >> 32) == number;
     }
-    __device__ __forceinline__ bool get(double& v, unsigned number) const { return seen().is(v, number); }
+    __device__ __forceinline__ bool get(double& v, unsigned number) const { return load().unpack(v, number); }
 };
 
 // Whether to look once more. A word that never comes must not hang the device for good: after some minutes of looking the
 // launch fails, and the server says that the device is lost.
-__device__ __forceinline__ bool again(bool missing, unsigned& spins) {
+__device__ __forceinline__ bool keep_polling(bool missing, unsigned& spins) {
     if (missing && ++spins > 1u << 27) __trap();
     return missing;
 }
 
-struct Team {
-    int index, blocks;       // of this thread block in the team
-    unsigned number;         // of the exchange: what is put now carries it
-    Word<double>* board;     // (2, 4, grid) of this body
+struct BlockGroup {
+    int index, blocks;             // of this thread block in the team
+    unsigned number;               // of the exchange: what is put now carries it
+    FlagWord<double>* block_sums;  // (2, 4, grid) of this body
     int grid;
     double (*scratch)[4];    // shared, 3 WARPS
-    double* totals;          // shared, 4
+    double* totals;  // shared, 4
     int lane, warp;
 
     // N <= 4 sums over the team at once, of lanes 0 to LANES - 1 of each warp. The sums are in every thread, and every thread
@@ -110,7 +110,7 @@ struct Team {
             for (int n = 0; n < N; ++n) scratch[LANES * warp + lane][n] = mine[n];
         ++number;
         __syncthreads();
-        Word<double>* row = board + (number & 1) * 4 * grid;
+        FlagWord<double>* row = block_sums + (number & 1) * 4 * grid;
         if (warp == 0) {
             double sum = 0;
             if (lane % 4 < N)
@@ -137,20 +137,20 @@ struct Team {
     }
 
     // A warp: the sum of what all thread blocks put, each lane those of every 32nd.
-    __device__ __forceinline__ double read(const Word<double>* row) const {
+    __device__ __forceinline__ double read(const FlagWord<double>* row) const {
         double sum = 0;
         for (int first = lane; first < blocks + lane; first += 32 * AT_ONCE) {
-            Word<double> seen[AT_ONCE];
+            FlagWord<double> seen[AT_ONCE];
             double got[AT_ONCE];
             bool all;
             unsigned spins = 0;
             do {  // no branch between the loads: they travel together
 #pragma unroll
-                for (int k = 0; k < AT_ONCE; ++k) seen[k] = row[min(first + 32 * k, blocks - 1)].seen();
+                for (int k = 0; k < AT_ONCE; ++k) seen[k] = row[min(first + 32 * k, blocks - 1)].load();
                 all = true;
 #pragma unroll
-                for (int k = 0; k < AT_ONCE; ++k) all &= seen[k].is(got[k], number);
-            } while (again(!all, spins));
+                for (int k = 0; k < AT_ONCE; ++k) all &= seen[k].unpack(got[k], number);
+            } while (keep_polling(!all, spins));
 #pragma unroll
             for (int k = 0; k < AT_ONCE; ++k) sum += first + 32 * k < blocks ? got[k] : 0;
         }

@@ -18,7 +18,7 @@ FUNCTIONS = {
 
 
 class CudaDevice:
-    """loop.Device on the current CUDA device. Raises DeviceError if the driver lacks a function."""
+    """loop.LoopDevice on the current CUDA device. Raises DeviceError if the driver lacks a function."""
 
     def __init__(self, cp: Any):
         self.cp = cp
@@ -27,7 +27,7 @@ class CudaDevice:
             found = {name: getattr(self._driver, symbol) for name, symbol in FUNCTIONS.items()}
         except (OSError, AttributeError) as error:
             raise DeviceError(f"--device gpu: the NVIDIA driver is too old or not there: {error}") from error
-        self.functions = structs.Cuda(**{name: c.cast(f, c.c_void_p) for name, f in found.items()})
+        self.functions = structs.CudaDriver(**{name: c.cast(f, c.c_void_p) for name, f in found.items()})
         cp.cuda.runtime.free(0)  # makes CuPy's context the thread's
         context = c.c_void_p()
         self._driver.cuCtxGetCurrent(c.byref(context))

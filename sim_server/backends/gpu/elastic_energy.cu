@@ -6,34 +6,34 @@
 #endif
 #include "energy_record.cuh"
 
-struct Elastic {
-    const local* energy;    // (elements,) [J]
-    const int* parts;       // (bodies + 1,) elements of each body
-    double* sum;            // (bodies,) over the effects so far [J]
-    const long long* step;  // (1,) completed
-    Balance* balance;       // (bodies,)
-    Energy* told;           // (capacity, bodies) on the host
-    int capacity, begins;   // 1: the first effect
+struct ElasticEnergy {
+    const local* energy;         // (elements,) [J]
+    const int* first_element;    // (bodies + 1,) elements of each body
+    double* sum;                 // (bodies,) over the effects so far [J]
+    const long long* step;       // (1,) completed
+    Balance* balance;            // (bodies,)
+    EnergyRecord* records;       // (capacity, bodies) on the host
+    int capacity, first_effect;  // 1: the first effect
 };
 
-#ifdef ELASTIC_BYTES  // as energies.py has it
-static_assert(sizeof(Elastic) == ELASTIC_BYTES, "layouts of Elastic differ");
+#ifdef ELASTIC_ENERGY_BYTES  // as energies.py has it
+static_assert(sizeof(ElasticEnergy) == ELASTIC_ENERGY_BYTES, "layouts of ElasticEnergy differ");
 #endif
 
 constexpr int THREADS = 128;
 
-extern "C" __global__ void __launch_bounds__(THREADS) elastic(const Elastic p) {
+extern "C" __global__ void __launch_bounds__(THREADS) elastic_energy(const ElasticEnergy p) {
     __shared__ double warps[THREADS / 32];
     const int body = blockIdx.x;
     double sum = 0;
-    for (int k = p.parts[body] + threadIdx.x; k < p.parts[body + 1]; k += THREADS) sum += (double)p.energy[k];
-    for (int by = 16; by; by /= 2) sum += __shfl_xor_sync(EVERYBODY, sum, by);
+    for (int k = p.first_element[body] + threadIdx.x; k < p.first_element[body + 1]; k += THREADS) sum += (double)p.energy[k];
+    for (int by = 16; by; by /= 2) sum += __shfl_xor_sync(FULL_WARP, sum, by);
     if (threadIdx.x % 32 == 0) warps[threadIdx.x / 32] = sum;
     __syncthreads();
     if (threadIdx.x) return;
-    sum = p.begins ? 0 : p.sum[body];
+    sum = p.first_effect ? 0 : p.sum[body];
     for (int k = 0; k < THREADS / 32; ++k) sum += warps[k];
     p.sum[body] = sum;
     const long long done = p.step[0];
-    if (done > 0 && !p.balance[body].found) p.told[(done - 1) % p.capacity * gridDim.x + body].elastic = sum;
+    if (done > 0 && !p.balance[body].found) p.records[(done - 1) % p.capacity * gridDim.x + body].elastic = sum;
 }

@@ -7,36 +7,36 @@
 
 constexpr int STILL = 5, WARPS = 4;  // arrays that are 0 at rest; warps of a thread block, at most
 
-struct Chunk {
+struct NodeChunk {
     int body, begin, end;  // nodes
     int first, chunks;     // of the body
 };
 
-struct Account {
-    const int* first;        // (bodies + 1,) node of each body
-    const Chunk* chunk;      // (chunks,)
-    Sums* sums;              // (chunks,)
-    unsigned* arrived;       // (bodies,) chunks that are summed up; zero between launches
-    const real* mass;        // (n,) [kg]
-    const real* before;      // (n, 3) x when the step began [m]
-    real* x;                 // (n, 3) [m]
-    const real* v;           // (n, 3) [m/s]
-    real* still[STILL];      // (n, 3) each, or null: v and what else is 0 in a body at rest
-    real* force;             // (n, 3) of hands (effects/touch.cu); null: nothing can be touched
-    real* spring;            // (n,)
-    real* anchor;            // (n, 3)
-    real* free;              // (n,) 0 from when a body is frozen
-    const real* gravity;     // (3,) [m/s2]
-    Balance* balance;        // (bodies,)
-    Energy* told;            // (capacity, bodies) on the host
-    const long long* step;   // (1,) completed
-    long long* settled;      // (bodies,) step that was settled last
+struct EnergyBalance {
+    const int* first_node;      // (bodies + 1,) node of each body
+    const NodeChunk* chunks;    // (chunks,)
+    Sums* sums;                 // (chunks,)
+    unsigned* finished_chunks;  // (bodies,) chunks that are summed up; zero between launches
+    const real* mass;           // (n,) [kg]
+    const real* before;         // (n, 3) x when the step began [m]
+    real* x;                    // (n, 3) [m]
+    const real* v;              // (n, 3) [m/s]
+    real* still[STILL];         // (n, 3) each, or null: v and what else is 0 in a body at rest
+    real* force;                // (n, 3) of hands (effects/touch.cu); null: nothing can be touched
+    real* spring;               // (n,)
+    real* anchor;               // (n, 3)
+    real* free;                 // (n,) 0 from when a body is frozen
+    const real* gravity;        // (3,) [m/s2]
+    Balance* balance;           // (bodies,)
+    EnergyRecord* records;      // (capacity, bodies) on the host
+    const long long* step;      // (1,) completed
+    long long* settled_step;    // (bodies,) step that was settled last
     int bodies, capacity, on_runaway, inertia;
 };
 
-#ifdef ACCOUNT_BYTES  // as energies.py has them
-static_assert(sizeof(Account) == ACCOUNT_BYTES && sizeof(Balance) == BALANCE_BYTES, "layouts of Account or Balance differ");
-static_assert(sizeof(Energy) == ENERGY_BYTES && sizeof(Sums) == SUMS_BYTES && sizeof(Chunk) == CHUNK_BYTES, "layouts differ");
+#ifdef ENERGY_BALANCE_BYTES  // as energies.py has them
+static_assert(sizeof(EnergyBalance) == ENERGY_BALANCE_BYTES && sizeof(Balance) == BALANCE_BYTES, "layouts of EnergyBalance or Balance differ");
+static_assert(sizeof(EnergyRecord) == ENERGY_RECORD_BYTES && sizeof(Sums) == SUMS_BYTES && sizeof(NodeChunk) == NODE_CHUNK_BYTES, "layouts differ");
 #endif
 
 __device__ __forceinline__ void add_sums(Sums& a, const Sums& b) {
@@ -51,7 +51,7 @@ __device__ __forceinline__ void add_sums(Sums& a, const Sums& b) {
 }
 
 // Of the nodes from `begin` on; those of this thread.
-__device__ __forceinline__ Sums sums_over(const Account& a, int begin, int end) {
+__device__ __forceinline__ Sums sums_over(const EnergyBalance& a, int begin, int end) {
     Sums s = no_sums();
 #pragma unroll 4
     for (int i = begin + threadIdx.x; i < end; i += blockDim.x) {
@@ -63,7 +63,7 @@ __device__ __forceinline__ Sums sums_over(const Account& a, int begin, int end) 
 }
 
 // Likewise the work of hands, whose forces are then 0 until something touches the nodes again.
-__device__ __forceinline__ double work_over(const Account& a, int begin, int end) {
+__device__ __forceinline__ double work_over(const EnergyBalance& a, int begin, int end) {
     double work = 0;
     for (int i = begin + threadIdx.x; i < end; i += blockDim.x) {
         real *force = a.force + 3ll * i, &spring = a.spring[i];
@@ -79,19 +79,19 @@ __device__ __forceinline__ double work_over(const Account& a, int begin, int end
 // Those of the lane across.
 __device__ __forceinline__ Sums sums_across(const Sums& s, int by) {
     Sums o;
-    o.kinetic = __shfl_xor_sync(EVERYBODY, s.kinetic, by);
-    o.gravity = __shfl_xor_sync(EVERYBODY, s.gravity, by);
-    o.fallen = __shfl_xor_sync(EVERYBODY, s.fallen, by);
-    o.work = __shfl_xor_sync(EVERYBODY, s.work, by);
+    o.kinetic = __shfl_xor_sync(FULL_WARP, s.kinetic, by);
+    o.gravity = __shfl_xor_sync(FULL_WARP, s.gravity, by);
+    o.fallen = __shfl_xor_sync(FULL_WARP, s.fallen, by);
+    o.work = __shfl_xor_sync(FULL_WARP, s.work, by);
     for (int c = 0; c < 3; ++c) {
-        o.low[c] = __shfl_xor_sync(EVERYBODY, s.low[c], by);
-        o.high[c] = __shfl_xor_sync(EVERYBODY, s.high[c], by);
+        o.low[c] = __shfl_xor_sync(FULL_WARP, s.low[c], by);
+        o.high[c] = __shfl_xor_sync(FULL_WARP, s.high[c], by);
     }
     return o;
 }
 
-__device__ void tell(const Account& a, const Balance& b, int body, long long done) {
-    Energy& e = a.told[done % a.capacity * a.bodies + body];
+__device__ void write_record(const EnergyBalance& a, const Balance& b, int body, long long done) {
+    EnergyRecord& e = a.records[done % a.capacity * a.bodies + body];
     e.kinetic = b.kinetic;
     e.elastic = __longlong_as_double(0x7ff8000000000000ll);  // not evaluated
     e.gravity = b.gravity;
@@ -103,8 +103,8 @@ __device__ void tell(const Account& a, const Balance& b, int body, long long don
 }
 
 // Back to where the step began, and at rest from now on: as if all nodes were fixed.
-__device__ void freeze(const Account& a, int body) {
-    for (int i = a.first[body] + threadIdx.x; i < a.first[body + 1]; i += blockDim.x) {
+__device__ void freeze(const EnergyBalance& a, int body) {
+    for (int i = a.first_node[body] + threadIdx.x; i < a.first_node[body + 1]; i += blockDim.x) {
         a.free[i] = 0;
         for (long long k = 3ll * i; k < 3ll * i + 3; ++k) {
             a.x[k] = a.before[k];
@@ -126,13 +126,13 @@ __device__ Sums sums_of_block(Sums s) {
 }
 
 // Whether this thread block finishes last of its body's; s then has the sums over all chunks in the first thread.
-__device__ bool gather(const Account& a, const Chunk& chunk, int number, Sums& s) {
+__device__ bool gather(const EnergyBalance& a, const NodeChunk& chunk, int number, Sums& s) {
     if (chunk.chunks == 1) return true;
     __shared__ bool last;
     if (threadIdx.x == 0) {
         a.sums[number] = s;
         __threadfence();
-        last = atomicAdd(a.arrived + chunk.body, 1u) == chunk.chunks - 1u;
+        last = atomicAdd(a.finished_chunks + chunk.body, 1u) == chunk.chunks - 1u;
     }
     __syncthreads();
     if (!last) return false;
@@ -140,15 +140,15 @@ __device__ bool gather(const Account& a, const Chunk& chunk, int number, Sums& s
     s = no_sums();
     for (int k = threadIdx.x; k < chunk.chunks; k += blockDim.x) add_sums(s, a.sums[chunk.first + k]);
     s = sums_of_block(s);
-    if (threadIdx.x == 0) a.arrived[chunk.body] = 0;
+    if (threadIdx.x == 0) a.finished_chunks[chunk.body] = 0;
     return true;
 }
 
 // By a thread block. What is read does not wait for anything that was read before but the chunk: it is done while others compute.
-__device__ void account_of(const Account& a, int number) {
+__device__ void balance_energy(const EnergyBalance& a, int number) {
     __shared__ int away;
-    const Chunk chunk = a.chunk[number];
-    const long long step = a.step[0], settled = a.settled[chunk.body];
+    const NodeChunk chunk = a.chunks[number];
+    const long long step = a.step[0], settled = a.settled_step[chunk.body];
     Balance b = a.balance[chunk.body];
     Sums s = sums_over(a, chunk.begin, chunk.end);
     if (settled == step) return;
@@ -158,11 +158,11 @@ __device__ void account_of(const Account& a, int number) {
     if (threadIdx.x == 0) {
         away = take_stock(b, s, a.on_runaway, a.inertia);
         a.balance[chunk.body] = b;
-        tell(a, b, chunk.body, step - 1);
-        a.settled[chunk.body] = step;
+        write_record(a, b, chunk.body, step - 1);
+        a.settled_step[chunk.body] = step;
     }
     __syncthreads();
     if (away) freeze(a, chunk.body);
 }
 
-extern "C" __global__ void __launch_bounds__(32 * WARPS) account(const Account a) { account_of(a, blockIdx.x); }
+extern "C" __global__ void __launch_bounds__(32 * WARPS) energy_balance(const EnergyBalance a) { balance_energy(a, blockIdx.x); }

@@ -3,9 +3,9 @@
 #pragma once
 #include "balance.cuh"
 
-struct Energy {  // beside Result
+struct EnergyRecord {  // beside Result
     double kinetic, elastic, gravity, work, budget, stride;
     int phase, found;
 };
 
-#define EVERYBODY 0xffffffffu  // all threads of a warp
+#define FULL_WARP 0xffffffffu  // all threads of a warp

@@ -17,30 +17,30 @@ from sim_server.backends.compiler import HERE
 from sim_server.backends.gpu.cuda import CudaDevice
 from sim_server.backends.gpu.device import DeviceLaunch, Gpu
 from sim_server.backends.gpu.energies import DeviceEnergies
-from sim_server.backends.gpu.factor_upload import Intake
-from sim_server.backends.gpu.kernel_fusion import DOMAINS, End, Fused, domain, fused
+from sim_server.backends.gpu.factor_upload import FactorUpload
+from sim_server.backends.gpu.kernel_fusion import DOMAINS, Epilogue, FusedKernel, domain, fused
 from sim_server.backends.gpu.loop import CAPACITY, MANY, DeviceLoop
-from sim_server.backends.gpu.mailbox import Mailbox
-from sim_server.backends.gpu.newton import Search, Turns
-from sim_server.backends.gpu.solver import BODY, RESULT, SETTINGS, Solver
-from sim_server.backends.gpu.structs import ENERGY, FOUND, STAMP, Mail
+from sim_server.backends.gpu.mailbox import DeviceMailbox
+from sim_server.backends.gpu.newton import NewtonIteration, NewtonPhases
+from sim_server.backends.gpu.solver import PCG_BODY, PCG_RESULT, SETTINGS_BYTES, PcgSolver
+from sim_server.backends.gpu.structs import ENERGY_RECORD, NEWTON_RESULT, STEP_TIMESTAMP, Mail
 from sim_server.mechanics.energy import Energies
 from sim_server.mechanics.newton import Newton
 
 FEW = 16  # trials in a step up to which MANY steps make one graph
-TICK = np.dtype(
+STEP_EPILOGUE = np.dtype(
     [
-        ("clock", "u8"), ("step", "u8"), ("dt", "f8"), ("arrived", "u8"), ("finished", "u8"), ("stamps", "u8"),
-        ("results", "u8"), ("reports", "u8"), ("moving", "u8"), ("barriers", "i4"), ("capacity", "i4"),
-        ("words", "i4"), ("bodies", "i4"),
+        ("clock", "u8"), ("step", "u8"), ("dt", "f8"), ("pool_counters", "u8"), ("finished_blocks", "u8"),
+        ("timestamps", "u8"), ("results", "u8"), ("host_results", "u8"), ("moving", "u8"), ("counters", "i4"),
+        ("capacity", "i4"), ("result_words", "i4"), ("bodies", "i4"),
     ]
 )  # fmt: skip
 
 
-class Settings:
+class DeviceSettings:
     """Solver settings of a body; what is set holds from its next batch on."""
 
-    def __init__(self, row: NDArray[Any], mailbox: Mailbox):
+    def __init__(self, row: NDArray[Any], mailbox: DeviceMailbox):
         object.__setattr__(self, "_row", row)
         object.__setattr__(self, "_mailbox", mailbox)
 
@@ -51,7 +51,7 @@ class Settings:
         if name in ("budget", "omega") or self._row[name] == value:  # no budget of wall time and no SSOR on a GPU
             return
         self._row[name] = value
-        self._mailbox.post(self._row.tobytes()[:SETTINGS])
+        self._mailbox.post(self._row.tobytes()[:SETTINGS_BYTES])
 
 
 class GpuEngine(DeviceLoop):
@@ -73,20 +73,20 @@ class GpuEngine(DeviceLoop):
         device = CudaDevice(cp)
         self._steps = device.steps
         self._counter = cp.zeros(1, np.int64)
-        self._stamps = device.pinned(CAPACITY * STAMP.itemsize)
-        self._results = device.pinned(CAPACITY * RESULT.itemsize * bodies)
-        told = device.pinned(CAPACITY * ENERGY.itemsize * bodies)
+        self._stamps = device.pinned(CAPACITY * STEP_TIMESTAMP.itemsize)
+        self._results = device.pinned(CAPACITY * PCG_RESULT.itemsize * bodies)
+        told = device.pinned(CAPACITY * ENERGY_RECORD.itemsize * bodies)
         self._energies = DeviceEnergies(gpu, energies, told, self._counter, dt)
         self._fused = self._beginning(assemble)
-        turns = Turns.of(gpu, bodies) if newton else None
-        self.solver = Solver(gpu, ranges, arrays, self._counter, CAPACITY, planes, turns or ())
+        phases = NewtonPhases.of(gpu, bodies) if newton else None
+        self.solver = PcgSolver(gpu, ranges, arrays, self._counter, CAPACITY, planes, phases or ())
         self._search, found = None, None
-        if newton and turns:
-            found = device.pinned(CAPACITY * FOUND.itemsize * bodies)
-            self._search = Search(gpu, newton, assemble, ranges, arrays, turns, self.solver, found)
-        row, first = BODY.itemsize, self.solver.bodies_device
-        boxes = [(first + row * k, SETTINGS) for k in range(bodies)]
-        boxes += [(first + row * k + SETTINGS, row - SETTINGS) for k in range(bodies)]
+        if newton and phases:
+            found = device.pinned(CAPACITY * NEWTON_RESULT.itemsize * bodies)
+            self._search = NewtonIteration(gpu, newton, assemble, ranges, arrays, phases, self.solver, found)
+        row, first = PCG_BODY.itemsize, self.solver.bodies_device
+        boxes = [(first + row * k, SETTINGS_BYTES) for k in range(bodies)]
+        boxes += [(first + row * k + SETTINGS_BYTES, row - SETTINGS_BYTES) for k in range(bodies)]
         self._mailed = {k: len(boxes) + i for i, k in enumerate(k for k, x in enumerate(self.launches) if x.mailed)}
         boxes += [(self.launches[k].mail_address, self.launches[k].params.nbytes) for k in self._mailed]
         twins = {name: gpu.twin(arrays[name]) for name in ("values", "x", "v")}
@@ -98,33 +98,38 @@ class GpuEngine(DeviceLoop):
             records, twins["values"].dtype, found, told, **addresses,
         )  # fmt: skip
         names = names or [f"body {k}" for k in range(bodies)]
-        self._intake = Intake(gpu, self.solver, self, names, self.mailboxes[bodies : 2 * bodies])
+        self._intake = FactorUpload(gpu, self.solver, self, names, self.mailboxes[bodies : 2 * bodies])
         for k in range(bodies):
             whole = self.solver.bodies[k : k + 1].tobytes()
-            self.mailboxes[k].post(whole[:SETTINGS])
-            self.mailboxes[bodies + k].post(whole[SETTINGS:])
+            self.mailboxes[k].post(whole[:SETTINGS_BYTES])
+            self.mailboxes[bodies + k].post(whole[SETTINGS_BYTES:])
         self.begin: list[DeviceLaunch] = []  # before the first step
         self._graphs: list[Any] = []
-        self._tick = self._end_of_step(dt)
-        self._last = Fused(integrate, End((HERE / "backends/gpu/step_epilogue.cu").read_text(), "Tick", self._tick))
+        self._epilogue = self._end_of_step(dt)
+        self._last = FusedKernel(
+            integrate,
+            Epilogue(
+                (HERE / "backends/gpu/step_epilogue.cu").read_text(), "StepEpilogue", "finish_step", self._epilogue
+            ),
+        )
         self._stamp = self._last.function("stamp")
         self._capture()
         cp.cuda.get_current_stream().synchronize()  # what was made until now is there for the loop's streams
 
     def _end_of_step(self, dt: float) -> NDArray[Any]:
         self._finished = self.gpu.cp.zeros(1, np.uint32)
-        tick = np.zeros((), TICK)
+        params = np.zeros((), STEP_EPILOGUE)
         arrays = {
-            "clock": self.gpu.twin(self._arrays["clock"]), "step": self._counter, "arrived": self.solver.arrived,
-            "finished": self._finished, "results": self.solver.results,
-            "moving": self.gpu.twin(self._arrays["moving"]),
+            "clock": self.gpu.twin(self._arrays["clock"]), "step": self._counter,
+            "pool_counters": self.solver.pool_counter, "finished_blocks": self._finished,
+            "results": self.solver.results, "moving": self.gpu.twin(self._arrays["moving"]),
         }  # fmt: skip
         for name, array in arrays.items():
-            tick[name] = array.data.ptr
-        tick["stamps"], tick["reports"] = self._stamps.ctypes.data, self._results.ctypes.data
-        tick["dt"], tick["barriers"], tick["capacity"] = dt, len(self.solver.arrived), CAPACITY
-        tick["words"], tick["bodies"] = len(self._ranges) * RESULT.itemsize // 8, len(self._ranges)
-        return tick
+            params[name] = array.data.ptr
+        params["timestamps"], params["host_results"] = self._stamps.ctypes.data, self._results.ctypes.data
+        params["dt"], params["counters"], params["capacity"] = dt, len(self.solver.pool_counter), CAPACITY
+        params["result_words"], params["bodies"] = len(self._ranges) * PCG_RESULT.itemsize // 8, len(self._ranges)
+        return params
 
     exact = False  # settings hold for batches of steps
 
@@ -179,7 +184,7 @@ class GpuEngine(DeviceLoop):
 
     def _begin(self) -> None:
         """Notes the time: the device has had nothing to do until now."""
-        self._stamp((1,), (1,), (self._tick,))
+        self._stamp((1,), (1,), (self._epilogue,))
 
     def _beginning(self, assemble: Sequence[DeviceLaunch]) -> list[Callable[[], None]]:
         """What a step begins with: the account of the one before, and the assembly.
@@ -189,7 +194,7 @@ class GpuEngine(DeviceLoop):
         """
         domains = {domain(launch) for launch in assemble}
         elements = "elements" in domains and domains <= set(DOMAINS)
-        launches = fused(assemble, first=self._energies.first if elements else None)
+        launches = fused(assemble, first=self._energies.prologue if elements else None)
         if not elements:
             return [self._energies.account, *launches]
         self._energies.threads = launches[0].shape.threads
@@ -227,10 +232,10 @@ class GpuEngine(DeviceLoop):
 
     # --- mailboxes ----------------------------------------------------------------------------------------------
 
-    def settings(self, body: int) -> Settings:
+    def settings(self, body: int) -> DeviceSettings:
         """Solver settings of a body."""
         row = self.solver.bodies[body : body + 1].reshape(())
-        return Settings(row, self.mailboxes[body])
+        return DeviceSettings(row, self.mailboxes[body])
 
     def post_factor(self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int) -> None:
         """Has L expanded beside the steps; taken up between batches once that is done."""

@@ -17,15 +17,15 @@ from protocol.factor import FactorPattern
 from sim_server.backends.compiler import CompileError
 from sim_server.backends.gpu.device import Gpu, no_memory_left
 from sim_server.backends.gpu.loop import DeviceLoop
-from sim_server.backends.gpu.mailbox import Mailbox
-from sim_server.backends.gpu.solver import SETTINGS
+from sim_server.backends.gpu.mailbox import DeviceMailbox
+from sim_server.backends.gpu.solver import SETTINGS_BYTES
 
 log = logging.getLogger(__name__)
 
-PATTERNS = 2  # of a body at a time: workers with different libraries send different ones
+MAX_PATTERNS = 2  # of a body at a time: workers with different libraries send different ones
 
 
-class Made(NamedTuple):
+class UploadedFactor(NamedTuple):
     """An expanded factor. used: the target that it occupies."""
 
     expanded: Any
@@ -35,25 +35,27 @@ class Made(NamedTuple):
 
 
 @dataclass
-class Track:
+class BodyUploads:
     """Of one body. targets: by pattern."""
 
     name: str
-    mailbox: Mailbox
+    mailbox: DeviceMailbox
     targets: dict[int, list[Any]] = field(default_factory=dict)
-    in_use: Made | None = None
-    leaving: tuple[Made, int] | None = None  # out of use once so many steps are completed
-    posted: Made | None = None
+    in_use: UploadedFactor | None = None
+    leaving: tuple[UploadedFactor, int] | None = None  # out of use once so many steps are completed
+    posted: UploadedFactor | None = None
     queued: tuple[FactorPattern, NDArray[Any], int] | None = None
     told: bool = False
 
 
-class Intake:
-    """solver: of solver.Solver; its rows are posted through the mailboxes given, one per body."""
+class FactorUpload:
+    """solver: of solver.PcgSolver; its rows are posted through the mailboxes given, one per body."""
 
-    def __init__(self, gpu: Gpu, solver: Any, loop: DeviceLoop, names: Sequence[str], mailboxes: Sequence[Mailbox]):
+    def __init__(
+        self, gpu: Gpu, solver: Any, loop: DeviceLoop, names: Sequence[str], mailboxes: Sequence[DeviceMailbox]
+    ):
         self._gpu, self._solver, self._loop = gpu, solver, loop
-        self._tracks = [Track(name, box) for name, box in zip(names, mailboxes, strict=True)]
+        self._tracks = [BodyUploads(name, box) for name, box in zip(names, mailboxes, strict=True)]
         self._lock = threading.RLock()
         self._waiting: set[int] = set()  # bodies with something queued
 
@@ -104,7 +106,7 @@ class Intake:
             made = self._tracks[body].in_use
             return made.step if made else -1
 
-    def _look(self, track: Track) -> None:
+    def _look(self, track: BodyUploads) -> None:
         """Notes what the loop has taken up and finished with."""
         if track.posted is not None and track.mailbox.taken:
             if track.in_use is not None:  # what was launched until now may still read it
@@ -126,16 +128,16 @@ class Intake:
             self._tell(track, f"not enough GPU memory: {error}")
             return
         track.posted = made
-        row = self._solver.bodies[body : body + 1].tobytes()[SETTINGS:]
+        row = self._solver.bodies[body : body + 1].tobytes()[SETTINGS_BYTES:]
         self._gpu.cp.cuda.get_current_stream().synchronize()  # what `use` may have made is there
         track.mailbox.post(row, keep=made, event=made.expanded.event.ptr)
 
-    def _made(self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int) -> Made:
+    def _made(self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int) -> UploadedFactor:
         track = self._tracks[body]
         expansion = self._solver.expansion(body, pattern)
         if pattern.id not in track.targets:
             for old in [k for k in track.targets if track.in_use is None or k != track.in_use.pattern.id]:
-                if len(track.targets) >= PATTERNS:
+                if len(track.targets) >= MAX_PATTERNS:
                     del track.targets[old]
         targets = track.targets.setdefault(pattern.id, [])
         used = track.in_use.target if track.in_use else None
@@ -146,9 +148,9 @@ class Intake:
         self._gpu.cp.cuda.get_current_stream().synchronize()  # what was made for it is there for other streams
         expanded = expansion.expand(values, target, self._solver.spared)  # beside the steps
         self._solver.use(body, pattern, expanded, step)
-        return Made(expanded, target, step, pattern)
+        return UploadedFactor(expanded, target, step, pattern)
 
-    def _tell(self, track: Track, reason: str) -> None:
+    def _tell(self, track: BodyUploads, reason: str) -> None:
         if not track.told:
             track.told = True
             held = "the factor that it has" if track.in_use else "block Jacobi"

@@ -23,23 +23,23 @@ from sim_server.backends.gpu.device import DeviceLaunch, compiled, cupy, options
 DOMAINS = ("elements", "nodes", "blocks")
 
 
-class Shape(NamedTuple):
+class BlockShape(NamedTuple):
     """Threads of a thread block, and how many of them share the sums of an item."""
 
     threads: int
     lanes: int
 
 
-SHAPES = {  # up to so many items per multiprocessor; few items are spread over many multiprocessors
-    "elements": {64: Shape(32, 1), 256: Shape(64, 1), 1 << 30: Shape(128, 1)},
-    "nodes": {16: Shape(64, 16), 256: Shape(128, 8), 1 << 30: Shape(128, 4)},
-    "blocks": {64: Shape(128, 8), 160: Shape(128, 4), 1 << 30: Shape(128, 2)},
+BLOCK_SHAPES = {  # up to so many items per multiprocessor; few items are spread over many multiprocessors
+    "elements": {64: BlockShape(32, 1), 256: BlockShape(64, 1), 1 << 30: BlockShape(128, 1)},
+    "nodes": {16: BlockShape(64, 16), 256: BlockShape(128, 8), 1 << 30: BlockShape(128, 4)},
+    "blocks": {64: BlockShape(128, 8), 160: BlockShape(128, 4), 1 << 30: BlockShape(128, 2)},
 }
 
 
-def shape(name: str, items: int, multiprocessors: int) -> Shape:
+def shape(name: str, items: int, multiprocessors: int) -> BlockShape:
     """For so many items of a domain."""
-    return next(s for most, s in SHAPES[name].items() if items <= most * multiprocessors)
+    return next(s for most, s in BLOCK_SHAPES[name].items() if items <= most * multiprocessors)
 
 
 def domain(launch: DeviceLaunch) -> str:
@@ -47,54 +47,61 @@ def domain(launch: DeviceLaunch) -> str:
     return domain_of(launch.text, launch.struct)
 
 
-class End(NamedTuple):
-    """What follows when all items are done: a text, its function of the same name as its struct in small letters, and
-    the struct's values."""
+class Epilogue(NamedTuple):
+    """What the thread blocks of a fused kernel do after their items.
+
+    text: CUDA source. function: device function in it that is called with the struct. params: values of the struct.
+    """
 
     text: str
     struct: str
+    function: str
     params: NDArray[Any]
 
 
-class First(NamedTuple):
-    """What further thread blocks do, before those of the items: a text, its function `<struct in small letters>_of` of
-    the struct's values and the number of the thread block, and how many blocks there are."""
+class Prologue(NamedTuple):
+    """What additional thread blocks of a fused kernel do; they come before those of the items.
+
+    text: CUDA source. function: device function in it that is called with the struct and the index of the thread block.
+    params: values of the struct. blocks: number of thread blocks.
+    """
 
     text: str
     struct: str
+    function: str
     params: NDArray[Any]
     blocks: int
 
 
-class Guard(NamedTuple):
+class PhaseGuard(NamedTuple):
     """Addresses of what says whether a launch of a step with several linearizations has anything to do (newton.cu):
     left (1,), phase (bodies,), and the body of each item (items,), 0 where it is not known."""
 
-    left: int
+    active: int
     phase: int
     body: int
 
 
-GUARD = [
-    "if (*left == 0) return;",
+PHASE_GUARD = [
+    "if (*active == 0) return;",
     "if (body && !__syncthreads_or(threadIdx.x < BLOCK_ITEMS && block * BLOCK_ITEMS + threadIdx.x < n &&",
     "                              phase[body[block * BLOCK_ITEMS + threadIdx.x]] != 2)) return;",
 ]
 
 
-class Fused:
+class FusedKernel:
     """Several launches over the same items as one. private: addresses of arrays that need no memory (`own`)."""
 
     def __init__(
-        self, launches: Sequence[DeviceLaunch], end: End | None = None, private: frozenset[int] = frozenset(),
-        guard: Guard | None = None, first: First | None = None,
+        self, launches: Sequence[DeviceLaunch], end: Epilogue | None = None, private: frozenset[int] = frozenset(),
+        guard: PhaseGuard | None = None, first: Prologue | None = None,
     ):  # fmt: skip
         self.name = "+".join(launch.name for launch in launches)
         self.items = next(launch.items for launch in launches if not launch.mailed)
         sums = any(launch.sums for launch in launches)
         self.shape = shape(domain(launches[0]) if sums else "elements", self.items, processors())
         self._launches, self._before = list(launches), first.blocks if first else 0  # keeps their arrays
-        text = Text(launches, self.shape, end, private, guard, first)
+        text = FusedSource(launches, self.shape, end, private, guard, first)
         self._arguments = (np.int32(self.items), *text.values, *(x.params for x in (end, first) if x))
         flags = (*options(launches[0].types), *own_headers())
         self._module = cupy().RawModule(code=text.source, options=flags, backend="nvrtc")
@@ -112,7 +119,7 @@ class Fused:
             self._function((self._before + blocks,), (self.shape.threads,), self._arguments)
 
 
-class Text:
+class FusedSource:
     """The kernel `fused` of some launches: its source, and the values of its arguments after the number of items.
 
     Each array is one argument, whatever launches have it, and no other overlaps it: that tells the compiler what it
@@ -121,8 +128,8 @@ class Text:
     """
 
     def __init__(
-        self, launches: Sequence[DeviceLaunch], shape: Shape, end: End | None = None,
-        private: frozenset[int] = frozenset(), guard: Guard | None = None, first: First | None = None,
+        self, launches: Sequence[DeviceLaunch], shape: BlockShape, end: Epilogue | None = None,
+        private: frozenset[int] = frozenset(), guard: PhaseGuard | None = None, first: Prologue | None = None,
     ):  # fmt: skip
         self._launches, self._private = launches, private
         self.values: list[Any] = [np.uint64(address) for address in guard or ()]
@@ -145,15 +152,15 @@ class Text:
         if end:
             lines.append(end.text)
             self._parameters.append(f"const {end.struct} end")
-            body_lines.append(f"{end.struct.lower()}(end);")
+            body_lines.append(f"{end.function}(end);")
         opening = [f"const int block = (int)blockIdx.x - {first.blocks if first else 0};"]
         if first:
             lines.append(first.text)
             self._parameters.append(f"const {first.struct} first")
-            opening.append(f"if (block < 0) {{ {first.struct.lower()}_of(first, blockIdx.x); return; }}")
+            opening.append(f"if (block < 0) {{ {first.function}(first, blockIdx.x); return; }}")
         heading = f'extern "C" __global__ void __launch_bounds__({shape.threads}) fused(int n'
         parameters = "".join(f", {p}" for p in self._parameters)
-        opening += GUARD if guard else []
+        opening += PHASE_GUARD if guard else []
         lines += [f"{heading}{parameters}) {{", *opening, *self._setup, *body_lines, "}"]
         self.source = "\n".join(lines)
 
@@ -161,7 +168,7 @@ class Text:
         for k, (launch, space) in enumerate(zip(self._launches, self._spaces, strict=True)):
             yield k, launch, space, launch.name.split(".")[1]
 
-    def _sums(self, shape: Shape) -> list[str]:
+    def _sums(self, shape: BlockShape) -> list[str]:
         """Sets the arguments up and sums over the lists."""
         for k, launch, space, _ in self._each():
             if launch.mailed:
@@ -249,8 +256,8 @@ class Text:
 
 def fused(
     launches: Sequence[DeviceLaunch],
-    guard: Callable[[Sequence[DeviceLaunch]], Guard] | None = None,
-    first: First | None = None,
+    guard: Callable[[Sequence[DeviceLaunch]], PhaseGuard] | None = None,
+    first: Prologue | None = None,
 ) -> list[Any]:
     """The launches in as few kernels as their domains allow. guard: makes that of those in one kernel. first: what the
     first kernel does besides."""
@@ -259,7 +266,7 @@ def fused(
     together = [group for d in DOMAINS for group in _alike([x for x in launches if domain(x) == d])]
     together = [group for group in together if group]
     return [
-        Fused(group, None, _private(group, launches), guard(group) if guard else None, None if k else first)
+        FusedKernel(group, None, _private(group, launches), guard(group) if guard else None, None if k else first)
         for k, group in enumerate(together)
     ]  # fmt: skip
 

@@ -10,94 +10,94 @@
 #include "readback.h"
 
 // New arguments, settings and factors: copies in the order of the steps, from memory that is not written to until they are done.
-static bool deliver(Loop& l, Batch& batch, int boxes) {
+static bool deliver(GpuLoop& l, StepBatch& batch, int slots) {
     char* room = batch.upload;
-    for (int k = 0; k < boxes; ++k) {
-        Mailbox& box = l.mailbox[k];
-        if (!box.held && box.mail.load(std::memory_order_relaxed)) box.held = box.mail.exchange(nullptr);
-        if (!box.held || (box.held->event && !done(l, box.held->event))) continue;
-        std::memcpy(room, box.held->bytes, box.size);
-        CALL(to_device, box.target, room, (size_t)box.size, l.stream);
-        room += (box.size + 15) / 16 * 16;
-        int64_t number = box.held->number;
-        box.held->taken.store(l.launched, std::memory_order_release);
-        box.held = nullptr;
-        box.taken.store(number, std::memory_order_release);
+    for (int k = 0; k < slots; ++k) {
+        MailSlot& slot = l.mail_slots[k];
+        if (!slot.pending && slot.posted.load(std::memory_order_relaxed)) slot.pending = slot.posted.exchange(nullptr);
+        if (!slot.pending || (slot.pending->event && !done(l, slot.pending->event))) continue;
+        std::memcpy(room, slot.pending->bytes, slot.size);
+        CALL(to_device, slot.target, room, (size_t)slot.size, l.stream);
+        room += (slot.size + 15) / 16 * 16;
+        int64_t number = slot.pending->number;
+        slot.pending->taken.store(l.launched, std::memory_order_release);
+        slot.pending = nullptr;
+        slot.taken.store(number, std::memory_order_release);
     }
     return !l.error;
 }
 
-static bool open_batch(Loop& l) {
-    Batch& batch = l.batches[l.begun % DEPTH];
+static bool open_batch(GpuLoop& l) {
+    StepBatch& batch = l.batches[l.begun % STEP_BATCHES];
     batch.first = l.launched;
     batch.steps = 0;
     batch.late = l.rings.late;
-    return deliver(l, batch, l.mailboxes);
+    return deliver(l, batch, l.mail_slot_count);
 }
 
 // So many steps were put onto the stream.
-static bool count(Loop& l, int64_t steps) {
+static bool count(GpuLoop& l, int64_t steps) {
     l.launched += steps;
-    l.batches[l.begun % DEPTH].steps += steps;
+    l.batches[l.begun % STEP_BATCHES].steps += steps;
     const int64_t every = l.rings.frame_every.load();
     const bool energy = energy_due(l.rings, l.launched), frame = every > 0 && l.launched % every == 0;
-    if (energy || frame) CALL(graph_launch, l.account, l.stream);  // a frame shows what has run away put back
-    if (energy) CALL(graph_launch, l.elastic, l.stream);
+    if (energy || frame) CALL(graph_launch, l.energy_balance, l.stream);  // a frame shows what has run away put back
+    if (energy) CALL(graph_launch, l.elastic_energy, l.stream);
     return begin_matrices(l) && begin_frame(l);
 }
 
-static bool close_batch(Loop& l) {
-    CALL(graph_launch, l.account, l.stream);  // of the last step; those before are settled beside the next one
-    CALL(event_record, l.batches[l.begun % DEPTH].done, l.stream);
+static bool close_batch(GpuLoop& l) {
+    CALL(graph_launch, l.energy_balance, l.stream);  // of the last step; those before are settled beside the next one
+    CALL(event_record, l.batches[l.begun % STEP_BATCHES].done, l.stream);
     ++l.begun;
     return true;
 }
 
-static int64_t batch_size(Loop& l, int64_t left) {
-    int64_t size = l.rings.realtime || l.step_seconds == 0 ? 1 : (int64_t)(l.span / l.step_seconds) + 1;
+static int64_t batch_size(GpuLoop& l, int64_t left) {
+    int64_t size = l.rings.realtime || l.step_seconds == 0 ? 1 : (int64_t)(l.batch_seconds / l.step_seconds) + 1;
     return std::max<int64_t>(1, std::min({size, left, l.batch - l.launched % l.batch}));  // so none goes over the end of the device's rings
 }
 
 // No step that is a multiple of `every` comes before the last of the next n.
-static bool none_within(const Loop& l, int64_t every, int64_t n) { return every <= 0 || every - l.launched % every >= n; }
+static bool none_within(const GpuLoop& l, int64_t every, int64_t n) { return every <= 0 || every - l.launched % every >= n; }
 
-static bool launch_batch(Loop& l, int64_t steps) {
+static bool launch_batch(GpuLoop& l, int64_t steps) {
     if (!open_batch(l)) return false;
-    if (l.begun == l.finished || done(l, l.batches[(l.begun - 1) % DEPTH].done)) {
-        l.stalled = 1;
-        l.idle = now();
+    if (l.begun == l.finished || done(l, l.batches[(l.begun - 1) % STEP_BATCHES].done)) {
+        l.ran_dry = 1;
+        l.idle_since = now();
     }
     for (int64_t left = steps; left > 0;) {
         int64_t n = l.many;
         bool undisturbed = none_within(l, l.rings.frame_every.load(), n) && none_within(l, l.rings.energy_every.load(), n);
-        bool wanted = l.asked.load(std::memory_order_relaxed) && l.matrix_step < 0;
+        bool wanted = l.requested.load(std::memory_order_relaxed) && l.matrix_step < 0;
         if (!l.graphs[0][1] || left < n || !undisturbed || wanted) n = 1;
-        CALL(graph_launch, l.graphs[l.stalled][n > 1], l.stream);
-        l.stalled = 0;
+        CALL(graph_launch, l.graphs[l.ran_dry][n > 1], l.stream);
+        l.ran_dry = 0;
         if (!count(l, n)) return false;
         left -= n;
     }
     return close_batch(l);
 }
 
-static void report(Loop& l, const Batch& batch, int64_t k, double end, double cpu) {
+static void report(GpuLoop& l, const StepBatch& batch, int64_t k, double end, double cpu) {
     Rings& rings = l.rings;
-    const Stamp &stamp = l.stamps[(batch.first + k) % l.capacity];
-    const Stamp &last = l.stamps[(batch.first + batch.steps - 1) % l.capacity];
+    const StepTimestamp &stamp = l.timestamps[(batch.first + k) % l.capacity];
+    const StepTimestamp &last = l.timestamps[(batch.first + batch.steps - 1) % l.capacity];
     const int64_t slot = (batch.first + k) % l.capacity * l.bodies;
-    const Result* results = l.results + slot;
-    const Found once{-1, 1, 0};
+    const PcgResult* results = l.results + slot;
+    const NewtonResult once{-1, 1, 0};
     int64_t step = batch.first + k + 1, head = rings.record_head.load();
     bool keep = room_for_records(rings, l.bodies, [&] { publish(l); });
     for (int i = 0; keep && i < l.bodies; ++i) {
-        const Result& r = results[i];
-        const Found& found = l.found ? l.found[slot + i] : once;
+        const PcgResult& r = results[i];
+        const NewtonResult& found = l.newton_results ? l.newton_results[slot + i] : once;
         Record& record = rings.records[(head + i) % rings.record_capacity];
         record = Record{step, r.factor_step, rings.start_time + step * rings.dt, r.residual, 0, r.seconds, 0,
                    1e-9 * (stamp.end - stamp.begin), k ? 0 : batch.late, end - 1e-9 * (last.end - stamp.begin), cpu,
                    found.nonlinear, NAN, NAN, NAN, NAN, NAN, NAN, i, r.iterations, r.status, r.kind, r.asked, r.fallbacks, r.bad_node, r.probe,
                    found.linearizations, 0};
-        if (l.energies) note_energy(record, l.energies[slot + i]);
+        if (l.energy_records) note_energy(record, l.energy_records[slot + i]);
     }
     rings.step.store(step);
     *l.clock = rings.start_time + step * rings.dt;
@@ -105,11 +105,11 @@ static void report(Loop& l, const Batch& batch, int64_t k, double end, double cp
     else rings.records_dropped += l.bodies;
 }
 
-static bool finish_batch(Loop& l) {
-    Batch& batch = l.batches[l.finished % DEPTH];
-    if (!await(l, batch.done, l.idle + l.step_seconds * batch.steps)) return false;
-    double end = l.idle = now(), cpu = thread_time();
-    const Stamp &first = l.stamps[batch.first % l.capacity], &last = l.stamps[(batch.first + batch.steps - 1) % l.capacity];
+static bool finish_batch(GpuLoop& l) {
+    StepBatch& batch = l.batches[l.finished % STEP_BATCHES];
+    if (!await(l, batch.done, l.idle_since + l.step_seconds * batch.steps)) return false;
+    double end = l.idle_since = now(), cpu = thread_time();
+    const StepTimestamp &first = l.timestamps[batch.first % l.capacity], &last = l.timestamps[(batch.first + batch.steps - 1) % l.capacity];
     l.step_seconds = 1e-9 * (last.end - first.begin) / batch.steps;
     for (int64_t k = 0; k < batch.steps; ++k) report(l, batch, k, end, (cpu - l.cpu) / batch.steps);
     l.cpu = cpu;
@@ -118,21 +118,21 @@ static bool finish_batch(Loop& l) {
     return !l.error;
 }
 
-static bool finish_down_to(Loop& l, int64_t under_way) {
+static bool finish_down_to(GpuLoop& l, int64_t under_way) {
     while (l.begun - l.finished > under_way)
         if (!finish_batch(l)) return false;
     return true;
 }
 
 // Until the next step is due; what is under way is finished meanwhile.
-static bool wait(Loop& l) {
+static bool wait(GpuLoop& l) {
     return wait_until_due(l.rings, [&] {
         if (finish_down_to(l, 0)) publish(l);
-        return l.matrix_step >= 0 || l.rings.frame_head.load() < l.drawn;
+        return l.matrix_step >= 0 || l.rings.frame_head.load() < l.frames_begun;
     });
 }
 
-static bool begin(Loop& l) {
+static bool begin(GpuLoop& l) {
     prctl(PR_SET_TIMERSLACK, 1000);  // ns: naps end when they should
     l.cpu = thread_time();
     CALL(context_set, l.context);
@@ -142,33 +142,33 @@ static bool begin(Loop& l) {
 extern "C" {
 
 // Runs until `steps` are done or `stop` is set; returns the steps done. l.error tells if the device failed.
-int64_t wf_gpu_run(Loop* loop, int64_t steps) {
-    Loop& l = *loop;
+int64_t wf_gpu_run(GpuLoop* loop, int64_t steps) {
+    GpuLoop& l = *loop;
     int64_t first = l.launched, left = steps;
     bool well = begin(l);
     while (well && left > 0) {
-        well = finish_down_to(l, l.rings.realtime ? 0 : DEPTH - 1);
+        well = finish_down_to(l, l.rings.realtime ? 0 : STEP_BATCHES - 1);
         if (!well || !wait(l)) break;
         int64_t size = batch_size(l, left);
         well = launch_batch(l, size);
         left -= size;
     }
-    if (well && finish_down_to(l, 0)) all_home(l);
+    if (well && finish_down_to(l, 0)) finish_readbacks(l);
     return l.rings.step - first;
 }
 
-int32_t wf_gpu_wait(Loop* loop) { return wait(*loop); }
+int32_t wf_gpu_wait(GpuLoop* loop) { return wait(*loop); }
 
 // One step whose kernels the caller puts onto the stream: between `open` and `close`; `renew` looks for settings and factors again,
 // with nothing under way. They come first among the mailboxes; arguments of launches that have run wait for the next step.
-int32_t wf_gpu_open(Loop* loop) { return begin(*loop) && open_batch(*loop); }
-int32_t wf_gpu_renew(Loop* loop) { return deliver(*loop, loop->batches[loop->begun % DEPTH], 2 * loop->bodies); }
-int32_t wf_gpu_close(Loop* loop) {
-    Loop& l = *loop;
-    return count(l, 1) && close_batch(l) && finish_down_to(l, 0) && all_home(l);
+int32_t wf_gpu_open(GpuLoop* loop) { return begin(*loop) && open_batch(*loop); }
+int32_t wf_gpu_renew(GpuLoop* loop) { return deliver(*loop, loop->batches[loop->begun % STEP_BATCHES], 2 * loop->bodies); }
+int32_t wf_gpu_close(GpuLoop* loop) {
+    GpuLoop& l = *loop;
+    return count(l, 1) && close_batch(l) && finish_down_to(l, 0) && finish_readbacks(l);
 }
 
-Mail* wf_gpu_post(Mailbox* box, Mail* mail) { return box->mail.exchange(mail); }
+Mail* wf_gpu_post(MailSlot* slot, Mail* mail) { return slot->posted.exchange(mail); }
 
 // Of a body before the first step. sums: kinetic, gravity, longest difference of dt v [m], diagonal [m] at the start.
 void wf_gpu_start_balance(Balance* balance, const double* sums, double dt, int32_t inertia) {
@@ -181,8 +181,8 @@ void wf_gpu_start_balance(Balance* balance, const double* sums, double dt, int32
 }
 
 int32_t wf_gpu_sizes(int32_t* sizes) {  // layouts, checked against the Python side
-    int32_t ours[] = {sizeof(Cuda), sizeof(Mail), sizeof(Mailbox), sizeof(Result), sizeof(Stamp), sizeof(Found), sizeof(Body),
-                      sizeof(Loop), sizeof(Record), sizeof(Energy), sizeof(Balance)};
+    int32_t ours[] = {sizeof(CudaDriver), sizeof(Mail), sizeof(MailSlot), sizeof(PcgResult), sizeof(StepTimestamp), sizeof(NewtonResult), sizeof(BodyReadback),
+                      sizeof(GpuLoop), sizeof(Record), sizeof(EnergyRecord), sizeof(Balance)};
     std::memcpy(sizes, ours, sizeof ours);
     return sizeof ours / sizeof *ours;
 }

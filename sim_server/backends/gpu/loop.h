@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: MIT
-// Memory of the GPU loop (loop.cpp), and its calls of the driver. loop.py holds the same layouts.
+// Memory of the GPU loop (loop.cpp), and its calls of the driver. structs.py holds the same layouts.
 #pragma once
 #include <cstdio>
 #include <cstring>
@@ -9,7 +9,7 @@
 
 typedef uint64_t Address;       // on the device
 
-struct Cuda {                   // functions of the driver; each returns 0 or an error
+struct CudaDriver {             // functions of the CUDA driver API; each returns 0 or an error
     int32_t (*context_set)(void* context);
     int32_t (*graph_launch)(void* graph, void* stream);
     int32_t (*to_device)(Address to, const void* from, size_t bytes, void* stream);
@@ -24,104 +24,106 @@ static const int32_t NOT_READY = 600;
 
 struct Mail {
     const void* bytes;
-    void* event;                // null, or what must be done before they are used
+    void* event;                 // null, or the event that must have completed before the bytes are used
     int64_t number;
-    std::atomic<int64_t> taken;     // steps launched before it went to the device: it holds for those after; -1: it has not
+    std::atomic<int64_t> taken;  // steps launched before it was copied to the device: it is valid for those after; -1: not copied yet
 };
 
-struct Mailbox {                // bytes on the device that are replaced between batches
+struct MailSlot {               // bytes on the device that are replaced between batches
     Address target;
     int64_t size;
-    std::atomic<Mail*> mail;
-    Mail* held;                 // taken out, its event not done yet
-    std::atomic<int64_t> taken; // number of the last one that went to the device
+    std::atomic<Mail*> posted;
+    Mail* pending;               // taken out of `posted`; its event has not completed yet
+    std::atomic<int64_t> taken;  // number of the mail that was copied to the device last
 };
 
-struct Result {                 // pcg_structs.cuh
+struct PcgResult {              // pcg_structs.cuh
     double residual, seconds;
     int64_t factor_step;
     int32_t iterations, status, kind, asked, fallbacks, bad_node, probe, unused;
 };
 
-struct Found { double nonlinear; int32_t linearizations, unused; };  // newton.cu
+struct NewtonResult { double nonlinear; int32_t linearizations, unused; };  // newton.cu
 
-struct Stamp { int64_t begin, end; };  // of a step, ns of the device's clock
+struct StepTimestamp { int64_t begin, end; };  // of a step, ns of the device's clock
 
-struct Body {
-    int64_t begin, bytes;          // of its blocks among the values of A
-    int64_t place, size;           // bytes: of its nodes in x
-    std::atomic<int32_t> wanted;   // 1: the blocks are asked for, 2: the positions
-    int32_t coming;                // ... and under way
-    std::atomic<int64_t> copied;   // step of the last copy made, -1: none
+enum { REQUEST_VALUES = 1, REQUEST_POSITIONS = 2 };
+
+struct BodyReadback {                    // copies of a body's matrix or positions to the host
+    int64_t values_begin, values_bytes;  // its blocks among the values of A
+    int64_t x_begin, x_bytes;            // its nodes in x
+    std::atomic<int32_t> requested;      // REQUEST_VALUES, REQUEST_POSITIONS or 0
+    int32_t in_flight;                   // the same, of the copy under way
+    std::atomic<int64_t> copied_step;    // step of the last copy that has arrived, -1: none
 };
 
-struct Batch {                     // steps that are looked at together
-    char* upload;                  // pinned room for all that mailboxes may hold
-    void* done;                    // event
-    int64_t first, steps;          // steps completed before it; in it
+struct StepBatch {                     // steps whose results are looked at together
+    char* upload;          // pinned; room for one mail of every slot
+    void* done;            // event
+    int64_t first, steps;  // steps completed before the batch; steps in it
     double late;
 };
 
-struct Picture { void *taken, *arrived; };  // events of a frame on its way
+struct FrameCopy { void *taken, *arrived; };  // events: copied on the device, copied to the host
 
-enum { DEPTH = 2, PICTURES = 4 };
+enum { STEP_BATCHES = 2, FRAME_COPIES = 4 };  // under way at most
 
-struct Loop {
-    const Cuda* cuda;
-    void *context, *stream, *copies;   // copies: the stream that brings frames and matrices home
-    void* graphs[2][2];                // [the device was idle: its clock is noted first][0: one step, 1: `many` steps or null]
+struct GpuLoop {
+    const CudaDriver* driver;
+    void *context, *stream, *copy_stream;  // copy_stream: copies frames and matrices to the host
+    void* graphs[2][2];                    // [1: begins by writing the time, for an idle device][0: one step, 1: `many` steps or null]
     int64_t many;
-    Mailbox* mailbox;
-    Body* body;
-    int32_t mailboxes, bodies;
-    const Result* results;             // (capacity, bodies) pinned; the steps write there themselves
-    const Stamp* stamps;               // (capacity,) likewise
-    const Found* found;                // (capacity, bodies) likewise; null: one linearization a step
-    const Energy* energies;            // (capacity, bodies) likewise
-    void* account;                     // graph that has the energy of the last step told there, unless it has been
-    void* elastic;                     // graph that adds its elastic energy
-    int64_t capacity, batch;           // batch: most steps in one; divides the capacity
-    Address values, staged;            // A of all bodies, and as much room beside
-    char* matrices;                    // ... and on the host, pinned
-    void *snapped, *home;              // events of matrices on their way
-    Address x, v, pictures;            // pictures: room for PICTURES frames
-    int64_t frame_bytes;               // of x
-    double* clock;                     // (1,) s, for those who ask the host
-    double span;                       // s that a batch lasts about, at most
-    double poll;                       // s between looks at an event that is nearly due
-    double step_seconds;               // of the last batch, 0: not known
-    double idle;                       // when the device had nothing to do, or the last batch was seen done
-    double cpu;                        // time of this thread when the last batch was finished
-    int64_t begun, finished;           // batches
-    std::atomic<int64_t> launched;     // steps
-    int64_t drawn;                     // frames begun
-    int64_t matrix_step;               // of the matrices on their way, -1: none are
-    std::atomic<int32_t> asked;        // some body's matrix is wanted
-    int32_t stalled;                   // the device has run dry meanwhile
+    MailSlot* mail_slots;
+    BodyReadback* readbacks;               // (bodies,)
+    int32_t mail_slot_count, bodies;
+    const PcgResult* results;              // (capacity, bodies) pinned, written by the steps
+    const StepTimestamp* timestamps;       // (capacity,) likewise
+    const NewtonResult* newton_results;    // (capacity, bodies) likewise; null: one linearization a step
+    const EnergyRecord* energy_records;    // (capacity, bodies) likewise
+    void* energy_balance;                  // graph that writes the energy record of the last step, unless that has been done
+    void* elastic_energy;                  // graph that adds the elastic energy to it
+    int64_t capacity, batch;               // batch: most steps in one; divides the capacity
+    Address values, staged;                // A of all bodies; memory of the same size for copies of it
+    char* host_matrices;                   // pinned, of the same size
+    void *staged_event, *copied_event;     // of the matrices under way: copied on the device, copied to the host
+    Address x, v, frame_staging;           // frame_staging: memory for FRAME_COPIES frames
+    int64_t frame_bytes;                   // of x
+    double* clock;                         // (1,) time of the simulation [s], for readers on the host
+    double batch_seconds;                  // largest aim for the duration of a batch [s]
+    double poll;                           // [s] between queries of an event that is nearly due
+    double step_seconds;                   // of the last batch, 0: not known
+    double idle_since;                     // time at which the device ran dry, or the end of the last batch was seen
+    double cpu;                            // processor time of this thread when the last batch was finished
+    int64_t begun, finished;               // batches
+    std::atomic<int64_t> launched;         // steps
+    int64_t frames_begun;
+    int64_t matrix_step;                   // of the matrices under way, -1: none
+    std::atomic<int32_t> requested;        // 1: a readback has a request
+    int32_t ran_dry;                       // 1: the device had nothing to do since the last launch
     int32_t error;
-    char where[28];                    // the call that failed
-    Batch batches[DEPTH];
-    Picture picture[PICTURES];
+    char failed_call[28];
+    StepBatch batches[STEP_BATCHES];
+    FrameCopy frame_copies[FRAME_COPIES];
     Rings rings;
 };
 
-static bool failed(Loop& l, int32_t error, const char* where) {
+static bool failed(GpuLoop& l, int32_t error, const char* where) {
     if (error && !l.error) {
         l.error = error;
-        std::snprintf(l.where, sizeof l.where, "%s", where);
+        std::snprintf(l.failed_call, sizeof l.failed_call, "%s", where);
     }
     return l.error != 0;
 }
-#define CALL(function, ...) if (failed(l, l.cuda->function(__VA_ARGS__), #function)) return false
+#define CALL(function, ...) if (failed(l, l.driver->function(__VA_ARGS__), #function)) return false
 
-static bool done(Loop& l, void* event) {
-    int32_t answer = l.cuda->event_query(event);
+static bool done(GpuLoop& l, void* event) {
+    int32_t answer = l.driver->event_query(event);
     if (answer == NOT_READY) return false;
     return !failed(l, answer, "event_query");
 }
 
-// Waits without burning the processor: sleeps until about when it is due, then looks again and again.
-static bool await(Loop& l, void* event, double due = 0) {
+// Waits for an event without a busy loop: sleeps until about when it is due, then queries it at intervals.
+static bool await(GpuLoop& l, void* event, double due = 0) {
     for (double begin = now(), t = begin; !done(l, event); t = now()) {
         if (l.error) return false;
         double over = t - (due > begin ? due : begin);

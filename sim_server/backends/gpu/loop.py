@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The native GPU loop (loop.cpp) as seen from Python: its memory, its mailboxes and what comes home.
 
-Nothing here knows CuPy: memory, events and the driver's functions come from a `Device`, which a test may play.
+Nothing here knows CuPy: memory, events and the driver's functions come from a `LoopDevice`, which a test may play.
 """
 
 import ctypes as c
@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_server.backends.gpu import structs
-from sim_server.backends.gpu.mailbox import Mailbox, library
-from sim_server.backends.gpu.structs import PICTURES
+from sim_server.backends.gpu.mailbox import DeviceMailbox, library
+from sim_server.backends.gpu.structs import FRAME_COPIES
 from sim_server.backends.ring_buffers import Reals, Reports
 from sim_server.errors import DeviceLost
 
@@ -25,10 +25,10 @@ SPAN = 2e-3  # s that a batch lasts about: what asks for something waits two of 
 POLL = 1e-5  # s
 
 
-class Device(Protocol):
+class LoopDevice(Protocol):
     """What the loop needs of a GPU: handles are integers."""
 
-    functions: structs.Cuda
+    functions: structs.CudaDriver
     context: int
     stream: int
     copies: int
@@ -54,58 +54,63 @@ class DeviceLoop(Reports):
     """The loop over graphs that were captured elsewhere.
 
     row_start: of A. ranges: nodes [first, last) of each body. mailboxes: (device address, bytes) of each.
-    results, stamps: host memory (CAPACITY, bodies) of RESULT and (CAPACITY,) of STAMP that the steps write to. found:
-    likewise (CAPACITY, bodies) of FOUND; None: one linearization a step. energies: likewise of ENERGY. clock:
-    host array (1,). real: of values, x and v on the device, whose addresses these are.
+    results, stamps: host memory (CAPACITY, bodies) of PCG_RESULT and (CAPACITY,) of STEP_TIMESTAMP that the steps write
+    to. found: likewise (CAPACITY, bodies) of NEWTON_RESULT; None: one linearization a step. energies: likewise of
+    ENERGY_RECORD. clock: host array (1,). real: of values, x and v on the device, whose addresses these are.
     """
 
     positions_later = True
 
     def __init__(
-        self, device: Device, ranges: Sequence[tuple[int, int]], row_start: NDArray[Any], dt: float,
+        self, device: LoopDevice, ranges: Sequence[tuple[int, int]], row_start: NDArray[Any], dt: float,
         mailboxes: Sequence[tuple[int, int]], results: NDArray[Any], stamps: NDArray[Any], clock: Reals,
         records: int = 8192, real: Any = np.float64, found: NDArray[Any] | None = None,
         energies: NDArray[Any] | None = None, **addresses: int,
     ):  # fmt: skip
         self._device, self._ranges, bodies, nodes = device, ranges, len(ranges), len(row_start) - 1
         self._native = library()
-        loop = structs.Loop()
+        loop = structs.GpuLoop()
         frame = 3 * nodes * np.dtype(real).itemsize
         frames = device.pinned(FRAMES * 2 * frame).view(real).reshape(FRAMES, 2, nodes, 3)
         super().__init__(loop, bodies, dt, records, frames)
-        self._box = (structs.Mailbox * max(len(mailboxes), 1))()
+        self._box = (structs.MailSlot * max(len(mailboxes), 1))()
         for box, (target, size) in zip(self._box, mailboxes, strict=False):
             box.target, box.size = target, size
-        self.mailboxes = [Mailbox(loop, box) for box in self._box]
-        self._body, block = (structs.Body * bodies)(), 9 * np.dtype(real).itemsize
+        self.mailboxes = [DeviceMailbox(loop, box) for box in self._box]
+        self._body, block = (structs.BodyReadback * bodies)(), 9 * np.dtype(real).itemsize
         for entry, (first, last) in zip(self._body, ranges, strict=True):
             begin, end = block * int(row_start[first]), block * int(row_start[last])
-            entry.begin, entry.bytes, entry.copied = begin, end - begin, -1
-            entry.place, entry.size = (3 * np.dtype(real).itemsize * k for k in (first, last - first))
+            entry.values_begin, entry.values_bytes, entry.copied_step = begin, end - begin, -1
+            entry.x_begin, entry.x_bytes = (3 * np.dtype(real).itemsize * k for k in (first, last - first))
         self._real, self._value_bytes = np.dtype(real), block * int(row_start[-1])
         self._targets: dict[int, Reals] = {}
         self._asked_of: dict[int, int] = {}  # bytes, of each body
-        loop.cuda = c.pointer(device.functions)
-        loop.context, loop.stream, loop.copies = device.context, device.stream, device.copies
-        loop.mailbox, loop.mailboxes, loop.body, loop.bodies = self._box, len(mailboxes), self._body, bodies
+        loop.driver = c.pointer(device.functions)
+        loop.context, loop.stream, loop.copy_stream = device.context, device.stream, device.copies
+        loop.mail_slots, loop.mail_slot_count, loop.readbacks, loop.bodies = (
+            self._box,
+            len(mailboxes),
+            self._body,
+            bodies,
+        )
         for name, address in addresses.items():
             setattr(loop, name, address)
-        loop.capacity, loop.batch, loop.many, loop.span, loop.poll = CAPACITY, BATCH, MANY, SPAN, POLL
+        loop.capacity, loop.batch, loop.many, loop.batch_seconds, loop.poll = CAPACITY, BATCH, MANY, SPAN, POLL
         loop.frame_bytes, loop.clock, loop.matrix_step = frame, clock.ctypes.data, -1
-        loop.pictures = device.memory(PICTURES * 2 * frame)
-        loop.results, loop.stamps = results.ctypes.data, stamps.ctypes.data
-        loop.found = None if found is None else found.ctypes.data
-        loop.energies = None if energies is None else energies.ctypes.data
+        loop.frame_staging = device.memory(FRAME_COPIES * 2 * frame)
+        loop.results, loop.timestamps = results.ctypes.data, stamps.ctypes.data
+        loop.newton_results = None if found is None else found.ctypes.data
+        loop.energy_records = None if energies is None else energies.ctypes.data
         self._written = (results, stamps, clock, found, energies)
         self._pinned = self._events_and_memory(loop, sum(-(-size // 16) * 16 for _, size in mailboxes))
 
-    def _events_and_memory(self, loop: structs.Loop, upload: int) -> list[NDArray[np.uint8]]:
+    def _events_and_memory(self, loop: structs.GpuLoop, upload: int) -> list[NDArray[np.uint8]]:
         memory = [self._device.pinned(max(upload, 16)) for _ in loop.batches]
         for batch, room in zip(loop.batches, memory, strict=True):
             batch.upload, batch.done = room.ctypes.data, self._device.event()
-        for picture in loop.picture:
+        for picture in loop.frame_copies:
             picture.taken, picture.arrived = self._device.event(), self._device.event()
-        loop.snapped, loop.home = self._device.event(), self._device.event()
+        loop.staged_event, loop.copied_event = self._device.event(), self._device.event()
         return memory
 
     # --- running ------------------------------------------------------------------------------------------------
@@ -113,7 +118,7 @@ class DeviceLoop(Reports):
     def use_graphs(self, graphs: Sequence[int], account: int, elastic: int) -> None:
         """Handles of the graphs of one step and of MANY steps (0: none), then of the same with the time noted first; of
         the graphs that tell the energy of the last step and evaluate its elastic energy."""
-        self.loop.graphs[:], self.loop.account, self.loop.elastic = graphs, account, elastic
+        self.loop.graphs[:], self.loop.energy_balance, self.loop.elastic_energy = graphs, account, elastic
 
     def run(self, steps: int) -> int:
         """Runs up to `steps` steps without Python; returns those done (fewer only after `stop`).
@@ -145,7 +150,7 @@ class DeviceLoop(Reports):
 
     def _check(self) -> None:
         if self.loop.error:
-            call = self.loop.where.decode()
+            call = self.loop.failed_call.decode()
             raise DeviceLost(f"the GPU failed at step {self.step}: {call}: {self._device.error(self.loop.error)}")
 
     # --- matrices -----------------------------------------------------------------------------------------------
@@ -164,19 +169,19 @@ class DeviceLoop(Reports):
         if not self.loop.staged:  # made once, when the first one is asked for
             self.loop.staged = self._device.memory(self._value_bytes)
             self._pinned_values = self._device.pinned(self._value_bytes)
-            self.loop.matrices = self._pinned_values.ctypes.data
+            self.loop.host_matrices = self._pinned_values.ctypes.data
         self._targets[body] = target
         entry = self._body[body]
-        entry.copied, entry.wanted = -1, what
-        self._asked_of[body] = entry.bytes if what == 1 else entry.size
-        self.loop.asked = 1
+        entry.copied_step, entry.requested = -1, what
+        self._asked_of[body] = entry.values_bytes if what == 1 else entry.x_bytes
+        self.loop.requested = 1
 
     def matrix_step(self, body: int) -> int:
         """Step of the copy asked for last, -1 while it is not there. `step` counts the steps completed before it."""
         entry = self._body[body]
-        step = int(entry.copied)
+        step = int(entry.copied_step)
         if step >= 0 and body in self._targets:
-            data = self._pinned_values[entry.begin : entry.begin + self._asked_of[body]]
+            data = self._pinned_values[entry.values_begin : entry.values_begin + self._asked_of[body]]
             target = self._targets.pop(body)
             target[...] = data.view(self._real).reshape(target.shape)
         return step

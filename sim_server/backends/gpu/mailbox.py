@@ -8,39 +8,45 @@ from typing import Any
 from sim_server.backends.compiler import native
 from sim_server.backends.cpu.structs import BALANCE, RECORD, check_sizes
 from sim_server.backends.gpu import structs
-from sim_server.backends.gpu.structs import ENERGY, FOUND, STAMP
+from sim_server.backends.gpu.structs import ENERGY_RECORD, NEWTON_RESULT, STEP_TIMESTAMP
 
 
 @cache
 def library() -> c.CDLL:
     """The compiled loop."""
-    loop, p = c.POINTER(structs.Loop), c.c_void_p
+    loop, p = c.POINTER(structs.GpuLoop), c.c_void_p
     compiled = native(
         "backends/gpu/loop.cpp",
         {
             "wf_gpu_run": (c.c_int64, [loop, c.c_int64]), "wf_gpu_wait": (c.c_int32, [loop]),
             "wf_gpu_open": (c.c_int32, [loop]), "wf_gpu_renew": (c.c_int32, [loop]),
-            "wf_gpu_close": (c.c_int32, [loop]), "wf_gpu_post": (p, [c.POINTER(structs.Mailbox), p]),
+            "wf_gpu_close": (c.c_int32, [loop]), "wf_gpu_post": (p, [c.POINTER(structs.MailSlot), p]),
             "wf_gpu_start_balance": (None, [p, p, c.c_double, c.c_int32]), "wf_gpu_sizes": (c.c_int32, [p]),
         },
     )  # fmt: skip
     sizes = (c.c_int32 * 11)()
     compiled.wf_gpu_sizes(sizes)
-    from sim_server.backends.gpu.solver import RESULT
+    from sim_server.backends.gpu.solver import PCG_RESULT
 
-    structures = (structs.Cuda, structs.Mail, structs.Mailbox)
-    ours = [*map(c.sizeof, structures), RESULT.itemsize, STAMP.itemsize, FOUND.itemsize]
-    ours += [c.sizeof(structs.Body), c.sizeof(structs.Loop), RECORD.itemsize, ENERGY.itemsize, BALANCE.itemsize]
+    structures = (structs.CudaDriver, structs.Mail, structs.MailSlot)
+    ours = [*map(c.sizeof, structures), PCG_RESULT.itemsize, STEP_TIMESTAMP.itemsize, NEWTON_RESULT.itemsize]
+    ours += [
+        c.sizeof(structs.BodyReadback),
+        c.sizeof(structs.GpuLoop),
+        RECORD.itemsize,
+        ENERGY_RECORD.itemsize,
+        BALANCE.itemsize,
+    ]
     check_sizes("backends/gpu/loop.cpp", list(sizes), ours)
     return compiled
 
 
-class Mailbox:
+class DeviceMailbox:
     """Bytes on the device that are replaced between batches. Old mail and what it leads to is kept until it is out of
     use."""
 
-    def __init__(self, loop: Any, box: structs.Mailbox):
-        self._loop, self._box, self.number = loop, box, 0
+    def __init__(self, loop: Any, slot: structs.MailSlot):
+        self._loop, self._slot, self.number = loop, slot, 0
         self._kept: list[Any] = []  # in use, waiting
         self._leaving: list[tuple[int, Any]] = []  # (free once so many steps are completed, what)
 
@@ -49,11 +55,11 @@ class Mailbox:
 
         They hold from the step after the result's `taken` steps, once it is not below 0.
         """
-        assert len(data) == self._box.size
+        assert len(data) == self._slot.size
         self.number += 1
         memory = c.create_string_buffer(data, len(data))
         mail = structs.Mail(c.addressof(memory), event, self.number, -1)
-        displaced = library().wf_gpu_post(c.byref(self._box), c.addressof(mail))
+        displaced = library().wf_gpu_post(c.byref(self._slot), c.addressof(mail))
         self._leaving = [(step, what) for step, what in self._leaving if step > self._loop.step]
         if displaced:
             self._kept.pop()  # it was never taken up; what is in use must live on
@@ -65,8 +71,8 @@ class Mailbox:
 
     def withdraw(self) -> bool:
         """Takes back what the loop has not looked at; only while it stands still. True if something came back."""
-        back = bool(library().wf_gpu_post(c.byref(self._box), None)) or bool(self._box.held)
-        self._box.held = None
+        back = bool(library().wf_gpu_post(c.byref(self._slot), None)) or bool(self._slot.pending)
+        self._slot.pending = None
         if back:
             self._kept.pop()
         return back
@@ -74,4 +80,4 @@ class Mailbox:
     @property
     def taken(self) -> bool:
         """What was posted last is on its way to the device."""
-        return bool(self._box.taken == self.number)
+        return bool(self._slot.taken == self.number)

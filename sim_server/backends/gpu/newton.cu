@@ -13,52 +13,52 @@
 #define local real
 #endif
 
-constexpr int STRETCH = 32, LANES = 8, ALL_LANES = STRETCH * LANES;  // nodes of a thread block; threads of a node in `move`
+constexpr int BLOCK_NODES = 32, LANES = 8, ALL_LANES = BLOCK_NODES * LANES;  // nodes of a thread block; threads of a node in `move`
 constexpr int NO_NODE = 0x7fffffff;
 #define WARP 0xffffffffu
 
-struct Stretch { int body, first, last, unused; };  // nodes [first, last) of the scene
+struct NodeRange { int body, first, last, unused; };  // nodes [first, last) of the scene
 
-struct Found { double nonlinear; int linearizations, unused; };  // goes home beside Result
+struct NewtonResult { double nonlinear; int linearizations, unused; };  // goes home beside PcgResult
 
-struct Searching {
-    const Stretch* stretch;     // (grid,) by body
-    const int* stretches;       // (bodies + 1,) of each body
-    double* partial;            // (grid, 2) sums of the stretches
-    unsigned* done;             // (bodies,) thread blocks that are; zero between launches
-    Search* search;             // (bodies,)
-    int* phase;                 // (bodies,) of search, for the launches between
-    int* left;                  // (1,) searches that are not over
-    int* bad;                   // (bodies,) first node whose b is not finite
-    const Body* bodies;
-    Result* results;            // (capacity, bodies) of the last solve; at the end of the step
-    Found* found;               // (capacity, bodies) on the host
-    const long long* step;      // (1,) completed
-    unsigned* arrived;          // (1,) of the solver's pool: zero before each of its launches
+struct NewtonArguments {
+    const NodeRange* ranges;       // (grid,) by body
+    const int* first_range;        // (bodies + 1,) of each body
+    double* partial_sums;          // (grid, 2) sums of the ranges
+    unsigned* finished_blocks;     // (bodies,) thread blocks that are; zero between launches
+    Search* search;                // (bodies,)
+    int* phase;                    // (bodies,) of search, for the launches between
+    int* active;                   // (1,) searches that are not over
+    int* bad_node;                 // (bodies,) first node whose b is not finite
+    const PcgBody* bodies;
+    PcgResult* results;            // (capacity, bodies) of the last solve; at the end of the step
+    NewtonResult* newton_results;  // (capacity, bodies) on the host
+    const long long* step;         // (1,) completed
+    unsigned* pool_counter;        // (1,) of the solver's pool: zero before each of its launches
     const int* row_start;
     const int* columns;
-    const real* values;         // (blocks, 3, 3)
-    const real* b;              // (nodes, 3) material frame
-    real* y;                    // (nodes, 3) material frame: the solution; zero before the solves of corrections; for `advance`
-    const local* rotation;      // (nodes, 3, 3)
-    const real* mass;           // (nodes,) in A [kg]
-    const real* beta;           // (nodes,) [s]
-    real* x;                    // (nodes, 3) [m]
-    real* v;                    // (nodes, 3) [m/s]
-    real* ahead;                // likewise
+    const real* values;            // (blocks, 3, 3)
+    const real* b;                 // (nodes, 3) material frame
+    real* y;                       // (nodes, 3) material frame: the solution; zero before the solves of corrections; for `advance`
+    const local* rotation;         // (nodes, 3, 3)
+    const real* mass;              // (nodes,) in A [kg]
+    const real* beta;              // (nodes,) [s]
+    real* x;                       // (nodes, 3) [m]
+    real* v;                       // (nodes, 3) [m/s]
+    real* ahead;                   // likewise
     real* drift;
     real* carried;
-    real* before;               // (4, nodes, 3) x, v, ahead, carried before the step
-    double* gain;               // (nodes, 3) [m/s]
-    double* way;                // (nodes, 3) [m/s]
-    double reach;               // [s]
+    real* initial_state;           // (4, nodes, 3) x, v, ahead, carried before the step
+    double* gain;                  // (nodes, 3) [m/s]
+    double* way;                   // (nodes, 3) [m/s]
+    double reach;                  // [s]
     double tolerance;
     int linearizations, trials, nodes, count, capacity, unused;
 };
 
-#ifdef SEARCHING_BYTES  // as newton.py has them
-static_assert(sizeof(Searching) == SEARCHING_BYTES && sizeof(Search) == SEARCH_BYTES, "layouts of Searching or Search differ");
-static_assert(sizeof(Stretch) == STRETCH_BYTES && sizeof(Found) == FOUND_BYTES, "layouts of Stretch or Found differ");
+#ifdef NEWTON_ARGUMENTS_BYTES  // as newton.py has them
+static_assert(sizeof(NewtonArguments) == NEWTON_ARGUMENTS_BYTES && sizeof(Search) == SEARCH_BYTES, "layouts of NewtonArguments or Search differ");
+static_assert(sizeof(NodeRange) == NODE_RANGE_BYTES && sizeof(NewtonResult) == NEWTON_RESULT_BYTES, "layouts of NodeRange or NewtonResult differ");
 #endif
 
 __device__ __forceinline__ void add_up(double (&sum)[2]) {
@@ -85,53 +85,53 @@ __device__ __forceinline__ void sum_block(double (&sum)[2]) {
 
 // Sums over a body; whether this is the thread that has them: one of the thread block that comes here last.
 template <int THREADS>
-__device__ __forceinline__ bool sum_body(const Searching& p, int body, double (&sum)[2]) {
+__device__ __forceinline__ bool sum_body(const NewtonArguments& p, int body, double (&sum)[2]) {
     __shared__ bool last;
-    const int first = p.stretches[body], end = p.stretches[body + 1];
+    const int first = p.first_range[body], end = p.first_range[body + 1];
     sum_block<THREADS>(sum);
     __syncthreads();  // this thread block has written what it writes
     if (threadIdx.x == 0) {
-        for (int n = 0; n < 2; ++n) __stcg(p.partial + 2 * blockIdx.x + n, sum[n]);
+        for (int n = 0; n < 2; ++n) __stcg(p.partial_sums + 2 * blockIdx.x + n, sum[n]);
         __threadfence();
-        last = atomicAdd(p.done + body, 1u) == (unsigned)(end - first) - 1;
+        last = atomicAdd(p.finished_blocks + body, 1u) == (unsigned)(end - first) - 1;
     }
     __syncthreads();
     if (!last) return false;
     __threadfence();
     sum[0] = sum[1] = 0;
     for (int k = first + threadIdx.x; k < end; k += THREADS)
-        for (int n = 0; n < 2; ++n) sum[n] += __ldcg(p.partial + 2 * k + n);
+        for (int n = 0; n < 2; ++n) sum[n] += __ldcg(p.partial_sums + 2 * k + n);
     sum_block<THREADS>(sum);
-    if (threadIdx.x == 0) p.done[body] = 0;
+    if (threadIdx.x == 0) p.finished_blocks[body] = 0;
     return threadIdx.x == 0;
 }
 
-__device__ __forceinline__ Result& result_of(const Searching& p, int body) {
+__device__ __forceinline__ PcgResult& result_of(const NewtonArguments& p, int body) {
     return p.results[(p.step[0] % p.capacity) * p.count + body];
 }
 
 // What the decision of a body changes beside its search.
-__device__ __forceinline__ void decided(const Searching& p, int body) {
+__device__ __forceinline__ void decided(const NewtonArguments& p, int body) {
     const int phase = p.search[body].phase;
     p.phase[body] = phase;
-    if (phase == DONE) atomicSub(p.left, 1);
+    if (phase == DONE) atomicSub(p.active, 1);
 }
 
 // way of node i as it stands after the solve: R y, and at the first linearization all that is to come to gain = -ahead.
-__device__ __forceinline__ void way_of(const Searching& p, int i, bool first, double (&way)[3]) {
+__device__ __forceinline__ void way_of(const NewtonArguments& p, int i, bool first, double (&way)[3]) {
     const double y[3] = {(double)p.y[3 * i], (double)p.y[3 * i + 1], (double)p.y[3 * i + 2]};
     turn_node(p.rotation + 9ll * i, false, y, way);
     if (!first) return;
-    const real* ahead = p.before + 6ll * p.nodes + 3 * i;
+    const real* ahead = p.initial_state + 6ll * p.nodes + 3 * i;
     for (int k = 0; k < 3; ++k) way[k] += ahead[k];
 }
 
 // The state of node i after gain + scale way.
-__device__ __forceinline__ void place(const Searching& p, int i, double scale) {
+__device__ __forceinline__ void place(const NewtonArguments& p, int i, double scale) {
     const long long n = 3ll * p.nodes;
     for (int k = 3 * i; k < 3 * i + 3; ++k) {
         const double gain = p.gain[k] + scale * p.way[k];
-        const Placed s = placed(p.before[k], p.before[n + k], p.before[2 * n + k], p.before[3 * n + k], gain, p.reach, p.beta[i]);
+        const Placed s = placed(p.initial_state[k], p.initial_state[n + k], p.initial_state[2 * n + k], p.initial_state[3 * n + k], gain, p.reach, p.beta[i]);
         p.x[k] = (real)s.x;
         p.v[k] = (real)s.v;
         p.ahead[k] = 0;
@@ -141,17 +141,17 @@ __device__ __forceinline__ void place(const Searching& p, int i, double scale) {
 }
 
 // Begins the search: a step has been assembled.
-extern "C" __global__ void __launch_bounds__(STRETCH) open(const Searching p) {
-    const Stretch here = p.stretch[blockIdx.x];
+extern "C" __global__ void __launch_bounds__(BLOCK_NODES) open(const NewtonArguments p) {
+    const NodeRange here = p.ranges[blockIdx.x];
     const int i = here.first + threadIdx.x;
     double sum[2] = {0, 0};
     if (i < here.last) {
         const long long n = 3ll * p.nodes;
         for (int k = 3 * i; k < 3 * i + 3; ++k) {
-            p.before[k] = p.x[k];
-            p.before[n + k] = p.v[k];
-            p.before[2 * n + k] = p.ahead[k];
-            p.before[3 * n + k] = p.carried[k];
+            p.initial_state[k] = p.x[k];
+            p.initial_state[n + k] = p.v[k];
+            p.initial_state[2 * n + k] = p.ahead[k];
+            p.initial_state[3 * n + k] = p.carried[k];
             p.gain[k] = -(double)p.ahead[k];
             sum[0] += (double)p.b[k] * (double)p.b[k];
         }
@@ -161,17 +161,17 @@ extern "C" __global__ void __launch_bounds__(STRETCH) open(const Searching p) {
             sum[1] = pull_square(p.values + 9ll * k, p.x + 3 * i, (double)p.mass[i], p.reach);
         }
     }
-    if (!sum_body<STRETCH>(p, here.body, sum)) return;
+    if (!sum_body<BLOCK_NODES>(p, here.body, sum)) return;
     start_search(p.search[here.body], sqrt(sum[0]), EPSILON<local> * sqrt(sum[1]), p.bodies[here.body].kind);
     p.phase[here.body] = SOLVE;
-    p.bad[here.body] = NO_NODE;
+    p.bad_node[here.body] = NO_NODE;
 }
 
 // To the next trial: along a new way where a system was solved, by a smaller part of the present one elsewhere.
-extern "C" __global__ void __launch_bounds__(ALL_LANES) move(const Searching p) {
-    if (blockIdx.x == 0 && threadIdx.x == 0) *p.arrived = 0;
-    if (*p.left == 0) return;
-    const Stretch here = p.stretch[blockIdx.x];
+extern "C" __global__ void __launch_bounds__(ALL_LANES) move(const NewtonArguments p) {
+    if (blockIdx.x == 0 && threadIdx.x == 0) *p.pool_counter = 0;
+    if (*p.active == 0) return;
+    const NodeRange here = p.ranges[blockIdx.x];
     Search& search = p.search[here.body];
     if (search.phase == DONE) return;
     const int i = here.first + threadIdx.x / LANES, lane = threadIdx.x % LANES;
@@ -180,7 +180,7 @@ extern "C" __global__ void __launch_bounds__(ALL_LANES) move(const Searching p) 
         if (mine) place(p, i, search.scale);
         return;
     }
-    const Result& r = result_of(p, here.body);
+    const PcgResult& r = result_of(p, here.body);
     const bool lost = r.status == NOT_FINITE, first = search.linearizations == 0;
     double sum[2] = {0, 0};
     if (!lost) {
@@ -215,9 +215,9 @@ extern "C" __global__ void __launch_bounds__(ALL_LANES) move(const Searching p) 
 }
 
 // What becomes of a trial that has been assembled: taken, made shorter, or the end.
-extern "C" __global__ void __launch_bounds__(STRETCH) judge(const Searching p) {
-    if (*p.left == 0) return;
-    const Stretch here = p.stretch[blockIdx.x];
+extern "C" __global__ void __launch_bounds__(BLOCK_NODES) judge(const NewtonArguments p) {
+    if (*p.active == 0) return;
+    const NodeRange here = p.ranges[blockIdx.x];
     Search& search = p.search[here.body];
     if (search.phase != TRY) return;
     const int i = here.first + threadIdx.x;
@@ -232,17 +232,17 @@ extern "C" __global__ void __launch_bounds__(STRETCH) judge(const Searching p) {
             p.y[3 * i + c] = 0;  // the last step's is no guess for a correction
         }
     }
-    if (!sum_body<STRETCH>(p, here.body, sum)) return;
+    if (!sum_body<BLOCK_NODES>(p, here.body, sum)) return;
     judge_trial(search, {p.linearizations, p.trials, p.tolerance}, sqrt(sum[0]), sum[1]);
     decided(p, here.body);
 }
 
 // The state before the step again, and y so that `advance` makes of it what was found; the results of the step as of one solve.
-extern "C" __global__ void __launch_bounds__(STRETCH) close(const Searching p) {
-    const Stretch here = p.stretch[blockIdx.x];
+extern "C" __global__ void __launch_bounds__(BLOCK_NODES) close(const NewtonArguments p) {
+    const NodeRange here = p.ranges[blockIdx.x];
     const int body = here.body, i = here.first + threadIdx.x;
     const Search s = p.search[body];
-    if (blockIdx.x == 0 && threadIdx.x == 0) *p.left = p.count;  // of the next step
+    if (blockIdx.x == 0 && threadIdx.x == 0) *p.active = p.count;  // of the next step
     if (i < here.last) {
         const long long n = 3ll * p.nodes;
         double gain[3], y[3];
@@ -250,20 +250,20 @@ extern "C" __global__ void __launch_bounds__(STRETCH) close(const Searching p) {
         for (int c = 0; c < 3; ++c) {
             const long long k = 3ll * i + c;
             gain[c] = gain_after(s, p.gain[k], p.way[k]);
-            p.x[k] = p.before[k];
-            p.v[k] = p.before[n + k];
-            p.ahead[k] = p.before[2 * n + k];
-            p.carried[k] = p.before[3 * n + k];
+            p.x[k] = p.initial_state[k];
+            p.v[k] = p.initial_state[n + k];
+            p.ahead[k] = p.initial_state[2 * n + k];
+            p.carried[k] = p.initial_state[3 * n + k];
             finite = finite && isfinite(p.b[k]);
         }
         turn_node(p.rotation + 9ll * i, true, gain, y);
         for (int c = 0; c < 3; ++c) p.y[3 * i + c] = (real)y[c];
-        if (s.status == NOT_FINITE && !finite) atomicMin(p.bad + body, i - p.stretch[p.stretches[body]].first);
+        if (s.status == NOT_FINITE && !finite) atomicMin(p.bad_node + body, i - p.ranges[p.first_range[body]].first);
     }
     double none[2] = {0, 0};
-    if (!sum_body<STRETCH>(p, body, none)) return;
-    Result& r = result_of(p, body);
-    const Body& settings = p.bodies[body];
+    if (!sum_body<BLOCK_NODES>(p, body, none)) return;
+    PcgResult& r = result_of(p, body);
+    const PcgBody& settings = p.bodies[body];
     const bool used = settings.plan && (r.asked == CHOLESKY || s.kind == CHOLESKY || s.fallbacks);
     r.factor_step = used ? settings.factor_step : -1;
     r.residual = s.residual;
@@ -272,7 +272,7 @@ extern "C" __global__ void __launch_bounds__(STRETCH) close(const Searching p) {
     r.status = s.status;
     r.kind = s.kind;
     r.fallbacks = s.fallbacks;
-    const int bad = __ldcg(p.bad + body);
+    const int bad = __ldcg(p.bad_node + body);
     r.bad_node = s.status == NOT_FINITE && bad != NO_NODE ? bad : -1;
-    p.found[(p.step[0] % p.capacity) * p.count + body] = {remaining(s), s.linearizations > 1 ? s.linearizations : 1, 0};
+    p.newton_results[(p.step[0] % p.capacity) * p.count + body] = {remaining(s), s.linearizations > 1 ? s.linearizations : 1, 0};
 }

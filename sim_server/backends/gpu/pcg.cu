@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: MIT
 // Preconditioned conjugate gradients of all bodies in one persistent launch, numbered as backends/cpu/native/pcg.h, which it mirrors.
 //
-// A body is solved by a team of thread blocks; small bodies of a large scene are taken one by one by whichever block is free.
+// A body is solved by a group of thread blocks; small bodies of a large scene are taken one by one by whichever block is free.
 // What blocks tell each other goes in words that carry their number (block_group.cuh); there are no barriers but at the ends. x and r
 // are updated in the preconditioner's first phase, and |r| after the update is known before it from
 // |r|^2 - 2 alpha r.q + alpha^2 q.q, so that nothing is applied in vain at the end.
@@ -11,20 +11,20 @@
 #include "clock.cuh"
 #include "spmv.cuh"
 
-struct Memory {  // fixed shared memory of a thread block: what is the same in all threads costs no registers
+struct BlockMemory {  // fixed shared memory of a thread block: what is the same in all threads costs no registers
     double scratch[3 * WARPS][4], totals[4];
-    Body body;
-    Plan plan;
-    Rows rows;
-    Inverse inverse;
-    real* d;         // (own, 3) scale of the own degrees of freedom, or null
-    real* diagonal;  // (own, 9) inverses of the diagonal blocks
-    double peak;     // largest scale
+    PcgBody body;
+    DevicePlan plan;
+    BlockRows rows;
+    PartitionedInverse inverse;
+    real* d;                       // (own, 3) scale of the own degrees of freedom, or null
+    real* diagonal;                // (own, 9) inverses of the diagonal blocks
+    double peak;                   // largest scale
     int next, bad, rests;
     double b2, goal, quarter, rz;  // of the iteration: all threads write the same
-    Result out;
+    PcgResult out;
 };
-__shared__ Memory memory;
+__shared__ BlockMemory memory;
 
 __device__ __forceinline__ bool usable(double a) { return a > 0 && a < 1e300; }
 
@@ -41,27 +41,27 @@ __device__ __forceinline__ float unit_for(double a) {
     return __int_as_float((127 - max(-120, min(120, k))) << 23);
 }
 
-struct Solver {
-    const Solve& s;
-    Team team;
-    int turn = 0;                   // half of inverse.residual that holds d r before the update
+struct PcgSolver {
+    const PcgArguments& s;
+    BlockGroup group;
+    int turn = 0;          // half of inverse.residual that holds d r before the update
     unsigned r_number = 0, q_number = 0, z_number = 0;  // exchanges in which d r, d q and z were put
-    bool packed = false;            // places are those of the inverse
-    bool fresh = false;             // inverse.residual holds d r as it is after the update that is still to be made
-    bool fetched = false;           // the chunks of the inverse are on their way to shared memory
-    bool arrived = false;           // and there
+    bool packed = false;   // places are those of the inverse
+    bool fresh = false;    // inverse.residual holds d r as it is after the update that is still to be made
+    bool fetched = false;  // the chunks of the inverse are on their way to shared memory
+    bool arrived = false;  // and there
 
-    __device__ __forceinline__ void set_up(const Share& share) {
-        const Body& body = memory.body;
-        Arena arena = {dynamic, dynamic + s.shared};
-        Inverse inverse;
+    __device__ __forceinline__ void set_up(const RowRange& range) {
+        const PcgBody& body = memory.body;
+        Arena arena = {shared_memory, shared_memory + s.shared};
+        PartitionedInverse inverse;
         const bool inverted = body.plan && (body.kind == CHOLESKY || body.probe > 0);
         if (inverted) inverse.reserve(&memory.plan, arena);
-        Rows rows;
-        rows.set_up(s, body, share, arena, inverted);
+        BlockRows rows;
+        rows.set_up(s, body, range, arena, inverted);
         real* diagonal = arena.take<real>(9 * rows.own);
         if (!diagonal) diagonal = s.diagonal + 9ll * (body.first + rows.begin);
-        if (inverted) inverse.set_up(body, &memory.plan, team.index, arena);
+        if (inverted) inverse.set_up(body, &memory.plan, group.index, arena);
         if (threadIdx.x == 0) {
             memory.rows = rows;
             memory.inverse = inverse;
@@ -72,7 +72,7 @@ struct Solver {
         packed = body.kind == CHOLESKY && body.plan;
         copies_end<0>();
         __syncthreads();
-        if (packed && team.blocks > 1) fetch();  // beside the first residual; the pool has many that need no more than that
+        if (packed && group.blocks > 1) fetch();  // beside the first residual; the pool has many that need no more than that
         find_places();
         __syncthreads();
     }
@@ -84,7 +84,7 @@ struct Solver {
 
     // Where the values that this block reads stand: with the inverse in its order, else in that of the nodes.
     __device__ __forceinline__ void find_places() {
-        const Rows& rows = memory.rows;
+        const BlockRows& rows = memory.rows;
         for (int k = threadIdx.x; k < rows.halo; k += THREADS) {
             int node = rows.nodes[k];
             rows.place[k] = packed ? memory.plan.place[node] : 3 * (memory.body.first + node);
@@ -100,19 +100,19 @@ struct Solver {
 
     // d r of an own degree of freedom for all to see.
     __device__ __forceinline__ void publish(int half, int k, real r) const {
-        residuals(half)[memory.rows.place[k / 3] + k % 3].put((float)(scale_of(k) * r), team.number);
+        residuals(half)[memory.rows.place[k / 3] + k % 3].put((float)(scale_of(k) * r), group.number);
     }
     __device__ __forceinline__ void publish_product(int k, real q) const {
-        memory.inverse.product[memory.rows.place[k / 3] + k % 3].put((float)(scale_of(k) * q), team.number);
+        memory.inverse.product[memory.rows.place[k / 3] + k % 3].put((float)(scale_of(k) * q), group.number);
     }
-    static __device__ __forceinline__ Word<float>* residuals(int half) {
+    static __device__ __forceinline__ FlagWord<float>* residuals(int half) {
         return memory.inverse.residual + (long long)half * (memory.inverse.size + 32);
     }
 
     // 1. r = b - A x for the x of the scene, left as the update by alpha = 1 that is still to be made: x = 0 + 1 x,
     // r = b - 1 (A x). So alpha = 0 starts from zero instead. Returns |r|^2; |b|^2 in `b2`.
     __device__ __forceinline__ double residual(double& b2) {
-        const Rows& rows = memory.rows;
+        const BlockRows& rows = memory.rows;
         const long long first = memory.body.first, begin = 3 * (first + rows.begin);
 #pragma unroll 4
         for (int k = threadIdx.x; k < 3 * rows.halo; k += THREADS)
@@ -132,14 +132,14 @@ struct Solver {
             publish(turn, k, bk);
             publish(1 - turn, k, (real)rk);  // not b - A x of float words: near the solution that would be noise
         });
-        r_number = team.number;
+        r_number = group.number;
         into_three<2>(mine);
-        team.sums<2, 3>(mine, out);
+        group.sums<2, 3>(mine, out);
         b2 = out[1];
         return out[0];
     }
 
-    // Sums of the lanes that Rows.finish used into lanes 0 to 2.
+    // Sums of the lanes that BlockRows.finish used into lanes 0 to 2.
     template <int N>
     static __device__ __forceinline__ void into_three(double mine[N]) {
         static_assert(SLAB_ROWS <= 4 && TOGETHER <= 4, "lanes 0 to 11 have sums");
@@ -151,7 +151,7 @@ struct Solver {
 
     // 7. 8. 2. p = z + beta p, q = A p; sums p.q, r.q, q.q, r.r
     __device__ __forceinline__ void direction(real beta, double out[4]) {
-        const Rows rows = memory.rows;
+        const BlockRows rows = memory.rows;
         if (packed) rows.form(memory.inverse.z, z_number, beta);
         else rows.form(s.z, z_number, beta);
         double mine[4] = {0, 0, 0, 0};
@@ -165,14 +165,14 @@ struct Solver {
             rows.q[k] = q;
             if (packed) publish_product(k, q);
         });
-        q_number = team.number;
+        q_number = group.number;
         into_three<4>(mine);
-        team.sums<4, 3>(mine, out);
+        group.sums<4, 3>(mine, out);
     }
 
     // 3. 4. 5. 6. x += alpha p, r -= alpha q, z = P^-1 r; returns z . r. r2: |r|^2 after the update.
     __device__ __forceinline__ double precondition(int kind, real alpha, double r2) {
-        const Rows rows = memory.rows;
+        const BlockRows rows = memory.rows;
         for (int k = threadIdx.x; k < 3 * rows.own; k += THREADS) {
             real r = rows.r[k];
             if (alpha != 0) {
@@ -184,7 +184,7 @@ struct Solver {
             if (packed) publish(1 - turn, k, r);
         }
         double mine[1], zr[1];
-        z_number = team.number;
+        z_number = group.number;
         if (kind == CHOLESKY) {
             mine[0] = by_inverse(alpha, r2);
         } else {
@@ -192,46 +192,46 @@ struct Solver {
             mine[0] = by_diagonal(kind);
         }
         for (int k = 16; k; k >>= 1) mine[0] += __shfl_xor_sync(ALL, mine[0], k);
-        team.sums<1, 1>(mine, zr);
+        group.sums<1, 1>(mine, zr);
         return zr[0];
     }
 
     __device__ __forceinline__ double by_diagonal(int kind) const {
-        const Rows rows = memory.rows;
+        const BlockRows rows = memory.rows;
         double mine = 0;
         for (int k = threadIdx.x; k < 3 * rows.own; k += THREADS) {
             const real *r = rows.r + k / 3 * 3, *v = memory.diagonal + 3 * k;
             const real z = kind == NONE ? rows.r[k] : v[0] * r[0] + v[1] * r[1] + v[2] * r[2];
-            s.z[3ll * (memory.body.first + rows.begin) + k].put(z, team.number);
+            s.z[3ll * (memory.body.first + rows.begin) + k].put(z, group.number);
             mine += (double)z * (double)rows.r[k];
         }
         return mine;
     }
 
     __device__ __forceinline__ double by_inverse(real alpha, double r2) {
-        const Inverse inverse = memory.inverse;
+        const PartitionedInverse inverse = memory.inverse;
         // a power of two that brings d r below 1: float16 has few of them
         const float unit = unit_for(r2 * memory.peak * memory.peak);
-        Residual from = {residuals(turn), r_number, q_number, fresh ? 0 : (float)alpha};  // the update is being made
+        ResidualSource from = {residuals(turn), r_number, q_number, fresh ? 0 : (float)alpha};  // the update is being made
         double mine = 0;
         fresh = false;
         if (!fetched) fetch();
         if (!arrived) copies_end<0>();
         arrived = true;
         for (int phase = 0; phase < inverse.phases; ++phase) {
-            inverse.gather(phase, from, team.number, unit);
+            inverse.gather(phase, from, group.number, unit);
             __syncthreads();
-            mine += inverse.multiply(phase, from, team.number, unit);
-            from = {residuals(1 - turn), team.number, 0, 0};
+            mine += inverse.multiply(phase, from, group.number, unit);
+            from = {residuals(1 - turn), group.number, 0, 0};
             if (phase + 1 < inverse.phases) __syncthreads();  // the vector has been read
         }
         turn = 1 - turn;
-        r_number = team.number;
+        r_number = group.number;
         return mine;
     }
 
     __device__ __forceinline__ void invert_diagonal(bool whole) const {
-        const Rows& rows = memory.rows;
+        const BlockRows& rows = memory.rows;
         for (int node = threadIdx.x; node < rows.own; node += THREADS) {
             int k = rows.row_start[node] - rows.base;
             while (rows.columns[k] != node) ++k;
@@ -241,25 +241,25 @@ struct Solver {
 
     // x + alpha p to the scene (keep = 0: zero); a barrier.
     __device__ __forceinline__ void give(real keep, real alpha) {
-        const Rows& rows = memory.rows;
+        const BlockRows& rows = memory.rows;
         for (int k = threadIdx.x; k < 3 * rows.own; k += THREADS) {
             const real x = keep != 0 ? rows.x[k] + (alpha != 0 ? alpha * rows.values[k] : 0) : 0;
             __stcg(s.y + 3ll * (memory.body.first + rows.begin) + k, x);
         }
-        team.barrier();
+        group.barrier();
     }
 
     // On with another preconditioner from the residual as it is.
     __device__ __forceinline__ void change(int kind) {
-        team.barrier();
+        group.barrier();
         packed = kind == CHOLESKY;
         fresh = false;
         find_places();
         __syncthreads();
         if (packed) {
             for (int k = threadIdx.x; k < 3 * memory.rows.own; k += THREADS) publish(turn, k, memory.rows.r[k]);
-            r_number = team.number;
-            team.barrier();
+            r_number = group.number;
+            group.barrier();
         } else {
             invert_diagonal(true);
         }
@@ -279,9 +279,9 @@ struct Solver {
 };
 
 // One loop with one place for each of its parts: written out twice they would not fit the instruction cache.
-__device__ __forceinline__ void Solver::solve() {
-    const Body& body = memory.body;
-    Result& out = memory.out;
+__device__ __forceinline__ void PcgSolver::solve() {
+    const PcgBody& body = memory.body;
+    PcgResult& out = memory.out;
     int kind = body.kind == CHOLESKY && !body.plan ? BLOCK_JACOBI : body.kind;
     out = {0, 0, -1, 0, CONVERGED, kind, body.kind, 0, -1, body.probe, 0};
     double r2 = 0, alpha = 0, last = 1e300;
@@ -370,53 +370,53 @@ __device__ __forceinline__ void Solver::solve() {
     }
 }
 
-__device__ __forceinline__ void solve_body(const Solve& s, const Share& share) {
-    const int k = share.body;
-    for (int i = threadIdx.x; i < (int)(sizeof(Body) / 4); i += THREADS) ((int*)&memory.body)[i] = ((const int*)(s.bodies + k))[i];
+__device__ __forceinline__ void solve_body(const PcgArguments& s, const RowRange& range) {
+    const int k = range.body;
+    for (int i = threadIdx.x; i < (int)(sizeof(PcgBody) / 4); i += THREADS) ((int*)&memory.body)[i] = ((const int*)(s.bodies + k))[i];
     if (threadIdx.x == THREADS - 1) memory.rests = s.moving[k] == 0;
     __syncthreads();
     if (memory.body.plan)
-        for (int i = threadIdx.x; i < (int)(sizeof(Plan) / 4); i += THREADS) ((int*)&memory.plan)[i] = ((const int*)memory.body.plan)[i];
+        for (int i = threadIdx.x; i < (int)(sizeof(DevicePlan) / 4); i += THREADS) ((int*)&memory.plan)[i] = ((const int*)memory.body.plan)[i];
     __syncthreads();
     const long long begin = nanoseconds();
-    Solver solver = {s, {share.index, memory.body.blocks, s.exchanges[k], s.board + 8ll * s.grid * k, s.grid, memory.scratch, memory.totals,
+    PcgSolver solver = {s, {range.index, memory.body.blocks, s.exchange_number[k], s.block_sums + 8ll * s.grid * k, s.grid, memory.scratch, memory.totals,
                          (int)threadIdx.x % 32, (int)threadIdx.x / 32}};
-    solver.set_up(share);
+    solver.set_up(range);
     solver.solve();
-    if (share.index == 0 && threadIdx.x == 0) {
-        Result out = memory.out;
+    if (range.index == 0 && threadIdx.x == 0) {
+        PcgResult out = memory.out;
         out.seconds = 1e-9 * (nanoseconds() - begin);
         if (memory.body.plan && (out.asked == CHOLESKY || out.kind == CHOLESKY || out.fallbacks)) out.factor_step = memory.body.factor_step;
         s.results[(s.step[0] % s.capacity) * s.count + k] = out;
-        s.exchanges[k] = solver.team.number;  // all have read it before the first exchange
+        s.exchange_number[k] = solver.group.number;  // all have read it before the first exchange
     }
     copies_end<0>();  // the next body has the same memory
     __syncthreads();
 }
 
-#ifdef SEARCHED  // a launch of a step with several linearizations: for the bodies in phase 0 alone (newton.cu)
-#define TURNS , const int* __restrict__ left, const int* __restrict__ phase
+#ifdef NEWTON_PHASES  // a launch of a step with several linearizations: for the bodies in phase 0 alone (newton.cu)
+#define PHASES , const int* __restrict__ active, const int* __restrict__ phase
 #else
-#define TURNS
+#define PHASES
 #endif
 
-extern "C" __global__ void __launch_bounds__(THREADS, PER_PROCESSOR) pcg(const Solve s TURNS) {
-#ifdef SEARCHED
-    if (*left == 0) return;
+extern "C" __global__ void __launch_bounds__(THREADS, PER_PROCESSOR) pcg(const PcgArguments s PHASES) {
+#ifdef NEWTON_PHASES
+    if (*active == 0) return;
 #endif
-    for (int next = s.own_share[blockIdx.x];; next = -1) {
+    for (int next = s.initial_range[blockIdx.x];; next = -1) {
         if (next < 0) {  // the next one of those that any block may take
-            if (threadIdx.x == 0) memory.next = s.pooled > 0 ? atomicAdd(s.arrived, 1) : s.pooled;
+            if (threadIdx.x == 0) memory.next = s.pooled > 0 ? atomicAdd(s.pool_counter, 1) : s.pooled;
             __syncthreads();
             if (memory.next >= s.pooled) return;
-            next = s.bodies[s.order[s.count - s.pooled + memory.next]].share;
+            next = s.bodies[s.order[s.count - s.pooled + memory.next]].first_range;
         }
-#ifdef SEARCHED
-        if (phase[s.shares[next].body] != 0) {
+#ifdef NEWTON_PHASES
+        if (phase[s.row_ranges[next].body] != 0) {
             __syncthreads();  // all have read memory.next
             continue;
         }
 #endif
-        solve_body(s, s.shares[next]);
+        solve_body(s, s.row_ranges[next]);
     }
 }

@@ -11,7 +11,7 @@ enum Status { CONVERGED = 0, MAX_ITERATIONS = 1, BUDGET = 2, BREAKDOWN_MATRIX = 
               MAX_LINEARIZATIONS = 6 };  // of a step
 
 // 32 entries of the vector that a phase multiplies, and where they come from.
-struct __align__(16) Piece {
+struct __align__(16) WarpSegment {
     int kind;  // 0: formed from the residual less what was contributed, 1: formed earlier, 2: solved, through `boundary`
     int from;  // packed position, or place in `boundary`
     int to;    // place in the vector
@@ -23,84 +23,84 @@ struct __align__(16) Piece {
 struct __align__(16) Tile { int chunk, x, chunks, out, rows, unused[3]; };
 
 // What a thread block has of a plan: ranges of its lists.
-struct Part { int piece, pieces, tile, tiles, chunk, chunks, unused[2]; };
+struct BlockRanges { int segment, segments, tile, tiles, chunk, chunks, unused[2]; };
 
 // How an inverse in parts is shared out over the thread blocks of a body (plan.py). Lists by thread block and phase.
-struct Plan {
+struct DevicePlan {
     int phases, blocks, groups, size;
-    const Part* parts;      // (blocks,)
-    const int* lists;       // (blocks, 4 phases + 2) of each phase: first piece (and the end), first tile (and the end), both
-                            // within the part; warps that share a tile; first piece that is not formed here
-    const Piece* pieces;
+    const BlockRanges* block_ranges;  // (blocks,)
+    const int* lists;                 // (blocks, 4 phases + 2) of each phase: first segment (and the end), first tile (and the end), both
+                                      // within the part; warps that share a tile; first segment that is not formed here
+    const WarpSegment* segments;
     const Tile* tiles;
-    const int* index;       // (pieces, 32) of each entry: where it stands (kinds 1 and 2), or the first of the contributions
-                            // that come off it and, in the upper 8 bits, how many there are (kind 0)
-    const int* target;      // where a contribution goes
-    const int* place;       // (nodes,) packed position of a node
-    int entries, unused;    // of the longest vector of a phase
+    const int* index;                 // (segments, 32) of each entry: where it stands (kinds 1 and 2), or the first of the contributions
+                                      // that come off it and, in the upper 8 bits, how many there are (kind 0)
+    const int* target;                // where a contribution goes
+    const int* place;                 // (nodes,) packed position of a node
+    int entries, unused;              // of the longest vector of a phase
 };
 
-template <class T> struct Word;  // block_group.cuh
+template <class T> struct FlagWord;  // block_group.cuh
 
 constexpr int ENOUGH = 20;  // backends/cpu/native/pcg.h
 
 // The rows of A that a thread block has of a body, and the nodes that they read.
-struct Share { int body, index, begin, own, halo_first, halo, block_first, blocks; };
+struct RowRange { int body, index, begin, own, halo_first, halo, block_first, blocks; };
 
-struct Body {
-    int first, nodes;                // of the scene's nodes
-    int blocks;                      // thread blocks that solve it
+struct PcgBody {
+    int first, nodes;              // of the scene's nodes
+    int blocks;                    // thread blocks that solve it
     int kind, max_iterations, warm_start, probe;
-    int share;                       // first of its thread blocks in Solve.shares
+    int first_range;               // first of its thread blocks in PcgArguments.row_ranges
     double tolerance;
-    long long factor_step;           // of the matrix it was made from
-    const Plan* plan;                // null: no factor yet
-    const uint4* matrix;             // chunks
-    const float* scale;              // (size + 1,) d: the inverse is d_i stored_ij d_j; the last is the largest
-    Word<float>* residual;           // (2, size + 32) d r
-    Word<float>* product;            // (size + 32,) d A p
-    Word<float>* z;                  // (size + 32,)
-    Word<float>* formed;             // (size + 32,)
-    Word<float>* solved;             // (size + 32,) z / d
-    Word<float>* given;              // contributions
-    int planes, unused;              // float16 values that make an entry of the inverse
+    long long factor_step;         // of the matrix it was made from
+    const DevicePlan* plan;        // null: no factor yet
+    const uint4* matrix;           // chunks
+    const float* scale;            // (size + 1,) d: the inverse is d_i stored_ij d_j; the last is the largest
+    FlagWord<float>* residual;     // (2, size + 32) d r
+    FlagWord<float>* product;      // (size + 32,) d A p
+    FlagWord<float>* z;            // (size + 32,)
+    FlagWord<float>* formed;       // (size + 32,)
+    FlagWord<float>* solved;       // (size + 32,) z / d
+    FlagWord<float>* contributed;  // contributions
+    int planes, unused;            // float16 values that make an entry of the inverse
 };
 
-struct Result {
-    double residual;                 // true, relative
+struct PcgResult {
+    double residual;        // true, relative
     double seconds;
-    long long factor_step;           // -1: no factor used
+    long long factor_step;  // -1: no factor used
     int iterations, status, kind, asked, fallbacks, bad_node, probe, unused;
 };
 
-struct Solve {
-    const Body* bodies;
-    int count, capacity;             // bodies; results kept per body
+struct PcgArguments {
+    const PcgBody* bodies;
+    int count, capacity;           // bodies; results kept per body
     const int* row_start;
-    const real* values;              // (blocks, 3, 3)
-    const real* b;                   // (nodes, 3)
-    real* y;                         // (nodes, 3) start in, solution out
-    const int* order;                // bodies: those with thread blocks of their own, then the pool, largest first
-    int pooled, grid;                // bodies in the pool: whichever thread block is free takes the next; all thread blocks
-    const Share* shares;             // of all thread blocks of all bodies
-    const int* own_share;            // (grid,) the one that a thread block begins with, or -1
-    const int* halo;                 // nodes of the body whose values a thread block reads, its own first
-    const int* seat;                 // (blocks,) column as a place in that list
-    real* halo_values;               // (halo, 3) where they do not fit into shared memory
-    int* halo_place;                 // (halo,) likewise
-    real* own;                       // (3, nodes, 3) x, r, q likewise
-    Word<real>* z;                   // (nodes, 3) without a factor
-    real* diagonal;                  // (nodes, 9) inverses of the diagonal blocks
-    Word<double>* board;             // (bodies, 2, 4, grid) sums of the thread blocks
-    unsigned* exchanges;             // (bodies,) counted from the first step on
-    unsigned* arrived;               // (1,) zero at launch: next of the pool
-    const long long* step;           // completed steps: where the result goes
-    Result* results;                 // (capacity, bodies)
-    const int* moving;               // (bodies,) 0: the body rests (kernels/nodes.cu)
-    int nodes, shared;               // of the scene; bytes of dynamic shared memory
+    const real* values;            // (blocks, 3, 3)
+    const real* b;                 // (nodes, 3)
+    real* y;                       // (nodes, 3) start in, solution out
+    const int* order;              // bodies: those with thread blocks of their own, then the pool, largest first
+    int pooled, grid;              // bodies in the pool: whichever thread block is free takes the next; all thread blocks
+    const RowRange* row_ranges;    // of all thread blocks of all bodies
+    const int* initial_range;      // (grid,) the one that a thread block begins with, or -1
+    const int* halo;               // nodes of the body whose values a thread block reads, its own first
+    const int* local_column;       // (blocks,) column as a place in that list
+    real* halo_values;             // (halo, 3) where they do not fit into shared memory
+    int* halo_position;            // (halo,) likewise
+    real* own_vectors;             // (3, nodes, 3) x, r, q likewise
+    FlagWord<real>* z;             // (nodes, 3) without a factor
+    real* diagonal;                // (nodes, 9) inverses of the diagonal blocks
+    FlagWord<double>* block_sums;  // (bodies, 2, 4, grid) sums of the thread blocks
+    unsigned* exchange_number;     // (bodies,) counted from the first step on
+    unsigned* pool_counter;        // (1,) zero at launch: next of the pool
+    const long long* step;         // completed steps: where the result goes
+    PcgResult* results;            // (capacity, bodies)
+    const int* moving;             // (bodies,) 0: the body rests (kernels/nodes.cu)
+    int nodes, shared;             // of the scene; bytes of dynamic shared memory
 };
 
-#ifdef BODY_BYTES  // as solver.py and device_plan.py have them
-static_assert(sizeof(Body) == BODY_BYTES && sizeof(Result) == RESULT_BYTES, "layouts of Body or Result differ");
-static_assert(sizeof(Solve) == SOLVE_BYTES && sizeof(Plan) == PLAN_BYTES, "layouts of Solve or Plan differ");
+#ifdef PCG_BODY_BYTES  // as solver.py and device_plan.py have them
+static_assert(sizeof(PcgBody) == PCG_BODY_BYTES && sizeof(PcgResult) == PCG_RESULT_BYTES, "layouts of PcgBody or PcgResult differ");
+static_assert(sizeof(PcgArguments) == PCG_ARGUMENTS_BYTES && sizeof(DevicePlan) == DEVICE_PLAN_BYTES, "layouts of PcgArguments or DevicePlan differ");
 #endif

@@ -5,89 +5,89 @@
 #include "loop.h"
 
 // Positions go through the room of the blocks: each node has at least its own.
-static int64_t coming_bytes(const Body& body) { return body.coming == 1 ? body.bytes : body.size; }
+static int64_t readback_bytes(const BodyReadback& body) { return body.in_flight == REQUEST_VALUES ? body.values_bytes : body.x_bytes; }
 
-static bool begin_matrices(Loop& l) {
-    if (l.matrix_step >= 0 || !l.asked.exchange(0, std::memory_order_acquire)) return true;
+static bool begin_matrices(GpuLoop& l) {
+    if (l.matrix_step >= 0 || !l.requested.exchange(0, std::memory_order_acquire)) return true;
     for (int i = 0; i < l.bodies; ++i) {
-        Body& body = l.body[i];
-        body.coming = body.wanted.exchange(0, std::memory_order_acquire);
-        if (!body.coming) continue;
-        Address from = body.coming == 1 ? l.values + body.begin : l.x + body.place;
-        CALL(on_device, l.staged + body.begin, from, (size_t)coming_bytes(body), l.stream);
+        BodyReadback& body = l.readbacks[i];
+        body.in_flight = body.requested.exchange(0, std::memory_order_acquire);
+        if (!body.in_flight) continue;
+        Address from = body.in_flight == REQUEST_VALUES ? l.values + body.values_begin : l.x + body.x_begin;
+        CALL(on_device, l.staged + body.values_begin, from, (size_t)readback_bytes(body), l.stream);
     }
-    CALL(event_record, l.snapped, l.stream);
-    CALL(stream_wait, l.copies, l.snapped, 0);
+    CALL(event_record, l.staged_event, l.stream);
+    CALL(stream_wait, l.copy_stream, l.staged_event, 0);
     for (int i = 0; i < l.bodies; ++i) {
-        Body& body = l.body[i];
-        if (body.coming)
-            CALL(to_host, l.matrices + body.begin, l.staged + body.begin, (size_t)coming_bytes(body), l.copies);
+        BodyReadback& body = l.readbacks[i];
+        if (body.in_flight)
+            CALL(to_host, l.host_matrices + body.values_begin, l.staged + body.values_begin, (size_t)readback_bytes(body), l.copy_stream);
     }
-    CALL(event_record, l.home, l.copies);
+    CALL(event_record, l.copied_event, l.copy_stream);
     l.matrix_step = l.launched - 1;  // steps completed when they were assembled; positions are those after it
     return true;
 }
 
-static void publish_matrices(Loop& l) {
+static void publish_matrices(GpuLoop& l) {
     for (int i = 0; i < l.bodies; ++i)
-        if (l.body[i].coming) {
-            l.body[i].coming = 0;
-            l.body[i].copied.store(l.matrix_step, std::memory_order_release);
+        if (l.readbacks[i].in_flight) {
+            l.readbacks[i].in_flight = 0;
+            l.readbacks[i].copied_step.store(l.matrix_step, std::memory_order_release);
         }
     l.matrix_step = -1;
 }
 
 // Tells of what has come home; never waits.
-static void publish(Loop& l) {
-    if (l.matrix_step >= 0 && done(l, l.home)) publish_matrices(l);
-    while (l.rings.frame_head.load() < l.drawn && done(l, l.picture[l.rings.frame_head.load() % PICTURES].arrived))
+static void publish(GpuLoop& l) {
+    if (l.matrix_step >= 0 && done(l, l.copied_event)) publish_matrices(l);
+    while (l.rings.frame_head.load() < l.frames_begun && done(l, l.frame_copies[l.rings.frame_head.load() % FRAME_COPIES].arrived))
         l.rings.frame_head.fetch_add(1, std::memory_order_release);
 }
 
-static bool oldest_frame_home(Loop& l) {
-    if (!await(l, l.picture[l.rings.frame_head.load() % PICTURES].arrived)) return false;
+static bool finish_oldest_frame(GpuLoop& l) {
+    if (!await(l, l.frame_copies[l.rings.frame_head.load() % FRAME_COPIES].arrived)) return false;
     l.rings.frame_head.fetch_add(1, std::memory_order_release);
     return true;
 }
 
 // A full ring: wait if nobody minds, else say no.
-static bool room_for_frame(Loop& l) {
+static bool room_for_frame(GpuLoop& l) {
     Rings& rings = l.rings;
-    while (l.drawn - rings.frame_head.load() >= PICTURES)  // as fast as the device gets there
-        if (!oldest_frame_home(l)) return false;
-    while (l.drawn - rings.frame_tail.load(std::memory_order_acquire) >= rings.frame_capacity) {
+    while (l.frames_begun - rings.frame_head.load() >= FRAME_COPIES)  // as fast as the device gets there
+        if (!finish_oldest_frame(l)) return false;
+    while (l.frames_begun - rings.frame_tail.load(std::memory_order_acquire) >= rings.frame_capacity) {
         if (!rings.patient || rings.stop.load() || l.error) return false;
-        l.stalled = 1;
+        l.ran_dry = 1;
         publish(l);
         nap(1e-4);
     }
     return true;
 }
 
-static bool begin_frame(Loop& l) {
+static bool begin_frame(GpuLoop& l) {
     const int64_t every = l.rings.frame_every.load(), bytes = l.frame_bytes;  // once: it may become 0 meanwhile
     if (every <= 0 || l.launched % every) return true;
     if (!room_for_frame(l)) { ++l.rings.frames_dropped; return !l.error; }
-    int64_t slot = l.drawn % l.rings.frame_capacity;
-    Picture& picture = l.picture[l.drawn % PICTURES];
-    Address aside = l.pictures + 2 * bytes * (l.drawn % PICTURES);
-    CALL(on_device, aside, l.x, (size_t)bytes, l.stream);
-    CALL(on_device, aside + bytes, l.v, (size_t)bytes, l.stream);
-    CALL(event_record, picture.taken, l.stream);
-    CALL(stream_wait, l.copies, picture.taken, 0);
-    CALL(to_host, (char*)l.rings.frames + 2 * bytes * slot, aside, (size_t)(2 * bytes), l.copies);
-    CALL(event_record, picture.arrived, l.copies);
+    int64_t slot = l.frames_begun % l.rings.frame_capacity;
+    FrameCopy& copy = l.frame_copies[l.frames_begun % FRAME_COPIES];
+    Address staging = l.frame_staging + 2 * bytes * (l.frames_begun % FRAME_COPIES);
+    CALL(on_device, staging, l.x, (size_t)bytes, l.stream);
+    CALL(on_device, staging + bytes, l.v, (size_t)bytes, l.stream);
+    CALL(event_record, copy.taken, l.stream);
+    CALL(stream_wait, l.copy_stream, copy.taken, 0);
+    CALL(to_host, (char*)l.rings.frames + 2 * bytes * slot, staging, (size_t)(2 * bytes), l.copy_stream);
+    CALL(event_record, copy.arrived, l.copy_stream);
     l.rings.frame_steps[slot] = l.launched;
-    ++l.drawn;
+    ++l.frames_begun;
     return true;
 }
 
 // Waits for all that is on its way.
-static bool all_home(Loop& l) {
-    while (l.rings.frame_head.load() < l.drawn)
-        if (!oldest_frame_home(l)) return false;
+static bool finish_readbacks(GpuLoop& l) {
+    while (l.rings.frame_head.load() < l.frames_begun)
+        if (!finish_oldest_frame(l)) return false;
     if (l.matrix_step >= 0) {
-        if (!await(l, l.home)) return false;
+        if (!await(l, l.copied_event)) return false;
         publish_matrices(l);
     }
     return true;

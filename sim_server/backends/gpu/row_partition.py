@@ -11,7 +11,7 @@ SPARED = 8  # multiprocessors that a step leaves to expansions beside it: one th
 NODES_A_BLOCK = 8  # a body of few nodes is not spread over more thread blocks than this gives
 
 
-class Shares(NamedTuple):
+class BlockAssignment(NamedTuple):
     """Thread blocks [first, first + blocks) of each body, first -1 where any free one takes it; `order`: those with
     blocks of their own, then the `pooled` others, largest first."""
 
@@ -21,7 +21,7 @@ class Shares(NamedTuple):
     pooled: int
 
 
-def shares(nodes: Ints, grid: int) -> Shares:
+def assignment(nodes: Ints, grid: int) -> BlockAssignment:
     """nodes (bodies,): by size while there are enough thread blocks; of many bodies the small share what is left."""
     bodies = len(nodes)
     wanted = nodes / nodes.sum() * grid
@@ -35,7 +35,7 @@ def shares(nodes: Ints, grid: int) -> Shares:
     first[own] = np.cumsum(count[own]) - count[own]
     rest = np.flatnonzero(~own)
     order = np.concatenate([np.flatnonzero(own), rest[np.argsort(-nodes[rest], kind="stable")]])
-    return Shares(first, count, order, pooled)
+    return BlockAssignment(first, count, order, pooled)
 
 
 def _spread(nodes: Ints, blocks: int) -> Ints:
@@ -47,7 +47,7 @@ def _spread(nodes: Ints, blocks: int) -> Ints:
     return np.minimum(np.ceil(nodes / high).astype(np.int64), -(-nodes // NODES_A_BLOCK))
 
 
-def busiest(nodes: Ints, given: Shares, grid: int) -> float:
+def busiest(nodes: Ints, given: BlockAssignment, grid: int) -> float:
     """Nodes that the busiest thread block has to do with, one round of the pool after another."""
     own, rest = given.first >= 0, given.first < 0
     alone = float((nodes[own] / given.blocks[own]).max(initial=0))
@@ -57,28 +57,30 @@ def busiest(nodes: Ints, given: Shares, grid: int) -> float:
     return max(alone, rounds * float(nodes[rest].mean()))
 
 
-def shared_out(nodes: Ints, processors: int, blocks: int) -> tuple[Shares, int]:
-    """Shares and thread blocks; `blocks` of them on a multiprocessor. Some multiprocessors are spared, fewer where more
-    would leave many others idle."""
+def assign_blocks(nodes: Ints, processors: int, blocks: int) -> tuple[BlockAssignment, int]:
+    """The assignment and its number of thread blocks, `blocks` of them on a multiprocessor. Some multiprocessors are
+    spared, fewer where more would leave many others idle."""
     spared = min(SPARED, processors // 4)
     grids = [blocks * (processors - s) for s in range(spared, spared // 2 - 1, -1)]
-    found = [(shares(nodes, grid), grid) for grid in grids]
+    found = [(assignment(nodes, grid), grid) for grid in grids]
     load = [busiest(nodes, share, grid) for share, grid in found]
     return found[int(np.argmax(np.array(load) <= 1.1 * min(load)))]
 
 
-SHARE = np.dtype([(n, "i4") for n in ("body", "index", "begin", "own", "halo_first", "halo", "block_first", "blocks")])
+ROW_RANGE = np.dtype(
+    [(n, "i4") for n in ("body", "index", "begin", "own", "halo_first", "halo", "block_first", "blocks")]
+)
 """What a thread block has of a body: own nodes [begin, begin + own) of the body, places in Halo.nodes, blocks of A."""
 
 
 class Halo(NamedTuple):
     """What each thread block of each body reads.
 
-    shares (thread blocks,): SHARE; nodes: of the body, lists of the thread blocks one after another, its own first;
+    ranges (thread blocks,): ROW_RANGE; nodes: of the body, lists of the thread blocks one after another, its own first;
     local (blocks of A,): the column as a place in its thread block's list; first (bodies,): first share of a body.
     """
 
-    shares: NDArray[Any]
+    ranges: NDArray[Any]
     nodes: Ints
     local: Ints
     first: Ints
@@ -110,7 +112,7 @@ def halo(ranges: Ints, count: Ints, row_start: NDArray[Any], columns: NDArray[An
     nodes[start[owner] + mine - low[owner]] = mine
     nodes[start[of] + own[of] + np.arange(len(keys)) - (np.cumsum(extra) - extra)[of]] = keys % total
     origin = np.repeat(ranges[:, 0], count)  # of each thread block
-    table = np.zeros(len(own), SHARE)
+    table = np.zeros(len(own), ROW_RANGE)
     table["body"] = np.repeat(np.arange(len(count)), count)
     table["index"] = np.arange(len(own)) - np.repeat(first, count)
     table["begin"], table["own"] = low - origin, own
@@ -119,7 +121,7 @@ def halo(ranges: Ints, count: Ints, row_start: NDArray[Any], columns: NDArray[An
     return Halo(table, nodes - np.repeat(origin, np.diff(start)), local, first)
 
 
-def first_shares(given: Shares, seen: Halo, grid: int) -> NDArray[np.int32]:
+def initial_ranges(given: BlockAssignment, seen: Halo, grid: int) -> NDArray[np.int32]:
     """The share that each thread block of the grid begins with, -1 where it takes one of the pool."""
     found = np.full(grid, -1, np.int32)
     for body in given.order[: len(given.order) - given.pooled]:

@@ -10,33 +10,33 @@ from numpy.typing import NDArray
 from protocol.factor import FactorPattern
 from sim_server.backends.compiler import HERE
 from sim_server.backends.gpu.device import Gpu, compiled, options, own_headers
-from sim_server.backends.gpu.inverse.build_inverse import Expanded, Expansion
-from sim_server.backends.gpu.inverse.device_plan import PLAN, Planned, room
+from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder, PartitionedInverse
+from sim_server.backends.gpu.inverse.device_plan import DEVICE_PLAN, DevicePlan, shared_bytes
 from sim_server.backends.gpu.inverse.plan import plan
-from sim_server.backends.gpu.row_partition import SPARED, first_shares, halo, shared_out
+from sim_server.backends.gpu.row_partition import SPARED, assign_blocks, halo, initial_ranges
 
-BODY = np.dtype(
+PCG_BODY = np.dtype(
     [
         ("first", "i4"), ("nodes", "i4"), ("blocks", "i4"), ("kind", "i4"), ("max_iterations", "i4"),
-        ("warm_start", "i4"), ("probe", "i4"), ("share", "i4"), ("tolerance", "f8"), ("factor_step", "i8"),
+        ("warm_start", "i4"), ("probe", "i4"), ("first_range", "i4"), ("tolerance", "f8"), ("factor_step", "i8"),
         ("plan", "u8"), ("matrix", "u8"), ("scale", "u8"), ("residual", "u8"), ("product", "u8"), ("z", "u8"),
-        ("formed", "u8"), ("solved", "u8"), ("given", "u8"), ("planes", "i4"), ("unused", "i4"),
+        ("formed", "u8"), ("solved", "u8"), ("contributed", "u8"), ("planes", "i4"), ("unused", "i4"),
     ]
 )  # fmt: skip
-SETTINGS = BODY.fields["factor_step"][1]  # type: ignore[index]  # bytes of a row before the factor: they change apart
-RESULT = np.dtype(
+SETTINGS_BYTES = PCG_BODY.fields["factor_step"][1]  # type: ignore[index]  # bytes of a row before the factor: they change apart
+PCG_RESULT = np.dtype(
     [
         ("residual", "f8"), ("seconds", "f8"), ("factor_step", "i8"), ("iterations", "i4"), ("status", "i4"),
         ("kind", "i4"), ("asked", "i4"), ("fallbacks", "i4"), ("bad_node", "i4"), ("probe", "i4"), ("unused", "i4"),
     ]
 )  # fmt: skip
-SOLVE = np.dtype(
+PCG_ARGUMENTS = np.dtype(
     [
-        ("bodies", "u8"), ("count", "i4"), ("capacity", "i4"), ("row_start", "u8"),
-        ("values", "u8"), ("b", "u8"), ("y", "u8"), ("order", "u8"), ("pooled", "i4"), ("grid", "i4"),
-        ("shares", "u8"), ("own_share", "u8"), ("halo", "u8"), ("seat", "u8"), ("halo_values", "u8"),
-        ("halo_place", "u8"), ("own", "u8"), ("z", "u8"), ("diagonal", "u8"), ("board", "u8"), ("exchanges", "u8"),
-        ("arrived", "u8"), ("step", "u8"), ("results", "u8"), ("moving", "u8"), ("nodes", "i4"), ("shared", "i4"),
+        ("bodies", "u8"), ("count", "i4"), ("capacity", "i4"), ("row_start", "u8"), ("values", "u8"), ("b", "u8"),
+        ("y", "u8"), ("order", "u8"), ("pooled", "i4"), ("grid", "i4"), ("row_ranges", "u8"), ("initial_range", "u8"),
+        ("halo", "u8"), ("local_column", "u8"), ("halo_values", "u8"), ("halo_position", "u8"), ("own_vectors", "u8"),
+        ("z", "u8"), ("diagonal", "u8"), ("block_sums", "u8"), ("exchange_number", "u8"), ("pool_counter", "u8"),
+        ("step", "u8"), ("results", "u8"), ("moving", "u8"), ("nodes", "i4"), ("shared", "i4"),
     ]
 )  # fmt: skip
 
@@ -48,59 +48,59 @@ def threads_and_blocks(nodes: NDArray[np.int64], processors: int) -> tuple[int, 
     return (64, 4) if len(nodes) > 2 * processors and np.median(nodes) < 300 else (128, 2)
 
 
-class Solver:
+class PcgSolver:
     """Solves the system of every body in one launch.
 
     ranges: nodes [first, last) of each body. arrays: host arrays by name (row_start, columns, values, b, y, moving),
     solved for their twins. counter: device array (1,) of completed steps. capacity: steps whose results are kept.
-    planes: 1 for a preconditioner in float16, 2 for one of 22 bits. turns: for several linearizations a step, device
+    planes: 1 for a preconditioner in float16, 2 for one of 22 bits. phases: for several linearizations a step, device
     arrays `left` and `phase` (newton.py).
 
-    bodies: host rows (BODY), one per body; whoever runs the loop uploads them, settings (the first SETTINGS bytes) and
-    factor (the rest) apart. results: device ring (capacity, bodies) of RESULT. arrived: zero at launch.
+    bodies: host rows (PCG_BODY), one per body; the loop uploads them, settings (the first SETTINGS_BYTES) and factor
+    (the rest) apart. results: device ring (capacity, bodies) of PCG_RESULT. pool_counter: zero at launch.
     spared: multiprocessors that a launch does not need.
     """
 
     def __init__(
         self, gpu: Gpu, ranges: Sequence[tuple[int, int]], arrays: Mapping[str, NDArray[Any]], counter: Any,
-        capacity: int, planes: int = 1, turns: Sequence[Any] = (),
+        capacity: int, planes: int = 1, phases: Sequence[Any] = (),
     ):  # fmt: skip
         cp, processors = gpu.cp, gpu.properties["multiProcessorCount"]
-        self.gpu, self.counter, self._capacity, self.planes, self._turns = gpu, counter, capacity, planes, turns
+        self.gpu, self.counter, self._capacity, self.planes, self._phases = gpu, counter, capacity, planes, phases
         self._twins = {name: gpu.twin(arrays[name]) for name in ("row_start", "values", "b", "y", "moving")}
         self.real = np.dtype(self._twins["values"].dtype)
         spans = np.array(ranges, np.int64)
         nodes = spans[:, 1] - spans[:, 0]
         self.threads, blocks = threads_and_blocks(nodes, processors)
-        share, most = shared_out(nodes, processors, blocks)
-        self.grid = most if share.pooled else int(share.blocks.sum())
+        assigned, most = assign_blocks(nodes, processors, blocks)
+        self.grid = most if assigned.pooled else int(assigned.blocks.sum())
         self.spared = processors - -(-self.grid // blocks)
-        self.bodies = np.zeros(len(ranges), BODY)
+        self.bodies = np.zeros(len(ranges), PCG_BODY)
         self.bodies["first"], self.bodies["nodes"] = spans[:, 0], nodes
-        self.bodies["blocks"] = share.blocks
-        seen = halo(spans, share.blocks, arrays["row_start"], arrays["columns"])
-        self.bodies["share"] = seen.first
+        self.bodies["blocks"] = assigned.blocks
+        seen = halo(spans, assigned.blocks, arrays["row_start"], arrays["columns"])
+        self.bodies["first_range"] = seen.first
         self._rows = cp.zeros(self.bodies.nbytes, np.uint8)
-        self.results = cp.zeros(capacity * len(ranges) * RESULT.itemsize, np.uint8)
-        self.arrived = cp.zeros(1, np.uint32)
+        self.results = cp.zeros(capacity * len(ranges) * PCG_RESULT.itemsize, np.uint8)
+        self.pool_counter = cp.zeros(1, np.uint32)
         total, ints = len(arrays["row_start"]) - 1, np.int32
         self._work = {
-            "order": cp.asarray(share.order.astype(ints)), "shares": cp.asarray(seen.shares.view(ints)),
-            "own_share": cp.asarray(first_shares(share, seen, self.grid)),
-            "halo": cp.asarray(seen.nodes.astype(ints)), "seat": cp.asarray(seen.local.astype(ints)),
-            "halo_values": cp.zeros(3 * len(seen.nodes), self.real), "halo_place": cp.zeros(len(seen.nodes), ints),
-            "own": cp.zeros(9 * total, self.real), "z": cp.zeros(6 * total),
-            "diagonal": cp.zeros(9 * total, self.real), "board": cp.zeros(16 * self.grid * len(ranges)),
-            "exchanges": cp.ones(len(ranges), np.uint32),  # words that nobody has put are of exchange 0
-            "arrived": self.arrived, "results": self.results, "step": counter,
+            "order": cp.asarray(assigned.order.astype(ints)), "row_ranges": cp.asarray(seen.ranges.view(ints)),
+            "initial_range": cp.asarray(initial_ranges(assigned, seen, self.grid)),
+            "halo": cp.asarray(seen.nodes.astype(ints)), "local_column": cp.asarray(seen.local.astype(ints)),
+            "halo_values": cp.zeros(3 * len(seen.nodes), self.real), "halo_position": cp.zeros(len(seen.nodes), ints),
+            "own_vectors": cp.zeros(9 * total, self.real), "z": cp.zeros(6 * total),
+            "diagonal": cp.zeros(9 * total, self.real), "block_sums": cp.zeros(16 * self.grid * len(ranges)),
+            "exchange_number": cp.ones(len(ranges), np.uint32),  # words that nobody has put are of exchange 0
+            "pool_counter": self.pool_counter, "results": self.results, "step": counter,
         }  # fmt: skip
         fixed = 2048  # bytes of its own that a thread block needs, and the driver's
         self._shared = (gpu.properties["sharedMemPerMultiprocessor"] // blocks - fixed - 1024) // 16 * 16
-        self._params = self._arguments(total, share.pooled)
+        self._params = self._arguments(total, assigned.pooled)
         self._function = self._compiled(blocks)
         self._function.max_dynamic_shared_size_bytes = self._shared
-        self._planned: dict[tuple[int, int], Planned] = {}
-        self._expansions: dict[tuple[int, int], Expansion] = {}  # likewise by pattern and thread blocks
+        self._planned: dict[tuple[int, int], DevicePlan] = {}
+        self._expansions: dict[tuple[int, int], InverseBuilder] = {}  # likewise by pattern and thread blocks
         self._vectors: dict[tuple[int, int], dict[str, Any]] = {}  # by body and plan
         self._applied = [0] * len(ranges)
 
@@ -110,7 +110,12 @@ class Solver:
         return int(self._rows.data.ptr)
 
     def _compiled(self, blocks: int) -> Any:
-        layouts = {"BODY": BODY, "RESULT": RESULT, "SOLVE": SOLVE, "PLAN": PLAN}
+        layouts = {
+            "PCG_BODY": PCG_BODY,
+            "PCG_RESULT": PCG_RESULT,
+            "PCG_ARGUMENTS": PCG_ARGUMENTS,
+            "DEVICE_PLAN": DEVICE_PLAN,
+        }
         numbers = {"THREADS": self.threads, "PER_PROCESSOR": blocks} | {
             f"{name}_BYTES": layout.itemsize for name, layout in layouts.items()
         }
@@ -118,7 +123,8 @@ class Solver:
             code=(HERE / "backends/gpu/pcg.cu").read_text(),
             options=(
                 *options({"real": "float" if self.real == np.float32 else "double"}), *own_headers(),
-                *(f"-D{name}={number}" for name, number in numbers.items()), *(["-DSEARCHED"] if self._turns else []),
+                *(f"-D{name}={number}" for name, number in numbers.items()),
+                *(["-DNEWTON_PHASES"] if self._phases else []),
             ),
             backend="nvrtc",
             enable_cooperative_groups=True,
@@ -127,31 +133,31 @@ class Solver:
 
     def launch(self) -> None:
         """Puts a solve onto the current stream."""
-        turns = (np.uint64(array.data.ptr) for array in self._turns)
-        self._function((self.grid,), (self.threads,), (self._params, *turns), shared_mem=self._shared)
+        phases = (np.uint64(array.data.ptr) for array in self._phases)
+        self._function((self.grid,), (self.threads,), (self._params, *phases), shared_mem=self._shared)
 
-    def planned(self, body: int, pattern: FactorPattern) -> Planned:
+    def planned(self, body: int, pattern: FactorPattern) -> DevicePlan:
         """How the inverse of factors of this pattern is shared out for a body. Raises ValueError if it cannot be."""
         blocks = int(self.bodies[body]["blocks"])
         key = (pattern.id, blocks)
         if key not in self._planned:
             found = plan(pattern, blocks, planes=self.planes, shared=self._shared)
-            if (needed := room(found)) > self._shared:
+            if (needed := shared_bytes(found)) > self._shared:
                 raise ValueError(
                     f"{pattern.size} degrees of freedom in {blocks} thread blocks need {needed} bytes of shared memory "
                     f"each, allowed: {self._shared}"
                 )
-            planned = Planned(self.gpu, found, self.threads // 32)
-            self._expansions[key] = Expansion(self.gpu, pattern, found)
+            planned = DevicePlan(self.gpu, found, self.threads // 32)
+            self._expansions[key] = InverseBuilder(self.gpu, pattern, found)
             self._planned[key] = planned  # once there was memory for both
         return self._planned[key]
 
-    def expansion(self, body: int, pattern: FactorPattern) -> Expansion:
+    def expansion(self, body: int, pattern: FactorPattern) -> InverseBuilder:
         """What makes factors of this pattern usable for a body, the same for all alike. Raises ValueError."""
         self.planned(body, pattern)
         return self._expansions[pattern.id, int(self.bodies[body]["blocks"])]
 
-    def use(self, body: int, pattern: FactorPattern, expanded: Expanded, step: int) -> None:
+    def use(self, body: int, pattern: FactorPattern, expanded: PartitionedInverse, step: int) -> None:
         """Writes a factor into the host row of a body; it holds once the row is uploaded."""
         planned, row = self.planned(body, pattern), self.bodies[body]
         row["plan"], row["matrix"], row["scale"] = planned.address, expanded.matrix, expanded.scale
@@ -168,7 +174,7 @@ class Solver:
         return self._applied[body]
 
     def _arguments(self, nodes: int, pooled: int) -> NDArray[Any]:
-        params = np.zeros((), SOLVE)
+        params = np.zeros((), PCG_ARGUMENTS)
         params["bodies"], params["count"], params["capacity"] = self.bodies_device, len(self.bodies), self._capacity
         for name, array in (self._twins | self._work).items():
             params[name] = array.data.ptr

@@ -11,36 +11,36 @@
 #define SLABS 2                      // ... so many places
 #define SLAB_BLOCKS (17 * SLAB)      // of A, at most; a slab with more is read where it is
 
-struct Rows {
-    int begin, own, halo;           // own nodes [begin, begin + own) of the body; nodes read
-    const int* nodes;               // (halo,) of the body
-    real* values;                   // (halo, 3) of the vector that A multiplies
-    int* place;                     // (halo,) where the next one is read
-    real *x, *r, *q;                // (own, 3)
-    real* scale;                    // (own, 3) of the inverse, or null
-    const int* row_start;           // (own + 1,), less `base`
-    const int* columns;             // places in halo
+struct BlockRows {
+    int begin, own, halo;  // own nodes [begin, begin + own) of the body; nodes read
+    const int* nodes;      // (halo,) of the body
+    real* values;          // (halo, 3) of the vector that A multiplies
+    int* place;            // (halo,) where the next one is read
+    real *x, *r, *q;       // (own, 3)
+    real* scale;           // (own, 3) of the inverse, or null
+    const int* row_start;  // (own + 1,), less `base`
+    const int* columns;    // places in halo
     const real* blocks;
     int base;
-    bool near;                      // A is in shared memory
-    int slabs;                      // place of (SLABS, SLAB_BYTES) of shared memory that A passes through, or -1
+    bool near;             // A is in shared memory
+    int slabs;             // place of (SLABS, SLAB_BYTES) of shared memory that A passes through, or -1
     int near_values, near_blocks, near_columns;  // places, where they are near
 
     // What is used most comes first. inverted: there is an inverse.
-    __device__ __forceinline__ void set_up(const Solve& s, const Body& body, const Share& share, Arena& arena, bool inverted) {
-        begin = share.begin; own = share.own; halo = share.halo;
-        nodes = s.halo + share.halo_first;
+    __device__ __forceinline__ void set_up(const PcgArguments& s, const PcgBody& body, const RowRange& range, Arena& arena, bool inverted) {
+        begin = range.begin; own = range.own; halo = range.halo;
+        nodes = s.halo + range.halo_first;
         values = arena.take<real>(3 * halo);
         near_values = place_of(values);
-        if (!values) values = s.halo_values + 3ll * share.halo_first;
+        if (!values) values = s.halo_values + 3ll * range.halo_first;
         place = arena.take<int>(halo);
-        if (!place) place = s.halo_place + share.halo_first;
+        if (!place) place = s.halo_position + range.halo_first;
         const long long row = body.first + begin, all = 3ll * s.nodes;
-        bring(s, (int)row, share, arena, (inverted ? 12 : 9) * own * (int)sizeof(real) + 64);
+        bring(s, (int)row, range, arena, (inverted ? 12 : 9) * own * (int)sizeof(real) + 64);
         scale = inverted ? arena.take<real>(3 * own) : nullptr;
-        r = taken(arena, s.own + 3 * row + all);
-        q = taken(arena, s.own + 3 * row + 2 * all);
-        x = taken(arena, s.own + 3 * row);
+        r = taken(arena, s.own_vectors + 3 * row + all);
+        q = taken(arena, s.own_vectors + 3 * row + 2 * all);
+        x = taken(arena, s.own_vectors + 3 * row);
         int* list = arena.take<int>(halo);
         if (!list) return;
         for (int k = threadIdx.x; k < halo; k += THREADS) copy_async(list + k, nodes + k, 4);
@@ -53,11 +53,11 @@ struct Rows {
     }
 
     // Copies the own rows of A into shared memory if they fit beside `others` bytes: loads after a barrier miss L1.
-    __device__ __forceinline__ void bring(const Solve& s, int row, const Share& share, Arena& arena, int others) {
-        const int count = share.blocks;
-        base = share.block_first;
+    __device__ __forceinline__ void bring(const PcgArguments& s, int row, const RowRange& range, Arena& arena, int others) {
+        const int count = range.blocks;
+        base = range.block_first;
         row_start = s.row_start + row;
-        columns = s.seat + base;
+        columns = s.local_column + base;
         blocks = s.values + 9ll * base;
         slabs = -1;
         Arena before = arena;
@@ -96,7 +96,7 @@ struct Rows {
     // Brings a slab into its place: from the 16 bytes on in which it begins.
     __device__ __forceinline__ void ask(int k, const int* starts) const {
         const Slab s = slab(k, starts);
-        char* to = dynamic + slabs + k % SLABS * SLAB_BYTES;
+        char* to = shared_memory + slabs + k % SLABS * SLAB_BYTES;
         if (s.count <= SLAB_BLOCKS && s.count > 0) {
             all_of(to, blocks + 9ll * s.first, 9 * (int)sizeof(real) * s.count);
             all_of(to + VALUE_BYTES, columns + s.first, 4 * s.count);
@@ -230,9 +230,9 @@ struct Rows {
 
     // The values that A multiplies: those of exchange `number` + beta what they are.
     template <class T>
-    __device__ __forceinline__ void form(const Word<T>* from, unsigned number, real beta) const {
+    __device__ __forceinline__ void form(const FlagWord<T>* from, unsigned number, real beta) const {
         for (int first = threadIdx.x; first < 3 * halo; first += 3 * THREADS) {
-            Word<T> seen[3];
+            FlagWord<T> seen[3];
             T got[3];
             int at[3];
             bool all;
@@ -244,11 +244,11 @@ struct Rows {
             unsigned spins = 0;
             do {  // no branch between the loads: they travel together
 #pragma unroll
-                for (int n = 0; n < 3; ++n) seen[n] = from[at[n]].seen();
+                for (int n = 0; n < 3; ++n) seen[n] = from[at[n]].load();
                 all = true;
 #pragma unroll
-                for (int n = 0; n < 3; ++n) all &= seen[n].is(got[n], number);
-            } while (again(!all, spins));
+                for (int n = 0; n < 3; ++n) all &= seen[n].unpack(got[n], number);
+            } while (keep_polling(!all, spins));
 #pragma unroll
             for (int n = 0; n < 3; ++n) {
                 const int k = first + n * THREADS;

@@ -8,16 +8,16 @@ import numpy as np
 from sim_server.backends.cpu.structs import Rings
 
 p, i64 = c.c_void_p, c.c_int64
-DEPTH, PICTURES = 2, 4  # batches and frames under way at most
-STAMP = np.dtype([("begin", "i8"), ("end", "i8")])
-ENERGY = np.dtype(
+STEP_BATCHES, FRAME_COPIES = 2, 4  # batches and frames under way at most
+STEP_TIMESTAMP = np.dtype([("begin", "i8"), ("end", "i8")])
+ENERGY_RECORD = np.dtype(
     [(n, "f8") for n in ("kinetic", "elastic", "gravity", "work", "budget", "stride")]
     + [("phase", "i4"), ("found", "i4")]
 )
-FOUND = np.dtype([("nonlinear", "f8"), ("linearizations", "i4"), ("unused", "i4")])
+NEWTON_RESULT = np.dtype([("nonlinear", "f8"), ("linearizations", "i4"), ("unused", "i4")])
 
 
-class Cuda(c.Structure):
+class CudaDriver(c.Structure):
     """Addresses of functions of the driver API."""
 
     _fields_ = [
@@ -33,39 +33,39 @@ class Mail(c.Structure):
     _fields_ = [("bytes", p), ("event", p), ("number", i64), ("taken", i64)]
 
 
-class Mailbox(c.Structure):
-    _fields_ = [("target", c.c_uint64), ("size", i64), ("mail", p), ("held", p), ("taken", i64)]
+class MailSlot(c.Structure):
+    _fields_ = [("target", c.c_uint64), ("size", i64), ("posted", p), ("pending", p), ("taken", i64)]
 
 
-class Body(c.Structure):
+class BodyReadback(c.Structure):
     _fields_ = [
-        ("begin", i64), ("bytes", i64), ("place", i64), ("size", i64), ("wanted", c.c_int32), ("coming", c.c_int32),
-        ("copied", i64),
+        ("values_begin", i64), ("values_bytes", i64), ("x_begin", i64), ("x_bytes", i64), ("requested", c.c_int32),
+        ("in_flight", c.c_int32), ("copied_step", i64),
     ]  # fmt: skip
 
 
-class Batch(c.Structure):
+class StepBatch(c.Structure):
     _fields_ = [
         ("upload", p), ("done", p), ("first", i64), ("steps", i64), ("late", c.c_double),
     ]  # fmt: skip
 
 
-class Picture(c.Structure):
+class FrameCopy(c.Structure):
     _fields_ = [("taken", p), ("arrived", p)]
 
 
-class Loop(c.Structure):
+class GpuLoop(c.Structure):
     _anonymous_ = ("rings",)
     _fields_ = [
-        ("cuda", c.POINTER(Cuda)), ("context", p), ("stream", p), ("copies", p), ("graphs", p * 4), ("many", i64),
-         ("mailbox", c.POINTER(Mailbox)), ("body", c.POINTER(Body)),
-        ("mailboxes", c.c_int32), ("bodies", c.c_int32), ("results", p), ("stamps", p),
-        ("found", p), ("energies", p), ("account", p), ("elastic", p), ("capacity", i64), ("batch", i64),
-        ("values", c.c_uint64), ("staged", c.c_uint64),
-        ("matrices", p), ("snapped", p), ("home", p), ("x", c.c_uint64), ("v", c.c_uint64), ("pictures", c.c_uint64),
-        ("frame_bytes", i64), ("clock", p), ("span", c.c_double), ("poll", c.c_double), ("step_seconds", c.c_double),
-        ("idle", c.c_double), ("cpu", c.c_double), ("begun", i64), ("finished", i64), ("launched", i64),
-        ("drawn", i64), ("matrix_step", i64), ("asked", c.c_int32), ("stalled", c.c_int32), ("error", c.c_int32),
-        ("where", c.c_char * 28),
-        ("batches", Batch * DEPTH), ("picture", Picture * PICTURES), ("rings", Rings),
+        ("driver", c.POINTER(CudaDriver)), ("context", p), ("stream", p), ("copy_stream", p), ("graphs", p * 4),
+        ("many", i64), ("mail_slots", c.POINTER(MailSlot)), ("readbacks", c.POINTER(BodyReadback)),
+        ("mail_slot_count", c.c_int32), ("bodies", c.c_int32), ("results", p), ("timestamps", p),
+        ("newton_results", p), ("energy_records", p), ("energy_balance", p), ("elastic_energy", p), ("capacity", i64),
+        ("batch", i64), ("values", c.c_uint64), ("staged", c.c_uint64), ("host_matrices", p), ("staged_event", p),
+        ("copied_event", p), ("x", c.c_uint64), ("v", c.c_uint64), ("frame_staging", c.c_uint64), ("frame_bytes", i64),
+        ("clock", p), ("batch_seconds", c.c_double), ("poll", c.c_double), ("step_seconds", c.c_double),
+        ("idle_since", c.c_double), ("cpu", c.c_double), ("begun", i64), ("finished", i64), ("launched", i64),
+        ("frames_begun", i64), ("matrix_step", i64), ("requested", c.c_int32), ("ran_dry", c.c_int32),
+        ("error", c.c_int32), ("failed_call", c.c_char * 28), ("batches", StepBatch * STEP_BATCHES),
+        ("frame_copies", FrameCopy * FRAME_COPIES), ("rings", Rings),
     ]  # fmt: skip

@@ -21,29 +21,29 @@
 extern __shared__ float4 dynamic[];   // of all groups
 
 struct Part {
-    long long g, t;                  // where G and T begin in the workspace
-    int v, b;                        // degrees of freedom
-    int pitch_g, pitch_t;            // entries per row
-    int start, boundary, out, unused; // as in plan.Parts
+    long long g, t;                    // where G and T begin in the workspace
+    int v, b;                          // degrees of freedom
+    int pitch_g, pitch_t;              // entries per row
+    int start, boundary, out, unused;  // as in plan.Parts
 };
 
 struct Column {                      // of L
-    long long value, row;            // its first value, and that value's place among the rows
-    int length, part, within, unused; // within: in the part
+    long long value, row;              // its first value, and that value's place among the rows
+    int length, part, within, unused;  // within: in the part
 };
 
-struct Task { int part, i, j, end; }; // tile in units of 64; end: of the first of two merged runs
+struct TileTask { int part, i, j, end; }; // tile in units of 64; end: of the first of two merged runs
 
-struct Target {                      // set before each run
-    unsigned short* matrix;          // (chunks, 8, 32)
-    float* scale;                    // (N + 1,)
+struct InverseStorage {                      // set before each run
+    unsigned short* matrix;  // (chunks, 8, 32)
+    float* scale;            // (N + 1,)
 };
 
 // Threads of a block that work together; first, step: of the tasks they take.
 template <int SIZE>
-struct Group {
+struct ThreadGroup {
     int thread, index, first, step;
-    __device__ __forceinline__ Group()
+    __device__ __forceinline__ ThreadGroup()
         : thread(threadIdx.x % SIZE), index(threadIdx.x / SIZE), first(blockIdx.x * (blockDim.x / SIZE) + index),
           step(gridDim.x * (blockDim.x / SIZE)) {}
     __device__ __forceinline__ void barrier() const { asm volatile("bar.sync %0, %1;" ::"r"(index + 1), "n"(SIZE) : "memory"); }
@@ -53,9 +53,9 @@ __device__ __forceinline__ int padded(int n, int step) { return (n + step - 1) /
 
 // Values into G, a warp per column. place: column in its part's G of each entry of L's row lists. begin: the first batch.
 KERNEL_OF(1024) scatter(const Part* parts, const Column* columns, int first, int last, const int* place,
-                           const float* values, float* workspace, int begin, int scale_end, const Target* target) {
+                           const float* values, float* workspace, int begin, int scale_end, const InverseStorage* target) {
     if (begin && blockIdx.x == 0 && threadIdx.x == 0) target->scale[scale_end] = 0;
-    Group<32> warp;
+    ThreadGroup<32> warp;
     for (int c = first + warp.first; c < last; c += warp.step) {
         const Column column = columns[c];
         const Part part = parts[column.part];
@@ -68,13 +68,13 @@ KERNEL_OF(1024) scatter(const Part* parts, const Column* columns, int first, int
 }
 
 // Diagonal blocks: L^T in, L^-1 out. A thread has a column of the inverse in registers.
-KERNEL_OF(4 * EDGE) invert(const Part* parts, const Task* tasks, int count, float* workspace) {
-    Group<EDGE> group;
+KERNEL_OF(4 * EDGE) invert(const Part* parts, const TileTask* tasks, int count, float* workspace) {
+    ThreadGroup<EDGE> group;
     int j = group.thread;
     float(*rows)[EDGE] = (float(*)[EDGE])((float*)dynamic + group.index * EDGE * (EDGE + 1));   // of L^T
     float* pivots = rows[EDGE];
     for (int t = group.first; t < count; t += group.step) {
-        const Task task = tasks[t];
+        const TileTask task = tasks[t];
         const Part part = parts[task.part];
         float* block = workspace + part.g + (long long)task.i * EDGE * part.pitch_g + task.i * EDGE + j;
         int inside = part.v - task.i * EDGE;
@@ -109,13 +109,13 @@ struct Operand { const float* from; int pitch; };
 // fewer a multiprocessor waits for shared memory, with more a tile takes too long.
 template <bool ACROSS>
 struct Product {
-    const Group<THREADS>& group;
+    const ThreadGroup<THREADS>& group;
     float (*const a)[DEPTH][EDGE];
     float (*const b)[DEPTH][EDGE];
     float sum[8][4];
-    int row, column;     // of this thread's entries in the tile: rows row .. row + 3 and row + 32 .. row + 35
+    int row, column;  // of this thread's entries in the tile: rows row .. row + 3 and row + 32 .. row + 35
 
-    __device__ __forceinline__ Product(const Group<THREADS>& g, float* shared)
+    __device__ __forceinline__ Product(const ThreadGroup<THREADS>& g, float* shared)
         : group(g), a((float(*)[DEPTH][EDGE])shared), b(a + 2) {
         int lane = g.thread % 32, warp = g.thread / 32;
         row = warp / 2 * 16 + lane / 8 * 4;
@@ -190,11 +190,11 @@ struct Product {
 };
 
 // T = C Y1: tile (i, j) of a pair of runs j .. end, end .. i ..
-KERNEL_OF(5 * THREADS) couple(const Part* parts, const Task* tasks, int count, float* workspace) {
-    Group<THREADS> group;
+KERNEL_OF(5 * THREADS) couple(const Part* parts, const TileTask* tasks, int count, float* workspace) {
+    ThreadGroup<THREADS> group;
     float* shared = (float*)dynamic + group.index * SHARED;
     for (int t = group.first; t < count; t += group.step) {
-        const Task task = tasks[t];
+        const TileTask task = tasks[t];
         const Part part = parts[task.part];
         const float* rows = workspace + part.g + (long long)task.j * EDGE * part.pitch_g;
         Product<false> product(group, shared);
@@ -204,11 +204,11 @@ KERNEL_OF(5 * THREADS) couple(const Part* parts, const Task* tasks, int count, f
 }
 
 // X = -Y2 T.
-KERNEL_OF(5 * THREADS) merge(const Part* parts, const Task* tasks, int count, float* workspace) {
-    Group<THREADS> group;
+KERNEL_OF(5 * THREADS) merge(const Part* parts, const TileTask* tasks, int count, float* workspace) {
+    ThreadGroup<THREADS> group;
     float* shared = (float*)dynamic + group.index * SHARED;
     for (int t = group.first; t < count; t += group.step) {
-        const Task task = tasks[t];
+        const TileTask task = tasks[t];
         const Part part = parts[task.part];
         float* row = workspace + part.g + (long long)task.i * EDGE * part.pitch_g;
         const float* coupled = workspace + part.t + (long long)task.end * EDGE * part.pitch_t + task.j * EDGE;
@@ -219,14 +219,14 @@ KERNEL_OF(5 * THREADS) merge(const Part* parts, const Task* tasks, int count, fl
 }
 
 // Scale: length of the columns of Y, 32 columns of a block of 64 at a time; the largest one goes to scale[scale_end].
-KERNEL_OF(4 * LENGTHS) lengths(const Part* parts, const Task* tasks, int count, const float* workspace, int scale_end,
-                           const Target* target) {
-    Group<LENGTHS> group;
+KERNEL_OF(4 * LENGTHS) lengths(const Part* parts, const TileTask* tasks, int count, const float* workspace, int scale_end,
+                           const InverseStorage* target) {
+    ThreadGroup<LENGTHS> group;
     float(*sums)[32] = (float(*)[32])((float*)dynamic + group.index * LENGTHS);
     float* scale = target->scale;
     int lane = group.thread % 32, warp = group.thread / 32;
     for (int t = group.first; t < 2 * count; t += group.step) {
-        const Task task = tasks[t / 2];
+        const TileTask task = tasks[t / 2];
         const Part part = parts[task.part];
         int j = task.i * EDGE + t % 2 * 32 + lane;
         float sum = 0;
@@ -291,15 +291,15 @@ __device__ __forceinline__ void store(int thread, float (*tile)[PITCH], float si
 
 // Tile (i, j) of [Y^T Y | Y^T L_BV^T] into the storage: twice, since the inverse is symmetric and the coupling is applied
 // both ways. row_chunk (N / 8,), out_chunk (contributions / 8,): first chunk of each 8 rows.
-KERNEL_OF(5 * THREADS) finish(const Part* parts, const Task* tasks, int count, const float* workspace, const int* boundary,
-                          const int* row_chunk, const int* out_chunk, int planes, const Target* target) {
-    Group<THREADS> group;
+KERNEL_OF(5 * THREADS) finish(const Part* parts, const TileTask* tasks, int count, const float* workspace, const int* boundary,
+                          const int* row_chunk, const int* out_chunk, int planes, const InverseStorage* target) {
+    ThreadGroup<THREADS> group;
     float* shared = (float*)dynamic + group.index * SHARED;
     float(*tile)[PITCH] = (float(*)[PITCH])shared;   // after the product
     float *down = shared + SHARED - 2 * EDGE, *across = down + EDGE;
-    const Target to = *target;
+    const InverseStorage to = *target;
     for (int t = group.first; t < count; t += group.step) {
-        const Task task = tasks[t];
+        const TileTask task = tasks[t];
         const Part part = parts[task.part];
         int i = task.i * EDGE, j = task.j * EDGE, inside = padded(part.v, EDGE), edge = j - inside;
         const float* rows = workspace + part.g + (long long)i * part.pitch_g;

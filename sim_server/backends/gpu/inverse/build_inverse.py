@@ -2,7 +2,7 @@
 """From the values of L to what the GPU applies (plan.py), on the device, beside the running steps.
 
 Per expansion: one copy from pinned memory and one launch of a graph of the kernels in build_inverse.cu. No memory is
-allocated but when an Expansion is made.
+allocated but when an InverseBuilder is made.
 """
 
 from typing import Any, NamedTuple
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from protocol.factor import FactorPattern
 from sim_server.backends.gpu.device import Gpu
-from sim_server.backends.gpu.inverse.expansion_batches import EDGE, Batch, layout
+from sim_server.backends.gpu.inverse.expansion_batches import EDGE, BuildBatch, layout
 from sim_server.backends.gpu.inverse.partition import COLUMNS, ROWS
 from sim_server.backends.gpu.inverse.plan import Plan
 from sim_server.backends.gpu.inverse.workspace import workspace
@@ -31,7 +31,7 @@ KERNELS: dict[str, Groups] = {
 }
 
 
-class Expanded(NamedTuple):
+class PartitionedInverse(NamedTuple):
     """Device addresses of the chunks (float16) and of the scale (float32, (N + 1,): d in packed order, 0 in padding,
     then the largest d); the event after which they hold."""
 
@@ -40,14 +40,14 @@ class Expanded(NamedTuple):
     event: Any
 
 
-class Target(NamedTuple):
+class InverseStorage(NamedTuple):
     """Memory for one expanded factor: chunks (chunks, 8, 32) float16, scale (N + 1,) float32."""
 
     matrix: Any
     scale: Any
 
 
-class Expansion:
+class InverseBuilder:
     """Of factors with one pattern by one plan, for any number of bodies."""
 
     def __init__(self, gpu: Gpu, pattern: FactorPattern, plan: Plan):
@@ -65,12 +65,14 @@ class Expansion:
         self._graphs: dict[int | None, Any] = {}
         self._generation = -1
 
-    def target(self) -> Target:
+    def target(self) -> InverseStorage:
         """New memory for one factor, all zeros."""
         cp, p = self._gpu.cp, self.plan
-        return Target(cp.zeros((p.chunks, ROWS, COLUMNS), np.float16), cp.zeros(p.size + 1, np.float32))
+        return InverseStorage(cp.zeros((p.chunks, ROWS, COLUMNS), np.float16), cp.zeros(p.size + 1, np.float32))
 
-    def expand(self, values: NDArray[Any], target: Target, multiprocessors: int | None = None) -> Expanded:
+    def expand(
+        self, values: NDArray[Any], target: InverseStorage, multiprocessors: int | None = None
+    ) -> PartitionedInverse:
         """Starts making what `values` (nonzeros,) stand for. Nobody may be using the target; returns at once, but
         waits for the values of an expansion before it to have been copied to the device. For one thread at a time.
 
@@ -90,7 +92,7 @@ class Expansion:
         )
         space.copied = stream.record()
         graph.launch(stream)
-        return Expanded(*addresses, stream.record())
+        return PartitionedInverse(*addresses, stream.record())
 
     def _graph(self, limit: int | None) -> Any:
         if self._generation != self._workspace.generation:  # they hold its addresses
@@ -107,7 +109,7 @@ class Expansion:
                 self._graphs[limit] = graph
         return self._graphs[limit]
 
-    def _batch(self, number: int, batch: Batch, limit: int | None) -> None:
+    def _batch(self, number: int, batch: BuildBatch, limit: int | None) -> None:
         space, parts, last = self._workspace, self._parts, np.int32(self.plan.size)
         memory, target = (np.uint64(a.data.ptr) for a in (space.memory, space.incoming))
         diagonal, finish, *merges = self._tasks[number]

@@ -13,21 +13,21 @@ DUMMY = 32  # entries behind the packed vectors, where padding points
 TILE_SUMS = 64  # partitioned_inverse.cuh
 ROUND = 6  # what a product costs besides its chunks, in chunks
 
-PLAN = np.dtype(
+DEVICE_PLAN = np.dtype(
     [
-        ("phases", "i4"), ("blocks", "i4"), ("groups", "i4"), ("size", "i4"), ("parts", "u8"), ("lists", "u8"),
-        ("pieces", "u8"), ("tiles", "u8"), ("index", "u8"), ("target", "u8"), ("place", "u8"),
+        ("phases", "i4"), ("blocks", "i4"), ("groups", "i4"), ("size", "i4"), ("block_ranges", "u8"), ("lists", "u8"),
+        ("segments", "u8"), ("tiles", "u8"), ("index", "u8"), ("target", "u8"), ("place", "u8"),
         ("entries", "i4"), ("unused", "i4"),
     ]
 )  # fmt: skip
 
 
-def room(plan: Plan) -> int:
+def shared_bytes(plan: Plan) -> int:
     """Bytes of shared memory that a thread block must have: the vector of a phase in two float16, sums of tiles."""
     return 4 * plan.x_area + 64 * TILE_SUMS + 48
 
 
-def by_block(start: NDArray[Any], phases: int, blocks: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def regrouped_by_block(start: NDArray[Any], phases: int, blocks: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Lists kept by phase and block, wanted by block and phase: where each begins then, and which items follow."""
     order = np.arange(phases * blocks).reshape(phases, blocks).T.ravel()
     start = start.astype(np.int64)
@@ -37,7 +37,7 @@ def by_block(start: NDArray[Any], phases: int, blocks: int) -> tuple[NDArray[np.
     return new, items
 
 
-def pieces(plan: Plan) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+def warp_segments(plan: Plan) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
     """Segments cut into 32 entries each: where those of each list begin, and (kind, from, to, 2 valid + keep)."""
     segments = plan.segments.astype(np.int64)
     count = segments[:, 2] // 32
@@ -52,7 +52,7 @@ def pieces(plan: Plan) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
     return ends[plan.segment_start], np.stack([kind & 3, begin, to, 2 * valid + (kind >> 2 & 1)], 1).astype(np.int32)
 
 
-def index(plan: Plan, cut: NDArray[np.int32]) -> NDArray[np.int64]:
+def entry_index(plan: Plan, cut: NDArray[np.int32]) -> NDArray[np.int64]:
     """(pieces, 32): where each entry stands, or its contributions. Raises ValueError if there are too many."""
     entry = cut[:, 1, None].astype(np.int64) + np.arange(32)
     formed = (cut[:, 0] == 0)[:, None]
@@ -71,7 +71,7 @@ def index(plan: Plan, cut: NDArray[np.int32]) -> NDArray[np.int64]:
     )
 
 
-def doubled(tiles: NDArray[Any], start: NDArray[Any], planes: int) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+def paired_tiles(tiles: NDArray[Any], start: NDArray[Any], planes: int) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
     """Tiles of 8 rows taken together where the next eight rows follow, (k, 8): chunk, x, chunks, out, rows, 0, 0, 0."""
     chunk, x, chunks, out = tiles.T.astype(np.int64)
     follows = np.zeros(len(tiles), bool)  # the one before, in the same list
@@ -86,7 +86,7 @@ def doubled(tiles: NDArray[Any], start: NDArray[Any], planes: int) -> tuple[NDAr
     return found[~second], kept[start]
 
 
-def splits(tiles: NDArray[Any], start: NDArray[Any], warps: int) -> NDArray[np.int32]:
+def warps_per_tile(tiles: NDArray[Any], start: NDArray[Any], warps: int) -> NDArray[np.int32]:
     """Warps that share each tile of a list, (lists,): few tiles would leave most warps idle."""
     count = np.diff(start)
     total = np.concatenate([[0], np.cumsum(tiles[:, 2].astype(np.int64))])
@@ -101,51 +101,51 @@ def splits(tiles: NDArray[Any], start: NDArray[Any], warps: int) -> NDArray[np.i
     return best
 
 
-def parts(piece_start: NDArray[Any], tile_start: NDArray[Any], plan: Plan) -> NDArray[np.int64]:
+def block_ranges(segment_start: NDArray[Any], tile_start: NDArray[Any], plan: Plan) -> NDArray[np.int64]:
     """(blocks, 8) what each thread block has: first and count of pieces, tiles, chunks."""
     found = np.zeros((plan.blocks, 8), np.int64)
-    for k, start in enumerate((piece_start[:: plan.phases], tile_start[:: plan.phases], plan.chunk_start)):
+    for k, start in enumerate((segment_start[:: plan.phases], tile_start[:: plan.phases], plan.chunk_start)):
         found[:, 2 * k], found[:, 2 * k + 1] = start[:-1], np.diff(start)
     return found
 
 
-def lists(
-    piece_start: NDArray[Any], tile_start: NDArray[Any], split: NDArray[Any], formed: NDArray[Any]
+def phase_lists(
+    segment_start: NDArray[Any], tile_start: NDArray[Any], split: NDArray[Any], formed: NDArray[Any]
 ) -> NDArray[np.int64]:
     """(blocks, 4 phases + 2): where the pieces of each phase begin, and its tiles, in a block's own; the splits; the
     first piece that is not formed. formed (pieces,): whether a piece is; those of a phase come first."""
     blocks, phases = split.shape
     at = phases * np.arange(blocks)[:, None] + np.arange(phases + 1)
-    own = [start[at] - start[at[:, :1]] for start in (piece_start, tile_start)]
-    total = np.concatenate([[0], np.cumsum(formed)])[piece_start]
+    own = [start[at] - start[at[:, :1]] for start in (segment_start, tile_start)]
+    total = np.concatenate([[0], np.cumsum(formed)])[segment_start]
     return np.hstack([*own, split, own[0][:, :-1] + np.diff(total[at], axis=1)])
 
 
-class Planned:
+class DevicePlan:
     """A plan on the device, with the vectors that an application of it needs made by `vectors`."""
 
     def __init__(self, gpu: Gpu, plan: Plan, warps: int):
         self.gpu, self.plan = gpu, plan
         self.bytes = int(plan.chunks) * 512
-        piece_start, cut = pieces(plan)
-        piece_start, piece_order = by_block(piece_start, plan.phases, plan.blocks)
-        tile_start, tile_order = by_block(plan.tile_start, plan.phases, plan.blocks)
-        tiles, tile_start = doubled(plan.tiles[tile_order], tile_start, plan.planes)
-        split = splits(tiles, tile_start, warps).reshape(plan.blocks, plan.phases)
+        segment_start, cut = warp_segments(plan)
+        segment_start, segment_order = regrouped_by_block(segment_start, plan.phases, plan.blocks)
+        tile_start, tile_order = regrouped_by_block(plan.tile_start, plan.phases, plan.blocks)
+        tiles, tile_start = paired_tiles(plan.tiles[tile_order], tile_start, plan.planes)
+        split = warps_per_tile(tiles, tile_start, warps).reshape(plan.blocks, plan.phases)
         target = np.full(plan.contributions + DUMMY, len(plan.slots), np.int32)
         target[plan.slots] = np.arange(len(plan.slots), dtype=np.int32)
-        self._given = len(plan.slots) + DUMMY
+        self._contributions = len(plan.slots) + DUMMY
         arrays: dict[str, NDArray[Any]] = {
-            "parts": parts(piece_start, tile_start, plan),
-            "lists": lists(piece_start, tile_start, split, cut[piece_order, 0] == 0), "pieces": cut[piece_order],
-            "index": index(plan, cut[piece_order]), "tiles": tiles,
+            "block_ranges": block_ranges(segment_start, tile_start, plan),
+            "lists": phase_lists(segment_start, tile_start, split, cut[segment_order, 0] == 0),
+            "segments": cut[segment_order], "index": entry_index(plan, cut[segment_order]), "tiles": tiles,
             "target": target, "place": plan.place,
         }  # fmt: skip
         self._arrays = {
             name: gpu.cp.asarray(array.astype(np.int64).astype(np.uint32).view(np.int32))
             for name, array in arrays.items()
         }
-        params = np.zeros((), PLAN)
+        params = np.zeros((), DEVICE_PLAN)
         params["phases"], params["blocks"], params["groups"] = plan.phases, plan.blocks, plan.groups
         params["size"], params["entries"] = plan.size, plan.x_area
         for name, array in self._arrays.items():
@@ -158,5 +158,5 @@ class Planned:
         zeros, n = self.gpu.cp.zeros, self.plan.size + DUMMY
         return {
             "residual": zeros(2 * n), "product": zeros(n), "z": zeros(n), "formed": zeros(n), "solved": zeros(n),
-            "given": zeros(self._given),
+            "contributed": zeros(self._contributions),
         }  # fmt: skip

@@ -28,7 +28,7 @@ COLUMN = np.dtype([("value", "i8"), ("row", "i8"), ("length", "i4"), ("part", "i
 
 
 @dataclass(frozen=True)
-class Batch:
+class BuildBatch:
     """Columns first..last of the table of columns; bytes of the workspace to be cleared; tasks (k, 4): part, tile row,
     tile column, end of the first run. merges: level by level."""
 
@@ -41,7 +41,7 @@ class Batch:
 
 
 @dataclass(frozen=True)
-class Layout:
+class WorkspaceLayout:
     """Tables of PART and COLUMN; place (rows of the pattern,): column in its part's G of each entry of L's row lists;
     row_chunk (N / 8,), out_chunk (contributions / 8,): first chunk of each tile; room: bytes of workspace."""
 
@@ -50,17 +50,17 @@ class Layout:
     place: Int32
     row_chunk: Int32
     out_chunk: Int32
-    batches: list[Batch]
+    batches: list[BuildBatch]
     room: int
 
 
-def layout(pattern: FactorPattern, plan: Plan, room: int = ROOM) -> Layout:
+def layout(pattern: FactorPattern, plan: Plan, room: int = ROOM) -> WorkspaceLayout:
     """Where the parts of a plan are made."""
     parts, members = _parts(plan, room)
     columns, first = _columns(pattern, plan)
     batches = [_batch(parts, p, first) for p in members]
     row_chunk, out_chunk = _homes(plan)
-    return Layout(
+    return WorkspaceLayout(
         parts, columns, _place(pattern, plan), row_chunk, out_chunk, batches, max(_end(parts, p) for p in members)
     )
 
@@ -139,7 +139,7 @@ def _homes(plan: Plan) -> tuple[Int32, Int32]:
     return row_chunk, out_chunk
 
 
-def _batch(parts: NDArray[Any], members: NDArray[np.int64], first: NDArray[np.int64]) -> Batch:
+def _batch(parts: NDArray[Any], members: NDArray[np.int64], first: NDArray[np.int64]) -> BuildBatch:
     inside, edge = parts["pitch_t"][members] // EDGE, (parts["pitch_g"] - parts["pitch_t"])[members] // EDGE
     lower = [_lower(int(n)) for n in inside]
     part = np.repeat(members, [len(pairs) for pairs in lower])
@@ -152,7 +152,7 @@ def _batch(parts: NDArray[Any], members: NDArray[np.int64], first: NDArray[np.in
     finish = np.concatenate([square, coupling])
     depth = (parts["pitch_t"] // EDGE)[finish[:, 0]] - finish[:, 1]
     low, high = int(first[members.min()]), int(first[members.max() + 1])  # members are consecutive
-    return Batch(
+    return BuildBatch(
         low,
         high,
         4 * int(parts["t"][members[0]]),

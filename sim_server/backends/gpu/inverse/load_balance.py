@@ -17,7 +17,7 @@ WORTH = 1.1  # matrices are cut anywhere only if everything else takes this many
 MANY = 8  # matrices per block from which whole ones balance well enough
 
 
-class Work(NamedTuple):
+class PhaseWork(NamedTuple):
     """Matrices of one phase: rows of tiles, time of one tile and of bringing the vector [ns]; (matrices,) each."""
 
     tiles: Ints
@@ -25,7 +25,7 @@ class Work(NamedTuple):
     bring: Reals
 
 
-class Pieces(NamedTuple):
+class TilePartition(NamedTuple):
     """Tiles first..first + tiles of a matrix belong to a block; sorted by block. (pieces,) each."""
 
     block: Ints
@@ -34,7 +34,7 @@ class Pieces(NamedTuple):
     tiles: Ints
 
 
-def share(work: Work, blocks: int) -> Pieces:
+def share(work: PhaseWork, blocks: int) -> TilePartition:
     """The pieces of every block; every tile is in one."""
     whole = _least(work, blocks, lambda time: _whole(work, blocks, time))
     if len(work.tiles) > MANY * blocks or blocks == 1:
@@ -43,13 +43,13 @@ def share(work: Work, blocks: int) -> Pieces:
     return _sorted(_cut(work, blocks, cut) if whole > WORTH * cut else _whole(work, blocks, whole))
 
 
-def _sorted(pieces: Pieces | None) -> Pieces:
+def _sorted(pieces: TilePartition | None) -> TilePartition:
     assert pieces is not None
     order = np.lexsort((pieces.first, pieces.matrix, pieces.block))
-    return Pieces(*(field[order] for field in pieces))
+    return TilePartition(*(field[order] for field in pieces))
 
 
-def _least(work: Work, blocks: int, attempt) -> float:
+def _least(work: PhaseWork, blocks: int, attempt) -> float:
     """Least time, to 1 %, in which the attempt succeeds."""
     total = float((work.tiles * work.tile + work.bring).sum())
     low, high = total / blocks, 1.001 * total
@@ -61,7 +61,7 @@ def _least(work: Work, blocks: int, attempt) -> float:
     return high
 
 
-def _whole(work: Work, blocks: int, time: float) -> Pieces | None:
+def _whole(work: PhaseWork, blocks: int, time: float) -> TilePartition | None:
     """Blocks of their own for matrices that take longer than `time`, the others packed; None if blocks run out."""
     cost = work.tiles * work.tile + work.bring
     large, small = np.flatnonzero(cost > time), np.flatnonzero(cost <= time)
@@ -80,7 +80,7 @@ def _whole(work: Work, blocks: int, time: float) -> Pieces | None:
     k = np.arange(used) - np.repeat(np.cumsum(count) - count, count)
     tiles, of = work.tiles[matrix], np.repeat(count, count)
     first, last = k * tiles // of, (k + 1) * tiles // of
-    return Pieces(
+    return TilePartition(
         np.concatenate([np.arange(used), used + bins]),
         np.concatenate([matrix, small]),
         np.concatenate([first, np.zeros(len(small), np.int64)]),
@@ -102,7 +102,7 @@ def _packed(cost: Reals, time: float, bins: int) -> Ints | None:
     return home if at == len(cost) else None
 
 
-def _cut(work: Work, blocks: int, time: float) -> Pieces | None:
+def _cut(work: PhaseWork, blocks: int, time: float) -> TilePartition | None:
     """One matrix after another, a block full before the next begins; None if blocks run out."""
     tiles, tile, bring = work.tiles.tolist(), work.tile.tolist(), work.bring.tolist()
     found: list[tuple[int, int, int, int]] = []
@@ -118,4 +118,4 @@ def _cut(work: Work, blocks: int, time: float) -> Pieces | None:
                 if left == time or block == blocks - 1:
                     return None
                 block, left = block + 1, time
-    return Pieces(*np.array(found, np.int64).reshape(-1, 4).T)
+    return TilePartition(*np.array(found, np.int64).reshape(-1, 4).T)

@@ -13,10 +13,10 @@
 #endif
 #define TILE_SUMS 64  // jobs of a phase that share tiles, at most
 #define LISTS 32768   // bytes of a list that is worth its place in shared memory
-#define FEW 3         // pieces that a warp brings together at a time
+#define FEW 3         // segments that a warp brings together at a time
 #define MANY 8        // 2304 entries in one trip through L2 with 8 warps
 
-struct Vector { unsigned short *high, *low; };  // of a phase, in shared memory
+struct SplitVector { unsigned short *high, *low; };  // of a phase, in shared memory
 
 __device__ __forceinline__ unsigned short half_of(float v) {
     unsigned short h;
@@ -29,7 +29,7 @@ __device__ __forceinline__ float of_half(unsigned short h) {
     return v;
 }
 
-__device__ __forceinline__ void put_halves(const Vector& to, int i, float v) {
+__device__ __forceinline__ void put_halves(const SplitVector& to, int i, float v) {
     v = fminf(fmaxf(v, -6e4f), 6e4f);
     unsigned short high = half_of(v);
     to.high[i] = high;
@@ -58,25 +58,25 @@ __device__ __forceinline__ void multiply_add(float sum[4], unsigned a0, unsigned
 }
 
 // Where d r is found before the update by alpha of this application, or after it, and the numbers of the exchanges.
-struct Residual {
-    const Word<float>* r;
+struct ResidualSource {
+    const FlagWord<float>* r;
     unsigned r_number, q_number;
     float alpha;
 };
 
-struct Inverse {
-    const Plan* plan;             // in shared memory
-    const uint4* matrix;          // chunks of this block, of which `near` are in shared memory
+struct PartitionedInverse {
+    const DevicePlan* plan;  // in shared memory
+    const uint4* matrix;     // chunks of this block, of which `near` are in shared memory
     uint4* kept;
     int begin, near, planes;
     const float* scale;
-    Word<float> *residual, *product, *z, *formed, *solved, *given;
-    Vector vector;
-    float* tile_sums;             // (TILE_SUMS, 16)
-    const int* lists;             // of the phases: first piece (phases + 1), first tile (phases + 1), warps that share a tile,
-                                  // first piece that is not formed here
-    const Piece* pieces;
-    const int* where;             // (pieces, 32) Plan.index
+    FlagWord<float> *residual, *product, *z, *formed, *solved, *contributed;
+    SplitVector vector;
+    float* tile_sums;        // (TILE_SUMS, 16)
+    const int* lists;        // of the phases: first segment (phases + 1), first tile (phases + 1), warps that share a tile,
+                             // first segment that is not formed here
+    const WarpSegment* segments;
+    const int* where;        // (segments, 32) DevicePlan.index
     const Tile* tiles;
     int size, phases, groups;
 
@@ -89,23 +89,23 @@ struct Inverse {
         return to;
     }
 
-    // What nothing can stand in for (Solver.planned sees to it that it fits).
-    __device__ __forceinline__ void reserve(const Plan* shared_plan, Arena& arena) {
+    // What nothing can stand in for (PcgSolver.planned sees to it that it fits).
+    __device__ __forceinline__ void reserve(const DevicePlan* shared_plan, Arena& arena) {
         vector.high = arena.take<unsigned short>(shared_plan->entries);
         vector.low = arena.take<unsigned short>(shared_plan->entries);
         tile_sums = arena.take<float>(16 * TILE_SUMS);
     }
 
-    __device__ __forceinline__ void set_up(const Body& body, const Plan* shared_plan, int index, Arena& arena) {
+    __device__ __forceinline__ void set_up(const PcgBody& body, const DevicePlan* shared_plan, int index, Arena& arena) {
         plan = shared_plan;
         size = plan->size; phases = plan->phases; groups = plan->groups;
         scale = body.scale; planes = body.planes;
         residual = body.residual; product = body.product; z = body.z;
-        formed = body.formed; solved = body.solved; given = body.given;
-        const Part part = plan->parts[index];
+        formed = body.formed; solved = body.solved; contributed = body.contributed;
+        const BlockRanges part = plan->block_ranges[index];
         lists = brought(plan->lists + index * (4 * phases + 2), 4 * phases + 2, arena);
-        pieces = brought(plan->pieces + part.piece, part.pieces, arena);
-        where = brought(plan->index + 32ll * part.piece, 32 * part.pieces, arena);
+        segments = brought(plan->segments + part.segment, part.segments, arena);
+        where = brought(plan->index + 32ll * part.segment, 32 * part.segments, arena);
         tiles = brought(plan->tiles + part.tile, part.tiles, arena);
         begin = part.chunk;
         matrix = body.matrix + 32ll * begin;
@@ -122,66 +122,66 @@ struct Inverse {
 
     // Brings together the vector of a phase: what this block forms, then what others do. No branches between loads: they
     // travel together.
-    __device__ __forceinline__ void gather(int phase, const Residual& from, unsigned number, float unit) const {
+    __device__ __forceinline__ void gather(int phase, const ResidualSource& from, unsigned number, float unit) const {
         const int warp = threadIdx.x / 32, first = lists[phase], last = lists[phase + 1];
         const int middle = phase < groups ? lists[3 * phases + 2 + phase] : first, formed_here = middle - first;
         if (phase == 0) {
-            if (formed_here <= FEW * WARPS) residual_pieces<FEW>(first + warp, middle, from, number, unit);
-            else for (int k = first + warp; k < middle; k += MANY * WARPS) residual_pieces<MANY>(k, middle, from, number, unit);
+            if (formed_here <= FEW * WARPS) residual_segments<FEW>(first + warp, middle, from, number, unit);
+            else for (int k = first + warp; k < middle; k += MANY * WARPS) residual_segments<MANY>(k, middle, from, number, unit);
         } else if (formed_here > FEW * WARPS) {
-            for (int k = first + warp; k < middle; k += 2 * WARPS) reduced_pieces<2, 6>(k, middle, from, number, unit);
+            for (int k = first + warp; k < middle; k += 2 * WARPS) reduced_segments<2, 6>(k, middle, from, number, unit);
         } else if (formed_here > WARPS) {
-            reduced_pieces<FEW, 4>(first + warp, middle, from, number, unit);
+            reduced_segments<FEW, 4>(first + warp, middle, from, number, unit);
         } else {
-            reduced_pieces<1, 12>(first + warp, middle, from, number, unit);
+            reduced_segments<1, 12>(first + warp, middle, from, number, unit);
         }
-        if (last - middle <= FEW * WARPS) solved_pieces<FEW>(middle + warp, last, number, unit);
-        else for (int k = middle + warp; k < last; k += MANY * WARPS) solved_pieces<MANY>(k, last, number, unit);
+        if (last - middle <= FEW * WARPS) solved_segments<FEW>(middle + warp, last, number, unit);
+        else for (int k = middle + warp; k < last; k += MANY * WARPS) solved_segments<MANY>(k, last, number, unit);
     }
 
     // Of the first phase: nothing has contributed yet.
     template <int N>
-    __device__ __forceinline__ void residual_pieces(int at, int last, const Residual& from, unsigned number, float unit) const {
+    __device__ __forceinline__ void residual_segments(int at, int last, const ResidualSource& from, unsigned number, float unit) const {
         if (at >= last) return;
         const int lane = threadIdx.x % 32;
-        Word<float> r[N], q[N];
+        FlagWord<float> r[N], q[N];
         float rk[N], qk[N];
         bool all;
         unsigned spins = 0;
         do {
 #pragma unroll
             for (int k = 0; k < N; ++k) {
-                const int i = pieces[min(at + k * WARPS, last - 1)].from + lane;
-                r[k] = from.r[i].seen();
-                q[k] = product[i].seen();
+                const int i = segments[min(at + k * WARPS, last - 1)].from + lane;
+                r[k] = from.r[i].load();
+                q[k] = product[i].load();
             }
             all = true;
 #pragma unroll
             for (int k = 0; k < N; ++k) {
-                const bool valid = lane < pieces[min(at + k * WARPS, last - 1)].keep >> 1;
-                all &= (r[k].is(rk[k], from.r_number) & (q[k].is(qk[k], from.q_number) | from.alpha == 0)) | !valid;
+                const bool valid = lane < segments[min(at + k * WARPS, last - 1)].keep >> 1;
+                all &= (r[k].unpack(rk[k], from.r_number) & (q[k].unpack(qk[k], from.q_number) | from.alpha == 0)) | !valid;
                 rk[k] = valid ? rk[k] : 0;
                 qk[k] = valid && from.alpha != 0 ? qk[k] : 0;
             }
-        } while (again(!all, spins));
+        } while (keep_polling(!all, spins));
 #pragma unroll
         for (int k = 0; k < N; ++k)
-            if (at + k * WARPS < last) put(pieces[at + k * WARPS], rk[k] - from.alpha * qk[k], number, unit);
+            if (at + k * WARPS < last) put(segments[at + k * WARPS], rk[k] - from.alpha * qk[k], number, unit);
     }
 
-    __device__ __forceinline__ void put(const Piece& piece, float v, unsigned number, float unit) const {
+    __device__ __forceinline__ void put(const WarpSegment& segment, float v, unsigned number, float unit) const {
         const int lane = threadIdx.x % 32;
-        put_halves(vector, piece.to + lane, unit * v);
-        if (piece.keep & 1) formed[piece.from + lane].put(v, number);
+        put_halves(vector, segment.to + lane, unit * v);
+        if (segment.keep & 1) formed[segment.from + lane].put(v, number);
     }
 
     // Of the phases up to the top: what has been contributed comes off.
     template <int N, int M>
-    __device__ __forceinline__ void reduced_pieces(int at, int last, const Residual& from, unsigned number, float unit) const {
+    __device__ __forceinline__ void reduced_segments(int at, int last, const ResidualSource& from, unsigned number, float unit) const {
         if (at >= last) return;
         const int lane = threadIdx.x % 32;
         int low[N], high[N], most = 0;
-        Word<float> r[N];
+        FlagWord<float> r[N];
         float v[N];
 #pragma unroll
         for (int k = 0; k < N; ++k) {
@@ -189,13 +189,13 @@ struct Inverse {
             const unsigned slots = where[32 * p + lane];
             low[k] = slots & 0xffffff;
             high[k] = low[k] + (slots >> 24);
-            r[k] = from.r[pieces[p].from + lane].seen();
+            r[k] = from.r[segments[p].from + lane].load();
             v[k] = 0;
         }
 #pragma unroll
         for (int k = 0; k < N; ++k) most = max(most, high[k] - low[k]);
         for (int m = 0; m < most; m += M) {
-            Word<float> c[N][M];
+            FlagWord<float> c[N][M];
             float ck[N][M];
             bool all;
             unsigned spins = 0;
@@ -203,13 +203,13 @@ struct Inverse {
 #pragma unroll
                 for (int k = 0; k < N; ++k)
 #pragma unroll
-                    for (int j = 0; j < M; ++j) c[k][j] = given[min(low[k] + m + j, max(high[k] - 1, 0))].seen();
+                    for (int j = 0; j < M; ++j) c[k][j] = contributed[min(low[k] + m + j, max(high[k] - 1, 0))].load();
                 all = true;
 #pragma unroll
                 for (int k = 0; k < N; ++k)
 #pragma unroll
-                    for (int j = 0; j < M; ++j) all &= c[k][j].is(ck[k][j], number) | (low[k] + m + j >= high[k]);
-            } while (again(!all, spins));
+                    for (int j = 0; j < M; ++j) all &= c[k][j].unpack(ck[k][j], number) | (low[k] + m + j >= high[k]);
+            } while (keep_polling(!all, spins));
 #pragma unroll
             for (int k = 0; k < N; ++k)
 #pragma unroll
@@ -218,43 +218,43 @@ struct Inverse {
 #pragma unroll
         for (int k = 0; k < N; ++k) {
             if (at + k * WARPS >= last) continue;
-            const Piece& piece = pieces[at + k * WARPS];
-            const bool valid = lane < piece.keep >> 1;
+            const WarpSegment& segment = segments[at + k * WARPS];
+            const bool valid = lane < segment.keep >> 1;
             float rk = 0;
-            for (unsigned spins = 0; again(valid && !r[k].is(rk, from.r_number), spins);) r[k] = from.r[piece.from + lane].seen();
-            put(piece, valid ? rk + v[k] : 0, number, unit);
+            for (unsigned spins = 0; keep_polling(valid && !r[k].unpack(rk, from.r_number), spins);) r[k] = from.r[segment.from + lane].load();
+            put(segment, valid ? rk + v[k] : 0, number, unit);
         }
     }
 
     // What has been formed, on the way to the top or in this phase by another block, and what is solved.
     template <int N>
-    __device__ __forceinline__ void solved_pieces(int at, int last, unsigned number, float unit) const {
+    __device__ __forceinline__ void solved_segments(int at, int last, unsigned number, float unit) const {
         if (at >= last) return;
         const int lane = threadIdx.x % 32;
-        const Word<float>* word[N];
-        Word<float> w[N];
+        const FlagWord<float>* word[N];
+        FlagWord<float> w[N];
         float v[N];
         bool all;
 #pragma unroll
         for (int k = 0; k < N; ++k) {
             const int p = min(at + k * WARPS, last - 1);
-            word[k] = (pieces[p].kind == 1 ? formed : solved) + where[32 * p + lane];
+            word[k] = (segments[p].kind == 1 ? formed : solved) + where[32 * p + lane];
         }
         unsigned spins = 0;
         do {
 #pragma unroll
-            for (int k = 0; k < N; ++k) w[k] = word[k]->seen();
+            for (int k = 0; k < N; ++k) w[k] = word[k]->load();
             all = true;
 #pragma unroll
             for (int k = 0; k < N; ++k) {
-                const bool valid = lane < pieces[min(at + k * WARPS, last - 1)].keep >> 1;
-                all &= w[k].is(v[k], number) | !valid;
+                const bool valid = lane < segments[min(at + k * WARPS, last - 1)].keep >> 1;
+                all &= w[k].unpack(v[k], number) | !valid;
                 v[k] = valid ? v[k] : 0;
             }
-        } while (again(!all, spins));
+        } while (keep_polling(!all, spins));
 #pragma unroll
         for (int k = 0; k < N; ++k)
-            if (at + k * WARPS < last) put_halves(vector, pieces[at + k * WARPS].to + lane, unit * v[k]);
+            if (at + k * WARPS < last) put_halves(vector, segments[at + k * WARPS].to + lane, unit * v[k]);
     }
 
     // Sums over chunks [from, to) of this block's storage, and over those `second` further on, of the next eight rows; the
@@ -300,7 +300,7 @@ struct Inverse {
     }
 
     // The products of a phase; returns this thread's part of z . r. unit: what the vector was multiplied by.
-    __device__ __forceinline__ double multiply(int phase, const Residual& from, unsigned number, float unit) const {
+    __device__ __forceinline__ double multiply(int phase, const ResidualSource& from, unsigned number, float unit) const {
         const int lane = threadIdx.x % 32, warp = threadIdx.x / 32;
         const int first = lists[phases + 1 + phase], count = lists[phases + 2 + phase] - first;
         const int parts = lists[2 * phases + 2 + phase];
@@ -309,7 +309,7 @@ struct Inverse {
         double zr = 0;
         int i = 0;
         float d = 0;
-        Word<float> r, q;  // of d r, for z . r
+        FlagWord<float> r, q;  // of d r, for z . r
         auto look_up = [&](const Tile& tile, int row) {  // before the product: these loads take as long
             i = tile.out + row;
             if (forward) {
@@ -317,21 +317,21 @@ struct Inverse {
                 return;
             }
             d = scale[i];
-            r = from.r[i].seen();
-            if (from.alpha != 0) q = product[i].seen();
+            r = from.r[i].load();
+            if (from.alpha != 0) q = product[i].load();
         };
         auto finish = [&](float value) {
             if (forward) {
-                given[i].put(value, number);
+                contributed[i].put(value, number);
                 return;
             }
             solved[i].put(value, number);
             z[i].put(d * value, number);
             if (d == 0) return;  // padding
             float ri, qi = 0;
-            for (unsigned spins = 0; again(!r.is(ri, from.r_number), spins);) r = from.r[i].seen();
+            for (unsigned spins = 0; keep_polling(!r.unpack(ri, from.r_number), spins);) r = from.r[i].load();
             if (from.alpha != 0)
-                for (unsigned spins = 0; again(!q.is(qi, from.q_number), spins);) q = product[i].seen();
+                for (unsigned spins = 0; keep_polling(!q.unpack(qi, from.q_number), spins);) q = product[i].load();
             zr += (double)value * (ri - from.alpha * qi);
         };
         const int row = threadIdx.x;

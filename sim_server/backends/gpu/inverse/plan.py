@@ -24,14 +24,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import FactorPattern
-from sim_server.backends.gpu.inverse.load_balance import Pieces, share
+from sim_server.backends.gpu.inverse.load_balance import TilePartition, share
 from sim_server.backends.gpu.inverse.partition import COLUMNS, NODE, ROWS, Partition, Tree, padded, partition, tree_of
 from sim_server.backends.gpu.inverse.tree_cuts import SHARED_MEMORY, choose, works
 
 Int32 = NDArray[np.int32]
 Ints = NDArray[np.int64]
 FORM, READ, GATHER, WRITE = 0, 1, 2, 4  # kinds of segments
-CHUNK = 2 * ROWS * COLUMNS  # bytes
+CHUNK_BYTES = 2 * ROWS * COLUMNS  # bytes
 TRIP_ENTRIES, TRIP_SLOTS = 512, 6  # entries of a part, contributions to each, that a block asks for in one trip
 TRIPS = 2  # more, and the blocks of a part form its entries once, each some of them, and read the others'
 _KEPT = 64  # plans
@@ -92,7 +92,7 @@ class Plan:
     @property
     def bytes(self) -> int:
         """Of the stored matrices."""
-        return CHUNK * self.chunks
+        return CHUNK_BYTES * self.chunks
 
     @property
     def nbytes(self) -> int:
@@ -224,7 +224,7 @@ def _starts(keys: Ints, count: int) -> Int32:
 class _Phase:
     """Segments and tiles of one phase, each with its block in front."""
 
-    def __init__(self, phase: int, groups: int, parts: Parts, which: Ints, pieces: Pieces, depth: Ints):
+    def __init__(self, phase: int, groups: int, parts: Parts, which: Ints, pieces: TilePartition, depth: Ints):
         self.forward, self.backward = phase < groups - 1, phase >= groups
         self.pieces = pieces
         part = which[pieces.matrix]

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_server.backends.gpu.inverse.load_balance import Work, share
+from sim_server.backends.gpu.inverse.load_balance import PhaseWork, share
 from sim_server.backends.gpu.inverse.partition import COLUMNS, ROWS, Partition, Tree, padded, partition
 
 Ints = NDArray[np.int64]
@@ -24,7 +24,7 @@ FLOPS, USES = 10e3, 3000  # making the matrices: float32 operations per ns; appl
 MOST = 9  # groups
 
 
-def works(cut: Partition, blocks: int, planes: int) -> Iterator[tuple[Ints, Work]]:
+def works(cut: Partition, blocks: int, planes: int) -> Iterator[tuple[Ints, PhaseWork]]:
     """Parts and what is to be done for each, phase by phase."""
     inside, outside = padded(cut.v, COLUMNS), padded(cut.b, COLUMNS)
     rate = _rate(cut, planes)
@@ -35,7 +35,7 @@ def works(cut: Partition, blocks: int, planes: int) -> Iterator[tuple[Ints, Work
         rows = padded(cut.b[which] if forward else cut.v[which], ROWS) // ROWS
         columns = inside[which] + outside[which] * backward
         tile = columns * (2.0 * ROWS * planes) / rate
-        yield which, Work(rows, tile, BRING + ENTRY * columns)
+        yield which, PhaseWork(rows, tile, BRING + ENTRY * columns)
 
 
 def _rate(cut: Partition, planes: int) -> float:
