@@ -12,7 +12,7 @@ import pytest
 
 from sim_server.backends import compiler as backend
 from sim_server.backends.gpu import kernel_fusion
-from sim_server.backends.gpu.device import PRECISIONS
+from sim_server.backends.gpu.device import PRECISIONS, own_headers
 from sim_server.backends.gpu.device import options as device_options
 from tests.support import nvrtc
 
@@ -178,7 +178,7 @@ LAWS = sorted(p.relative_to(PACKAGE).as_posix() for p in PACKAGE.glob("effects/*
 FRAME = "kernels/hyperelastic.cu"  # of the laws: no text by itself
 GPU_TEXTS = sorted(p.relative_to(PACKAGE).as_posix() for p in PACKAGE.rglob("*.cu"))
 GPU_TEXTS = [path for path in GPU_TEXTS if path != FRAME] + [f"{FRAME}+{law}" for law in LAWS]
-TEXTS = [path for path in GPU_TEXTS if not path.startswith("gpu/")]
+TEXTS = [path for path in GPU_TEXTS if not path.startswith("backends/gpu/")]
 
 
 @pytest.mark.slow
@@ -199,12 +199,12 @@ def test_every_text_of_the_package_compiles_for_gpus(path, arch, tmp_path):
     """By NVRTC, which needs no GPU and no driver; what it says counts as a failure too."""
     if (library := nvrtc.library()) is None:
         pytest.skip("needs the package nvidia-cuda-nvrtc")
-    own = path.startswith("gpu/")
+    own = path.startswith("backends/gpu/")
     for name, types in PRECISIONS.items():
         if name == "mixed" and own and "local*" not in backend.read_text(path)[1]:
             continue  # the same: they know no elements
         options = nvrtc.arch(arch, "max" if own else "mid")
-        options += [*device_options(types), f"-I{PACKAGE / 'backends/gpu'}"]  # as they are compiled there
+        options += [*device_options(types), *own_headers()]  # as they are compiled there
         text = tmp_path / "text.cu"
         text.write_text(backend.read_text(path)[1])
         code, said = nvrtc.compiled(library, text, options)
@@ -325,7 +325,7 @@ def test_what_lets_further_linearizations_return_comes_in_front_and_changes_noth
         for guard in (None, kernel_fusion.PhaseGuard(64, 128, 192))
     )
     before, after = plain.source.split("fused(int n"), guarded.source.split("fused(int n")
-    arguments = ", const int* __restrict__ left, const int* __restrict__ phase, const int* __restrict__ body"
+    arguments = ", const int* __restrict__ active, const int* __restrict__ phase, const int* __restrict__ body"
     assert "".join(["\n", *(f"{line}\n" for line in kernel_fusion.PHASE_GUARD)]) in after[1]
     assert after[1].replace(arguments, "").replace("\n".join(kernel_fusion.PHASE_GUARD) + "\n", "") == before[1]
     assert before[0] == after[0] and guarded.values == [64, 128, 192, *plain.values]
