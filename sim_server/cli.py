@@ -244,7 +244,7 @@ def _wait_for_workers(service: "Service", supervisor: "Supervisor | None") -> No
 
 def _summary(service: "Service") -> str:
     p50, p99, most = (1e3 * s for s in service.telemetry.percentiles())
-    used = sum(t.used for t in service.driver.tracks)
+    used = sum(state.factors.used for state in service.driver.bodies)
     return (
         f"{service.engine.step} steps; last {len(service.telemetry.seconds)}: p50 {p50:.3f}, p99 {p99:.3f}, "
         f"max {most:.3f} ms; {used} factors used, {service.engine.loop.late_steps} late steps; "

@@ -28,7 +28,7 @@ KINDS = {"none": Kind.NONE, "jacobi": Kind.JACOBI, "block_jacobi": Kind.BLOCK_JA
 
 
 class Simulation:
-    """A scene on a device, "cpu" or "gpu". `engine.run(n)` makes n steps; when factors come is policy.py's business.
+    """A scene on a device, "cpu" or "gpu". `engine.run(n)` makes n steps; when factors come is for updates/driver.py.
 
     watched: whether bodies that run away are looked for at all; a log of a version that did not is repeated without.
 

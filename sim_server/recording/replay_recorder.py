@@ -19,8 +19,8 @@ from protocol.validate import checksum
 from sim_server.network.link import ServerLink
 from sim_server.recording.recorder import Recorder
 from sim_server.service.commands import interaction_message
+from sim_server.updates.driver import Driver
 from sim_server.updates.factor_source import EXACT
-from sim_server.updates.policy import Driver
 
 if TYPE_CHECKING:
     from sim_server.effects.touch import Interaction

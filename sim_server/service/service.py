@@ -27,7 +27,7 @@ from sim_server.service.commands import Commands
 from sim_server.service.pace import LOOKS, Pace
 from sim_server.service.telemetry import Telemetry
 from sim_server.simulation import Simulation
-from sim_server.updates.policy import Driver
+from sim_server.updates.driver import Driver
 
 log = logging.getLogger(__name__)
 
@@ -160,7 +160,7 @@ class Service:
         if self.pace is None or now < self._pace_due:
             return
         self._pace_due = now + LOOKS
-        warm = not self.driver.wants_factors or all(track.used for track in self.driver.tracks)
+        warm = not self.driver.wants_factors or all(state.factors.used for state in self.driver.bodies)
         line = self.pace.look(now, self.engine.step, self._state() != "running", warm)
         if line:
             log.warning("%s", line)
@@ -174,7 +174,7 @@ class Service:
         """What makes steps take less time, or lets them take it."""
         ways = ["a larger dt (--set dt=...)", "a coarser mesh"]
         workers = len(self.link.dispatch.workers())
-        if self.driver.wants_factors and workers < len(self.driver.tracks):
+        if self.driver.wants_factors and workers < len(self.driver.bodies):
             ways.append("more workers" if workers else "a worker (--workers 1)")
         if not self._on_gpu and nvidia_device():
             ways.append("--device gpu")

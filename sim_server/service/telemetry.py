@@ -17,7 +17,7 @@ from sim_server.recording.recorder import Recorder
 from sim_server.recording.replay_recorder import Trace
 from sim_server.service.commands import Commands
 from sim_server.service.points import Points
-from sim_server.updates.policy import Driver
+from sim_server.updates.driver import Driver
 
 STEPS_PERIOD = 0.05  # s between batches of step records
 STATE_PERIOD = 1 / 30  # s between states for viewers
@@ -113,19 +113,19 @@ class Telemetry:
         messages = describe.steps(self.simulation, wanted, self._method)
         bound = self.driver.age_bound() if messages else -1
         for message in messages:
-            message.excess = self.driver.by_name[message.header.object].excess
+            message.excess = self.driver.by_name[message.header.object].solves.excess
             message.factor_age_bound = bound
         return messages
 
     def _method(self, body: int, step: int) -> Method | None:
         """How the factor of a step was made."""
-        return self.driver.tracks[body].method(step)
+        return self.driver.bodies[body].factors.method(step)
 
     def _latest(self, body: int, bound: int) -> pb.ObjectStep | None:
         if not self._window[body]:
             return None
         message = describe.steps(self.simulation, self._last[body : body + 1], self._method)[0]
-        message.excess, message.factor_age_bound = self.driver.tracks[body].excess, bound
+        message.excess, message.factor_age_bound = self.driver.bodies[body].solves.excess, bound
         return message
 
     def _touch(self, messages: list[pb.ObjectStep]) -> None:
@@ -197,8 +197,8 @@ class Telemetry:
         status.records_lost = self.recorder.lost if self.recorder else 0
         status.recording_failure = self.recorder.failure[:400] if self.recorder else ""
         bound = self.driver.age_bound()
-        for track in self.driver.tracks:
-            body, window = track.body, self._window[track.body.index]
+        for updates in self.driver.bodies:
+            body, window = updates.body, self._window[updates.body.index]
             status.objects.append(
                 pb.ObjectStatus(
                     object=body.name,
@@ -206,14 +206,14 @@ class Telemetry:
                     tets=len(body.mesh.tets),
                     last=self._latest(body.index, bound),
                     mean_iterations=float(np.mean(window)) if window else 0.0,
-                    excess=track.excess,
-                    factors_used=track.used,
-                    factors_refused=track.refused,
-                    factors_mended=track.mended,
-                    refusal=track.refusal[:400],
-                    in_flight=track.in_flight,
-                    factor_age=track.age(status.step),
-                    factor_age_max=track.age_max,
+                    excess=updates.solves.excess,
+                    factors_used=updates.factors.used,
+                    factors_refused=updates.failures.refused,
+                    factors_mended=updates.factors.regularized,
+                    refusal=updates.failures.reason[:400],
+                    in_flight=updates.job.in_flight,
+                    factor_age=updates.factors.age(status.step),
+                    factor_age_max=updates.solves.max_factor_age,
                     factor_age_bound=bound,
                     runaway_steps=self.runaways[body.index],
                     total_energy=self._energy.get(body.index),

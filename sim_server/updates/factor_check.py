@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A factor is looked at before it is used: one application to a fixed vector, in the service thread.
+"""Checks a factor before it is used: one application to a fixed vector, in the service thread.
 
 With z = P^-1 r the first iteration of conjugate gradients takes (z.r)^2 / (z.Az) off e.Ae, the energy of the error
 (Saad, Iterative Methods for Sparse Linear Systems, 2nd edition, 5.3.1), whatever scale P has. An exact factor takes off
@@ -19,7 +19,7 @@ from sim_server.backends.cpu import structs
 from sim_server.backends.cpu.engine import NativeFactor
 
 Reals = NDArray[np.float64]
-SHARE = 0.9  # of what block Jacobi takes off: below it a factor is refused; not 1, as one vector is not the whole space
+MIN_SHARE = 0.9  # of what block Jacobi takes off, for a factor to be used; not 1, as one vector is not the space
 
 
 @cache
@@ -36,47 +36,55 @@ def _library() -> c.CDLL:
     return library
 
 
-class Guard:
-    """patterns: row_start and columns of A by object, nodes numbered from 0."""
+class FactorCheck:
+    """Checks factors of some objects. patterns: row_start and columns of A by object, nodes numbered from 0."""
 
     def __init__(self, patterns: dict[str, tuple[NDArray[np.int32], NDArray[np.int32]]]):
         self._patterns = patterns
-        self._room: dict[int, tuple[Reals, Reals]] = {}  # by size: probe vector, work
+        self._arrays: dict[int, tuple[Reals, Reals]] = {}  # by size: probe vector, work
 
     def prepare(self) -> None:
-        """Compiles what is needed, so that the first factor does not wait for it."""
+        """Compiles the native check, so that the first factor does not wait for it."""
         _library()
 
-    def complaint(self, factor: Factor, matrix: Reals | None) -> str:
-        """Why a factor is not to be used, empty if it is. matrix: values (blocks, 3, 3) it was made from, if known."""
-        row_start, columns = self._patterns[factor.object]
-        nodes = len(row_start) - 1
+    def reject_reason(self, factor: Factor, matrix: Reals | None) -> str:
+        """Returns why a factor is not to be used; empty if it is.
+
+        matrix: values (blocks, 3, 3) that it was made from; None: not known, and the test against block Jacobi is left
+            out
+        """
+        nodes = len(self._patterns[factor.object][0]) - 1
         if factor.pattern.size != 3 * nodes:
             return f"its size is {factor.pattern.size}, that of the object {3 * nodes}"
         if len(factor.values) != factor.pattern.nonzeros:
             return f"it has {len(factor.values)} values, its pattern {factor.pattern.nonzeros}"
-        zr, reached, block_jacobi = self._judge(factor, nodes, row_start, columns, matrix)
+        zr, reduction, block_jacobi = self.probe(factor, matrix)
         if not 0 < zr < np.inf:
             return f"not positive definite or not finite (z.r = {zr:.3g} on a probe vector)"
-        if matrix is not None and not reached >= SHARE * block_jacobi:
+        if matrix is not None and not reduction >= MIN_SHARE * block_jacobi:
             return (
                 "worse than block Jacobi on a probe vector: an iteration takes "
-                f"{reached:.3g} off the energy of the error, with block Jacobi {block_jacobi:.3g}"
+                f"{reduction:.3g} off the energy of the error, with block Jacobi {block_jacobi:.3g}"
             )
         return ""
 
-    def _judge(
-        self, factor: Factor, nodes: int, row_start: NDArray[Any], columns: NDArray[Any], matrix: Reals | None
-    ) -> tuple[float, float, float]:
-        """z.r, and (z.r)^2 / z.Az with the factor and with block Jacobi (0 where A is not positive definite)."""
+    def probe(self, factor: Factor, matrix: Reals | None) -> tuple[float, float, float]:
+        """Applies a factor, which has the right size, to the probe vector r.
+
+        Returns z.r, and the energy (z.r)^2 / z.Az that an iteration takes off with the factor and with block Jacobi (0
+        if A is not positive definite).
+        """
+        row_start, columns = self._patterns[factor.object]
+        nodes = len(row_start) - 1
         n = 3 * nodes
-        if n not in self._room:
-            self._room[n] = np.random.default_rng(0).standard_normal(n), np.empty(8 * n)
-        r, work = self._room[n]
-        seen, out = NativeFactor(factor.pattern, np.ascontiguousarray(factor.values), factor.step), np.zeros(4)
+        if n not in self._arrays:
+            self._arrays[n] = np.random.default_rng(0).standard_normal(n), np.empty(8 * n)
+        r, work = self._arrays[n]
+        native_factor = NativeFactor(factor.pattern, np.ascontiguousarray(factor.values), factor.step)
+        out = np.zeros(4)
         values = None if matrix is None else matrix.ctypes.data
         _library().wf_judge(
-            c.byref(seen.native), nodes, row_start.ctypes.data, columns.ctypes.data, values, r.ctypes.data,
+            c.byref(native_factor.native), nodes, row_start.ctypes.data, columns.ctypes.data, values, r.ctypes.data,
             work.ctypes.data, out.ctypes.data,
         )  # fmt: skip
         energy = [zr * zr / za if za > 0 else 0.0 for zr, za in (out[:2], out[2:])]

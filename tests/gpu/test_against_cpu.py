@@ -7,8 +7,8 @@ import pytest
 from protocol.messages_pb2 import SolveStatus
 from sim_server.backends.gpu.solver import PCG_RESULT
 from sim_server.simulation import Simulation
+from sim_server.updates.driver import Driver
 from sim_server.updates.factor_source import Job
-from sim_server.updates.policy import Driver
 
 pytestmark = pytest.mark.gpu
 

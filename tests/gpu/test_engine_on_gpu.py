@@ -13,8 +13,8 @@ from protocol.messages_pb2 import SolveStatus
 from sim_server.errors import DeviceError
 from sim_server.service.telemetry import Telemetry
 from sim_server.simulation import Simulation
+from sim_server.updates.driver import Driver
 from sim_server.updates.factor_source import Job
-from sim_server.updates.policy import Driver
 
 pytestmark = pytest.mark.gpu
 SCENE = "deploy/scenes/beam.toml"

@@ -6,7 +6,7 @@ import pytest
 
 from protocol.messages_pb2 import SolveStatus
 from sim_server.simulation import Simulation
-from sim_server.updates.policy import Driver
+from sim_server.updates.driver import Driver
 
 pytestmark = pytest.mark.gpu
 

@@ -18,7 +18,7 @@ from sim_server.backends.gpu.engine import FEW
 from sim_server.errors import InputError
 from sim_server.scene import Scene
 from sim_server.simulation import Simulation
-from sim_server.updates.policy import Driver
+from sim_server.updates.driver import Driver
 from tests.scenes import bar, scene
 from tests.state import put
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from sim_server.backends.cpu.engine import Kind
 from sim_server.effects.touch import Touch
 from sim_server.simulation import Simulation
-from sim_server.updates.policy import Driver
+from sim_server.updates.driver import Driver
 from tests.hard_cases.case import Case, Hold
 
 Reals = NDArray[np.float64]

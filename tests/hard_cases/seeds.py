@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from sim_server.simulation import Simulation
-from sim_server.updates.policy import Driver
+from sim_server.updates.driver import Driver
 from tests.hard_cases.models import ELASTIC, MODELS_BAR, Table, toml
 from tests.hard_cases.running import determinants
 from tests.hard_cases.starts import randomly_placed

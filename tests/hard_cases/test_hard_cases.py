@@ -12,7 +12,7 @@ import pytest
 
 from sim_server.effects import known_effects
 from sim_server.simulation import Simulation
-from sim_server.updates.policy import Driver
+from sim_server.updates.driver import Driver
 from tests.hard_cases.case import BAR, FREE_BAR, Case
 from tests.hard_cases.models import MODEL_CASES, MODELS, QUICK, SITUATIONS
 from tests.hard_cases.running import Outcome, broken, finer, run_case, unexpected

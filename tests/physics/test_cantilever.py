@@ -7,7 +7,7 @@ from scipy.sparse import csc_array, diags_array
 from scipy.sparse.linalg import eigsh
 
 from sim_server.simulation import Simulation
-from sim_server.updates.policy import Driver
+from sim_server.updates.driver import Driver
 from tests.scenes import bar, simulation
 
 LENGTH, SIDE, YOUNG, DENSITY = 8.0, 0.5, 1e7, 1000.0

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from protocol.messages_pb2 import SolveStatus
-from sim_server.updates.policy import Driver
+from sim_server.updates.driver import Driver
 from tests.hard_cases.starts import Start, flattened, mirrored, random_in_box
 from tests.physics.laws import LAWS, deform, determinants, law_bar, stiffness
 
@@ -75,7 +75,11 @@ def test_without_projection_the_factor_is_still_positive_definite(name):
     assert np.linalg.eigvalsh(A)[0] < -1
     driver = Driver(sim)
     records = driver.advance(1)
-    assert (driver.tracks[0].used, driver.tracks[0].mended, driver.tracks[0].refused) == (1, 1, 0)
+    assert (driver.bodies[0].factors.used, driver.bodies[0].factors.regularized, driver.bodies[0].failures.refused) == (
+        1,
+        1,
+        0,
+    )
     assert np.isfinite(sim.world.x).all() and np.isfinite(records["residual"]).all()
 
 
@@ -90,4 +94,4 @@ def test_projected_matrices_need_no_mending(name, projection):
     driver = Driver(sim)
     records = driver.advance(5)
     assert (records["status"] == SolveStatus.CONVERGED).all()
-    assert driver.tracks[0].mended == 0 and driver.tracks[0].used == 5
+    assert driver.bodies[0].factors.regularized == 0 and driver.bodies[0].factors.used == 5

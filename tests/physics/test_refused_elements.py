@@ -8,7 +8,7 @@ import pytest
 
 from protocol.messages_pb2 import SolveStatus
 from sim_server.service.telemetry import Telemetry
-from sim_server.updates.policy import Driver
+from sim_server.updates.driver import Driver
 from tests.physics.laws import LAWS, Law, determinants, forces, law_bar, stiffness
 
 REFUSING = {name: law for name, law in LAWS.items() if not law.inverts}

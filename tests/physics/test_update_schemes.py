@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from sim_server.simulation import Simulation
-from sim_server.updates.policy import Driver
+from sim_server.updates.driver import Driver
 
 pytestmark = pytest.mark.slow
 BEAM = Path(__file__).resolve().parents[2] / "deploy" / "scenes" / "beam.toml"

@@ -9,7 +9,7 @@ from rich.console import Console
 from clients.watch import tables
 from protocol import messages_pb2 as pb
 from sim_server.service.telemetry import Telemetry
-from sim_server.updates.policy import Driver
+from sim_server.updates.driver import Driver
 from tests.scenes import bar, simulation
 
 
@@ -72,9 +72,9 @@ def test_the_status_and_the_log_tell_the_age_of_factors_and_its_bound():
     telemetry.publish_status("running")
     bound = driver.age_bound()
     assert 0 < bound < 40
-    for status, track in zip(found[1].objects, driver.tracks, strict=True):
+    for status, state in zip(found[1].objects, driver.bodies, strict=True):
         steps = [s for s in logged if s.header.object == status.object]
-        assert status.factor_age == 40 - track.newest > 0
+        assert status.factor_age == 40 - state.factors.newest > 0
         assert status.factor_age_max == max(s.factor_age for s in steps) <= bound == status.factor_age_bound
         assert {s.factor_age_bound for s in steps[:1]} == {-1} and steps[-1].factor_age_bound == bound
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from sim_server.simulation import Simulation
-from sim_server.updates.policy import Driver
+from sim_server.updates.driver import Driver
 from tests.scenes import bar, scene, simulation
 
 SCHEMES = {

@@ -8,7 +8,7 @@ import pytest
 
 from sim_server.backends.cpu.engine import Kind
 from sim_server.simulation import Simulation
-from sim_server.updates.policy import Driver
+from sim_server.updates.driver import Driver
 from tests.scenes import bar, simulation
 from tests.solver.solves import bent, solve
 

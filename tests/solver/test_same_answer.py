@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from sim_server.effects.touch import Touch
 from sim_server.recording import messages as describe
 from sim_server.simulation import Simulation
+from sim_server.updates.driver import Driver
 from sim_server.updates.factor_source import Inline, Job
-from sim_server.updates.policy import Driver
 from sim_server.updates.worker_assembly import Assembly
 from tests.scenes import bar, simulation
 

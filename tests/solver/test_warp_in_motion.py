@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from sim_server.effects.gravity import Gravity
 from sim_server.mesh import pose_matrix
-from sim_server.updates.policy import Driver
+from sim_server.updates.driver import Driver
 from tests.scenes import bar, simulation
 
 POSE = (40.0, 0.0, 70.0)  # degrees about x, y, z

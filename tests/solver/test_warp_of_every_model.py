@@ -12,7 +12,7 @@ from sim_server.backends.cpu.engine import Kind
 from sim_server.effects import known_effects
 from sim_server.mesh import pose_matrix
 from sim_server.simulation import Simulation
-from sim_server.updates.policy import Driver
+from sim_server.updates.driver import Driver
 from tests.scenes import bar, factor_of, rotation, simulation
 from tests.solver.solves import solve
 

@@ -12,7 +12,7 @@ from sim_server.backends.cpu.engine import NativeFactor
 from sim_server.effects.touch import Interaction, Touch
 from sim_server.errors import InputError
 from sim_server.simulation import Simulation
-from sim_server.updates.policy import Driver
+from sim_server.updates.driver import Driver
 from tests.scenes import bar, factor_of, rotation, simulation
 
 END = np.array([2.0, 1.0, 0.5])

@@ -8,8 +8,8 @@ from link_helpers import Driver, free_endpoint, process
 from sim_server.network.link import ServerLink
 from sim_server.recording import messages as describe
 from sim_server.simulation import Simulation
+from sim_server.updates.driver import Driver as Loop
 from sim_server.updates.factor_source import Job
-from sim_server.updates.policy import Driver as Loop
 from tests.scenes import bar, simulation
 
 pytestmark = pytest.mark.system

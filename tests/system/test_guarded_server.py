@@ -13,7 +13,7 @@ from protocol.messages_pb2 import Factor, Topology
 from protocol.validate import checksum
 from sim_server.network.link import ServerLink
 from sim_server.recording import messages as describe
-from sim_server.updates.policy import Driver
+from sim_server.updates.driver import Driver
 from tests.scenes import bar, simulation
 
 pytestmark = pytest.mark.system
@@ -55,7 +55,7 @@ def test_factors_that_are_no_good_are_refused_and_right_ones_are_used(caplog: py
         driver = Driver(sim, link.dispatch)
         link.announce(topology)
         hand.hello()
-        track = driver.tracks[0]
+        state = driver.bodies[0]
 
         def until(done: Callable[[], bool]) -> None:
             for _ in range(200_000):
@@ -65,15 +65,15 @@ def test_factors_that_are_no_good_are_refused_and_right_ones_are_used(caplog: py
             raise AssertionError("it never happened")
 
         for count in (1, 2):
-            until(lambda: track.in_flight)
+            until(lambda: state.job.in_flight)
             answered(hand, topology, identity)
-            until(lambda count=count: track.refused == count)  # type: ignore[misc]
-        assert track.used == 0 and driver.advance(1)["factor_step"].tolist() == [-1]
-        until(lambda: track.in_flight)
+            until(lambda count=count: state.failures.refused == count)  # type: ignore[misc]
+        assert state.factors.used == 0 and driver.advance(1)["factor_step"].tolist() == [-1]
+        until(lambda: state.job.in_flight)
         answered(hand, topology, nothing)
-        until(lambda: track.used == 1)
+        until(lambda: state.factors.used == 1)
         records = driver.advance(3)
         assert (records["factor_step"] >= 0).all() and (records["status"] == 0).all()
     told = [r.getMessage() for r in caplog.records if "no factor" in r.getMessage()]
     assert len(told) == 1 and "that of hand is not used: worse than block Jacobi" in told[0]
-    assert "worse than block Jacobi" in track.refusal
+    assert "worse than block Jacobi" in state.failures.reason

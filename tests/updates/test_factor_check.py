@@ -12,17 +12,17 @@ from precond_worker.factorization.registry import make_factorization
 from protocol.factor import Factor
 from protocol.method import Method
 from sim_server.simulation import Simulation
-from sim_server.updates.factor_check import Guard
+from sim_server.updates.driver import Driver
+from sim_server.updates.factor_check import FactorCheck
 from sim_server.updates.factor_source import Inline, Job
-from sim_server.updates.policy import Driver
 from tests.scenes import bar, simulation
 from tests.solver.solves import bent, system
 
 
-def guard_of(sim: Simulation) -> tuple[Guard, NDArray]:
+def check_of(sim: Simulation) -> tuple[FactorCheck, NDArray]:
     body = sim.world.bodies[0]
     pattern = sim.system.body_pattern(body.first, body.last)
-    return Guard({body.name: pattern}), np.ascontiguousarray(sim.system.body_values(body.first, body.last))
+    return FactorCheck({body.name: pattern}), np.ascontiguousarray(sim.system.body_values(body.first, body.last))
 
 
 def made(sim: Simulation, method: Method | None = None, dtype: type = np.float32) -> Factor:
@@ -69,42 +69,42 @@ BAD = ["nan", "infinite", "zero pivot", "identity", "random", "shuffled", "some 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_good_ones_pass(method, dtype, seed):
     sim = bent(seed)
-    guard, matrix = guard_of(sim)
+    check, matrix = check_of(sim)
     factor = made(sim, method, dtype)
     for scale in (1.0, 1e6, 1e-6):  # the scale of a preconditioner does not matter
         scaled = dataclasses.replace(factor, values=factor.values * dtype(scale))
-        assert guard.complaint(scaled, matrix) == ""
-    assert guard.complaint(factor, None) == ""
+        assert check.reject_reason(scaled, matrix) == ""
+    assert check.reject_reason(factor, None) == ""
 
 
 @pytest.mark.parametrize("how", BAD)
 @pytest.mark.parametrize("method", GOOD[:1] + GOOD[2:3], ids=lambda m: m.name)
 def test_bad_ones_do_not(how, method):
     sim = bent()
-    guard, matrix = guard_of(sim)
-    words = guard.complaint(changed(made(sim, method), how), matrix)
+    check, matrix = check_of(sim)
+    words = check.reject_reason(changed(made(sim, method), how), matrix)
     assert "not positive definite or not finite" in words or "worse than block Jacobi" in words
     if how == "identity":
         assert "worse than block Jacobi" in words
     if how in ("nan", "infinite", "zero pivot"):
         assert "not finite" in words
-        assert "not finite" in guard.complaint(changed(made(sim, method), how), None)
+        assert "not finite" in check.reject_reason(changed(made(sim, method), how), None)
 
 
 def test_of_another_size():
     sim, other = bent(), simulation(bar((3, 2, 2), name="bar"))
     other.engine.assemble()
-    guard, matrix = guard_of(sim)
-    assert "its size is 108, that of the object 162" in guard.complaint(made(other), matrix)
+    check, matrix = check_of(sim)
+    assert "its size is 108, that of the object 162" in check.reject_reason(made(other), matrix)
     factor = made(sim)
     cut = dataclasses.replace(factor, values=factor.values[:-1])
-    assert f"it has {len(cut.values)} values" in guard.complaint(cut, matrix)
+    assert f"it has {len(cut.values)} values" in check.reject_reason(cut, matrix)
 
 
 def test_the_energy_that_an_iteration_takes_off():
-    """The figures in the complaint are those of one step of conjugate gradients in NumPy."""
+    """The figures in the reason are those of one step of conjugate gradients in NumPy."""
     sim = bent()
-    guard, matrix = guard_of(sim)
+    check, matrix = check_of(sim)
     A = system(sim)[0].toarray()
     r = np.random.default_rng(0).standard_normal(len(A))
     own = np.arange(len(A)) // 3
@@ -116,9 +116,8 @@ def test_the_energy_that_an_iteration_takes_off():
         x = (z @ r) / (z @ A @ z) * z
         return float(e @ A @ e - (e - x) @ A @ (e - x))
 
-    pattern = (len(sim.system.row_start) - 1, *sim.system.body_pattern(0, len(sim.system.row_start) - 1))
     for factor, P in ((made(sim, dtype=np.float64), A), (changed(made(sim), "identity"), np.eye(len(A)))):
-        zr, reached, block_jacobi = guard._judge(factor, *pattern, matrix)
+        zr, reached, block_jacobi = check.probe(factor, matrix)
         assert zr == pytest.approx(r @ np.linalg.solve(P, r), rel=1e-6)
         assert reached == pytest.approx(taken_off(P), rel=1e-6)
         assert block_jacobi == pytest.approx(taken_off(blocks), rel=1e-9)
@@ -154,9 +153,9 @@ def test_a_bad_one_is_refused_and_the_old_one_stays(caplog):
     assert records["factor_step"].tolist() == [-1, -1, 0, 0, 0, 0, 4, 4, 4, 4, 4, 4, 10, 10, 12]
     assert adopted == [0, 4, 10, 12]
     assert (records["status"] == 0).all() and (records["fallbacks"] == 0).all()
-    track = driver.tracks[0]
-    assert (track.used, track.refused) == (4, 3)
-    assert "worse than block Jacobi" in track.refusal
+    state = driver.bodies[0]
+    assert (state.factors.used, state.failures.refused) == (4, 3)
+    assert "worse than block Jacobi" in state.failures.reason
     told = [r.getMessage() for r in caplog.records]
     assert len(told) == 2, "each cause once"
     assert "object 'bar': no factor: that of in process is not used: worse than block Jacobi" in told[0]
@@ -173,7 +172,7 @@ def test_with_none_but_bad_ones_it_is_block_jacobi(update):
     driver = driven(update, dict.fromkeys(range(20), "random"))
     records = driver.advance(10)
     assert (records["factor_step"] == -1).all()
-    assert driver.tracks[0].refused >= 1 and driver.tracks[0].used == 0
+    assert driver.bodies[0].failures.refused >= 1 and driver.bodies[0].factors.used == 0
     assert np.array_equal(driver.simulation.world.x, plain.world.x)
 
 
@@ -182,16 +181,16 @@ def test_the_copy_of_a_matrix_is_kept_until_its_factor_came(monkeypatch):
     driver = driven("async", {})
     seen: list[tuple[int, bool]] = []
     places: set[int] = set()
-    complaint = driver.guard.complaint
+    reject_reason = driver.check.reject_reason
 
     def looked(factor: Factor, matrix: NDArray | None) -> str:
         values = matrix if matrix is not None else np.zeros(1)
         fresh = made_of(driver, values) if matrix is not None else None
         places.add(values.ctypes.data)
         seen.append((factor.step, fresh is not None and np.array_equal(fresh, factor.values)))
-        return complaint(factor, matrix)
+        return reject_reason(factor, matrix)
 
-    monkeypatch.setattr(driver.guard, "complaint", looked)
+    monkeypatch.setattr(driver.check, "reject_reason", looked)
     driver.advance(20)
     assert len(seen) > 5 and all(same for _, same in seen)
     assert len(places) <= 2
@@ -209,5 +208,5 @@ def test_a_job_that_fails_again_and_again_is_told_once(caplog):
     driver.inline.submit = lambda job: submit(Job(job.object, 1, job.step, True, np.nan * job.values))  # type: ignore[method-assign]
     with caplog.at_level(logging.WARNING):
         driver.advance(40)
-    assert driver.tracks[0].refused > 2
+    assert driver.bodies[0].failures.refused > 2
     assert len(caplog.records) == 1

@@ -11,7 +11,8 @@ from sim_server.backends.cpu.engine import Kind
 from sim_server.backends.cpu.structs import RECORD
 from sim_server.recording import messages as describe
 from sim_server.service.telemetry import Telemetry
-from sim_server.updates.policy import TOGETHER, Driver
+from sim_server.updates.driver import Driver
+from sim_server.updates.solve_observer import MIN_TOGETHER
 from tests.scenes import bar, simulation
 
 BODIES, STEPS = 3, 40
@@ -44,10 +45,17 @@ def solves(rng: np.random.Generator, first: int, steps: int, kind: Kind = Kind.C
 def seen(driver: Driver) -> list[tuple]:
     """What the scheduler and `auto` know."""
     out = []
-    for t in driver.tracks:
-        exact = (t.excess, t.latest, t.lost, t.in_use, t.age_max, t.refused)
-        choice = () if t.choice is None else (t.choice.kind, t.choice.probe)
-        out.append((*exact, *choice))
+    for t in driver.bodies:
+        exact = (
+            t.solves.excess,
+            t.solves.latest,
+            t.solves.lost,
+            t.solves.factor_step,
+            t.solves.max_factor_age,
+            t.failures.refused,
+        )
+        tuner = () if t.tuner is None else (t.tuner.kind, t.tuner.probe)
+        out.append((*exact, *tuner))
     return out
 
 
@@ -58,16 +66,16 @@ def test_many_records_say_what_each_says(preconditioner, at_once):
     rng = np.random.default_rng(at_once)
     for first in range(0, STEPS * at_once, at_once):
         r = solves(rng, first, at_once)
-        for t in (*one.tracks, *many.tracks):
-            t.newest = max(t.newest, int(r["factor_step"].max()))
-        assert r.size >= TOGETHER
+        for t in (*one.bodies, *many.bodies):
+            t.factors.newest = max(t.factors.newest, int(r["factor_step"].max()))
+        assert r.size >= MIN_TOGETHER
         many.observe(r.ravel())
         for record in r.ravel():  # fewer than are summed up together
             one.observe(record.reshape(1))
         assert seen(one) == seen(many)
-        for a, b in zip(one.tracks, many.tracks, strict=True):
-            assert a.per_iteration.value == pytest.approx(b.per_iteration.value, rel=1e-9)
-    assert one.tracks[0].excess > 0
+        for a, b in zip(one.bodies, many.bodies, strict=True):
+            assert a.solves.iteration_cost.value == pytest.approx(b.solves.iteration_cost.value, rel=1e-9)
+    assert one.bodies[0].solves.excess > 0
 
 
 def told(listening: bool, monkeypatch) -> tuple[list[pb.Steps], list[pb.Status], int]:

@@ -17,8 +17,9 @@ from protocol.factor import Factor
 from sim_server.backends.cpu.engine import Kind
 from sim_server.backends.cpu.structs import RECORD
 from sim_server.simulation import Simulation
+from sim_server.updates.driver import Driver
 from sim_server.updates.factor_source import Inline, Job
-from sim_server.updates.policy import COPIES, Driver
+from sim_server.updates.policies.free_running import MAX_REQUESTS
 from sim_server.updates.stats import flops
 from tests.scenes import bar, factor_of, simulation
 from tests.support.virtual_workers import VirtualWorkers
@@ -129,9 +130,9 @@ def test_async_serves_every_body_in_turn():
     bodies = [bar(name=f"beam{i}", young=1e5 * 4**i, fixed="X < 0.01") for i in range(3)]
     driver = Driver(falling(*bodies, update="async"))
     driver.advance(60)
-    used = [t.used for t in driver.tracks]
+    used = [t.factors.used for t in driver.bodies]
     assert min(used) >= 3
-    assert all(t.newest > 20 for t in driver.tracks)
+    assert all(t.factors.newest > 20 for t in driver.bodies)
 
 
 class Failing(Inline):
@@ -139,13 +140,17 @@ class Failing(Inline):
 
     def __init__(self, patterns, bad):
         super().__init__(patterns)
-        self.bad = bad
+        self.bad, self.refused = bad, []
 
     def submit(self, job: Job) -> bool:
         if job.step in self.bad:
-            self._failed.append((job.object, "matrix: not positive definite (as the test wants it)"))
+            self.refused.append((job.object, "matrix: not positive definite (as the test wants it)"))
             return True
         return super().submit(job)
+
+    def failures(self) -> list[tuple[str, str]]:
+        refused, self.refused = self.refused, []
+        return refused + super().failures()
 
 
 def patterns_of(sim: Simulation) -> dict:
@@ -159,7 +164,7 @@ def test_the_shaken_one_of_four_is_served_most():
     for _ in range(60):
         sim.world.v[shaken.nodes] += rng.normal(size=(shaken.last - shaken.first, 3))
         driver.advance(1)
-    used = [t.used for t in driver.tracks]
+    used = [t.factors.used for t in driver.bodies]
     calm = used[:2] + used[3:]
     assert min(calm) >= 1
     assert used[2] > 2 * max(calm)
@@ -234,11 +239,11 @@ def test_all_idle_workers_get_a_matrix_of_the_same_step(idle):
 
 def test_of_many_idle_workers_some_are_served_in_each_step():
     """The loop is not asked to copy everything at once."""
-    sim = falling(*(bar(name=f"beam{k}", young=1e6, fixed="X < 0.01") for k in range(COPIES + 3)), update="async")
+    sim = falling(*(bar(name=f"beam{k}", young=1e6, fixed="X < 0.01") for k in range(MAX_REQUESTS + 3)), update="async")
     source = Idle(patterns_of(sim), 100)
     Driver(sim, source).advance(4)
     steps = [step for _, step in source.sent]
-    assert [steps.count(k) for k in range(2)] == [COPIES, 3]
+    assert [steps.count(k) for k in range(2)] == [MAX_REQUESTS, 3]
 
 
 def test_matrices_are_copied_into_the_same_memory_again():
@@ -265,7 +270,7 @@ def test_the_scene_names_the_rule(rule):
     for _ in range(60):
         sim.world.v[shaken.nodes] += rng.normal(size=(shaken.last - shaken.first, 3))
         driver.advance(1)
-    used = [t.used for t in driver.tracks]
+    used = [t.factors.used for t in driver.bodies]
     if rule == "excess":
         assert used[2] > 2 * max(used[:2] + used[3:])
     else:
@@ -282,7 +287,7 @@ def test_ages_stay_within_the_bound_that_is_told(rounds):
             sim.world.v[body.nodes] += rng.normal(size=(body.last - body.first, 3))
         driver.advance(1)
     bound = driver.age_bound()
-    ages = [t.age_max for t in driver.tracks]
+    ages = [t.solves.max_factor_age for t in driver.bodies]
     assert max(ages) <= bound < 100
     assert max(ages) >= 10 * rounds > min(ages) > 0  # the calm wait until they are overdue
 
@@ -292,8 +297,8 @@ def test_bound_of_the_age_by_policy(update, bound):
     driver = Driver(falling(update=update))
     assert driver.age_bound() == bound
     records = driver.advance(14)
-    assert driver.tracks[0].age_max == (records["step"] - 1 - records["factor_step"])[3:].max()
-    assert update == "never" or driver.tracks[0].age_max <= driver.age_bound()
+    assert driver.bodies[0].solves.max_factor_age == (records["step"] - 1 - records["factor_step"])[3:].max()
+    assert update == "never" or driver.bodies[0].solves.max_factor_age <= driver.age_bound()
 
 
 def adaptive(gravity: float, steps: int, **solver) -> tuple[Driver, NDArray]:
@@ -310,7 +315,7 @@ def simulation_driver(sim: Simulation) -> Driver:
 
 def test_adaptive_keeps_the_factor_of_a_body_at_rest():
     driver, records = adaptive(-1e-6, 60, update="adaptive")
-    assert driver.tracks[0].used == 1
+    assert driver.bodies[0].factors.used == 1
     assert (records["factor_step"][10:] == 0).all()
     assert driver.age_bound() == -1
 
@@ -320,14 +325,14 @@ def test_adaptive_makes_few_factors_for_a_body_in_motion_at_little_cost():
     driver, records = adaptive(-2.0, 150, update="adaptive", warp=False)
     eager, often = adaptive(-2.0, 150, update="async", warp=False)
     _, once = adaptive(-2.0, 150, update="never", warp=False)
-    assert 2 <= driver.tracks[0].used < 0.7 * eager.tracks[0].used
+    assert 2 <= driver.bodies[0].factors.used < 0.7 * eager.bodies[0].factors.used
     assert often["iterations"].sum() <= records["iterations"].sum() < 0.7 * once["iterations"].sum()
 
 
 def test_adaptive_with_threshold_0_is_async():
     one, records = adaptive(-2.0, 40, update="adaptive", update_threshold=0)
     other, same = adaptive(-2.0, 40, update="async")
-    assert one.tracks[0].used == other.tracks[0].used
+    assert one.bodies[0].factors.used == other.bodies[0].factors.used
     assert records["factor_step"].tolist() == same["factor_step"].tolist()
 
 
@@ -335,7 +340,7 @@ def test_what_was_lost_is_lost_to_the_factor_in_use():
     driver, records = adaptive(-2.0, 60, update="adaptive", warp=True)
     newest = records["factor_step"][-1]
     of_it = records[records["factor_step"] == newest]
-    assert driver.tracks[0].lost == np.maximum(of_it["iterations"] - 3, 0).sum()
+    assert driver.bodies[0].solves.lost == np.maximum(of_it["iterations"] - 3, 0).sum()
 
 
 def test_no_bound_where_no_factor_is_made():
@@ -373,7 +378,7 @@ def test_a_failed_factorization_does_not_stop_a_run(caplog):
         records = driver.advance(13)
     assert records["factor_step"].tolist() == [-1, -1, -1, 0, 0, 0, 0, 0, 0, 6, 6, 6, 9]
     assert (records["status"] == 0).all()
-    assert driver.tracks[0].refused == 1
+    assert driver.bodies[0].failures.refused == 1
     assert "object 'bar': no factor: matrix: not positive definite" in caplog.text
 
 
@@ -393,7 +398,7 @@ def test_a_matrix_without_a_factor_leaves_block_jacobi(update, monkeypatch):
     records = driver.advance(8)
     assert (records["kind"] == Kind.BLOCK_JACOBI).all()
     assert (records["factor_step"] == -1).all()
-    assert driver.tracks[0].refused >= 1
+    assert driver.bodies[0].failures.refused >= 1
     assert np.array_equal(sim.world.x, plain.world.x)
 
 
@@ -412,7 +417,7 @@ def test_an_older_factor_does_not_replace_a_newer_one():
     for step, used in ((5, 5), (3, 5), (5, 5), (7, 7)):
         driver.adopt(made(driver, step, values))
         assert driver.advance(1)["factor_step"].tolist() == [used]
-    assert driver.tracks[0].used == 2
+    assert driver.bodies[0].factors.used == 2
 
 
 def test_excess_iterations_are_summed_until_the_next_matrix_goes_out():
@@ -420,7 +425,7 @@ def test_excess_iterations_are_summed_until_the_next_matrix_goes_out():
     driver = Driver(sim, Failing(patterns_of(sim), bad=range(1000)))
     driver.wants_factors = False  # nothing goes out
     records = driver.advance(10)
-    assert driver.tracks[0].excess == np.maximum(records["iterations"] - 3, 0).sum() > 0
+    assert driver.bodies[0].solves.excess == np.maximum(records["iterations"] - 3, 0).sum() > 0
 
 
 def solved(iterations: int, factor_step: int, step: int) -> Any:
@@ -433,30 +438,32 @@ def solved(iterations: int, factor_step: int, step: int) -> Any:
 def test_the_sum_begins_anew_with_the_factor_and_comes_back_where_there_is_none():
     sim = falling(update="async")
     driver = Driver(sim, Inline(patterns_of(sim)))
-    track, values = driver.tracks[0], driver._values(sim.world.bodies[0])
+    state, values = driver.bodies[0], sim.system.values
     sim.engine.assemble()
 
     def factor(step: int) -> Factor:
         driver.inline.submit(Job("bar", 1, step, True, values))
         return driver.inline.poll()[0]
 
-    assert track.came_in(factor(0), 1)
+    assert state.on_factor(factor(0), 1)
     for step, iterations in ((1, 5), (2, 9), (3, 10)):
-        track.observe(solved(iterations, 0, step), 3, 1.0)
-    assert (track.excess, track.latest, track.lost) == (2 + 6 + 7, 7, 15)
-    track.went_out(3)
-    track.observe(solved(12, 0, 4), 3, 1.0)
-    assert (track.excess, track.latest) == (9, 9)
-    track.came_to_nothing("lost")
-    assert track.excess == 9 + 15, "nothing was done about it"
-    track.went_out(5)
-    track.observe(solved(20, 0, 6), 3, 1.0)
-    assert track.came_in(factor(5), 7)
-    assert (track.excess, track.latest, track.lost) == (2, 2, 0), "what the first solve with a new factor usually has"
-    track.observe(solved(40, 0, 7), 3, 1.0)  # made before the factor was taken up
-    assert (track.excess, track.latest, track.lost) == (2, 2, 0)
-    track.observe(solved(4, 5, 8), 3, 1.0)
-    assert (track.excess, track.latest, track.lost) == (1, 1, 1)
+        state.observe(solved(iterations, 0, step), 3, 1.0)
+    assert (state.solves.excess, state.solves.latest, state.solves.lost) == (2 + 6 + 7, 7, 15)
+    state.on_sent(3)
+    state.observe(solved(12, 0, 4), 3, 1.0)
+    assert (state.solves.excess, state.solves.latest) == (9, 9)
+    state.on_failure("lost")
+    assert state.solves.excess == 9 + 15, "nothing was done about it"
+    state.on_sent(5)
+    state.observe(solved(20, 0, 6), 3, 1.0)
+    assert state.on_factor(factor(5), 7)
+    assert (state.solves.excess, state.solves.latest, state.solves.lost) == (2, 2, 0), (
+        "what the first solve with a new factor usually has"
+    )
+    state.observe(solved(40, 0, 7), 3, 1.0)  # made before the factor was taken up
+    assert (state.solves.excess, state.solves.latest, state.solves.lost) == (2, 2, 0)
+    state.observe(solved(4, 5, 8), 3, 1.0)
+    assert (state.solves.excess, state.solves.latest, state.solves.lost) == (1, 1, 1)
 
 
 def test_records_of_many_steps_count_as_one_after_another():
@@ -471,31 +478,36 @@ def test_records_of_many_steps_count_as_one_after_another():
         records["factor_step"][4:, 1:3] = 7 * batch
         records["fallbacks"][2, 3], records["linearizations"][3] = 1, 2
         for driver in (one, all_at_once):
-            for t in driver.tracks:
-                t.newest = 7 * batch if t.body.index in (1, 2) and batch else t.newest
-                t.newest = 7 * (batch - 1) if t.body.index == 0 and batch else t.newest
+            for t in driver.bodies:
+                t.factors.newest = 7 * batch if t.body.index in (1, 2) and batch else t.factors.newest
+                t.factors.newest = 7 * (batch - 1) if t.body.index == 0 and batch else t.factors.newest
         for k in range(7):
             one.observe(records[k])
         all_at_once.observe(records.ravel())
-        for a, b in zip(one.tracks, all_at_once.tracks, strict=True):
-            assert (a.excess, a.latest, a.lost, a.in_use) == (b.excess, b.latest, b.lost, b.in_use)
-            assert (a.refused, a.age_max) == (b.refused, b.age_max)
-            assert a.per_iteration.value == pytest.approx(b.per_iteration.value, rel=1e-12)
-            assert a.need(99).excess == b.need(99).excess
+        for a, b in zip(one.bodies, all_at_once.bodies, strict=True):
+            assert (a.solves.excess, a.solves.latest, a.solves.lost, a.solves.factor_step) == (
+                b.solves.excess,
+                b.solves.latest,
+                b.solves.lost,
+                b.solves.factor_step,
+            )
+            assert (a.failures.refused, a.solves.max_factor_age) == (b.failures.refused, b.solves.max_factor_age)
+            assert a.solves.iteration_cost.value == pytest.approx(b.solves.iteration_cost.value, rel=1e-12)
+            assert a.request(99).excess == b.request(99).excess
 
 
 def test_a_poisoned_factor_that_reached_the_loop_is_counted_as_refused():
-    """Past the guard (test_guard.py), which looks at one vector only."""
+    """Past the check (test_factor_check.py), which looks at one vector only."""
     sim = falling(update="async")
     driver = Driver(sim, Failing(patterns_of(sim), bad=range(1000)))
     driver.advance(1)
-    before = driver.tracks[0].refused
+    before = driver.bodies[0].failures.refused
     factor = made(driver, 5, sim.system.values)
     factor.values[7] = np.nan
     sim.engine.post_factor(0, factor.pattern, factor.values, 5)
     record = driver.advance(1)[0]
     assert (record["status"], record["fallbacks"], record["kind"]) == (0, 1, Kind.BLOCK_JACOBI)
-    assert driver.tracks[0].refused >= before + 1
+    assert driver.bodies[0].failures.refused >= before + 1
 
 
 @pytest.mark.parametrize("update", ["every-1", "lockstep-2", "async", "never"])
@@ -595,4 +607,8 @@ def test_a_factor_of_a_matrix_that_was_not_positive_definite_is_used_and_counted
     records = driver.advance(9)
     assert records["factor_step"].tolist() == [-1, -1, 0, 0, 2, 2, 4, 4, 6]
     assert (records["status"] == 0).all()
-    assert (driver.tracks[0].used, driver.tracks[0].mended, driver.tracks[0].refused) == (4, 1, 0)
+    assert (driver.bodies[0].factors.used, driver.bodies[0].factors.regularized, driver.bodies[0].failures.refused) == (
+        4,
+        1,
+        0,
+    )

@@ -5,51 +5,52 @@ import time
 
 import pytest
 
+from sim_server.updates.driver import Driver
 from sim_server.updates.factor_source import Inline, Job
-from sim_server.updates.policy import KEPT, Driver
-from sim_server.updates.prefetch import MOST, TRANSFER, Stock
+from sim_server.updates.policies.free_running import MAX_WAIT, Async
+from sim_server.updates.prefetch import MAX_DEPTH, TRANSFER, PrefetchDepth
 from tests.scenes import bar
 from tests.updates.test_policy import falling, patterns_of
 
 
-def paced(period: float, steps: int = 20) -> Stock:
+def paced(period: float, steps: int = 20) -> PrefetchDepth:
     """After so many steps of equal length [s]."""
-    stock = Stock()
+    prefetch = PrefetchDepth()
     for step in range(steps):
-        stock.paced(step, step * period)
-    return stock
+        prefetch.on_step(step, step * period)
+    return prefetch
 
 
 @pytest.mark.parametrize(
-    ("period", "service", "workers", "size"),
+    ("period", "service", "workers", "depth"),
     [
         (1.0, 0.004, 1, 200),
-        (1.0, 0.004, 2, MOST),
+        (1.0, 0.004, 2, MAX_DEPTH),
         (0.02, 0.004, 1, 4),
         (0.02, 0.004, 0, 0),
         (0.001, 0.05, 4, 0),
         (0.02, 0.5, 3, 0),
     ],
 )
-def test_as_many_as_workers_can_take_within_a_step(period, service, workers, size):
-    stock = paced(period)
-    stock.reckon([service, None, service], workers)
-    assert stock.size == pytest.approx(size, abs=1)
+def test_as_many_as_workers_can_take_within_a_step(period, service, workers, depth):
+    prefetch = paced(period)
+    prefetch.update([service, None, service], workers)
+    assert prefetch.depth == pytest.approx(depth, abs=1)
     assert TRANSFER < 0.002
 
 
 def test_nothing_is_known_before_the_first_steps_and_factors():
-    stock = Stock()
-    stock.reckon([0.001], 4)
-    assert stock.size == 0
-    stock = paced(1.0)
-    stock.reckon([None, None], 4)
-    assert stock.size == 0
+    prefetch = PrefetchDepth()
+    prefetch.update([0.001], 4)
+    assert prefetch.depth == 0
+    prefetch = paced(1.0)
+    prefetch.update([None, None], 4)
+    assert prefetch.depth == 0
 
 
 def test_the_pace_is_told_once_a_step():
-    stock = Stock()
-    assert [stock.paced(step, now) for step, now in ((0, 0.0), (0, 0.5), (2, 1.0), (2, 1.1), (3, 1.5))] == [
+    prefetch = PrefetchDepth()
+    assert [prefetch.on_step(step, now) for step, now in ((0, 0.0), (0, 0.5), (2, 1.0), (2, 1.1), (3, 1.5))] == [
         False, False, True, False, True,
     ]  # fmt: skip
 
@@ -72,59 +73,60 @@ class OneAtATime(Inline):
         return super().submit(job)
 
 
-def stocked(size: int) -> tuple[Driver, OneAtATime]:
+def prefetching(depth: int) -> tuple[Driver, Async, OneAtATime]:
     sim = falling(*(bar(name=f"beam{k}", young=1e6, fixed="X < 0.01") for k in range(6)), update="async")
     source = OneAtATime(patterns_of(sim))
     driver = Driver(sim, source)
-    driver._stock.size = size
-    return driver, source
+    assert isinstance(driver.policy, Async)
+    driver.policy.prefetch.depth = depth
+    return driver, driver.policy, source
 
 
 def test_copies_in_stock_go_to_the_worker_as_it_becomes_idle():
-    driver, source = stocked(4)
-    driver.pump_factors()
+    driver, policy, source = prefetching(4)
+    policy.exchange()
     driver.engine.run(1)
     for _ in range(4):
         source.idle = 1
-        driver.pump_factors()
+        policy.exchange()
     assert source.order == [(f"beam{k}", 0) for k in range(4)], "all of one step, in the order of need"
 
 
 def test_without_a_stock_there_is_one_for_each_idle_worker():
-    driver, source = stocked(0)
-    driver.pump_factors()
+    driver, policy, source = prefetching(0)
+    policy.exchange()
     driver.engine.run(1)
     for _ in range(4):
         source.idle = 1
-        driver.pump_factors()
+        policy.exchange()
     assert source.order == [("beam0", 0)]
 
 
 def test_copies_that_wait_too_long_are_given_up():
-    driver, source = stocked(4)
-    driver.pump_factors()
+    driver, policy, source = prefetching(4)
+    policy.exchange()
     driver.engine.run(1)
     source.idle = 0
-    driver.engine.run(KEPT + 1)
-    driver._stock.size = 4
-    driver.pump_factors()
+    driver.engine.run(MAX_WAIT + 1)
+    policy.prefetch.depth = 4
+    policy.exchange()
     source.idle = 1
     driver.engine.run(1)
-    driver.pump_factors()
+    policy.exchange()
     assert all(step > 0 for _, step in source.order) and source.order
 
 
 def test_what_has_a_factor_and_needs_none_is_not_kept_in_stock():
-    driver, source = stocked(6)
+    driver, policy, source = prefetching(6)
     for _ in range(30):
-        driver.pump_factors()
+        policy.exchange()
         driver.engine.run(1)
         driver.engine.records()  # unseen: nobody's excess grows
         source.idle = 1
     sent = [name for name, _ in source.order]
     assert set(sent) == {f"beam{k}" for k in range(6)}, "who had none got one, and then those idle workers are given"
-    driver.pump_factors()
-    assert sum(t.wanted is not None for t in driver.tracks) <= 1
+    policy.exchange()
+    assert sum(t.job.copy is not None for t in driver.bodies) <= 1
 
 
 def test_counted_runs_have_no_stock():
@@ -134,4 +136,4 @@ def test_counted_runs_have_no_stock():
         driver.engine.run(1)
         driver.pump()
         time.sleep(0.01)
-    assert driver._stock.size == 0
+    assert isinstance(driver.policy, Async) and driver.policy.prefetch.depth == 0

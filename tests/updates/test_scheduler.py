@@ -8,15 +8,23 @@ from typing import get_args
 import pytest
 
 from sim_server.scene.solver_options import Rule
-from sim_server.updates.scheduler import Need, excess, oldest_possible, one_round, overdue_after, pays, pick
+from sim_server.updates.scheduler import (
+    UpdateRequest,
+    excess,
+    is_worthwhile,
+    max_factor_age,
+    overdue_after,
+    pick,
+    round_duration,
+)
 
 NEW, BUSY = None, True
 RULES = get_args(Rule)
 
 
-def needs(*rows: tuple) -> list[Need]:
+def requests(*rows: tuple) -> list[UpdateRequest]:
     """Rows (object, excess, waited, in flight)."""
-    return [Need(*row) for row in rows]
+    return [UpdateRequest(*row) for row in rows]
 
 
 @pytest.mark.parametrize(
@@ -27,7 +35,7 @@ def test_excess(iterations, floor, expected):
 
 
 # lost, cost of an iteration, of a factorization, age of the factor, threshold, on trial
-PAYS = {
+WORTHWHILE = {
     "nothing lost": (0, 1, 9, 5, 1, False, False),
     "less than a factorization": (8, 1, 9, 5, 1, False, False),
     "as much": (9, 1, 9, 5, 1, False, True),
@@ -41,10 +49,13 @@ PAYS = {
 }
 
 
-@pytest.mark.parametrize("case", PAYS.values(), ids=PAYS.keys())
-def test_pays(case):
+@pytest.mark.parametrize("case", WORTHWHILE.values(), ids=WORTHWHILE.keys())
+def test_is_worthwhile(case):
     lost, cost, service, age, threshold, trial, expected = case
-    assert pays(Need("a", 0, 7, False, age, cost, service, lost=lost, trial=trial), threshold) is expected
+    assert (
+        is_worthwhile(UpdateRequest("a", 0, 7, False, age, cost, service, lost=lost, on_trial=trial), threshold)
+        is expected
+    )
 
 
 def test_what_pays_makes_the_least_sum_of_lost_iterations_and_factorizations():
@@ -61,7 +72,7 @@ def test_what_pays_makes_the_least_sum_of_lost_iterations_and_factorizations():
         return spent
 
     best = min(total(lambda age, lost, every=every: age >= every) for every in range(1, 200))
-    found = total(lambda age, lost: pays(Need("a", 0, age, False, age, cost, service, lost=lost)))
+    found = total(lambda age, lost: is_worthwhile(UpdateRequest("a", 0, age, False, age, cost, service, lost=lost)))
     assert found < 1.02 * best
 
 
@@ -87,7 +98,7 @@ TABLE = {
 
 @pytest.mark.parametrize(("rows", "places", "floor", "expected"), TABLE.values(), ids=TABLE.keys())
 def test_pick(rows, places, floor, expected):
-    assert pick(needs(*rows), places, floor) == expected
+    assert pick(requests(*rows), places, floor) == expected
 
 
 def test_everybody_gets_a_turn():
@@ -95,7 +106,7 @@ def test_everybody_gets_a_turn():
     waited: dict[str, int | None] = dict.fromkeys("abc")
     order = []
     for _ in range(9):
-        chosen = pick(needs(*((name, 1.0, w, False) for name, w in waited.items())), 1)[0]
+        chosen = pick(requests(*((name, 1.0, w, False) for name, w in waited.items())), 1)[0]
         order.append(chosen)
         waited = {name: None if w is None else w + 1 for name, w in waited.items()}
         waited[chosen] = 1
@@ -108,21 +119,25 @@ def test_the_busy_do_not_starve_the_calm():
     for _ in range(60):
         sums["shaken"] += 20
         sums["calm"] += 1
-        chosen = pick(needs(*((name, s, 5, False) for name, s in sums.items())), 1)[0]
+        chosen = pick(requests(*((name, s, 5, False) for name, s in sums.items())), 1)[0]
         sums[chosen] = 0
         order.append(chosen)
     assert order.count("calm") == 2
 
 
-def need(object: str, **counters) -> Need:
-    return Need(**({"object": object, "excess": 0.0, "waited": 10, "in_flight": False, "age": 12} | counters))
+def request(object: str, **counters) -> UpdateRequest:
+    return UpdateRequest(**({"object": object, "excess": 0.0, "waited": 10, "in_flight": False, "age": 12} | counters))
 
 
 RULE_TABLE = {
-    "round robin: sent longest ago": ("round_robin", [need("a", waited=5, excess=99), need("b", waited=9)], "ba"),
-    "round robin: of equals the first": ("round_robin", [need("a"), need("b")], "ab"),
-    "excess: the sum as it will be": ("excess", [need("a", excess=30), need("b", excess=15, latest=2.0)], "ba"),
-    "excess: a larger sum all the same": ("excess", [need("a", excess=30), need("b", excess=5, latest=2.0)], "ab"),
+    "round robin: sent longest ago": ("round_robin", [request("a", waited=5, excess=99), request("b", waited=9)], "ba"),
+    "round robin: of equals the first": ("round_robin", [request("a"), request("b")], "ab"),
+    "excess: the sum as it will be": ("excess", [request("a", excess=30), request("b", excess=15, latest=2.0)], "ba"),
+    "excess: a larger sum all the same": (
+        "excess",
+        [request("a", excess=30), request("b", excess=5, latest=2.0)],
+        "ab",
+    ),
 }
 
 
@@ -134,11 +149,11 @@ def test_rules(rule, rows, expected):
 @pytest.mark.parametrize("rule", RULES)
 def test_whatever_the_rule(rule):
     """First those never sent, then the overdue, longest first; those in flight or just served are left out."""
-    rows = [need("wild", excess=1e9, waited=3, age=1000), need("late", waited=40), need("later", waited=41),
-            need("new", waited=None, age=None), need("busy", excess=1e9, waited=90, in_flight=True),
-            need("just", excess=1e9, waited=1, age=2000)]  # fmt: skip
-    assert pick(rows, 9, floor_steps=2, rule=rule, overdue=40) == ["new", "later", "late", "wild"]
-    assert pick(rows, 2, floor_steps=2, rule=rule, overdue=40) == ["new", "later"]
+    rows = [request("wild", excess=1e9, waited=3, age=1000), request("late", waited=40), request("later", waited=41),
+            request("new", waited=None, age=None), request("busy", excess=1e9, waited=90, in_flight=True),
+            request("just", excess=1e9, waited=1, age=2000)]  # fmt: skip
+    assert pick(rows, 9, min_interval=2, rule=rule, overdue=40) == ["new", "later", "late", "wild"]
+    assert pick(rows, 2, min_interval=2, rule=rule, overdue=40) == ["new", "later"]
 
 
 @pytest.mark.parametrize(
@@ -146,20 +161,20 @@ def test_whatever_the_rule(rule):
     [(0, 3, True), (1, 5, False), (1, 6, True), (2, 11, False), (99, 3 * 2**10 - 1, False), (99, 3 * 2**10, True)],
 )
 def test_an_object_whose_jobs_fail_is_asked_less_and_less_often(failures, waited, ready):
-    assert bool(pick([need("a", waited=waited, failures=failures)], 1, floor_steps=3)) is ready
+    assert bool(pick([request("a", waited=waited, failures=failures)], 1, min_interval=3)) is ready
 
 
 def test_bounds_of_the_age():
-    assert one_round([1, 2, 3], 2) == 3
+    assert round_duration([1, 2, 3], 2) == 3
     assert overdue_after(8, [1, 2, 3], 2) == 24
-    assert oldest_possible(24, [1, 2, 3], 2) == 24 + 3 + 2 * 3 + 2
+    assert max_factor_age(24, [1, 2, 3], 2) == 24 + 3 + 2 * 3 + 2
     assert overdue_after(8, [1.0], 0) == math.inf  # nobody serves: nobody is overdue before another
-    assert oldest_possible(math.inf, [1.0], 0) == oldest_possible(8, [], 1) == -1
+    assert max_factor_age(math.inf, [1.0], 0) == max_factor_age(8, [], 1) == -1
 
 
 def oldest_seen(rule: Rule, services: list[int], wild: dict[int, float], workers: int, rounds: float) -> int:
     """Largest age of a factor in 3000 steps of a server with such objects, whose factors take so many steps each."""
-    rows = [need(str(k), waited=0, age=0, service=float(s)) for k, s in enumerate(services)]
+    rows = [request(str(k), waited=0, age=0, factorization_cost=float(s)) for k, s in enumerate(services)]
     done: dict[int, int] = {}  # object: step at which its factor comes
     seen, overdue = 0, overdue_after(rounds, services, workers)
     for step in range(3000):
@@ -182,7 +197,7 @@ def oldest_seen(rule: Rule, services: list[int], wild: dict[int, float], workers
 def test_nobody_starves(rule, rounds, workers):
     """Three of twelve need all that the workers can do; the others are served within the bound all the same."""
     services = [1, 2, 5, 9] * 3
-    bound = oldest_possible(overdue_after(rounds, services, workers), services, workers)
+    bound = max_factor_age(overdue_after(rounds, services, workers), services, workers)
     seen = oldest_seen(rule, services, {0: 50.0, 5: 80.0, 6: 100.0}, workers, rounds)
     assert 0 < seen <= bound
 

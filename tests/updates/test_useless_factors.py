@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A factor that passes the guard and is no use is dropped once solves have left it a few times, not kept for ever."""
+"""A factor that passes the check and is useless is dropped once solves have abandoned it a few times."""
 
 import logging
 from dataclasses import replace
@@ -7,27 +7,30 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from precond_worker.factorization.registry import make_factorization
 from protocol.factor import Factor
 from sim_server.backends.cpu.engine import Kind
 from sim_server.simulation import Simulation
+from sim_server.updates.driver import Driver
 from sim_server.updates.factor_source import Inline, Job
-from sim_server.updates.policy import Driver
-from sim_server.updates.useless_factors import LEFT, Finding, Usefulness
+from sim_server.updates.useless_factors import MAX_FALLBACKS, FallbackCounter, Verdict
 from tests.scenes import bar, simulation
 
 SHARE = 0.08  # of the nodes
 
 
 class Stiffened(Inline):
-    """Exact factors of A with some nodes 1e3 to 1e10 times stiffer, as long as `bad`: they pass the guard."""
+    """Exact factors of A with some nodes 1e3 to 1e10 times stiffer, as long as `bad`: they pass the check."""
 
     def __init__(self, sim: Simulation):
-        super().__init__({b.name: sim.system.body_pattern(b.first, b.last) for b in sim.world.bodies})
+        (body,) = sim.world.bodies
+        self.pattern = sim.system.body_pattern(body.first, body.last)
+        super().__init__({body.name: self.pattern})
         self.bad, self.jobs, self.told = True, 0, []
 
     def submit(self, job: Job) -> bool:
         self.jobs += 1
-        row_start, columns = self._patterns[job.object]
+        row_start, columns = self.pattern
         nodes, random = len(row_start) - 1, np.random.default_rng(0)
         scale = np.ones(nodes)
         chosen = random.choice(nodes, int(SHARE * nodes), replace=False)
@@ -56,7 +59,7 @@ def run(update: str = "async", **solver: object) -> tuple[Driver, Stiffened]:
 @pytest.mark.parametrize("update", ["async", "lockstep-2"])
 def test_one_that_solves_leave_is_dropped_until_another_comes(update: str, caplog: pytest.LogCaptureFixture) -> None:
     driver, source = run(update)
-    track = driver.tracks[0]
+    state = driver.bodies[0]
     submit, source.submit = source.submit, lambda job: source.jobs == 0 and submit(job)  # one, and no other
     if update == "lockstep-2":
         source.submit = submit
@@ -65,18 +68,18 @@ def test_one_that_solves_leave_is_dropped_until_another_comes(update: str, caplo
     left = np.flatnonzero(records["fallbacks"])
     assert (records["status"] == 0).all() and (records["residual"] <= 1e-6).all()
     if update == "async":
-        assert len(left) == LEFT and left[-1] - left[0] == LEFT - 1
+        assert len(left) == MAX_FALLBACKS and left[-1] - left[0] == MAX_FALLBACKS - 1
         assert (records["kind"][left[-1] + 1 :] == Kind.BLOCK_JACOBI).all()
-        assert (records["factor_step"][left[-1] + 1 :] == -1).all() and track.age(driver.engine.step) == -1
+        assert (records["factor_step"][left[-1] + 1 :] == -1).all() and state.factors.age(driver.engine.step) == -1
         assert records["iterations"][left[-1] + 1 :].max() < records["iterations"][left].min() / 2
         assert source.told == [("no use", Inline.WORKER, "bar")]
-        assert [r.message for r in caplog.records] == [f"object 'bar': no factor: {track.refusal}"]
-    assert track.refusal == f"that of in process is not used any more: {LEFT} solves in a row had to leave theirs"
+        assert [r.message for r in caplog.records] == [f"object 'bar': no factor: {state.failures.reason}"]
+    assert f"not used any more: {MAX_FALLBACKS} solves in a row" in state.failures.reason
     source.bad, source.submit = False, submit
     records = driver.advance(10)
     assert records["kind"][-1] == Kind.CHOLESKY and not records["fallbacks"][-3:].any()
     assert records["iterations"][-1] < 10
-    assert source.told[-1] == ("of use", Inline.WORKER, "bar") and track.age(driver.engine.step) >= 0
+    assert source.told[-1] == ("of use", Inline.WORKER, "bar") and state.factors.age(driver.engine.step) >= 0
 
 
 def test_bad_ones_one_after_another_are_each_dropped() -> None:
@@ -90,20 +93,20 @@ def test_bad_ones_one_after_another_are_each_dropped() -> None:
 
 def test_auto_without_its_factor_tries_the_next_one() -> None:
     driver, source = run(preconditioner="auto")
-    choice, track = driver.tracks[0].choice, driver.tracks[0]
-    assert choice is not None
+    tuner, state = driver.bodies[0].tuner, driver.bodies[0]
+    assert tuner is not None
     source.bad, submit = False, source.submit
     driver.advance(10)
     source.submit = lambda job: False
     driver.advance(4)
-    driver._dropping._drop(track, track.newest)
-    assert (choice.kind, choice.probe, track.age(driver.engine.step)) == (Kind.BLOCK_JACOBI, 0, -1)
+    driver.useless_factors.drop(state)
+    assert (tuner.kind, tuner.probe, state.factors.age(driver.engine.step)) == (Kind.BLOCK_JACOBI, 0, -1)
     assert driver.engine.settings(0).kind == Kind.BLOCK_JACOBI
     records = driver.advance(4)
     assert (records["asked"] == Kind.BLOCK_JACOBI).all(), "no probe with what was dropped"
     source.submit = submit
     records = driver.advance(8)
-    assert (records["asked"] == Kind.CHOLESKY).any() and track.dropped is None
+    assert (records["asked"] == Kind.CHOLESKY).any() and state.factors.dropped is None
 
 
 @pytest.mark.parametrize("update", ["never", "every-5"])
@@ -115,25 +118,25 @@ def test_where_no_other_would_come_none_is_dropped(update: str) -> None:
 
 
 def test_what_is_found_is_told_once_of_each_factor() -> None:
-    use = Usefulness()
-    assert use.observe(1, left=False, used=True) is Finding.OF_USE
-    assert use.observe(1, left=False, used=True) is None
-    assert [use.observe(1, left=True, used=False) for _ in range(LEFT + 1)] == [None] * (LEFT - 1) + [
-        Finding.NO_USE,
-        None,
-    ]
-    assert use.observe(5, left=True, used=False) is Finding.NO_USE, "the next one, at once"
-    assert use.observe(6, left=False, used=False) is None, "a probe that went over to block Jacobi"
-    assert use.observe(7, left=False, used=True) is Finding.OF_USE
-    assert [use.observe(7, left=True, used=False) for _ in range(2)] == [None, None]
-    assert use.observe(7, left=False, used=True) is None
-    assert use.observe(7, left=True, used=False) is None, "not in a row"
+    use = FallbackCounter()
+    assert use.observe(1, abandoned=False, used=True) is Verdict.USEFUL
+    assert use.observe(1, abandoned=False, used=True) is None
+    found = [use.observe(1, abandoned=True, used=False) for _ in range(MAX_FALLBACKS + 1)]
+    assert found == [None] * (MAX_FALLBACKS - 1) + [Verdict.USELESS, None]
+    assert use.observe(5, abandoned=True, used=False) is Verdict.USELESS, "the next one, at once"
+    assert use.observe(6, abandoned=False, used=False) is None, "a probe that went over to block Jacobi"
+    assert use.observe(7, abandoned=False, used=True) is Verdict.USEFUL
+    assert [use.observe(7, abandoned=True, used=False) for _ in range(2)] == [None, None]
+    assert use.observe(7, abandoned=False, used=True) is None
+    assert use.observe(7, abandoned=True, used=False) is None, "not in a row"
 
 
 def test_a_refused_factor_is_told() -> None:
     driver, source = run()
     values = np.full(3, np.nan)
-    pattern = driver.inline._analysis("bar", driver.solver.method).pattern
+    body = driver.simulation.world.bodies[0]
+    row_start, columns = driver.simulation.system.body_pattern(body.first, body.last)
+    pattern = make_factorization(row_start, columns, driver.solver.method).pattern
     driver.adopt(Factor("bar", 1, 5, False, pattern, values, "w", 0.1, ""))
     assert source.told == [("no use", "w", "bar")]
 
@@ -144,15 +147,15 @@ def test_a_loop_that_takes_the_next_one_later_goes_without_until_it_has(monkeypa
     submit = source.submit
     source.submit = lambda job: source.jobs == 0 and submit(job)
     driver.advance(8)
-    track, settings = driver.tracks[0], driver.engine.settings(0)
-    dropped = track.newest
-    assert track.dropped == (dropped, Kind.CHOLESKY) and settings.kind == Kind.BLOCK_JACOBI
+    state, settings = driver.bodies[0], driver.engine.settings(0)
+    dropped = state.factors.newest
+    assert state.factors.dropped == (dropped, Kind.CHOLESKY) and settings.kind == Kind.BLOCK_JACOBI
     in_use = [dropped]
     monkeypatch.setattr(driver.engine, "exact", False, raising=False)
     monkeypatch.setattr(driver.engine, "factor_step", lambda body: in_use[0])
     source.bad, source.submit = False, submit
     records = driver.advance(6)
-    assert track.newest > dropped and (records["asked"] == Kind.BLOCK_JACOBI).all()
-    in_use[0] = track.newest
+    assert state.factors.newest > dropped and (records["asked"] == Kind.BLOCK_JACOBI).all()
+    in_use[0] = state.factors.newest
     driver.advance(2)
-    assert track.dropped is None and settings.kind == Kind.CHOLESKY
+    assert state.factors.dropped is None and settings.kind == Kind.CHOLESKY

@@ -11,8 +11,8 @@ from protocol import messages_pb2 as pb
 from protocol.refused import Refused
 from sim_server.recording import messages as describe
 from sim_server.simulation import Simulation
+from sim_server.updates.driver import Driver
 from sim_server.updates.factor_source import Inline, Job
-from sim_server.updates.policy import Driver
 from sim_server.updates.worker_assembly import Assembly
 from tests.scenes import bar, jittered_bar, mesh_file, scene, simulation
 
@@ -179,7 +179,7 @@ def test_positions_that_a_grab_overtook_go_to_nobody(update):
     touch, driver = sim.effects["touch"], Driver(sim, source)
     place = next(i for i, launch in enumerate(sim.engine.launches) if launch.name == "touch.apply")
     touch.publish = lambda new: sim.engine.replace(place, new)
-    ask, begun, over = driver._copies.ask, [], []
+    ask, begun, over = driver.snapshots.request, [], []
 
     def overtaken(t):
         ask(t)
@@ -190,7 +190,7 @@ def test_positions_that_a_grab_overtook_go_to_nobody(update):
             over.append(sim.engine.step)
             touch.release("me", 1)
 
-    driver._copies.ask = overtaken
+    driver.snapshots.request = overtaken
     driver.advance(16)
     positions, matrices = ([step for step, alone in source.jobs if alone is kind] for kind in (True, False))
     assert positions[0] < begun[0] and positions[-1] > over[0], "before and after"

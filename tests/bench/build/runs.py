@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from protocol.factor import Factor
 from sim_server.recording import messages as describe
-from sim_server.updates.policy import Driver
+from sim_server.updates.driver import Driver
 from sim_server.network.link import ServerLink
 from sim_server.simulation import Simulation
 from sim_server.service.supervisor import Supervisor
@@ -114,7 +114,7 @@ def _run(sim: Simulation, link: ServerLink, steps: int, first: int) -> Found:
     try:
         while found.steps < steps:
             found.records.append(driver.pump())
-            if driver.tracks[0].used < first:
+            if driver.bodies[0].factors.used < first:
                 found = Found(link)
             time.sleep(5e-4)
         found.close()

@@ -26,7 +26,7 @@ from sim_server.network.link import ServerLink
 from sim_server.recording import messages as describe
 from sim_server.service.supervisor import Supervisor
 from sim_server.simulation import Simulation
-from sim_server.updates.policy import Driver
+from sim_server.updates.driver import Driver
 from tests.bench.cpu.scipy_step import ScipyStep
 from tests.bench.harness.report import ROOT, Report, plots
 
@@ -97,7 +97,7 @@ def _loop(sim: Simulation, link: ServerLink, steps: int) -> NDArray[Any]:
     try:
         while sum(len(r) for r in records) < steps:
             records.append(driver.pump())
-            if driver.tracks[0].used == 0:
+            if driver.bodies[0].factors.used == 0:
                 records.clear()  # counting starts with the first factor
             time.sleep(1e-3)
     finally:

@@ -23,8 +23,8 @@ from sim_server.recording import messages as describe
 from sim_server.service.service import NAP
 from sim_server.service.supervisor import Supervisor
 from sim_server.simulation import Simulation
+from sim_server.updates.driver import Driver
 from sim_server.updates.factor_source import Job
-from sim_server.updates.policy import Driver
 from tests.bench.gpu.problem import Problem
 from tests.state import put
 
@@ -87,7 +87,7 @@ class Served:
     def helped(self, seconds: float) -> NDArray[Any]:
         """Records of `seconds` with factors coming and going; it begins half a second after the first."""
         end = time.monotonic() + PATIENCE
-        while self.driver.tracks[0].used == 0:
+        while self.driver.bodies[0].factors.used == 0:
             if time.monotonic() > end:
                 raise RuntimeError(f"no factor of a {self._worker} worker came within {PATIENCE:g} s")
             self.driver.pump()

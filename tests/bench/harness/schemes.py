@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from protocol import messages_pb2 as pb
 from sim_server.simulation import Simulation
-from sim_server.updates.policy import Driver
+from sim_server.updates.driver import Driver
 from tests.bench.harness.report import ROOT
 from tests.ports import free_port
 

@@ -21,8 +21,8 @@ from sim_server.network.link import ServerLink
 from sim_server.recording import messages as describe
 from sim_server.service.supervisor import Supervisor
 from sim_server.simulation import Simulation
+from sim_server.updates.driver import Driver
 from sim_server.updates.factor_source import Job
-from sim_server.updates.policy import Driver
 from tests.bench.build.runs import started, until
 from tests.bench.harness.cores import Cores
 from tests.bench.paper.beam import COROTATIONAL, LOADS, Beam, calibrated
@@ -136,7 +136,7 @@ def _taking_turns(one: Published, twin: Simulation, steps: int) -> Pair:
     on, off, counted = [], [], 0
     in_use, end = -1, time.monotonic() + PATIENCE
     while counted < steps:
-        warm = one.driver.tracks[0].used >= FIRST
+        warm = one.driver.bodies[0].factors.used >= FIRST
         if not warm and time.monotonic() > end:
             raise RuntimeError(f"no {FIRST} factors within {PATIENCE:g} s")
         records = one.stretch(STRETCH)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from precond_worker.factorization.factorize import Analysis
 from sim_server.backends.cpu.engine import Kind
 from sim_server.simulation import Simulation
-from sim_server.updates.policy import Driver
+from sim_server.updates.driver import Driver
 from sim_server.updates.stats import flops
 from tests.bench.paper.beam import Beam, Load
 from tests.bench.paper.building import BuildingInline
@@ -57,7 +57,7 @@ def run(beam: Beam, load: Load, way: Way, steps: int, device: str = "cpu", **sol
     driver = Driver(sim, source, counted=True)
     made: list[float] = []  # ms
     driver.adopted = lambda factor: made.append(1e3 * factor.seconds)
-    early = driver.wants_factors and driver.kind in ("lockstep", "async", "adaptive")
+    early = driver.wants_factors and driver.solver.update.kind in ("lockstep", "async", "adaptive")
     first = [driver.step_with_fresh_factors()] if early else []
     r = np.concatenate([*first, driver.advance(steps - len(first))])
     own = r["assemble"] + r["solve"] + r["integrate"]

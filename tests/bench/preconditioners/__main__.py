@@ -15,8 +15,8 @@ import typer
 
 from protocol.factor import Factor, FactorPattern
 from sim_server.simulation import Simulation
-from sim_server.updates.factor_check import Guard
-from sim_server.updates.policy import Driver
+from sim_server.updates.driver import Driver
+from sim_server.updates.factor_check import FactorCheck
 from tests.bench.harness.report import Report, best_of, plots
 from tests.bench.harness.schemes import SCENES
 from tests.bench.preconditioners.grabs import WAYS, Hand, grab_row, short
@@ -88,8 +88,8 @@ def round_of(found: Found, name: str, cells: tuple[int, int, int], steps: int, l
     body = sim.world.bodies[0]
     sim.engine.assemble()
     matrix = sim.system.body_values(body.first, body.last)
-    guard = Guard({body.name: sim.system.body_pattern(body.first, body.last)})
-    found.guard = 1e3 * best_of(10, lambda: guard.complaint(last, matrix))
+    guard = FactorCheck({body.name: sim.system.body_pattern(body.first, body.last)})
+    found.guard = 1e3 * best_of(10, lambda: guard.reject_reason(last, matrix))
 
 
 def diagram(rows: list[dict[str, Any]]) -> Any:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from sim_server.effects.touch import Interaction, Touch
 from sim_server.simulation import Simulation
-from sim_server.updates.policy import Driver
+from sim_server.updates.driver import Driver
 from tests.bench.harness.schemes import SCENES
 
 SPEED = 0.5  # m/s, of the hand

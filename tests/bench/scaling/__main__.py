@@ -31,7 +31,7 @@ from sim_server.recording import messages as describe
 from sim_server.service.service import NAP
 from sim_server.service.supervisor import Supervisor
 from sim_server.simulation import Simulation
-from sim_server.updates.policy import Driver
+from sim_server.updates.driver import Driver
 from tests.bench.harness.pieces import Limit, Merged, Piece, arguments_of_pieces, say, shown
 from tests.bench.scaling import page
 from tests.state import put
@@ -124,7 +124,7 @@ class Run:
             time.sleep(NAP)
         self._thread.start()
         begun = time.monotonic()
-        while min(t.used for t in self.driver.tracks) == 0 and time.monotonic() < begun + warm:
+        while min(t.factors.used for t in self.driver.bodies) == 0 and time.monotonic() < begun + warm:
             self._round()
         warmed, begun = time.monotonic() - begun, time.monotonic()
         before, steps, dropped, found = self._used(), self.engine.step, self.engine.loop.records_dropped, []
@@ -144,7 +144,7 @@ class Run:
         return records
 
     def _used(self) -> int:
-        return sum(t.used for t in self.driver.tracks)
+        return sum(t.factors.used for t in self.driver.bodies)
 
 
 def measure(objects: int, workers: int, seconds: float, warm: float, device: str, worker_device: str) -> Row:
@@ -157,7 +157,7 @@ def measure(objects: int, workers: int, seconds: float, warm: float, device: str
         loaded = time.monotonic() - begun
     with Run(sim, workers, worker_device) as run:
         r, counted = run.measured(seconds, warm)
-        helped = sum(t.used > 0 for t in run.driver.tracks)
+        helped = sum(t.factors.used > 0 for t in run.driver.bodies)
     whole = 1e3 * r["whole"][r["body"] == 0]
     age = (r["step"] - 1 - r["factor_step"])[r["factor_step"] >= 0]
     lasted, steps = counted["lasted"], counted["steps"]

@@ -10,8 +10,8 @@ import typer
 from numpy.typing import NDArray
 
 from sim_server.simulation import Simulation
+from sim_server.updates.driver import Driver
 from sim_server.updates.factor_source import Job
-from sim_server.updates.policy import Driver
 from tests.bench.harness.pieces import Merged, Piece
 from tests.bench.harness.report import Report, plots
 from tests.bench.scheduler.few_wild import APART, Load, is_wild, scene
@@ -46,13 +46,13 @@ def run(objects: int, workers: int, name: str, setting: Setting, **solver: Any) 
     records = []
     for step in range(setting.warm + setting.steps):
         if step == setting.warm:
-            before = sum(t.used for t in driver.tracks)
+            before = sum(t.factors.used for t in driver.bodies)
         load.act()
         records.append(driver.advance(1))
     r = np.concatenate(records[setting.warm :]).reshape(setting.steps, objects)
     assert (r["status"] == 0).all(), "a solve did not converge"
     bound = driver.age_bound()
-    made = sum(t.used for t in driver.tracks) - before
+    made = sum(t.factors.used for t in driver.bodies) - before
     wild = np.array([is_wild(k) for k in range(objects)])
     return {"objects": objects, "wild": int(wild.sum()), "workers": workers, "rule": name,
             **_figures(r["iterations"].astype(int), r["step"] - 1 - r["factor_step"], wild),

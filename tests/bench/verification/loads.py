@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sim_server.effects.touch import Interaction, Touch
 from sim_server.simulation import Simulation
-from sim_server.updates.policy import Driver
+from sim_server.updates.driver import Driver
 from tests.scenes import bar, mesh_file, simulation
 
 Reals = NDArray[np.float64]

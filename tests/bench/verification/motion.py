@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from sim_server.simulation import Simulation
-from sim_server.updates.policy import Driver
+from sim_server.updates.driver import Driver
 from tests.bench.verification.row import Row, absolute, relative
 from tests.integrators.test_conserved import SCHEMES, TIGHT, energy, spin
 from tests.integrators.test_time_order import ORDER, orders

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_server.updates.policy import Driver
+from sim_server.updates.driver import Driver
 from tests.bench.harness.pieces import Limit, Merged, Piece, Row, arguments_of_pieces
 from tests.bench.harness.report import Report, plots
 from tests.bench.harness.units import Unit, arguments_of_units, asked_for, chosen, measure
@@ -50,7 +50,7 @@ class Made:
 def run(beam: Beam, load: Load, update: str, warp: bool, steps: int) -> Made:
     """Lockstep begins with the factor of the first matrix."""
     driver = Driver(beam.simulation(load, **SOLVER, update=update, warp=warp), counted=True)
-    first = [driver.step_with_fresh_factors()] if driver.kind == "lockstep" else []
+    first = [driver.step_with_fresh_factors()] if driver.solver.update.kind == "lockstep" else []
     r = np.concatenate([*first, driver.advance(steps - len(first))])
     steps_alone = r["factor_step"] != r["step"] - 1  # that made no factor
     return Made(r["iterations"], r["cpu"][steps_alone], int((r["status"] != 0).sum()))

@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: MIT
+"""How far a solve got before it converged or was cut off: its cost alone does not rate it."""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol import messages_pb2 as pb
+from sim_server.scene.solver_options import SolverOptions
+
+MIN_DECADES = 0.01  # decades of the residual; a smaller reduction counts as this one
+
+
+class Convergence(NamedTuple):
+    """How far a solve got.
+
+    shortfall: 0 if it converged, else the decades of the residual that were wanted by those gained, 1 or more
+    used: part of the iterations or of the time allowed that it took
+    """
+
+    shortfall: float
+    used: float
+
+
+CONVERGED = Convergence(0.0, 0.0)
+
+
+def convergence(records: NDArray[Any], solver: SolverOptions) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Returns shortfall and used (Convergence) of solves (records of a loop, of any shape).
+
+    In a step with several linear solves the largest residual counts, and the mean use. A step whose nonlinear equation
+    is not solved (MAX_LINEARIZATIONS) counts as converged, since its linear solves are.
+    """
+    solves = np.maximum(records["linearizations"], 1)
+    converged = np.isin(records["status"], (pb.CONVERGED, pb.MAX_LINEARIZATIONS))
+    wanted = max(-math.log10(solver.tolerance), MIN_DECADES)
+    residual = np.where(records["residual"] > 0, records["residual"], 1.0)  # NaN counts as 1
+    gained = np.clip(-np.log10(residual), MIN_DECADES, wanted)
+    used = records["iterations"] / (solves * solver.max_iterations)
+    if solver.budget:
+        used = np.maximum(used, records["solve"] / (solves * solver.budget))
+    return np.where(converged, 0.0, wanted / gained), used

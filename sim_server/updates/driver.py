@@ -1,0 +1,191 @@
+# SPDX-License-Identifier: MIT
+"""Runs a simulation under its scene's update policy (policies/): matrices out, factors in, steps.
+
+`advance` makes steps and waits where the policy says so. For async and adaptive the loop may run on its own instead
+(Engine.run in a thread, which lets go of Python's lock), and `pump` is called beside it.
+"""
+
+import logging
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol.factor import Factor
+from sim_server.simulation import Simulation
+from sim_server.updates.body_state import BodyUpdateState
+from sim_server.updates.factor_check import FactorCheck
+from sim_server.updates.factor_source import FactorSource, Inline, Job
+from sim_server.updates.policies import make_policy
+from sim_server.updates.scheduler import UpdateRequest
+from sim_server.updates.snapshots import SnapshotPool
+from sim_server.updates.solve_observer import SolveObserver
+from sim_server.updates.useless_factors import UselessFactors
+
+log = logging.getLogger(__name__)
+
+MAX_CAUSES = 20  # reasons of missing factors that are logged of an object, each once
+
+
+class Driver:
+    """Runs one simulation under its scene's update policy.
+
+    source: makes factors; None: this process does
+    counted: the scheduler and `auto` reckon with bytes and operations instead of seconds, so that a run repeats
+        exactly; None: unless no step waits for a factor
+    """
+
+    def __init__(self, simulation: Simulation, source: FactorSource | None = None, counted: bool | None = None):
+        self.simulation, self.engine = simulation, simulation.engine
+        self.solver = simulation.scene.solver
+        world, system = simulation.world, simulation.system
+        patterns = {b.name: system.body_pattern(b.first, b.last) for b in world.bodies}
+        self.inline, self.check = Inline(patterns), FactorCheck(patterns)
+        self.source: FactorSource = source or self.inline
+        self.policy = make_policy(self)
+        self.free = self.policy.free
+        self.counted = not self.free if counted is None else counted
+        methods = self.solver.choices(world.backend.name)
+        self.bodies = [BodyUpdateState(b, methods, self.counted) for b in world.bodies]
+        self.by_name = {s.body.name: s for s in self.bodies}
+        self.wants_factors = self.solver.wants_factors
+        if self.wants_factors:
+            self.check.prepare()
+        self.adopted: Callable[[Factor], None] = lambda factor: None  # called with every factor put into a mailbox
+        self.snapshots = SnapshotPool(simulation, self.source, self.policy.expected_latency)
+        self.useless_factors = UselessFactors(self)
+        self._observer = SolveObserver(self)
+        self._warped = {b.name: b.index in simulation.warped for b in world.bodies}
+
+    # --- steps --------------------------------------------------------------------------------------------------
+
+    def advance(self, steps: int) -> NDArray[Any]:
+        """Makes steps; returns their records (engine.RECORD)."""
+        out = []
+        for _ in range(steps):
+            if self.wants_factors:
+                self.policy.step()
+            else:
+                self.engine.run(1)
+            out.append(self._new_records())
+        return np.concatenate(out) if out else self.engine.records()
+
+    def pump(self) -> NDArray[Any]:
+        """Does what belongs beside a loop that runs on its own: records in, factors in, matrices out. Returns the new
+        records."""
+        records = self._new_records()
+        if self.wants_factors:
+            self.policy.pump()
+        return records
+
+    def step_with_fresh_factors(self) -> NDArray[Any]:
+        """Makes a step with the factors of its own matrices, whatever the policy; returns its records."""
+        self.solve_with_fresh_factors()
+        return self._new_records()
+
+    def solve_with_fresh_factors(self) -> None:
+        """Makes a step that waits for the factors of its own matrices, made in this process."""
+        self.engine.assemble()
+        step = self.engine.step
+        for state in self.bodies:
+            if not state.frozen:
+                values = self.simulation.system.body_values(state.body.first, state.body.last)
+                state.job.matrix = step, values
+                self.inline.submit(self._job(state, step, values))
+        self.receive(self.inline, self.adopt)
+        self.engine.solve()
+
+    def _new_records(self) -> NDArray[Any]:
+        records = self.engine.records()
+        self.observe(records)
+        return records
+
+    def observe(self, records: NDArray[Any]) -> None:
+        """Sums up what solves cost, lets `auto` choose, drops useless factors."""
+        self._observer.observe(records)
+        self.useless_factors.observe(records)
+
+    # --- matrices out -------------------------------------------------------------------------------------------
+
+    def requests(self) -> list[UpdateRequest]:
+        """Returns what the scheduler is told of each body but those that are frozen."""
+        step = self.engine.step
+        return [state.request(step) for state in self.bodies if not state.frozen]
+
+    def make_job(self, state: BodyUpdateState) -> Job | None:
+        """Returns the job of the copy that the loop has made for a body. None: the copy does not suffice and is
+        discarded."""
+        assert state.job.copy is not None
+        if self.snapshots.suffices(state):
+            return self._job(state, self.snapshots.step(state), state.job.copy)
+        self.snapshots.discard(state)
+        return None
+
+    def _job(self, state: BodyUpdateState, step: int, values: NDArray[np.float64]) -> Job:
+        name = state.body.name
+        method = self.solver.method if state.tuner is None else state.tuner.factorization.method
+        state.on_job(step, method)
+        return Job(name, 1, step, self._warped[name], values, self.solver.factor_dtype, method)
+
+    # --- factors in ---------------------------------------------------------------------------------------------
+
+    def receive(self, source: FactorSource, on_factor: Callable[[Factor], None]) -> None:
+        """Passes on the factors that a source has made since the last call, and takes note of failed jobs."""
+        for factor in source.poll():
+            on_factor(factor)
+        for name, reason in source.failures():
+            self.fail(name, reason)
+
+    def adopt(self, factor: Factor) -> None:
+        """Puts a factor into its body's mailbox, unless a newer one is there or the check refuses it."""
+        state = self.by_name[factor.object]
+        self.policy.on_job_end()
+        matrix = self.snapshots.release(state, factor.step)
+        # Check it, if it is to be used
+        is_new = factor.step > state.factors.newest and not state.frozen
+        if is_new and (why := self.check.reject_reason(factor, matrix)):
+            self.useless_factors.on_rejected(factor)
+            self.fail(factor.object, f"that of {factor.worker} is not used: {why}")
+            return
+        # Post it, unless it is older than the newest
+        if not state.on_factor(factor, self.engine.step):
+            return
+        self.engine.post_factor(state.body.index, factor.pattern, factor.values, factor.step)
+        # Tell the log how it was made
+        method, extrapolated = state.factors.method(factor.step), state.job.extrapolated
+        later = state.job.positions and self.engine.positions_later and factor.worker != self.inline.WORKER
+        made = replace(factor, ahead=extrapolated, later=later) if extrapolated or later else factor
+        self.adopted(replace(made, method=method.name) if method else made)
+        # Let `auto` try it
+        if state.tuner is not None:
+            state.tuner.on_factor(method)
+            self.apply_choice(state)
+        self.useless_factors.resume(state)
+
+    def fail(self, name: str, reason: str) -> None:
+        """Takes note of a job without a factor; the object may be sent again."""
+        state = self.by_name[name]
+        self.snapshots.release(state)
+        state.on_failure(reason)
+        self.policy.on_job_end()
+        self.report(state, reason)
+
+    def report(self, state: BodyUpdateState, reason: str) -> None:
+        """Logs why a factor is missing or not used: once per cause, since the status counts them."""
+        cause, reported = re.sub(r"[0-9.e+-]*[0-9]", "#", reason), state.failures.reported
+        if cause not in reported and len(reported) < MAX_CAUSES and not state.frozen:
+            reported.add(cause)
+            log.warning("object %r: no factor: %s", state.body.name, reason)
+
+    def apply_choice(self, state: BodyUpdateState) -> None:
+        """Gives the loop what `auto` has chosen for the next solve of a body."""
+        assert state.tuner is not None
+        settings = self.engine.settings(state.body.index)
+        settings.kind, settings.probe = state.tuner.kind, state.tuner.probe
+
+    def age_bound(self) -> int:
+        """Returns the age [steps] that no factor exceeds while all goes well, by what was measured; -1: not known."""
+        return self.policy.max_age() if self.wants_factors else -1

@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: MIT
+"""Policies under which no step waits: matrices go to workers, and a factor is used as soon as it is there."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from sim_server.updates.policies.base import UpdatePolicy
+from sim_server.updates.prefetch import PrefetchDepth
+from sim_server.updates.scheduler import UpdateRequest, is_worthwhile, max_factor_age, overdue_after, pick
+
+if TYPE_CHECKING:
+    from sim_server.updates.driver import Driver
+
+MAX_REQUESTS = 32  # matrices that the loop may be asked to copy within one step
+MAX_WAIT = 2  # steps that a copied matrix may wait for a worker
+
+
+class Async(UpdatePolicy):
+    """Matrices of the most urgent bodies go to idle workers, one of a body at a time."""
+
+    free = True
+
+    def __init__(self, driver: Driver, n: int = 0):
+        super().__init__(driver, n)
+        self.prefetch = PrefetchDepth()
+        self._exhausted = -1  # step at which no body was left to be asked for its matrix
+
+    def step(self) -> None:
+        """Makes a step after an exchange with the workers."""
+        self.exchange()
+        self.driver.engine.run(1)
+
+    def pump(self) -> None:
+        """Makes an exchange with the workers and adapts the prefetch depth to the time of steps."""
+        driver = self.driver
+        if self.prefetch.on_step(driver.engine.step, time.monotonic()) and not driver.counted:
+            self.prefetch.update([s.factors.cost.value for s in driver.bodies], driver.source.worker_count())
+        self.exchange()
+
+    def exchange(self) -> None:
+        """Takes up factors, sends the matrices that were copied, requests those of the most urgent bodies."""
+        driver, source, solver = self.driver, self.driver.source, self.driver.solver
+        # Take up factors; bodies whose worker is slow may be sent again
+        driver.receive(source, self.on_factor)
+        for name in source.reassigned():
+            driver.snapshots.release(driver.by_name[name])
+            driver.by_name[name].on_reassignment()
+            self.on_job_end()
+        self._send_copies()
+        # Count the places: idle workers without a copy on the way, and copies to hold in advance
+        step, waiting = driver.engine.step, sum(s.job.copy is not None for s in driver.bodies)
+        idle = max(min(source.ready(), MAX_REQUESTS) - waiting, 0)
+        places = max(idle, self.prefetch.depth - waiting)
+        if places <= 0 or step == self._exhausted:
+            return
+        # Choose the most urgent bodies, and leave the first of them to faster workers that are busy
+        requests = [r for r in self._requests() if self.wants(r, step)]
+        reserved = source.faster_busy_workers()
+        interval = solver.update_floor_steps
+        chosen = pick(requests, reserved + places, interval, solver.schedule, self._overdue())[reserved:]
+        # Request their matrices; in advance only those of bodies that need a factor
+        states = [driver.by_name[name] for name in chosen]
+        wanted = states[:idle] + [s for s in states[idle:] if s.job.sent is None or s.solves.excess > 0]
+        for state in wanted:
+            driver.snapshots.request(state)
+        if len(wanted) < places:
+            self._exhausted = step
+
+    def wants(self, request: UpdateRequest, step: int) -> bool:
+        """Returns True: the scheduler decides."""
+        return True
+
+    def max_age(self) -> int:
+        """Returns a bound by the latencies measured so far."""
+        if all(s.factors.latency.value is None for s in self.driver.bodies):
+            return -1
+        return max_factor_age(self._overdue(), self._latencies(), self.driver.source.worker_count())
+
+    def on_job_end(self) -> None:
+        """Takes note that there is a body again whose matrix may be requested."""
+        self._exhausted = -1
+
+    def _requests(self) -> list[UpdateRequest]:
+        """Returns the requests of all bodies but frozen ones and those that are better left for a busy worker."""
+        requests, source = self.driver.requests(), self.driver.source
+        failures = source.consecutive_failures()
+        if failures is not None:
+            reserved = source.reserved()
+            if reserved or failures or any(r.failures for r in requests):
+                return [replace(r, failures=failures.get(r.object, 0)) for r in requests if r.object not in reserved]
+        return requests
+
+    def _send_copies(self) -> None:
+        """Sends copies to idle workers in the order of the requests. With a prefetch depth others wait their turn."""
+        driver = self.driver
+        copied = driver.snapshots.completed(driver.bodies)
+        idle = driver.source.ready() if copied else 0
+        for state in copied:
+            waited = driver.engine.step - driver.snapshots.step(state)
+            if idle <= 0 and self.prefetch.depth and waited <= MAX_WAIT:
+                continue
+            job = driver.make_job(state)
+            if job is not None:
+                if driver.source.submit(job):
+                    state.on_sent(job.step)
+                else:
+                    driver.snapshots.discard(state)
+            idle -= state.job.in_flight
+
+    def _overdue(self) -> float:
+        """Returns the steps after which a body goes next whatever the rule."""
+        solver, workers = self.driver.solver, self.driver.source.worker_count()
+        return max(overdue_after(solver.schedule_rounds, self._latencies(), workers), solver.update_floor_steps)
+
+    def _latencies(self) -> list[float]:
+        """Returns the steps from matrix to factor of each body; those not known yet are the mean of the others."""
+        values = [s.factors.latency.value for s in self.driver.bodies]
+        known = [v for v in values if v is not None]
+        mean = sum(known) / len(known) if known else 1.0
+        return [mean if v is None else v for v in values]
+
+
+class Adaptive(Async):
+    """As Async, but a matrix is sent only once the excess iterations have cost as much as a factorization."""
+
+    def wants(self, request: UpdateRequest, step: int) -> bool:
+        """True if a new factor is worth its time (scheduler.is_worthwhile)."""
+        return is_worthwhile(request, self.driver.solver.update_threshold)
+
+    def max_age(self) -> int:
+        """Returns -1: a factor is kept as long as it does."""
+        return -1
