@@ -64,14 +64,14 @@ class Driver:
 
     def advance(self, steps: int) -> NDArray[Any]:
         """Makes steps; returns their records (engine.RECORD)."""
-        out = []
+        out: list[NDArray[Any]] = []
         for _ in range(steps):
             if self.wants_factors:
                 self.policy.step()
             else:
                 self.engine.run(1)
             out.append(self._new_records())
-        return np.concatenate(out) if out else self.engine.records()
+        return np.concatenate(out or [self.engine.records()])
 
     def pump(self) -> NDArray[Any]:
         """Does what belongs beside a loop that runs on its own: records in, factors in, matrices out. Returns the new
@@ -99,7 +99,7 @@ class Driver:
         self.engine.solve()
 
     def _new_records(self) -> NDArray[Any]:
-        records = self.engine.records()
+        records: NDArray[Any] = self.engine.records()
         self.observe(records)
         return records
 

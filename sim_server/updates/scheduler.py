@@ -107,7 +107,7 @@ def pick(
 
 def _with_backoff(request: UpdateRequest, min_interval: int) -> int:
     """Returns the least number of steps between two matrices of an object."""
-    return min_interval * 2 ** min(request.failures, MAX_DOUBLINGS)
+    return min_interval << min(request.failures, MAX_DOUBLINGS)
 
 
 def round_duration(latencies: Sequence[float], workers: int) -> float:

@@ -48,7 +48,8 @@ class SnapshotPool:
 
     def step(self, state: BodyUpdateState) -> int:
         """Returns the steps completed before the one whose matrix was copied; -1: the copy is not there yet."""
-        return self._simulation.engine.matrix_step(state.body.index)
+        step: int = self._simulation.engine.matrix_step(state.body.index)
+        return step
 
     def completed(self, states: Iterable[BodyUpdateState]) -> list[BodyUpdateState]:
         """Returns those whose copy is there, in the order of the requests."""

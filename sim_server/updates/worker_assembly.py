@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The system matrix of one object from its positions: for workers that build it themselves (section 5 of Courtecuisse
-et al. 2010).
+"""Assembles the system matrix of one object from its positions, in a worker (section 5 of Courtecuisse et al. 2010).
 
-The same kernels on the same constants as in the server's loop, so the same matrix. The object is what the server has
-described: its scene and topology are looked at like anything that came over a network, and no file that they name is
-read.
+The kernels and their constants are those of the server's loop, and so is the matrix. Scene and topology of the object
+come from the server; they are checked like anything that came over a network, and no file that they name is read.
 """
 
 import json
@@ -23,33 +21,36 @@ from sim_server.mesh import Mesh, check
 from sim_server.scene.model import Scene
 from sim_server.simulation import Simulation
 
-# What a worker has for the settings of its server's device.
-HERE = {"precision": "float64", "factor_precision": "auto", "threads": 1, "budget": 0.0, "build": "server",
+# Settings of the server's device, and what a worker has in their place
+WORKER_SETTINGS = {"precision": "float64", "factor_precision": "auto", "threads": 1, "budget": 0.0, "build": "server",
         "extrapolate": 0.0, "woodbury": 0}  # fmt: skip
 
 
 class Assembly:
-    """Matrices of one object in one topology epoch. Raises Refused for a description that cannot be built."""
+    """Assembles the matrices of one object in one topology epoch.
+
+    Raises Refused for a description of which no simulation can be made.
+    """
 
     def __init__(self, scene: SceneMessage, topology: Topology):
         name = topology.header.object
         try:
-            self._simulation = Simulation(described(scene.resolved, name, _mesh(topology)))
+            self._simulation = Simulation(single_object_scene(scene.resolved, name, _mesh(topology)))
         except (InputError, ValidationError) as error:
             raise Refused(f"Scene.resolved, object {name!r}: {error}", "malformed") from error
-        self._simulation.engine.begin = []  # A of a scheme that looks back does not depend on what it saw
+        self._simulation.engine.begin = []  # A of a scheme of several steps does not depend on the states before
         self._check_pattern(topology)
 
     @property
     def nodes(self) -> int:
-        """Of the object."""
+        """Number of nodes of the object."""
         return self._simulation.world.nodes
 
     def matrix(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """A' of positions x (nodes, 3) [m]: (blocks, 3, 3) in the order of the topology; overwritten by the next call.
+        """Returns A' = R^T A R, (blocks, 3, 3) in the order of the topology; overwritten by the next call.
 
-        Velocities are taken for zero: no effect that may be built here has any in A. Raises ValueError for positions of
-        another shape or not finite.
+        x: positions (nodes, 3) [m]. Velocities are taken as zero: A of no effect that workers know depends on them.
+        Raises ValueError for positions of another shape or not finite.
         """
         world = self._simulation.world
         if x.shape != world.x.shape or not all_finite(x):
@@ -65,13 +66,17 @@ class Assembly:
             raise Refused("Topology.columns is not the pattern that is built here: another version?", "pattern")
 
 
-def described(resolved: str, name: str, mesh: Mesh) -> Scene:
-    """The scene of one object alone, on a CPU, with this mesh. resolved: Scene.resolved. Raises InputError, Refused or
-    pydantic's ValidationError."""
+def single_object_scene(resolved: str, name: str, mesh: Mesh) -> Scene:
+    """Returns the scene of one object alone, on a CPU, with this mesh.
+
+    resolved: Scene.resolved
+    name: of the object
+    Raises InputError, Refused or pydantic's ValidationError.
+    """
     try:
         table: dict[str, Any] = json.loads(resolved)
         listed = [o for o in table["object"] if o["name"] == name]
-        table["solver"] = {**table["solver"], **HERE}
+        table["solver"] = {**table["solver"], **WORKER_SETTINGS}
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise Refused(f"Scene.resolved is no scene: {type(error).__name__}", "malformed") from error
     if len(listed) != 1:

@@ -189,7 +189,7 @@ def test_what_a_dead_client_held_is_released(stage: Stage, tmp_path: Path) -> No
 
 
 def test_four_beams_share_one_worker(stage: Stage) -> None:
-    """Everybody gets factors. Who gets most: tests/updates/test_policy.py."""
+    """Everybody gets factors. Who gets most: tests/updates/test_policies.py."""
     scene = Path(__file__).parents[2] / "deploy" / "scenes" / "four_beams.toml"
     server = stage.server(scene, "--workers", "1")
     with stage.client() as client:

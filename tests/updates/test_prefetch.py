@@ -10,7 +10,7 @@ from sim_server.updates.factor_source import Inline, Job
 from sim_server.updates.policies.free_running import MAX_WAIT, Async
 from sim_server.updates.prefetch import MAX_DEPTH, TRANSFER, PrefetchDepth
 from tests.scenes import bar
-from tests.updates.test_policy import falling, patterns_of
+from tests.updates.test_policies import falling, patterns_of
 
 
 def paced(period: float, steps: int = 20) -> PrefetchDepth:

@@ -68,8 +68,9 @@ class FactorizationTuner(Tuner[Method, RecentCosts]):
         if method == self.current:
             if self.candidate is not None and self.costs[self.candidate].costs and not self._confirmed:
                 return self._judge(replaced=True)
-            self.costs[method].costs.append(cost)
-            if self.is_due() and len(self.costs[method].costs) >= MIN_SOLVES and len(self.arms) > 1:
+            known = self.costs[method].costs
+            known.append(cost)
+            if self.is_due() and len(known) >= MIN_SOLVES and len(self.arms) > 1:
                 self._begin_trial()
         return False
 

@@ -20,7 +20,7 @@ from sim_server.backends.cpu.engine import Kind
 from sim_server.updates.autotune.convergence import CONVERGED, Convergence
 from sim_server.updates.autotune.factorization import FactorizationTuner
 from sim_server.updates.autotune.tuner import MARGIN, TRIAL_INTERVAL, Tuner
-from sim_server.updates.stats import updated
+from sim_server.updates.stats import MEMORY
 
 HARDER = 2.0  # cost of a solve by that at the last probe from which the next probe is made at once
 MAX_UNCONVERGED = 0.3  # running mean of solves not converged above which a kind counts as not converging: two in a row
@@ -48,8 +48,16 @@ class SolveCost(NamedTuple):
 
     def with_solve(self, new: "SolveCost") -> "SolveCost":
         """Returns the means after one more solve."""
-        before = new._replace(unconverged=self.unconverged) if self.cost < 0 else self
-        return SolveCost(*map(updated, before, new))
+        cost, each, full, unconverged, used = self
+        if cost < 0:
+            cost, each, full, _, used = new
+        return SolveCost(
+            cost + MEMORY * (new.cost - cost),
+            each + MEMORY * (new.per_iteration - each),
+            full + MEMORY * (new.full - full),
+            unconverged + MEMORY * (new.unconverged - unconverged),
+            used + MEMORY * (new.used - used),
+        )
 
     @property
     def fails(self) -> bool:
