@@ -11,7 +11,9 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
-from sim_server.backends.compiler import Cpu, Launch, ahead
+from sim_server.backends.base import Launch
+from sim_server.backends.compiler import ahead
+from sim_server.backends.cpu.device import Cpu
 from sim_server.backends.cpu.engine import Engine, Kind
 from sim_server.effects import effect
 from sim_server.effects._base import Effect, Refusal
@@ -68,20 +70,20 @@ class Simulation:
         ranges = [(b.first, b.last) for b in w.bodies]
         newton = self.integrator.newton(assemble, list(self.effects.values()))
         self.engine: Any
+        launches: tuple[Any, Any] = assemble, integrate  # of the kind that the engine runs
         if device == "gpu":
             from sim_server.backends.gpu.engine import GpuEngine
 
             gpu: Any = w.backend
             names = [b.name for b in w.bodies]
             planes = 2 if scene.solver.factor_precision == "float32" else 1
-            launches: tuple[Any, Any] = assemble, integrate
             self.engine = GpuEngine(
                 gpu, *launches, ranges, w.dt, self.energies, names, planes=planes, newton=newton, **arrays
             )
         else:
             threads = scene.solver.threads
             self.engine = Engine(
-                assemble, integrate, ranges, w.dt, threads=threads, newton=newton, energies=self.energies, **arrays
+                *launches, ranges, w.dt, threads=threads, newton=newton, energies=self.energies, **arrays
             )
         self.engine.begin = self.integrator.begin(assemble)
         for body in w.bodies:

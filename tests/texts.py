@@ -8,12 +8,13 @@ from pathlib import Path
 import pytest
 
 from sim_server.backends import compiler
+from sim_server.backends.cpu.device import CpuModule
 
 
 @contextmanager
-def compiled(text: str, folder: Path) -> Iterator[dict[str, compiler.Module]]:
+def compiled(text: str, folder: Path) -> Iterator[dict[str, CpuModule]]:
     """A module of the text in double and in single precision."""
     (folder / "text.cu").write_text(text)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(compiler, "HERE", folder)
-        yield {real: compiler.Module("text.cu", real) for real in ("double", "float")}
+        yield {real: CpuModule("text.cu", real) for real in ("double", "float")}

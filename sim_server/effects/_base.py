@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_server.backends.compiler import Launch
+from sim_server.backends.base import Launch
 from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.world import Body, World
 

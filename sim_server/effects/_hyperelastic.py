@@ -52,7 +52,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, create_model
 
-from sim_server.backends.compiler import Launch
+from sim_server.backends.base import Launch
 from sim_server.effects._base import Effect, ElementEnergies, Refusal
 from sim_server.effects.corotational import shape_gradients
 from sim_server.errors import InputError

@@ -26,7 +26,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BeforeValidator, PlainSerializer
 
-from sim_server.backends.compiler import Launch
+from sim_server.backends.base import Launch
 from sim_server.effects._base import ElementEnergies
 from sim_server.effects._hyperelastic import Constant, Law, Tetrahedra, constants_of
 from sim_server.errors import InputError

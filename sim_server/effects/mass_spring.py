@@ -34,7 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 
-from sim_server.backends.compiler import Launch
+from sim_server.backends.base import Launch
 from sim_server.effects._base import Effect, ElementEnergies
 from sim_server.errors import InputError
 from sim_server.mechanics.system import Stencil, System

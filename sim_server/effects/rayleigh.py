@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from sim_server.backends.compiler import Launch
+from sim_server.backends.base import Launch
 from sim_server.effects._base import Effect, per_node
 from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.world import Body, World

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from protocol.push_limits import ORPHANED_PUSH
-from sim_server.backends.compiler import Launch
+from sim_server.backends.base import Launch
 from sim_server.effects._base import Effect
 from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.world import Body, World

@@ -17,8 +17,8 @@
 // MAILED_KERNEL is the same for a launch whose arguments are replaced while the simulation runs: on a GPU it reads them from
 // device memory and takes any number of items.
 // at(a, i) reads any items, at_items(a, i) those of the kernel itself: neighbours in memory.
-// Structs hold 4-byte ints, reals and pointers; the Python side reads their layout from this very text (compiler.py), so that
-// names and order stand nowhere else.
+// Structs hold 4-byte ints, reals and pointers; the Python side reads their layout from this very text
+// (backends/kernel_binding.py), so that names and order stand nowhere else.
 #pragma once
 
 #ifndef real

@@ -38,7 +38,7 @@ from typing import Any
 
 import numpy as np
 
-from sim_server.backends.compiler import Launch
+from sim_server.backends.base import Launch
 from sim_server.effects._base import Effect
 from sim_server.mechanics.newton import Newton
 from sim_server.mechanics.system import Ints, System

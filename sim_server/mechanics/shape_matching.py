@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_server.backends.compiler import Launch
+from sim_server.backends.base import Launch
 from sim_server.mechanics.world import Body, World
 
 Ints = NDArray[np.int32]

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_server.backends.compiler import Launch
+from sim_server.backends.base import Launch
 from sim_server.mechanics.world import World
 
 Ints = NDArray[np.int32]

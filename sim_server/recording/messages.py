@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from protocol import messages_pb2 as pb
 from protocol.method import Method
 from protocol.process.version import version
-from sim_server.backends.compiler import Cpu
+from sim_server.backends.cpu.device import Cpu
 from sim_server.backends.cpu.engine import Kind
 from sim_server.mechanics.world import Body
 from sim_server.mesh import posed

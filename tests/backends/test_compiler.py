@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 
 from sim_server.backends import compiler as backend
+from sim_server.backends.cpu.device import CpuModule
 from sim_server.backends.gpu import kernel_fusion
 from sim_server.backends.gpu.device import PRECISIONS, own_headers
 from sim_server.backends.gpu.device import options as device_options
+from sim_server.backends.kernel_binding import members_of
 from tests.support import nvrtc
 
 PUSH = """#include "kernel.h"
@@ -50,7 +52,7 @@ def libraries(folder: Path) -> set[str]:
 @pytest.mark.parametrize(("real", "dtype"), [("double", "f8"), ("float", "f4")])
 def test_a_text_is_compiled_bound_and_run(folder, real, dtype):
     given = arguments(real=dtype)
-    launch = backend.Module("push.cu", real).bind("push", 5, **given)
+    launch = CpuModule("push.cu", real).bind("push", 5, **given)
     launch()
     launch()
     np.testing.assert_array_equal(given["x"], [0, 1, 2, 3, 4])
@@ -62,16 +64,16 @@ def test_a_cache_that_cannot_be_made_is_named(folder, monkeypatch, tmp_path):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("WARPFACTOR_CACHE", str(tmp_path / "file" / "cache"))
     with pytest.raises(backend.CompileError, match=r"kept in .*file/cache: Not a directory; WARPFACTOR"):
-        backend.Module("push.cu").address("push")
+        CpuModule("push.cu").address("push")
 
 
 def test_nothing_is_compiled_twice(folder):
-    backend.Module("push.cu").address("push")
+    CpuModule("push.cu").address("push")
     first = libraries(folder)
     assert len(first) == 1
     assert next(iter(first)).startswith("push-")
     stamp = next((folder.parent / "cache").iterdir()).stat().st_mtime_ns
-    backend.Module("push.cu").address("push")
+    CpuModule("push.cu").address("push")
     assert libraries(folder) == first
     assert next((folder.parent / "cache").iterdir()).stat().st_mtime_ns == stamp
 
@@ -83,7 +85,7 @@ def test_the_cache_knows_text_headers_flags_and_precision(folder, monkeypatch):
 
     def result() -> float:
         given = arguments()
-        backend.Module("push.cu").bind("push", 5, **given)()
+        CpuModule("push.cu").bind("push", 5, **given)()
         return given["x"][1]
 
     assert result() == 1.0
@@ -96,7 +98,7 @@ def test_the_cache_knows_text_headers_flags_and_precision(folder, monkeypatch):
     monkeypatch.setattr(backend, "FLAGS", [*backend.FLAGS, "-DUNUSED"])
     assert result() == 30.0
     assert len(libraries(folder)) == 4
-    backend.Module("push.cu", "float").address("push")
+    CpuModule("push.cu", "float").address("push")
     assert len(libraries(folder)) == 5
     (folder / "mine.cuh").write_text("#define FACTOR 2\n")
     source.write_text(PUSH)
@@ -106,7 +108,7 @@ def test_the_cache_knows_text_headers_flags_and_precision(folder, monkeypatch):
 def test_a_text_that_does_not_compile_says_why_and_leaves_nothing(folder):
     (folder / "push.cu").write_text(PUSH.replace("p.h", "p.nonsense"))
     with pytest.raises(backend.CompileError, match=r"push\.cu did not compile:[\s\S]*nonsense"):
-        backend.Module("push.cu").address("push")
+        CpuModule("push.cu").address("push")
     assert not any(name.endswith(".so") for name in libraries(folder))
 
 
@@ -146,17 +148,17 @@ def test_arguments_that_do_not_fit_are_refused(folder, kept, monkeypatch, change
     monkeypatch.setenv("WARPFACTOR_CACHE", kept)
     given = {k: v for k, v in (arguments() | change).items() if v is not None}
     with pytest.raises(TypeError, match=message):
-        backend.Module("push.cu").bind("push", 5, **given)
+        CpuModule("push.cu").bind("push", 5, **given)
 
 
 def test_kernels_and_members_that_cannot_be_found_are_named(folder):
-    module = backend.Module("push.cu")
+    module = CpuModule("push.cu")
     with pytest.raises(backend.CompileError, match=r"no kernel pull in push\.cu"):
         module.bind("pull", 5, **arguments())
     (folder / "odd.cu").write_text(PUSH.replace("real h;", "real h[3];"))
     (folder / "odd.cu").write_text((folder / "odd.cu").read_text().replace("p.h *", "p.h[0] *"))
     with pytest.raises(backend.CompileError, match=r"struct Push: cannot read the member 'real h\[3\];'"):
-        backend.Module("odd.cu").bind("push", 5, **arguments())
+        CpuModule("odd.cu").bind("push", 5, **arguments())
 
 
 def test_layouts_are_those_of_the_compiler(folder):
@@ -167,7 +169,7 @@ def test_layouts_are_those_of_the_compiler(folder):
     (folder / "odd.cu").write_text(text)
     for real, dtype in (("double", "f8"), ("float", "f4")):
         out = np.zeros(3, dtype)
-        launch = backend.Module("odd.cu", real).bind("odd", 3, a=1.0, k=2, v=np.full(3, 3, dtype), m=4, b=5.0, out=out)
+        launch = CpuModule("odd.cu", real).bind("odd", 3, a=1.0, k=2, v=np.full(3, 3, dtype), m=4, b=5.0, out=out)
         launch()
         assert (out == 54321).all()
         assert ctypes.sizeof(launch.params) in (40, 48, 56)
@@ -246,7 +248,7 @@ def test_the_last_kernel_of_a_step_compiles_with_the_end_of_the_step(arch, name,
 def _launch(path: str, struct: str, name: str, mailed: bool = False) -> SimpleNamespace:
     """What fusing reads of a DeviceLaunch, its arrays by name at addresses of their own."""
     text = backend.read_text(path)[1]
-    fields = backend._members(text, struct, {"real": "double", "local": "double"})
+    fields = members_of(text, struct, {"real": "double", "local": "double"})
     arrays = {
         f.name: SimpleNamespace(data=SimpleNamespace(ptr=hash(f.name) & 0xFFFFF00), shape=(9, 3), size=27)
         for f in fields if f.dtype is not None
@@ -302,7 +304,7 @@ def test_launches_put_together_compile_in_every_precision(group, real, local, tm
         pytest.skip("needs the package nvidia-cuda-nvrtc")
     launches = [_launch(*given) for given in group]
     for launch, (path, struct, *_) in zip(launches, group, strict=True):
-        launch.fields = backend._members(backend.read_text(path)[1], struct, {"real": real, "local": local})
+        launch.fields = members_of(backend.read_text(path)[1], struct, {"real": real, "local": local})
     private = kernel_fusion._private(launches, launches)  # type: ignore[arg-type]
     shape = kernel_fusion.BlockShape(64, 4)
     made = kernel_fusion.FusedSource(launches, shape, None, private)  # type: ignore[arg-type]

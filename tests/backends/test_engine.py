@@ -9,7 +9,7 @@ import weakref
 import numpy as np
 import pytest
 
-from sim_server.backends.compiler import module
+from sim_server.backends.cpu.device import module
 from sim_server.backends.cpu.engine import RECORD, Engine, Kind
 from sim_server.simulation import Simulation
 from tests.scenes import bar, factor_of, simulation

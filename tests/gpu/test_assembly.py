@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sim_server.backends.compiler import Cpu
+from sim_server.backends.cpu.device import Cpu
 from sim_server.scene import load
 from sim_server.simulation import Simulation
 

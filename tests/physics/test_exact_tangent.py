@@ -137,7 +137,7 @@ def test_newton_is_faster_with_it_where_some_is_clamped(tmp_path):
 
 
 def test_single_precision_agrees(tmp_path):
-    from sim_server.backends.compiler import module
+    from sim_server.backends.cpu.device import module
 
     sim = exact_bar(tmp_path)
     stir(sim, 0.1)

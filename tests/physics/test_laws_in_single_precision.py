@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sim_server.backends.compiler import module
+from sim_server.backends.cpu.device import module
 from sim_server.effects._hyperelastic import PROJECTIONS
 from tests.physics.laws import LAWS, Law, deform, odd_bar
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sim_server.backends.compiler import module
+from sim_server.backends.cpu.device import module
 from sim_server.effects.mass_spring import CALIBRATION, MassSpring
 from sim_server.errors import InputError
 from sim_server.simulation import Simulation

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sim_server.backends.compiler import module
+from sim_server.backends.cpu.device import module
 from sim_server.effects.corotational import rotation_matrices
 from tests.reference.corotational import nearest_rotation
 from tests.scenes import random_rotations

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from protocol import messages_pb2 as pb
-from sim_server.backends.compiler import module
+from sim_server.backends.cpu.device import module
 from sim_server.service.telemetry import Telemetry
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from sim_server.backends.compiler import module
+from sim_server.backends.cpu.device import module
 from tests.physics.test_forces import solid_bar, stir
 from tests.scenes import elastic, solid
 

@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import FactorPattern
-from sim_server.backends.compiler import Launch, native
+from sim_server.backends.compiler import native
 from sim_server.backends.cpu import structs
+from sim_server.backends.cpu.device import CpuLaunch
 from sim_server.backends.cpu.structs import RECORD
 from sim_server.backends.ring_buffers import Reports
 from sim_server.mechanics.energy import Energies, NativeEnergies
@@ -134,8 +135,8 @@ class Engine(Reports):
     """
 
     def __init__(
-        self, assemble: Sequence[Launch], integrate: Sequence[Launch], ranges: Sequence[tuple[int, int]], dt: float,
-        records: int = 8192, frames: int = 8, threads: int = 1, newton: Newton | None = None,
+        self, assemble: Sequence[CpuLaunch], integrate: Sequence[CpuLaunch], ranges: Sequence[tuple[int, int]],
+        dt: float, records: int = 8192, frames: int = 8, threads: int = 1, newton: Newton | None = None,
         energies: Energies | None = None, **arrays: NDArray[Any],
     ):  # fmt: skip
         self._native = _library()
@@ -166,7 +167,7 @@ class Engine(Reports):
         self._energies = energies and NativeEnergies(energies)
         if self._energies:
             loop.energies = c.pointer(self._energies.native)
-        self.begin: list[Launch] = []  # before the first step
+        self.begin: list[CpuLaunch] = []  # before the first step
 
     exact = True  # settings and factors hold from the very next solve on
 
@@ -305,7 +306,7 @@ class Engine(Reports):
         """Step of the copy asked for last, -1 while it is not there. `step` counts the steps completed before it."""
         return int(self._body[body].snapshot_step)
 
-    def replace(self, launch: int, new: Launch) -> structs.Binding:
+    def replace(self, launch: int, new: CpuLaunch) -> structs.Binding:
         """Gives a launch other arguments, from the next step on: the one after the result's `taken` steps, once it is
         not below 0."""
         binding = structs.Binding(c.addressof(new.params), new.items, 0, -1)

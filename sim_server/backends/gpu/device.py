@@ -15,17 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.process.extras import to_install
-from sim_server.backends.build_pool import compilers
-from sim_server.backends.compiler import (
-    HERE,
-    INCLUDE,
-    Argument,
-    CompileError,
-    arguments_of,
-    build_id,
-    domain_of,
-    read_text,
-)
+from sim_server.backends.build_pool import CompileError, compilers
+from sim_server.backends.compiler import HERE, INCLUDE, build_id, read_text
+from sim_server.backends.kernel_binding import Argument, arguments_of, domain_of
 from sim_server.errors import DeviceError
 
 LEAST = 80  # compute capability times 10: the solver multiplies by matrix instructions that came with it

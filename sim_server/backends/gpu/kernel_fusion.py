@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_server.backends.compiler import domain_of
 from sim_server.backends.gpu.device import DeviceLaunch, compiled, cupy, options, own_headers, processors
+from sim_server.backends.kernel_binding import domain_of
 
 DOMAINS = ("elements", "nodes", "blocks")
 

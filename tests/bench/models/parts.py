@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_server.backends.compiler import Cpu
+from sim_server.backends.cpu.device import Cpu
 from sim_server.effects import effect, known_effects
 from sim_server.effects._base import Effect
 from sim_server.scene.model import Scene

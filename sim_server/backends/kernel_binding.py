@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: MIT
+"""Reads the argument struct of a kernel from its text and checks arrays and numbers against it.
+
+A struct's layout stands in one place, the kernel text (kernels/kernel.h). `arguments_of` gives the members of a
+kernel's struct, each with its argument; cpu/device.py and gpu/device.py fill the struct for their side.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from sim_server.backends.build_pool import CompileError
+
+_TYPES = {"int": "i4", "double": "f8", "float": "f4"}
+
+
+@dataclass(frozen=True)
+class Argument:
+    """A member of a kernel's argument struct. dtype: of the array that a pointer points to, None for a number.
+
+    own: only the items of the kernel's domain touch it, each its row. constant: the kernel only reads it.
+    """
+
+    name: str
+    kind: str  # int, float or double
+    dtype: np.dtype | None
+    own: bool = False
+    constant: bool = False
+
+
+def members_of(text: str, struct: str, types: dict[str, str]) -> list[Argument]:
+    """Members of a struct of a text, in order. types: what `real` and `local` stand for. Raises CompileError."""
+    body = re.search(rf"struct {struct} \{{(.*?)\n\}};", text, re.DOTALL)
+    if body is None:
+        raise CompileError(f"no struct {struct} in the kernel text")
+    members: list[Argument] = []
+    for line in body.group(1).splitlines():
+        member = re.fullmatch(r"\s*(const )?(?:own<(\w+)>|(\w+)(\*?)) (\w+);.*", line)
+        if member is None:
+            if line.split("//")[0].strip():
+                raise CompileError(f"struct {struct}: cannot read the member {line.strip()!r}")
+            continue
+        constant, own, kind, star, name = member.groups()
+        kind = types.get(own or kind, own or kind)
+        dtype = np.dtype(_TYPES[kind]) if star or own else None
+        members.append(Argument(name, kind, dtype, bool(own), bool(constant)))
+    return members
+
+
+def arguments_of(
+    text: str, kernel: str, module: str, types: dict[str, str], given: dict[str, Any], converts: bool = False
+) -> tuple[list[tuple[Argument, Any]], str, str]:
+    """The members of a kernel's struct in order, each with its argument; the struct's name; "", "MAILED_" or "SUM_".
+
+    types: what `real` and `local` stand for. converts: an array of float64 may stand for one of float32.
+    Raises CompileError for an unknown kernel, TypeError where an argument does not fit the text.
+    """
+    members, struct, form = _signature(text, kernel, module, tuple(types.items()))
+    if set(given) != {m.name for m in members}:
+        raise TypeError(f"{module}.{kernel} takes {[m.name for m in members]}, not {sorted(given)}")
+    for m in members:
+        value = given[m.name]
+        if m.dtype is None:
+            continue
+        fits = [m.dtype, np.dtype("f8")] if converts and m.dtype.kind == "f" else [m.dtype]
+        if not (isinstance(value, np.ndarray) and value.dtype in fits and value.flags.c_contiguous):
+            raise TypeError(f"{module}.{kernel}: {m.name} must be a contiguous array of {m.dtype}")
+    return [(m, given[m.name]) for m in members], struct, form
+
+
+@cache
+def _signature(
+    text: str, kernel: str, module: str, types: tuple[tuple[str, str], ...]
+) -> tuple[list[Argument], str, str]:
+    """Once for each kernel: touch.apply is bound anew whenever clients move what they hold."""
+    found = re.search(rf"^(MAILED_|SUM_)?KERNEL\({kernel}, (\w+)[,)]", text, re.MULTILINE)
+    if found is None:
+        raise CompileError(f"no kernel {kernel} in {module}.cu")
+    return members_of(text, found.group(2), dict(types)), found.group(2), found.group(1) or ""
+
+
+@cache
+def domain_of(text: str, struct: str) -> str:
+    """What the items of a kernel are: the first word behind `int n;` in its struct."""
+    found = re.search(rf"struct {struct} \{{\s*int n;\s*// (\w+)", text)
+    return found.group(1) if found else ""
