@@ -54,10 +54,10 @@ from pydantic import Field, create_model
 
 from sim_server.backends.base import Launch
 from sim_server.effects._base import Effect, ElementEnergies, Refusal
-from sim_server.effects.corotational import shape_gradients
 from sim_server.errors import InputError
 from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.world import Body, World
+from sim_server.mesh.shape_functions import shape_gradients
 from sim_server.scene.parameters import Parameters, Positive
 from sim_server.scene.regions import Poisson, Regional, by_region, constants_by_region
 

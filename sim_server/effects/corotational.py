@@ -53,6 +53,7 @@ from sim_server.effects._base import Effect, ElementEnergies
 from sim_server.errors import InputError
 from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.world import Body, World
+from sim_server.mesh.shape_functions import shape_gradients
 from sim_server.scene.integrator_options import IntegratorOptions
 from sim_server.scene.parameters import complaint
 from sim_server.scene.regions import Poisson, Regional, Young, region_values
@@ -178,14 +179,6 @@ def rotation_matrices(turn: NDArray[Any]) -> NDArray[np.float64]:
         2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
     ]  # fmt: skip
     return np.stack(entries, axis=1).reshape(-1, 3, 3)
-
-
-def shape_gradients(
-    rest: NDArray[np.float64], tets: NDArray[np.int32]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Volumes (m,) [m3] and rest gradients of the shape functions of corners 1, 2, 3, (m, 3, 3) [1/m]."""
-    edges = rest[tets[:, 1:]] - rest[tets[:, :1]]  # rows are edges: Dm^T
-    return np.linalg.det(edges) / 6, np.ascontiguousarray(np.swapaxes(np.linalg.inv(edges), 1, 2))
 
 
 def build(world: World, listed: list[tuple[Body, Any]]) -> Corotational:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csc_array
 
-from sim_server.effects.corotational import shape_gradients
+from sim_server.mesh.shape_functions import shape_gradients
 from sim_server.simulation import Simulation
 
 Reals = NDArray[np.float64]
