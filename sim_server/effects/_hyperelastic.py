@@ -161,12 +161,12 @@ class Tetrahedra(Effect):
     def gathers(self, system: System, stencil: Stencil, accumulate: bool) -> list[Launch]:
         """What collects corners and edges into the system."""
         w, m = self.world, len(self.elements)
-        gather = w.backend.module("kernels/corner_rows.cu").bind(
+        gather = w.backend.module("kernels/gather_forces.cu").bind(
             "gather", w.nodes, elements=m, start=stencil.corner_start, slots=stencil.corners, rows=self.corners,
             b=system.b, block=system.block,
         )  # fmt: skip
-        blocks = w.backend.module("kernels/edge_rows.cu").bind(
-            "blocks", len(system.row), elements=m, accumulate=int(accumulate), start=stencil.pair_start,
+        blocks = w.backend.module("kernels/gather_blocks.cu").bind(
+            "gather", len(system.row), elements=m, accumulate=int(accumulate), start=stencil.pair_start,
             pairs=stencil.pairs, edges=self.edges, sums=system.sums,
         )  # fmt: skip
         return [gather, blocks]

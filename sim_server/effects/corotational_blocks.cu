@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: MIT
-// Sums the element tangents of corotational tetrahedra block by block (corotational_rows.cuh). A block gathers its elements
+// Sums the element tangents of corotational tetrahedra block by block (corotational_tangent.cuh). A block gathers its elements
 // from a list made once per topology: no atomics, the same sum in the same order every time, and no 12x12 matrix is ever
 // formed. The nodes' own blocks, those on the diagonal, are corotational_nodes.cu's.
-#include "corotational_rows.cuh"
+#include "corotational_tangent.cuh"
 
 struct Blocks {
     int n;                // blocks above the diagonal

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: MIT
 // Sums the exact tangents of corotational tetrahedra block by block (corotational_exact.cu), as corotational_blocks.cu does.
-#include "corotational_rows.cuh"
+#include "corotational_tangent.cuh"
 
 struct Blocks {
     int n;                // blocks above the diagonal

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: MIT
 // Collects at each node what its elements left for it (corotational_exact.cu).
-#include "corotational_rows.cuh"
+#include "corotational_tangent.cuh"
 
 struct Gather {
     int n;                // nodes

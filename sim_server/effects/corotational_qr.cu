@@ -2,7 +2,7 @@
 // Corotational linear tetrahedra that turn with their first edge and the plane of their first face (formulas: corotational.py).
 #define WIDE
 #include "corotational.cuh"
-#include "frames.cuh"
+#include "gram_schmidt.cuh"
 
 struct Elements {
     int n;                    // elements

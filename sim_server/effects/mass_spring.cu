@@ -2,7 +2,7 @@
 // Springs between two nodes (formulas: mass_spring.py).
 #define WIDE
 #include "mat3.cuh"
-#include "together.cuh"
+#include "coalesced_io.cuh"
 
 struct Springs {
     int n;                    // elements

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: MIT
 // The tangent of springs off the diagonal, -(g g^T + d I): one spring a block, or a few side by side.
-#include "together.cuh"
+#include "coalesced_io.cuh"
 
 struct Blocks {
     int n;                // blocks above the diagonal

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: MIT
 // Collects at each node what its springs left for it: a gather, so that no two items write one place.
-#include "together.cuh"
+#include "coalesced_io.cuh"
 
 struct Gather {
     int n;                // nodes

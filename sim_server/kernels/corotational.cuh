@@ -2,7 +2,7 @@
 // What the texts of corotational tetrahedra share (formulas: effects/corotational.py).
 #pragma once
 #include "polar.cuh"
-#include "together.cuh"
+#include "coalesced_io.cuh"
 
 INLINE local_mat3 rest_gradients(const local* gradients, int n, index i) {
     local_mat3 g;

@@ -3,7 +3,7 @@
 #pragma once
 #include "eigen9.cuh"
 #include "svd3.cuh"
-#include "together.cuh"
+#include "coalesced_io.cuh"
 
 template <class T> INLINE mat<T> mul_transposed(const mat<T>& a, const mat<T>& b) { return mul(a, transposed(b)); }
 

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: MIT
 #pragma once
-#include "anywhere.cuh"
+#include "host_device.cuh"
 
 // v = inverse of the symmetric 3x3 block a, row major; whole = false: of its diagonal alone.
 template <class T>

@@ -137,7 +137,7 @@ BY_LANES(sqrt)
 #define PASTED(a, b) a##b
 #define IS(type) PASTED(IS_, type)
 #if IS(real)
-#include "elementary.h"
+#include "vector_math.h"
 #else
 BY_LANES(log)
 BY_LANES(exp)

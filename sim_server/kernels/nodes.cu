@@ -2,7 +2,7 @@
 // What every step does node by node, whatever its effects.
 #define WIDE
 #include "polar.cuh"
-#include "together.cuh"
+#include "coalesced_io.cuh"
 
 struct Start {
     int n;               // nodes
@@ -21,7 +21,7 @@ KERNEL(start, Start) {
     for (int k = 0; k < 10; ++k) row_put<10>(p.mean, i, k, local_number{});
 }
 
-struct Turn {
+struct Rotate {
     int n;               // nodes
     const real* free;    // (n,) 1, or 0 at fixed nodes
     const int* body;     // (n,) of the node
@@ -55,7 +55,7 @@ INLINE local_mat3 sum_of_rotations(own<local> mean, index i) {
 }
 
 // Frame of a node: its rotation, the one nearest to the mean of its elements' (Courtecuisse et al. 2010, section 6), or the identity.
-INLINE local_mat3 frame_of(const Turn& p, index i) {
+INLINE local_mat3 frame_of(const Rotate& p, index i) {
     index warped = at(p.warped, at(p.body, i));
     quaternion<local_number> rest = {local_number{} + 1, {}, {}, {}}, q = rest;
     if (any(warped)) {
@@ -74,14 +74,14 @@ constexpr int SAFETY = 4;
 
 INLINE number largest(vec3 a) { return larger(larger(magnitude(a.x), magnitude(a.y)), magnitude(a.z)); }
 
-INLINE auto rests(const Turn& p, index i, vec3 b, vec3 v, number stiffness) {
+INLINE auto rests(const Rotate& p, index i, vec3 b, vec3 v, number stiffness) {
     number from = largest(load3(p.x, i)), extent = at(p.extent, i);
     number place = EPSILON<number> * (from + extent), strain = EPSILON<local_number> * extent;
     number rounding = SAFETY * stiffness * at(p.gain, i) * larger(place, strain);
     return (largest(b) <= rounding) & (p.h * largest(v) <= place);
 }
 
-KERNEL(turn, Turn) {
+KERNEL(rotate, Rotate) {
     local_mat3 R = frame_of(p, i);
     number keep = at(p.free, i), d = row_at<1>(p.diagonal, i, 0);
     local_number k[6];

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The energy of each body in every step, and what becomes of one that runs away: kernels/balance.cuh says when."""
+"""Energy of each body in every step, and the handling of runaways (criterion: kernels/energy_balance.cuh)."""
 
 import ctypes as c
 from typing import Any

@@ -18,9 +18,9 @@ beta K, and the solution dv = v' - v,
     carried = V - v,    ahead = (X + c v - x) / c,    drift = (c ahead + beta v) / (c + beta)
 
 where f has all forces but beta K v, which is in drift; then v += dv, x += c (ahead + dv). So a scheme is a few numbers:
-what it makes of dv for the next ahead and carried (kernels/schemes.cu). In backward Euler ahead and drift are v,
-nothing is carried, and the launches are those of kernels/nodes.cu. Newton-Raphson (kernels/search.cuh) linearizes again
-at what came out: there ahead = 0.
+what it makes of dv for the next ahead and carried (kernels/time_integration.cu). In backward Euler ahead and drift are
+v, nothing is carried, and the launches are those of kernels/nodes.cu. Newton-Raphson (kernels/newton_line_search.cuh)
+linearizes again at what came out: there ahead = 0.
 
 Order: 1, 2 (gamma = 1/2), 2. One linearization keeps it only where K is the exact slope of the forces; the usual
 tangent of corotational elements is not, by as much as they are strained.
@@ -44,7 +44,7 @@ from sim_server.mechanics.newton import Newton
 from sim_server.mechanics.system import Ints, System
 from sim_server.scene import Scene
 
-TEXT = "kernels/schemes.cu"
+TEXT = "kernels/time_integration.cu"
 
 
 @dataclass(frozen=True)

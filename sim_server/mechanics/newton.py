@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What an engine needs to know for several linearizations a step (kernels/search.cuh)."""
+"""What an engine needs to know for several linearizations a step (kernels/newton_line_search.cuh)."""
 
 from collections.abc import Sequence
 from typing import Any

@@ -34,8 +34,8 @@ class ShapeMatching:
 
     def launch(self, mean: NDArray[np.float64]) -> Launch:
         """Writes A_i in place of the mean of rotations (n, 10) of the bodies' nodes."""
-        return self.world.backend.module("kernels/shape.cu").bind(
-            "shape", self.world.nodes, start=self.start, neighbour=self.neighbour, arm=self.arm, x=self.world.x,
+        return self.world.backend.module("kernels/shape_matching.cu").bind(
+            "match", self.world.nodes, start=self.start, neighbour=self.neighbour, arm=self.arm, x=self.world.x,
             mean=mean,
         )  # fmt: skip
 

@@ -5,8 +5,8 @@ A is block CSR with 3x3 blocks over all nodes of the scene, both triangles, colu
 a body's blocks are one range of it. Rows of fixed nodes hold their diagonal block alone (the identity). Effects add to
     b (n, 3) [N s], diagonal (n,) [kg], block (n, 6) [kg]: upper triangle of the nodes' own blocks,
     sums (blocks above the diagonal, 3, 3) [kg] and mean (n, 10): of the rotations' products of quaternions,
-all in the world frame; `turn` and `assemble` then take b and A into the material frame, where the solve happens
-(kernels/nodes.cu, kernels/assemble.cu).
+all in the world frame; kernels/nodes.cu (`rotate`) and kernels/rotate_blocks.cu then take b and A into the material
+frame, where the solve happens.
 """
 
 from dataclasses import dataclass
@@ -40,7 +40,7 @@ class System:
 
     elements: per effect, (m, c) node numbers of the elements that couple their corners, c = 2 or 4.
 
-    moving (bodies,): 1 where a step is to be solved, as some node does not rest (kernels/nodes.cu), set by `turn` and
+    moving (bodies,): 1 where a step is to be solved, as some node does not rest, set by `rotate` (kernels/nodes.cu) and
     cleared by the loop. extent (n,): diagonal of the box around the node's body at rest [m]; gain (n,) [1/s].
     rotation (n, 3, 3): frames of the nodes. warped (bodies,): 1 where they follow the nodes' rotations, 0 where they
     stay the identity; set before the launches are made.
@@ -103,17 +103,17 @@ class System:
         """Everything into the material frame: A' = R^T A R, b' = R^T b, and the start of the solve."""
         w = self.world
         velocity = w.v if w.inertia else w.ahead  # without inertia that of the last step is no velocity to begin with
-        turn = self.world.backend.module("kernels/nodes.cu").bind(
-            "turn", w.nodes, free=w.free, body=self.body, warped=self.warped, place=self.own,
+        rotate = self.world.backend.module("kernels/nodes.cu").bind(
+            "rotate", w.nodes, free=w.free, body=self.body, warped=self.warped, place=self.own,
             mean=self.mean, b=self.b, diagonal=self.diagonal, block=self.block, dv=self.dv,
             x=w.x, v=velocity, extent=self.extent, gain=self.gain, h=w.dt, moving=self.moving,
             rotation=self.rotation, b_material=self.b_material, y=self.y, values=self.values,
         )  # fmt: skip
-        assemble = self.world.backend.module("kernels/assemble.cu").bind(
-            "assemble", len(self.row), row=self.row, column=self.column, upper=self.upper, lower=self.lower,
+        rotate_blocks = self.world.backend.module("kernels/rotate_blocks.cu").bind(
+            "rotate_blocks", len(self.row), row=self.row, column=self.column, upper=self.upper, lower=self.lower,
             sums=self.sums, rotation=self.rotation, values=self.values,
         )  # fmt: skip
-        return [turn, assemble]
+        return [rotate, rotate_blocks]
 
     def advance(self, before: NDArray[np.float64]) -> Launch:
         """v += R y, x += h v: backward Euler. before (n, 3): gets x as it was [m]."""

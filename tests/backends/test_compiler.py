@@ -228,7 +228,7 @@ def test_a_process_without_kernels_compiles_none(tmp_path):
     assert run.stdout.strip() == "[]"
 
 
-@pytest.mark.parametrize("name", ["nodes", "schemes"])
+@pytest.mark.parametrize("name", ["nodes", "time_integration"])
 @pytest.mark.parametrize("arch", ["sm_80", "sm_90"])
 def test_the_last_kernel_of_a_step_compiles_with_the_end_of_the_step(arch, name, tmp_path):
     if (library := nvrtc.library()) is None:
@@ -267,8 +267,9 @@ NODES = [
     ("effects/corotational_exact_nodes.cu", "Gather", "corotational_exact_nodes.gather"),
     ("effects/mass_spring_nodes.cu", "Gather", "mass_spring_nodes.gather"),
     ("effects/touch.cu", "Apply", "touch.apply", True), ("effects/gravity.cu", "Gravity", "gravity.gravity"),
-    ("kernels/corner_rows.cu", "Gather", "corner_rows.gather"), ("kernels/shape.cu", "Shape", "shape.shape"),
-    ("kernels/nodes.cu", "Turn", "nodes.turn"),
+    ("kernels/gather_forces.cu", "GatherForces", "gather_forces.gather"),
+    ("kernels/shape_matching.cu", "Match", "shape_matching.match"),
+    ("kernels/nodes.cu", "Rotate", "nodes.rotate"),
 ]  # fmt: skip
 ELEMENTS = [
     ("effects/corotational.cu", "Elements", "corotational.elements"),
@@ -281,13 +282,13 @@ LAW_ELEMENTS = [
     (f"{FRAME}+effects/mooney_rivlin.cuh", "Elements", "mooney_rivlin.elements"),
     ("effects/fibres.cu", "Elements", "fibres.elements"),
 ]
-OTHER_SCHEME = [("kernels/schemes.cu", "Inertia", "schemes.inertia"), *NODES[1:]]
+OTHER_SCHEME = [("kernels/time_integration.cu", "Inertia", "time_integration.inertia"), *NODES[1:]]
 BLOCKS = [
     ("effects/corotational_blocks.cu", "Blocks", "corotational_blocks.blocks"),
     ("effects/corotational_exact_blocks.cu", "Blocks", "corotational_exact_blocks.blocks"),
     ("effects/mass_spring_blocks.cu", "Blocks", "mass_spring_blocks.blocks"),
-    ("kernels/edge_rows.cu", "Blocks", "edge_rows.blocks"),
-    ("kernels/assemble.cu", "Assemble", "assemble.assemble"),
+    ("kernels/gather_blocks.cu", "GatherBlocks", "gather_blocks.gather"),
+    ("kernels/rotate_blocks.cu", "RotateBlocks", "rotate_blocks.rotate_blocks"),
 ]
 
 

@@ -29,7 +29,7 @@ from tests.support import nvrtc
 SIZES = {"int": 4, "unsigned": 4, "float": 4, "double": 8, "long long": 8}
 TEXTS = "".join(
     (HERE / name).read_text()
-    for name in ("backends/gpu/pcg_structs.cuh", "backends/gpu/newton.cu", "kernels/search.cuh")
+    for name in ("backends/gpu/pcg_structs.cuh", "backends/gpu/newton.cu", "kernels/newton_line_search.cuh")
 )
 
 

@@ -26,9 +26,9 @@ print(json.dumps({
 """
 
 OBJECT = '[[object]]\nname = "block"\nmesh = { bar = [2, 2, 2], size = [1, 1, 1] }\n[object.effects]\n'
-FRAME = {"before": ["nodes.start"], "after": ["nodes.turn", "assemble.assemble", "nodes.advance"]}
+FRAME = {"before": ["nodes.start"], "after": ["nodes.rotate", "rotate_blocks.rotate_blocks", "nodes.advance"]}
 ELASTIC = ["corotational.elements", "corotational_nodes.gather", "corotational_blocks.blocks"]
-ALWAYS = ["assemble.cu", "loop.cpp", "nodes.cu"]
+ALWAYS = ["loop.cpp", "nodes.cu", "rotate_blocks.cu"]
 ELASTIC_TEXTS = ["corotational.cu", "corotational_blocks.cu", "corotational_nodes.cu"]
 COROTATIONAL = "corotational = { young = 1e5, poisson = 0.3 }\n"
 
@@ -57,13 +57,13 @@ SCENES = {
     ),
     "springs": (
         "", "mass_spring = { young = 1e5 }\n", ["mass_spring"],
-        ["mass_spring.cu", "mass_spring_blocks.cu", "mass_spring_nodes.cu", "shape.cu"],
-        ["mass_spring.springs", "mass_spring_nodes.gather", "mass_spring_blocks.blocks", "shape.shape"],
+        ["mass_spring.cu", "mass_spring_blocks.cu", "mass_spring_nodes.cu", "shape_matching.cu"],
+        ["mass_spring.springs", "mass_spring_nodes.gather", "mass_spring_blocks.blocks", "shape_matching.match"],
     ),
     "a hyperelastic law": (
         "", "neo_hookean = { young = 1e5, poisson = 0.3 }\n", ["neo_hookean"],
-        ["corner_rows.cu", "edge_rows.cu", "neo_hookean.cuh", "shape.cu"],
-        ["neo_hookean.elements", "corner_rows.gather", "edge_rows.blocks", "shape.shape"],
+        ["gather_blocks.cu", "gather_forces.cu", "neo_hookean.cuh", "shape_matching.cu"],
+        ["neo_hookean.elements", "gather_forces.gather", "gather_blocks.gather", "shape_matching.match"],
     ),
     "everything": (
         "gravity = true", COROTATIONAL + 'rayleigh = { mass = 0.1 }\nfixed = { where = "X < 0.01" }\ntouch = true\n',

@@ -95,7 +95,11 @@ def test_the_default_has_the_launches_of_backward_euler_alone():
     assert [launch.name for launch in usual.engine.launches] == names
     exact = [launch.name for launch in simulation(bar(fixed="X < 0.01", tangent="exact")).engine.launches]
     other = simulation(bar(fixed="X < 0.01"), integrator={"scheme": "bdf2"})
-    assert [launch.name for launch in other.engine.launches] == ["schemes.inertia", *exact[1:-1], "schemes.advance"]
+    assert [launch.name for launch in other.engine.launches] == [
+        "time_integration.inertia",
+        *exact[1:-1],
+        "time_integration.advance",
+    ]
 
 
 def test_a_scheme_starts_from_the_state_that_it_finds():

@@ -35,7 +35,7 @@ def released(*objects: dict, names: tuple[str, ...] = ("wild",), **table) -> Sim
 
 
 def criterion(sim: Simulation, start: float, size: float, x: NDArray) -> bool:
-    """As kernels/balance.cuh has it, for one body without gravity or hands."""
+    """As kernels/energy_balance.cuh has it, for one body without gravity or hands."""
     w = sim.world
     kinetic = 0.5 * (w.mass[:, None] * w.v**2).sum()
     floor = 0.5 * w.mass.sum() * (1e-3 * size / w.dt) ** 2

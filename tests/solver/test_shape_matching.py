@@ -103,12 +103,12 @@ def test_a_posed_beam_takes_as_many_iterations_and_the_warp_pays(level, matched)
 
 
 def test_it_costs_nothing_where_elements_have_rotations(monkeypatch):
-    assert "shape.shape" not in launches(simulation(bar()))
+    assert "shape_matching.match" not in launches(simulation(bar()))
     monkeypatch.setattr(Simulation, "_rotated", lambda sim: sim.world.bodies[:1])
     table = [bar(), bar(name="other", pose={"rotate": [0, 0, 90], "translate": [0, 5, 0]})]
-    assert "shape.shape" not in launches(simulation(*table, warp=False))
+    assert "shape_matching.match" not in launches(simulation(*table, warp=False))
     mixed, alone = simulation(*table), simulation(table[0])
-    assert launches(mixed)[-4:-1] == ["shape.shape", "nodes.turn", "assemble.assemble"]
+    assert launches(mixed)[-4:-1] == ["shape_matching.match", "nodes.rotate", "rotate_blocks.rotate_blocks"]
     for sim in (mixed, alone):
         sim.world.x[:45] += np.random.default_rng(0).normal(scale=0.05, size=(45, 3))
         sim.engine.assemble()
@@ -118,7 +118,7 @@ def test_it_costs_nothing_where_elements_have_rotations(monkeypatch):
 
 def test_bodies_that_nothing_couples_need_no_rotations():
     sim = simulation(bar(young=None))
-    assert "shape.shape" not in launches(sim)
+    assert "shape_matching.match" not in launches(sim)
     sim.engine.run(2)
     assert np.array_equal(sim.system.rotation, np.tile(np.eye(3), (45, 1, 1)))
 

@@ -19,7 +19,7 @@ RECORD = np.dtype(
 )  # fmt: skip
 """One body, one step: what a loop reports. Seconds, except step numbers; `step` counts completed steps.
 
-kinetic, elastic, gravity, work and budget [J], stride [m]: kernels/balance.cuh. elastic: NaN unless it was wanted.
+kinetic, elastic, gravity, work and budget [J], stride [m]: kernels/energy_balance.cuh. elastic: NaN unless wanted.
 On a GPU only the solve is timed apart: assemble and integrate are 0 there. whole is the step's time on the device.
 """
 

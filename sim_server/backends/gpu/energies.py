@@ -21,7 +21,7 @@ from sim_server.mechanics.energy import CODES, Energies
 THREADS = 128  # of a thread block of elastic_energy.cu
 NODES = 128  # that a thread block sums over
 STILL = 5  # arrays that are 0 in a body at rest, at most
-SUMS = 10  # double numbers in Sums (kernels/balance.cuh)
+SUMS = 10  # double numbers in Sums (kernels/energy_balance.cuh)
 ENERGY_BALANCE = np.dtype(
     [(n, "u8") for n in ("first_node", "chunks", "sums", "finished_chunks", "mass", "before", "x", "v")]
     + [("still", "u8", STILL)]

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: MIT
-// The energy of each body after a step, and whether it has run away (kernels/balance.cuh). Each thread block sums over a chunk of a
+// The energy of each body after a step, and whether it has run away (kernels/energy_balance.cuh). Each thread block sums over a chunk of a
 // body's nodes; the one that finishes last of a body adds the chunks up in a fixed order, decides, and freezes. It runs as the first
 // thread blocks of the kernel over elements that begins the next step (kernel_fusion.py), or by itself after the last step of a batch; a step
 // that is settled already is left alone.

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: MIT
 // What the host is told of the energy of a body (energy_balance.cu, elastic_energy.cu).
 #pragma once
-#include "balance.cuh"
+#include "energy_balance.cuh"
 
 struct EnergyRecord {  // beside Result
     double kinetic, elastic, gravity, work, budget, stride;

@@ -144,7 +144,7 @@ class FusedSource:
         }  # fmt: skip
         lines = ["#define ITEMS_ONLY", f"#define BLOCK_ITEMS {shape.threads // shape.lanes}"]
         headers = [h for text in texts for h in re.findall(r'^#include "[^"]+"', text, re.MULTILINE)]
-        lines += dict.fromkeys([*headers, '#include "sums.cuh"'])  # outside of the texts' namespaces, once
+        lines += dict.fromkeys([*headers, '#include "warp_reduce.cuh"'])  # outside of the texts' namespaces, once
         for text, name in texts.items():
             body = re.sub(r"^#(include|define WIDE).*$", "", text, flags=re.MULTILINE)
             lines += [f"namespace {name} {{", body, "}"]

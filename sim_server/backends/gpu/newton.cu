@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: MIT
-// Newton-Raphson within a step on a GPU, for each body by itself (kernels/search.cuh says what it is). A step is, in one graph,
+// Newton-Raphson within a step on a GPU, for each body by itself (kernels/newton_line_search.cuh says what it is). A step is, in one graph,
 //     assemble, open, rounds times (pcg, move, assemble, judge), close, integrate
 // and nobody on the host decides anything: a body's phase says in each launch whether it is the body's turn, and once no search is
 // left the launches of the rounds that are over return at once. A round is one trial: rounds = linearizations (1 + trials).
@@ -7,7 +7,7 @@
 // A thread block has a stretch of a body's nodes; the last one of a body to be done adds up what all have left, in a fixed order,
 // and makes the body's decision. Sums and the gain are double, whatever `real` is.
 #include "pcg_structs.cuh"
-#include "search.cuh"
+#include "newton_line_search.cuh"
 
 #ifndef local
 #define local real

@@ -36,7 +36,7 @@ NEWTON_ARGUMENTS = np.dtype(
 
 class NewtonPhases(NamedTuple):
     """Whose turn it is, on the device: searches that are left, (1,), and the phase of each body's (bodies,), of
-    kernels/search.cuh."""
+    kernels/newton_line_search.cuh."""
 
     active: Any
     phase: Any

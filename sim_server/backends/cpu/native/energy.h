@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: MIT
-// The energy of each body after a step, and whether it has run away (kernels/balance.cuh). One pass over the nodes; the elastic
+// The energy of each body after a step, and whether it has run away (kernels/energy_balance.cuh). One pass over the nodes; the elastic
 // energy takes one over the elements and is made on demand alone.
 #pragma once
 #include <cstring>

@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: MIT
 // Memory of the simulation loop (loop.cpp). structs.py holds the same layouts.
 #pragma once
-#include "balance.cuh"
+#include "energy_balance.cuh"
 #include "pcg.h"
-#include "search.cuh"
+#include "newton_line_search.cuh"
 
 typedef void (*Kernel)(const void* params, int begin, int end);
 

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: MIT
-// Newton-Raphson within a step on a CPU: what it is stands in kernels/search.cuh.
+// Newton-Raphson within a step on a CPU: what it is stands in kernels/newton_line_search.cuh.
 #pragma once
 #include <algorithm>
 

@@ -7,7 +7,7 @@
 #include <cstdint>
 #include <ctime>
 
-#include "balance.cuh"
+#include "energy_balance.cuh"
 
 struct Record {
     int64_t step;          // steps completed
@@ -17,14 +17,14 @@ struct Record {
     double assemble, solve, integrate, whole, late, begin;  // s; begin: steady clock
     double cpu;            // s of processor time of the thread, whole step
     double nonlinear;      // |b| at the end of the step over the first |b|; -1: not evaluated
-    double kinetic, elastic, gravity, work, budget;  // J (kernels/balance.cuh); elastic: NaN where it was not evaluated
+    double kinetic, elastic, gravity, work, budget;  // J (kernels/energy_balance.cuh); elastic: NaN where it was not evaluated
     double stride;         // m
     int32_t body, iterations, status, kind, asked, fallbacks, bad_node, probe, linearizations, unused;
 };
 
 constexpr int32_t STATUS_NOT_FINITE = 5, STATUS_RUNAWAY = 7;  // as in Status (pcg.h)
 
-// b: Balance or Energy of the body (kernels/balance.cuh).
+// b: Balance or Energy of the body (kernels/energy_balance.cuh).
 template <class B> static inline void note_energy(Record& record, const B& b) {
     record.kinetic = b.kinetic;
     record.elastic = b.elastic;

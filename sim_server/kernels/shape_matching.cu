@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: MIT
 // Rotations of nodes by shape matching (formulas: shape_matching.py), for bodies whose elements have none of their own.
 #include "mat3.cuh"
-#include "together.cuh"
+#include "coalesced_io.cuh"
 
-struct Shape {
+struct Match {
     int n;                 // nodes
     const int* start;      // (n + 1,) into neighbours; none: the node keeps the mean that it has
     const int* neighbour;  // (start[n],) nodes
@@ -13,7 +13,7 @@ struct Shape {
 };
 
 // A = sum_j m_j (x_j - x_c) (X_j - X_c)^T, where x_i may stand for x_c, since the arms of a node and its own sum to zero.
-INLINE void shape_add(const Shape& p, int i, int k, local* sum) {
+INLINE void match_add(const Match& p, int i, int k, local* sum) {
     const real *there = p.x + 3 * p.neighbour[k], *here = p.x + 3 * i;
     const local* arm = p.arm + 3 * k;
     for (int m = 0; m < 3; ++m) {
@@ -23,7 +23,7 @@ INLINE void shape_add(const Shape& p, int i, int k, local* sum) {
 }
 
 // What nodes.cu makes a sum of rotations of are ten numbers of which it needs nine: they can stand for any matrix.
-INLINE void shape_put(const Shape& p, int i, const local* a) {
+INLINE void match_put(const Match& p, int i, const local* a) {
     if (p.start[i] == p.start[i + 1]) return;
     const local quarter = (local)0.25, half = (local)0.5, w = quarter * (a[0] + a[4] + a[8]);
     const local mean[10] = {w, quarter * (a[7] - a[5]), quarter * (a[2] - a[6]), quarter * (a[3] - a[1]),
@@ -32,4 +32,4 @@ INLINE void shape_put(const Shape& p, int i, const local* a) {
     for (int m = 0; m < 10; ++m) row_put<10>(p.mean, i, m, mean[m]);
 }
 
-SUM_KERNEL(shape, Shape, 9)
+SUM_KERNEL(match, Match, 9)

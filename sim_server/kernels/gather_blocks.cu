@@ -2,9 +2,9 @@
 // Sums the edge blocks that tetrahedra left (kernels/hyperelastic.cuh) block by block of A: a gather from a list made once per
 // topology, in its order. An edge of an element is stored once, from its lower to its higher corner; a block that couples
 // them the other way takes the transpose.
-#include "together.cuh"
+#include "coalesced_io.cuh"
 
-struct Blocks {
+struct GatherBlocks {
     int n;               // blocks above the diagonal
     int elements;
     int accumulate;      // 0: write, 1: add to what another effect wrote
@@ -14,7 +14,7 @@ struct Blocks {
     own<local> sums;     // (n, 9) out, world frame, row major [kg]
 };
 
-INLINE void blocks_add(const Blocks& p, int, int k, local* sum) {
+INLINE void gather_add(const GatherBlocks& p, int, int k, local* sum) {
     int pair = p.pairs[k], a = (pair >> 2) & 3, b = pair & 3;
     int low = a < b ? a : b, edge = low ? a + b : a + b - 1;
     const local* m = p.edges + 9 * ((long long)p.elements * edge + (pair >> 4));
@@ -26,8 +26,8 @@ INLINE void blocks_add(const Blocks& p, int, int k, local* sum) {
     sum[6] += turned ? row[2] : row[6]; sum[7] += turned ? row[5] : row[7]; sum[8] += row[8];
 }
 
-INLINE void blocks_put(const Blocks& p, int i, const local* sum) {
+INLINE void gather_put(const GatherBlocks& p, int i, const local* sum) {
     for (int m = 0; m < 9; ++m) row_put<9>(p.sums, i, m, p.accumulate ? row_at<9>(p.sums, i, m) + sum[m] : sum[m]);
 }
 
-SUM_KERNEL(blocks, Blocks, 9)
+SUM_KERNEL(gather, GatherBlocks, 9)

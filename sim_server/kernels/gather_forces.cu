@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: MIT
 // Collects at each node the rows that tetrahedra left for it (kernels/hyperelastic.cuh): a gather, so that no two items write
 // one place.
-#include "together.cuh"
+#include "coalesced_io.cuh"
 
-struct Gather {
+struct GatherForces {
     int n;                // nodes
     int elements;
     const int* start;     // (n + 1,) into slots
@@ -13,15 +13,15 @@ struct Gather {
     own<local> block;     // (n, 6) in, out: upper triangle of the node's own block of A, world frame [kg]
 };
 
-INLINE void gather_add(const Gather& p, int, int k, local* sum) {
+INLINE void gather_add(const GatherForces& p, int, int k, local* sum) {
     int slot = p.slots[k];
     const local* row = p.rows + 9 * ((long long)p.elements * (slot & 3) + (slot >> 2));
     for (int m = 0; m < 9; ++m) sum[m] += row[m];
 }
 
-INLINE void gather_put(const Gather& p, int i, const local* sum) {
+INLINE void gather_put(const GatherForces& p, int i, const local* sum) {
     for (int m = 0; m < 3; ++m) row_put<3>(p.b, i, m, row_at<3>(p.b, i, m) + sum[m]);
     for (int m = 0; m < 6; ++m) row_put<6>(p.block, i, m, row_at<6>(p.block, i, m) + sum[3 + m]);
 }
 
-SUM_KERNEL(gather, Gather, 9)
+SUM_KERNEL(gather, GatherForces, 9)

@@ -3,9 +3,9 @@
 // factor R_s R_t^T P^-1 R_t R_s^T at time s (Courtecuisse et al. 2010, eq. 12 and 13), at no cost per iteration. Here the
 // blocks off the diagonal; those on it are the nodes' (nodes.cu).
 #include "mat3.cuh"
-#include "together.cuh"
+#include "coalesced_io.cuh"
 
-struct Assemble {
+struct RotateBlocks {
     int n;                  // blocks above the diagonal
     const int* row;         // (n,) node
     const int* column;      // (n,) node, above row
@@ -16,7 +16,7 @@ struct Assemble {
     real* values;           // (blocks, 3, 3) out: A' = R^T A R, block CSR, both triangles [kg]
 };
 
-KERNEL(assemble, Assemble) {
+KERNEL(rotate_blocks, RotateBlocks) {
     local_mat3 A = mul(transposed(load9(p.rotation, p.row[i])), mul(load9(p.sums, i), load9(p.rotation, p.column[i])));
     put_block(p.values, p.upper[i], i, p.n, as<real>(A).m);
     put_block(p.values, p.lower[i], i, p.n, as<real>(transposed(A)).m);

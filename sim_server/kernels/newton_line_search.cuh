@@ -12,7 +12,7 @@
 //   - The search is over when |b| <= tolerance |b of the step's first linearization|, or when b is rounding.
 // Who includes this has Status (backends/cpu/native/pcg.h, backends/gpu/pcg_structs.cuh).
 #pragma once
-#include "anywhere.cuh"
+#include "host_device.cuh"
 
 constexpr double SLACK = 0.9;
 template <class T> constexpr double EPSILON = sizeof(T) == 8 ? 2.2e-16 : 1.2e-7;  // of what forces are reckoned in

@@ -2,7 +2,7 @@
 // The blocks of a corotational tetrahedron's usual tangent: with g_a the scaled rotated gradient of corner a,
 // h (c + beta) K_ab = (lambda / mu) g_a g_b^T + g_b g_a^T + (g_a . g_b) I. A row is g_a, lambda / mu.
 #pragma once
-#include "together.cuh"
+#include "coalesced_io.cuh"
 
 INLINE void add_block(local* s, const local (&a)[4], const local (&b)[4]) {
     local wx = a[3] * a[0], wy = a[3] * a[1], wz = a[3] * a[2], d = a[0] * b[0] + a[1] * b[1] + a[2] * b[2];

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""kernels/elementary.h: log, exp and cbrt of a vector, against the system's."""
+"""kernels/vector_math.h: log, exp and cbrt of a vector, against the system's."""
 
 import numpy as np
 import pytest

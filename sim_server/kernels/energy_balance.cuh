@@ -13,7 +13,7 @@
 //     start. In the same cases it is at most 1.7, but where a body was thrown or spun. Without inertia there is this one alone.
 // Its size is the longer of its diagonals at rest and at the start.
 #pragma once
-#include "anywhere.cuh"
+#include "host_device.cuh"
 
 constexpr double SLACK_OF_ENERGY = 2, LONG = 4, SLOW = 1e-3;
 
