@@ -7,8 +7,8 @@ from types import MappingProxyType
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sim_server.arrays import Float64, Int32, Int64
 from sim_server.backends.base import Launch
 from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.world import Body, World
@@ -39,8 +39,8 @@ class ElementEnergies:
     """
 
     launch: Any
-    energy: NDArray[np.float64]
-    owner: NDArray[np.int64]
+    energy: Float64
+    owner: Int64
 
 
 class Effect:
@@ -52,9 +52,9 @@ class Effect:
     elements, (m,) each, for viewers.
     """
 
-    elements: NDArray[np.int32] | None = None
+    elements: Int32 | None = None
     rotated: tuple[Body, ...] = ()
-    elastic: Mapping[int, tuple[NDArray[np.float64], NDArray[np.float64]]] = MappingProxyType({})
+    elastic: Mapping[int, tuple[Float64, Float64]] = MappingProxyType({})
 
     @property
     def told(self) -> bool:
@@ -102,7 +102,7 @@ class Build(Protocol):
     def __call__(self, world: World, listed: list[tuple[Body, Any]]) -> Effect: ...
 
 
-def per_node(world: World, listed: list[tuple[Body, Any]], value: str) -> NDArray[np.float64]:
+def per_node(world: World, listed: list[tuple[Body, Any]], value: str) -> Float64:
     """(nodes,) with the parameter `value` of each listed body at its nodes, 0 elsewhere."""
     out = np.zeros(world.nodes)
     for body, params in listed:

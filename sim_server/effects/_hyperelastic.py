@@ -49,9 +49,9 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, create_model
 
+from sim_server.arrays import Float64, Int32
 from sim_server.backends.base import Launch
 from sim_server.effects._base import Effect, ElementEnergies, Refusal
 from sim_server.errors import InputError
@@ -61,8 +61,7 @@ from sim_server.mesh.shape_functions import shape_gradients
 from sim_server.scene.parameters import Parameters, Positive
 from sim_server.scene.regions import Poisson, Regional, by_region, constants_by_region
 
-Reals = NDArray[np.float64]
-Values = Mapping[str, Reals]
+Values = Mapping[str, Float64]
 PROJECTIONS = {"none": 0, "clamp": 1, "absolute": 2, "excess": 3}  # kernels/hyperelastic.cuh
 
 
@@ -97,9 +96,9 @@ class Law:
 
     name: str
     constants: Sequence[Constant]
-    pack: Callable[[Values], Sequence[Reals]]
-    elastic: Callable[[Values], tuple[Reals, Reals]] | None = None
-    axes: Callable[[Values], Reals] | None = None
+    pack: Callable[[Values], Sequence[Float64]]
+    elastic: Callable[[Values], tuple[Float64, Float64]] | None = None
+    axes: Callable[[Values], Float64] | None = None
     text: str = ""
     refuses: bool = True
     regularizes: bool = True
@@ -143,7 +142,7 @@ class Tetrahedra(Effect):
         self.world = world
         tets = np.concatenate([body.tets for body, _ in listed])
         self.order = np.argsort(tets.min(axis=1), kind="stable")  # neighbours in memory, whatever the mesh's order
-        self.elements: NDArray[np.int32] = np.ascontiguousarray(tets[self.order])
+        self.elements: Int32 = np.ascontiguousarray(tets[self.order])
         m = len(self.elements)
         counts = [len(body.mesh.tets) for body, _ in listed]
         self.owner = np.repeat([body.index for body, _ in listed], counts)[self.order]
@@ -233,17 +232,17 @@ def young_and_poisson_of(poisson: Any = Poisson) -> tuple[Constant, Constant]:
 YOUNG_AND_POISSON = young_and_poisson_of()
 
 
-def lame(values: Values) -> list[Reals]:
+def lame(values: Values) -> list[Float64]:
     """lambda and mu [Pa] of `young` and `poisson`."""
     young, poisson = values["young"], values["poisson"]
     return [young * poisson / ((1 + poisson) * (1 - 2 * poisson)), young / (2 * (1 + poisson))]
 
 
-def young_and_poisson(values: Values) -> tuple[Reals, Reals]:
+def young_and_poisson(values: Values) -> tuple[Float64, Float64]:
     """As they stand in the scene."""
     return values["young"], values["poisson"]
 
 
-def of_shear_and_bulk(shear: Reals, bulk: Reals) -> tuple[Reals, Reals]:
+def of_shear_and_bulk(shear: Float64, bulk: Float64) -> tuple[Float64, Float64]:
     """Young's modulus [Pa] and Poisson's ratio of a material with these moduli [Pa]."""
     return 9 * bulk * shear / (3 * bulk + shear), (3 * bulk - 2 * shear) / (2 * (3 * bulk + shear))

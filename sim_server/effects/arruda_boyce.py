@@ -24,7 +24,8 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from sim_server.effects._hyperelastic import Constant, Hyperelastic, Law, Reals, Values, of_shear_and_bulk
+from sim_server.arrays import Float64
+from sim_server.effects._hyperelastic import Constant, Hyperelastic, Law, Values, of_shear_and_bulk
 from sim_server.mechanics.world import Body, World
 from sim_server.scene.parameters import Positive
 
@@ -32,7 +33,7 @@ SCOPE = "object"
 SERIES = (1 / 2, 1 / 20, 11 / 1050, 19 / 7000, 519 / 673750)
 
 
-def small_strains(values: Values) -> tuple[Reals, Reals]:
+def small_strains(values: Values) -> tuple[Float64, Float64]:
     """Young's modulus and Poisson's ratio; the shear modulus is 2 dW/dI1 at rest."""
     n = values["segments"]
     shear = 2 * values["shear"] * sum(i * a * (3 / n) ** (i - 1) for i, a in enumerate(SERIES, 1))

@@ -48,6 +48,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from sim_server.arrays import Float64, Int32
 from sim_server.backends.base import Launch
 from sim_server.effects._base import Effect, ElementEnergies
 from sim_server.errors import InputError
@@ -111,7 +112,7 @@ class Corotational(Effect):
         self.rotated = tuple(body for body, _ in listed)
         tets = np.concatenate([body.tets for body, _ in listed])
         order = np.argsort(tets.min(axis=1), kind="stable")  # neighbours in memory, whatever the mesh's order
-        self.elements: NDArray[np.int32] = np.ascontiguousarray(tets[order])
+        self.elements: Int32 = np.ascontiguousarray(tets[order])
         self.elastic = {body.index: _constants(body, params) for body, params in listed}  # young, poisson
         young = np.concatenate([self.elastic[body.index][0] for body, _ in listed])[order]
         poisson = np.concatenate([self.elastic[body.index][1] for body, _ in listed])[order]
@@ -149,7 +150,7 @@ class Corotational(Effect):
         return [elements, gather, blocks]
 
     @property
-    def rotation(self) -> NDArray[np.float64]:
+    def rotation(self) -> Float64:
         """(m, 3, 3) rotations of the elements at the last step, from `turn`."""
         return rotation_matrices(self.world.backend.fetch(self.turn))
 
@@ -163,14 +164,14 @@ class Corotational(Effect):
         return ElementEnergies(launch, self._energy, self.owner)
 
 
-def _constants(body: Body, params: Params) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _constants(body: Body, params: Params) -> tuple[Float64, Float64]:
     try:
         return region_values(params.young, params.poisson, body.centroids)
     except InputError as error:
         raise InputError(f"object {body.name!r}, effect corotational: {error}") from error
 
 
-def rotation_matrices(turn: NDArray[Any]) -> NDArray[np.float64]:
+def rotation_matrices(turn: NDArray[Any]) -> Float64:
     """(m, 3, 3) of unit quaternions (m, 4), w first."""
     w, x, y, z = turn.astype(float).T
     entries = [

@@ -27,7 +27,8 @@ from typing import Any
 
 import numpy as np
 
-from sim_server.effects._hyperelastic import Constant, Hyperelastic, Law, Reals, Values
+from sim_server.arrays import Float64
+from sim_server.effects._hyperelastic import Constant, Hyperelastic, Law, Values
 from sim_server.errors import InputError
 from sim_server.mechanics.world import Body, World
 from sim_server.scene.parameters import NotNegative, Positive, Vector
@@ -37,7 +38,7 @@ PAIRS = ("ff", "fs", "fn", "ss", "sn", "nn")
 STIFFEST = {"ff": 18.5, "fs": 2.8, "fn": 2.8, "ss": 3.58, "sn": 2.8, "nn": 3.58}
 
 
-def axes(values: Values) -> Reals:
+def axes(values: Values) -> Float64:
     """(m, 3, 3), columns f, s, n; raises InputError where fibre and sheet are parallel or zero."""
     fibre, sheet = values["fibre"], values["sheet"]
     normal = np.cross(fibre, sheet)

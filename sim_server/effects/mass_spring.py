@@ -31,9 +31,9 @@ but responsive cloth, 2002 (the tangent under compression); Love, Mathematical T
 from typing import Annotated, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 
+from sim_server.arrays import Float64, Int32, Int64
 from sim_server.backends.base import Launch
 from sim_server.effects._base import Effect, ElementEnergies
 from sim_server.errors import InputError
@@ -47,8 +47,6 @@ POISSON = 0.25  # of every network of springs without preferred directions
 CALIBRATION = 1.12  # of the stiffness, by stretching unstructured bars (tests/physics/test_mass_spring_young.py)
 EDGES = np.array([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)])  # of a tetrahedron
 
-Reals = NDArray[np.float64]
-Ints = NDArray[np.int32]
 Node = Annotated[int, Field(ge=0)]
 Pair = Annotated[tuple[Node, Node], BeforeValidator(as_tuple)]
 Length = Annotated[float, Field(ge=0)]
@@ -105,12 +103,12 @@ class MassSpring(Effect):
 
     def __init__(self, world: World, listed: list[tuple[Body, Any]]):
         self.world = world
-        self.elastic: dict[int, tuple[Reals, Reals]] = {}
+        self.elastic: dict[int, tuple[Float64, Float64]] = {}
         self._from_files = any(isinstance(params.springs, str) for _, params in listed)
         parts = [self._springs(body, params) for body, params in listed]
         ends = np.concatenate([part[0] for part in parts])
         order = np.argsort(ends.min(axis=1), kind="stable")  # neighbours in memory
-        self.elements: Ints = np.ascontiguousarray(ends[order])
+        self.elements: Int32 = np.ascontiguousarray(ends[order])
         self.stiffness = np.concatenate([part[1] for part in parts])[order]
         self.length = np.concatenate([part[2] for part in parts])[order]
         owner = np.repeat([body.index for body, _ in listed], [len(part[0]) for part in parts])
@@ -123,7 +121,7 @@ class MassSpring(Effect):
         """Files are read here alone."""
         return not self._from_files
 
-    def _springs(self, body: Body, params: Params) -> tuple[Ints, Reals, Reals]:
+    def _springs(self, body: Body, params: Params) -> tuple[Int32, Float64, Float64]:
         """Ends, stiffness and rest length of a body's springs."""
         try:
             if params.young is None:
@@ -161,7 +159,7 @@ class MassSpring(Effect):
         return ElementEnergies(launch, self._energy, self.owner)
 
 
-def edge_springs(rest: Reals, tets: Ints, young: Reals) -> tuple[Ints, Reals, Reals]:
+def edge_springs(rest: Float64, tets: Int32, young: Float64) -> tuple[Int32, Float64, Float64]:
     """Of springs on the edges of elements (m, 4) of young (m,): ends (k, 2), stiffness [N/m] and length [m] (k,)."""
     corners = rest[tets]
     volume = np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6
@@ -173,7 +171,7 @@ def edge_springs(rest: Reals, tets: Ints, young: Reals) -> tuple[Ints, Reals, Re
     return ends, CALIBRATION * share / length**2, length
 
 
-def listed_springs(body: Body, params: Params) -> tuple[Ints, Reals, Reals]:
+def listed_springs(body: Body, params: Params) -> tuple[Int32, Float64, Float64]:
     """Ends (of the scene), stiffness and length of the springs that the scene lists; raises InputError."""
     ends = _pairs_of(params.springs) if isinstance(params.springs, str) else np.array(params.springs or [], np.int64)
     nodes = body.last - body.first
@@ -199,13 +197,13 @@ def listed_springs(body: Body, params: Params) -> tuple[Ints, Reals, Reals]:
     return (ends + body.first).astype(np.int32), stiffness, length
 
 
-def _one_each(name: str, given: Any, count: int) -> Reals:
+def _one_each(name: str, given: Any, count: int) -> Float64:
     if isinstance(given, list) and len(given) != count:
         raise InputError(f"{name} has {len(given)} values for {count} springs; must be one for all, or one for each")
     return np.broadcast_to(np.asarray(given, float), (count,)).copy()
 
 
-def _pairs_of(path: str) -> NDArray[np.int64]:
+def _pairs_of(path: str) -> Int64:
     """Two node numbers a line, (k, 2); raises InputError that names the line."""
     pairs = []
     try:

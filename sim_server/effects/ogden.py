@@ -25,7 +25,8 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BeforeValidator
 
-from sim_server.effects._hyperelastic import Constant, Hyperelastic, Law, Reals, Values, of_shear_and_bulk
+from sim_server.arrays import Float64
+from sim_server.effects._hyperelastic import Constant, Hyperelastic, Law, Values, of_shear_and_bulk
 from sim_server.errors import InputError
 from sim_server.mechanics.world import Body, World
 from sim_server.scene.parameters import Positive, complaint
@@ -43,7 +44,7 @@ def _terms(value: Any) -> Any:
 Terms = Annotated[tuple[float, float, float], BeforeValidator(_terms)]
 
 
-def pack(values: Values) -> list[Reals]:
+def pack(values: Values) -> list[Float64]:
     """mu_p, alpha_p and the bulk modulus; terms that are not there have mu = 0 and alpha = 1. Raises InputError."""
     mu, alpha = values["mu"].T, values["alpha"].T
     absent = (mu == 0) & (alpha == 0)

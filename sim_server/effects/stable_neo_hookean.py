@@ -29,10 +29,10 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
+from sim_server.arrays import Float64
 from sim_server.effects._hyperelastic import (
     Hyperelastic,
     Law,
-    Reals,
     Values,
     lame,
     young_and_poisson,
@@ -43,7 +43,7 @@ from sim_server.mechanics.world import Body, World
 SCOPE = "object"
 
 
-def pack(values: Values) -> list[Reals]:
+def pack(values: Values) -> list[Float64]:
     """l and m [Pa], so that the law is Hooke's at small strains."""
     lam, mu = lame(values)
     return [lam + 5 / 6 * mu, 4 / 3 * mu]

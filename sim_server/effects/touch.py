@@ -27,10 +27,10 @@ from math import dist, hypot
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from protocol.push_limits import ORPHANED_PUSH
+from sim_server.arrays import Float64, Int32
 from sim_server.backends.base import Launch
 from sim_server.effects._base import Effect
 from sim_server.mechanics.system import Stencil, System
@@ -69,8 +69,8 @@ class Interaction:
     object: str
     point: Point  # m
     radius: float  # m
-    nodes: NDArray[np.int32]
-    offset: NDArray[np.float64]
+    nodes: Int32
+    offset: Float64
     duration: float  # s of simulation
     force: Point = (0.0, 0.0, 0.0)  # N
     target: Point = (0.0, 0.0, 0.0)  # m
@@ -285,7 +285,7 @@ class Touch(Effect):
                 f"whose targets may be {far:.4g} m away"
             )
 
-    def _near(self, name: str, point: Point, radius: float) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+    def _near(self, name: str, point: Point, radius: float) -> tuple[Int32, Float64]:
         points = self.points(name)
         if radius < 0:
             raise TouchError(f"radius = {radius:g} m: must not be negative (0 = the nearest node)")
@@ -351,7 +351,7 @@ def _allowed(name: str, far: float) -> str:
     return f"at most {far:.4g} m, {REACH:g} times the size of {name!r}"
 
 
-def _each(interactions: list[Interaction], value: str) -> NDArray[np.float64]:
+def _each(interactions: list[Interaction], value: str) -> Float64:
     return np.array([getattr(a, value) for a in interactions], dtype=float)
 
 

@@ -5,8 +5,8 @@ import ctypes as c
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sim_server.arrays import Float64, Int32
 from sim_server.backends.cpu import structs
 from sim_server.effects._base import Effect, ElementEnergies
 from sim_server.mechanics.world import World
@@ -23,11 +23,11 @@ class Energies:
     """
 
     def __init__(
-        self, world: World, effects: dict[str, Effect], before: NDArray[np.float64], still: list[NDArray[np.float64]],
+        self, world: World, effects: dict[str, Effect], before: Float64, still: list[Float64],
         on_runaway: OnRunaway | None,
     ):  # fmt: skip
         self.world, self.before, self.still, self.on_runaway = world, before, still, on_runaway
-        self.gravity: NDArray[np.float64] = getattr(effects.get("gravity"), "g", np.zeros(3))
+        self.gravity: Float64 = getattr(effects.get("gravity"), "g", np.zeros(3))
         world.backend.keep(self.gravity)
         self.touch: Any = effects.get("touch")
         self.elastic: list[ElementEnergies] = [e for x in effects.values() if (e := x.energies()) is not None]
@@ -36,7 +36,7 @@ class Energies:
             b["mass"] = world.mass[body.nodes].sum()
             b["diagonal"] = np.linalg.norm(np.ptp(world.rest[body.nodes], axis=0))
 
-    def parts(self, elements: ElementEnergies) -> NDArray[np.int32]:
+    def parts(self, elements: ElementEnergies) -> Int32:
         """(bodies + 1,) where the elements of each body begin."""
         return np.searchsorted(elements.owner, np.arange(len(self.world.bodies) + 1)).astype(np.int32)
 

@@ -38,10 +38,11 @@ from typing import Any
 
 import numpy as np
 
+from sim_server.arrays import Int32
 from sim_server.backends.base import Launch
 from sim_server.effects._base import Effect
 from sim_server.mechanics.newton import Newton
-from sim_server.mechanics.system import Ints, System
+from sim_server.mechanics.system import System
 from sim_server.scene import Scene
 
 TEXT = "kernels/time_integration.cu"
@@ -141,7 +142,7 @@ class Integrator:
         return launch
 
 
-def _parts(launch: Launch, starts: Ints, row: Ints, firsts: list[Ints]) -> Ints | None:
+def _parts(launch: Launch, starts: Int32, row: Int32, firsts: list[Int32]) -> Int32 | None:
     """(bodies + 1,) where the items of each body begin; None for a launch that does not tell them apart.
 
     row: of the blocks; firsts: one corner of each element, per effect.

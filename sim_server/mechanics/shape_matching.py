@@ -14,12 +14,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sim_server.arrays import Float64, Int32
 from sim_server.backends.base import Launch
 from sim_server.mechanics.world import Body, World
-
-Ints = NDArray[np.int32]
 
 
 class ShapeMatching:
@@ -32,7 +30,7 @@ class ShapeMatching:
         self.start, self.neighbour = neighbours(tets, world.nodes, level)
         self.arm = _arms(world.rest, world.mass, self.start, self.neighbour)
 
-    def launch(self, mean: NDArray[np.float64]) -> Launch:
+    def launch(self, mean: Float64) -> Launch:
         """Writes A_i in place of the mean of rotations (n, 10) of the bodies' nodes."""
         return self.world.backend.module("kernels/shape_matching.cu").bind(
             "match", self.world.nodes, start=self.start, neighbour=self.neighbour, arm=self.arm, x=self.world.x,
@@ -40,7 +38,7 @@ class ShapeMatching:
         )  # fmt: skip
 
 
-def neighbours(tets: Ints, nodes: int, level: int) -> tuple[Ints, Ints]:
+def neighbours(tets: Int32, nodes: int, level: int) -> tuple[Int32, Int32]:
     """start (nodes + 1,) and neighbours of each node up to `level`, ascending, without itself."""
     from scipy.sparse import coo_array
 
@@ -58,7 +56,7 @@ def neighbours(tets: Ints, nodes: int, level: int) -> tuple[Ints, Ints]:
     return start.astype(np.int32), reached.indices[others].astype(np.int32)
 
 
-def _arms(rest: NDArray[np.float64], mass: NDArray[np.float64], start: Ints, neighbour: Ints) -> NDArray[np.float64]:
+def _arms(rest: Float64, mass: Float64, start: Int32, neighbour: Int32) -> Float64:
     """(k, 3), scaled: see ShapeMatching."""
     n = len(rest)
     node = np.repeat(np.arange(n), np.diff(start))

@@ -4,16 +4,15 @@
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sim_server.arrays import Float64, Int32, Int64
 from sim_server.errors import InputError
 from sim_server.mechanics.world import Body, World
 
-Ints = NDArray[np.int32]
 FLAT = 1e-9  # width of what counts as a line, over its length
 
 
-def check_held(world: World, elements: list[Ints]) -> None:
+def check_held(world: World, elements: list[Int32]) -> None:
     """Raises InputError naming the object if nodes of it could move without resistance.
 
     elements: per effect, (m, c) node numbers. Tetrahedra that hang together by faces are one piece; it is held by three
@@ -32,7 +31,7 @@ def check_held(world: World, elements: list[Ints]) -> None:
             )
 
 
-def _loose(world: World, body: Body, pieces: list[Ints]) -> NDArray[np.int64]:
+def _loose(world: World, body: Body, pieces: list[Int32]) -> Int64:
     """Nodes of the scene that belong to the body and are not held, ascending."""
     held = world.free == 0
     left = pieces
@@ -43,7 +42,7 @@ def _loose(world: World, body: Body, pieces: list[Ints]) -> NDArray[np.int64]:
     return body.first + np.flatnonzero(~held[body.nodes])
 
 
-def _hold(points: NDArray[np.float64]) -> bool:
+def _hold(points: Float64) -> bool:
     """Three of them are not on one line."""
     if len(points) < 3:
         return False
@@ -51,7 +50,7 @@ def _hold(points: NDArray[np.float64]) -> bool:
     return bool(sizes[1] > FLAT * sizes[0])
 
 
-def _pieces(elements: Ints) -> list[Ints]:
+def _pieces(elements: Int32) -> list[Int32]:
     """Nodes of each set of elements that hang together by faces (four corners) or corners (two)."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components

@@ -12,12 +12,10 @@ frame, where the solve happens.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sim_server.arrays import Float64, Int32, Int64
 from sim_server.backends.base import Launch
 from sim_server.mechanics.world import World
-
-Ints = NDArray[np.int32]
 
 
 @dataclass(frozen=True)
@@ -29,10 +27,10 @@ class Stencil:
     pair_start (blocks above the diagonal + 1,), pairs (k,): c^2 e + c a + b, the corners of e that couple in a block.
     """
 
-    corner_start: Ints
-    corners: Ints
-    pair_start: Ints
-    pairs: Ints
+    corner_start: Int32
+    corners: Int32
+    pair_start: Int32
+    pairs: Int32
 
 
 class System:
@@ -46,7 +44,7 @@ class System:
     stay the identity; set before the launches are made.
     """
 
-    def __init__(self, world: World, elements: list[Ints]):
+    def __init__(self, world: World, elements: list[Int32]):
         n = world.nodes
         self.world = world
         couplings = [_couplings(e, world.free, n) for e in elements]
@@ -83,16 +81,16 @@ class System:
         upper = np.bincount(self.row, minlength=n)
         start = np.concatenate([[0], np.cumsum(lower + 1 + upper)])
         own = start[:-1] + lower
-        self.row_start: Ints = start.astype(np.int32)
-        self.own: Ints = own.astype(np.int32)
-        self.upper: Ints = _runs(self.row, own + 1, upper)
-        self.lower: Ints = np.empty_like(self.upper)
+        self.row_start: Int32 = start.astype(np.int32)
+        self.own: Int32 = own.astype(np.int32)
+        self.upper: Int32 = _runs(self.row, own + 1, upper)
+        self.lower: Int32 = np.empty_like(self.upper)
         self.lower[below] = _runs(self.column[below], start[:-1], lower)
-        self.columns: Ints = np.empty(start[-1], dtype=np.int32)
+        self.columns: Int32 = np.empty(start[-1], dtype=np.int32)
         self.columns[self.own] = np.arange(n, dtype=np.int32)
         self.columns[self.upper], self.columns[self.lower] = self.column, self.row
 
-    def start(self, mass: NDArray[np.float64]) -> Launch:
+    def start(self, mass: Float64) -> Launch:
         """b = 0, diagonal = mass (n,) [kg]."""
         return self.world.backend.module("kernels/nodes.cu").bind(
             "start", self.world.nodes, mass=mass, diagonal=self.diagonal, b=self.b, block=self.block,
@@ -115,7 +113,7 @@ class System:
         )  # fmt: skip
         return [rotate, rotate_blocks]
 
-    def advance(self, before: NDArray[np.float64]) -> Launch:
+    def advance(self, before: Float64) -> Launch:
         """v += R y, x += h v: backward Euler. before (n, 3): gets x as it was [m]."""
         w = self.world
         return self.world.backend.module("kernels/nodes.cu").bind(
@@ -134,23 +132,23 @@ class System:
         """Whether anything couples nodes of a body."""
         return bool(self.row_start[last] - self.row_start[first] > last - first)
 
-    def body_pattern(self, first: int, last: int) -> tuple[Ints, Ints]:
+    def body_pattern(self, first: int, last: int) -> tuple[Int32, Int32]:
         """row_start and columns of one body, numbered from 0."""
         start = self.row_start[first : last + 1]
         return (start - start[0]).astype(np.int32), (self.columns[start[0] : start[-1]] - first).astype(np.int32)
 
-    def body_values(self, first: int, last: int) -> NDArray[np.float64]:
+    def body_values(self, first: int, last: int) -> Float64:
         """View of the blocks of one body, (blocks, 3, 3)."""
         return self.values[self.row_start[first] : self.row_start[last]]
 
 
-def _runs(group: Ints, begin: NDArray[np.int64], count: NDArray[np.int64]) -> Ints:
+def _runs(group: Int32, begin: Int64, count: Int64) -> Int32:
     """Consecutive places for the members of each group, counted from begin[group]; groups ascend."""
     first = np.cumsum(count) - count
     return (np.arange(len(group)) - first[group] + begin[group]).astype(np.int32)
 
 
-def _couplings(elements: Ints, free: NDArray[np.float64], n: int) -> tuple[NDArray[np.int64], Ints]:
+def _couplings(elements: Int32, free: Float64, n: int) -> tuple[Int64, Int32]:
     """Key row * n + column and pair c c e + c a + b of every coupling above the diagonal between free corners."""
     keys, pairs = [], []
     corners = elements.shape[1]
@@ -164,7 +162,7 @@ def _couplings(elements: Ints, free: NDArray[np.float64], n: int) -> tuple[NDArr
     return np.concatenate(keys), np.concatenate(pairs)
 
 
-def _stencil(elements: Ints, couplings: tuple[NDArray[np.int64], Ints], n: int, above: NDArray[np.int64]) -> Stencil:
+def _stencil(elements: Int32, couplings: tuple[Int64, Int32], n: int, above: Int64) -> Stencil:
     corners = np.argsort(elements.ravel(), kind="stable").astype(np.int32)
     corner_start = np.concatenate([[0], np.cumsum(np.bincount(elements.ravel(), minlength=n))]).astype(np.int32)
     keys, pairs = couplings

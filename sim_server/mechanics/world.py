@@ -5,15 +5,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sim_server.arrays import Float64, Int32
 from sim_server.backends.cpu.device import Cpu
 from sim_server.errors import InputError
 from sim_server.mesh import Mesh, posed
 from sim_server.mesh.surface import volumes
 from sim_server.scene import Scene, SceneObject
-
-Reals = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -33,12 +31,12 @@ class Body:
         return slice(self.first, self.last)
 
     @property
-    def tets(self) -> NDArray[np.int32]:
+    def tets(self) -> Int32:
         """(m, 4) in node numbers of the scene."""
         return self.mesh.tets + np.int32(self.first)
 
     @property
-    def centroids(self) -> Reals:
+    def centroids(self) -> Float64:
         """(m, 3) of the elements at rest, before the pose [m]."""
         return self.mesh.rest[self.mesh.tets].mean(axis=1)
 
@@ -82,7 +80,7 @@ class World:
         self.drift = self.v if self.plain else np.zeros_like(self.v)
 
     @property
-    def stiffening(self) -> Reals:
+    def stiffening(self) -> Float64:
         """impulse (reach + beta) of each body [s2]: times K is what goes into A."""
         return self.impulse * (self.reach + self.beta)
 
@@ -103,7 +101,7 @@ class World:
         return [(b, b.effects[name]) for b in self.bodies if name in b.effects]
 
 
-def _lumped(o: SceneObject, mesh: Mesh) -> Reals:
+def _lumped(o: SceneObject, mesh: Mesh) -> Float64:
     """Nodal masses [kg], (n,): a quarter of each adjacent element's, or all equal."""
     volume = volumes(mesh.rest, mesh.tets)
     total = o.mass if o.mass is not None else (o.density or 0) * volume.sum()

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sim_server.arrays import Float64, Int32
 from sim_server.errors import InputError
 from sim_server.mesh.cells import tetrahedra
 from sim_server.mesh.check import complaints, crowded_faces, indices
@@ -33,8 +34,8 @@ class Mesh:
     nodes of the file that are left out, so that the others have other numbers than there.
     """
 
-    rest: NDArray[np.float64]
-    tets: NDArray[np.int32]
+    rest: Float64
+    tets: Int32
     name: str = "mesh"
     dropped: int = 0
 
@@ -149,7 +150,7 @@ def check(mesh: Mesh) -> Mesh:
     return replace(mesh, tets=tets)
 
 
-def pose_matrix(rotate: ArrayLike) -> NDArray[np.float64]:
+def pose_matrix(rotate: ArrayLike) -> Float64:
     """Rotation (3, 3) by `rotate` = three angles [degrees] about the fixed axes x, then y, then z: Rz Ry Rx."""
     (cx, cy, cz), (sx, sy, sz) = (f(np.radians(np.asarray(rotate, dtype=float))) for f in (np.cos, np.sin))
     about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
@@ -158,6 +159,6 @@ def pose_matrix(rotate: ArrayLike) -> NDArray[np.float64]:
     return about_z @ about_y @ about_x
 
 
-def posed(points: NDArray[np.float64], rotate: ArrayLike, translate: ArrayLike) -> NDArray[np.float64]:
+def posed(points: Float64, rotate: ArrayLike, translate: ArrayLike) -> Float64:
     """`points` (n, 3) [m] rotated by `pose_matrix`, then moved by `translate` [m]."""
     return points @ pose_matrix(rotate).T + np.asarray(translate, dtype=float)

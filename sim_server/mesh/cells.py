@@ -12,12 +12,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sim_server.arrays import Float64, Int64
 from sim_server.errors import InputError
 from sim_server.mesh.surface import volumes
-
-Ints = NDArray[np.int64]
 
 # Faces by corner numbers, normals outward, in the order of nodes that meshio has for every format (VTK's).
 FACES: dict[str, tuple[tuple[int, ...], ...]] = {
@@ -35,7 +33,7 @@ SHAPE = {  # of each type of cell that is read; the corners of quadratic ones co
 EDGES = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))  # of a tetrahedron
 
 
-def tetrahedra(rest: NDArray[np.float64], blocks: Sequence[Any]) -> tuple[Ints, list[str]]:
+def tetrahedra(rest: Float64, blocks: Sequence[Any]) -> tuple[Int64, list[str]]:
     """(m, 4) node numbers of all volume cells in meshio's `blocks`, and what was changed, one sentence each.
 
     Raises InputError: no volume cells, other ones than those of SHAPE, node numbers out of range, or a cell that is
@@ -61,13 +59,13 @@ def tetrahedra(rest: NDArray[np.float64], blocks: Sequence[Any]) -> tuple[Ints, 
     return np.concatenate(tets), said
 
 
-def _corners(shape: str, blocks: Sequence[Any]) -> Ints:
+def _corners(shape: str, blocks: Sequence[Any]) -> Int64:
     count = CORNERS[shape]
     parts = [np.asarray(b.data)[:, :count] for b in blocks if SHAPE[b.type] == shape]
     return np.concatenate([np.empty((0, count), np.int64), *parts]).astype(np.int64)
 
 
-def _split(rest: NDArray[np.float64], shape: str, corners: Ints) -> Ints:
+def _split(rest: Float64, shape: str, corners: Int64) -> Int64:
     """(k m, 4) tetrahedra of positive volume, k of each of the cells (m, c)."""
     if ((corners < 0) | (corners >= len(rest))).any():
         bad = int(np.flatnonzero(((corners < 0) | (corners >= len(rest))).any(axis=1))[0])
@@ -91,7 +89,7 @@ def _split(rest: NDArray[np.float64], shape: str, corners: Ints) -> Ints:
     return tets.reshape(-1, 4)
 
 
-def _triangles(corners: Ints, face: Sequence[int]) -> Ints:
+def _triangles(corners: Int64, face: Sequence[int]) -> Int64:
     """(m, 1 or 2, 3) triangles of one face of cells (m, c)."""
     nodes = corners[:, list(face)]
     if len(face) == 3:
@@ -101,7 +99,7 @@ def _triangles(corners: Ints, face: Sequence[int]) -> Ints:
     return np.stack([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)], axis=1)
 
 
-def _check_diagonals(tets: Ints, cells: dict[str, Ints]) -> None:
+def _check_diagonals(tets: Int64, cells: dict[str, Int64]) -> None:
     """Raises InputError where a tetrahedron has the diagonal of a quadrilateral face that is split along the other."""
     quads = np.concatenate([cells[s][:, list(f)] for s in cells for f in FACES[s] if len(f) == 4])
     if not len(quads):

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_server.arrays import Float64
 from sim_server.mesh.surface import FACES, volumes
 
 FLAT = 1e-12  # |volume| / (longest edge)^3 below which a tetrahedron is flat; rounding alone gives about 1e-15
@@ -16,7 +17,7 @@ COINCIDENT = 1e-9  # distance / diagonal of the bounding box below which two nod
 EDGES = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
 NAMED = 3  # offenders named in a message
 
-Rest = NDArray[np.float64]
+Rest = Float64
 Tets = NDArray[np.integer]
 
 
@@ -100,7 +101,7 @@ def crowded_faces(rest: Rest, tets: Tets) -> str | None:
     return f"{bad.size} faces belong to more than two tets, as that of nodes {faces[bad[0]].tolist()}"
 
 
-def _point(x: NDArray[np.float64]) -> str:
+def _point(x: Float64) -> str:
     return "(" + ", ".join(f"{c:.6g}" for c in x) + ")"
 
 

@@ -4,17 +4,19 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_server.arrays import Float64, Int32
+
 # Faces of a tetrahedron of positive volume, normals outward by the right-hand rule.
 FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
 
 
-def volumes(rest: NDArray[np.float64], tets: NDArray[np.integer]) -> NDArray[np.float64]:
+def volumes(rest: Float64, tets: NDArray[np.integer]) -> Float64:
     """Signed volumes [m3], (m,): det(x1 - x0, x2 - x0, x3 - x0) / 6."""
     a, b, c = (rest[tets[:, k]] - rest[tets[:, 0]] for k in (1, 2, 3))
     return np.einsum("ij,ij->i", np.cross(a, b), c) / 6.0
 
 
-def surface_triangles(tets: NDArray[np.integer]) -> NDArray[np.int32]:
+def surface_triangles(tets: NDArray[np.integer]) -> Int32:
     """The faces that belong to one tetrahedron only: int32 (t, 3), outward for positive volumes.
 
     They come in the order of the tetrahedra.

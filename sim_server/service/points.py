@@ -13,7 +13,8 @@ from math import hypot
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_server.mechanics.world import Body, Reals, World
+from sim_server.arrays import Float64
+from sim_server.mechanics.world import Body, World
 
 SIDES = {"right": (0, 1), "left": (0, -1), "top": (1, 1), "bottom": (1, -1), "front": (2, 1), "back": (2, -1)}
 NAMES = ("tip", *SIDES)
@@ -27,11 +28,11 @@ class Points:
     def __init__(self, world: World, body: Body):
         self.body = body
         self._world = world
-        self._x: Reals = np.zeros((0, 3))
+        self._x: Float64 = np.zeros((0, 3))
         self.free: NDArray[np.bool_] = world.free[body.nodes] > 0
         self.size = float(np.linalg.norm(np.ptp(body.mesh.rest, axis=0)))  # m, diagonal of the box at rest
 
-    def now(self, x: Reals | None = None) -> Reals:
+    def now(self, x: Float64 | None = None) -> Float64:
         """Copies the positions of its nodes [m], (nodes, 3). x: of all nodes of the scene, if fetched already."""
         fetched = self._world.backend.fetch(self._world.x) if x is None else x
         self._x = fetched[self.body.nodes].copy()
@@ -79,11 +80,11 @@ class Points:
         return int(np.where(free, distance, -np.inf).argmax())
 
 
-def shown(point: Sequence[float] | Reals) -> str:
+def shown(point: Sequence[float] | Float64) -> str:
     """Coordinates in short."""
     return "(" + ", ".join(f"{float(c):.4g}" for c in point) + ")"
 
 
-def _point(values: Reals) -> Point:
+def _point(values: Float64) -> Point:
     x, y, z = values.tolist()
     return x, y, z

@@ -108,7 +108,7 @@ def part(launch: Any) -> str:
     kernel = launch.name.split(".")[1]
     if kernel in ("gather", "blocks"):
         return "sums"
-    return "rest" if kernel in ("start", "turn", "assemble", "shape") else "elements"
+    return "rest" if kernel in ("start", "rotate", "rotate_blocks", "match") else "elements"
 
 
 def megabytes(kernel: Any) -> float:
