@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -135,7 +136,7 @@ class Replay:
         recorded = {f.library for f in made if f.library} - {"native"}  # which is everywhere
         wanted = {_library(name) for name in recorded}
         choice = wanted.pop() if len(wanted) == 1 else "auto"
-        if choice.startswith("gpu") and not _usable(choice):
+        if not _usable(choice):
             choice = "auto"
         if wanted or (recorded and choice == "auto"):
             self.compared.notes.append(
@@ -272,6 +273,10 @@ def _library(name: str) -> str:
 
 
 def _usable(library: str) -> bool:
+    if library == "cholmod":
+        return find_spec("sksparse") is not None
+    if not library.startswith("gpu"):
+        return True
     from precond_worker.errors import DeviceUnusable
     from precond_worker.gpu.device import try_out
 
