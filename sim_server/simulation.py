@@ -7,14 +7,15 @@ unless the scene asks for another integrator (integrator.py). Start reading ther
 """
 
 from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
-from sim_server.backends.base import Launch
+from numpy.typing import NDArray
+
+from sim_server import backends
+from sim_server.backends.base import Backend, Capability, EngineInput, Launch
 from sim_server.backends.compiler import ahead
-from sim_server.backends.cpu.device import Cpu
-from sim_server.backends.cpu.engine import Engine, Kind
+from sim_server.backends.cpu.engine import Kind
 from sim_server.effects import effect
 from sim_server.effects._base import Effect, Refusal
 from sim_server.errors import DeviceError, InputError
@@ -38,56 +39,46 @@ class Simulation:
     """
 
     def __init__(self, scene: Scene, device: str = "cpu", watched: bool = True):
-        self.scene, self._watched = scene, watched
-        with _building(device):
-            self._build(scene, device)
-
-    def _build(self, scene: Scene, device: str) -> None:
+        self.scene = scene
         scene.solver.check_device(device)
         scene.integrator.check_device(device)
-        loop = (
-            "backends/gpu/loop.cpp" if device == "gpu" else "backends/cpu/native/loop.cpp"
-        )  # takes longest to compile
-        ahead(loop, *(["backends/cpu/native/factor_check.cpp"] if scene.solver.wants_factors else []))
-        self.world = World(scene, _backend(device, scene.solver.precision))
+        backend = backends.create(device, scene.solver.precision)
+        if scene.solver.wants_factors:
+            ahead("backends/cpu/native/factor_check.cpp")
+        with backend.building():
+            self._build(backend, watched)
+
+    def _build(self, backend: Backend, watched: bool) -> None:
+        scene, solver = self.scene, self.scene.solver
+        self.world = World(scene, backend)
         self.effects = build_effects(scene, self.world)
         elements = [e.elements for e in self.effects.values() if e.elements is not None]
         self.system = System(self.world, elements)
         matched = self._matched()
-        self.shape = ShapeMatching(self.world, matched, scene.solver.warp_level) if matched else None
+        self.shape = ShapeMatching(self.world, matched, solver.warp_level) if matched else None
         self.warped = {body.index for body in self._rotated() + matched}  # whose solve is in the material frame
         self.system.warped[:] = [body.index in self.warped for body in self.world.bodies]
         self.integrator = Integrator(scene, self.system)
         if not self.world.inertia:
             check_held(self.world, elements)
-        on_runaway = scene.solver.on_runaway if self._watched else None
         still = [self.world.v, self.system.dv, *self.integrator.still]
+        on_runaway = solver.on_runaway if watched else None
         self.energies = Energies(self.world, self.effects, self.integrator.before, still, on_runaway)
-        assemble, integrate = self.launches()
-        w, s = self.world, self.system
-        arrays: dict[str, Any] = {"row_start": s.row_start, "columns": s.columns, "values": s.values}
-        arrays |= {"b": s.b_material, "y": s.y, "x": w.x, "v": w.v, "clock": s.clock, "moving": s.moving}
-        ranges = [(b.first, b.last) for b in w.bodies]
-        newton = self.integrator.newton(assemble, list(self.effects.values()))
-        self.engine: Any
-        launches: tuple[Any, Any] = assemble, integrate  # of the kind that the engine runs
-        if device == "gpu":
-            from sim_server.backends.gpu.engine import GpuEngine
-
-            gpu: Any = w.backend
-            names = [b.name for b in w.bodies]
-            planes = 2 if scene.solver.factor_precision == "float32" else 1
-            self.engine = GpuEngine(
-                gpu, *launches, ranges, w.dt, self.energies, names, planes=planes, newton=newton, **arrays
-            )
-        else:
-            threads = scene.solver.threads
-            self.engine = Engine(
-                *launches, ranges, w.dt, threads=threads, newton=newton, energies=self.energies, **arrays
-            )
-        self.engine.begin = self.integrator.begin(assemble)
-        for body in w.bodies:
+        given = self.engine_input()
+        self.engine = backend.engine(given)
+        self.engine.begin = self.integrator.begin(given.assemble)
+        for body in self.world.bodies:
             self._settle(body)
+
+    def engine_input(self) -> EngineInput:
+        """Returns what an engine runs: the launches of a step and the arrays of the solve."""
+        w, s = self.world, self.system
+        arrays: dict[str, NDArray[Any]] = {"row_start": s.row_start, "columns": s.columns, "values": s.values}
+        arrays |= {"b": s.b_material, "y": s.y, "x": w.x, "v": w.v, "clock": s.clock, "moving": s.moving}
+        names, ranges = [b.name for b in w.bodies], [(b.first, b.last) for b in w.bodies]
+        assemble, integrate = self.launches()
+        newton = self.integrator.newton(assemble, list(self.effects.values()))
+        return EngineInput(assemble, integrate, names, ranges, w.dt, self.scene.solver, self.energies, newton, arrays)
 
     @classmethod
     def load(cls, path: str | Path, overrides: Sequence[str] = (), device: str = "cpu") -> "Simulation":
@@ -135,13 +126,14 @@ class Simulation:
         return [b for b in self.world.bodies if b.index not in rotated and self.system.couples(b.first, b.last)]
 
     def _settle(self, body: Body) -> None:
-        solver, native = self.scene.solver, self.engine.settings(body.index)
-        native.tolerance, native.max_iterations = solver.tolerance, solver.max_iterations
-        native.budget, native.warm_start = solver.budget, int(solver.warm_start)
-        if solver.woodbury and solver.wants_factors and "touch" in body.effects and isinstance(self.engine, Engine):
+        solver, settings = self.scene.solver, self.engine.settings(body.index)
+        settings.tolerance, settings.max_iterations = solver.tolerance, solver.max_iterations
+        settings.budget, settings.warm_start = solver.budget, int(solver.warm_start)
+        settings.kind, settings.omega = KINDS.get(solver.preconditioner, Kind.CHOLESKY), solver.omega
+        corrects = solver.woodbury and solver.wants_factors and "touch" in body.effects
+        if corrects and Capability.LOW_RANK_UPDATE in self.engine.capabilities:
             double = solver.factor_precision == "float64"
             self.engine.correct(body.index, solver.woodbury, self.system.diagonal, double)
-        native.kind, native.omega = KINDS.get(solver.preconditioner, Kind.CHOLESKY), solver.omega
 
     def refusals(self) -> list[Refusal]:
         """Elements in states that their law does not define, by the time at which they had them first."""
@@ -166,22 +158,6 @@ class Simulation:
         row_start, columns = self.system.body_pattern(b.first, b.last)
         n = 3 * (b.last - b.first)
         return bsr_array((self.system.body_values(b.first, b.last).copy(), columns, row_start), shape=(n, n)).tocsc()
-
-
-def _building(device: str) -> AbstractContextManager[None]:
-    if device == "gpu":
-        from sim_server.backends.gpu.device import building
-
-        return building()
-    return nullcontext()
-
-
-def _backend(device: str, precision: str) -> Any:
-    if device == "gpu":
-        from sim_server.backends.gpu.device import Gpu
-
-        return Gpu(precision)
-    return Cpu()
 
 
 def build_effects(scene: Scene, world: World) -> dict[str, Effect]:

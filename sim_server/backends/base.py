@@ -1,19 +1,36 @@
 # SPDX-License-Identifier: MIT
-"""What the rest of the server uses of a place where steps run, the processor or a GPU.
+"""The contract of a place where steps run, the processor or a GPU: all that the rest of the server uses of it.
 
-A `Backend` compiles kernel texts and binds host arrays to them.
+A `Backend` compiles kernel texts and binds host arrays to them, which gives launches; its `engine` runs the launches of
+a step and the solve between them, and has mailboxes that may be used from another thread meanwhile.
 """
 
-from typing import Any, Protocol
+from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from enum import Enum, auto
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
 from numpy.typing import NDArray
+
+from protocol.factor import FactorPattern
+from sim_server.arrays import Float64
+
+if TYPE_CHECKING:
+    from sim_server.mechanics.energy import Energies
+    from sim_server.mechanics.newton import Newton
+    from sim_server.scene.solver_options import SolverOptions
 
 
 class Launch(Protocol):
-    """One kernel with its arguments."""
+    """One kernel with its arguments. name: TEXT.KERNEL. mailed: the arguments may be replaced while steps run."""
 
-    name: str  # text.kernel
+    name: str
     items: int
+    mailed: bool
 
     @property
     def domain(self) -> str:
@@ -21,7 +38,7 @@ class Launch(Protocol):
         ...
 
     def fetch(self, name: str) -> NDArray[Any]:
-        """One of its arrays as kernels have left it."""
+        """Returns one of its arrays as kernels have left it."""
         ...
 
     def __call__(self) -> None:
@@ -33,27 +50,221 @@ class Module(Protocol):
     """A compiled kernel text."""
 
     def bind(self, kernel: str, n: int, **arguments: Any) -> Launch:
-        """Launch of `kernel` over n items with arrays and numbers by the names of its argument struct.
+        """Returns the launch of `kernel` over n items. arguments: arrays and numbers by the names of its struct.
 
         Raises TypeError where an argument does not fit the text.
         """
         ...
 
 
+class PendingUpdate(Protocol):
+    """New arguments of a launch on their way to the loop.
+
+    taken: number of completed steps when the loop took them up; negative: not yet, or never if newer ones came
+    """
+
+    taken: int
+
+
+class Capability(Enum):
+    """What not every engine can do."""
+
+    EXACT_STEPS = auto()
+    """Settings and factors hold from the very next solve on; without it from the next batch of steps on."""
+    MATRIX_POSITIONS = auto()
+    """Positions requested are those that the next matrix is assembled from, extrapolated if wanted; without it those at
+    the end of that step."""
+    LOW_RANK_UPDATE = auto()
+    """A factor is corrected for springs that came after its matrix (`correct`)."""
+
+
+class SolveSettings(Protocol):
+    """Settings of the solves of a body; what is set holds from the next solve, or batch of steps, on.
+
+    kind: a Kind. budget: of wall time [s]; negative: of iterations. probe: a solve that `auto` measures. omega: of SSOR
+    """
+
+    tolerance: float
+    budget: float
+    max_iterations: int
+    kind: int
+    warm_start: int
+    probe: int
+    omega: float
+
+
+class LoopState(Protocol):
+    """Memory that a running loop shares with other threads.
+
+    realtime, patient, stop, pause: 0 or 1, set by others
+    frame_every, energy_every: steps between those that are reported, 0: none
+    deadline: 0 while the loop stands still in a pause [s]
+    late_steps, frames_dropped, records_dropped: numbers of each so far
+    """
+
+    realtime: int
+    patient: int
+    stop: int
+    pause: int
+    deadline: float
+    frame_every: int
+    energy_every: int
+    late_steps: int
+    frames_dropped: int
+    records_dropped: int
+
+
+class Engine(Protocol):
+    """The loop over the steps of one scene.
+
+    loop: memory shared with the running loop
+    begin: launches that make the state before the first step; set before it
+    """
+
+    loop: LoopState
+    begin: Sequence[Launch]
+
+    @property
+    def capabilities(self) -> frozenset[Capability]:
+        """What this engine can do beyond the others."""
+        ...
+
+    @property
+    def launches(self) -> Sequence[Launch]:
+        """Launches of a step, before and after the solve."""
+        ...
+
+    @property
+    def records_dtype(self) -> np.dtype[np.void]:
+        """Type of step records."""
+        ...
+
+    @property
+    def step(self) -> int:
+        """Number of completed steps."""
+        ...
+
+    def run(self, steps: int) -> int:
+        """Runs up to `steps` steps without Python's lock; returns those done, fewer only after a stop.
+
+        Raises DeviceLost.
+        """
+        ...
+
+    def assemble(self) -> None:
+        """Runs the first half of one step: the system matrix, on the host too, and the right-hand side."""
+        ...
+
+    def solve(self) -> None:
+        """Runs the second half: solve, integrate, report."""
+        ...
+
+    def wait(self) -> bool:
+        """Sleeps until the next step is due (real time) and while paused; returns False if the loop is to stop."""
+        ...
+
+    def records(self) -> NDArray[np.void]:
+        """Returns the step records since the last call, one for each body and step, oldest first."""
+        ...
+
+    def frames(self) -> list[tuple[int, Float64, Float64]]:
+        """Returns the frames since the last call: step, x (n, 3) [m] and v (n, 3) [m/s]."""
+        ...
+
+    def settings(self, body: int) -> SolveSettings:
+        """Returns the solver settings of a body, to be read and set."""
+        ...
+
+    def post_factor(self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int) -> None:
+        """Copies a factor of the matrix of `step`; one of the next solves of the body takes it up."""
+        ...
+
+    def settle_factors(self) -> None:
+        """Blocks until the next solves will use what was posted."""
+        ...
+
+    def factor_step(self, body: int) -> int:
+        """Returns the step of the factor in use, -1 without one."""
+        ...
+
+    def factor_bytes(self, body: int) -> int:
+        """Returns the number of bytes that an application of the newest factor reads, 0 without one."""
+        ...
+
+    def correct(self, body: int, nodes: int, diagonal: Float64, double: bool = False) -> None:
+        """Has factors of the body corrected for changes of the diagonal at `nodes` (1 to 64) nodes at most.
+
+        diagonal: (nodes of the scene,) [kg], as assembled. double: for factors in float64. To be called before the
+        first step, and only with LOW_RANK_UPDATE.
+        """
+        ...
+
+    def request_matrix(self, body: int, target: Float64) -> None:
+        """Has the values of the next matrix of the body copied into `target` (blocks, 3, 3)."""
+        ...
+
+    def request_positions(self, body: int, target: Float64, ahead: float = 0.0) -> None:
+        """Has positions, `ahead` [s] further along their velocities, copied into `target` (nodes, 3).
+
+        Replaces a request for the matrix, and the other way round. Raises ValueError for an `ahead` above 0 without
+        MATRIX_POSITIONS.
+        """
+        ...
+
+    def matrix_step(self, body: int) -> int:
+        """Returns the number of steps completed before the copy requested last was made; -1: it is not there yet."""
+        ...
+
+    def replace(self, launch: int, new: Launch) -> PendingUpdate:
+        """Gives a mailed launch (its number among `launches`) new arguments, from one of the next steps on."""
+        ...
+
+
+@dataclass(frozen=True)
+class EngineInput:
+    """What an engine runs.
+
+    assemble, integrate: launches before and after the solve
+    names, ranges: of the bodies, and their nodes [first, last)
+    dt: time step [s]
+    energies: what the energy of each step is summed from
+    newton: for several linearizations a step; None for one
+    arrays: of the system by name: row_start, columns, values, b, y, x, v, clock, moving
+    """
+
+    assemble: Sequence[Launch]
+    integrate: Sequence[Launch]
+    names: Sequence[str]
+    ranges: Sequence[tuple[int, int]]
+    dt: float
+    solver: SolverOptions
+    energies: Energies
+    newton: Newton | None
+    arrays: Mapping[str, NDArray[Any]]
+
+
 class Backend(Protocol):
-    """A device as a place for kernels to run. Arrays are named by the host's; a GPU has a twin of each."""
+    """A device as a place for kernels to run. Arrays are named by those of the host; a GPU has a twin of each."""
 
     @property
     def name(self) -> str:
         """The word for it: cpu or gpu."""
         ...
 
+    def building(self) -> AbstractContextManager[None]:
+        """Around the building of a scene: too little memory of the device becomes a DeviceError."""
+        ...
+
     def module(self, path: str) -> Module:
-        """A kernel text of this package (path: as of compiler.read_text), compiled once."""
+        """Returns a kernel text of this package (path: as of compiler.read_text), compiled once."""
+        ...
+
+    def engine(self, given: EngineInput) -> Engine:
+        """Returns the loop over launches of this backend."""
         ...
 
     def build(self) -> str:
-        """Digest of what a run depends on beside its scene: equal ones repeat it bit for bit."""
+        """Returns a digest of what a run depends on beside its scene: equal ones repeat it bit for bit."""
         ...
 
     def keep(self, *hosts: NDArray[Any], exact: bool = False) -> None:
@@ -61,5 +272,5 @@ class Backend(Protocol):
         ...
 
     def fetch(self, host: NDArray[Any]) -> NDArray[Any]:
-        """The array with what kernels have made of it."""
+        """Returns the array with what kernels have made of it."""
         ...

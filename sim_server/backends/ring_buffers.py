@@ -19,7 +19,6 @@ class Reports:
     """
 
     records_dtype = RECORD
-    positions_later = False  # positions asked for are those at the end of the step
 
     def __init__(self, loop: Any, bodies: int, dt: float, records: int, frames: NDArray[Any]):
         self.loop = loop

@@ -33,6 +33,7 @@ Sources: Newmark 1959; Hughes, The Finite Element Method, section 9.1; Hairer an
 Equations II, section V.1 (BDF2); Baraff and Witkin 1998 (one linearization).
 """
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -108,7 +109,7 @@ class Integrator:
             drift=w.drift, dv=s.dv, v=w.v, x=w.x, before=self.before, **asdict(self._parts),
         )  # fmt: skip
 
-    def begin(self, assemble: list[Launch]) -> list[Launch]:
+    def begin(self, assemble: Sequence[Launch]) -> list[Launch]:
         """What makes ahead, drift and carried from x and v before the first step; assemble: the launches of a step."""
         w = self.world
         if w.plain or not w.inertia:
@@ -122,7 +123,7 @@ class Integrator:
         )
         return [self._bind("prepare", of_v=0.0, **state), *assemble, begin]
 
-    def newton(self, assemble: list[Launch], effects: list[Effect]) -> Newton | None:
+    def newton(self, assemble: Sequence[Launch], effects: list[Effect]) -> Newton | None:
         """What several linearizations a step need; None for one. assemble: the launches of each of them."""
         w, s = self.world, self.system
         if self.options.linearizations == 1:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from sim_server.arrays import Float64, Int32
-from sim_server.backends.cpu.device import Cpu
+from sim_server.backends.base import Backend
 from sim_server.errors import InputError
 from sim_server.mesh import Mesh, posed
 from sim_server.mesh.surface import volumes
@@ -47,7 +47,7 @@ class World:
     rest (n, 3): before the pose [m]; x (n, 3): positions [m]; v (n, 3): velocities [m/s]; mass (n,): lumped [kg];
     free (n,): 1, or 0 at fixed nodes; beta (bodies,): Rayleigh damping of the stiffness [s]; dt: time step [s];
     projection: of the elements' stiffness, the scene's choice;
-    backend: where kernels run, Cpu or gpu.device.Gpu.
+    backend: where kernels run.
 
     Symbols: docs/notation.md. What effects need of the integrator (formulas: integrator.py) instead of dt and v:
     impulse [s]: times a force is what goes into b. reach [s]: x moves by reach (ahead + dv) until the end of the step,
@@ -56,8 +56,8 @@ class World:
     In backward Euler impulse = reach = dt, ahead and drift are v.
     """
 
-    def __init__(self, scene: Scene, backend: Any = None):
-        self.backend = backend or Cpu()
+    def __init__(self, scene: Scene, backend: Backend):
+        self.backend = backend
         self.dt = float(scene.dt)
         self.projection = scene.projection
         self.bodies: list[Body] = []

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from protocol import messages_pb2 as pb
 from protocol.method import Method
 from protocol.process.version import version
-from sim_server.backends.cpu.device import Cpu
 from sim_server.backends.cpu.engine import Kind
 from sim_server.mechanics.world import Body
 from sim_server.mesh import posed
@@ -37,7 +36,7 @@ def scene(simulation: Simulation) -> pb.Scene:
         started_ns=time.time_ns(),
         software=f"warpfactor {version()}, {simulation.world.backend.name}, Python {platform.python_version()}",
         objects=[b.name for b in simulation.world.bodies],
-        device="cpu" if isinstance(simulation.world.backend, Cpu) else "gpu",
+        device=simulation.world.backend.name,
         build=simulation.world.backend.build(),
     )
 

@@ -168,7 +168,7 @@ class Service:
 
     @property
     def _on_gpu(self) -> bool:
-        return bool(self.simulation.world.backend.name == "gpu")
+        return self.simulation.world.backend.name == "gpu"
 
     def _advice(self) -> str:
         """What makes steps take less time, or lets them take it."""

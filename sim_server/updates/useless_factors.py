@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from numpy.typing import NDArray
 
 from protocol.factor import Factor
+from sim_server.backends.base import Capability
 from sim_server.backends.cpu.engine import Kind
 from sim_server.updates.body_state import BodyUpdateState
 
@@ -117,7 +118,7 @@ class UselessFactors:
             return
         step, kind = dropped
         engine = self._driver.engine
-        if engine.exact or engine.factor_step(state.body.index) != step:
+        if Capability.EXACT_STEPS in engine.capabilities or engine.factor_step(state.body.index) != step:
             state.factors.dropped = None
             if state.tuner is None:
                 engine.settings(state.body.index).kind = kind

@@ -38,7 +38,7 @@ class Assembly:
             self._simulation = Simulation(single_object_scene(scene.resolved, name, _mesh(topology)))
         except (InputError, ValidationError) as error:
             raise Refused(f"Scene.resolved, object {name!r}: {error}", "malformed") from error
-        self._simulation.engine.begin = []  # A of a scheme of several steps does not depend on the states before
+        self._simulation.engine.begin = ()  # A of a scheme of several steps does not depend on the states before
         self._check_pattern(topology)
 
     @property

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sim_server.backends.cpu.device import module
-from sim_server.backends.cpu.engine import RECORD, Engine, Kind
+from sim_server.backends.cpu.engine import RECORD, CpuEngine, Kind
 from sim_server.simulation import Simulation
 from tests.scenes import bar, factor_of, simulation
 
@@ -45,15 +45,9 @@ def test_a_record_says_what_was_done():
     assert len(sim.engine.records()) == 0
 
 
-def small_ring(sim: Simulation, records: int) -> Engine:
+def small_ring(sim: Simulation, records: int) -> CpuEngine:
     """The same loop with room for few records."""
-    assemble, integrate = sim.launches()
-    s, w = sim.system, sim.world
-    return Engine(
-        assemble, integrate, [(b.first, b.last) for b in w.bodies], w.dt, records=records, frames=4,
-        row_start=s.row_start, columns=s.columns, values=s.values, b=s.b_material, y=s.y, x=w.x, v=w.v, clock=s.clock,
-        moving=s.moving,
-    )  # fmt: skip
+    return CpuEngine(sim.engine_input(), records=records, frames=4)
 
 
 def test_records_that_nobody_fetches_are_dropped_and_counted_and_the_run_goes_on():

@@ -5,14 +5,16 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import cache, cached_property, partial
 from typing import Any
 
 import numpy as np
 
+from sim_server.backends.base import Engine, EngineInput
 from sim_server.backends.build_pool import compilers
-from sim_server.backends.compiler import begin_kernels, build_id, read_text
+from sim_server.backends.compiler import ahead, begin_kernels, build_id, read_text
 from sim_server.backends.kernel_binding import arguments_of, domain_of
 
 _SCALARS = {"int": ctypes.c_int32, "double": ctypes.c_double, "float": ctypes.c_float}
@@ -27,6 +29,7 @@ class CpuLaunch:
     params: ctypes.Structure
     items: int
     arrays: dict[str, np.ndarray]  # kept alive
+    mailed: bool = False  # its arguments may be replaced while steps run
     domain: str = ""  # what its items are, as its text says
 
     @property
@@ -71,7 +74,7 @@ class CpuModule:
 
     def bind(self, kernel: str, n: int, **arguments: Any) -> CpuLaunch:
         """Argument struct of `kernel` over `n` items; raises TypeError where an argument does not fit the text."""
-        fields, struct, _ = arguments_of(
+        fields, struct, form = arguments_of(
             self._text, kernel, self.name, {"real": self.real, "local": self.real}, {"n": n, **arguments}
         )
         if kernel not in self._layouts:
@@ -81,8 +84,8 @@ class CpuModule:
         for a, value in fields:
             setattr(params, a.name, value if a.dtype is None else value.ctypes.data)
         arrays = {a.name: value for a, value in fields if a.dtype is not None}
-        address = partial(self.address, kernel)
-        return CpuLaunch(f"{self.name}.{kernel}", address, params, n, arrays, domain_of(self._text, struct))
+        address, domain = partial(self.address, kernel), domain_of(self._text, struct)
+        return CpuLaunch(f"{self.name}.{kernel}", address, params, n, arrays, form == "MAILED_", domain)
 
 
 @cache
@@ -95,6 +98,21 @@ class Cpu:
     """The processor as a place for kernels to run."""
 
     name = "cpu"
+
+    def __init__(self) -> None:
+        ahead("backends/cpu/native/loop.cpp")  # takes longest to compile
+
+    @staticmethod
+    def building() -> AbstractContextManager[None]:
+        """Around the building of a scene: nothing to translate here."""
+        return nullcontext()
+
+    @staticmethod
+    def engine(given: EngineInput) -> Engine:
+        """Returns the loop over launches of this backend."""
+        from sim_server.backends.cpu.engine import CpuEngine
+
+        return CpuEngine(given)
 
     @staticmethod
     def module(path: str) -> CpuModule:

@@ -10,18 +10,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cache
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import FactorPattern
+from sim_server.backends.base import Capability, EngineInput, Launch
 from sim_server.backends.compiler import native
 from sim_server.backends.cpu import structs
 from sim_server.backends.cpu.device import CpuLaunch
 from sim_server.backends.cpu.structs import RECORD
 from sim_server.backends.ring_buffers import Reports
-from sim_server.mechanics.energy import Energies, NativeEnergies
+from sim_server.mechanics.energy import NativeEnergies
 from sim_server.mechanics.newton import Newton
 
 Reals = NDArray[np.float64]
@@ -126,21 +127,15 @@ class _NativeNewton:
             launch.parts = None if part is None else part.ctypes.data
 
 
-class Engine(Reports):
-    """The loop over one system.
+class CpuEngine(Reports):
+    """The loop over one system. records, frames: numbers of them that its rings hold."""
 
-    assemble, integrate: the launches of a step, in order. ranges: nodes [first, last) of each body. newton: for several
-    linearizations a step. energies: of its bodies; None: steps are not watched. arrays: those of the system by name
-    (row_start, columns, values, b, y, x, v, clock, moving).
-    """
+    capabilities = frozenset(Capability)
 
-    def __init__(
-        self, assemble: Sequence[CpuLaunch], integrate: Sequence[CpuLaunch], ranges: Sequence[tuple[int, int]],
-        dt: float, records: int = 8192, frames: int = 8, threads: int = 1, newton: Newton | None = None,
-        energies: Energies | None = None, **arrays: NDArray[Any],
-    ):  # fmt: skip
+    def __init__(self, given: EngineInput, records: int = 8192, frames: int = 8):
         self._native = _library()
-        launches = [*assemble, *integrate]
+        launches = cast(list[CpuLaunch], [*given.assemble, *given.integrate])
+        arrays, ranges = given.arrays, given.ranges
         nodes, bodies = len(arrays["x"]), len(ranges)
         self.launches = launches
         self._bindings = [structs.Binding(c.addressof(x.params), x.items, 0, -1) for x in launches]
@@ -157,19 +152,16 @@ class Engine(Reports):
         self._copies: list[Reals | None] = [None] * bodies
         self._posted: dict[int, Any] = {}
         loop = structs.Loop()
-        super().__init__(loop, bodies, dt, records, np.zeros((frames, 2, nodes, 3)))
-        loop.launches, loop.before, loop.launch = len(launches), len(assemble), self._launch
+        super().__init__(loop, bodies, given.dt, records, np.zeros((frames, 2, nodes, 3)))
+        loop.launches, loop.before, loop.launch = len(launches), len(given.assemble), self._launch
         loop.bodies, loop.nodes, loop.body = bodies, nodes, self._body
         for name in ("row_start", "columns", "values", "b", "y", "x", "v", "clock", "moving"):
             setattr(loop, name, arrays[name].ctypes.data)
-        loop.work, loop.threads = self._work.ctypes.data, threads
-        self._newton = newton and _NativeNewton(newton, loop, self._launch)
-        self._energies = energies and NativeEnergies(energies)
-        if self._energies:
-            loop.energies = c.pointer(self._energies.native)
-        self.begin: list[CpuLaunch] = []  # before the first step
-
-    exact = True  # settings and factors hold from the very next solve on
+        loop.work, loop.threads = self._work.ctypes.data, given.solver.threads
+        self._newton = given.newton and _NativeNewton(given.newton, loop, self._launch)
+        self._energies = NativeEnergies(given.energies)
+        loop.energies = c.pointer(self._energies.native)
+        self.begin: Sequence[Launch] = ()  # before the first step
 
     # --- running ------------------------------------------------------------------------------------------------
 
@@ -306,9 +298,10 @@ class Engine(Reports):
         """Step of the copy asked for last, -1 while it is not there. `step` counts the steps completed before it."""
         return int(self._body[body].snapshot_step)
 
-    def replace(self, launch: int, new: CpuLaunch) -> structs.Binding:
+    def replace(self, launch: int, new: Launch) -> structs.Binding:
         """Gives a launch other arguments, from the next step on: the one after the result's `taken` steps, once it is
         not below 0."""
+        new = cast(CpuLaunch, new)
         binding = structs.Binding(c.addressof(new.params), new.items, 0, -1)
         displaced = self._native.wf_post_binding(c.byref(self._launch[launch]), c.addressof(binding))
         kept = self._posted.setdefault(launch, [])  # in use, waiting

@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.process.extras import to_install
+from sim_server.backends.base import Engine, EngineInput
 from sim_server.backends.build_pool import CompileError, compilers
-from sim_server.backends.compiler import HERE, INCLUDE, build_id, read_text
+from sim_server.backends.compiler import HERE, INCLUDE, ahead, build_id, read_text
 from sim_server.backends.kernel_binding import Argument, arguments_of, domain_of
 from sim_server.errors import DeviceError
 
@@ -214,8 +215,10 @@ class Gpu:
     """The current CUDA device. precision: of the kernels, a key of PRECISIONS; host arrays are float64 in any case."""
 
     name = "gpu"
+    building = staticmethod(building)
 
     def __init__(self, precision: str = "float64") -> None:
+        ahead("backends/gpu/loop.cpp")  # takes longest to compile
         self.cp = cupy()
         self.precision, self.types = precision, PRECISIONS[precision]
         self._real = np.dtype("f4" if self.types["real"] == "float" else "f8")
@@ -251,6 +254,12 @@ class Gpu:
         if id(host) in self._twins:
             host[...] = self.twin(host).get()
         return host
+
+    def engine(self, given: EngineInput) -> Engine:
+        """Returns the loop over launches of this backend."""
+        from sim_server.backends.gpu.engine import GpuEngine
+
+        return GpuEngine(self, given)
 
     def build(self) -> str:
         """What a run depends on beside its scene: equal ones repeat it bit for bit."""

@@ -7,12 +7,14 @@ graphs and puts settings, factors, arguments and requests into mailboxes.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import FactorPattern
+from sim_server.arrays import Float64
+from sim_server.backends.base import Capability, EngineInput, Launch
 from sim_server.backends.compiler import HERE
 from sim_server.backends.gpu.cuda import CudaDevice
 from sim_server.backends.gpu.device import DeviceLaunch, Gpu
@@ -24,8 +26,6 @@ from sim_server.backends.gpu.mailbox import DeviceMailbox
 from sim_server.backends.gpu.newton import NewtonIteration, NewtonPhases
 from sim_server.backends.gpu.solver import PCG_BODY, PCG_RESULT, SETTINGS_BYTES, PcgSolver
 from sim_server.backends.gpu.structs import ENERGY_RECORD, NEWTON_RESULT, STEP_TIMESTAMP, Mail
-from sim_server.mechanics.energy import Energies
-from sim_server.mechanics.newton import Newton
 
 FEW = 16  # trials in a step up to which MANY steps make one graph
 STEP_EPILOGUE = np.dtype(
@@ -55,19 +55,14 @@ class DeviceSettings:
 
 
 class GpuEngine(DeviceLoop):
-    """Arguments as engine.Engine's, launches from Gpu.module. names: of the bodies, for messages. planes: float16
-    numbers that make an entry of a preconditioner (solver.py). newton: for several linearizations a step, each of which
-    runs `assemble` again (newton.py).
+    """The loop over one system. records: number of them that the ring holds. Raises what Gpu.building translates."""
 
-    Raises what Gpu.building translates.
-    """
+    capabilities: frozenset[Capability] = frozenset()
 
-    def __init__(
-        self, gpu: Gpu, assemble: Sequence[DeviceLaunch], integrate: Sequence[DeviceLaunch],
-        ranges: Sequence[tuple[int, int]], dt: float, energies: Energies, names: Sequence[str] = (),
-        records: int = 8192, planes: int = 1, newton: Newton | None = None,
-        **arrays: NDArray[Any],
-    ):  # fmt: skip
+    def __init__(self, gpu: Gpu, given: EngineInput, records: int = 8192):
+        assemble, integrate = (cast(Sequence[DeviceLaunch], part) for part in (given.assemble, given.integrate))
+        ranges, arrays, dt, newton = given.ranges, given.arrays, given.dt, given.newton
+        planes = 2 if given.solver.factor_precision == "float32" else 1  # float16 numbers that make one of a factor
         self.gpu, self.launches, self._arrays = gpu, [*assemble, *integrate], arrays
         cp, bodies = gpu.cp, len(ranges)
         device = CudaDevice(cp)
@@ -76,7 +71,7 @@ class GpuEngine(DeviceLoop):
         self._stamps = device.pinned(CAPACITY * STEP_TIMESTAMP.itemsize)
         self._results = device.pinned(CAPACITY * PCG_RESULT.itemsize * bodies)
         told = device.pinned(CAPACITY * ENERGY_RECORD.itemsize * bodies)
-        self._energies = DeviceEnergies(gpu, energies, told, self._counter, dt)
+        self._energies = DeviceEnergies(gpu, given.energies, told, self._counter, dt)
         self._fused = self._beginning(assemble)
         phases = NewtonPhases.of(gpu, bodies) if newton else None
         self.solver = PcgSolver(gpu, ranges, arrays, self._counter, CAPACITY, planes, phases or ())
@@ -97,13 +92,12 @@ class GpuEngine(DeviceLoop):
             device, ranges, arrays["row_start"], dt, boxes, self._results, self._stamps, arrays["clock"],
             records, twins["values"].dtype, found, told, **addresses,
         )  # fmt: skip
-        names = names or [f"body {k}" for k in range(bodies)]
-        self._intake = FactorUpload(gpu, self.solver, self, names, self.mailboxes[bodies : 2 * bodies])
+        self._intake = FactorUpload(gpu, self.solver, self, given.names, self.mailboxes[bodies : 2 * bodies])
         for k in range(bodies):
             whole = self.solver.bodies[k : k + 1].tobytes()
             self.mailboxes[k].post(whole[:SETTINGS_BYTES])
             self.mailboxes[bodies + k].post(whole[SETTINGS_BYTES:])
-        self.begin: list[DeviceLaunch] = []  # before the first step
+        self.begin: Sequence[Launch] = ()  # before the first step
         self._graphs: list[Any] = []
         self._epilogue = self._end_of_step(dt)
         self._last = FusedKernel(
@@ -130,8 +124,6 @@ class GpuEngine(DeviceLoop):
         params["dt"], params["counters"], params["capacity"] = dt, len(self.solver.pool_counter), CAPACITY
         params["result_words"], params["bodies"] = len(self._ranges) * PCG_RESULT.itemsize // 8, len(self._ranges)
         return params
-
-    exact = False  # settings hold for batches of steps
 
     # --- running ------------------------------------------------------------------------------------------------
 
@@ -253,11 +245,15 @@ class GpuEngine(DeviceLoop):
         """Of the inverse that an application reads."""
         return self.solver.factor_bytes(body)
 
-    def replace(self, launch: int, new: DeviceLaunch) -> Mail:
+    def correct(self, body: int, nodes: int, diagonal: Float64, double: bool = False) -> None:
+        """Not on a GPU (Capability.LOW_RANK_UPDATE)."""
+        raise NotImplementedError
+
+    def replace(self, launch: int, new: Launch) -> Mail:
         """Gives a mailed launch other arguments, from the next batch on: its first step is the one after the result's
         `taken` steps, once it is not below 0."""
         self.gpu.cp.cuda.get_current_stream().synchronize()  # its arrays are on the device
-        return self.mailboxes[self._mailed[launch]].post(new.params.tobytes(), keep=new)
+        return self.mailboxes[self._mailed[launch]].post(cast(DeviceLaunch, new).params.tobytes(), keep=new)
 
     def records(self) -> NDArray[Any]:
         """New records since the last call, oldest first; also begins factors that have waited for room."""

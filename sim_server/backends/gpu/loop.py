@@ -59,8 +59,6 @@ class DeviceLoop(Reports):
     ENERGY_RECORD. clock: host array (1,). real: of values, x and v on the device, whose addresses these are.
     """
 
-    positions_later = True
-
     def __init__(
         self, device: LoopDevice, ranges: Sequence[tuple[int, int]], row_start: NDArray[Any], dt: float,
         mailboxes: Sequence[tuple[int, int]], results: NDArray[Any], stamps: NDArray[Any], clock: Reals,
