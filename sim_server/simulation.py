@@ -6,14 +6,14 @@ THE STEP is the list made in `launches`: backward Euler with one linearization (
 unless the scene asks for another integrator (integrator.py). Start reading there.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 from numpy.typing import NDArray
 
 from sim_server import backends
-from sim_server.backends.base import Backend, Capability, EngineInput, Launch
+from sim_server.backends.base import Backend, Capability, EngineInput, Launch, PendingUpdate
 from sim_server.backends.compiler import ahead
 from sim_server.backends.cpu.engine import Kind
 from sim_server.effects import effect
@@ -26,6 +26,9 @@ from sim_server.mechanics.static_check import check_held
 from sim_server.mechanics.system import System
 from sim_server.mechanics.world import Body, World
 from sim_server.scene import Scene, load
+
+if TYPE_CHECKING:
+    from sim_server.effects.touch import Touch  # imported where a scene lists it
 
 KINDS = {"none": Kind.NONE, "jacobi": Kind.JACOBI, "block_jacobi": Kind.BLOCK_JACOBI, "ssor": Kind.SSOR}
 
@@ -45,6 +48,8 @@ class Simulation:
         backend = backends.create(device, scene.solver.precision)
         if scene.solver.wants_factors:
             ahead("backends/cpu/native/factor_check.cpp")
+        self.on_effect_update: list[Callable[[Effect, PendingUpdate], None]] = []
+        self._mailed: dict[Effect, int] = {}  # numbers of their launches whose arguments may change
         with backend.building():
             self._build(backend, watched)
 
@@ -67,6 +72,8 @@ class Simulation:
         given = self.engine_input()
         self.engine = backend.engine(given)
         self.engine.begin = self.integrator.begin(given.assemble)
+        for e in self.effects.values():
+            e.connect(self)
         for body in self.world.bodies:
             self._settle(body)
 
@@ -105,12 +112,31 @@ class Simulation:
         accumulate = False
         for e in sorted(self.effects.values(), key=lambda e: e.elements is None):  # touch asks what the elements added
             stencil = next(stencils) if e.elements is not None else None
-            assemble += e.launches(system, stencil, accumulate)  # f and K, M, B of each effect
+            added = e.launches(system, stencil, accumulate)  # f and K, M, B of each effect
+            for number, launch in enumerate(added, len(assemble)):
+                if launch.mailed:
+                    self._mailed[e] = number
+            assemble += added
             accumulate = accumulate or stencil is not None
         if self.shape is not None:
             assemble.append(self.shape.launch(system.mean))
         assemble += system.finish()  # into the material frame (eq. 12 and 13)
         return assemble, [self.integrator.advance()]
+
+    def update_effect(self, effect: Effect, launch: Launch) -> PendingUpdate:
+        """Gives the mailed launch of an effect other arguments, those of `launch`, from one of the next steps on.
+
+        This is the one way in which an effect changes while steps run. Each of `on_effect_update` is then called.
+        """
+        pending = self.engine.replace(self._mailed[effect], launch)
+        for observe in self.on_effect_update:
+            observe(effect, pending)
+        return pending
+
+    @property
+    def touch(self) -> "Touch | None":
+        """Pushes and grabs, if the scene lists them."""
+        return cast("Touch | None", self.effects.get("touch"))
 
     def _rotated(self) -> list[Body]:
         """Bodies whose rotations for the warp are those of elements."""

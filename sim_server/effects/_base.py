@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from sim_server.arrays import Float64, Int32, Int64
-from sim_server.backends.base import Launch
+from sim_server.backends.base import Launch, PendingUpdate
 from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.world import Body, World
 
@@ -43,6 +43,14 @@ class ElementEnergies:
     owner: Int64
 
 
+class EffectUpdates(Protocol):
+    """What an effect that changes while steps run needs of the simulation."""
+
+    def update_effect(self, effect: "Effect", launch: Launch) -> PendingUpdate:
+        """Gives the mailed launch of the effect other arguments, those of `launch`, from one of the next steps on."""
+        ...
+
+
 class Effect:
     """Base of all effects. A file under effects/ has `build(world, listed) -> Effect`.
 
@@ -66,8 +74,14 @@ class Effect:
         return self.told
 
     def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
-        """What adds the effect to system.b, .diagonal, .block, .sums and .mean. accumulate: to sums, others have."""
+        """What adds the effect to system.b, .diagonal, .block, .sums and .mean. accumulate: to sums, others have.
+
+        One at most may be of a MAILED_KERNEL, whose arguments change while steps run.
+        """
         return []
+
+    def connect(self, simulation: EffectUpdates) -> None:
+        """Called when the loop is there. An effect that changes while steps run keeps `simulation`."""
 
     def energies(self) -> ElementEnergies | None:
         """Potential energies of its elements, or None for an effect without any."""

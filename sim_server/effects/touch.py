@@ -20,7 +20,7 @@ of a grab near young times the size of the grabbed patch moves that patch withou
 """
 
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from math import dist, hypot
@@ -31,8 +31,8 @@ from pydantic import Field
 
 from protocol.push_limits import ORPHANED_PUSH
 from sim_server.arrays import Float64, Int32
-from sim_server.backends.base import Launch
-from sim_server.effects._base import Effect
+from sim_server.backends.base import Launch, PendingUpdate
+from sim_server.effects._base import Effect, EffectUpdates
 from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.world import Body, World
 from sim_server.scene.parameters import Parameters
@@ -89,7 +89,7 @@ class TouchError(ValueError):
 
 
 class Touch(Effect):
-    """All interactions of a scene. Changes go to the loop as a new launch, through `publish`.
+    """All interactions of a scene. Changes go to the loop as new arguments of the launch.
 
     force (n, 3) [N], spring (n,) [N/m], anchor (n, 3) [m]: what they exert on each node in a step.
     """
@@ -97,11 +97,11 @@ class Touch(Effect):
     def __init__(self, world: World, listed: list[tuple[Body, Any]]):
         self.world = world
         self.params: dict[str, Params] = {body.name: params for body, params in listed}
-        self.publish: Callable[[Launch], Any] = lambda launch: None  # set by the server
+        self._simulation: EffectUpdates | None = None
         self._system: System | None = None
         self._applied: list[Interaction] = []
         self._begun: list[Interaction] = []  # the same, with the times at which they began as far as they are known
-        self._given: deque[tuple[Any, bool]] = deque(maxlen=GIVEN)  # what a loop tells of each change, and `told` of it
+        self._given: deque[tuple[PendingUpdate | None, bool]] = deque(maxlen=GIVEN)  # each change, and `told` of it
         self._together = False
         self._changed: dict[int, Interaction] | None = None  # by id: what the loop is to be given after `together`
         self._same: tuple[list[int], dict[str, Any]] | None = None  # ids, and what of a launch no move changes
@@ -114,6 +114,9 @@ class Touch(Effect):
     def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
         self._system = system
         return [self._bind([])]
+
+    def connect(self, simulation: EffectUpdates) -> None:
+        self._simulation = simulation
 
     def push(self, client: str, name: str, point: Point, radius: float, force: Point, duration: float) -> Interaction:
         """A force [N] shared by the free nodes within `radius` [m] of `point` (0: the nearest one), for a while [s].
@@ -193,8 +196,8 @@ class Touch(Effect):
 
     def told_at(self, step: int) -> bool:
         """There was no grab among what the loop had taken up by then, which may be other than it was given last."""
-        for binding, told in reversed(tuple(self._given)):
-            if binding is None or 0 <= binding.taken <= step:
+        for pending, told in reversed(tuple(self._given)):
+            if pending is None or 0 <= pending.taken <= step:
                 return told
         return len(self._given) < GIVEN  # else the beginning is not known any more
 
@@ -214,12 +217,13 @@ class Touch(Effect):
         if self._changed is not None:
             changed, self._changed = self._changed, None
             launch, told = self._bind(list(changed.values())), self.told
-            if not told:  # it counts already: the loop may take it up before `publish` returns
+            if not told:  # it counts already: the loop may take it up before `update_effect` returns
                 self._given.append((None, told))
-            binding = self.publish(launch)
+            assert self._simulation is not None
+            pending = self._simulation.update_effect(self, launch)
             if not told:
                 self._given.pop()
-            self._given.append((binding, told))
+            self._given.append((pending, told))
 
     @property
     def applied(self) -> list[Interaction]:

@@ -9,13 +9,15 @@ by whom; the step records say which one a solve used.
 from __future__ import annotations
 
 from collections import deque
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from protocol import messages_pb2 as pb
 from protocol.factor import Factor
 from protocol.validate import checksum
+from sim_server.backends.base import PendingUpdate
+from sim_server.effects._base import Effect
 from sim_server.network.link import ServerLink
 from sim_server.recording.recorder import Recorder
 from sim_server.service.commands import interaction_message
@@ -32,35 +34,30 @@ class Trace:
     def __init__(self, driver: Driver, link: ServerLink, recorder: Recorder):
         self._driver, self._link, self._recorder = driver, link, recorder
         self._factors: deque[Factor] = deque()  # appended by whoever adopts, maybe the loop's thread
-        self._bindings: deque[tuple[Any, list[Interaction]]] = deque()
+        self._updates: deque[tuple[PendingUpdate, list[Interaction]]] = deque()
         self._shown: set[int] = set()  # ids whose nodes the log holds
         self._workers: dict[str, pb.WorkerInfo] = {}
         driver.adopted = self._factors.append
-        touch: Any = driver.simulation.effects.get("touch")
-        if touch is not None:
-            publish = touch.publish
+        self._touch = driver.simulation.touch
+        driver.simulation.on_effect_update.append(self._on_update)
 
-            def published(launch: Any) -> Any:
-                binding = publish(launch)
-                if binding is not None:  # a loop that tells when it takes one up
-                    self._bindings.append((binding, touch.applied))
-                return binding
-
-            touch.publish = published
+    def _on_update(self, effect: Effect, pending: PendingUpdate) -> None:
+        if self._touch is not None and effect is self._touch:
+            self._updates.append((pending, self._touch.applied))
 
     def write(self, block: bool) -> None:
         """Everything taken up since the last call; a log cut off after a record holds what the record rests on."""
         for _ in range(len(self._factors)):
             self._recorder.factor(self._factor(self._factors.popleft()), block)
-        taken = [i for i, (binding, _) in enumerate(self._bindings) if binding.taken >= 0]
+        taken = [i for i, (pending, _) in enumerate(self._updates) if pending.taken >= 0]
         for i in range(taken[-1] + 1 if taken else 0):
-            binding, interactions = self._bindings.popleft()
+            pending, interactions = self._updates.popleft()
             if i in taken:  # the others were replaced before the loop saw them
-                self._recorder.touch_set(self._touch_set(binding.taken, interactions), self._dt * binding.taken, block)
+                self._recorder.touch_set(self._touch_set(pending.taken, interactions), self._dt * pending.taken, block)
 
     @property
     def _dt(self) -> float:
-        return float(self._driver.simulation.world.dt)
+        return self._driver.simulation.world.dt
 
     def _touch_set(self, step: int, interactions: list[Interaction]) -> pb.TouchSet:
         messages = []

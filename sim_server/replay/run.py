@@ -79,10 +79,6 @@ class Replay:
             self.compared.notes.append(
                 "another build than the recorded one (kernels, compiler, processor or GPU): last digits may differ"
             )
-        if "touch" in self.simulation.effects:
-            index = next(i for i, launch in enumerate(self.engine.launches) if launch.name == "touch.apply")
-            touch: Any = self.simulation.effects["touch"]
-            touch.publish = lambda launch: self.engine.replace(index, launch)
 
     def run(self, progress: Callable[[int], None] = lambda _: None) -> Comparison:
         """Repeats all steps and compares them; calls `progress` with the number of steps done."""
@@ -150,7 +146,7 @@ class Replay:
         """Sets the interactions that the loop took up at this step."""
         if step not in self._touch_sets:
             return
-        touch: Any = self.simulation.effects.get("touch")
+        touch = self.simulation.touch
         if touch is None:
             raise BadLog(f"{self.recording.path}: pushes or grabs in a scene that takes none")
         try:

@@ -4,10 +4,14 @@
 import math
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
+from typing import TYPE_CHECKING
 
 from protocol import messages_pb2 as pb
 from protocol.push_limits import LONGEST_PUSH
 from sim_server.simulation import Simulation
+
+if TYPE_CHECKING:
+    from sim_server.effects.touch import Interaction, Touch  # imported where a scene lists it
 
 
 class Refusal(ValueError):
@@ -22,13 +26,6 @@ class Commands:
         self.accepted = accepted
         self.stopping = False
         self.frozen: Callable[[str], bool] = lambda name: False  # objects that have run away and move no more
-        if "touch" in simulation.effects:
-            from sim_server.effects.touch import Touch
-
-            touch = simulation.effects["touch"]
-            assert isinstance(touch, Touch)
-            index = next(i for i, launch in enumerate(self.engine.launches) if launch.name == "touch.apply")
-            touch.publish = lambda launch: self.engine.replace(index, launch)
         self._owners: set[str] = set()
 
     @property
@@ -53,7 +50,8 @@ class Commands:
 
     def together(self) -> AbstractContextManager[None]:
         """Around the commands of a round: what they change goes to the loop at once."""
-        return self._touch().together() if "touch" in self.simulation.effects else nullcontext()
+        touch = self.simulation.touch
+        return nullcontext() if touch is None else touch.together()
 
     def gone(self, clients: set[str]) -> int:
         """Releases what clients that are no longer there still held; returns how many.
@@ -66,7 +64,8 @@ class Commands:
 
     def applied(self) -> list[pb.Interaction]:
         """Interactions that the loop knows, with the time of their first step (negative: not yet); some may be over."""
-        return [self._message(a) for a in self._touch().known()] if "touch" in self.simulation.effects else []
+        touch = self.simulation.touch
+        return [] if touch is None else [interaction_message(a) for a in touch.known()]
 
     # --- verbs --------------------------------------------------------------------------------------------------
 
@@ -97,7 +96,7 @@ class Commands:
         return self._took(command, self._touch().move(command.client, i.id, _tuple(i.target)))
 
     def _release(self, command: pb.Command) -> pb.Reply:
-        return pb.Reply(interaction=self._message(self._touch().release(command.client, command.interaction.id)))
+        return pb.Reply(interaction=interaction_message(self._touch().release(command.client, command.interaction.id)))
 
     def _pause(self, command: pb.Command) -> pb.Reply:
         unchanged, loop = self.engine_paused, self.engine.loop
@@ -108,8 +107,8 @@ class Commands:
 
     def _resume(self, command: pb.Command) -> pb.Reply:
         unchanged = not self.engine_paused
-        if "touch" in self.simulation.effects:
-            self._touch().flush()  # what came before it holds from the first step on
+        if self.simulation.touch is not None:
+            self.simulation.touch.flush()  # what came before it holds from the first step on
         self.engine.loop.pause = 0
         return pb.Reply(status=self._happened("running"), unchanged=unchanged)
 
@@ -127,34 +126,31 @@ class Commands:
         status.step = self.engine.step
         status.time = status.step * self.simulation.world.dt
 
-    def _took(self, command: pb.Command, taken: object) -> pb.Reply:
-        message = self._message(taken)
+    def _took(self, command: pb.Command, taken: "Interaction") -> pb.Reply:
+        message = interaction_message(taken)
         self._owners.add(command.client)
         self.accepted(message, float(self.simulation.system.clock[0]))
         return pb.Reply(interaction=message)
 
-    def _touch(self, name: str = ""):  # type: ignore[no-untyped-def]
+    def _touch(self, name: str = "") -> "Touch":
+        """Pushes and grabs of the scene. name: of the object that they are asked for. Raises Refusal without any."""
         if name and self.frozen(name):
             raise Refusal(f"object {name!r} has run away and is frozen: it takes no pushes or grabs any more")
-        if "touch" not in self.simulation.effects:
+        if self.simulation.touch is None:
             raise Refusal(
                 f"object {name!r} does not list the effect touch, so it takes no pushes or grabs; "
                 "add touch = true to its effects"
                 if name
                 else "no object of the scene lists the effect touch"
             )
-        return self.simulation.effects["touch"]
+        return self.simulation.touch
 
     def _point(self, i: pb.Interaction) -> tuple[float, float, float]:
         """Where a push or grab is to begin, in coordinates [m]."""
         return self._touch(i.object).points(i.object).named(i.at) if i.at else _tuple(i.point)
 
-    @staticmethod
-    def _message(a) -> pb.Interaction:  # type: ignore[no-untyped-def]
-        return interaction_message(a)
 
-
-def interaction_message(a) -> pb.Interaction:  # type: ignore[no-untyped-def]
+def interaction_message(a: "Interaction") -> pb.Interaction:
     """An interaction of the effect touch in the words of the protocol."""
 
     def vector(v: tuple[float, float, float]) -> pb.Vector:

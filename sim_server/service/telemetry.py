@@ -130,7 +130,7 @@ class Telemetry:
 
     def _touch(self, messages: list[pb.ObjectStep]) -> None:
         """Adds to each step the interactions that acted in it."""
-        if self.commands is None or "touch" not in self.simulation.effects:
+        if self.commands is None or self.simulation.touch is None:
             return
         known = {i.id: i for i in self.commands.applied()}
         clock, dt = float(self.simulation.system.clock[0]), self.simulation.world.dt

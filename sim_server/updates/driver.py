@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import Factor
+from sim_server.backends.base import Capability
 from sim_server.simulation import Simulation
 from sim_server.updates.body_state import BodyUpdateState
 from sim_server.updates.factor_check import FactorCheck
@@ -156,7 +157,8 @@ class Driver:
         self.engine.post_factor(state.body.index, factor.pattern, factor.values, factor.step)
         # Tell the log how it was made
         method, extrapolated = state.factors.method(factor.step), state.job.extrapolated
-        later = state.job.positions and self.engine.positions_later and factor.worker != self.inline.WORKER
+        at_end = Capability.MATRIX_POSITIONS not in self.engine.capabilities
+        later = state.job.positions and at_end and factor.worker != self.inline.WORKER
         made = replace(factor, ahead=extrapolated, later=later) if extrapolated or later else factor
         self.adopted(replace(made, method=method.name) if method else made)
         # Let `auto` try it

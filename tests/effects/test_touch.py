@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from protocol.push_limits import ORPHANED_PUSH
+from sim_server.effects._base import Effect
 from sim_server.effects.touch import Touch, TouchError
 from sim_server.simulation import Simulation
 from tests.scenes import bar, simulation
@@ -17,18 +18,15 @@ EVER = float("inf")
 
 
 def held_bar(touch: dict | None = None, **table: Any) -> tuple[Simulation, Touch]:
-    """A bar held at one end, and its touch, connected to the loop as the server does it."""
+    """A bar held at one end, and its touch."""
     given: dict[str, Any] = {"young": 1e5, "fixed": "X < 0.01", "touch": touch or {"max_force": 1e6}} | table
     sim = simulation(bar(**given), dt=H, tolerance=1e-9, max_iterations=5000)
-    return sim, connected(sim)
+    return sim, touch_of(sim)
 
 
-def connected(sim: Simulation) -> Touch:
-    touch = sim.effects["touch"]
-    assert isinstance(touch, Touch)
-    index = next(i for i, launch in enumerate(sim.engine.launches) if launch.name == "touch.apply")
-    touch.publish = lambda launch: sim.engine.replace(index, launch)
-    return touch
+def touch_of(sim: Simulation) -> Touch:
+    assert sim.touch is not None
+    return sim.touch
 
 
 def force_in(sim: Simulation) -> np.ndarray:
@@ -75,15 +73,9 @@ def test_nodes_are_those_within_the_radius_now_and_free():
 
 def test_changes_together_are_given_to_the_loop_as_one():
     sims = {together: held_bar() for together in (False, True)}
-    given: dict[bool, list[int]] = {False: [], True: []}
+    given: list[Effect] = []
     for together, (sim, touch) in sims.items():
-        publish = touch.publish
-
-        def counted(launch: Any, publish: Any = publish, together: bool = together) -> Any:
-            given[together].append(launch.items)
-            return publish(launch)
-
-        touch.publish = counted
+        sim.on_effect_update.append(lambda effect, pending: given.append(effect))
 
         def act(touch: Touch = touch) -> None:
             first = touch.push("anna", "bar", END, 0.6, (0, 5, 0), 1.0)
@@ -100,8 +92,8 @@ def test_changes_together_are_given_to_the_loop_as_one():
         else:
             act()
         sim.engine.run(3)
-    assert len(given[False]) == 4 and len(given[True]) == 1
-    (apart, _), (once, touch) = sims.values()
+    (apart, first), (once, touch) = sims.values()
+    assert given == [first] * 4 + [touch]
     assert np.array_equal(apart.world.x, once.world.x)
     assert touch.known()[0].start == 0.0 and touch.known()[0].target == (2.0, 0.9, 0.5)
 
@@ -109,7 +101,7 @@ def test_changes_together_are_given_to_the_loop_as_one():
 def test_nodes_of_the_named_body_only():
     bodies = [bar(name=name, young=1e5, touch={"max_force": 100}) for name in ("a", "b")]
     sim = simulation(*bodies, dt=H)
-    touch = connected(sim)
+    touch = touch_of(sim)
     push = touch.push("anna", "b", END, 0.6, (0, 1, 0), 1.0)
     first = sim.world.bodies[1].first
     assert (push.nodes >= first).all()

@@ -77,8 +77,6 @@ def assembled(case: str, precision: str | None, push: bool = False) -> Simulatio
     sim = Simulation(load(path, [*overrides, *more]), device)
     if push:
         touch: Any = sim.effects["touch"]
-        index = next(i for i, launch in enumerate(sim.engine.launches) if launch.name == "touch.apply")
-        touch.publish = lambda launch: sim.engine.replace(index, launch)
         name = sim.world.bodies[0].name
         far = tuple(sim.world.x[sim.world.free > 0].max(axis=0))
         touch.push("me", name, far, 0.3, (800.0, 0.0, 0.0), 0.1)

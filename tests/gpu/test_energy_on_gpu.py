@@ -35,8 +35,6 @@ def run(sim: Simulation, steps: int) -> NDArray[Any]:
     """Records (steps, bodies), with a push and a grab that moves."""
     touch = sim.effects.get("touch")
     if isinstance(touch, Touch):
-        index = [launch.name for launch in sim.engine.launches].index("touch.apply")
-        touch.publish = lambda launch: sim.engine.replace(index, launch)
         touch.push("me", "a", (2.0, 0.5, 0.5), 0.8, (0.0, 200.0, 50.0), 0.05)
         held = touch.grab("me", "b", (3.0, 1.0, 1.0), 0.4, (3.2, 1.0, 1.0), 2e4, 1e4, 10.0)
     found = []

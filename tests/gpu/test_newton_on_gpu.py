@@ -303,9 +303,6 @@ def test_a_push_moves_it_as_on_the_cpu():
 
     def push(sim: Simulation, step: int) -> None:
         touch = sim.effects["touch"]
-        if step == 0:
-            index = next(i for i, launch in enumerate(sim.engine.launches) if launch.name == "touch.apply")
-            touch.publish = lambda launch: sim.engine.replace(index, launch)
         if step == 2:
             touch.push("me", "bar", (2.0, 0.4, 0.4), 0.3, (0.0, 0.0, 90.0), 0.1)
         if step == 4:

@@ -60,9 +60,6 @@ class Load:
         touch = self.sim.effects["touch"]
         assert isinstance(touch, Touch)
         self.touch = touch
-        engine = self.sim.engine
-        index = [launch.name for launch in engine.launches].index("touch.apply")
-        self.touch.publish = lambda launch: engine.replace(index, launch)
         if hold.target is None:
             self.held = self.touch.push("test", "bar", hold.point, hold.radius, hold.force, math.inf)
         else:

@@ -21,12 +21,8 @@ def watched(*objects: dict, every: int = 1, **table) -> Simulation:
 
 
 def touched(sim: Simulation) -> Touch:
-    """Whose pushes and grabs go to the loop."""
-    touch = sim.effects["touch"]
-    assert isinstance(touch, Touch)
-    index = [launch.name for launch in sim.engine.launches].index("touch.apply")
-    touch.publish = lambda launch: sim.engine.replace(index, launch)
-    return touch
+    assert sim.touch is not None
+    return sim.touch
 
 
 def kinetic(sim: Simulation, body: int) -> float:

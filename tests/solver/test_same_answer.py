@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sim_server.effects.touch import Touch
 from sim_server.recording import messages as describe
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
@@ -78,9 +77,8 @@ def trajectory(tolerance: float = TOLERANCE, **solver) -> tuple[NDArray, NDArray
     """(steps, nodes, 3) of these bodies, the first grabbed for a while, and the records."""
     sim = simulation(*bodies(), gravity=(0, -9.81, 0), tolerance=tolerance, max_iterations=5000, **solver)
     sim.world.v[sim.world.bodies[1].nodes] += np.random.default_rng(0).normal(size=(45, 3))
-    touch, index = sim.effects["touch"], [launch.name for launch in sim.engine.launches].index("touch.apply")
-    assert isinstance(touch, Touch)
-    touch.publish = lambda launch: sim.engine.replace(index, launch)
+    touch = sim.touch
+    assert touch is not None
     source = Building(sim)
     driver, frames, records = Driver(sim, source), [], []
     for step in range(STEPS):

@@ -61,8 +61,6 @@ def test_a_run_with_positions_alone_repeats_the_run_with_matrices() -> None:
 def test_while_something_is_grabbed_the_matrix_is_sent() -> None:
     sim, endpoint = served("lockstep-2"), free_endpoint()
     touch = sim.effects["touch"]
-    place = next(i for i, launch in enumerate(sim.engine.launches) if launch.name == "touch.apply")
-    touch.publish = lambda new: sim.engine.replace(place, new)  # type: ignore[attr-defined]
     with ServerLink(listen=[endpoint]) as link, process("-m", "precond_worker", "--connect", endpoint):
         link.set_scene(describe.scene(sim))
         link.announce(describe.topology(sim, sim.world.bodies[0]))

@@ -9,7 +9,6 @@ import numpy as np
 from scipy.sparse.linalg import eigsh
 
 from sim_server.effects import known_effects
-from sim_server.effects.touch import Touch
 from sim_server.scene.model import Scene
 from sim_server.simulation import Simulation
 
@@ -132,10 +131,8 @@ class Beam:
 
 def _twist(sim: Simulation, force: float) -> None:
     """Loads on the edges of the free end, along it, around the axis; they keep their direction."""
-    touch, engine = sim.effects["touch"], sim.engine
-    assert isinstance(touch, Touch)
-    place = next(i for i, launch in enumerate(engine.launches) if launch.name == "touch.apply")
-    touch.publish = lambda new: engine.replace(place, new)
+    touch = sim.touch
+    assert touch is not None
     for x, y, along in ((0.5, 0, (1, 0)), (1, 0.5, (0, 1)), (0.5, 1, (-1, 0)), (0, 0.5, (0, -1))):
         touch.push("bench", "beam", (x, y, LENGTH), 0.3, (force * along[0], force * along[1], 0.0), FOREVER)
 

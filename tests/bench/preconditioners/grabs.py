@@ -85,7 +85,8 @@ def _run(
     overrides = [f"solver.{key}={_toml(value)}" for key, value in solver.items()]
     overrides += [f"object.beam.mesh.bar={list(cells)}", "object.beam.effects.touch={max_force=1e15}"]
     sim = Simulation.load(SCENES / f"{scene}.toml", overrides)
-    touch, driver, unaware = _connected(sim), Driver(sim), 2 * latency - 1
+    touch, driver, unaware = sim.touch, Driver(sim), 2 * latency - 1
+    assert touch is not None
     driver.step_with_fresh_factors()
     driver.advance(max(1, SETTLED // latency) * latency + 1)  # a matrix has gone out with the last one
     held = _grab(sim, touch, hand)
@@ -100,14 +101,6 @@ def _run(
 
 def _toml(value: Any) -> str:
     return f"'{value}'" if isinstance(value, str) else str(value).lower()
-
-
-def _connected(sim: Simulation) -> Touch:
-    touch, engine = sim.effects["touch"], sim.engine
-    assert isinstance(touch, Touch)
-    place = next(i for i, launch in enumerate(engine.launches) if launch.name == "touch.apply")
-    touch.publish = lambda new: engine.replace(place, new)
-    return touch
 
 
 def _grab(sim: Simulation, touch: Touch, hand: Hand) -> Interaction:

@@ -77,12 +77,10 @@ class Load:
     """What happens to the objects of a simulation of `scene`, drawn from a seed."""
 
     def __init__(self, simulation: Simulation, hold: int, seed: int):
-        self._x, engine = simulation.world.x, simulation.engine
+        self._x = simulation.world.x
         touch = simulation.effects["touch"]
         assert isinstance(touch, Touch)
         self._touch, rng = touch, np.random.default_rng(seed)
-        launch = next(i for i, found in enumerate(engine.launches) if found.name == "touch.apply")
-        touch.publish = lambda new: engine.replace(launch, new)
         self._hands = []
         for body in simulation.world.bodies:
             if is_wild(body.index):

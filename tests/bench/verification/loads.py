@@ -40,8 +40,6 @@ def statics(
 def push(sim: Simulation, groups: Sequence[Group]) -> None:
     """Forces that stay, in place of those before: nodes (k,) and the force on all of them together (3,) [N]."""
     touch = cast(Touch, sim.effects["touch"])
-    index = next(i for i, launch in enumerate(sim.engine.launches) if launch.name == "touch.apply")
-    touch.publish = lambda launch: sim.engine.replace(index, launch)
     touch.restore(
         [
             Interaction(
