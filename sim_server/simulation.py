@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
+import numpy as np
 from numpy.typing import NDArray
 
 from sim_server import backends
@@ -28,6 +29,8 @@ from sim_server.mechanics.world import Body, World
 from sim_server.scene import Scene, load
 
 if TYPE_CHECKING:
+    from scipy.sparse import csc_array
+
     from sim_server.effects.touch import Touch  # imported where a scene lists it
 
 KINDS = {"none": Kind.NONE, "jacobi": Kind.JACOBI, "block_jacobi": Kind.BLOCK_JACOBI, "ssor": Kind.SSOR}
@@ -176,8 +179,8 @@ class Simulation:
         self.fetch()
         return 0.5 * float(self.world.mass @ (self.world.v**2).sum(axis=1))
 
-    def matrix(self, body: int = 0) -> Any:
-        """A' of a body as it was last assembled, scipy.sparse (3 n, 3 n)."""
+    def matrix(self, body: int = 0) -> "csc_array[np.float64]":
+        """A' of a body as it was last assembled, (3 n, 3 n)."""
         from scipy.sparse import bsr_array
 
         b = self.world.bodies[body]

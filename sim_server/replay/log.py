@@ -51,7 +51,7 @@ class RecordedObject:
     packed: bytearray = field(default_factory=bytearray)
     frames: dict[int, tuple[int, int]] = field(default_factory=dict)
     factors: dict[int, pb.FactorUse] = field(default_factory=dict)
-    rows: NDArray = field(default_factory=lambda: np.zeros(0, ROW))
+    rows: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, ROW))
 
 
 class Recording:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from importlib.util import find_spec
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,9 @@ from sim_server.scene.messages import readable
 from sim_server.simulation import Simulation
 from sim_server.updates.factor_source import Inline, Job
 from sim_server.updates.worker_assembly import Assembly
+
+if TYPE_CHECKING:
+    from sim_server.effects.touch import Interaction
 
 MESH = ("nodes", "tets", "row_start", "columns", "fixed")
 
@@ -71,7 +74,7 @@ class Replay:
         self._factors: dict[tuple[str, int], Factor] = {}
         self._in_use: dict[str, int] = {}
         self._touch_sets: dict[int, pb.TouchSet] = {t.step: t for t in recording.touch}
-        self._nodes: dict[int, tuple[Any, Any]] = {}  # nodes and offsets of interactions, by id
+        self._nodes: dict[int, tuple[NDArray[np.int32], Float64]] = {}  # nodes and offsets of interactions, by id
         self._inline = self._library()
         self._positions: dict[str, Float64] = {}  # sent instead of a matrix, and not those of its step, by body
         self._assemblies: dict[str, Assembly] = {}
@@ -99,7 +102,7 @@ class Replay:
             progress(step + 1)
         return self.compared
 
-    def _rows(self, name: str) -> Any:
+    def _rows(self, name: str) -> NDArray[np.void]:
         return self.recording.objects[name].rows[: self.recording.steps]
 
     def _last_uses(self) -> dict[tuple[str, int], int]:
@@ -154,7 +157,7 @@ class Replay:
         except Refused as error:
             raise BadLog(f"{self.recording.path}: interactions of step {step}: {error}") from error
 
-    def _interaction(self, m: pb.Interaction) -> Any:
+    def _interaction(self, m: pb.Interaction) -> Interaction:
         from sim_server.effects.touch import Interaction
 
         if m.held:
@@ -255,7 +258,7 @@ class Replay:
                 self.compared.frame(step, body.name, frame, (world.x[body.nodes], world.v[body.nodes]))
 
 
-def taken_up(rows: Any) -> NDArray[np.int64]:
+def taken_up(rows: NDArray[np.void]) -> NDArray[np.int64]:
     """Finds of which steps the factors were that a body's solves used, (steps, 2): taken up before the step assembled,
     and made from the very step; -1: none. rows: of a log (log.ROW), one a step."""
     used, fresh = rows["factor_step"], rows["factor_step"] == np.arange(len(rows))

@@ -290,7 +290,7 @@ class Telemetry:
         return lines
 
 
-def cause_of(r: Any) -> str:
+def cause_of(r: np.void) -> str:
     """What showed in a record (layouts.RECORD) that a body had run away."""
     if not (np.isfinite(r["kinetic"]) and np.isfinite(r["gravity"])):
         return "its positions or velocities are no finite numbers"

@@ -194,7 +194,8 @@ class CpuEngine(Reports):
 
     def settings(self, body: int) -> structs.Settings:
         """Solver settings of a body; what is set holds from its next solve on."""
-        return self._body[body].settings
+        settings: structs.Settings = self._body[body].settings
+        return settings
 
     def correct(self, body: int, nodes: int, diagonal: Reals, double: bool = False) -> None:
         """Factors of the body are corrected for what has come onto the diagonal since their matrix, or has left it, at

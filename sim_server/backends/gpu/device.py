@@ -136,7 +136,8 @@ class DeviceLaunch:
 
     def fetch(self, name: str) -> NDArray[Any]:
         """One of its arrays as kernels have left it, copied."""
-        return self.arrays[name].get()
+        array: NDArray[Any] = self.arrays[name].get()
+        return array
 
     @property
     def domain(self) -> str:
