@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Reads the argument struct of a kernel from its text and checks arrays and numbers against it.
 
-A struct's layout stands in one place, the kernel text (kernels/kernel.h). `arguments_of` gives the members of a
-kernel's struct, each with its argument; cpu/device.py and gpu/device.py fill the struct for their side.
+A struct's layout stands in one place, the kernel text (kernels/kernel.h). cpu/device.py and gpu/device.py fill the
+struct for their side.
 """
 
 from __future__ import annotations
@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 
 from sim_server.backends.build_pool import CompileError
+from sim_server.backends.compiler import read_text
 
-_TYPES = {"int": "i4", "double": "f8", "float": "f4"}
+NUMBERS = {"int": "i4", "double": "f8", "float": "f4"}
 
 
 @dataclass(frozen=True)
@@ -47,30 +48,9 @@ def members_of(text: str, struct: str, types: dict[str, str]) -> list[Argument]:
             continue
         constant, own, kind, star, name = member.groups()
         kind = types.get(own or kind, own or kind)
-        dtype = np.dtype(_TYPES[kind]) if star or own else None
+        dtype = np.dtype(NUMBERS[kind]) if star or own else None
         members.append(Argument(name, kind, dtype, bool(own), bool(constant)))
     return members
-
-
-def arguments_of(
-    text: str, kernel: str, module: str, types: dict[str, str], given: dict[str, Any], converts: bool = False
-) -> tuple[list[tuple[Argument, Any]], str, str]:
-    """The members of a kernel's struct in order, each with its argument; the struct's name; "", "MAILED_" or "SUM_".
-
-    types: what `real` and `local` stand for. converts: an array of float64 may stand for one of float32.
-    Raises CompileError for an unknown kernel, TypeError where an argument does not fit the text.
-    """
-    members, struct, form = _signature(text, kernel, module, tuple(types.items()))
-    if set(given) != {m.name for m in members}:
-        raise TypeError(f"{module}.{kernel} takes {[m.name for m in members]}, not {sorted(given)}")
-    for m in members:
-        value = given[m.name]
-        if m.dtype is None:
-            continue
-        fits = [m.dtype, np.dtype("f8")] if converts and m.dtype.kind == "f" else [m.dtype]
-        if not (isinstance(value, np.ndarray) and value.dtype in fits and value.flags.c_contiguous):
-            raise TypeError(f"{module}.{kernel}: {m.name} must be a contiguous array of {m.dtype}")
-    return [(m, given[m.name]) for m in members], struct, form
 
 
 @cache
@@ -89,3 +69,40 @@ def domain_of(text: str, struct: str) -> str:
     """What the items of a kernel are: the first word behind `int n;` in its struct."""
     found = re.search(rf"struct {struct} \{{\s*int n;\s*// (\w+)", text)
     return found.group(1) if found else ""
+
+
+class KernelText:
+    """A kernel text of this package. path: as of compiler.read_text. types: what `real` and `local` stand for."""
+
+    def __init__(self, path: str, types: dict[str, str]):
+        self.name, self.text = read_text(path)
+        self.types = types
+
+
+class BoundKernel:
+    """Base of launches: a kernel of a text, and its arguments by the names of its struct's members.
+
+    fields: the members. values: an argument for each. mailed: the arguments may be replaced while steps run. sums: its
+    items sum over lists. converts: an array of float64 may stand for one of float32.
+    Raises CompileError for an unknown kernel, TypeError where an argument does not fit the text.
+    """
+
+    def __init__(self, of: KernelText, kernel: str, given: dict[str, Any], converts: bool = False):
+        self.name, self.items = f"{of.name}.{kernel}", int(given["n"])
+        self.text, self.types = of.text, of.types
+        self.fields, self.struct, form = _signature(of.text, kernel, of.name, tuple(of.types.items()))
+        self.mailed, self.sums = form == "MAILED_", form == "SUM_"
+        if set(given) != {f.name for f in self.fields}:
+            raise TypeError(f"{self.name} takes {[f.name for f in self.fields]}, not {sorted(given)}")
+        self.values = [given[f.name] for f in self.fields]
+        for f, value in zip(self.fields, self.values, strict=True):
+            if f.dtype is None:
+                continue
+            fits = [f.dtype, np.dtype("f8")] if converts and f.dtype.kind == "f" else [f.dtype]
+            if not (isinstance(value, np.ndarray) and value.dtype in fits and value.flags.c_contiguous):
+                raise TypeError(f"{self.name}: {f.name} must be a contiguous array of {f.dtype}")
+
+    @property
+    def domain(self) -> str:
+        """What its items are: the first word behind `int n;` in its struct."""
+        return domain_of(self.text, self.struct)

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from protocol.process.extras import to_install
 from sim_server.backends.base import Engine, EngineInput
 from sim_server.backends.build_pool import CompileError, compilers
-from sim_server.backends.compiler import HERE, INCLUDE, ahead, build_id, read_text
-from sim_server.backends.kernel_binding import Argument, arguments_of, domain_of
+from sim_server.backends.compiler import HERE, INCLUDE, ahead, build_id
+from sim_server.backends.kernel_binding import NUMBERS, Argument, BoundKernel, KernelText
 from sim_server.errors import DeviceError
 
 LEAST = 80  # compute capability times 10: the solver multiplies by matrix instructions that came with it
@@ -114,19 +114,41 @@ def shape(threads: int) -> tuple[tuple[int], tuple[int]]:
     return (max(1, -(-threads // block)),), (block,)
 
 
-class DeviceLaunch:
-    """One kernel with its arguments on the device. mailed: they lie in device memory and may be replaced."""
+class DeviceModule(KernelText):
+    """A kernel text compiled by NVRTC; raises CompileError."""
 
-    def __init__(
-        self, name: str, function: Any, params: NDArray[Any], items: int, mailed: bool, arrays: dict[str, Any]
-    ):  # fmt: skip
-        self.name, self.items, self.mailed, self.arrays = name, items, mailed, arrays
-        self._function, self.params = function, params
-        self.text = self.struct = ""  # where it comes from
-        self.types: dict[str, str] = {}  # what its reals are
-        self.fields: list[Argument] = []
-        self.sums = False  # its items sum over lists
-        self._mail = cupy().asarray(params.reshape(1).view(np.uint8)) if mailed else None
+    def __init__(self, path: str, gpu: "Gpu", real: str = "double", cooperative: bool = False, local: str = ""):
+        super().__init__(path, {"real": real, "local": local or real})
+        self.gpu = gpu
+        self._module = cupy().RawModule(
+            code=self.text,
+            options=options(self.types),
+            backend="nvrtc",
+            enable_cooperative_groups=cooperative,
+        )
+
+    def function(self, kernel: str) -> Any:
+        """A kernel by name."""
+        return compiled(f"{self.name}.cu", self._module, kernel)
+
+    def bind(self, kernel: str, n: int, **arguments: Any) -> "DeviceLaunch":
+        """Returns the launch of `kernel` over n items, with the twins of the arrays."""
+        return DeviceLaunch(self, kernel, {"n": n, **arguments})
+
+
+class DeviceLaunch(BoundKernel):
+    """One kernel with its arguments on the device; those of a mailed one lie in device memory. arrays: the twins."""
+
+    def __init__(self, module: DeviceModule, kernel: str, given: dict[str, Any]):
+        super().__init__(module, kernel, given, converts=True)
+        self.params = np.zeros((), dtype=_layout(self.fields))
+        self.arrays: dict[str, Any] = {}
+        for f, value in zip(self.fields, self.values, strict=True):
+            if f.dtype is not None:
+                self.arrays[f.name] = module.gpu.twin(value, keep=not self.mailed, dtype=f.dtype)
+            self.params[f.name] = value if f.dtype is None else self.arrays[f.name].data.ptr
+        self._function = module.function(kernel)
+        self._mail = cupy().asarray(self.params.reshape(1).view(np.uint8)) if self.mailed else None
 
     def __call__(self) -> None:
         """Puts it onto the current stream."""
@@ -140,58 +162,14 @@ class DeviceLaunch:
         return array
 
     @property
-    def domain(self) -> str:
-        """What its items are."""
-        return domain_of(self.text, self.struct)
-
-    @property
     def mail_address(self) -> int:
         """Where the arguments of a mailed launch lie."""
         assert self._mail is not None
         return int(self._mail.data.ptr)
 
 
-class DeviceModule:
-    """A kernel text compiled by NVRTC; raises CompileError."""
-
-    def __init__(self, path: str, gpu: "Gpu", real: str = "double", cooperative: bool = False, local: str = ""):
-        self._gpu = gpu
-        self.name, self._text = read_text(path)
-        self._types = {"real": real, "local": local or real}
-        self._module = cupy().RawModule(
-            code=self._text,
-            options=options(self._types),
-            backend="nvrtc",
-            enable_cooperative_groups=cooperative,
-        )
-
-    def function(self, kernel: str) -> Any:
-        """A kernel by name."""
-        return compiled(f"{self.name}.cu", self._module, kernel)
-
-    def bind(self, kernel: str, n: int, **arguments: Any) -> DeviceLaunch:
-        """As backend.Module.bind, with the twins of the arrays."""
-        fields, struct, form = arguments_of(
-            self._text, kernel, self.name, self._types, {"n": n, **arguments}, converts=True
-        )
-        mailed = form == "MAILED_"
-        params = np.zeros((), dtype=_layout(fields))
-        twins = {}
-        for field, value in fields:
-            if field.dtype is not None:
-                twins[field.name] = self._gpu.twin(value, keep=not mailed, dtype=field.dtype)
-                value = twins[field.name].data.ptr
-            params[field.name] = value
-        launch = DeviceLaunch(f"{self.name}.{kernel}", self.function(kernel), params, n, mailed, twins)
-        launch.text, launch.struct, launch.sums = self._text, struct, form == "SUM_"
-        launch.types = self._types
-        launch.fields = [field for field, _ in fields]
-        return launch
-
-
-def _layout(fields: list[tuple[Argument, Any]]) -> np.dtype:
-    types = {"int": "i4", "double": "f8", "float": "f4"}
-    return np.dtype([(f.name, "u8" if f.dtype is not None else types[f.kind]) for f, _ in fields], align=True)
+def _layout(fields: list[Argument]) -> np.dtype[np.void]:
+    return np.dtype([(f.name, "u8" if f.dtype is not None else NUMBERS[f.kind]) for f in fields], align=True)
 
 
 def own_headers() -> tuple[str, ...]:
