@@ -159,7 +159,7 @@ class FakeScene:
         self.loop = DeviceLoop(
             device, [(2 * k, 2 * k + 2) for k in range(bodies)], np.arange(nodes + 1, dtype=np.int32), 0.5,
             [*boxes, (self.argument.ctypes.data, 8)], self.results, self.stamps, self.clock, records,
-            real, energies=self.energies, **addresses,
+            real, energy_records=self.energies, **addresses,
         )  # fmt: skip
         device.graphs = {7: lambda: self._steps(1), 8: lambda: self._steps(MANY)}
         device.graphs |= {9: lambda: self._steps(1, True), 10: lambda: self._steps(MANY, True)}

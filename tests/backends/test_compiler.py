@@ -344,6 +344,6 @@ def test_elements_of_effects_of_different_numbers_are_not_put_together():
         return SimpleNamespace(name=name, items=items, mailed=mailed)
 
     tetrahedra, springs, also = launch("tetrahedra", 6), launch("springs", 19), launch("also tetrahedra", 6)
-    assert kernel_fusion._alike([tetrahedra, springs, also]) == [[tetrahedra, also], [springs]]  # type: ignore[list-item]
+    assert kernel_fusion._by_items([tetrahedra, springs, also]) == [[tetrahedra, also], [springs]]  # type: ignore[list-item]
     start, touch = launch("start", 5), launch("touch", 2, mailed=True)
-    assert kernel_fusion._alike([start, touch]) == [[start, touch]]  # type: ignore[list-item]
+    assert kernel_fusion._by_items([start, touch]) == [[start, touch]]  # type: ignore[list-item]

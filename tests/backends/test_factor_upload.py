@@ -44,18 +44,18 @@ class Maker:
         self.events: list[Event] = []
         self.fail: Exception | None = None
 
-    def expansion(self, body: int, pattern: SimpleNamespace) -> "Maker":
+    def inverse_builder(self, body: int, pattern: SimpleNamespace) -> "Maker":
         if isinstance(self.fail, ValueError):
             raise self.fail
         return self
 
-    def target(self) -> list[int]:
+    def storage(self) -> list[int]:
         self.targets.append([])
         return self.targets[-1]
 
     spared = None
 
-    def expand(self, values: np.ndarray, target: list[int], multiprocessors: int | None = None) -> PartitionedInverse:
+    def build(self, values: np.ndarray, target: list[int], multiprocessors: int | None = None) -> PartitionedInverse:
         if self.fail:
             raise self.fail
         target[:] = [int(values[0])]
@@ -122,8 +122,8 @@ def test_two_targets_do_and_the_one_in_use_is_never_written_to(parts):
         if value % 3 == 0:
             scene.loop.run(1)
             intake.advance()
-            in_use = intake._tracks[0].in_use
-            assert in_use.target[0] == scene.factor[0] == intake.step(0)
+            in_use = intake._uploads[0].in_use
+            assert in_use.storage[0] == scene.factor[0] == intake.step(0)
     assert len(maker.targets) == 2
 
 
@@ -137,7 +137,7 @@ def test_what_was_launched_with_a_factor_ends_before_its_target_is_written_again
     scene.loop.run(1)
     assert intake.step(0) == 2
     scene.loop.loop.launched += 1  # as if a step were under way
-    track = intake._tracks[0]
+    track = intake._uploads[0]
     track.leaving = (track.in_use, int(scene.loop.loop.launched))
     post(intake, 3)
     assert [t[0] for t in maker.targets] == [1, 2]

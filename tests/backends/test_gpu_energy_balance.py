@@ -10,7 +10,7 @@ import pytest
 
 from sim_server.backends.compiler import HERE, INCLUDE, compiler
 from sim_server.backends.cpu.structs import BALANCE
-from sim_server.backends.gpu.energies import ENERGY_BALANCE, SUMS, chunked
+from sim_server.backends.gpu.energies import ENERGY_BALANCE, SUMS, node_chunks
 from sim_server.backends.gpu.structs import ENERGY_RECORD
 
 G = np.array([0.3, -9.81, 2.0])
@@ -52,7 +52,7 @@ class Bodies:
         self.balance["start"], self.balance["limit"] = 1e6, 1e6
         self.records = np.zeros((4, len(sizes)), ENERGY_RECORD)
         self.step, self.settled_step = np.ones(1, "i8"), np.zeros(len(sizes), "i8")
-        self.chunks = chunked(self.first_node, chunk)
+        self.chunks = node_chunks(self.first_node, chunk)
         self.sums, self.finished_chunks = np.full((len(self.chunks), SUMS), np.nan), np.zeros(len(sizes), "u4")
         self.gravity, self.params = G, np.zeros((), ENERGY_BALANCE)
         names = (

@@ -39,7 +39,7 @@ def expanded(gpu, shape, values, p, multiprocessors=None):
 
     expansion = InverseBuilder(gpu, shape, p)
     target = expansion.target()
-    made = expansion.expand(values, target, multiprocessors)
+    made = expansion.build(values, target, multiprocessors)
     made.event.synchronize()
     assert (made.matrix, made.scale) == (target.matrix.data.ptr, target.scale.data.ptr)
     return target.matrix.get(), target.scale.get()
@@ -94,12 +94,12 @@ def test_fifty_in_a_row_allocate_nothing_and_end_with_the_last(gpu):
     expansion = InverseBuilder(gpu, shape, p)
     larger = InverseBuilder(gpu, other[0], plan(other[0], 132, 1))  # moves the workspace that both use
     targets, large = [expansion.target() for _ in range(3)], larger.target()
-    expansion.expand(first, targets[0])
-    larger.expand(other[1], large)
+    expansion.build(first, targets[0])
+    larger.build(other[1], large)
     pool = gpu.cp.get_default_memory_pool()
     used, held = pool.used_bytes(), pool.total_bytes()
     for k in range(50):
-        made = expansion.expand(second if k % 2 else first, targets[k % 3])
+        made = expansion.build(second if k % 2 else first, targets[k % 3])
     made.event.synchronize()
     assert (pool.used_bytes(), pool.total_bytes()) == (used, held)
     for k in (48, 49):
@@ -114,10 +114,10 @@ def test_another_expansion_may_make_the_workspace_grow(gpu):
     shape, values = factor(SMALL)
     expansion = InverseBuilder(gpu, shape, plan(shape, 16, 2))
     target = expansion.target()
-    expansion.expand(values, target).event.synchronize()
+    expansion.build(values, target).event.synchronize()
     before = target.matrix.get()
     space = expansion._workspace
     space.reserve(space.memory.nbytes + 1024, space.incoming.nbytes + 1024)
     target.matrix.fill(0)
-    expansion.expand(values, target).event.synchronize()
+    expansion.build(values, target).event.synchronize()
     assert np.array_equal(target.matrix.get(), before)

@@ -368,7 +368,7 @@ def test_rounding_of_single_precision_ends_the_search(precision):
 
 def test_a_step_with_one_linearization_has_nothing_of_it():
     engine = Simulation(scene(MODELS["corotational"](), gravity=GRAVITY, **TIGHT), "gpu").engine
-    assert engine._search is None and engine.solver._turns == () and not engine.loop.found
+    assert engine._newton is None and engine.solver._phases == () and not engine.loop.newton_results
     assert all(engine.loop.graphs)
 
 

@@ -160,7 +160,7 @@ def by_tasks(layout: WorkspaceLayout, values: NDArray, plan: Plan) -> tuple[NDAr
     """Chunks in float64 and scale as build_inverse.cu makes them, task by task. NaN where nobody writes."""
     chunks, scale = np.full((plan.chunks, ROWS, COLUMNS), np.nan), np.zeros(plan.size + 1)
     for batch in layout.batches:
-        memory = np.full(layout.room // 4, np.nan)
+        memory = np.full(layout.size // 4, np.nan)
         memory[: batch.cleared // 4] = 0
         for column in layout.columns[batch.first : batch.last]:
             part = layout.parts[column["part"]]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from precond_worker.factorization.factorize import Analysis
 from protocol.factor import FactorPattern
-from sim_server.backends.gpu.inverse.expansion_batches import layout
+from sim_server.backends.gpu.inverse.expansion_batches import workspace_layout
 from sim_server.backends.gpu.inverse.partition import tree_of
 from sim_server.backends.gpu.inverse.plan import FORM, GATHER, READ, WRITE, Plan, lay_out, plan
 from tests.reference.partitioned import Application, by_tasks, stored
@@ -201,7 +201,7 @@ def test_it_solves_on_any_graph(nodes, data):
     p = lay_out(tree_of(s.pattern), thresholds, data.draw(st.sampled_from((1, 2, 7, 132))))
     assert error(s, p, np.float64) < 1e-11
     chunks, scale = stored(s.pattern, s.factor, p)
-    made, lengths = by_tasks(layout(s.pattern, p, data.draw(st.sampled_from((1000, 100000)))), s.factor, p)
+    made, lengths = by_tasks(workspace_layout(s.pattern, p, data.draw(st.sampled_from((1000, 100000)))), s.factor, p)
     assert np.abs(made - chunks).max() < 1e-12 and np.abs(lengths - scale).max() < 1e-12
 
 
@@ -210,9 +210,9 @@ def test_the_tasks_of_the_kernels_make_the_matrices_of_the_plan():
     s = system(GRAPHS["long bar with a fixed end"])
     for groups, room in itertools.product((1, 2, 3), (1000, 1 << 28)):
         p = plan(s.pattern, 3, groups)
-        exact, made = stored(s.pattern, s.factor, p), by_tasks(layout(s.pattern, p, room), s.factor, p)
+        exact, made = stored(s.pattern, s.factor, p), by_tasks(workspace_layout(s.pattern, p, room), s.factor, p)
         assert np.abs(made[0] - exact[0]).max() < 1e-12 and np.abs(made[1] - exact[1]).max() < 1e-12
-        assert (room > 1000) == (len(layout(s.pattern, p, room).batches) == 1)
+        assert (room > 1000) == (len(workspace_layout(s.pattern, p, room).batches) == 1)
 
 
 def test_a_pattern_without_whole_nodes_is_refused():

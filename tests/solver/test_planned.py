@@ -11,7 +11,7 @@ from sim_server.backends.gpu.inverse import plan as plans
 from sim_server.backends.gpu.inverse.device_plan import DevicePlan
 from sim_server.backends.gpu.inverse.partition import tree_of
 from sim_server.backends.gpu.inverse.plan import lay_out, plan
-from sim_server.backends.gpu.row_partition import assign_blocks, assignment, busiest, halo, initial_ranges
+from sim_server.backends.gpu.row_partition import assign_blocks, best_assignment, busiest, halo, initial_ranges
 from tests.reference.partitioned import stored
 from tests.solver.test_partitioned_inverse import GRAPHS, graphs, system
 
@@ -104,17 +104,17 @@ def test_tiles_of_one_warp_each_and_of_several():
 
 
 def test_thread_blocks_are_shared_out_by_size():
-    few = assignment(np.array([4840, 720, 160]), 124)
+    few = assign_blocks(np.array([4840, 720, 160]), 124)
     assert few.pooled == 0 and few.blocks.sum() <= 124 and (few.blocks >= 1).all()
     assert few.blocks[0] > few.blocks[1] > few.blocks[2]
     assert few.first.tolist() == [0, few.blocks[0], few.blocks[0] + few.blocks[1]]
-    many = assignment(np.r_[np.full(300, 160), 20000], 124)
+    many = assign_blocks(np.r_[np.full(300, 160), 20000], 124)
     assert many.pooled == 300 and many.order[0] == 300 and many.blocks[300] > 8
     assert many.blocks[300] < 124, "some are left for the others"
-    alike = assignment(np.full(1024, 720), 248)
+    alike = assign_blocks(np.full(1024, 720), 248)
     assert alike.pooled == 1024 and (alike.first == -1).all()
-    assert assignment(np.full(16, 720), 124).blocks.tolist() == [7] * 16, "an eighth for some would help nobody"
-    assert assignment(np.array([4, 4]), 124).blocks.tolist() == [1, 1]
+    assert assign_blocks(np.full(16, 720), 124).blocks.tolist() == [7] * 16, "an eighth for some would help nobody"
+    assert assign_blocks(np.array([4, 4]), 124).blocks.tolist() == [1, 1]
 
 
 @pytest.mark.parametrize(
@@ -122,9 +122,9 @@ def test_thread_blocks_are_shared_out_by_size():
 )
 def test_multiprocessors_are_spared_unless_others_would_idle(bodies, blocks, spared):
     nodes = np.full(bodies, 720)
-    contributed, grid = assign_blocks(nodes, 132, blocks)
+    contributed, grid = best_assignment(nodes, 132, blocks)
     assert grid == blocks * (132 - spared)
-    assert busiest(nodes, contributed, grid) <= busiest(nodes, assignment(nodes, blocks * 124), blocks * 124)
+    assert busiest(nodes, contributed, grid) <= busiest(nodes, assign_blocks(nodes, blocks * 124), blocks * 124)
 
 
 @pytest.mark.parametrize("counts", [[1], [3], [7, 2]])
@@ -147,6 +147,6 @@ def test_each_thread_block_knows_the_nodes_that_its_rows_read(counts):
         assert (nodes[seen.local[blocks]] == columns[blocks]).all()
         rows += row_range["own"]
     assert rows == offset[-1]
-    contributed = assignment(np.array(sizes), 12)
+    contributed = assign_blocks(np.array(sizes), 12)
     table = initial_ranges(contributed, halo(ranges, contributed.blocks, row_start, columns), 12)
     assert sorted(table[table >= 0].tolist()) == list(range(contributed.blocks.sum()))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The GPU as the native loop sees it: CuPy's memory, streams and context, and the driver's functions by address."""
+"""The CUDA device as the native GPU loop uses it: memory, streams and context of CuPy, functions of the driver."""
 
 import ctypes as c
 from typing import Any
@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_server.backends.gpu import structs
+from sim_server.backends.gpu.cupy_types import DeviceArray, Event, Pointer, Stream
 from sim_server.errors import DeviceError
 
 FUNCTIONS = {
@@ -18,7 +19,11 @@ FUNCTIONS = {
 
 
 class CudaDevice:
-    """loop.LoopDevice on the current CUDA device. Raises DeviceError if the driver lacks a function."""
+    """Implements loop.LoopDevice on the current CUDA device.
+
+    step_stream: stream of the steps. copy_stream: stream of copies to the host.
+    Raises DeviceError if the driver lacks a function.
+    """
 
     def __init__(self, cp: Any):
         self.cp = cp
@@ -28,17 +33,17 @@ class CudaDevice:
         except (OSError, AttributeError) as error:
             raise DeviceError(f"--device gpu: the NVIDIA driver is too old or not there: {error}") from error
         self.functions = structs.CudaDriver(**{name: c.cast(f, c.c_void_p) for name, f in found.items()})
-        cp.cuda.runtime.free(0)  # makes CuPy's context the thread's
+        cp.cuda.runtime.free(0)  # makes CuPy's context current in this thread
         context = c.c_void_p()
         self._driver.cuCtxGetCurrent(c.byref(context))
         self.context = context.value or 0
-        self.steps = cp.cuda.Stream(non_blocking=True, priority=-5)
-        self.home = cp.cuda.Stream(non_blocking=True, priority=-5)
-        self.stream, self.copies = self.steps.ptr, self.home.ptr
-        self._kept: list[Any] = []
+        self.step_stream: Stream = cp.cuda.Stream(non_blocking=True, priority=-5)
+        self.copy_stream: Stream = cp.cuda.Stream(non_blocking=True, priority=-5)
+        self.stream, self.copies = self.step_stream.ptr, self.copy_stream.ptr
+        self._kept: list[Pointer | DeviceArray | Event] = []
 
     def pinned(self, size: int) -> NDArray[np.uint8]:
-        """Page-locked host memory, zero."""
+        """Allocates page-locked host memory, set to zero."""
         memory = self.cp.cuda.alloc_pinned_memory(size)
         self._kept.append(memory)
         array = np.frombuffer(memory, np.uint8, size)
@@ -46,20 +51,20 @@ class CudaDevice:
         return array
 
     def memory(self, size: int) -> int:
-        """Device memory, zero, there when this returns."""
-        array = self.cp.zeros(size, np.uint8)
+        """Allocates device memory and returns its address once it is set to zero."""
+        array: DeviceArray = self.cp.zeros(size, np.uint8)
         self.cp.cuda.get_current_stream().synchronize()
         self._kept.append(array)
         return int(array.data.ptr)
 
     def event(self) -> int:
-        """An event whose waiter sleeps."""
-        event = self.cp.cuda.Event(block=True, disable_timing=True)
+        """Creates an event; a thread that waits for it sleeps."""
+        event: Event = self.cp.cuda.Event(block=True, disable_timing=True)
         self._kept.append(event)
         return int(event.ptr)
 
     def error(self, code: int) -> str:
-        """Name and text of a driver error."""
+        """Returns text and number of a driver error."""
         text = c.c_char_p()
         self._driver.cuGetErrorString(code, c.byref(text))
         return f"{(text.value or b'unknown').decode()} (CUDA error {code})"

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The energy of bodies on a GPU: its memory, the elastic energy on demand, and the start that all is reckoned from.
+"""Energy balance of bodies on a GPU: memory, launches, and the initial energy.
 
-Everything but the elastic energy is summed up after each step, by thread blocks of the first kernel of the next one
-(energy_balance.cu).
+All but the elastic energy is summed after each step by thread blocks of the first kernel of the next step
+(energy_balance.cu); the elastic energy is evaluated on demand (elastic_energy.cu).
 """
 
 from typing import Any
@@ -10,18 +10,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_server.arrays import Float64, Int32
 from sim_server.backends.compiler import HERE
 from sim_server.backends.cpu.structs import BALANCE
-from sim_server.backends.gpu.device import Gpu, compiled, options, own_headers
+from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction
+from sim_server.backends.gpu.device import DeviceLaunch, Gpu, compiled, options, own_headers
 from sim_server.backends.gpu.kernel_fusion import Prologue
 from sim_server.backends.gpu.mailbox import library
 from sim_server.backends.gpu.structs import ENERGY_RECORD
 from sim_server.mechanics.energy import CODES, Energies
 
 THREADS = 128  # of a thread block of elastic_energy.cu
-NODES = 128  # that a thread block sums over
-STILL = 5  # arrays that are 0 in a body at rest, at most
-SUMS = 10  # double numbers in Sums (kernels/energy_balance.cuh)
+NODES = 128  # nodes that a thread block sums over
+STILL = 5  # most arrays that are 0 in a body at rest (energy_balance.cu)
+SUMS = 10  # numbers in the struct Sums (kernels/energy_balance.cuh)
 ENERGY_BALANCE = np.dtype(
     [(n, "u8") for n in ("first_node", "chunks", "sums", "finished_chunks", "mass", "before", "x", "v")]
     + [("still", "u8", STILL)]
@@ -46,18 +48,18 @@ class DeviceEnergies:
     threads: of these thread blocks; the order of summation depends on it
     """
 
-    def __init__(self, gpu: Gpu, energies: Energies, records: NDArray[np.uint8], counter: Any, dt: float):
+    def __init__(self, gpu: Gpu, energies: Energies, records: NDArray[np.uint8], counter: DeviceArray, dt: float):
         self._gpu, self._energies, self._dt, self._counter = gpu, energies, dt, counter
         cp, world = gpu.cp, energies.world
         starts = np.array([*(b.first for b in world.bodies), world.nodes], np.int32)
         self._bodies, self._capacity = len(world.bodies), records.nbytes // ENERGY_RECORD.itemsize // len(world.bodies)
         self.threads, self.started = THREADS, False
-        chunk = chunked(starts, NODES)
+        chunks = node_chunks(starts, NODES)
         self._balance = cp.asarray(np.frombuffer(energies.balance.tobytes(), np.uint8))
         self._settled, self._sum = cp.zeros(self._bodies, np.int64), cp.zeros(self._bodies)
-        self._memory: dict[str, Any] = {
-            "first_node": cp.asarray(starts), "chunks": cp.asarray(chunk.view(np.int32)),
-            "sums": cp.zeros((len(chunk), SUMS)), "finished_chunks": cp.zeros(self._bodies, np.uint32),
+        self._memory: dict[str, DeviceArray] = {
+            "first_node": cp.asarray(starts), "chunks": cp.asarray(chunks.view(np.int32)),
+            "sums": cp.zeros((len(chunks), SUMS)), "finished_chunks": cp.zeros(self._bodies, np.uint32),
             "mass": gpu.twin(world.mass), "free": gpu.twin(world.free), "before": gpu.twin(energies.before),
             "x": gpu.twin(world.x), "v": gpu.twin(world.v), "gravity": gpu.twin(energies.gravity),
             "balance": self._balance, "step": counter, "settled_step": self._settled,
@@ -73,22 +75,20 @@ class DeviceEnergies:
         self._params["records"], self._params["capacity"] = records.ctypes.data, self._capacity
         self._params["bodies"], self._params["inertia"] = self._bodies, world.inertia
         self._params["on_runaway"] = CODES[energies.on_runaway]
-        self.prologue = Prologue(text("energy_balance"), "EnergyBalance", "balance_energy", self._params, len(chunk))
-        self._account, self._add = (
-            self._function(*names)
-            for names in (("energy_balance", "energy_balance"), ("elastic_energy", "elastic_energy"))
-        )
+        self.prologue = Prologue(text("energy_balance"), "EnergyBalance", "balance_energy", self._params, len(chunks))
+        self._balance_kernel, self._elastic_kernel = self._kernel("energy_balance"), self._kernel("elastic_energy")
         self._launches = self._elastic(records)
 
-    def _function(self, name: str, kernel: str) -> Any:
+    def _kernel(self, name: str) -> KernelFunction:
+        """Compiles the kernel `name` of the text <name>.cu."""
         module = self._gpu.cp.RawModule(
             code=text(name), options=(*options(self._gpu.types), *own_headers()),
             backend="nvrtc",
         )  # fmt: skip
-        return compiled(f"{name}.cu", module, kernel)
+        return compiled(f"{name}.cu", module, name)
 
-    def _elastic(self, records: NDArray[np.uint8]) -> list[tuple[Any, Any, NDArray[Any]]]:
-        """(what evaluates the energies of the elements, its array, arguments of the sums over them) for each effect."""
+    def _elastic(self, records: NDArray[np.uint8]) -> list[tuple[DeviceLaunch | None, DeviceArray, NDArray[Any]]]:
+        """Returns per effect the launch that evaluates the element energies, their array, and arguments of the sum."""
         cp = self._gpu.cp
         found = [(e.launch, e.launch.arrays["energy"], self._energies.parts(e)) for e in self._energies.elastic]
         found = found or [(None, cp.zeros(1), np.zeros(self._bodies + 1, np.int32))]
@@ -102,21 +102,21 @@ class DeviceEnergies:
             made.append((launch, array, params))
         return made
 
-    def account(self) -> None:
-        """Puts the account of the last step onto the current stream; one that is settled already is left alone."""
-        self._account((self.prologue.blocks,), (self.threads,), (self._params,))
+    def launch_balance(self) -> None:
+        """Launches the energy balance of the last step; does nothing on the device if it was settled before."""
+        self._balance_kernel((self.prologue.blocks,), (self.threads,), (self._params,))
 
-    def elastic(self) -> None:
-        """Puts the evaluation of the elastic energy of the last step, which is settled, onto the current stream."""
+    def launch_elastic(self) -> None:
+        """Launches the evaluation of the elastic energy of the last step, which is settled."""
         for launch, _, params in self._launches:
             if launch is not None:
                 launch()
-            self._add((self._bodies,), (THREADS,), (params,))
+            self._elastic_kernel((self._bodies,), (THREADS,), (params,))
 
     def start(self) -> None:
-        """Reckons from the state that is on the device now, before the first step."""
+        """Takes the state on the device as the initial state of the balance."""
         e, w = self._energies, self._energies.world
-        self.elastic()
+        self.launch_elastic()
         self._settled[:] = self._counter
         x, v = (self._gpu.twin(array).get().astype(float) for array in (w.x, w.v))
         balance = np.frombuffer(self._balance.get().tobytes(), BALANCE).copy()
@@ -129,8 +129,8 @@ class DeviceEnergies:
         self.started = True
 
 
-def chunked(starts: NDArray[np.int32], nodes: int) -> NDArray[Any]:
-    """The nodes of bodies in chunks of so many (NODE_CHUNK). starts: (bodies + 1,) node of each body."""
+def node_chunks(starts: Int32, nodes: int) -> NDArray[Any]:
+    """Returns chunks (NODE_CHUNK) of at most `nodes` nodes. starts: (bodies + 1,), first node of each body."""
     counts = -(-np.diff(starts) // nodes)
     chunks = np.zeros(counts.sum(), NODE_CHUNK)
     body = chunks["body"] = np.repeat(np.arange(len(counts)), counts)
@@ -141,14 +141,17 @@ def chunked(starts: NDArray[np.int32], nodes: int) -> NDArray[Any]:
 
 
 def text(name: str) -> str:
-    """Of gpu/<name>.cu."""
+    """Returns the text of <name>.cu in this folder."""
     return (HERE / f"backends/gpu/{name}.cu").read_text()
 
 
 def start_sums(
-    mass: NDArray[np.float64], x: NDArray[np.float64], v: NDArray[np.float64], gravity: NDArray[np.float64], dt: float
-) -> NDArray[np.float64]:
-    """Kinetic energy and that of gravity [J], the largest difference of dt v along an axis and the diagonal [m]."""
+    mass: Float64, x: Float64, v: Float64, gravity: Float64, dt: float
+) -> Float64:  # fmt: skip
+    """Returns kinetic and potential energy [J], the largest difference of dt v along an axis [m], the diagonal [m].
+
+    mass: (n,) [kg]. x, v: (n, 3) [m], [m/s]. gravity: (3,) [m/s2]. dt [s].
+    """
     stride = float(dt * np.ptp(v, axis=0).max())
     diagonal = float(np.linalg.norm(np.ptp(x, axis=0)))
     return np.array([0.5 * mass @ (v**2).sum(axis=1), -mass @ (x @ gravity), stride, diagonal])

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""The simulation loop on a GPU: the same face as engine.Engine, on one CUDA graph per step.
+"""The engine of a GPU: one CUDA graph per step.
 
-A step is a graph of the scene's launches with the persistent solver among them; the stop test of the iteration is on
-the device, so the native loop (loop.cpp) only launches graphs, moves mail and reads results. What is here captures the
-graphs and puts settings, factors, arguments and requests into mailboxes.
+The graph holds the launches of the scene and the persistent solver, whose stop test is on the device. The native loop
+(loop.cpp) launches graphs, copies mail to the device and reads results. This module captures the graphs and posts
+settings, factors and arguments.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,17 +17,18 @@ from sim_server.arrays import Float64
 from sim_server.backends.base import Capability, EngineInput, Launch
 from sim_server.backends.compiler import HERE
 from sim_server.backends.gpu.cuda import CudaDevice
+from sim_server.backends.gpu.cupy_types import DeviceArray, Graph
 from sim_server.backends.gpu.device import DeviceLaunch, Gpu
 from sim_server.backends.gpu.energies import DeviceEnergies
 from sim_server.backends.gpu.factor_upload import FactorUpload
-from sim_server.backends.gpu.kernel_fusion import DOMAINS, Epilogue, FusedKernel, domain, fused
+from sim_server.backends.gpu.kernel_fusion import DOMAINS, Epilogue, FusedKernel, domain, fuse
 from sim_server.backends.gpu.loop import CAPACITY, MANY, DeviceLoop
 from sim_server.backends.gpu.mailbox import DeviceMailbox
 from sim_server.backends.gpu.newton import NewtonIteration, NewtonPhases
 from sim_server.backends.gpu.solver import PCG_BODY, PCG_RESULT, SETTINGS_BYTES, PcgSolver
 from sim_server.backends.gpu.structs import ENERGY_RECORD, NEWTON_RESULT, STEP_TIMESTAMP, Mail
 
-FEW = 16  # trials in a step up to which MANY steps make one graph
+FEW = 16  # largest number of trials in a step for which MANY steps are captured in one graph
 STEP_EPILOGUE = np.dtype(
     [
         ("clock", "u8"), ("step", "u8"), ("dt", "f8"), ("pool_counters", "u8"), ("finished_blocks", "u8"),
@@ -38,7 +39,7 @@ STEP_EPILOGUE = np.dtype(
 
 
 class DeviceSettings:
-    """Solver settings of a body; what is set holds from its next batch on."""
+    """Solver settings of a body. An attribute that is set is valid from the next batch on."""
 
     def __init__(self, row: NDArray[Any], mailbox: DeviceMailbox):
         object.__setattr__(self, "_row", row)
@@ -55,7 +56,13 @@ class DeviceSettings:
 
 
 class GpuEngine(DeviceLoop):
-    """The loop over one system. records: number of them that the ring holds. Raises what Gpu.building translates."""
+    """Runs the steps of a scene on a GPU.
+
+    given: what the scene gives an engine (base.EngineInput)
+    records: capacity of the ring of records
+
+    Raises errors that device.building translates, for lack of memory.
+    """
 
     capabilities: frozenset[Capability] = frozenset()
 
@@ -66,61 +73,60 @@ class GpuEngine(DeviceLoop):
         self.gpu, self.launches, self._arrays = gpu, [*assemble, *integrate], arrays
         cp, bodies = gpu.cp, len(ranges)
         device = CudaDevice(cp)
-        self._steps = device.steps
-        self._counter = cp.zeros(1, np.int64)
-        self._stamps = device.pinned(CAPACITY * STEP_TIMESTAMP.itemsize)
+        self._steps = device.step_stream
+        self._counter: DeviceArray = cp.zeros(1, np.int64)  # completed steps
+        self._timestamps = device.pinned(CAPACITY * STEP_TIMESTAMP.itemsize)
         self._results = device.pinned(CAPACITY * PCG_RESULT.itemsize * bodies)
-        told = device.pinned(CAPACITY * ENERGY_RECORD.itemsize * bodies)
-        self._energies = DeviceEnergies(gpu, given.energies, told, self._counter, dt)
-        self._fused = self._beginning(assemble)
-        phases = NewtonPhases.of(gpu, bodies) if newton else None
+        energy_records = device.pinned(CAPACITY * ENERGY_RECORD.itemsize * bodies)
+        self._energies = DeviceEnergies(gpu, given.energies, energy_records, self._counter, dt)
+        self._first_launches = self._beginning(assemble)
+        phases = NewtonPhases.initial(gpu, bodies) if newton else None
         self.solver = PcgSolver(gpu, ranges, arrays, self._counter, CAPACITY, planes, phases or ())
-        self._search, found = None, None
+        self._newton, newton_results = None, None
         if newton and phases:
-            found = device.pinned(CAPACITY * NEWTON_RESULT.itemsize * bodies)
-            self._search = NewtonIteration(gpu, newton, assemble, ranges, arrays, phases, self.solver, found)
+            newton_results = device.pinned(CAPACITY * NEWTON_RESULT.itemsize * bodies)
+            self._newton = NewtonIteration(gpu, newton, assemble, ranges, arrays, phases, self.solver, newton_results)
         row, first = PCG_BODY.itemsize, self.solver.bodies_device
-        boxes = [(first + row * k, SETTINGS_BYTES) for k in range(bodies)]
-        boxes += [(first + row * k + SETTINGS_BYTES, row - SETTINGS_BYTES) for k in range(bodies)]
-        self._mailed = {k: len(boxes) + i for i, k in enumerate(k for k, x in enumerate(self.launches) if x.mailed)}
-        boxes += [(self.launches[k].mail_address, self.launches[k].params.nbytes) for k in self._mailed]
+        mailboxes = [(first + row * k, SETTINGS_BYTES) for k in range(bodies)]
+        mailboxes += [(first + row * k + SETTINGS_BYTES, row - SETTINGS_BYTES) for k in range(bodies)]
+        self._mailed = {k: len(mailboxes) + i for i, k in enumerate(k for k, x in enumerate(self.launches) if x.mailed)}
+        mailboxes += [(self.launches[k].mail_address, self.launches[k].params.nbytes) for k in self._mailed]
         twins = {name: gpu.twin(arrays[name]) for name in ("values", "x", "v")}
         addresses = {name: int(twin.data.ptr) for name, twin in twins.items()}
-        if self._search:
-            addresses["values"] = int(self._search.first_values.data.ptr)
+        if self._newton:
+            addresses["values"] = int(self._newton.first_values.data.ptr)
         super().__init__(
-            device, ranges, arrays["row_start"], dt, boxes, self._results, self._stamps, arrays["clock"],
-            records, twins["values"].dtype, found, told, **addresses,
+            device, ranges, arrays["row_start"], dt, mailboxes, self._results, self._timestamps, arrays["clock"],
+            records, twins["values"].dtype, newton_results, energy_records, **addresses,
         )  # fmt: skip
-        self._intake = FactorUpload(gpu, self.solver, self, given.names, self.mailboxes[bodies : 2 * bodies])
+        self._factor_upload = FactorUpload(gpu, self.solver, self, given.names, self.mailboxes[bodies : 2 * bodies])
         for k in range(bodies):
             whole = self.solver.bodies[k : k + 1].tobytes()
             self.mailboxes[k].post(whole[:SETTINGS_BYTES])
             self.mailboxes[bodies + k].post(whole[SETTINGS_BYTES:])
-        self.begin: Sequence[Launch] = ()  # before the first step
-        self._graphs: list[Any] = []
-        self._epilogue = self._end_of_step(dt)
-        self._last = FusedKernel(
-            integrate,
-            Epilogue(
-                (HERE / "backends/gpu/step_epilogue.cu").read_text(), "StepEpilogue", "finish_step", self._epilogue
-            ),
-        )
-        self._stamp = self._last.function("stamp")
+        self.begin: Sequence[Launch] = ()  # launches before the first step
+        self._graphs: list[Graph | None] = []
+        self._epilogue = self._epilogue_params(dt)
+        epilogue = (HERE / "backends/gpu/step_epilogue.cu").read_text()
+        self._integrate = FusedKernel(
+            integrate, Epilogue(epilogue, "StepEpilogue", "finish_step", self._epilogue)
+        )  # fmt: skip
+        self._stamp_begin = self._integrate.function("stamp_begin")
         self._capture()
-        cp.cuda.get_current_stream().synchronize()  # what was made until now is there for the loop's streams
+        cp.cuda.get_current_stream().synchronize()  # arrays are complete for the streams of the loop
 
-    def _end_of_step(self, dt: float) -> NDArray[Any]:
-        self._finished = self.gpu.cp.zeros(1, np.uint32)
+    def _epilogue_params(self, dt: float) -> NDArray[Any]:
+        """Returns the arguments of step_epilogue.cu."""
+        self._finished_blocks: DeviceArray = self.gpu.cp.zeros(1, np.uint32)
         params = np.zeros((), STEP_EPILOGUE)
         arrays = {
             "clock": self.gpu.twin(self._arrays["clock"]), "step": self._counter,
-            "pool_counters": self.solver.pool_counter, "finished_blocks": self._finished,
+            "pool_counters": self.solver.pool_counter, "finished_blocks": self._finished_blocks,
             "results": self.solver.results, "moving": self.gpu.twin(self._arrays["moving"]),
         }  # fmt: skip
         for name, array in arrays.items():
             params[name] = array.data.ptr
-        params["timestamps"], params["host_results"] = self._stamps.ctypes.data, self._results.ctypes.data
+        params["timestamps"], params["host_results"] = self._timestamps.ctypes.data, self._results.ctypes.data
         params["dt"], params["counters"], params["capacity"] = dt, len(self.solver.pool_counter), CAPACITY
         params["result_words"], params["bodies"] = len(self._ranges) * PCG_RESULT.itemsize // 8, len(self._ranges)
         return params
@@ -128,12 +134,12 @@ class GpuEngine(DeviceLoop):
     # --- running ------------------------------------------------------------------------------------------------
 
     def run(self, steps: int) -> int:
-        self._intake.advance()
+        self._factor_upload.advance()
         self._make_ready()
         return super().run(steps)
 
     def _make_ready(self) -> None:
-        """What a scheme makes of the state before the first step, and the energy that it has."""
+        """Runs the launches before the first step, and takes the initial state of the energy balance."""
         begins = bool(self.begin) and self.step == 0
         if begins:
             for launch in self.begin:
@@ -145,11 +151,12 @@ class GpuEngine(DeviceLoop):
             self.gpu.cp.cuda.get_current_stream().synchronize()
 
     def restart_energy(self) -> None:
-        """Has energy reckoned from the state at the beginning of the next step: for those who have set x or v."""
+        """Restarts the energy balance from the state at the beginning of the next step, after x or v were set."""
         self._energies.started = False
 
     def _capture(self) -> None:
-        many = self._search is None or self._search.rounds <= FEW
+        """Captures the graphs of the steps and of the energies."""
+        many = self._newton is None or self._newton.rounds <= FEW
         for begin in (False, True):
             for steps in (1, MANY):
                 if steps > 1 and not many:
@@ -162,61 +169,63 @@ class GpuEngine(DeviceLoop):
                     for _ in range(steps):
                         self._one_step()
                     self._graphs.append(self._steps.end_capture())
-        others = [self._captured(self._energies.account), self._captured(self._energies.elastic)]
+        others = [self._captured(self._energies.launch_balance), self._captured(self._energies.launch_elastic)]
         handles = [int(graph.graphExec) if graph else 0 for graph in self._graphs]
         self.use_graphs(handles, *(int(graph.graphExec) for graph in others))
-        self._graphs += others  # they live as long
+        self._graphs += others  # kept as long as the engine
 
-    def _captured(self, launch: Callable[[], None]) -> Any:
-        """The graph of what `launch` puts onto a stream."""
+    def _captured(self, launch: Callable[[], None]) -> Graph:
+        """Returns the graph of the work that `launch` appends to the stream."""
         with self._steps:
             self._steps.begin_capture()
             launch()
             return self._steps.end_capture()
 
     def _begin(self) -> None:
-        """Notes the time: the device has had nothing to do until now."""
-        self._stamp((1,), (1,), (self._epilogue,))
+        """Launches the kernel that writes the time at which the step begins, for an idle device."""
+        self._stamp_begin((1,), (1,), (self._epilogue,))
 
-    def _beginning(self, assemble: Sequence[DeviceLaunch]) -> list[Callable[[], None]]:
-        """What a step begins with: the account of the one before, and the assembly.
+    def _beginning(self, assemble: Sequence[DeviceLaunch]) -> Sequence[Callable[[], None]]:
+        """Fuses the assembly with the energy balance of the step before.
 
-        The account is part of a kernel over elements, since such kernels write nothing that it reads. What they make of
-        a body that is frozen meanwhile does not count: its nodes are fixed.
+        The balance is the prologue of a kernel over elements, since these write nothing that it reads. If it freezes a
+        body meanwhile, the element results of this body do not matter, since its nodes are fixed then.
         """
         domains = {domain(launch) for launch in assemble}
         elements = "elements" in domains and domains <= set(DOMAINS)
-        launches = fused(assemble, first=self._energies.prologue if elements else None)
+        launches = fuse(assemble, prologue=self._energies.prologue if elements else None)
         if not elements:
-            return [self._energies.account, *launches]
-        self._energies.threads = launches[0].shape.threads
+            return [self._energies.launch_balance, *launches]
+        first = launches[0]
+        assert isinstance(first, FusedKernel)
+        self._energies.threads = first.shape.threads
         return launches
 
     def _one_step(self) -> None:
-        """Everything a step puts onto the stream."""
-        for launch in self._fused:
+        """Appends a whole step to the stream."""
+        for launch in self._first_launches:
             launch()
         self._finish_step()
 
     def _finish_step(self) -> None:
-        """Solve, integrate, count."""
-        (self._search or self.solver).launch()
-        self._last()
+        """Appends solve, integration and epilogue."""
+        (self._newton or self.solver).launch()
+        self._integrate()
 
     def assemble(self) -> None:
-        """First half of one step: the system matrix, which the host has then too."""
+        """Runs the first half of one step, and copies the system matrix to the host."""
         self._make_ready()
         self._open()
         with self._steps:
             self._begin()
-            for launch in self._fused:
+            for launch in self._first_launches:
                 launch()
             values = self._arrays["values"]
             values[...] = self.gpu.twin(values).get(stream=self._steps)
 
     def solve(self) -> None:
-        """Second half: solve, integrate, report."""
-        self._intake.settle()
+        """Runs the second half: solve, integration, records."""
+        self._factor_upload.settle()
         self._renew()
         with self._steps:
             self._finish_step()
@@ -225,24 +234,24 @@ class GpuEngine(DeviceLoop):
     # --- mailboxes ----------------------------------------------------------------------------------------------
 
     def settings(self, body: int) -> DeviceSettings:
-        """Solver settings of a body."""
+        """Returns the solver settings of a body."""
         row = self.solver.bodies[body : body + 1].reshape(())
         return DeviceSettings(row, self.mailboxes[body])
 
     def post_factor(self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int) -> None:
-        """Has L expanded beside the steps; taken up between batches once that is done."""
-        self._intake.post(body, pattern, values, step)
+        """Builds the inverse of a factor beside the steps; it is used from the first batch after its completion on."""
+        self._factor_upload.post(body, pattern, values, step)
 
     def settle_factors(self) -> None:
-        """Sees to it that the next solve uses what was posted: waits until it is expanded (deterministic policies)."""
-        self._intake.settle()
+        """Blocks until the next solve will use the posted factors (deterministic policies)."""
+        self._factor_upload.settle()
 
     def factor_step(self, body: int) -> int:
-        """Step of the factor in use, -1 without one."""
-        return self._intake.step(body)
+        """Returns the step of the factor in use, -1 without one."""
+        return self._factor_upload.step(body)
 
     def factor_bytes(self, body: int) -> int:
-        """Of the inverse that an application reads."""
+        """Returns the bytes of the inverse that one application reads."""
         return self.solver.factor_bytes(body)
 
     def correct(self, body: int, nodes: int, diagonal: Float64, double: bool = False) -> None:
@@ -250,12 +259,14 @@ class GpuEngine(DeviceLoop):
         raise NotImplementedError
 
     def replace(self, launch: int, new: Launch) -> Mail:
-        """Gives a mailed launch other arguments, from the next batch on: its first step is the one after the result's
-        `taken` steps, once it is not below 0."""
-        self.gpu.cp.cuda.get_current_stream().synchronize()  # its arrays are on the device
+        """Replaces the arguments of a mailed launch from the next batch on.
+
+        Its first step is the one after the result's `taken` steps, once that is not below 0.
+        """
+        self.gpu.cp.cuda.get_current_stream().synchronize()  # its arrays are complete
         return self.mailboxes[self._mailed[launch]].post(cast(DeviceLaunch, new).params.tobytes(), keep=new)
 
     def records(self) -> NDArray[Any]:
-        """New records since the last call, oldest first; also begins factors that have waited for room."""
-        self._intake.advance()
+        """Returns the records since the last call, oldest first; also begins to build inverses that were queued."""
+        self._factor_upload.advance()
         return super().records()

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Factors on their way into the GPU loop: expanded beside the steps, then posted into the body's mailbox.
+"""Upload of factors: a partitioned inverse is built beside the steps, then posted into the mailbox of the body.
 
-Per body and pattern there are two targets, front and back: an expansion begins when the one before it is in use and
-nothing under way reads the other target any more. A factor that comes earlier waits, and a newer one takes its place.
+Each body has two storages per pattern (double buffering). A build begins once the inverse before it is in use and no
+step under way reads the other storage. A factor that arrives earlier is queued; a newer one replaces it.
 """
 
 import logging
@@ -16,144 +16,158 @@ from numpy.typing import NDArray
 from protocol.factor import FactorPattern
 from sim_server.backends.compiler import CompileError
 from sim_server.backends.gpu.device import Gpu, no_memory_left
+from sim_server.backends.gpu.inverse.build_inverse import InverseStorage, PartitionedInverse
 from sim_server.backends.gpu.loop import DeviceLoop
 from sim_server.backends.gpu.mailbox import DeviceMailbox
-from sim_server.backends.gpu.solver import SETTINGS_BYTES
+from sim_server.backends.gpu.solver import SETTINGS_BYTES, PcgSolver
 
 log = logging.getLogger(__name__)
 
-MAX_PATTERNS = 2  # of a body at a time: workers with different libraries send different ones
+MAX_PATTERNS = 2  # of a body at a time; workers with different libraries send different patterns
 
 
 class UploadedFactor(NamedTuple):
-    """An expanded factor. used: the target that it occupies."""
+    """A factor on the device, complete once the event of its inverse is. step: of the matrix it was made from."""
 
-    expanded: Any
-    target: Any
+    inverse: PartitionedInverse
+    storage: InverseStorage
     step: int
     pattern: FactorPattern
 
 
 @dataclass
 class BodyUploads:
-    """Of one body. targets: by pattern."""
+    """Factors of one body.
+
+    storages: by id of the pattern
+    leaving: the factor in use before, and the number of steps after whose completion no step reads it
+    posted: not taken by the loop yet
+    queued: pattern, values and step of a factor that waits for a storage
+    warned: True after the first factor that could not be used
+    """
 
     name: str
     mailbox: DeviceMailbox
-    targets: dict[int, list[Any]] = field(default_factory=dict)
+    storages: dict[int, list[InverseStorage]] = field(default_factory=dict)
     in_use: UploadedFactor | None = None
-    leaving: tuple[UploadedFactor, int] | None = None  # out of use once so many steps are completed
+    leaving: tuple[UploadedFactor, int] | None = None
     posted: UploadedFactor | None = None
     queued: tuple[FactorPattern, NDArray[Any], int] | None = None
-    told: bool = False
+    warned: bool = False
 
 
 class FactorUpload:
-    """solver: of solver.PcgSolver; its rows are posted through the mailboxes given, one per body."""
+    """Builds inverses of factors and posts them.
+
+    solver: its rows of the bodies are what is posted
+    names: of the bodies, for messages
+    mailboxes: of the factors, one per body
+    """
 
     def __init__(
-        self, gpu: Gpu, solver: Any, loop: DeviceLoop, names: Sequence[str], mailboxes: Sequence[DeviceMailbox]
+        self, gpu: Gpu, solver: PcgSolver, loop: DeviceLoop, names: Sequence[str], mailboxes: Sequence[DeviceMailbox]
     ):
         self._gpu, self._solver, self._loop = gpu, solver, loop
-        self._tracks = [BodyUploads(name, box) for name, box in zip(names, mailboxes, strict=True)]
+        self._uploads = [BodyUploads(name, box) for name, box in zip(names, mailboxes, strict=True)]
         self._lock = threading.RLock()
-        self._waiting: set[int] = set()  # bodies with something queued
+        self._waiting: set[int] = set()  # bodies with a queued factor
 
     def post(self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int) -> None:
-        """Takes a factor; it is expanded now or when there is room, and used once that is done."""
+        """Takes a factor: begins to build its inverse now, or once a storage is free."""
         with self._lock:
-            track = self._tracks[body]
-            self._look(track)
-            if track.posted is None and track.leaving is None:
-                self._expand(body, pattern, values, step)
+            uploads = self._uploads[body]
+            self._refresh(uploads)
+            if uploads.posted is None and uploads.leaving is None:
+                self._begin(body, pattern, values, step)
             else:
-                track.queued = (pattern, values.copy(), step)
+                uploads.queued = (pattern, values.copy(), step)
                 self._waiting.add(body)
 
     def advance(self) -> None:
-        """Begins what has waited for room."""
+        """Begins the builds that have waited for a storage."""
         with self._lock:
             for body in sorted(self._waiting):
-                track = self._tracks[body]
-                self._look(track)
-                if track.posted is None and track.leaving is None:
-                    self._expand(body, *self._queued(body))
+                uploads = self._uploads[body]
+                self._refresh(uploads)
+                if uploads.posted is None and uploads.leaving is None:
+                    self._begin(body, *self._pop_queued(body))
 
     def settle(self) -> None:
-        """The newest factors will be used by the next step: waits for them. Only while the loop stands still."""
+        """Waits until the next step will use the newest factors. Only while the loop stands still."""
         with self._lock:
-            for body, track in enumerate(self._tracks):
-                self._look(track)
+            for body, uploads in enumerate(self._uploads):
+                self._refresh(uploads)
                 if body in self._waiting:
-                    if track.posted is not None and track.mailbox.withdraw():
-                        track.posted.expanded.event.synchronize()  # its target may be given away
-                        track.posted = None
-                    self._expand(body, *self._queued(body))
-                if track.posted is not None:
-                    track.posted.expanded.event.synchronize()
+                    if uploads.posted is not None and uploads.mailbox.withdraw():
+                        uploads.posted.inverse.event.synchronize()  # its storage may be reused
+                        uploads.posted = None
+                    self._begin(body, *self._pop_queued(body))
+                if uploads.posted is not None:
+                    uploads.posted.inverse.event.synchronize()
 
-    def _queued(self, body: int) -> tuple[FactorPattern, NDArray[Any], int]:
+    def _pop_queued(self, body: int) -> tuple[FactorPattern, NDArray[Any], int]:
         self._waiting.discard(body)
-        track = self._tracks[body]
-        queued, track.queued = track.queued, None
+        uploads = self._uploads[body]
+        queued, uploads.queued = uploads.queued, None
         assert queued is not None
         return queued
 
     def step(self, body: int) -> int:
-        """Step of the factor in use, -1 without one."""
+        """Returns the step of the factor in use, -1 without one."""
         with self._lock:
-            self._look(self._tracks[body])
-            made = self._tracks[body].in_use
-            return made.step if made else -1
+            self._refresh(self._uploads[body])
+            factor = self._uploads[body].in_use
+            return factor.step if factor else -1
 
-    def _look(self, track: BodyUploads) -> None:
-        """Notes what the loop has taken up and finished with."""
-        if track.posted is not None and track.mailbox.taken:
-            if track.in_use is not None:  # what was launched until now may still read it
-                track.leaving = (track.in_use, int(self._loop.loop.launched))
-            track.in_use, track.posted = track.posted, None
-        if track.leaving is not None and self._loop.step >= track.leaving[1]:
-            track.leaving = None
+    def _refresh(self, uploads: BodyUploads) -> None:
+        """Updates the state of the factors: taken by the loop, out of use."""
+        if uploads.posted is not None and uploads.mailbox.taken:
+            if uploads.in_use is not None:  # steps launched until now may still read it
+                uploads.leaving = (uploads.in_use, int(self._loop.loop.launched))
+            uploads.in_use, uploads.posted = uploads.posted, None
+        if uploads.leaving is not None and self._loop.step >= uploads.leaving[1]:
+            uploads.leaving = None
 
-    def _expand(self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int) -> None:
-        track = self._tracks[body]
+    def _begin(self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int) -> None:
+        uploads = self._uploads[body]
         try:
-            made = self._made(body, pattern, values, step)
+            factor = self._build(body, pattern, values, step)
         except (ValueError, CompileError) as error:
-            self._tell(track, str(error))
+            self._warn(uploads, str(error))
             return
         except Exception as error:
             if not no_memory_left(error):
                 raise
-            self._tell(track, f"not enough GPU memory: {error}")
+            self._warn(uploads, f"not enough GPU memory: {error}")
             return
-        track.posted = made
+        uploads.posted = factor
         row = self._solver.bodies[body : body + 1].tobytes()[SETTINGS_BYTES:]
-        self._gpu.cp.cuda.get_current_stream().synchronize()  # what `use` may have made is there
-        track.mailbox.post(row, keep=made, event=made.expanded.event.ptr)
+        self._gpu.cp.cuda.get_current_stream().synchronize()  # arrays that `use` may have made are complete
+        uploads.mailbox.post(row, keep=factor, event=factor.inverse.event.ptr)
 
-    def _made(self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int) -> UploadedFactor:
-        track = self._tracks[body]
-        expansion = self._solver.expansion(body, pattern)
-        if pattern.id not in track.targets:
-            for old in [k for k in track.targets if track.in_use is None or k != track.in_use.pattern.id]:
-                if len(track.targets) >= MAX_PATTERNS:
-                    del track.targets[old]
-        targets = track.targets.setdefault(pattern.id, [])
-        used = track.in_use.target if track.in_use else None
-        target = next((t for t in targets if t is not used), None)
-        if target is None:
-            target = expansion.target()
-            targets.append(target)
-        self._gpu.cp.cuda.get_current_stream().synchronize()  # what was made for it is there for other streams
-        expanded = expansion.expand(values, target, self._solver.spared)  # beside the steps
-        self._solver.use(body, pattern, expanded, step)
-        return UploadedFactor(expanded, target, step, pattern)
+    def _build(self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int) -> UploadedFactor:
+        uploads = self._uploads[body]
+        builder = self._solver.inverse_builder(body, pattern)
+        if pattern.id not in uploads.storages:
+            in_use = uploads.in_use.pattern.id if uploads.in_use else None
+            for old in [k for k in uploads.storages if k != in_use]:
+                if len(uploads.storages) >= MAX_PATTERNS:
+                    del uploads.storages[old]
+        storages = uploads.storages.setdefault(pattern.id, [])
+        used = uploads.in_use.storage if uploads.in_use else None
+        storage = next((s for s in storages if s is not used), None)
+        if storage is None:
+            storage = builder.storage()
+            storages.append(storage)
+        self._gpu.cp.cuda.get_current_stream().synchronize()  # new arrays are complete for other streams
+        inverse = builder.build(values, storage, self._solver.spared)  # beside the steps
+        self._solver.use(body, pattern, inverse, step)
+        return UploadedFactor(inverse, storage, step, pattern)
 
-    def _tell(self, track: BodyUploads, reason: str) -> None:
-        if not track.told:
-            track.told = True
-            held = "the factor that it has" if track.in_use else "block Jacobi"
+    def _warn(self, uploads: BodyUploads, reason: str) -> None:
+        if not uploads.warned:
+            uploads.warned = True
+            held = "the factor that it has" if uploads.in_use else "block Jacobi"
             log.warning(
-                "object %r: a factor cannot be used on the GPU: %s; it goes on with %s", track.name, reason, held
+                "object %r: a factor cannot be used on the GPU: %s; it goes on with %s", uploads.name, reason, held
             )

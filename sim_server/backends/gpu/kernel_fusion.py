@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""Launches of one domain put together into one kernel: a step of many small launches is mostly the gaps between them.
+"""Fusion of the launches of one domain into one kernel, which saves the gaps between many small launches.
 
-A launch says in its text what its items are (`int n;  // nodes`). Items of a domain touch only what is their own, and
-read other domains in the order elements, nodes, blocks; so all launches of a domain may run one after another in the
-thread that has the item, and arrays that they alone share (`own<T>`) stay in its registers.
+The text of a launch names its domain (`int n;  // nodes`). An item writes only its own rows and reads other domains in
+the order elements, nodes, blocks. So all launches of a domain may run one after another in the thread of an item, and
+arrays that only they use (`own<T>`) stay in its registers.
 
-Sums over lists come first: `lanes` threads of an item share its entries and leave the sum in shared memory. Then one
-thread per item does the rest, so that the threads of a warp all have one. A launch whose arguments may be replaced
-finds out for each item whether it is among its own (`node`, ascending).
+Sums over lists come first: `lanes` threads per item add up its entries and leave the sum in shared memory. Then one
+thread per item does the rest. A launch whose arguments may be replaced looks up each item in its list (`node`,
+ascending).
 """
 
 import re
@@ -17,33 +17,35 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_server.backends.gpu.cupy_types import KernelFunction
 from sim_server.backends.gpu.device import DeviceLaunch, compiled, cupy, options, own_headers, processors
 from sim_server.backends.kernel_binding import domain_of
 
 DOMAINS = ("elements", "nodes", "blocks")
+NUMBERS: dict[str, type[np.number[Any]]] = {"int": np.int32, "float": np.float32, "double": np.float64}
 
 
 class BlockShape(NamedTuple):
-    """Threads of a thread block, and how many of them share the sums of an item."""
+    """Number of threads of a thread block, and of threads that add up the sums of one item (lanes)."""
 
     threads: int
     lanes: int
 
 
-BLOCK_SHAPES = {  # up to so many items per multiprocessor; few items are spread over many multiprocessors
+BLOCK_SHAPES = {  # by the largest number of items per multiprocessor; few items are spread over many multiprocessors
     "elements": {64: BlockShape(32, 1), 256: BlockShape(64, 1), 1 << 30: BlockShape(128, 1)},
     "nodes": {16: BlockShape(64, 16), 256: BlockShape(128, 8), 1 << 30: BlockShape(128, 4)},
     "blocks": {64: BlockShape(128, 8), 160: BlockShape(128, 4), 1 << 30: BlockShape(128, 2)},
 }
 
 
-def shape(name: str, items: int, multiprocessors: int) -> BlockShape:
-    """For so many items of a domain."""
+def block_shape(name: str, items: int, multiprocessors: int) -> BlockShape:
+    """Returns the shape of the thread blocks for so many items of the domain `name`."""
     return next(s for most, s in BLOCK_SHAPES[name].items() if items <= most * multiprocessors)
 
 
 def domain(launch: DeviceLaunch) -> str:
-    """What its items are: the first word behind `int n;` in its struct."""
+    """Returns the domain of a launch: the first word behind `int n;` in its struct."""
     return domain_of(launch.text, launch.struct)
 
 
@@ -74,8 +76,12 @@ class Prologue(NamedTuple):
 
 
 class PhaseGuard(NamedTuple):
-    """Addresses of what says whether a launch of a step with several linearizations has anything to do (newton.cu):
-    left (1,), phase (bodies,), and the body of each item (items,), 0 where it is not known."""
+    """Device addresses of arrays that tell whether a later linearization of a step needs a launch (newton.cu).
+
+    active: (1,), number of bodies whose iteration is not over
+    phase: (bodies,), phase of each body's iteration
+    body: (items,), body of each item; 0 (no address): not known
+    """
 
     active: int
     phase: int
@@ -90,49 +96,58 @@ PHASE_GUARD = [
 
 
 class FusedKernel:
-    """Several launches over the same items as one. private: addresses of arrays that need no memory (`own`)."""
+    """Launches several kernels over the same items as one.
+
+    private: addresses of arrays that need no memory, since only these launches use them (`own`)
+    """
 
     def __init__(
-        self, launches: Sequence[DeviceLaunch], end: Epilogue | None = None, private: frozenset[int] = frozenset(),
-        guard: PhaseGuard | None = None, first: Prologue | None = None,
+        self, launches: Sequence[DeviceLaunch], epilogue: Epilogue | None = None, private: frozenset[int] = frozenset(),
+        guard: PhaseGuard | None = None, prologue: Prologue | None = None,
     ):  # fmt: skip
         self.name = "+".join(launch.name for launch in launches)
         self.items = next(launch.items for launch in launches if not launch.mailed)
         sums = any(launch.sums for launch in launches)
-        self.shape = shape(domain(launches[0]) if sums else "elements", self.items, processors())
-        self._launches, self._before = list(launches), first.blocks if first else 0  # keeps their arrays
-        text = FusedSource(launches, self.shape, end, private, guard, first)
-        self._arguments = (np.int32(self.items), *text.values, *(x.params for x in (end, first) if x))
+        self.shape = block_shape(domain(launches[0]) if sums else "elements", self.items, processors())
+        self._launches = list(launches)  # keeps their arrays
+        self._prologue_blocks = prologue.blocks if prologue else 0
+        text = FusedSource(launches, self.shape, epilogue, private, guard, prologue)
+        self._arguments = (np.int32(self.items), *text.values, *(x.params for x in (epilogue, prologue) if x))
         flags = (*options(launches[0].types), *own_headers())
         self._module = cupy().RawModule(code=text.source, options=flags, backend="nvrtc")
         self._function = self.function("fused")
-        self._ends = end is not None
+        self._has_epilogue = epilogue is not None
 
-    def function(self, kernel: str) -> Any:
-        """A kernel of the whole text."""
+    def function(self, kernel: str) -> KernelFunction:
+        """Returns a kernel of the whole text."""
         return compiled(self.name, self._module, kernel)
 
     def __call__(self) -> None:
-        """Puts it onto the current stream."""
-        if self.items or self._ends:
+        """Appends the launch to the current stream."""
+        if self.items or self._has_epilogue:
             blocks = max(1, -(-self.items * self.shape.lanes // self.shape.threads))
-            self._function((self._before + blocks,), (self.shape.threads,), self._arguments)
+            self._function((self._prologue_blocks + blocks,), (self.shape.threads,), self._arguments)
 
 
 class FusedSource:
-    """The kernel `fused` of some launches: its source, and the values of its arguments after the number of items.
+    """CUDA source of the kernel `fused` of some launches.
 
-    Each array is one argument, whatever launches have it, and no other overlaps it: that tells the compiler what it
-    may keep in registers from one launch to the next. private: addresses of arrays that need no memory at all. guard:
-    thread blocks without an item of a body whose search is not over return at once.
+    Each array is one argument, even if several launches use it, and arguments do not overlap. So the compiler may keep
+    its entries in registers from one launch to the next.
+
+    private: addresses of arrays that need no memory
+    guard: thread blocks return at once if they have no item of a body whose Newton iteration is not over
+
+    source: the text
+    values: of the arguments after the number of items
     """
 
     def __init__(
-        self, launches: Sequence[DeviceLaunch], shape: BlockShape, end: Epilogue | None = None,
-        private: frozenset[int] = frozenset(), guard: PhaseGuard | None = None, first: Prologue | None = None,
+        self, launches: Sequence[DeviceLaunch], shape: BlockShape, epilogue: Epilogue | None = None,
+        private: frozenset[int] = frozenset(), guard: PhaseGuard | None = None, prologue: Prologue | None = None,
     ):  # fmt: skip
         self._launches, self._private = launches, private
-        self.values: list[Any] = [np.uint64(address) for address in guard or ()]
+        self.values: list[np.number[Any]] = [np.uint64(address) for address in guard or ()]
         self._parameters = [f"const int* __restrict__ {name}" for name in guard._fields] if guard else []
         self._setup: list[str] = []
         self._names: dict[int, str] = {}
@@ -149,15 +164,15 @@ class FusedSource:
             body = re.sub(r"^#(include|define WIDE).*$", "", text, flags=re.MULTILINE)
             lines += [f"namespace {name} {{", body, "}"]
         body_lines = [*self._sums(shape), *self._items()]
-        if end:
-            lines.append(end.text)
-            self._parameters.append(f"const {end.struct} end")
-            body_lines.append(f"{end.function}(end);")
-        opening = [f"const int block = (int)blockIdx.x - {first.blocks if first else 0};"]
-        if first:
-            lines.append(first.text)
-            self._parameters.append(f"const {first.struct} first")
-            opening.append(f"if (block < 0) {{ {first.function}(first, blockIdx.x); return; }}")
+        if epilogue:
+            lines.append(epilogue.text)
+            self._parameters.append(f"const {epilogue.struct} epilogue")
+            body_lines.append(f"{epilogue.function}(epilogue);")
+        opening = [f"const int block = (int)blockIdx.x - {prologue.blocks if prologue else 0};"]
+        if prologue:
+            lines.append(prologue.text)
+            self._parameters.append(f"const {prologue.struct} prologue")
+            opening.append(f"if (block < 0) {{ {prologue.function}(prologue, blockIdx.x); return; }}")
         heading = f'extern "C" __global__ void __launch_bounds__({shape.threads}) fused(int n'
         parameters = "".join(f", {p}" for p in self._parameters)
         opening += PHASE_GUARD if guard else []
@@ -169,7 +184,7 @@ class FusedSource:
             yield k, launch, space, launch.name.split(".")[1]
 
     def _sums(self, shape: BlockShape) -> list[str]:
-        """Sets the arguments up and sums over the lists."""
+        """Sets up the arguments, and returns the lines that sum over the lists."""
         for k, launch, space, _ in self._each():
             if launch.mailed:
                 self._parameters.append(f"const {space}::{launch.struct}* mail{k}")
@@ -201,14 +216,14 @@ class FusedSource:
         for f in launch.fields[1:]:
             if f.dtype is None:
                 self._parameters.append(f"{f.kind} p{k}_{f.name}")
-                kind = {"int": np.int32, "float": np.float32, "double": np.float64}[f.kind]
+                kind = NUMBERS[f.kind]
                 self.values.append(kind(launch.params[f.name]))
                 yield f"p{k}.{f.name} = p{k}_{f.name};"
             elif not f.own:
                 yield f"p{k}.{f.name} = {self._array(launch, f.name, f.kind)};"
 
     def _array(self, launch: DeviceLaunch, name: str, kind: str) -> str:
-        """The argument of the kernel that is this array."""
+        """Returns the name of the kernel's argument for an array."""
         array = launch.arrays[name]
         address = int(array.data.ptr)
         if array.size == 0:
@@ -221,7 +236,7 @@ class FusedSource:
         return self._names[address]
 
     def _items(self) -> list[str]:
-        """One item of each launch, by one thread."""
+        """Returns the lines that do one item of each launch in one thread."""
         lines = ["const int i = block * BLOCK_ITEMS + threadIdx.x;", "if (threadIdx.x < BLOCK_ITEMS && i < n) {"]
         rows: dict[int, str] = {}
         for k, launch, space, kernel in self._each():
@@ -240,7 +255,7 @@ class FusedSource:
         return [*lines, "}"]
 
     def _rows(self, launch: DeviceLaunch, rows: dict[int, str], lines: list[str]) -> Iterator[tuple[str, str]]:
-        """Where the item's rows of the arrays of its own are, by member."""
+        """Yields member and expression of the item's row for each `own` array."""
         for f in (f for f in launch.fields if f.own):
             array = launch.arrays[f.name]
             address = int(array.data.ptr)
@@ -254,31 +269,34 @@ class FusedSource:
             yield f.name, rows[address]
 
 
-def fused(
+def fuse(
     launches: Sequence[DeviceLaunch],
     guard: Callable[[Sequence[DeviceLaunch]], PhaseGuard] | None = None,
-    first: Prologue | None = None,
-) -> list[Any]:
-    """The launches in as few kernels as their domains allow. guard: makes that of those in one kernel. first: what the
-    first kernel does besides."""
+    prologue: Prologue | None = None,
+) -> list[FusedKernel | DeviceLaunch]:
+    """Fuses launches into as few kernels as their domains allow.
+
+    guard: makes the guard of a kernel from its launches
+    prologue: of the first kernel
+    """
     if any(domain(launch) not in DOMAINS for launch in launches):
         return list(launches)
-    together = [group for d in DOMAINS for group in _alike([x for x in launches if domain(x) == d])]
+    together = [group for d in DOMAINS for group in _by_items([x for x in launches if domain(x) == d])]
     together = [group for group in together if group]
     return [
-        FusedKernel(group, None, _private(group, launches), guard(group) if guard else None, None if k else first)
+        FusedKernel(group, None, _private(group, launches), guard(group) if guard else None, None if k else prologue)
         for k, group in enumerate(together)
     ]  # fmt: skip
 
 
-def _alike(launches: Sequence[DeviceLaunch]) -> list[list[DeviceLaunch]]:
-    """Those of one domain by number of items: the elements of one effect are not those of another."""
+def _by_items(launches: Sequence[DeviceLaunch]) -> list[list[DeviceLaunch]]:
+    """Groups launches of one domain by number of items, since the elements of two effects differ."""
     counts = {x.items: None for x in launches if not x.mailed}
     return [[x for x in launches if x.mailed or x.items == n] for n in counts]
 
 
 def _private(group: Sequence[DeviceLaunch], launches: Sequence[DeviceLaunch]) -> frozenset[int]:
-    """Addresses of the arrays that are `own` to all launches that have them, all of this group."""
+    """Returns the addresses of the arrays that only launches of this group use, all of them as `own`."""
     owned: set[int] = set()
     others: set[int] = set()
     for launch in launches:

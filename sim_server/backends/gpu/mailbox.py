@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The compiled GPU loop (loop.cpp), and its mailboxes."""
+"""The compiled GPU loop (loop.cpp) and its mailboxes."""
 
 import ctypes as c
 from functools import cache
@@ -13,7 +13,7 @@ from sim_server.backends.gpu.structs import ENERGY_RECORD, NEWTON_RESULT, STEP_T
 
 @cache
 def library() -> c.CDLL:
-    """The compiled loop."""
+    """Compiles and loads loop.cpp. Raises RuntimeError if a struct has another size there."""
     loop, p = c.POINTER(structs.GpuLoop), c.c_void_p
     compiled = native(
         "backends/gpu/loop.cpp",
@@ -30,30 +30,28 @@ def library() -> c.CDLL:
 
     structures = (structs.CudaDriver, structs.Mail, structs.MailSlot)
     ours = [*map(c.sizeof, structures), PCG_RESULT.itemsize, STEP_TIMESTAMP.itemsize, NEWTON_RESULT.itemsize]
-    ours += [
-        c.sizeof(structs.BodyReadback),
-        c.sizeof(structs.GpuLoop),
-        RECORD.itemsize,
-        ENERGY_RECORD.itemsize,
-        BALANCE.itemsize,
-    ]
+    ours += [c.sizeof(structs.BodyReadback), c.sizeof(structs.GpuLoop)]
+    ours += [RECORD.itemsize, ENERGY_RECORD.itemsize, BALANCE.itemsize]
     check_sizes("backends/gpu/loop.cpp", list(sizes), ours)
     return compiled
 
 
 class DeviceMailbox:
-    """Bytes on the device that are replaced between batches. Old mail and what it leads to is kept until it is out of
-    use."""
+    """Replaces bytes on the device between batches (structs.MailSlot).
 
-    def __init__(self, loop: Any, slot: structs.MailSlot):
+    Keeps mail, and what its bytes point to, until no step under way uses it.
+    """
+
+    def __init__(self, loop: structs.GpuLoop, slot: structs.MailSlot):
         self._loop, self._slot, self.number = loop, slot, 0
-        self._kept: list[Any] = []  # in use, waiting
-        self._leaving: list[tuple[int, Any]] = []  # (free once so many steps are completed, what)
+        self._kept: list[Any] = []  # mail in use, then mail posted
+        self._leaving: list[tuple[int, Any]] = []  # (steps after whose completion it is out of use, mail)
 
     def post(self, data: bytes, keep: Any = None, event: int | None = None) -> structs.Mail:
-        """Replaces the bytes from the next batch on (once the event is done). keep: what the bytes point to.
+        """Replaces the bytes from the next batch on, or from the first one after an event has completed.
 
-        They hold from the step after the result's `taken` steps, once it is not below 0.
+        keep: objects that the bytes point to. event: handle of the event.
+        The bytes are valid from the step after the result's `taken` steps, once that is not below 0.
         """
         assert len(data) == self._slot.size
         self.number += 1
@@ -62,15 +60,15 @@ class DeviceMailbox:
         displaced = library().wf_gpu_post(c.byref(self._slot), c.addressof(mail))
         self._leaving = [(step, what) for step, what in self._leaving if step > self._loop.step]
         if displaced:
-            self._kept.pop()  # it was never taken up; what is in use must live on
-        elif len(self._kept) > 1:  # the last one was taken up: those before are done with after what is under way
+            self._kept.pop()  # never taken; the mail in use stays
+        elif len(self._kept) > 1:  # the last one was taken: those before it are out of use after the steps under way
             self._leaving.append((int(self._loop.launched), self._kept[:-1]))
             del self._kept[:-1]
         self._kept.append((memory, mail, keep))
         return mail
 
     def withdraw(self) -> bool:
-        """Takes back what the loop has not looked at; only while it stands still. True if something came back."""
+        """Takes back mail that was not copied to the device, while the loop stands still; True if there was any."""
         back = bool(library().wf_gpu_post(c.byref(self._slot), None)) or bool(self._slot.pending)
         self._slot.pending = None
         if back:
@@ -79,5 +77,5 @@ class DeviceMailbox:
 
     @property
     def taken(self) -> bool:
-        """What was posted last is on its way to the device."""
+        """True if the copy of the last mail to the device has begun."""
         return bool(self._slot.taken == self.number)

@@ -141,7 +141,7 @@ __device__ __forceinline__ void place(const NewtonArguments& p, int i, double sc
 }
 
 // Begins the search: a step has been assembled.
-extern "C" __global__ void __launch_bounds__(BLOCK_NODES) open(const NewtonArguments p) {
+extern "C" __global__ void __launch_bounds__(BLOCK_NODES) begin_newton(const NewtonArguments p) {
     const NodeRange here = p.ranges[blockIdx.x];
     const int i = here.first + threadIdx.x;
     double sum[2] = {0, 0};
@@ -168,7 +168,7 @@ extern "C" __global__ void __launch_bounds__(BLOCK_NODES) open(const NewtonArgum
 }
 
 // To the next trial: along a new way where a system was solved, by a smaller part of the present one elsewhere.
-extern "C" __global__ void __launch_bounds__(ALL_LANES) move(const NewtonArguments p) {
+extern "C" __global__ void __launch_bounds__(ALL_LANES) update_state(const NewtonArguments p) {
     if (blockIdx.x == 0 && threadIdx.x == 0) *p.pool_counter = 0;
     if (*p.active == 0) return;
     const NodeRange here = p.ranges[blockIdx.x];
@@ -215,7 +215,7 @@ extern "C" __global__ void __launch_bounds__(ALL_LANES) move(const NewtonArgumen
 }
 
 // What becomes of a trial that has been assembled: taken, made shorter, or the end.
-extern "C" __global__ void __launch_bounds__(BLOCK_NODES) judge(const NewtonArguments p) {
+extern "C" __global__ void __launch_bounds__(BLOCK_NODES) accept_trial(const NewtonArguments p) {
     if (*p.active == 0) return;
     const NodeRange here = p.ranges[blockIdx.x];
     Search& search = p.search[here.body];
@@ -238,7 +238,7 @@ extern "C" __global__ void __launch_bounds__(BLOCK_NODES) judge(const NewtonArgu
 }
 
 // The state before the step again, and y so that `advance` makes of it what was found; the results of the step as of one solve.
-extern "C" __global__ void __launch_bounds__(BLOCK_NODES) close(const NewtonArguments p) {
+extern "C" __global__ void __launch_bounds__(BLOCK_NODES) end_newton(const NewtonArguments p) {
     const NodeRange here = p.ranges[blockIdx.x];
     const int body = here.body, i = here.first + threadIdx.x;
     const Search s = p.search[body];

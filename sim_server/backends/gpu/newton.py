@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Newton-Raphson within a step on a GPU (newton.cu): its memory, and what it puts onto the stream.
+"""Newton-Raphson iteration within a step on a GPU (newton.cu): its memory and its launches.
 
-All trials that a scene allows are in the graph of a step, linearizations x (1 + trials) of them; launches that nobody
-needs any more return at once. The first assembly of a step is that of scenes with one linearization; the others are
-made by the same texts with a guard in front (kernel_fusion.PhaseGuard).
+The graph of a step holds all trials that the scene allows, linearizations x (1 + trials); launches that no body needs
+any more return at once. The first assembly of a step is that of scenes with one linearization; the kernels of the later
+ones begin with a guard (kernel_fusion.PhaseGuard).
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,15 +12,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_server.arrays import Int32, Int64
 from sim_server.backends.compiler import HERE
 from sim_server.backends.cpu.structs import Search as SearchLayout
+from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction
 from sim_server.backends.gpu.device import DeviceLaunch, Gpu, compiled, options, own_headers
-from sim_server.backends.gpu.kernel_fusion import PhaseGuard, fused
+from sim_server.backends.gpu.kernel_fusion import FusedKernel, PhaseGuard, fuse
 from sim_server.backends.gpu.solver import PcgSolver
 from sim_server.backends.gpu.structs import NEWTON_RESULT
 from sim_server.mechanics.newton import Newton
 
-BLOCK_NODES, LANES = 32, 8  # nodes of a thread block, threads of a node in `move`: newton.cu
+BLOCK_NODES, LANES = 32, 8  # nodes of a thread block, threads of a node in the kernel `update_state` (newton.cu)
 NODE_RANGE = np.dtype([("body", "i4"), ("first", "i4"), ("last", "i4"), ("unused", "i4")])
 SEARCH = np.dtype(SearchLayout)
 POINTERS = (
@@ -35,24 +37,30 @@ NEWTON_ARGUMENTS = np.dtype(
 
 
 class NewtonPhases(NamedTuple):
-    """Whose turn it is, on the device: searches that are left, (1,), and the phase of each body's (bodies,), of
-    kernels/newton_line_search.cuh."""
+    """State of the Newton iterations that launches of a step read, on the device.
 
-    active: Any
-    phase: Any
+    active: (1,), number of bodies whose iteration is not over
+    phase: (bodies,), phase of each body's iteration (kernels/newton_line_search.cuh)
+    """
+
+    active: DeviceArray
+    phase: DeviceArray
 
     @classmethod
-    def of(cls, gpu: Gpu, bodies: int) -> "NewtonPhases":
-        """Before the first step."""
+    def initial(cls, gpu: Gpu, bodies: int) -> "NewtonPhases":
+        """Returns the state before the first step."""
         return cls(gpu.cp.full(1, bodies, np.int32), gpu.cp.zeros(bodies, np.int32))
 
-    def guard(self, body: Any) -> PhaseGuard:
-        """Of a kernel whose items are of these bodies; None: not known."""
+    def guard(self, body: DeviceArray | None) -> PhaseGuard:
+        """Returns the guard of a kernel. body: (items,), body of each item; None: not known."""
         return PhaseGuard(self.active.data.ptr, self.phase.data.ptr, 0 if body is None else body.data.ptr)
 
 
-def node_ranges(ranges: NDArray[np.int64]) -> tuple[NDArray[Any], NDArray[np.int32]]:
-    """Nodes of each thread block (NODE_RANGE), and where those of each body begin, (bodies + 1,)."""
+def node_ranges(ranges: Int64) -> tuple[NDArray[Any], Int32]:
+    """Returns the nodes of each thread block (NODE_RANGE), and the first thread block of each body, (bodies + 1,).
+
+    ranges: (bodies, 2), nodes [first, last) of each body.
+    """
     count = -(-(ranges[:, 1] - ranges[:, 0]) // BLOCK_NODES)
     start = np.concatenate([[0], np.cumsum(count)])
     found = np.zeros(start[-1], NODE_RANGE)
@@ -62,9 +70,11 @@ def node_ranges(ranges: NDArray[np.int64]) -> tuple[NDArray[Any], NDArray[np.int
     return found, start.astype(np.int32)
 
 
-def bodies_of(parts: Sequence[NDArray[np.int32] | None]) -> NDArray[np.int32] | None:
-    """The body of each item of launches put together, (items,), from where the items of the bodies begin in each of
-    them, (bodies + 1,); None where that is not known or not the same."""
+def bodies_of(parts: Sequence[Int32 | None]) -> Int32 | None:
+    """Returns the body of each item of a fused kernel, (items,); None if not known or different among its launches.
+
+    parts: per launch (bodies + 1,), the first item of each body; None: not known.
+    """
     first = parts[0] if parts else None
     if first is None or first[-1] == 0 or not all(p is not None and np.array_equal(p, first) for p in parts):
         return None
@@ -72,22 +82,25 @@ def bodies_of(parts: Sequence[NDArray[np.int32] | None]) -> NDArray[np.int32] | 
 
 
 class NewtonIteration:
-    """The launches between the first assembly of a step and its end.
+    """Launches the Newton iteration of a step, between its first assembly and its end.
 
-    newton: what to search for, with `parts` of the launches in `again`, which assemble a step once more. ranges: nodes
-    [first, last) of each body. arrays: host arrays by name (row_start, columns, values, b, y, x, v). found: host memory
-    (capacity, bodies) of NEWTON_RESULT that the steps write to.
+    newton: options, arrays, and `parts` of the launches in `again`
+    again: launches that assemble the system once more
+    ranges: nodes [first, last) of each body
+    arrays: host arrays by name (row_start, columns, values, b, y, x, v)
+    results: host memory (capacity, bodies) of NEWTON_RESULT that the steps write to
 
-    first_values: A as the step's first linearization had it, which is what factors are made of.
+    rounds: trials in a step
+    first_values: A of the first linearization of the step, from which factors are made
     """
 
     def __init__(
         self, gpu: Gpu, newton: Newton, again: Sequence[DeviceLaunch], ranges: Sequence[tuple[int, int]],
-        arrays: Mapping[str, NDArray[Any]], phases: NewtonPhases, solver: PcgSolver, found: NDArray[Any],
+        arrays: Mapping[str, NDArray[Any]], phases: NewtonPhases, solver: PcgSolver, results: NDArray[Any],
     ):  # fmt: skip
         cp, nodes, bodies = gpu.cp, len(arrays["x"]), len(ranges)
         self._gpu, self._solver, self.rounds = gpu, solver, newton.options.rounds
-        self._bodies: list[Any] = []  # of the items of each kernel
+        self._bodies: list[DeviceArray | None] = []  # of the items of each kernel
         self._again = self._guarded(newton, again, phases)
         names = ("row_start", "columns", "values", "b", "y", "x", "v")
         host = {name: arrays[name] for name in names} | newton.arrays
@@ -105,18 +118,22 @@ class NewtonIteration:
         self._params = np.zeros((), NEWTON_ARGUMENTS)
         for name, array in self._memory.items():
             self._params[name] = array.data.ptr
-        self._params["newton_results"], self._params["bodies"] = found.ctypes.data, solver.bodies_device
+        self._params["newton_results"], self._params["bodies"] = results.ctypes.data, solver.bodies_device
         self._params["reach"], self._params["tolerance"] = newton.reach, newton.options.tolerance
         self._params["linearizations"], self._params["trials"] = newton.options.linearizations, newton.options.trials
         self._params["nodes"], self._params["count"] = nodes, bodies
-        self._params["capacity"] = found.nbytes // NEWTON_RESULT.itemsize // bodies
+        self._params["capacity"] = results.nbytes // NEWTON_RESULT.itemsize // bodies
         self._values, self.first_values = twins["values"], cp.empty_like(twins["values"])
         module = self._module()
-        self._open, self._move, self._judge, self._close = (
-            compiled("newton.cu", module, name) for name in ("open", "move", "judge", "close")
+        self._begin, self._update_state, self._accept_trial, self._end = (
+            compiled("newton.cu", module, name)
+            for name in ("begin_newton", "update_state", "accept_trial", "end_newton")
         )
 
-    def _guarded(self, newton: Newton, again: Sequence[DeviceLaunch], phases: NewtonPhases) -> list[Any]:
+    def _guarded(
+        self, newton: Newton, again: Sequence[DeviceLaunch], phases: NewtonPhases
+    ) -> list[FusedKernel | DeviceLaunch]:
+        """Fuses the launches, each kernel with its guard."""
         parts = {id(launch): part for launch, part in zip(again, newton.parts, strict=True)}
 
         def guard(group: Sequence[DeviceLaunch]) -> PhaseGuard:
@@ -125,15 +142,13 @@ class NewtonIteration:
             self._bodies.append(None if body is None else self._gpu.cp.asarray(body))
             return phases.guard(self._bodies[-1])
 
-        return fused(again, guard)
+        return fuse(again, guard)
 
     def _module(self) -> Any:
         sizes = {
-            "NEWTON_ARGUMENTS": NEWTON_ARGUMENTS,
-            "SEARCH": SEARCH,
-            "NODE_RANGE": NODE_RANGE,
+            "NEWTON_ARGUMENTS": NEWTON_ARGUMENTS, "SEARCH": SEARCH, "NODE_RANGE": NODE_RANGE,
             "NEWTON_RESULT": NEWTON_RESULT,
-        }
+        }  # fmt: skip
         return self._gpu.cp.RawModule(
             code=(HERE / "backends/gpu/newton.cu").read_text(),
             options=(
@@ -144,18 +159,18 @@ class NewtonIteration:
         )  # fmt: skip
 
     def launch(self) -> None:
-        """Puts the whole search of a step that has been assembled onto the current stream."""
+        """Launches the whole iteration of a step whose first linearization has been assembled."""
         cuda, kept, values = self._gpu.cp.cuda, self.first_values, self._values
         to, stream = cuda.runtime.memcpyDeviceToDevice, cuda.get_current_stream().ptr
         cuda.runtime.memcpyAsync(kept.data.ptr, values.data.ptr, values.nbytes, to, stream)
-        self._put(self._open, BLOCK_NODES)
+        self._launch(self._begin, BLOCK_NODES)
         for _ in range(self.rounds):
             self._solver.launch()
-            self._put(self._move, BLOCK_NODES * LANES)
+            self._launch(self._update_state, BLOCK_NODES * LANES)
             for launch in self._again:
                 launch()
-            self._put(self._judge, BLOCK_NODES)
-        self._put(self._close, BLOCK_NODES)
+            self._launch(self._accept_trial, BLOCK_NODES)
+        self._launch(self._end, BLOCK_NODES)
 
-    def _put(self, function: Any, threads: int) -> None:
+    def _launch(self, function: KernelFunction, threads: int) -> None:
         function((self._grid,), (threads,), (self._params,))

@@ -1,28 +1,37 @@
 # SPDX-License-Identifier: MIT
-"""Who does what on the device: thread blocks of each body, the rows of A of each, the nodes that their rows read."""
+"""Partition of A over thread blocks: the thread blocks of each body, the rows of each, and the nodes that rows read."""
 
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-Ints = NDArray[np.int64]
-SPARED = 8  # multiprocessors that a step leaves to expansions beside it: one that needs all would wait for them to end
-NODES_A_BLOCK = 8  # a body of few nodes is not spread over more thread blocks than this gives
+from sim_server.arrays import Int32, Int64
+
+SPARED = 8  # multiprocessors left to the building of inverses; a solve that needs all would wait until that ends
+NODES_A_BLOCK = 8  # smallest number of nodes for which a body gets one more thread block
 
 
 class BlockAssignment(NamedTuple):
-    """Thread blocks [first, first + blocks) of each body, first -1 where any free one takes it; `order`: those with
-    blocks of their own, then the `pooled` others, largest first."""
+    """Thread blocks of each body.
 
-    first: Ints
-    blocks: Ints
-    order: Ints
+    first (bodies,): first thread block; -1: the body is in the pool, and any free thread block takes it
+    blocks (bodies,): number of thread blocks
+    order: bodies with thread blocks of their own, then those in the pool, largest first
+    pooled: number of bodies in the pool
+    """
+
+    first: Int64
+    blocks: Int64
+    order: Int64
     pooled: int
 
 
-def assignment(nodes: Ints, grid: int) -> BlockAssignment:
-    """nodes (bodies,): by size while there are enough thread blocks; of many bodies the small share what is left."""
+def assign_blocks(nodes: Int64, grid: int) -> BlockAssignment:
+    """Assigns `grid` thread blocks to bodies of so many nodes, (bodies,), by size.
+
+    If there are more bodies than thread blocks, small bodies form a pool that shares what the large ones leave.
+    """
     bodies = len(nodes)
     wanted = nodes / nodes.sum() * grid
     own = np.ones(bodies, bool) if bodies <= grid else wanted >= 2
@@ -38,8 +47,8 @@ def assignment(nodes: Ints, grid: int) -> BlockAssignment:
     return BlockAssignment(first, count, order, pooled)
 
 
-def _spread(nodes: Ints, blocks: int) -> Ints:
-    """Thread blocks of each body so that the busiest block of all has as few nodes as can be; no more than help."""
+def _spread(nodes: Int64, blocks: int) -> Int64:
+    """Returns the thread blocks of each body that minimize the nodes of the busiest one, and no more than help."""
     low, high = nodes.sum() / blocks, float(nodes.max())
     for _ in range(40):
         middle = (low + high) / 2
@@ -47,47 +56,58 @@ def _spread(nodes: Ints, blocks: int) -> Ints:
     return np.minimum(np.ceil(nodes / high).astype(np.int64), -(-nodes // NODES_A_BLOCK))
 
 
-def busiest(nodes: Ints, given: BlockAssignment, grid: int) -> float:
-    """Nodes that the busiest thread block has to do with, one round of the pool after another."""
-    own, rest = given.first >= 0, given.first < 0
-    alone = float((nodes[own] / given.blocks[own]).max(initial=0))
-    if not given.pooled:
+def busiest(nodes: Int64, assigned: BlockAssignment, grid: int) -> float:
+    """Returns the number of nodes of the busiest thread block, over all its rounds of the pool."""
+    own, rest = assigned.first >= 0, assigned.first < 0
+    alone = float((nodes[own] / assigned.blocks[own]).max(initial=0))
+    if not assigned.pooled:
         return alone
-    rounds = -(-given.pooled // max(1, grid - int(given.blocks[own].sum())))
+    rounds = -(-assigned.pooled // max(1, grid - int(assigned.blocks[own].sum())))
     return max(alone, rounds * float(nodes[rest].mean()))
 
 
-def assign_blocks(nodes: Ints, processors: int, blocks: int) -> tuple[BlockAssignment, int]:
-    """The assignment and its number of thread blocks, `blocks` of them on a multiprocessor. Some multiprocessors are
-    spared, fewer where more would leave many others idle."""
+def best_assignment(nodes: Int64, processors: int, blocks: int) -> tuple[BlockAssignment, int]:
+    """Returns an assignment and its number of thread blocks, `blocks` of them on a multiprocessor.
+
+    It spares SPARED multiprocessors, or fewer where that would leave many others idle.
+    """
     spared = min(SPARED, processors // 4)
     grids = [blocks * (processors - s) for s in range(spared, spared // 2 - 1, -1)]
-    found = [(assignment(nodes, grid), grid) for grid in grids]
-    load = [busiest(nodes, share, grid) for share, grid in found]
+    found = [(assign_blocks(nodes, grid), grid) for grid in grids]
+    load = [busiest(nodes, assigned, grid) for assigned, grid in found]
     return found[int(np.argmax(np.array(load) <= 1.1 * min(load)))]
 
 
 ROW_RANGE = np.dtype(
     [(n, "i4") for n in ("body", "index", "begin", "own", "halo_first", "halo", "block_first", "blocks")]
 )
-"""What a thread block has of a body: own nodes [begin, begin + own) of the body, places in Halo.nodes, blocks of A."""
+"""Rows of A of one thread block.
+
+body; index: of the thread block in its body; begin, own: own nodes [begin, begin + own) of the body;
+halo_first, halo: range in Halo.nodes; block_first, blocks: range of the blocks of A.
+"""
 
 
 class Halo(NamedTuple):
-    """What each thread block of each body reads.
+    """Nodes that each thread block of each body reads.
 
-    ranges (thread blocks,): ROW_RANGE; nodes: of the body, lists of the thread blocks one after another, its own first;
-    local (blocks of A,): the column as a place in its thread block's list; first (bodies,): first share of a body.
+    ranges (thread blocks,): ROW_RANGE
+    nodes: of the body; the lists of all thread blocks one after another, in each its own nodes first
+    local (blocks of A,): column of each block as a position in the list of its thread block
+    first (bodies,): first range of each body
     """
 
     ranges: NDArray[Any]
-    nodes: Ints
-    local: Ints
-    first: Ints
+    nodes: Int64
+    local: Int64
+    first: Int64
 
 
-def halo(ranges: Ints, count: Ints, row_start: NDArray[Any], columns: NDArray[Any]) -> Halo:
-    """ranges (bodies, 2): nodes [first, last) of each; count (bodies,): thread blocks. Rows are cut evenly by nodes."""
+def halo(ranges: Int64, count: Int64, row_start: Int32, columns: Int32) -> Halo:
+    """Cuts the rows of each body evenly by nodes.
+
+    ranges (bodies, 2): nodes [first, last) of each body. count (bodies,): its number of thread blocks.
+    """
     total = int(row_start.shape[0]) - 1
     first = np.cumsum(count) - count
     begin, end = [], []
@@ -121,10 +141,10 @@ def halo(ranges: Ints, count: Ints, row_start: NDArray[Any], columns: NDArray[An
     return Halo(table, nodes - np.repeat(origin, np.diff(start)), local, first)
 
 
-def initial_ranges(given: BlockAssignment, seen: Halo, grid: int) -> NDArray[np.int32]:
-    """The share that each thread block of the grid begins with, -1 where it takes one of the pool."""
+def initial_ranges(assigned: BlockAssignment, partition: Halo, grid: int) -> Int32:
+    """Returns the range with which each thread block of the grid begins, -1 where it takes one of the pool."""
     found = np.full(grid, -1, np.int32)
-    for body in given.order[: len(given.order) - given.pooled]:
-        k = np.arange(given.blocks[body])
-        found[given.first[body] + k] = seen.first[body] + k
+    for body in assigned.order[: len(assigned.order) - assigned.pooled]:
+        k = np.arange(assigned.blocks[body])
+        found[assigned.first[body] + k] = partition.first[body] + k
     return found

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Memory and launch of the persistent solver (pcg.cu): rows of the bodies in, rows of results out."""
+"""Memory and launch of the persistent conjugate gradient kernel (pcg.cu)."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -8,12 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import FactorPattern
+from sim_server.arrays import Int64
 from sim_server.backends.compiler import HERE
+from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction
 from sim_server.backends.gpu.device import Gpu, compiled, options, own_headers
 from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder, PartitionedInverse
 from sim_server.backends.gpu.inverse.device_plan import DEVICE_PLAN, DevicePlan, shared_bytes
 from sim_server.backends.gpu.inverse.plan import plan
-from sim_server.backends.gpu.row_partition import SPARED, assign_blocks, halo, initial_ranges
+from sim_server.backends.gpu.row_partition import SPARED, best_assignment, halo, initial_ranges
 
 PCG_BODY = np.dtype(
     [
@@ -23,7 +25,8 @@ PCG_BODY = np.dtype(
         ("formed", "u8"), ("solved", "u8"), ("contributed", "u8"), ("planes", "i4"), ("unused", "i4"),
     ]
 )  # fmt: skip
-SETTINGS_BYTES = PCG_BODY.fields["factor_step"][1]  # type: ignore[index]  # bytes of a row before the factor: they change apart
+SETTINGS_BYTES = PCG_BODY.fields["factor_step"][1]  # type: ignore[index]
+"""Bytes of a PCG_BODY before the factor: the settings."""
 PCG_RESULT = np.dtype(
     [
         ("residual", "f8"), ("seconds", "f8"), ("factor_step", "i8"), ("iterations", "i4"), ("status", "i4"),
@@ -41,29 +44,33 @@ PCG_ARGUMENTS = np.dtype(
 )  # fmt: skip
 
 
-def threads_and_blocks(nodes: NDArray[np.int64], processors: int) -> tuple[int, int]:
-    """Threads of a thread block, and thread blocks a processor: many small bodies are solved side by side."""
+def threads_and_blocks(nodes: Int64, processors: int) -> tuple[int, int]:
+    """Returns threads per thread block and thread blocks per multiprocessor. nodes (bodies,): of each body."""
     if len(nodes) <= processors - SPARED:
-        return 256, 1  # 255 registers a thread: what is spilled to local memory costs a trip to L2
+        return 256, 1  # 255 registers a thread: spilling to local memory costs a trip to L2
     return (64, 4) if len(nodes) > 2 * processors and np.median(nodes) < 300 else (128, 2)
 
 
 class PcgSolver:
-    """Solves the system of every body in one launch.
+    """Solves the linear systems of all bodies in one launch (pcg.cu).
 
-    ranges: nodes [first, last) of each body. arrays: host arrays by name (row_start, columns, values, b, y, moving),
-    solved for their twins. counter: device array (1,) of completed steps. capacity: steps whose results are kept.
-    planes: 1 for a preconditioner in float16, 2 for one of 22 bits. phases: for several linearizations a step, device
-    arrays `left` and `phase` (newton.py).
+    ranges: nodes [first, last) of each body
+    arrays: host arrays by name (row_start, columns, values, b, y, moving); their twins on the device are used
+    counter: device array (1,), number of completed steps
+    capacity: number of steps whose results are kept
+    planes: float16 numbers per entry of an inverse; 1, or 2 for 22 bits
+    phases: newton.NewtonPhases; empty: one linearization a step
 
-    bodies: host rows (PCG_BODY), one per body; the loop uploads them, settings (the first SETTINGS_BYTES) and factor
-    (the rest) apart. results: device ring (capacity, bodies) of PCG_RESULT. pool_counter: zero at launch.
-    spared: multiprocessors that a launch does not need.
+    bodies: host rows (PCG_BODY), one per body. The loop uploads the settings (the first SETTINGS_BYTES bytes of a row)
+        and the factor (the others) separately.
+    results: device ring (capacity, bodies) of PCG_RESULT
+    pool_counter: device array (1,), zero at launch
+    spared: multiprocessors that a launch leaves free
     """
 
     def __init__(
-        self, gpu: Gpu, ranges: Sequence[tuple[int, int]], arrays: Mapping[str, NDArray[Any]], counter: Any,
-        capacity: int, planes: int = 1, phases: Sequence[Any] = (),
+        self, gpu: Gpu, ranges: Sequence[tuple[int, int]], arrays: Mapping[str, NDArray[Any]], counter: DeviceArray,
+        capacity: int, planes: int = 1, phases: Sequence[DeviceArray] = (),
     ):  # fmt: skip
         cp, processors = gpu.cp, gpu.properties["multiProcessorCount"]
         self.gpu, self.counter, self._capacity, self.planes, self._phases = gpu, counter, capacity, planes, phases
@@ -72,50 +79,49 @@ class PcgSolver:
         spans = np.array(ranges, np.int64)
         nodes = spans[:, 1] - spans[:, 0]
         self.threads, blocks = threads_and_blocks(nodes, processors)
-        assigned, most = assign_blocks(nodes, processors, blocks)
+        assigned, most = best_assignment(nodes, processors, blocks)
         self.grid = most if assigned.pooled else int(assigned.blocks.sum())
         self.spared = processors - -(-self.grid // blocks)
         self.bodies = np.zeros(len(ranges), PCG_BODY)
         self.bodies["first"], self.bodies["nodes"] = spans[:, 0], nodes
         self.bodies["blocks"] = assigned.blocks
-        seen = halo(spans, assigned.blocks, arrays["row_start"], arrays["columns"])
-        self.bodies["first_range"] = seen.first
+        partition = halo(spans, assigned.blocks, arrays["row_start"], arrays["columns"])
+        self.bodies["first_range"] = partition.first
         self._rows = cp.zeros(self.bodies.nbytes, np.uint8)
-        self.results = cp.zeros(capacity * len(ranges) * PCG_RESULT.itemsize, np.uint8)
-        self.pool_counter = cp.zeros(1, np.uint32)
+        self.results: DeviceArray = cp.zeros(capacity * len(ranges) * PCG_RESULT.itemsize, np.uint8)
+        self.pool_counter: DeviceArray = cp.zeros(1, np.uint32)
         total, ints = len(arrays["row_start"]) - 1, np.int32
-        self._work = {
-            "order": cp.asarray(assigned.order.astype(ints)), "row_ranges": cp.asarray(seen.ranges.view(ints)),
-            "initial_range": cp.asarray(initial_ranges(assigned, seen, self.grid)),
-            "halo": cp.asarray(seen.nodes.astype(ints)), "local_column": cp.asarray(seen.local.astype(ints)),
-            "halo_values": cp.zeros(3 * len(seen.nodes), self.real), "halo_position": cp.zeros(len(seen.nodes), ints),
-            "own_vectors": cp.zeros(9 * total, self.real), "z": cp.zeros(6 * total),
-            "diagonal": cp.zeros(9 * total, self.real), "block_sums": cp.zeros(16 * self.grid * len(ranges)),
-            "exchange_number": cp.ones(len(ranges), np.uint32),  # words that nobody has put are of exchange 0
+        self._work: dict[str, DeviceArray] = {
+            "order": cp.asarray(assigned.order.astype(ints)), "row_ranges": cp.asarray(partition.ranges.view(ints)),
+            "initial_range": cp.asarray(initial_ranges(assigned, partition, self.grid)),
+            "halo": cp.asarray(partition.nodes.astype(ints)), "local_column": cp.asarray(partition.local.astype(ints)),
+            "halo_values": cp.zeros(3 * len(partition.nodes), self.real),
+            "halo_position": cp.zeros(len(partition.nodes), ints), "own_vectors": cp.zeros(9 * total, self.real),
+            "z": cp.zeros(6 * total), "diagonal": cp.zeros(9 * total, self.real),
+            "block_sums": cp.zeros(16 * self.grid * len(ranges)),
+            "exchange_number": cp.ones(len(ranges), np.uint32),  # unwritten words have the number 0
             "pool_counter": self.pool_counter, "results": self.results, "step": counter,
         }  # fmt: skip
-        fixed = 2048  # bytes of its own that a thread block needs, and the driver's
+        fixed = 2048  # bytes: shared memory that pcg.cu declares, and the driver's
         self._shared = (gpu.properties["sharedMemPerMultiprocessor"] // blocks - fixed - 1024) // 16 * 16
         self._params = self._arguments(total, assigned.pooled)
         self._function = self._compiled(blocks)
         self._function.max_dynamic_shared_size_bytes = self._shared
-        self._planned: dict[tuple[int, int], DevicePlan] = {}
-        self._expansions: dict[tuple[int, int], InverseBuilder] = {}  # likewise by pattern and thread blocks
-        self._vectors: dict[tuple[int, int], dict[str, Any]] = {}  # by body and plan
-        self._applied = [0] * len(ranges)
+        self._plans: dict[tuple[int, int], DevicePlan] = {}  # by pattern and number of thread blocks
+        self._builders: dict[tuple[int, int], InverseBuilder] = {}  # likewise
+        self._vectors: dict[tuple[int, int], dict[str, DeviceArray]] = {}  # by body and plan
+        self._factor_bytes = [0] * len(ranges)
 
     @property
     def bodies_device(self) -> int:
-        """Address of the rows that the solver reads."""
+        """Address of the rows of the bodies on the device."""
         return int(self._rows.data.ptr)
 
-    def _compiled(self, blocks: int) -> Any:
+    def _compiled(self, blocks: int) -> KernelFunction:
+        """Compiles pcg.cu for `blocks` thread blocks a multiprocessor."""
         layouts = {
-            "PCG_BODY": PCG_BODY,
-            "PCG_RESULT": PCG_RESULT,
-            "PCG_ARGUMENTS": PCG_ARGUMENTS,
-            "DEVICE_PLAN": DEVICE_PLAN,
-        }
+            "PCG_BODY": PCG_BODY, "PCG_RESULT": PCG_RESULT, "PCG_ARGUMENTS": PCG_ARGUMENTS, "DEVICE_PLAN": DEVICE_PLAN
+        }  # fmt: skip
         numbers = {"THREADS": self.threads, "PER_PROCESSOR": blocks} | {
             f"{name}_BYTES": layout.itemsize for name, layout in layouts.items()
         }
@@ -132,46 +138,49 @@ class PcgSolver:
         return compiled("pcg.cu", module, "pcg")
 
     def launch(self) -> None:
-        """Puts a solve onto the current stream."""
+        """Launches a solve of all bodies."""
         phases = (np.uint64(array.data.ptr) for array in self._phases)
         self._function((self.grid,), (self.threads,), (self._params, *phases), shared_mem=self._shared)
 
-    def planned(self, body: int, pattern: FactorPattern) -> DevicePlan:
-        """How the inverse of factors of this pattern is shared out for a body. Raises ValueError if it cannot be."""
+    def plan(self, body: int, pattern: FactorPattern) -> DevicePlan:
+        """Returns the plan of the inverse of factors of this pattern for a body.
+
+        Raises ValueError if the pattern has no plan (inverse.plan.plan) or needs more shared memory than there is.
+        """
         blocks = int(self.bodies[body]["blocks"])
         key = (pattern.id, blocks)
-        if key not in self._planned:
+        if key not in self._plans:
             found = plan(pattern, blocks, planes=self.planes, shared=self._shared)
             if (needed := shared_bytes(found)) > self._shared:
                 raise ValueError(
                     f"{pattern.size} degrees of freedom in {blocks} thread blocks need {needed} bytes of shared memory "
                     f"each, allowed: {self._shared}"
                 )
-            planned = DevicePlan(self.gpu, found, self.threads // 32)
-            self._expansions[key] = InverseBuilder(self.gpu, pattern, found)
-            self._planned[key] = planned  # once there was memory for both
-        return self._planned[key]
+            device_plan = DevicePlan(self.gpu, found, self.threads // 32)
+            self._builders[key] = InverseBuilder(self.gpu, pattern, found)
+            self._plans[key] = device_plan  # only if there was memory for both
+        return self._plans[key]
 
-    def expansion(self, body: int, pattern: FactorPattern) -> InverseBuilder:
-        """What makes factors of this pattern usable for a body, the same for all alike. Raises ValueError."""
-        self.planned(body, pattern)
-        return self._expansions[pattern.id, int(self.bodies[body]["blocks"])]
+    def inverse_builder(self, body: int, pattern: FactorPattern) -> InverseBuilder:
+        """Returns the builder of inverses of factors of this pattern for a body. Raises ValueError as `plan` does."""
+        self.plan(body, pattern)
+        return self._builders[pattern.id, int(self.bodies[body]["blocks"])]
 
-    def use(self, body: int, pattern: FactorPattern, expanded: PartitionedInverse, step: int) -> None:
-        """Writes a factor into the host row of a body; it holds once the row is uploaded."""
-        planned, row = self.planned(body, pattern), self.bodies[body]
-        row["plan"], row["matrix"], row["scale"] = planned.address, expanded.matrix, expanded.scale
+    def use(self, body: int, pattern: FactorPattern, inverse: PartitionedInverse, step: int) -> None:
+        """Writes a factor into the host row of a body; it is in use once the row is uploaded."""
+        device_plan, row = self.plan(body, pattern), self.bodies[body]
+        row["plan"], row["matrix"], row["scale"] = device_plan.address, inverse.matrix, inverse.scale
         row["planes"], row["factor_step"] = self.planes, step
-        key = (body, planned.address)
+        key = (body, device_plan.address)
         if key not in self._vectors:
-            self._vectors[key] = planned.vectors()
+            self._vectors[key] = device_plan.vectors()
         for name, array in self._vectors[key].items():
             row[name] = array.data.ptr
-        self._applied[body] = planned.bytes
+        self._factor_bytes[body] = device_plan.bytes
 
     def factor_bytes(self, body: int) -> int:
-        """What an application of the factor of a body's host row reads, 0 without one."""
-        return self._applied[body]
+        """Returns the bytes that an application of the factor in a body's host row reads, 0 without one."""
+        return self._factor_bytes[body]
 
     def _arguments(self, nodes: int, pooled: int) -> NDArray[Any]:
         params = np.zeros((), PCG_ARGUMENTS)

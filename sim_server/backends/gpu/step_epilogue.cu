@@ -11,7 +11,7 @@ struct StepEpilogue {
     unsigned* pool_counters;    // (counters,)
     unsigned* finished_blocks;  // (1,) thread blocks that have; zero between launches
     long long* timestamps;      // (capacity, 2) on the host: ns when each step began and ended; a step begins when the one before
-                                // has ended, or when `stamp` says so
+                                // has ended, or when `stamp_begin` says so
     const long long* results;   // (capacity, result_words)
     long long* host_results;    // likewise on the host
     int* moving;                // (bodies,)
@@ -43,4 +43,4 @@ __device__ void finish_step(const StepEpilogue& t) {
 }
 
 // The device had nothing to do until now: the next step begins here.
-extern "C" __global__ void stamp(const StepEpilogue t) { t.timestamps[2 * (t.step[0] % t.capacity)] = nanoseconds(); }
+extern "C" __global__ void stamp_begin(const StepEpilogue t) { t.timestamps[2 * (t.step[0] % t.capacity)] = nanoseconds(); }

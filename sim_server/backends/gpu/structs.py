@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Memory that the native GPU loop and Python share. The C++ side is loop.h; sizes are compared when it is loaded."""
+"""Memory that the native GPU loop (loop.h) and Python share, as ctypes and NumPy see it.
+
+mailbox.library compares the sizes of both sides when it loads the loop.
+"""
 
 import ctypes as c
 
@@ -8,7 +11,8 @@ import numpy as np
 from sim_server.backends.cpu.structs import Rings
 
 p, i64 = c.c_void_p, c.c_int64
-STEP_BATCHES, FRAME_COPIES = 2, 4  # batches and frames under way at most
+REQUEST_VALUES, REQUEST_POSITIONS = 1, 2  # of a BodyReadback
+STEP_BATCHES, FRAME_COPIES = 2, 4  # largest numbers of batches and of frames under way
 STEP_TIMESTAMP = np.dtype([("begin", "i8"), ("end", "i8")])
 ENERGY_RECORD = np.dtype(
     [(n, "f8") for n in ("kinetic", "elastic", "gravity", "work", "budget", "stride")]
@@ -18,7 +22,7 @@ NEWTON_RESULT = np.dtype([("nonlinear", "f8"), ("linearizations", "i4"), ("unuse
 
 
 class CudaDriver(c.Structure):
-    """Addresses of functions of the driver API."""
+    """Addresses of functions of the CUDA driver API."""
 
     _fields_ = [
         (name, p)
@@ -30,14 +34,20 @@ class CudaDriver(c.Structure):
 
 
 class Mail(c.Structure):
+    """New bytes for a mail slot."""
+
     _fields_ = [("bytes", p), ("event", p), ("number", i64), ("taken", i64)]
 
 
 class MailSlot(c.Structure):
+    """Bytes on the device that are replaced between batches."""
+
     _fields_ = [("target", c.c_uint64), ("size", i64), ("posted", p), ("pending", p), ("taken", i64)]
 
 
 class BodyReadback(c.Structure):
+    """Copies of the matrix or the positions of a body to the host."""
+
     _fields_ = [
         ("values_begin", i64), ("values_bytes", i64), ("x_begin", i64), ("x_bytes", i64), ("requested", c.c_int32),
         ("in_flight", c.c_int32), ("copied_step", i64),
@@ -45,16 +55,22 @@ class BodyReadback(c.Structure):
 
 
 class StepBatch(c.Structure):
+    """Steps whose results are read together."""
+
     _fields_ = [
         ("upload", p), ("done", p), ("first", i64), ("steps", i64), ("late", c.c_double),
     ]  # fmt: skip
 
 
 class FrameCopy(c.Structure):
+    """Events of a frame under way: copied on the device, copied to the host."""
+
     _fields_ = [("taken", p), ("arrived", p)]
 
 
 class GpuLoop(c.Structure):
+    """State of the native loop."""
+
     _anonymous_ = ("rings",)
     _fields_ = [
         ("driver", c.POINTER(CudaDriver)), ("context", p), ("stream", p), ("copy_stream", p), ("graphs", p * 4),

@@ -72,10 +72,10 @@ def _by_part(launches: Sequence[Any]) -> dict[str, list[Any]]:
 
 def _fused(launches: Sequence[Any]) -> dict[str, list[Any]]:
     """Those of nodes and of blocks, whatever parts they have, count as sums."""
-    from sim_server.backends.gpu.kernel_fusion import fused
+    from sim_server.backends.gpu.kernel_fusion import fuse
 
     kernels: dict[str, list[Any]] = {p: [] for p in PARTS}
-    for kernel in fused(launches):
+    for kernel in fuse(launches):
         kernels["elements" if part(kernel._launches[0]) == "elements" else "sums"].append(kernel)
     return kernels
 

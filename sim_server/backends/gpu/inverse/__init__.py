@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""A factor as a partitioned inverse on a GPU."""
+"""The partitioned inverse of a factor on a GPU."""

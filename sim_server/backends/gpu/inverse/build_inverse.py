@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""From the values of L to what the GPU applies (plan.py), on the device, beside the running steps.
+"""Builds the partitioned inverse (plan.py) from the values of L on the device, beside the running steps.
 
-Per expansion: one copy from pinned memory and one launch of a graph of the kernels in build_inverse.cu. No memory is
-allocated but when an InverseBuilder is made.
+A build is one copy from pinned memory and one launch of a graph of the kernels in build_inverse.cu. Memory is allocated
+only when an InverseBuilder or an InverseStorage is made.
 """
 
 from typing import Any, NamedTuple
@@ -11,15 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import FactorPattern
+from sim_server.backends.gpu.cupy_types import DeviceArray, Event, Graph, KernelFunction
 from sim_server.backends.gpu.device import Gpu
-from sim_server.backends.gpu.inverse.expansion_batches import EDGE, BuildBatch, layout
+from sim_server.backends.gpu.inverse.expansion_batches import EDGE, BuildBatch, workspace_layout
 from sim_server.backends.gpu.inverse.partition import COLUMNS, ROWS
 from sim_server.backends.gpu.inverse.plan import Plan
 from sim_server.backends.gpu.inverse.workspace import workspace
 
-HEAD = 16  # bytes in front of the values: the two addresses of a target
-# Of a kernel: threads and bytes of shared memory of a group, groups in a small and in a large block.
+HEAD = 16  # bytes in front of the values: the two addresses of a storage
 Groups = tuple[int, int, int, int]
+"""Of a kernel: threads and bytes of shared memory of a group of threads, groups in a small and in a large block."""
 TILES: Groups = (128, 4 * (EDGE * (EDGE + 1) + 2 * EDGE), 1, 5)
 KERNELS: dict[str, Groups] = {
     "scatter": (32, 0, 8, 32),
@@ -32,58 +33,66 @@ KERNELS: dict[str, Groups] = {
 
 
 class PartitionedInverse(NamedTuple):
-    """Device addresses of the chunks (float16) and of the scale (float32, (N + 1,): d in packed order, 0 in padding,
-    then the largest d); the event after which they hold."""
+    """The inverse of a factor on the device.
+
+    matrix: address of the chunks, float16
+    scale: address of d in packed order, float32 (N + 1,): 0 in padding, then the largest d
+    event: after it both are complete
+    """
 
     matrix: int
     scale: int
-    event: Any
+    event: Event
 
 
 class InverseStorage(NamedTuple):
-    """Memory for one expanded factor: chunks (chunks, 8, 32) float16, scale (N + 1,) float32."""
+    """Device memory for one inverse. matrix: (chunks, 8, 32) float16. scale: (N + 1,) float32."""
 
-    matrix: Any
-    scale: Any
+    matrix: DeviceArray
+    scale: DeviceArray
 
 
 class InverseBuilder:
-    """Of factors with one pattern by one plan, for any number of bodies."""
+    """Builds the inverses of factors with one pattern by one plan, for any number of bodies."""
 
     def __init__(self, gpu: Gpu, pattern: FactorPattern, plan: Plan):
         cp = gpu.cp
         self.plan, self._gpu, self._nonzeros = plan, gpu, pattern.nonzeros
-        self._layout = made = layout(pattern, plan)
-        tables = (made.parts, made.columns)
+        self._layout = layout = workspace_layout(pattern, plan)
+        tables = (layout.parts, layout.columns)
         self._parts, self._columns = (cp.asarray(t.view(np.uint8)) for t in tables)
-        self._place, self._boundary = cp.asarray(made.place), cp.asarray(plan.boundary)
-        self._row_chunk, self._out_chunk = cp.asarray(made.row_chunk), cp.asarray(made.out_chunk)
-        self._tasks = [[cp.asarray(t) for t in (b.diagonal, b.finish, *b.merges)] for b in made.batches]
+        self._place, self._boundary = cp.asarray(layout.place), cp.asarray(plan.boundary)
+        self._row_chunk, self._out_chunk = cp.asarray(layout.row_chunk), cp.asarray(layout.out_chunk)
+        self._tasks = [[cp.asarray(t) for t in (b.diagonal, b.finish, *b.merges)] for b in layout.batches]
         self._workspace = workspace(cp.cuda.Device().id)
-        self._workspace.reserve(made.room, HEAD + 4 * self._nonzeros)
-        self._functions = {name: gpu.module("backends/gpu/inverse/build_inverse.cu").function(name) for name in KERNELS}
-        self._graphs: dict[int | None, Any] = {}
+        self._workspace.reserve(layout.size, HEAD + 4 * self._nonzeros)
+        self._functions: dict[str, KernelFunction] = {
+            name: gpu.module("backends/gpu/inverse/build_inverse.cu").function(name) for name in KERNELS
+        }
+        self._graphs: dict[int | None, Graph] = {}
         self._generation = -1
 
-    def target(self) -> InverseStorage:
-        """New memory for one factor, all zeros."""
+    def storage(self) -> InverseStorage:
+        """Allocates memory for one inverse, set to zero."""
         cp, p = self._gpu.cp, self.plan
         return InverseStorage(cp.zeros((p.chunks, ROWS, COLUMNS), np.float16), cp.zeros(p.size + 1, np.float32))
 
-    def expand(
-        self, values: NDArray[Any], target: InverseStorage, multiprocessors: int | None = None
+    def build(
+        self, values: NDArray[np.floating], storage: InverseStorage, multiprocessors: int | None = None
     ) -> PartitionedInverse:
-        """Starts making what `values` (nonzeros,) stand for. Nobody may be using the target; returns at once, but
-        waits for the values of an expansion before it to have been copied to the device. For one thread at a time.
+        """Begins to build the inverse for the values (nonzeros,) of L; returns before it is complete.
 
-        multiprocessors: at most so many are kept busy, for whole milliseconds; a launch that needs all the others
-        runs beside. None: all of them, and a launch that needs all waits some 100 us now and then.
+        Waits until the values of the build before have been copied to the device. Only one thread may call it.
+
+        storage: memory that nothing under way reads
+        multiprocessors: the build keeps at most so many busy, for whole milliseconds, so that a launch that needs only
+            the others runs beside it. None: all of them; a launch that needs all then waits some 100 us now and then.
         """
         space, cp = self._workspace, self._gpu.cp
         if space.copied is not None:
             space.copied.synchronize()
         size = HEAD + 4 * self._nonzeros
-        addresses = target.matrix.data.ptr, target.scale.data.ptr
+        addresses = storage.matrix.data.ptr, storage.scale.data.ptr
         space.staging[:HEAD].view(np.uint64)[:] = addresses
         space.staging[HEAD:size].view(np.float32)[:] = values
         graph, stream = self._graph(multiprocessors), space.stream
@@ -94,8 +103,9 @@ class InverseBuilder:
         graph.launch(stream)
         return PartitionedInverse(*addresses, stream.record())
 
-    def _graph(self, limit: int | None) -> Any:
-        if self._generation != self._workspace.generation:  # they hold its addresses
+    def _graph(self, limit: int | None) -> Graph:
+        """Returns the graph of a build that keeps at most `limit` multiprocessors busy."""
+        if self._generation != self._workspace.generation:  # graphs hold its addresses
             self._graphs, self._generation = {}, self._workspace.generation
         if limit not in self._graphs:
             stream = self._workspace.stream
@@ -110,11 +120,12 @@ class InverseBuilder:
         return self._graphs[limit]
 
     def _batch(self, number: int, batch: BuildBatch, limit: int | None) -> None:
+        """Launches the kernels that build the parts of a batch."""
         space, parts, last = self._workspace, self._parts, np.int32(self.plan.size)
         memory, target = (np.uint64(a.data.ptr) for a in (space.memory, space.incoming))
         diagonal, finish, *merges = self._tasks[number]
 
-        def launch(name: str, tasks: Any, *more: Any) -> None:
+        def launch(name: str, tasks: DeviceArray, *more: Any) -> None:
             self._launch(name, limit, len(tasks), parts, tasks, np.int32(len(tasks)), memory, *more)
 
         self._gpu.cp.cuda.runtime.memsetAsync(int(memory), 0, batch.cleared, space.stream.ptr)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A plan (plan.py) as the kernel reads it, on the device. Layouts: pcg_structs.cuh."""
+"""Plan of the partitioned inverse (plan.py) on the device, as the kernel reads it (pcg_structs.cuh)."""
 
 from typing import Any
 
@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from sim_server.backends.gpu.device import Gpu
 from sim_server.backends.gpu.inverse.plan import Plan
 
-DUMMY = 32  # entries behind the packed vectors, where padding points
+PADDING = 32  # entries behind the packed vectors, to which padding refers
 TILE_SUMS = 64  # partitioned_inverse.cuh
-ROUND = 6  # what a product costs besides its chunks, in chunks
+ROUND = 6  # constant cost of a product, in chunks
 
 DEVICE_PLAN = np.dtype(
     [
@@ -23,12 +23,12 @@ DEVICE_PLAN = np.dtype(
 
 
 def shared_bytes(plan: Plan) -> int:
-    """Bytes of shared memory that a thread block must have: the vector of a phase in two float16, sums of tiles."""
+    """Returns the bytes of shared memory that a thread block needs: vector of a phase in two float16, sums of tiles."""
     return 4 * plan.x_area + 64 * TILE_SUMS + 48
 
 
 def regrouped_by_block(start: NDArray[Any], phases: int, blocks: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Lists kept by phase and block, wanted by block and phase: where each begins then, and which items follow."""
+    """Reorders lists from [phase, block] to [block, phase]; returns the new starts and the old index of each item."""
     order = np.arange(phases * blocks).reshape(phases, blocks).T.ravel()
     start = start.astype(np.int64)
     length = np.diff(start)[order]
@@ -38,7 +38,7 @@ def regrouped_by_block(start: NDArray[Any], phases: int, blocks: int) -> tuple[N
 
 
 def warp_segments(plan: Plan) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-    """Segments cut into 32 entries each: where those of each list begin, and (kind, from, to, 2 valid + keep)."""
+    """Cuts segments into 32 entries each; returns starts of the lists, and (kind, from, to, 2 valid + keep)."""
     segments = plan.segments.astype(np.int64)
     count = segments[:, 2] // 32
     ends = np.concatenate([[0], np.cumsum(count)])
@@ -53,7 +53,10 @@ def warp_segments(plan: Plan) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
 
 
 def entry_index(plan: Plan, cut: NDArray[np.int32]) -> NDArray[np.int64]:
-    """(pieces, 32): where each entry stands, or its contributions. Raises ValueError if there are too many."""
+    """Returns the position of each entry, or its range of contributions, (segments, 32).
+
+    Raises ValueError if there are too many contributions.
+    """
     entry = cut[:, 1, None].astype(np.int64) + np.arange(32)
     formed = (cut[:, 0] == 0)[:, None]
     start = plan.slot_start.astype(np.int64)
@@ -72,7 +75,7 @@ def entry_index(plan: Plan, cut: NDArray[np.int32]) -> NDArray[np.int64]:
 
 
 def paired_tiles(tiles: NDArray[Any], start: NDArray[Any], planes: int) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
-    """Tiles of 8 rows taken together where the next eight rows follow, (k, 8): chunk, x, chunks, out, rows, 0, 0, 0."""
+    """Joins tiles of 8 rows with the next 8 rows where they follow, (k, 8): chunk, x, chunks, out, rows, 0, 0, 0."""
     chunk, x, chunks, out = tiles.T.astype(np.int64)
     follows = np.zeros(len(tiles), bool)  # the one before, in the same list
     follows[1:] = (x[1:] == x[:-1]) & (out[1:] == out[:-1] + 8) & (chunk[1:] == chunk[:-1] + planes * chunks[:-1])
@@ -87,7 +90,7 @@ def paired_tiles(tiles: NDArray[Any], start: NDArray[Any], planes: int) -> tuple
 
 
 def warps_per_tile(tiles: NDArray[Any], start: NDArray[Any], warps: int) -> NDArray[np.int32]:
-    """Warps that share each tile of a list, (lists,): few tiles would leave most warps idle."""
+    """Returns the number of warps that share each tile of a list, (lists,); one alone would leave warps idle."""
     count = np.diff(start)
     total = np.concatenate([[0], np.cumsum(tiles[:, 2].astype(np.int64))])
     mean = (total[start[1:]] - total[start[:-1]]) / np.maximum(count, 1)
@@ -102,7 +105,7 @@ def warps_per_tile(tiles: NDArray[Any], start: NDArray[Any], warps: int) -> NDAr
 
 
 def block_ranges(segment_start: NDArray[Any], tile_start: NDArray[Any], plan: Plan) -> NDArray[np.int64]:
-    """(blocks, 8) what each thread block has: first and count of pieces, tiles, chunks."""
+    """Returns first and number of the segments, tiles and chunks of each thread block, (blocks, 8)."""
     found = np.zeros((plan.blocks, 8), np.int64)
     for k, start in enumerate((segment_start[:: plan.phases], tile_start[:: plan.phases], plan.chunk_start)):
         found[:, 2 * k], found[:, 2 * k + 1] = start[:-1], np.diff(start)
@@ -112,8 +115,11 @@ def block_ranges(segment_start: NDArray[Any], tile_start: NDArray[Any], plan: Pl
 def phase_lists(
     segment_start: NDArray[Any], tile_start: NDArray[Any], split: NDArray[Any], formed: NDArray[Any]
 ) -> NDArray[np.int64]:
-    """(blocks, 4 phases + 2): where the pieces of each phase begin, and its tiles, in a block's own; the splits; the
-    first piece that is not formed. formed (pieces,): whether a piece is; those of a phase come first."""
+    """Returns the lists of each thread block, (blocks, 4 phases + 2): starts of the segments of each phase and of its
+    tiles, within the block; warps per tile; first segment that is not formed.
+
+    formed (segments,): True for segments that the block forms; they come first in a phase.
+    """
     blocks, phases = split.shape
     at = phases * np.arange(blocks)[:, None] + np.arange(phases + 1)
     own = [start[at] - start[at[:, :1]] for start in (segment_start, tile_start)]
@@ -122,7 +128,12 @@ def phase_lists(
 
 
 class DevicePlan:
-    """A plan on the device, with the vectors that an application of it needs made by `vectors`."""
+    """A plan on the device.
+
+    warps: of a thread block
+    address: of the struct DevicePlan (pcg_structs.cuh)
+    bytes: of the matrices
+    """
 
     def __init__(self, gpu: Gpu, plan: Plan, warps: int):
         self.gpu, self.plan = gpu, plan
@@ -132,9 +143,9 @@ class DevicePlan:
         tile_start, tile_order = regrouped_by_block(plan.tile_start, plan.phases, plan.blocks)
         tiles, tile_start = paired_tiles(plan.tiles[tile_order], tile_start, plan.planes)
         split = warps_per_tile(tiles, tile_start, warps).reshape(plan.blocks, plan.phases)
-        target = np.full(plan.contributions + DUMMY, len(plan.slots), np.int32)
+        target = np.full(plan.contributions + PADDING, len(plan.slots), np.int32)
         target[plan.slots] = np.arange(len(plan.slots), dtype=np.int32)
-        self._contributions = len(plan.slots) + DUMMY
+        self._contributions = len(plan.slots) + PADDING
         arrays: dict[str, NDArray[Any]] = {
             "block_ranges": block_ranges(segment_start, tile_start, plan),
             "lists": phase_lists(segment_start, tile_start, split, cut[segment_order, 0] == 0),
@@ -154,8 +165,8 @@ class DevicePlan:
         self.address = int(self._params.data.ptr)
 
     def vectors(self) -> dict[str, Any]:
-        """Those of one body, in words (block_group.cuh) of no exchange."""
-        zeros, n = self.gpu.cp.zeros, self.plan.size + DUMMY
+        """Allocates the vectors of one body, as flag words (block_group.cuh) with exchange number 0."""
+        zeros, n = self.gpu.cp.zeros, self.plan.size + PADDING
         return {
             "residual": zeros(2 * n), "product": zeros(n), "z": zeros(n), "formed": zeros(n), "solved": zeros(n),
             "contributed": zeros(self._contributions),

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""What the kernels of build_inverse.cu are told: where everything lies in the workspace, and lists of tasks.
+"""Input of the kernels of build_inverse.cu: layout of the workspace and lists of tasks.
 
-Parts are made in batches that fit into the workspace, from the top of the tree down: the scale of a boundary belongs to
-parts above. Host code, once per pattern and plan.
+Parts are built in batches that fit into the workspace, from the top of the tree down, since the scale of a boundary
+belongs to parts above. Runs on the host, once per pattern and plan.
 """
 
 from dataclasses import dataclass
@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import FactorPattern
+from sim_server.arrays import Int32, Int64
 from sim_server.backends.gpu.inverse.partition import ROWS, padded
 from sim_server.backends.gpu.inverse.plan import Plan, ranges
 
-Int32 = NDArray[np.int32]
-EDGE = 64  # of a tile of the kernels
-ROOM = 256 << 20  # bytes of workspace unless a single part needs more
+EDGE = 64  # rows and columns of a tile of the kernels
+WORKSPACE = 256 << 20  # bytes, unless a single part needs more
 
 PART = np.dtype(
     [("g", "i8"), ("t", "i8")]
@@ -29,8 +29,13 @@ COLUMN = np.dtype([("value", "i8"), ("row", "i8"), ("length", "i4"), ("part", "i
 
 @dataclass(frozen=True)
 class BuildBatch:
-    """Columns first..last of the table of columns; bytes of the workspace to be cleared; tasks (k, 4): part, tile row,
-    tile column, end of the first run. merges: level by level."""
+    """Parts that are built together.
+
+    first, last: range of the table of columns
+    cleared: bytes at the beginning of the workspace that are set to zero
+    diagonal, finish: tasks (k, 4): part, tile row, tile column, end of the first run
+    merges: tasks, level by level
+    """
 
     first: int
     last: int
@@ -42,8 +47,13 @@ class BuildBatch:
 
 @dataclass(frozen=True)
 class WorkspaceLayout:
-    """Tables of PART and COLUMN; place (rows of the pattern,): column in its part's G of each entry of L's row lists;
-    row_chunk (N / 8,), out_chunk (contributions / 8,): first chunk of each tile; room: bytes of workspace."""
+    """Layout of the workspace, and tasks.
+
+    parts, columns: tables of PART and COLUMN
+    place (rows of the pattern,): column of each entry of L's row lists in the matrix G of its part
+    row_chunk (N / 8,), out_chunk (contributions / 8,): first chunk of each tile
+    size: bytes of workspace
+    """
 
     parts: NDArray[Any]
     columns: NDArray[Any]
@@ -51,27 +61,27 @@ class WorkspaceLayout:
     row_chunk: Int32
     out_chunk: Int32
     batches: list[BuildBatch]
-    room: int
+    size: int
 
 
-def layout(pattern: FactorPattern, plan: Plan, room: int = ROOM) -> WorkspaceLayout:
-    """Where the parts of a plan are made."""
-    parts, members = _parts(plan, room)
+def workspace_layout(pattern: FactorPattern, plan: Plan, workspace: int = WORKSPACE) -> WorkspaceLayout:
+    """Lays out the workspace in which the parts of a plan are built."""
+    parts, members = _parts(plan, workspace)
     columns, first = _columns(pattern, plan)
     batches = [_batch(parts, p, first) for p in members]
-    row_chunk, out_chunk = _homes(plan)
+    row_chunk, out_chunk = _chunks(plan)
     return WorkspaceLayout(
         parts, columns, _place(pattern, plan), row_chunk, out_chunk, batches, max(_end(parts, p) for p in members)
     )
 
 
-def _end(parts: NDArray[Any], members: NDArray[np.int64]) -> int:
+def _end(parts: NDArray[Any], members: Int64) -> int:
     last = parts[members[-1]]
     return 4 * int(last["t"] + int(last["pitch_t"]) ** 2)
 
 
-def _parts(plan: Plan, room: int) -> tuple[NDArray[Any], list[NDArray[np.int64]]]:
-    """The table, and the parts of each batch."""
+def _parts(plan: Plan, workspace: int) -> tuple[NDArray[Any], list[Int64]]:
+    """Returns the table of parts, and the parts of each batch."""
     table = np.zeros(len(plan.parts.v), PART)
     for name in ("v", "b", "start", "boundary", "out"):
         table[name] = getattr(plan.parts, name)
@@ -83,7 +93,7 @@ def _parts(plan: Plan, room: int) -> tuple[NDArray[Any], list[NDArray[np.int64]]
     batch: list[int] = []
     used = 0
     for p in range(len(table) - 1, -1, -1):  # the last group first
-        if batch and used + int(g[p] + t[p]) > room // 4:
+        if batch and used + int(g[p] + t[p]) > workspace // 4:
             members.append(batch)
             batch, used = [], 0
         batch.append(p)
@@ -96,8 +106,8 @@ def _parts(plan: Plan, room: int) -> tuple[NDArray[Any], list[NDArray[np.int64]]
     return table, found
 
 
-def _columns(pattern: FactorPattern, plan: Plan) -> tuple[NDArray[Any], NDArray[np.int64]]:
-    """The table, in packed order, and the first entry of each part with one more for the end."""
+def _columns(pattern: FactorPattern, plan: Plan) -> tuple[NDArray[Any], Int64]:
+    """Returns the table of columns in packed order, and the first entry of each part, (parts + 1,)."""
     width = np.diff(pattern.super_start).astype(np.int64)
     supernode = np.repeat(np.arange(len(width)), width)
     within = np.arange(pattern.size) - pattern.super_start[:-1].astype(np.int64)[supernode]
@@ -130,7 +140,7 @@ def _place(pattern: FactorPattern, plan: Plan) -> Int32:
     return local.astype(np.int32)
 
 
-def _homes(plan: Plan) -> tuple[Int32, Int32]:
+def _chunks(plan: Plan) -> tuple[Int32, Int32]:
     forward = plan.tile_start[(plan.groups - 1) * plan.blocks]
     row_chunk = np.zeros(plan.size // ROWS, np.int32)
     out_chunk = np.zeros(max(1, plan.contributions // ROWS), np.int32)
@@ -139,7 +149,7 @@ def _homes(plan: Plan) -> tuple[Int32, Int32]:
     return row_chunk, out_chunk
 
 
-def _batch(parts: NDArray[Any], members: NDArray[np.int64], first: NDArray[np.int64]) -> BuildBatch:
+def _batch(parts: NDArray[Any], members: Int64, first: Int64) -> BuildBatch:
     inside, edge = parts["pitch_t"][members] // EDGE, (parts["pitch_g"] - parts["pitch_t"])[members] // EDGE
     lower = [_lower(int(n)) for n in inside]
     part = np.repeat(members, [len(pairs) for pairs in lower])
@@ -167,14 +177,16 @@ def _tasks(tasks: NDArray[Any]) -> Int32:
 
 
 @lru_cache(64)
-def _lower(n: int) -> NDArray[np.int64]:
-    """(i, j) of the lower triangle of n x n tiles, the diagonal included."""
+def _lower(n: int) -> Int64:
+    """Returns (i, j) of the lower triangle of n x n tiles, the diagonal included."""
     return np.column_stack(np.tril_indices(n))
 
 
-def _levels(pairs: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-    """Tiles (part, i, j, ..) below the diagonal by the level at which they are made: that of the highest bit in which
-    i and j differ. Runs of 2^level tiles are then merged; the first of the two ends at the last field."""
+def _levels(pairs: Int64) -> list[Int64]:
+    """Groups tiles (part, i, j, end) below the diagonal by level, the highest bit in which i and j differ.
+
+    On a level, runs of 2^level tiles are merged in pairs; `end` is the end of the first of the two.
+    """
     differ = pairs[:, 1] ^ pairs[:, 2]
     levels = []
     for level in range(int(differ.max(initial=0)).bit_length()):

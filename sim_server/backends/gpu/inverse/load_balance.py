@@ -1,46 +1,46 @@
 # SPDX-License-Identifier: MIT
-"""Rows of many dense matrices shared out over thread blocks: whole tiles, and few matrices per block.
+"""Load balance: partition of the rows of many dense matrices into whole tiles over thread blocks.
 
-A block that works on a matrix must first bring its vector into shared memory, so cutting matrices anywhere for the
-sake of balance costs more than it gains. Either every matrix gets a number of blocks of its own (small ones share a
-block), or, where that leaves blocks idle for too long, a block goes on with the next matrix.
+A block must load the vector of each matrix that it has rows of into shared memory, so it gets rows of few matrices.
+Either every matrix has a number of blocks of its own (small ones share a block), or, if that leaves blocks idle for too
+long, a block that is full is followed by the next one anywhere in a matrix.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Ints = NDArray[np.int64]
-Reals = NDArray[np.float64]
-WORTH = 1.1  # matrices are cut anywhere only if everything else takes this many times as long
-MANY = 8  # matrices per block from which whole ones balance well enough
+from sim_server.arrays import Float64, Int64
+
+CUT_GAIN = 1.1  # matrices are cut anywhere only if whole ones take this many times as long
+MANY = 8  # matrices per block above which whole ones balance well enough
 
 
 class PhaseWork(NamedTuple):
-    """Matrices of one phase: rows of tiles, time of one tile and of bringing the vector [ns]; (matrices,) each."""
+    """Work of one phase, per matrix: number of tiles, time of one tile [ns], time of loading the vector [ns]."""
 
-    tiles: Ints
-    tile: Reals
-    bring: Reals
+    tiles: Int64
+    tile: Float64
+    load: Float64
 
 
 class TilePartition(NamedTuple):
-    """Tiles first..first + tiles of a matrix belong to a block; sorted by block. (pieces,) each."""
+    """Pieces of matrices, sorted by block, (pieces,): tiles [first, first + tiles) of a matrix belong to a block."""
 
-    block: Ints
-    matrix: Ints
-    first: Ints
-    tiles: Ints
+    block: Int64
+    matrix: Int64
+    first: Int64
+    tiles: Int64
 
 
-def share(work: PhaseWork, blocks: int) -> TilePartition:
-    """The pieces of every block; every tile is in one."""
+def balance(work: PhaseWork, blocks: int) -> TilePartition:
+    """Assigns each tile to one of the blocks so that the longest time of a block is short."""
     whole = _least(work, blocks, lambda time: _whole(work, blocks, time))
     if len(work.tiles) > MANY * blocks or blocks == 1:
         return _sorted(_whole(work, blocks, whole))
     cut = _least(work, blocks, lambda time: _cut(work, blocks, time))
-    return _sorted(_cut(work, blocks, cut) if whole > WORTH * cut else _whole(work, blocks, whole))
+    return _sorted(_cut(work, blocks, cut) if whole > CUT_GAIN * cut else _whole(work, blocks, whole))
 
 
 def _sorted(pieces: TilePartition | None) -> TilePartition:
@@ -49,9 +49,9 @@ def _sorted(pieces: TilePartition | None) -> TilePartition:
     return TilePartition(*(field[order] for field in pieces))
 
 
-def _least(work: PhaseWork, blocks: int, attempt) -> float:
-    """Least time, to 1 %, in which the attempt succeeds."""
-    total = float((work.tiles * work.tile + work.bring).sum())
+def _least(work: PhaseWork, blocks: int, attempt: Callable[[float], TilePartition | None]) -> float:
+    """Returns the least time [ns], to 1 %, for which `attempt` finds a partition."""
+    total = float((work.tiles * work.tile + work.load).sum())
     low, high = total / blocks, 1.001 * total
     if attempt(low) is not None:
         return low
@@ -62,10 +62,10 @@ def _least(work: PhaseWork, blocks: int, attempt) -> float:
 
 
 def _whole(work: PhaseWork, blocks: int, time: float) -> TilePartition | None:
-    """Blocks of their own for matrices that take longer than `time`, the others packed; None if blocks run out."""
-    cost = work.tiles * work.tile + work.bring
+    """Gives matrices that take longer than `time` blocks of their own and packs the others; None if blocks run out."""
+    cost = work.tiles * work.tile + work.load
     large, small = np.flatnonzero(cost > time), np.flatnonzero(cost <= time)
-    each = ((time - work.bring[large]) // work.tile[large]).astype(np.int64)  # tiles that a block has time for
+    each = ((time - work.load[large]) // work.tile[large]).astype(np.int64)  # tiles that a block has time for
     if (each < 1).any():
         return None
     count = -(-work.tiles[large] // each)
@@ -88,8 +88,8 @@ def _whole(work: PhaseWork, blocks: int, time: float) -> TilePartition | None:
     )
 
 
-def _packed(cost: Reals, time: float, bins: int) -> Ints | None:
-    """A bin for each, none above `time` (next fit, the largest first); None if bins run out."""
+def _packed(cost: Float64, time: float, bins: int) -> Int64 | None:
+    """Returns a bin for each cost, none above `time` (next fit, the largest first); None if bins run out."""
     order = np.argsort(-cost, kind="stable")
     total = np.concatenate([[0], np.cumsum(cost[order])])
     home, at = np.zeros(len(cost), np.int64), 0
@@ -103,17 +103,17 @@ def _packed(cost: Reals, time: float, bins: int) -> Ints | None:
 
 
 def _cut(work: PhaseWork, blocks: int, time: float) -> TilePartition | None:
-    """One matrix after another, a block full before the next begins; None if blocks run out."""
-    tiles, tile, bring = work.tiles.tolist(), work.tile.tolist(), work.bring.tolist()
+    """Fills one block after another with the tiles of one matrix after another; None if blocks run out."""
+    tiles, tile, load = work.tiles.tolist(), work.tile.tolist(), work.load.tolist()
     found: list[tuple[int, int, int, int]] = []
     block, left = 0, time
     for m, rest in enumerate(tiles):
         while rest:
-            fits = min(rest, int((left - bring[m]) // tile[m]))
+            fits = min(rest, int((left - load[m]) // tile[m]))
             if fits > 0:
                 found.append((block, m, tiles[m] - rest, fits))
                 rest -= fits
-                left -= bring[m] + fits * tile[m]
+                left -= load[m] + fits * tile[m]
             if rest:
                 if left == time or block == blocks - 1:
                     return None

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""The elimination tree of L cut into groups of levels, and the connected pieces of a group: parts.
+"""Partition of the elimination tree of L into groups of levels, and of each group into connected parts.
 
 Alvarado, Pothen and Schreiber, Highly parallel sparse triangular solution, 1993: the inverse of L as a product of few
 sparse factors. Here the supernodes of a part are treated as one dense block, so that applying the factor takes two
-phases per group and none of them has a dependency inside. Host code, once per pattern.
+phases per group without dependencies inside. Runs on the host, once per pattern.
 """
 
 from dataclasses import dataclass
@@ -14,29 +14,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import FactorPattern
+from sim_server.arrays import Int64
 
-Ints = NDArray[np.int64]
 NODE = 3  # degrees of freedom of a node
 COLUMNS, ROWS = 32, 8  # of a chunk of the stored matrices
 
 
 def padded(count: Any, step: int) -> Any:
-    """The next multiple of `step`."""
+    """Returns the next multiple of `step`."""
     return -(-count // step) * step
 
 
 @dataclass(frozen=True)
 class Tree:
-    """The supernodes of a pattern. parent (s,), -1 at a root; width, height, size (s,): degrees of freedom of the
-    columns, of the columns with the rows below, and of the columns of the whole subtree."""
+    """Elimination tree of the supernodes of a pattern.
+
+    parent (s,): -1 at a root
+    width, height (s,): degrees of freedom of the columns, and of the columns with the rows below
+    """
 
     pattern: FactorPattern
-    parent: Ints
-    width: Ints
-    height: Ints
+    parent: Int64
+    width: Int64
+    height: Int64
 
     @cached_property
-    def size(self) -> Ints:
+    def size(self) -> Int64:
+        """Degrees of freedom of the columns of each whole subtree, (s,)."""
         size = self.width.tolist()
         for s, p in enumerate(self.parent.tolist()):
             if p >= 0:
@@ -45,23 +49,29 @@ class Tree:
 
 
 class Partition(NamedTuple):
-    """Parts, the children's groups before the parents'.
+    """Parts of the elimination tree; groups of children come before those of their parents.
 
-    part (s,): of each supernode. Of each part, (parts,): group 0..P-1, the last one's parts having no rows below;
-    root: a supernode whose rows below are the part's boundary; v, b: degrees of freedom inside and in the boundary.
+    groups: P
+    part (s,): part of each supernode
+    group (parts,): 0 .. P - 1; parts of the last group have no boundary
+    root (parts,): a supernode whose rows below are the boundary of the part
+    v, b (parts,): degrees of freedom inside and in the boundary
     """
 
     groups: int
-    part: Ints
-    group: Ints
-    root: Ints
-    v: Ints
-    b: Ints
+    part: Int64
+    group: Int64
+    root: Int64
+    v: Int64
+    b: Int64
 
 
 def tree_of(pattern: FactorPattern) -> Tree:
-    """Raises ValueError if rows do not come in whole nodes, or if they are not those of a Cholesky factor: what lies
-    below a supernode's parent is not among its parent's rows."""
+    """Builds the elimination tree of a pattern.
+
+    Raises ValueError if rows do not come in whole nodes, or if the pattern is not that of a Cholesky factor, i.e. a row
+    below a supernode is missing in its parent.
+    """
     _check_nodes(pattern)
     start, row_start, rows = pattern.super_start.astype(np.int64), pattern.row_start, pattern.rows
     width, height = np.diff(start), np.diff(row_start)
@@ -90,7 +100,7 @@ def _check_nodes(pattern: FactorPattern) -> None:
 
 
 def _check_closed(tree: Tree) -> None:
-    """Every row below a supernode is a column or a row of its parent."""
+    """Raises ValueError unless every row below a supernode is a column or a row of its parent."""
     pattern, n = tree.pattern, tree.pattern.size // NODE
     node_rows = pattern.rows[::NODE].astype(np.int64) // NODE
     counts = tree.height // NODE
@@ -105,8 +115,10 @@ def _check_closed(tree: Tree) -> None:
 
 
 def partition(tree: Tree, thresholds: tuple[int, ...]) -> Partition:
-    """Cuts where the degrees of freedom of a subtree pass one of the ascending thresholds. Parts without a boundary
-    (of whole trees, or of their tops) are in the last group whatever their size."""
+    """Cuts the tree where the degrees of freedom of a subtree exceed one of the ascending thresholds.
+
+    Parts without a boundary (whole trees, or their tops) are in the last group.
+    """
     groups = len(thresholds) + 1
     level = np.searchsorted(np.asarray(thresholds), tree.size, side="left")
     label = np.arange(len(level)).tolist()
@@ -128,9 +140,8 @@ def partition(tree: Tree, thresholds: tuple[int, ...]) -> Partition:
     return Partition(groups, rank[part], group[order], root[order], v[order], b[order])
 
 
-def _join_small(v: Ints, b: Ints) -> Ints:
-    """New number of each part: trees of a few nodes (fixed nodes are trees of one) share parts of one column of
-    chunks."""
+def _join_small(v: Int64, b: Int64) -> Int64:
+    """Returns a new number for each part; trees of a few nodes (e.g. fixed ones) share a part of one chunk's width."""
     label, small = np.arange(len(v)), np.flatnonzero((b == 0) & (v <= COLUMNS // 2))
     room, home = 0, -1
     for s in small.tolist():

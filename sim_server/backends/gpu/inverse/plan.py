@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""How a factor is laid out and applied on a GPU: matrices in tiles, phases, and who does what.
+"""Plan of the partitioned inverse on a GPU: storage of the matrices in tiles, phases, and their thread blocks.
 
 With parts (partition.py) V, their boundaries B and A_VV as it is once everything below has been eliminated, the factor
 is applied as, S~ = D^-1 A_VV^-1 D^-1 and W~ = D^-1 A_VV^-1 A_VB D with D the square root of the diagonal of A_VV^-1,
@@ -21,25 +21,29 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from protocol.factor import FactorPattern
-from sim_server.backends.gpu.inverse.load_balance import TilePartition, share
+from sim_server.arrays import Int32, Int64
+from sim_server.backends.gpu.inverse.load_balance import TilePartition, balance
 from sim_server.backends.gpu.inverse.partition import COLUMNS, NODE, ROWS, Partition, Tree, padded, partition, tree_of
-from sim_server.backends.gpu.inverse.tree_cuts import SHARED_MEMORY, choose, works
+from sim_server.backends.gpu.inverse.tree_cuts import SHARED_MEMORY, choose_thresholds, phase_work
 
-Int32 = NDArray[np.int32]
-Ints = NDArray[np.int64]
 FORM, READ, GATHER, WRITE = 0, 1, 2, 4  # kinds of segments
 CHUNK_BYTES = 2 * ROWS * COLUMNS  # bytes
-TRIP_ENTRIES, TRIP_SLOTS = 512, 6  # entries of a part, contributions to each, that a block asks for in one trip
-TRIPS = 2  # more, and the blocks of a part form its entries once, each some of them, and read the others'
-_KEPT = 64  # plans
+TRIP_ENTRIES, TRIP_SLOTS = 512, 6  # entries of a part, and contributions to each, that a block loads in one trip
+TRIPS = 2  # above it each block of a part forms some of its entries and reads those of the other blocks
+_CACHED = 64  # plans
 
 
 class Parts(NamedTuple):
-    """Of each part, (parts,): group; start: packed position; v, b: degrees of freedom inside and in the boundary;
-    boundary: where it begins in Plan.boundary; out: its first entry of the contributions."""
+    """Parts of the partition, (parts,) each.
+
+    group
+    start: packed position of the first degree of freedom
+    v, b: number of degrees of freedom inside and in the boundary
+    boundary: first entry in Plan.boundary
+    out: first entry of its contributions
+    """
 
     group: Int32
     start: Int32
@@ -91,12 +95,12 @@ class Plan:
 
     @property
     def bytes(self) -> int:
-        """Of the stored matrices."""
+        """Size of the stored matrices."""
         return CHUNK_BYTES * self.chunks
 
     @property
     def nbytes(self) -> int:
-        """Of the plan's own arrays."""
+        """Size of the arrays of the plan."""
         return sum(v.nbytes for v in vars(self).values() if isinstance(v, np.ndarray))
 
 
@@ -113,10 +117,10 @@ def plan(
     """
     key = (pattern.id, blocks, groups, planes, shared)
     if key not in _plans:
-        if len(_plans) >= _KEPT:
+        if len(_plans) >= _CACHED:
             _plans.clear()
         tree = _tree(pattern)
-        _plans[key] = lay_out(tree, choose(tree, blocks, groups, planes, shared), blocks, planes)
+        _plans[key] = lay_out(tree, choose_thresholds(tree, blocks, groups, planes, shared), blocks, planes)
     return _plans[key]
 
 
@@ -126,7 +130,7 @@ def _tree(pattern: FactorPattern) -> Tree:
 
 
 def lay_out(tree: Tree, thresholds: tuple[int, ...], blocks: int, planes: int = 1) -> Plan:
-    """The plan for given thresholds (partition.partition)."""
+    """Makes the plan for given thresholds (partition.partition)."""
     cut = partition(tree, thresholds)
     parts, column, contributions = _packed(tree, cut)
     size = len(column)
@@ -134,7 +138,7 @@ def lay_out(tree: Tree, thresholds: tuple[int, ...], blocks: int, planes: int = 
     position[column[column >= 0]] = np.flatnonzero(column >= 0)
     boundary = _boundaries(tree, cut, parts, position, size)
     slot_start, slots = _slots(parts, boundary, size)
-    work = _shared_out(cut, parts, blocks, planes, _depth(parts, slot_start))
+    work = _partition_work(cut, parts, blocks, planes, _depth(parts, slot_start))
     return Plan(
         boundary=boundary, slot_start=slot_start, slots=slots, place=_places(tree.pattern, position), column=column,
         part=cut.part.astype(np.int32), parts=parts, size=size, phases=2 * cut.groups - 1,
@@ -143,7 +147,7 @@ def lay_out(tree: Tree, thresholds: tuple[int, ...], blocks: int, planes: int = 
 
 
 def _packed(tree: Tree, cut: Partition) -> tuple[Parts, Int32, int]:
-    """Parts, column of L at each packed position, entries of the contributions."""
+    """Returns the parts, the column of L at each packed position, and the number of contributions."""
     span, edge, out = padded(cut.v, COLUMNS), padded(cut.b, COLUMNS), padded(cut.b, ROWS)
     start = np.cumsum(span) - span
     of = np.repeat(cut.part, tree.width)  # part of each column
@@ -155,18 +159,18 @@ def _packed(tree: Tree, cut: Partition) -> tuple[Parts, Int32, int]:
     return Parts(*(np.asarray(f, np.int32) for f in fields)), column, int(out.sum())
 
 
-def _places(pattern: FactorPattern, position: Ints) -> Int32:
+def _places(pattern: FactorPattern, position: Int64) -> Int32:
     place = np.empty(pattern.size // NODE, np.int32)
     place[pattern.permutation[::NODE] // NODE] = position[::NODE]
     return place
 
 
-def ranges(first: Ints, count: Ints) -> Ints:
-    """first[i] .. first[i] + count[i] for all i, one after another."""
+def ranges(first: Int64, count: Int64) -> Int64:
+    """Concatenates the ranges [first[i], first[i] + count[i])."""
     return np.repeat(first - np.cumsum(count) + count, count) + np.arange(int(count.sum()))
 
 
-def _boundaries(tree: Tree, cut: Partition, parts: Parts, position: Ints, size: int) -> Int32:
+def _boundaries(tree: Tree, cut: Partition, parts: Parts, position: Int64, size: int) -> Int32:
     rows = ranges(tree.pattern.row_start[cut.root] + tree.width[cut.root], cut.b)
     boundary = np.full(int(padded(cut.b, COLUMNS).sum()), size, np.int32)
     boundary[ranges(parts.boundary.astype(np.int64), cut.b)] = position[tree.pattern.rows[rows]]
@@ -182,7 +186,7 @@ def _slots(parts: Parts, boundary: Int32, size: int) -> tuple[Int32, Int32]:
     return start.astype(np.int32), source[order].astype(np.int32)
 
 
-def _depth(parts: Parts, slot_start: Int32) -> Ints:
+def _depth(parts: Parts, slot_start: Int32) -> Int64:
     """(parts,) most contributions that come off an entry."""
     order = np.argsort(parts.start, kind="stable")
     depth = np.zeros(len(order), np.int64)
@@ -190,11 +194,11 @@ def _depth(parts: Parts, slot_start: Int32) -> Ints:
     return depth
 
 
-def _shared_out(cut: Partition, parts: Parts, blocks: int, planes: int, depth: Ints) -> dict:
+def _partition_work(cut: Partition, parts: Parts, blocks: int, planes: int, depth: Int64) -> dict:
     """Segments and tiles of all phases, and where each block's storage begins."""
     segments, tiles, keys, areas = [], [], [], [0]
-    for phase, (which, work) in enumerate(works(cut, blocks, planes)):
-        pieces = share(work, blocks)
+    for phase, (which, work) in enumerate(phase_work(cut, blocks, planes)):
+        pieces = balance(work, blocks)
         found = _Phase(phase, cut.groups, parts, which, pieces, depth)
         segments.append(found.segments())
         tiles.append(found.tiles())
@@ -217,14 +221,14 @@ def _shared_out(cut: Partition, parts: Parts, blocks: int, planes: int, depth: I
     }
 
 
-def _starts(keys: Ints, count: int) -> Int32:
+def _starts(keys: Int64, count: int) -> Int32:
     return np.concatenate([[0], np.cumsum(np.bincount(keys, minlength=count))]).astype(np.int32)
 
 
 class _Phase:
     """Segments and tiles of one phase, each with its block in front."""
 
-    def __init__(self, phase: int, groups: int, parts: Parts, which: Ints, pieces: TilePartition, depth: Ints):
+    def __init__(self, phase: int, groups: int, parts: Parts, which: Int64, pieces: TilePartition, depth: Int64):
         self.forward, self.backward = phase < groups - 1, phase >= groups
         self.pieces = pieces
         part = which[pieces.matrix]
@@ -237,9 +241,9 @@ class _Phase:
         self.x = total - total[opens]
         self.area = int((self.x + length).max(initial=0))
         trips = -(-self.inside // TRIP_ENTRIES) * -(-depth[part] // TRIP_SLOTS)
-        self.together = (trips > TRIPS) & (phase > 0) & (not self.backward)  # pieces of these are formed once
+        self.shared_forming = (trips > TRIPS) & (phase > 0) & (not self.backward)
 
-    def segments(self) -> Ints:
+    def segments(self) -> Int64:
         """(k, 5): block, kind, from, count, to."""
         if self.backward:
             own, edge = np.full(len(self.x), READ), np.full(len(self.x), GATHER)
@@ -247,10 +251,10 @@ class _Phase:
             return found[found[:, 3] > 0]
         kind = np.full(len(self.x), FORM)
         if self.forward:
-            kind[(self.pieces.first == 0) & ~self.together] |= WRITE
+            kind[(self.pieces.first == 0) & ~self.shared_forming] |= WRITE
         low, high = 0 * self.x, self.inside.copy()
-        low[self.together], high[self.together] = self._slices()
-        kind[self.together & (high > low)] |= WRITE
+        low[self.shared_forming], high[self.shared_forming] = self._slices()
+        kind[self.shared_forming & (high > low)] |= WRITE
         formed = self._segments(kind, low, high)
         read = np.full(len(self.x), READ)
         below, above = self._segments(read, 0 * low, low), self._segments(read, high, self.inside)
@@ -258,16 +262,16 @@ class _Phase:
         found = found[found[:, 3] > 0]
         return found[np.argsort(found[:, 0], kind="stable")]  # by block, what is formed first
 
-    def _segments(self, kind: Ints, low: Ints, high: Ints) -> Ints:
+    def _segments(self, kind: Int64, low: Int64, high: Int64) -> Int64:
         """Of entries low to high of each piece's part."""
         return np.stack([self.pieces.block, kind, self.start + low, high - low, self.x + low], axis=1)
 
-    def _edges(self, kind: Ints) -> Ints:
+    def _edges(self, kind: Int64) -> Int64:
         return np.stack([self.pieces.block, kind, self.boundary, self.outside, self.x + self.inside], axis=1)
 
-    def _slices(self) -> tuple[Ints, Ints]:
+    def _slices(self) -> tuple[Int64, Int64]:
         """Entries of its part that each block forms for all that have rows of it, as evenly as whole 32 allow."""
-        matrix, groups = self.pieces.matrix[self.together], self.inside[self.together] // COLUMNS
+        matrix, groups = self.pieces.matrix[self.shared_forming], self.inside[self.shared_forming] // COLUMNS
         order = np.argsort(matrix, kind="stable")
         count = np.bincount(matrix)
         first = np.cumsum(count) - count
@@ -276,7 +280,7 @@ class _Phase:
         of = count[matrix]
         return COLUMNS * (k * groups // of), COLUMNS * ((k + 1) * groups // of)
 
-    def tiles(self) -> Ints:
+    def tiles(self) -> Int64:
         """(m, 5): block, 0 (the chunk comes later), x, chunks, out."""
         count = self.pieces.tiles
         tile = ranges(self.pieces.first, count)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Memory in which factors are expanded: one set per device, as large as its largest user needs.
+"""Workspace in which inverses are built: one per device, as large as the largest build needs.
 
-Expansions run one after another on one stream of the lowest priority, so they share it.
+Builds share it, since they run one after another on one stream of the lowest priority.
 """
 
 from functools import cache
@@ -10,27 +10,35 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_server.backends.gpu.cupy_types import DeviceArray, Event, Stream
 from sim_server.backends.gpu.device import cupy
 
 
 class Workspace:
-    """staging: pinned, what goes to `incoming` on the device; memory: of the kernels. All bytes.
+    """Memory of the builds, in bytes.
 
-    generation counts how often any of them has moved: graphs hold addresses.
+    staging: pinned host memory that is copied to `incoming`
+    incoming: device memory
+    memory: device memory of the kernels
+    generation: number of reallocations; graphs hold addresses of one generation
+    copied: event after which `staging` may be written again
     """
 
     def __init__(self) -> None:
         cp = cupy()
-        self.stream = cp.cuda.Stream(non_blocking=True, priority=0)  # 0 is the lowest
+        self.stream: Stream = cp.cuda.Stream(non_blocking=True, priority=0)  # 0 is the lowest
         self.generation = 0
-        self.memory = self.incoming = cp.zeros(0, np.uint8)
+        self.memory: DeviceArray = cp.zeros(0, np.uint8)
+        self.incoming = self.memory
         self._pinned: Any = None
         self.staging: NDArray[np.uint8] = np.zeros(0, np.uint8)
-        self.copied: Any = None  # event after which the staging may be written again
+        self.copied: Event | None = None
 
     def reserve(self, memory: int, incoming: int) -> None:
-        """At least that many bytes, from now on. Without room for them it stays as large as it is, and CuPy's error is
-        raised."""
+        """Enlarges the workspace to at least so many bytes.
+
+        Raises CuPy's error, and leaves the workspace as it is, if there is too little memory.
+        """
         cp = cupy()
         if memory <= self.memory.nbytes and incoming <= self.incoming.nbytes:
             return
@@ -53,5 +61,5 @@ class Workspace:
 
 @cache
 def workspace(device: int) -> Workspace:
-    """Of a device, by its number, which is the current one."""
+    """Returns the workspace of the current device, whose number is `device`."""
     return Workspace()
