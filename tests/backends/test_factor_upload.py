@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Factors on their way into the GPU loop: two targets, none written while it may be read, no memory for one."""
+"""Upload of factors to the GPU loop: two storages, none written while a step may read it; lack of memory."""
 
 import logging
 from types import SimpleNamespace
@@ -15,7 +15,7 @@ from tests.backends.fake_cuda import FakeScene
 
 
 class Event:
-    """Of an expansion under way; the test says when it is done."""
+    """The event of a build under way; the test completes it."""
 
     def __init__(self, scene: FakeScene):
         self._device, self.ptr = scene.device, scene.device.event()
@@ -26,7 +26,7 @@ class Event:
 
 
 class PartitionedInverse(NamedTuple):
-    target: list[int]
+    storage: list[int]
     event: Event
 
 
@@ -35,12 +35,12 @@ class NoMemory(MemoryError):
 
 
 class Maker:
-    """Stands for the solver and what makes its factors: a target is a list that holds the value it was filled with."""
+    """Stands for the solver and its inverse builder; a storage is a list that holds the value written to it."""
 
     def __init__(self, scene: FakeScene):
         self.scene = scene
         self.bodies = np.zeros(1, [("setting", "i8"), ("factor", "i8")])
-        self.targets: list[list[int]] = []
+        self.storages: list[list[int]] = []
         self.events: list[Event] = []
         self.fail: Exception | None = None
 
@@ -50,20 +50,20 @@ class Maker:
         return self
 
     def storage(self) -> list[int]:
-        self.targets.append([])
-        return self.targets[-1]
+        self.storages.append([])
+        return self.storages[-1]
 
     spared = None
 
-    def build(self, values: np.ndarray, target: list[int], multiprocessors: int | None = None) -> PartitionedInverse:
+    def build(self, values: np.ndarray, storage: list[int], multiprocessors: int | None = None) -> PartitionedInverse:
         if self.fail:
             raise self.fail
-        target[:] = [int(values[0])]
+        storage[:] = [int(values[0])]
         self.events.append(Event(self.scene))
-        return PartitionedInverse(target, self.events[-1])
+        return PartitionedInverse(storage, self.events[-1])
 
-    def use(self, body: int, pattern: SimpleNamespace, expanded: PartitionedInverse, step: int) -> None:
-        self.bodies["factor"] = expanded.target[0]
+    def use(self, body: int, pattern: SimpleNamespace, inverse: PartitionedInverse, step: int) -> None:
+        self.bodies["factor"] = inverse.storage[0]
 
 
 PATTERN = SimpleNamespace(id=1)
@@ -80,8 +80,8 @@ def parts(monkeypatch):
     return scene, maker, FactorUpload(gpu, maker, scene.loop, ["beam"], scene.loop.mailboxes[1:2])
 
 
-def post(intake: FactorUpload, value: int) -> None:
-    intake.post(0, PATTERN, np.array([value]), value)
+def post(upload: FactorUpload, value: int) -> None:
+    upload.post(0, PATTERN, np.array([value]), value)
 
 
 def used(scene: FakeScene) -> list[int]:
@@ -89,100 +89,100 @@ def used(scene: FakeScene) -> list[int]:
 
 
 def test_a_factor_is_used_when_it_is_made(parts):
-    scene, maker, intake = parts
-    post(intake, 5)
+    scene, maker, upload = parts
+    post(upload, 5)
     scene.loop.run(1)
-    assert intake.step(0) == -1
+    assert upload.step(0) == -1
     maker.events[0].synchronize()
     scene.loop.run(1)
-    assert intake.step(0) == 5
+    assert upload.step(0) == 5
     assert used(scene) == [0, 5]
 
 
 def test_what_comes_too_early_waits_and_the_newest_wins(parts):
-    scene, maker, intake = parts
+    scene, maker, upload = parts
     for value in (5, 6, 7):
-        post(intake, value)
-    assert [t[0] for t in maker.targets] == [5]
+        post(upload, value)
+    assert [t[0] for t in maker.storages] == [5]
     maker.events[0].synchronize()
     scene.loop.run(1)
-    intake.advance()
-    assert [t[0] for t in maker.targets] == [5, 7]
+    upload.advance()
+    assert [t[0] for t in maker.storages] == [5, 7]
     maker.events[1].synchronize()
     scene.loop.run(1)
     assert used(scene) == [5, 7]
-    assert intake.step(0) == 7
+    assert upload.step(0) == 7
 
 
-def test_two_targets_do_and_the_one_in_use_is_never_written_to(parts):
-    scene, maker, intake = parts
+def test_two_storages_do_and_the_one_in_use_is_never_written_to(parts):
+    scene, maker, upload = parts
     for value in range(1, 40):
-        post(intake, value)
+        post(upload, value)
         maker.events[-1].synchronize()
         if value % 3 == 0:
             scene.loop.run(1)
-            intake.advance()
-            in_use = intake._uploads[0].in_use
-            assert in_use.storage[0] == scene.factor[0] == intake.step(0)
-    assert len(maker.targets) == 2
+            upload.advance()
+            in_use = upload._uploads[0].in_use
+            assert in_use.storage[0] == scene.factor[0] == upload.step(0)
+    assert len(maker.storages) == 2
 
 
-def test_what_was_launched_with_a_factor_ends_before_its_target_is_written_again(parts):
-    scene, maker, intake = parts
-    post(intake, 1)
-    intake.settle()
+def test_what_was_launched_with_a_factor_ends_before_its_storage_is_written_again(parts):
+    scene, maker, upload = parts
+    post(upload, 1)
+    upload.settle()
     scene.loop.run(1)
-    post(intake, 2)
-    intake.settle()
+    post(upload, 2)
+    upload.settle()
     scene.loop.run(1)
-    assert intake.step(0) == 2
+    assert upload.step(0) == 2
     scene.loop.loop.launched += 1  # as if a step were under way
-    track = intake._uploads[0]
-    track.leaving = (track.in_use, int(scene.loop.loop.launched))
-    post(intake, 3)
-    assert [t[0] for t in maker.targets] == [1, 2]
+    uploads = upload._uploads[0]
+    uploads.leaving = (uploads.in_use, int(scene.loop.loop.launched))
+    post(upload, 3)
+    assert [t[0] for t in maker.storages] == [1, 2]
     scene.loop.loop.launched -= 1
-    track.leaving = (track.in_use, scene.loop.step)
-    intake.advance()
-    assert [t[0] for t in maker.targets] == [3, 2]
+    uploads.leaving = (uploads.in_use, scene.loop.step)
+    upload.advance()
+    assert [t[0] for t in maker.storages] == [3, 2]
 
 
 def test_settled_means_used_by_the_next_step_even_if_others_wait(parts):
-    scene, maker, intake = parts
+    scene, maker, upload = parts
     for value in (5, 6, 7):
-        post(intake, value)
-    intake.settle()
+        post(upload, value)
+    upload.settle()
     scene.loop.run(1)
     assert used(scene) == [7]
-    assert len(maker.targets) <= 2
+    assert len(maker.storages) <= 2
 
 
 @pytest.mark.parametrize(
     "error", [ValueError("not by nodes"), NoMemory("Out of memory allocating 5,000 bytes"), CompileError("x.cu(3): no")]
 )
 def test_a_factor_that_does_not_fit_leaves_what_is_there_and_is_told_once(parts, caplog, error):
-    scene, maker, intake = parts
-    post(intake, 5)
-    intake.settle()
+    scene, maker, upload = parts
+    post(upload, 5)
+    upload.settle()
     maker.fail = error
     with caplog.at_level(logging.WARNING):
         for value in (6, 7, 8):
             scene.loop.run(1)
-            post(intake, value)
-            intake.settle()
+            post(upload, value)
+            upload.settle()
     assert used(scene) == [5, 5, 5]
-    assert intake.step(0) == 5
+    assert upload.step(0) == 5
     assert len(caplog.records) == 1
     assert "object 'beam'" in caplog.text and str(error) in caplog.text and "the factor that it has" in caplog.text
     maker.fail = None
-    post(intake, 9)
-    intake.settle()
+    post(upload, 9)
+    upload.settle()
     scene.loop.run(1)
     assert used(scene) == [9]
 
 
 def test_other_errors_are_not_hidden(parts):
-    _, maker, intake = parts
+    _, maker, upload = parts
     maker.fail = RuntimeError("broken")
     with pytest.raises(RuntimeError, match="broken"):
-        post(intake, 5)
+        post(upload, 5)

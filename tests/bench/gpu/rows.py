@@ -39,10 +39,10 @@ def row(beams: Beams, found: Found) -> Row:
 
 def phases(beams: Beams) -> int | None:
     """Of an application of the factor that the first beam has on a GPU, a barrier each; None where there is none."""
-    planned = getattr(getattr(beams.engine, "solver", None), "planned", None)
-    if planned is None or beams.analysis is None:
+    plan = getattr(getattr(beams.engine, "solver", None), "plan", None)
+    if plan is None or beams.analysis is None:
         return None
-    return int(planned(0, beams.analysis.pattern).plan.phases)
+    return int(plan(0, beams.analysis.pattern).plan.phases)
 
 
 def _first(records: NDArray[Any]) -> NDArray[Any]:

@@ -37,12 +37,12 @@ def expanded(gpu, shape, values, p, multiprocessors=None):
     """Chunks and scale, on the host."""
     from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder
 
-    expansion = InverseBuilder(gpu, shape, p)
-    target = expansion.target()
-    made = expansion.build(values, target, multiprocessors)
+    builder = InverseBuilder(gpu, shape, p)
+    storage = builder.storage()
+    made = builder.build(values, storage, multiprocessors)
     made.event.synchronize()
-    assert (made.matrix, made.scale) == (target.matrix.data.ptr, target.scale.data.ptr)
-    return target.matrix.get(), target.scale.get()
+    assert (made.matrix, made.scale) == (storage.matrix.data.ptr, storage.scale.data.ptr)
+    return storage.matrix.get(), storage.scale.get()
 
 
 @pytest.mark.parametrize("groups", [1, 2, 3, 4])
@@ -80,8 +80,8 @@ def test_few_multiprocessors_make_the_same_bits(gpu):
 
 def test_the_scale_ends_with_its_largest(gpu):
     shape, values = factor(SMALL)
-    expansion_scale = expanded(gpu, shape, values, plan(shape, 16, 2))[1]
-    assert expansion_scale[-1] == expansion_scale[:-1].max() > 0
+    scale = expanded(gpu, shape, values, plan(shape, 16, 2))[1]
+    assert scale[-1] == scale[:-1].max() > 0
 
 
 def test_fifty_in_a_row_allocate_nothing_and_end_with_the_last(gpu):
@@ -91,33 +91,33 @@ def test_fifty_in_a_row_allocate_nothing_and_end_with_the_last(gpu):
     second = factor(SMALL, seed=5)[1]
     other = factor(MIDDLE)
     p = plan(shape, 16, 2)
-    expansion = InverseBuilder(gpu, shape, p)
+    builder = InverseBuilder(gpu, shape, p)
     larger = InverseBuilder(gpu, other[0], plan(other[0], 132, 1))  # moves the workspace that both use
-    targets, large = [expansion.target() for _ in range(3)], larger.target()
-    expansion.build(first, targets[0])
+    storages, large = [builder.storage() for _ in range(3)], larger.storage()
+    builder.build(first, storages[0])
     larger.build(other[1], large)
     pool = gpu.cp.get_default_memory_pool()
     used, held = pool.used_bytes(), pool.total_bytes()
     for k in range(50):
-        made = expansion.build(second if k % 2 else first, targets[k % 3])
+        made = builder.build(second if k % 2 else first, storages[k % 3])
     made.event.synchronize()
     assert (pool.used_bytes(), pool.total_bytes()) == (used, held)
     for k in (48, 49):
         chunks, scale = expanded(gpu, shape, second if k % 2 else first, p)
-        assert np.array_equal(targets[k % 3].matrix.get(), chunks)
-        assert np.array_equal(targets[k % 3].scale.get(), scale)
+        assert np.array_equal(storages[k % 3].matrix.get(), chunks)
+        assert np.array_equal(storages[k % 3].scale.get(), scale)
 
 
-def test_another_expansion_may_make_the_workspace_grow(gpu):
+def test_another_build_may_make_the_workspace_grow(gpu):
     from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder
 
     shape, values = factor(SMALL)
-    expansion = InverseBuilder(gpu, shape, plan(shape, 16, 2))
-    target = expansion.target()
-    expansion.build(values, target).event.synchronize()
-    before = target.matrix.get()
-    space = expansion._workspace
+    builder = InverseBuilder(gpu, shape, plan(shape, 16, 2))
+    storage = builder.storage()
+    builder.build(values, storage).event.synchronize()
+    before = storage.matrix.get()
+    space = builder._workspace
     space.reserve(space.memory.nbytes + 1024, space.incoming.nbytes + 1024)
-    target.matrix.fill(0)
-    expansion.build(values, target).event.synchronize()
-    assert np.array_equal(target.matrix.get(), before)
+    storage.matrix.fill(0)
+    builder.build(values, storage).event.synchronize()
+    assert np.array_equal(storage.matrix.get(), before)
