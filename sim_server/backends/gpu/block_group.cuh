@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: MIT
-// The thread blocks that solve one body: their barrier, their sums, their shared memory. All sums have a fixed order.
+// Group of the thread blocks that solve one body: barrier, sums, shared memory. All sums have a fixed order.
 #pragma once
 #include "pcg_structs.cuh"
 
@@ -12,12 +12,12 @@
 #define WARPS (THREADS / 32)
 #define ALL 0xffffffffu
 #ifndef AT_ONCE
-#define AT_ONCE 5  // words that a thread asks for at a time: 160 thread blocks, or 2560 entries of a vector, in one trip
+#define AT_ONCE 5  // words that a thread loads at a time: 160 thread blocks, or 2560 entries of a vector, in one trip
 #endif
 
 extern __shared__ __align__(16) char shared_memory[];
 
-// Shared memory allocated once per body. Null where it does not fit: then global memory stands in.
+// Allocates shared memory, once per body. Null if it does not fit; global memory is used instead.
 struct Arena {
     char* next;
     char* end;
@@ -31,7 +31,7 @@ struct Arena {
     }
 };
 
-// Place of what an arena gave. Through `shared_memory + place` it is read as shared memory, which a pointer kept in memory is not.
+// Offset of an allocation of an arena. `shared_memory + offset` is compiled to loads from shared memory; a pointer kept in memory is not.
 __device__ __forceinline__ int place_of(const void* taken) { return taken ? (int)((const char*)taken - shared_memory) : -1; }
 template <class T>
 __device__ __forceinline__ const T* shared_at(int place) { return (const T*)(shared_memory + place); }
@@ -46,9 +46,9 @@ __device__ __forceinline__ void copies_begin() { asm volatile("cp.async.commit_g
 template <int LEFT>
 __device__ __forceinline__ void copies_end() { asm volatile("cp.async.wait_group %0;" ::"n"(LEFT) : "memory"); }
 
-// What goes from one thread block to another goes in words of 8 bytes, half of them the value (or half of a double) and half
-// the number of the exchange: a reader sees by itself whether a value is there yet. So there is no barrier, no fence, and one
-// trip through L2 instead of four. 8 bytes are written and read in one piece; ordering between words is not needed.
+// Thread blocks exchange values as words of 8 bytes: half a value (or half of a double), half the number of the exchange. A reader
+// polls the word itself until it has the number. This needs no barrier and no fence, and one trip through L2 instead of four. A
+// word is written and read atomically; no ordering between words is needed.
 template <class T> struct FlagWord;
 template <> struct FlagWord<float> {
     unsigned long long bits;
@@ -56,7 +56,7 @@ template <> struct FlagWord<float> {
         const unsigned long long w = (unsigned long long)number << 32 | __float_as_uint(v);
         asm volatile("st.relaxed.gpu.global.u64 [%0], %1;" ::"l"(this), "l"(w) : "memory");
     }
-    __device__ __forceinline__ FlagWord<float> load() const {  // as it is now
+    __device__ __forceinline__ FlagWord<float> load() const {  // a copy of the word
         FlagWord<float> w;
         asm volatile("ld.relaxed.gpu.global.u64 %0, [%1];" : "=l"(w.bits) : "l"(this));
         return w;
@@ -86,24 +86,24 @@ template <> struct __align__(16) FlagWord<double> {
     __device__ __forceinline__ bool get(double& v, unsigned number) const { return load().unpack(v, number); }
 };
 
-// Whether to look once more. A word that never comes must not hang the device for good: after some minutes of looking the
-// launch fails, and the server says that the device is lost.
+// True if the word must be read again. After some minutes the launch fails instead of hanging the device, and the server reports
+// that the device is lost.
 __device__ __forceinline__ bool keep_polling(bool missing, unsigned& spins) {
     if (missing && ++spins > 1u << 27) __trap();
     return missing;
 }
 
 struct BlockGroup {
-    int index, blocks;             // of this thread block in the team
-    unsigned number;               // of the exchange: what is put now carries it
+    int index, blocks;             // of this thread block; number of thread blocks in the group
+    unsigned number;               // of the present exchange
     FlagWord<double>* block_sums;  // (2, 4, grid) of this body
     int grid;
     double (*scratch)[4];    // shared, 3 WARPS
     double* totals;  // shared, 4
     int lane, warp;
 
-    // N <= 4 sums over the team at once, of lanes 0 to LANES - 1 of each warp. The sums are in every thread, and every thread
-    // block has come this far. fenced: what was written to memory before is visible after.
+    // Adds N <= 4 values over lanes 0 to LANES - 1 of all warps of the group; every thread gets the sums. Also a barrier.
+    // fenced: writes to memory before it are visible to all after it.
     template <int N, int LANES>
     __device__ __forceinline__ void sums(const double mine[N], double out[N], bool fenced = false) {
         if (lane < LANES)
@@ -136,7 +136,7 @@ struct BlockGroup {
         sums<1, 1>(none, sum, true);
     }
 
-    // A warp: the sum of what all thread blocks put, each lane those of every 32nd.
+    // Sum of the words of all thread blocks, by one warp; each lane adds every 32nd.
     __device__ __forceinline__ double read(const FlagWord<double>* row) const {
         double sum = 0;
         for (int first = lane; first < blocks + lane; first += 32 * AT_ONCE) {
@@ -144,7 +144,7 @@ struct BlockGroup {
             double got[AT_ONCE];
             bool all;
             unsigned spins = 0;
-            do {  // no branch between the loads: they travel together
+            do {  // no branch between the loads, so that their latencies overlap
 #pragma unroll
                 for (int k = 0; k < AT_ONCE; ++k) seen[k] = row[min(first + 32 * k, blocks - 1)].load();
                 all = true;

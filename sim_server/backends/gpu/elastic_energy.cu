@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: MIT
-// Elastic energy of the bodies, on demand after a step: an effect's energies of elements, summed in a fixed order. A launch for each
-// effect, a thread block for each body.
+// Elastic energy of the bodies, on demand after a step: sums of the element energies of an effect in a fixed order. One launch per
+// effect, one thread block per body.
 #ifndef local
 #define local real
 #endif

@@ -1,11 +1,11 @@
 // SPDX-License-Identifier: MIT
-// The energy of each body after a step, and whether it has run away (kernels/energy_balance.cuh). Each thread block sums over a chunk of a
-// body's nodes; the one that finishes last of a body adds the chunks up in a fixed order, decides, and freezes. It runs as the first
-// thread blocks of the kernel over elements that begins the next step (kernel_fusion.py), or by itself after the last step of a batch; a step
-// that is settled already is left alone.
+// Energy balance of each body after a step, and detection of runaways (kernels/energy_balance.cuh). A thread block sums over a chunk of a
+// body's nodes; the last one of a body to finish adds the chunks in a fixed order, decides, and freezes a runaway. It runs as the
+// prologue of the kernel over elements that begins the next step (kernel_fusion.py), or by itself after the last step of a batch. A
+// step is settled once: later launches for it do nothing.
 #include "energy_record.cuh"
 
-constexpr int STILL = 5, WARPS = 4;  // arrays that are 0 at rest; warps of a thread block, at most
+constexpr int STILL = 5, WARPS = 4;  // most arrays that are 0 at rest; most warps of a thread block
 
 struct NodeChunk {
     int body, begin, end;  // nodes
@@ -22,10 +22,10 @@ struct EnergyBalance {
     real* x;                    // (n, 3) [m]
     const real* v;              // (n, 3) [m/s]
     real* still[STILL];         // (n, 3) each, or null: v and what else is 0 in a body at rest
-    real* force;                // (n, 3) of hands (effects/touch.cu); null: nothing can be touched
+    real* force;                // (n, 3) of touches (effects/touch.cu); null: nothing can be touched
     real* spring;               // (n,)
     real* anchor;               // (n, 3)
-    real* free;                 // (n,) 0 from when a body is frozen
+    real* free;                 // (n,) set to 0 where a body is frozen
     const real* gravity;        // (3,) [m/s2]
     Balance* balance;           // (bodies,)
     EnergyRecord* records;      // (capacity, bodies) on the host
@@ -50,7 +50,7 @@ __device__ __forceinline__ void add_sums(Sums& a, const Sums& b) {
     }
 }
 
-// Of the nodes from `begin` on; those of this thread.
+// Sums over this thread's nodes of [begin, end).
 __device__ __forceinline__ Sums sums_over(const EnergyBalance& a, int begin, int end) {
     Sums s = no_sums();
 #pragma unroll 4
@@ -62,7 +62,7 @@ __device__ __forceinline__ Sums sums_over(const EnergyBalance& a, int begin, int
     return s;
 }
 
-// Likewise the work of hands, whose forces are then 0 until something touches the nodes again.
+// Work of touch forces on the same nodes; sets the forces to 0 until the next touch.
 __device__ __forceinline__ double work_over(const EnergyBalance& a, int begin, int end) {
     double work = 0;
     for (int i = begin + threadIdx.x; i < end; i += blockDim.x) {
@@ -76,7 +76,7 @@ __device__ __forceinline__ double work_over(const EnergyBalance& a, int begin, i
     return work;
 }
 
-// Those of the lane across.
+// Sums of the lane whose number differs in the bits `by`.
 __device__ __forceinline__ Sums sums_across(const Sums& s, int by) {
     Sums o;
     o.kinetic = __shfl_xor_sync(FULL_WARP, s.kinetic, by);
@@ -102,7 +102,7 @@ __device__ void write_record(const EnergyBalance& a, const Balance& b, int body,
     e.found = b.found;
 }
 
-// Back to where the step began, and at rest from now on: as if all nodes were fixed.
+// Puts a body back to the state before the step, at rest, with all nodes fixed from now on.
 __device__ void freeze(const EnergyBalance& a, int body) {
     for (int i = a.first_node[body] + threadIdx.x; i < a.first_node[body + 1]; i += blockDim.x) {
         a.free[i] = 0;
@@ -114,7 +114,7 @@ __device__ void freeze(const EnergyBalance& a, int body) {
     }
 }
 
-// Of all threads of the block; the first one has it. Threads add in an order that depends on their number alone.
+// Returns the sums over the thread block, in its first thread. Their order depends on the number of threads alone.
 __device__ Sums sums_of_block(Sums s) {
     __shared__ Sums warps[WARPS];
     for (int by = 16; by; by /= 2) add_sums(s, sums_across(s, by));
@@ -125,7 +125,7 @@ __device__ Sums sums_of_block(Sums s) {
     return s;
 }
 
-// Whether this thread block finishes last of its body's; s then has the sums over all chunks in the first thread.
+// True if this thread block is the last one of its body to finish; s then holds the sums over all chunks in the first thread.
 __device__ bool gather(const EnergyBalance& a, const NodeChunk& chunk, int number, Sums& s) {
     if (chunk.chunks == 1) return true;
     __shared__ bool last;
@@ -144,7 +144,7 @@ __device__ bool gather(const EnergyBalance& a, const NodeChunk& chunk, int numbe
     return true;
 }
 
-// By a thread block. What is read does not wait for anything that was read before but the chunk: it is done while others compute.
+// Done by thread block `number`. All loads depend on the chunk alone, so that their latencies overlap.
 __device__ void balance_energy(const EnergyBalance& a, int number) {
     __shared__ int away;
     const NodeChunk chunk = a.chunks[number];

@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: MIT
-// What the host is told of the energy of a body (energy_balance.cu, elastic_energy.cu).
+// Energy record of a body, written to host memory (energy_balance.cu, elastic_energy.cu).
 #pragma once
 #include "energy_balance.cuh"
 
-struct EnergyRecord {  // beside Result
+struct EnergyRecord {  // one per PcgResult
     double kinetic, elastic, gravity, work, budget, stride;
     int phase, found;
 };

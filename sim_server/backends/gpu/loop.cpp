@@ -1,24 +1,24 @@
 // SPDX-License-Identifier: MIT
-// The simulation loop on a GPU. It launches the graph of a step, again and again, and looks at results once per batch; the
-// next batch is under way before the results of the last one are looked at, so that the device never waits for this thread.
-// Data is exchanged with the rest of the server through mailboxes, looked at before each batch. No Python: the caller (ctypes)
-// has let go of its lock. The driver's functions come as a table, so that all of this can be tested without a GPU.
+// The simulation loop on a GPU. It launches the graph of a step repeatedly and reads the results once per batch. The next batch
+// is launched before the results of the last one are read, so that the device never waits for this thread. The rest of the server
+// sends data through mail slots, which are read before each batch. The thread runs without Python's lock. The functions of the
+// driver are a table, so that tests need no GPU.
 #include <sys/prctl.h>
 
 #include <algorithm>
 
 #include "readback.h"
 
-// New arguments, settings and factors: copies in the order of the steps, from memory that is not written to until they are done.
+// Copies new arguments, settings and factors to the device, in the order of the steps, from memory that stays unchanged meanwhile.
 static bool deliver(GpuLoop& l, StepBatch& batch, int slots) {
-    char* room = batch.upload;
+    char* next = batch.upload;
     for (int k = 0; k < slots; ++k) {
         MailSlot& slot = l.mail_slots[k];
         if (!slot.pending && slot.posted.load(std::memory_order_relaxed)) slot.pending = slot.posted.exchange(nullptr);
         if (!slot.pending || (slot.pending->event && !done(l, slot.pending->event))) continue;
-        std::memcpy(room, slot.pending->bytes, slot.size);
-        CALL(to_device, slot.target, room, (size_t)slot.size, l.stream);
-        room += (slot.size + 15) / 16 * 16;
+        std::memcpy(next, slot.pending->bytes, slot.size);
+        CALL(to_device, slot.target, next, (size_t)slot.size, l.stream);
+        next += (slot.size + 15) / 16 * 16;
         int64_t number = slot.pending->number;
         slot.pending->taken.store(l.launched, std::memory_order_release);
         slot.pending = nullptr;
@@ -35,19 +35,19 @@ static bool open_batch(GpuLoop& l) {
     return deliver(l, batch, l.mail_slot_count);
 }
 
-// So many steps were put onto the stream.
+// Counts steps that were launched, and launches what follows them: energies, copies of matrices and frames.
 static bool count(GpuLoop& l, int64_t steps) {
     l.launched += steps;
     l.batches[l.begun % STEP_BATCHES].steps += steps;
     const int64_t every = l.rings.frame_every.load();
     const bool energy = energy_due(l.rings, l.launched), frame = every > 0 && l.launched % every == 0;
-    if (energy || frame) CALL(graph_launch, l.energy_balance, l.stream);  // a frame shows what has run away put back
+    if (energy || frame) CALL(graph_launch, l.energy_balance, l.stream);  // a frame shows frozen bodies at their last valid state
     if (energy) CALL(graph_launch, l.elastic_energy, l.stream);
     return begin_matrices(l) && begin_frame(l);
 }
 
 static bool close_batch(GpuLoop& l) {
-    CALL(graph_launch, l.energy_balance, l.stream);  // of the last step; those before are settled beside the next one
+    CALL(graph_launch, l.energy_balance, l.stream);  // of the last step; the others are part of the next step's first kernel
     CALL(event_record, l.batches[l.begun % STEP_BATCHES].done, l.stream);
     ++l.begun;
     return true;
@@ -58,7 +58,7 @@ static int64_t batch_size(GpuLoop& l, int64_t left) {
     return std::max<int64_t>(1, std::min({size, left, l.batch - l.launched % l.batch}));  // so none goes over the end of the device's rings
 }
 
-// No step that is a multiple of `every` comes before the last of the next n.
+// True if none of the next n - 1 steps is a multiple of `every`.
 static bool none_within(const GpuLoop& l, int64_t every, int64_t n) { return every <= 0 || every - l.launched % every >= n; }
 
 static bool launch_batch(GpuLoop& l, int64_t steps) {
@@ -91,12 +91,12 @@ static void report(GpuLoop& l, const StepBatch& batch, int64_t k, double end, do
     bool keep = room_for_records(rings, l.bodies, [&] { publish(l); });
     for (int i = 0; keep && i < l.bodies; ++i) {
         const PcgResult& r = results[i];
-        const NewtonResult& found = l.newton_results ? l.newton_results[slot + i] : once;
+        const NewtonResult& newton = l.newton_results ? l.newton_results[slot + i] : once;
         Record& record = rings.records[(head + i) % rings.record_capacity];
         record = Record{step, r.factor_step, rings.start_time + step * rings.dt, r.residual, 0, r.seconds, 0,
                    1e-9 * (stamp.end - stamp.begin), k ? 0 : batch.late, end - 1e-9 * (last.end - stamp.begin), cpu,
-                   found.nonlinear, NAN, NAN, NAN, NAN, NAN, NAN, i, r.iterations, r.status, r.kind, r.asked, r.fallbacks, r.bad_node, r.probe,
-                   found.linearizations, 0};
+                   newton.nonlinear, NAN, NAN, NAN, NAN, NAN, NAN, i, r.iterations, r.status, r.kind, r.asked, r.fallbacks, r.bad_node, r.probe,
+                   newton.linearizations, 0};
         if (l.energy_records) note_energy(record, l.energy_records[slot + i]);
     }
     rings.step.store(step);
@@ -124,7 +124,7 @@ static bool finish_down_to(GpuLoop& l, int64_t under_way) {
     return true;
 }
 
-// Until the next step is due; what is under way is finished meanwhile.
+// Waits until the next step is due, and finishes batches and copies under way meanwhile.
 static bool wait(GpuLoop& l) {
     return wait_until_due(l.rings, [&] {
         if (finish_down_to(l, 0)) publish(l);
@@ -141,7 +141,7 @@ static bool begin(GpuLoop& l) {
 
 extern "C" {
 
-// Runs until `steps` are done or `stop` is set; returns the steps done. l.error tells if the device failed.
+// Runs until `steps` are done or `stop` is set; returns the steps done. l.error is set if the device failed.
 int64_t wf_gpu_run(GpuLoop* loop, int64_t steps) {
     GpuLoop& l = *loop;
     int64_t first = l.launched, left = steps;
@@ -159,8 +159,8 @@ int64_t wf_gpu_run(GpuLoop* loop, int64_t steps) {
 
 int32_t wf_gpu_wait(GpuLoop* loop) { return wait(*loop); }
 
-// One step whose kernels the caller puts onto the stream: between `open` and `close`; `renew` looks for settings and factors again,
-// with nothing under way. They come first among the mailboxes; arguments of launches that have run wait for the next step.
+// One step whose kernels the caller launches, between `open` and `close`. `renew` reads the slots of settings and factors again, with
+// nothing under way; these slots come first. Arguments of launches that have run wait for the next step.
 int32_t wf_gpu_open(GpuLoop* loop) { return begin(*loop) && open_batch(*loop); }
 int32_t wf_gpu_renew(GpuLoop* loop) { return deliver(*loop, loop->batches[loop->begun % STEP_BATCHES], 2 * loop->bodies); }
 int32_t wf_gpu_close(GpuLoop* loop) {
@@ -170,7 +170,7 @@ int32_t wf_gpu_close(GpuLoop* loop) {
 
 Mail* wf_gpu_post(MailSlot* slot, Mail* mail) { return slot->posted.exchange(mail); }
 
-// Of a body before the first step. sums: kinetic, gravity, longest difference of dt v [m], diagonal [m] at the start.
+// Starts the balance of a body. sums: kinetic and potential energy [J], largest difference of dt v [m], diagonal [m].
 void wf_gpu_start_balance(Balance* balance, const double* sums, double dt, int32_t inertia) {
     Sums s = no_sums();
     s.kinetic = sums[0];
@@ -180,7 +180,7 @@ void wf_gpu_start_balance(Balance* balance, const double* sums, double dt, int32
     start_balance(*balance, s, sums[3], dt, inertia);
 }
 
-int32_t wf_gpu_sizes(int32_t* sizes) {  // layouts, checked against the Python side
+int32_t wf_gpu_sizes(int32_t* sizes) {  // compared with those of Python (mailbox.py)
     int32_t ours[] = {sizeof(CudaDriver), sizeof(Mail), sizeof(MailSlot), sizeof(PcgResult), sizeof(StepTimestamp), sizeof(NewtonResult), sizeof(BodyReadback),
                       sizeof(GpuLoop), sizeof(Record), sizeof(EnergyRecord), sizeof(Balance)};
     std::memcpy(sizes, ours, sizeof ours);

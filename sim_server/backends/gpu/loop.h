@@ -7,7 +7,7 @@
 #include "../cpu/native/ring_buffers.h"
 #include "energy_record.cuh"
 
-typedef uint64_t Address;       // on the device
+typedef uint64_t Address;       // of device memory
 
 struct CudaDriver {             // functions of the CUDA driver API; each returns 0 or an error
     int32_t (*context_set)(void* context);

@@ -1,11 +1,11 @@
 // SPDX-License-Identifier: MIT
-// Newton-Raphson within a step on a GPU, for each body by itself (kernels/newton_line_search.cuh says what it is). A step is, in one graph,
-//     assemble, open, rounds times (pcg, move, assemble, judge), close, integrate
-// and nobody on the host decides anything: a body's phase says in each launch whether it is the body's turn, and once no search is
-// left the launches of the rounds that are over return at once. A round is one trial: rounds = linearizations (1 + trials).
+// Newton-Raphson iteration within a step on a GPU, independent for each body (decisions: kernels/newton_line_search.cuh). The graph of a step is
+//     assemble, begin_newton, rounds times (pcg, update_state, assemble, accept_trial), end_newton, integrate
+// A round is one trial: rounds = linearizations (1 + trials). The device decides: the phase of a body tells each launch whether it
+// applies to the body; once all bodies are done, the launches of the remaining rounds return at once.
 //
-// A thread block has a stretch of a body's nodes; the last one of a body to be done adds up what all have left, in a fixed order,
-// and makes the body's decision. Sums and the gain are double, whatever `real` is.
+// A thread block has a range of a body's nodes; the last one of a body to finish adds the partial sums in a fixed order and makes
+// the body's decision. Sums and the gain are double for every `real`.
 #include "pcg_structs.cuh"
 #include "newton_line_search.cuh"
 
@@ -13,28 +13,28 @@
 #define local real
 #endif
 
-constexpr int BLOCK_NODES = 32, LANES = 8, ALL_LANES = BLOCK_NODES * LANES;  // nodes of a thread block; threads of a node in `move`
+constexpr int BLOCK_NODES = 32, LANES = 8, ALL_LANES = BLOCK_NODES * LANES;  // nodes of a thread block; threads of a node in update_state
 constexpr int NO_NODE = 0x7fffffff;
 #define WARP 0xffffffffu
 
 struct NodeRange { int body, first, last, unused; };  // nodes [first, last) of the scene
 
-struct NewtonResult { double nonlinear; int linearizations, unused; };  // goes home beside PcgResult
+struct NewtonResult { double nonlinear; int linearizations, unused; };  // one per PcgResult, on the host
 
 struct NewtonArguments {
     const NodeRange* ranges;       // (grid,) by body
     const int* first_range;        // (bodies + 1,) of each body
     double* partial_sums;          // (grid, 2) sums of the ranges
-    unsigned* finished_blocks;     // (bodies,) thread blocks that are; zero between launches
+    unsigned* finished_blocks;     // (bodies,) zero between launches
     Search* search;                // (bodies,)
-    int* phase;                    // (bodies,) of search, for the launches between
-    int* active;                   // (1,) searches that are not over
+    int* phase;                    // (bodies,) of each body's search, read by the other launches
+    int* active;                   // (1,) bodies whose iteration is not over
     int* bad_node;                 // (bodies,) first node whose b is not finite
     const PcgBody* bodies;
     PcgResult* results;            // (capacity, bodies) of the last solve; at the end of the step
     NewtonResult* newton_results;  // (capacity, bodies) on the host
     const long long* step;         // (1,) completed
-    unsigned* pool_counter;        // (1,) of the solver's pool: zero before each of its launches
+    unsigned* pool_counter;        // (1,) of the solver; set to zero before each of its launches
     const int* row_start;
     const int* columns;
     const real* values;            // (blocks, 3, 3)
@@ -72,7 +72,7 @@ __device__ __forceinline__ void sum_block(double (&sum)[2]) {
     add_up(sum);
     if constexpr (THREADS > 32) {
         __shared__ double warps[THREADS / 32][2];
-        __syncthreads();  // what was there before has been read
+        __syncthreads();  // earlier contents have been read
         if (threadIdx.x % 32 == 0)
             for (int n = 0; n < 2; ++n) warps[threadIdx.x / 32][n] = sum[n];
         __syncthreads();
@@ -83,13 +83,13 @@ __device__ __forceinline__ void sum_block(double (&sum)[2]) {
     }
 }
 
-// Sums over a body; whether this is the thread that has them: one of the thread block that comes here last.
+// Sums over a body; true in the one thread that has the result, in the thread block that finishes last.
 template <int THREADS>
 __device__ __forceinline__ bool sum_body(const NewtonArguments& p, int body, double (&sum)[2]) {
     __shared__ bool last;
     const int first = p.first_range[body], end = p.first_range[body + 1];
     sum_block<THREADS>(sum);
-    __syncthreads();  // this thread block has written what it writes
+    __syncthreads();  // all writes of this thread block are done
     if (threadIdx.x == 0) {
         for (int n = 0; n < 2; ++n) __stcg(p.partial_sums + 2 * blockIdx.x + n, sum[n]);
         __threadfence();
@@ -110,14 +110,14 @@ __device__ __forceinline__ PcgResult& result_of(const NewtonArguments& p, int bo
     return p.results[(p.step[0] % p.capacity) * p.count + body];
 }
 
-// What the decision of a body changes beside its search.
+// Publishes the phase of a body after a decision.
 __device__ __forceinline__ void decided(const NewtonArguments& p, int body) {
     const int phase = p.search[body].phase;
     p.phase[body] = phase;
     if (phase == DONE) atomicSub(p.active, 1);
 }
 
-// way of node i as it stands after the solve: R y, and at the first linearization all that is to come to gain = -ahead.
+// Search direction of node i after the solve: R y; at the first linearization plus `ahead`, since gain begins at -ahead.
 __device__ __forceinline__ void way_of(const NewtonArguments& p, int i, bool first, double (&way)[3]) {
     const double y[3] = {(double)p.y[3 * i], (double)p.y[3 * i + 1], (double)p.y[3 * i + 2]};
     turn_node(p.rotation + 9ll * i, false, y, way);
@@ -126,7 +126,7 @@ __device__ __forceinline__ void way_of(const NewtonArguments& p, int i, bool fir
     for (int k = 0; k < 3; ++k) way[k] += ahead[k];
 }
 
-// The state of node i after gain + scale way.
+// Sets the state of node i to that after gain + scale way.
 __device__ __forceinline__ void place(const NewtonArguments& p, int i, double scale) {
     const long long n = 3ll * p.nodes;
     for (int k = 3 * i; k < 3 * i + 3; ++k) {
@@ -140,7 +140,7 @@ __device__ __forceinline__ void place(const NewtonArguments& p, int i, double sc
     }
 }
 
-// Begins the search: a step has been assembled.
+// Begins the iteration after the first assembly of a step: keeps the state, and sets gain = -ahead.
 extern "C" __global__ void __launch_bounds__(BLOCK_NODES) begin_newton(const NewtonArguments p) {
     const NodeRange here = p.ranges[blockIdx.x];
     const int i = here.first + threadIdx.x;
@@ -167,7 +167,7 @@ extern "C" __global__ void __launch_bounds__(BLOCK_NODES) begin_newton(const New
     p.bad_node[here.body] = NO_NODE;
 }
 
-// To the next trial: along a new way where a system was solved, by a smaller part of the present one elsewhere.
+// Sets the state of the next trial: along a new direction after a solve, else with a shorter step along the present one.
 extern "C" __global__ void __launch_bounds__(ALL_LANES) update_state(const NewtonArguments p) {
     if (blockIdx.x == 0 && threadIdx.x == 0) *p.pool_counter = 0;
     if (*p.active == 0) return;
@@ -214,7 +214,7 @@ extern "C" __global__ void __launch_bounds__(ALL_LANES) update_state(const Newto
     decided(p, here.body);
 }
 
-// What becomes of a trial that has been assembled: taken, made shorter, or the end.
+// Decides on an assembled trial: accept, shorten, or end the iteration.
 extern "C" __global__ void __launch_bounds__(BLOCK_NODES) accept_trial(const NewtonArguments p) {
     if (*p.active == 0) return;
     const NodeRange here = p.ranges[blockIdx.x];
@@ -229,7 +229,7 @@ extern "C" __global__ void __launch_bounds__(BLOCK_NODES) accept_trial(const New
             const double b = p.b[3 * i + c];
             sum[0] += b * b;
             sum[1] += turned[c] * b;
-            p.y[3 * i + c] = 0;  // the last step's is no guess for a correction
+            p.y[3 * i + c] = 0;  // the last solution is no initial guess for a correction
         }
     }
     if (!sum_body<BLOCK_NODES>(p, here.body, sum)) return;
@@ -237,7 +237,7 @@ extern "C" __global__ void __launch_bounds__(BLOCK_NODES) accept_trial(const New
     decided(p, here.body);
 }
 
-// The state before the step again, and y so that `advance` makes of it what was found; the results of the step as of one solve.
+// Restores the state before the step, and sets y so that `advance` arrives at the state found; writes the results of the step.
 extern "C" __global__ void __launch_bounds__(BLOCK_NODES) end_newton(const NewtonArguments p) {
     const NodeRange here = p.ranges[blockIdx.x];
     const int body = here.body, i = here.first + threadIdx.x;

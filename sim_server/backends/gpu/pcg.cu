@@ -1,17 +1,17 @@
 // SPDX-License-Identifier: MIT
-// Preconditioned conjugate gradients of all bodies in one persistent launch, numbered as backends/cpu/native/pcg.h, which it mirrors.
+// Preconditioned conjugate gradients of all bodies in one persistent launch; steps are numbered as in backends/cpu/native/pcg.h.
 //
-// A body is solved by a group of thread blocks; small bodies of a large scene are taken one by one by whichever block is free.
-// What blocks tell each other goes in words that carry their number (block_group.cuh); there are no barriers but at the ends. x and r
-// are updated in the preconditioner's first phase, and |r| after the update is known before it from
-// |r|^2 - 2 alpha r.q + alpha^2 q.q, so that nothing is applied in vain at the end.
+// A body is solved by a group of thread blocks; small bodies of a large scene form a pool, from which free thread blocks take one
+// after the other. Thread blocks exchange values as flag words (block_group.cuh); barriers are needed only at the beginning and end
+// of a solve. x and r are updated in the first phase of the preconditioner. |r| after the update is known before, from
+// |r|^2 - 2 alpha r.q + alpha^2 q.q, so that the preconditioner is not applied after convergence.
 //
-// Vectors and A are `real`, so that the residual is, whatever the preconditioner's precision. No float atomics.
+// Vectors and A have the type `real`, and so has the residual, for every precision of the preconditioner. No float atomics.
 #include "partitioned_inverse.cuh"
 #include "clock.cuh"
 #include "spmv.cuh"
 
-struct BlockMemory {  // fixed shared memory of a thread block: what is the same in all threads costs no registers
+struct BlockMemory {  // static shared memory of a thread block: data that is the same in all threads needs no registers
     double scratch[3 * WARPS][4], totals[4];
     PcgBody body;
     DevicePlan plan;
@@ -21,14 +21,14 @@ struct BlockMemory {  // fixed shared memory of a thread block: what is the same
     real* diagonal;                // (own, 9) inverses of the diagonal blocks
     double peak;                   // largest scale
     int next, bad, rests;
-    double b2, goal, quarter, rz;  // of the iteration: all threads write the same
+    double b2, goal, quarter, rz;  // of the iteration; all threads write the same values
     PcgResult out;
 };
 __shared__ BlockMemory memory;
 
 __device__ __forceinline__ bool usable(double a) { return a > 0 && a < 1e300; }
 
-// 1 / a to 40 bits, in a tenth of the time of a division: step lengths and directions need no more.
+// 1 / a to 40 bits, in a tenth of the time of a division; enough for alpha and beta.
 __device__ __forceinline__ double inverse_of(double a) {
     double y;
     asm("rcp.approx.ftz.f64 %0, %1;" : "=d"(y) : "d"(a));
@@ -45,11 +45,11 @@ struct PcgSolver {
     const PcgArguments& s;
     BlockGroup group;
     int turn = 0;          // half of inverse.residual that holds d r before the update
-    unsigned r_number = 0, q_number = 0, z_number = 0;  // exchanges in which d r, d q and z were put
-    bool packed = false;   // places are those of the inverse
-    bool fresh = false;    // inverse.residual holds d r as it is after the update that is still to be made
-    bool fetched = false;  // the chunks of the inverse are on their way to shared memory
-    bool arrived = false;  // and there
+    unsigned r_number = 0, q_number = 0, z_number = 0;  // exchanges in which d r, d q and z were written
+    bool packed = false;   // positions are those of the inverse
+    bool fresh = false;    // inverse.residual holds d r as it will be after the pending update
+    bool fetched = false;  // the copy of the inverse into shared memory has begun
+    bool arrived = false;  // and is complete
 
     __device__ __forceinline__ void set_up(const RowRange& range) {
         const PcgBody& body = memory.body;
@@ -72,7 +72,7 @@ struct PcgSolver {
         packed = body.kind == CHOLESKY && body.plan;
         copies_end<0>();
         __syncthreads();
-        if (packed && group.blocks > 1) fetch();  // beside the first residual; the pool has many that need no more than that
+        if (packed && group.blocks > 1) fetch();  // beside the first residual; many bodies of the pool need only that
         find_places();
         __syncthreads();
     }
@@ -82,7 +82,7 @@ struct PcgSolver {
         fetched = true;
     }
 
-    // Where the values that this block reads stand: with the inverse in its order, else in that of the nodes.
+    // Sets the positions of the values that this block reads: in packed order for the inverse, else in the order of the nodes.
     __device__ __forceinline__ void find_places() {
         const BlockRows& rows = memory.rows;
         for (int k = threadIdx.x; k < rows.halo; k += THREADS) {
@@ -98,7 +98,7 @@ struct PcgSolver {
         return memory.d ? memory.d[k] : (real)memory.inverse.scale[memory.rows.place[k / 3] + k % 3];
     }
 
-    // d r of an own degree of freedom for all to see.
+    // Writes d r of an own degree of freedom for all thread blocks.
     __device__ __forceinline__ void publish(int half, int k, real r) const {
         residuals(half)[memory.rows.place[k / 3] + k % 3].put((float)(scale_of(k) * r), group.number);
     }
@@ -109,8 +109,8 @@ struct PcgSolver {
         return memory.inverse.residual + (long long)half * (memory.inverse.size + 32);
     }
 
-    // 1. r = b - A x for the x of the scene, left as the update by alpha = 1 that is still to be made: x = 0 + 1 x,
-    // r = b - 1 (A x). So alpha = 0 starts from zero instead. Returns |r|^2; |b|^2 in `b2`.
+    // 1. r = b - A x for the x of the scene, as a pending update by alpha = 1: x = 0 + 1 x, r = b - 1 (A x). With alpha = 0 the
+    // solve starts from zero instead. Returns |r|^2; |b|^2 in `b2`.
     __device__ __forceinline__ double residual(double& b2) {
         const BlockRows& rows = memory.rows;
         const long long first = memory.body.first, begin = 3 * (first + rows.begin);
@@ -130,7 +130,7 @@ struct PcgSolver {
             rows.q[k] = qk;
             if (!packed) return;
             publish(turn, k, bk);
-            publish(1 - turn, k, (real)rk);  // not b - A x of float words: near the solution that would be noise
+            publish(1 - turn, k, (real)rk);  // not b - A x from float words, which near the solution would be rounding errors
         });
         r_number = group.number;
         into_three<2>(mine);
@@ -210,9 +210,9 @@ struct PcgSolver {
 
     __device__ __forceinline__ double by_inverse(real alpha, double r2) {
         const PartitionedInverse inverse = memory.inverse;
-        // a power of two that brings d r below 1: float16 has few of them
+        // a power of two that scales d r below 1, for the small range of float16
         const float unit = unit_for(r2 * memory.peak * memory.peak);
-        ResidualSource from = {residuals(turn), r_number, q_number, fresh ? 0 : (float)alpha};  // the update is being made
+        ResidualSource from = {residuals(turn), r_number, q_number, fresh ? 0 : (float)alpha};  // the update is being applied
         double mine = 0;
         fresh = false;
         if (!fetched) fetch();
@@ -239,7 +239,7 @@ struct PcgSolver {
         }
     }
 
-    // x + alpha p to the scene (keep = 0: zero); a barrier.
+    // Writes x + alpha p to the scene (keep = 0: zero), then a barrier.
     __device__ __forceinline__ void give(real keep, real alpha) {
         const BlockRows& rows = memory.rows;
         for (int k = threadIdx.x; k < 3 * rows.own; k += THREADS) {
@@ -249,7 +249,7 @@ struct PcgSolver {
         group.barrier();
     }
 
-    // On with another preconditioner from the residual as it is.
+    // Continues with another preconditioner from the present residual.
     __device__ __forceinline__ void change(int kind) {
         group.barrier();
         packed = kind == CHOLESKY;
@@ -265,7 +265,7 @@ struct PcgSolver {
         }
     }
 
-    // Of the whole body, -1 if there is none: |b|^2 was too large.
+    // First node of the body whose b is not finite; -1: none, |b|^2 has overflowed.
     __device__ __forceinline__ int first_bad_node() const {
         if (threadIdx.x == 0) memory.bad = 0x7fffffff;
         __syncthreads();
@@ -278,7 +278,7 @@ struct PcgSolver {
     __device__ __forceinline__ void solve();
 };
 
-// One loop with one place for each of its parts: written out twice they would not fit the instruction cache.
+// One loop in which each part occurs once: the code would not fit into the instruction cache if parts were inlined twice.
 __device__ __forceinline__ void PcgSolver::solve() {
     const PcgBody& body = memory.body;
     PcgResult& out = memory.out;
@@ -299,7 +299,7 @@ __device__ __forceinline__ void PcgSolver::solve() {
                 begun = true;
                 memory.b2 = bb;
                 const bool refused = !isfinite(bb);
-                if (memory.rests && bb > 0 && !refused) {  // b is rounding; the scene has what it starts from: to stand still
+                if (memory.rests && bb > 0 && !refused) {  // b is rounding error: the solution stays as it is, the body rests
                     out.residual = sqrt(r2 / bb);
                     return;
                 }
@@ -312,18 +312,18 @@ __device__ __forceinline__ void PcgSolver::solve() {
                         out.status = NOT_FINITE;
                         out.bad_node = first_bad_node();
                     }
-                    if (alpha == 0) give(refused, (real)(0 * bb));  // NaN: `advance` takes the body back; else the scene has x
+                    if (alpha == 0) give(refused, (real)(0 * bb));  // NaN: `advance` restores the body; else the scene has x already
                     out.residual = refused ? bb : bb > 0 ? sqrt(r2 / bb) : 0;
                     return;
                 }
             } else {
-                if (stop == CONVERGED && r2 > memory.goal && !(r2 < 0.25 * last)) stop = MAX_ITERATIONS;  // rounding is reached
+                if (stop == CONVERGED && r2 > memory.goal && !(r2 < 0.25 * last)) stop = MAX_ITERATIONS;  // rounding errors dominate
                 if (stop != CONVERGED || r2 <= memory.goal) {
                     out.status = stop;
                     out.residual = sqrt(r2 / memory.b2);
                     return;
                 }
-                last = r2;  // the recursive residual was too good
+                last = r2;  // the recursive residual was smaller than the true one
                 fresh = true;
             }
             if (fresh) turn = 1 - turn;
@@ -336,8 +336,8 @@ __device__ __forceinline__ void PcgSolver::solve() {
             if (!usable(zr)) stop = BREAKDOWN_PRECONDITIONER;
             else if (iterations == body.max_iterations) stop = MAX_ITERATIONS;
             else if (kind == CHOLESKY && body.max_iterations >= ENOUGH && iterations == body.max_iterations / 2 && !(r2 < memory.quarter))
-                stop = BREAKDOWN_PRECONDITIONER;  // not a quarter of the way: pcg.h says why
-            if (stop == BREAKDOWN_PRECONDITIONER && kind == CHOLESKY) {  // a useless factor: on with block Jacobi
+                stop = BREAKDOWN_PRECONDITIONER;  // not a quarter of the way, see pcg.h
+            if (stop == BREAKDOWN_PRECONDITIONER && kind == CHOLESKY) {  // a useless factor: continue with block Jacobi
                 other = BLOCK_JACOBI;
                 out.fallbacks = 1;
             } else if (stop < 0 && body.probe > 0 && iterations == body.probe && body.plan && kind >= BLOCK_JACOBI && !switched) {
@@ -388,13 +388,13 @@ __device__ __forceinline__ void solve_body(const PcgArguments& s, const RowRange
         out.seconds = 1e-9 * (nanoseconds() - begin);
         if (memory.body.plan && (out.asked == CHOLESKY || out.kind == CHOLESKY || out.fallbacks)) out.factor_step = memory.body.factor_step;
         s.results[(s.step[0] % s.capacity) * s.count + k] = out;
-        s.exchange_number[k] = solver.group.number;  // all have read it before the first exchange
+        s.exchange_number[k] = solver.group.number;  // read by all blocks before the first exchange
     }
-    copies_end<0>();  // the next body has the same memory
+    copies_end<0>();  // the next body uses the same memory
     __syncthreads();
 }
 
-#ifdef NEWTON_PHASES  // a launch of a step with several linearizations: for the bodies in phase 0 alone (newton.cu)
+#ifdef NEWTON_PHASES  // several linearizations a step: solve only the bodies in phase 0 (newton.cu)
 #define PHASES , const int* __restrict__ active, const int* __restrict__ phase
 #else
 #define PHASES
@@ -405,7 +405,7 @@ extern "C" __global__ void __launch_bounds__(THREADS, PER_PROCESSOR) pcg(const P
     if (*active == 0) return;
 #endif
     for (int next = s.initial_range[blockIdx.x];; next = -1) {
-        if (next < 0) {  // the next one of those that any block may take
+        if (next < 0) {  // take the next body of the pool
             if (threadIdx.x == 0) memory.next = s.pooled > 0 ? atomicAdd(s.pool_counter, 1) : s.pooled;
             __syncthreads();
             if (memory.next >= s.pooled) return;
@@ -413,7 +413,7 @@ extern "C" __global__ void __launch_bounds__(THREADS, PER_PROCESSOR) pcg(const P
         }
 #ifdef NEWTON_PHASES
         if (phase[s.row_ranges[next].body] != 0) {
-            __syncthreads();  // all have read memory.next
+            __syncthreads();  // all threads have read memory.next
             continue;
         }
 #endif

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: MIT
-// What the solver reads and writes. Layouts: solver.py holds the same, checked when it starts.
+// Data of the persistent solver (pcg.cu). solver.py and device_plan.py hold the same layouts; sizes are compared at compilation.
 #pragma once
 
 #ifndef real
@@ -10,22 +10,22 @@ enum Kind { NONE = 0, JACOBI = 1, BLOCK_JACOBI = 2, CHOLESKY = 3 };
 enum Status { CONVERGED = 0, MAX_ITERATIONS = 1, BUDGET = 2, BREAKDOWN_MATRIX = 3, BREAKDOWN_PRECONDITIONER = 4, NOT_FINITE = 5,
               MAX_LINEARIZATIONS = 6 };  // of a step
 
-// 32 entries of the vector that a phase multiplies, and where they come from.
+// 32 entries of the vector that a phase multiplies, one per lane of a warp, and their source.
 struct __align__(16) WarpSegment {
-    int kind;  // 0: formed from the residual less what was contributed, 1: formed earlier, 2: solved, through `boundary`
-    int from;  // packed position, or place in `boundary`
-    int to;    // place in the vector
-    int keep;  // 2 valid + 1 where this block also leaves it for others (kind 0); entries from `valid` on are zero
+    int kind;  // 0: formed (residual minus contributions), 1: formed earlier, 2: solved, through `boundary`
+    int from;  // packed position, or index in `boundary`
+    int to;    // index in the vector
+    int keep;  // 2 valid + 1 if this block also stores it for others (kind 0); entries from `valid` on are zero
 };
 
 // Eight or sixteen rows of a part's matrix: `chunks` chunks of 8 rows x 32 columns from `chunk` on, then those of the other
-// eight rows. x: where the vector begins; out: where the rows go.
+// eight rows. x: first entry of the vector; out: first result.
 struct __align__(16) Tile { int chunk, x, chunks, out, rows, unused[3]; };
 
-// What a thread block has of a plan: ranges of its lists.
+// First and number of the segments, tiles and chunks of a thread block.
 struct BlockRanges { int segment, segments, tile, tiles, chunk, chunks, unused[2]; };
 
-// How an inverse in parts is shared out over the thread blocks of a body (plan.py). Lists by thread block and phase.
+// Partitioned inverse over the thread blocks of a body (inverse/plan.py). Lists by thread block and phase.
 struct DevicePlan {
     int phases, blocks, groups, size;
     const BlockRanges* block_ranges;  // (blocks,)
@@ -33,9 +33,9 @@ struct DevicePlan {
                                       // within the part; warps that share a tile; first segment that is not formed here
     const WarpSegment* segments;
     const Tile* tiles;
-    const int* index;                 // (segments, 32) of each entry: where it stands (kinds 1 and 2), or the first of the contributions
-                                      // that come off it and, in the upper 8 bits, how many there are (kind 0)
-    const int* target;                // where a contribution goes
+    const int* index;                 // (segments, 32) of each entry: its position (kinds 1 and 2), or the first of its contributions
+                                      // and, in the upper 8 bits, their number (kind 0)
+    const int* target;                // position of each contribution in PcgBody.contributed
     const int* place;                 // (nodes,) packed position of a node
     int entries, unused;              // of the longest vector of a phase
 };
@@ -44,16 +44,16 @@ template <class T> struct FlagWord;  // block_group.cuh
 
 constexpr int ENOUGH = 20;  // backends/cpu/native/pcg.h
 
-// The rows of A that a thread block has of a body, and the nodes that they read.
+// Rows of A of one thread block, and the nodes that they read (row_partition.ROW_RANGE).
 struct RowRange { int body, index, begin, own, halo_first, halo, block_first, blocks; };
 
 struct PcgBody {
-    int first, nodes;              // of the scene's nodes
-    int blocks;                    // thread blocks that solve it
+    int first, nodes;              // range of the nodes of the scene
+    int blocks;                    // number of thread blocks
     int kind, max_iterations, warm_start, probe;
     int first_range;               // first of its thread blocks in PcgArguments.row_ranges
     double tolerance;
-    long long factor_step;         // of the matrix it was made from
+    long long factor_step;         // step of the matrix of the factor
     const DevicePlan* plan;        // null: no factor yet
     const uint4* matrix;           // chunks
     const float* scale;            // (size + 1,) d: the inverse is d_i stored_ij d_j; the last is the largest
@@ -62,8 +62,8 @@ struct PcgBody {
     FlagWord<float>* z;            // (size + 32,)
     FlagWord<float>* formed;       // (size + 32,)
     FlagWord<float>* solved;       // (size + 32,) z / d
-    FlagWord<float>* contributed;  // contributions
-    int planes, unused;            // float16 values that make an entry of the inverse
+    FlagWord<float>* contributed;  // contributions of parts below
+    int planes, unused;            // float16 numbers per entry of the inverse
 };
 
 struct PcgResult {
@@ -79,22 +79,22 @@ struct PcgArguments {
     const int* row_start;
     const real* values;            // (blocks, 3, 3)
     const real* b;                 // (nodes, 3)
-    real* y;                       // (nodes, 3) start in, solution out
+    real* y;                       // (nodes, 3) in: initial guess; out: solution
     const int* order;              // bodies: those with thread blocks of their own, then the pool, largest first
-    int pooled, grid;              // bodies in the pool: whichever thread block is free takes the next; all thread blocks
+    int pooled, grid;              // number of bodies in the pool, which free thread blocks take one by one; number of thread blocks
     const RowRange* row_ranges;    // of all thread blocks of all bodies
-    const int* initial_range;      // (grid,) the one that a thread block begins with, or -1
-    const int* halo;               // nodes of the body whose values a thread block reads, its own first
-    const int* local_column;       // (blocks,) column as a place in that list
-    real* halo_values;             // (halo, 3) where they do not fit into shared memory
+    const int* initial_range;      // (grid,) range with which each thread block begins, -1: the pool
+    const int* halo;               // lists of nodes that a thread block reads, its own first
+    const int* local_column;       // (blocks of A,) column as an index into that list
+    real* halo_values;             // (halo, 3) used if they do not fit into shared memory
     int* halo_position;            // (halo,) likewise
     real* own_vectors;             // (3, nodes, 3) x, r, q likewise
     FlagWord<real>* z;             // (nodes, 3) without a factor
     real* diagonal;                // (nodes, 9) inverses of the diagonal blocks
-    FlagWord<double>* block_sums;  // (bodies, 2, 4, grid) sums of the thread blocks
-    unsigned* exchange_number;     // (bodies,) counted from the first step on
-    unsigned* pool_counter;        // (1,) zero at launch: next of the pool
-    const long long* step;         // completed steps: where the result goes
+    FlagWord<double>* block_sums;  // (bodies, 2, 4, grid) partial sums
+    unsigned* exchange_number;     // (bodies,) of the last exchange, counted from the first step on
+    unsigned* pool_counter;        // (1,) zero at launch; bodies of the pool that were taken
+    const long long* step;         // number of completed steps, which selects the slot of the result
     PcgResult* results;            // (capacity, bodies)
     const int* moving;             // (bodies,) 0: the body rests (kernels/nodes.cu)
     int nodes, shared;             // of the scene; bytes of dynamic shared memory

@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: MIT
-// Frames and matrices on their way home, beside the steps: copied aside on the device in the order of the steps, then to the
-// host on a stream of their own, and told of when they are there.
+// Copies of frames and matrices from the device to the host, beside the steps: first a copy within the device in the order of
+// the steps, then one to the host on another stream. They are published once they have arrived.
 #pragma once
 #include "loop.h"
 
-// Positions go through the room of the blocks: each node has at least its own.
+// Bytes of the copy under way. Positions use the staging memory of the blocks, of which each node has at least one.
 static int64_t readback_bytes(const BodyReadback& body) { return body.in_flight == REQUEST_VALUES ? body.values_bytes : body.x_bytes; }
 
 static bool begin_matrices(GpuLoop& l) {
@@ -24,7 +24,7 @@ static bool begin_matrices(GpuLoop& l) {
             CALL(to_host, l.host_matrices + body.values_begin, l.staged + body.values_begin, (size_t)readback_bytes(body), l.copy_stream);
     }
     CALL(event_record, l.copied_event, l.copy_stream);
-    l.matrix_step = l.launched - 1;  // steps completed when they were assembled; positions are those after it
+    l.matrix_step = l.launched - 1;  // steps completed before the matrix was assembled; positions are those after that step
     return true;
 }
 
@@ -37,7 +37,7 @@ static void publish_matrices(GpuLoop& l) {
     l.matrix_step = -1;
 }
 
-// Tells of what has come home; never waits.
+// Publishes the copies that have arrived, without waiting.
 static void publish(GpuLoop& l) {
     if (l.matrix_step >= 0 && done(l, l.copied_event)) publish_matrices(l);
     while (l.rings.frame_head.load() < l.frames_begun && done(l, l.frame_copies[l.rings.frame_head.load() % FRAME_COPIES].arrived))
@@ -50,10 +50,10 @@ static bool finish_oldest_frame(GpuLoop& l) {
     return true;
 }
 
-// A full ring: wait if nobody minds, else say no.
+// False if the ring of frames is full; in patient mode waits for room instead.
 static bool room_for_frame(GpuLoop& l) {
     Rings& rings = l.rings;
-    while (l.frames_begun - rings.frame_head.load() >= FRAME_COPIES)  // as fast as the device gets there
+    while (l.frames_begun - rings.frame_head.load() >= FRAME_COPIES)  // waits for the device
         if (!finish_oldest_frame(l)) return false;
     while (l.frames_begun - rings.frame_tail.load(std::memory_order_acquire) >= rings.frame_capacity) {
         if (!rings.patient || rings.stop.load() || l.error) return false;
@@ -65,7 +65,7 @@ static bool room_for_frame(GpuLoop& l) {
 }
 
 static bool begin_frame(GpuLoop& l) {
-    const int64_t every = l.rings.frame_every.load(), bytes = l.frame_bytes;  // once: it may become 0 meanwhile
+    const int64_t every = l.rings.frame_every.load(), bytes = l.frame_bytes;  // read once, since it may become 0 meanwhile
     if (every <= 0 || l.launched % every) return true;
     if (!room_for_frame(l)) { ++l.rings.frames_dropped; return !l.error; }
     int64_t slot = l.frames_begun % l.rings.frame_capacity;
@@ -82,7 +82,7 @@ static bool begin_frame(GpuLoop& l) {
     return true;
 }
 
-// Waits for all that is on its way.
+// Waits for all copies under way.
 static bool finish_readbacks(GpuLoop& l) {
     while (l.rings.frame_head.load() < l.frames_begun)
         if (!finish_oldest_frame(l)) return false;

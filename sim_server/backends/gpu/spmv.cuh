@@ -1,32 +1,32 @@
 // SPDX-License-Identifier: MIT
-// The rows of A that a thread block has, with the vectors that are its own. A block keeps the values of every node that its
-// rows read ("halo", its own nodes first), so that a search direction is formed where it is used and never sent.
+// Matrix-vector product with the rows of A of one thread block, and the block's part of the vectors. A block keeps the values of
+// all nodes that its rows read (the halo, own nodes first), so that it forms a search direction itself where it is used.
 #pragma once
 #include "block_group.cuh"
 #include "invert3.cuh"
 
-#define TOGETHER 3                   // rows of a warp at a time
-#define SLAB_ROWS 4                  // ... of a slab
-#define SLAB (SLAB_ROWS * WARPS)     // rows that come into shared memory at a time where not all fit, in turns into ...
-#define SLABS 2                      // ... so many places
-#define SLAB_BLOCKS (17 * SLAB)      // of A, at most; a slab with more is read where it is
+#define TOGETHER 3                   // rows that a warp multiplies at a time
+#define SLAB_ROWS 4                  // likewise in a slab
+#define SLAB (SLAB_ROWS * WARPS)     // rows that are copied to shared memory at a time if not all fit
+#define SLABS 2                      // buffers of a slab, used in turns
+#define SLAB_BLOCKS (17 * SLAB)      // most blocks of A in a slab; a slab with more is read from global memory
 
 struct BlockRows {
     int begin, own, halo;  // own nodes [begin, begin + own) of the body; nodes read
     const int* nodes;      // (halo,) of the body
     real* values;          // (halo, 3) of the vector that A multiplies
-    int* place;            // (halo,) where the next one is read
+    int* place;            // (halo,) position from which its next values are read
     real *x, *r, *q;       // (own, 3)
     real* scale;           // (own, 3) of the inverse, or null
     const int* row_start;  // (own + 1,), less `base`
-    const int* columns;    // places in halo
+    const int* columns;    // indices into the halo
     const real* blocks;
     int base;
-    bool near;             // A is in shared memory
-    int slabs;             // place of (SLABS, SLAB_BYTES) of shared memory that A passes through, or -1
-    int near_values, near_blocks, near_columns;  // places, where they are near
+    bool near;             // the rows of A are in shared memory
+    int slabs;             // offset of the buffers (SLABS, SLAB_BYTES) in shared memory, or -1
+    int near_values, near_blocks, near_columns;  // offsets in shared memory, if they are there
 
-    // What is used most comes first. inverted: there is an inverse.
+    // Allocates shared memory, for the most frequently used arrays first. inverted: there is an inverse.
     __device__ __forceinline__ void set_up(const PcgArguments& s, const PcgBody& body, const RowRange& range, Arena& arena, bool inverted) {
         begin = range.begin; own = range.own; halo = range.halo;
         nodes = s.halo + range.halo_first;
@@ -52,7 +52,7 @@ struct BlockRows {
         return found ? found : instead;
     }
 
-    // Copies the own rows of A into shared memory if they fit beside `others` bytes: loads after a barrier miss L1.
+    // Copies the own rows of A into shared memory if they and `others` bytes fit, since loads after a barrier miss L1.
     __device__ __forceinline__ void bring(const PcgArguments& s, int row, const RowRange& range, Arena& arena, int others) {
         const int count = range.blocks;
         base = range.block_first;
@@ -86,14 +86,14 @@ struct BlockRows {
 
     static constexpr int VALUE_BYTES = SLAB_BLOCKS * 9 * (int)sizeof(real) + 16, SLAB_BYTES = VALUE_BYTES + 4 * SLAB_BLOCKS + 16;
 
-    struct Slab { int low, high, first, count; };  // rows, and their blocks of A as places in `blocks`
+    struct Slab { int low, high, first, count; };  // rows, and their range in `blocks`
 
     __device__ __forceinline__ Slab slab(int k, const int* starts) const {
         const int low = min(k * SLAB, own), high = min(low + SLAB, own);
         return {low, high, starts[low] - base, starts[high] - starts[low]};
     }
 
-    // Brings a slab into its place: from the 16 bytes on in which it begins.
+    // Begins to copy a slab into its buffer, aligned to 16 bytes.
     __device__ __forceinline__ void ask(int k, const int* starts) const {
         const Slab s = slab(k, starts);
         char* to = shared_memory + slabs + k % SLABS * SLAB_BYTES;
@@ -128,14 +128,14 @@ struct BlockRows {
         }
     }
 
-    // A passes through shared memory; the first slabs of the next product come beside what is between. Whole rounds of slabs,
-    // so that each finds its place.
+    // The rows pass through shared memory in slabs. The first slabs of the next product are copied after this one, beside other
+    // work; the number of slabs is a multiple of SLABS, so that each slab has its buffer.
     template <class Done>
     __device__ __forceinline__ void through_slabs(Done done) const {
         const int count = (own + SLABS * SLAB - 1) / (SLABS * SLAB) * SLABS;
         for (int k = 0; k < count; ++k) {
             copies_end<SLABS - 2>();
-            __syncthreads();  // all have this one, and nobody reads the one before any more
+            __syncthreads();  // this slab is complete, and the one before is not read any more
             const int next = k + SLABS - 1;
             ask(next < count ? next : next - count, row_start);
             const Slab s = slab(k, row_start);
@@ -158,7 +158,7 @@ struct BlockRows {
         }
     }
 
-    // Hands on the sums of rows first, first + WARPS, ...: lane 3 n + c has entry c of the n-th.
+    // Passes the sums of rows first, first + WARPS, ... to `done`: lane 3 n + c has entry c of the n-th row.
     template <int N, class Done>
     static __device__ __forceinline__ void finish(int first, int end, const real sum[N], Done done) {
         const int lane = threadIdx.x % 32, n = lane / 3, c = lane - 3 * n;
@@ -175,7 +175,7 @@ struct BlockRows {
     }
 
     // Eight blocks of a row at a time: lane 3 e + r has row r of block e. The sums end in lanes 0, 1, 2. Rows of up to 16 blocks
-    // go without a branch, so that the warp's rows overlap. a_at, c_at: places of values and columns from the
+    // go without a branch, so that the warp's rows overlap. a_at, c_at: offsets of values and columns from the
     // block on that is `origin`-th.
     template <int N>
     __device__ __forceinline__ void of_near(int first, int end, int origin, int a_at, int c_at, real sum[N]) const {
@@ -228,7 +228,7 @@ struct BlockRows {
         }
     }
 
-    // The values that A multiplies: those of exchange `number` + beta what they are.
+    // values = (values of exchange `number`) + beta values, for all nodes of the halo.
     template <class T>
     __device__ __forceinline__ void form(const FlagWord<T>* from, unsigned number, real beta) const {
         for (int first = threadIdx.x; first < 3 * halo; first += 3 * THREADS) {

@@ -1,19 +1,18 @@
 // SPDX-License-Identifier: MIT
-// The end of a step, done by whichever thread block of its last kernel finishes last: one more step is completed, the counters
-// of the next solve begin at zero, all bodies rest until their nodes say otherwise, and the results go to the host with the
-// device's clock. kernel_fusion.py appends this to that kernel.
+// Epilogue of a step, done by the thread block of its last kernel that finishes last: counts the step, resets the counters of the
+// next solve and the flags `moving`, and writes results and time stamps to the host. kernel_fusion.py appends it to that kernel.
 #include "clock.cuh"
 
 struct StepEpilogue {
-    double* clock;              // (1,) s of simulation
-    long long* step;            // (1,) completed
+    double* clock;              // (1,) time of the simulation [s]
+    long long* step;            // (1,) number of completed steps
     double dt;                  // s
     unsigned* pool_counters;    // (counters,)
-    unsigned* finished_blocks;  // (1,) thread blocks that have; zero between launches
-    long long* timestamps;      // (capacity, 2) on the host: ns when each step began and ended; a step begins when the one before
-                                // has ended, or when `stamp_begin` says so
+    unsigned* finished_blocks;  // (1,) zero between launches
+    long long* timestamps;      // (capacity, 2) on the host: begin and end of each step [ns]; a step begins at the end of the one before,
+                                // or at the time of `stamp_begin`
     const long long* results;   // (capacity, result_words)
-    long long* host_results;    // likewise on the host
+    long long* host_results;    // the same on the host
     int* moving;                // (bodies,)
     int counters, capacity, result_words, bodies;
 };
@@ -42,5 +41,5 @@ __device__ void finish_step(const StepEpilogue& t) {
     }
 }
 
-// The device had nothing to do until now: the next step begins here.
+// Writes the time at which the next step begins, where the device was idle before.
 extern "C" __global__ void stamp_begin(const StepEpilogue t) { t.timestamps[2 * (t.step[0] % t.capacity)] = nanoseconds(); }

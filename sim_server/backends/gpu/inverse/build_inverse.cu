@@ -1,15 +1,15 @@
 // SPDX-License-Identifier: MIT
-// From the values of L to the matrices of a plan (plan.py), all parts of a batch at once. GPU only.
+// Builds the matrices of a plan (plan.py) from the values of L, all parts of a batch at once. GPU only.
 //
-// Of a part with v degrees of freedom inside and b in its boundary, both padded to 64, there is a matrix G of v rows and
-// v + b columns: at first [L_VV^T | L_BV^T], just as the values stand in L's columns. The diagonal blocks of 64 are inverted
-// in place, then neighbouring ones are merged, 64 -> 128 -> ..: inverse of [L1 0; C L2] = [Y1 0; X Y2], X = -Y2 (C Y1).
-// X goes below the diagonal, C = L21 is above it as its transpose, C Y1 lies in a matrix T of its own. So in the end G is
-// Y = L_VV^-1 on and below its diagonal blocks, and [Y^T Y | Y^T L_BV^T] are the matrices wanted, tile by tile of 64 x 64.
+// A part with v degrees of freedom inside and b in its boundary, both padded to 64, has a matrix G of v rows and v + b columns,
+// at first [L_VV^T | L_BV^T], in the order of L's columns. The diagonal blocks of 64 are inverted in place. Then neighbouring
+// blocks are merged, 64 -> 128 -> ..: the inverse of [L1 0; C L2] is [Y1 0; X Y2] with X = -Y2 (C Y1). X is written below the
+// diagonal; C = L21 is above it, transposed; C Y1 is in a matrix T. At the end G holds Y = L_VV^-1 on and below its diagonal
+// blocks, and the result is [Y^T Y | Y^T L_BV^T] in tiles of 64 x 64.
 //
-// A group of threads takes tasks one after another from a list, and a thread block may have any number of groups: few large
-// blocks keep to few multiprocessors, many small ones are over soon and leave room for more urgent work.
-// Float32 throughout: every sum has a fixed order, so results depend on neither number.
+// A group of threads takes tasks one after another from a list; a thread block may have any number of groups. Few large blocks
+// keep few multiprocessors busy; many small ones end soon and leave room for more urgent work. All is float32, and every sum has
+// a fixed order, so results do not depend on the number of blocks or groups.
 #define EDGE 64          // of a tile
 #define DEPTH 8          // rows of G that are in shared memory at a time
 #define THREADS 128      // of a group
@@ -21,25 +21,25 @@
 extern __shared__ float4 dynamic[];   // of all groups
 
 struct Part {
-    long long g, t;                    // where G and T begin in the workspace
+    long long g, t;                    // first entries of G and T in the workspace
     int v, b;                          // degrees of freedom
     int pitch_g, pitch_t;              // entries per row
     int start, boundary, out, unused;  // as in plan.Parts
 };
 
 struct Column {                      // of L
-    long long value, row;              // its first value, and that value's place among the rows
-    int length, part, within, unused;  // within: in the part
+    long long value, row;              // index of its first value, and of that value's row in the row lists
+    int length, part, within, unused;  // within: index in the part
 };
 
 struct TileTask { int part, i, j, end; }; // tile in units of 64; end: of the first of two merged runs
 
-struct InverseStorage {                      // set before each run
+struct InverseStorage {                      // set before each build
     unsigned short* matrix;  // (chunks, 8, 32)
     float* scale;            // (N + 1,)
 };
 
-// Threads of a block that work together; first, step: of the tasks they take.
+// Threads of a block that do a task together. first, step: of the tasks that they take.
 template <int SIZE>
 struct ThreadGroup {
     int thread, index, first, step;
@@ -105,8 +105,8 @@ KERNEL_OF(4 * EDGE) invert(const Part* parts, const TileTask* tasks, int count, 
 
 struct Operand { const float* from; int pitch; };
 
-// 8 x 4 entries of a 64 x 64 tile of A^T B per thread: A, B (depth, 64), row by row; or of A B with A (64, depth). With
-// fewer a multiprocessor waits for shared memory, with more a tile takes too long.
+// Product A^T B of A, B (depth, 64), row-major, in tiles of 64 x 64 (ACROSS: A B with A (64, depth)). A thread has 8 x 4
+// entries: with fewer a multiprocessor waits for shared memory, with more a tile takes too long.
 template <bool ACROSS>
 struct Product {
     const ThreadGroup<THREADS>& group;
@@ -151,7 +151,7 @@ struct Product {
         }
     }
 
-    // depth: a multiple of 64. While one slice is multiplied the next one is on its way.
+    // depth: a multiple of 64. The next slice is loaded while one is multiplied.
     __device__ __forceinline__ void run(Operand oa, Operand ob, int depth) {
 #pragma unroll
         for (int i = 0; i < 8; i++)
@@ -247,7 +247,7 @@ KERNEL_OF(4 * LENGTHS) lengths(const Part* parts, const TileTask* tasks, int cou
     }
 }
 
-// Two float16 numbers, as large as they can be rather than infinite.
+// Packs two float16 numbers; the largest finite one instead of infinity.
 __device__ __forceinline__ unsigned halves(float lo, float hi) {
     unsigned word;
     lo = lo > 65504.f ? 65504.f : lo < -65504.f ? -65504.f : lo;

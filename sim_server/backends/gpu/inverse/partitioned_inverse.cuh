@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: MIT
-// z = P^-1 r by an inverse in parts (plan.py): 2 P - 1 phases of dense products in float16 with float32 sums.
+// z = P^-1 r by a partitioned inverse (plan.py): 2 P - 1 phases of dense products in float16 with float32 sums.
 //
-// A product of 16 rows x 32 columns is two matrix instructions. The vector is their right factor, split into two columns of
-// float16 (value = high + low / 2048): 22 bits of it count, nearly as many as float32 has. So a warp needs five instructions
-// for 1024 bytes of matrix, and memory is the only limit.
+// A product of 16 rows x 32 columns is two matrix instructions. Their right factor is the vector, split into two columns of
+// float16 (value = high + low / 2048), which keep 22 bits of it, nearly those of float32. A warp needs five instructions for
+// 1024 bytes of matrix, so memory is the limit.
 #pragma once
 #include "block_group.cuh"
 
@@ -11,9 +11,9 @@
 #ifndef CHUNKS_AT_ONCE
 #define CHUNKS_AT_ONCE 4
 #endif
-#define TILE_SUMS 64  // jobs of a phase that share tiles, at most
-#define LISTS 32768   // bytes of a list that is worth its place in shared memory
-#define FEW 3         // segments that a warp brings together at a time
+#define TILE_SUMS 64  // most partial products of shared tiles in a phase
+#define LISTS 32768   // most bytes of a list that is copied to shared memory
+#define FEW 3         // segments that a warp loads at a time, for short lists
 #define MANY 8        // 2304 entries in one trip through L2 with 8 warps
 
 struct SplitVector { unsigned short *high, *low; };  // of a phase, in shared memory
@@ -38,7 +38,7 @@ __device__ __forceinline__ void put_halves(const SplitVector& to, int i, float v
 
 __device__ __forceinline__ unsigned shared_address(const void* p) { return (unsigned)__cvta_generic_to_shared(p); }
 
-// 16 bytes of shared memory if they are wanted, else zeros, without a branch.
+// Loads 16 bytes of shared memory if `wanted`, else zeros, without a branch.
 __device__ __forceinline__ uint4 shared_load(unsigned from, bool wanted) {
     uint4 v;
     asm volatile(
@@ -48,7 +48,7 @@ __device__ __forceinline__ uint4 shared_load(unsigned from, bool wanted) {
     return v;
 }
 
-// sum += a b: a of 16 rows x 16 columns, b of 16 x 8, of which two columns are meant.
+// sum += a b: a of 16 rows x 16 columns, b of 16 x 8, of which two columns are used.
 __device__ __forceinline__ void multiply_add(float sum[4], unsigned a0, unsigned a1, unsigned a2, unsigned a3, unsigned b0, unsigned b1) {
 #if __CUDA_ARCH__ >= 800
     asm("mma.sync.aligned.m16n8k16.row.col.f32.f16.f16.f32 {%0, %1, %2, %3}, {%4, %5, %6, %7}, {%8, %9}, {%0, %1, %2, %3};"
@@ -57,7 +57,7 @@ __device__ __forceinline__ void multiply_add(float sum[4], unsigned a0, unsigned
 #endif
 }
 
-// Where d r is found before the update by alpha of this application, or after it, and the numbers of the exchanges.
+// Source of d r: before the update by alpha of this application, or (alpha = 0) after it; numbers of the exchanges.
 struct ResidualSource {
     const FlagWord<float>* r;
     unsigned r_number, q_number;
@@ -80,7 +80,7 @@ struct PartitionedInverse {
     const Tile* tiles;
     int size, phases, groups;
 
-    // A list into shared memory if it is short: loads after a barrier miss L1.
+    // Copies a list into shared memory if it is short, since loads after a barrier miss L1.
     template <class T>
     static __device__ __forceinline__ const T* brought(const T* list, int count, Arena& arena) {
         T* to = count * sizeof(T) <= LISTS ? arena.take<T>(count) : nullptr;
@@ -89,7 +89,7 @@ struct PartitionedInverse {
         return to;
     }
 
-    // What nothing can stand in for (PcgSolver.planned sees to it that it fits).
+    // Allocates what has to be in shared memory; solver.PcgSolver.plan has checked that it fits.
     __device__ __forceinline__ void reserve(const DevicePlan* shared_plan, Arena& arena) {
         vector.high = arena.take<unsigned short>(shared_plan->entries);
         vector.low = arena.take<unsigned short>(shared_plan->entries);
@@ -109,7 +109,7 @@ struct PartitionedInverse {
         tiles = brought(plan->tiles + part.tile, part.tiles, arena);
         begin = part.chunk;
         matrix = body.matrix + 32ll * begin;
-        near = (int)((arena.end - arena.next) / 512);  // as many chunks as fit into what is left of shared memory
+        near = (int)((arena.end - arena.next) / 512);  // chunks that fit into the rest of shared memory
         near = near < part.chunks ? near : part.chunks;
         kept = arena.take<uint4>(32ll * near);
         copies_begin();
@@ -120,8 +120,8 @@ struct PartitionedInverse {
         copies_begin();
     }
 
-    // Brings together the vector of a phase: what this block forms, then what others do. No branches between loads: they
-    // travel together.
+    // Loads the vector of a phase: entries that this block forms, then those of other blocks. There are no branches between
+    // loads, so that their latencies overlap.
     __device__ __forceinline__ void gather(int phase, const ResidualSource& from, unsigned number, float unit) const {
         const int warp = threadIdx.x / 32, first = lists[phase], last = lists[phase + 1];
         const int middle = phase < groups ? lists[3 * phases + 2 + phase] : first, formed_here = middle - first;
@@ -139,7 +139,7 @@ struct PartitionedInverse {
         else for (int k = middle + warp; k < last; k += MANY * WARPS) solved_segments<MANY>(k, last, number, unit);
     }
 
-    // Of the first phase: nothing has contributed yet.
+    // Segments of the first phase, to which nothing has contributed.
     template <int N>
     __device__ __forceinline__ void residual_segments(int at, int last, const ResidualSource& from, unsigned number, float unit) const {
         if (at >= last) return;
@@ -175,7 +175,7 @@ struct PartitionedInverse {
         if (segment.keep & 1) formed[segment.from + lane].put(v, number);
     }
 
-    // Of the phases up to the top: what has been contributed comes off.
+    // Segments of the later phases up to the top: residual minus contributions.
     template <int N, int M>
     __device__ __forceinline__ void reduced_segments(int at, int last, const ResidualSource& from, unsigned number, float unit) const {
         if (at >= last) return;
@@ -226,7 +226,7 @@ struct PartitionedInverse {
         }
     }
 
-    // What has been formed, on the way to the top or in this phase by another block, and what is solved.
+    // Segments that were formed (earlier, or in this phase by another block) or solved.
     template <int N>
     __device__ __forceinline__ void solved_segments(int at, int last, unsigned number, float unit) const {
         if (at >= last) return;
@@ -299,7 +299,7 @@ struct PartitionedInverse {
         return total;
     }
 
-    // The products of a phase; returns this thread's part of z . r. unit: what the vector was multiplied by.
+    // Computes the products of a phase; returns this thread's part of z . r. unit: factor by which the vector is scaled.
     __device__ __forceinline__ double multiply(int phase, const ResidualSource& from, unsigned number, float unit) const {
         const int lane = threadIdx.x % 32, warp = threadIdx.x / 32;
         const int first = lists[phases + 1 + phase], count = lists[phases + 2 + phase] - first;
@@ -310,7 +310,7 @@ struct PartitionedInverse {
         int i = 0;
         float d = 0;
         FlagWord<float> r, q;  // of d r, for z . r
-        auto look_up = [&](const Tile& tile, int row) {  // before the product: these loads take as long
+        auto look_up = [&](const Tile& tile, int row) {  // loads before the product, whose latency hides theirs
             i = tile.out + row;
             if (forward) {
                 i = plan->target[i];
@@ -341,7 +341,7 @@ struct PartitionedInverse {
             if (here) look_up(tiles[first + row / 16], row % 16);
         }
         for (int job = warp; job < count * parts; job += WARPS) {
-            __syncwarp();  // some lanes may still be at what they finish
+            __syncwarp();  // some lanes may still be in `finish`
             const int at = parts > 1 ? job / parts : job, part = job - at * parts;
             const Tile tile = tiles[first + at];
             if (parts == 1 && lane < tile.rows) look_up(tile, lane);
