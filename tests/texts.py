@@ -16,5 +16,5 @@ def compiled(text: str, folder: Path) -> Iterator[dict[str, CpuModule]]:
     """A module of the text in double and in single precision."""
     (folder / "text.cu").write_text(text)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(compiler, "HERE", folder)
+        patch.setattr(compiler, "SOURCES", folder)
         yield {real: CpuModule("text.cu", real) for real in ("double", "float")}

@@ -20,8 +20,8 @@ from typing import Any
 
 from sim_server.backends.build_pool import CompileError, Job, compilers
 
-HERE = Path(__file__).parents[1]  # sim_server/
-INCLUDE = HERE / "kernels"
+SOURCES = Path(__file__).parents[1]  # sim_server/
+INCLUDE = SOURCES / "kernels"
 # No -ffast-math: it deletes NaN checks. Contraction to FMA is the compiler's default on both sides.
 FLAGS = [
     "-O3",
@@ -83,10 +83,10 @@ def read_text(path: str) -> tuple[str, str]:
     "a.cu+b.cuh" is the text a.cu with b.cuh in place of its line `#include LAW`, and its name is b.
     """
     frame, _, law = path.partition("+")
-    text = (HERE / frame).read_text()
+    text = (SOURCES / frame).read_text()
     if not law:
         return Path(frame).stem, text
-    return Path(law).stem, text.replace("#include LAW\n", (HERE / law).read_text())
+    return Path(law).stem, text.replace("#include LAW\n", (SOURCES / law).read_text())
 
 
 def begin(source: Path, defines: tuple[str, ...] = (), text: str | None = None) -> Path:
@@ -94,7 +94,7 @@ def begin(source: Path, defines: tuple[str, ...] = (), text: str | None = None) 
 
     text: where the file does not hold it. Raises CompileError without a compiler or a folder for the library.
     """
-    folders = [f for f in {INCLUDE, source.parent, HERE / "backends/cpu/native"} if f.is_dir()]
+    folders = [f for f in {INCLUDE, source.parent, SOURCES / "backends/cpu/native"} if f.is_dir()]
     headers = sorted(p for folder in folders for p in folder.iterdir() if p.suffix in (".h", ".cuh"))
     flags = [*FLAGS, *(f"-D{d}" for d in defines)]
     digest = hashlib.sha256(
@@ -126,7 +126,7 @@ def build(source: Path, stepping: bool = True) -> Path:
 
 def begin_kernels(path: str, text: str, defines: tuple[str, ...]) -> Path:
     """As `begin`, of a kernel text of this package as read_text gives it; notes that this process uses it."""
-    source = HERE / path.rpartition("+")[2]
+    source = SOURCES / path.rpartition("+")[2]
     library = begin(source, defines, text if "+" in path else None)
     used(source, library)
     return library
@@ -135,7 +135,7 @@ def begin_kernels(path: str, text: str, defines: tuple[str, ...]) -> Path:
 def ahead(*paths: str) -> None:
     """Begins to compile host-only texts of this package that will be asked for soon."""
     for path in paths:
-        begin(HERE / path)
+        begin(SOURCES / path)
 
 
 def build_id() -> str:
@@ -145,7 +145,7 @@ def build_id() -> str:
 
 def native(path: str, signatures: dict[str, tuple[Any, list[Any]]], stepping: bool = True) -> ctypes.CDLL:
     """A host-only C++ text of this package with its functions' types declared."""
-    library = ctypes.CDLL(str(build(HERE / path, stepping=stepping)))
+    library = ctypes.CDLL(str(build(SOURCES / path, stepping=stepping)))
     for name, (result, arguments) in signatures.items():
         function: Callable[..., Any] = getattr(library, name)
         function.restype, function.argtypes = result, arguments  # type: ignore[attr-defined]

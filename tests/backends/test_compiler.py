@@ -36,7 +36,7 @@ def folder(tmp_path, monkeypatch) -> Path:
     texts = tmp_path / "texts"
     texts.mkdir()
     (texts / "push.cu").write_text(PUSH)
-    monkeypatch.setattr(backend, "HERE", texts)
+    monkeypatch.setattr(backend, "SOURCES", texts)
     monkeypatch.setenv("WARPFACTOR_CACHE", str(tmp_path / "cache"))
     return texts
 
@@ -175,10 +175,10 @@ def test_layouts_are_those_of_the_compiler(folder):
         assert ctypes.sizeof(launch.params) in (40, 48, 56)
 
 
-PACKAGE = backend.HERE
-LAWS = sorted(p.relative_to(PACKAGE).as_posix() for p in PACKAGE.glob("effects/*.cuh"))
+SOURCES = backend.SOURCES
+LAWS = sorted(p.relative_to(SOURCES).as_posix() for p in SOURCES.glob("effects/*.cuh"))
 FRAME = "kernels/hyperelastic.cu"  # of the laws: no text by itself
-GPU_TEXTS = sorted(p.relative_to(PACKAGE).as_posix() for p in PACKAGE.rglob("*.cu"))
+GPU_TEXTS = sorted(p.relative_to(SOURCES).as_posix() for p in SOURCES.rglob("*.cu"))
 GPU_TEXTS = [path for path in GPU_TEXTS if path != FRAME] + [f"{FRAME}+{law}" for law in LAWS]
 TEXTS = [path for path in GPU_TEXTS if not path.startswith("backends/gpu/")]
 
@@ -224,7 +224,7 @@ def test_the_gpu_compiler_names_an_error(tmp_path):
 
 def test_a_process_without_kernels_compiles_none(tmp_path):
     code = "import sim_server.scene, sim_server.simulation, sim_server.backends.compiler as b; print(b.compiled)"
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=PACKAGE.parent)
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=SOURCES.parent)
     assert run.stdout.strip() == "[]"
 
 
@@ -235,12 +235,12 @@ def test_the_last_kernel_of_a_step_compiles_with_the_end_of_the_step(arch, name,
         pytest.skip("needs the package nvidia-cuda-nvrtc")
     advance = _launch(f"kernels/{name}.cu", "Advance", f"{name}.advance")
     end = kernel_fusion.Epilogue(
-        (PACKAGE / "backends/gpu/step_epilogue.cu").read_text(), "StepEpilogue", "finish_step", np.zeros(())
+        (SOURCES / "backends/gpu/step_epilogue.cu").read_text(), "StepEpilogue", "finish_step", np.zeros(())
     )
     text = tmp_path / "last.cu"
     text.write_text(kernel_fusion.FusedSource([advance], kernel_fusion.BlockShape(32, 1), end).source)  # type: ignore[list-item]
     code, said = nvrtc.compiled(
-        library, text, [f"-arch={arch}", "-std=c++17", f"-I{backend.INCLUDE}", f"-I{PACKAGE / 'backends/gpu'}"]
+        library, text, [f"-arch={arch}", "-std=c++17", f"-I{backend.INCLUDE}", f"-I{SOURCES / 'backends/gpu'}"]
     )
     assert len(code) > 1000 and not said, said
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sim_server.backends.compiler import HERE, INCLUDE, compiler
+from sim_server.backends.compiler import INCLUDE, SOURCES, compiler
 from sim_server.backends.cpu.structs import BALANCE
 from sim_server.backends.gpu.energies import ENERGY_BALANCE, SUMS, node_chunks
 from sim_server.backends.gpu.structs import ENERGY_RECORD
@@ -29,7 +29,7 @@ extern "C" void settle(int chunks, int threads, const EnergyBalance* a) {
 def library(tmp_path_factory: pytest.TempPathFactory) -> c.CDLL:
     folder = tmp_path_factory.mktemp("account")
     (folder / "settle.cpp").write_text(TEXT)
-    paths = [f"-I{p}" for p in (folder, Path(__file__).parent, HERE / "backends/gpu", INCLUDE)]
+    paths = [f"-I{p}" for p in (folder, Path(__file__).parent, SOURCES / "backends/gpu", INCLUDE)]
     command = [compiler(), "-std=c++17", "-O1", "-shared", "-fPIC", "-pthread", "-Dreal=double", *paths]
     subprocess.run([*command, str(folder / "settle.cpp"), "-o", str(folder / "settle.so")], check=True)
     return c.CDLL(str(folder / "settle.so"))

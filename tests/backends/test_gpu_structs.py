@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 
-from sim_server.backends.compiler import HERE
+from sim_server.backends.compiler import SOURCES
 from sim_server.backends.cpu.structs import BALANCE
 from sim_server.backends.gpu.device import PRECISIONS, own_headers
 from sim_server.backends.gpu.device import options as device_options
@@ -28,7 +28,7 @@ from tests.support import nvrtc
 
 SIZES = {"int": 4, "unsigned": 4, "float": 4, "double": 8, "long long": 8}
 TEXTS = "".join(
-    (HERE / name).read_text()
+    (SOURCES / name).read_text()
     for name in ("backends/gpu/pcg_structs.cuh", "backends/gpu/newton.cu", "kernels/newton_line_search.cuh")
 )
 
@@ -74,7 +74,7 @@ def test_the_solver_spills_no_registers(threads, blocks, more):
         pytest.skip("needs the package nvidia-cuda-nvrtc")
     options = [*device_options(PRECISIONS["float64"]), *own_headers(), "--ptxas-options=-v"]
     options += [f"-DTHREADS={threads}", f"-DPER_PROCESSOR={blocks}", "-arch=sm_90", *more]
-    code, said = nvrtc.compiled(library, HERE / "backends/gpu/pcg.cu", options)
+    code, said = nvrtc.compiled(library, SOURCES / "backends/gpu/pcg.cu", options)
     spilled = [int(n) for n in re.findall(r"(\d+) bytes (?:stack frame|spill stores|spill loads)", said)]
     assert code and spilled and max(spilled) <= 32, said
 
@@ -118,7 +118,7 @@ def test_the_search_compiles_with_the_layouts_of_this_side_and_spills_no_registe
         f"-arch={arch}",
     ]
     options += [f"-D{name}_BYTES={layout.itemsize}" for name, layout in sizes.items()]
-    code, said = nvrtc.compiled(library, HERE / "backends/gpu/newton.cu", options)
+    code, said = nvrtc.compiled(library, SOURCES / "backends/gpu/newton.cu", options)
     spilled = [int(n) for n in re.findall(r"(\d+) bytes (?:stack frame|spill stores|spill loads)", said)]
     assert code and len(spilled) >= 12 and max(spilled) == 0, said
 
@@ -137,12 +137,12 @@ def test_the_account_of_energy_compiles_with_the_layouts_of_this_side(precision,
     options += [f"-D{name}_BYTES={layout.itemsize}" for name, layout in sizes.items()]
     options += [f"-DNODE_CHUNK_BYTES={NODE_CHUNK.itemsize}", f"-DSUMS_BYTES={8 * SUMS}"]
     for name in ("energy_balance", "elastic_energy"):
-        code, said = nvrtc.compiled(library, HERE / f"backends/gpu/{name}.cu", options)
+        code, said = nvrtc.compiled(library, SOURCES / f"backends/gpu/{name}.cu", options)
         assert code and not said, said
 
 
 def test_the_nodes_of_a_body_are_shared_out_in_stretches():
-    text = (HERE / "backends/gpu/newton.cu").read_text()
+    text = (SOURCES / "backends/gpu/newton.cu").read_text()
     assert f"BLOCK_NODES = {BLOCK_NODES}, LANES = {LANES}," in text
     found, start = node_ranges(np.array([[0, 1], [1, 1 + 2 * BLOCK_NODES], [1 + 2 * BLOCK_NODES, 5 + 3 * BLOCK_NODES]]))
     assert start.tolist() == [0, 1, 3, 5]

@@ -49,7 +49,7 @@ def test_the_yardstick_compiles_for_gpus(law: str, tmp_path: Path) -> None:
     if (library := nvrtc.library()) is None:
         pytest.skip("needs the package nvidia-cuda-nvrtc")
     text = tmp_path / "generic.cu"
-    here = timing.HERE
+    here = timing.TEXTS
     text.write_text(compiler.read_text(f"{here}generic_elements.cu+{here}generic_{law}.cuh")[1])
     for types in PRECISIONS.values():
         code, said = nvrtc.compiled(library, text, ["-arch=sm_90", *options(types)])

@@ -14,12 +14,12 @@ from tests.system.link_helpers import PATIENCE, ROOT, free_endpoint
 from tests.system.server_process import Stage, beam, fresh, until
 
 pytestmark = pytest.mark.system
-HERE = Path(__file__).parent
+FOLDER = Path(__file__).parent
 
 
 def ended(script: str, *arguments: str) -> "subprocess.CompletedProcess[str]":
     """A program run by one of the scripts beside this file."""
-    command = [sys.executable, str(HERE / script), *arguments]
+    command = [sys.executable, str(FOLDER / script), *arguments]
     paths = {**os.environ, "PYTHONPATH": str(ROOT), "RUST_BACKTRACE": "0"}
     return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=PATIENCE, env=paths)
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from protocol.process.extras import to_install
 from sim_server.backends.base import Engine, EngineInput
 from sim_server.backends.build_pool import CompileError, compilers
-from sim_server.backends.compiler import HERE, INCLUDE, ahead, build_id
+from sim_server.backends.compiler import INCLUDE, SOURCES, ahead, build_id
 from sim_server.backends.kernel_binding import NUMBERS, Argument, BoundKernel, KernelText
 from sim_server.errors import DeviceError
 
@@ -99,7 +99,7 @@ def processors() -> int:
 @cache
 def digest(*suffixes: str) -> str:
     """Of all texts of this package whose names end so."""
-    found = sorted(p for p in HERE.rglob("*") if p.suffix in suffixes)
+    found = sorted(p for p in SOURCES.rglob("*") if p.suffix in suffixes)
     return hashlib.sha256(b"".join(path.read_bytes() for path in found)).hexdigest()[:16]
 
 
@@ -174,7 +174,7 @@ def _layout(fields: list[Argument]) -> np.dtype[np.void]:
 
 def own_headers() -> tuple[str, ...]:
     """For the compiler: where texts of this folder find their headers."""
-    return f"-I{HERE / 'backends/gpu'}", f"-I{HERE / 'backends/gpu/inverse'}"
+    return f"-I{SOURCES / 'backends/gpu'}", f"-I{SOURCES / 'backends/gpu/inverse'}"
 
 
 def options(types: dict[str, str]) -> tuple[str, ...]:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_server.arrays import Float64, Int32
-from sim_server.backends.compiler import HERE
+from sim_server.backends.compiler import SOURCES
 from sim_server.backends.cpu.structs import BALANCE
 from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction
 from sim_server.backends.gpu.device import DeviceLaunch, Gpu, compiled, options, own_headers
@@ -142,7 +142,7 @@ def node_chunks(starts: Int32, nodes: int) -> NDArray[Any]:
 
 def text(name: str) -> str:
     """Returns the text of <name>.cu in this folder."""
-    return (HERE / f"backends/gpu/{name}.cu").read_text()
+    return (SOURCES / f"backends/gpu/{name}.cu").read_text()
 
 
 def start_sums(

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from protocol.factor import FactorPattern
 from sim_server.arrays import Float64
 from sim_server.backends.base import Capability, EngineInput, Launch
-from sim_server.backends.compiler import HERE
+from sim_server.backends.compiler import SOURCES
 from sim_server.backends.gpu.cuda import CudaDevice
 from sim_server.backends.gpu.cupy_types import DeviceArray, Graph
 from sim_server.backends.gpu.device import DeviceLaunch, Gpu
@@ -107,7 +107,7 @@ class GpuEngine(DeviceLoop):
         self.begin: Sequence[Launch] = ()  # launches before the first step
         self._graphs: list[Graph | None] = []
         self._epilogue = self._epilogue_params(dt)
-        epilogue = (HERE / "backends/gpu/step_epilogue.cu").read_text()
+        epilogue = (SOURCES / "backends/gpu/step_epilogue.cu").read_text()
         self._integrate = FusedKernel(
             integrate, Epilogue(epilogue, "StepEpilogue", "finish_step", self._epilogue)
         )  # fmt: skip

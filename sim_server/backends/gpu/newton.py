@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_server.arrays import Int32, Int64
-from sim_server.backends.compiler import HERE
+from sim_server.backends.compiler import SOURCES
 from sim_server.backends.cpu.structs import Search as SearchLayout
 from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction
 from sim_server.backends.gpu.device import DeviceLaunch, Gpu, compiled, options, own_headers
@@ -150,7 +150,7 @@ class NewtonIteration:
             "NEWTON_RESULT": NEWTON_RESULT,
         }  # fmt: skip
         return self._gpu.cp.RawModule(
-            code=(HERE / "backends/gpu/newton.cu").read_text(),
+            code=(SOURCES / "backends/gpu/newton.cu").read_text(),
             options=(
                 *options(self._gpu.types), *own_headers(),
                 *(f"-D{name}_BYTES={layout.itemsize}" for name, layout in sizes.items()),

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from protocol.factor import FactorPattern
 from sim_server.arrays import Int64
-from sim_server.backends.compiler import HERE
+from sim_server.backends.compiler import SOURCES
 from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction
 from sim_server.backends.gpu.device import Gpu, compiled, options, own_headers
 from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder, PartitionedInverse
@@ -126,7 +126,7 @@ class PcgSolver:
             f"{name}_BYTES": layout.itemsize for name, layout in layouts.items()
         }
         module = self.gpu.cp.RawModule(
-            code=(HERE / "backends/gpu/pcg.cu").read_text(),
+            code=(SOURCES / "backends/gpu/pcg.cu").read_text(),
             options=(
                 *options({"real": "float" if self.real == np.float32 else "double"}), *own_headers(),
                 *(f"-D{name}={number}" for name, number in numbers.items()),

@@ -11,7 +11,7 @@ from tests.bench.gpu.problem import BARS
 from tests.bench.harness.report import best_of
 from tests.bench.models.parts import PARTS, Model, megabytes, model, part, states
 
-HERE = "../tests/bench/models/"  # from the package, where kernel texts are looked up
+TEXTS = "../tests/bench/models/"  # from the package, where kernel texts are looked up
 LAWS = ("neo_hookean", "st_venant_kirchhoff")  # measured against 9x9
 GENERIC = {"six edges": "elements", "all blocks": "all_blocks"}  # and their kernels
 
@@ -99,7 +99,7 @@ def generic(made: Model, kernel: str) -> Any:
     """The launch of the yardstick for the elements of a model, with arrays of its own for what it leaves."""
     e: Any = made.effect
     w = made.simulation.world
-    module = w.backend.module(f"{HERE}generic_elements.cu+{HERE}generic_{made.name}.cuh")
+    module = w.backend.module(f"{TEXTS}generic_elements.cu+{TEXTS}generic_{made.name}.cuh")
     return module.bind(
         kernel, len(e.elements), tets=e.elements, x=w.x, v=w.drift, gradients=e.gradients, volume=e.volume,
         constants=e.constants, stiffening=w.stiffening[e.owner], h=w.impulse, corners=np.zeros_like(e.corners),
