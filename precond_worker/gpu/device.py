@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from precond_worker.errors import DeviceUnusable
-from protocol.process.extras import to_install
+from protocol.process.nvidia import NoGpu, first_line, usable_cupy
 
 SOURCE = Path(__file__).with_name("multifrontal.cu")
 PRECISIONS = ("auto", "float32", "float64")
@@ -16,19 +16,11 @@ _C_TYPES = {"float32": "float", "float64": "double"}
 
 @cache
 def cupy() -> Any:
-    """Imports cupy and checks that there is a device; raises DeviceUnusable."""
+    """Imports CuPy and checks that it sees a device. Raises DeviceUnusable."""
     try:
-        import cupy as cp
-    except ImportError as error:
-        raise DeviceUnusable(f"needs CuPy ({_first_line(error)}); {to_install('gpu')}") from error
-    try:
-        count = cp.cuda.runtime.getDeviceCount()
-    except cp.cuda.runtime.CUDARuntimeError as error:
-        text = f"no usable NVIDIA driver, or one that is older than CuPy's CUDA; see nvidia-smi ({error})"
-        raise DeviceUnusable(text) from error
-    if count == 0:
-        raise DeviceUnusable("no NVIDIA GPU is visible (CUDA_VISIBLE_DEVICES?)")
-    return cp
+        return usable_cupy()
+    except NoGpu as error:
+        raise DeviceUnusable(str(error)) from error
 
 
 def name() -> str:
@@ -56,11 +48,7 @@ def kernels(precision: str, stored: str) -> dict[str, Any]:
         module = cp.RawModule(code=SOURCE.read_text(), options=options, backend="nvrtc")
         return {kernel: module.get_function(kernel) for kernel in KERNELS}
     except Exception as error:  # of CuPy's compiler, of the driver, or of a library that is not there
-        raise DeviceUnusable(f"{SOURCE.name} does not compile for this GPU: {_first_line(error)}") from error
-
-
-def _first_line(error: BaseException) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]
+        raise DeviceUnusable(f"{SOURCE.name} does not compile for this GPU: {first_line(error)}") from error
 
 
 def try_out(precision: str = "auto") -> str:

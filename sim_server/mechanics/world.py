@@ -38,7 +38,7 @@ class Body:
     @property
     def centroids(self) -> Float64:
         """(m, 3) of the elements at rest, before the pose [m]."""
-        centroids: Reals = self.mesh.rest[self.mesh.tets].mean(axis=1)
+        centroids: Float64 = self.mesh.rest[self.mesh.tets].mean(axis=1)
         return centroids
 
 

@@ -52,9 +52,12 @@ def forgotten():
 
 
 OBSTACLES = {
-    "no CuPy": (None, r"needs CuPy \(.*cupy.*\); .*-m pip install -e '.*\[gpu\]'"),
-    "no driver": (installed(CUDARuntimeError("cudaErrorInsufficientDriver")), r"no usable NVIDIA driver.*Insufficient"),
-    "no device": (installed(0), r"no NVIDIA GPU is visible \(CUDA_VISIBLE_DEVICES\?\)"),
+    "no CuPy": (None, r"CuPy is not usable \(.*cupy.*\); .*-m pip install -e '.*\[gpu\]'"),
+    "no driver": (
+        installed(CUDARuntimeError("cudaErrorInsufficientDriver")),
+        r"no NVIDIA driver, or .* too old.*Insuff",
+    ),
+    "no device": (installed(0), r"sees no NVIDIA device \(is CUDA_VISIBLE_DEVICES empty\?\)"),
     "no compiler": (installed(1, RuntimeError("libnvrtc.so\nmore")), r"does not compile for this GPU: libnvrtc\.so$"),
 }
 obstacles = pytest.mark.parametrize(("module", "text"), OBSTACLES.values(), ids=OBSTACLES.keys())

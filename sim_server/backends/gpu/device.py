@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.process.extras import to_install
+from protocol.process.nvidia import NoGpu, usable_cupy
 from sim_server.backends.base import Engine, EngineInput
 from sim_server.backends.build_pool import CompileError, compilers
 from sim_server.backends.compiler import INCLUDE, SOURCES, ahead, build_id
@@ -29,32 +29,14 @@ MAILED = 4096  # threads of a launch whose number of items may change
 def cupy() -> Any:
     """The cupy package, imported when a GPU is asked for; raises DeviceError."""
     try:
-        import cupy as cp
-    except ImportError as error:
-        raise DeviceError(f"no GPU: CuPy is not usable ({error}); {to_install('gpu')}") from error
-    try:
-        count = cp.cuda.runtime.getDeviceCount()
-    except cp.cuda.runtime.CUDARuntimeError as error:
-        raise DeviceError(_no_device(error)) from error
-    if count == 0:
-        raise DeviceError("no GPU: CuPy sees no NVIDIA device (is CUDA_VISIBLE_DEVICES empty?)")
+        cp = usable_cupy()
+    except NoGpu as error:
+        raise DeviceError(f"no GPU: {error}") from error
     if int(capability := cp.cuda.Device().compute_capability) < LEAST:
         raise DeviceError(
             f"no GPU: this one has compute capability {int(capability) / 10:g}, allowed: {LEAST / 10:g} and above"
         )
     return cp
-
-
-def _no_device(error: Exception) -> str:
-    text = str(error)
-    if "InsufficientDriver" in text:
-        return (
-            f"no GPU: there is no NVIDIA driver, or it is too old for this CuPy ({text}); nvidia-smi shows it. "
-            "Update the driver, or install the CuPy of its CUDA version (for 12: pip install 'cupy-cuda12x[ctk]')"
-        )
-    if "NoDevice" in text:
-        return f"no GPU: CuPy sees no NVIDIA device ({text}); see nvidia-smi and CUDA_VISIBLE_DEVICES"
-    return f"no GPU: the NVIDIA driver does not answer ({text}); see nvidia-smi"
 
 
 def no_memory_left(error: Exception) -> bool:
