@@ -84,6 +84,14 @@ class Stream(Protocol):
         ...
 
 
+class KernelModule(Protocol):
+    """A compiled text (cupy.RawModule)."""
+
+    def get_function(self, name: str) -> "KernelFunction":
+        """Returns a kernel by name."""
+        ...
+
+
 class KernelFunction(Protocol):
     """A compiled kernel (cupy.RawKernel)."""
 

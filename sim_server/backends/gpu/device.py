@@ -18,6 +18,7 @@ from protocol.process.nvidia import NoGpu, usable_cupy
 from sim_server.backends.base import Engine, EngineInput
 from sim_server.backends.build_pool import CompileError, compilers
 from sim_server.backends.compiler import INCLUDE, SOURCES, ahead, build_id
+from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction, KernelModule
 from sim_server.backends.kernel_binding import NUMBERS, Argument, BoundKernel, KernelText
 from sim_server.errors import DeviceError
 
@@ -61,8 +62,8 @@ def building() -> Iterator[None]:
         ) from error
 
 
-def compiled(name: str, module: Any, kernel: str) -> Any:
-    """A kernel of a text; raises CompileError with the first error of the compiler."""
+def compiled(name: str, module: KernelModule, kernel: str) -> KernelFunction:
+    """Returns a kernel of a text. Raises CompileError with the first error of the compiler."""
     try:
         with compilers.counted():
             return module.get_function(kernel)
@@ -109,8 +110,8 @@ class DeviceModule(KernelText):
             enable_cooperative_groups=cooperative,
         )
 
-    def function(self, kernel: str) -> Any:
-        """A kernel by name."""
+    def function(self, kernel: str) -> KernelFunction:
+        """Returns a kernel by name. Raises CompileError."""
         return compiled(f"{self.name}.cu", self._module, kernel)
 
     def bind(self, kernel: str, n: int, **arguments: Any) -> "DeviceLaunch":
@@ -124,7 +125,7 @@ class DeviceLaunch(BoundKernel):
     def __init__(self, module: DeviceModule, kernel: str, given: dict[str, Any]):
         super().__init__(module, kernel, given, converts=True)
         self.params = np.zeros((), dtype=_layout(self.fields))
-        self.arrays: dict[str, Any] = {}
+        self.arrays: dict[str, DeviceArray] = {}
         for f, value in zip(self.fields, self.values, strict=True):
             if f.dtype is not None:
                 self.arrays[f.name] = module.gpu.twin(value, keep=not self.mailed, dtype=f.dtype)
@@ -183,12 +184,12 @@ class Gpu:
         self.cp = cupy()
         self.precision, self.types = precision, PRECISIONS[precision]
         self._real = np.dtype("f4" if self.types["real"] == "float" else "f8")
-        self._twins: dict[int, tuple[NDArray[Any], Any]] = {}
+        self._twins: dict[int, tuple[NDArray[Any], DeviceArray]] = {}
         self._kept: dict[int, tuple[NDArray[Any], np.dtype | None]] = {}  # keeping an array keeps its id its own
         self._modules: dict[str, DeviceModule] = {}
         self.properties = self.cp.cuda.runtime.getDeviceProperties(self.cp.cuda.Device().id)
 
-    def twin(self, host: NDArray[Any], keep: bool = True, dtype: np.dtype | None = None) -> Any:
+    def twin(self, host: NDArray[Any], keep: bool = True, dtype: np.dtype | None = None) -> DeviceArray:
         """The device array of a host array. keep: the same one from now on; else of a new one just a copy.
 
         dtype: of its entries; None: what it has been kept with, else `real` for float64.
@@ -200,7 +201,7 @@ class Gpu:
             return known
         kept = self._kept.get(id(host))
         dtype = dtype or (kept and kept[1]) or (self._real if host.dtype == np.float64 else host.dtype)
-        copy = self.cp.asarray(host.astype(dtype, copy=False))
+        copy: DeviceArray = self.cp.asarray(host.astype(dtype, copy=False))
         if keep or kept:
             self._twins[id(host)] = (host, copy)
         return copy

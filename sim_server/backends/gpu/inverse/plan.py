@@ -18,7 +18,7 @@ is 8 rows by all columns, its chunks one after another; with planes = 2 as many 
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -194,7 +194,7 @@ def _depth(parts: Parts, slot_start: Int32) -> Int64:
     return depth
 
 
-def _partition_work(cut: Partition, parts: Parts, blocks: int, planes: int, depth: Int64) -> dict:
+def _partition_work(cut: Partition, parts: Parts, blocks: int, planes: int, depth: Int64) -> dict[str, Any]:
     """Segments and tiles of all phases, and where each block's storage begins."""
     segments, tiles, keys, areas = [], [], [], [0]
     for phase, (which, work) in enumerate(phase_work(cut, blocks, planes)):
