@@ -15,7 +15,7 @@ from sim_server.backends.cpu.device import CpuModule
 from sim_server.backends.gpu import kernel_fusion
 from sim_server.backends.gpu.device import PRECISIONS, own_headers
 from sim_server.backends.gpu.device import options as device_options
-from sim_server.backends.kernel_binding import members_of
+from sim_server.backends.kernel_binding import domain_of, members_of
 from tests.support import nvrtc
 
 PUSH = """#include "kernel.h"
@@ -257,7 +257,7 @@ def _launch(path: str, struct: str, name: str, mailed: bool = False) -> SimpleNa
     sums = f"SUM_KERNEL({name.split('.')[1]}," in text
     return SimpleNamespace(
         text=text, struct=struct, name=name, sums=sums, mailed=mailed, fields=fields, arrays=arrays, params=params,
-        mail_address=64, items=9,
+        mail_address=64, items=9, domain=domain_of(text, struct),
     )  # fmt: skip
 
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""An NVIDIA GPU: its arrays, and the kernel texts compiled for it by NVRTC.
+"""An NVIDIA GPU: its arrays, and the kernel texts that NVRTC compiles for it.
 
-Host arrays keep their names: `twin` gives the device array that stands for one, made and filled at the first call. So
-the code that lists the launches of a step is the same on both devices.
+Code that lists the launches of a step is the same on both devices, since it names host arrays: `Gpu.twin` returns the
+device array of a host array, which it makes and fills at the first call.
 """
 
 import hashlib
@@ -22,26 +22,26 @@ from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction, Kern
 from sim_server.backends.kernel_binding import NUMBERS, Argument, BoundKernel, KernelText
 from sim_server.errors import DeviceError
 
-LEAST = 80  # compute capability times 10: the solver multiplies by matrix instructions that came with it
-MAILED = 4096  # threads of a launch whose number of items may change
+MIN_CAPABILITY = 80  # compute capability times 10; the solver needs matrix instructions of float16
+MAILED_THREADS = 4096  # of a launch whose number of items may change
 
 
 @cache
 def cupy() -> Any:
-    """The cupy package, imported when a GPU is asked for; raises DeviceError."""
+    """Imports CuPy and checks the device. Raises DeviceError."""
     try:
         cp = usable_cupy()
     except NoGpu as error:
         raise DeviceError(f"no GPU: {error}") from error
-    if int(capability := cp.cuda.Device().compute_capability) < LEAST:
+    if int(capability := cp.cuda.Device().compute_capability) < MIN_CAPABILITY:
         raise DeviceError(
-            f"no GPU: this one has compute capability {int(capability) / 10:g}, allowed: {LEAST / 10:g} and above"
+            f"no GPU: this one has compute capability {int(capability) / 10:g}, allowed: {MIN_CAPABILITY / 10:g} and above"
         )
     return cp
 
 
 def no_memory_left(error: Exception) -> bool:
-    """The GPU (or page-locked host memory) has no room for what was asked for."""
+    """True if the error is a lack of device memory or page-locked host memory."""
     cp = cupy()
     out = isinstance(error, cp.cuda.memory.OutOfMemoryError)
     return out or (isinstance(error, cp.cuda.runtime.CUDARuntimeError) and "MemoryAllocation" in str(error))
@@ -49,7 +49,7 @@ def no_memory_left(error: Exception) -> bool:
 
 @contextmanager
 def building() -> Iterator[None]:
-    """While a scene is put onto the GPU: too little memory becomes a DeviceError that says what to do."""
+    """Translates lack of memory while a scene is built into a DeviceError that says what to do."""
     try:
         yield
     except Exception as error:
@@ -75,24 +75,24 @@ def compiled(name: str, module: KernelModule, kernel: str) -> KernelFunction:
 
 @cache
 def processors() -> int:
-    """Multiprocessors of the device."""
+    """Returns the number of multiprocessors of the device."""
     return int(cupy().cuda.Device().attributes["MultiProcessorCount"])
 
 
 @cache
 def digest(*suffixes: str) -> str:
-    """Of all texts of this package whose names end so."""
+    """Returns a digest of all texts of this package with these suffixes."""
     found = sorted(p for p in SOURCES.rglob("*") if p.suffix in suffixes)
     return hashlib.sha256(b"".join(path.read_bytes() for path in found)).hexdigest()[:16]
 
 
-def texts() -> str:
-    """Of all headers, in an option: CuPy keeps compiled kernels by their own text and options alone."""
+def headers_option() -> str:
+    """Returns a compiler option with the digest of all headers, since CuPy caches kernels by text and options alone."""
     return "-DTEXTS=x" + digest(".h", ".cuh")
 
 
-def shape(threads: int) -> tuple[tuple[int], tuple[int]]:
-    """Grid and thread blocks for so many threads: small blocks spread a small launch over more processors."""
+def grid_of(threads: int) -> tuple[tuple[int], tuple[int]]:
+    """Returns grid and block of a launch; small thread blocks spread a small launch over more multiprocessors."""
     block = next((b for b in (32, 64) if threads <= 16 * b * processors()), 128)
     return (max(1, -(-threads // block)),), (block,)
 
@@ -134,19 +134,19 @@ class DeviceLaunch(BoundKernel):
         self._mail = cupy().asarray(self.params.reshape(1).view(np.uint8)) if self.mailed else None
 
     def __call__(self) -> None:
-        """Puts it onto the current stream."""
+        """Appends the launch to the current stream."""
         argument = self._mail if self.mailed else self.params
         if self.items or self.mailed:
-            self._function(*shape(MAILED if self.mailed else self.items), (argument,))
+            self._function(*grid_of(MAILED_THREADS if self.mailed else self.items), (argument,))
 
     def fetch(self, name: str) -> NDArray[Any]:
-        """One of its arrays as kernels have left it, copied."""
+        """Copies one of its arrays to the host."""
         array: NDArray[Any] = self.arrays[name].get()
         return array
 
     @property
     def mail_address(self) -> int:
-        """Where the arguments of a mailed launch lie."""
+        """Device address of the arguments of a mailed launch."""
         assert self._mail is not None
         return int(self._mail.data.ptr)
 
@@ -156,13 +156,13 @@ def _layout(fields: list[Argument]) -> np.dtype[np.void]:
 
 
 def own_headers() -> tuple[str, ...]:
-    """For the compiler: where texts of this folder find their headers."""
+    """Returns the compiler options for headers of this folder."""
     return f"-I{SOURCES / 'backends/gpu'}", f"-I{SOURCES / 'backends/gpu/inverse'}"
 
 
 def options(types: dict[str, str]) -> tuple[str, ...]:
-    """For the compiler; types: what `real` and `local` stand for."""
-    return ("-std=c++17", f"-I{INCLUDE}", *(f"-D{name}={kind}" for name, kind in types.items()), texts())
+    """Returns the compiler options of a text. types: that `real` and `local` stand for."""
+    return ("-std=c++17", f"-I{INCLUDE}", *(f"-D{name}={kind}" for name, kind in types.items()), headers_option())
 
 
 PRECISIONS = {
@@ -170,11 +170,11 @@ PRECISIONS = {
     "mixed": {"real": "double", "local": "float"},
     "float32": {"real": "float", "local": "float"},
 }
-"""What kernel texts call the reals of state and system, and those of elements (kernels/kernel.h)."""
+"""Types `real` (state and system) and `local` (elements) of kernel texts, by precision (kernels/kernel.h)."""
 
 
 class Gpu:
-    """The current CUDA device. precision: of the kernels, a key of PRECISIONS; host arrays are float64 in any case."""
+    """The current CUDA device. precision: of the kernels, a key of PRECISIONS; host arrays are always float64."""
 
     name = "gpu"
     building = staticmethod(building)
@@ -190,9 +190,10 @@ class Gpu:
         self.properties = self.cp.cuda.runtime.getDeviceProperties(self.cp.cuda.Device().id)
 
     def twin(self, host: NDArray[Any], keep: bool = True, dtype: np.dtype | None = None) -> DeviceArray:
-        """The device array of a host array. keep: the same one from now on; else of a new one just a copy.
+        """Returns the device array of a host array, which is filled when it is made.
 
-        dtype: of its entries; None: what it has been kept with, else `real` for float64.
+        keep: the same array from now on; False: a new copy, unless the host array has a twin or was declared by `keep`
+        dtype: of its entries; None: its declared type, else `real` for float64
         """
         if id(host) in self._twins:
             known = self._twins[id(host)][1]
@@ -207,12 +208,12 @@ class Gpu:
         return copy
 
     def keep(self, *hosts: NDArray[Any], exact: bool = False) -> None:
-        """Arrays that stay for the whole run: one twin each, made when it is first asked for. exact: in their type."""
+        """Declares arrays that stay for the whole run, with one twin each. exact: the twins have the same types."""
         for host in hosts:
             self._kept.setdefault(id(host), (host, host.dtype if exact else None))
 
     def fetch(self, host: NDArray[Any]) -> NDArray[Any]:
-        """The array with what kernels have made of its twin."""
+        """Copies the twin into the host array, and returns it."""
         if id(host) in self._twins:
             host[...] = self.twin(host).get()
         return host
@@ -224,13 +225,13 @@ class Gpu:
         return GpuEngine(self, given)
 
     def build(self) -> str:
-        """What a run depends on beside its scene: equal ones repeat it bit for bit."""
+        """Returns a digest of code, device and CUDA; runs of a scene with equal ones agree bit for bit."""
         runtime = self.cp.cuda.runtime.runtimeGetVersion()
         parts = [build_id(), digest(".cu", ".cuh", ".h"), self.properties["name"].decode(), str(runtime)]
         return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:24]
 
     def module(self, path: str) -> DeviceModule:
-        """A kernel text, compiled once."""
+        """Returns the module of a kernel text, compiled once."""
         if path not in self._modules:
             self._modules[path] = DeviceModule(path, self, self.types["real"], local=self.types["local"])
         return self._modules[path]

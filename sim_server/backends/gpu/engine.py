@@ -21,7 +21,7 @@ from sim_server.backends.gpu.cupy_types import DeviceArray, Graph
 from sim_server.backends.gpu.device import DeviceLaunch, Gpu
 from sim_server.backends.gpu.energies import DeviceEnergies
 from sim_server.backends.gpu.factor_upload import FactorUpload
-from sim_server.backends.gpu.kernel_fusion import DOMAINS, Epilogue, FusedKernel, domain, fuse
+from sim_server.backends.gpu.kernel_fusion import DOMAINS, Epilogue, FusedKernel, fuse
 from sim_server.backends.gpu.loop import CAPACITY, MANY, DeviceLoop
 from sim_server.backends.gpu.mailbox import DeviceMailbox
 from sim_server.backends.gpu.newton import NewtonIteration, NewtonPhases
@@ -191,7 +191,7 @@ class GpuEngine(DeviceLoop):
         The balance is the prologue of a kernel over elements, since these write nothing that it reads. If it freezes a
         body meanwhile, the element results of this body do not matter, since its nodes are fixed then.
         """
-        domains = {domain(launch) for launch in assemble}
+        domains = {launch.domain for launch in assemble}
         elements = "elements" in domains and domains <= set(DOMAINS)
         launches = fuse(assemble, prologue=self._energies.prologue if elements else None)
         if not elements:

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from sim_server.backends.gpu.cupy_types import KernelFunction
 from sim_server.backends.gpu.device import DeviceLaunch, compiled, cupy, options, own_headers, processors
-from sim_server.backends.kernel_binding import domain_of
 
 DOMAINS = ("elements", "nodes", "blocks")
 NUMBERS: dict[str, type[np.number[Any]]] = {"int": np.int32, "float": np.float32, "double": np.float64}
@@ -42,11 +41,6 @@ BLOCK_SHAPES = {  # by the largest number of items per multiprocessor; few items
 def block_shape(name: str, items: int, multiprocessors: int) -> BlockShape:
     """Returns the shape of the thread blocks for so many items of the domain `name`."""
     return next(s for most, s in BLOCK_SHAPES[name].items() if items <= most * multiprocessors)
-
-
-def domain(launch: DeviceLaunch) -> str:
-    """Returns the domain of a launch: the first word behind `int n;` in its struct."""
-    return domain_of(launch.text, launch.struct)
 
 
 class Epilogue(NamedTuple):
@@ -108,7 +102,7 @@ class FusedKernel:
         self.name = "+".join(launch.name for launch in launches)
         self.items = next(launch.items for launch in launches if not launch.mailed)
         sums = any(launch.sums for launch in launches)
-        self.shape = block_shape(domain(launches[0]) if sums else "elements", self.items, processors())
+        self.shape = block_shape(launches[0].domain if sums else "elements", self.items, processors())
         self._launches = list(launches)  # keeps their arrays
         self._prologue_blocks = prologue.blocks if prologue else 0
         text = FusedSource(launches, self.shape, epilogue, private, guard, prologue)
@@ -279,9 +273,9 @@ def fuse(
     guard: makes the guard of a kernel from its launches
     prologue: of the first kernel
     """
-    if any(domain(launch) not in DOMAINS for launch in launches):
+    if any(launch.domain not in DOMAINS for launch in launches):
         return list(launches)
-    together = [group for d in DOMAINS for group in _by_items([x for x in launches if domain(x) == d])]
+    together = [group for d in DOMAINS for group in _by_items([x for x in launches if x.domain == d])]
     together = [group for group in together if group]
     return [
         FusedKernel(group, None, _private(group, launches), guard(group) if guard else None, None if k else prologue)
