@@ -22,7 +22,7 @@ from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction, Kern
 from sim_server.backends.kernel_binding import NUMBERS, Argument, BoundKernel, KernelText
 from sim_server.errors import DeviceError
 
-MIN_CAPABILITY = 80  # compute capability times 10; the solver needs matrix instructions of float16
+CAPABILITY = 80  # compute capability times 10; the solver needs matrix instructions of float16
 MAILED_THREADS = 4096  # of a launch whose number of items may change
 
 
@@ -33,9 +33,9 @@ def cupy() -> Any:
         cp = usable_cupy()
     except NoGpu as error:
         raise DeviceError(f"no GPU: {error}") from error
-    if int(capability := cp.cuda.Device().compute_capability) < MIN_CAPABILITY:
+    if int(capability := cp.cuda.Device().compute_capability) < CAPABILITY:
         raise DeviceError(
-            f"no GPU: this one has compute capability {int(capability) / 10:g}, allowed: {MIN_CAPABILITY / 10:g} and above"
+            f"no GPU: this one has compute capability {int(capability) / 10:g}, allowed: {CAPABILITY / 10:g} and above"
         )
     return cp
 
