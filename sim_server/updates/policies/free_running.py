@@ -7,6 +7,7 @@ import time
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from sim_server.updates.body_state import BodyUpdateState
 from sim_server.updates.policies.base import UpdatePolicy
 from sim_server.updates.prefetch import PrefetchDepth
 from sim_server.updates.scheduler import UpdateRequest, is_worthwhile, max_factor_age, overdue_after, pick
@@ -58,9 +59,8 @@ class Async(UpdatePolicy):
             return
         # Choose the most urgent bodies, and leave the first of them to faster workers that are busy
         requests = [r for r in self._requests() if self.wants(r, step)]
-        reserved = source.faster_busy_workers()
-        interval = solver.update_floor_steps
-        chosen = pick(requests, reserved + places, interval, solver.schedule, self._overdue())[reserved:]
+        left, interval = source.faster_busy_workers(), solver.update_floor_steps
+        chosen = pick(requests, left + places, interval, solver.schedule, self._overdue())[left:]
         # Request their matrices; in advance only those of bodies that need a factor
         states = [driver.by_name[name] for name in chosen]
         wanted = states[:idle] + [s for s in states[idle:] if s.job.sent is None or s.solves.excess > 0]
@@ -102,13 +102,18 @@ class Async(UpdatePolicy):
             waited = driver.engine.step - driver.snapshots.step(state)
             if idle <= 0 and self.prefetch.depth and waited <= MAX_WAIT:
                 continue
-            job = driver.make_job(state)
-            if job is not None:
-                if driver.source.submit(job):
-                    state.on_sent(job.step)
-                else:
-                    driver.snapshots.discard(state)
-            idle -= state.job.in_flight
+            idle -= self._send(state)
+
+    def _send(self, state: BodyUpdateState) -> bool:
+        """Sends a copy. False: it does not suffice or no worker takes it, and it is discarded."""
+        job = self.driver.make_job(state)
+        if job is None:
+            return False
+        if not self.driver.source.submit(job):
+            self.driver.snapshots.discard(state)
+            return False
+        state.on_sent(job.step)
+        return True
 
     def _overdue(self) -> float:
         """Returns the steps after which a body goes next whatever the rule."""
