@@ -82,7 +82,7 @@ def prefetching(depth: int) -> tuple[Driver, Async, OneAtATime]:
     return driver, driver.policy, source
 
 
-def test_copies_in_stock_go_to_the_worker_as_it_becomes_idle():
+def test_prefetched_copies_go_to_the_worker_as_it_becomes_idle():
     driver, policy, source = prefetching(4)
     policy.exchange()
     driver.engine.run(1)
@@ -92,7 +92,7 @@ def test_copies_in_stock_go_to_the_worker_as_it_becomes_idle():
     assert source.order == [(f"beam{k}", 0) for k in range(4)], "all of one step, in the order of need"
 
 
-def test_without_a_stock_there_is_one_for_each_idle_worker():
+def test_without_prefetching_there_is_one_copy_for_each_idle_worker():
     driver, policy, source = prefetching(0)
     policy.exchange()
     driver.engine.run(1)
@@ -116,7 +116,7 @@ def test_copies_that_wait_too_long_are_given_up():
     assert all(step > 0 for _, step in source.order) and source.order
 
 
-def test_what_has_a_factor_and_needs_none_is_not_kept_in_stock():
+def test_the_matrix_of_a_body_that_needs_no_factor_is_not_prefetched():
     driver, policy, source = prefetching(6)
     for _ in range(30):
         policy.exchange()
@@ -129,7 +129,7 @@ def test_what_has_a_factor_and_needs_none_is_not_kept_in_stock():
     assert sum(t.job.copy is not None for t in driver.bodies) <= 1
 
 
-def test_counted_runs_have_no_stock():
+def test_counted_runs_do_not_prefetch():
     sim = falling(bar(name="beam", young=1e6, fixed="X < 0.01"), update="async")
     driver = Driver(sim, counted=True)
     for _ in range(5):
