@@ -153,9 +153,10 @@ class Tetrahedra(Effect):
         self._energy = np.zeros(m)
 
     def _of_a_step(self) -> dict[str, Any]:
-        """What the integrator asks for: factors of force and tangent, and the field that the tangent is applied to."""
+        """Arguments of the integrator: coefficients of force and tangent, and the field that the tangent multiplies."""
         w = self.world
-        return {"h": w.impulse, "stiffening": w.stiffening[self.owner], "v": w.drift}
+        coefficient = w.stiffness_coefficient[self.owner]
+        return {"h": w.force_coefficient, "stiffness_coefficient": coefficient, "v": w.damping_velocity}
 
     def gathers(self, system: System, stencil: Stencil, accumulate: bool) -> list[Launch]:
         """What collects corners and edges into the system."""

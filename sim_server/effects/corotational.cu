@@ -4,17 +4,17 @@
 #include "corotational.cuh"
 
 struct Elements {
-    int n;                    // elements
-    const int* tets;          // (n, 4) nodes
-    const real* x;            // (nodes, 3) positions [m]
-    const real* v;            // (nodes, 3) world.drift [m/s]
-    const local* gradients;   // (9, n) rest gradients of the shape functions of nodes 1, 2, 3, one after another [1/m]
-    const local* lame;        // (2, n) lambda V, mu V [Pa m3]
-    const local* stiffening;  // (n,) h (c + beta) [s2], c world.reach, beta the Rayleigh damping of the stiffness
-    local h;                  // world.impulse: the time step in backward Euler [s]
-    local* turn;              // (n, 4) out: unit quaternion of the nearest rotation of F, w first
-    local* spread;            // (n, 4, 4) out: g_a = sqrt(h (c + beta) mu V) R grad N_a, and lambda / mu
-    local* push;              // (n, 4, 3) out: h f_a + h (c + beta) (K v)_a [N s]
+    int n;                               // elements
+    const int* tets;                     // (n, 4) nodes
+    const real* x;                       // (nodes, 3) positions [m]
+    const real* v;                       // (nodes, 3) world.damping_velocity [m/s]
+    const local* gradients;              // (9, n) rest gradients of the shape functions of nodes 1, 2, 3, one after another [1/m]
+    const local* lame;                   // (2, n) lambda V, mu V [Pa m3]
+    const local* stiffness_coefficient;  // (n,) h (c + beta) [s2], c world.dx_dv, beta the Rayleigh damping of the stiffness
+    local h;                             // world.force_coefficient: the time step in backward Euler [s]
+    local* quaternion;                   // (n, 4) out: unit quaternion of the nearest rotation of F, w first
+    local* scaled_gradients;             // (n, 4, 4) out: g_a = sqrt(h (c + beta) mu V) R grad N_a, and lambda / mu
+    local* nodal_impulse;                // (n, 4, 3) out: h f_a + h (c + beta) (K v)_a [N s]
 };
 
 KERNEL(elements, Elements) {
@@ -26,13 +26,13 @@ KERNEL(elements, Elements) {
     local_mat3 R = rotation_matrix(q), Rt = transposed(R);
     local_mat3 S = mul(Rt, F), T = mul(Rt, G);
 
-    local_number k = at_items(p.stiffening, i), lambda = at_items(p.lame, i), mu = at_items(p.lame + p.n, i);
+    local_number k = at_items(p.stiffness_coefficient, i), lambda = at_items(p.lame, i), mu = at_items(p.lame + p.n, i);
     local_mat3 P = mul(R, hooke(S, T, p.h, k, lambda, mu));
-    put_push(p.push, i, p.n, P, g);
+    put_impulses(p.nodal_impulse, i, p.n, P, g);
     local_number w = sqrt(k * mu), ratio = lambda / mu;
-    put_spread(p.spread, i, p.n, R, g, w, ratio);
-    const local_number turn[4] = {q.w, q.x, q.y, q.z};
-    put_row(p.turn, i, p.n, turn);
+    put_scaled_gradients(p.scaled_gradients, i, p.n, R, g, w, ratio);
+    const local_number wxyz[4] = {q.w, q.x, q.y, q.z};
+    put_row(p.quaternion, i, p.n, wxyz);
 }
 
 struct Energy {

@@ -101,9 +101,9 @@ class Params(Regional):
 class Corotational(Effect):
     """Elements of all bodies that list the effect in one of its variants, in the order of their first nodes.
 
-    elements (m, 4); gradients (9, m), lame (2, m): constants of the elements, one kind after another. What a step makes
-    of them: turn (m, 4) unit quaternions, spread (m, 4, 4) scaled rotated gradients and lambda / mu, push (m, 4, 3);
-    of the exact tangent, twist (m, 6).
+    elements (m, 4); gradients (9, m), lame (2, m): constants of the elements, one kind after another. Results of a
+    step: quaternion (m, 4): unit quaternions of the rotations; scaled_gradients (m, 4, 4): scaled, rotated shape
+    gradients and lambda / mu; nodal_impulse (m, 4, 3) [N s]; twist (m, 6), of the exact tangent.
     """
 
     def __init__(self, world: World, listed: list[tuple[Body, Any]]):
@@ -124,7 +124,8 @@ class Corotational(Effect):
         owner = np.repeat([body.index for body, _ in listed], [len(body.mesh.tets) for body, _ in listed])
         self.owner = owner[order]
         m = len(self.elements)
-        self.turn, self.spread, self.push = np.zeros((m, 4)), np.zeros((m, 4, 4)), np.zeros((m, 4, 3))
+        self.quaternion, self.scaled_gradients = np.zeros((m, 4)), np.zeros((m, 4, 4))
+        self.nodal_impulse = np.zeros((m, 4, 3))
         self.twist = np.zeros((m if self.variant == "_exact" else 0, 6))
         self._energy = np.zeros(m)
 
@@ -135,24 +136,26 @@ class Corotational(Effect):
         twist = {"twist": self.twist} if exact else {}
         sums = text if exact else "effects/corotational"
         elements = w.backend.module(f"{text}.cu").bind(
-            "elements", m, tets=self.elements, x=w.x, v=w.drift, gradients=self.gradients, lame=self.lame,
-            stiffening=w.stiffening[self.owner], h=w.impulse, turn=self.turn, spread=self.spread, push=self.push,
+            "elements", m, tets=self.elements, x=w.x, v=w.damping_velocity, gradients=self.gradients, lame=self.lame,
+            stiffness_coefficient=w.stiffness_coefficient[self.owner], h=w.force_coefficient,
+            quaternion=self.quaternion, scaled_gradients=self.scaled_gradients, nodal_impulse=self.nodal_impulse,
             **twist,
         )  # fmt: skip
         gather = w.backend.module(f"{sums}_nodes.cu").bind(
-            "gather", w.nodes, start=stencil.corner_start, corners=stencil.corners, push=self.push,
-            spread=self.spread, turn=self.turn, b=system.b, block=system.block, mean=system.mean, **twist,
+            "gather", w.nodes, start=stencil.corner_start, corners=stencil.corners, nodal_impulse=self.nodal_impulse,
+            scaled_gradients=self.scaled_gradients, quaternion=self.quaternion, b=system.b, block=system.block,
+            mean=system.mean, **twist,
         )  # fmt: skip
         blocks = w.backend.module(f"{sums}_blocks.cu").bind(
             "blocks", len(system.row), accumulate=int(accumulate), start=stencil.pair_start, pairs=stencil.pairs,
-            spread=self.spread, sums=system.sums, **twist,
+            scaled_gradients=self.scaled_gradients, sums=system.sums, **twist,
         )  # fmt: skip
         return [elements, gather, blocks]
 
     @property
     def rotation(self) -> Float64:
-        """(m, 3, 3) rotations of the elements at the last step, from `turn`."""
-        return rotation_matrices(self.world.backend.fetch(self.turn))
+        """(m, 3, 3) rotations of the elements at the last step."""
+        return rotation_matrices(self.world.backend.fetch(self.quaternion))
 
     def energies(self) -> ElementEnergies:
         """V (mu |S - I|^2 + lambda / 2 tr(S - I)^2) with S = R^T F [J]."""
@@ -171,9 +174,9 @@ def _constants(body: Body, params: Params) -> tuple[Float64, Float64]:
         raise InputError(f"object {body.name!r}, effect corotational: {error}") from error
 
 
-def rotation_matrices(turn: NDArray[Any]) -> Float64:
-    """(m, 3, 3) of unit quaternions (m, 4), w first."""
-    w, x, y, z = turn.astype(float).T
+def rotation_matrices(quaternion: NDArray[Any]) -> Float64:
+    """Rotation matrices (m, 3, 3) of unit quaternions (m, 4), w first."""
+    w, x, y, z = quaternion.astype(float).T
     entries = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
         2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),

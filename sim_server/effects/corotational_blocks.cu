@@ -5,19 +5,19 @@
 #include "corotational_tangent.cuh"
 
 struct Blocks {
-    int n;                // blocks above the diagonal
-    int accumulate;       // 0: write, 1: add to what another effect wrote
-    const int* start;     // (n + 1,) into pairs
-    const int* pairs;     // (start[n],) 16 e + 4 a + b: corners a and b of element e are at the block's row and column
-    const local* spread;  // (elements, 4, 4) g_a, lambda / mu
-    own<local> sums;      // (n, 9) out, world frame, row major [kg]
+    int n;                          // blocks above the diagonal
+    int accumulate;                 // 0: write, 1: add to what another effect wrote
+    const int* start;               // (n + 1,) into pairs
+    const int* pairs;               // (start[n],) 16 e + 4 a + b: corners a and b of element e are at the block's row and column
+    const local* scaled_gradients;  // (elements, 4, 4) g_a, lambda / mu
+    own<local> sums;                // (n, 9) out, world frame, row major [kg]
 };
 
 INLINE void blocks_add(const Blocks& p, int, int k, local* s) {
     int pair = p.pairs[k];
     local a[4], b[4];
-    get_row(p.spread, pair >> 2, a);
-    get_row(p.spread, (pair >> 4) * 4 + (pair & 3), b);
+    get_row(p.scaled_gradients, pair >> 2, a);
+    get_row(p.scaled_gradients, (pair >> 4) * 4 + (pair & 3), b);
     add_block(s, a, b);
 }
 

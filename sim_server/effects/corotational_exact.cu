@@ -6,18 +6,18 @@
 #include "eigen3.cuh"
 
 struct Elements {
-    int n;                    // elements
-    const int* tets;          // (n, 4) nodes
-    const real* x;            // (nodes, 3) positions [m]
-    const real* v;            // (nodes, 3) world.drift [m/s]
-    const local* gradients;   // (9, n) rest gradients of the shape functions of nodes 1, 2, 3, one after another [1/m]
-    const local* lame;        // (2, n) lambda V, mu V [Pa m3]
-    const local* stiffening;  // (n,) h (c + beta) [s2], c world.reach, beta the Rayleigh damping of the stiffness
-    local h;                  // world.impulse: the time step in backward Euler [s]
-    local* turn;              // (n, 4) out: unit quaternion of the nearest rotation of F, w first
-    local* spread;            // (n, 4, 4) out: g_a = sqrt(h (c + beta) mu V) R grad N_a, and lambda / mu
-    local* twist;             // (n, 6) out: upper triangle of E, positive semi-definite
-    local* push;              // (n, 4, 3) out: h f_a + h (c + beta) (K v)_a [N s]
+    int n;                               // elements
+    const int* tets;                     // (n, 4) nodes
+    const real* x;                       // (nodes, 3) positions [m]
+    const real* v;                       // (nodes, 3) world.damping_velocity [m/s]
+    const local* gradients;              // (9, n) rest gradients of the shape functions of nodes 1, 2, 3, one after another [1/m]
+    const local* lame;                   // (2, n) lambda V, mu V [Pa m3]
+    const local* stiffness_coefficient;  // (n,) h (c + beta) [s2], c world.dx_dv, beta the Rayleigh damping of the stiffness
+    local h;                             // world.force_coefficient: the time step in backward Euler [s]
+    local* quaternion;                   // (n, 4) out: unit quaternion of the nearest rotation of F, w first
+    local* scaled_gradients;             // (n, 4, 4) out: g_a = sqrt(h (c + beta) mu V) R grad N_a, and lambda / mu
+    local* twist;                        // (n, 6) out: upper triangle of E, positive semi-definite
+    local* nodal_impulse;                // (n, 4, 3) out: h f_a + h (c + beta) (K v)_a [N s]
 };
 
 // sum e / (2 mu) u u^T over the twists, from S = R^T F; e is clamped at 0.
@@ -48,13 +48,13 @@ KERNEL(elements, Elements) {
     local_mat3 R = rotation_matrix(q), Rt = transposed(R);
     local_mat3 S = mul(Rt, F), T = mul(Rt, G);
 
-    local_number k = at_items(p.stiffening, i), lambda = at_items(p.lame, i), mu = at_items(p.lame + p.n, i);
+    local_number k = at_items(p.stiffness_coefficient, i), lambda = at_items(p.lame, i), mu = at_items(p.lame + p.n, i);
     local_mat3 E = twists(S, lambda, mu), P = hooke(S, T, p.h, k, lambda, mu);
     local_vec3 c = k * mu * mul(E, local_vec3{T.m[5] - T.m[7], T.m[6] - T.m[2], T.m[1] - T.m[3]});
     P.m[1] += c.z; P.m[2] -= c.y; P.m[3] -= c.z; P.m[5] += c.x; P.m[6] += c.y; P.m[7] -= c.x;  // the spin of T
-    put_push(p.push, i, p.n, mul(R, P), g);
-    put_spread(p.spread, i, p.n, R, g, sqrt(k * mu), lambda / mu);
+    put_impulses(p.nodal_impulse, i, p.n, mul(R, P), g);
+    put_scaled_gradients(p.scaled_gradients, i, p.n, R, g, sqrt(k * mu), lambda / mu);
     E = mul(R, mul(E, Rt));
     put_row(p.twist, i, p.n, {E.m[0], E.m[1], E.m[2], E.m[4], E.m[5], E.m[8]});
-    put_row(p.turn, i, p.n, {q.w, q.x, q.y, q.z});
+    put_row(p.quaternion, i, p.n, {q.w, q.x, q.y, q.z});
 }

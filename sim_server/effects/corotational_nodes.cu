@@ -3,26 +3,26 @@
 #include "corotational_tangent.cuh"
 
 struct Gather {
-    int n;                // nodes
-    const int* start;     // (n + 1,) into corners
-    const int* corners;   // (start[n],) slots 4 e + a of the elements at the node
-    const local* push;    // (elements, 4, 3) [N s]
-    const local* spread;  // (elements, 4, 4) scaled rotated gradients g_a, lambda / mu
-    const local* turn;    // (elements, 4) unit quaternions
-    own<real> b;          // (n, 3) in, out: right-hand side, world frame [N s]
-    own<local> block;     // (n, 6) in, out: upper triangle of the node's own block of A, world frame [kg]
-    own<local> mean;      // (n, 10) in, out: upper triangle of the sum of q q^T, q the elements' rotations
+    int n;                          // nodes
+    const int* start;               // (n + 1,) into corners
+    const int* corners;             // (start[n],) slots 4 e + a of the elements at the node
+    const local* nodal_impulse;     // (elements, 4, 3) [N s]
+    const local* scaled_gradients;  // (elements, 4, 4) scaled rotated gradients g_a, lambda / mu
+    const local* quaternion;        // (elements, 4) unit quaternions
+    own<real> b;                    // (n, 3) in, out: right-hand side, world frame [N s]
+    own<local> block;               // (n, 6) in, out: upper triangle of the node's own block of A, world frame [kg]
+    own<local> mean;                // (n, 10) in, out: upper triangle of the sum of q q^T, q the elements' rotations
 };
 
 INLINE void gather_add(const Gather& p, int, int k, local* sum) {
     int corner = p.corners[k];
-    const local* f = p.push + 3 * corner;
+    const local* f = p.nodal_impulse + 3 * corner;
     local g[4], q[4];
-    get_row(p.spread, corner, g);
-    get_row(p.turn, corner >> 2, q);
+    get_row(p.scaled_gradients, corner, g);
+    get_row(p.quaternion, corner >> 2, q);
     for (int m = 0; m < 3; ++m) sum[m] += f[m];
     add_own(sum + 3, g);
-    add_turn(sum + 9, q);
+    add_quaternion_product(sum + 9, q);
 }
 
 INLINE void gather_put(const Gather& p, int i, const local* sum) {

@@ -6,20 +6,20 @@
 constexpr int CONSTANTS = 8;  // a [Pa], b of ff, fs, fn, ss, sn, nn [-], bulk [Pa]
 
 struct Elements {
-    int n;                    // elements
-    int projection;           // of the tangent
-    const int* tets;          // (n, 4) nodes
-    const real* x;            // (nodes, 3) positions [m]
-    const real* v;            // (nodes, 3) what the tangent is applied to [m/s]
-    const local* gradients;   // (9, n) rest gradients of the shape functions of nodes 1, 2, 3, one after another [1/m]
-    const local* volume;      // (n,) [m3]
-    const local* constants;   // (CONSTANTS, n)
-    const local* stiffening;  // (n,) factor of the tangent [s2]
-    local h;                  // factor of the force [s]
-    const double* clock;      // (1,) [s]
-    double* refused;          // (n, 2) in, out: when the element was first refused [s], -1: never; its J then
-    local* corners;           // (4, n, 9) out: h f_a - factor (K v)_a [N s], upper triangle of factor K_aa [kg]
-    local* edges;             // (6, n, 9) out: factor K_ab, a < b [kg]
+    int n;                               // elements
+    int projection;                      // of the tangent
+    const int* tets;                     // (n, 4) nodes
+    const real* x;                       // (nodes, 3) positions [m]
+    const real* v;                       // (nodes, 3) what the tangent is applied to [m/s]
+    const local* gradients;              // (9, n) rest gradients of the shape functions of nodes 1, 2, 3, one after another [1/m]
+    const local* volume;                 // (n,) [m3]
+    const local* constants;              // (CONSTANTS, n)
+    const local* stiffness_coefficient;  // (n,) factor of the tangent [s2]
+    local h;                             // factor of the force [s]
+    const double* clock;                 // (1,) [s]
+    double* refused;                     // (n, 2) in, out: when the element was first refused [s], -1: never; its J then
+    local* corners;                      // (4, n, 9) out: h f_a - factor (K v)_a [N s], upper triangle of factor K_aa [kg]
+    local* edges;                        // (6, n, 9) out: factor K_ab, a < b [kg]
 };
 
 INLINE constexpr int pair_of(int a, int b) { return a > b ? pair_of(b, a) : a == 0 ? b : a + b + 1; }  // 00, 01, 02, 11, 12, 22
@@ -45,17 +45,17 @@ KERNEL(elements, Elements) {
     local_vec3 v[3];
     Tetrahedron<T> t = element_at(p, i, tet);
     field_edges(p.v, tet, v);
-    T c[CONSTANTS], volume = at_items(p.volume, i), k = volume * at_items(p.stiffening, i), s[6];
+    T c[CONSTANTS], volume = at_items(p.volume, i), k = volume * at_items(p.stiffness_coefficient, i), s[6];
     constants_at(p, i, c);
     T stress = exponential(c, t.F, s);
     mat<T> S = symmetric(s[0], s[1], s[2], s[3], s[4], s[5]), Ft = transposed(t.F);
     T dU = c[7] * log(t.J), ddU = c[7] / t.J;
 
-    local_vec3 push[4], a[4], u[4];
+    local_vec3 impulse[4], a[4], u[4];
     UNROLL for (int m = 1; m < 4; ++m) a[m] = mul(t.F, mul(S, t.D[m]));
-    spread_to_four(a);
+    set_corner_0(a);
     UNROLL for (int m = 0; m < 4; ++m) {
-        push[m] = (-p.h * volume) * (a[m] + dU * t.area[m]);
+        impulse[m] = (-p.h * volume) * (a[m] + dU * t.area[m]);
         u[m] = (2 * k / stress) * a[m];
     }
     Blocks6<T> B;
@@ -83,12 +83,12 @@ KERNEL(elements, Elements) {
     }
     auto here = t.J <= 0;
     note_refusal(here, p.refused, i, p.clock[0], t.J);
-    refuse(here, B, push);
+    refuse(here, B, impulse);
     if (p.projection != NONE) {
         auto wrong = indefinite(B);
         if (any(wrong)) project_edges(t.D, p.projection, wrong && !here, B);
     }
-    leave(B, push, v, p.corners, p.edges, p.n, i);
+    store_element(B, impulse, v, p.corners, p.edges, p.n, i);
 }
 
 struct Energy {

@@ -4,18 +4,18 @@
 #include "hyperelastic.cuh"
 
 struct Elements {
-    int n;                    // elements
-    const int* tets;          // (n, 4) nodes
-    const real* x;            // (nodes, 3) positions [m]
-    const real* v;            // (nodes, 3) what the tangent is applied to [m/s]
-    const local* gradients;   // (9, n) rest gradients of the shape functions of nodes 1, 2, 3, one after another [1/m]
-    const local* volume;      // (n,) [m3]
-    const local* constants;   // (2, n) stiffness [Pa], exponent [-]
-    const local* directions;  // (6, n) of two families at rest; 0: no such family
-    const local* stiffening;  // (n,) factor of the tangent [s2]
-    local h;                  // factor of the force [s]
-    local* corners;           // (4, n, 9) out: h f_a - factor (K v)_a [N s], upper triangle of factor K_aa [kg]
-    local* edges;             // (6, n, 9) out: factor K_ab, a < b [kg]
+    int n;                               // elements
+    const int* tets;                     // (n, 4) nodes
+    const real* x;                       // (nodes, 3) positions [m]
+    const real* v;                       // (nodes, 3) what the tangent is applied to [m/s]
+    const local* gradients;              // (9, n) rest gradients of the shape functions of nodes 1, 2, 3, one after another [1/m]
+    const local* volume;                 // (n,) [m3]
+    const local* constants;              // (2, n) stiffness [Pa], exponent [-]
+    const local* directions;             // (6, n) of two families at rest; 0: no such family
+    const local* stiffness_coefficient;  // (n,) factor of the tangent [s2]
+    local h;                             // factor of the force [s]
+    local* corners;                      // (4, n, 9) out: h f_a - factor (K v)_a [N s], upper triangle of factor K_aa [kg]
+    local* edges;                        // (6, n, 9) out: factor K_ab, a < b [kg]
 };
 
 template <class T> struct Family {
@@ -34,12 +34,12 @@ template <class T> INLINE Family<T> family(const local* directions, int n, index
 KERNEL(elements, Elements) {
     typedef local_number T;
     index tet[4];
-    local_vec3 v[3], push[4];
+    local_vec3 v[3], impulse[4];
     Tetrahedron<T> t = element_at(p, i, tet);
     field_edges(p.v, tet, v);
-    T volume = at_items(p.volume, i), k = volume * at_items(p.stiffening, i), k1 = at_items(p.constants, i), k2 = at_items(p.constants + p.n, i);
+    T volume = at_items(p.volume, i), k = volume * at_items(p.stiffness_coefficient, i), k1 = at_items(p.constants, i), k2 = at_items(p.constants + p.n, i);
     Blocks6<T> B;
-    UNROLL for (int a = 0; a < 4; ++a) push[a] = {T{}, T{}, T{}};
+    UNROLL for (int a = 0; a < 4; ++a) impulse[a] = {T{}, T{}, T{}};
     UNROLL for (int e = 0; e < 6; ++e) B.e[e] = mat<T>{};
     for (int which = 0; which < 2; ++which) {
         Family<T> f = family(p.directions, p.n, i, which, t.F);
@@ -47,14 +47,14 @@ KERNEL(elements, Elements) {
         T w44 = f.stretch > 0 ? e * (1 + 2 * k2 * f.stretch * f.stretch) : T{}, c[4];
         UNROLL for (int a = 1; a < 4; ++a) c[a] = dot(t.D[a], f.rest);
         c[0] = -(c[1] + c[2] + c[3]);
-        UNROLL for (int a = 0; a < 4; ++a) push[a] = push[a] + (-2 * p.h * volume * w4 * c[a]) * f.now;
+        UNROLL for (int a = 0; a < 4; ++a) impulse[a] = impulse[a] + (-2 * p.h * volume * w4 * c[a]) * f.now;
         UNROLL for (int edge = 0; edge < 6; ++edge) {
             T share = k * c[edge_first(edge)] * c[edge_second(edge)];
             add_identity(B.e[edge], 2 * share * w4);
             add_outer(B.e[edge], (4 * share * w44) * f.now, f.now);
         }
     }
-    leave(B, push, v, p.corners, p.edges, p.n, i);
+    store_element(B, impulse, v, p.corners, p.edges, p.n, i);
 }
 
 struct Energy {

@@ -6,7 +6,7 @@ struct Gravity {
     int n;             // nodes
     const real* mass;  // (n,) [kg]
     const real* g;     // (3,) [m/s2]
-    real h;            // world.impulse [s]
+    real h;            // world.force_coefficient [s]
     own<real> b;       // (n, 3) in, out: += h m g [N s]
 };
 

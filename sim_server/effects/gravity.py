@@ -40,7 +40,7 @@ class Gravity(Effect):
         w = self.world
         return [
             self.world.backend.module("effects/gravity.cu").bind(
-                "gravity", w.nodes, mass=w.mass, g=self.g, h=w.impulse, b=system.b
+                "gravity", w.nodes, mass=w.mass, g=self.g, h=w.force_coefficient, b=system.b
             )
         ]
 

@@ -5,16 +5,16 @@
 #include "coalesced_io.cuh"
 
 struct Springs {
-    int n;                    // elements
-    const int* ends;          // (n, 2) nodes
-    const real* x;            // (nodes, 3) positions [m]
-    const real* v;            // (nodes, 3) world.drift [m/s]
-    const local* stiffness;   // (n,) k [N/m]
-    const local* length;      // (n,) l0 [m]
-    const local* stiffening;  // (n,) h (c + beta) [s2], c world.reach, beta the Rayleigh damping of the stiffness
-    local h;                  // world.impulse: the time step in backward Euler [s]
-    local* spread;            // (n, 4) out: g and d; h (c + beta) K = g g^T + d I on the diagonal, its negative off it
-    local* push;              // (n, 3) out: h f + h (c + beta) (K v) of the first end, the second has its negative [N s]
+    int n;                               // elements
+    const int* ends;                     // (n, 2) nodes
+    const real* x;                       // (nodes, 3) positions [m]
+    const real* v;                       // (nodes, 3) world.damping_velocity [m/s]
+    const local* stiffness;              // (n,) k [N/m]
+    const local* length;                 // (n,) l0 [m]
+    const local* stiffness_coefficient;  // (n,) h (c + beta) [s2], c world.dx_dv, beta the Rayleigh damping of the stiffness
+    local h;                             // world.force_coefficient: the time step in backward Euler [s]
+    local* tangent;                      // (n, 4) out: g and d; h (c + beta) K = g g^T + d I on the diagonal, its negative off it
+    local* nodal_impulse;                // (n, 3) out: h f + h (c + beta) (K v) of the first end, the second has its negative [N s]
 };
 
 // From the first end to the second: the difference of a nodal field in the field's precision.
@@ -27,14 +27,14 @@ INLINE local_number inverse(local_number l) { return 1 / (l + (local)1e-37); }
 
 KERNEL(springs, Springs) {
     local_vec3 d = difference(p.x, p.ends, i), dv = difference(p.v, p.ends, i);
-    local_number k = at_items(p.stiffness, i), l0 = at_items(p.length, i), c = at_items(p.stiffening, i), l = sqrt(dot(d, d));
+    local_number k = at_items(p.stiffness, i), l0 = at_items(p.length, i), c = at_items(p.stiffness_coefficient, i), l = sqrt(dot(d, d));
     local_vec3 u = inverse(l) * d;
     local_number across = larger(1 - l0 * inverse(l), local_number{});  // under compression 0: K has no negative part
     local_vec3 g = sqrt(c * k * (1 - across)) * u;
     local_number all = c * k * across;
     local_vec3 f = (p.h * k * (l - l0)) * u + dot(g, dv) * g + all * dv;
-    put_row(p.spread, i, p.n, {g.x, g.y, g.z, all});
-    put_row(p.push, i, p.n, {f.x, f.y, f.z});
+    put_row(p.tangent, i, p.n, {g.x, g.y, g.z, all});
+    put_row(p.nodal_impulse, i, p.n, {f.x, f.y, f.z});
 }
 
 struct Energy {

@@ -97,8 +97,8 @@ class Params(Parameters):
 class MassSpring(Effect):
     """Springs of all bodies that list the effect, in the order of their first nodes.
 
-    elements (m, 2): the ends; stiffness (m,) [N/m]; length (m,) [m]. What a step makes of them: spread (m, 4), push
-    (m, 3), as in mass_spring.cu.
+    elements (m, 2): the ends; stiffness (m,) [N/m]; length (m,) [m]. Results of a step (mass_spring.cu):
+    tangent (m, 4), nodal_impulse (m, 3).
     """
 
     def __init__(self, world: World, listed: list[tuple[Body, Any]]):
@@ -114,7 +114,7 @@ class MassSpring(Effect):
         owner = np.repeat([body.index for body, _ in listed], [len(part[0]) for part in parts])
         self.owner = owner[order]
         m = len(self.elements)
-        self.spread, self.push, self._energy = np.zeros((m, 4)), np.zeros((m, 3)), np.zeros(m)
+        self.tangent, self.nodal_impulse, self._energy = np.zeros((m, 4)), np.zeros((m, 3)), np.zeros(m)
 
     @property
     def told(self) -> bool:
@@ -137,16 +137,17 @@ class MassSpring(Effect):
         assert stencil is not None
         w, m = self.world, len(self.elements)
         springs = w.backend.module("effects/mass_spring.cu").bind(
-            "springs", m, ends=self.elements, x=w.x, v=w.drift, stiffness=self.stiffness, length=self.length,
-            stiffening=w.stiffening[self.owner], h=w.impulse, spread=self.spread, push=self.push,
+            "springs", m, ends=self.elements, x=w.x, v=w.damping_velocity, stiffness=self.stiffness, length=self.length,
+            stiffness_coefficient=w.stiffness_coefficient[self.owner], h=w.force_coefficient, tangent=self.tangent,
+            nodal_impulse=self.nodal_impulse,
         )  # fmt: skip
         gather = w.backend.module("effects/mass_spring_nodes.cu").bind(
-            "gather", w.nodes, start=stencil.corner_start, corners=stencil.corners, push=self.push,
-            spread=self.spread, b=system.b, block=system.block,
+            "gather", w.nodes, start=stencil.corner_start, corners=stencil.corners, nodal_impulse=self.nodal_impulse,
+            tangent=self.tangent, b=system.b, block=system.block,
         )  # fmt: skip
         blocks = w.backend.module("effects/mass_spring_blocks.cu").bind(
             "blocks", len(system.row), accumulate=int(accumulate), start=stencil.pair_start, pairs=stencil.pairs,
-            spread=self.spread, sums=system.sums,
+            tangent=self.tangent, sums=system.sums,
         )  # fmt: skip
         return [springs, gather, blocks]
 

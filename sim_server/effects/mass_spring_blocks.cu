@@ -3,17 +3,17 @@
 #include "coalesced_io.cuh"
 
 struct Blocks {
-    int n;                // blocks above the diagonal
-    int accumulate;       // 0: write, 1: add to what another effect wrote
-    const int* start;     // (n + 1,) into pairs
-    const int* pairs;     // (start[n],) 4 e + 2 a + b: spring e joins the block's row and column
-    const local* spread;  // (springs, 4) g, d
-    own<local> sums;      // (n, 9) out, world frame, row major [kg]
+    int n;                 // blocks above the diagonal
+    int accumulate;        // 0: write, 1: add to what another effect wrote
+    const int* start;      // (n + 1,) into pairs
+    const int* pairs;      // (start[n],) 4 e + 2 a + b: spring e joins the block's row and column
+    const local* tangent;  // (springs, 4) g, d
+    own<local> sums;       // (n, 9) out, world frame, row major [kg]
 };
 
 INLINE void blocks_add(const Blocks& p, int, int k, local* s) {
     local g[4];
-    get_row(p.spread, p.pairs[k] >> 2, g);
+    get_row(p.tangent, p.pairs[k] >> 2, g);
     local xy = g[0] * g[1], xz = g[0] * g[2], yz = g[1] * g[2];
     s[0] -= g[0] * g[0] + g[3]; s[1] -= xy; s[2] -= xz;
     s[3] -= xy; s[4] -= g[1] * g[1] + g[3]; s[5] -= yz;

@@ -6,20 +6,20 @@
 constexpr int TERMS = 3, CONSTANTS = 2 * TERMS + 1;  // mu_p [Pa], alpha_p [-], bulk [Pa]
 
 struct Elements {
-    int n;                    // elements
-    int projection;           // of the tangent
-    const int* tets;          // (n, 4) nodes
-    const real* x;            // (nodes, 3) positions [m]
-    const real* v;            // (nodes, 3) what the tangent is applied to [m/s]
-    const local* gradients;   // (9, n) rest gradients of the shape functions of nodes 1, 2, 3, one after another [1/m]
-    const local* volume;      // (n,) [m3]
-    const local* constants;   // (CONSTANTS, n)
-    const local* stiffening;  // (n,) factor of the tangent [s2]
-    local h;                  // factor of the force [s]
-    const double* clock;      // (1,) [s]
-    double* refused;          // (n, 2) in, out: when the element was first refused [s], -1: never; its J then
-    local* corners;           // (4, n, 9) out: h f_a - factor (K v)_a [N s], upper triangle of factor K_aa [kg]
-    local* edges;             // (6, n, 9) out: factor K_ab, a < b [kg]
+    int n;                               // elements
+    int projection;                      // of the tangent
+    const int* tets;                     // (n, 4) nodes
+    const real* x;                       // (nodes, 3) positions [m]
+    const real* v;                       // (nodes, 3) what the tangent is applied to [m/s]
+    const local* gradients;              // (9, n) rest gradients of the shape functions of nodes 1, 2, 3, one after another [1/m]
+    const local* volume;                 // (n,) [m3]
+    const local* constants;              // (CONSTANTS, n)
+    const local* stiffness_coefficient;  // (n,) factor of the tangent [s2]
+    local h;                             // factor of the force [s]
+    const double* clock;                 // (1,) [s]
+    double* refused;                     // (n, 2) in, out: when the element was first refused [s], -1: never; its J then
+    local* corners;                      // (4, n, 9) out: h f_a - factor (K v)_a [N s], upper triangle of factor K_aa [kg]
+    local* edges;                        // (6, n, 9) out: factor K_ab, a < b [kg]
 };
 
 // t_i = s_i dW/ds_i and m_ij = s_j dt_i/ds_j (00, 01, 02, 11, 12, 22); returns W.
@@ -78,19 +78,19 @@ KERNEL(elements, Elements) {
     }
     project(modes, p.projection);
 
-    local_vec3 push[4];
+    local_vec3 impulse[4];
     UNROLL for (int k = 1; k < 4; ++k) {  // -h V U diag(dW/ds) V^T D
-        push[k] = (slope[0] * dot(frame.v[0], e.D[k])) * frame.u[0];
-        push[k] = push[k] + (slope[1] * dot(frame.v[1], e.D[k])) * frame.u[1];
-        push[k] = (-p.h * volume) * (push[k] + (slope[2] * dot(frame.v[2], e.D[k])) * frame.u[2]);
+        impulse[k] = (slope[0] * dot(frame.v[0], e.D[k])) * frame.u[0];
+        impulse[k] = impulse[k] + (slope[1] * dot(frame.v[1], e.D[k])) * frame.u[1];
+        impulse[k] = (-p.h * volume) * (impulse[k] + (slope[2] * dot(frame.v[2], e.D[k])) * frame.u[2]);
     }
-    spread_to_four(push);
+    set_corner_0(impulse);
     Blocks6<T> B;
-    principal_edges(frame, modes, volume * at_items(p.stiffening, i), e.D, B);
+    principal_edges(frame, modes, volume * at_items(p.stiffness_coefficient, i), e.D, B);
     auto here = e.J <= 0;
     note_refusal(here, p.refused, i, p.clock[0], e.J);
-    refuse(here, B, push);
-    leave(B, push, v, p.corners, p.edges, p.n, i);
+    refuse(here, B, impulse);
+    store_element(B, impulse, v, p.corners, p.edges, p.n, i);
 }
 
 struct Energy {

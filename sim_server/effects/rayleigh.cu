@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: MIT
-// The damping of the mass; that of the stiffness is in world.stiffening.
+// The damping of the mass; that of the stiffness is in world.stiffness_coefficient.
 #define WIDE
 #include "mat3.cuh"
 
@@ -8,7 +8,7 @@ struct Drag {
     const real* mass;    // (n,) [kg]
     const real* alpha;   // (n,) [1/s]
     const real* v;       // (n, 3) [m/s]
-    real h;              // world.impulse [s]
+    real h;              // world.force_coefficient [s]
     own<real> diagonal;  // (n, 1) in, out: += h alpha m [kg]
     own<real> b;         // (n, 3) in, out: -= h alpha m v [N s]
 };

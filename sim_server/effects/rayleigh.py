@@ -38,7 +38,7 @@ class Params(Parameters):
 
 
 class Drag(Effect):
-    """The damping of the mass, b -= h alpha m v; that of the stiffness is in world.stiffening."""
+    """The damping of the mass, b -= h alpha m v; that of the stiffness is in world.stiffness_coefficient."""
 
     def __init__(self, world: World, alpha: np.ndarray):
         self.world, self.alpha = world, alpha
@@ -48,7 +48,14 @@ class Drag(Effect):
         if not self.alpha.any():
             return []
         drag = self.world.backend.module("effects/rayleigh.cu").bind(
-            "drag", w.nodes, mass=w.mass, alpha=self.alpha, v=w.v, h=w.impulse, diagonal=system.diagonal, b=system.b
+            "drag",
+            w.nodes,
+            mass=w.mass,
+            alpha=self.alpha,
+            v=w.v,
+            h=w.force_coefficient,
+            diagonal=system.diagonal,
+            b=system.b,
         )
         return [drag]
 

@@ -3,31 +3,31 @@
 #include "mat3.cuh"
 
 struct Apply {
-    int n;                  // nodes touched
-    const int* node;        // (n,) ascending
-    const int* first;       // (n + 1,) into the entries
-    const int* entry;       // (first[n],) interaction of each entry
-    const real* offset;     // (first[n], 3) of the node from the grabbed point [m]
-    const real* share;      // (interactions,) 1 / nodes of the interaction
-    double* start;          // (interactions,) in, out: negative until its first step [s]
-    const double* duration; // (interactions,) [s]
-    const real* push;       // (interactions, 3) [N]
-    const real* target;     // (interactions, 3) of a grab [m]
-    const real* stiffness;  // (interactions,) of a grab; 0: a push [N/m]
-    const real* limit;      // (interactions,) largest force of a grab [N]
-    const double* clock;    // (1,) [s]
-    const real* x;          // (nodes, 3) [m]
-    const real* ahead;      // (nodes, 3) world.ahead: reach * ahead is the motion until the end of the step, dv apart [m/s]
-    const real* free;       // (nodes,) 1, or 0 at fixed nodes
-    own<local> block;       // (nodes, 6) what elements have put into the node's own block of A, world frame [kg]
-    double dt;              // time step [s]
-    real h;                 // world.impulse: dt in backward Euler [s]
-    real reach;             // world.reach: dt in backward Euler [s]
-    own<real> diagonal;     // (nodes, 1) in, out: += h reach k [kg]
-    own<real> b;            // (nodes, 3) in, out: += h f - h reach k ahead [N s]
-    real* force;            // (nodes, 3) out: what pushes, and grabs at their limit, exert in this step [N]
-    real* spring;           // (nodes,) out: k of the grabs below their limit [N/m]
-    real* anchor;           // (nodes, 3) out: where the spring pulls to [m]
+    int n;                   // nodes touched
+    const int* node;         // (n,) ascending
+    const int* first;        // (n + 1,) into the entries
+    const int* entry;        // (first[n],) interaction of each entry
+    const real* offset;      // (first[n], 3) of the node from the grabbed point [m]
+    const real* share;       // (interactions,) 1 / nodes of the interaction
+    double* start;           // (interactions,) in, out: negative until its first step [s]
+    const double* duration;  // (interactions,) [s]
+    const real* push;        // (interactions, 3) [N]
+    const real* target;      // (interactions, 3) of a grab [m]
+    const real* stiffness;   // (interactions,) of a grab; 0: a push [N/m]
+    const real* limit;       // (interactions,) largest force of a grab [N]
+    const double* clock;     // (1,) [s]
+    const real* x;           // (nodes, 3) [m]
+    const real* predictor;   // (nodes, 3) world.predictor: dx_dv * predictor is the motion until the end of the step, dv apart [m/s]
+    const real* free;        // (nodes,) 1, or 0 at fixed nodes
+    own<local> block;        // (nodes, 6) what elements have put into the node's own block of A, world frame [kg]
+    double dt;               // time step [s]
+    real h;                  // world.force_coefficient: dt in backward Euler [s]
+    real dx_dv;              // world.dx_dv: dt in backward Euler [s]
+    own<real> diagonal;      // (nodes, 1) in, out: += h dx_dv k [kg]
+    own<real> b;             // (nodes, 3) in, out: += h f - h dx_dv k predictor [N s]
+    real* force;             // (nodes, 3) out: what pushes, and grabs at their limit, exert in this step [N]
+    real* spring;            // (nodes,) out: k of the grabs below their limit [N/m]
+    real* anchor;            // (nodes, 3) out: where the spring pulls to [m]
 };
 
 // A grab is a spring, implicit while it is below its limit and a constant force above. What it will be is reckoned at the end
@@ -35,7 +35,7 @@ struct Apply {
 // one side of its target to the other for ever.
 MAILED_KERNEL(apply, Apply) {
     int node = p.node[i];
-    vec3 x = load3(p.x, node), ahead = load3(p.ahead, node), b = load3(p.b, node);
+    vec3 x = load3(p.x, node), predictor = load3(p.predictor, node), b = load3(p.b, node);
     real diagonal = row_at<1>(p.diagonal, node, 0);
     vec3 force = {}, anchored = {};
     real springs = 0;
@@ -53,14 +53,14 @@ MAILED_KERNEL(apply, Apply) {
         }
         real spring = share * p.stiffness[k], limit = share * p.limit[k];
         vec3 goal = load3(p.target, k) + load3(p.offset, e);
-        vec3 pull = spring * (goal - x - p.reach * ahead);
+        vec3 pull = spring * (goal - x - p.dx_dv * predictor);
         real size = sqrt(dot(pull, pull));
-        if (size > limit * (1 + p.h * p.reach * spring / inertia)) {
+        if (size > limit * (1 + p.h * p.dx_dv * spring / inertia)) {
             b = b + (p.h * limit / size) * pull;
             force = force + (limit / size) * pull;
         } else {
             b = b + p.h * pull;
-            diagonal += p.h * p.reach * spring;
+            diagonal += p.h * p.dx_dv * spring;
             springs += spring;
             anchored = anchored + spring * (goal - x);
         }

@@ -1,13 +1,13 @@
 // SPDX-License-Identifier: MIT
-// Rows of several reals, one a item. On a CPU they are read and written as they stand. On a GPU a thread that writes a row
-// entry by entry leaves memory with pieces of pieces, so the threads of a warp write their rows together, through shared
-// memory; and four entries are read at once.
+// Reads and writes rows of several reals, one row per item. On a GPU a thread that wrote its row entry by entry would make
+// uncoalesced accesses, so the threads of a warp write their rows together, through shared memory, and read four entries at
+// once. On a CPU rows are read and written directly.
 #pragma once
 #include "kernel.h"
 
 #ifdef __CUDACC_RTC__
 
-// Threads of this warp that have an item: the first so many.
+// Number of threads of this warp that have an item; they are the first ones.
 INLINE int companions(int i, int n) {
     int lane = threadIdx.x & 31, most = BLOCK_ITEMS < 32 ? BLOCK_ITEMS : 32, left = n - (i - lane);
     return left < most ? left : most;

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: MIT
-// What the texts of corotational tetrahedra share (formulas: effects/corotational.py).
+// Shared by the texts of corotational tetrahedra (formulas: effects/corotational.py).
 #pragma once
 #include "polar.cuh"
 #include "coalesced_io.cuh"
@@ -29,18 +29,19 @@ INLINE local_mat3 hooke(const local_mat3& S, const local_mat3& T, local h, local
     return symmetric(xx, xy, xz, yy, yz, zz);
 }
 
-// Forces of the corners, -P grad N_a.
-INLINE void put_push(local* push, index i, int n, const local_mat3& P, const local_mat3& g) {
+// Nodal impulses of the corners, -P grad N_a.
+INLINE void put_impulses(local* nodal_impulse, index i, int n, const local_mat3& P, const local_mat3& g) {
     local_vec3 f1 = mul(P, row(g, 0)), f2 = mul(P, row(g, 1)), f3 = mul(P, row(g, 2)), f0 = f1 + f2 + f3;
     const local_number row[12] = {f0.x, f0.y, f0.z, -f1.x, -f1.y, -f1.z, -f2.x, -f2.y, -f2.z, -f3.x, -f3.y, -f3.z};
-    put_row(push, i, n, row);
+    put_row(nodal_impulse, i, n, row);
 }
 
-// w R grad N_a and the ratio lambda / mu, of every corner.
-INLINE void put_spread(local* spread, index i, int n, const local_mat3& R, const local_mat3& g, local_number w, local_number ratio) {
+// Scaled gradients w R grad N_a and the ratio lambda / mu, of every corner.
+INLINE void put_scaled_gradients(local* scaled_gradients, index i, int n, const local_mat3& R, const local_mat3& g, local_number w,
+                                 local_number ratio) {
     local_vec3 g1 = w * mul(R, row(g, 0)), g2 = w * mul(R, row(g, 1)), g3 = w * mul(R, row(g, 2));
     local_vec3 g0 = -(g1 + g2 + g3);
     const local_number row[16] = {g0.x, g0.y, g0.z, ratio, g1.x, g1.y, g1.z, ratio,
                                   g2.x, g2.y, g2.z, ratio, g3.x, g3.y, g3.z, ratio};
-    put_row(spread, i, n, row);
+    put_row(scaled_gradients, i, n, row);
 }

@@ -19,7 +19,7 @@ INLINE void add_own(local* s, const local (&g)[4]) {
 }
 
 // Upper triangle of the sum of q q^T: the mean of rotations is linear in the products of their quaternions.
-INLINE void add_turn(local* s, const local (&q)[4]) {
+INLINE void add_quaternion_product(local* s, const local (&q)[4]) {
     s[0] += q[0] * q[0]; s[1] += q[0] * q[1]; s[2] += q[0] * q[2]; s[3] += q[0] * q[3];
     s[4] += q[1] * q[1]; s[5] += q[1] * q[2]; s[6] += q[1] * q[3];
     s[7] += q[2] * q[2]; s[8] += q[2] * q[3]; s[9] += q[3] * q[3];

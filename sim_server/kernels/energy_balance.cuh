@@ -1,28 +1,30 @@
 // SPDX-License-Identifier: MIT
-// The energy of a body from step to step, and when it is called a runaway: what both devices share (backends/cpu/native/energy.h, backends/gpu/step_epilogue.cu).
+// Energy balance of a body from step to step, and the criterion of a runaway; shared by both devices (backends/cpu/native/energy.h,
+// backends/gpu/energy_balance.cu).
 //
 //     kinetic  sum m v.v / 2          gravity  -sum m g.x          work  of pushes and grabs since the start
 //     budget   kinetic + elastic before the first step, + work, + what gravity has done since, sum m g.dx (g may change)
 //
-// Elasticity and damping take from the budget and give nothing to it, so that kinetic <= budget but for errors of the time step. A
-// body runs away in the step in which
-//   - kinetic > SLACK max(budget, 0) + floor, or is no number. Over all scenes and hard cases of the tests kinetic / budget is at most
-//     1.13, and what grows without bound passes any factor soon. The floor is a body all of whose nodes move by 1e-3 of its size in
-//     a step: below it the budget may be rounding;
-//   - the steps of two of its nodes differ by more than LONG of its size along an axis, beyond what they differed by at the
-//     start. In the same cases it is at most 1.7, but where a body was thrown or spun. Without inertia there is this one alone.
-// Its size is the longer of its diagonals at rest and at the start.
+// Elasticity and damping only take from the budget, so that kinetic <= budget up to the errors of the time step. A body runs away
+// in the step in which
+//   - kinetic > SLACK_OF_ENERGY max(budget, 0) + floor, or is NaN. Over all scenes and hard cases of the tests kinetic / budget is
+//     at most 1.13, and energy that grows without bound soon exceeds any factor. The floor is the kinetic energy of a body all of
+//     whose nodes move by 1e-3 of its size in a step: below it the budget may be rounding;
+//   - the steps of two of its nodes differ along an axis by more than LONG times its size plus twice their difference at the
+//     start. In the same cases it is at most 1.7 times, except where a body was thrown or spun. Without inertia this is the only
+//     criterion.
+// Its size is the longer of the diagonals of its boxes at rest and at the start.
 #pragma once
 #include "host_device.cuh"
 
 constexpr double SLACK_OF_ENERGY = 2, LONG = 4, SLOW = 1e-3;
 
 enum OnRunaway { FREEZE = 0, GO_ON = 1, UNWATCHED = 2 };
-enum BalancePhase { WELL = 0, AWAY = 1, FROZEN = 2 };  // AWAY: in the last step, and it goes on
+enum BalancePhase { WELL = 0, AWAY = 1, FROZEN = 2 };  // AWAY: ran away in the last step, and goes on
 
 struct Sums {  // over nodes
     double kinetic, gravity, fallen, work;  // fallen: work of gravity
-    double low[3], high[3];  // of their steps [m]
+    double low[3], high[3];  // range of their steps [m]
 };
 
 ANYWHERE Sums no_sums() { return {0, 0, 0, 0, {1e300, 1e300, 1e300}, {-1e300, -1e300, -1e300}}; }
@@ -37,7 +39,7 @@ struct Balance {      // of a body, after its last step [J]
     double fallen;    // work of gravity
     double stride;    // largest difference of two nodes' steps along an axis [m]
     int phase;
-    int found;        // 1: in the last step it was found to run away; figures are then of the state that it came to
+    int found;        // 1: found to run away in the last step; the figures are then of the state at its end
 };
 
 ANYWHERE double square(double a) { return a * a; }
@@ -55,7 +57,7 @@ ANYWHERE void add_node(Sums& s, double mass, const T* x, const T* v, const doubl
     }
 }
 
-// Of a force that does not change and of a spring, along the straight way from `from`: exact.
+// Work of a constant force and of a spring along the straight path from `from`: exact.
 template <class T>
 ANYWHERE double work_on(const T* force, double spring, const T* anchor, const T* from, const double* step) {
     double work = 0;
@@ -69,7 +71,8 @@ ANYWHERE double stride_of(const Sums& s) {
     return most;
 }
 
-// s: before the first step, with dt v for steps. size: diagonal at the start [m]. elastic and diagonal are there.
+// Begins the balance; `elastic` and `diagonal` are set already. s: sums before the first step, with dt v for steps; size: diagonal
+// at the start [m].
 ANYWHERE void start_balance(Balance& b, const Sums& s, double size, double dt, bool inertia) {
     if (b.phase == FROZEN) return;
     const double longest = size > b.diagonal ? size : b.diagonal;
@@ -82,7 +85,7 @@ ANYWHERE void start_balance(Balance& b, const Sums& s, double size, double dt, b
     b.phase = WELL;
 }
 
-// After a step. True where the body is to be frozen now.
+// Updates the balance after a step. True if the body is to be frozen now.
 ANYWHERE bool take_stock(Balance& b, const Sums& s, int on_runaway, bool inertia) {
     b.kinetic = inertia ? s.kinetic : 0;
     b.gravity = s.gravity;
@@ -93,7 +96,7 @@ ANYWHERE bool take_stock(Balance& b, const Sums& s, int on_runaway, bool inertia
     if (b.phase == FROZEN) return false;
     b.budget = b.start + work + fallen;
     const double most = SLACK_OF_ENERGY * (b.budget > 0 ? b.budget : 0) + b.floor;
-    const bool known = b.budget == b.budget;  // else the start had no energy that the law defines
+    const bool known = b.budget == b.budget;  // NaN: the law defines no energy of the state at the start
     const bool away = !is_finite(s.kinetic) || !is_finite(s.gravity) || (known && b.kinetic > most) || b.stride > b.limit;
     b.found = away && on_runaway != UNWATCHED;
     b.phase = !b.found ? WELL : on_runaway == FREEZE ? FROZEN : AWAY;

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: MIT
-// Sums the edge blocks that tetrahedra left (kernels/hyperelastic.cuh) block by block of A: a gather from a list made once per
-// topology, in its order. An edge of an element is stored once, from its lower to its higher corner; a block that couples
-// them the other way takes the transpose.
+// Sums the edge blocks of tetrahedra (kernels/hyperelastic.cuh) into the blocks of A above the diagonal. A gather from a list made
+// once per topology, in its order. An edge of an element is stored once, from its lower to its higher corner; a block that couples
+// them in the other order takes the transpose.
 #include "coalesced_io.cuh"
 
 struct GatherBlocks {
@@ -20,10 +20,10 @@ INLINE void gather_add(const GatherBlocks& p, int, int k, local* sum) {
     const local* m = p.edges + 9 * ((long long)p.elements * edge + (pair >> 4));
     local row[9];
     for (int j = 0; j < 9; ++j) row[j] = m[j];
-    bool turned = a > b;
-    sum[0] += row[0]; sum[1] += turned ? row[3] : row[1]; sum[2] += turned ? row[6] : row[2];
-    sum[3] += turned ? row[1] : row[3]; sum[4] += row[4]; sum[5] += turned ? row[7] : row[5];
-    sum[6] += turned ? row[2] : row[6]; sum[7] += turned ? row[5] : row[7]; sum[8] += row[8];
+    bool transposed = a > b;
+    sum[0] += row[0]; sum[1] += transposed ? row[3] : row[1]; sum[2] += transposed ? row[6] : row[2];
+    sum[3] += transposed ? row[1] : row[3]; sum[4] += row[4]; sum[5] += transposed ? row[7] : row[5];
+    sum[6] += transposed ? row[2] : row[6]; sum[7] += transposed ? row[5] : row[7]; sum[8] += row[8];
 }
 
 INLINE void gather_put(const GatherBlocks& p, int i, const local* sum) {

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: MIT
-// Collects at each node the rows that tetrahedra left for it (kernels/hyperelastic.cuh): a gather, so that no two items write
-// one place.
+// Sums at each node the nodal impulses and diagonal blocks of its tetrahedra (kernels/hyperelastic.cuh). A gather: no two items
+// write to the same place.
 #include "coalesced_io.cuh"
 
 struct GatherForces {
@@ -8,7 +8,7 @@ struct GatherForces {
     int elements;
     const int* start;     // (n + 1,) into slots
     const int* slots;     // (start[n],) 4 e + a: corner a of element e is at the node
-    const local* rows;    // (4, elements, 9) push [N s], upper triangle of the corner's own block [kg]
+    const local* rows;    // (4, elements, 9) nodal impulse [N s], upper triangle of the corner's own block [kg]
     own<real> b;          // (n, 3) in, out: right-hand side, world frame [N s]
     own<local> block;     // (n, 6) in, out: upper triangle of the node's own block of A, world frame [kg]
 };

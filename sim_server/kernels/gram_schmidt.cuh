@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: MIT
-// Rotations from an edge and a plane: Gram and Schmidt's, in place of the nearest rotation.
+// Rotation of an element from an edge and a face by Gram-Schmidt orthogonalization, in place of the nearest rotation.
 #pragma once
 #include "polar.cuh"
 

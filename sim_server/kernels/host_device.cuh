@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: MIT
-// For functions that the native loop and GPU texts share, where kernel.h would be too much.
+// Marks functions that the native loop and GPU texts share and that need nothing of kernel.h.
 #pragma once
 #ifdef __CUDACC_RTC__
 #define ANYWHERE __device__ __forceinline__

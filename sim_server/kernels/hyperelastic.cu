@@ -6,21 +6,21 @@
 #include LAW
 
 struct Elements {
-    int n;                    // elements
-    int projection;           // of the tangent
-    const int* tets;          // (n, 4) nodes
-    const real* x;            // (nodes, 3) positions [m]
-    const real* v;            // (nodes, 3) what the tangent is applied to [m/s]
-    const local* gradients;   // (9, n) rest gradients of the shape functions of nodes 1, 2, 3, one after another [1/m]
-    const local* volume;      // (n,) [m3]
-    const local* constants;   // (CONSTANTS, n) of the law
-    const local* floor;       // (n,) J below which the law goes on as a parabola, 0: J <= 0 is refused
-    const local* stiffening;  // (n,) factor of the tangent [s2]
-    local h;                  // factor of the force [s]
-    const double* clock;      // (1,) [s]
-    double* refused;          // (n, 2) in, out: when the element was first refused [s], -1: never; its J then
-    local* corners;           // (4, n, 9) out: h f_a - factor (K v)_a [N s], upper triangle of factor K_aa [kg]
-    local* edges;             // (6, n, 9) out: factor K_ab, a < b [kg]
+    int n;                               // elements
+    int projection;                      // of the tangent
+    const int* tets;                     // (n, 4) nodes
+    const real* x;                       // (nodes, 3) positions [m]
+    const real* v;                       // (nodes, 3) what the tangent is applied to [m/s]
+    const local* gradients;              // (9, n) rest gradients of the shape functions of nodes 1, 2, 3, one after another [1/m]
+    const local* volume;                 // (n,) [m3]
+    const local* constants;              // (CONSTANTS, n) of the law
+    const local* floor;                  // (n,) J below which the law goes on as a parabola, 0: J <= 0 is refused
+    const local* stiffness_coefficient;  // (n,) factor of the tangent [s2]
+    local h;                             // factor of the force [s]
+    const double* clock;                 // (1,) [s]
+    double* refused;                     // (n, 2) in, out: when the element was first refused [s], -1: never; its J then
+    local* corners;                      // (4, n, 9) out: h f_a - factor (K v)_a [N s], upper triangle of factor K_aa [kg]
+    local* edges;                        // (6, n, 9) out: factor K_ab, a < b [kg]
 };
 
 KERNEL(elements, Elements) {
@@ -28,14 +28,14 @@ KERNEL(elements, Elements) {
     local_vec3 v[3];
     Tetrahedron<local_number> t = element_at(p, i, tet);
     field_edges(p.v, tet, v);
-    local_number c[CONSTANTS], volume = at_items(p.volume, i), floor = at_items(p.floor, i), k = volume * at_items(p.stiffening, i);
+    local_number c[CONSTANTS], volume = at_items(p.volume, i), floor = at_items(p.floor, i), k = volume * at_items(p.stiffness_coefficient, i);
     constants_at(p, i, c);
     mat<local_number> left = mul(t.F, transposed(t.F));
     Invariants<local_number> q = invariants<HAS>(left, t.J);
     Slopes<local_number> w = slopes(c, q, floor);
 
-    local_vec3 push[4];
-    forces<HAS>(w, q, left, t, -p.h * volume, push);
+    local_vec3 impulse[4];
+    forces<HAS>(w, q, left, t, -p.h * volume, impulse);
     Blocks6<local_number> B;
     invariant_edges<HAS>(w, q, left, t, k, B);
     if (p.projection != NONE) {
@@ -48,9 +48,9 @@ KERNEL(elements, Elements) {
     if constexpr (REFUSES) {
         auto here = t.J <= 0 && floor == 0;
         note_refusal(here, p.refused, i, p.clock[0], t.J);
-        refuse(here, B, push);
+        refuse(here, B, impulse);
     }
-    leave(B, push, v, p.corners, p.edges, p.n, i);
+    store_element(B, impulse, v, p.corners, p.edges, p.n, i);
 }
 
 struct Energy {

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: MIT
-// What the laws of hyperelastic tetrahedra share (formulas: sim_server/effects/_hyperelastic.py).
+// Shared by the laws of hyperelastic tetrahedra (formulas: sim_server/effects/_hyperelastic.py).
 #pragma once
 #include "eigen9.cuh"
 #include "svd3.cuh"
@@ -22,7 +22,8 @@ template <class T> struct Tetrahedron {
     T J;
 };
 
-template <class T> INLINE void spread_to_four(vec<T> (&u)[4]) { u[0] = -(u[1] + u[2] + u[3]); }
+// The value of corner 0: those of the four corners sum to zero.
+template <class T> INLINE void set_corner_0(vec<T> (&u)[4]) { u[0] = -(u[1] + u[2] + u[3]); }
 
 // edges: from corner 0 now; gradients (9, n): rest gradients of corners 1, 2, 3.
 template <class T> INLINE Tetrahedron<T> tetrahedron(const vec<T> (&edges)[3], const local* gradients, int n, index i) {
@@ -30,17 +31,17 @@ template <class T> INLINE Tetrahedron<T> tetrahedron(const vec<T> (&edges)[3], c
     mat<T> rows;
     for (int k = 0; k < 9; ++k) rows.m[k] = at_items(gradients + k * n, i);
     UNROLL for (int k = 0; k < 3; ++k) t.D[k + 1] = row(rows, k);
-    spread_to_four(t.D);
+    set_corner_0(t.D);
     t.F = outer3(edges[0], edges[1], edges[2], rows);
     T inverse = dot(t.D[1], cross(t.D[2], t.D[3]));  // 1 / (6 V)
     UNROLL for (int k = 0; k < 3; ++k) t.q[k] = inverse * edges[k];
     t.area[1] = cross(t.q[1], edges[2]);
     t.area[2] = cross(t.q[2], edges[0]);
     t.area[3] = cross(t.q[0], edges[1]);
-    spread_to_four(t.area);
+    set_corner_0(t.area);
     t.J = dot(t.area[1], edges[0]);
     UNROLL for (int k = 1; k < 4; ++k) t.g[k] = mul(t.F, t.D[k]);
-    spread_to_four(t.g);
+    set_corner_0(t.g);
     return t;
 }
 
@@ -181,7 +182,7 @@ template <class T> INLINE void project(Modes<T>& m, int projection) {
 
 // B_ij += share y_i y_j^T: a mode of d2W/dF2 with y_i its matrix times D_i.
 template <class T> INLINE void add_mode(Blocks6<T>& B, T share, vec<T> (&y)[4]) {
-    spread_to_four(y);
+    set_corner_0(y);
     vec<T> w[3] = {share * y[0], share * y[1], share * y[2]};
     UNROLL for (int e = 0; e < 6; ++e) add_outer(B.e[e], w[edge_first(e)], y[edge_second(e)]);
 }
@@ -219,7 +220,7 @@ template <class T>
 INLINE void principal_edges(const Principal<T>& p, const Modes<T>& m, T k, const vec<T> (&D)[4], Blocks6<T>& B) {
     vec<T> d[4];  // V^T D_i
     UNROLL for (int i = 1; i < 4; ++i) d[i] = {dot(p.v[0], D[i]), dot(p.v[1], D[i]), dot(p.v[2], D[i])};
-    spread_to_four(d);
+    set_corner_0(d);
     mat<T> U = {{p.u[0].x, p.u[1].x, p.u[2].x, p.u[0].y, p.u[1].y, p.u[2].y, p.u[0].z, p.u[1].z, p.u[2].z}};
     T plus[3], minus[3];
     const entry<T> half = 0.5;
@@ -316,9 +317,9 @@ template <class T> INLINE Thirds<T> thirds(T J, T floor) {
     return {r * r, 1 / base, J, floor};
 }
 
-// --- what an element leaves for nodes and blocks ------------------------------------------------------------------------------
+// --- output of an element for nodes and blocks ------------------------------------------------------------------------------
 
-// Remembers the first time at which the element was refused and its J there; refused (n, 2) begins with (-1, 0).
+// Records the first time at which the element was refused and its J there; refused (n, 2) begins with (-1, 0).
 #ifdef __CUDACC_RTC__
 INLINE void note_refusal(bool here, double* refused, index i, double now, local_number J) {
     if (here && refused[2 * i] < 0) {
@@ -341,22 +342,24 @@ template <class T> INLINE T no_number() {
     return zero / zero;
 }
 
-// Of a refused element nothing but a force that is no number: the solver tells, and the matrix stays finite.
-template <class M, class T> INLINE void refuse(M here, Blocks6<T>& B, vec<T> (&push)[4]) {
+// A refused element has zero stiffness and a force of NaN: the solver reports it, and the matrix stays finite.
+template <class M, class T> INLINE void refuse(M here, Blocks6<T>& B, vec<T> (&impulse)[4]) {
     const T zero = T{}, nan = no_number<T>();
     UNROLL for (int e = 0; e < 6; ++e)
         for (int a = 0; a < 9; ++a) B.e[e].m[a] = here ? zero : B.e[e].m[a];
-    UNROLL for (int a = 0; a < 4; ++a) push[a] = {here ? nan : push[a].x, here ? nan : push[a].y, here ? nan : push[a].z};
+    UNROLL for (int a = 0; a < 4; ++a) impulse[a] = {here ? nan : impulse[a].x, here ? nan : impulse[a].y, here ? nan : impulse[a].z};
 }
 
-// push_i = -h grad_i - sum_j B_ij v_j, each with the upper triangle of its B_ii: rows of nine, one corner after another; and
-// the blocks of the edges, one edge after another. v: edges from corner 0 of the field that the tangent is applied to.
+// Stores the nodal impulses f_i = impulse_i - sum_j B_ij v_j, impulse_i = -h grad_i, each with the upper triangle of B_ii in a row
+// of nine, one corner after another; and the blocks of the edges, one edge after another. v: differences from corner 0 of the
+// field that the tangent is applied to.
 template <class T>
-INLINE void leave(const Blocks6<T>& B, const vec<T> (&push)[4], const vec<T> (&v)[3], local* corners, local* edges, int n, index i) {
+INLINE void store_element(const Blocks6<T>& B, const vec<T> (&impulse)[4], const vec<T> (&v)[3], local* corners, local* edges, int n,
+                          index i) {
     vec<T> f[4];
     T own[4][6];
     UNROLL for (int a = 0; a < 4; ++a) {
-        f[a] = push[a];
+        f[a] = impulse[a];
         UNROLL for (int k = 0; k < 6; ++k) own[a][k] = T{};
     }
     UNROLL for (int e = 0; e < 6; ++e) {

@@ -27,8 +27,8 @@ INLINE void invariant_gradients(const Invariants<T>& q, const mat<T>& left, cons
         if constexpr ((HAS & (W_2 | W_12 | W_22 | W_2J)) != 0) a2[i] = (entry<T>)2 * (q.I1 * t.g[i] - mul(left, t.g[i]));
         else a2[i] = vec<T>{};
     }
-    spread_to_four(a1);
-    spread_to_four(a2);
+    set_corner_0(a1);
+    set_corner_0(a2);
 }
 
 // f_i = factor sum_p W_p a^p_i
@@ -41,7 +41,7 @@ INLINE void forces(const Slopes<T>& w, const Invariants<T>& q, const mat<T>& lef
         if constexpr ((HAS & W_2) != 0) f[i] = f[i] + (factor * w.w2) * a2[i];
         if constexpr ((HAS & W_J) != 0) f[i] = f[i] + (factor * w.wJ) * t.area[i];
     }
-    spread_to_four(f);
+    set_corner_0(f);
 }
 
 // k { sum_pq W_pq a^p_i a^q_j^T + sum_p W_p d2q_p / dQ_i dQ_j } of every edge.

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: MIT
 // One text, two compilers. A kernel is a function of independent items:
 //
-//     struct Push { int n; const real* v; real* x; real h; };                      // n = items, always first
-//     KERNEL(push, Push) { put(p.x, i, at(p.x, i) + p.h * at(p.v, i)); }           // `p` parameters, `i` item
+//     struct Move { int n; const real* v; real* x; real h; };                      // n = items, always first
+//     KERNEL(move, Move) { put(p.x, i, at(p.x, i) + p.h * at(p.v, i)); }           // `p` parameters, `i` item
 //
 // NVRTC turns it into a __global__ function, one thread per item; a C++ compiler into a loop over a range of items.
 // A text that defines WIDE first is written on `number` and `index`: scalars on a GPU, as many items at once as a vector

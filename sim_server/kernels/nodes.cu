@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: MIT
-// What every step does node by node, whatever its effects.
+// Nodal kernels of every step, whatever its effects.
 #define WIDE
 #include "polar.cuh"
 #include "coalesced_io.cuh"
@@ -13,7 +13,7 @@ struct Start {
     own<local> mean;     // (n, 10) out: upper triangle of the sum of q q^T, q the elements' rotations
 };
 
-// Lumped mass and nothing else; the effects then add to all of them.
+// Begins the system with the lumped masses; the effects then add to it.
 KERNEL(start, Start) {
     row_put<1>(p.diagonal, i, 0, at(p.mass, i));
     store3(p.b, i, vec3{});
@@ -22,26 +22,26 @@ KERNEL(start, Start) {
 }
 
 struct Rotate {
-    int n;               // nodes
-    const real* free;    // (n,) 1, or 0 at fixed nodes
-    const int* body;     // (n,) of the node
-    const int* warped;   // (bodies,) 1 where frames follow the nodes' rotations, 0 where they stay the identity
-    const int* place;    // (n,) of the node's own block in the full pattern
-    own<local> mean;     // (n, 10) upper triangle of the sum of q q^T
-    own<real> b;         // (n, 3) world frame [N s]
-    own<real> diagonal;  // (n, 1) [kg]
-    own<local> block;    // (n, 6) upper triangle, world frame [kg]
-    const real* dv;      // (n, 3) solution of the last step, world frame [m/s]
-    const real* x;       // (n, 3) [m]
-    const real* v;       // (n, 3) velocity that the step begins with; zero without inertia [m/s]
-    const real* extent;  // (n,) of the node's body [m]
-    const real* gain;    // (n,) 1 / (c + beta), c world.reach, beta the Rayleigh damping of the stiffness [1/s]
-    real h;              // time step [s]
-    local* rotation;     // (n, 3, 3) out: frame of the node: its rotation from rest to now, or the identity
-    real* b_material;    // (n, 3) out: R^T b, 0 at fixed nodes
-    real* y;             // (n, 3) out: where the solve starts: R^T dv, R^T (-v) where the node rests, 0 at fixed nodes
-    int* moving;         // (bodies,) out: 1 where a node does not rest; else left as it is
-    real* values;        // (blocks, 3, 3) out: R^T A R of the node's own block; the identity's at fixed nodes [kg]
+    int n;                     // nodes
+    const real* free;          // (n,) 1, or 0 at fixed nodes
+    const int* body;           // (n,) of the node
+    const int* warped;         // (bodies,) 1 where frames follow the nodes' rotations, 0 where they stay the identity
+    const int* place;          // (n,) of the node's own block in the full pattern
+    own<local> mean;           // (n, 10) upper triangle of the sum of q q^T
+    own<real> b;               // (n, 3) world frame [N s]
+    own<real> diagonal;        // (n, 1) [kg]
+    own<local> block;          // (n, 6) upper triangle, world frame [kg]
+    const real* dv;            // (n, 3) solution of the last step, world frame [m/s]
+    const real* x;             // (n, 3) [m]
+    const real* v;             // (n, 3) velocity that the step begins with; zero without inertia [m/s]
+    const real* extent;        // (n,) of the node's body [m]
+    const real* inverse_time;  // (n,) 1 / (c + beta), which makes i K of a block i (c + beta) K; c world.dx_dv [1/s]
+    real h;                    // time step [s]
+    local* rotation;           // (n, 3, 3) out: frame of the node: its rotation from rest to now, or the identity
+    real* b_material;          // (n, 3) out: R^T b, 0 at fixed nodes
+    real* y;                   // (n, 3) out: where the solve starts: R^T dv, R^T (-v) where the node rests, 0 at fixed nodes
+    int* moving;               // (bodies,) out: 1 where a node does not rest; else left as it is
+    real* values;              // (blocks, 3, 3) out: R^T A R of the node's own block; the identity's at fixed nodes [kg]
 };
 
 // Sum of the rotations whose products of quaternions `mean` sums.
@@ -66,9 +66,9 @@ INLINE local_mat3 frame_of(const Rotate& p, index i) {
     return rotation_matrix(q);
 }
 
-// A node rests if it moves in a step by less than its position is rounded, and b there is less than the rounding of the forces
-// that act on it: what its own stiffness makes of rounded positions (all of x) and of rounded strains (of the body's extent). SAFETY
-// times that: at rest b is 0.1 of it. A node that rests is solved for no further: the step takes its velocity away.
+// A node rests if it moves in a step by less than the rounding error of its position, and b there is less than SAFETY times the
+// rounding error of the forces on it: its own stiffness times the errors of positions (of x) and of strains (of the body's extent).
+// At rest b is 0.1 of that bound. A node at rest is not solved for: the step sets its velocity to zero.
 template <class T> constexpr entry<T> EPSILON = sizeof(entry<T>) == 8 ? (entry<T>)2.2e-16 : (entry<T>)1.2e-7;
 constexpr int SAFETY = 4;
 
@@ -77,7 +77,7 @@ INLINE number largest(vec3 a) { return larger(larger(magnitude(a.x), magnitude(a
 INLINE auto rests(const Rotate& p, index i, vec3 b, vec3 v, number stiffness) {
     number from = largest(load3(p.x, i)), extent = at(p.extent, i);
     number place = EPSILON<number> * (from + extent), strain = EPSILON<local_number> * extent;
-    number rounding = SAFETY * stiffness * at(p.gain, i) * larger(place, strain);
+    number rounding = SAFETY * stiffness * at(p.inverse_time, i) * larger(place, strain);
     return (largest(b) <= rounding) & (p.h * largest(v) <= place);
 }
 
@@ -88,7 +88,7 @@ KERNEL(rotate, Rotate) {
     put_row(p.rotation, i, p.n, R.m);
     mat3 Rt = as<number>(transposed(R));
     for (int m = 0; m < 6; ++m) k[m] = row_at<6>(p.block, i, m);
-    auto fixed = keep == 0;  // also all of a body that has run away, whatever was assembled of it
+    auto fixed = keep == 0;  // includes all nodes of a frozen body, whatever was assembled there
     vec3 zero = {}, b = select(fixed, zero, mul(Rt, load3(p.b, i))), v = load3(p.v, i);
     auto still = fixed | rests(p, i, b, v, (number)((k[0] + k[3] + k[5]) / 3));
     vec3 y = select(fixed, zero, mul(Rt, select(still, -v, load3(p.dv, i))));

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: MIT
-// The system matrix in the material frame, A' = R^T A R: solved there, the factor of A' made at time t *is* the warped
-// factor R_s R_t^T P^-1 R_t R_s^T at time s (Courtecuisse et al. 2010, eq. 12 and 13), at no cost per iteration. Here the
-// blocks off the diagonal; those on it are the nodes' (nodes.cu).
+// Rotates the blocks off the diagonal into the material frame, A' = R^T A R; nodes.cu rotates those on it. In this frame the
+// factor of the matrix of time t is the warped factor R_s R_t^T P^-1 R_t R_s^T of time s (Courtecuisse et al. 2010, eq. 12 and
+// 13), at no cost per iteration.
 #include "mat3.cuh"
 #include "coalesced_io.cuh"
 

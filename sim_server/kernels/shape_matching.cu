@@ -12,7 +12,7 @@ struct Match {
     own<local> mean;       // (n, 10) out: products of quaternions whose sum of rotations is A
 };
 
-// A = sum_j m_j (x_j - x_c) (X_j - X_c)^T, where x_i may stand for x_c, since the arms of a node and its own sum to zero.
+// A = sum_j m_j (x_j - x_c) (X_j - X_c)^T. x_i may replace x_c: the arms of a node's neighbours and its own sum to zero.
 INLINE void match_add(const Match& p, int i, int k, local* sum) {
     const real *there = p.x + 3 * p.neighbour[k], *here = p.x + 3 * i;
     const local* arm = p.arm + 3 * k;
@@ -22,7 +22,7 @@ INLINE void match_add(const Match& p, int i, int k, local* sum) {
     }
 }
 
-// What nodes.cu makes a sum of rotations of are ten numbers of which it needs nine: they can stand for any matrix.
+// Stores the matrix in the ten numbers from which nodes.cu makes a sum of rotations: they can represent any matrix.
 INLINE void match_put(const Match& p, int i, const local* a) {
     if (p.start[i] == p.start[i + 1]) return;
     const local quarter = (local)0.25, half = (local)0.5, w = quarter * (a[0] + a[4] + a[8]);

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: MIT
-// log, exp and cbrt of a vector of double: in the lanes themselves, where the system's functions take one number at a time and
-// everything else out of the registers. Within two units in the last place; kernel.h includes this where vectors are of double.
+// log, exp and cbrt of a vector of doubles, within two units in the last place. Computed in all lanes at once: the functions of the
+// system take one number at a time and spill all registers. kernel.h includes this where vectors are of double.
 #pragma once
 
 typedef long long bits __attribute__((vector_size(REGISTER)));

@@ -1,12 +1,12 @@
 // SPDX-License-Identifier: MIT
-// What backends/gpu/kernel_fusion.py needs of the threads of a warp. GPU only.
+// Sums over the threads of a warp, for backends/gpu/kernel_fusion.py. GPU only.
 #pragma once
 #include "kernel.h"
 
 INLINE constexpr int padded(int n, int lanes) { return (n + lanes - 1) / lanes * lanes; }
 
-// The sums of SIZE values over LANES neighbouring threads, written to `row`: each step hands half of the values to the
-// partner and takes the partner's share of the other half, so that every thread ends with SIZE / LANES whole sums.
+// Sums SIZE values over LANES neighbouring threads into `row`: in each step a thread sends half of its values to its partner and
+// adds the other half of the partner's, so that it ends with SIZE / LANES complete sums.
 template <int SIZE, int LANES>
 INLINE void share_sum(local (&sum)[SIZE], int lane, local* row) {
     int count = SIZE;

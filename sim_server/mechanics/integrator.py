@@ -1,26 +1,29 @@
 # SPDX-License-Identifier: MIT
 """What a step does before the effects and after the solve, by the scheme of the scene.
 
-Symbols: docs/notation.md. All schemes are, with f the forces, M the lumped masses and h the time step,
+Symbols and names: docs/notation.md. All schemes are, with f the forces, M the lumped masses and h the time step,
 
     x' = X + c v',    M (v' - V) = i f(x', v')         (a prime: at the end of the step)
 
-    scheme          c = reach    i = impulse   V                        X
-    backward_euler  h            h             v                        x
-    newmark         beta h / g   g h           v + h (1 - g) a          x + h v + h^2 (1/2 - beta) a - c V
-    bdf2            2 h / 3      2 h / 3       v + (v - v_before) / 3   x + (x - x_before) / 3
-    quasi_static    h            h             0 = f(x'), v' = (x' - x) / h
+    scheme          c = dx_dv    i = force_coefficient   V                        X
+    backward_euler  h            h                       v                        x
+    newmark         beta h / g   g h                     v + h (1 - g) a          x + h v + h^2 (1/2 - beta) a - c V
+    bdf2            2 h / 3      2 h / 3                 v + (v - v_before) / 3   x + (x - x_before) / 3
+    quasi_static    h            h                       0 = f(x'), v' = (x' - x) / h
 
 with g Newmark's gamma and a = (v' - V) / (g h) of the step before. Linearized at (x, v), with K = -df/dx, C = alpha M +
 beta K, and the solution dv = v' - v,
 
-    (M + i alpha M + i (c + beta) K) dv = i f(x, v) - i (c + beta) K drift + M carried
-    carried = V - v,    ahead = (X + c v - x) / c,    drift = (c ahead + beta v) / (c + beta)
+    (M + i alpha M + i (c + beta) K) dv = i f(x, v) - i (c + beta) K d + M r
 
-where f has all forces but beta K v, which is in drift; then v += dv, x += c (ahead + dv). So a scheme is a few numbers:
-what it makes of dv for the next ahead and carried (kernels/time_integration.cu). In backward Euler ahead and drift are
-v, nothing is carried, and the launches are those of kernels/nodes.cu. Newton-Raphson (kernels/newton_line_search.cuh)
-linearizes again at what came out: there ahead = 0.
+    p = (X + c v - x) / c             predictor: the displacement for dv = 0, over c
+    r = V - v                         inertial_increment: dv without forces
+    d = (c p + beta v) / (c + beta)   damping_velocity
+
+where f has all forces but beta K v, which is in d; then v += dv, x += c (p + dv). A scheme is given by c, i and the
+weights with which it makes p and r of the next step (PredictorWeights, kernels/time_integration.cu). In backward Euler
+p = d = v, r = 0, and the launches are those of kernels/nodes.cu. Newton-Raphson (kernels/newton_line_search.cuh)
+linearizes again at the state reached; there p = 0.
 
 Order: 1, 2 (gamma = 1/2), 2. One linearization keeps it only where K is the exact slope of the forces; the usual
 tangent of corotational elements is not, by as much as they are strained.
@@ -50,81 +53,94 @@ TEXT = "kernels/time_integration.cu"
 
 
 @dataclass(frozen=True)
-class Parts:
-    """Of what a step left, in the next ahead: of v, of ahead + dv, of dv - carried; and in the next carried."""
+class PredictorWeights:
+    """Weights with which a step makes predictor p and inertial increment r of the next one (primed).
 
-    keeps_v: float = 1.0
-    of_v: float = 0.0
-    of_way: float = 0.0
-    of_gain: float = 0.0
-    carries_gain: float = 0.0
-    carries_dv: float = 0.0
+    v' = keeps_velocity v + dv,   p' = from_velocity v' + from_step (p + dv) + from_force (dv - r)
+    r' = inertia_from_force (dv - r) + inertia_from_dv dv
+    """
+
+    keeps_velocity: float = 1.0
+    from_velocity: float = 0.0
+    from_step: float = 0.0
+    from_force: float = 0.0
+    inertia_from_force: float = 0.0
+    inertia_from_dv: float = 0.0
 
 
 @dataclass(frozen=True)
-class First:
-    """Likewise before the first step, of v and of the acceleration [s]."""
+class InitialWeights:
+    """Weights that make p and r of the first step from velocity v and acceleration a at the beginning.
 
-    of_v: float
-    of_a: float
-    carries_a: float
+    p = from_velocity v + from_acceleration a,   r = inertia_from_acceleration a; the latter two weights in s.
+    """
+
+    from_velocity: float
+    from_acceleration: float
+    inertia_from_acceleration: float
 
 
 class Integrator:
-    """The launches of a scheme. carried (n, 3) [m/s]: see above; beta (n,): damping of the stiffness at nodes [s];
-    before (n, 3) [m]: x when the last step began, to which a body goes back whose forces are no numbers."""
+    """The launches of a scheme.
+
+    inertial_increment (n, 3) [m/s]: r, above; none in backward Euler. beta (n,): damping of the stiffness at nodes [s].
+    before (n, 3) [m]: x at the start of the last step, to which a body goes back whose forces are NaN.
+    """
 
     def __init__(self, scene: Scene, system: System):
         self.options, self.system, self.world = scene.integrator, system, system.world
         w = self.world
-        self.carried = np.zeros((0 if w.plain else w.nodes, 3))
+        self.inertial_increment = np.zeros((0 if w.plain else w.nodes, 3))
         self.beta = np.repeat(w.beta, [b.last - b.first for b in w.bodies]) if not w.plain else np.zeros(0)
         self.before = w.x.copy()
-        w.backend.keep(self.carried, self.beta, self.before)
-        self._parts, self._first = _coefficients(scene)
+        w.backend.keep(self.inertial_increment, self.beta, self.before)
+        self._weights, self._initial = _weights_of(scene)
 
     @property
     def still(self) -> list[np.ndarray]:
-        """Arrays (n, 3) beside v that are 0 where nothing moves."""
-        return [] if self.world.plain else [self.world.ahead, self.world.drift, self.carried]
+        """Arrays (n, 3) other than v that are 0 in a body at rest."""
+        return [] if self.world.plain else [self.world.predictor, self.world.damping_velocity, self.inertial_increment]
 
     def start(self) -> Launch:
-        """b and A with the masses alone."""
+        """Sets b and A to the terms of inertia."""
         s, w = self.system, self.world
         if w.plain:
             return s.start(w.mass)
         if not w.inertia:
             return s.start(np.zeros(w.nodes))
         return self._bind(
-            "inertia", mass=w.mass, carried=self.carried, diagonal=s.diagonal, b=s.b, block=s.block, mean=s.mean
-        )
+            "inertia", mass=w.mass, inertial_increment=self.inertial_increment, diagonal=s.diagonal, b=s.b,
+            block=s.block, mean=s.mean,
+        )  # fmt: skip
 
     def advance(self) -> Launch:
-        """From the solution to the next state."""
+        """Advances the state by the solution."""
         s, w = self.system, self.world
         if w.plain:
             return s.advance(self.before)
         return self._bind(
-            "advance", rotation=s.rotation, y=s.y, beta=self.beta, reach=w.reach, carried=self.carried, ahead=w.ahead,
-            drift=w.drift, dv=s.dv, v=w.v, x=w.x, before=self.before, **asdict(self._parts),
+            "advance", rotation=s.rotation, y=s.y, beta=self.beta, dx_dv=w.dx_dv, v=w.v, x=w.x, dv=s.dv,
+            inertial_increment=self.inertial_increment, predictor=w.predictor, damping_velocity=w.damping_velocity,
+            before=self.before, **asdict(self._weights),
         )  # fmt: skip
 
     def begin(self, assemble: Sequence[Launch]) -> list[Launch]:
-        """What makes ahead, drift and carried from x and v before the first step; assemble: the launches of a step."""
+        """Launches that make p, d and r from x and v before the first step. assemble: the launches of a step."""
         w = self.world
         if w.plain or not w.inertia:
             return []
-        state: dict[str, Any] = {"ahead": w.ahead, "drift": w.drift, "carried": self.carried}
-        state |= {"v": w.v, "beta": self.beta, "reach": w.reach}
-        if self._first is None:
-            return [self._bind("prepare", of_v=self._parts.of_v, **state)]
+        state: dict[str, Any] = {"v": w.v, "beta": self.beta, "dx_dv": w.dx_dv, "predictor": w.predictor}
+        state |= {"damping_velocity": w.damping_velocity, "inertial_increment": self.inertial_increment}
+        if self._initial is None:
+            return [self._bind("prepare", from_velocity=self._weights.from_velocity, **state)]
         begin = self._bind(
-            "begin", b=self.system.b, mass=w.mass, free=w.free, impulse=w.impulse, **asdict(self._first), **state
-        )
-        return [self._bind("prepare", of_v=0.0, **state), *assemble, begin]
+            "begin", b=self.system.b, mass=w.mass, free=w.free, force_coefficient=w.force_coefficient,
+            **asdict(self._initial), **state,
+        )  # fmt: skip
+        return [self._bind("prepare", from_velocity=0.0, **state), *assemble, begin]
 
     def newton(self, assemble: Sequence[Launch], effects: list[Effect]) -> Newton | None:
-        """What several linearizations a step need; None for one. assemble: the launches of each of them."""
+        """Input of Newton-Raphson; None with one linearization a step. assemble: the launches of each linearization."""
         w, s = self.world, self.system
         if self.options.linearizations == 1:
             return None
@@ -132,10 +148,10 @@ class Integrator:
         w.backend.keep(mass)
         starts = np.array([*(b.first for b in w.bodies), w.nodes], dtype=np.int32)
         rows = [e.elements[:, 0] for e in effects if e.elements is not None]
-        parts = [_parts(launch, starts, s.row, rows) for launch in assemble]
+        parts = [_items_of_bodies(launch, starts, s.row, rows) for launch in assemble]
         return Newton(
-            self.options, w.reach, parts, rotation=s.rotation, mass=mass, beta=self.beta, ahead=w.ahead, drift=w.drift,
-            carried=self.carried,
+            self.options, w.dx_dv, parts, rotation=s.rotation, mass=mass, beta=self.beta, predictor=w.predictor,
+            damping_velocity=w.damping_velocity, inertial_increment=self.inertial_increment,
         )  # fmt: skip
 
     def _bind(self, kernel: str, **arguments: Any) -> Launch:
@@ -143,10 +159,10 @@ class Integrator:
         return launch
 
 
-def _parts(launch: Launch, starts: Int32, row: Int32, firsts: list[Int32]) -> Int32 | None:
-    """(bodies + 1,) where the items of each body begin; None for a launch that does not tell them apart.
+def _items_of_bodies(launch: Launch, starts: Int32, row: Int32, firsts: list[Int32]) -> Int32 | None:
+    """First item of each body, (bodies + 1,); None for a launch whose items are not ordered by body.
 
-    row: of the blocks; firsts: one corner of each element, per effect.
+    starts: first node of each body; row: of each block; firsts: one corner of each element, per effect.
     """
     if launch.domain == "nodes" and launch.items == starts[-1]:
         return starts
@@ -158,14 +174,17 @@ def _parts(launch: Launch, starts: Int32, row: Int32, firsts: list[Int32]) -> In
     return parts[0].astype(np.int32) if same and ascending else None
 
 
-def _coefficients(scene: Scene) -> tuple[Parts, First | None]:
+def _weights_of(scene: Scene) -> tuple[PredictorWeights, InitialWeights | None]:
     options, h = scene.integrator, scene.dt
     if options.scheme == "newmark":
         beta, gamma = options.newmark
-        parts = Parts(of_v=gamma / beta, of_gain=0.5 / beta - 1 / gamma, carries_gain=1 / gamma - 1)
-        return parts, First(gamma / beta, h * (0.5 * gamma / beta - 1), h * (1 - gamma))
-    if options.scheme == "bdf2":  # as if the step before had the acceleration of the beginning
-        return Parts(of_v=1.0, of_way=1 / 3, carries_dv=1 / 3), First(1.5, -h / 4, h / 3)
+        weights = PredictorWeights(
+            from_velocity=gamma / beta, from_force=0.5 / beta - 1 / gamma, inertia_from_force=1 / gamma - 1
+        )
+        return weights, InitialWeights(gamma / beta, h * (0.5 * gamma / beta - 1), h * (1 - gamma))
+    if options.scheme == "bdf2":  # as if the acceleration at the beginning had been that of the step before
+        weights = PredictorWeights(from_velocity=1.0, from_step=1 / 3, inertia_from_dv=1 / 3)
+        return weights, InitialWeights(1.5, -h / 4, h / 3)
     if options.scheme == "quasi_static":
-        return Parts(keeps_v=0.0), None
-    return Parts(of_v=1.0), None
+        return PredictorWeights(keeps_velocity=0.0), None
+    return PredictorWeights(from_velocity=1.0), None

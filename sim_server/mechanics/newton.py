@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What an engine needs to know for several linearizations a step (kernels/newton_line_search.cuh)."""
+"""Newton-Raphson as input of an engine (method: kernels/newton_line_search.cuh)."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -11,15 +11,15 @@ from sim_server.scene.integrator_options import IntegratorOptions
 
 
 class Newton:
-    """Input of the search for the state at the end of a step.
+    """Input of Newton-Raphson: options, and arrays of the state and the system.
 
     options: of the scene
-    reach: derivative dx / dv [s] of positions by velocities at the end of the step
+    dx_dv: derivative dx / dv [s] of positions by velocities at the end of the step
     parts: (bodies + 1,) first item of each body in each assembling launch; None if a launch does not tell bodies apart
-    arrays: rotation (n, 3, 3), mass (n,), beta (n,), ahead, drift, carried (n, 3)
+    arrays: rotation (n, 3, 3), mass (n,), beta (n,), predictor, damping_velocity, inertial_increment (n, 3)
     """
 
     def __init__(
-        self, options: IntegratorOptions, reach: float, parts: Sequence[Int32 | None], **arrays: NDArray[Any]
+        self, options: IntegratorOptions, dx_dv: float, parts: Sequence[Int32 | None], **arrays: NDArray[Any]
     ):  # fmt: skip
-        self.options, self.reach, self.parts, self.arrays = options, reach, parts, arrays
+        self.options, self.dx_dv, self.parts, self.arrays = options, dx_dv, parts, arrays

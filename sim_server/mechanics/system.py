@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""The linear system of a step: arrays of A' and b', their pattern, and who adds what where.
+"""The linear system of a step: arrays of A' and b', their pattern, and the launches that begin and finish them.
 
 A is block CSR with 3x3 blocks over all nodes of the scene, both triangles, columns ascending; bodies do not couple, so
 a body's blocks are one range of it. Rows of fixed nodes hold their diagonal block alone (the identity). Effects add to
     b (n, 3) [N s], diagonal (n,) [kg], block (n, 6) [kg]: upper triangle of the nodes' own blocks,
-    sums (blocks above the diagonal, 3, 3) [kg] and mean (n, 10): of the rotations' products of quaternions,
+    sums (blocks above the diagonal, 3, 3) [kg], mean (n, 10): sums of q q^T over the quaternions q of the rotations,
 all in the world frame; kernels/nodes.cu (`rotate`) and kernels/rotate_blocks.cu then take b and A into the material
 frame, where the solve happens.
 """
@@ -20,7 +20,7 @@ from sim_server.mechanics.world import World
 
 @dataclass(frozen=True)
 class Stencil:
-    """Where the elements of an effect stand in the system.
+    """Places of the elements of an effect in the system.
 
     An element has c corners, 2 (a spring) or 4 (a tetrahedron).
     corner_start (nodes + 1,), corners: slots c e + a of the elements at each node.
@@ -38,10 +38,13 @@ class System:
 
     elements: per effect, (m, c) node numbers of the elements that couple their corners, c = 2 or 4.
 
-    moving (bodies,): 1 where a step is to be solved, as some node does not rest, set by `rotate` (kernels/nodes.cu) and
-    cleared by the loop. extent (n,): diagonal of the box around the node's body at rest [m]; gain (n,) [1/s].
-    rotation (n, 3, 3): frames of the nodes. warped (bodies,): 1 where they follow the nodes' rotations, 0 where they
-    stay the identity; set before the launches are made.
+    moving (bodies,): 1 if a node of the body does not rest, so that the step is solved; set by `rotate`
+        (kernels/nodes.cu) and cleared by the loop
+    extent (n,): diagonal of the box around the node's body at rest [m]
+    inverse_time (n,): 1 / (dx_dv + beta) [1/s]
+    rotation (n, 3, 3): frames of the nodes
+    warped (bodies,): 1 where frames follow the nodes' rotations, 0 where they stay the identity; set before the
+        launches are made
     """
 
     def __init__(self, world: World, elements: list[Int32]):
@@ -65,7 +68,7 @@ class System:
         self.warped = np.ones(len(world.bodies), np.int32)
         self.moving = np.zeros(len(world.bodies), np.int32)
         extents = np.array([np.linalg.norm(np.ptp(world.rest[b.nodes], axis=0)) for b in world.bodies])
-        self.extent, self.gain = extents[self.body], 1 / (world.reach + world.beta[self.body])
+        self.extent, self.inverse_time = extents[self.body], 1 / (world.dx_dv + world.beta[self.body])
         self.rotation = np.tile(np.eye(3), (n, 1, 1))
         self.b_material = np.zeros((n, 3))
         self.y = np.zeros((n, 3))
@@ -75,7 +78,7 @@ class System:
         world.backend.keep(*(a for o in (world, self) for a in vars(o).values() if isinstance(a, np.ndarray)))
 
     def _number(self, n: int) -> None:
-        """Places in block CSR of the blocks above the diagonal, of their transposes and of the nodes' own."""
+        """Numbers the places in block CSR of the blocks above, below and on the diagonal."""
         below = np.argsort(self.column, kind="stable")  # row after row of the lower triangle, columns ascending
         lower = np.bincount(self.column, minlength=n)
         upper = np.bincount(self.row, minlength=n)
@@ -91,20 +94,20 @@ class System:
         self.columns[self.upper], self.columns[self.lower] = self.column, self.row
 
     def start(self, mass: Float64) -> Launch:
-        """b = 0, diagonal = mass (n,) [kg]."""
+        """Sets b = 0 and the diagonal to mass (n,) [kg]."""
         return self.world.backend.module("kernels/nodes.cu").bind(
             "start", self.world.nodes, mass=mass, diagonal=self.diagonal, b=self.b, block=self.block,
             mean=self.mean,
         )  # fmt: skip
 
     def finish(self) -> list[Launch]:
-        """Everything into the material frame: A' = R^T A R, b' = R^T b, and the start of the solve."""
+        """Takes the system into the material frame, A' = R^T A R and b' = R^T b, and sets the start of the solve."""
         w = self.world
-        velocity = w.v if w.inertia else w.ahead  # without inertia that of the last step is no velocity to begin with
+        velocity = w.v if w.inertia else w.predictor  # without inertia v is only the last displacement over dt
         rotate = self.world.backend.module("kernels/nodes.cu").bind(
             "rotate", w.nodes, free=w.free, body=self.body, warped=self.warped, place=self.own,
             mean=self.mean, b=self.b, diagonal=self.diagonal, block=self.block, dv=self.dv,
-            x=w.x, v=velocity, extent=self.extent, gain=self.gain, h=w.dt, moving=self.moving,
+            x=w.x, v=velocity, extent=self.extent, inverse_time=self.inverse_time, h=w.dt, moving=self.moving,
             rotation=self.rotation, b_material=self.b_material, y=self.y, values=self.values,
         )  # fmt: skip
         rotate_blocks = self.world.backend.module("kernels/rotate_blocks.cu").bind(
@@ -114,42 +117,34 @@ class System:
         return [rotate, rotate_blocks]
 
     def advance(self, before: Float64) -> Launch:
-        """v += R y, x += h v: backward Euler. before (n, 3): gets x as it was [m]."""
+        """Advances by backward Euler: v += R y, x += h v. before (n, 3): gets x at the start of the step [m]."""
         w = self.world
         return self.world.backend.module("kernels/nodes.cu").bind(
-            "advance",
-            w.nodes,
-            rotation=self.rotation,
-            y=self.y,
-            h=w.dt,
-            dv=self.dv,
-            v=w.v,
-            x=w.x,
-            before=before,
-        )
+            "advance", w.nodes, rotation=self.rotation, y=self.y, h=w.dt, dv=self.dv, v=w.v, x=w.x, before=before,
+        )  # fmt: skip
 
     def couples(self, first: int, last: int) -> bool:
-        """Whether anything couples nodes of a body."""
+        """True if any two nodes of a body are coupled."""
         return bool(self.row_start[last] - self.row_start[first] > last - first)
 
     def body_pattern(self, first: int, last: int) -> tuple[Int32, Int32]:
-        """row_start and columns of one body, numbered from 0."""
+        """Returns row_start and columns of one body, numbered from 0."""
         start = self.row_start[first : last + 1]
         return (start - start[0]).astype(np.int32), (self.columns[start[0] : start[-1]] - first).astype(np.int32)
 
     def body_values(self, first: int, last: int) -> Float64:
-        """View of the blocks of one body, (blocks, 3, 3)."""
+        """Returns a view of the blocks of one body, (blocks, 3, 3)."""
         return self.values[self.row_start[first] : self.row_start[last]]
 
 
 def _runs(group: Int32, begin: Int64, count: Int64) -> Int32:
-    """Consecutive places for the members of each group, counted from begin[group]; groups ascend."""
+    """Assigns consecutive places to the members of each group, from begin[group] on; groups ascend."""
     first = np.cumsum(count) - count
     return (np.arange(len(group)) - first[group] + begin[group]).astype(np.int32)
 
 
 def _couplings(elements: Int32, free: Float64, n: int) -> tuple[Int64, Int32]:
-    """Key row * n + column and pair c c e + c a + b of every coupling above the diagonal between free corners."""
+    """Keys row * n + column and pairs c c e + c a + b of all couplings above the diagonal between free corners."""
     keys, pairs = [], []
     corners = elements.shape[1]
     element = corners**2 * np.arange(len(elements), dtype=np.int32)

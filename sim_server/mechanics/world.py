@@ -16,7 +16,7 @@ from sim_server.scene import Scene, SceneObject
 
 @dataclass(frozen=True)
 class Body:
-    """One object's share of the arrays: nodes [first, last)."""
+    """The part of the arrays that belongs to one object: nodes [first, last)."""
 
     index: int
     name: str
@@ -32,12 +32,12 @@ class Body:
 
     @property
     def tets(self) -> Int32:
-        """(m, 4) in node numbers of the scene."""
+        """Corners (m, 4) in node numbers of the scene."""
         return self.mesh.tets + np.int32(self.first)
 
     @property
     def centroids(self) -> Float64:
-        """(m, 3) of the elements at rest, before the pose [m]."""
+        """Centroids (m, 3) of the elements at rest, before the pose [m]."""
         centroids: Float64 = self.mesh.rest[self.mesh.tets].mean(axis=1)
         return centroids
 
@@ -50,11 +50,16 @@ class World:
     projection: of the elements' stiffness, the scene's choice;
     backend: where kernels run.
 
-    Symbols: docs/notation.md. What effects need of the integrator (formulas: integrator.py) instead of dt and v:
-    impulse [s]: times a force is what goes into b. reach [s]: x moves by reach (ahead + dv) until the end of the step,
-    dv the solution. ahead (n, 3) [m/s]. drift (n, 3) [m/s]: (reach ahead + beta v) / (reach + beta), what elements take
-    for the velocity, so that stiffening * (K drift) holds motion and damping. inertia: False in a quasi-static scene.
-    In backward Euler impulse = reach = dt, ahead and drift are v.
+    Effects use the following of the integrator in place of dt and v (formulas: integrator.py; symbols:
+    docs/notation.md). In backward Euler force_coefficient and dx_dv are dt, both velocities are v.
+
+    force_coefficient [s]: factor of forces in b
+    dx_dv [s]: derivative of the positions by the velocities at the end of the step
+    stiffness_coefficient (bodies,) [s2]: factor of K in A
+    predictor (n, 3) [m/s]: the step moves x by dx_dv (predictor + dv), dv the solution
+    damping_velocity (n, 3) [m/s]: (dx_dv predictor + beta v) / (dx_dv + beta). Elements take it for their velocity: the
+        impulse stiffness_coefficient (K damping_velocity) then holds displacement and damping
+    inertia: False in a quasi-static scene
     """
 
     def __init__(self, scene: Scene, backend: Backend):
@@ -74,24 +79,24 @@ class World:
         self.free = np.ones(first)
         self.beta = np.zeros(len(self.bodies))
         integrator = scene.integrator
-        self.impulse, self.reach = integrator.impulse(self.dt), integrator.reach(self.dt)
+        self.force_coefficient, self.dx_dv = integrator.force_coefficient(self.dt), integrator.dx_dv(self.dt)
         self.inertia = integrator.scheme != "quasi_static"
         self.plain = integrator.scheme == "backward_euler" and integrator.linearizations == 1
-        self.ahead = self.v if self.plain else np.zeros_like(self.v)
-        self.drift = self.v if self.plain else np.zeros_like(self.v)
+        self.predictor = self.v if self.plain else np.zeros_like(self.v)
+        self.damping_velocity = self.v if self.plain else np.zeros_like(self.v)
 
     @property
-    def stiffening(self) -> Float64:
-        """impulse (reach + beta) of each body [s2]: times K is what goes into A."""
-        return self.impulse * (self.reach + self.beta)
+    def stiffness_coefficient(self) -> Float64:
+        """force_coefficient (dx_dv + beta) of each body [s2]: factor of K in A."""
+        return self.force_coefficient * (self.dx_dv + self.beta)
 
     @property
     def nodes(self) -> int:
-        """Of all bodies."""
+        """Number of nodes of all bodies."""
         return len(self.rest)
 
     def body(self, name: str) -> Body:
-        """By name; raises KeyError."""
+        """Returns a body by name; raises KeyError."""
         for body in self.bodies:
             if body.name == name:
                 return body

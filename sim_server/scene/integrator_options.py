@@ -48,18 +48,18 @@ class IntegratorOptions(Parameters):
         """Newmark's beta and gamma [-]."""
         return (0.25 if self.beta is None else self.beta, 0.5 if self.gamma is None else self.gamma)
 
-    def impulse(self, dt: float) -> float:
+    def force_coefficient(self, dt: float) -> float:
         """Coefficient i [s] of the forces in M (v' - V) = i f (integrator.py)."""
         if self.scheme == "newmark":
             return self.newmark[1] * dt
         return 2 * dt / 3 if self.scheme == "bdf2" else dt
 
-    def reach(self, dt: float) -> float:
+    def dx_dv(self, dt: float) -> float:
         """Derivative c = dx / dv [s] of positions by velocities at the end of the step (integrator.py)."""
         if self.scheme == "newmark":
             beta, gamma = self.newmark
             return beta * dt / gamma
-        return self.impulse(dt)
+        return self.force_coefficient(dt)
 
     @property
     def rounds(self) -> int:

@@ -14,7 +14,7 @@ from sim_server.backends.gpu.energies import ENERGY_BALANCE, SUMS, node_chunks
 from sim_server.backends.gpu.structs import ENERGY_RECORD
 
 G = np.array([0.3, -9.81, 2.0])
-STILL = ("v", "dv", "ahead", "drift", "carried")
+STILL = ("v", "dv", "predictor", "damping_velocity", "inertial_increment")
 MOTION = ("x", "before", *STILL)
 TEXT = """
 #include "cuda_threads.h"

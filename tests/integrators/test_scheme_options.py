@@ -89,7 +89,7 @@ def test_the_default_has_the_launches_of_backward_euler_alone():
     sim = simulation(bar(fixed="X < 0.01"))
     names = [launch.name for launch in sim.engine.launches]
     assert names[0] == "nodes.start" and names[-1] == "nodes.advance"
-    assert sim.world.drift is sim.world.v and sim.world.ahead is sim.world.v
+    assert sim.world.damping_velocity is sim.world.v and sim.world.predictor is sim.world.v
     assert sim.engine.begin == [] and not sim.engine.loop.newton
     usual = simulation(bar(fixed="X < 0.01", tangent="usual"))
     assert [launch.name for launch in usual.engine.launches] == names

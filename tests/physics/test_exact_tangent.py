@@ -145,14 +145,18 @@ def test_single_precision_agrees(tmp_path):
     for real, dtype in (("float", np.float32), ("double", np.float64)):
         m = len(e.elements)
         x, v, gradients, lame = (a.astype(dtype) for a in (w.x, w.v, e.gradients, e.lame))
-        out: dict[str, NDArray] = {"turn": np.zeros((m, 4), dtype), "spread": np.zeros((m, 4, 4), dtype)}
-        out |= {"twist": np.zeros((m, 6), dtype), "push": np.zeros((m, 4, 3), dtype)}
+        out: dict[str, NDArray] = {"quaternion": np.zeros((m, 4), dtype)}
+        out |= {
+            "scaled_gradients": np.zeros((m, 4, 4), dtype),
+            "twist": np.zeros((m, 6), dtype),
+            "nodal_impulse": np.zeros((m, 4, 3), dtype),
+        }
         module("effects/corotational_exact.cu", real).bind(
             "elements", m, tets=e.elements, x=x, v=v, gradients=gradients, lame=lame,
-            stiffening=np.full(m, w.dt**2, dtype), h=w.dt, **out,
+            stiffness_coefficient=np.full(m, w.dt**2, dtype), h=w.dt, **out,
         )()  # fmt: skip
         found.append(out)
-    for name in ("twist", "push", "spread"):
+    for name in ("twist", "nodal_impulse", "scaled_gradients"):
         single, double = (out[name].astype(float) for out in found)
         assert np.abs(single - double).max() < 2e-5 * np.abs(double).max(), name
 

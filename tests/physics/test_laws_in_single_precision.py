@@ -26,7 +26,7 @@ def in_precision(sim, law: Law, real: str) -> dict[str, np.ndarray]:
         inputs |= {"floor": effect.floor} if effect.law.regularizes else {}
         only = {"projection": PROJECTIONS["clamp"], "clock": np.zeros(1), "refused": effect.refused.copy()}
     given = {name: array.astype(dtype) for name, array in inputs.items()}
-    step = {"v": sim.world.v.astype(dtype), "h": 0.02, "stiffening": np.full(m, 0.02**2, dtype)}
+    step = {"v": sim.world.v.astype(dtype), "h": 0.02, "stiffness_coefficient": np.full(m, 0.02**2, dtype)}
     text = module(path, real)
     text.bind("elements", m, tets=effect.elements, **given, **step, **only, **out)()
     text.bind("energy", m, tets=effect.elements, **given, **energy)()

@@ -254,17 +254,17 @@ def test_single_precision_agrees(tmp_path, size):
     for real, dtype in (("float", np.float32), ("double", np.float64)):
         m = len(e.elements)
         x, v, k, l0 = (a.astype(dtype) for a in (w.x, w.v, e.stiffness, e.length))
-        spread, push, energy = np.zeros((m, 4), dtype), np.zeros((m, 3), dtype), np.zeros(m, dtype)
+        tangent, impulse, energy = np.zeros((m, 4), dtype), np.zeros((m, 3), dtype), np.zeros(m, dtype)
         text = module("effects/mass_spring.cu", real)
         c = np.full(m, w.dt**2, dtype)
         text.bind(
-            "springs", m, ends=e.elements, x=x, v=v, stiffness=k, length=l0, stiffening=c, h=w.dt, spread=spread,
-            push=push,
+            "springs", m, ends=e.elements, x=x, v=v, stiffness=k, length=l0, stiffness_coefficient=c, h=w.dt,
+            tangent=tangent, nodal_impulse=impulse,
         )()  # fmt: skip
         text.bind("energy", m, ends=e.elements, x=x, stiffness=k, length=l0, energy=energy)()
-        d = spread[:, 3]
-        K = np.einsum("ei,ej->eij", spread[:, :3], spread[:, :3]) + d[:, None, None] * np.eye(3, dtype=dtype)
-        results.append([K, push, energy])
+        d = tangent[:, 3]
+        K = np.einsum("ei,ej->eij", tangent[:, :3], tangent[:, :3]) + d[:, None, None] * np.eye(3, dtype=dtype)
+        results.append([K, impulse, energy])
     for single, double in zip(*results, strict=True):
         assert np.abs(single - double).max() < 1e-5 * np.abs(double).max()
 

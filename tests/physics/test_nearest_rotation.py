@@ -22,14 +22,14 @@ def kernel(F: NDArray, real: str = "double") -> NDArray:
     m, dtype = len(F), np.dtype("f8" if real == "double" else "f4")
     corners = np.zeros((m, 4, 3), dtype)
     corners[:, 1:] = np.swapaxes(F, 1, 2)
-    turn = np.full((m, 4), np.nan, dtype)
+    quaternion = np.full((m, 4), np.nan, dtype)
     module("effects/corotational.cu", real).bind(
         "elements", m, tets=np.arange(4 * m, dtype=np.int32).reshape(m, 4), x=corners.reshape(-1, 3),
         v=np.zeros((4 * m, 3), dtype), gradients=np.repeat(np.eye(3, dtype=dtype).reshape(9, 1), m, axis=1),
-        lame=np.ones((2, m), dtype), stiffening=np.ones(m, dtype), h=0.01, turn=turn,
-        spread=np.zeros((m, 4, 4), dtype), push=np.zeros((m, 4, 3), dtype),
+        lame=np.ones((2, m), dtype), stiffness_coefficient=np.ones(m, dtype), h=0.01, quaternion=quaternion,
+        scaled_gradients=np.zeros((m, 4, 4), dtype), nodal_impulse=np.zeros((m, 4, 3), dtype),
     )()  # fmt: skip
-    return rotation_matrices(turn)
+    return rotation_matrices(quaternion)
 
 
 def with_singular_values(s1, s2, s3, seed: int = 1) -> NDArray:

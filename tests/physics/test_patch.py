@@ -46,7 +46,7 @@ def test_stress_is_uniform(sim, F):
     stress = R @ (YOUNG / (1 + POISSON) * (strain + strain.T) / 2 + lam * np.trace(strain) * np.eye(3))
     X = sim.world.rest[elements.elements]
     volume = np.linalg.det(X[:, 1:] - X[:, :1]) / 6
-    found = -np.einsum("mai,maj,m->mij", elements.push / sim.world.dt, X, 1 / volume)  # sum f_a (x) X_a = -V P
+    found = -np.einsum("mai,maj,m->mij", elements.nodal_impulse / sim.world.dt, X, 1 / volume)  # sum f_a (x) X_a = -V P
     assert np.abs(found - stress).max() < 1e-10 * YOUNG
 
 

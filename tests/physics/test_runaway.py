@@ -101,7 +101,7 @@ def driven(integrator: dict, gravity: tuple[float, float, float], **table) -> Si
     w, index = sim.world, [launch.name for launch in sim.engine.launches].index("gravity.gravity")
     mass = np.where(np.arange(w.nodes) < w.bodies[0].last, w.mass, 0.0)
     up = module("effects/gravity.cu").bind(
-        "gravity", w.nodes, mass=mass, g=np.array([0.0, 1e4, 0.0]), h=w.impulse, b=sim.system.b
+        "gravity", w.nodes, mass=mass, g=np.array([0.0, 1e4, 0.0]), h=w.force_coefficient, b=sim.system.b
     )
     sim.drive = lambda: sim.engine.replace(index, up)  # type: ignore[attr-defined]
     return sim
@@ -123,7 +123,7 @@ def test_a_frozen_body_stays_where_it_is_in_every_scheme(integrator):
     first = statuses.index(pb.RUNAWAY)
     assert set(statuses[first:]) == {pb.RUNAWAY}
     np.testing.assert_array_equal(sim.world.x[mine], before[first])
-    assert not sim.world.v[mine].any() and not sim.world.ahead[mine].any() and np.isfinite(sim.world.x).all()
+    assert not sim.world.v[mine].any() and not sim.world.predictor[mine].any() and np.isfinite(sim.world.x).all()
 
 
 def test_what_is_thrown_or_spun_is_no_runaway():

@@ -15,26 +15,29 @@ def in_precision(real: str, sim) -> dict[str, np.ndarray]:
     m, stencil = len(e.elements), s.stencils[0]
     x, v, gradients, lame = (a.astype(dtype) for a in (w.x, w.v, e.gradients, e.lame))
     out = {
-        "turn": np.zeros((m, 4), dtype), "spread": np.zeros((m, 4, 4), dtype), "push": np.zeros((m, 4, 3), dtype),
+        "quaternion": np.zeros((m, 4), dtype), "scaled_gradients": np.zeros((m, 4, 4), dtype),
+        "nodal_impulse": np.zeros((m, 4, 3), dtype),
         "energy": np.zeros(m, dtype), "sums": np.zeros(s.sums.shape, dtype), "b": np.zeros((w.nodes, 3), dtype),
         "block": np.zeros((w.nodes, 6), dtype), "mean": np.zeros((w.nodes, 10), dtype),
     }  # fmt: skip
     corotational = module("effects/corotational.cu", real)
     corotational.bind(
-        "elements", m, tets=e.elements, x=x, v=v, gradients=gradients, lame=lame, stiffening=np.full(m, w.dt**2, dtype),
-        h=w.dt, turn=out["turn"], spread=out["spread"], push=out["push"],
+        "elements", m, tets=e.elements, x=x, v=v, gradients=gradients, lame=lame,
+        stiffness_coefficient=np.full(m, w.dt**2, dtype), h=w.dt, quaternion=out["quaternion"],
+        scaled_gradients=out["scaled_gradients"], nodal_impulse=out["nodal_impulse"],
     )()  # fmt: skip
     corotational.bind("energy", m, tets=e.elements, x=x, gradients=gradients, lame=lame, energy=out["energy"])()
     module("effects/corotational_blocks.cu", real).bind(
-        "blocks", len(s.row), accumulate=0, start=stencil.pair_start, pairs=stencil.pairs, spread=out["spread"],
-        sums=out["sums"],
+        "blocks", len(s.row), accumulate=0, start=stencil.pair_start, pairs=stencil.pairs,
+        scaled_gradients=out["scaled_gradients"], sums=out["sums"],
     )()  # fmt: skip
     module("effects/corotational_nodes.cu", real).bind(
-        "gather", w.nodes, start=stencil.corner_start, corners=stencil.corners, push=out["push"],
-        spread=out["spread"], turn=out["turn"], b=out["b"], block=out["block"], mean=out["mean"],
+        "gather", w.nodes, start=stencil.corner_start, corners=stencil.corners, nodal_impulse=out["nodal_impulse"],
+        scaled_gradients=out["scaled_gradients"], quaternion=out["quaternion"], b=out["b"], block=out["block"],
+        mean=out["mean"],
     )()  # fmt: skip
-    sign = np.sign(out["turn"][:, :1])  # q and -q are one rotation
-    out["turn"] *= np.where(sign == 0, 1, sign)
+    sign = np.sign(out["quaternion"][:, :1])  # q and -q are one rotation
+    out["quaternion"] *= np.where(sign == 0, 1, sign)
     return {name: array.astype(float) for name, array in out.items()}
 
 

@@ -26,7 +26,7 @@ def hanging(dt: float = 0.02, young: float = 1e6, damping: tuple[float, float] =
 
 def never_at_rest(sim: Simulation) -> Simulation:
     """The same body without the floor."""
-    sim.system.gain[:] = 0
+    sim.system.inverse_time[:] = 0
     return sim
 
 

@@ -117,7 +117,7 @@ class _NativeNewton:
         self._search = (structs.Search * loop.bodies)()
         self._arrays = newton.arrays
         options = newton.options
-        self.native = structs.Newton(options.linearizations, options.trials, options.tolerance, newton.reach)
+        self.native = structs.Newton(options.linearizations, options.trials, options.tolerance, newton.dx_dv)
         for name, array in {**newton.arrays, "room": self._room}.items():
             setattr(self.native, name, array.ctypes.data)
         self.native.search = self._search

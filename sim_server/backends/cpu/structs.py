@@ -97,9 +97,11 @@ class Search(c.Structure):
 
 class Newton(c.Structure):
     _fields_ = [
-        ("linearizations", c.c_int32), ("trials", c.c_int32), ("tolerance", c.c_double), ("reach", c.c_double),
-        ("rotation", c.c_void_p), ("mass", c.c_void_p), ("beta", c.c_void_p), ("ahead", c.c_void_p),
-        ("drift", c.c_void_p), ("carried", c.c_void_p), ("room", c.c_void_p), ("search", c.POINTER(Search)),
+        ("linearizations", c.c_int32), ("trials", c.c_int32), ("tolerance", c.c_double), ("dx_dv", c.c_double),
+        ("rotation", c.c_void_p), ("mass", c.c_void_p), ("beta", c.c_void_p),
+        ("predictor", c.c_void_p),
+        ("damping_velocity", c.c_void_p), ("inertial_increment", c.c_void_p), ("room", c.c_void_p),
+        ("search", c.POINTER(Search)),
     ]  # fmt: skip
 
 

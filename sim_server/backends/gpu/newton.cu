@@ -5,7 +5,7 @@
 // applies to the body; once all bodies are done, the launches of the remaining rounds return at once.
 //
 // A thread block has a range of a body's nodes; the last one of a body to finish adds the partial sums in a fixed order and makes
-// the body's decision. Sums and the gain are double for every `real`.
+// the body's decision. Sums and the increment are double for every `real`.
 #include "pcg_structs.cuh"
 #include "newton_line_search.cuh"
 
@@ -45,13 +45,13 @@ struct NewtonArguments {
     const real* beta;              // (nodes,) [s]
     real* x;                       // (nodes, 3) [m]
     real* v;                       // (nodes, 3) [m/s]
-    real* ahead;                   // likewise
-    real* drift;
-    real* carried;
-    real* initial_state;           // (4, nodes, 3) x, v, ahead, carried before the step
-    double* gain;                  // (nodes, 3) [m/s]
-    double* way;                   // (nodes, 3) [m/s]
-    double reach;                  // [s]
+    real* predictor;               // likewise
+    real* damping_velocity;
+    real* inertial_increment;
+    real* initial_state;           // (4, nodes, 3) x, v, predictor, inertial_increment before the step
+    double* increment;             // (nodes, 3) [m/s]
+    double* direction;             // (nodes, 3) [m/s]
+    double dx_dv;                  // [s]
     double tolerance;
     int linearizations, trials, nodes, count, capacity, unused;
 };
@@ -117,26 +117,27 @@ __device__ __forceinline__ void decided(const NewtonArguments& p, int body) {
     if (phase == DONE) atomicSub(p.active, 1);
 }
 
-// Search direction of node i after the solve: R y; at the first linearization plus `ahead`, since gain begins at -ahead.
-__device__ __forceinline__ void way_of(const NewtonArguments& p, int i, bool first, double (&way)[3]) {
+// Search direction of node i after the solve: R y; at the first linearization plus the predictor, from which it starts.
+__device__ __forceinline__ void direction_of(const NewtonArguments& p, int i, bool first, double (&direction)[3]) {
     const double y[3] = {(double)p.y[3 * i], (double)p.y[3 * i + 1], (double)p.y[3 * i + 2]};
-    turn_node(p.rotation + 9ll * i, false, y, way);
+    rotate_node(p.rotation + 9ll * i, false, y, direction);
     if (!first) return;
-    const real* ahead = p.initial_state + 6ll * p.nodes + 3 * i;
-    for (int k = 0; k < 3; ++k) way[k] += ahead[k];
+    const real* predictor = p.initial_state + 6ll * p.nodes + 3 * i;
+    for (int k = 0; k < 3; ++k) direction[k] += predictor[k];
 }
 
-// Sets the state of node i to that after gain + scale way.
-__device__ __forceinline__ void place(const NewtonArguments& p, int i, double scale) {
+// Sets the state of node i to that after increment + scale direction.
+__device__ __forceinline__ void set_state(const NewtonArguments& p, int i, double scale) {
     const long long n = 3ll * p.nodes;
     for (int k = 3 * i; k < 3 * i + 3; ++k) {
-        const double gain = p.gain[k] + scale * p.way[k];
-        const Placed s = placed(p.initial_state[k], p.initial_state[n + k], p.initial_state[2 * n + k], p.initial_state[3 * n + k], gain, p.reach, p.beta[i]);
+        const double increment = p.increment[k] + scale * p.direction[k];
+        const NodeState s = state_after(p.initial_state[k], p.initial_state[n + k], p.initial_state[2 * n + k],
+                                        p.initial_state[3 * n + k], increment, p.dx_dv, p.beta[i]);
         p.x[k] = (real)s.x;
         p.v[k] = (real)s.v;
-        p.ahead[k] = 0;
-        p.carried[k] = (real)s.carried;
-        p.drift[k] = (real)s.drift;
+        p.predictor[k] = 0;
+        p.inertial_increment[k] = (real)s.inertial_increment;
+        p.damping_velocity[k] = (real)s.damping_velocity;
     }
 }
 
@@ -150,15 +151,15 @@ extern "C" __global__ void __launch_bounds__(BLOCK_NODES) begin_newton(const New
         for (int k = 3 * i; k < 3 * i + 3; ++k) {
             p.initial_state[k] = p.x[k];
             p.initial_state[n + k] = p.v[k];
-            p.initial_state[2 * n + k] = p.ahead[k];
-            p.initial_state[3 * n + k] = p.carried[k];
-            p.gain[k] = -(double)p.ahead[k];
+            p.initial_state[2 * n + k] = p.predictor[k];
+            p.initial_state[3 * n + k] = p.inertial_increment[k];
+            p.increment[k] = -(double)p.predictor[k];
             sum[0] += (double)p.b[k] * (double)p.b[k];
         }
         int k = p.row_start[i];
         if (p.row_start[i + 1] - k > 1) {  // else fixed
             while (p.columns[k] != i) ++k;
-            sum[1] = pull_square(p.values + 9ll * k, p.x + 3 * i, (double)p.mass[i], p.reach);
+            sum[1] = elastic_impulse_square(p.values + 9ll * k, p.x + 3 * i, (double)p.mass[i], p.dx_dv);
         }
     }
     if (!sum_body<BLOCK_NODES>(p, here.body, sum)) return;
@@ -177,40 +178,40 @@ extern "C" __global__ void __launch_bounds__(ALL_LANES) update_state(const Newto
     const int i = here.first + threadIdx.x / LANES, lane = threadIdx.x % LANES;
     const bool inside = i < here.last, mine = inside && lane == 0;
     if (search.phase == TRY) {
-        if (mine) place(p, i, search.scale);
+        if (mine) set_state(p, i, search.scale);
         return;
     }
     const PcgResult& r = result_of(p, here.body);
     const bool lost = r.status == NOT_FINITE, first = search.linearizations == 0;
     double sum[2] = {0, 0};
     if (!lost) {
-        double way[3] = {0, 0, 0}, turned[3], q[3] = {0, 0, 0};
+        double direction[3] = {0, 0, 0}, material[3], q[3] = {0, 0, 0};
         if (inside)
             for (int k = p.row_start[i] + lane; k < p.row_start[i + 1]; k += LANES) {
                 const real* a = p.values + 9ll * k;
-                way_of(p, p.columns[k], first, way);
-                turn_node(p.rotation + 9ll * p.columns[k], true, way, turned);
-                for (int c = 0; c < 3; ++c) q[c] += a[3 * c] * turned[0] + a[3 * c + 1] * turned[1] + a[3 * c + 2] * turned[2];
+                direction_of(p, p.columns[k], first, direction);
+                rotate_node(p.rotation + 9ll * p.columns[k], true, direction, material);
+                for (int c = 0; c < 3; ++c) q[c] += a[3 * c] * material[0] + a[3 * c + 1] * material[1] + a[3 * c + 2] * material[2];
             }
         for (int k = LANES / 2; k; k >>= 1)
             for (int c = 0; c < 3; ++c) q[c] += __shfl_xor_sync(WARP, q[c], k);
         if (mine) {
-            way_of(p, i, first, way);
-            turn_node(p.rotation + 9ll * i, true, way, turned);
+            direction_of(p, i, first, direction);
+            rotate_node(p.rotation + 9ll * i, true, direction, material);
             for (int c = 0; c < 3; ++c) {
-                sum[0] += turned[c] * q[c];
+                sum[0] += material[c] * q[c];
                 sum[1] += q[c] * q[c];
-                p.gain[3 * i + c] = gain_after(search, p.gain[3 * i + c], p.way[3 * i + c]);
-                p.way[3 * i + c] = way[c];
+                p.increment[3 * i + c] = increment_after(search, p.increment[3 * i + c], p.direction[3 * i + c]);
+                p.direction[3 * i + c] = direction[c];
             }
-            place(p, i, 1);
+            set_state(p, i, 1);
         }
     } else if (mine) {
-        for (int k = 3 * i; k < 3 * i + 3; ++k) p.gain[k] = gain_after(search, p.gain[k], p.way[k]);
+        for (int k = 3 * i; k < 3 * i + 3; ++k) p.increment[k] = increment_after(search, p.increment[k], p.direction[k]);
     }
     if (!sum_body<ALL_LANES>(p, here.body, sum)) return;
-    note_solve(search, r.residual, r.seconds, r.iterations, r.fallbacks, r.kind, r.status);
-    if (!lost) set_out(search, sum[0], sqrt(sum[1]));
+    record_solve(search, r.residual, r.seconds, r.iterations, r.fallbacks, r.kind, r.status);
+    if (!lost) begin_line_search(search, sum[0], sqrt(sum[1]));
     decided(p, here.body);
 }
 
@@ -223,17 +224,17 @@ extern "C" __global__ void __launch_bounds__(BLOCK_NODES) accept_trial(const New
     const int i = here.first + threadIdx.x;
     double sum[2] = {0, 0};
     if (i < here.last) {
-        double turned[3];
-        turn_node(p.rotation + 9ll * i, true, p.way + 3 * i, turned);
+        double material[3];
+        rotate_node(p.rotation + 9ll * i, true, p.direction + 3 * i, material);
         for (int c = 0; c < 3; ++c) {
             const double b = p.b[3 * i + c];
             sum[0] += b * b;
-            sum[1] += turned[c] * b;
+            sum[1] += material[c] * b;
             p.y[3 * i + c] = 0;  // the last solution is no initial guess for a correction
         }
     }
     if (!sum_body<BLOCK_NODES>(p, here.body, sum)) return;
-    judge_trial(search, {p.linearizations, p.trials, p.tolerance}, sqrt(sum[0]), sum[1]);
+    evaluate_trial(search, {p.linearizations, p.trials, p.tolerance}, sqrt(sum[0]), sum[1]);
     decided(p, here.body);
 }
 
@@ -245,18 +246,18 @@ extern "C" __global__ void __launch_bounds__(BLOCK_NODES) end_newton(const Newto
     if (blockIdx.x == 0 && threadIdx.x == 0) *p.active = p.count;  // of the next step
     if (i < here.last) {
         const long long n = 3ll * p.nodes;
-        double gain[3], y[3];
+        double increment[3], y[3];
         bool finite = true;
         for (int c = 0; c < 3; ++c) {
             const long long k = 3ll * i + c;
-            gain[c] = gain_after(s, p.gain[k], p.way[k]);
+            increment[c] = increment_after(s, p.increment[k], p.direction[k]);
             p.x[k] = p.initial_state[k];
             p.v[k] = p.initial_state[n + k];
-            p.ahead[k] = p.initial_state[2 * n + k];
-            p.carried[k] = p.initial_state[3 * n + k];
+            p.predictor[k] = p.initial_state[2 * n + k];
+            p.inertial_increment[k] = p.initial_state[3 * n + k];
             finite = finite && isfinite(p.b[k]);
         }
-        turn_node(p.rotation + 9ll * i, true, gain, y);
+        rotate_node(p.rotation + 9ll * i, true, increment, y);
         for (int c = 0; c < 3; ++c) p.y[3 * i + c] = (real)y[c];
         if (s.status == NOT_FINITE && !finite) atomicMin(p.bad_node + body, i - p.ranges[p.first_range[body]].first);
     }
@@ -274,5 +275,5 @@ extern "C" __global__ void __launch_bounds__(BLOCK_NODES) end_newton(const Newto
     r.fallbacks = s.fallbacks;
     const int bad = __ldcg(p.bad_node + body);
     r.bad_node = s.status == NOT_FINITE && bad != NO_NODE ? bad : -1;
-    p.newton_results[(p.step[0] % p.capacity) * p.count + body] = {remaining(s), s.linearizations > 1 ? s.linearizations : 1, 0};
+    p.newton_results[(p.step[0] % p.capacity) * p.count + body] = {residual_ratio(s), s.linearizations > 1 ? s.linearizations : 1, 0};
 }

@@ -28,11 +28,11 @@ SEARCH = np.dtype(SearchLayout)
 POINTERS = (
     "ranges", "first_range", "partial_sums", "finished_blocks", "search", "phase", "active", "bad_node", "bodies",
     "results", "newton_results", "step", "pool_counter", "row_start", "columns", "values", "b", "y", "rotation", "mass",
-    "beta", "x", "v", "ahead", "drift", "carried", "initial_state", "gain", "way",
+    "beta", "x", "v", "predictor", "damping_velocity", "inertial_increment", "initial_state", "increment", "direction",
 )  # fmt: skip
 NUMBERS = ("linearizations", "trials", "nodes", "count", "capacity", "unused")
 NEWTON_ARGUMENTS = np.dtype(
-    [(n, "u8") for n in POINTERS] + [("reach", "f8"), ("tolerance", "f8")] + [(n, "i4") for n in NUMBERS]
+    [(n, "u8") for n in POINTERS] + [("dx_dv", "f8"), ("tolerance", "f8")] + [(n, "i4") for n in NUMBERS]
 )
 
 
@@ -113,13 +113,14 @@ class NewtonIteration:
             "search": cp.zeros(bodies * SEARCH.itemsize, np.uint8), "phase": phases.phase, "active": phases.active,
             "bad_node": cp.zeros(bodies, np.int32), "step": solver.counter, "pool_counter": solver.pool_counter,
             "results": solver.results,
-            "initial_state": cp.zeros(12 * nodes, real), "gain": cp.zeros(3 * nodes), "way": cp.zeros(3 * nodes),
+            "initial_state": cp.zeros(12 * nodes, real), "increment": cp.zeros(3 * nodes),
+            "direction": cp.zeros(3 * nodes),
         }  # fmt: skip
         self._params = np.zeros((), NEWTON_ARGUMENTS)
         for name, array in self._memory.items():
             self._params[name] = array.data.ptr
         self._params["newton_results"], self._params["bodies"] = results.ctypes.data, solver.bodies_device
-        self._params["reach"], self._params["tolerance"] = newton.reach, newton.options.tolerance
+        self._params["dx_dv"], self._params["tolerance"] = newton.dx_dv, newton.options.tolerance
         self._params["linearizations"], self._params["trials"] = newton.options.linearizations, newton.options.trials
         self._params["nodes"], self._params["count"] = nodes, bodies
         self._params["capacity"] = results.nbytes // NEWTON_RESULT.itemsize // bodies

@@ -14,7 +14,7 @@ struct Elements {
     const local* gradients;   // (9, n) rest gradients of the shape functions of nodes 1, 2, 3, one after another [1/m]
     const local* volume;      // (n,) [m3]
     const local* constants;   // (2, n) lambda, mu [Pa]
-    const local* stiffening;  // (n,) factor of the tangent [s2]
+    const local* stiffness_coefficient;  // (n,) factor of the tangent [s2]
     local h;                  // factor of the force [s]
     local* corners;           // (4, n, 9) out: h f_a - factor (K v)_a [N s], upper triangle of factor K_aa [kg]
     local* edges;             // (6, n, 9) out: factor K_ab, a < b [kg]
@@ -34,7 +34,7 @@ template <class T> INLINE mat<T> outer(const T (&M)[27], vec<T> d) {
 }
 
 struct Read {
-    local_vec3 D[4], v[3], push[4];
+    local_vec3 D[4], v[3], impulse[4];
     local_number A[81];
 };
 
@@ -47,11 +47,11 @@ INLINE void evaluated(const Elements& p, index i, Read& e) {
     local_mat3 g, P;
     for (int k = 0; k < 9; ++k) g.m[k] = at_items(p.gradients + k * p.n, i);
     for (int k = 0; k < 3; ++k) e.D[k + 1] = row(g, k);
-    spread_to_four(e.D);
-    local_number volume = at_items(p.volume, i), k = volume * at_items(p.stiffening, i), force = -p.h * volume;
+    set_corner_0(e.D);
+    local_number volume = at_items(p.volume, i), k = volume * at_items(p.stiffness_coefficient, i), force = -p.h * volume;
     derivatives(outer3(edges[0], edges[1], edges[2], g), at_items(p.constants, i), at_items(p.constants + p.n, i), P, e.A);
     UNROLL for (int m = 0; m < 81; ++m) e.A[m] *= k;
-    for (int a = 0; a < 4; ++a) e.push[a] = force * mul(P, e.D[a]);
+    for (int a = 0; a < 4; ++a) e.impulse[a] = force * mul(P, e.D[a]);
 }
 
 // The blocks of the six edges; those of the corners follow by translation.
@@ -64,7 +64,7 @@ KERNEL(elements, Elements) {
         inner(e.A, e.D[b], M);
         UNROLL for (int a = 0; a < b; ++a) B.e[a == 0 ? b - 1 : a + b] = outer(M, e.D[a]);
     }
-    leave(B, e.push, e.v, p.corners, p.edges, p.n, i);
+    store_element(B, e.impulse, e.v, p.corners, p.edges, p.n, i);
 }
 
 // All sixteen blocks, as a stiffness of 12x12 has them.
@@ -78,7 +78,7 @@ KERNEL(all_blocks, Elements) {
         UNROLL for (int a = 0; a < 4; ++a) K[a][b] = outer(M, e.D[a]);
     }
     UNROLL for (int a = 0; a < 4; ++a) {
-        local_vec3 f = e.push[a];
+        local_vec3 f = e.impulse[a];
         UNROLL for (int b = 1; b < 4; ++b) f = f - mul(K[a][b], e.v[b - 1]);
         const local_number* m = K[a][a].m;
         const local_number row[9] = {f.x, f.y, f.z, m[0], m[1], m[2], m[4], m[5], m[8]};

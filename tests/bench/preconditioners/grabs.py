@@ -112,7 +112,7 @@ def _grab(sim: Simulation, touch: Touch, hand: Hand) -> Interaction:
     order = np.argsort(distance)
     near, radius = order[: hand.nodes], float(distance[order[hand.nodes - 1 : hand.nodes + 1]].mean())
     own = float((s.diagonal + s.block[:, [0, 3, 5]].sum(axis=1) / 3)[near].mean())
-    stiffness = hand.nodes * hand.stiffness * own / (w.impulse * w.reach)
+    stiffness = hand.nodes * hand.stiffness * own / (w.force_coefficient * w.dx_dv)
     at = (float(point[0]), float(point[1]), float(point[2]))
     held = touch.grab("bench", "beam", at, radius, at, stiffness, 0.0, 1e9)
     assert len(held.nodes) == hand.nodes

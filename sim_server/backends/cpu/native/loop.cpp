@@ -149,9 +149,9 @@ static void finish_step(Loop* loop) {
         double nonlinear = -1;
         SolveResult r;
         if (loop->newton) {
-            r = found(loop->newton->search[i]);
+            r = as_solve_result(loop->newton->search[i]);
             linearizations = std::max(1, loop->newton->search[i].linearizations);
-            nonlinear = remaining(loop->newton->search[i]);
+            nonlinear = residual_ratio(loop->newton->search[i]);
         } else {
             BlockCsr A{body.first, body.last, loop->row_start, loop->columns, loop->values};
             r = pcg(A, loop->b + 3 * body.first, body.factor, settings, loop->y + 3 * body.first,

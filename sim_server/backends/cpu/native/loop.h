@@ -36,11 +36,11 @@ struct Body {
 
 struct Newton {                        // several linearizations a step (newton.h)
     Limits most;
-    double reach;                      // dx / dv [s]
+    double dx_dv;                      // dx / dv [s]
     const double* rotation;            // (nodes, 3, 3)
     const double* mass;                // (nodes,) in A [kg]
     const double* beta;                // (nodes,) [s]
-    double *ahead, *drift, *carried;   // (nodes, 3) [m/s]
+    double *predictor, *damping_velocity, *inertial_increment;  // (nodes, 3) [m/s]
     double* room;                      // 18 doubles a node
     Search* search;                    // (bodies,)
 };

@@ -1,22 +1,23 @@
 // SPDX-License-Identifier: MIT
-// Newton-Raphson within a step on a CPU: what it is stands in kernels/newton_line_search.cuh.
+// Newton-Raphson within a step on a CPU (method: kernels/newton_line_search.cuh).
 #pragma once
 #include <algorithm>
 
 #include "loop.h"
 
-struct Room {  // parts of a body's share of Newton::room, (3 n,) each
+struct BodyRoom {  // views of a body's part of Newton::room, (3 n,) each
     int n;
-    double *x, *v, *ahead, *carried, *gain, *way;
-    Room(const Newton& newton, const Body& body) : n(3 * (body.last - body.first)) {
+    double *x, *v, *predictor, *inertial_increment, *increment, *direction;
+    BodyRoom(const Newton& newton, const Body& body) : n(3 * (body.last - body.first)) {
         x = newton.room + 18 * (int64_t)body.first;
-        v = x + n; ahead = v + n; carried = ahead + n; gain = carried + n; way = gain + n;
+        v = x + n; predictor = v + n; inertial_increment = predictor + n;
+        increment = inertial_increment + n; direction = increment + n;
     }
 };
 
 static double norm(int n, const double* a) { return std::sqrt(dot(n, a, a)); }
 
-// Of b.
+// Rounding error of b.
 static double rounding(const Loop& loop, const Body& body) {
     const Newton& newton = *loop.newton;
     double sum = 0;
@@ -24,7 +25,7 @@ static double rounding(const Loop& loop, const Body& body) {
         int k = loop.row_start[i], end = loop.row_start[i + 1];
         if (end - k < 2) continue;  // fixed
         while (loop.columns[k] != i) ++k;
-        sum += pull_square(loop.values + 9 * (int64_t)k, loop.x + 3 * i, newton.mass[i], newton.reach);
+        sum += elastic_impulse_square(loop.values + 9 * (int64_t)k, loop.x + 3 * i, newton.mass[i], newton.dx_dv);
     }
     return EPSILON<double> * std::sqrt(sum);
 }
@@ -32,38 +33,39 @@ static double rounding(const Loop& loop, const Body& body) {
 static void begin_search(Loop& loop, int index) {
     const Newton& newton = *loop.newton;
     const Body& body = loop.body[index];
-    Room room(newton, body);
+    BodyRoom room(newton, body);
     const int64_t at = 3 * (int64_t)body.first;
     for (int k = 0; k < room.n; ++k) {
         room.x[k] = loop.x[at + k];
         room.v[k] = loop.v[at + k];
-        room.ahead[k] = newton.ahead[at + k];
-        room.carried[k] = newton.carried[at + k];
-        room.gain[k] = -room.ahead[k];
+        room.predictor[k] = newton.predictor[at + k];
+        room.inertial_increment[k] = newton.inertial_increment[at + k];
+        room.increment[k] = -room.predictor[k];
     }
     start_search(newton.search[index], norm(room.n, loop.b + at), rounding(loop, body), body.now.kind);
 }
 
-// The state after gain + scale * way.
-static void place(Loop& loop, const Body& body, double scale) {
+// Sets the state to that after increment + scale * direction.
+static void set_state(Loop& loop, const Body& body, double scale) {
     const Newton& newton = *loop.newton;
-    Room room(newton, body);
+    BodyRoom room(newton, body);
     const int64_t at = 3 * (int64_t)body.first;
     for (int k = 0; k < room.n; ++k) {
-        const double gain = room.gain[k] + scale * room.way[k], beta = newton.beta[body.first + k / 3];
-        const Placed p = placed(room.x[k], room.v[k], room.ahead[k], room.carried[k], gain, newton.reach, beta);
+        const double increment = room.increment[k] + scale * room.direction[k], beta = newton.beta[body.first + k / 3];
+        const NodeState p =
+            state_after(room.x[k], room.v[k], room.predictor[k], room.inertial_increment[k], increment, newton.dx_dv, beta);
         loop.x[at + k] = p.x;
         loop.v[at + k] = p.v;
-        newton.ahead[at + k] = 0;
-        newton.carried[at + k] = p.carried;
-        newton.drift[at + k] = p.drift;
+        newton.predictor[at + k] = 0;
+        newton.inertial_increment[at + k] = p.inertial_increment;
+        newton.damping_velocity[at + k] = p.damping_velocity;
     }
 }
 
-// to = R from, or R^T from
-static void turn(const Newton& newton, const Body& body, bool back, const double* from, double* to) {
+// to = R from; back: R^T from
+static void rotate(const Newton& newton, const Body& body, bool back, const double* from, double* to) {
     for (int i = 0; i < body.last - body.first; ++i)
-        turn_node(newton.rotation + 9 * (int64_t)(body.first + i), back, from + 3 * i, to + 3 * i);
+        rotate_node(newton.rotation + 9 * (int64_t)(body.first + i), back, from + 3 * i, to + 3 * i);
 }
 
 // One linearization, if it is the body's turn.
@@ -72,60 +74,60 @@ static void solve(Loop& loop, int index) {
     Body& body = loop.body[index];
     Search& search = newton.search[index];
     if (search.phase != SOLVE) return;
-    Room room(newton, body);
+    BodyRoom room(newton, body);
     const int64_t at = 3 * (int64_t)body.first;
-    double *y = loop.y + at, *work = loop.work + 27 * (int64_t)body.first, *turned = work, *product = work + room.n;
+    double *y = loop.y + at, *work = loop.work + 27 * (int64_t)body.first, *material = work, *product = work + room.n;
     BlockCsr A{body.first, body.last, loop.row_start, loop.columns, loop.values};
     SolveSettings settings = body.now;
     settings.warm_start = settings.warm_start && search.linearizations == 0;  // the last step's is no guess for a correction
     SolveResult r = pcg(A, loop.b + at, body.factor, settings, y, work, !loop.moving[index], &body.correction);
-    note_solve(search, r.residual, r.seconds, r.iterations, r.fallbacks, r.kind, r.status);
+    record_solve(search, r.residual, r.seconds, r.iterations, r.fallbacks, r.kind, r.status);
     if (search.phase == DONE) {
-        for (int k = 0; k < room.n; ++k) room.gain[k] = gain_after(search, room.gain[k], room.way[k]);
+        for (int k = 0; k < room.n; ++k) room.increment[k] = increment_after(search, room.increment[k], room.direction[k]);
         return;
     }
-    turn(newton, body, false, y, room.way);
+    rotate(newton, body, false, y, room.direction);
     if (search.linearizations == 0)
-        for (int k = 0; k < room.n; ++k) room.way[k] += room.ahead[k];
-    turn(newton, body, true, room.way, turned);
-    const double slope = multiply(A, turned, product);
-    set_out(search, slope, norm(room.n, product));
-    place(loop, body, 1);
+        for (int k = 0; k < room.n; ++k) room.direction[k] += room.predictor[k];
+    rotate(newton, body, true, room.direction, material);
+    const double slope = multiply(A, material, product);
+    begin_line_search(search, slope, norm(room.n, product));
+    set_state(loop, body, 1);
 }
 
-// What becomes of a trial: taken, made shorter, or the end.
+// Evaluates a trial: accept, reduce the scale, or end. Returns the phase.
 static int judge(Loop& loop, int index) {
     const Newton& newton = *loop.newton;
     const Body& body = loop.body[index];
     Search& search = newton.search[index];
     if (search.phase != TRY) return search.phase;
-    Room room(newton, body);
+    BodyRoom room(newton, body);
     const double* b = loop.b + 3 * (int64_t)body.first;
-    double* turned = loop.work + 27 * (int64_t)body.first;
-    turn(newton, body, true, room.way, turned);
-    const int verdict = judge_trial(search, newton.most, norm(room.n, b), dot(room.n, turned, b));
-    if (verdict == SHORTER) place(loop, body, search.scale);
+    double* material = loop.work + 27 * (int64_t)body.first;
+    rotate(newton, body, true, room.direction, material);
+    const int verdict = evaluate_trial(search, newton.most, norm(room.n, b), dot(room.n, material, b));
+    if (verdict == SHORTER) set_state(loop, body, search.scale);
     else
-        for (int k = 0; k < room.n; ++k) room.gain[k] = gain_after(search, room.gain[k], room.way[k]);
+        for (int k = 0; k < room.n; ++k) room.increment[k] = increment_after(search, room.increment[k], room.direction[k]);
     return search.phase;
 }
 
-// The state before the step again, and y so that `advance` makes of it what was found.
+// Restores the state before the step and sets y so that `advance` reaches the state that was found.
 static void end_search(Loop& loop, int index) {
     const Newton& newton = *loop.newton;
     const Body& body = loop.body[index];
-    Room room(newton, body);
+    BodyRoom room(newton, body);
     const int64_t at = 3 * (int64_t)body.first;
     for (int k = 0; k < room.n; ++k) {
         loop.x[at + k] = room.x[k];
         loop.v[at + k] = room.v[k];
-        newton.ahead[at + k] = room.ahead[k];
-        newton.carried[at + k] = room.carried[k];
+        newton.predictor[at + k] = room.predictor[k];
+        newton.inertial_increment[at + k] = room.inertial_increment[k];
     }
-    turn(newton, body, true, room.gain, loop.y + at);
+    rotate(newton, body, true, room.increment, loop.y + at);
 }
 
-// As of one solve.
-static SolveResult found(const Search& search) {
+// The search in the form of one solve.
+static SolveResult as_solve_result(const Search& search) {
     return SolveResult{search.residual, search.seconds, search.iterations, search.status, search.kind, search.fallbacks};
 }
