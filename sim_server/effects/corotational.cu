@@ -3,7 +3,7 @@
 #define WIDE
 #include "corotational.cuh"
 
-struct Elements {
+struct CorotationalElements {
     int n;                               // elements
     const int* tets;                     // (n, 4) nodes
     const real* x;                       // (nodes, 3) positions [m]
@@ -17,7 +17,7 @@ struct Elements {
     local* nodal_impulse;                // (n, 4, 3) out: h f_a + h (c + beta) (K v)_a [N s]
 };
 
-KERNEL(elements, Elements) {
+KERNEL(elements, CorotationalElements) {
     index tet[4];
     get_item_row(p.tets, i, tet);
     local_mat3 g = rest_gradients(p.gradients, p.n, i);
@@ -35,7 +35,7 @@ KERNEL(elements, Elements) {
     put_row(p.quaternion, i, p.n, wxyz);
 }
 
-struct Energy {
+struct CorotationalEnergy {
     int n;                   // elements
     const int* tets;         // (n, 4)
     const real* x;           // (nodes, 3) [m]
@@ -44,7 +44,7 @@ struct Energy {
     local* energy;           // (n,) out: V (mu |S - I|^2 + lambda / 2 tr(S - I)^2), S = R^T F [J]
 };
 
-KERNEL(energy, Energy) {
+KERNEL(energy, CorotationalEnergy) {
     index tet[4];
     get_item_row(p.tets, i, tet);
     local_mat3 F = gradient(p.x, tet, rest_gradients(p.gradients, p.n, i));

@@ -5,7 +5,7 @@
 #include "corotational.cuh"
 #include "eigen3.cuh"
 
-struct Elements {
+struct CorotationalExactElements {
     int n;                               // elements
     const int* tets;                     // (n, 4) nodes
     const real* x;                       // (nodes, 3) positions [m]
@@ -39,7 +39,7 @@ INLINE local_mat3 twists(const local_mat3& S, local_number lambda, local_number 
     return symmetric(E.m[0], E.m[1], E.m[2], E.m[4], E.m[5], E.m[8]);
 }
 
-KERNEL(elements, Elements) {
+KERNEL(elements, CorotationalExactElements) {
     index tet[4];
     get_item_row(p.tets, i, tet);
     local_mat3 g = rest_gradients(p.gradients, p.n, i);

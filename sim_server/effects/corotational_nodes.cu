@@ -2,7 +2,7 @@
 // Collects at each node what its elements left for it: a gather, so that no two items write one place.
 #include "corotational_tangent.cuh"
 
-struct Gather {
+struct CorotationalNodes {
     int n;                          // nodes
     const int* start;               // (n + 1,) into corners
     const int* corners;             // (start[n],) slots 4 e + a of the elements at the node
@@ -14,7 +14,7 @@ struct Gather {
     own<local> mean;                // (n, 10) in, out: upper triangle of the sum of q q^T, q the elements' rotations
 };
 
-INLINE void gather_add(const Gather& p, int, int k, local* sum) {
+INLINE void gather_add(const CorotationalNodes& p, int, int k, local* sum) {
     int corner = p.corners[k];
     const local* f = p.nodal_impulse + 3 * corner;
     local g[4], q[4];
@@ -25,10 +25,10 @@ INLINE void gather_add(const Gather& p, int, int k, local* sum) {
     add_quaternion_product(sum + 9, q);
 }
 
-INLINE void gather_put(const Gather& p, int i, const local* sum) {
+INLINE void gather_put(const CorotationalNodes& p, int i, const local* sum) {
     for (int m = 0; m < 3; ++m) row_put<3>(p.b, i, m, row_at<3>(p.b, i, m) + sum[m]);
     for (int m = 0; m < 6; ++m) row_put<6>(p.block, i, m, row_at<6>(p.block, i, m) + sum[3 + m]);
     for (int m = 0; m < 10; ++m) row_put<10>(p.mean, i, m, row_at<10>(p.mean, i, m) + sum[9 + m]);
 }
 
-SUM_KERNEL(gather, Gather, 19)
+SUM_KERNEL(gather, CorotationalNodes, 19)

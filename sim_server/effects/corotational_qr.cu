@@ -4,7 +4,7 @@
 #include "corotational.cuh"
 #include "gram_schmidt.cuh"
 
-struct Elements {
+struct CorotationalQrElements {
     int n;                               // elements
     const int* tets;                     // (n, 4) nodes
     const real* x;                       // (nodes, 3) positions [m]
@@ -28,7 +28,7 @@ INLINE local_mat3 turned(const real* x, const index (&tet)[4], const local_mat3&
     return between(unit(edge), unit(row(g, 2)), scale * first, scale * second);
 }
 
-KERNEL(elements, Elements) {
+KERNEL(elements, CorotationalQrElements) {
     index tet[4];
     get_item_row(p.tets, i, tet);
     local_mat3 g = rest_gradients(p.gradients, p.n, i);
@@ -41,7 +41,7 @@ KERNEL(elements, Elements) {
     put_row(p.quaternion, i, p.n, {q.w, q.x, q.y, q.z});
 }
 
-struct Energy {
+struct CorotationalQrEnergy {
     int n;                   // elements
     const int* tets;         // (n, 4)
     const real* x;           // (nodes, 3) [m]
@@ -50,7 +50,7 @@ struct Energy {
     local* energy;           // (n,) out: V (mu |e|^2 + lambda / 2 tr(e)^2), e the symmetric part of R^T F - I [J]
 };
 
-KERNEL(energy, Energy) {
+KERNEL(energy, CorotationalQrEnergy) {
     index tet[4];
     get_item_row(p.tets, i, tet);
     local_mat3 g = rest_gradients(p.gradients, p.n, i);

@@ -5,7 +5,7 @@
 
 constexpr int CONSTANTS = 8;  // a [Pa], b of ff, fs, fn, ss, sn, nn [-], bulk [Pa]
 
-struct Elements {
+struct CostaElements {
     int n;                               // elements
     int projection;                      // of the tangent
     const int* tets;                     // (n, 4) nodes
@@ -39,7 +39,7 @@ template <class T> INLINE T exponential(const T (&c)[CONSTANTS], const mat<T>& F
     return stress;
 }
 
-KERNEL(elements, Elements) {
+KERNEL(elements, CostaElements) {
     typedef local_number T;
     index tet[4];
     local_vec3 v[3];
@@ -91,7 +91,7 @@ KERNEL(elements, Elements) {
     store_element(B, impulse, v, p.corners, p.edges, p.n, i);
 }
 
-struct Energy {
+struct CostaEnergy {
     int n;                   // elements
     const int* tets;         // (n, 4)
     const real* x;           // (nodes, 3) [m]
@@ -101,7 +101,7 @@ struct Energy {
     local* energy;           // (n,) out: V W [J]; NaN where the law is not defined
 };
 
-KERNEL(energy, Energy) {
+KERNEL(energy, CostaEnergy) {
     typedef local_number T;
     index tet[4];
     Tetrahedron<T> t = element_at(p, i, tet);

@@ -3,7 +3,7 @@
 #define WIDE
 #include "hyperelastic.cuh"
 
-struct Elements {
+struct FibresElements {
     int n;                               // elements
     const int* tets;                     // (n, 4) nodes
     const real* x;                       // (nodes, 3) positions [m]
@@ -31,7 +31,7 @@ template <class T> INLINE Family<T> family(const local* directions, int n, index
     return f;
 }
 
-KERNEL(elements, Elements) {
+KERNEL(elements, FibresElements) {
     typedef local_number T;
     index tet[4];
     local_vec3 v[3], impulse[4];
@@ -57,7 +57,7 @@ KERNEL(elements, Elements) {
     store_element(B, impulse, v, p.corners, p.edges, p.n, i);
 }
 
-struct Energy {
+struct FibresEnergy {
     int n;                    // elements
     const int* tets;          // (n, 4)
     const real* x;            // (nodes, 3) [m]
@@ -68,7 +68,7 @@ struct Energy {
     local* energy;            // (n,) out: V W [J]
 };
 
-KERNEL(energy, Energy) {
+KERNEL(energy, FibresEnergy) {
     typedef local_number T;
     index tet[4];
     Tetrahedron<T> t = element_at(p, i, tet);

@@ -37,7 +37,7 @@ KERNEL(springs, Springs) {
     put_row(p.nodal_impulse, i, p.n, {f.x, f.y, f.z});
 }
 
-struct Energy {
+struct MassSpringEnergy {
     int n;                   // elements
     const int* ends;         // (n, 2)
     const real* x;           // (nodes, 3) [m]
@@ -46,7 +46,7 @@ struct Energy {
     local* energy;           // (n,) out: k / 2 (l - l0)^2 [J]
 };
 
-KERNEL(energy, Energy) {
+KERNEL(energy, MassSpringEnergy) {
     local_vec3 d = difference(p.x, p.ends, i);
     local_number longer = sqrt(dot(d, d)) - at_items(p.length, i);
     put(p.energy, i, (local)0.5 * at_items(p.stiffness, i) * longer * longer);

@@ -2,7 +2,7 @@
 // The tangent of springs off the diagonal, -(g g^T + d I): one spring a block, or a few side by side.
 #include "coalesced_io.cuh"
 
-struct Blocks {
+struct MassSpringBlocks {
     int n;                 // blocks above the diagonal
     int accumulate;        // 0: write, 1: add to what another effect wrote
     const int* start;      // (n + 1,) into pairs
@@ -11,7 +11,7 @@ struct Blocks {
     own<local> sums;       // (n, 9) out, world frame, row major [kg]
 };
 
-INLINE void blocks_add(const Blocks& p, int, int k, local* s) {
+INLINE void blocks_add(const MassSpringBlocks& p, int, int k, local* s) {
     local g[4];
     get_row(p.tangent, p.pairs[k] >> 2, g);
     local xy = g[0] * g[1], xz = g[0] * g[2], yz = g[1] * g[2];
@@ -20,8 +20,8 @@ INLINE void blocks_add(const Blocks& p, int, int k, local* s) {
     s[6] -= xz; s[7] -= yz; s[8] -= g[2] * g[2] + g[3];
 }
 
-INLINE void blocks_put(const Blocks& p, int i, const local* sum) {
+INLINE void blocks_put(const MassSpringBlocks& p, int i, const local* sum) {
     for (int m = 0; m < 9; ++m) row_put<9>(p.sums, i, m, p.accumulate ? row_at<9>(p.sums, i, m) + sum[m] : sum[m]);
 }
 
-SUM_KERNEL(blocks, Blocks, 9)
+SUM_KERNEL(blocks, MassSpringBlocks, 9)

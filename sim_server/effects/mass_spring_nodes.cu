@@ -2,7 +2,7 @@
 // Collects at each node what its springs left for it: a gather, so that no two items write one place.
 #include "coalesced_io.cuh"
 
-struct Gather {
+struct MassSpringNodes {
     int n;                       // nodes
     const int* start;            // (n + 1,) into corners
     const int* corners;          // (start[n],) 2 e + a: end a of spring e is at the node
@@ -12,7 +12,7 @@ struct Gather {
     own<local> block;            // (n, 6) in, out: upper triangle of the node's own block of A, world frame [kg]
 };
 
-INLINE void gather_add(const Gather& p, int, int k, local* sum) {
+INLINE void gather_add(const MassSpringNodes& p, int, int k, local* sum) {
     int corner = p.corners[k];
     const local* f = p.nodal_impulse + 3 * (corner >> 1);
     const local sign = corner & 1 ? -1 : 1;
@@ -23,9 +23,9 @@ INLINE void gather_add(const Gather& p, int, int k, local* sum) {
     sum[6] += g[1] * g[1] + g[3]; sum[7] += g[1] * g[2]; sum[8] += g[2] * g[2] + g[3];
 }
 
-INLINE void gather_put(const Gather& p, int i, const local* sum) {
+INLINE void gather_put(const MassSpringNodes& p, int i, const local* sum) {
     for (int m = 0; m < 3; ++m) row_put<3>(p.b, i, m, row_at<3>(p.b, i, m) + sum[m]);
     for (int m = 0; m < 6; ++m) row_put<6>(p.block, i, m, row_at<6>(p.block, i, m) + sum[3 + m]);
 }
 
-SUM_KERNEL(gather, Gather, 9)
+SUM_KERNEL(gather, MassSpringNodes, 9)

@@ -5,7 +5,7 @@
 
 constexpr int TERMS = 3, CONSTANTS = 2 * TERMS + 1;  // mu_p [Pa], alpha_p [-], bulk [Pa]
 
-struct Elements {
+struct OgdenElements {
     int n;                               // elements
     int projection;                      // of the tangent
     const int* tets;                     // (n, 4) nodes
@@ -45,7 +45,7 @@ template <class T> INLINE T logarithmic(const T (&c)[CONSTANTS], const T (&s)[3]
     return W;
 }
 
-KERNEL(elements, Elements) {
+KERNEL(elements, OgdenElements) {
     typedef local_number T;
     index tet[4];
     local_vec3 v[3];
@@ -93,7 +93,7 @@ KERNEL(elements, Elements) {
     store_element(B, impulse, v, p.corners, p.edges, p.n, i);
 }
 
-struct Energy {
+struct OgdenEnergy {
     int n;                   // elements
     const int* tets;         // (n, 4)
     const real* x;           // (nodes, 3) [m]
@@ -103,7 +103,7 @@ struct Energy {
     local* energy;           // (n,) out: V W [J]; NaN where the law is not defined
 };
 
-KERNEL(energy, Energy) {
+KERNEL(energy, OgdenEnergy) {
     typedef local_number T;
     index tet[4];
     Tetrahedron<T> e = element_at(p, i, tet);

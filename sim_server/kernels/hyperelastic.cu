@@ -5,7 +5,7 @@
 #include "invariants.cuh"
 #include LAW
 
-struct Elements {
+struct HyperelasticElements {
     int n;                               // elements
     int projection;                      // of the tangent
     const int* tets;                     // (n, 4) nodes
@@ -23,7 +23,7 @@ struct Elements {
     local* edges;                        // (6, n, 9) out: factor K_ab, a < b [kg]
 };
 
-KERNEL(elements, Elements) {
+KERNEL(elements, HyperelasticElements) {
     index tet[4];
     local_vec3 v[3];
     Tetrahedron<local_number> t = element_at(p, i, tet);
@@ -53,7 +53,7 @@ KERNEL(elements, Elements) {
     store_element(B, impulse, v, p.corners, p.edges, p.n, i);
 }
 
-struct Energy {
+struct HyperelasticEnergy {
     int n;                   // elements
     const int* tets;         // (n, 4)
     const real* x;           // (nodes, 3) [m]
@@ -64,7 +64,7 @@ struct Energy {
     local* energy;           // (n,) out: V W [J]; NaN where the law is not defined
 };
 
-KERNEL(energy, Energy) {
+KERNEL(energy, HyperelasticEnergy) {
     index tet[4];
     Tetrahedron<local_number> t = element_at(p, i, tet);
     local_number c[CONSTANTS], floor = at_items(p.floor, i);

@@ -263,30 +263,30 @@ def _launch(path: str, struct: str, name: str, mailed: bool = False) -> SimpleNa
 
 NODES = [
     ("kernels/nodes.cu", "Start", "nodes.start"),
-    ("effects/corotational_nodes.cu", "Gather", "corotational_nodes.gather"),
-    ("effects/corotational_exact_nodes.cu", "Gather", "corotational_exact_nodes.gather"),
-    ("effects/mass_spring_nodes.cu", "Gather", "mass_spring_nodes.gather"),
+    ("effects/corotational_nodes.cu", "CorotationalNodes", "corotational_nodes.gather"),
+    ("effects/corotational_exact_nodes.cu", "CorotationalExactNodes", "corotational_exact_nodes.gather"),
+    ("effects/mass_spring_nodes.cu", "MassSpringNodes", "mass_spring_nodes.gather"),
     ("effects/touch.cu", "Apply", "touch.apply", True), ("effects/gravity.cu", "Gravity", "gravity.gravity"),
     ("kernels/gather_forces.cu", "GatherForces", "gather_forces.gather"),
     ("kernels/shape_matching.cu", "Match", "shape_matching.match"),
     ("kernels/nodes.cu", "Rotate", "nodes.rotate"),
 ]  # fmt: skip
 ELEMENTS = [
-    ("effects/corotational.cu", "Elements", "corotational.elements"),
-    ("effects/corotational_qr.cu", "Elements", "corotational_qr.elements"),
-    ("effects/corotational_exact.cu", "Elements", "corotational_exact.elements"),
+    ("effects/corotational.cu", "CorotationalElements", "corotational.elements"),
+    ("effects/corotational_qr.cu", "CorotationalQrElements", "corotational_qr.elements"),
+    ("effects/corotational_exact.cu", "CorotationalExactElements", "corotational_exact.elements"),
     ("effects/mass_spring.cu", "Springs", "mass_spring.springs"),
 ]  # fmt: skip
 LAW_ELEMENTS = [
-    (f"{FRAME}+effects/neo_hookean.cuh", "Elements", "neo_hookean.elements"),
-    (f"{FRAME}+effects/mooney_rivlin.cuh", "Elements", "mooney_rivlin.elements"),
-    ("effects/fibres.cu", "Elements", "fibres.elements"),
+    (f"{FRAME}+effects/neo_hookean.cuh", "HyperelasticElements", "neo_hookean.elements"),
+    (f"{FRAME}+effects/mooney_rivlin.cuh", "HyperelasticElements", "mooney_rivlin.elements"),
+    ("effects/fibres.cu", "FibresElements", "fibres.elements"),
 ]
 OTHER_SCHEME = [("kernels/time_integration.cu", "Inertia", "time_integration.inertia"), *NODES[1:]]
 BLOCKS = [
-    ("effects/corotational_blocks.cu", "Blocks", "corotational_blocks.blocks"),
-    ("effects/corotational_exact_blocks.cu", "Blocks", "corotational_exact_blocks.blocks"),
-    ("effects/mass_spring_blocks.cu", "Blocks", "mass_spring_blocks.blocks"),
+    ("effects/corotational_blocks.cu", "CorotationalBlocks", "corotational_blocks.blocks"),
+    ("effects/corotational_exact_blocks.cu", "CorotationalExactBlocks", "corotational_exact_blocks.blocks"),
+    ("effects/mass_spring_blocks.cu", "MassSpringBlocks", "mass_spring_blocks.blocks"),
     ("kernels/gather_blocks.cu", "GatherBlocks", "gather_blocks.gather"),
     ("kernels/rotate_blocks.cu", "RotateBlocks", "rotate_blocks.rotate_blocks"),
 ]

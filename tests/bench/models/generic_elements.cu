@@ -6,7 +6,7 @@
 #include "hyperelastic.cuh"
 #include LAW
 
-struct Elements {
+struct GenericElements {
     int n;                    // elements
     const int* tets;          // (n, 4) nodes
     const real* x;            // (nodes, 3) positions [m]
@@ -38,7 +38,7 @@ struct Read {
     local_number A[81];
 };
 
-INLINE void evaluated(const Elements& p, index i, Read& e) {
+INLINE void evaluated(const GenericElements& p, index i, Read& e) {
     index tet[4];
     get_item_row(p.tets, i, tet);
     local_vec3 edges[3];
@@ -55,7 +55,7 @@ INLINE void evaluated(const Elements& p, index i, Read& e) {
 }
 
 // The blocks of the six edges; those of the corners follow by translation.
-KERNEL(elements, Elements) {
+KERNEL(elements, GenericElements) {
     Read e;
     evaluated(p, i, e);
     Blocks6<local_number> B;
@@ -68,7 +68,7 @@ KERNEL(elements, Elements) {
 }
 
 // All sixteen blocks, as a stiffness of 12x12 has them.
-KERNEL(all_blocks, Elements) {
+KERNEL(all_blocks, GenericElements) {
     Read e;
     evaluated(p, i, e);
     local_mat3 K[4][4];
