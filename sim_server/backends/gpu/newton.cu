@@ -141,7 +141,7 @@ __device__ __forceinline__ void set_state(const NewtonArguments& p, int i, doubl
     }
 }
 
-// Begins the iteration after the first assembly of a step: keeps the state, and sets gain = -ahead.
+// Begins the iteration after the first assembly of a step: keeps the state, and sets increment = -predictor.
 extern "C" __global__ void __launch_bounds__(BLOCK_NODES) begin_newton(const NewtonArguments p) {
     const NodeRange here = p.ranges[blockIdx.x];
     const int i = here.first + threadIdx.x;
