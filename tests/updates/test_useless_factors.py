@@ -9,6 +9,7 @@ import pytest
 
 from precond_worker.factorization.registry import make_factorization
 from protocol.factor import Factor
+from sim_server.backends.base import Capability
 from sim_server.backends.cpu.engine import Kind
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
@@ -151,7 +152,7 @@ def test_a_loop_that_takes_the_next_one_later_goes_without_until_it_has(monkeypa
     dropped = state.factors.newest
     assert state.factors.dropped == (dropped, Kind.CHOLESKY) and settings.kind == Kind.BLOCK_JACOBI
     in_use = [dropped]
-    monkeypatch.setattr(driver.engine, "exact", False, raising=False)
+    monkeypatch.setattr(driver.engine, "capabilities", driver.engine.capabilities - {Capability.EXACT_STEPS})
     monkeypatch.setattr(driver.engine, "factor_step", lambda body: in_use[0])
     source.bad, source.submit = False, submit
     records = driver.advance(6)
