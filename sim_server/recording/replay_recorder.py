@@ -37,7 +37,7 @@ class Trace:
         self._updates: deque[tuple[PendingUpdate, list[Interaction]]] = deque()
         self._shown: set[int] = set()  # ids whose nodes the log holds
         self._workers: dict[str, pb.WorkerInfo] = {}
-        driver.adopted = self._factors.append
+        driver.on_adopt.append(self._factors.append)
         self._touch = driver.simulation.touch
         driver.simulation.on_effect_update.append(self._on_update)
 

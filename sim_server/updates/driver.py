@@ -55,7 +55,7 @@ class Driver:
         self.wants_factors = self.solver.wants_factors
         if self.wants_factors:
             self.check.prepare()
-        self.adopted: Callable[[Factor], None] = lambda factor: None  # called with every factor put into a mailbox
+        self.on_adopt: list[Callable[[Factor], Any]] = []  # called with every factor that the loop is given
         self.snapshots = SnapshotPool(simulation, self.source, self.policy.expected_latency)
         self.useless_factors = UselessFactors(self)
         self._observer = SolveObserver(self)
@@ -155,12 +155,14 @@ class Driver:
         if not state.on_factor(factor, self.engine.step):
             return
         self.engine.post_factor(state.body.index, factor.pattern, factor.values, factor.step)
-        # Tell the log how it was made
+        # Tell observers how it was made
         method, extrapolated = state.factors.method(factor.step), state.job.extrapolated
         at_end = Capability.MATRIX_POSITIONS not in self.engine.capabilities
         later = state.job.positions and at_end and factor.worker != self.inline.WORKER
         made = replace(factor, ahead=extrapolated, later=later) if extrapolated or later else factor
-        self.adopted(replace(made, method=method.name) if method else made)
+        made = replace(made, method=method.name) if method else made
+        for observe in self.on_adopt:
+            observe(made)
         # Let `auto` try it
         if state.tuner is not None:
             state.tuner.on_factor(method)

@@ -111,7 +111,7 @@ def test_any_factor_is_corrected_by_the_change_and_stays_positive_definite(metho
     precision = np.dtype(dtype).name
     sim, touch = touched(preconditioner=method, factor_precision=precision, update="lockstep-40")
     driver, posted = Driver(sim), []
-    driver.adopted = posted.append
+    driver.on_adopt.append(posted.append)
     stays, goes = grab(sim, touch, 3.0), touch.grab("anna", "bar", (2, 0, 0), 0, (2, 0, 0.1), spring(sim, 2.0), 0, 1e9)
     driver.step_with_fresh_factors()
     driver.advance(2)
@@ -283,7 +283,7 @@ def test_factors_posted_again_at_the_same_steps_are_corrected_alike():
     sims = [touched(**options) for _ in range(2)]
     (sim, _), (other, _) = sims
     driver, posted, records = Driver(sim), {}, []
-    driver.adopted = lambda factor: posted.setdefault(sim.engine.step, factor)
+    driver.on_adopt.append(lambda factor: posted.setdefault(sim.engine.step, factor))
     for step in range(14):
         if step == 5:
             for each, its in sims:

@@ -147,7 +147,7 @@ def driven(update: str, bad: dict[int, str]) -> Driver:
 def test_a_bad_one_is_refused_and_the_old_one_stays(caplog):
     driver = driven("lockstep-2", {2: "identity", 6: "nan", 8: "identity"})
     adopted: list[int] = []
-    driver.adopted = lambda factor: adopted.append(factor.step)
+    driver.on_adopt.append(lambda factor: adopted.append(factor.step))
     with caplog.at_level(logging.WARNING):
         records = driver.advance(15)
     assert records["factor_step"].tolist() == [-1, -1, 0, 0, 0, 0, 4, 4, 4, 4, 4, 4, 10, 10, 12]

@@ -108,7 +108,7 @@ def _run(sim: Simulation, link: ServerLink, steps: int, first: int) -> Found:
         found.seconds.append(factor.seconds)
         found.latencies.append(max(1, sim.engine.step - factor.step))
 
-    driver.adopted = adopted
+    driver.on_adopt.append(adopted)
     loop = threading.Thread(target=sim.engine.run, args=(1 << 40,))
     loop.start()
     try:

@@ -51,7 +51,7 @@ class Published:
 
     def __post_init__(self) -> None:
         self.driver = Driver(self.sim, self.link.dispatch, counted=False)
-        self.driver.adopted = self._adopted
+        self.driver.on_adopt.append(self._adopted)
         submit = self.link.dispatch.submit
 
         def noted(job: Job) -> bool:

@@ -56,7 +56,7 @@ def run(beam: Beam, load: Load, way: Way, steps: int, device: str = "cpu", **sol
     source = BuildingInline(sim) if way.extrapolate else _worker(sim, way.latency) if way.latency else None
     driver = Driver(sim, source, counted=True)
     made: list[float] = []  # ms
-    driver.adopted = lambda factor: made.append(1e3 * factor.seconds)
+    driver.on_adopt.append(lambda factor: made.append(1e3 * factor.seconds))
     early = driver.wants_factors and driver.solver.update.kind in ("lockstep", "async", "adaptive")
     first = [driver.step_with_fresh_factors()] if early else []
     r = np.concatenate([*first, driver.advance(steps - len(first))])

@@ -72,7 +72,7 @@ def round_of(found: Found, name: str, cells: tuple[int, int, int], steps: int, l
     overrides = [f"solver.{key}={value}" for key, value in solver.items()]
     sim = Simulation.load(SCENES / "heterogeneous.toml", [*overrides, f"object.beam.mesh.bar={list(cells)}"])
     driver, factors = Driver(sim), list[Factor]()
-    driver.adopted = factors.append
+    driver.on_adopt.append(factors.append)
     r = driver.advance(latency + steps)[latency:]
     found.iterations.append(float(r["iterations"].mean()))
     found.most = max(found.most, int(r["iterations"].max()))
