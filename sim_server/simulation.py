@@ -1,9 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""A scene made ready to run: effects built, the launches of a step listed, the native loop set up.
+"""Start reading here: a scene made ready to run, its effects built and the kernels of a step listed for the engine.
 
 THE STEP is the list made in `launches`: backward Euler with one linearization (Courtecuisse et al. 2010, eq. 5),
     (M - h B - h^2 K) dv = h f + h^2 K v,    v += dv,    x += h v,
-unless the scene asks for another integrator (integrator.py). Start reading there.
+unless the scene asks for another integrator (mechanics/integrator.py). The engine (backends/base.py) runs it.
+
+matrix  updates/driver.py has the engine copy one (`request_matrix`); network/dispatch.py sends it to a worker
+factor  comes back to updates/driver.py, which checks it and gives it to the engine (`post_factor`)
+push    service/commands.py carries it out on effects/touch.py, which calls `update_effect` here
+record  service/telemetry.py fetches those of the engine (`records`) for recording/recorder.py and network/publishers.py
 """
 
 from collections.abc import Callable, Sequence
@@ -195,7 +200,7 @@ def build_effects(scene: Scene, world: World) -> dict[str, Effect]:
     for name in sorted({n for o in scene.objects for n in o.effects}):
         variants: dict[str, list[tuple[Body, Any]]] = {}
         for body, params in world.with_effect(name):
-            variants.setdefault(getattr(params, "variant", ""), []).append((body, params))
+            variants.setdefault(params.variant, []).append((body, params))
         for variant, listed in variants.items():
             built[name + variant] = effect(name).build(world, listed)
     for name, params in scene.effects.items():

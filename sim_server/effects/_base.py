@@ -110,7 +110,7 @@ class Effect:
 class Build(Protocol):
     """Of an effect's module. listed: the bodies that have it, each with its parameters (scene effects: all bodies).
 
-    Where parameters have a `variant`, bodies that differ in it are not built together: each variant has other kernels.
+    Bodies whose parameters differ in `variant` are not built together: each variant has other kernels.
     """
 
     def __call__(self, world: World, listed: list[tuple[Body, Any]]) -> Effect: ...

@@ -32,6 +32,11 @@ class Parameters(BaseModel):
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
+    @property
+    def variant(self) -> str:
+        """Of an effect: bodies whose parameters differ in it get other kernels (effects/_base.py, Build)."""
+        return ""
+
     @model_validator(mode="wrap")
     @classmethod
     def _name_the_known_keys(cls, table: Any, validate: ValidatorFunctionWrapHandler) -> Any:
