@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from protocol.push_limits import ORPHANED_PUSH
+from sim_server.backends.base import PendingUpdate
 from sim_server.effects._base import Effect
 from sim_server.effects.touch import Touch, TouchError
 from sim_server.simulation import Simulation
@@ -96,6 +97,17 @@ def test_changes_together_are_given_to_the_loop_as_one():
     assert given == [first] * 4 + [touch]
     assert np.array_equal(apart.world.x, once.world.x)
     assert touch.known()[0].start == 0.0 and touch.known()[0].target == (2.0, 0.9, 0.5)
+
+
+def test_observers_learn_in_which_step_the_loop_took_a_change_up():
+    sim, touch = held_bar()
+    given: list[PendingUpdate] = []
+    sim.on_effect_update.append(lambda effect, pending: given.append(pending))
+    sim.engine.run(3)
+    touch.push("anna", "bar", END, 0.6, (0, 5, 0), 1.0)
+    assert len(given) == 1 and given[0].taken < 0
+    sim.engine.run(2)
+    assert given[0].taken == 3
 
 
 def test_nodes_of_the_named_body_only():

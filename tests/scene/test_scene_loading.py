@@ -168,7 +168,8 @@ def imported_by(program):
     report = (
         "\nimport json, sys\n"
         "prefix = 'sim_server.effects.'\n"
-        "print(json.dumps(sorted(m[len(prefix):] for m in sys.modules if m.startswith(prefix))))"
+        "names = sorted(m[len(prefix):] for m in sys.modules if m.startswith(prefix))\n"
+        "print(json.dumps([name for name in names if not name.startswith('_')]))"
     )
     done = subprocess.run(
         [sys.executable, "-c", program + report],
