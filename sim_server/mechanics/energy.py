@@ -47,7 +47,9 @@ class NativeEnergies:
     def __init__(self, energies: Energies):
         self._energies, w = energies, energies.world
         self._parts = [energies.parts(e) for e in energies.elastic]
-        self._bindings = [structs.Binding(c.addressof(e.launch.params), e.launch.items) for e in energies.elastic]
+        self._bindings = [
+            structs.Binding(params=c.addressof(e.launch.params), items=e.launch.items) for e in energies.elastic
+        ]
         self._elastic = (structs.Elastic * max(len(energies.elastic), 1))()
         for entry, e, parts, binding in zip(self._elastic, energies.elastic, self._parts, self._bindings, strict=False):
             entry.launch.kernel, entry.launch.binding = e.launch.function, c.addressof(binding)
@@ -66,6 +68,6 @@ class NativeEnergies:
         arrays["left"] = self._left = np.zeros((2, w.nodes, 3))
         for name, array in arrays.items():
             setattr(self.native, name, array.ctypes.data)
-        self.native.still, self.native.stills = self._still, len(self._still)
-        self.native.elastic, self.native.elastics = self._elastic, len(energies.elastic)
+        self.native.still, self.native.stills = c.addressof(self._still), len(self._still)
+        self.native.elastic, self.native.elastics = c.addressof(self._elastic), len(energies.elastic)
         self.native.on_runaway, self.native.inertia = CODES[energies.on_runaway], int(w.inertia)

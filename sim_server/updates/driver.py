@@ -64,7 +64,7 @@ class Driver:
     # --- steps --------------------------------------------------------------------------------------------------
 
     def advance(self, steps: int) -> NDArray[Any]:
-        """Makes steps; returns their records (engine.RECORD)."""
+        """Makes steps; returns their records (structs.RECORD)."""
         out: list[NDArray[Any]] = []
         for _ in range(steps):
             if self.wants_factors:

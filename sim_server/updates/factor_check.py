@@ -26,13 +26,8 @@ MIN_SHARE = 0.9  # of what block Jacobi takes off, for a factor to be used; not 
 def _library() -> c.CDLL:
     p = c.c_void_p
     arguments = [c.POINTER(structs.Factor), c.c_int32, p, p, p, p, p, p]
-    signatures: dict[str, tuple[Any, list[Any]]] = {"wf_judge": (None, arguments), "wf_sizes": (c.c_int32, [p])}
-    library = native("backends/cpu/native/factor_check.cpp", signatures, stepping=False)
-    sizes = (c.c_int32 * 2)()
-    library.wf_sizes(sizes)
-    structs.check_sizes(
-        "backends/cpu/native/factor_check.cpp", list(sizes), [c.sizeof(structs.Factor), c.sizeof(structs.Pattern)]
-    )
+    library = native("backends/cpu/native/factor_check.cpp", {"wf_judge": (None, arguments)}, stepping=False)
+    structs.TEXT.check_sizes(library)
     return library
 
 

@@ -85,7 +85,7 @@ def test_bytes_of_a_step() -> None:
 
 
 def test_percentiles_leave_out_steps_without_a_factor() -> None:
-    from sim_server.backends.cpu.engine import RECORD
+    from sim_server.backends.cpu.structs import RECORD
 
     records = np.zeros(4, RECORD)
     records["factor_step"], records["step"], records["whole"] = [-1, 0, 0, 0], [1, 2, 3, 4], [9, 1e-6, 2e-6, 3e-6]

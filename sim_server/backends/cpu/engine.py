@@ -20,7 +20,6 @@ from sim_server.backends.base import Capability, EngineInput, Launch
 from sim_server.backends.compiler import native
 from sim_server.backends.cpu import structs
 from sim_server.backends.cpu.device import CpuLaunch
-from sim_server.backends.cpu.structs import RECORD
 from sim_server.backends.ring_buffers import Reports
 from sim_server.mechanics.energy import NativeEnergies
 from sim_server.mechanics.newton import Newton
@@ -48,17 +47,11 @@ def _library() -> c.CDLL:
             "wf_assemble": (None, [loop]), "wf_solve": (None, [loop]), "wf_run": (c.c_int64, [loop, c.c_int64]),
             "wf_wait": (c.c_int32, [loop]),
             "wf_post_factor": (p, [c.POINTER(structs.Body), p]), "wf_post_binding": (p, [c.POINTER(structs.Launch), p]),
-            "wf_apply_factor": (None, [c.POINTER(structs.Factor), p, p, p]), "wf_sizes": (c.c_int32, [p]),
+            "wf_apply_factor": (None, [c.POINTER(structs.Factor), p, p, p]),
             "wf_precondition": (None, [loop, c.c_int32, p, p, p]),
         },
     )  # fmt: skip
-    sizes = (c.c_int32 * 11)()
-    library.wf_sizes(sizes)
-    newton = [c.sizeof(structs.Newton), c.sizeof(structs.Search)]
-    energy = [c.sizeof(structs.Elastic), c.sizeof(structs.Energies), structs.BALANCE.itemsize]
-    shared = (structs.Launch, structs.Body, structs.Loop, structs.Factor, structs.Pattern)
-    ours = [*(c.sizeof(t) for t in shared), RECORD.itemsize, *newton, *energy]
-    structs.check_sizes("backends/cpu/native/loop.cpp", list(sizes), ours)
+    structs.TEXT.check_sizes(library)
     return library
 
 
@@ -72,10 +65,13 @@ class NativeFactor:
         sizes = width * height - width * (width - 1) // 2
         self._value_start = np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64)
         self._pattern = structs.Pattern(
-            pattern.size, len(width), pattern.permutation.ctypes.data, pattern.super_start.ctypes.data,
-            pattern.row_start.ctypes.data, pattern.rows.ctypes.data, self._value_start.ctypes.data,
+            size=pattern.size, supernodes=len(width), permutation=pattern.permutation.ctypes.data,
+            super_start=pattern.super_start.ctypes.data, row_start=pattern.row_start.ctypes.data,
+            rows=pattern.rows.ctypes.data, value_start=self._value_start.ctypes.data,
         )  # fmt: skip
-        self.native = structs.Factor(c.pointer(self._pattern), values.ctypes.data, step, values.itemsize, 0)
+        self.native = structs.Factor(
+            pattern=c.addressof(self._pattern), values=values.ctypes.data, step=step, bytes=values.itemsize
+        )
 
     @classmethod
     def empty(cls, pattern: FactorPattern, dtype: np.dtype | type) -> "NativeFactor":
@@ -117,14 +113,20 @@ class _NativeNewton:
         self._search = (structs.Search * loop.bodies)()
         self._arrays = newton.arrays
         options = newton.options
-        self.native = structs.Newton(options.linearizations, options.trials, options.tolerance, newton.dx_dv)
+        limits = structs.Limits(options.linearizations, options.trials, options.tolerance)
+        self.native = structs.Newton(most=limits, dx_dv=newton.dx_dv)
         for name, array in {**newton.arrays, "room": self._room}.items():
             setattr(self.native, name, array.ctypes.data)
-        self.native.search = self._search
-        loop.newton = c.pointer(self.native)
+        self.native.search = c.addressof(self._search)
+        loop.newton = c.addressof(self.native)
         self._parts = newton.parts
         for launch, part in zip(launches, newton.parts, strict=False):
             launch.parts = None if part is None else part.ctypes.data
+
+
+def _binding(launch: CpuLaunch) -> structs.Binding:
+    """Arguments of a launch that the loop has not taken up yet."""
+    return structs.Binding(params=c.addressof(launch.params), items=launch.items, taken=-1)
 
 
 class CpuEngine(Reports):
@@ -138,7 +140,7 @@ class CpuEngine(Reports):
         arrays, ranges = given.arrays, given.ranges
         nodes, bodies = len(arrays["x"]), len(ranges)
         self.launches = launches
-        self._bindings = [structs.Binding(c.addressof(x.params), x.items, 0, -1) for x in launches]
+        self._bindings = [_binding(x) for x in launches]
         self._launch = (structs.Launch * max(len(launches), 1))()
         for entry, launch, binding in zip(self._launch, launches, self._bindings, strict=False):
             entry.kernel, entry.binding = launch.function, c.addressof(binding)
@@ -153,14 +155,14 @@ class CpuEngine(Reports):
         self._posted: dict[int, Any] = {}
         loop = structs.Loop()
         super().__init__(loop, bodies, given.dt, records, np.zeros((frames, 2, nodes, 3)))
-        loop.launches, loop.before, loop.launch = len(launches), len(given.assemble), self._launch
-        loop.bodies, loop.nodes, loop.body = bodies, nodes, self._body
+        loop.launches, loop.before, loop.launch = len(launches), len(given.assemble), c.addressof(self._launch)
+        loop.bodies, loop.nodes, loop.body = bodies, nodes, c.addressof(self._body)
         for name in ("row_start", "columns", "values", "b", "y", "x", "v", "clock", "moving"):
             setattr(loop, name, arrays[name].ctypes.data)
         loop.work, loop.threads = self._work.ctypes.data, given.solver.threads
         self._newton = given.newton and _NativeNewton(given.newton, loop, self._launch)
         self._energies = NativeEnergies(given.energies)
-        loop.energies = c.pointer(self._energies.native)
+        loop.energies = c.addressof(self._energies.native)
         self.begin: Sequence[Launch] = ()  # before the first step
 
     # --- running ------------------------------------------------------------------------------------------------
@@ -192,9 +194,9 @@ class CpuEngine(Reports):
         """
         return bool(self._native.wf_wait(c.byref(self.loop)))
 
-    def settings(self, body: int) -> structs.Settings:
+    def settings(self, body: int) -> structs.SolveSettings:
         """Solver settings of a body; what is set holds from its next solve on."""
-        settings: structs.Settings = self._body[body].settings
+        settings: structs.SolveSettings = self._body[body].settings
         return settings
 
     def correct(self, body: int, nodes: int, diagonal: Reals, double: bool = False) -> None:
@@ -208,7 +210,8 @@ class CpuEngine(Reports):
         entry = self._body[body]
         count, width = entry.last - entry.first, -(-3 * nodes // 8) * 8
         room: dict[str, NDArray[Any]] = {
-            "last": np.full(count, 0.0), "then": np.full(count, 0.0), "change": np.full((HISTORY, 3), 0.0),
+            "last": np.full(count, 0.0), "then": np.full(count, 0.0),
+            "change": np.zeros(HISTORY, structs.CHANGE),
             "node": np.full(nodes, 0, np.int32), "supernode": np.full(3 * count, 0, np.int32),
             "marked": np.full(3 * count, 0, np.uint8), "delta": np.full(nodes, 0.0),
             "small": np.full(4 * width**2 + 2 * width, 0.0),
@@ -302,8 +305,7 @@ class CpuEngine(Reports):
     def replace(self, launch: int, new: Launch) -> structs.Binding:
         """Gives a launch other arguments, from the next step on: the one after the result's `taken` steps, once it is
         not below 0."""
-        new = cast(CpuLaunch, new)
-        binding = structs.Binding(c.addressof(new.params), new.items, 0, -1)
+        binding = _binding(cast(CpuLaunch, new))
         displaced = self._native.wf_post_binding(c.byref(self._launch[launch]), c.addressof(binding))
         kept = self._posted.setdefault(launch, [])  # in use, waiting
         if displaced:

@@ -7,6 +7,7 @@
 
 #include <algorithm>
 
+#include "../cpu/native/sizes.h"
 #include "readback.h"
 
 // Copies new arguments, settings and factors to the device, in the order of the steps, from memory that stays unchanged meanwhile.
@@ -180,10 +181,10 @@ void wf_gpu_start_balance(Balance* balance, const double* sums, double dt, int32
     start_balance(*balance, s, sums[3], dt, inertia);
 }
 
-int32_t wf_gpu_sizes(int32_t* sizes) {  // compared with those of Python (mailbox.py)
-    int32_t ours[] = {sizeof(CudaDriver), sizeof(Mail), sizeof(MailSlot), sizeof(PcgResult), sizeof(StepTimestamp), sizeof(NewtonResult), sizeof(BodyReadback),
-                      sizeof(GpuLoop), sizeof(Record), sizeof(EnergyRecord), sizeof(Balance)};
-    std::memcpy(sizes, ours, sizeof ours);
-    return sizeof ours / sizeof *ours;
+const StructSize* wf_sizes() {
+    static const StructSize sizes[] = {SIZE(CudaDriver), SIZE(Mail), SIZE(MailSlot), SIZE(PcgResult), SIZE(StepTimestamp),
+                                       SIZE(NewtonResult), SIZE(BodyReadback), SIZE(GpuLoop), SIZE(Record), SIZE(EnergyRecord),
+                                       SIZE(Balance), {}};
+    return sizes;
 }
 }

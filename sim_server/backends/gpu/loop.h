@@ -66,7 +66,7 @@ struct StepBatch {                     // steps whose results are looked at toge
 
 struct FrameCopy { void *taken, *arrived; };  // events: copied on the device, copied to the host
 
-enum { STEP_BATCHES = 2, FRAME_COPIES = 4 };  // under way at most
+constexpr int STEP_BATCHES = 2, FRAME_COPIES = 4;  // under way at most
 
 struct GpuLoop {
     const CudaDriver* driver;

@@ -6,9 +6,7 @@ from functools import cache
 from typing import Any
 
 from sim_server.backends.compiler import native
-from sim_server.backends.cpu.structs import BALANCE, RECORD, check_sizes
 from sim_server.backends.gpu import structs
-from sim_server.backends.gpu.structs import ENERGY_RECORD, NEWTON_RESULT, STEP_TIMESTAMP
 
 
 @cache
@@ -21,18 +19,10 @@ def library() -> c.CDLL:
             "wf_gpu_run": (c.c_int64, [loop, c.c_int64]), "wf_gpu_wait": (c.c_int32, [loop]),
             "wf_gpu_open": (c.c_int32, [loop]), "wf_gpu_renew": (c.c_int32, [loop]),
             "wf_gpu_close": (c.c_int32, [loop]), "wf_gpu_post": (p, [c.POINTER(structs.MailSlot), p]),
-            "wf_gpu_start_balance": (None, [p, p, c.c_double, c.c_int32]), "wf_gpu_sizes": (c.c_int32, [p]),
+            "wf_gpu_start_balance": (None, [p, p, c.c_double, c.c_int32]),
         },
     )  # fmt: skip
-    sizes = (c.c_int32 * 11)()
-    compiled.wf_gpu_sizes(sizes)
-    from sim_server.backends.gpu.solver import PCG_RESULT
-
-    structures = (structs.CudaDriver, structs.Mail, structs.MailSlot)
-    ours = [*map(c.sizeof, structures), PCG_RESULT.itemsize, STEP_TIMESTAMP.itemsize, NEWTON_RESULT.itemsize]
-    ours += [c.sizeof(structs.BodyReadback), c.sizeof(structs.GpuLoop)]
-    ours += [RECORD.itemsize, ENERGY_RECORD.itemsize, BALANCE.itemsize]
-    check_sizes("backends/gpu/loop.cpp", list(sizes), ours)
+    structs.TEXT.check_sizes(compiled)
     return compiled
 
 

@@ -9,7 +9,9 @@ import ctypes as c
 import numpy as np
 
 from sim_server.backends.cpu.structs import Rings
+from sim_server.backends.declarations import Declarations
 
+TEXT = Declarations("backends/gpu/loop.h")
 p, i64 = c.c_void_p, c.c_int64
 REQUEST_VALUES, REQUEST_POSITIONS = 1, 2  # of a BodyReadback
 STEP_BATCHES, FRAME_COPIES = 2, 4  # largest numbers of batches and of frames under way

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: MIT
 // What one application of a factor says about it, beside one of block Jacobi. For the service thread; no loop calls this.
 #include "pcg.h"
+#include "sizes.h"
 
 extern "C" {
 
@@ -21,9 +22,8 @@ void wf_judge(const Factor* factor, int32_t nodes, const int32_t* row_start, con
     out[3] = multiply(A, z, q);
 }
 
-int32_t wf_sizes(int32_t* sizes) {  // layouts, checked against the Python side
-    sizes[0] = sizeof(Factor);
-    sizes[1] = sizeof(Pattern);
-    return 2;
+const StructSize* wf_sizes() {
+    static const StructSize sizes[] = {SIZE(Factor), SIZE(Pattern), {}};
+    return sizes;
 }
 }

@@ -6,6 +6,7 @@
 
 #include "energy.h"
 #include "newton.h"
+#include "sizes.h"
 
 static_assert(NOT_FINITE == STATUS_NOT_FINITE && RUNAWAY == STATUS_RUNAWAY, "statuses of ring_buffers.h and pcg.h differ");
 
@@ -234,10 +235,9 @@ void wf_precondition(Loop* loop, int32_t index, const double* r, double* z, doub
     P.apply(r, std::sqrt(dot(A.size(), r, r)), z);
 }
 
-int32_t wf_sizes(int32_t* sizes) {  // layouts, checked against the Python side
-    sizes[0] = sizeof(Launch); sizes[1] = sizeof(Body); sizes[2] = sizeof(Loop); sizes[3] = sizeof(Factor);
-    sizes[4] = sizeof(Pattern); sizes[5] = sizeof(Record); sizes[6] = sizeof(Newton); sizes[7] = sizeof(Search);
-    sizes[8] = sizeof(Elastic); sizes[9] = sizeof(Energies); sizes[10] = sizeof(Balance);
-    return 11;
+const StructSize* wf_sizes() {
+    static const StructSize sizes[] = {SIZE(Launch), SIZE(Body), SIZE(Loop), SIZE(Factor), SIZE(Pattern), SIZE(Record),
+                                       SIZE(Newton), SIZE(Search), SIZE(Elastic), SIZE(Energies), SIZE(Balance), {}};
+    return sizes;
 }
 }

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: MIT
-// Memory of the simulation loop (loop.cpp). structs.py holds the same layouts.
+// Memory of the simulation loop (loop.cpp). structs.py reads their layouts.
 #pragma once
 #include "energy_balance.cuh"
 #include "pcg.h"
@@ -10,7 +10,6 @@ typedef void (*Kernel)(const void* params, int begin, int end);
 struct Binding {           // arguments of a launch, replaceable between steps
     const void* params;
     int32_t items;
-    int32_t unused;
     int64_t taken;   // steps completed when the loop took it up, -1: it has not
 };
 
@@ -63,7 +62,6 @@ struct Energies {                      // energy.h
     double* left;                      // (2, nodes, 3) x and v when the loop was left
     int32_t stills, elastics, on_runaway, inertia;
     int32_t begun;                     // the energy before the first step is known
-    int32_t unused;
 };
 
 struct Loop {
@@ -84,7 +82,6 @@ struct Loop {
     int32_t* moving;                   // (bodies,) 0: the body rests (kernels/nodes.cu)
     Energies* energies;                // or null
     int32_t threads;                   // of this process, for launches and bodies
-    int32_t unused;
     double assemble_begin;
     double assemble_seconds;
     double cpu_begin;

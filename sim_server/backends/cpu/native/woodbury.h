@@ -23,13 +23,12 @@ struct Factor {
     const void* values;
     int64_t step;      // of the matrix it was made from
     int32_t bytes;     // of a value: 4 or 8
-    int32_t unused;
 };
 
 struct Change {        // of the diagonal of a node
     int64_t step;      // whose matrix is the first with the new value
     double before;     // the old one [kg]
-    int32_t node, unused;
+    int32_t node;
 };
 
 struct Correction {
@@ -39,7 +38,7 @@ struct Correction {
     int32_t count;          // nodes of V; 0: none is made
     int32_t supernodes;     // of V
     int32_t usable;         // W is there and what it makes is positive definite
-    int32_t used, unused;   // nodes corrected in the last solve with a factor
+    int32_t used;           // nodes corrected in the last solve with a factor
     int64_t changes;        // so far
     int64_t forgotten;      // step of the newest change that is not remembered any more
     int64_t step;           // of the factor that `then` and V are for
@@ -316,7 +315,7 @@ static void note_changes(Correction& c, int64_t step, bool first) {
         Change& change = c.change[c.changes % c.history];
         if (c.changes >= c.history) c.forgotten = change.step;
         ++c.changes;
-        change = Change{step, c.last[i], i, 0};
+        change = Change{step, c.last[i], i};
         c.last[i] = c.diagonal[i];
     }
 }
