@@ -118,6 +118,11 @@ class Declarations:
         found = re.findall(r"\benum (\w*) ?\{(.*?)\}", text, re.DOTALL)
         return {name: {n: int(number) for n, number in re.findall(r"(\w+) = (-?\d+)", body)} for name, body in found}
 
+    @cached_property
+    def _bodies(self) -> dict[str, str]:
+        pattern = r"^struct (?:__align__\(\d+\) )?(\w+) \{(.*?)\};"
+        return dict(re.findall(pattern, self.text, re.DOTALL | re.MULTILINE))
+
     def constant(self, name: str) -> Any:
         """A constexpr number: int, or float where its type is double."""
         pattern = rf"^(?:static )?constexpr (\w+) (?:[^;]*,\s*)?{name} = ([-+.\w]+)"
@@ -128,11 +133,10 @@ class Declarations:
 
     def members(self, struct: str) -> list[Member]:
         """Members of a struct, in order."""
-        found = re.search(rf"\bstruct (?:__align__\(\d+\) )?{struct} \{{(.*?)\}};", self.text, re.DOTALL)
-        if found is None:
+        if struct not in self._bodies:
             raise ValueError(f"no struct {struct} in {self._path}")
         try:
-            return list(split_members(found[1]))
+            return list(split_members(self._bodies[struct]))
         except ValueError as error:
             raise ValueError(f"{self._path}, struct {struct}: {error}") from None
 
