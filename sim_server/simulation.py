@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from sim_server import backends
 from sim_server.backends.base import Backend, Capability, EngineInput, Launch, PendingUpdate
 from sim_server.backends.compiler import ahead
-from sim_server.backends.cpu.engine import Kind
+from sim_server.backends.kinds import Kind
 from sim_server.effects import effect
 from sim_server.effects._base import Effect, Refusal
 from sim_server.errors import DeviceError, InputError

@@ -12,9 +12,9 @@
 //     longer: in a slender body the minimum along a straight direction is a short step.
 //   - The first direction starts at the state before the step, u = -p0: its first trial is the result of one linearization.
 //   - The iteration ends when |b| <= tolerance |b of the step's first linearization|, or when b is rounding.
-// The including file defines Status (backends/cpu/native/pcg.h, backends/gpu/pcg_structs.cuh).
 #pragma once
 #include "host_device.cuh"
+#include "kinds.h"
 
 constexpr double SLOPE_REDUCTION = 0.9;
 template <class T> constexpr double EPSILON = sizeof(T) == 8 ? 2.2e-16 : 1.2e-7;  // T: type in which forces are computed

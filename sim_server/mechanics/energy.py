@@ -8,11 +8,17 @@ import numpy as np
 
 from sim_server.arrays import Float64, Int32
 from sim_server.backends.cpu import structs
+from sim_server.backends.kinds import BALANCE
 from sim_server.effects._base import Effect, ElementEnergies
 from sim_server.mechanics.world import World
 from sim_server.scene.solver_options import OnRunaway
 
-CODES: dict[OnRunaway | None, int] = {"freeze": 0, "go_on": 1, None: 2}  # None: bodies are not watched at all
+_numbers = BALANCE.enumeration("OnRunaway")
+CODES: dict[OnRunaway | None, int] = {  # None: bodies are not watched at all
+    "freeze": _numbers["FREEZE"],
+    "go_on": _numbers["GO_ON"],
+    None: _numbers["UNWATCHED"],
+}
 
 
 class Energies:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from protocol import messages_pb2 as pb
 from protocol.method import Method
 from protocol.process.version import version
-from sim_server.backends.cpu.engine import Kind
+from sim_server.backends.kinds import Kind
 from sim_server.mechanics.world import Body
 from sim_server.mesh import posed
 from sim_server.mesh.surface import surface_triangles

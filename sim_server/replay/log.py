@@ -22,7 +22,7 @@ from protocol.log_file import LogFile, LogMessage
 from protocol.refused import Refused
 from protocol.validate import array
 from sim_server.arrays import Float64
-from sim_server.backends.cpu.engine import Kind
+from sim_server.backends.kinds import Kind
 from sim_server.scene.solver_options import FACTORS
 
 ROW = np.dtype(

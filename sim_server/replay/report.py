@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from protocol import messages_pb2 as pb
 from sim_server.arrays import Float64
-from sim_server.backends.cpu.engine import Kind
+from sim_server.backends.kinds import Kind
 from sim_server.replay.log import Recording
 
 Pair = tuple[Float64, Float64]

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from protocol import messages_pb2 as pb
 from protocol.method import Method
+from sim_server.backends.kinds import BALANCE
 from sim_server.network.link import ServerLink
 from sim_server.recording import messages as describe
 from sim_server.recording.recorder import Recorder
@@ -26,6 +27,7 @@ LOOK_PERIOD = 0.02  # s between looks at whether somebody listens to states
 BATCH = 4096  # steps sent together at most
 WINDOW = 1000  # steps that percentiles are taken over
 ENERGY_STEPS = 20  # between elastic energies in real time: one costs up to a fifth of a step
+SLACK_OF_ENERGY: float = BALANCE.constant("SLACK_OF_ENERGY")
 
 
 class Telemetry:
@@ -294,6 +296,6 @@ def cause_of(r: np.void) -> str:
     """What showed in a record (layouts.RECORD) that a body had run away."""
     if not (np.isfinite(r["kinetic"]) and np.isfinite(r["gravity"])):
         return "its positions or velocities are no finite numbers"
-    if r["kinetic"] > 2 * max(r["budget"], 0.0):
+    if r["kinetic"] > SLACK_OF_ENERGY * max(r["budget"], 0.0):
         return f"kinetic energy {r['kinetic']:.3g} J, where start and loads account for {r['budget']:.3g} J"
     return f"two of its nodes moved {r['stride']:.3g} m apart within a step"

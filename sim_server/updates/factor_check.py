@@ -8,7 +8,6 @@ all of it; a factor that takes off less than block Jacobi does is worth less tha
 
 import ctypes as c
 from functools import cache
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray

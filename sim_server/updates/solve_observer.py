@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.messages_pb2 import RUNAWAY
-from sim_server.backends.cpu.engine import Kind
+from sim_server.backends.kinds import Kind
 from sim_server.updates.autotune.convergence import Convergence, convergence
 from sim_server.updates.body_state import BodyUpdateState, observe_steps
 

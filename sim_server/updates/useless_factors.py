@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from protocol.factor import Factor
 from sim_server.backends.base import Capability
-from sim_server.backends.cpu.engine import Kind
+from sim_server.backends.kinds import Kind
 from sim_server.updates.body_state import BodyUpdateState
 
 if TYPE_CHECKING:

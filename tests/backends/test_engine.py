@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from sim_server.backends.cpu.device import module
-from sim_server.backends.cpu.engine import CpuEngine, Kind
+from sim_server.backends.cpu.engine import CpuEngine
 from sim_server.backends.cpu.structs import RECORD
+from sim_server.backends.kinds import Kind
 from sim_server.simulation import Simulation
 from tests.scenes import bar, factor_of, simulation
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_server.backends.cpu.engine import Kind
+from sim_server.backends.kinds import Kind
 from sim_server.effects.touch import Touch
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver

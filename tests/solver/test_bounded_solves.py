@@ -6,7 +6,7 @@ import itertools
 import numpy as np
 import pytest
 
-from sim_server.backends.cpu.engine import Kind
+from sim_server.backends.kinds import Kind
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
 from tests.scenes import bar, simulation

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from sim_server.backends.cpu.engine import Kind
+from sim_server.backends.kinds import Kind
 from tests.scenes import factor_of
 from tests.solver.solves import STATUSES, bent, solve, true_residual
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.sparse.linalg import spsolve
 
-from sim_server.backends.cpu.engine import Kind
+from sim_server.backends.kinds import Kind
 from tests.reference.pcg import block_jacobi, jacobi, pcg
 from tests.scenes import factor_of
 from tests.solver.solves import applied, bent, solve, stops, system, true_residual

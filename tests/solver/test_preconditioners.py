@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from precond_worker.factorization.registry import make_factorization
 from protocol.method import Method
-from sim_server.backends.cpu.engine import Kind
+from sim_server.backends.kinds import Kind
 from sim_server.simulation import Simulation
 from tests.scenes import bar, rotation, simulation
 from tests.solver.solves import applied, bent, solve, system, true_residual

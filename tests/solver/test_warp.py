@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.linalg import block_diag, cho_factor, cho_solve
 
-from sim_server.backends.cpu.engine import Kind
+from sim_server.backends.kinds import Kind
 from sim_server.simulation import Simulation
 from tests.reference.pcg import pcg
 from tests.scenes import bar, factor_of, rotation, simulation

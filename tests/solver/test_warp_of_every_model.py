@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sim_server.backends.cpu.engine import Kind
+from sim_server.backends.kinds import Kind
 from sim_server.effects import known_effects
 from sim_server.mesh import pose_matrix
 from sim_server.simulation import Simulation

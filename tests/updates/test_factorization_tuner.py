@@ -6,7 +6,7 @@ import itertools
 import pytest
 
 from protocol.method import Method
-from sim_server.backends.cpu.engine import Kind
+from sim_server.backends.kinds import Kind
 from sim_server.updates.autotune.factorization import (
     FIRST_SOLVES,
     MAX_FAILURES,

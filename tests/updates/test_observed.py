@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from protocol import messages_pb2 as pb
-from sim_server.backends.cpu.engine import Kind
 from sim_server.backends.cpu.structs import RECORD
+from sim_server.backends.kinds import Kind
 from sim_server.recording import messages as describe
 from sim_server.service.telemetry import Telemetry
 from sim_server.updates.driver import Driver

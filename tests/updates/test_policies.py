@@ -14,8 +14,8 @@ import pytest
 from numpy.typing import NDArray
 
 from protocol.factor import Factor
-from sim_server.backends.cpu.engine import Kind
 from sim_server.backends.cpu.structs import RECORD
+from sim_server.backends.kinds import Kind
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
 from sim_server.updates.factor_source import Inline, Job

@@ -5,7 +5,7 @@ import itertools
 
 import pytest
 
-from sim_server.backends.cpu.engine import Kind
+from sim_server.backends.kinds import Kind
 from sim_server.updates.autotune.convergence import Convergence
 from sim_server.updates.autotune.preconditioner import PreconditionerTuner
 from sim_server.updates.autotune.tuner import MAX_TRIAL_INTERVAL, TRIAL_INTERVAL

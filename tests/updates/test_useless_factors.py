@@ -10,7 +10,7 @@ import pytest
 from precond_worker.factorization.registry import make_factorization
 from protocol.factor import Factor
 from sim_server.backends.base import Capability
-from sim_server.backends.cpu.engine import Kind
+from sim_server.backends.kinds import Kind
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
 from sim_server.updates.factor_source import Inline, Job

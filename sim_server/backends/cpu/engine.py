@@ -8,7 +8,6 @@ reads what the loop has left in its rings, and may be called from another thread
 import ctypes as c
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import IntEnum
 from functools import cache
 from typing import Any, cast
 
@@ -26,16 +25,6 @@ from sim_server.mechanics.newton import Newton
 
 Reals = NDArray[np.float64]
 HISTORY = 1024  # changes of the diagonal that are remembered, of each body
-
-
-class Kind(IntEnum):
-    """Preconditioners that the loop can apply."""
-
-    NONE = 0
-    JACOBI = 1
-    BLOCK_JACOBI = 2
-    CHOLESKY = 3  # and any other factor
-    SSOR = 4  # by sweeps over the present matrix
 
 
 @cache

@@ -1,14 +1,11 @@
 // SPDX-License-Identifier: MIT
 // Data of the persistent solver (pcg.cu). solver.py and device_plan.py hold the same layouts; sizes are compared at compilation.
 #pragma once
+#include "kinds.h"
 
 #ifndef real
 #define real double
 #endif
-
-enum Kind { NONE = 0, JACOBI = 1, BLOCK_JACOBI = 2, CHOLESKY = 3 };
-enum Status { CONVERGED = 0, MAX_ITERATIONS = 1, BUDGET = 2, BREAKDOWN_MATRIX = 3, BREAKDOWN_PRECONDITIONER = 4, NOT_FINITE = 5,
-              MAX_LINEARIZATIONS = 6 };  // of a step
 
 // 32 entries of the vector that a phase multiplies, one per lane of a warp, and their source.
 struct __align__(16) WarpSegment {
@@ -41,8 +38,6 @@ struct DevicePlan {
 };
 
 template <class T> struct FlagWord;  // block_group.cuh
-
-constexpr int ENOUGH = 20;  // backends/cpu/native/pcg.h
 
 // Rows of A of one thread block, and the nodes that they read (row_partition.ROW_RANGE).
 struct RowRange { int body, index, begin, own, halo_first, halo, block_first, blocks; };

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from protocol.method import Method
-from sim_server.backends.cpu.engine import Kind
+from sim_server.backends.kinds import Kind
 from sim_server.updates.autotune.convergence import CONVERGED, Convergence
 from sim_server.updates.autotune.factorization import FactorizationTuner
 from sim_server.updates.autotune.tuner import MARGIN, TRIAL_INTERVAL, Tuner

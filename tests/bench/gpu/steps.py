@@ -17,7 +17,7 @@ from scipy.sparse import bsr_array
 
 from precond_worker.factorization.factorize import Analysis
 from protocol.factor import FactorPattern
-from sim_server.backends.cpu.engine import Kind
+from sim_server.backends.kinds import Kind
 from sim_server.simulation import Simulation
 from tests.bench.gpu import traffic as moved
 from tests.bench.gpu.problem import Problem

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from precond_worker.factorization.factorize import Analysis
-from sim_server.backends.cpu.engine import Kind
+from sim_server.backends.kinds import Kind
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
 from sim_server.updates.stats import flops

@@ -8,8 +8,6 @@
 #include "newton.h"
 #include "sizes.h"
 
-static_assert(NOT_FINITE == STATUS_NOT_FINITE && RUNAWAY == STATUS_RUNAWAY, "statuses of ring_buffers.h and pcg.h differ");
-
 static void take_mail(Launch& l, int64_t step) {
     if (Binding* next = l.mail.exchange(nullptr)) {
         l.binding = next;

@@ -13,14 +13,9 @@
 // An iteration is one application of A after the initial residual.
 #pragma once
 #include "bsr.h"
+#include "kinds.h"
 #include "ring_buffers.h"
 #include "woodbury.h"
-
-enum Kind { NONE = 0, JACOBI = 1, BLOCK_JACOBI = 2, CHOLESKY = 3, SSOR = 4 };  // CHOLESKY: any factor
-enum Status { CONVERGED = 0, MAX_ITERATIONS = 1, BUDGET = 2, BREAKDOWN_MATRIX = 3, BREAKDOWN_PRECONDITIONER = 4, NOT_FINITE = 5,
-              MAX_LINEARIZATIONS = 6, RUNAWAY = 7 };  // the last two of a step
-
-constexpr int ENOUGH = 20;
 
 struct SolveSettings {
     double tolerance;       // of |b|

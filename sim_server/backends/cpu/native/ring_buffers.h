@@ -8,6 +8,7 @@
 #include <ctime>
 
 #include "energy_balance.cuh"
+#include "kinds.h"
 
 struct Record {
     int64_t step;          // steps completed
@@ -22,8 +23,6 @@ struct Record {
     int32_t body, iterations, status, kind, asked, fallbacks, bad_node, probe, linearizations, unused;
 };
 
-constexpr int32_t STATUS_NOT_FINITE = 5, STATUS_RUNAWAY = 7;  // as in Status (pcg.h)
-
 // b: Balance or Energy of the body (kernels/energy_balance.cuh).
 template <class B> static inline void note_energy(Record& record, const B& b) {
     record.kinetic = b.kinetic;
@@ -33,7 +32,7 @@ template <class B> static inline void note_energy(Record& record, const B& b) {
     record.budget = b.budget;
     record.stride = b.stride;
     const bool rests = b.phase == FROZEN && !b.found;
-    if (b.phase != WELL && (rests || record.status != STATUS_NOT_FINITE)) record.status = STATUS_RUNAWAY;
+    if (b.phase != WELL && (rests || record.status != NOT_FINITE)) record.status = RUNAWAY;
     if (!rests) return;
     record.factor_step = -1;  // there was nothing to solve
     record.kind = record.asked;

@@ -1,0 +1,23 @@
+# SPDX-License-Identifier: MIT
+"""Numbers of kernels/kinds.h and kernels/energy_balance.cuh by name."""
+
+from enum import IntEnum, auto
+
+from sim_server.backends.declarations import Declarations
+
+KINDS = Declarations("kernels/kinds.h")
+BALANCE = Declarations("kernels/energy_balance.cuh")
+
+
+class Kind(IntEnum):
+    """Preconditioners that the loop can apply. The numbers are those of kernels/kinds.h."""
+
+    @staticmethod
+    def _generate_next_value_(name: str, start: int, count: int, last_values: list[int]) -> int:
+        return KINDS.enumeration("Kind")[name]
+
+    NONE = auto()
+    JACOBI = auto()
+    BLOCK_JACOBI = auto()
+    CHOLESKY = auto()  # and any other factor
+    SSOR = auto()  # by sweeps over the present matrix
