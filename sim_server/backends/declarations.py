@@ -22,7 +22,8 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-HERE = Path(__file__).parents[1]  # sim_server/
+from sim_server.backends.compiler import SOURCES
+
 FOLDERS = ("kernels", "backends/cpu/native", "backends/gpu", "backends/gpu/inverse")  # of headers
 NUMBERS: dict[str, type[Any]] = {
     "bool": c.c_bool, "char": c.c_char, "uint8_t": c.c_uint8, "int": c.c_int32, "int32_t": c.c_int32,
@@ -77,7 +78,7 @@ class Declarations:
     Nothing is read before it is asked for. Methods raise ValueError where the text has no such declaration.
     """
 
-    def __init__(self, path: str, root: Path = HERE):
+    def __init__(self, path: str, root: Path = SOURCES):
         self._path, self._root = path, root
         self._structs: dict[str, type[c.Structure]] = {}
 
@@ -168,6 +169,10 @@ class Declarations:
             ]
             lines.append(f'static_assert(sizeof({struct}) == {c.sizeof(made)}, "{struct}");')
         return "\n" + "\n".join(lines) + "\n"
+
+    def checked(self) -> str:
+        """The text itself with `assertions` of the structs asked for: a compiler refuses it if it has other layouts."""
+        return (self._root / self._path).read_text() + self.assertions()
 
     def check_sizes(self, library: c.CDLL) -> None:
         """Raises RuntimeError if a library was compiled with other sizes of these structs (native/sizes.h)."""

@@ -26,7 +26,7 @@ def _library() -> c.CDLL:
     p = c.c_void_p
     arguments = [c.POINTER(structs.Factor), c.c_int32, p, p, p, p, p, p]
     library = native("backends/cpu/native/factor_check.cpp", {"wf_judge": (None, arguments)}, stepping=False)
-    structs.TEXT.check_sizes(library)
+    structs.LOOP.check_sizes(library)
     return library
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sim_server.backends.compiler import HERE, INCLUDE, compiler
+from sim_server.backends.compiler import INCLUDE, SOURCES, compiler
 from sim_server.backends.cpu import structs as cpu
 from sim_server.backends.declarations import Declarations, Member, split_members
 
@@ -63,7 +63,7 @@ def texts(tmp_path: Path) -> Declarations:
 def accepted(texts: str, folder: Path) -> str:
     """What the C++ compiler says against a text; empty: nothing."""
     (folder / "asserted.cpp").write_text(texts)
-    folders = [f"-I{p}" for p in (folder, folder / "kernels", HERE, INCLUDE)]
+    folders = [f"-I{p}" for p in (folder, folder / "kernels", SOURCES, INCLUDE)]
     command = [compiler(), "-std=c++17", "-fsyntax-only", *folders, "-include", "cstdint", str(folder / "asserted.cpp")]
     return subprocess.run(command, capture_output=True, text=True).stderr
 
@@ -118,5 +118,5 @@ def test_members_of_a_kernel(texts):
 
 
 def test_the_compiler_agrees_with_all_that_the_loop_of_the_cpu_shares(tmp_path):
-    asserted = '#include "backends/cpu/native/loop.h"\n' + cpu.TEXT.assertions()
+    asserted = '#include "backends/cpu/native/loop.h"\n' + cpu.LOOP.assertions()
     assert "sizeof(Loop)" in asserted and "Record.step" in asserted and accepted(asserted, tmp_path) == ""

@@ -1,67 +1,66 @@
 # SPDX-License-Identifier: MIT
-"""The structs of the GPU solver stand twice, in C and in NumPy: same names, same order, same sizes."""
+"""Structs of the GPU loop and of its kernels as Python has read them, against both compilers; shapes of launches."""
 
 import re
+import subprocess
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from sim_server.backends.compiler import SOURCES
-from sim_server.backends.cpu.structs import BALANCE
+from sim_server.backends.compiler import INCLUDE, SOURCES, compiler
+from sim_server.backends.declarations import Declarations
+from sim_server.backends.gpu import structs
 from sim_server.backends.gpu.device import PRECISIONS, own_headers
 from sim_server.backends.gpu.device import options as device_options
-from sim_server.backends.gpu.energies import ELASTIC_ENERGY, ENERGY_BALANCE, NODE_CHUNK, SUMS
-from sim_server.backends.gpu.inverse.device_plan import DEVICE_PLAN
-from sim_server.backends.gpu.newton import (
-    BLOCK_NODES,
-    LANES,
-    NEWTON_ARGUMENTS,
-    NODE_RANGE,
-    SEARCH,
-    bodies_of,
-    node_ranges,
-)
-from sim_server.backends.gpu.row_partition import ROW_RANGE
-from sim_server.backends.gpu.solver import PCG_ARGUMENTS, PCG_BODY, PCG_RESULT, threads_and_blocks
-from sim_server.backends.gpu.structs import ENERGY_RECORD, NEWTON_RESULT
+from sim_server.backends.gpu.energies import BALANCE_TEXT, ELASTIC_TEXT
+from sim_server.backends.gpu.engine import EPILOGUE
+from sim_server.backends.gpu.inverse.expansion_batches import INVERSE
+from sim_server.backends.gpu.newton import BLOCK_NODES, NEWTON, bodies_of, node_ranges
+from sim_server.backends.gpu.solver import threads_and_blocks
+from sim_server.backends.gpu.structs import PCG
 from tests.support import nvrtc
 
-SIZES = {"int": 4, "unsigned": 4, "float": 4, "double": 8, "long long": 8}
-TEXTS = "".join(
-    (SOURCES / name).read_text()
-    for name in ("backends/gpu/pcg_structs.cuh", "backends/gpu/newton.cu", "kernels/newton_line_search.cuh")
-)
+
+def asserted(tmp_path: Path, include: str, *declarations: Declarations) -> Path:
+    """A text that includes another and holds what Python assumes of its structs."""
+    path = tmp_path / "asserted.cu"
+    path.write_text(f'#include "{include}"\n' + "".join(d.assertions() for d in declarations))
+    return path
 
 
-def fields(name: str) -> list[tuple[str, int]]:
-    """Names and bytes of a struct's fields, pointers 8."""
-    body = re.search(rf"struct (?:__align__\(\d+\) )?{name} \{{(.*?)\}};", TEXTS, re.DOTALL)
-    assert body, name
-    found = []
-    for line in re.sub(r"//.*", "", body[1]).split(";"):
-        declaration = re.match(r"\s*(?:const )?(long long|struct \w+|[\w<>]+)(\s*\*?)\s*(.*)", line.strip(), re.DOTALL)
-        if not line.strip():
-            continue
-        assert declaration, line
-        kind, star, names = declaration.groups()
-        for each in re.split(r",\s*", names):
-            pointer = "*" in star or each.startswith("*")
-            found.append((each.strip("* "), 8 if pointer else SIZES[kind]))
-    return found
+def test_the_compiler_agrees_with_all_that_the_loop_shares(tmp_path):
+    source = asserted(tmp_path, "backends/gpu/loop.h", structs.LOOP)
+    assert "GpuLoop.frame_copies" in source.read_text() and "PcgResult.probe" in source.read_text()
+    command = [compiler(), "-std=c++17", "-fsyntax-only", "-x", "c++", f"-I{SOURCES}", f"-I{INCLUDE}", str(source)]
+    assert subprocess.run(command, capture_output=True, text=True).stderr == ""
 
 
 @pytest.mark.parametrize(
-    ("name", "layout"),
+    ("text", "declarations"),
     [
-        ("DevicePlan", DEVICE_PLAN), ("PcgBody", PCG_BODY), ("PcgResult", PCG_RESULT), ("PcgArguments", PCG_ARGUMENTS),
-        ("RowRange", ROW_RANGE), ("NodeRange", NODE_RANGE),
-        ("NewtonResult", NEWTON_RESULT), ("Search", SEARCH), ("NewtonArguments", NEWTON_ARGUMENTS),
+        ("pcg_structs.cuh", PCG), ("newton.cu", NEWTON), ("energy_balance.cu", BALANCE_TEXT),
+        ("elastic_energy.cu", ELASTIC_TEXT), ("step_epilogue.cu", EPILOGUE),
+        ("inverse/build_inverse.cu", INVERSE),
     ],
+    ids=lambda value: value if isinstance(value, str) else "layouts",
 )  # fmt: skip
-def test_both_sides_agree(name: str, layout: np.dtype) -> None:
-    assert layout.names is not None
-    ours = [(n, layout[n].itemsize) for n in layout.names]
-    assert fields(name) == ours
+def test_the_compiler_for_gpus_agrees(text: str, declarations: Declarations, tmp_path: Path) -> None:
+    if (library := nvrtc.library()) is None:
+        pytest.skip("needs the package nvidia-cuda-nvrtc")
+    source = asserted(tmp_path, text, declarations)
+    options = [*device_options(PRECISIONS["float64"]), *own_headers(), "-arch=sm_90", "--Ofast-compile=max"]
+    code, said = nvrtc.compiled(library, source, options)
+    assert code and not said and "static_assert" in source.read_text(), said
+
+
+def test_the_compiler_for_gpus_refuses_another_layout(tmp_path):
+    if (library := nvrtc.library()) is None:
+        pytest.skip("needs the package nvidia-cuda-nvrtc")
+    source = asserted(tmp_path, "pcg_structs.cuh", PCG)
+    source.write_text(source.read_text().replace("PcgBody, planes", "PcgBody, plan"))
+    code, said = nvrtc.compiled(library, source, [*device_options(PRECISIONS["float64"]), *own_headers()])
+    assert not code and "PcgBody.planes" in said
 
 
 @pytest.mark.slow
@@ -102,48 +101,31 @@ def test_thread_blocks_take_all_registers():
 @pytest.mark.slow
 @pytest.mark.parametrize("arch", ["sm_80", "sm_90"])
 @pytest.mark.parametrize("precision", PRECISIONS)
-def test_the_search_compiles_with_the_layouts_of_this_side_and_spills_no_registers(precision, arch):
+def test_the_search_compiles_and_spills_no_registers(precision, arch):
     if (library := nvrtc.library()) is None:
         pytest.skip("needs the package nvidia-cuda-nvrtc")
-    sizes = {
-        "NEWTON_ARGUMENTS": NEWTON_ARGUMENTS,
-        "SEARCH": SEARCH,
-        "NODE_RANGE": NODE_RANGE,
-        "NEWTON_RESULT": NEWTON_RESULT,
-    }
     options = [
         *device_options(PRECISIONS[precision]),
         *own_headers(),
         "--ptxas-options=-v",
         f"-arch={arch}",
     ]
-    options += [f"-D{name}_BYTES={layout.itemsize}" for name, layout in sizes.items()]
     code, said = nvrtc.compiled(library, SOURCES / "backends/gpu/newton.cu", options)
     spilled = [int(n) for n in re.findall(r"(\d+) bytes (?:stack frame|spill stores|spill loads)", said)]
     assert code and len(spilled) >= 12 and max(spilled) == 0, said
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
-def test_the_account_of_energy_compiles_with_the_layouts_of_this_side(precision, tmp_path):
+def test_the_account_of_energy_compiles(precision):
     if (library := nvrtc.library()) is None:
         pytest.skip("needs the package nvidia-cuda-nvrtc")
-    sizes = {
-        "ENERGY_BALANCE": ENERGY_BALANCE,
-        "BALANCE": BALANCE,
-        "ENERGY_RECORD": ENERGY_RECORD,
-        "ELASTIC_ENERGY": ELASTIC_ENERGY,
-    }
     options = [*device_options(PRECISIONS[precision]), *own_headers(), "-arch=sm_90"]
-    options += [f"-D{name}_BYTES={layout.itemsize}" for name, layout in sizes.items()]
-    options += [f"-DNODE_CHUNK_BYTES={NODE_CHUNK.itemsize}", f"-DSUMS_BYTES={8 * SUMS}"]
     for name in ("energy_balance", "elastic_energy"):
         code, said = nvrtc.compiled(library, SOURCES / f"backends/gpu/{name}.cu", options)
         assert code and not said, said
 
 
 def test_the_nodes_of_a_body_are_shared_out_in_stretches():
-    text = (SOURCES / "backends/gpu/newton.cu").read_text()
-    assert f"BLOCK_NODES = {BLOCK_NODES}, LANES = {LANES}," in text
     found, start = node_ranges(np.array([[0, 1], [1, 1 + 2 * BLOCK_NODES], [1 + 2 * BLOCK_NODES, 5 + 3 * BLOCK_NODES]]))
     assert start.tolist() == [0, 1, 3, 5]
     assert found["body"].tolist() == [0, 1, 1, 2, 2]

@@ -165,7 +165,7 @@ def by_tasks(layout: WorkspaceLayout, values: NDArray, plan: Plan) -> tuple[NDAr
         for column in layout.columns[batch.first : batch.last]:
             part = layout.parts[column["part"]]
             to = layout.place[column["row"] : column["row"] + column["length"]]
-            at = part["g"] + int(column["local"]) * int(part["pitch_g"]) + to
+            at = part["g"] + int(column["within"]) * int(part["pitch_g"]) + to
             memory[at] = values[column["value"] : column["value"] + column["length"]]
         _inverted(layout, batch, memory)
         for p, i, _, _ in batch.diagonal:

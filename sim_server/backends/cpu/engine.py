@@ -40,7 +40,7 @@ def _library() -> c.CDLL:
             "wf_precondition": (None, [loop, c.c_int32, p, p, p]),
         },
     )  # fmt: skip
-    structs.TEXT.check_sizes(library)
+    structs.LOOP.check_sizes(library)
     return library
 
 

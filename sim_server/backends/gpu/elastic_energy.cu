@@ -16,10 +16,6 @@ struct ElasticEnergy {
     int capacity, first_effect;  // 1: the first effect
 };
 
-#ifdef ELASTIC_ENERGY_BYTES  // as energies.py has it
-static_assert(sizeof(ElasticEnergy) == ELASTIC_ENERGY_BYTES, "layouts of ElasticEnergy differ");
-#endif
-
 constexpr int THREADS = 128;
 
 extern "C" __global__ void __launch_bounds__(THREADS) elastic_energy(const ElasticEnergy p) {

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_server.arrays import Float64, Int32
-from sim_server.backends.compiler import SOURCES
 from sim_server.backends.cpu.structs import BALANCE
+from sim_server.backends.declarations import Declarations
 from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction
 from sim_server.backends.gpu.device import DeviceLaunch, Gpu, compiled, options, own_headers
 from sim_server.backends.gpu.kernel_fusion import Prologue
@@ -20,22 +20,14 @@ from sim_server.backends.gpu.mailbox import library
 from sim_server.backends.gpu.structs import ENERGY_RECORD
 from sim_server.mechanics.energy import CODES, Energies
 
-THREADS = 128  # of a thread block of elastic_energy.cu
+BALANCE_TEXT = Declarations("backends/gpu/energy_balance.cu")
+ELASTIC_TEXT = Declarations("backends/gpu/elastic_energy.cu")
+THREADS: int = ELASTIC_TEXT.constant("THREADS")  # of a thread block of elastic_energy.cu
 NODES = 128  # nodes that a thread block sums over
-STILL = 5  # most arrays that are 0 in a body at rest (energy_balance.cu)
-SUMS = 10  # numbers in the struct Sums (kernels/energy_balance.cuh)
-ENERGY_BALANCE = np.dtype(
-    [(n, "u8") for n in ("first_node", "chunks", "sums", "finished_chunks", "mass", "before", "x", "v")]
-    + [("still", "u8", STILL)]
-    + [(n, "u8") for n in ("force", "spring", "anchor", "free", "gravity", "balance", "records")]
-    + [(n, "u8") for n in ("step", "settled_step")]
-    + [(n, "i4") for n in ("bodies", "capacity", "on_runaway", "inertia")]
-)
-NODE_CHUNK = np.dtype([(n, "i4") for n in ("body", "begin", "end", "first", "chunks")])
-ELASTIC_ENERGY = np.dtype(
-    [(n, "u8") for n in ("energy", "first_element", "sum", "step", "balance", "records")]
-    + [("capacity", "i4"), ("first_effect", "i4")]
-)  # fmt: skip
+ENERGY_BALANCE = BALANCE_TEXT.dtype("EnergyBalance")
+NODE_CHUNK = BALANCE_TEXT.dtype("NodeChunk")
+SUMS = BALANCE_TEXT.dtype("Sums").itemsize // 8  # numbers
+ELASTIC_ENERGY = ELASTIC_TEXT.dtype("ElasticEnergy")
 
 
 class DeviceEnergies:
@@ -75,16 +67,15 @@ class DeviceEnergies:
         self._params["records"], self._params["capacity"] = records.ctypes.data, self._capacity
         self._params["bodies"], self._params["inertia"] = self._bodies, world.inertia
         self._params["on_runaway"] = CODES[energies.on_runaway]
-        self.prologue = Prologue(text("energy_balance"), "EnergyBalance", "balance_energy", self._params, len(chunks))
-        self._balance_kernel, self._elastic_kernel = self._kernel("energy_balance"), self._kernel("elastic_energy")
+        self.prologue = Prologue(BALANCE_TEXT.checked(), "EnergyBalance", "balance_energy", self._params, len(chunks))
+        self._balance_kernel = self._kernel(BALANCE_TEXT, "energy_balance")
+        self._elastic_kernel = self._kernel(ELASTIC_TEXT, "elastic_energy")
         self._launches = self._elastic(records)
 
-    def _kernel(self, name: str) -> KernelFunction:
-        """Compiles the kernel `name` of the text <name>.cu."""
-        module = self._gpu.cp.RawModule(
-            code=text(name), options=(*options(self._gpu.types), *own_headers()),
-            backend="nvrtc",
-        )  # fmt: skip
+    def _kernel(self, text: Declarations, name: str) -> KernelFunction:
+        """Compiles the kernel of the text <name>.cu."""
+        flags = (*options(self._gpu.types), *own_headers())
+        module = self._gpu.cp.RawModule(code=text.checked(), options=flags, backend="nvrtc")
         return compiled(f"{name}.cu", module, name)
 
     def _elastic(self, records: NDArray[np.uint8]) -> list[tuple[DeviceLaunch | None, DeviceArray, NDArray[Any]]]:
@@ -138,11 +129,6 @@ def node_chunks(starts: Int32, nodes: int) -> NDArray[Any]:
     chunks["begin"] = starts[body] + nodes * (np.arange(len(chunks)) - chunks["first"])
     chunks["end"] = np.minimum(chunks["begin"] + nodes, starts[body + 1])
     return chunks
-
-
-def text(name: str) -> str:
-    """Returns the text of <name>.cu in this folder."""
-    return (SOURCES / f"backends/gpu/{name}.cu").read_text()
 
 
 def start_sums(

@@ -34,11 +34,6 @@ struct EnergyBalance {
     int bodies, capacity, on_runaway, inertia;
 };
 
-#ifdef ENERGY_BALANCE_BYTES  // as energies.py has them
-static_assert(sizeof(EnergyBalance) == ENERGY_BALANCE_BYTES && sizeof(Balance) == BALANCE_BYTES, "layouts of EnergyBalance or Balance differ");
-static_assert(sizeof(EnergyRecord) == ENERGY_RECORD_BYTES && sizeof(Sums) == SUMS_BYTES && sizeof(NodeChunk) == NODE_CHUNK_BYTES, "layouts differ");
-#endif
-
 __device__ __forceinline__ void add_sums(Sums& a, const Sums& b) {
     a.kinetic += b.kinetic;
     a.gravity += b.gravity;

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from protocol.factor import FactorPattern
 from sim_server.arrays import Float64
 from sim_server.backends.base import Capability, EngineInput, Launch
-from sim_server.backends.compiler import SOURCES
+from sim_server.backends.declarations import Declarations
 from sim_server.backends.gpu.cuda import CudaDevice
 from sim_server.backends.gpu.cupy_types import DeviceArray, Graph
 from sim_server.backends.gpu.device import DeviceLaunch, Gpu
@@ -29,13 +29,8 @@ from sim_server.backends.gpu.solver import PCG_BODY, PCG_RESULT, SETTINGS_BYTES,
 from sim_server.backends.gpu.structs import ENERGY_RECORD, NEWTON_RESULT, STEP_TIMESTAMP, Mail
 
 FEW = 16  # largest number of trials in a step for which MANY steps are captured in one graph
-STEP_EPILOGUE = np.dtype(
-    [
-        ("clock", "u8"), ("step", "u8"), ("dt", "f8"), ("pool_counters", "u8"), ("finished_blocks", "u8"),
-        ("timestamps", "u8"), ("results", "u8"), ("host_results", "u8"), ("moving", "u8"), ("counters", "i4"),
-        ("capacity", "i4"), ("result_words", "i4"), ("bodies", "i4"),
-    ]
-)  # fmt: skip
+EPILOGUE = Declarations("backends/gpu/step_epilogue.cu")
+STEP_EPILOGUE = EPILOGUE.dtype("StepEpilogue")
 
 
 class DeviceSettings:
@@ -107,9 +102,8 @@ class GpuEngine(DeviceLoop):
         self.begin: Sequence[Launch] = ()  # launches before the first step
         self._graphs: list[Graph | None] = []
         self._epilogue = self._epilogue_params(dt)
-        epilogue = (SOURCES / "backends/gpu/step_epilogue.cu").read_text()
         self._integrate = FusedKernel(
-            integrate, Epilogue(epilogue, "StepEpilogue", "finish_step", self._epilogue)
+            integrate, Epilogue(EPILOGUE.checked(), "StepEpilogue", "finish_step", self._epilogue)
         )  # fmt: skip
         self._stamp_begin = self._integrate.function("stamp_begin")
         self._capture()

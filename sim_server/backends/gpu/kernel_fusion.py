@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_server.backends.declarations import Declarations
 from sim_server.backends.gpu.cupy_types import KernelFunction
 from sim_server.backends.gpu.device import DeviceLaunch, compiled, cupy, options, own_headers, processors
 
@@ -82,10 +83,11 @@ class PhaseGuard(NamedTuple):
     body: int
 
 
+DONE = Declarations("kernels/newton_line_search.cuh").enumeration("Phase")["DONE"]
 PHASE_GUARD = [
     "if (*active == 0) return;",
     "if (body && !__syncthreads_or(threadIdx.x < BLOCK_ITEMS && block * BLOCK_ITEMS + threadIdx.x < n &&",
-    "                              phase[body[block * BLOCK_ITEMS + threadIdx.x]] != 2)) return;",
+    f"                              phase[body[block * BLOCK_ITEMS + threadIdx.x]] != {DONE})) return;",
 ]
 
 

@@ -87,7 +87,7 @@ static void report(GpuLoop& l, const StepBatch& batch, int64_t k, double end, do
     const StepTimestamp &last = l.timestamps[(batch.first + batch.steps - 1) % l.capacity];
     const int64_t slot = (batch.first + k) % l.capacity * l.bodies;
     const PcgResult* results = l.results + slot;
-    const NewtonResult once{-1, 1, 0};
+    const NewtonResult once{-1, 1};
     int64_t step = batch.first + k + 1, head = rings.record_head.load();
     bool keep = room_for_records(rings, l.bodies, [&] { publish(l); });
     for (int i = 0; keep && i < l.bodies; ++i) {

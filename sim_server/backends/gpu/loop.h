@@ -6,6 +6,7 @@
 
 #include "../cpu/native/ring_buffers.h"
 #include "energy_record.cuh"
+#include "step_results.cuh"
 
 typedef uint64_t Address;       // of device memory
 
@@ -37,17 +38,7 @@ struct MailSlot {               // bytes on the device that are replaced between
     std::atomic<int64_t> taken;  // number of the mail that was copied to the device last
 };
 
-struct PcgResult {              // pcg_structs.cuh
-    double residual, seconds;
-    int64_t factor_step;
-    int32_t iterations, status, kind, asked, fallbacks, bad_node, probe, unused;
-};
-
-struct NewtonResult { double nonlinear; int32_t linearizations, unused; };  // newton.cu
-
-struct StepTimestamp { int64_t begin, end; };  // of a step, ns of the device's clock
-
-enum { REQUEST_VALUES = 1, REQUEST_POSITIONS = 2 };
+enum Request { REQUEST_VALUES = 1, REQUEST_POSITIONS = 2 };
 
 struct BodyReadback {                    // copies of a body's matrix or positions to the host
     int64_t values_begin, values_bytes;  // its blocks among the values of A

@@ -95,10 +95,10 @@ class DeviceLoop(Reports):
         self._real, self._value_bytes = np.dtype(real), block * int(row_start[-1])
         self._targets: dict[int, Float64] = {}
         self._requested_bytes: dict[int, int] = {}  # by body
-        loop.driver = c.pointer(device.functions)
+        loop.driver = c.addressof(device.functions)
         loop.context, loop.stream, loop.copy_stream = device.context, device.stream, device.copies
-        loop.mail_slots, loop.mail_slot_count = self._slots, len(mailboxes)
-        loop.readbacks, loop.bodies = self._readbacks, bodies
+        loop.mail_slots, loop.mail_slot_count = c.addressof(self._slots), len(mailboxes)
+        loop.readbacks, loop.bodies = c.addressof(self._readbacks), bodies
         for name, address in addresses.items():
             setattr(loop, name, address)
         loop.capacity, loop.batch, loop.many, loop.batch_seconds, loop.poll = CAPACITY, BATCH, MANY, BATCH_SECONDS, POLL
@@ -128,7 +128,7 @@ class DeviceLoop(Reports):
         energy_balance: writes the energy record of the last step
         elastic_energy: adds the elastic energy to it
         """
-        self.loop.graphs[:] = graphs
+        self.loop.graphs[0][:], self.loop.graphs[1][:] = graphs[:2], graphs[2:]
         self.loop.energy_balance, self.loop.elastic_energy = energy_balance, elastic_energy
 
     def run(self, steps: int) -> int:

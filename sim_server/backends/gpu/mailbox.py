@@ -22,7 +22,7 @@ def library() -> c.CDLL:
             "wf_gpu_start_balance": (None, [p, p, c.c_double, c.c_int32]),
         },
     )  # fmt: skip
-    structs.TEXT.check_sizes(compiled)
+    structs.LOOP.check_sizes(compiled)
     return compiled
 
 

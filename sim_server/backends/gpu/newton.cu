@@ -19,8 +19,6 @@ constexpr int NO_NODE = 0x7fffffff;
 
 struct NodeRange { int body, first, last, unused; };  // nodes [first, last) of the scene
 
-struct NewtonResult { double nonlinear; int linearizations, unused; };  // one per PcgResult, on the host
-
 struct NewtonArguments {
     const NodeRange* ranges;       // (grid,) by body
     const int* first_range;        // (bodies + 1,) of each body
@@ -53,13 +51,8 @@ struct NewtonArguments {
     double* direction;             // (nodes, 3) [m/s]
     double dx_dv;                  // [s]
     double tolerance;
-    int linearizations, trials, nodes, count, capacity, unused;
+    int linearizations, trials, nodes, count, capacity;
 };
-
-#ifdef NEWTON_ARGUMENTS_BYTES  // as newton.py has them
-static_assert(sizeof(NewtonArguments) == NEWTON_ARGUMENTS_BYTES && sizeof(Search) == SEARCH_BYTES, "layouts of NewtonArguments or Search differ");
-static_assert(sizeof(NodeRange) == NODE_RANGE_BYTES && sizeof(NewtonResult) == NEWTON_RESULT_BYTES, "layouts of NodeRange or NewtonResult differ");
-#endif
 
 __device__ __forceinline__ void add_up(double (&sum)[2]) {
     for (int k = 16; k; k >>= 1)
@@ -275,5 +268,5 @@ extern "C" __global__ void __launch_bounds__(BLOCK_NODES) end_newton(const Newto
     r.fallbacks = s.fallbacks;
     const int bad = __ldcg(p.bad_node + body);
     r.bad_node = s.status == NOT_FINITE && bad != NO_NODE ? bad : -1;
-    p.newton_results[(p.step[0] % p.capacity) * p.count + body] = {residual_ratio(s), s.linearizations > 1 ? s.linearizations : 1, 0};
+    p.newton_results[(p.step[0] % p.capacity) * p.count + body] = {residual_ratio(s), s.linearizations > 1 ? s.linearizations : 1};
 }

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_server.arrays import Int32, Int64
-from sim_server.backends.compiler import SOURCES
-from sim_server.backends.cpu.structs import Search as SearchLayout
+from sim_server.backends.declarations import Declarations
 from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction
 from sim_server.backends.gpu.device import DeviceLaunch, Gpu, compiled, options, own_headers
 from sim_server.backends.gpu.kernel_fusion import FusedKernel, PhaseGuard, fuse
@@ -22,18 +21,12 @@ from sim_server.backends.gpu.solver import PcgSolver
 from sim_server.backends.gpu.structs import NEWTON_RESULT
 from sim_server.mechanics.newton import Newton
 
-BLOCK_NODES, LANES = 32, 8  # nodes of a thread block, threads of a node in the kernel `update_state` (newton.cu)
-NODE_RANGE = np.dtype([("body", "i4"), ("first", "i4"), ("last", "i4"), ("unused", "i4")])
-SEARCH = np.dtype(SearchLayout)
-POINTERS = (
-    "ranges", "first_range", "partial_sums", "finished_blocks", "search", "phase", "active", "bad_node", "bodies",
-    "results", "newton_results", "step", "pool_counter", "row_start", "columns", "values", "b", "y", "rotation", "mass",
-    "beta", "x", "v", "predictor", "damping_velocity", "inertial_increment", "initial_state", "increment", "direction",
-)  # fmt: skip
-NUMBERS = ("linearizations", "trials", "nodes", "count", "capacity", "unused")
-NEWTON_ARGUMENTS = np.dtype(
-    [(n, "u8") for n in POINTERS] + [("dx_dv", "f8"), ("tolerance", "f8")] + [(n, "i4") for n in NUMBERS]
-)
+NEWTON = Declarations("backends/gpu/newton.cu")
+BLOCK_NODES: int = NEWTON.constant("BLOCK_NODES")  # of a thread block
+LANES: int = NEWTON.constant("LANES")  # threads of a node in the kernel `update_state`
+NODE_RANGE = NEWTON.dtype("NodeRange")
+SEARCH = NEWTON.dtype("Search")
+NEWTON_ARGUMENTS = NEWTON.dtype("NewtonArguments")
 
 
 class NewtonPhases(NamedTuple):
@@ -125,7 +118,8 @@ class NewtonIteration:
         self._params["nodes"], self._params["count"] = nodes, bodies
         self._params["capacity"] = results.nbytes // NEWTON_RESULT.itemsize // bodies
         self._values, self.first_values = twins["values"], cp.empty_like(twins["values"])
-        module = self._module()
+        flags = (*options(gpu.types), *own_headers())
+        module = gpu.cp.RawModule(code=NEWTON.checked(), options=flags, backend="nvrtc")
         self._begin, self._update_state, self._accept_trial, self._end = (
             compiled("newton.cu", module, name)
             for name in ("begin_newton", "update_state", "accept_trial", "end_newton")
@@ -144,20 +138,6 @@ class NewtonIteration:
             return phases.guard(self._bodies[-1])
 
         return fuse(again, guard)
-
-    def _module(self) -> Any:
-        sizes = {
-            "NEWTON_ARGUMENTS": NEWTON_ARGUMENTS, "SEARCH": SEARCH, "NODE_RANGE": NODE_RANGE,
-            "NEWTON_RESULT": NEWTON_RESULT,
-        }  # fmt: skip
-        return self._gpu.cp.RawModule(
-            code=(SOURCES / "backends/gpu/newton.cu").read_text(),
-            options=(
-                *options(self._gpu.types), *own_headers(),
-                *(f"-D{name}_BYTES={layout.itemsize}" for name, layout in sizes.items()),
-            ),
-            backend="nvrtc",
-        )  # fmt: skip
 
     def launch(self) -> None:
         """Launches the whole iteration of a step whose first linearization has been assembled."""

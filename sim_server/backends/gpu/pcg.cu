@@ -283,7 +283,7 @@ __device__ __forceinline__ void PcgSolver::solve() {
     const PcgBody& body = memory.body;
     PcgResult& out = memory.out;
     int kind = body.kind == CHOLESKY && !body.plan ? BLOCK_JACOBI : body.kind;
-    out = {0, 0, -1, 0, CONVERGED, kind, body.kind, 0, -1, body.probe, 0};
+    out = {0, 0, -1, 0, CONVERGED, kind, body.kind, 0, -1, body.probe};
     double r2 = 0, alpha = 0, last = 1e300;
     int stop = CONVERGED, iterations = 0;
     bool begun = false, measure = true, restart = true, switched = false;

@@ -1,7 +1,8 @@
 // SPDX-License-Identifier: MIT
-// Data of the persistent solver (pcg.cu). solver.py and device_plan.py hold the same layouts; sizes are compared at compilation.
+// Data of the persistent solver (pcg.cu). Python reads its layouts (declarations.py).
 #pragma once
 #include "kinds.h"
+#include "step_results.cuh"
 
 #ifndef real
 #define real double
@@ -34,7 +35,7 @@ struct DevicePlan {
                                       // and, in the upper 8 bits, their number (kind 0)
     const int* target;                // position of each contribution in PcgBody.contributed
     const int* place;                 // (nodes,) packed position of a node
-    int entries, unused;              // of the longest vector of a phase
+    int entries;                      // of the longest vector of a phase
 };
 
 template <class T> struct FlagWord;  // block_group.cuh
@@ -58,14 +59,7 @@ struct PcgBody {
     FlagWord<float>* formed;       // (size + 32,)
     FlagWord<float>* solved;       // (size + 32,) z / d
     FlagWord<float>* contributed;  // contributions of parts below
-    int planes, unused;            // float16 numbers per entry of the inverse
-};
-
-struct PcgResult {
-    double residual;        // true, relative
-    double seconds;
-    long long factor_step;  // -1: no factor used
-    int iterations, status, kind, asked, fallbacks, bad_node, probe, unused;
+    int planes;                    // float16 numbers per entry of the inverse
 };
 
 struct PcgArguments {
@@ -94,8 +88,3 @@ struct PcgArguments {
     const int* moving;             // (bodies,) 0: the body rests (kernels/nodes.cu)
     int nodes, shared;             // of the scene; bytes of dynamic shared memory
 };
-
-#ifdef PCG_BODY_BYTES  // as solver.py and device_plan.py have them
-static_assert(sizeof(PcgBody) == PCG_BODY_BYTES && sizeof(PcgResult) == PCG_RESULT_BYTES, "layouts of PcgBody or PcgResult differ");
-static_assert(sizeof(PcgArguments) == PCG_ARGUMENTS_BYTES && sizeof(DevicePlan) == DEVICE_PLAN_BYTES, "layouts of PcgArguments or DevicePlan differ");
-#endif

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_server.arrays import Int32, Int64
+from sim_server.backends.gpu.structs import PCG
 
 SPARED = 8  # multiprocessors left to the building of inverses; a solve that needs all would wait until that ends
 NODES_A_BLOCK = 8  # smallest number of nodes for which a body gets one more thread block
@@ -78,9 +79,7 @@ def best_assignment(nodes: Int64, processors: int, blocks: int) -> tuple[BlockAs
     return found[int(np.argmax(np.array(load) <= 1.1 * min(load)))]
 
 
-ROW_RANGE = np.dtype(
-    [(n, "i4") for n in ("body", "index", "begin", "own", "halo_first", "halo", "block_first", "blocks")]
-)
+ROW_RANGE = PCG.dtype("RowRange")
 """Rows of A of one thread block.
 
 body; index: of the thread block in its body; begin, own: own nodes [begin, begin + own) of the body;

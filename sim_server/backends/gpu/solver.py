@@ -13,35 +13,15 @@ from sim_server.backends.compiler import SOURCES
 from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction
 from sim_server.backends.gpu.device import Gpu, compiled, options, own_headers
 from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder, PartitionedInverse
-from sim_server.backends.gpu.inverse.device_plan import DEVICE_PLAN, DevicePlan, shared_bytes
+from sim_server.backends.gpu.inverse.device_plan import DevicePlan, shared_bytes
 from sim_server.backends.gpu.inverse.plan import plan
 from sim_server.backends.gpu.row_partition import SPARED, best_assignment, halo, initial_ranges
+from sim_server.backends.gpu.structs import PCG, PCG_RESULT
 
-PCG_BODY = np.dtype(
-    [
-        ("first", "i4"), ("nodes", "i4"), ("blocks", "i4"), ("kind", "i4"), ("max_iterations", "i4"),
-        ("warm_start", "i4"), ("probe", "i4"), ("first_range", "i4"), ("tolerance", "f8"), ("factor_step", "i8"),
-        ("plan", "u8"), ("matrix", "u8"), ("scale", "u8"), ("residual", "u8"), ("product", "u8"), ("z", "u8"),
-        ("formed", "u8"), ("solved", "u8"), ("contributed", "u8"), ("planes", "i4"), ("unused", "i4"),
-    ]
-)  # fmt: skip
+PCG_BODY = PCG.dtype("PcgBody")
 SETTINGS_BYTES = PCG_BODY.fields["factor_step"][1]  # type: ignore[index]
 """Bytes of a PCG_BODY before the factor: the settings."""
-PCG_RESULT = np.dtype(
-    [
-        ("residual", "f8"), ("seconds", "f8"), ("factor_step", "i8"), ("iterations", "i4"), ("status", "i4"),
-        ("kind", "i4"), ("asked", "i4"), ("fallbacks", "i4"), ("bad_node", "i4"), ("probe", "i4"), ("unused", "i4"),
-    ]
-)  # fmt: skip
-PCG_ARGUMENTS = np.dtype(
-    [
-        ("bodies", "u8"), ("count", "i4"), ("capacity", "i4"), ("row_start", "u8"), ("values", "u8"), ("b", "u8"),
-        ("y", "u8"), ("order", "u8"), ("pooled", "i4"), ("grid", "i4"), ("row_ranges", "u8"), ("initial_range", "u8"),
-        ("halo", "u8"), ("local_column", "u8"), ("halo_values", "u8"), ("halo_position", "u8"), ("own_vectors", "u8"),
-        ("z", "u8"), ("diagonal", "u8"), ("block_sums", "u8"), ("exchange_number", "u8"), ("pool_counter", "u8"),
-        ("step", "u8"), ("results", "u8"), ("moving", "u8"), ("nodes", "i4"), ("shared", "i4"),
-    ]
-)  # fmt: skip
+PCG_ARGUMENTS = PCG.dtype("PcgArguments")
 
 
 def threads_and_blocks(nodes: Int64, processors: int) -> tuple[int, int]:
@@ -119,14 +99,9 @@ class PcgSolver:
 
     def _compiled(self, blocks: int) -> KernelFunction:
         """Compiles pcg.cu for `blocks` thread blocks a multiprocessor."""
-        layouts = {
-            "PCG_BODY": PCG_BODY, "PCG_RESULT": PCG_RESULT, "PCG_ARGUMENTS": PCG_ARGUMENTS, "DEVICE_PLAN": DEVICE_PLAN
-        }  # fmt: skip
-        numbers = {"THREADS": self.threads, "PER_PROCESSOR": blocks} | {
-            f"{name}_BYTES": layout.itemsize for name, layout in layouts.items()
-        }
+        numbers = {"THREADS": self.threads, "PER_PROCESSOR": blocks}
         module = self.gpu.cp.RawModule(
-            code=(SOURCES / "backends/gpu/pcg.cu").read_text(),
+            code=(SOURCES / "backends/gpu/pcg.cu").read_text() + PCG.assertions(),
             options=(
                 *options({"real": "float" if self.real == np.float32 else "double"}), *own_headers(),
                 *(f"-D{name}={number}" for name, number in numbers.items()),

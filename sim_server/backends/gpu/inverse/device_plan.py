@@ -6,20 +6,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_server.backends.declarations import Declarations
 from sim_server.backends.gpu.device import Gpu
 from sim_server.backends.gpu.inverse.plan import Plan
+from sim_server.backends.gpu.structs import PCG
 
 PADDING = 32  # entries behind the packed vectors, to which padding refers
-TILE_SUMS = 64  # partitioned_inverse.cuh
+TILE_SUMS: int = Declarations("backends/gpu/inverse/partitioned_inverse.cuh").constant("TILE_SUMS")
 ROUND = 6  # constant cost of a product, in chunks
 
-DEVICE_PLAN = np.dtype(
-    [
-        ("phases", "i4"), ("blocks", "i4"), ("groups", "i4"), ("size", "i4"), ("block_ranges", "u8"), ("lists", "u8"),
-        ("segments", "u8"), ("tiles", "u8"), ("index", "u8"), ("target", "u8"), ("place", "u8"),
-        ("entries", "i4"), ("unused", "i4"),
-    ]
-)  # fmt: skip
+DEVICE_PLAN = PCG.dtype("DevicePlan")
 
 
 def shared_bytes(plan: Plan) -> int:

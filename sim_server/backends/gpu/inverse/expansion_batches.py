@@ -14,17 +14,15 @@ from numpy.typing import NDArray
 
 from protocol.factor import FactorPattern
 from sim_server.arrays import Int32, Int64
+from sim_server.backends.declarations import Declarations
 from sim_server.backends.gpu.inverse.partition import ROWS, padded
 from sim_server.backends.gpu.inverse.plan import Plan, ranges
 
 EDGE = 64  # rows and columns of a tile of the kernels
 WORKSPACE = 256 << 20  # bytes, unless a single part needs more
 
-PART = np.dtype(
-    [("g", "i8"), ("t", "i8")]
-    + [(n, "i4") for n in ("v", "b", "pitch_g", "pitch_t", "start", "boundary", "out", "unused")]
-)
-COLUMN = np.dtype([("value", "i8"), ("row", "i8"), ("length", "i4"), ("part", "i4"), ("local", "i4"), ("unused", "i4")])
+INVERSE = Declarations("backends/gpu/inverse/build_inverse.cu")
+PART, COLUMN = INVERSE.dtype("Part"), INVERSE.dtype("Column")
 
 
 @dataclass(frozen=True)
@@ -118,7 +116,7 @@ def _columns(pattern: FactorPattern, plan: Plan) -> tuple[NDArray[Any], Int64]:
     table["length"] = (np.diff(pattern.row_start)[supernode] - within)[column]
     table["part"] = plan.part[supernode][column]
     first = np.concatenate([[0], np.cumsum(plan.parts.v.astype(np.int64))])
-    table["local"] = np.arange(pattern.size) - first[table["part"]]
+    table["within"] = np.arange(pattern.size) - first[table["part"]]
     return table, first
 
 

@@ -11,7 +11,7 @@
 #ifndef CHUNKS_AT_ONCE
 #define CHUNKS_AT_ONCE 4
 #endif
-#define TILE_SUMS 64  // most partial products of shared tiles in a phase
+constexpr int TILE_SUMS = 64;  // most partial products of shared tiles in a phase
 #define LISTS 32768   // most bytes of a list that is copied to shared memory
 #define FEW 3         // segments that a warp loads at a time, for short lists
 #define MANY 8        // 2304 entries in one trip through L2 with 8 warps
