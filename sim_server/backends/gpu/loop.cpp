@@ -40,11 +40,10 @@ static bool open_batch(GpuLoop& l) {
 static bool count(GpuLoop& l, int64_t steps) {
     l.launched += steps;
     l.batches[l.begun % STEP_BATCHES].steps += steps;
-    const int64_t every = l.rings.frame_every.load();
-    const bool energy = energy_due(l.rings, l.launched), frame = every > 0 && l.launched % every == 0;
+    const bool energy = energy_due(l.rings, l.launched), frame = frame_due(l.rings, l.launched);
     if (energy || frame) CALL(graph_launch, l.energy_balance, l.stream);  // a frame shows frozen bodies at their last valid state
     if (energy) CALL(graph_launch, l.elastic_energy, l.stream);
-    return begin_matrices(l) && begin_frame(l);
+    return begin_matrices(l) && copy_frame(l);
 }
 
 static bool close_batch(GpuLoop& l) {
@@ -87,17 +86,24 @@ static void report(GpuLoop& l, const StepBatch& batch, int64_t k, double end, do
     const StepTimestamp &last = l.timestamps[(batch.first + batch.steps - 1) % l.capacity];
     const int64_t slot = (batch.first + k) % l.capacity * l.bodies;
     const PcgResult* results = l.results + slot;
-    const NewtonResult once{-1, 1};
     int64_t step = batch.first + k + 1, head = rings.record_head.load();
-    bool keep = room_for_records(rings, l.bodies, [&] { publish(l); });
+    bool keep = room_for_records(rings, l.bodies, [&] { publish(l); return true; });
     for (int i = 0; keep && i < l.bodies; ++i) {
         const PcgResult& r = results[i];
-        const NewtonResult& newton = l.newton_results ? l.newton_results[slot + i] : once;
         Record& record = rings.records[(head + i) % rings.record_capacity];
-        record = Record{step, r.factor_step, rings.start_time + step * rings.dt, r.residual, 0, r.seconds, 0,
-                   1e-9 * (stamp.end - stamp.begin), k ? 0 : batch.late, end - 1e-9 * (last.end - stamp.begin), cpu,
-                   newton.nonlinear, NAN, NAN, NAN, NAN, NAN, NAN, i, r.iterations, r.status, r.kind, r.asked, r.fallbacks, r.bad_node, r.probe,
-                   newton.linearizations, 0};
+        record = make_record(rings, step, i, r);
+        record.factor_step = r.factor_step;
+        record.whole = 1e-9 * (stamp.end - stamp.begin);
+        record.late = k ? 0 : batch.late;
+        record.begin = end - 1e-9 * (last.end - stamp.begin);
+        record.cpu = cpu;
+        record.asked = r.asked;
+        record.bad_node = r.bad_node;
+        record.probe = r.probe;
+        if (l.newton_results) {
+            record.nonlinear = l.newton_results[slot + i].nonlinear;
+            record.linearizations = l.newton_results[slot + i].linearizations;
+        }
         if (l.energy_records) note_energy(record, l.energy_records[slot + i]);
     }
     rings.step.store(step);

@@ -50,25 +50,17 @@ static bool finish_oldest_frame(GpuLoop& l) {
     return true;
 }
 
-// False if the ring of frames is full; in patient mode waits for room instead.
-static bool room_for_frame(GpuLoop& l) {
-    Rings& rings = l.rings;
-    while (l.frames_begun - rings.frame_head.load() >= FRAME_COPIES)  // waits for the device
-        if (!finish_oldest_frame(l)) return false;
-    while (l.frames_begun - rings.frame_tail.load(std::memory_order_acquire) >= rings.frame_capacity) {
-        if (!rings.patient || rings.stop.load() || l.error) return false;
+// Begins to copy x and v of the last step launched to the ring of frames, if they are wanted.
+static bool copy_frame(GpuLoop& l) {
+    const int64_t bytes = l.frame_bytes;
+    const int64_t slot = begin_frame(l.rings, l.frames_begun, l.launched, [&] {
         l.ran_dry = 1;
         publish(l);
-        nap(1e-4);
-    }
-    return true;
-}
-
-static bool begin_frame(GpuLoop& l) {
-    const int64_t every = l.rings.frame_every.load(), bytes = l.frame_bytes;  // read once, since it may become 0 meanwhile
-    if (every <= 0 || l.launched % every) return true;
-    if (!room_for_frame(l)) { ++l.rings.frames_dropped; return !l.error; }
-    int64_t slot = l.frames_begun % l.rings.frame_capacity;
+        return !l.error;
+    });
+    if (slot < 0) return !l.error;
+    while (l.frames_begun - l.rings.frame_head.load() >= FRAME_COPIES)  // as fast as the device gets there
+        if (!finish_oldest_frame(l)) return false;
     FrameCopy& copy = l.frame_copies[l.frames_begun % FRAME_COPIES];
     Address staging = l.frame_staging + 2 * bytes * (l.frames_begun % FRAME_COPIES);
     CALL(on_device, staging, l.x, (size_t)bytes, l.stream);
@@ -77,7 +69,6 @@ static bool begin_frame(GpuLoop& l) {
     CALL(stream_wait, l.copy_stream, copy.taken, 0);
     CALL(to_host, (char*)l.rings.frames + 2 * bytes * slot, staging, (size_t)(2 * bytes), l.copy_stream);
     CALL(event_record, copy.arrived, l.copy_stream);
-    l.rings.frame_steps[slot] = l.launched;
     ++l.frames_begun;
     return true;
 }

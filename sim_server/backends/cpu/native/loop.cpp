@@ -80,24 +80,14 @@ static void copy_for_worker(Loop& loop, Body& body) {
     body.snapshot_step.store(loop.rings.step, std::memory_order_release);
 }
 
-static bool room_for_frame(Rings& rings) {
-    while (rings.frame_head.load() - rings.frame_tail.load(std::memory_order_acquire) >= rings.frame_capacity) {
-        if (!rings.patient || rings.stop.load()) return false;
-        nap(2e-4);
-    }
-    return true;
-}
-
 static void write_frame(Loop& loop) {
     Rings& rings = loop.rings;
-    const int64_t every = rings.frame_every.load();  // once: it may become 0 meanwhile
-    if (every <= 0 || rings.step % every) return;
-    if (!room_for_frame(rings)) { ++rings.frames_dropped; return; }
-    int64_t slot = rings.frame_head.load() % rings.frame_capacity, size = 3 * (int64_t)loop.nodes;
+    const int64_t slot = begin_frame(rings, rings.frame_head.load(), rings.step, [] { return true; });
+    if (slot < 0) return;
+    const int64_t size = 3 * (int64_t)loop.nodes;
     double* frame = rings.frames + 2 * size * slot;
     std::memcpy(frame, loop.x, sizeof(double) * size);
     std::memcpy(frame + size, loop.v, sizeof(double) * size);
-    rings.frame_steps[slot] = rings.step;
     rings.frame_head.fetch_add(1, std::memory_order_release);
 }
 
@@ -134,7 +124,7 @@ static void finish_step(Loop* loop) {
     Rings& rings = loop->rings;
     int64_t first = rings.record_head.load(), step = rings.step + 1;
     double entered = now();
-    bool keep = room_for_records(rings, loop->bodies, [] {});
+    bool keep = room_for_records(rings, loop->bodies, [] { return true; });
     double waited = now() - entered;  // no part of the step
     if (loop->newton) {
         for (int i = 0; i < loop->bodies; ++i) begin_search(*loop, i);
@@ -160,11 +150,16 @@ static void finish_step(Loop* loop) {
         if (!keep) continue;
         Record& record = rings.records[(first + i) % rings.record_capacity];
         bool used = body.factor && (settings.kind == CHOLESKY || r.kind == CHOLESKY || r.fallbacks);
-        record = Record{step, used ? body.factor->step : -1, rings.start_time + step * rings.dt, r.residual,
-                        loop->assemble_seconds, r.seconds, 0, 0, rings.late, loop->assemble_begin, 0, nonlinear, NAN, NAN, NAN, NAN,
-                        NAN, NAN, i, r.iterations,
-                        r.status, r.kind, settings.kind, r.fallbacks, r.status == NOT_FINITE ? first_bad_node(*loop, body) : -1,
-                        settings.probe, linearizations, 0};
+        record = make_record(rings, step, i, r);
+        if (used) record.factor_step = body.factor->step;
+        record.assemble = loop->assemble_seconds;
+        record.late = rings.late;
+        record.begin = loop->assemble_begin;
+        record.nonlinear = nonlinear;
+        record.asked = settings.kind;
+        record.bad_node = r.status == NOT_FINITE ? first_bad_node(*loop, body) : -1;
+        record.probe = settings.probe;
+        record.linearizations = linearizations;
     }
     double solved = now();
     for (int i = loop->before; i < loop->launches; ++i) run(loop->launch[i], loop->threads);

@@ -10,20 +10,39 @@
 #include "energy_balance.cuh"
 #include "kinds.h"
 
+// The step record: one body, one step. Python reads its columns from here; ObjectStep of protocol/messages.proto has those of the
+// same name. On a GPU only the solve is timed apart: assemble and integrate are 0 there, whole is the step's time on the device.
 struct Record {
-    int64_t step;          // steps completed
-    int64_t factor_step;   // -1: no factor used
-    double time;           // s, at the end of the step
-    double residual;
-    double assemble, solve, integrate, whole, late, begin;  // s; begin: steady clock
-    double cpu;            // s of processor time of the thread, whole step
-    double nonlinear;      // |b| at the end of the step over the first |b|; -1: not evaluated
-    double kinetic, elastic, gravity, work, budget;  // J (kernels/energy_balance.cuh); elastic: NaN where it was not evaluated
-    double stride;         // m
-    int32_t body, iterations, status, kind, asked, fallbacks, bad_node, probe, linearizations, unused;
+    int64_t step = 0;           // steps completed
+    int64_t factor_step = -1;   // of the matrix that the factor was made from; -1: no factor used
+    double time = 0;            // of the simulation at the end of the step [s]
+    double residual = 0;        // true, |b - A y| / |b|
+    double assemble = 0;        // [s], as the next three
+    double solve = 0;
+    double integrate = 0;
+    double whole = 0;
+    double late = 0;            // start of the step after its deadline [s]
+    double begin = 0;           // steady clock [s]
+    double cpu = 0;             // processor time of the loop's thread in the whole step [s]
+    double nonlinear = -1;      // |b| at the end of the step over the first |b|; -1: not evaluated
+    double kinetic = NAN;       // energies (kernels/energy_balance.cuh) [J]; NaN: not evaluated
+    double elastic = NAN;
+    double gravity = NAN;
+    double work = NAN;
+    double budget = NAN;
+    double stride = NAN;        // [m]
+    int32_t body = 0;
+    int32_t iterations = 0;
+    int32_t status = 0;         // Status
+    int32_t kind = 0;           // Kind used at the end of the solve
+    int32_t asked = 0;          // Kind that it began with
+    int32_t fallbacks = 0;      // solves that left their factor
+    int32_t bad_node = -1;      // first node of the body whose b is not finite
+    int32_t probe = 0;          // iterations after which the solve was to go over to the other Kind; 0: never
+    int32_t linearizations = 1;
 };
 
-// b: Balance or Energy of the body (kernels/energy_balance.cuh).
+// b: Balance or EnergyRecord of the body (kernels/energy_balance.cuh).
 template <class B> static inline void note_energy(Record& record, const B& b) {
     record.kinetic = b.kinetic;
     record.elastic = b.elastic;
@@ -59,7 +78,13 @@ struct Rings {
     double late;                           // s that the step began after its deadline
 };
 
-// Is the elastic energy after so many steps wanted?
+// Whether the frame after `step` steps is wanted.
+static inline bool frame_due(const Rings& rings, int64_t step) {
+    const int64_t every = rings.frame_every.load(std::memory_order_relaxed);  // once: it may become 0 meanwhile
+    return every > 0 && step % every == 0;
+}
+
+// Whether the elastic energy after `step` steps is wanted.
 static inline bool energy_due(const Rings& rings, int64_t step) {
     const int64_t every = rings.energy_every.load(std::memory_order_relaxed);
     return every > 0 && step % every == 0;
@@ -80,15 +105,47 @@ static inline void nap(double seconds) {
     nanosleep(&t, nullptr);
 }
 
-// Room for the records of one step. A full ring: wait if nobody minds, doing `meanwhile`, else say no.
+// The record of a body after `step` steps, of a solve with the members of SolveResult (pcg.h). The rest is filled in by name.
+template <class Solve>
+static inline Record make_record(const Rings& rings, int64_t step, int32_t body, const Solve& solve) {
+    Record record;
+    record.step = step;
+    record.time = rings.start_time + step * rings.dt;
+    record.body = body;
+    record.residual = solve.residual;
+    record.solve = solve.seconds;
+    record.iterations = solve.iterations;
+    record.status = solve.status;
+    record.kind = solve.kind;
+    record.fallbacks = solve.fallbacks;
+    return record;
+}
+
+// Whether a ring filled up to `head` has room for `count` more. If it is full: in patient mode block, calling `meanwhile`, until it
+// has (false only if that returns false, or on stop); otherwise return false at once.
 template <class Meanwhile>
-static bool room_for_records(Rings& rings, int64_t count, Meanwhile meanwhile) {
-    while (rings.record_head.load() - rings.record_tail.load(std::memory_order_acquire) > rings.record_capacity - count) {
-        if (!rings.patient || rings.stop.load()) return false;
-        meanwhile();
-        nap(2e-4);
+static bool has_room(const Rings& rings, int64_t head, const std::atomic<int64_t>& tail, int64_t capacity, int64_t count, Meanwhile meanwhile) {
+    while (head - tail.load(std::memory_order_acquire) > capacity - count) {
+        if (!rings.patient || rings.stop.load() || !meanwhile()) return false;
+        nap(1e-4);
     }
     return true;
+}
+
+// Room for the records of one step.
+template <class Meanwhile>
+static bool room_for_records(const Rings& rings, int64_t count, Meanwhile meanwhile) {
+    return has_room(rings, rings.record_head.load(), rings.record_tail, rings.record_capacity, count, meanwhile);
+}
+
+// Slot of the ring that the frame after `step` steps goes to, where `head` frames came before it; -1: none is wanted, or it is
+// dropped as there is no room.
+template <class Meanwhile>
+static int64_t begin_frame(Rings& rings, int64_t head, int64_t step, Meanwhile meanwhile) {
+    if (!frame_due(rings, step)) return -1;
+    if (!has_room(rings, head, rings.frame_tail, rings.frame_capacity, 1, meanwhile)) { ++rings.frames_dropped; return -1; }
+    rings.frame_steps[head % rings.frame_capacity] = step;
+    return head % rings.frame_capacity;
 }
 
 // Before a step: sleep while paused and until it is due. False if the loop is to stop. `meanwhile` is called before each nap and
