@@ -5,42 +5,30 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
+from google.protobuf.descriptor import FieldDescriptor
 from numpy.typing import NDArray
 
 from protocol import messages_pb2 as pb
 
 Columns = dict[str, NDArray]
 
-# Names as in the ObjectStep message; seconds are wall-clock, time is simulated.
-DTYPES: dict[str, str] = {
-    "step": "i8",
-    "time": "f8",  # s
-    "iterations": "i8",
-    "residual": "f8",  # true, |b - A dv| / |b|
-    "status": "U24",
-    "factor_step": "i8",  # -1: no factor
-    "factor_age": "i8",  # steps; -1: no factor
-    "preconditioner": "U24",
-    "assemble_seconds": "f8",
-    "solve_seconds": "f8",
-    "integrate_seconds": "f8",
-    "step_seconds": "f8",
-    "late_seconds": "f8",
-    "cpu_seconds": "f8",
-    "fallbacks": "i8",
-    "excess": "f8",
-    "factor_age_bound": "i8",  # steps; -1: none known
-    "linearizations": "i8",  # of Newton-Raphson; 0: the scene has one a step
-    "nonlinear_residual": "f8",  # of the step's first |b|
-    "kinetic_energy": "f8",  # J; this and the next four are NaN where they were not recorded
-    "elastic_energy": "f8",  # J; recorded in some steps
-    "gravity_energy": "f8",  # J; zero at the origin
-    "work": "f8",  # J, of pushes and grabs since the start
-    "dissipated": "f8",  # J since the start
-}
-ENERGIES = ("kinetic_energy", "elastic_energy", "gravity_energy", "work", "dissipated")
+INPUTS = ("asked", "probe")  # of a solve: for replays only
+
+
+def _dtype(field: Any) -> str:
+    if field.type == FieldDescriptor.TYPE_DOUBLE:
+        return "f8"
+    return "U24" if field.type in (FieldDescriptor.TYPE_STRING, FieldDescriptor.TYPE_ENUM) else "i8"
+
+
+_FIELDS = [f for f in pb.ObjectStep.DESCRIPTOR.fields if f.message_type is None and f.name not in INPUTS]
+DTYPES: dict[str, str] = {f.name: _dtype(f) for f in _FIELDS}
+"""Type by name, in the order of ObjectStep (protocol/messages.proto has the units). Seconds are wall-clock, time is
+simulated."""
+OPTIONAL = frozenset(f.name for f in _FIELDS if f.has_presence)  # NaN where they were not recorded
 
 
 def status_name(value: int) -> str:
@@ -56,7 +44,7 @@ def row(message: pb.ObjectStep) -> tuple:
 def _value(message: pb.ObjectStep, name: str) -> object:
     if name == "status":
         return status_name(message.status)
-    return math.nan if name in ENERGIES and not message.HasField(name) else getattr(message, name)  # type: ignore[arg-type]
+    return math.nan if name in OPTIONAL and not message.HasField(name) else getattr(message, name)  # type: ignore[arg-type]
 
 
 def columns(rows: Iterable[tuple]) -> Columns:

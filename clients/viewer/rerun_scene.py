@@ -13,7 +13,7 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from clients.log.frames import Frame, Mesh
-from clients.log.scalars import ENERGIES, Columns
+from clients.log.scalars import Columns
 from clients.viewer.colors import colors
 from clients.viewer.surface import Coloring, Surface, legend
 
@@ -24,6 +24,7 @@ PLOTS = {  # entity below /plots -> title
     "step_time": "step time [ms]",
     "energy": "energy [J]",
 }
+ENERGIES = ("kinetic_energy", "elastic_energy", "gravity_energy", "work", "dissipated")
 
 
 class RerunScene:

@@ -2,7 +2,6 @@
 """The simulation in the words of the protocol: scene, topologies, states, step records."""
 
 import json
-import math
 import platform
 import time
 from collections.abc import Callable
@@ -18,6 +17,7 @@ from sim_server.backends.kinds import Kind
 from sim_server.mechanics.world import Body
 from sim_server.mesh import posed
 from sim_server.mesh.surface import surface_triangles
+from sim_server.recording.object_steps import object_step, rows
 from sim_server.scene.solver_options import FACTORS
 from sim_server.service.points import Points
 from sim_server.simulation import Simulation
@@ -88,14 +88,15 @@ def state(body: Body, step: int, time: float, x: NDArray[np.float64], v: NDArray
 def steps(
     simulation: Simulation, records: NDArray[Any], methods: Callable[[int, int], Method | None] | None = None
 ) -> list[pb.ObjectStep]:
-    """Step records (engine.RECORD) as messages. methods: of body and step, how that factor was made ("auto")."""
+    """Step records (structs.RECORD) as messages. methods: of body and step, how that factor was made ("auto")."""
     names = [b.name for b in simulation.world.bodies]
     kinds = preconditioner_names(simulation)
-    columns = [records[name].tolist() for name in records.dtype.names or ()]
-    rows = (dict(zip(records.dtype.names or (), row, strict=True)) for row in zip(*columns, strict=True))
     if methods is None or simulation.scene.solver.preconditioner != "auto":
-        return [_step(names, kinds, row) for row in rows]
-    return [_step(names, kinds | _factor_name(methods(row["body"], row["factor_step"])), row) for row in rows]
+        return [object_step(row, names[row["body"]], kinds) for row in rows(records)]
+    return [
+        object_step(row, names[row["body"]], kinds | _factor_name(methods(row["body"], row["factor_step"])))
+        for row in rows(records)
+    ]
 
 
 def preconditioner_names(simulation: Simulation) -> dict[Kind, str]:
@@ -106,35 +107,6 @@ def preconditioner_names(simulation: Simulation) -> dict[Kind, str]:
 
 def _factor_name(method: Method | None) -> dict[Kind, str]:
     return {} if method is None else {Kind.CHOLESKY: method.name}
-
-
-def _step(names: list[str], kinds: dict[Kind, str], r: dict[str, Any]) -> pb.ObjectStep:
-    made = r["factor_step"]
-    energies = {"kinetic_energy": r["kinetic"], "elastic_energy": r["elastic"], "gravity_energy": r["gravity"]}
-    energies |= {"work": r["work"], "dissipated": r["budget"] - r["kinetic"] - r["elastic"]}
-    return pb.ObjectStep(
-        header=pb.Header(object=names[r["body"]], epoch=1),
-        step=r["step"],
-        time=r["time"],
-        iterations=r["iterations"],
-        status=r["status"],
-        residual=r["residual"],
-        factor_step=made,
-        factor_age=r["step"] - 1 - made if made >= 0 else -1,
-        preconditioner=kinds[Kind(r["kind"])],
-        assemble_seconds=r["assemble"],
-        solve_seconds=r["solve"],
-        integrate_seconds=r["integrate"],
-        step_seconds=r["whole"],
-        late_seconds=r["late"],
-        cpu_seconds=r["cpu"],
-        fallbacks=r["fallbacks"],
-        asked=kinds[Kind(r["asked"])] if r["asked"] != r["kind"] else "",
-        probe=r["probe"],
-        linearizations=0 if r["nonlinear"] == -1 else r["linearizations"],
-        nonlinear_residual=0.0 if r["nonlinear"] == -1 else r["nonlinear"],
-        **{name: value for name, value in energies.items() if not math.isnan(value)},
-    )
 
 
 def _bytes(values: NDArray[Any], dtype: str) -> bytes:

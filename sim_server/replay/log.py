@@ -11,6 +11,7 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from google.protobuf.message import DecodeError
@@ -22,18 +23,19 @@ from protocol.log_file import LogFile, LogMessage
 from protocol.refused import Refused
 from protocol.validate import array
 from sim_server.arrays import Float64
+from sim_server.backends.cpu.structs import RECORD
 from sim_server.backends.kinds import Kind
+from sim_server.recording import object_steps
 from sim_server.scene.solver_options import FACTORS
 
-ROW = np.dtype(
-    [
-        ("step", "i8"), ("iterations", "i8"), ("status", "i8"), ("residual", "f8"), ("factor_step", "i8"),
-        ("kind", "i8"), ("asked", "i8"), ("probe", "i8"), ("fallbacks", "i8"), ("linearizations", "i8"),
-        ("kinetic", "f8"), ("work", "f8"),
-    ]
-)  # fmt: skip
-"""Input and result of a solve, from an ObjectStep. Energies are NaN in logs of versions that did not record them."""
-_PACK = struct.Struct("<qqqdqqqqqqdd")
+COMPARED = ("iterations", "residual", "status", "kind", "fallbacks", "factor_step", "linearizations", "kinetic", "work")
+INPUTS = ("step", "asked", "probe")
+ROW = np.dtype([(name, "f8" if RECORD[name].kind == "f" else "i8") for name in (*INPUTS, *COMPARED)])
+"""Input and result of a solve: columns of the step record, from an ObjectStep."""
+FIELDS = {name: (object_steps.COPIED | object_steps.KINDS)[name] for name in ROW.names or ()}
+OPTIONAL = tuple(name for name in COMPARED if FIELDS[name] in object_steps.OPTIONAL)
+"""NaN in logs of versions that did not record them."""
+_PACK = struct.Struct("<" + "".join("d" if ROW[name].kind == "f" else "q" for name in ROW.names or ()))
 _KINDS = {kind.name.lower(): int(kind) for kind in Kind} | dict.fromkeys(FACTORS, int(Kind.CHOLESKY))
 
 
@@ -136,22 +138,7 @@ class Recording:
             found.factors[factor.step] = factor
         elif kind == "step":
             s = pb.ObjectStep.FromString(data)
-            kind_used = _KINDS[s.preconditioner]
-            asked = _KINDS[s.asked] if s.asked else kind_used
-            found.packed += _PACK.pack(
-                s.step,
-                s.iterations,
-                s.status,
-                s.residual,
-                s.factor_step,
-                kind_used,
-                asked,
-                s.probe,
-                s.fallbacks,
-                max(s.linearizations, 1),
-                s.kinetic_energy if s.HasField("kinetic_energy") else math.nan,
-                s.work if s.HasField("work") else math.nan,
-            )
+            found.packed += _PACK.pack(*_row(s).values())
 
     def _complete(self) -> int:
         """Sorts the rows; returns the last step up to which no object lacks a row."""
@@ -190,3 +177,15 @@ class Recording:
                 f"{self.path}: written by an older version, which did not record the build, the steps at which pushes "
                 "and grabs took effect, and probes of the automatic preconditioner: only runs without these repeat"
             )
+
+
+def _row(message: pb.ObjectStep) -> dict[str, Any]:
+    """Values of the columns of ROW, in its order."""
+    row = {name: getattr(message, field) for name, field in FIELDS.items()}
+    for name in OPTIONAL:
+        if not message.HasField(FIELDS[name]):  # type: ignore[arg-type]
+            row[name] = math.nan
+    row["kind"] = _KINDS[message.preconditioner]
+    row["asked"] = _KINDS[message.asked] if message.asked else row["kind"]
+    row["linearizations"] = max(message.linearizations, 1)
+    return row

@@ -12,11 +12,9 @@ from numpy.typing import NDArray
 from protocol import messages_pb2 as pb
 from sim_server.arrays import Float64
 from sim_server.backends.kinds import Kind
-from sim_server.replay.log import Recording
+from sim_server.replay.log import COMPARED, OPTIONAL, Recording
 
 Pair = tuple[Float64, Float64]
-COMPARED = ("iterations", "residual", "status", "kind", "fallbacks", "factor_step", "linearizations", "kinetic", "work")
-OPTIONAL = ("kinetic", "work")  # NaN in logs of versions that did not record them
 
 
 class Comparison:

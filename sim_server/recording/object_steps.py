@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: MIT
+"""Step records of a loop as ObjectStep messages.
+
+A column of struct Record (backends/cpu/native/ring_buffers.h) is the field of the same name, or that in FIELDS. A
+column without a field is not sent. NaN leaves an `optional` field unset.
+"""
+
+from typing import Any
+
+from numpy.typing import NDArray
+
+from protocol import messages_pb2 as pb
+from sim_server.backends.cpu.structs import RECORD
+from sim_server.backends.kinds import Kind
+
+FIELDS = {  # of ObjectStep by column, where names differ
+    "assemble": "assemble_seconds",
+    "solve": "solve_seconds",
+    "integrate": "integrate_seconds",
+    "whole": "step_seconds",
+    "late": "late_seconds",
+    "cpu": "cpu_seconds",
+    "nonlinear": "nonlinear_residual",
+    "kinetic": "kinetic_energy",
+    "elastic": "elastic_energy",
+    "gravity": "gravity_energy",
+}
+KINDS = {"kind": "preconditioner", "asked": "asked"}  # field by column, where the field is the name of a Kind
+KNOWN = pb.ObjectStep.DESCRIPTOR.fields_by_name
+COPIED = {  # field by column, where the value is the same
+    column: field
+    for column in RECORD.names or ()
+    if column not in KINDS and (field := FIELDS.get(column, column)) in KNOWN
+}
+OPTIONAL = tuple(field for field in (*COPIED.values(), "dissipated") if KNOWN[field].has_presence)
+
+
+def rows(records: NDArray[Any]) -> list[dict[str, Any]]:
+    """Step records (structs.RECORD) as dictionaries of Python numbers."""
+    names = records.dtype.names or ()
+    columns = [records[name].tolist() for name in names]
+    return [dict(zip(names, row, strict=True)) for row in zip(*columns, strict=True)]
+
+
+def object_step(record: dict[str, Any], name: str, kinds: dict[Kind, str]) -> pb.ObjectStep:
+    """Makes the message of one record. name: of the object. kinds: names of preconditioners."""
+    made, kind, asked = record["factor_step"], record["kind"], record["asked"]
+    values = {field: record[column] for column, field in COPIED.items()}
+    values["dissipated"] = record["budget"] - record["kinetic"] - record["elastic"]
+    for field in OPTIONAL:
+        if values[field] != values[field]:
+            del values[field]
+    if record["nonlinear"] == -1:  # no Newton-Raphson
+        values["linearizations"] = values["nonlinear_residual"] = 0
+    return pb.ObjectStep(
+        header=pb.Header(object=name, epoch=1),
+        factor_age=record["step"] - 1 - made if made >= 0 else -1,
+        preconditioner=kinds[Kind(kind)],
+        asked=kinds[Kind(asked)] if asked != kind else "",
+        **values,
+    )
