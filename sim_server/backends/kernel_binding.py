@@ -7,6 +7,7 @@ struct for their side.
 
 from __future__ import annotations
 
+import ctypes
 import re
 from dataclasses import dataclass
 from functools import cache
@@ -16,8 +17,9 @@ import numpy as np
 
 from sim_server.backends.build_pool import CompileError
 from sim_server.backends.compiler import read_text
+from sim_server.backends.declarations import NUMBERS, split_members
 
-NUMBERS = {"int": "i4", "double": "f8", "float": "f4"}
+REALS_AND_INT = ("int", "float", "double")
 
 
 @dataclass(frozen=True)
@@ -39,18 +41,25 @@ def members_of(text: str, struct: str, types: dict[str, str]) -> list[Argument]:
     body = re.search(rf"struct {struct} \{{(.*?)\n\}};", text, re.DOTALL)
     if body is None:
         raise CompileError(f"no struct {struct} in the kernel text")
-    members: list[Argument] = []
-    for line in body.group(1).splitlines():
-        member = re.fullmatch(r"\s*(const )?(?:own<(\w+)>|(\w+)(\*?)) (\w+);.*", line)
-        if member is None:
-            if line.split("//")[0].strip():
-                raise CompileError(f"struct {struct}: cannot read the member {line.strip()!r}")
-            continue
-        constant, own, kind, star, name = member.groups()
-        kind = types.get(own or kind, own or kind)
-        dtype = np.dtype(NUMBERS[kind]) if star or own else None
-        members.append(Argument(name, kind, dtype, bool(own), bool(constant)))
+    members = []
+    try:
+        for member in split_members(body.group(1)):
+            own = member.kind.startswith("own<")
+            written = member.kind[4:-1] if own else member.kind
+            kind = types.get(written, written)
+            if kind not in REALS_AND_INT or member.shape:
+                raise ValueError(f"cannot read the member {member.name!r}")
+            dtype = np.dtype(NUMBERS[kind]) if member.pointer else None
+            members.append(Argument(member.name, kind, dtype, own, member.constant))
+    except ValueError as error:
+        raise CompileError(f"struct {struct}: {error}") from None
     return members
+
+
+def structure_of(members: list[Argument]) -> type[ctypes.Structure]:
+    """The argument struct as ctypes has it: numbers and addresses of arrays."""
+    fields = [(m.name, NUMBERS[m.kind] if m.dtype is None else ctypes.c_void_p) for m in members]
+    return type("Arguments", (ctypes.Structure,), {"_fields_": fields})
 
 
 @cache

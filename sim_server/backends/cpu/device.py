@@ -13,9 +13,7 @@ from numpy.typing import NDArray
 from sim_server.backends.base import Engine, EngineInput
 from sim_server.backends.build_pool import compilers
 from sim_server.backends.compiler import ahead, begin_kernels, build_id
-from sim_server.backends.kernel_binding import Argument, BoundKernel, KernelText
-
-_SCALARS = {"int": ctypes.c_int32, "double": ctypes.c_double, "float": ctypes.c_float}
+from sim_server.backends.kernel_binding import Argument, BoundKernel, KernelText, structure_of
 
 
 class CpuModule(KernelText):
@@ -45,8 +43,7 @@ class CpuModule(KernelText):
     def layout(self, kernel: str, fields: list[Argument]) -> type[ctypes.Structure]:
         """The argument struct of a kernel as ctypes sees it."""
         if kernel not in self._layouts:
-            members = [(f.name, _SCALARS[f.kind] if f.dtype is None else ctypes.c_void_p) for f in fields]
-            self._layouts[kernel] = type(kernel, (ctypes.Structure,), {"_fields_": members})
+            self._layouts[kernel] = structure_of(fields)
         return self._layouts[kernel]
 
     def bind(self, kernel: str, n: int, **arguments: Any) -> CpuLaunch:

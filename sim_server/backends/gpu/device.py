@@ -19,7 +19,7 @@ from sim_server.backends.base import Engine, EngineInput
 from sim_server.backends.build_pool import CompileError, compilers
 from sim_server.backends.compiler import INCLUDE, SOURCES, ahead, build_id
 from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction, KernelModule
-from sim_server.backends.kernel_binding import NUMBERS, Argument, BoundKernel, KernelText
+from sim_server.backends.kernel_binding import BoundKernel, KernelText, structure_of
 from sim_server.errors import DeviceError
 
 CAPABILITY = 80  # compute capability times 10; the solver needs matrix instructions of float16
@@ -124,7 +124,7 @@ class DeviceLaunch(BoundKernel):
 
     def __init__(self, module: DeviceModule, kernel: str, given: dict[str, Any]):
         super().__init__(module, kernel, given, converts=True)
-        self.params = np.zeros((), dtype=_layout(self.fields))
+        self.params = np.zeros((), dtype=structure_of(self.fields))
         self.arrays: dict[str, DeviceArray] = {}
         for f, value in zip(self.fields, self.values, strict=True):
             if f.dtype is not None:
@@ -149,10 +149,6 @@ class DeviceLaunch(BoundKernel):
         """Device address of the arguments of a mailed launch."""
         assert self._mail is not None
         return int(self._mail.data.ptr)
-
-
-def _layout(fields: list[Argument]) -> np.dtype[np.void]:
-    return np.dtype([(f.name, "u8" if f.dtype is not None else NUMBERS[f.kind]) for f in fields], align=True)
 
 
 def own_headers() -> tuple[str, ...]:
