@@ -26,22 +26,22 @@ struct Front {
     int children, unused;
 };
 
-struct Status {
+struct FactorStatus {
     int pivot;     // first column of L whose pivot was not positive
     int range;     // first column with a value outside the range of Value
     int infinite;  // a value of A is NaN or infinite
 };
 
-extern "C" __global__ void reset(Status* status) { *status = Status{0x7fffffff, 0x7fffffff, 0}; }
+extern "C" __global__ void reset(FactorStatus* status) { *status = FactorStatus{0x7fffffff, 0x7fffffff, 0}; }
 
 template <class T> __device__ bool finite(T v) { return v - v == 0; }
 
-extern "C" __global__ void check_finite(const double* blocks, Long count, Status* status) {
+extern "C" __global__ void check_finite(const double* blocks, Long count, FactorStatus* status) {
     for (Long i = blockIdx.x * (Long)blockDim.x + threadIdx.x; i < count; i += (Long)gridDim.x * blockDim.x)
         if (!finite(blocks[i])) status->infinite = 1;
 }
 
-// The i with start[i] <= block < start[i + 1], found by all threads of a block together.
+// Returns the i with start[i] <= block < start[i + 1]; all threads of the block search together.
 __device__ int locate(const int* start, int count, int block) {
     __shared__ int found;
     int low = 0, n = count;
@@ -57,7 +57,7 @@ __device__ int locate(const int* start, int count, int block) {
     return low;
 }
 
-// One block per CHUNK nodes of a front, one warp per column: zeros, entries of A, then child after child.
+// Assembles CHUNK nodes of a front per block, one column per warp: zeros, entries of A, then the children one by one.
 extern "C" __global__ void __launch_bounds__(192)
 assemble(const Front* fronts, const int* start, int count, const Front* all, const int* child, const int* map,
          const int* split, const Long* entry_start, const int* entry_block, const int* entry_row,
@@ -110,10 +110,10 @@ assemble(const Front* fronts, const int* start, int count, const Front* all, con
 __device__ double rsqrt_of(double v) { return rsqrt(v); }
 __device__ float rsqrt_of(float v) { return 1 / sqrtf(v); }
 
-// Cholesky factor and inverse of 32 x 32 entries in shared memory by one warp, a row in each lane: column by column,
-// s holds what remains of A right of the current column and the inverse, its rows not yet divided by their pivots, left
-// of it. The result: L below the diagonal, the inverse transposed above it, 1 / diagonal in `reciprocal`.
-__device__ void eliminate(real* m, real* reciprocal, int active, int column, Status* status) {
+// Cholesky factor and inverse of 32 x 32 entries in shared memory, by one warp with a row in each lane, column by column.
+// s holds the remaining entries of A to the right of the current column, and to its left the inverse, whose rows are not
+// divided by their pivots yet. Result: L below the diagonal, the transposed inverse above it, 1 / diagonal in `reciprocal`.
+__device__ void eliminate(real* m, real* reciprocal, int active, int column, FactorStatus* status) {
     int i = LANE;
     real s[32], own = 1;
 #pragma unroll
@@ -147,17 +147,17 @@ __device__ void eliminate(real* m, real* reciprocal, int active, int column, Sta
         if (c < i) m[i * PITCH + c] = s[c] * own;
 }
 
-// Entry [i][q] of the inverse of a factor that `eliminate` has left in m.
+// Entry [i][q] of the inverse, as `eliminate` stores it in m.
 __device__ real inverse_entry(const real* m, const real* reciprocal, int i, int q) {
     return q < i ? m[i * PITCH + q] : q == i ? reciprocal[i] : 0;
 }
 
-// Of the factor and inverse in two halves of 32: [m .; under corner], 8 rows or columns for each warp.
-struct Halves {
+// Factor and inverse of a block in halves of 32: [m .; under corner]; each warp has 8 rows or columns.
+struct HalfBlocks {
     real *m, *under, *corner, *reciprocal;
     int first;
 
-    // under becomes the lower left quarter of the factor, and corner loses its product with itself.
+    // Makes `under` the lower left quarter of the factor, and subtracts under under^T from `corner`.
     __device__ void divide() {
         real x[8] = {};
         for (int q = 0; q < first + 8; q++) {
@@ -180,7 +180,7 @@ struct Halves {
             if (first + a <= LANE) corner[(first + a) * PITCH + LANE] -= x[a];
     }
 
-    // By warps 1 to 3: under times the inverse, into the place of the inverse's lower left quarter (transposed).
+    // By warps 1 to 3: writes `under` times the inverse to the lower left quarter of the inverse (transposed).
     __device__ void multiply() {
         real y[11] = {};
         int top = 11 * (WARP - 1);
@@ -195,7 +195,7 @@ struct Halves {
             if (top + a < 32) m[(32 + top + a) * PITCH + LANE] = y[a];
     }
 
-    // ... and that times the inverse of the corner.
+    // Multiplies this quarter by the inverse of the corner.
     __device__ void finish() {
         real x[8] = {};
         for (int q = 0; q < first + 8; q++) {
@@ -211,9 +211,9 @@ struct Halves {
 
 // Factorizes the leading w x w entries (w <= 64) of `block` in place, its inverse transposed above the diagonal.
 // m: 64 columns of shared memory.
-__device__ void diagonal(real* m, real* block, int stride, int w, int column, Status* status) {
+__device__ void diagonal(real* m, real* block, int stride, int w, int column, FactorStatus* status) {
     __shared__ real reciprocal[WIDTH];
-    Halves halves = {m, m + 32, m + 32 * PITCH + 32, reciprocal, 8 * WARP};
+    HalfBlocks halves = {m, m + 32, m + 32 * PITCH + 32, reciprocal, 8 * WARP};
     int r = threadIdx.x % 64, c0 = threadIdx.x / 64;
     real v[WIDTH / 2];
 #pragma unroll
@@ -242,15 +242,15 @@ __device__ void diagonal(real* m, real* block, int stride, int w, int column, St
         if (r < w) block[r + (Long)c * stride] = m[c * PITCH + r];
 }
 
-extern "C" __global__ void __launch_bounds__(THREADS) factor(const Front* fronts, real* here, Status* status) {
+extern "C" __global__ void __launch_bounds__(THREADS) factor(const Front* fronts, real* here, FactorStatus* status) {
     __shared__ __align__(16) real work[2 * DEEP * PITCH];
     Front f = fronts[blockIdx.x];
     diagonal(work, here + f.at, f.stride, min(WIDTH, f.own), f.column, status);
 }
 
-// Tiles of 64 x 64 sums, 32 of them in each thread: where they stand, and adding a b^T of DEEP columns of a and b.
+// Tiles of 64 x 64 sums, 32 in each thread: row and column of the e-th of them, and the addition of a b^T for DEEP columns.
 #if __CUDA_ARCH__ >= 800
-struct Matrix {  // float64 by matrix instructions: a warp has 32 x 32 sums, 4 x 4 squares of 8 x 8
+struct TensorCoreTiles {  // float64 matrix instructions: a warp has 32 x 32 sums, 4 x 4 squares of 8 x 8
     __device__ static int row(int e) { return 32 * (WARP % 2) + 8 * (e / 8) + LANE / 4; }
     __device__ static int column(int e) { return 32 * (WARP / 2) + 8 * (e / 2 % 4) + 2 * (LANE % 4) + e % 2; }
     __device__ static void multiply(double& s0, double& s1, double a, double b) {
@@ -274,7 +274,7 @@ struct Matrix {  // float64 by matrix instructions: a warp has 32 x 32 sums, 4 x
 };
 #endif
 
-struct Scalar {  // a thread has 4 x 8 sums
+struct ScalarTiles {  // a thread has 4 x 8 sums
     __device__ static int row(int e) { return threadIdx.x % 16 + 16 * (e / 8); }
     __device__ static int column(int e) { return 8 * (threadIdx.x / 16) + e % 8; }
     __device__ static void add(real* sum, const real* a, const real* b) {
@@ -294,14 +294,14 @@ struct Scalar {  // a thread has 4 x 8 sums
     }
 };
 
-template <class T> struct Choice { typedef Scalar Tiles; };
+template <class T> struct TilesOf { typedef ScalarTiles Tiles; };
 #if __CUDA_ARCH__ >= 800
-template <> struct Choice<double> { typedef Matrix Tiles; };
+template <> struct TilesOf<double> { typedef TensorCoreTiles Tiles; };
 #endif
-typedef Choice<real>::Tiles Tiles;
+typedef TilesOf<real>::Tiles Tiles;
 
-// 64 rows of DEEP columns into shared memory; zeros outside of rows x columns. Here and below reads come first, all of
-// them, then writes: a read that might follow a write to the same place would wait for it.
+// Loads 64 rows of DEEP columns into shared memory; zeros outside of rows x columns. Here and below all reads come before
+// all writes, since a read waits for an earlier write that may be to the same address.
 __device__ void load(real* to, const real* from, int stride, int rows, int columns) {
     int r = threadIdx.x % 64, k = threadIdx.x / 64;
     real v[DEEP / 2];
@@ -312,7 +312,7 @@ __device__ void load(real* to, const real* from, int stride, int rows, int colum
     for (int i = 0; i < DEEP / 2; i++) to[(2 * i + k) * PITCH + r] = v[i];
 }
 
-// DEEP columns, from q0 on, of the inverse of a factorized diagonal block.
+// Loads DEEP columns, from q0 on, of the inverse of a factorized diagonal block.
 __device__ void load_inverse(real* to, const real* block, int stride, int w, int q0) {
     const int APART = THREADS / DEEP;
     int k = threadIdx.x % DEEP, q = q0 + k, c0 = threadIdx.x / DEEP;
@@ -355,7 +355,7 @@ panel(const Front* fronts, const int* start, int count, int step, real* here) {
 }
 
 extern "C" __global__ void __launch_bounds__(THREADS, 3)
-update(const Front* fronts, const int* start, int count, int step, real* here, Status* status) {
+update(const Front* fronts, const int* start, int count, int step, real* here, FactorStatus* status) {
     __shared__ __align__(16) real work[2 * DEEP * PITCH];
     real *a = work, *b = work + DEEP * PITCH;
     int index = locate(start, count, blockIdx.x);
@@ -397,10 +397,10 @@ update(const Front* fronts, const int* start, int count, int step, real* here, S
     }
 }
 
-// Columns of L, one warp each, to where the pattern has them.
+// Copies columns of L, one per warp, to their positions in the pattern.
 extern "C" __global__ void __launch_bounds__(192)
 store(const Front* fronts, const int* start, int count, const real* __restrict__ here, Value* __restrict__ values,
-      Status* status) {
+      FactorStatus* status) {
     const Value tiny = sizeof(Value) == 4 ? Value(1.17549435e-38f) : Value(2.2250738585072014e-308);
     int index = locate(start, count, blockIdx.x);
     Front f = fronts[index];
