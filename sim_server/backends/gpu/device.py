@@ -98,7 +98,7 @@ def grid_of(threads: int) -> tuple[tuple[int], tuple[int]]:
 
 
 class DeviceModule(KernelText):
-    """A kernel text compiled by NVRTC; raises CompileError."""
+    """A kernel text that NVRTC compiles. Raises CompileError."""
 
     def __init__(self, path: str, gpu: "Gpu", real: str = "double", cooperative: bool = False, local: str = ""):
         super().__init__(path, {"real": real, "local": local or real})
@@ -120,7 +120,10 @@ class DeviceModule(KernelText):
 
 
 class DeviceLaunch(BoundKernel):
-    """One kernel with its arguments on the device; those of a mailed one lie in device memory. arrays: the twins."""
+    """A kernel with its arguments on the device.
+
+    arrays: twins of the arrays, by argument. The arguments of a mailed launch are in device memory and may be replaced.
+    """
 
     def __init__(self, module: DeviceModule, kernel: str, given: dict[str, Any]):
         super().__init__(module, kernel, given, converts=True)

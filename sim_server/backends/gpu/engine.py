@@ -53,7 +53,7 @@ class DeviceSettings:
 class GpuEngine(DeviceLoop):
     """Runs the steps of a scene on a GPU.
 
-    given: what the scene gives an engine (base.EngineInput)
+    given: input from the scene
     records: capacity of the ring of records
 
     Raises errors that device.building translates, for lack of memory.
@@ -64,7 +64,7 @@ class GpuEngine(DeviceLoop):
     def __init__(self, gpu: Gpu, given: EngineInput, records: int = 8192):
         assemble, integrate = (cast(Sequence[DeviceLaunch], part) for part in (given.assemble, given.integrate))
         ranges, arrays, dt, newton = given.ranges, given.arrays, given.dt, given.newton
-        planes = 2 if given.solver.factor_precision == "float32" else 1  # float16 numbers that make one of a factor
+        planes = 2 if given.solver.factor_precision == "float32" else 1  # float16 numbers per entry of an inverse
         self.gpu, self.launches, self._arrays = gpu, [*assemble, *integrate], arrays
         cp, bodies = gpu.cp, len(ranges)
         device = CudaDevice(cp)

@@ -195,7 +195,7 @@ def _depth(parts: Parts, slot_start: Int32) -> Int64:
 
 
 def _partition_work(cut: Partition, parts: Parts, blocks: int, planes: int, depth: Int64) -> dict[str, Any]:
-    """Segments and tiles of all phases, and where each block's storage begins."""
+    """Returns segments and tiles of all phases, and the first chunk of each block."""
     segments, tiles, keys, areas = [], [], [], [0]
     for phase, (which, work) in enumerate(phase_work(cut, blocks, planes)):
         pieces = balance(work, blocks)
@@ -263,7 +263,7 @@ class _Phase:
         return found[np.argsort(found[:, 0], kind="stable")]  # by block, what is formed first
 
     def _segments(self, kind: Int64, low: Int64, high: Int64) -> Int64:
-        """Of entries low to high of each piece's part."""
+        """Returns segments of the entries [low, high) of the part of each piece."""
         return np.stack([self.pieces.block, kind, self.start + low, high - low, self.x + low], axis=1)
 
     def _edges(self, kind: Int64) -> Int64:

@@ -35,7 +35,7 @@ class Workspace:
         self.copied: Event | None = None
 
     def reserve(self, memory: int, incoming: int) -> None:
-        """Enlarges the workspace to at least so many bytes.
+        """Enlarges the workspace to at least these numbers of bytes.
 
         Raises CuPy's error, and leaves the workspace as it is, if there is too little memory.
         """
