@@ -85,8 +85,8 @@ class InverseBuilder:
         Waits until the values of the build before have been copied to the device. Only one thread may call it.
 
         storage: memory that nothing under way reads
-        multiprocessors: the build keeps at most this number busy, for whole milliseconds, so that a launch that needs only
-            the others runs beside it. None: all of them; a launch that needs all then waits some 100 us now and then.
+        multiprocessors: largest number that the build keeps busy, for whole milliseconds; a launch that needs only the
+            others runs beside it. None: all of them; a launch that needs all then waits some 100 us now and then.
         """
         space, cp = self._workspace, self._gpu.cp
         if space.copied is not None:

@@ -187,7 +187,7 @@ def _slots(parts: Parts, boundary: Int32, size: int) -> tuple[Int32, Int32]:
 
 
 def _depth(parts: Parts, slot_start: Int32) -> Int64:
-    """(parts,) most contributions that come off an entry."""
+    """Returns the largest number of contributions to an entry of each part, (parts,)."""
     order = np.argsort(parts.start, kind="stable")
     depth = np.zeros(len(order), np.int64)
     depth[order] = np.maximum.reduceat(np.append(np.diff(slot_start), 0), parts.start[order])
@@ -226,7 +226,7 @@ def _starts(keys: Int64, count: int) -> Int32:
 
 
 class _Phase:
-    """Segments and tiles of one phase, each with its block in front."""
+    """Segments and tiles of one phase; the first column is their block."""
 
     def __init__(self, phase: int, groups: int, parts: Parts, which: Int64, pieces: TilePartition, depth: Int64):
         self.forward, self.backward = phase < groups - 1, phase >= groups
@@ -244,7 +244,7 @@ class _Phase:
         self.shared_forming = (trips > TRIPS) & (phase > 0) & (not self.backward)
 
     def segments(self) -> Int64:
-        """(k, 5): block, kind, from, count, to."""
+        """Returns the segments, (k, 5): block, kind, from, count, to."""
         if self.backward:
             own, edge = np.full(len(self.x), READ), np.full(len(self.x), GATHER)
             found = np.stack([self._segments(own, 0 * self.x, self.inside), self._edges(edge)], axis=1).reshape(-1, 5)
@@ -270,7 +270,7 @@ class _Phase:
         return np.stack([self.pieces.block, kind, self.boundary, self.outside, self.x + self.inside], axis=1)
 
     def _slices(self) -> tuple[Int64, Int64]:
-        """Entries of its part that each block forms for all that have rows of it, as evenly as whole 32 allow."""
+        """Returns the range of entries of its part that each block forms for the others, in multiples of 32."""
         matrix, groups = self.pieces.matrix[self.shared_forming], self.inside[self.shared_forming] // COLUMNS
         order = np.argsort(matrix, kind="stable")
         count = np.bincount(matrix)
@@ -281,7 +281,7 @@ class _Phase:
         return COLUMNS * (k * groups // of), COLUMNS * ((k + 1) * groups // of)
 
     def tiles(self) -> Int64:
-        """(m, 5): block, 0 (the chunk comes later), x, chunks, out."""
+        """Returns the tiles, (m, 5): block, 0 (set later to the chunk), x, chunks, out."""
         count = self.pieces.tiles
         tile = ranges(self.pieces.first, count)
         found = np.zeros((len(tile), 5), np.int64)
