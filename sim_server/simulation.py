@@ -25,7 +25,7 @@ from sim_server.backends.kinds import Kind
 from sim_server.effects import effect
 from sim_server.effects._base import Effect, Refusal
 from sim_server.errors import DeviceError, InputError
-from sim_server.mechanics.energy import Energies
+from sim_server.mechanics.energy import collected_energies
 from sim_server.mechanics.integrator import Integrator
 from sim_server.mechanics.shape_matching import ShapeMatching
 from sim_server.mechanics.static_check import check_held
@@ -76,7 +76,7 @@ class Simulation:
             check_held(self.world, elements)
         still = [self.world.v, self.system.dv, *self.integrator.still]
         on_runaway = solver.on_runaway if watched else None
-        self.energies = Energies(self.world, self.effects, self.integrator.before, still, on_runaway)
+        self.energies = collected_energies(self.world, self.effects, self.integrator.before, still, on_runaway)
         given = self.engine_input()
         self.engine = backend.engine(given)
         self.engine.begin = self.integrator.begin(given.assemble)

@@ -20,8 +20,8 @@ from protocol.factor import FactorPattern
 from sim_server.arrays import Float64
 
 if TYPE_CHECKING:
-    from sim_server.mechanics.energy import Energies
-    from sim_server.mechanics.newton import Newton
+    from sim_server.backends.energies import Energies
+    from sim_server.backends.newton import Newton
     from sim_server.scene.solver_options import SolverOptions
 
 

@@ -8,8 +8,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from sim_server.arrays import Float64, Int32, Int64
+from sim_server.arrays import Float64, Int32
 from sim_server.backends.base import Launch, PendingUpdate
+from sim_server.backends.energies import ElementEnergies
 from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.world import Body, World
 
@@ -29,18 +30,6 @@ class Refusal:
 
     def __str__(self) -> str:
         return f"element {self.element} has J = {self.J:.3g}, which {self.effect} does not define"
-
-
-@dataclass(frozen=True)
-class ElementEnergies:
-    """Potential energies of the elements of an effect, which `launch` leaves in energy (m,) [J].
-
-    owner (m,): index of the body of each element, ascending.
-    """
-
-    launch: Any
-    energy: Float64
-    owner: Int64
 
 
 class EffectUpdates(Protocol):

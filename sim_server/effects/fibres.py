@@ -27,7 +27,7 @@ import numpy as np
 from pydantic import BeforeValidator, PlainSerializer
 
 from sim_server.backends.base import Launch
-from sim_server.effects._base import ElementEnergies
+from sim_server.backends.energies import ElementEnergies
 from sim_server.effects._hyperelastic import Constant, Law, Tetrahedra, constants_of
 from sim_server.errors import InputError
 from sim_server.mechanics.system import Stencil, System

@@ -35,7 +35,8 @@ from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 
 from sim_server.arrays import Float64, Int32, Int64
 from sim_server.backends.base import Launch
-from sim_server.effects._base import Effect, ElementEnergies
+from sim_server.backends.energies import ElementEnergies
+from sim_server.effects._base import Effect
 from sim_server.errors import InputError
 from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.world import Body, World

@@ -33,10 +33,10 @@ from protocol.push_limits import ORPHANED_PUSH
 from sim_server.arrays import Float64, Int32
 from sim_server.backends.base import Launch, PendingUpdate
 from sim_server.effects._base import Effect, EffectUpdates
+from sim_server.mechanics.named_points import NamedPoints, shown
 from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.world import Body, World
 from sim_server.scene.parameters import Parameters
-from sim_server.service.points import Points, shown
 
 SCOPE = "object"
 REACH = 1e3  # sizes of the object: how far from it a point, and from its point a target, may be
@@ -107,7 +107,7 @@ class Touch(Effect):
         self._same: tuple[list[int], dict[str, Any]] | None = None  # ids, and what of a launch no move changes
         self._launch: Launch | None = None  # in use, or about to be; it writes when each interaction began
         self._last_id = 0
-        self._points: dict[str, Points] = {}
+        self._points: dict[str, NamedPoints] = {}
         self.force, self.spring, self.anchor = np.zeros_like(world.x), np.zeros(world.nodes), np.zeros_like(world.x)
         world.backend.keep(self.force, self.spring, self.anchor)
 
@@ -270,11 +270,11 @@ class Touch(Effect):
             raise TouchError(f"client {client!r} has no interaction {id}; it may be over")
         return found
 
-    def points(self, name: str) -> Points:
+    def points(self, name: str) -> NamedPoints:
         """Where the object is now. Raises TouchError if it cannot be touched."""
         self._params(name)
         if name not in self._points:
-            self._points[name] = Points(self.world, self.world.body(name))
+            self._points[name] = NamedPoints(self.world, self.world.body(name))
         return self._points[name]
 
     def _check_spring(self, name: str, point: Point, target: Point, stiffness: float) -> None:

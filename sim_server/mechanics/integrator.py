@@ -38,14 +38,13 @@ Equations II, section V.1 (BDF2); Baraff and Witkin 1998 (one linearization).
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from sim_server.arrays import Int32
 from sim_server.backends.base import Launch
-from sim_server.effects._base import Effect
-from sim_server.mechanics.newton import Newton
+from sim_server.backends.newton import Newton
 from sim_server.mechanics.system import System
 from sim_server.scene import Scene
 
@@ -78,6 +77,12 @@ class InitialWeights:
     from_velocity: float
     from_acceleration: float
     inertia_from_acceleration: float
+
+
+class CouplesNodes(Protocol):
+    """An effect, as far as it couples nodes. elements (m, c): node numbers of the corners of its elements, or None."""
+
+    elements: Int32 | None
 
 
 class Integrator:
@@ -139,7 +144,7 @@ class Integrator:
         )  # fmt: skip
         return [self._bind("prepare", from_velocity=0.0, **state), *assemble, begin]
 
-    def newton(self, assemble: Sequence[Launch], effects: list[Effect]) -> Newton | None:
+    def newton(self, assemble: Sequence[Launch], effects: Sequence[CouplesNodes]) -> Newton | None:
         """Input of Newton-Raphson; None with one linearization a step. assemble: the launches of each linearization."""
         w, s = self.world, self.system
         if self.options.linearizations == 1:

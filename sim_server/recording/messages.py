@@ -14,12 +14,12 @@ from protocol import messages_pb2 as pb
 from protocol.method import Method
 from protocol.process.version import version
 from sim_server.backends.kinds import Kind
+from sim_server.mechanics.named_points import NamedPoints
 from sim_server.mechanics.world import Body
 from sim_server.mesh import posed
 from sim_server.mesh.surface import surface_triangles
 from sim_server.recording.object_steps import object_step, rows
 from sim_server.scene.solver_options import FACTORS
-from sim_server.service.points import Points
 from sim_server.simulation import Simulation
 
 NAMES = {kind: kind.name.lower() for kind in Kind}
@@ -65,7 +65,7 @@ def topology(simulation: Simulation, body: Body) -> pb.Topology:
     return message
 
 
-def places(points: list[Points], status: pb.Status) -> None:
+def places(points: list[NamedPoints], status: pb.Status) -> None:
     """Adds to a status where each object is now."""
     for found, place in zip(status.objects, points, strict=True):
         low, high = place.box()
@@ -83,6 +83,19 @@ def state(body: Body, step: int, time: float, x: NDArray[np.float64], v: NDArray
         x=_bytes(x[body.nodes], "<f8"),
         v=_bytes(v[body.nodes], "<f8"),
     )
+
+
+def interaction(a: Any) -> pb.Interaction:
+    """A push or a grab, an Interaction of the effect touch."""
+
+    def vector(v: tuple[float, float, float]) -> pb.Vector:
+        return pb.Vector(x=v[0], y=v[1], z=v[2])
+
+    return pb.Interaction(
+        id=a.id, client=a.client, object=a.object, kind="grab" if a.stiffness else "push", point=vector(a.point),
+        radius=a.radius, force=vector(a.force), duration=a.duration, target=vector(a.target),
+        stiffness=a.stiffness, max_force=a.limit, nodes=len(a.nodes), start=a.start,
+    )  # fmt: skip
 
 
 def steps(

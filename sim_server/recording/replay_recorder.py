@@ -19,8 +19,8 @@ from protocol.validate import checksum
 from sim_server.backends.base import PendingUpdate
 from sim_server.effects._base import Effect
 from sim_server.network.link import ServerLink
+from sim_server.recording import messages
 from sim_server.recording.recorder import Recorder
-from sim_server.service.commands import interaction_message
 from sim_server.updates.driver import Driver
 from sim_server.updates.factor_source import EXACT
 
@@ -60,15 +60,13 @@ class Trace:
         return self._driver.simulation.world.dt
 
     def _touch_set(self, step: int, interactions: list[Interaction]) -> pb.TouchSet:
-        messages = []
-        for a in interactions:
-            message = interaction_message(a)
+        found = pb.TouchSet(step=step, interactions=map(messages.interaction, interactions))
+        for a, message in zip(interactions, found.interactions, strict=True):
             if a.id not in self._shown:
                 self._shown.add(a.id)
                 message.held = a.nodes.astype("<i4").tobytes()
                 message.offsets = np.ascontiguousarray(a.offset, "<f8").tobytes()
-            messages.append(message)
-        return pb.TouchSet(step=step, interactions=messages)
+        return found
 
     def _factor(self, factor: Factor) -> pb.FactorUse:
         if factor.worker == self._driver.inline.WORKER:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from protocol import messages_pb2 as pb
 from protocol.push_limits import LONGEST_PUSH
+from sim_server.recording import messages
 from sim_server.simulation import Simulation
 
 if TYPE_CHECKING:
@@ -65,7 +66,7 @@ class Commands:
     def applied(self) -> list[pb.Interaction]:
         """Interactions that the loop knows, with the time of their first step (negative: not yet); some may be over."""
         touch = self.simulation.touch
-        return [] if touch is None else [interaction_message(a) for a in touch.known()]
+        return [] if touch is None else [messages.interaction(a) for a in touch.known()]
 
     # --- verbs --------------------------------------------------------------------------------------------------
 
@@ -96,7 +97,7 @@ class Commands:
         return self._took(command, self._touch().move(command.client, i.id, _tuple(i.target)))
 
     def _release(self, command: pb.Command) -> pb.Reply:
-        return pb.Reply(interaction=interaction_message(self._touch().release(command.client, command.interaction.id)))
+        return pb.Reply(interaction=messages.interaction(self._touch().release(command.client, command.interaction.id)))
 
     def _pause(self, command: pb.Command) -> pb.Reply:
         unchanged, loop = self.engine_paused, self.engine.loop
@@ -127,7 +128,7 @@ class Commands:
         status.time = status.step * self.simulation.world.dt
 
     def _took(self, command: pb.Command, taken: "Interaction") -> pb.Reply:
-        message = interaction_message(taken)
+        message = messages.interaction(taken)
         self._owners.add(command.client)
         self.accepted(message, float(self.simulation.system.clock[0]))
         return pb.Reply(interaction=message)
@@ -148,19 +149,6 @@ class Commands:
     def _point(self, i: pb.Interaction) -> tuple[float, float, float]:
         """Where a push or grab is to begin, in coordinates [m]."""
         return self._touch(i.object).points(i.object).named(i.at) if i.at else _tuple(i.point)
-
-
-def interaction_message(a: "Interaction") -> pb.Interaction:
-    """An interaction of the effect touch in the words of the protocol."""
-
-    def vector(v: tuple[float, float, float]) -> pb.Vector:
-        return pb.Vector(x=v[0], y=v[1], z=v[2])
-
-    return pb.Interaction(
-        id=a.id, client=a.client, object=a.object, kind="grab" if a.stiffness else "push", point=vector(a.point),
-        radius=a.radius, force=vector(a.force), duration=a.duration, target=vector(a.target),
-        stiffness=a.stiffness, max_force=a.limit, nodes=len(a.nodes), start=a.start,
-    )  # fmt: skip
 
 
 def _tuple(v: pb.Vector) -> tuple[float, float, float]:

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from protocol import messages_pb2 as pb
 from protocol.method import Method
 from sim_server.backends.kinds import BALANCE
+from sim_server.mechanics.named_points import NamedPoints
 from sim_server.network.link import ServerLink
 from sim_server.recording import messages as describe
 from sim_server.recording.recorder import Recorder
 from sim_server.recording.replay_recorder import Trace
 from sim_server.service.commands import Commands
-from sim_server.service.points import Points
 from sim_server.updates.driver import Driver
 
 STEPS_PERIOD = 0.05  # s between batches of step records
@@ -54,7 +54,7 @@ class Telemetry:
         self._due = {"steps": 0.0, "state": 0.0, "status": 0.0, "look": 0.0}
         self._watched = False
         self._touched: dict[int, pb.Interaction] = {}
-        self._points: list[Points] = []
+        self._points: list[NamedPoints] = []
 
     def open(self) -> None:
         """Scene, topologies and the initial state: first in the log, first on the network."""
@@ -225,10 +225,10 @@ class Telemetry:
             describe.places(self._places(), status)
         self.link.publish_status(status)
 
-    def _places(self) -> list[Points]:
+    def _places(self) -> list[NamedPoints]:
         """Of all objects, as they are now."""
         world = self.simulation.world
-        self._points = self._points or [Points(world, body) for body in world.bodies]
+        self._points = self._points or [NamedPoints(world, body) for body in world.bodies]
         x = world.backend.fetch(world.x)
         for points in self._points:
             points.now(x)

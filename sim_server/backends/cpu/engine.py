@@ -19,9 +19,9 @@ from sim_server.backends.base import Capability, EngineInput, Launch
 from sim_server.backends.compiler import native
 from sim_server.backends.cpu import structs
 from sim_server.backends.cpu.device import CpuLaunch
+from sim_server.backends.cpu.energies import NativeEnergies
+from sim_server.backends.newton import Newton
 from sim_server.backends.ring_buffers import Reports
-from sim_server.mechanics.energy import NativeEnergies
-from sim_server.mechanics.newton import Newton
 
 Reals = NDArray[np.float64]
 HISTORY = 1024  # changes of the diagonal that are remembered, of each body

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from sim_server.arrays import Float64, Int32
 from sim_server.backends.cpu.structs import BALANCE
 from sim_server.backends.declarations import Declarations
+from sim_server.backends.energies import CODES, Energies
 from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction
 from sim_server.backends.gpu.device import DeviceLaunch, Gpu, compiled, options, own_headers
 from sim_server.backends.gpu.kernel_fusion import Prologue
 from sim_server.backends.gpu.mailbox import library
 from sim_server.backends.gpu.structs import ENERGY_RECORD
-from sim_server.mechanics.energy import CODES, Energies
 
 BALANCE_TEXT = Declarations("backends/gpu/energy_balance.cu")
 ELASTIC_TEXT = Declarations("backends/gpu/elastic_energy.cu")
@@ -42,31 +42,29 @@ class DeviceEnergies:
 
     def __init__(self, gpu: Gpu, energies: Energies, records: NDArray[np.uint8], counter: DeviceArray, dt: float):
         self._gpu, self._energies, self._dt, self._counter = gpu, energies, dt, counter
-        cp, world = gpu.cp, energies.world
-        starts = np.array([*(b.first for b in world.bodies), world.nodes], np.int32)
-        self._bodies, self._capacity = len(world.bodies), records.nbytes // ENERGY_RECORD.itemsize // len(world.bodies)
+        cp, e, bodies = gpu.cp, energies, len(energies.starts) - 1
+        self._bodies, self._capacity = bodies, records.nbytes // ENERGY_RECORD.itemsize // bodies
         self.threads, self.started = THREADS, False
-        chunks = node_chunks(starts, NODES)
-        self._balance = cp.asarray(np.frombuffer(energies.balance.tobytes(), np.uint8))
+        chunks = node_chunks(e.starts, NODES)
+        self._balance = cp.asarray(np.frombuffer(e.balance.tobytes(), np.uint8))
         self._settled, self._sum = cp.zeros(self._bodies, np.int64), cp.zeros(self._bodies)
         self._memory: dict[str, DeviceArray] = {
-            "first_node": cp.asarray(starts), "chunks": cp.asarray(chunks.view(np.int32)),
+            "first_node": cp.asarray(e.starts), "chunks": cp.asarray(chunks.view(np.int32)),
             "sums": cp.zeros((len(chunks), SUMS)), "finished_chunks": cp.zeros(self._bodies, np.uint32),
-            "mass": gpu.twin(world.mass), "free": gpu.twin(world.free), "before": gpu.twin(energies.before),
-            "x": gpu.twin(world.x), "v": gpu.twin(world.v), "gravity": gpu.twin(energies.gravity),
+            "mass": gpu.twin(e.mass), "free": gpu.twin(e.free), "before": gpu.twin(e.before),
+            "x": gpu.twin(e.x), "v": gpu.twin(e.v), "gravity": gpu.twin(e.gravity),
             "balance": self._balance, "step": counter, "settled_step": self._settled,
         }  # fmt: skip
-        if energies.touch is not None:
-            self._memory |= {n: gpu.twin(getattr(energies.touch, n)) for n in ("force", "spring", "anchor")}
+        self._memory |= {name: gpu.twin(array) for name, array in e.touch.items()}
         self._params = np.zeros((), ENERGY_BALANCE)
         for name, array in self._memory.items():
             self._params[name] = array.data.ptr
-        still = [gpu.twin(array) for array in energies.still]
+        still = [gpu.twin(array) for array in e.still]
         self._params["still"][: len(still)] = [array.data.ptr for array in still]
         self._memory |= {f"still{k}": array for k, array in enumerate(still)}
         self._params["records"], self._params["capacity"] = records.ctypes.data, self._capacity
-        self._params["bodies"], self._params["inertia"] = self._bodies, world.inertia
-        self._params["on_runaway"] = CODES[energies.on_runaway]
+        self._params["bodies"], self._params["inertia"] = self._bodies, e.inertia
+        self._params["on_runaway"] = CODES[e.on_runaway]
         self.prologue = Prologue(BALANCE_TEXT.checked(), "EnergyBalance", "balance_energy", self._params, len(chunks))
         self._balance_kernel = self._kernel(BALANCE_TEXT, "energy_balance")
         self._elastic_kernel = self._kernel(ELASTIC_TEXT, "elastic_energy")
@@ -106,16 +104,16 @@ class DeviceEnergies:
 
     def start(self) -> None:
         """Takes the state on the device as the initial state of the balance."""
-        e, w = self._energies, self._energies.world
+        e = self._energies
         self.launch_elastic()
         self._settled[:] = self._counter
-        x, v = (self._gpu.twin(array).get().astype(float) for array in (w.x, w.v))
+        x, v = (self._gpu.twin(array).get().astype(float) for array in (e.x, e.v))
         balance = np.frombuffer(self._balance.get().tobytes(), BALANCE).copy()
         balance["elastic"] = self._sum.get()
-        for body in w.bodies:
-            row = balance[body.index : body.index + 1]
-            sums = start_sums(w.mass[body.nodes], x[body.nodes], v[body.nodes], e.gravity, self._dt)
-            library().wf_gpu_start_balance(row.ctypes.data, sums.ctypes.data, self._dt, int(w.inertia))
+        for body, nodes in enumerate(map(slice, e.starts[:-1], e.starts[1:])):
+            row = balance[body : body + 1]
+            sums = start_sums(e.mass[nodes], x[nodes], v[nodes], e.gravity, self._dt)
+            library().wf_gpu_start_balance(row.ctypes.data, sums.ctypes.data, self._dt, int(e.inertia))
         self._balance.set(np.frombuffer(balance.tobytes(), np.uint8))
         self.started = True
 

@@ -19,7 +19,7 @@ from sim_server.backends.gpu.device import DeviceLaunch, Gpu, compiled, options,
 from sim_server.backends.gpu.kernel_fusion import FusedKernel, PhaseGuard, fuse
 from sim_server.backends.gpu.solver import PcgSolver
 from sim_server.backends.gpu.structs import NEWTON_RESULT
-from sim_server.mechanics.newton import Newton
+from sim_server.backends.newton import Newton
 
 NEWTON = Declarations("backends/gpu/newton.cu")
 BLOCK_NODES: int = NEWTON.constant("BLOCK_NODES")  # of a thread block

@@ -22,8 +22,8 @@ NAMES = ("tip", *SIDES)
 Point = tuple[float, float, float]
 
 
-class Points:
-    """Of one body. `now` gets its positions from the device; the other methods tell of those."""
+class NamedPoints:
+    """Named points and bounding box of one body, from its positions at the last call of `now`."""
 
     def __init__(self, world: World, body: Body):
         self.body = body

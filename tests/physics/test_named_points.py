@@ -4,15 +4,15 @@
 import numpy as np
 import pytest
 
-from sim_server.service.points import NAMES, Points
+from sim_server.mechanics.named_points import NAMES, NamedPoints
 from tests.scenes import bar, simulation
 
 H = 0.02
 
 
-def points(**table: object) -> Points:
+def points(**table: object) -> NamedPoints:
     sim = simulation(bar(**({"young": 1e5, "touch": True} | table)), dt=H)  # type: ignore[arg-type]
-    found = Points(sim.world, sim.world.bodies[0])
+    found = NamedPoints(sim.world, sim.world.bodies[0])
     found.now()
     return found
 
