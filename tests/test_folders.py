@@ -1,22 +1,18 @@
 # SPDX-License-Identifier: MIT
-"""Imports between the folders of a package go one way. `python tests/test_folders.py` prints them.
+"""Imports between the folders of a package go one way. `python -m tests.arrows` counts them."""
 
-A folder is a node of the graph, and so is a file at the root of the package.
-"""
-
-import ast
-from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[1]
-PACKAGES = ("protocol", "precond_worker", "clients")
-MOST_FILES = 12  # of a folder, without __init__.py
+from tests.arrows import PACKAGES, ROOT, Graph, arrows, cycles, floors, report, upward, within
+
+SMALL = ("protocol", "precond_worker", "clients")
+MOST_FILES = 12  # of a folder of theirs, without __init__.py
 ALLOWED = {  # what each folder imports of its package
     "protocol.network": {"channels", "shared_memory"},
     "protocol.process": set(),
-    "protocol.shared_memory": {"channels", "messages_pb2", "refused", "validate"},
+    "protocol.shared_memory": {"channels", "refused", "validate"},
     "precond_worker.symbolic": {"arrays"},
     "precond_worker.gpu": {"arrays", "errors", "symbolic"},
     "precond_worker.factorization": {"arrays", "errors", "gpu", "symbolic"},
@@ -26,49 +22,87 @@ ALLOWED = {  # what each folder imports of its package
     "clients.replay": {"errors", "log", "progress"},
     "clients.load_test": {"client", "errors", "log", "progress", "watch"},
 }
+ORDER = (  # of sim_server: each imports of those before it
+    "errors", "arrays", "kernels", "mesh", "scene", "backends", "mechanics", "effects", "simulation", "updates",
+    "network", "recording", "service", "replay", "cli", "__main__",
+)  # fmt: skip
+REGISTRY = ("scene", "effects")  # a scene looks the names of effects up; the effects that it lists are imported later
 
 
-def imported(path: Path) -> set[str]:
-    """Modules that a file imports anywhere, and what it imports from them."""
-    found: set[str] = set()
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
-            found |= {str(node.module), *(f"{node.module}.{alias.name}" for alias in node.names)}
-    return found
+@pytest.fixture(scope="module")
+def graph() -> Graph:
+    return arrows()
 
 
-def arrows(package: str) -> dict[str, set[str]]:
-    """Which nodes of a package each of its nodes imports."""
-    files = {path: path.relative_to(ROOT).with_suffix("").parts for path in (ROOT / package).rglob("*.py")}
-    nodes = {parts[1] for parts in files.values()} - {"__init__"}
-    graph: dict[str, set[str]] = {node: set() for node in nodes}
-    for path, (_, node, *_) in files.items():
-        names = {module.split(".")[1] for module in imported(path) if module.startswith(f"{package}.")}
-        graph.setdefault(node, set()).update((names & nodes) - {node})
-    return graph
+@pytest.mark.parametrize("package", SMALL)
+def test_no_folder_imports_one_that_imports_it(graph: Graph, package: str) -> None:
+    assert len(within(graph, package)) > 3
+    assert cycles(within(graph, package)) == []
 
 
-@pytest.mark.parametrize("package", PACKAGES)
-def test_no_folder_imports_one_that_imports_it(package: str) -> None:
-    assert list(TopologicalSorter(arrows(package)).static_order())  # raises CycleError with the cycle
+@pytest.mark.parametrize("package", SMALL)
+def test_folders_import_what_they_may(graph: Graph, package: str) -> None:
+    found = {
+        name: {to.split(".", 1)[1] for to in others}
+        for name, others in within(graph, package).items()
+        if name.count(".") == 1 and (ROOT / name.replace(".", "/")).is_dir()
+    }
+    assert found == {name: to for name, to in ALLOWED.items() if name.startswith(f"{package}.")}
 
 
-@pytest.mark.parametrize("package", PACKAGES)
-def test_folders_import_what_they_may(package: str) -> None:
-    found = {f"{package}.{node}": to for node, to in arrows(package).items() if (ROOT / package / node).is_dir()}
-    assert found == {node: to for node, to in ALLOWED.items() if node.startswith(f"{package}.")}
+def test_folders_of_the_server_import_what_stands_below_them(graph: Graph) -> None:
+    found = {(a.split(".")[1], b.split(".")[1]) for a, to in within(graph, "sim_server").items() for b in to}
+    assert {name for arrow in found for name in arrow} == set(ORDER)
+    assert {(a, b) for a, b in found if ORDER.index(b) > ORDER.index(a)} == {REGISTRY}
 
 
-@pytest.mark.parametrize("package", PACKAGES)
+def test_the_backend_of_the_cpu_knows_none_of_the_gpu(graph: Graph) -> None:
+    for name in ("cpu.native", "cpu"):
+        assert not any(".gpu" in to for to in graph[f"sim_server.backends.{name}"]), name
+    assert "sim_server.backends.cpu" not in graph["sim_server.backends.cpu.native"]
+
+
+@pytest.mark.parametrize("package", SMALL)
 def test_folders_stay_small(package: str) -> None:
     for folder in {path.parent for path in (ROOT / package).rglob("*.py")}:
         files = [path.name for path in folder.glob("*.py") if path.name != "__init__.py"]
         assert len(files) <= MOST_FILES, f"{folder.relative_to(ROOT)} holds {len(files)} files"
 
 
-if __name__ == "__main__":
-    for name in PACKAGES:
-        for node, to in sorted(arrows(name).items()):
-            print(f"{name}.{node}: {', '.join(sorted(to)) or '-'}")
+def test_every_kind_of_import_is_an_arrow(tmp_path: Path) -> None:
+    files = {
+        "protocol/a.py": "import protocol.b.x\n",
+        "protocol/b/__init__.py": "",
+        "protocol/b/x.py": "def f():\n    from protocol import c\n",
+        "protocol/b/y.cu": '#include "z.h"\n',
+        "protocol/c.py": "if TYPE_CHECKING:\n    from protocol.d.w import W\n",
+        "protocol/d/w.py": "W = 1\n",
+        "protocol/d/z.h": "int z;\n",
+        "clients/e.py": "from protocol.b import x, y\n",
+        "tests/test_e.py": "import clients\n",
+    }  # fmt: skip
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    found = arrows(tmp_path)
+    assert found == {
+        "protocol.a": {"protocol.b"}, "protocol.b": {"protocol.c", "protocol.d"}, "protocol.c": {"protocol.d"},
+        "protocol.d": set(), "clients.e": {"protocol.b"},
+    }  # fmt: skip
+    assert (cycles(found), floors(found)) == ([], 4)
+    found["protocol.d"].add("protocol.b")
+    assert cycles(found) == [{"protocol.b", "protocol.c", "protocol.d"}]
+    assert upward(found) == {("protocol.d", "protocol.b")} and floors(found) == 4
+    told = list(report(tmp_path))
+    assert "| protocol | 4 | 7 | 4 | 4 | 0 | 0 |" in told
+    assert "| all | 5 | 8 | 5 (1 between packages) | | | |" in told
+    assert "| product | 7 | 2 |" in told and "| tests | 1 | 0 |" in told
+
+
+def test_the_report_counts_this_product() -> None:
+    told = list(report(ROOT))
+    assert all(any(line.startswith(f"| {package} |") for line in told) for package in PACKAGES)
+    rows = told[told.index("| largest functions of Python | lines |") + 2 :]
+    place, lines = rows[0].strip("| ").split(" | ")
+    path, name = place.split(": ")
+    assert f"def {name}(" in (ROOT / path).read_text() and int(lines) > 20
