@@ -16,7 +16,7 @@ import typer
 from protocol.process.command_line import Program, Terminated, end_in_order
 from protocol.process.nvidia import nvidia_device
 from sim_server.errors import DeviceError, DeviceLost, InputError, NameTaken
-from sim_server.service.compile_notice import compiling_told
+from sim_server.service.compile_notice import compile_notices
 
 if TYPE_CHECKING:
     from sim_server.service.service import Service
@@ -37,7 +37,7 @@ Examples:
         with other values than the scene's
 """
 
-WORKERS_JOIN = 15.0  # s to wait for the first local worker before the simulation starts
+WORKER_TIMEOUT = 15.0  # s that the start waits for the first local worker, at most
 
 
 @app.command(epilog=EPILOG)
@@ -79,11 +79,11 @@ def serve(
     code = 0
     try:
         options = Options(
-            scene, set_ or [], chosen(device, say), name, listen, connect, not no_shared_memory, record, steps,
+            scene, set_ or [], choose_device(device, say), name, listen, connect, not no_shared_memory, record, steps,
             realtime, workers, worker_device,
         )  # fmt: skip
         with ExitStack() as closing:
-            with nullcontext() if quiet else compiling_told(say):
+            with nullcontext() if quiet else compile_notices(say):
                 service, supervisor = _set_up(closing, options)
             _announce(say, service, scene, listen)
             _wait_for_workers(service, supervisor)
@@ -107,8 +107,8 @@ def serve(
     raise typer.Exit(code)
 
 
-def chosen(device: str, say: Callable[[str], None]) -> str:
-    """The device to run on: auto is the GPU if there is a usable one. Says why if there is one that is not usable."""
+def choose_device(device: str, say: Callable[[str], None]) -> str:
+    """Returns the device to run on; auto: the GPU if there is a usable one. Reports why a GPU is not usable."""
     if device != "auto":
         return device
     if not nvidia_device():
@@ -125,7 +125,7 @@ def chosen(device: str, say: Callable[[str], None]) -> str:
 
 @dataclass(frozen=True)
 class Options:
-    """The command line, read."""
+    """Values of the command line."""
 
     scene: Path
     overrides: list[str]
@@ -142,7 +142,7 @@ class Options:
 
 
 def _set_up(closing: ExitStack, o: Options) -> "tuple[Service, Supervisor | None]":
-    """Everything that can fail on bad input, before the simulation starts."""
+    """Builds simulation, link, recorder and workers; exits with code 2 on bad input."""
     from protocol.channels import DEFAULT_ENDPOINT
     from protocol.network.endpoints import BadEndpoint, on_this_machine
     from protocol.network.exposure import unrestricted
@@ -161,7 +161,7 @@ def _set_up(closing: ExitStack, o: Options) -> "tuple[Service, Supervisor | None
         link = closing.enter_context(ServerLink(o.name, o.listen, o.connect, shared_memory=o.shared_memory))
         recorder = None
         if o.record is not None:
-            _only_over_logs(o.record)
+            _check_log_path(o.record)
             compression = simulation.scene.record.compression
             recorder = closing.enter_context(Recorder(o.record, compression, overwrite=True, report=logging.error))
         service = Service(simulation, link, recorder, o.steps, o.realtime)
@@ -179,11 +179,11 @@ def _set_up(closing: ExitStack, o: Options) -> "tuple[Service, Supervisor | None
         endpoint = on_this_machine((o.listen or [DEFAULT_ENDPOINT])[0])
         supervisor = Supervisor(o.workers, o.name, [endpoint], ["--device", o.worker_device])
         closing.callback(supervisor.close)
-        service.beside, link.local_workers = supervisor.look, supervisor.report
+        service.check_workers, link.local_workers = supervisor.check, supervisor.local_workers
     return service, supervisor
 
 
-def _only_over_logs(path: Path) -> None:
+def _check_log_path(path: Path) -> None:
     """Raises InputError if something other than a log would be replaced."""
     if path.is_file() and path.stat().st_size:
         with path.open("rb") as file:
@@ -204,14 +204,14 @@ def _announce(say, service: "Service", scene: Path, listen: list[str] | None) ->
 
 
 def _describe_objects(say, service: "Service", listen: list[str] | None) -> None:  # type: ignore[no-untyped-def]
-    """Size and mass of each object, where a mesh in millimetres or a density in g/cm3 shows; then notices."""
-    from sim_server.service.notices import notices
+    """Reports size and mass of each object, where a mesh in millimetres or a density in g/cm3 shows, and notes."""
+    from sim_server.service.scene_notes import scene_notes
 
     world = service.simulation.world
     for body in world.bodies[:20]:
         size = " x ".join(f"{s:.3g}" for s in body.mesh.rest.max(axis=0) - body.mesh.rest.min(axis=0))
         say(f"  {body.name}: {body.last - body.first} nodes, {size} m, {world.mass[body.nodes].sum():.3g} kg")
-    for line in notices(service.simulation):
+    for line in scene_notes(service.simulation):
         say(f"note: {line}")
     if service.driver.wants_factors and service.driver.free and not service.link.dispatch.workers():
         say(
@@ -221,7 +221,7 @@ def _describe_objects(say, service: "Service", listen: list[str] | None) -> None
 
 
 def _worker_command(name: str, listen: list[str] | None) -> str:
-    """How a worker for this server is started on this machine."""
+    """Returns the command that starts a worker for this server on this machine."""
     from protocol.channels import DEFAULT_ENDPOINT, SERVER_NAME
     from protocol.network.endpoints import on_this_machine
 
@@ -234,10 +234,10 @@ def _worker_command(name: str, listen: list[str] | None) -> str:
 
 
 def _wait_for_workers(service: "Service", supervisor: "Supervisor | None") -> None:
-    """A run that was given workers starts when the first is there; it never waits for one afterwards."""
-    end = time.monotonic() + WORKERS_JOIN
+    """Waits for the first local worker, WORKER_TIMEOUT at most."""
+    end = time.monotonic() + WORKER_TIMEOUT
     while supervisor is not None and not service.link.dispatch.workers() and time.monotonic() < end:
-        supervisor.look()
+        supervisor.check()
         service.link.check_name()
         time.sleep(0.02)
 
@@ -253,7 +253,7 @@ def _summary(service: "Service") -> str:
 
 
 def _unconverged(service: "Service") -> str:
-    """How many solves did not reach the tolerance, and why."""
+    """Returns how many solves did not reach the tolerance, by cause."""
     counts = service.telemetry.unconverged
     if not counts:
         return "all solves converged"
@@ -262,7 +262,7 @@ def _unconverged(service: "Service") -> str:
 
 
 def _runaways(service: "Service") -> str:
-    """Which objects have run away; empty if none have."""
+    """Returns the names of objects that have run away; empty if none have."""
     names = [service.simulation.world.bodies[body].name for body in sorted(service.telemetry.runaways)]
     return f"; run away: {', '.join(names[:20])}" if names else ""
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The one error that a user of the commands is meant to read."""
+"""Errors whose text is written for the user of the commands."""
 
 
 class InputError(Exception):
@@ -11,11 +11,11 @@ class InputError(Exception):
 
 
 class NameTaken(InputError):
-    """Another server that this one is linked with has its name."""
+    """A linked server has the same name."""
 
 
 class DeviceError(InputError):
-    """The device asked for is not there or not usable; the message says what to do."""
+    """The requested device is missing or not usable; the message says what to do."""
 
 
 class DeviceLost(RuntimeError):

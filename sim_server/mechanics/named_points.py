@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Where an object is while it moves: the box around it, and points of it that have names.
+"""Bounding box and named points of an object while it moves.
 
-tip: the free node farthest from the fixed ones (from the middle of the object if nothing is fixed), in the shape at
+tip: the free node farthest from the fixed ones (from the middle of the object if nothing is fixed) in the shape at
 rest, so that it is the same node throughout. right, left, top, bottom, front, back: the free node that is now farthest
 along +x, -x, +y, -y, +z, -z.
 """
@@ -33,28 +33,28 @@ class NamedPoints:
         self.size = float(np.linalg.norm(np.ptp(body.mesh.rest, axis=0)))  # m, diagonal of the box at rest
 
     def now(self, x: Float64 | None = None) -> Float64:
-        """Copies the positions of its nodes [m], (nodes, 3). x: of all nodes of the scene, if fetched already."""
+        """Copies and returns positions of its nodes [m], (nodes, 3). x: of all nodes of the scene; None: fetch them."""
         fetched = self._world.backend.fetch(self._world.x) if x is None else x
         self._x = fetched[self.body.nodes].copy()
         return self._x
 
     def box(self) -> tuple[Point, Point]:
-        """Lowest and highest coordinates [m]."""
+        """Returns the lowest and highest coordinates [m]."""
         return _point(self._x.min(axis=0)), _point(self._x.max(axis=0))
 
     def where(self) -> str:
-        """The box in words."""
+        """Returns the box in words."""
         low, high = self.box()
         spans = ", ".join(f"{c} from {a:.4g} to {b:.4g}" for c, a, b in zip("xyz", low, high, strict=True))
         return f"{self.body.name!r} now fills {spans} m"
 
     def distance(self, point: Point) -> float:
-        """Of a point from the box [m]; 0 within."""
+        """Returns the distance of a point from the box [m]; 0 within."""
         low, high = self.box()
         return hypot(*(max(a - p, p - b, 0.0) for a, p, b in zip(low, point, high, strict=True)))
 
     def named(self, name: str) -> Point:
-        """Where a named point is now [m]. Raises ValueError."""
+        """Fetches positions and returns a named point [m]. Raises ValueError."""
         if name not in NAMES:
             raise ValueError(f"no point {name[:80]!r}; known: {', '.join(NAMES)}, or give coordinates")
         x = self.now()
@@ -64,7 +64,7 @@ class NamedPoints:
         return _point(x[int(np.where(self.free, sign * x[:, axis], -np.inf).argmax())])
 
     def tip(self) -> Point:
-        """Where the tip is [m]."""
+        """Returns the position of the tip [m]."""
         return _point(self._x[self._tip])
 
     @cached_property
@@ -81,7 +81,7 @@ class NamedPoints:
 
 
 def shown(point: Sequence[float] | Float64) -> str:
-    """Coordinates in short."""
+    """Formats coordinates with four digits."""
     return "(" + ", ".join(f"{float(c):.4g}" for c in point) + ")"
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""An MCAP file being written: chunks of 1 MiB, one embedded protobuf schema per message type."""
+"""Writes MCAP files: chunks of 1 MiB, one embedded protobuf schema per message type."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ COMPRESSIONS = {"lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD, "none"
 
 
 class McapFile:
-    """Thin layer over mcap.writer: registers channels and schemas at their first message."""
+    """Writes a file; registers channels and schemas at their first message. Raises InputError if it cannot be made."""
 
     def __init__(self, path: Path, compression: str, overwrite: bool) -> None:
         if compression not in COMPRESSIONS:
@@ -33,7 +33,7 @@ class McapFile:
             raise InputError(f"{path}: the file exists: remove it or choose another name for the log") from None
         except OSError as error:
             raise InputError(f"{path}: a log cannot be written there: {error.strerror}") from None
-        self._linked = os.fstat(self._stream.fileno()).st_nlink > 0  # there are file systems that do not count
+        self._linked = os.fstat(self._stream.fileno()).st_nlink > 0  # some file systems do not count links
         self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES, compression=COMPRESSIONS[compression])
         self._schemas: dict[type[Message], int] = {}
         self._channels: dict[str, int] = {}
@@ -50,24 +50,24 @@ class McapFile:
         self._writer.add_message(channel, log_time, data, publish_time, sequence)
 
     def flush(self) -> None:
-        """Ends the chunk in progress and hands everything to the operating system. Raises OSError."""
+        """Ends the chunk in progress and writes all to the operating system. Raises OSError."""
         self._writer.flush()
-        self._check_there()
+        self._check_exists()
 
     def finish(self, notes: dict[str, str]) -> None:
         """Writes `notes` and the index, and closes. Raises OSError."""
         self._writer.add_metadata("recorder", notes)
         self._writer.finish()
-        self._check_there()
+        self._check_exists()
         self._stream.close()
 
     def abandon(self) -> None:
-        """Closes without index after an error; what was flushed stays readable."""
+        """Closes the file without an index after an error; flushed chunks stay readable."""
         with contextlib.suppress(OSError, ValueError):
             self._stream.close()
 
-    def _check_there(self) -> None:
-        """Raises OSError if the file was removed: what is written to it is on no disk once it is closed."""
+    def _check_exists(self) -> None:
+        """Raises OSError if the file was removed: its contents would be lost when it is closed."""
         if self._linked and os.fstat(self._stream.fileno()).st_nlink == 0:
             raise OSError(errno.ENOENT, "the file was removed or replaced")
 

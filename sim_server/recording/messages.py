@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The simulation in the words of the protocol: scene, topologies, states, step records."""
+"""Converts a simulation to messages: scene, topologies, states, interactions, step records."""
 
 import json
 import platform
@@ -26,7 +26,7 @@ NAMES = {kind: kind.name.lower() for kind in Kind}
 
 
 def scene(simulation: Simulation) -> pb.Scene:
-    """What is simulated, with the text of the scene file and its defaults filled in."""
+    """Converts the scene, with the text of its file and with all defaults."""
     s = simulation.scene
     return pb.Scene(
         name=s.path.name or s.name,
@@ -42,7 +42,7 @@ def scene(simulation: Simulation) -> pb.Scene:
 
 
 def topology(simulation: Simulation, body: Body) -> pb.Topology:
-    """Mesh and block pattern of one object, epoch 1."""
+    """Converts mesh and block pattern of one object, epoch 1."""
     pose = simulation.scene.objects[body.index].pose
     row_start, columns = simulation.system.body_pattern(body.first, body.last)
     fixed = np.flatnonzero(simulation.world.free[body.nodes] == 0)
@@ -65,8 +65,8 @@ def topology(simulation: Simulation, body: Body) -> pb.Topology:
     return message
 
 
-def places(points: list[NamedPoints], status: pb.Status) -> None:
-    """Adds to a status where each object is now."""
+def add_places(points: list[NamedPoints], status: pb.Status) -> None:
+    """Adds bounding box and tip of each object to a status."""
     for found, place in zip(status.objects, points, strict=True):
         low, high = place.box()
         for vector, (x, y, z) in ((found.low, low), (found.high, high), (found.tip, place.tip())):
@@ -74,7 +74,7 @@ def places(points: list[NamedPoints], status: pb.Status) -> None:
 
 
 def state(body: Body, step: int, time: float, x: NDArray[np.float64], v: NDArray[np.float64]) -> pb.State:
-    """One frame of one object; x and v of all nodes of the scene."""
+    """Converts a frame of one object. x, v: positions [m] and velocities [m/s] of all nodes of the scene."""
     return pb.State(
         header=pb.Header(object=body.name, epoch=1),
         step=step,
@@ -86,7 +86,7 @@ def state(body: Body, step: int, time: float, x: NDArray[np.float64], v: NDArray
 
 
 def interaction(a: Any) -> pb.Interaction:
-    """A push or a grab, an Interaction of the effect touch."""
+    """Converts a push or a grab, an Interaction of the effect touch."""
 
     def vector(v: tuple[float, float, float]) -> pb.Vector:
         return pb.Vector(x=v[0], y=v[1], z=v[2])
@@ -113,7 +113,7 @@ def steps(
 
 
 def preconditioner_names(simulation: Simulation) -> dict[Kind, str]:
-    """Of the kinds that the loop knows: any factor is Kind.CHOLESKY there."""
+    """Returns the name of each kind of preconditioner; any factor is Kind.CHOLESKY in the loop."""
     wanted = simulation.scene.solver.preconditioner
     return NAMES | ({Kind.CHOLESKY: wanted} if wanted in FACTORS else {})
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The log: every message of the run, self-describing, in one MCAP file.
+"""Writes the messages of a run to a log, an MCAP file that describes itself.
 
-The caller only serializes and appends to a queue; one thread compresses and writes. The file is a sequence of
-complete chunks at most FLUSH_SECONDS old, so what a `kill -9` leaves behind is readable up to the last flush.
+The caller serializes a message and appends it to a queue; one thread compresses and writes. The file is a sequence of
+complete chunks, flushed every FLUSH_SECONDS, so that after `kill -9` it is readable up to the last flush.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from google.protobuf.message import Message
 from protocol import messages_pb2 as pb
 from sim_server.recording.mcap_file import McapFile
 
-FLUSH_SECONDS = 1.0  # oldest record that a crash may lose
-FRAME_BYTES = 64 << 20  # waiting for the disk, all kinds together: above this, frames are dropped ...
-TOTAL_BYTES = 256 << 20  # ... and above this, everything
+FLUSH_SECONDS = 1.0  # age of the oldest record that a crash may lose
+FRAME_BYTES = 64 << 20  # of all records that wait for the disk; above it frames are dropped
+TOTAL_BYTES = 256 << 20  # the same; above it all records are lost
 
 Compression = Literal["lz4", "zstd", "none"]
 
@@ -47,10 +47,10 @@ class Recorder:
     Messages are stored under /scene, /topology/OBJECT, /state/OBJECT, /step/OBJECT, /interaction/OBJECT, /touch and
     /factor/OBJECT with `log_time` = simulation time and `publish_time` = wall clock, both in ns.
 
-    Feeding never waits unless asked to (`block=True`, for runs faster than real time). While more than FRAME_BYTES
-    wait for the disk, states are dropped and counted in `dropped`; everything else is kept up to TOTAL_BYTES and
-    counted in `lost` beyond that. Both numbers are written at the end of the file. A disk error, or the file's
-    removal, stops the recording, is told once through `report` and kept in `failure`; feeding is then a no-op.
+    Appending does not wait for the disk unless `block` is true (for runs without a pace). While more than FRAME_BYTES
+    wait, states are dropped and counted in `dropped`; other records are kept up to TOTAL_BYTES, and counted in `lost`
+    beyond that. Both numbers are written at the end of the file. A disk error, or the file's removal, ends the
+    recording, is reported once through `report` and kept in `failure`; later messages are ignored.
 
     Raises InputError if the file cannot be created, if it is there already and not to be overwritten, or for an
     unknown compression.
@@ -83,32 +83,32 @@ class Recorder:
         self._thread.start()
 
     def scene(self, message: pb.Scene, block: bool = False) -> None:
-        self._feed("/scene", message, 0, 0, block)
+        self._append("/scene", message, 0, 0, block)
 
     def topology(self, message: pb.Topology, block: bool = False) -> None:
-        self._feed(f"/topology/{message.header.object}", message, self._time, message.header.epoch, block)
+        self._append(f"/topology/{message.header.object}", message, self._time, message.header.epoch, block)
 
     def state(self, message: pb.State, block: bool = False) -> None:
         """Appends a frame; the only kind that is dropped when the disk falls behind."""
-        self._feed(f"/state/{message.header.object}", message, self._stamp(message.time), message.step, block)
+        self._append(f"/state/{message.header.object}", message, self._stamp(message.time), message.step, block)
 
     def step(self, message: pb.ObjectStep, block: bool = False) -> None:
-        self._feed(f"/step/{message.header.object}", message, self._stamp(message.time), message.step, block)
+        self._append(f"/step/{message.header.object}", message, self._stamp(message.time), message.step, block)
 
     def interaction(self, message: pb.Interaction, time: float, block: bool = False) -> None:
         """Appends a push or grab that took effect at `time` [s of simulation]."""
-        self._feed(f"/interaction/{message.object}", message, self._stamp(time), message.id, block)
+        self._append(f"/interaction/{message.object}", message, self._stamp(time), message.id, block)
 
     def touch_set(self, message: pb.TouchSet, time: float, block: bool = False) -> None:
         """Appends the interactions that the loop works with from `time` [s of simulation] on."""
-        self._feed("/touch", message, self._stamp(time), message.step, block)
+        self._append("/touch", message, self._stamp(time), message.step, block)
 
     def factor(self, message: pb.FactorUse, block: bool = False) -> None:
-        """Appends what is known of a factor that was handed to the loop."""
-        self._feed(f"/factor/{message.header.object}", message, self._time, message.step, block)
+        """Appends the origin of a factor that the loop was given."""
+        self._append(f"/factor/{message.header.object}", message, self._time, message.step, block)
 
     def close(self) -> None:
-        """Writes what waits and the index of the file; may be called again."""
+        """Writes the records that wait and the index of the file; further calls do nothing."""
         with self._changed:
             self._closing = True
             self._changed.notify_all()
@@ -125,27 +125,27 @@ class Recorder:
             self._time = round(seconds * 1e9)
         return self._time
 
-    def _feed(self, topic: str, message: Message, log_time: int, sequence: int, block: bool) -> None:
+    def _append(self, topic: str, message: Message, log_time: int, sequence: int, block: bool) -> None:
         record = _Record(
             topic, type(message), log_time, time.time_ns(), sequence & 0xFFFFFFFF, message.SerializeToString()
         )
         limit = self._frame_bytes if isinstance(message, pb.State) else self._total_bytes
         with self._changed:
             if block:
-                self._changed.wait_for(lambda: self._room(record, self._frame_bytes) or self.failure or self._closing)
+                self._changed.wait_for(lambda: self._fits(record, self._frame_bytes) or self.failure or self._closing)
             if self._closing or self.failure:
                 return
-            if not block and not self._room(record, limit):
-                self._count(record)
+            if not block and not self._fits(record, limit):
+                self._count_dropped(record)
                 return
             self._waiting.append(record)
             self._waiting_bytes += len(record.data)
             self._changed.notify_all()
 
-    def _room(self, record: _Record, limit: int) -> bool:
+    def _fits(self, record: _Record, limit: int) -> bool:
         return not self._waiting or self._waiting_bytes + len(record.data) <= limit
 
-    def _count(self, record: _Record) -> None:
+    def _count_dropped(self, record: _Record) -> None:
         if record.kind is pb.State:
             self.dropped += 1
             return
@@ -171,7 +171,7 @@ class Recorder:
         unflushed = False
         while True:
             due = flushed + FLUSH_SECONDS - time.monotonic() if unflushed else None
-            batch, closing = self._take(due)
+            batch, closing = self._next_batch(due)
             for record in batch:
                 self._file.write(
                     record.topic, record.kind, record.log_time, record.publish_time, record.sequence, record.data
@@ -184,7 +184,7 @@ class Recorder:
             if closing and not batch:
                 return
 
-    def _take(self, timeout: float | None) -> tuple[list[_Record], bool]:
+    def _next_batch(self, timeout: float | None) -> tuple[list[_Record], bool]:
         with self._changed:
             self._changed.wait_for(
                 lambda: self._waiting or self._closing, timeout if timeout is None else max(timeout, 0)

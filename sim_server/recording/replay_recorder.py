@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""What a log holds beside records and frames so that the run can be repeated bit by bit (replay.py).
+"""Records the inputs of a run that records and frames lack, so that it can be repeated bit for bit (replay/run.py).
 
-The loop decides at which step a push, a move or a release takes effect, as it looks into its mailbox; so the whole list
-of interactions is written as the loop took it up, with that step. Of factors the log tells what each was made from and
-by whom; the step records say which one a solve used.
+The loop decides at which step a push, a move or a release takes effect, when it reads its mailbox; so the whole list
+of interactions is written with the step at which the loop took it up. Each factor is written with the step of its
+matrix and its maker; step records tell which one a solve used.
 """
 
 from __future__ import annotations
@@ -28,14 +28,17 @@ if TYPE_CHECKING:
     from sim_server.effects.touch import Interaction
 
 
-class Trace:
-    """Listens to driver and touch; `write` before the records of steps that it may concern."""
+class ReplayRecorder:
+    """Collects factors and interactions as the loop gets them.
+
+    Call `write` before the steps that they act in are recorded.
+    """
 
     def __init__(self, driver: Driver, link: ServerLink, recorder: Recorder):
         self._driver, self._link, self._recorder = driver, link, recorder
-        self._factors: deque[Factor] = deque()  # appended by whoever adopts, maybe the loop's thread
+        self._factors: deque[Factor] = deque()  # appended by the thread that posts them, maybe the loop's
         self._updates: deque[tuple[PendingUpdate, list[Interaction]]] = deque()
-        self._shown: set[int] = set()  # ids whose nodes the log holds
+        self._with_nodes: set[int] = set()  # ids whose nodes the log holds
         self._workers: dict[str, pb.WorkerInfo] = {}
         driver.on_adopt.append(self._factors.append)
         self._touch = driver.simulation.touch
@@ -46,7 +49,7 @@ class Trace:
             self._updates.append((pending, self._touch.applied))
 
     def write(self, block: bool) -> None:
-        """Everything taken up since the last call; a log cut off after a record holds what the record rests on."""
+        """Writes all that was taken up since the last call; so a log that is cut off holds the inputs of its steps."""
         for _ in range(len(self._factors)):
             self._recorder.factor(self._factor(self._factors.popleft()), block)
         taken = [i for i, (pending, _) in enumerate(self._updates) if pending.taken >= 0]
@@ -62,8 +65,8 @@ class Trace:
     def _touch_set(self, step: int, interactions: list[Interaction]) -> pb.TouchSet:
         found = pb.TouchSet(step=step, interactions=map(messages.interaction, interactions))
         for a, message in zip(interactions, found.interactions, strict=True):
-            if a.id not in self._shown:
-                self._shown.add(a.id)
+            if a.id not in self._with_nodes:
+                self._with_nodes.add(a.id)
                 message.held = a.nodes.astype("<i4").tobytes()
                 message.offsets = np.ascontiguousarray(a.offset, "<f8").tobytes()
         return found

@@ -24,11 +24,11 @@ def main() -> int:
     from sim_server.errors import DeviceLost, InputError
     from sim_server.replay.log import Recording
     from sim_server.replay.run import Replay
-    from sim_server.service.compile_notice import compiling_told
+    from sim_server.service.compile_notice import compile_notices
 
     try:
         say = partial(print, "replay:", file=sys.stderr, flush=True)
-        with Recording(arguments.log) as recording, compiling_told(say):
+        with Recording(arguments.log) as recording, compile_notices(say):
             found = Replay(recording).run()
     except (BadLog, InputError, CompileError, DeviceLost) as error:
         print(f"replay: {printable(str(error))}", file=sys.stderr)

@@ -25,7 +25,7 @@ from protocol.validate import array, check_range, checksum
 from sim_server.arrays import Float64
 from sim_server.errors import DeviceError
 from sim_server.mechanics.world import Body
-from sim_server.recording import messages as describe
+from sim_server.recording import messages
 from sim_server.replay.log import Recording
 from sim_server.replay.report import Comparison
 from sim_server.scene import Scene, deleted
@@ -116,7 +116,7 @@ class Replay:
         if [b.name for b in self.bodies] != list(self.recording.scene.objects):
             raise BadLog(f"{self.recording.path}: the scene in the log has other objects than the log")
         for body in self.bodies:
-            now, then = describe.topology(self.simulation, body), self.recording.objects[body.name].topology
+            now, then = messages.topology(self.simulation, body), self.recording.objects[body.name].topology
             assert then is not None
             other = [name for name in MESH if getattr(now, name) != getattr(then, name)]
             if not other and not np.allclose(np.frombuffer(now.rest), np.frombuffer(then.rest), rtol=1e-9, atol=1e-12):
@@ -200,8 +200,8 @@ class Replay:
         values, solver = self.simulation.system.body_values(body.first, body.last), self.simulation.scene.solver
         if body.name in self._positions:
             if body.name not in self._assemblies:
-                topology = describe.topology(self.simulation, body)
-                self._assemblies[body.name] = Assembly(describe.scene(self.simulation), topology)
+                topology = messages.topology(self.simulation, body)
+                self._assemblies[body.name] = Assembly(messages.scene(self.simulation), topology)
             values = self._assemblies[body.name].matrix(self._positions[body.name])
         use = self.recording.objects[body.name].factors.get(made)
         method = solver.method_named(use.method if use is not None else "")

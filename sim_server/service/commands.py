@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What clients ask of a running simulation: touch it, pause it, stop it."""
+"""Carries out commands of clients on a running simulation: push, grab, move, release, pause, resume, stop."""
 
 import math
 from collections.abc import Callable
@@ -15,56 +15,60 @@ if TYPE_CHECKING:
     from sim_server.effects.touch import Interaction, Touch  # imported where a scene lists it
 
 
-class Refusal(ValueError):
+class BadCommand(ValueError):
     """A command that is not carried out; the text goes back to the client."""
 
 
 class Commands:
-    """Carries out commands on one simulation. accepted(interaction, time): told of every push and grab taken."""
+    """Carries out commands on one simulation.
 
-    def __init__(self, simulation: Simulation, accepted: Callable[[pb.Interaction, float], None]):
+    on_interaction: called with every accepted push and grab and the present time [s]
+    frozen: returns True for an object that has run away and moves no more
+    """
+
+    def __init__(self, simulation: Simulation, on_interaction: Callable[[pb.Interaction, float], None]):
         self.simulation, self.engine = simulation, simulation.engine
-        self.accepted = accepted
+        self.on_interaction = on_interaction
         self.stopping = False
-        self.frozen: Callable[[str], bool] = lambda name: False  # objects that have run away and move no more
+        self.frozen: Callable[[str], bool] = lambda name: False
         self._owners: set[str] = set()
 
     @property
     def engine_paused(self) -> bool:
-        """The loop stands still until `resume`."""
+        """True from `pause` to `resume`."""
         return bool(self.engine.loop.pause)
 
     @property
-    def engine_stands(self) -> bool:
-        """After `pause`: the step under way has ended. The loop sets its deadline to 0 while it waits."""
+    def engine_halted(self) -> bool:
+        """True if the loop has halted after `pause`: it sets its deadline to 0 while it waits."""
         return bool(self.engine.loop.deadline == 0)
 
     def carry_out(self, command: pb.Command) -> pb.Reply:
-        """Does it and says so; what cannot be done is answered with an error."""
+        """Carries out a command and returns the reply, with an error if it cannot be done."""
         try:
-            verb = _VERBS.get(command.verb)
+            verb = VERBS.get(command.verb)
             if verb is None:
-                raise Refusal(f"unknown verb {command.verb!r}; known: {', '.join(sorted(_VERBS))}")
+                raise BadCommand(f"unknown verb {command.verb!r}; known: {', '.join(sorted(VERBS))}")
             return verb(self, command)
-        except ValueError as error:  # Refusal and TouchError
+        except ValueError as error:  # BadCommand and TouchError
             return pb.Reply(error=str(error))
 
     def together(self) -> AbstractContextManager[None]:
-        """Around the commands of a round: what they change goes to the loop at once."""
+        """Returns a context for the commands of a round: the loop gets their changes together when it ends."""
         touch = self.simulation.touch
         return nullcontext() if touch is None else touch.together()
 
-    def gone(self, clients: set[str]) -> int:
-        """Releases what clients that are no longer there still held; returns how many.
+    def release_absent(self, clients: set[str]) -> int:
+        """Releases the interactions of clients that are not in `clients`; returns their number.
 
-        Asked after each round of commands: one that waited while its client died takes hold for a moment at most.
+        Called after each round: a command that waited while its client died acts for a moment at most.
         """
         lost = self._owners - clients
         self._owners -= lost
         return sum(self._touch().release_all(client) for client in lost)
 
-    def applied(self) -> list[pb.Interaction]:
-        """Interactions that the loop knows, with the time of their first step (negative: not yet); some may be over."""
+    def interactions(self) -> list[pb.Interaction]:
+        """Interactions that the loop has, with the time of their first step (negative: not yet); some may be over."""
         touch = self.simulation.touch
         return [] if touch is None else [messages.interaction(a) for a in touch.known()]
 
@@ -74,9 +78,9 @@ class Commands:
         i = command.interaction
         _finite(i, "point", "force", "radius", "duration")
         if i.duration > LONGEST_PUSH:
-            raise Refusal(f"duration = {i.duration:g} s: a push lasts at most {LONGEST_PUSH:g} s")
+            raise BadCommand(f"duration = {i.duration:g} s: a push lasts at most {LONGEST_PUSH:g} s")
         point, force = self._point(i), _tuple(i.force)
-        return self._took(
+        return self._accept(
             command, self._touch(i.object).push(command.client, i.object, point, i.radius, force, i.duration)
         )
 
@@ -89,12 +93,12 @@ class Commands:
         taken = self._touch(i.object).grab(
             command.client, i.object, point, i.radius, target, i.stiffness, i.max_force, duration
         )
-        return self._took(command, taken)
+        return self._accept(command, taken)
 
     def _move(self, command: pb.Command) -> pb.Reply:
         i = command.interaction
         _finite(i, "target")
-        return self._took(command, self._touch().move(command.client, i.id, _tuple(i.target)))
+        return self._accept(command, self._touch().move(command.client, i.id, _tuple(i.target)))
 
     def _release(self, command: pb.Command) -> pb.Reply:
         return pb.Reply(interaction=messages.interaction(self._touch().release(command.client, command.interaction.id)))
@@ -104,41 +108,41 @@ class Commands:
         if not unchanged and not loop.realtime:
             loop.deadline = -1.0  # not looked at without a pace; 0 again once the loop stands still
         loop.pause = 1
-        return pb.Reply(status=self._happened("paused"), unchanged=unchanged)
+        return pb.Reply(status=self._status_of("paused"), unchanged=unchanged)
 
     def _resume(self, command: pb.Command) -> pb.Reply:
         unchanged = not self.engine_paused
         if self.simulation.touch is not None:
             self.simulation.touch.flush()  # what came before it holds from the first step on
         self.engine.loop.pause = 0
-        return pb.Reply(status=self._happened("running"), unchanged=unchanged)
+        return pb.Reply(status=self._status_of("running"), unchanged=unchanged)
 
     def _stop(self, command: pb.Command) -> pb.Reply:
         self.stopping = True
-        return pb.Reply(status=self._happened("stopping"))
+        return pb.Reply(status=self._status_of("stopping"))
 
-    def _happened(self, state: str) -> pb.Status:
+    def _status_of(self, state: str) -> pb.Status:
         status = pb.Status(state=state)
-        self.date(status)
+        self.stamp(status)
         return status
 
-    def date(self, status: pb.Status) -> None:
-        """Sets step and time to those of now."""
+    def stamp(self, status: pb.Status) -> None:
+        """Sets the present step and time."""
         status.step = self.engine.step
         status.time = status.step * self.simulation.world.dt
 
-    def _took(self, command: pb.Command, taken: "Interaction") -> pb.Reply:
+    def _accept(self, command: pb.Command, taken: "Interaction") -> pb.Reply:
         message = messages.interaction(taken)
         self._owners.add(command.client)
-        self.accepted(message, float(self.simulation.system.clock[0]))
+        self.on_interaction(message, float(self.simulation.system.clock[0]))
         return pb.Reply(interaction=message)
 
     def _touch(self, name: str = "") -> "Touch":
-        """Pushes and grabs of the scene. name: of the object that they are asked for. Raises Refusal without any."""
+        """Returns the pushes and grabs of the scene. name: object of a command. Raises BadCommand if it takes none."""
         if name and self.frozen(name):
-            raise Refusal(f"object {name!r} has run away and is frozen: it takes no pushes or grabs any more")
+            raise BadCommand(f"object {name!r} has run away and is frozen: it takes no pushes or grabs any more")
         if self.simulation.touch is None:
-            raise Refusal(
+            raise BadCommand(
                 f"object {name!r} does not list the effect touch, so it takes no pushes or grabs; "
                 "add touch = true to its effects"
                 if name
@@ -147,7 +151,7 @@ class Commands:
         return self.simulation.touch
 
     def _point(self, i: pb.Interaction) -> tuple[float, float, float]:
-        """Where a push or grab is to begin, in coordinates [m]."""
+        """Returns the point at which a push or grab begins [m]."""
         return self._touch(i.object).points(i.object).named(i.at) if i.at else _tuple(i.point)
 
 
@@ -160,10 +164,10 @@ def _finite(i: pb.Interaction, *names: str) -> None:
         value = getattr(i, name)
         values = _tuple(value) if isinstance(value, pb.Vector) else (value,)
         if not all(map(math.isfinite, values)):
-            raise Refusal(f"{name} = {values}: must be finite")
+            raise BadCommand(f"{name} = {values}: must be finite")
 
 
-_VERBS: dict[str, Callable[[Commands, pb.Command], pb.Reply]] = {
+VERBS: dict[str, Callable[[Commands, pb.Command], pb.Reply]] = {
     "push": Commands._push, "grab": Commands._grab, "move": Commands._move, "release": Commands._release,
     "pause": Commands._pause, "resume": Commands._resume, "stop": Commands._stop,
 }  # fmt: skip

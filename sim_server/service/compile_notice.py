@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Tells people that kernels are being compiled, where they would wait without a word."""
+"""Reports on the terminal that kernels are being compiled, which may take a minute."""
 
 import sys
 import time
@@ -12,10 +12,12 @@ from sim_server.backends.build_pool import Compilers, Progress, compilers
 Say = Callable[[str], None]
 
 
-class Notice:
-    """Says one line when compiling begins and one when it has ended; nothing if nothing is compiled.
+class CompileNotice:
+    """Reports one line when compiling begins and one when it has ended; nothing if nothing is compiled.
 
-    clock: monotonic time [s]. bar: opens what shows the progress between the two lines, until its stack is closed.
+    say: prints a line
+    bar: opens a progress bar, which closes with the stack
+    clock: monotonic time [s]
     """
 
     def __init__(
@@ -28,7 +30,7 @@ class Notice:
         self._closing = ExitStack()
 
     def progress(self, done: int, total: int) -> None:
-        """As Compilers.progress."""
+        """Updates the progress; called by Compilers with the number of texts done and in all."""
         if self._begun is None:
             self._begun, self._count = self._clock(), 0
             self._say("compiling kernels for this machine, once: less than a minute")
@@ -40,7 +42,7 @@ class Notice:
             self.end()
 
     def end(self) -> None:
-        """Says how long it took, if that was not said yet."""
+        """Reports how long it took, unless that was done."""
         self.close()
         if self._begun is not None:
             texts = f"{self._count} kernel text{'s' * (self._count > 1)}"
@@ -48,14 +50,14 @@ class Notice:
             self._begun = None
 
     def close(self) -> None:
-        """Takes the bar away."""
+        """Removes the bar."""
         self._closing.close()
 
 
 @contextmanager
-def compiling_told(say: Say, by: Compilers = compilers) -> Iterator[None]:
-    """Within, what is compiled is told; a bar on stderr, if that is a terminal, vanishes at the end."""
-    notice = Notice(say, _bar if sys.stderr.isatty() else None)
+def compile_notices(say: Say, by: Compilers = compilers) -> Iterator[None]:
+    """Context in which compiling is reported, with a bar on stderr if that is a terminal."""
+    notice = CompileNotice(say, _bar if sys.stderr.isatty() else None)
     by.progress = notice.progress
     try:
         yield

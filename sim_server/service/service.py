@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""The server at work: one thread runs the loop, this one serves its mailboxes, the log and the network.
+"""Serves a running simulation: its mailboxes, the log, commands and the network.
 
-loop thread      Engine.run, native, without Python's lock (policies that wait by their nature run Driver.advance)
-service thread   here: factors in, matrices out, commands, records to log and listeners, every millisecond or so
-recorder, link   threads of their own for the disk and the network
+Threads:
+    loop: Engine.run, native, without Python's lock; Driver.advance for policies that wait for factors
+    service: every millisecond or so factors, matrices, commands, and records for log and subscribers
+    recorder and link: have threads of their own for the disk and the network
 """
 
 import contextlib
@@ -22,20 +23,20 @@ from protocol import messages_pb2 as pb
 from protocol.process.nvidia import nvidia_device
 from sim_server.network.link import ServerLink
 from sim_server.recording.recorder import Recorder
-from sim_server.recording.replay_recorder import Trace
+from sim_server.recording.replay_recorder import ReplayRecorder
 from sim_server.service.commands import Commands
-from sim_server.service.pace import LOOKS, Pace
+from sim_server.service.pace import LOOK_PERIOD, PaceMonitor
 from sim_server.service.telemetry import Telemetry
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
 
 log = logging.getLogger(__name__)
 
-NAP = 1e-3  # s between rounds of the service thread
-BESIDE = 0.02  # s between looks at local workers
-STATUS_AGAIN = 0.02  # s between two statuses that clients ask for
-STEP_ENDS = 1.0  # s that the answer to `pause` or `stop` waits at most for the end of the step under way
-HALTS = 64  # such answers that may wait at once
+ROUND_PERIOD = 1e-3  # s that the service thread sleeps between rounds
+WORKERS_PERIOD = 0.02  # s between checks of local workers
+STATUS_INTERVAL = 0.02  # s between two statuses that clients request, at least
+HALT_TIMEOUT = 1.0  # s that the answer to `pause` or `stop` waits for the end of the step under way, at most
+MAX_HALTS = 64  # answers that wait for the end of a step at a time
 LOOP_NICE = -5  # of the loop's thread in real time: before workers, clients and our own threads on a full machine
 ENDLESS = 1 << 62
 
@@ -52,29 +53,30 @@ class Service:
         self.engine.loop.realtime, self.engine.loop.patient = int(realtime), int(not realtime)
         self.driver = Driver(simulation, link.dispatch)
         self.telemetry = Telemetry(self.driver, link, recorder, patient=not realtime)
-        self.commands = Commands(simulation, self._accepted)
+        self.commands = Commands(simulation, self._record_interaction)
         self.commands.frozen = lambda name: name in self.driver.by_name and self.driver.by_name[name].frozen
         self.telemetry.commands = self.commands
-        self.telemetry.trace = Trace(self.driver, link, recorder) if recorder else None
-        self._ask_loop()
-        self._waiting: deque[NDArray[Any]] = deque()
+        self.telemetry.replay_recorder = ReplayRecorder(self.driver, link, recorder) if recorder else None
+        self._set_intervals()
+        self._batches: deque[NDArray[Any]] = deque()
         self._failure: BaseException | None = None
-        self._asked: list[Callable[[pb.Reply], None]] = []  # those who want a fresh status
-        self._halts: list[tuple[float, Callable[[pb.Reply], None], pb.Reply]] = []  # pause and stop, until when to wait
-        self._status_due = self._beside_due = self._pace_due = 0.0
-        self.beside: Callable[[], None] = lambda: None  # called now and then: the supervisor of local workers
-        self.pace = Pace(simulation.world.dt, self._advice, not self._on_gpu) if realtime else None
-        self._alone = not self.driver.wants_factors or self.driver.free  # the loop needs no Python
+        self._status_replies: list[Callable[[pb.Reply], None]] = []  # of clients that requested a status
+        # deadline, reply and answer of each `pause` and `stop`
+        self._halts: list[tuple[float, Callable[[pb.Reply], None], pb.Reply]] = []
+        self._status_due = self._workers_due = self._pace_due = 0.0
+        self.check_workers: Callable[[], None] = lambda: None  # called every WORKERS_PERIOD
+        self.pace = PaceMonitor(simulation.world.dt, self._advice, not self._on_gpu) if realtime else None
+        self._loop_alone = not self.driver.wants_factors or self.driver.free  # no step waits for Python
         self.telemetry.open()
 
     def run(self) -> None:
-        """Blocks until the run is over; KeyboardInterrupt passes through after a clean end of the loop."""
+        """Blocks until the run is over; a KeyboardInterrupt ends the loop first and is then raised."""
         loop = threading.Thread(target=self._loop, name="loop")
         loop.start()
         try:
             while loop.is_alive() and not self.commands.stopping:
                 self.round()
-                time.sleep(NAP)
+                time.sleep(ROUND_PERIOD)
         finally:
             self.engine.loop.stop = 1
             while loop.is_alive():  # it may wait for room in its rings
@@ -92,30 +94,30 @@ class Service:
             with contextlib.suppress(OSError, AttributeError):  # needs a privilege, and Linux
                 os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), LOOP_NICE)
         try:
-            if self._alone:
+            if self._loop_alone:
                 self.engine.run(ENDLESS if self.steps is None else self.steps)
                 return
             while not self.engine.loop.stop and (self.steps is None or self.engine.step < self.steps):
-                self._waiting.append(self.driver.advance(1))
+                self._batches.append(self.driver.advance(1))
         except BaseException as error:
             self._failure = error
 
     def round(self) -> None:
-        """One turn of the service thread: everything that is due, nothing that waits."""
+        """Does all that is due, without waiting."""
         self._drain()
-        if time.monotonic() >= self._beside_due:
-            self._beside_due = time.monotonic() + BESIDE
-            self.beside()
+        if time.monotonic() >= self._workers_due:
+            self._workers_due = time.monotonic() + WORKERS_PERIOD
+            self.check_workers()
             self.link.check_name()
         self._carry_out()
         self._answer_halts()
-        self._tell_status()
-        self._look_at_pace()
-        self.commands.gone(set(self.link.clients()))
+        self._publish_status()
+        self._check_pace()
+        self.commands.release_absent(set(self.link.clients()))
         self.telemetry.publish_status(self._state(), force=False)
 
     def _carry_out(self) -> None:
-        """All commands that wait; they are answered once the loop has what they change."""
+        """Carries out all commands that wait; answers them once the loop has what they change."""
         waiting = self.link.commands()
         if not waiting:
             return
@@ -123,45 +125,45 @@ class Service:
         with self.commands.together():
             for command, reply in waiting:
                 if command.verb == "status":
-                    self._asked.append(reply)
+                    self._status_replies.append(reply)
                     continue
                 answer = self.commands.carry_out(command)
-                if command.verb in ("pause", "stop") and not answer.error and len(self._halts) < HALTS:
-                    self._halts.append((time.monotonic() + STEP_ENDS, reply, answer))
+                if command.verb in ("pause", "stop") and not answer.error and len(self._halts) < MAX_HALTS:
+                    self._halts.append((time.monotonic() + HALT_TIMEOUT, reply, answer))
                 else:
                     answers.append((reply, answer))
         for reply, answer in answers:
             reply(answer)
 
     def _answer_halts(self, ended: bool = False) -> None:
-        """Answers those who paused or stopped the loop once it has, with the number of its steps."""
+        """Answers `pause` and `stop` once the loop has halted, with the number of its steps."""
         waiting = []
         for until, reply, answer in self._halts:
-            stands = self.commands.engine_stands or not self.commands.engine_paused  # or it goes on already
+            stands = self.commands.engine_halted or not self.commands.engine_paused  # or it goes on already
             if (stands and answer.status.state == "paused") or ended or time.monotonic() >= until:
-                self.commands.date(answer.status)
+                self.commands.stamp(answer.status)
                 reply(answer)
             else:
                 waiting.append((until, reply, answer))
         self._halts = waiting
 
-    def _tell_status(self) -> None:
-        """A fresh one to all who asked since the last: it costs more than any other command."""
-        if self._asked and time.monotonic() >= self._status_due:
+    def _publish_status(self) -> None:
+        """Publishes one status for all requests since the last: it costs more than any other command."""
+        if self._status_replies and time.monotonic() >= self._status_due:
             self.telemetry.publish_status(self._state(), where=True)
-            self._status_due = time.monotonic() + STATUS_AGAIN
-            for reply in self._asked:
+            self._status_due = time.monotonic() + STATUS_INTERVAL
+            for reply in self._status_replies:
                 reply(pb.Reply())
-            self._asked.clear()
+            self._status_replies.clear()
 
-    def _look_at_pace(self) -> None:
-        """Says so if the run does not keep pace with the clock."""
+    def _check_pace(self) -> None:
+        """Logs a line if the run does not keep pace with the clock."""
         now = time.monotonic()
         if self.pace is None or now < self._pace_due:
             return
-        self._pace_due = now + LOOKS
+        self._pace_due = now + LOOK_PERIOD
         warm = not self.driver.wants_factors or all(state.factors.used for state in self.driver.bodies)
-        line = self.pace.look(now, self.engine.step, self._state() != "running", warm)
+        line = self.pace.check(now, self.engine.step, self._state() != "running", warm)
         if line:
             log.warning("%s", line)
         self.telemetry.pace = self.pace.verdict
@@ -171,7 +173,7 @@ class Service:
         return self.simulation.world.backend.name == "gpu"
 
     def _advice(self) -> str:
-        """What makes steps take less time, or lets them take it."""
+        """Returns what makes steps shorter, or gives them more time."""
         ways = ["a larger dt (--set dt=...)", "a coarser mesh"]
         workers = len(self.link.dispatch.workers())
         if self.driver.wants_factors and workers < len(self.driver.bodies):
@@ -181,31 +183,31 @@ class Service:
         return f"What helps: {', '.join(ways)}; --free-run does without the clock"
 
     def _drain(self) -> None:
-        if self._alone:
+        if self._loop_alone:
             records = self.driver.pump()
         else:
-            batches = [self._waiting.popleft() for _ in range(len(self._waiting))]
+            batches = [self._batches.popleft() for _ in range(len(self._batches))]
             records = np.concatenate(batches) if batches else np.zeros(0, self.engine.records_dtype)
-        for line in self.telemetry.count(records):
+        for line in self.telemetry.count_unconverged(records):
             log.warning("%s", line)
-        for line in [*self.telemetry.count_runaways(records), *self.telemetry.bad_steps(records)]:
+        for line in [*self.telemetry.count_runaways(records), *self.telemetry.not_finite(records)]:
             log.error("%s", line)
         if self.pace is not None and len(records):
-            self.pace.note(records)
+            self.pace.add(records)
         self.telemetry.records(records)
         self.telemetry.frames()
-        self._ask_loop()
+        self._set_intervals()
 
-    def _ask_loop(self) -> None:
-        """Has it make the frames and energies that somebody looks at."""
-        self.engine.loop.frame_every = self.telemetry.wanted_frames()
-        self.engine.loop.energy_every = self.telemetry.wanted_energies()
+    def _set_intervals(self) -> None:
+        """Sets how often the loop copies frames and evaluates elastic energies: as subscribers and the log need."""
+        self.engine.loop.frame_every = self.telemetry.frame_interval()
+        self.engine.loop.energy_every = self.telemetry.energy_interval()
 
     def _state(self) -> str:
         if self.commands.stopping:
             return "stopping"
         return "paused" if self.commands.engine_paused else "running"
 
-    def _accepted(self, interaction: pb.Interaction, time: float) -> None:
+    def _record_interaction(self, interaction: pb.Interaction, time: float) -> None:
         if self.recorder:
             self.recorder.interaction(interaction, time)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Local workers of `sim-server --workers N`: started, restarted within a budget, stopped with the server.
+"""Starts, restarts and stops the local workers of `sim-server --workers N`.
 
-A worker that ends is started again after a pause that doubles with each restart in the last PERIOD; with more than
-BUDGET of them it is left alone. The simulation goes on whatever happens to its workers.
+A worker that ends is started again after a pause that doubles with each restart in the last RESTART_PERIOD; after
+MAX_RESTARTS of them it is given up. The simulation goes on without it.
 """
 
 import logging
@@ -15,12 +15,12 @@ from protocol.messages_pb2 import LocalWorker
 
 log = logging.getLogger(__name__)
 
-BUDGET = 5  # restarts of one worker ...
-PERIOD = 60.0  # ... within so many seconds; more, and it is left alone
+MAX_RESTARTS = 5  # of one worker within RESTART_PERIOD
+RESTART_PERIOD = 60.0  # s
 BACK_OFF = 0.2  # s before the first restart, doubled each time
 
 
-class _Worker:
+class _Process:
     def __init__(self, name: str):
         self.name = name
         self.process: subprocess.Popen[bytes] | None = None
@@ -30,8 +30,8 @@ class _Worker:
         self.count = 0  # restarts in all
         self.exit_code = 0
 
-    def report(self) -> LocalWorker:
-        """For the status."""
+    def status(self) -> LocalWorker:
+        """Returns its state as a message."""
         state = "given up" if self.given_up else "restarting" if self.due else "running"
         pid = self.process.pid if self.process is not None else 0
         return LocalWorker(worker=self.name, state=state, pid=pid, restarts=self.count, exit_code=self.exit_code)
@@ -41,12 +41,16 @@ Start = Callable[[Sequence[str]], "subprocess.Popen[bytes]"]
 
 
 def worker_process(command: Sequence[str], env: Mapping[str, str] | None = None) -> "subprocess.Popen[bytes]":
-    """A worker that neither reads nor prints. env: None: ours."""
+    """Starts a worker without input and output. env: environment; None: that of this process."""
     return subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, env=env)
 
 
 class Supervisor:
-    """Keeps `count` precond-worker processes running. connect: endpoints of the server. Call `look` now and then."""
+    """Keeps `count` precond-worker processes running, as long as `check` is called.
+
+    server, connect: name and endpoints of the server
+    arguments: further options of the workers
+    """
 
     def __init__(
         self, count: int, server: str, connect: Sequence[str], arguments: Sequence[str] = (),
@@ -57,37 +61,38 @@ class Supervisor:
             sys.executable, "-m", "precond_worker", "--exit-with-parent", "--server", server, *endpoints, *arguments
         ]  # fmt: skip
         self._clock, self._popen = clock, start
-        self.workers = [_Worker(f"local-{i + 1}") for i in range(count)]
+        self.workers = [_Process(f"local-{i + 1}") for i in range(count)]
         for worker in self.workers:
             self._start(worker)
 
-    def _start(self, worker: _Worker) -> None:
+    def _start(self, worker: _Process) -> None:
         worker.process = self._popen([*self._command, "--name", worker.name])
 
-    def report(self) -> list[LocalWorker]:
-        """All of them, alive or not."""
-        return [worker.report() for worker in self.workers]
+    def local_workers(self) -> list[LocalWorker]:
+        """Returns the state of all local workers, alive or not."""
+        return [worker.status() for worker in self.workers]
 
-    def look(self) -> None:
-        """Restarts what has died, after a pause that doubles; gives up on a worker that keeps dying."""
+    def check(self) -> None:
+        """Restarts workers that have ended, after a pause that doubles; gives up one that keeps ending."""
         now = self._clock()
         for worker in self.workers:
             if worker.given_up or worker.process is None or worker.process.poll() is None:
                 continue
             if worker.due == 0.0:
                 worker.exit_code = worker.process.returncode
-                worker.restarts = [t for t in worker.restarts if now - t < PERIOD]
-                if len(worker.restarts) >= BUDGET:
+                worker.restarts = [t for t in worker.restarts if now - t < RESTART_PERIOD]
+                if len(worker.restarts) >= MAX_RESTARTS:
                     worker.given_up = True
                     log.error(
                         "worker %s ended %d times within %g s, the last time with %s: left alone",
-                        worker.name, BUDGET + 1, PERIOD, worker.exit_code,
+                        worker.name, MAX_RESTARTS + 1, RESTART_PERIOD, worker.exit_code,
                     )  # fmt: skip
                     continue
                 worker.due = now + BACK_OFF * 2 ** len(worker.restarts)
                 log.warning(
                     "worker %s ended with %s: starting it again in %.1f s (restart %d of %d within %g s)",
-                    worker.name, worker.exit_code, worker.due - now, len(worker.restarts) + 1, BUDGET, PERIOD,
+                    worker.name, worker.exit_code, worker.due - now, len(worker.restarts) + 1, MAX_RESTARTS,
+                    RESTART_PERIOD,
                 )  # fmt: skip
             if now >= worker.due:
                 worker.restarts.append(now)
@@ -96,7 +101,7 @@ class Supervisor:
                 self._start(worker)
 
     def close(self) -> None:
-        """Ends all workers: SIGTERM, then SIGKILL after two seconds."""
+        """Ends all workers by SIGTERM, and by SIGKILL after two seconds."""
         running = [w.process for w in self.workers if w.process is not None and w.process.poll() is None]
         for process in running:
             process.terminate()

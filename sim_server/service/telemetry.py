@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the loop reports, on its way to the log and to whoever listens."""
+"""Passes records and frames of the loop to the log and to subscribers."""
 
 import os
 import time
@@ -14,57 +14,60 @@ from protocol.method import Method
 from sim_server.backends.kinds import BALANCE
 from sim_server.mechanics.named_points import NamedPoints
 from sim_server.network.link import ServerLink
-from sim_server.recording import messages as describe
+from sim_server.recording import messages
 from sim_server.recording.recorder import Recorder
-from sim_server.recording.replay_recorder import Trace
+from sim_server.recording.replay_recorder import ReplayRecorder
 from sim_server.service.commands import Commands
+from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
 
 STEPS_PERIOD = 0.05  # s between batches of step records
 STATE_PERIOD = 1 / 30  # s between states for viewers
 STATUS_PERIOD = 1.0  # s
-LOOK_PERIOD = 0.02  # s between looks at whether somebody listens to states
-BATCH = 4096  # steps sent together at most
-WINDOW = 1000  # steps that percentiles are taken over
-ENERGY_STEPS = 20  # between elastic energies in real time: one costs up to a fifth of a step
+LOOK_PERIOD = 0.02  # s between checks for subscribers
+MAX_BATCH = 4096  # step records sent together at most
+STATISTICS_STEPS = 1000  # last steps that percentiles and means are taken over
+ENERGY_STEPS = 20  # steps between elastic energies in real time: one costs up to a fifth of a step
 SLACK_OF_ENERGY: float = BALANCE.constant("SLACK_OF_ENERGY")
 
 
 class Telemetry:
-    """Turns records and frames of one run into messages. patient: the log may be waited for (no deadline to miss)."""
+    """Turns records and frames of one run into messages. patient: wait for the log; without it, drop."""
 
     def __init__(self, driver: Driver, link: ServerLink, recorder: Recorder | None, patient: bool):
         self.driver, self.link, self.recorder, self.patient = driver, link, recorder, patient
         self.simulation, self.engine = driver.simulation, driver.engine
         self.commands: Commands | None = None
-        self.trace: Trace | None = None
-        self.begun = time.monotonic()
-        self.every = self.simulation.scene.record.every if recorder else 0
-        self._batch: deque[pb.ObjectStep] = deque(maxlen=BATCH)
-        self._window: list[deque[int]] = [deque(maxlen=WINDOW) for _ in self.simulation.world.bodies]  # iterations
-        self.seconds: deque[float] = deque(maxlen=WINDOW)
+        self.replay_recorder: ReplayRecorder | None = None
+        self.started = time.monotonic()
+        self.record_every = self.simulation.scene.record.every if recorder else 0
+        self._batch: deque[pb.ObjectStep] = deque(maxlen=MAX_BATCH)
+        self._window: list[deque[int]] = [
+            deque(maxlen=STATISTICS_STEPS) for _ in self.simulation.world.bodies
+        ]  # iterations
+        self.seconds: deque[float] = deque(maxlen=STATISTICS_STEPS)
         self._last: NDArray[Any] = np.zeros(len(self._window), self.engine.records_dtype)
-        self._bad: set[str] = set()
+        self._not_finite: set[str] = set()  # objects of which it was said
         self.solves = 0
         self.pace = ""  # why the run does not keep pace with the clock; empty: it does, or need not
         self.unconverged: Counter[str] = Counter()  # solves by status, of those that did not converge
         self._energy: dict[int, float] = {}  # by body, kinetic + elastic + gravity of the last step with all three [J]
         self.runaways: Counter[int] = Counter()  # steps by body
-        self._listened = False
+        self._has_listeners = False
         self._due = {"steps": 0.0, "state": 0.0, "status": 0.0, "look": 0.0}
-        self._watched = False
-        self._touched: dict[int, pb.Interaction] = {}
+        self._has_viewers = False
+        self._interactions: dict[int, pb.Interaction] = {}
         self._points: list[NamedPoints] = []
 
     def open(self) -> None:
-        """Scene, topologies and the initial state: first in the log, first on the network."""
-        message = describe.scene(self.simulation)
+        """Sends scene, topologies and the initial state, before anything else, to log and network."""
+        message = messages.scene(self.simulation)
         message.server = self.link.name
         self.link.set_scene(message)
         if self.recorder:
             self.recorder.scene(message)
         for body in self.simulation.world.bodies:
-            topology = describe.topology(self.simulation, body)
+            topology = messages.topology(self.simulation, body)
             self.link.announce(topology)
             if self.recorder:
                 self.recorder.topology(topology)
@@ -72,7 +75,7 @@ class Telemetry:
             self._record_frame(0, self.simulation.world.x, self.simulation.world.v)
         self.publish_status("running")
 
-    def _period(self, what: str, period: float) -> bool:
+    def _is_due(self, what: str, period: float) -> bool:
         now = time.monotonic()
         if now < self._due[what]:
             return False
@@ -80,25 +83,25 @@ class Telemetry:
         return True
 
     def records(self, records: NDArray[Any]) -> None:
-        """Step records: all of them to the log, in batches to listeners."""
-        if self.trace:
-            self.trace.write(self.patient)
+        """Sends step records, each to the log, in batches to subscribers."""
+        if self.replay_recorder:
+            self.replay_recorder.write(self.patient)
         if len(records):
             self.seconds.extend(records["whole"][records["body"] == 0].tolist())
-            self._note(records)
-            messages = self._messages(records)
-            self._touch(messages)
+            self.update_summary(records)
+            steps = self._messages(records)
+            self._add_interactions(steps)
             if self.recorder:
-                for message in messages:
-                    self.recorder.step(message, block=self.patient)
-            self._batch.extend(messages)
-        if self._period("steps", STEPS_PERIOD) and self._batch:
+                for step in steps:
+                    self.recorder.step(step, block=self.patient)
+            self._batch.extend(steps)
+        if self._is_due("steps", STEPS_PERIOD) and self._batch:
             if self.link.wants_steps():
                 self.link.publish_steps(pb.Steps(steps=self._batch))
             self._batch.clear()
 
-    def _note(self, records: NDArray[Any]) -> None:
-        """For the status: the last record of each body, and iterations of those before."""
+    def update_summary(self, records: NDArray[Any]) -> None:
+        """Keeps what the status tells of steps: the last record of each body, iterations and energies."""
         order = np.argsort(records["body"], kind="stable")
         present, first = np.unique(records["body"][order], return_index=True)
         iterations = records["iterations"][order].tolist()
@@ -110,80 +113,84 @@ class Telemetry:
             self._energy[int(r["body"])] = float(r["kinetic"] + r["elastic"] + r["gravity"])
 
     def _messages(self, records: NDArray[Any]) -> list[pb.ObjectStep]:
-        """Those that somebody wants: to make one takes longer than all else that is done with a record."""
-        wanted = records if self.recorder else records[-BATCH:] if self.link.wants_steps() else records[:0]
-        messages = describe.steps(self.simulation, wanted, self._method)
-        bound = self.driver.age_bound() if messages else -1
-        for message in messages:
-            message.excess = self.driver.by_name[message.header.object].solves.excess
-            message.factor_age_bound = bound
-        return messages
+        """Makes messages for the log and for subscribers only: it is the most expensive part of telemetry."""
+        wanted = records if self.recorder else records[-MAX_BATCH:] if self.link.wants_steps() else records[:0]
+        steps = messages.steps(self.simulation, wanted, self._method)
+        bound = self.driver.age_bound() if steps else -1
+        for step in steps:
+            step.excess = self.driver.by_name[step.header.object].solves.excess
+            step.factor_age_bound = bound
+        return steps
 
     def _method(self, body: int, step: int) -> Method | None:
-        """How the factor of a step was made."""
+        """Returns how the factor of a step was made."""
         return self.driver.bodies[body].factors.method(step)
 
     def _latest(self, body: int, bound: int) -> pb.ObjectStep | None:
         if not self._window[body]:
             return None
-        message = describe.steps(self.simulation, self._last[body : body + 1], self._method)[0]
+        message = messages.steps(self.simulation, self._last[body : body + 1], self._method)[0]
         message.excess, message.factor_age_bound = self.driver.bodies[body].solves.excess, bound
         return message
 
-    def _touch(self, messages: list[pb.ObjectStep]) -> None:
-        """Adds to each step the interactions that acted in it."""
+    def _add_interactions(self, steps: list[pb.ObjectStep]) -> None:
+        """Adds to each step record the interactions that acted in it."""
         if self.commands is None or self.simulation.touch is None:
             return
-        known = {i.id: i for i in self.commands.applied()}
+        known = {i.id: i for i in self.commands.interactions()}
         clock, dt = float(self.simulation.system.clock[0]), self.simulation.world.dt
-        for id in set(self._touched) - set(known):  # over or released: it acted up to the step under way at most
-            self._touched[id].duration = min(self._touched[id].duration, max(clock + dt - self._touched[id].start, 0))
-        self._touched.update(known)
+        for id in set(self._interactions) - set(known):  # over or released: it acted up to the step under way at most
+            self._interactions[id].duration = min(
+                self._interactions[id].duration, max(clock + dt - self._interactions[id].start, 0)
+            )
+        self._interactions.update(known)
         of: dict[str, list[pb.Interaction]] = {}
-        for i in self._touched.values():
+        for i in self._interactions.values():
             of.setdefault(i.object, []).append(i)
-        for message in messages:
-            begin = message.time - dt
-            mine = of.get(message.header.object, ())
-            message.interactions.extend(i for i in mine if 0 <= i.start <= begin + 0.5 * dt < i.start + i.duration)
-        for id in set(self._touched) - set(known):
-            del self._touched[id]
+        for step in steps:
+            begin = step.time - dt
+            mine = of.get(step.header.object, ())
+            step.interactions.extend(i for i in mine if 0 <= i.start <= begin + 0.5 * dt < i.start + i.duration)
+        for id in set(self._interactions) - set(known):
+            del self._interactions[id]
 
     def frames(self) -> None:
-        """States: to the log at the scene's rate, the newest one to viewers."""
+        """Sends states, to the log at the scene's rate, the newest one to viewers."""
         frames = self.engine.frames()
         for step, x, v in frames:
-            if self.every and step % self.every == 0:
+            if self.record_every and step % self.record_every == 0:
                 self._record_frame(step, x, v)
-        if frames and self._period("state", STATE_PERIOD):
+        if frames and self._is_due("state", STATE_PERIOD):
             step, x, v = frames[-1]
             for body in self.simulation.world.bodies:
                 if self.link.wants_state(body.name):
-                    self.link.publish_state(describe.state(body, step, step * self.simulation.world.dt, x, v))
+                    self.link.publish_state(messages.state(body, step, step * self.simulation.world.dt, x, v))
 
-    def wanted_frames(self) -> int:
-        """Steps between frames that the loop should copy out: 0 if nobody looks."""
-        if self._period("look", LOOK_PERIOD):
-            self._watched = self.link.wants_state()
-            self._listened = self.link.wants_steps() or bool(self.link.clients())
-        return self.every or (max(1, round(STATE_PERIOD / self.simulation.world.dt)) if self._watched else 0)
+    def frame_interval(self) -> int:
+        """Returns the steps between frames that the loop should copy out; 0 for none."""
+        if self._is_due("look", LOOK_PERIOD):
+            self._has_viewers = self.link.wants_state()
+            self._has_listeners = self.link.wants_steps() or bool(self.link.clients())
+        return self.record_every or (max(1, round(STATE_PERIOD / self.simulation.world.dt)) if self._has_viewers else 0)
 
-    def wanted_energies(self) -> int:
-        """Steps between those whose elastic energy the loop should evaluate: 0 if nobody looks. Call `wanted_frames`
-        before."""
+    def energy_interval(self) -> int:
+        """Returns the steps between those whose elastic energy the loop should evaluate; 0 for none.
+
+        Call `frame_interval` first: it checks for subscribers.
+        """
         if self.recorder and self.patient:
-            return self.every
-        return ENERGY_STEPS if self.recorder or self._listened else 0
+            return self.record_every
+        return ENERGY_STEPS if self.recorder or self._has_listeners else 0
 
     def _record_frame(self, step: int, x: NDArray[np.float64], v: NDArray[np.float64]) -> None:
         assert self.recorder is not None
         for body in self.simulation.world.bodies:
-            message = describe.state(body, step, step * self.simulation.world.dt, x, v)
+            message = messages.state(body, step, step * self.simulation.world.dt, x, v)
             self.recorder.state(message, block=self.patient)
 
     def publish_status(self, state: str, force: bool = True, where: bool = False) -> None:
-        """The health of the whole scene. where: also where its objects are, which a GPU has to be asked for."""
-        if not self._period("status", STATUS_PERIOD) and not force:
+        """Publishes the status of the scene. where: with the places of its objects, which are fetched from a GPU."""
+        if not self._is_due("status", STATUS_PERIOD) and not force:
             return
         self._due["status"] = time.monotonic() + STATUS_PERIOD
         loop, world = self.engine.loop, self.simulation.world
@@ -192,7 +199,7 @@ class Telemetry:
             scene=self.simulation.scene.name, state=state, step=self.engine.step, time=self.engine.step * world.dt,
             dt=world.dt, step_p50=p50, step_p99=p99, step_max=most, late_steps=loop.late_steps,
             device=self.simulation.world.backend.name,
-            pid=os.getpid(), uptime=time.monotonic() - self.begun, pace=self.pace,
+            pid=os.getpid(), uptime=time.monotonic() - self.started, pace=self.pace,
         )  # fmt: skip
         dropped = loop.frames_dropped + (self.recorder.dropped if self.recorder else 0)
         status.frames_dropped, status.records_dropped = dropped, loop.records_dropped
@@ -222,11 +229,11 @@ class Telemetry:
                 )
             )
         if where:
-            describe.places(self._places(), status)
+            messages.add_places(self._places(), status)
         self.link.publish_status(status)
 
     def _places(self) -> list[NamedPoints]:
-        """Of all objects, as they are now."""
+        """Returns the named points of all objects at their present positions."""
         world = self.simulation.world
         self._points = self._points or [NamedPoints(world, body) for body in world.bodies]
         x = world.backend.fetch(world.x)
@@ -235,14 +242,14 @@ class Telemetry:
         return self._points
 
     def percentiles(self) -> tuple[float, float, float]:
-        """p50, p99 and maximum of the step time over the last steps [s]."""
+        """Returns p50, p99 and maximum of the time [s] of the last steps."""
         if not self.seconds:
             return 0.0, 0.0, 0.0
         seconds = np.array(self.seconds)
         return float(np.percentile(seconds, 50)), float(np.percentile(seconds, 99)), float(seconds.max())
 
-    def count(self, records: NDArray[Any]) -> list[str]:
-        """Counts statuses; one line for the first solve that did not converge."""
+    def count_unconverged(self, records: NDArray[Any]) -> list[str]:
+        """Counts solves that did not converge, by status; returns a line for the first."""
         self.solves += len(records)
         failed = records[(records["status"] != pb.CONVERGED) & (records["status"] != pb.RUNAWAY)]
         if not len(failed):
@@ -258,8 +265,12 @@ class Telemetry:
             "further ones are counted"
         ]
 
+    def not_finite(self, records: NDArray[Any]) -> list[str]:
+        """Returns a line for each object whose solve met numbers that are not finite for the first time."""
+        return not_finite_lines(self.simulation, records, self._not_finite)
+
     def count_runaways(self, records: NDArray[Any]) -> list[str]:
-        """Counts steps of bodies that have run away; one line for each of them, with what showed it."""
+        """Counts steps of bodies that have run away; returns a line for each new one, with the cause."""
         away, lines = records[records["status"] == pb.RUNAWAY], []
         for r in away[np.unique(away["body"], return_index=True)[1]]:
             body = self.simulation.world.bodies[int(r["body"])]
@@ -274,22 +285,26 @@ class Telemetry:
         self.runaways.update(away["body"].tolist())
         return lines
 
-    def bad_steps(self, records: NDArray[Any]) -> list[str]:
-        """One line for each object whose solve met numbers that are not finite for the first time."""
-        lines = []
-        for r in records[records["bad_node"] >= 0]:
-            name = self.simulation.world.bodies[int(r["body"])].name
-            if name not in self._bad:
-                self._bad.add(name)
-                begin = float(r["time"]) - self.simulation.world.dt / 2
-                refused = [x for x in self.simulation.refusals() if x.body == int(r["body"]) and x.time < begin]
-                latest = max(refused, key=lambda x: x.time, default=None)  # before, a line search may have tried one
-                why = str(latest) if latest else f"force is not finite at node {int(r['bad_node'])}"
-                lines.append(
-                    f"object {name!r}, step {int(r['step'])}: {why}; "
-                    "it goes back to where the step before began and rests there"
-                )
-        return lines
+
+def not_finite_lines(simulation: Simulation, records: NDArray[Any], known: set[str]) -> list[str]:
+    """Returns a line for each object whose solve met numbers that are not finite for the first time.
+
+    known: objects of which that was said before; the names of new ones are added
+    """
+    lines = []
+    for r in records[records["bad_node"] >= 0]:
+        name = simulation.world.bodies[int(r["body"])].name
+        if name not in known:
+            known.add(name)
+            begin = float(r["time"]) - simulation.world.dt / 2
+            refused = [x for x in simulation.refusals() if x.body == int(r["body"]) and x.time < begin]
+            latest = max(refused, key=lambda x: x.time, default=None)  # before, a line search may have tried one
+            why = str(latest) if latest else f"force is not finite at node {int(r['bad_node'])}"
+            lines.append(
+                f"object {name!r}, step {int(r['step'])}: {why}; "
+                "it goes back to where the step before began and rests there"
+            )
+    return lines
 
 
 def cause_of(r: np.void) -> str:

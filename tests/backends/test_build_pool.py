@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from sim_server.backends.build_pool import CompileError, Compilers, Job
-from sim_server.service.compile_notice import Notice, compiling_told
+from sim_server.service.compile_notice import CompileNotice, compile_notices
 
 ROOT = Path(__file__).parents[2]
 SCENE = """dt = 0.02
@@ -130,7 +130,7 @@ def test_one_line_says_that_kernels_are_compiled_and_one_that_they_are(tmp_path)
         closing.callback(said.append, "the bar is gone")
         return lambda done, total: bars[-1].append((done, total))
 
-    notice = Notice(said.append, bar, lambda: now[0])
+    notice = CompileNotice(said.append, bar, lambda: now[0])
     notice.end()
     assert said == [], "nothing was compiled"
     for done in range(4):
@@ -164,11 +164,11 @@ def test_what_another_compiler_makes_counts_if_it_took_its_time(monkeypatch):
 
 def test_progress_is_told_within_and_not_after(tmp_path, capsys):
     compilers, said = Compilers(1), []
-    with compiling_told(said.append, compilers):
+    with compile_notices(said.append, compilers):
         finish(compilers, job(tmp_path, "a", 'sleep 0.05; touch "$2"'))
     finish(compilers, job(tmp_path, "b", 'sleep 0.05; touch "$2"'))
     assert [line.split()[0] for line in said] == ["compiling", "compiled"]
-    with pytest.raises(CompileError), compiling_told(said.append, compilers):
+    with pytest.raises(CompileError), compile_notices(said.append, compilers):
         finish(compilers, job(tmp_path, "c", "sleep 0.05; exit 1"))
     assert [line.split()[0] for line in said[2:]] == ["compiling"], "it has not been compiled"
     assert capsys.readouterr().err == ""  # stderr is no terminal: no bar

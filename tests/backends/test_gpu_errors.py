@@ -11,7 +11,7 @@ import pytest
 from sim_server import cli
 from sim_server.backends.compiler import CompileError
 from sim_server.backends.gpu import device
-from sim_server.cli import chosen
+from sim_server.cli import choose_device
 from sim_server.errors import DeviceError
 
 ROOT = Path(__file__).parents[2]
@@ -96,7 +96,7 @@ def test_auto_goes_on_with_the_cpu_and_says_why_in_one_line(cupy, found, text, m
     cupy(None if found is None else fake(found))
     monkeypatch.setattr(cli, "nvidia_device", lambda: True)
     said: list[str] = []
-    assert chosen("auto", said.append) == "cpu"
+    assert choose_device("auto", said.append) == "cpu"
     assert len(said) == 1
     assert said[0].startswith("on the CPU; no GPU: ")
     assert "\n" not in said[0]
@@ -107,7 +107,7 @@ def test_auto_says_nothing_of_gpus_where_there_is_none(cupy, installed, monkeypa
     cupy(installed)
     monkeypatch.setattr(cli, "nvidia_device", lambda: False)
     said: list[str] = []
-    assert chosen("auto", said.append) == "cpu"
+    assert choose_device("auto", said.append) == "cpu"
     assert said == []
 
 
@@ -115,8 +115,8 @@ def test_auto_takes_a_gpu_that_is_there_and_says_nothing(cupy, monkeypatch):
     cupy(fake())
     monkeypatch.setattr(cli, "nvidia_device", lambda: True)
     said: list[str] = []
-    assert chosen("auto", said.append) == "gpu"
-    assert [chosen(d, said.append) for d in ("cpu", "gpu")] == ["cpu", "gpu"]
+    assert choose_device("auto", said.append) == "gpu"
+    assert [choose_device(d, said.append) for d in ("cpu", "gpu")] == ["cpu", "gpu"]
     assert said == []
 
 

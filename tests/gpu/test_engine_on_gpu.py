@@ -4,14 +4,13 @@
 import gc
 import logging
 import threading
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from protocol.messages_pb2 import SolveStatus
 from sim_server.errors import DeviceError
-from sim_server.service.telemetry import Telemetry
+from sim_server.service.telemetry import not_finite_lines
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
 from sim_server.updates.factor_source import Job
@@ -177,7 +176,7 @@ def test_numbers_that_are_not_finite_are_told_as_on_the_cpu():
         sim.engine.run(1)
         records = sim.engine.records()
         assert records[-1]["status"] == SolveStatus.NOT_FINITE
-        lines.append(Telemetry.bad_steps(SimpleNamespace(simulation=sim, _bad=set()), records))  # type: ignore[arg-type]
+        lines.append(not_finite_lines(sim, records, set()))
     assert lines[0] == lines[1]
     assert len(lines[0]) == 1
     assert lines[0][0].startswith("object 'beam', step 3: force is not finite at node ")

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import pytest
 
-from sim_server.service.supervisor import BACK_OFF, BUDGET, PERIOD, Supervisor
+from sim_server.service.supervisor import BACK_OFF, MAX_RESTARTS, RESTART_PERIOD, Supervisor
 
 
 class Process:
@@ -33,7 +33,7 @@ class World:
     def die(self, code: int = -9) -> None:
         """The process started last ends."""
         self.started[-1].returncode = code
-        self.supervisor.look()
+        self.supervisor.check()
 
     def pass_until_restart(self) -> float:
         """Time until another process is started."""
@@ -41,7 +41,7 @@ class World:
         while len(self.started) == count:
             self.now += 0.05
             assert self.now - begun < 100
-            self.supervisor.look()
+            self.supervisor.check()
         return self.now - begun
 
 
@@ -50,7 +50,7 @@ def test_each_has_a_name_and_the_servers_endpoint() -> None:
     names = [process.command[process.command.index("--name") + 1] for process in world.started]
     assert names == ["local-1", "local-2"]
     assert all("tcp/h:1" in process.command and "--exit-with-parent" in process.command for process in world.started)
-    assert [(w.worker, w.state, w.restarts) for w in world.supervisor.report()] == [
+    assert [(w.worker, w.state, w.restarts) for w in world.supervisor.local_workers()] == [
         ("local-1", "running", 0),
         ("local-2", "running", 0),
     ]
@@ -59,24 +59,24 @@ def test_each_has_a_name_and_the_servers_endpoint() -> None:
 def test_pauses_double_and_the_budget_ends_it(caplog: pytest.LogCaptureFixture) -> None:
     world = World()
     with caplog.at_level(logging.WARNING):
-        for restart in range(BUDGET):
+        for restart in range(MAX_RESTARTS):
             world.die()
-            assert world.supervisor.report()[0].state == "restarting"
+            assert world.supervisor.local_workers()[0].state == "restarting"
             assert world.pass_until_restart() == pytest.approx(BACK_OFF * 2**restart, abs=0.06)
         world.die(1)
-    (report,) = world.supervisor.report()
-    assert (report.state, report.restarts, report.exit_code) == ("given up", BUDGET, 1)
-    assert f"restart {BUDGET} of {BUDGET}" in caplog.text and "left alone" in caplog.text
-    world.now += 10 * PERIOD
-    world.supervisor.look()
-    assert len(world.started) == 1 + BUDGET
+    (report,) = world.supervisor.local_workers()
+    assert (report.state, report.restarts, report.exit_code) == ("given up", MAX_RESTARTS, 1)
+    assert f"restart {MAX_RESTARTS} of {MAX_RESTARTS}" in caplog.text and "left alone" in caplog.text
+    world.now += 10 * RESTART_PERIOD
+    world.supervisor.check()
+    assert len(world.started) == 1 + MAX_RESTARTS
 
 
 def test_a_worker_that_lasts_gets_its_budget_back() -> None:
     world = World()
-    for _ in range(3 * BUDGET):
-        world.now += PERIOD
+    for _ in range(3 * MAX_RESTARTS):
+        world.now += RESTART_PERIOD
         world.die()
         assert world.pass_until_restart() == pytest.approx(BACK_OFF, abs=0.06)
-    (report,) = world.supervisor.report()
-    assert (report.state, report.restarts, report.pid) == ("running", 3 * BUDGET, world.started[-1].pid)
+    (report,) = world.supervisor.local_workers()
+    assert (report.state, report.restarts, report.pid) == ("running", 3 * MAX_RESTARTS, world.started[-1].pid)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from protocol import messages_pb2 as pb
 from sim_server.backends.kinds import Kind
-from sim_server.recording import messages as describe
+from sim_server.recording import messages
 from sim_server.recording.recorder import Recorder
 from sim_server.replay.log import Recording
 from sim_server.replay.run import Replay
@@ -61,16 +61,16 @@ def replayed(sim: Simulation, records: NDArray[Any], path: Path, **scene: str) -
     """What a replay of the log with these records, and the state at their end, finds. scene: other fields of its
     message."""
     with Recorder(path) as recorder:
-        message = describe.scene(sim)
+        message = messages.scene(sim)
         message.MergeFrom(pb.Scene(**scene))
         recorder.scene(message)
-        recorder.topology(describe.topology(sim, sim.world.bodies[0]))
+        recorder.topology(messages.topology(sim, sim.world.bodies[0]))
         for made in set(records["factor_step"].tolist()) - {-1}:
             recorder.factor(pb.FactorUse(header=pb.Header(object="bar", epoch=1), step=made, method="cholesky"))
-        for step in describe.steps(sim, records):
+        for step in messages.steps(sim, records):
             recorder.step(step)
         w, last = sim.fetch(), len(records)
-        recorder.state(describe.state(sim.world.bodies[0], last, last * w.dt, w.x, w.v))
+        recorder.state(messages.state(sim.world.bodies[0], last, last * w.dt, w.x, w.v))
     with Recording(path) as recording:
         return Replay(recording).run()
 
@@ -107,7 +107,7 @@ def test_a_step_that_makes_its_own_factor_begins_with_the_one_before(tmp_path: P
 def test_a_log_whose_warp_was_switched_by_trials_is_repeated_with_the_warp(tmp_path: Path) -> None:
     """An earlier version had them; a run that made none, as here, is the same."""
     sim = beam()
-    table = json.loads(describe.scene(sim).resolved)
+    table = json.loads(messages.scene(sim).resolved)
     resolved = json.dumps(table | {"solver": table["solver"] | {"warp": "auto"}})
     found = replayed(sim, run(sim, "j j"), tmp_path / "run.mcap", resolved=resolved)
     assert found.same and 'recorded with warp = "auto"' in found.notes[0]

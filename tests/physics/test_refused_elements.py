@@ -1,13 +1,11 @@
 # SPDX-License-Identifier: MIT
 """J <= 0 in laws with powers or a logarithm of J: the solve ends, the run does not, and the element is named."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
 from protocol.messages_pb2 import SolveStatus
-from sim_server.service.telemetry import Telemetry
+from sim_server.service.telemetry import not_finite_lines
 from sim_server.updates.driver import Driver
 from tests.physics.laws import LAWS, Law, determinants, forces, law_bar, stiffness
 
@@ -39,7 +37,7 @@ def test_the_element_is_named_and_the_run_goes_on(law):
     assert (first.effect, first.body, first.time) == (law.name, 0, 0.0)
     expected = determinants(sim)[list(sim.effects[law.name].number).index(first.element)]
     assert pytest.approx(expected, rel=1e-12) == first.J
-    lines = Telemetry.bad_steps(SimpleNamespace(simulation=sim, _bad=set()), records)  # type: ignore[arg-type]
+    lines = not_finite_lines(sim, records, set())
     assert lines == [
         f"object 'bar', step 1: element {bad[0]} has J = {expected:.3g}, which {law.name} does not define; "
         "it goes back to where the step before began and rests there"
@@ -121,6 +119,6 @@ def test_the_element_named_is_that_of_the_step():
     other = int(np.argmax(pressed[:, 0] * (pressed == sim.world.rest).all(axis=1)))
     sim.world.x[other] -= [2.5, 0.2, 0.1]
     records = Driver(sim).advance(1)
-    (line,) = Telemetry.bad_steps(SimpleNamespace(simulation=sim, _bad=set()), records)  # type: ignore[arg-type]
+    (line,) = not_finite_lines(sim, records, set())
     number = int(line.split("element ")[1].split()[0])
     assert number not in bad and {r.element: r.time for r in sim.refusals()}[number] == pytest.approx(3 * 0.02)

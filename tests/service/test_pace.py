@@ -12,10 +12,10 @@ from rich.console import Console
 from clients.watch import tables
 from protocol import messages_pb2 as pb
 from sim_server.backends.cpu.structs import RECORD
-from sim_server.service.pace import LOOKS, Pace
+from sim_server.service.pace import LOOK_PERIOD, PaceMonitor
 
 DT = 0.02
-NAP = 2.5e-3  # s between rounds of the service thread
+ROUND_PERIOD = 2.5e-3  # s between rounds of the service thread
 
 
 class Run:
@@ -29,7 +29,7 @@ class Run:
         self.now, self.step, self.busy_until, self.due = 0.0, 0, -1.0, 0.0
         self.paused = self.stopped = False
         self.whole = self.look_due = 0.0
-        self.pace = Pace(DT, lambda: "ADVICE")
+        self.pace = PaceMonitor(DT, lambda: "ADVICE")
         self.said: list[tuple[float, str]] = []
 
     def until(self, end: float) -> list[tuple[float, str]]:
@@ -38,10 +38,10 @@ class Run:
         while self.now < end:
             self._loop()
             look = not self.stopped and self.now >= self.look_due
-            if look and (line := self.pace.look(self.now, self.step, self.paused, self.now >= self.warm)):
+            if look and (line := self.pace.check(self.now, self.step, self.paused, self.now >= self.warm)):
                 self.said.append((self.now, line))
-            self.look_due = self.now + LOOKS if look else self.look_due
-            self.now += NAP
+            self.look_due = self.now + LOOK_PERIOD if look else self.look_due
+            self.now += ROUND_PERIOD
         return self.said[before:]
 
     def _loop(self) -> None:
@@ -50,7 +50,7 @@ class Run:
             self.step += 1
             record = np.zeros(1, RECORD)
             record["whole"], record["cpu"] = self.whole, self.whole * self.share
-            self.pace.note(record)
+            self.pace.add(record)
         if self.busy_until < 0 and self.now >= self.due and not (self.paused or self.stopped):
             self.whole = self.takes(self.now)
             self.busy_until = self.now + self.whole

@@ -24,7 +24,7 @@ def push(commands: Commands, **fields: object) -> pb.Reply:
 @pytest.mark.parametrize("duration", [LONGEST_PUSH * 1.001, 1e308])
 def test_a_push_lasts_a_bounded_time(commands: Commands, duration: float) -> None:
     assert push(commands, duration=duration).error == f"duration = {duration:g} s: a push lasts at most 3600 s"
-    assert commands.applied() == []
+    assert commands.interactions() == []
     assert push(commands, duration=LONGEST_PUSH).error == ""
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sim_server.recording import messages as describe
+from sim_server.recording import messages
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
 from sim_server.updates.factor_source import Inline, Job
@@ -46,8 +46,8 @@ class Building(Inline):
 
     def __init__(self, sim: Simulation):
         super().__init__({b.name: sim.system.body_pattern(b.first, b.last) for b in sim.world.bodies})
-        told = describe.scene(sim)
-        self.assemblies = {b.name: Assembly(told, describe.topology(sim, b)) for b in sim.world.bodies}
+        told = messages.scene(sim)
+        self.assemblies = {b.name: Assembly(told, messages.topology(sim, b)) for b in sim.world.bodies}
         self.built = 0
 
     def assembles_matrices(self) -> bool:

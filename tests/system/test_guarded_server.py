@@ -12,7 +12,7 @@ from link_helpers import DenseAnalysis, free_endpoint
 from protocol.messages_pb2 import Factor, Topology
 from protocol.validate import checksum
 from sim_server.network.link import ServerLink
-from sim_server.recording import messages as describe
+from sim_server.recording import messages
 from sim_server.updates.driver import Driver
 from tests.scenes import bar, simulation
 
@@ -46,7 +46,7 @@ def test_factors_that_are_no_good_are_refused_and_right_ones_are_used(caplog: py
     sim = simulation(
         bar((3, 1, 1), young=1e6, fixed="X < 0.01"), gravity=(0, -9.81, 0), preconditioner="cholesky", update="async"
     )
-    endpoint, topology = free_endpoint(), describe.topology(sim, sim.world.bodies[0])
+    endpoint, topology = free_endpoint(), messages.topology(sim, sim.world.bodies[0])
     with (
         ServerLink(listen=[endpoint], shared_memory=False, silence=60) as link,
         HandWorker(endpoint, link.incarnation) as hand,

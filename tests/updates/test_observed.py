@@ -9,7 +9,7 @@ import pytest
 from protocol import messages_pb2 as pb
 from sim_server.backends.cpu.structs import RECORD
 from sim_server.backends.kinds import Kind
-from sim_server.recording import messages as describe
+from sim_server.recording import messages
 from sim_server.service.telemetry import Telemetry
 from sim_server.updates.driver import Driver
 from sim_server.updates.solve_observer import MIN_TOGETHER
@@ -82,8 +82,8 @@ def told(listening: bool, monkeypatch) -> tuple[list[pb.Steps], list[pb.Status],
     """Steps and statuses that went out, and how many messages of steps were made before the status was."""
     driver = drivers("cholesky")[0]
     made, sent, statuses = [], [], []
-    plain = describe.steps
-    monkeypatch.setattr(describe, "steps", lambda sim, records, *more: made.extend(records) or plain(sim, records))
+    plain = messages.steps
+    monkeypatch.setattr(messages, "steps", lambda sim, records, *more: made.extend(records) or plain(sim, records))
     link = SimpleNamespace(wants_steps=lambda: listening, publish_steps=sent.append, publish_status=statuses.append)
     telemetry = Telemetry(driver, link, None, patient=False)  # type: ignore[arg-type]
     telemetry.records(solves(np.random.default_rng(0), 0, 10).ravel())

@@ -9,7 +9,7 @@ import pytest
 
 from protocol import messages_pb2 as pb
 from protocol.refused import Refused
-from sim_server.recording import messages as describe
+from sim_server.recording import messages
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
 from sim_server.updates.factor_source import Inline, Job
@@ -28,8 +28,8 @@ SOLIDS = {
 
 def described(sim: Simulation, body: int = 0) -> tuple[pb.Scene, pb.Topology]:
     """As a worker gets it."""
-    topology = describe.topology(sim, sim.world.bodies[body])
-    return pb.Scene.FromString(describe.scene(sim).SerializeToString()), topology
+    topology = messages.topology(sim, sim.world.bodies[body])
+    return pb.Scene.FromString(messages.scene(sim).SerializeToString()), topology
 
 
 def deformed(sim: Simulation, seed: int = 0) -> None:

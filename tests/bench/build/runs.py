@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import Factor
-from sim_server.recording import messages as describe
+from sim_server.recording import messages
 from sim_server.updates.driver import Driver
 from sim_server.network.link import ServerLink
 from sim_server.simulation import Simulation
@@ -75,8 +75,8 @@ def measured(case: Case, steps: int) -> dict[str, Any]:
     endpoint = f"tcp/{ADDRESS if far else '127.0.0.1'}:{free_port()}"
     prefix = Cable.far if far else ()
     with ServerLink("bench", [endpoint], shared_memory=case.way == SHARED) as link:
-        link.set_scene(describe.scene(sim))
-        link.announce(describe.topology(sim, sim.world.bodies[0]))
+        link.set_scene(messages.scene(sim))
+        link.announce(messages.topology(sim, sim.world.bodies[0]))
         workers = Supervisor(1, "bench", [endpoint], start=lambda command: started([*prefix, *command]))
         try:
             until(link.dispatch.workers)

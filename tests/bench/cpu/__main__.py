@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_server.network.link import ServerLink
-from sim_server.recording import messages as describe
+from sim_server.recording import messages
 from sim_server.service.supervisor import Supervisor
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
@@ -79,8 +79,8 @@ def with_worker(tets: int, steps: int) -> dict[str, Any]:
         probe.bind(("127.0.0.1", 0))
         endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
     with ServerLink("bench", [endpoint]) as link:
-        link.set_scene(describe.scene(sim))
-        link.announce(describe.topology(sim, sim.world.bodies[0]))
+        link.set_scene(messages.scene(sim))
+        link.announce(messages.topology(sim, sim.world.bodies[0]))
         workers = Supervisor(1, "bench", [endpoint])
         try:
             while not link.dispatch.workers():

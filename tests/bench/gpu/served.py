@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_server.network.link import ServerLink
-from sim_server.recording import messages as describe
+from sim_server.recording import messages
 from sim_server.service.service import NAP
 from sim_server.service.supervisor import Supervisor
 from sim_server.simulation import Simulation
@@ -56,8 +56,8 @@ class Served:
     def __enter__(self) -> Self:
         body = self.sim.world.bodies[0]
         self.link = ServerLink("bench", [self._endpoint])
-        self.link.set_scene(describe.scene(self.sim))
-        self.link.announce(describe.topology(self.sim, body))
+        self.link.set_scene(messages.scene(self.sim))
+        self.link.announce(messages.topology(self.sim, body))
         arguments = ("--device", "gpu") if self._worker == "gpu" else ()
         self._supervisor = Supervisor(1, "bench", [self._endpoint], arguments)
         self.driver = Driver(self.sim, self.link.dispatch)

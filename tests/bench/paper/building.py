@@ -3,7 +3,7 @@
 
 from dataclasses import replace
 
-from sim_server.recording import messages as describe
+from sim_server.recording import messages
 from sim_server.simulation import Simulation
 from sim_server.updates.factor_source import Inline, Job
 from sim_server.updates.worker_assembly import Assembly
@@ -15,8 +15,8 @@ class BuildingInline(Inline):
     def __init__(self, simulation: Simulation):
         bodies = simulation.world.bodies
         super().__init__({b.name: simulation.system.body_pattern(b.first, b.last) for b in bodies})
-        scene = describe.scene(simulation)
-        self._assemblies = {b.name: Assembly(scene, describe.topology(simulation, b)) for b in bodies}
+        scene = messages.scene(simulation)
+        self._assemblies = {b.name: Assembly(scene, messages.topology(simulation, b)) for b in bodies}
 
     def assembles_matrices(self) -> bool:
         return True

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from protocol.factor import Factor
 from sim_server.network.link import ServerLink
-from sim_server.recording import messages as describe
+from sim_server.recording import messages
 from sim_server.service.supervisor import Supervisor
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
@@ -116,8 +116,8 @@ def one_round(beam: Beam, setting: Setting, steps: int, cores: Cores) -> Pair:
     sim, twin = (beam.simulation(LOADS[1], **solver) for _ in range(2))
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     with ServerLink("bench", [endpoint]) as link:
-        link.set_scene(describe.scene(sim))
-        link.announce(describe.topology(sim, sim.world.bodies[0]))
+        link.set_scene(messages.scene(sim))
+        link.announce(messages.topology(sim, sim.world.bodies[0]))
 
         def start(command: Any) -> Any:
             process = started(command)

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from sim_server.errors import DeviceError
 from sim_server.network.link import ServerLink
-from sim_server.recording import messages as describe
+from sim_server.recording import messages
 from sim_server.service.service import NAP
 from sim_server.service.supervisor import Supervisor
 from sim_server.simulation import Simulation
@@ -80,9 +80,9 @@ class Run:
             probe.bind(("127.0.0.1", 0))
             endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
         self.link = ServerLink("bench", [endpoint])
-        self.link.set_scene(describe.scene(sim))
+        self.link.set_scene(messages.scene(sim))
         for body in sim.world.bodies:
-            self.link.announce(describe.topology(sim, body))
+            self.link.announce(messages.topology(sim, body))
         self._supervisor = Supervisor(workers, "bench", [endpoint], ["--device", worker_device])
         self.driver = Driver(sim, self.link.dispatch)
         self._thread = threading.Thread(target=self._loop)

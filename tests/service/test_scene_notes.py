@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sim_server.service.notices import notices
+from sim_server.service.scene_notes import scene_notes
 from sim_server.simulation import Simulation
 from tests.scenes import bar, jittered_bar, mesh_file, simulation
 
@@ -20,22 +20,22 @@ def small(name: str, **table) -> dict:
 
 @pytest.mark.parametrize("scene", sorted((Path(__file__).parents[2] / "deploy" / "scenes").glob("*.toml")), ids=str)
 def test_nothing_is_said_of_the_scenes_that_come_along(scene):
-    assert notices(Simulation.load(scene)) == []
+    assert scene_notes(Simulation.load(scene)) == []
 
 
 def test_free_fall_is_said_once_for_all_bodies():
     bodies = [small(f"b{k}") for k in range(5)]
-    assert notices(simulation(*bodies, gravity=GRAVITY)) == [f"objects 'b0', 'b1', 'b2' and 2 more {FALLING}"]
-    assert notices(simulation(small("a", touch={}), gravity=GRAVITY)) == [f"object 'a' {FALLING}"]
-    assert notices(simulation(*bodies)) == []  # nothing pulls
-    assert notices(simulation(small("a", fixed="X < 0.1"), gravity=GRAVITY)) == []
+    assert scene_notes(simulation(*bodies, gravity=GRAVITY)) == [f"objects 'b0', 'b1', 'b2' and 2 more {FALLING}"]
+    assert scene_notes(simulation(small("a", touch={}), gravity=GRAVITY)) == [f"object 'a' {FALLING}"]
+    assert scene_notes(simulation(*bodies)) == []  # nothing pulls
+    assert scene_notes(simulation(small("a", fixed="X < 0.1"), gravity=GRAVITY)) == []
 
 
 def test_a_body_without_elasticity_is_said():
-    assert notices(simulation(small("a", young=None), small("b"), gravity=GRAVITY)) == [
+    assert scene_notes(simulation(small("a", young=None), small("b"), gravity=GRAVITY)) == [
         f"object 'a' without elasticity: each node moves by itself; object 'b' {FALLING}"
     ]
-    assert notices(simulation(small("a", young=None, fixed="X < 0.1"))) == [
+    assert scene_notes(simulation(small("a", young=None, fixed="X < 0.1"))) == [
         "object 'a' without elasticity: each node moves by itself"
     ]
 
@@ -44,14 +44,14 @@ def test_springs_hold_a_part_that_tetrahedra_leave_loose(tmp_path):
     rest, tets = jittered_bar((1, 1, 1), (1, 1, 1), seed=0)
     two = np.concatenate([rest, rest + np.array([3.0, 0, 0])]), np.concatenate([tets, tets + len(rest)])
     body = bar(mesh=mesh_file(tmp_path, *two), name="a", fixed="X < 0.01")
-    assert notices(simulation(body, gravity=GRAVITY)) == [
+    assert scene_notes(simulation(body, gravity=GRAVITY)) == [
         "object 'a' with parts that no element connects to a fixed node: these fall"
     ]
     body["effects"]["mass_spring"] = {"springs": [[0, len(rest)]], "stiffness": 10.0}
-    assert notices(simulation(body, gravity=GRAVITY)) == []
+    assert scene_notes(simulation(body, gravity=GRAVITY)) == []
 
 
 def test_nearly_incompressible_materials_are_said():
-    assert notices(simulation(small("a", poisson=0.4999))) == []
-    lines = notices(simulation(small("a", poisson=0.3), small("b", poisson=0.49999999)))
+    assert scene_notes(simulation(small("a", poisson=0.4999))) == []
+    lines = scene_notes(simulation(small("a", poisson=0.3), small("b", poisson=0.49999999)))
     assert len(lines) == 1 and lines[0].startswith("object 'b' with a Poisson's ratio of 0.49999999: above 0.4999")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a scene may well have, and its author may not have meant: a line when it is loaded, no error."""
+"""Notes on a loaded scene: valid, but perhaps not what its author meant."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,11 +13,11 @@ NEARLY_INCOMPRESSIBLE = 0.4999  # Poisson's ratio; beyond it solves were seen to
 NAMED = 3  # objects named in a line
 
 
-def notices(simulation: Simulation) -> list[str]:
-    """At most two lines: bodies that fall apart or fall freely, and materials that are nearly incompressible.
+def scene_notes(simulation: Simulation) -> list[str]:
+    """Returns at most two lines: bodies that fall apart or fall freely, and nearly incompressible materials.
 
-    A body falls if gravity acts on it and no fixed node is connected with it by elements, whether or not it can be
-    touched: a grab may hold it, but only once somebody has caught it. In a quasi-static scene such a body is refused.
+    A body falls if gravity acts on it and no element connects it to a fixed node, even if clients may grab it. In a
+    quasi-static scene such a body is refused.
     """
     return [line for line in (_loose(simulation), _incompressible(simulation)) if line]
 
@@ -43,7 +43,7 @@ def _loose(simulation: Simulation) -> str:
 
 
 def _parts(simulation: Simulation) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
-    """Number of the connected part of each node, and whether the node belongs to an element, (nodes,) each."""
+    """Returns the connected part of each node, and whether the node belongs to an element, (nodes,) each."""
     n = simulation.world.nodes
     elements = [e.elements for e in simulation.effects.values() if e.elements is not None]
     ends = [e[:, [0, k]] for e in elements for k in range(1, e.shape[1])]
