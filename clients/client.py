@@ -33,7 +33,7 @@ class Client:
     """A connection to the server `name`; use it as a context manager, which always closes it.
 
     connect: endpoints; by default those of the environment variable WARPFACTOR_CONNECT, or tcp/127.0.0.1:7447.
-    timeout [s]: for connecting and for every answer.
+    timeout [s]: for connecting and for every answer; may be changed. secret: proves that commands are of this client.
     Raises ClientError if there is no such server, BadInput for a bad name or endpoint.
 
     >>> with Client() as client:
@@ -42,8 +42,8 @@ class Client:
 
     def __init__(self, name: str = SERVER_NAME, connect: Sequence[str] | None = None, timeout: float = 3.0) -> None:
         self.name = name
-        self.id, self._secret = new_client()
-        self._timeout = timeout
+        self.id, self.secret = new_client()
+        self.timeout = timeout
         try:
             check_name(name, "server name")
             connect = list(connect or usual_endpoints())
@@ -196,7 +196,7 @@ class Client:
         try:
             payload = self._command(verb, interaction)
             handler = zenoh.handlers.Callback(take, done)
-            send_query(self._session.zenoh, self.name, "command", payload, self._timeout, handler)
+            send_query(self._session.zenoh, self.name, "command", payload, self.timeout, handler)
         except zenoh.ZError as error:
             raise ClientError(f"lost the server {self.name!r} at {self._where}: {error}") from None
 
@@ -215,14 +215,14 @@ class Client:
         if interaction is not None:
             interaction.client = self.id
         header = pb.Header(protocol=PROTOCOL)
-        command = pb.Command(header=header, client=self.id, secret=self._secret, verb=verb, interaction=interaction)
+        command = pb.Command(header=header, client=self.id, secret=self.secret, verb=verb, interaction=interaction)
         return command.SerializeToString()
 
     def _query(
         self, channel: str, kind: type[M], payload: bytes | None = None,
         complete: Callable[[list[M]], bool] = bool,
     ) -> list[M]:  # fmt: skip
-        return self._queries.ask(channel, kind, payload, self._timeout, complete)
+        return self._queries.ask(channel, kind, payload, self.timeout, complete)
 
     def _no_server(self) -> ClientError:
         others = self._servers() if hasattr(self, "_session") else []
@@ -230,7 +230,7 @@ class Client:
         return ClientError(f"no server {self.name!r} at {self._where}{there}")
 
     def _servers(self) -> list[str]:
-        tokens = self._session.zenoh.liveliness().get(f"{ROOT}/*/alive/server/*", timeout=self._timeout)
+        tokens = self._session.zenoh.liveliness().get(f"{ROOT}/*/alive/server/*", timeout=self.timeout)
         names = {str(token.ok.key_expr).split("/")[1] for token in tokens if token.ok is not None}
         return sorted(repr(name) for name in names)
 

@@ -168,7 +168,7 @@ class Fleet:
                 self.names, self.endpoints, self._parts, self.servers, self.gpus, strict=True
             )
         ]  # fmt: skip
-        pool = self.workers.report() if self.workers else []
+        pool = self.workers.local_workers() if self.workers else []
         return {
             "scene": str(self._scene.path),
             "servers": servers,
@@ -187,7 +187,7 @@ class Fleet:
             if all(code == 0 for code in codes):
                 return 0
             if self.workers:
-                self.workers.look()
+                self.workers.check()
             time.sleep(0.05)
 
     def close(self) -> None:

@@ -81,7 +81,7 @@ def work(
             from precond_worker.die_with_parent import die_with_parent
 
             die_with_parent()
-        library = _library(device, precision)
+        library = chosen_library(device, precision)
         servers = ["sim"] if server is None else server
         _serve(connect or [], threads, name or _default_name(), servers, not no_shared_memory, library)
     except NameTaken as error:
@@ -104,7 +104,7 @@ def _default_name() -> str:
     return f"{host[:50]}-{os.getpid()}"
 
 
-def _library(device: str, precision: str) -> str:
+def chosen_library(device: str, precision: str) -> str:
     """Returns the library for Analysis; ends the program if it cannot work here."""
     if device not in ("auto", "cpu", "gpu"):
         PROGRAM.bad_input(f"--device {device}: allowed are auto, cpu, gpu")
@@ -145,7 +145,7 @@ def _serve(connect: list[str], threads: int, name: str, servers: list[str], shar
         where = server_addresses(servers, connect)
     except ValueError as error:  # BadEndpoint or Refused
         PROGRAM.bad_input(str(error))
-    shown = _shown(library)
+    shown = library_title(library)
     compile_ahead()
 
     def connection(session: Session, server: str, wake: Event) -> ServerConnection:
@@ -169,7 +169,7 @@ def _serve(connect: list[str], threads: int, name: str, servers: list[str], shar
         serving.run()
 
 
-def _shown(library: str) -> str:
+def library_title(library: str) -> str:
     """Names the library that is used. On the CPU without CHOLMOD it also prints what that costs."""
     if library.startswith("gpu"):
         from precond_worker.gpu.gpu_factorization import title

@@ -88,7 +88,7 @@ class ChunkFile:
                     record = Metadata.read(body)
                     self.metadata[record.name] = record.metadata
                 elif opcode == Opcode.CHUNK:
-                    records = _unpack(Chunk.read(body))
+                    records = unpack(Chunk.read(body))
                     messages += sum(isinstance(record, Message) for record in records)
                     yield offset, records
             except BROKEN as error:
@@ -122,7 +122,7 @@ class ChunkFile:
         """Returns the records of the chunk at `offset`, one that `scan` has yielded."""
         self.stream.seek(offset)
         _, length = struct.unpack("<BQ", self.stream.read(9))
-        return _unpack(Chunk.read(ReadDataStream(BytesIO(self.stream.read(length)))))
+        return unpack(Chunk.read(ReadDataStream(BytesIO(self.stream.read(length)))))
 
     def _statistics(self, offset: int) -> int | None:
         """Returns the number of messages in the summary that begins at `offset`; None without a summary."""
@@ -158,7 +158,7 @@ class ChunkFile:
         )
 
 
-def _unpack(chunk: Chunk) -> list[McapRecord]:
+def unpack(chunk: Chunk) -> list[McapRecord]:
     """Checks size and checksum of a chunk and returns its channels and messages; raises one of BROKEN."""
     size = chunk.uncompressed_size
     if size > RECORD_LIMIT:

@@ -69,7 +69,7 @@ class Simulation:
         self.system = System(self.world, elements)
         matched = self._matched()
         self.shape = ShapeMatching(self.world, matched, solver.warp_level) if matched else None
-        self.warped = {body.index for body in self._rotated() + matched}  # whose solve is in the material frame
+        self.warped = {body.index for body in self.rotated_bodies() + matched}  # whose solve is in the material frame
         self.system.warped[:] = [body.index in self.warped for body in self.world.bodies]
         self.integrator = Integrator(scene, self.system)
         if not self.world.inertia:
@@ -146,7 +146,7 @@ class Simulation:
         """Pushes and grabs, if the scene lists them."""
         return cast("Touch | None", self.effects.get("touch"))
 
-    def _rotated(self) -> list[Body]:
+    def rotated_bodies(self) -> list[Body]:
         """Bodies whose rotations for the warp are those of elements."""
         if not self.scene.solver.warp:
             return []
@@ -156,7 +156,7 @@ class Simulation:
         """Bodies with elements none of which have rotations: theirs are matched shapes."""
         if not self.scene.solver.warp:
             return []
-        rotated = {body.index for body in self._rotated()}
+        rotated = {body.index for body in self.rotated_bodies()}
         return [b for b in self.world.bodies if b.index not in rotated and self.system.couples(b.first, b.last)]
 
     def _settle(self, body: Body) -> None:

@@ -143,10 +143,11 @@ def view_live(client: Client, coloring: Coloring, web: bool) -> None:
     from clients.viewer.rerun_scene import RerunScene
 
     with _viewer(web) as viewer, _connected_to(viewer) as recording:
-        _follow(client, RerunScene(recording, coloring, grow=True), viewer, recording)
+        follow(client, RerunScene(recording, coloring, grow=True), viewer, recording)
 
 
-def _follow(client: Client, scene: RerunScene, viewer: Viewer, recording: rr.RecordingStream) -> None:
+def follow(client: Client, scene: RerunScene, viewer: Viewer, recording: rr.RecordingStream) -> None:
+    """Logs states and steps of a server to a recording until the viewer is closed."""
     meshes = client.meshes()
     states, steps = client.states(), client.steps()
     first = min(meshes, default="")

@@ -30,12 +30,12 @@ class Packer:
 
         Raises RuntimeError if L has an entry outside the pattern that is not zero.
         """
-        if self._is_packed(factor):
+        if self.is_packed(factor):
             out[:] = factor.data
         else:
             self._scatter(factor, out)
 
-    def _is_packed(self, factor: csc_matrix) -> bool:
+    def is_packed(self, factor: csc_matrix) -> bool:
         """True if the library's columns are those of the pattern.
 
         The first column of each supernode is compared. That is enough: in a Cholesky factor the rows of a column are

@@ -66,6 +66,12 @@ class Compilers:
         self._failed: dict[Path, str] = {}
         self._done = self._total = 0
 
+    @property
+    def running(self) -> int:
+        """Number of compilers that have not ended. A probe for tests."""
+        with self._lock:
+            return sum(running.process.poll() is None for running in self._running.values())
+
     def begin(self, job: Job) -> None:
         """Starts a compiler now or once one of the others has ended; returns at once."""
         with self._lock:

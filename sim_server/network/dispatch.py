@@ -91,6 +91,11 @@ class Dispatch(FactorSource):
             infos = (self._registry.info(name) for name in self._available())
             return [info for info in infos if info is not None]
 
+    def unclaimed_tokens(self) -> int:
+        """Number of tokens of workers that have sent no heartbeat. A probe for tests."""
+        with self._lock:
+            return self._registry.unclaimed_tokens
+
     def ready(self) -> int:
         """Number of idle workers."""
         with self._lock:

@@ -72,7 +72,7 @@ class ServerLink:
                 "server", listen=listen, connect=connect, shared_memory=shared_memory, name=self.name
             )
             closing.callback(self._session.close)
-            self._claim = NameClaim(self._session, self.name, self.incarnation, listen, connect)
+            self._claim = NameClaim(self._session, self.name, self.incarnation, listen, connect, clock)
             closing.callback(self._claim.close)
             self._pool, probe_slot = self._make_slots(slots)
             if self._pool is not None:
@@ -122,6 +122,11 @@ class ServerLink:
     def shared_memory(self) -> bool:
         """True if there is a pool of slots for workers on this host."""
         return self._pool is not None
+
+    @property
+    def slots_lent(self) -> int:
+        """Number of slots lent to jobs now. A probe for tests."""
+        return self._pool.lent - 1 if self._pool is not None else 0  # one is for shm_probe
 
     def announce(self, topology: Topology) -> None:
         """Begins a new epoch of an object: sends its topology to all and offers it to those who join later."""

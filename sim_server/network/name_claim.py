@@ -10,7 +10,7 @@ import contextlib
 import logging
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import zenoh
 
@@ -32,14 +32,14 @@ class NameClaim:
 
     Queries are sent by a client session to the servers in `connect`: a router does not forward them between servers.
 
-    listen, connect: as of ServerLink
+    listen, connect, clock: as of ServerLink
     """
 
     def __init__(
         self, session: Session, server: str, incarnation: int,
-        listen: Sequence[str] | None, connect: Sequence[str] | None,
+        listen: Sequence[str] | None, connect: Sequence[str] | None, clock: Callable[[], float] = time.monotonic,
     ):  # fmt: skip
-        self._server, self._incarnation = server, incarnation
+        self._server, self._incarnation, self._clock = server, incarnation, clock
         self._where = ", ".join(connect or listen or [DEFAULT_ENDPOINT])
         self._session, self._client = session, None if not connect else _client(connect)
         self._since = float("inf")  # time of the first check [s, monotonic]: setting up may take long before it
@@ -53,7 +53,7 @@ class NameClaim:
     @property
     def settled(self) -> bool:
         """True once this server keeps its name for good."""
-        return time.monotonic() - self._since > SETTLED
+        return self._clock() - self._since > SETTLED
 
     @property
     def _query_session(self) -> zenoh.Session:
@@ -89,7 +89,7 @@ class NameClaim:
         """Raises NameTaken if this server has to leave; queries again while that is not known."""
         if self._taken:
             raise self._error()
-        now = time.monotonic()
+        now = self._clock()
         self._since = min(self._since, now)
         if self._token_seen and now - self._queried > QUERY_INTERVAL:
             self._token_seen, self._queried = not self.settled, now

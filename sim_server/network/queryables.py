@@ -79,13 +79,14 @@ class Queryables:
             except zenoh.ZError:
                 return  # the session was closed
             try:
-                self._serve_all(queries, own)
+                self.serve_all(queries, own)
             except zenoh.ZError as error:
                 log.debug("a query was not answered: %s", error)
             except Exception:
                 log.exception("a query was not answered")
 
-    def _serve_all(self, queries: list[zenoh.Query], own: zenoh.KeyExpr) -> None:
+    def serve_all(self, queries: list[zenoh.Query], own: zenoh.KeyExpr) -> None:
+        """Answers queries, and queues commands. own: key expression of the queryable."""
         commands = []
         for query in queries:
             if str(query.key_expr) == self._command_key:

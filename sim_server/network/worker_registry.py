@@ -118,6 +118,11 @@ class WorkerRegistry:
             self._tokens[removed] = None
         return removed
 
+    @property
+    def unclaimed_tokens(self) -> int:
+        """Number of tokens of workers that have sent no heartbeat."""
+        return len(self._tokens)
+
     def mark_seen(self, name: str, now: float) -> None:
         """Notes any other message of a worker, which is a sign of life too."""
         if name in self._workers:

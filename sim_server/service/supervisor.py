@@ -63,9 +63,10 @@ class Supervisor:
         self._clock, self._popen = clock, start
         self.workers = [_Process(f"local-{i + 1}") for i in range(count)]
         for worker in self.workers:
-            self._start(worker)
+            self.start(worker)
 
-    def _start(self, worker: _Process) -> None:
+    def start(self, worker: _Process) -> None:
+        """Starts the process of a worker, maybe again."""
         worker.process = self._popen([*self._command, "--name", worker.name])
 
     def local_workers(self) -> list[LocalWorker]:
@@ -98,7 +99,7 @@ class Supervisor:
                 worker.restarts.append(now)
                 worker.due = 0.0
                 worker.count += 1
-                self._start(worker)
+                self.start(worker)
 
     def close(self) -> None:
         """Ends all workers by SIGTERM, and by SIGKILL after two seconds."""

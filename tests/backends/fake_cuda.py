@@ -4,6 +4,7 @@
 import ctypes as c
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +23,9 @@ SIGNATURES = {
 }  # fmt: skip
 Work = Callable[[], None]
 
-BALANCE_GRAPH = 12  # handle of the graph
+ELASTIC_GRAPH, BALANCE_GRAPH = 11, 12  # handles of graphs
+STEPS = {7: 1, 8: MANY, 9: 1, 10: MANY}  # of the graphs that step
+TIMED = (9, 10)  # those that note the time first
 
 
 class FakeDevice:
@@ -45,7 +48,7 @@ class FakeDevice:
         self._functions: dict[str, object] = {}
         self.functions = structs.CudaDriver()
         for name in SIGNATURES:
-            self.set(name, getattr(self, "_" + name))
+            self.set(name, getattr(self, name))
 
     def set(self, name: str, function: Callable[..., int]) -> None:
         """Another function of the driver in place of what stands here."""
@@ -73,28 +76,28 @@ class FakeDevice:
         self._queues[stream].append(("work", work))
         return 0
 
-    def _context_set(self, context: int) -> int:
+    def context_set(self, context: int) -> int:
         assert context == self.context
         return 0
 
-    def _graph_launch(self, graph: int, stream: int) -> int:
+    def graph_launch(self, graph: int, stream: int) -> int:
         return self._put("graph_launch", stream, self.graphs[graph])
 
-    def _to_device(self, to: int, source: int, count: int, stream: int) -> int:
+    def to_device(self, to: int, source: int, count: int, stream: int) -> int:
         return self._put("to_device", stream, lambda: c.memmove(to, source, count))  # type: ignore[arg-type,return-value]
 
-    def _to_host(self, to: int, source: int, count: int, stream: int) -> int:
+    def to_host(self, to: int, source: int, count: int, stream: int) -> int:
         return self._put("to_host", stream, lambda: c.memmove(to, source, count))  # type: ignore[arg-type,return-value]
 
-    def _on_device(self, to: int, source: int, count: int, stream: int) -> int:
+    def on_device(self, to: int, source: int, count: int, stream: int) -> int:
         return self._put("on_device", stream, lambda: c.memmove(to, source, count))  # type: ignore[arg-type,return-value]
 
-    def _event_record(self, event: int, stream: int) -> int:
+    def event_record(self, event: int, stream: int) -> int:
         self._recorded[event] = self._recorded.get(event, 0) + 1
         count = self._recorded[event]
         return self._put("event_record", stream, lambda: self._done.__setitem__(event, count))
 
-    def _stream_wait(self, stream: int, event: int, flags: int) -> int:
+    def stream_wait(self, stream: int, event: int, flags: int) -> int:
         self.calls.append("stream_wait")
         self._queues[stream].append(("wait", event))
         return 0
@@ -103,11 +106,15 @@ class FakeDevice:
         """Everything before its last record has been done."""
         return self._done.get(event, 0) >= self._recorded.get(event, 1 << 30)
 
+    def begin(self, event: int) -> None:
+        """As if the work before an event were under way on a stream of somebody else."""
+        self._recorded[event] = 1
+
     def record(self, event: int) -> None:
         """As if a stream of somebody else had come so far."""
         self._recorded[event] = self._done[event] = 1
 
-    def _event_query(self, event: int) -> int:
+    def event_query(self, event: int) -> int:
         self.calls.append("event_query")
         if self.fail == "event_query":
             return 700
@@ -116,7 +123,7 @@ class FakeDevice:
                 self._one(self.stream) or self._one(self.copies)
         return 0 if self.is_done(event) else NOT_READY
 
-    def _event_wait(self, event: int) -> int:
+    def event_wait(self, event: int) -> int:
         self.calls.append("event_wait")
         if self.fail == "event_wait":
             return 700
@@ -161,11 +168,10 @@ class FakeScene:
             [*boxes, (self.argument.ctypes.data, 8)], self.results, self.stamps, self.clock, records,
             real, energy_records=self.energies, **addresses,
         )  # fmt: skip
-        device.graphs = {7: lambda: self._steps(1), 8: lambda: self._steps(MANY)}
-        device.graphs |= {9: lambda: self._steps(1, True), 10: lambda: self._steps(MANY, True)}
-        device.graphs[11] = self._elastic
+        device.graphs = {graph: partial(self._steps, steps, graph in TIMED) for graph, steps in STEPS.items()}
+        device.graphs[ELASTIC_GRAPH] = self._elastic
         device.graphs[BALANCE_GRAPH] = lambda: None  # steps tell their energies themselves
-        self.loop.use_graphs([7, 8, 9, 10], BALANCE_GRAPH, 11)
+        self.loop.use_graphs(list(STEPS), BALANCE_GRAPH, ELASTIC_GRAPH)
 
     def _steps(self, steps: int, stamp: bool = False) -> None:
         if stamp:

@@ -87,7 +87,7 @@ def test_what_nobody_has_waited_for_is_kept_at_the_end(tmp_path):
     compilers, one = Compilers(2), job(tmp_path, "a", 'touch "$2"')
     compilers.begin(one)
     deadline = time.monotonic() + 20
-    while compilers._running and not all(r.process.poll() is not None for r in compilers._running.values()):
+    while compilers.running:
         assert time.monotonic() < deadline
         time.sleep(0.01)
     compilers.stop()

@@ -261,6 +261,12 @@ def _launch(path: str, struct: str, name: str, mailed: bool = False) -> SimpleNa
     )  # fmt: skip
 
 
+def kernels(launches: list[SimpleNamespace], monkeypatch) -> list[tuple[list, frozenset[int]]]:
+    """Which launches are put together into one kernel each, and which arrays need no memory there."""
+    monkeypatch.setattr(kernel_fusion, "FusedKernel", lambda together, end, private, *_: (together, private))
+    return kernel_fusion.fused(launches)  # type: ignore[arg-type]
+
+
 NODES = [
     ("kernels/nodes.cu", "Start", "nodes.start"),
     ("effects/corotational_nodes.cu", "CorotationalNodes", "corotational_nodes.gather"),
@@ -299,14 +305,15 @@ BLOCKS = [
     [NODES, OTHER_SCHEME, BLOCKS, ELEMENTS, LAW_ELEMENTS],
     ids=["nodes", "other scheme", "blocks", "elements", "laws"],
 )
-def test_launches_put_together_compile_in_every_precision(group, real, local, tmp_path):
+def test_launches_put_together_compile_in_every_precision(group, real, local, tmp_path, monkeypatch):
     """With rows in registers, and one argument for each array whatever launches have it."""
     if (library := nvrtc.library()) is None:
         pytest.skip("needs the package nvidia-cuda-nvrtc")
     launches = [_launch(*given) for given in group]
     for launch, (path, struct, *_) in zip(launches, group, strict=True):
         launch.fields = members_of(backend.read_text(path)[1], struct, {"real": real, "local": local})
-    private = kernel_fusion._private(launches, launches)  # type: ignore[arg-type]
+    ((together, private),) = kernels(launches, monkeypatch)
+    assert together == launches
     shape = kernel_fusion.BlockShape(64, 4)
     made = kernel_fusion.FusedSource(launches, shape, None, private)  # type: ignore[arg-type]
     assert (group in (ELEMENTS, LAW_ELEMENTS) or private) and made.source.count("[3];") >= len(private)
@@ -318,20 +325,21 @@ def test_launches_put_together_compile_in_every_precision(group, real, local, tm
 
 
 @pytest.mark.parametrize("group", [OTHER_SCHEME, BLOCKS], ids=["nodes", "blocks"])
-def test_what_lets_further_linearizations_return_comes_in_front_and_changes_nothing_else(group, tmp_path):
+def test_what_lets_further_linearizations_return_comes_in_front_and_changes_nothing_else(group, tmp_path, monkeypatch):
     if (library := nvrtc.library()) is None:
         pytest.skip("needs the package nvidia-cuda-nvrtc")
     launches = [_launch(*given) for given in group]
-    private = kernel_fusion._private(launches, launches)  # type: ignore[arg-type]
+    ((_, private),) = kernels(launches, monkeypatch)
     plain, guarded = (
         kernel_fusion.FusedSource(launches, kernel_fusion.BlockShape(64, 4), None, private, guard)  # type: ignore[arg-type]
         for guard in (None, kernel_fusion.PhaseGuard(64, 128, 192))
     )
-    before, after = plain.source.split("fused(int n"), guarded.source.split("fused(int n")
-    arguments = ", const int* __restrict__ active, const int* __restrict__ phase, const int* __restrict__ body"
-    assert "".join(["\n", *(f"{line}\n" for line in kernel_fusion.PHASE_GUARD)]) in after[1]
-    assert after[1].replace(arguments, "").replace("\n".join(kernel_fusion.PHASE_GUARD) + "\n", "") == before[1]
-    assert before[0] == after[0] and guarded.values == [64, 128, 192, *plain.values]
+    before, after = (made.source.split("fused(int n")[1].splitlines()[1:] for made in (plain, guarded))
+    added = [k for k, line in enumerate(after) if line not in before]
+    assert any("return" in after[k] for k in added)
+    assert [line for k, line in enumerate(after) if k not in added] == before, "nothing else is changed"
+    assert max(added) < next(k for k, line in enumerate(after) if "::" in line), "before anything of a launch"
+    assert guarded.values == [64, 128, 192, *plain.values]
     text = tmp_path / "guarded.cu"
     text.write_text(guarded.source)
     options = ["-arch=sm_90", "-std=c++17", "-Dreal=double", "-Dlocal=double", f"-I{backend.INCLUDE}"]
@@ -339,11 +347,12 @@ def test_what_lets_further_linearizations_return_comes_in_front_and_changes_noth
     assert len(code) > 1000 and not said, said
 
 
-def test_elements_of_effects_of_different_numbers_are_not_put_together():
-    def launch(name: str, items: int, mailed: bool = False) -> SimpleNamespace:
-        return SimpleNamespace(name=name, items=items, mailed=mailed)
+def test_elements_of_effects_of_different_numbers_are_not_put_together(monkeypatch):
+    def launch(domain: str, items: int, mailed: bool = False) -> SimpleNamespace:
+        text = f"struct Items {{\n    int n;  // {domain}\n}};"
+        return SimpleNamespace(text=text, struct="Items", domain=domain, items=items, mailed=mailed, fields=[])
 
-    tetrahedra, springs, also = launch("tetrahedra", 6), launch("springs", 19), launch("also tetrahedra", 6)
-    assert kernel_fusion._by_items([tetrahedra, springs, also]) == [[tetrahedra, also], [springs]]  # type: ignore[list-item]
-    start, touch = launch("start", 5), launch("touch", 2, mailed=True)
-    assert kernel_fusion._by_items([start, touch]) == [[start, touch]]  # type: ignore[list-item]
+    tetrahedra, springs, also = launch("elements", 6), launch("elements", 19), launch("elements", 6)
+    start, touch = launch("nodes", 5), launch("nodes", 2, mailed=True)
+    found = kernels([tetrahedra, springs, also, start, touch], monkeypatch)
+    assert [together for together, _ in found] == [[tetrahedra, also], [springs], [start, touch]]

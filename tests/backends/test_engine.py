@@ -143,11 +143,11 @@ def test_a_factor_in_use_is_never_overwritten():
         sim.engine.post_factor(0, pattern, values * (1 + step), step)
         if step % 3 == 0:
             sim.engine.run(1)
-        in_use = [b for b in sim.engine._mail[0].buffers if b.address == sim.engine._body[0].factor]
+        assert sim.engine.factor_step(0) == step - step % 3
+        in_use = [b for b in sim.engine.factor_buffers(0) if b.native.step == sim.engine.factor_step(0)]
         assert len(in_use) == 1
-        assert in_use[0].native.step == sim.engine.factor_step(0) == step - step % 3
         assert np.array_equal(in_use[0].values, values * (1 + step - step % 3))
-    assert len(sim.engine._mail[0].buffers) == 2
+    assert len(sim.engine.factor_buffers(0)) == 2
 
 
 def test_a_factor_just_taken_out_of_the_mailbox_is_not_overwritten():
@@ -162,7 +162,7 @@ def test_a_factor_just_taken_out_of_the_mailbox_is_not_overwritten():
     body = sim.engine._body[0]
     taken = sim.engine._native.wf_post_factor(ctypes.byref(body), None)  # as the loop does it
     sim.engine.post_factor(0, pattern, values * 3, 3)
-    buffer = next(b for b in sim.engine._mail[0].buffers if b.address == taken)
+    buffer = next(b for b in sim.engine.factor_buffers(0) if b.address == taken)
     assert buffer.native.step == 2
     assert np.array_equal(buffer.values, values * 2)
 

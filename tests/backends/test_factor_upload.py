@@ -19,7 +19,7 @@ class Event:
 
     def __init__(self, scene: FakeScene):
         self._device, self.ptr = scene.device, scene.device.event()
-        scene.device._recorded[self.ptr] = 1
+        scene.device.begin(self.ptr)
 
     def synchronize(self) -> None:
         self._device.record(self.ptr)

@@ -59,7 +59,7 @@ def test_a_slow_cable_keeps_what_fits_and_drops_the_rest(way):
         for _ in range(4):
             near.send(bytes(100))
         way.take(False, rate / 1e3)
-    assert 1 <= len(way._under_way) <= 2
+    assert 1 <= len(way.under_way) <= 2
 
 
 @pytest.mark.system

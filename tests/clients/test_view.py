@@ -287,7 +287,7 @@ def test_live_frames_and_curves(tmp_path: Path) -> None:
         publisher.start()
         try:
             scene = RerunScene(recording, "displacement", grow=True)
-            view._follow(client, scene, _Switch(2.0), recording)  # type: ignore[arg-type]
+            view.follow(client, scene, _Switch(2.0), recording)  # type: ignore[arg-type]
         finally:
             done.set()
             publisher.join()

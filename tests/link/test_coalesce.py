@@ -76,21 +76,24 @@ class Query:
 
 
 @pytest.fixture
-def queryables() -> Any:
+def counters() -> Counters:
+    return Counters(logging.getLogger("test"))
+
+
+@pytest.fixture
+def queryables(counters: Counters) -> Any:
     """Queryables without a network: a posted reply is sent at once."""
     session: Any = SimpleNamespace(zenoh=SimpleNamespace(declare_queryable=lambda *_: None), thread=lambda *_: None)
     replies: Any = SimpleNamespace(post=lambda send: send() or True)
-    return Queryables(
-        session, "sim", 5, Counters(logging.getLogger("test")), None, replies, SimpleNamespace(settled=True)
-    )
+    return Queryables(session, "sim", 5, counters, None, replies, SimpleNamespace(settled=True))  # type: ignore[arg-type]
 
 
-def test_each_of_a_round_is_answered_once(queryables: Queryables) -> None:
+def test_each_of_a_round_is_answered_once(queryables: Queryables, counters: Counters) -> None:
     moves = [Query(command("move", id=7, x=float(i)).SerializeToString()) for i in range(40)]
     push, old = Query(command("push").SerializeToString()), Query(command("push", protocol=99).SerializeToString())
     broken, elsewhere = Query(b"\xff\xff"), Query(b"", key("status", "sim"))
     wrong = Query(command("move", id=7, x=NAN).SerializeToString())
-    queryables._serve_all([*moves[:20], push, broken, old, elsewhere, *moves[20:], wrong], None)  # type: ignore[arg-type, list-item]
+    queryables.serve_all([*moves[:20], push, broken, old, elsewhere, *moves[20:], wrong], None)  # type: ignore[arg-type, list-item]
     taken = queryables.commands()
     assert [(c.verb, c.interaction.target.x) for c, _ in taken] == [("push", 0.0), ("move", 39.0)]
     assert not push.answers and not moves[-1].answers, "they are answered once they are carried out"
@@ -102,4 +105,4 @@ def test_each_of_a_round_is_answered_once(queryables: Queryables) -> None:
     assert [bool(q.answers[0].error) for q in everybody] == [False] * 41 + [True] * 3
     assert wrong.answers[0].error == "Vector.x is nan; allowed: finite"
     assert not elsewhere.answers and elsewhere.dropped == 1
-    assert queryables._counters.moves_replaced == 39 and queryables._counters.refused == 3
+    assert counters.moves_replaced == 39 and counters.refused == 3

@@ -8,6 +8,14 @@ from precond_worker.network.retry import ATTEMPTS, Retry
 PATIENCE = 30.0  # s
 
 
+def wait_for_threads() -> None:
+    """Until no attempt is under way, replaced ones included."""
+    for thread in threading.enumerate():
+        if thread.name == "retry":
+            thread.join(PATIENCE)
+            assert not thread.is_alive()
+
+
 def test_it_is_repeated_until_it_succeeds() -> None:
     again, answers, done = Retry(1e-4), iter([False, False, True]), threading.Event()
     again.start(lambda: next(answers), done.set)
@@ -19,8 +27,7 @@ def test_it_is_repeated_until_it_succeeds() -> None:
 def test_it_is_not_repeated_for_ever() -> None:
     again, asked, called = Retry(1e-5), [], []
     again.start(lambda: bool(asked.append(1)), lambda: called.append(1))
-    assert again._thread is not None
-    again._thread.join(PATIENCE)
+    wait_for_threads()
     assert len(asked) == ATTEMPTS and not called
 
 
@@ -33,11 +40,10 @@ def test_an_attempt_that_was_replaced_or_stopped_has_no_effect() -> None:
 
     again.start(slow, lambda: called.append("old"))
     assert asking.wait(PATIENCE)
-    old, done = again._thread, threading.Event()
+    done = threading.Event()
     again.start(lambda: True, done.set)
     assert done.wait(PATIENCE)
     go_on.set()
-    assert old is not None
-    old.join(PATIENCE)
+    wait_for_threads()
     again.close()
     assert called == []

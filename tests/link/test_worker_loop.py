@@ -246,9 +246,11 @@ def test_the_symbolic_phase_is_done_once_per_epoch(worker: Worker, connection: F
     assert len(connection.answers) == 4
 
 
-def test_another_method_is_another_analysis(worker: Worker, connection: FakeConnection) -> None:
+def test_another_method_is_another_analysis(connection: FakeConnection) -> None:
     made = []
-    worker._analyse = lambda *given: made.append(Diagonal(*given)) or made[-1]  # type: ignore[func-returns-value]
+    worker = Worker(connection, lambda *given: made.append(Diagonal(*given)) or made[-1])  # type: ignore
+    connection.received.put(ServersThere((7,)))
+    worker.step(0.0)
     asked = {"method": "incomplete_cholesky", "drop_tolerance": 0.25, "fill": 3.0, "omega": 1.0}
     for number, changes in enumerate(({}, asked, asked, asked | {"fill": 4.0}), start=1):
         drain(worker, connection, matrix(number, **changes))

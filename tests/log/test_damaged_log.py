@@ -170,10 +170,10 @@ def test_a_chunk_that_unpacks_to_more_than_it_says(compression: str) -> None:
     packed = lz4.frame.compress(plain) if compression == "lz4" else zstandard.compress(plain)
     bomb = Chunk(compression, packed, 0, 0, zlib.crc32(b""), 100)
     with pytest.raises(ValueError, match="101 bytes instead of 100"):
-        log_chunks._unpack(bomb)
+        log_chunks.unpack(bomb)
     bomb.uncompressed_size = log_chunks.RECORD_LIMIT + 1
     with pytest.raises(ValueError, match="at most"):
-        log_chunks._unpack(bomb)
+        log_chunks.unpack(bomb)
 
 
 @pytest.mark.slow

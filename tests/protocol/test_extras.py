@@ -40,7 +40,7 @@ def driver(init: int, count: int = 0, error: int = 0) -> SimpleNamespace:
     """As much of libcuda.so.1 as is asked."""
 
     def devices(found: object) -> int:
-        found._obj.value = count  # type: ignore[attr-defined]
+        ctypes.cast(found, ctypes.POINTER(ctypes.c_int)).contents.value = count  # type: ignore[arg-type]
         return error
 
     return SimpleNamespace(cuInit=lambda flags: init, cuDeviceGetCount=devices)

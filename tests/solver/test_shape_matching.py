@@ -26,7 +26,7 @@ LEVELS = [1, 2]
 @pytest.fixture
 def matched(monkeypatch) -> None:
     """Every body as if its elements had no rotations."""
-    monkeypatch.setattr(Simulation, "_rotated", lambda sim: [])
+    monkeypatch.setattr(Simulation, "rotated_bodies", lambda sim: [])
 
 
 def launches(sim: Simulation) -> list[str]:
@@ -104,7 +104,7 @@ def test_a_posed_beam_takes_as_many_iterations_and_the_warp_pays(level, matched)
 
 def test_it_costs_nothing_where_elements_have_rotations(monkeypatch):
     assert "shape_matching.match" not in launches(simulation(bar()))
-    monkeypatch.setattr(Simulation, "_rotated", lambda sim: sim.world.bodies[:1])
+    monkeypatch.setattr(Simulation, "rotated_bodies", lambda sim: sim.world.bodies[:1])
     table = [bar(), bar(name="other", pose={"rotate": [0, 0, 90], "translate": [0, 5, 0]})]
     assert "shape_matching.match" not in launches(simulation(*table, warp=False))
     mixed, alone = simulation(*table), simulation(table[0])

@@ -258,13 +258,16 @@ def test_several_linearizations_of_another_scheme():
     assert counts[1] < 0.7 * counts[0]
 
 
-def test_bodies_that_cannot_be_touched_and_the_option_off_take_no_room():
-    assert touched(0)[0].engine._body[0].correction.capacity == 0
-    plain = simulation(bar(fixed="X < 0.01"))
-    assert plain.engine._body[0].correction.capacity == 0 and touched()[0].engine._body[0].correction.capacity == 32
-    jacobi, touch = touched(preconditioner="block_jacobi")
-    grab(jacobi, touch, 10.0)
-    assert iterations(jacobi) > 2 and jacobi.engine._body[0].correction.capacity == 0
+def test_without_factors_and_with_the_option_off_nothing_is_corrected():
+    corrected = []
+    for woodbury, preconditioner in ((32, "cholesky"), (0, "cholesky"), (32, "block_jacobi")):
+        sim, touch = touched(woodbury, preconditioner=preconditioner, update="never")
+        driver = Driver(sim)
+        driver.advance(2)
+        grab(sim, touch, 10.0)
+        assert driver.advance(3)["iterations"].sum() > 2
+        corrected.append(sim.engine.corrected(0))
+    assert corrected[0] > 0 and corrected[1:] == [0, 0]
 
 
 def test_a_gpu_leaves_it_out():

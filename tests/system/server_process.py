@@ -86,12 +86,12 @@ class Stage:
         self._count = 0
 
     def server(self, scene: Path, *arguments: str) -> Process:
-        return self._start("sim_server", str(scene), "--listen", self.endpoint, *arguments)
+        return self.start("sim_server", str(scene), "--listen", self.endpoint, *arguments)
 
     def worker(self, name: str = "w1", *arguments: str) -> Process:
-        return self._start("precond_worker", "--connect", self.endpoint, "--name", name, *arguments)
+        return self.start("precond_worker", "--connect", self.endpoint, "--name", name, *arguments)
 
-    def _start(self, package: str, *arguments: str) -> Process:
+    def start(self, package: str, *arguments: str) -> Process:
         self._count += 1
         process = Process(package, *arguments, log=self.folder / f"{self._count}-{package}.log")
         self._processes.append(process)
@@ -104,7 +104,7 @@ class Stage:
         while True:
             try:
                 client = Client(connect=[self.endpoint], timeout=1.0)
-                client._timeout = PATIENCE
+                client.timeout = PATIENCE
                 break
             except ClientError:
                 if time.monotonic() > deadline:

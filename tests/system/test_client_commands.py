@@ -97,7 +97,7 @@ def test_another_cannot_act_in_the_name_of_a_client(running: Stage) -> None:
         assert fresh(client).refused >= before + 304
         held.move((0.5, 0.5, 4.0))  # it is still there
         held.release()
-        assert forge("release", client._secret) == f"client '{client.id}' has no interaction {ids.id}; it may be over"
+        assert forge("release", client.secret) == f"client '{client.id}' has no interaction {ids.id}; it may be over"
 
 
 def test_pause_resume_and_stop_answer(stage: Stage, tmp_path: Path) -> None:
@@ -186,7 +186,7 @@ def test_a_client_goes_on_with_a_server_that_was_started_again(stage: Stage, tmp
         stage.server(scene)
 
         def answered() -> bool:
-            client._timeout = 1.0
+            client.timeout = 1.0
             try:
                 lives.add(client.status().header.incarnation)
             except ClientError:
@@ -194,7 +194,7 @@ def test_a_client_goes_on_with_a_server_that_was_started_again(stage: Stage, tmp
             return len(lives) == 2
 
         until(answered, "the new server answers")
-        client._timeout = PATIENCE
+        client.timeout = PATIENCE
         assert client.push("beam", at="tip", force=(1, 0, 0)).nodes == 1
         told: queue.SimpleQueue[pb.Reply | None] = queue.SimpleQueue()
         client.send("pause", answered=told.put)

@@ -52,7 +52,7 @@ def stage() -> Iterator[tuple[str, Driver, Forger]]:
 
 
 def known_tokens(driver: Driver) -> int:
-    return len(driver.link.dispatch._registry._tokens)
+    return driver.link.dispatch.unclaimed_tokens()
 
 
 def test_a_worker_joins_behind_more_idle_tokens_than_are_kept(

@@ -145,7 +145,7 @@ def test_each_process_sees_its_gpu_alone(tmp_path: Path, monkeypatch: Any) -> No
         with launch.Fleet(whole, launch.distribute([1, 1], 2), "127.0.0.1", 7447, None, True) as fleet:
             fleet.use_gpus(pool, True, 2)
             fleet.start(2, ["--device", "gpu"], ["--device", "gpu"])
-            fleet.workers._start(fleet.workers.workers[1])
+            fleet.workers.start(fleet.workers.workers[1])
             told = fleet.describe()
         assert seen == expected
         assert [(p["name"], p["gpu"]) for p in told["servers"] + told["workers"]] == expected[:4]

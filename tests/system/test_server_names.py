@@ -33,7 +33,7 @@ def test_a_second_server_of_one_name_is_refused_and_the_first_keeps_its_worker(s
     with stage.client() as client:
         until(lambda: client.status().workers, "the worker")
         written = log.stat().st_size
-        second = stage._start(
+        second = stage.start(
             "sim_server", str(scene), "--listen", free_endpoint(), "--connect", stage.endpoint, "--record", str(log)
         )
         assert second.wait() == 2
@@ -48,7 +48,7 @@ def test_of_two_that_start_at_the_same_instant_one_leaves(stage: Stage, tmp_path
     scene, meeting = beam(tmp_path), free_endpoint()
     with open_session("server", listen=[meeting], shared_memory=False):
         pair = [
-            stage._start("sim_server", str(scene), "--listen", free_endpoint(), "--connect", meeting) for _ in range(2)
+            stage.start("sim_server", str(scene), "--listen", free_endpoint(), "--connect", meeting) for _ in range(2)
         ]
         until(lambda: any(server.process.poll() is not None for server in pair), "one to leave")
         left, stays = sorted(pair, key=lambda server: server.process.poll() is None)
@@ -63,7 +63,7 @@ def test_a_server_that_was_killed_comes_up_again_under_its_name(stage: Stage, tm
     with open_session("server", listen=[meeting], shared_memory=False):
 
         def start() -> Process:
-            return stage._start("sim_server", str(scene), "--listen", free_endpoint(), "--connect", meeting)
+            return stage.start("sim_server", str(scene), "--listen", free_endpoint(), "--connect", meeting)
 
         first = start()
         with stage.client() as client:
@@ -77,10 +77,15 @@ def test_a_server_that_was_killed_comes_up_again_under_its_name(stage: Stage, tm
 def test_two_that_meet_when_a_link_is_made_late_keep_one_of_them() -> None:
     """The one that has been there for longer stays, whatever their numbers: here it waits for the other's endpoint."""
     own, late = free_endpoint(), free_endpoint()
-    with ServerLink(listen=[own], connect=[late], shared_memory=False) as first:
+    ahead = 0.0
+
+    def clock() -> float:
+        return time.monotonic() + ahead
+
+    with ServerLink(listen=[own], connect=[late], shared_memory=False, clock=clock) as first:
         first.announce(chain())
         first.check_name()
-        first._claim._since -= 60.0
+        ahead = 60.0  # as if it had been there for a minute
         with light_worker(own):
             Driver(first).factor(chain(), 1)
             with ServerLink(listen=[late], shared_memory=False) as second, pytest.raises(NameTaken):

@@ -16,7 +16,10 @@ from hand_worker import HandWorker
 from link_helpers import Driver, chain, dense, free_endpoint, light_worker, matrix, process, product
 
 from protocol import messages_pb2 as pb
+from protocol.refused import Refused
 from protocol.shared_memory import limits as shm_limits
+from protocol.shared_memory import probe as shm_probe
+from protocol.shared_memory.pool import Slot
 from sim_server.network.link import ServerLink
 
 pytestmark = pytest.mark.system
@@ -67,19 +70,20 @@ def test_a_worker_without_shared_memory_gets_bytes_and_that_is_said_once(caplog:
 
 
 @shared
-def test_shared_memory_comes_back_after_a_server_that_was_too_busy_to_answer() -> None:
+def test_shared_memory_comes_back_after_a_server_that_was_too_busy_to_answer(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     endpoint, asked = free_endpoint(), []
     with ServerLink(listen=[endpoint]) as link:
-        answer = link._queryables._answer_probe
+        answer = shm_probe.answer
 
-        def busy(query: zenoh.Query) -> None:
-            if query.payload is not None and pb.Echo.FromString(bytes(query.payload)).nonce:
-                asked.append(query)  # the others ask who is there
-                if len(asked) <= 2:
-                    return
-            answer(query)
+        def busy(slot: Slot, question: pb.Echo, incarnation: int) -> tuple[pb.Echo, zenoh.ZBytes]:
+            asked.append(question)
+            if len(asked) <= 2:
+                raise Refused("busy", "limit")
+            return answer(slot, question, incarnation)
 
-        link._queryables._answer_probe = busy  # type: ignore[method-assign]
+        monkeypatch.setattr(shm_probe, "answer", busy)
         with light_worker(endpoint):
             driver = Driver(link)
             link.announce(BEAM)
@@ -102,11 +106,6 @@ def test_a_server_without_shared_memory_sends_bytes() -> None:
         assert (link.counters.bulk_shared, link.counters.bulk_copied) == (0, 6)
 
 
-def slots_lent(link: ServerLink) -> int:
-    """Beside the one for echoes."""
-    return link._pool.lent - 1 if link._pool else 0
-
-
 def test_killed_with_a_job_in_hand_and_started_again() -> None:
     endpoint = free_endpoint()
     with ServerLink(listen=[endpoint]) as link:
@@ -122,7 +121,7 @@ def test_killed_with_a_job_in_hand_and_started_again() -> None:
             driver.until(lambda: driver.failures, "the loss to be seen")
             assert driver.failures == [("beam", "factorization of beam at step 2 was lost with worker mortal")]
             assert link.dispatch.workers() == [] and not link.dispatch.ready()
-            assert slots_lent(link) == 0
+            assert link.slots_lent == 0
         with light_worker(endpoint, "mortal"):
             check(driver, 3, 0.3)
         assert link.counters.jobs_lost == 1 and link.counters.refused == 0
@@ -164,15 +163,15 @@ def test_a_late_worker_keeps_its_slots_and_its_answer_is_refused() -> None:
         link.announce(chain(object="bar"))
         driver.submit(chain(object="bar"), 1)
         job = hand.receive()
-        lent = slots_lent(link)
+        lent = link.slots_lent
         answer, values = hand.right_answer(job, chain(object="bar"))
         now[0] += 130.0  # the lease is over
         driver.until(lambda: driver.failures, "the lease to be over")
         assert "not answered within its lease" in driver.failures[0][1]
-        assert slots_lent(link) == lent > 0
+        assert link.slots_lent == lent > 0
         hand.answer(answer, values)
         driver.until(lambda: link.counters.refusals["late"] == 1, "the late answer")
-        assert slots_lent(link) == 0
+        assert link.slots_lent == 0
         assert not [f for f in driver.factors if f.object == "bar"]
         hand.hello()
         driver.until(lambda: len(link.dispatch.workers()) == 2, "both workers again")
@@ -324,7 +323,7 @@ def test_fifty_workers_one_after_another_leak_nothing() -> None:
                 used |= segments_of(str(child.pid))
                 os.kill(child.pid, signal.SIGKILL if life % 2 else signal.SIGTERM)
             driver.until(lambda: not link.dispatch.workers(), "the worker to leave")
-            driver.until(lambda: slots_lent(link) == 0, "its slots")
+            driver.until(lambda: link.slots_lent == 0, "its slots")
             locked.append(locked_kib())
         # The first lives make the slots that the others use again.
         assert locked[-1] <= locked[3], locked

@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from precond_worker.factorization.cpu_factorization import CpuFactorization
 from precond_worker.factorization.factorize import CHOICE, Analysis, NotPositiveDefinite, default_library
 from protocol.process.extras import to_install
 from tests.reference import supernodal
@@ -106,8 +107,8 @@ def test_both_libraries_give_the_same_factor_in_the_same_pattern(graph):
 @graphs
 def test_cholmod_merges_columns_as_the_pattern_says(graph):
     """Otherwise its values would have to be looked up one by one: right, but slower."""
-    analysis = Analysis(*graph, "cholmod")
-    assert analysis._library.packer._is_packed(analysis._library.numeric.factorize(spd(*graph)))
+    cholmod = CpuFactorization(*graph, "cholmod")
+    assert cholmod.packer.is_packed(cholmod.numeric.factorize(spd(*graph)))
 
 
 @both
@@ -117,7 +118,8 @@ def test_cholmod_merges_columns_of_a_large_bar_as_the_pattern_says():
     assert np.diff(analysis.pattern.super_start).max() > 48  # panels of all widths that the rule tells apart
     identity = np.zeros((len(graph[1]), 3, 3))
     identity[diagonal_blocks(*graph)] = np.eye(3)
-    assert analysis._library.packer._is_packed(analysis._library.numeric.factorize(identity))
+    cholmod = CpuFactorization(*graph, "cholmod")
+    assert cholmod.packer.is_packed(cholmod.numeric.factorize(identity))
     assert np.count_nonzero(analysis.factorize(identity)) == analysis.pattern.size
 
 

@@ -78,10 +78,10 @@ def test_the_worker_ends_with_code_2_or_takes_the_cpu(module, text, monkeypatch,
     monkeypatch.setitem(sys.modules, "cupy", module)
     monkeypatch.setattr(cli, "nvidia_device", lambda: True)
     with pytest.raises(cli.typer.Exit) as ended:
-        cli._library("gpu", "auto")
+        cli.chosen_library("gpu", "auto")
     assert ended.value.exit_code == 2
     assert capsys.readouterr().err.startswith("precond-worker: --device gpu: ")
-    assert cli._library("auto", "auto") == "auto"
+    assert cli.chosen_library("auto", "auto") == "auto"
     assert "--device auto takes the CPU: " in capsys.readouterr().err
 
 
@@ -89,18 +89,18 @@ def test_the_worker_ends_with_code_2_or_takes_the_cpu(module, text, monkeypatch,
 def test_the_worker_says_nothing_of_gpus_where_there_is_none(module, text, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "cupy", module)
     monkeypatch.setattr(cli, "nvidia_device", lambda: False)
-    assert cli._library("auto", "auto") == "auto"
+    assert cli.chosen_library("auto", "auto") == "auto"
     assert capsys.readouterr().err == ""
 
 
 def test_the_worker_takes_the_gpu_where_there_is_one(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "cupy", installed())
     monkeypatch.setattr(cli, "nvidia_device", lambda: True)
-    assert cli._library("auto", "auto") == cli._library("gpu", "auto") == "gpu"
-    assert cli._library("gpu", "float64") == "gpu-float64"
-    assert cli._library("cpu", "auto") == "auto"
-    assert cli._shown("gpu") == "Test GPU, float32", "float64 is slow there"
-    assert cli._shown("gpu-float64") == "Test GPU, float64"
+    assert cli.chosen_library("auto", "auto") == cli.chosen_library("gpu", "auto") == "gpu"
+    assert cli.chosen_library("gpu", "float64") == "gpu-float64"
+    assert cli.chosen_library("cpu", "auto") == "auto"
+    assert cli.library_title("gpu") == "Test GPU, float32", "float64 is slow there"
+    assert cli.library_title("gpu-float64") == "Test GPU, float64"
     assert capsys.readouterr().err == ""
 
 
@@ -113,7 +113,7 @@ def test_the_worker_takes_the_gpu_where_there_is_one(monkeypatch, capsys):
 )
 def test_other_words_are_refused(choice, text, capsys):
     with pytest.raises(cli.typer.Exit) as ended:
-        cli._library(*choice)
+        cli.chosen_library(*choice)
     assert ended.value.exit_code == 2
     assert text in capsys.readouterr().err
 

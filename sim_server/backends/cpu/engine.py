@@ -263,6 +263,10 @@ class CpuEngine(Reports):
         address = self._body[body].factor
         return int(c.cast(address, c.POINTER(structs.Factor)).contents.step) if address else -1
 
+    def factor_buffers(self, body: int) -> list[NativeFactor]:
+        """Returns all factors of a body that are in memory. A probe for tests."""
+        return self._mail[body].buffers
+
     def factor_bytes(self, body: int) -> int:
         """What an application reads of the factor posted last, values and rows; 0 while there is none."""
         mail = self._mail[body]

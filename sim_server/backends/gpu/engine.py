@@ -209,7 +209,7 @@ class GpuEngine(DeviceLoop):
     def assemble(self) -> None:
         """Runs the first half of one step, and copies the system matrix to the host."""
         self._make_ready()
-        self._open()
+        self.open_step()
         with self._steps:
             self._begin()
             for launch in self._first_launches:
@@ -220,10 +220,10 @@ class GpuEngine(DeviceLoop):
     def solve(self) -> None:
         """Runs the second half: solve, integration, records."""
         self._factor_upload.settle()
-        self._renew()
+        self.renew_mail()
         with self._steps:
             self._finish_step()
-        self._close()
+        self.close_step()
 
     # --- mailboxes ----------------------------------------------------------------------------------------------
 

@@ -144,17 +144,17 @@ class DeviceLoop(Reports):
         """Sleeps while paused and, in real time, until the next step is due; False if the loop is to stop."""
         return bool(self._native.wf_gpu_wait(c.byref(self.loop)))
 
-    def _open(self) -> None:
+    def open_step(self) -> None:
         """Begins a step whose kernels the caller launches."""
         self._native.wf_gpu_open(c.byref(self.loop))
         self._check()
 
-    def _renew(self) -> None:
+    def renew_mail(self) -> None:
         """Reads the mailboxes of settings and factors again within such a step; the stream must be empty."""
         self._native.wf_gpu_renew(c.byref(self.loop))
         self._check()
 
-    def _close(self) -> None:
+    def close_step(self) -> None:
         """Ends such a step: waits for it and writes its records."""
         self._native.wf_gpu_close(c.byref(self.loop))
         self._check()

@@ -50,7 +50,7 @@ class Way:
 
     def __init__(self, source: int, target: int):
         self.source, self._target = source, target
-        self._under_way: deque[tuple[float, bytes]] = deque()
+        self.under_way: deque[tuple[float, bytes]] = deque()
         self._free = 0.0  # when the last packet has left
 
     def take(self, is_cut: bool, rate: float) -> None:
@@ -65,17 +65,17 @@ class Way:
             if is_cut or begin - now > BACKLOG:
                 continue
             self._free = begin + (len(packet) / rate if rate else 0.0)
-            self._under_way.append((self._free, packet))
+            self.under_way.append((self._free, packet))
 
     def give(self) -> float | None:
         """Writes those that have arrived; seconds until the next one does."""
-        while self._under_way:
-            due, packet = self._under_way[0]
+        while self.under_way:
+            due, packet = self.under_way[0]
             if (wait := due - time.monotonic()) > 0:
                 return wait
             with contextlib.suppress(OSError):  # nobody there takes it: lost
                 os.write(self._target, packet)
-            self._under_way.popleft()
+            self.under_way.popleft()
         return None
 
 
