@@ -18,6 +18,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("protocol", "sim_server", "precond_worker", "clients")
 NATIVE = (".cu", ".cuh", ".h", ".cpp")
+PRIVATE = re.compile(r"_(?!(fields|replace|asdict)$)[A-Za-z0-9]\w*(?<!_)")  # of Python, but for those of a named tuple
 LISTED = 5  # of the largest files and functions
 Graph = dict[str, set[str]]
 
@@ -146,6 +147,27 @@ def lines(texts: dict[Path, str]) -> tuple[int, int]:
     return python, sum(count.values()) - python
 
 
+def private_accesses(root: Path = ROOT) -> list[str]:
+    """Places where a test other than a bench uses a private name of something else: `x._name`, where x is not self or
+    cls, `from x import _name` or `monkeypatch.setattr(x, "_name", ...)`."""
+    found = []
+    for path, text in sources(root, "tests").items():
+        if path.suffix != ".py" or path.relative_to(root).parts[1] == "bench":
+            continue
+        for n in ast.walk(ast.parse(text)):
+            names: list[str] = []
+            if isinstance(n, ast.Attribute) and not (isinstance(n.value, ast.Name) and n.value.id in ("self", "cls")):
+                names = [n.attr]
+            elif isinstance(n, ast.ImportFrom):
+                names = [alias.name for alias in n.names]
+            elif isinstance(n, ast.Call) and isinstance(n.func, ast.Attribute) and n.func.attr == "setattr":
+                names = [
+                    a.value.split(".")[-1] for a in n.args if isinstance(a, ast.Constant) and isinstance(a.value, str)
+                ]
+            found += [f"{path.relative_to(root)}:{n.lineno} {name}" for name in names if PRIVATE.fullmatch(name)]
+    return found
+
+
 def report(root: Path) -> Iterator[str]:
     """Lines of the tables, as Markdown."""
     graph, texts, tests = arrows(root), product(root), sources(root, "tests")
@@ -164,6 +186,7 @@ def report(root: Path) -> Iterator[str]:
     yield from ("", "| lines | Python | C++ and CUDA |", "|---|---|---|")
     for name, kind in (("product", texts), ("tests", rest), ("benches and their tests", bench)):
         yield "| {} | {} | {} |".format(name, *lines(kind))
+    yield from ("", f"Private names used by tests: {len(private_accesses(root))}")
     yield from ("", "| largest files | lines |", "|---|---|")
     for path, text in sorted(texts.items(), key=lambda item: -len(item[1].splitlines()))[:LISTED]:
         yield f"| {path.relative_to(root)} | {len(text.splitlines())} |"

@@ -5,10 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from tests.arrows import PACKAGES, ROOT, Graph, arrows, cycles, floors, report, upward, within
+from tests.arrows import PACKAGES, ROOT, Graph, arrows, cycles, floors, private_accesses, report, upward, within
 
 SMALL = ("protocol", "precond_worker", "clients")
 MOST_FILES = 12  # of a folder of theirs, without __init__.py
+PRIVATE_NAMES = 15  # that tests may use, fewer than
 ALLOWED = {  # what each folder imports of its package
     "protocol.network": {"channels", "shared_memory"},
     "protocol.process": set(),
@@ -67,6 +68,28 @@ def test_folders_stay_small(package: str) -> None:
     for folder in {path.parent for path in (ROOT / package).rglob("*.py")}:
         files = [path.name for path in folder.glob("*.py") if path.name != "__init__.py"]
         assert len(files) <= MOST_FILES, f"{folder.relative_to(ROOT)} holds {len(files)} files"
+
+
+def test_tests_use_few_private_names() -> None:
+    found = private_accesses()
+    assert len(found) < PRIVATE_NAMES, found
+
+
+def test_every_use_of_a_private_name_is_found(tmp_path: Path) -> None:
+    (tmp_path / "tests" / "bench").mkdir(parents=True)
+    lines = [
+        "x._a",
+        "self._b",
+        "x.__dict__",
+        "x._fields",
+        "from x import _c, d",
+        'm.setattr(x, "_e", 1)',
+        "x._f._g",
+        "C._H",
+    ]
+    (tmp_path / "tests" / "test_x.py").write_text("\n".join(lines))
+    (tmp_path / "tests" / "bench" / "y.py").write_text("x._a")
+    assert sorted(place.split()[1] for place in private_accesses(tmp_path)) == ["_H", "_a", "_c", "_e", "_f", "_g"]
 
 
 def test_every_kind_of_import_is_an_arrow(tmp_path: Path) -> None:

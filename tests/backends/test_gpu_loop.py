@@ -227,7 +227,7 @@ def test_a_factor_is_used_once_its_event_is_done():
 def test_what_was_not_taken_can_be_withdrawn():
     scene = FakeScene()
     event, box = scene.device.event(), scene.loop.mailboxes[1]
-    scene.device._recorded[event] = 1
+    scene.device.begin(event)
     box.post(number(9), event=event)
     scene.loop.run(1)  # the loop holds it, but does not use it
     assert box.withdraw()
