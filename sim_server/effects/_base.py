@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What an effect is to the simulation: elements that couple nodes, and launches that add to the system of a step."""
+"""Base of the effects: elements that couple nodes, and launches that add to the system of a step."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,9 +17,9 @@ from sim_server.mechanics.world import Body, World
 
 @dataclass(frozen=True)
 class Refusal:
-    """An element whose deformation its law does not define: the first time [s] at which it was found, and its J.
+    """An element whose deformation its law does not define.
 
-    element: its number in the object's mesh.
+    element: its number in the object's mesh; time: of the first occurrence [s]; J: determinant of F there.
     """
 
     effect: str
@@ -44,9 +44,9 @@ class Effect:
     """Base of all effects. A file under effects/ has `build(world, listed) -> Effect`.
 
     elements (m, c): node numbers (of the scene) of the elements whose c = 2 or 4 corners the effect couples, or None.
-    rotated: the bodies whose elements have rotations, which go into system.mean for the warp; other bodies' nodes get
-    theirs by shape matching. elastic: by body index, Young's modulus [Pa] and Poisson's ratio of its
-    elements, (m,) each, for viewers.
+    rotated: the bodies whose elements add their rotations to system.mean for the warp; nodes of other bodies get
+    theirs by shape matching. elastic: by body index, Young's modulus [Pa] and Poisson's ratio of its elements, (m,)
+    each, for viewers.
     """
 
     elements: Int32 | None = None
@@ -54,26 +54,27 @@ class Effect:
     elastic: Mapping[int, tuple[Float64, Float64]] = MappingProxyType({})
 
     @property
-    def told(self) -> bool:
-        """What it adds to A follows from the scene, the mesh and the positions, so that others can build A too."""
+    def known_to_workers(self) -> bool:
+        """True if its part of A follows from scene, mesh and positions, so that workers can assemble A, too."""
         return True
 
-    def told_at(self, step: int) -> bool:
-        """The same of the A that was assembled after so many completed steps."""
-        return self.told
+    def known_to_workers_at(self, step: int) -> bool:
+        """The same for the matrix A assembled after `step` completed steps."""
+        return self.known_to_workers
 
     def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
-        """What adds the effect to system.b, .diagonal, .block, .sums and .mean. accumulate: to sums, others have.
+        """Launches that add the effect to system.b, .diagonal, .block, .sums and .mean.
 
-        One at most may be of a MAILED_KERNEL, whose arguments change while steps run.
+        stencil: places of its elements in the system; accumulate: add to sums, which another effect has written.
+        At most one launch may be of a MAILED_KERNEL, whose arguments change while steps run.
         """
         return []
 
     def connect(self, simulation: EffectUpdates) -> None:
-        """Called when the loop is there. An effect that changes while steps run keeps `simulation`."""
+        """Called once the loop exists. An effect that changes while steps run keeps `simulation`."""
 
     def energies(self) -> ElementEnergies | None:
-        """Potential energies of its elements, or None for an effect without any."""
+        """Potential energies of its elements; None for an effect without."""
         return None
 
     def energy(self) -> float:
@@ -88,25 +89,26 @@ class Effect:
         return float(elements.launch.fetch("energy").sum(dtype=float))
 
     def refusals(self) -> list[Refusal]:
-        """Elements that had a state which the effect does not define, by the time at which they had it first; that a
-        line search tried it is enough.
+        """Elements whose deformation the law does not define (e.g. J <= 0), by the time of the first occurrence.
 
-        The solver finds their forces not finite (status not_finite) and leaves the velocity as it was.
+        States tried by the line search count, too. The solver finds their forces not finite (status not_finite) and
+        leaves the velocity as it was.
         """
         return []
 
 
 class Build(Protocol):
-    """Of an effect's module. listed: the bodies that have it, each with its parameters (scene effects: all bodies).
+    """Function `build` of an effect's module, which makes the effect.
 
-    Bodies whose parameters differ in `variant` are not built together: each variant has other kernels.
+    listed: the bodies that have it, each with its parameters (scene effects: all bodies). Bodies whose parameters have
+    different values of `variant` are built apart, as each variant has its own kernels.
     """
 
     def __call__(self, world: World, listed: list[tuple[Body, Any]]) -> Effect: ...
 
 
 def per_node(world: World, listed: list[tuple[Body, Any]], value: str) -> Float64:
-    """(nodes,) with the parameter `value` of each listed body at its nodes, 0 elsewhere."""
+    """Returns the parameter `value` of each listed body at its nodes, 0 elsewhere; (nodes,)."""
     out = np.zeros(world.nodes)
     for body, params in listed:
         out[body.nodes] = getattr(params, value)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Hyperelastic tetrahedra: what the laws under effects/ share (st_venant_kirchhoff, neo_hookean, ...).
+"""Hyperelastic tetrahedra: common part of the laws under effects/ (st_venant_kirchhoff, neo_hookean, ...).
 
 Multiplicative Jacobian Energy Decomposition (Marchesseau, Heimann, Chatelin, Willinger, Delingette, MICCAI 2010; Prog.
 Biophys. Mol. Biol. 103, 2010), with derivatives by invariants in place of its sums of products. With corners Q_i, rest
@@ -87,7 +87,7 @@ INVERSION: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class Law:
-    """A law: the name of its effect, its constants, and what the kernels get of them.
+    """A law: the name of its effect, its constants, and their form in the kernels.
 
     pack: values of the constants, (m,) each -> (k, m) in the order of the kernel text. elastic: the Young's modulus
     [Pa] and Poisson's ratio that it has at small strains. axes: (m, 3, 3) material axes in columns, or None. text:
@@ -106,7 +106,7 @@ class Law:
 
     @property
     def path(self) -> str:
-        """Of the kernel text, as backend.read_text takes it."""
+        """Path of the kernel text, as backend.module takes it."""
         return self.text or f"kernels/hyperelastic.cu+effects/{self.name}.cuh"
 
     def parameters(self) -> type[Parameters]:
@@ -133,16 +133,16 @@ def constants_of(law: Law, body: Body, params: Any) -> Values:
 
 
 class Tetrahedra(Effect):
-    """Elements of all bodies that list a law, in the order of their first nodes, and what they leave for the system.
+    """Elements of all bodies that list a law, in the order of their first nodes.
 
-    elements (m, 4); owner (m,): index of the body; number (m,): in its mesh. What a step makes of them: corners
-    (4, m, 9) and edges (6, m, 9), as kernels/hyperelastic.cuh leaves them.
+    elements (m, 4); owner (m,): index of the body; number (m,): in its mesh. Results of a step, stored by
+    kernels/hyperelastic.cuh: corners (4, m, 9): nodal impulses and diagonal blocks; edges (6, m, 9): blocks of edges.
     """
 
     def __init__(self, world: World, listed: list[tuple[Body, Any]]):
         self.world = world
         tets = np.concatenate([body.tets for body, _ in listed])
-        self.order = np.argsort(tets.min(axis=1), kind="stable")  # neighbours in memory, whatever the mesh's order
+        self.order = np.argsort(tets.min(axis=1), kind="stable")  # elements near in the mesh are near in memory
         self.elements: Int32 = np.ascontiguousarray(tets[self.order])
         m = len(self.elements)
         counts = [len(body.mesh.tets) for body, _ in listed]
@@ -160,7 +160,7 @@ class Tetrahedra(Effect):
         return {"h": w.force_coefficient, "stiffness_coefficient": coefficient, "v": w.damping_velocity}
 
     def gathers(self, system: System, stencil: Stencil, accumulate: bool) -> list[Launch]:
-        """What collects corners and edges into the system."""
+        """Launches that gather corners and edges into the system."""
         w, m = self.world, len(self.elements)
         gather = w.backend.module("kernels/gather_forces.cu").bind(
             "gather", w.nodes, elements=m, start=stencil.corner_start, slots=stencil.corners, rows=self.corners,
@@ -174,7 +174,7 @@ class Tetrahedra(Effect):
 
 
 class Hyperelastic(Tetrahedra):
-    """Elements of one law. constants (k, m), floor (m,): as its kernel text has them."""
+    """Elements of one law. constants (k, m), floor (m,): in the form of its kernel text."""
 
     def __init__(self, world: World, listed: list[tuple[Body, Any]], law: Law):
         super().__init__(world, listed)
@@ -235,16 +235,16 @@ YOUNG_AND_POISSON = young_and_poisson_of()
 
 
 def lame(values: Values) -> list[Float64]:
-    """lambda and mu [Pa] of `young` and `poisson`."""
+    """Returns Lamé's lambda and mu [Pa] of `young` and `poisson`."""
     young, poisson = values["young"], values["poisson"]
     return [young * poisson / ((1 + poisson) * (1 - 2 * poisson)), young / (2 * (1 + poisson))]
 
 
 def young_and_poisson(values: Values) -> tuple[Float64, Float64]:
-    """As they stand in the scene."""
+    """Returns Young's modulus and Poisson's ratio as given in the scene."""
     return values["young"], values["poisson"]
 
 
 def of_shear_and_bulk(shear: Float64, bulk: Float64) -> tuple[Float64, Float64]:
-    """Young's modulus [Pa] and Poisson's ratio of a material with these moduli [Pa]."""
+    """Returns Young's modulus [Pa] and Poisson's ratio of a material with these moduli [Pa]."""
     return 9 * bulk * shear / (3 * bulk + shear), (3 * bulk - 2 * shear) / (2 * (3 * bulk + shear))

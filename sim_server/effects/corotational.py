@@ -15,7 +15,7 @@ Rotation of an element:
   the slope of V (mu |S - I|^2 + lambda / 2 tr(S - I)^2); where an element is inverted, its least stretch is negative.
 * "qr": that of edge 01 and face 012, by Gram and Schmidt. Cheaper, and defined however the element is inverted (short
   of a lost edge or face), but at large strains the answer depends on the order of the corners, forces have a torque
-  of second order in the strain and no energy: what `energy` tells is that of the strains alone.
+  of second order in the strain and no energy: `energy` is that of the strains alone.
 
 Both are exact for rigid motion and agree for small strains.
 
@@ -80,7 +80,7 @@ class Params(Regional):
         return self
 
     def under(self, integrator: IntegratorOptions) -> "Params":
-        """These, with a tangent in place of auto. Raises a complaint about one with which the energy would grow."""
+        """Returns the parameters with a tangent in place of auto. Raises a complaint if the energy would grow."""
         if integrator.needs_stiff_matrix and (self.tangent == "usual" or self.rotation == "qr"):
             given, instead = ('rotation = "qr"', 'rotation = "polar"') if self.rotation == "qr" else (
                 'tangent = "usual"', 'tangent = "exact" (the default here)')  # fmt: skip
@@ -95,7 +95,7 @@ class Params(Regional):
 
     @property
     def variant(self) -> str:
-        """Of the kernels: that of the file name behind `corotational`."""
+        """Variant of the kernels: the end of their file name, after `corotational`."""
         return "_exact" if self.tangent == "exact" else "_qr" if self.rotation == "qr" else ""
 
 
@@ -112,7 +112,7 @@ class Corotational(Effect):
         self.variant = listed[0][1].variant
         self.rotated = tuple(body for body, _ in listed)
         tets = np.concatenate([body.tets for body, _ in listed])
-        order = np.argsort(tets.min(axis=1), kind="stable")  # neighbours in memory, whatever the mesh's order
+        order = np.argsort(tets.min(axis=1), kind="stable")  # elements near in the mesh are near in memory
         self.elements: Int32 = np.ascontiguousarray(tets[order])
         self.elastic = {body.index: _constants(body, params) for body, params in listed}  # young, poisson
         young = np.concatenate([self.elastic[body.index][0] for body, _ in listed])[order]

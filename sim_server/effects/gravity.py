@@ -31,7 +31,7 @@ class Params(Parameters):
 
 
 class Gravity(Effect):
-    """b += h m g."""
+    """Adds the weight: b += h m g."""
 
     def __init__(self, world: World, g: tuple[float, float, float]):
         self.world, self.g = world, np.array(g, dtype=float)
@@ -45,7 +45,7 @@ class Gravity(Effect):
         ]
 
     def energy(self) -> float:
-        """-sum m g . x, zero at the origin [J]."""
+        """Potential energy -sum m g . x, zero at the origin [J]."""
         return -float(self.world.mass @ (self.world.x @ self.g))
 
 

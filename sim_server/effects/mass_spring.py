@@ -118,12 +118,12 @@ class MassSpring(Effect):
         self.tangent, self.nodal_impulse, self._energy = np.zeros((m, 4)), np.zeros((m, 3)), np.zeros(m)
 
     @property
-    def told(self) -> bool:
-        """Files are read here alone."""
+    def known_to_workers(self) -> bool:
+        """False if springs come from files, which workers do not read."""
         return not self._from_files
 
     def _springs(self, body: Body, params: Params) -> tuple[Int32, Float64, Float64]:
-        """Ends, stiffness and rest length of a body's springs."""
+        """Returns ends, stiffness and rest length of a body's springs."""
         try:
             if params.young is None:
                 return listed_springs(body, params)
@@ -162,7 +162,7 @@ class MassSpring(Effect):
 
 
 def edge_springs(rest: Float64, tets: Int32, young: Float64) -> tuple[Int32, Float64, Float64]:
-    """Of springs on the edges of elements (m, 4) of young (m,): ends (k, 2), stiffness [N/m] and length [m] (k,)."""
+    """Springs on the edges of elements (m, 4) of young (m,): ends (k, 2), stiffness [N/m] and length [m] (k,)."""
     corners = rest[tets]
     volume = np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6
     pairs = np.sort(tets[:, EDGES].reshape(-1, 2), axis=1)
@@ -206,7 +206,7 @@ def _one_each(name: str, given: Any, count: int) -> Float64:
 
 
 def _pairs_of(path: str) -> Int64:
-    """Two node numbers a line, (k, 2); raises InputError that names the line."""
+    """Reads two node numbers per line, (k, 2); raises InputError that names the line."""
     pairs = []
     try:
         with open(path, encoding="utf-8") as file:

@@ -48,20 +48,14 @@ class Drag(Effect):
         if not self.alpha.any():
             return []
         drag = self.world.backend.module("effects/rayleigh.cu").bind(
-            "drag",
-            w.nodes,
-            mass=w.mass,
-            alpha=self.alpha,
-            v=w.v,
-            h=w.force_coefficient,
-            diagonal=system.diagonal,
+            "drag", w.nodes, mass=w.mass, alpha=self.alpha, v=w.v, h=w.force_coefficient, diagonal=system.diagonal,
             b=system.b,
-        )
+        )  # fmt: skip
         return [drag]
 
 
 def build(world: World, listed: list[tuple[Body, Any]]) -> Drag:
-    """Tells the elements their beta and drags the nodes by alpha."""
+    """Sets world.beta of the bodies and returns the damping of the mass; a quasi-static scene has neither."""
     if not world.inertia:
         return Drag(world, np.zeros(world.nodes))
     for body, params in listed:

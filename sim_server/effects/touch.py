@@ -53,7 +53,7 @@ class Params(Parameters):
 
     @property
     def total(self) -> float:
-        """max_total_force, or what stands for it [N]."""
+        """max_total_force, or its default [N]."""
         return 4 * self.max_force if self.max_total_force is None else self.max_total_force
 
 
@@ -80,7 +80,7 @@ class Interaction:
 
     @property
     def largest(self) -> float:
-        """Force that it never exceeds [N]."""
+        """Bound of its force [N]."""
         return self.limit if self.stiffness else hypot(*self.force)
 
 
@@ -119,7 +119,7 @@ class Touch(Effect):
         self._simulation = simulation
 
     def push(self, client: str, name: str, point: Point, radius: float, force: Point, duration: float) -> Interaction:
-        """A force [N] shared by the free nodes within `radius` [m] of `point` (0: the nearest one), for a while [s].
+        """Adds a force [N] on the free nodes within `radius` [m] of `point` (0: the nearest one) for `duration` [s].
 
         Raises TouchError.
         """
@@ -190,15 +190,15 @@ class Touch(Effect):
         return push if push.duration <= past + ORPHANED_PUSH else replace(push, duration=past + ORPHANED_PUSH)
 
     @property
-    def told(self) -> bool:
-        """Not while there are grabs: they are known here alone."""
+    def known_to_workers(self) -> bool:
+        """False while there are grabs: workers do not know them."""
         return not any(a.stiffness for a in self._applied)
 
-    def told_at(self, step: int) -> bool:
+    def known_to_workers_at(self, step: int) -> bool:
         """There was no grab among what the loop had taken up by then, which may be other than it was given last."""
-        for pending, told in reversed(tuple(self._given)):
+        for pending, known in reversed(tuple(self._given)):
             if pending is None or 0 <= pending.taken <= step:
-                return told
+                return known
         return len(self._given) < GIVEN  # else the beginning is not known any more
 
     @contextmanager
@@ -216,14 +216,14 @@ class Touch(Effect):
         """Gives the loop what has changed."""
         if self._changed is not None:
             changed, self._changed = self._changed, None
-            launch, told = self._bind(list(changed.values())), self.told
-            if not told:  # it counts already: the loop may take it up before `update_effect` returns
-                self._given.append((None, told))
+            launch, known = self._bind(list(changed.values())), self.known_to_workers
+            if not known:  # it counts already: the loop may take it up before `update_effect` returns
+                self._given.append((None, known))
             assert self._simulation is not None
             pending = self._simulation.update_effect(self, launch)
-            if not told:
+            if not known:
                 self._given.pop()
-            self._given.append((pending, told))
+            self._given.append((pending, known))
 
     @property
     def applied(self) -> list[Interaction]:
@@ -236,7 +236,7 @@ class Touch(Effect):
         self._put({a.id: a for a in interactions})
 
     def known(self) -> list[Interaction]:
-        """All that the loop was given last, also those that are over, with the time at which they began."""
+        """All interactions given to the loop last, with their start times; includes those that are over."""
         if not self._applied or self._launch is None:
             return []
         begun = zip(self._begun, self._launch.fetch("start").tolist(), strict=True)
@@ -244,7 +244,7 @@ class Touch(Effect):
         return self._begun
 
     def alive(self) -> list[Interaction]:
-        """Interactions that are not over, with the time at which they began."""
+        """Interactions that are not over, with their start times."""
         assert self._system is not None
         if self._changed is not None:
             return list(self._changed.values())
@@ -261,7 +261,7 @@ class Touch(Effect):
         return self.params[name]
 
     def _alive(self) -> dict[int, Interaction]:
-        """`alive` by id, to be changed and put."""
+        """Returns `alive` by id, for a change that `_put` carries out."""
         return {a.id: a for a in self.alive()} if self._changed is None else self._changed
 
     def _found(self, alive: dict[int, Interaction], client: str, id: int) -> Interaction:
@@ -271,7 +271,7 @@ class Touch(Effect):
         return found
 
     def points(self, name: str) -> NamedPoints:
-        """Where the object is now. Raises TouchError if it cannot be touched."""
+        """Named points of the object at its present state. Raises TouchError if it cannot be touched."""
         self._params(name)
         if name not in self._points:
             self._points[name] = NamedPoints(self.world, self.world.body(name))
@@ -360,7 +360,7 @@ def _each(interactions: list[Interaction], value: str) -> Float64:
 
 
 def _unmoved(interactions: list[Interaction]) -> dict[str, Any]:
-    """What a launch is told of interactions but for when they began and where their targets are."""
+    """Arguments of a launch that no move changes: all but start times and targets."""
     n, count = len(interactions), [len(a.nodes) for a in interactions]
     nodes = np.concatenate([a.nodes for a in interactions]) if n else np.zeros(0, np.int32)
     order = np.argsort(nodes, kind="stable")

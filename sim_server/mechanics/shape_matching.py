@@ -21,8 +21,11 @@ from sim_server.mechanics.world import Body, World
 
 
 class ShapeMatching:
-    """Of some bodies. start (nodes + 1,), neighbour (k,): neighbours of each node, none at nodes of other bodies; arm
-    (k, 3): m_j (X_j - X_c), scaled so that the trace of A_i at rest is 1."""
+    """Shape matching of some bodies.
+
+    start (nodes + 1,), neighbour (k,): neighbours of each node, none at nodes of other bodies
+    arm (k, 3): m_j (X_j - X_c), scaled so that the trace of A_i at rest is 1
+    """
 
     def __init__(self, world: World, bodies: Sequence[Body], level: int):
         self.world = world
@@ -31,7 +34,7 @@ class ShapeMatching:
         self.arm = _arms(world.rest, world.mass, self.start, self.neighbour)
 
     def launch(self, mean: Float64) -> Launch:
-        """Writes A_i in place of the mean of rotations (n, 10) of the bodies' nodes."""
+        """Launch that writes A_i in place of the sum of rotations `mean` (n, 10) at the bodies' nodes."""
         return self.world.backend.module("kernels/shape_matching.cu").bind(
             "match", self.world.nodes, start=self.start, neighbour=self.neighbour, arm=self.arm, x=self.world.x,
             mean=mean,
@@ -39,7 +42,7 @@ class ShapeMatching:
 
 
 def neighbours(tets: Int32, nodes: int, level: int) -> tuple[Int32, Int32]:
-    """start (nodes + 1,) and neighbours of each node up to `level`, ascending, without itself."""
+    """Returns start (nodes + 1,) and the neighbours of each node up to `level`, ascending, without the node itself."""
     from scipy.sparse import coo_array
 
     one = np.ones(tets.size, bool)
@@ -57,10 +60,10 @@ def neighbours(tets: Int32, nodes: int, level: int) -> tuple[Int32, Int32]:
 
 
 def _arms(rest: Float64, mass: Float64, start: Int32, neighbour: Int32) -> Float64:
-    """(k, 3), scaled: see ShapeMatching."""
+    """Returns the scaled arms (k, 3) of ShapeMatching."""
     n = len(rest)
     node = np.repeat(np.arange(n), np.diff(start))
-    offset = rest[neighbour] - rest[node]  # from the node: no digits are lost far from the origin
+    offset = rest[neighbour] - rest[node]  # relative to the node: no cancellation far from the origin
     weight = mass[neighbour]
     total = mass + np.bincount(node, weights=weight, minlength=n)
     centre = np.stack([np.bincount(node, weights=weight * o, minlength=n) for o in offset.T], axis=1) / total[:, None]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Whether a scene without inertia has an equilibrium: what nothing holds would make its matrix singular."""
+"""Check that every part of a scene without inertia is held: a part that is not makes the matrix singular."""
 
 from itertools import combinations
 
@@ -9,15 +9,15 @@ from sim_server.arrays import Float64, Int32, Int64
 from sim_server.errors import InputError
 from sim_server.mechanics.world import Body, World
 
-FLAT = 1e-9  # width of what counts as a line, over its length
+FLAT = 1e-9  # width over length below which points count as collinear
 
 
 def check_held(world: World, elements: list[Int32]) -> None:
     """Raises InputError naming the object if nodes of it could move without resistance.
 
-    elements: per effect, (m, c) node numbers. Tetrahedra that hang together by faces are one piece; it is held by three
-    nodes that are not on one line, fixed or of pieces that are held. Springs: what they connect is taken for one piece,
-    so a mechanism of springs is not found here.
+    elements: per effect, (m, c) node numbers. Tetrahedra connected by faces form a piece; it is held by three nodes
+    that are not collinear and are fixed or belong to pieces that are held. Nodes connected by springs form a piece,
+    too, so a mechanism of springs is not detected.
     """
     for body in world.bodies:
         pieces = [p for e in elements for p in _pieces(e[(e[:, 0] >= body.first) & (e[:, 0] < body.last)])]
@@ -32,7 +32,7 @@ def check_held(world: World, elements: list[Int32]) -> None:
 
 
 def _loose(world: World, body: Body, pieces: list[Int32]) -> Int64:
-    """Nodes of the scene that belong to the body and are not held, ascending."""
+    """Returns the nodes of the body that are not held, in numbers of the scene, ascending."""
     held = world.free == 0
     left = pieces
     while found := [p for p in left if _hold(world.rest[p[held[p]]])]:
@@ -43,7 +43,7 @@ def _loose(world: World, body: Body, pieces: list[Int32]) -> Int64:
 
 
 def _hold(points: Float64) -> bool:
-    """Three of them are not on one line."""
+    """True if three of the points are not collinear."""
     if len(points) < 3:
         return False
     sizes = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
@@ -51,7 +51,7 @@ def _hold(points: Float64) -> bool:
 
 
 def _pieces(elements: Int32) -> list[Int32]:
-    """Nodes of each set of elements that hang together by faces (four corners) or corners (two)."""
+    """Returns the nodes of each set of elements connected by faces (four corners) or nodes (two corners)."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 

@@ -84,7 +84,7 @@ def _kuhn_paths(stride: NDArray[np.integer]) -> NDArray[np.integer]:
 
 
 def read(path: str | Path) -> Mesh:
-    """The volume cells of a file in any format that meshio knows, as tetrahedra; unchecked, see `check`.
+    """Reads the volume cells of a file in any format of meshio, as tetrahedra; unchecked, see `check`.
 
     Quadratic cells are reduced to their corners; hexahedra, wedges and pyramids are split (cells.py). Triangles, lines
     and points of the file are left out, and so are nodes without a cell; what was changed is logged in one line.
@@ -132,7 +132,7 @@ def _meshio_read(path: Path) -> Any:
 
 
 def check(mesh: Mesh) -> Mesh:
-    """`mesh` with every tetrahedron wound to positive volume; how many were turned is logged.
+    """Returns `mesh` with every tetrahedron wound to positive volume; logs how many were inverted.
 
     Raises InputError that names the first nodes or tetrahedra concerned: not finite, out of range, flat, duplicate,
     coincident or unused.
@@ -160,5 +160,5 @@ def pose_matrix(rotate: ArrayLike) -> Float64:
 
 
 def posed(points: Float64, rotate: ArrayLike, translate: ArrayLike) -> Float64:
-    """`points` (n, 3) [m] rotated by `pose_matrix`, then moved by `translate` [m]."""
+    """Returns `points` (n, 3) [m] rotated by `pose_matrix`, then moved by `translate` [m]."""
     return points @ pose_matrix(rotate).T + np.asarray(translate, dtype=float)

@@ -3,7 +3,7 @@
 
 A convex cell is split by cones from its node of smallest number to the faces that do not hold it; a quadrilateral
 face is split along the diagonal from its node of smallest number. Both cells at a face thus use the same diagonal, and
-neighbours match without knowing of each other (Dompierre, Labbé, Vallet, Camarero 1999). A hexahedron gives 6
+neighbours match independently (Dompierre, Labbé, Vallet, Camarero 1999). A hexahedron gives 6
 tetrahedra, a wedge 3, a pyramid 2.
 """
 
@@ -34,7 +34,7 @@ EDGES = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))  # of a tetrahedron
 
 
 def tetrahedra(rest: Float64, blocks: Sequence[Any]) -> tuple[Int64, list[str]]:
-    """(m, 4) node numbers of all volume cells in meshio's `blocks`, and what was changed, one sentence each.
+    """Returns the tetrahedra (m, 4) of all volume cells in meshio's `blocks`, and one sentence per change.
 
     Raises InputError: no volume cells, other ones than those of SHAPE, node numbers out of range, or a cell that is
     too warped to be split.
@@ -66,7 +66,7 @@ def _corners(shape: str, blocks: Sequence[Any]) -> Int64:
 
 
 def _split(rest: Float64, shape: str, corners: Int64) -> Int64:
-    """(k m, 4) tetrahedra of positive volume, k of each of the cells (m, c)."""
+    """Splits the cells (m, c) into tetrahedra of positive volume, (k m, 4), k per cell."""
     if ((corners < 0) | (corners >= len(rest))).any():
         bad = int(np.flatnonzero(((corners < 0) | (corners >= len(rest))).any(axis=1))[0])
         raise InputError(f"{shape} {bad} has nodes {corners[bad].tolist()}: must be 0 to {len(rest) - 1}")
@@ -90,7 +90,7 @@ def _split(rest: Float64, shape: str, corners: Int64) -> Int64:
 
 
 def _triangles(corners: Int64, face: Sequence[int]) -> Int64:
-    """(m, 1 or 2, 3) triangles of one face of cells (m, c)."""
+    """Returns the triangles (m, 1 or 2, 3) of one face of cells (m, c)."""
     nodes = corners[:, list(face)]
     if len(face) == 3:
         return nodes[:, None]

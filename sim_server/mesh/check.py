@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a tetrahedral mesh must satisfy before anything is computed on it.
+"""Checks of a tetrahedral mesh before anything is computed on it.
 
 Each function returns None or one complaint that names the first few offenders and their count.
 """
@@ -22,7 +22,7 @@ Tets = NDArray[np.integer]
 
 
 def complaints(rest: Rest, tets: Tets) -> Iterator[str]:
-    """What is wrong with the mesh, most basic first; later checks run only on what the earlier ones let through."""
+    """Yields what is wrong with the mesh, most basic first; each check runs only if the earlier ones found nothing."""
     for check in (shapes, coordinates, indices, repeated_corners):
         if text := check(rest, tets):
             yield text
@@ -92,7 +92,7 @@ def unused_nodes(rest: Rest, tets: Tets) -> str | None:
 
 
 def crowded_faces(rest: Rest, tets: Tets) -> str | None:
-    """Faces of more than two tetrahedra: parts of such a mesh lie in one another. No complaint, but worth a line."""
+    """Describes faces of more than two tetrahedra, where parts of the mesh overlap; only logged."""
     faces = np.sort(tets[:, FACES].reshape(-1, 3), axis=1)
     faces = faces[np.lexsort(faces.T)]
     bad = np.flatnonzero((faces[2:] == faces[:-2]).all(axis=1))

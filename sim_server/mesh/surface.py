@@ -17,10 +17,7 @@ def volumes(rest: Float64, tets: NDArray[np.integer]) -> Float64:
 
 
 def surface_triangles(tets: NDArray[np.integer]) -> Int32:
-    """The faces that belong to one tetrahedron only: int32 (t, 3), outward for positive volumes.
-
-    They come in the order of the tetrahedra.
-    """
+    """Returns the faces of one tetrahedron only, (t, 3), outward for positive volumes, in order of the tetrahedra."""
     faces = tets[:, FACES].reshape(-1, 3)
     corners = np.sort(faces, axis=1)
     order = np.lexsort(corners.T)

@@ -61,7 +61,7 @@ class SnapshotPool:
         begun between the request and the copy."""
         assert state.job.copy is not None
         step = self.step(state)
-        return state.job.copy.ndim == 3 or all(e.told_at(step) for e in self._simulation.effects.values())
+        return state.job.copy.ndim == 3 or all(e.known_to_workers_at(step) for e in self._simulation.effects.values())
 
     def discard(self, state: BodyUpdateState) -> None:
         """Gives up a copy that is not sent."""
@@ -91,7 +91,7 @@ class SnapshotPool:
         MAX_FAILED_ASSEMBLIES attempts in a row have failed."""
         if self._solver.build != "worker" or state.failures.assemblies >= MAX_FAILED_ASSEMBLIES:
             return False
-        known = all(e.told for e in self._simulation.effects.values())
+        known = all(e.known_to_workers for e in self._simulation.effects.values())
         return known and self._source.assembles_matrices()
 
     def _extrapolated_time(self, state: BodyUpdateState) -> float:

@@ -104,7 +104,7 @@ def test_no_file_is_read(tmp_path):
     (tmp_path / "springs.txt").write_text("0 1\n")
     springs = {"mass_spring": {"springs": str(tmp_path / "springs.txt"), "stiffness": 10.0}}
     sim = simulation({**bar(young=None), "effects": springs})
-    assert not all(e.told for e in sim.effects.values())
+    assert not all(e.known_to_workers for e in sim.effects.values())
     with pytest.raises(Refused, match="names a file"):
         Assembly(*described(sim))
 
@@ -147,11 +147,11 @@ def test_positions_that_do_not_fit_are_refused(x):
 def test_a_grab_is_known_to_the_server_alone():
     sim = simulation(bar(touch={"max_force": 1e4}))
     touch = sim.effects["touch"]
-    assert touch.told
+    assert touch.known_to_workers
     touch.push("me", "bar", (2, 0, 0), 0.0, (1, 0, 0), 1.0)
-    assert touch.told, "a push does not enter the matrix"
+    assert touch.known_to_workers, "a push does not enter the matrix"
     touch.grab("me", "bar", (2, 0, 0), 0.0, (3, 0, 0), 1e3, 10.0, 1e9)
-    assert not touch.told
+    assert not touch.known_to_workers
 
 
 class Builders(Inline):
