@@ -50,7 +50,7 @@ def _families(value: Any) -> Any:
 
 
 def _as_listed(families: tuple[float, ...]) -> list[list[float]]:
-    """As a scene has them."""
+    """Directions as given in a scene."""
     return [list(v) for v in (families[:3], families[3:]) if any(v)]
 
 

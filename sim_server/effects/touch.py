@@ -101,7 +101,9 @@ class Touch(Effect):
         self._system: System | None = None
         self._applied: list[Interaction] = []
         self._begun: list[Interaction] = []  # the same, with the times at which they began as far as they are known
-        self._given: deque[tuple[PendingUpdate | None, bool]] = deque(maxlen=GIVEN)  # known_to_workers after each change
+        self._given: deque[tuple[PendingUpdate | None, bool]] = deque(
+            maxlen=GIVEN
+        )  # known_to_workers after each change
         self._together = False
         self._changed: dict[int, Interaction] | None = None  # by id: what the loop is to be given after `together`
         self._same: tuple[list[int], dict[str, Any]] | None = None  # ids, and what of a launch no move changes

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a step does before the effects and after the solve, by the scheme of the scene.
+"""Time integration: the launches of a step before the effects and after the solve, by the scheme of the scene.
 
 Symbols and names: docs/notation.md. All schemes are, with f the forces, M the lumped masses and h the time step,
 

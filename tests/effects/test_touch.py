@@ -31,7 +31,7 @@ def touch_of(sim: Simulation) -> Touch:
 
 
 def force_in(sim: Simulation) -> np.ndarray:
-    """What a step at rest puts into b, as a force: (n, 3) [N]."""
+    """Forces (n, 3) [N] that a step at rest adds to b."""
     sim.world.x[:], sim.world.v[:] = sim.world.rest, 0
     sim.engine.assemble()
     return sim.system.b / H

@@ -46,7 +46,7 @@ UNSTABLE = {"tangent": "usual"}, {"rotation": "qr"}
 @pytest.mark.parametrize("scheme", ["newmark", "bdf2"])
 @pytest.mark.parametrize("given", UNSTABLE, ids=str)
 def test_a_tangent_with_which_the_energy_grows_is_refused(tmp_path, scheme, given):
-    """By the name of the object that has it; with more linearizations, or another scheme, it may be had."""
+    """The message names the object. More linearizations, or another scheme, allow it."""
     (key, value), path = next(iter(given.items())), tmp_path / "two.toml"
     body = '[[object]]\nname = "{}"\nmesh = {{ bar = [2, 1, 1], size = [2, 1, 1] }}\n'
     elastic = "[object.effects]\ncorotational = {{ young = 1e5, poisson = 0.3{} }}\n"
@@ -71,7 +71,7 @@ def test_the_tangent_is_exact_where_it_must_be(scheme):
 
 
 def test_negative_eigenvalues_by_default():
-    """What is written holds; else what keeps a step with one linearization from overshooting."""
+    """A given value holds; the default keeps a step with one linearization from overshooting."""
     chosen = {"linearizations": 1}, {"scheme": "bdf2"}, {"linearizations": 2}, {"scheme": "quasi_static"}
     assert [scene(bar(), integrator=i).projection for i in chosen] == ["excess", "excess", "clamp", "clamp"]
     assert scene(bar(), projection="absolute", integrator={"linearizations": 2}).projection == "absolute"
@@ -103,7 +103,7 @@ def test_the_default_has_the_launches_of_backward_euler_alone():
 
 
 def test_a_scheme_starts_from_the_state_that_it_finds():
-    """What a test or a program puts into x and v before the first step is what the history is made from."""
+    """The history of the first step is made from x and v as a test or a program sets them before it."""
     runs = []
     for early in (True, False):
         sim = simulation(bar((3, 1, 1), (3, 1, 1), young=1e5), dt=0.01, tolerance=1e-10, integrator={"scheme": "bdf2"})

@@ -42,7 +42,7 @@ def swing(scheme: str, steps: int, linearizations: int, tangent: str = "usual") 
 
 
 def orders(scheme: str, linearizations: int, tangent: str = "usual") -> NDArray:
-    """Of x and of v, from each halving: (halvings, 2)."""
+    """Orders of x and v from each halving of the step, (halvings, 2)."""
     exact = swing("newmark", 3200 if tangent == "usual" else 1600, 40, tangent)
     error = [np.linalg.norm(swing(scheme, n, linearizations, tangent) - exact, axis=(1, 2)) for n in STEPS]
     return np.log2(np.array(error[:-1]) / error[1:])

@@ -98,7 +98,7 @@ def law_bar(law: Law | str, mesh: Any = None, table: dict[str, Any] | None = Non
 
 
 def odd_bar(folder: Path, law: Law | str, cells: tuple[int, int, int] = (2, 1, 1), **scene: Any) -> Simulation:
-    """Of unequal elements, all nodes free."""
+    """A bar of unequal elements, all nodes free."""
     return law_bar(law, mesh_file(folder, *jittered_bar(cells, SIZE, seed=2)), **scene)
 
 
@@ -123,7 +123,7 @@ def deform(sim: Simulation, size: float, seed: int = 0) -> None:
 
 
 def forces(sim: Simulation) -> NDArray[np.float64]:
-    """From the kernels: b / h of an undamped body, its velocity set to zero."""
+    """Forces by the kernels: b / h of an undamped body, with its velocity set to zero."""
     sim.world.v[:] = 0
     sim.engine.assemble()
     return sim.system.b / sim.world.dt

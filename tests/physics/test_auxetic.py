@@ -106,7 +106,7 @@ def test_patch_of_a_law(tmp_path, law):
 
 @pytest.mark.parametrize("law", ["corotational", "st_venant_kirchhoff", "stable_neo_hookean"])
 def test_a_pulled_bar_grows_thicker(law):
-    """By 0.3 of the strain along it."""
+    """The strain across is 0.3 of that along the bar."""
     sim = law_bar(law, cells=(1, 1, 1), size=(1, 1, 1), table=table(-0.3))
     rest, strain = sim.world.rest, 1e-4
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a step keeps and what it loses: mass, momentum, energy."""
+"""Conservation of mass and momentum in a step, and its loss of energy."""
 
 import numpy as np
 import pytest

@@ -14,7 +14,7 @@ EXACT = {"preconditioner": "block_jacobi", "tolerance": 1e-12, "max_iterations":
 
 
 def watched(*objects: dict, every: int = 1, **table) -> Simulation:
-    """With elastic energies each `every`-th step."""
+    """Runs with elastic energies in each `every`-th step."""
     sim = simulation(*objects, **(EXACT | table))
     sim.engine.loop.energy_every = every
     return sim
@@ -73,7 +73,7 @@ def dissipated(records: NDArray) -> NDArray:
 
 
 def test_backward_euler_dissipates_in_each_step():
-    """Of small motions: M (v' - v) = h f(x') takes sum m |v' - v|^2 / 2 and the energy of x' - x in each step."""
+    """In small motions a step M (v' - v) = h f(x') loses sum m |v' - v|^2 / 2 and the energy of x' - x."""
     sim = watched(bar((4, 1, 1), young=1e6, fixed="X < 0.01"), gravity=(0, -1e-3, 0), dt=0.01)
     found, steps, v, x = [], 60, np.zeros_like(sim.world.v), sim.world.x.copy()
     stiffness = solid(sim).tangent()

@@ -35,7 +35,7 @@ def clamped(sim: Simulation) -> int:
 @stirred
 @pytest.mark.parametrize("fixed", [None, "X < 0.01"])
 def test_matrix_and_right_side_are_the_reference(tmp_path, size, fixed):
-    """With singular vectors and a 9x9 matrix there, without either here; also where elements are inverted."""
+    """The reference uses singular vectors and a 9x9 matrix, the kernel neither; also where elements are inverted."""
     sim = exact_bar(tmp_path, damping=(0.7, 0.03), dt=0.013, fixed=fixed, gravity=(1, -9.81, 2))
     stir(sim, size)
     sim.engine.assemble()
@@ -181,7 +181,7 @@ def test_the_matrix_is_definite_in_any_shape(tmp_path, shape):
 
 
 def test_the_default_is_the_usual_one(tmp_path):
-    """With what it costs: no kernel of another variant."""
+    """A scene compiles and launches no kernel of another variant."""
     sim = simulation(bar())
     assert [launch.name for launch in sim.engine.launches[1:4]] == [
         "corotational.elements", "corotational_nodes.gather", "corotational_blocks.blocks",

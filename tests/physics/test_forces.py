@@ -40,7 +40,7 @@ def gaps(body: Solid) -> NDArray:
 
 
 def elastic_forces(sim: Simulation) -> NDArray:
-    """From the kernels: b / h of an undamped body at rest in its present shape."""
+    """Forces by the kernels: b / h of an undamped body at rest in its present shape."""
     sim.world.v[:] = 0
     sim.engine.assemble()
     return sim.system.b / sim.world.dt

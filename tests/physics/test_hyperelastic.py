@@ -50,7 +50,7 @@ def test_forces_are_minus_the_slope_of_the_energy(tmp_path, law, size):
 
 @every_state
 def test_the_stiffness_is_minus_the_slope_of_the_forces(tmp_path, law, size):
-    """With projection = "none"; and it is the reference's."""
+    """The stiffness with projection = "none" is the derivative of the forces, and that of the reference."""
     sim = stirred(tmp_path, law, size, projection="none")
     K = stiffness(sim)
     assert np.abs(K - reference_system(sim, law)[2]).max() < 1e-8 * np.abs(K).max()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What is known of the hyperelastic laws: Hooke's law at small strains, the patch test, uniaxial tests, regions."""
+"""Known answers of the hyperelastic laws: Hooke's law at small strains, the patch test, uniaxial tests, regions."""
 
 import numpy as np
 import pytest

@@ -12,7 +12,7 @@ from tests.physics.laws import LAWS, Law, deform, odd_bar
 
 
 def in_precision(sim, law: Law, real: str) -> dict[str, np.ndarray]:
-    """What the elements leave in the present state, in float64 for comparison."""
+    """Results of the elements' kernels in the present state, in float64 for comparison."""
     dtype, effect = np.dtype("f8" if real == "double" else "f4"), sim.effects[law.name]
     m = len(effect.elements)
     out = {"corners": np.zeros((4, m, 9), dtype), "edges": np.zeros((6, m, 9), dtype)}
@@ -49,7 +49,7 @@ def test_single_precision_agrees(tmp_path: Path, law: Law, size: float):
 
 @pytest.mark.parametrize("law", LAWS.values(), ids=LAWS.keys())
 def test_at_rest_too(tmp_path: Path, law: Law):
-    """Where stretches meet and eigenvalues are zero."""
+    """At rest stretches are equal and eigenvalues zero."""
     sim = odd_bar(tmp_path, law)
     single, double = in_precision(sim, law, "float"), in_precision(sim, law, "double")
     bound = 1e-4 * np.abs(double["edges"]).max() + 1e-30

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What Young's modulus and Poisson's ratio a mesh of springs shows when it is stretched: the calibration of their k."""
+"""Young's modulus and Poisson's ratio of a mesh of springs under tension: the calibration of their stiffness."""
 
 from pathlib import Path
 
@@ -58,7 +58,7 @@ def test_an_unstructured_bar_has_the_young_it_was_given_and_poisson_one_quarter(
 
 @pytest.mark.parametrize(("split", "young", "poisson"), [("kuhn", 1.16, 0.035), ("mirrored", 1.49, 0.16)])
 def test_regular_bars_have_preferred_directions(split, young, poisson):
-    """As the manual says: their edges do not point everywhere alike."""
+    """Edges of regular meshes have preferred directions, as the docstring of mass_spring says."""
     found, ratio = stretched(
         simulation(springs_bar({"young": YOUNG}, mesh={"bar": [18, 6, 6], "size": list(SIZE), "split": split}))
     )

@@ -94,7 +94,7 @@ def test_it_is_a_proper_rotation(F):
 
 @well_posed
 def test_it_is_the_nearest_one(F):
-    """The same as by singular values, up to rounding times the condition number."""
+    """The rotation equals that by singular values, up to rounding times the condition number."""
     R, s = kernel(F), singular_values(F)
     assert loss(F, R).max() < 1e-14
     expected = np.array([nearest_rotation(f) for f in F])

@@ -63,7 +63,7 @@ def test_solving_for_the_inside_gives_the_affine_field(sim):
 
 
 def test_steps_settle_to_the_affine_field(tmp_path):
-    """The same through the simulation: the boundary is fixed in its deformed place, the inside starts anywhere."""
+    """The patch test through the simulation: a deformed boundary is fixed, the inside starts anywhere."""
     rest, tets = jittered_bar((3, 3, 3), SIZE, seed=6)
     hold = "X < 1e-6 or X > 1.1999 or Y < 1e-6 or Y > 0.9999 or Z < 1e-6 or Z > 0.7999"
     sim = simulation(

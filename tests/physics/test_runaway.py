@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Bodies with more energy than they can have come by: seen in that very step, told, frozen or let go on."""
+"""Bodies with more energy than their budget: detected in the step in which it occurs, reported, frozen or continued."""
 
 import logging
 from types import SimpleNamespace
@@ -35,7 +35,7 @@ def released(*objects: dict, names: tuple[str, ...] = ("wild",), **table) -> Sim
 
 
 def criterion(sim: Simulation, start: float, size: float, x: NDArray) -> bool:
-    """As kernels/energy_balance.cuh has it, for one body without gravity or hands."""
+    """The criterion of kernels/energy_balance.cuh for one body without gravity, pushes or grabs."""
     w = sim.world
     kinetic = 0.5 * (w.mass[:, None] * w.v**2).sum()
     floor = 0.5 * w.mass.sum() * (1e-3 * size / w.dt) ** 2
@@ -158,7 +158,7 @@ def test_without_inertia_a_step_longer_than_the_body_is_one():
 
 
 def lines_and_status(on_runaway: str) -> tuple[list[str], pb.Status, Driver]:
-    """What is told of a run, in batches of seven steps."""
+    """Returns the notices of a run, in batches of seven steps."""
     sim, found, lines = released(wild(), on_runaway=on_runaway), [], []
     driver = Driver(sim)
     telemetry = Telemetry(driver, SimpleNamespace(publish_status=found.append), None, patient=False)  # type: ignore[arg-type]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The same kernel texts built with real = float agree with double precision to about 1e-5."""
+"""Kernel texts built with real = float agree with double precision to about 1e-5."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from tests.scenes import elastic, solid
 
 
 def in_precision(real: str, sim) -> dict[str, np.ndarray]:
-    """What the elements' kernels make of the present state, in float64 for comparison."""
+    """Results of the elements' kernels in the present state, in float64 for comparison."""
     dtype, e, w, s = np.dtype("f8" if real == "double" else "f4"), elastic(sim), sim.world, sim.system
     m, stencil = len(e.elements), s.stencils[0]
     x, v, gradients, lame = (a.astype(dtype) for a in (w.x, w.v, e.gradients, e.lame))

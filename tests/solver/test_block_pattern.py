@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Where blocks stand: the pattern of A against dense incidence, and bodies beside one another in the same arrays."""
+"""Pattern of A against dense incidence, and several bodies in the same arrays."""
 
 import numpy as np
 import pytest

@@ -23,7 +23,7 @@ def swinging(preconditioner: str, **solver) -> Simulation:
 
 
 def residuals(sim: Simulation) -> np.ndarray:
-    """Of the steps with a factor, and those before its first one."""
+    """Residuals of the steps with a factor: those before the first one are left out."""
     return np.asarray(Driver(sim).advance(STEPS)["residual"][4:])
 
 

@@ -39,7 +39,7 @@ def test_out_of_time():
 
 @pytest.mark.parametrize("kind", [Kind.NONE, Kind.JACOBI, Kind.BLOCK_JACOBI])
 def test_an_indefinite_matrix_is_named(kind):
-    """All of A but its diagonal blocks turned round: z'r > 0 still, p'Ap < 0 for some p."""
+    """The blocks off the diagonal are multiplied by 5: z'r > 0 still, p'Ap < 0 for some p."""
     sim = bent()
     diagonal = [diagonal_block(sim, i) for i in range(sim.world.nodes)]
     off = np.setdiff1d(np.arange(len(sim.system.values)), diagonal)

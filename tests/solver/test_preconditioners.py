@@ -115,7 +115,7 @@ def test_what_the_loop_applies_is_symmetric_positive_definite_and_its_formula(ki
 
 @pytest.mark.parametrize("kind", [Kind.JACOBI, Kind.BLOCK_JACOBI, Kind.SSOR], ids=lambda k: k.name)
 def test_what_the_loop_applies_turns_with_the_body(kind):
-    """The same operator in the material frame, up to rounding."""
+    """In the material frame the operator is the same, up to rounding."""
     here, turned = (loop_operator(small(R), kind) for R in (None, rotation((1, 2, -1), 2.0)))
     here, turned = here / np.abs(here).max(), turned / np.abs(turned).max()
     assert np.abs(here - turned).max() < 1e-9

@@ -94,7 +94,7 @@ def test_it_solves_the_system_of_a_step():
 
 
 def test_it_is_symmetric_and_positive():
-    """What the conjugate gradients ask of a preconditioner, also in single precision (to its rounding)."""
+    """Conjugate gradients need a symmetric positive definite preconditioner; in single precision up to its rounding."""
     sim = simulation(bar((4, 2, 2), young=1e6, fixed="X < 0.01"))
     sim.engine.assemble()
     random = np.random.default_rng(1)

@@ -71,7 +71,7 @@ def test_frames_stay_the_identity_without_the_warp_and_where_nothing_tells_rotat
 
 
 def frames_of(sim: Simulation) -> list[NDArray]:
-    """Of the nodes of each body, (n, 3, 3)."""
+    """Rotations of the nodes of each body, (n, 3, 3)."""
     return [sim.system.rotation[body.nodes] for body in sim.world.bodies]
 
 

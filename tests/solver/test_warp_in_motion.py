@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the warp is worth in scenes: mean iterations of PCG with a factor that is 10 to 20 steps old.
+"""Benefit of the warp in scenes: mean iterations of PCG with a factor that is 10 to 20 steps old.
 
 Numbers found (12 x 3 x 3 cells, tolerance 1e-6, lockstep-10; block Jacobi alone: 20): falling beam 3.2 with warp, 7.3
 without; load turning about the axis by 0.05 rad a step 4.0 and 11.8; beam of 1000:50:10 in stiffness 10 and 26.
@@ -38,7 +38,7 @@ def iterations(
     posed: bool = False,
     update: str = "lockstep-10",
 ) -> NDArray:
-    """Of each step, (steps,). spin: angle of the load's turn about the beam's axis in a step [rad]."""
+    """Iterations of each step, (steps,). spin: angle of the load's rotation about the beam's axis in a step [rad]."""
     pose: dict[str, Any] = {"pose": {"rotate": list(POSE)}} if posed else {}
     sim = simulation(
         bar(poisson=0.4, damping=(0.1, 0.01), **beam, **pose), gravity=(0, -9.81, 0), preconditioner="cholesky",

@@ -34,7 +34,7 @@ POSE = (40.0, 0.0, 70.0)
 
 @pytest.fixture(params=MODELS)
 def effects(request) -> dict[str, Any]:
-    """Of an object; skipped while there is no such effect."""
+    """Effects of an object; skips if there is no such effect."""
     table = MODELS[request.param]
     if missing := set(table) - set(known_effects()):
         pytest.skip(f"no effect {missing}")

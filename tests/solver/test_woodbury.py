@@ -38,7 +38,7 @@ def spring(sim: Simulation, stiffness: float) -> float:
 
 
 def grab(sim: Simulation, touch: Touch, stiffness: float, radius: float = 0.0, by: tuple = (0, 0.01, 0)) -> Interaction:
-    """Of each node, by own blocks; pulls by so much [m]."""
+    """Grabs nodes at the end. stiffness: per node, in units of its own block; by: from the end to the target [m]."""
     at = tuple(END)
     target = tuple(END + by)
     distance = np.linalg.norm(sim.world.x - END, axis=1)
@@ -281,7 +281,7 @@ def test_a_gpu_leaves_it_out():
 
 
 def test_factors_posted_again_at_the_same_steps_are_corrected_alike():
-    """As a replay does it, which asks for no matrices."""
+    """Gives factors as a replay does, which requests no matrices."""
     options: dict[str, Any] = {"preconditioner": "cholesky", "update": "lockstep-3", "warp": True}
     sims = [touched(**options) for _ in range(2)]
     (sim, _), (other, _) = sims

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: MIT
-// Block CSR of 3x3 blocks, and the vector loops of the conjugate gradient method fused so that each vector is read once.
+// Block sparse rows of 3x3 blocks (BSR), and the vector loops of conjugate gradients, fused so that each vector is read once.
 #pragma once
 #include <cmath>
 #include <cstdint>

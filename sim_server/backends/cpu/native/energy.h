@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: MIT
-// The energy of each body after a step, and whether it has run away (kernels/energy_balance.cuh). One pass over the nodes; the elastic
-// energy takes one over the elements and is made on demand alone.
+// Energy of each body after a step, and whether it has run away (criterion: kernels/energy_balance.cuh). One pass over the nodes;
+// the elastic energy takes one over the elements and is evaluated on demand only.
 #pragma once
 #include <cstring>
 
@@ -36,7 +36,7 @@ static void measure_elastic(Loop& loop) {
     }
 }
 
-// Whether somebody has set the body's positions or velocities since the loop was left.
+// True if the body's positions or velocities were set since the loop was left.
 static bool was_set(const Loop& loop, const Body& body) {
     const int64_t at = 3 * (int64_t)body.first, bytes = sizeof(double) * 3 * (int64_t)(body.last - body.first);
     const double* left = loop.energies->left;
@@ -60,7 +60,7 @@ static void begin_balance(const Loop& loop, const Body& body, Balance& balance) 
     start_balance(balance, s, std::sqrt(size), dt, e.inertia);
 }
 
-// Before the first step, and where the state was set: energy is reckoned from here on.
+// Begins the balance of bodies before the first step, and of those whose state was set.
 static void enter(Loop& loop) {
     Energies& e = *loop.energies;
     bool measured = false;
@@ -79,7 +79,7 @@ static void leave(const Loop& loop) {
     std::memcpy(loop.energies->left + n, loop.v, sizeof(double) * n);
 }
 
-// Back to where the step began, and at rest from now on: as if all nodes were fixed.
+// Sets the body back to the start of the step and fixes all its nodes.
 static void freeze(const Loop& loop, const Body& body) {
     const Energies& e = *loop.energies;
     const int64_t at = 3 * (int64_t)body.first, n = 3 * (int64_t)(body.last - body.first);
@@ -88,7 +88,7 @@ static void freeze(const Loop& loop, const Body& body) {
     for (int i = body.first; i < body.last; ++i) e.free[i] = 0;
 }
 
-// After a step. elastic: the elastic energy is wanted.
+// Updates all balances after a step. elastic: evaluate the elastic energy, too.
 static void account(Loop& loop, bool elastic) {
     Energies& e = *loop.energies;
 #pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) if (loop.threads > 1 && loop.bodies > 1)

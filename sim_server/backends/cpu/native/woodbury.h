@@ -1,14 +1,14 @@
 // SPDX-License-Identifier: MIT
-// What has come onto the diagonal of A, or left it, since the matrix of the factor in use: grabs of clients (effects/touch.py) set
-// in from one step to the next, and their stiff springs are missing from a factor until one comes that was made with them.
+// Low-rank correction of a factor for changes of the diagonal of A since its matrix. Grabs of clients (effects/touch.py) begin
+// from one step to the next; their stiff springs are missing from the factor until one arrives that was made with them.
 // With U the columns of the identity at the nodes concerned and C the difference of their diagonals,
 //     (P + U C U')^-1 = L^-T (I - V W V') L^-1,    V = L^-1 U,  W = (C^-1 + V'V)^-1,
-// the formula of Sherman, Morrison and Woodbury between the two triangular solves. V has entries only in the supernodes on the
-// ways from these nodes to the root, so that it costs a few applications of the factor to make. With V'V = K K' and
-// G = I + K'C K,  W = C - C K G^-1 K'C  whatever the sign of C and also where it is 0; what results is positive definite
-// exactly if G is. A number times the identity is the same in all frames, so the warp makes no difference.
+// the Sherman-Morrison-Woodbury formula between the two triangular solves. V has entries only in the supernodes on the paths
+// from these nodes to the root, so that it costs a few applications of the factor. With V'V = K K' and
+// G = I + K'C K,  W = C - C K G^-1 K'C  for C of any sign, including 0; the result is positive definite if and only
+// if G is. Multiples of the identity are the same in all frames, so the warp does not change them.
 //
-// Which matrices had what is told by a list of changes, read backwards from now to the step of the factor; a factor made
+// The diagonal of an older matrix follows from a list of changes, read backwards to the step of the factor; so a factor made
 // with the spring is not corrected for it. (Hager, Updating the inverse of a matrix, SIAM Review 31, 1989.)
 #pragma once
 #include <algorithm>
@@ -32,15 +32,15 @@ struct Change {        // of the diagonal of a node
 };
 
 struct Correction {
-    int32_t capacity;       // nodes that are corrected at once; 0: off
-    int32_t history;        // changes that are remembered
+    int32_t capacity;       // most nodes corrected at once; 0: off
+    int32_t history;        // changes kept in the ring
     int32_t nodes;          // of the body
-    int32_t count;          // nodes of V; 0: none is made
+    int32_t count;          // nodes of V; 0: there is no V
     int32_t supernodes;     // of V
-    int32_t usable;         // W is there and what it makes is positive definite
+    int32_t usable;         // W exists and the corrected factor is positive definite
     int32_t used;           // nodes corrected in the last solve with a factor
     int64_t changes;        // so far
-    int64_t forgotten;      // step of the newest change that is not remembered any more
+    int64_t forgotten;      // step of the newest change that has left the ring
     int64_t step;           // of the factor that `then` and V are for
     const Factor* factor;   // likewise
     const double* diagonal; // (nodes,) of A as assembled now [kg]
@@ -54,16 +54,17 @@ struct Correction {
     void* columns;          // (3 nodes, width) V, in the values' type, only rows of its supernodes
 };
 
-constexpr double NOTHING = 0.004;              // of the node's own block: so much is no change
-constexpr double WEAK = 0.2, WEAK_EACH = 0.02;  // likewise, all changes together and their mean: less is left to the iteration
-constexpr double STIFF = 1e5;   // likewise: more is corrected as so much, which leaves one cluster of eigenvalues and no rounding;
-                                // of more that has gone 1e-4 stays
+constexpr double NOTHING = 0.004;              // relative to the node's own block: smaller changes are ignored
+constexpr double WEAK = 0.2, WEAK_EACH = 0.02;  // likewise, for the sum of all changes and their mean: below, no correction
+// Larger changes, in blocks, are corrected as this much: one cluster of eigenvalues remains, and rounding stays small. Of a larger
+// spring that has gone 1e-4 remains.
+constexpr double STIFF = 1e5;
 constexpr double LEAST = 1e-6;  // pivot of G
 
-// Columns of V, filled up with zeros to a whole number of vectors.
+// Number of columns of V, padded with zeros to a whole number of vectors.
 inline int width_of(int nodes) { return (3 * nodes + 7) / 8 * 8; }
 
-// K of a = K K', lower, in place; false if a pivot is below `least`.
+// Cholesky factor K of a = K K', lower, in place; false if a pivot is below `least`.
 static bool cholesky(double* a, int d, int stride, double least) {
     for (int i = 0; i < d; ++i) {
         for (int j = 0; j <= i; ++j) {
@@ -77,7 +78,7 @@ static bool cholesky(double* a, int d, int stride, double least) {
     return true;
 }
 
-// Rows of many right-hand sides at once: y = L^-1 y within a panel, and what it takes from the rows below.
+// Forward substitution y = L^-1 y of many right-hand sides within a panel, and the update of the rows below.
 template <class T>
 static void forward_rows(const Panel<T>& L, const int32_t* rows, int width, T* y) {
     const T* own = y + (int64_t)rows[0] * width;
@@ -96,7 +97,7 @@ static void forward_rows(const Panel<T>& L, const int32_t* rows, int width, T* y
     }
 }
 
-// Uses a Correction in a solve. Made anew for each; nothing is allocated.
+// Applies a Correction in one solve; allocates nothing.
 struct Corrected {
     Correction& c;
     const BlockCsr& A;
@@ -107,7 +108,7 @@ struct Corrected {
     double *gram() const { return c.small; }
     double *inner() const { return c.small + (int64_t)width() * width(); }
 
-    // Sees to it that W is that of now; true if there is something to correct.
+    // Updates W to the present diagonal; true if there is something to correct.
     bool prepare() {
         if (c.factor != &factor || c.step != factor.step) take_factor();
         c.used = 0;
@@ -160,8 +161,8 @@ private:
         }
     }
 
-    // The diagonal of its matrix: that of now, changes since then taken back. Where some of them are forgotten nothing is
-    // corrected until the next factor.
+    // Reconstructs the diagonal of the factor's matrix from the present one by undoing the changes since. If some have left the
+    // ring nothing is corrected until the next factor.
     void take_factor() {
         c.factor = &factor;
         c.step = factor.step;
@@ -188,8 +189,8 @@ private:
         return delta > most ? most : delta < -most ? delta - 1e-4 * delta : delta;
     }
 
-    // The nodes of V; those that it has stay while no others are needed, as springs that are at their limit come and go.
-    // False: more than fit, or too little to be worth it.
+    // Chooses the nodes of V; present ones stay while no others are needed, as springs at their force limit come and go. False: too
+    // many nodes, or changes too small.
     bool choose() {
         if (c.count < 0) return false;
         int changed = 0, others = 0, chosen[MOST];
@@ -306,7 +307,7 @@ private:
     static constexpr int MOST = 64;
 };
 
-// After the launches of a step: notes what has changed on the diagonal.
+// Records changes of the diagonal after the launches of a step.
 static void note_changes(Correction& c, int64_t step, bool first) {
     if (c.capacity == 0) return;
     if (first) std::copy(c.diagonal, c.diagonal + c.nodes, c.last);
