@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: MIT
-// Corotational linear tetrahedra with the tangent that knows how their rotations change (formulas: corotational.py). Its part
-// beside the usual one, of corners a and b, is [g_a]x E [g_b]x^T with E = R (sum e / (2 mu) u u^T) R^T, one E per element.
+// Corotational linear tetrahedra with the tangent that includes the change of their rotations (formulas: corotational.py). What it
+// adds to the usual tangent, for corners a and b, is [g_a]x E [g_b]x^T with E = R (sum e / (2 mu) u u^T) R^T, one E per element.
 #define WIDE
 #include "corotational.cuh"
 #include "eigen3.cuh"

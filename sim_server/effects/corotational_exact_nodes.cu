@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: MIT
-// Collects at each node what its elements left for it (corotational_exact.cu).
+// Sums nodal impulses, diagonal blocks and rotations of the elements at each node, for the exact tangent (corotational_exact.cu).
 #include "corotational_tangent.cuh"
 
 struct CorotationalExactNodes {

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: MIT
-// Collects at each node what its elements left for it: a gather, so that no two items write one place.
+// Sums nodal impulses, diagonal blocks and rotations of the elements at each node. A gather: no two items write to the same place.
 #include "corotational_tangent.cuh"
 
 struct CorotationalNodes {

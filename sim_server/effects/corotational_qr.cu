@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: MIT
-// Corotational linear tetrahedra that turn with their first edge and the plane of their first face (formulas: corotational.py).
+// Corotational linear tetrahedra with the rotation of their first edge and first face (formulas: corotational.py).
 #define WIDE
 #include "corotational.cuh"
 #include "gram_schmidt.cuh"
@@ -18,21 +18,21 @@ struct CorotationalQrElements {
     local* nodal_impulse;                // (n, 4, 3) out: h f_a + h (c + beta) (K v)_a [N s]
 };
 
-// From the rest frame of edge 01 and face 012 to the present one.
-INLINE local_mat3 turned(const real* x, const index (&tet)[4], const local_mat3& g) {
+// Rotation from the frame of edge 01 and face 012 at rest to the present one.
+INLINE local_mat3 edge_face_rotation(const real* x, const index (&tet)[4], const local_mat3& g) {
     vec3 origin = load3(x, tet[0]);
     local_vec3 first = as<local_number>(load3(x, tet[1]) - origin), second = as<local_number>(load3(x, tet[2]) - origin);
     // At rest: N_3 rises off the face, N_2 and N_3 are constant along the edge. In units of rest lengths no scale is special.
     local_vec3 edge = cross(row(g, 1), row(g, 2));
     local_number per_volume = dot(row(g, 0), edge), scale = per_volume / sqrt(dot(edge, edge));  // 1 / length
-    return between(unit(edge), unit(row(g, 2)), scale * first, scale * second);
+    return rotation_between(unit(edge), unit(row(g, 2)), scale * first, scale * second);
 }
 
 KERNEL(elements, CorotationalQrElements) {
     index tet[4];
     get_item_row(p.tets, i, tet);
     local_mat3 g = rest_gradients(p.gradients, p.n, i);
-    local_mat3 R = turned(p.x, tet, g), Rt = transposed(R);
+    local_mat3 R = edge_face_rotation(p.x, tet, g), Rt = transposed(R);
     local_mat3 S = mul(Rt, gradient(p.x, tet, g)), T = mul(Rt, gradient(p.v, tet, g));
     local_number k = at_items(p.stiffness_coefficient, i), lambda = at_items(p.lame, i), mu = at_items(p.lame + p.n, i);
     put_impulses(p.nodal_impulse, i, p.n, mul(R, hooke(S, T, p.h, k, lambda, mu)), g);
@@ -54,7 +54,7 @@ KERNEL(energy, CorotationalQrEnergy) {
     index tet[4];
     get_item_row(p.tets, i, tet);
     local_mat3 g = rest_gradients(p.gradients, p.n, i);
-    local_mat3 S = mul(transposed(turned(p.x, tet, g)), gradient(p.x, tet, g));
+    local_mat3 S = mul(transposed(edge_face_rotation(p.x, tet, g)), gradient(p.x, tet, g));
     local_number xx = S.m[0] - 1, yy = S.m[4] - 1, zz = S.m[8] - 1, dilation = xx + yy + zz;
     local_number xy = S.m[1] + S.m[3], xz = S.m[2] + S.m[6], yz = S.m[5] + S.m[7];
     local_number square = xx * xx + yy * yy + zz * zz + (local)0.5 * (xy * xy + xz * xz + yz * yz);

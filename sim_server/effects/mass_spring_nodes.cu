@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: MIT
-// Collects at each node what its springs left for it: a gather, so that no two items write one place.
+// Sums nodal impulses and diagonal blocks of the springs at each node. A gather: no two items write to the same place.
 #include "coalesced_io.cuh"
 
 struct MassSpringNodes {

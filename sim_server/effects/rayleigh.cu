@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: MIT
-// The damping of the mass; that of the stiffness is in world.stiffness_coefficient.
+// Damping of the mass; world.stiffness_coefficient includes that of the stiffness.
 #define WIDE
 #include "mat3.cuh"
 

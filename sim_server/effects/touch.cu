@@ -11,13 +11,13 @@ struct Apply {
     const real* share;       // (interactions,) 1 / nodes of the interaction
     double* start;           // (interactions,) in, out: negative until its first step [s]
     const double* duration;  // (interactions,) [s]
-    const real* push;        // (interactions, 3) [N]
+    const real* push;        // (interactions, 3) force of a push [N]
     const real* target;      // (interactions, 3) of a grab [m]
     const real* stiffness;   // (interactions,) of a grab; 0: a push [N/m]
     const real* limit;       // (interactions,) largest force of a grab [N]
     const double* clock;     // (1,) [s]
     const real* x;           // (nodes, 3) [m]
-    const real* predictor;   // (nodes, 3) world.predictor: dx_dv * predictor is the motion until the end of the step, dv apart [m/s]
+    const real* predictor;   // (nodes, 3) world.predictor: the step moves x by dx_dv (predictor + dv) [m/s]
     const real* free;        // (nodes,) 1, or 0 at fixed nodes
     own<local> block;        // (nodes, 6) what elements have put into the node's own block of A, world frame [kg]
     double dt;               // time step [s]
@@ -30,9 +30,9 @@ struct Apply {
     real* anchor;            // (nodes, 3) out: where the spring pulls to [m]
 };
 
-// A grab is a spring, implicit while it is below its limit and a constant force above. What it will be is reckoned at the end
-// of the step, with the node's own part of A for inertia; reckoned at the beginning, a stiff spring would throw the node from
-// one side of its target to the other for ever.
+// A grab is a spring: implicit below its limit, a constant force above. Which of the two is decided by its force at the end of the
+// step, estimated with the node's own block of A as inertia; by the force at the start a stiff spring would throw the node from one
+// side of its target to the other without end.
 MAILED_KERNEL(apply, Apply) {
     int node = p.node[i];
     vec3 x = load3(p.x, node), predictor = load3(p.predictor, node), b = load3(p.b, node);
@@ -43,8 +43,8 @@ MAILED_KERNEL(apply, Apply) {
     for (int e = p.first[i]; e < p.first[i + 1]; ++e) {
         int k = p.entry[e];
         double now = p.clock[0];
-        if (p.start[k] < 0) p.start[k] = now;  // whoever comes first writes the same
-        if (now + p.dt / 2 >= p.start[k] + p.duration[k]) continue;  // so many whole steps, whatever the rounding
+        if (p.start[k] < 0) p.start[k] = now;  // all nodes write the same
+        if (now + p.dt / 2 >= p.start[k] + p.duration[k]) continue;  // a whole number of steps, in spite of rounding
         real share = p.share[k];
         if (p.stiffness[k] == 0) {
             b = b + (p.h * share) * load3(p.push, k);

@@ -25,7 +25,7 @@ INLINE void add_quaternion_product(local* s, const local (&q)[4]) {
     s[7] += q[2] * q[2]; s[8] += q[2] * q[3]; s[9] += q[3] * q[3];
 }
 
-// [a]x E [b]x^T, E (6,) the upper triangle of a symmetric matrix: what the exact tangent has beside the usual one.
+// [a]x E [b]x^T, E (6,) the upper triangle of a symmetric matrix: the addition of the exact tangent to the usual one.
 INLINE void add_twist(local* s, const local (&a)[4], const local (&b)[4], const local* E) {
     const local xx = E[0], xy = E[1], xz = E[2], yy = E[3], yz = E[4], zz = E[5];
     // E [b]x^T: its rows are b x (row of E)

@@ -27,7 +27,7 @@ struct Sums {  // over nodes
     double low[3], high[3];  // range of their steps [m]
 };
 
-ANYWHERE Sums no_sums() { return {0, 0, 0, 0, {1e300, 1e300, 1e300}, {-1e300, -1e300, -1e300}}; }
+HOST_DEVICE Sums no_sums() { return {0, 0, 0, 0, {1e300, 1e300, 1e300}, {-1e300, -1e300, -1e300}}; }
 
 struct Balance {      // of a body, after its last step [J]
     double start;     // kinetic + elastic before the first step
@@ -42,11 +42,11 @@ struct Balance {      // of a body, after its last step [J]
     int found;        // 1: found to run away in the last step; the figures are then of the state at its end
 };
 
-ANYWHERE double square(double a) { return a * a; }
-ANYWHERE bool is_finite(double a) { return a - a == 0; }
+HOST_DEVICE double square(double a) { return a * a; }
+HOST_DEVICE bool is_finite(double a) { return a - a == 0; }
 
 template <class T>
-ANYWHERE void add_node(Sums& s, double mass, const T* x, const T* v, const double* step, const T* gravity) {
+HOST_DEVICE void add_node(Sums& s, double mass, const T* x, const T* v, const double* step, const T* gravity) {
     const double g[3] = {mass * gravity[0], mass * gravity[1], mass * gravity[2]};
     s.kinetic += 0.5 * mass * ((double)v[0] * v[0] + (double)v[1] * v[1] + (double)v[2] * v[2]);
     s.gravity -= g[0] * x[0] + g[1] * x[1] + g[2] * x[2];
@@ -59,13 +59,13 @@ ANYWHERE void add_node(Sums& s, double mass, const T* x, const T* v, const doubl
 
 // Work of a constant force and of a spring along the straight path from `from`: exact.
 template <class T>
-ANYWHERE double work_on(const T* force, double spring, const T* anchor, const T* from, const double* step) {
+HOST_DEVICE double work_on(const T* force, double spring, const T* anchor, const T* from, const double* step) {
     double work = 0;
     for (int c = 0; c < 3; ++c) work += (force[c] + spring * ((double)anchor[c] - from[c] - 0.5 * step[c])) * step[c];
     return work;
 }
 
-ANYWHERE double stride_of(const Sums& s) {
+HOST_DEVICE double stride_of(const Sums& s) {
     double most = 0;
     for (int c = 0; c < 3; ++c) most = s.high[c] - s.low[c] > most ? s.high[c] - s.low[c] : most;
     return most;
@@ -73,7 +73,7 @@ ANYWHERE double stride_of(const Sums& s) {
 
 // Begins the balance; `elastic` and `diagonal` are set already. s: sums before the first step, with dt v for steps; size: diagonal
 // at the start [m].
-ANYWHERE void start_balance(Balance& b, const Sums& s, double size, double dt, bool inertia) {
+HOST_DEVICE void start_balance(Balance& b, const Sums& s, double size, double dt, bool inertia) {
     if (b.phase == FROZEN) return;
     const double longest = size > b.diagonal ? size : b.diagonal;
     b.kinetic = inertia ? s.kinetic : 0;
@@ -86,7 +86,7 @@ ANYWHERE void start_balance(Balance& b, const Sums& s, double size, double dt, b
 }
 
 // Updates the balance after a step. True if the body is to be frozen now.
-ANYWHERE bool take_stock(Balance& b, const Sums& s, int on_runaway, bool inertia) {
+HOST_DEVICE bool update_balance(Balance& b, const Sums& s, int on_runaway, bool inertia) {
     b.kinetic = inertia ? s.kinetic : 0;
     b.gravity = s.gravity;
     b.stride = stride_of(s);

@@ -8,7 +8,7 @@ template <class M, class T> INLINE vec<T> pick(M first, vec<T> a, vec<T> b) {
     return {first ? a.x : b.x, first ? a.y : b.y, first ? a.z : b.z};
 }
 
-// Unit vector across the unit vector a: from the axis that a is least along.
+// Unit vector orthogonal to the unit vector a, from the axis with the smallest component of a.
 template <class T> INLINE vec<T> across(vec<T> a) {
     T x = a.x * a.x, y = a.y * a.y, z = a.z * a.z, one = T{} + 1;
     vec<T> axis = pick(x < y, pick(x < z, vec<T>{one, T{}, T{}}, vec<T>{T{}, T{}, one}),
@@ -16,9 +16,9 @@ template <class T> INLINE vec<T> across(vec<T> a) {
     return unit(cross(a, axis));
 }
 
-// The rotation that takes the unit vector `edge` along `first`, and `normal`, a unit vector across it, to the side of the
-// plane of `first` and `second` that their cross product has; lengths are near 1. Where they give no direction, any one.
-template <class T> INLINE mat<T> between(vec<T> edge, vec<T> normal, vec<T> first, vec<T> second) {
+// Rotation that takes the unit vector `edge` to the direction of `first`, and the unit vector `normal` across it to the direction of
+// first x second; lengths are near 1. Where they give no direction, any direction is taken.
+template <class T> INLINE mat<T> rotation_between(vec<T> edge, vec<T> normal, vec<T> first, vec<T> second) {
     const T none = T{} + (single<T> ? (entry<T>)1e-12 : (entry<T>)1e-24);  // of a square
     T length2 = dot(first, first);
     vec<T> b1 = pick(length2 > none, (1 / sqrt(larger(length2, none))) * first, edge);

@@ -2,7 +2,7 @@
 // Marks functions that the native loop and GPU texts share and that need nothing of kernel.h.
 #pragma once
 #ifdef __CUDACC_RTC__
-#define ANYWHERE __device__ __forceinline__
+#define HOST_DEVICE __device__ __forceinline__
 #else
-#define ANYWHERE static inline
+#define HOST_DEVICE static inline
 #endif

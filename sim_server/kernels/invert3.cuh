@@ -4,7 +4,7 @@
 
 // v = inverse of the symmetric 3x3 block a, row major; whole = false: of its diagonal alone.
 template <class T>
-ANYWHERE void invert3(const T* a, bool whole, T* v) {
+HOST_DEVICE void invert3(const T* a, bool whole, T* v) {
     if (!whole) {
         for (int m = 0; m < 9; ++m) v[m] = 0;
         v[0] = 1 / a[0]; v[4] = 1 / a[4]; v[8] = 1 / a[8];

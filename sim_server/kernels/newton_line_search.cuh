@@ -38,11 +38,11 @@ struct Limits {
     double tolerance;                  // of the first |b|
 };
 
-ANYWHERE bool is_number(double norm) { return norm <= 1.7976931348623157e308; }  // neither NaN nor infinite; norm >= 0
+HOST_DEVICE bool is_number(double norm) { return norm <= 1.7976931348623157e308; }  // neither NaN nor infinite; norm >= 0
 
 // to = R from, or R^T from, with R (3, 3) of a node
 template <class R, class F, class T>
-ANYWHERE void rotate_node(const R* rotation, bool back, const F* from, T* to) {
+HOST_DEVICE void rotate_node(const R* rotation, bool back, const F* from, T* to) {
     const int row = back ? 1 : 3, column = back ? 3 : 1;
     for (int k = 0; k < 3; ++k)
         to[k] = (T)rotation[k * row] * from[0] + (T)rotation[k * row + column] * from[1] + (T)rotation[k * row + 2 * column] * from[2];
@@ -50,7 +50,7 @@ ANYWHERE void rotate_node(const R* rotation, bool back, const F* from, T* to) {
 
 // One component of a node after the increment, from the state before the step.
 struct NodeState { double x, v, inertial_increment, damping_velocity; };
-ANYWHERE NodeState state_after(double x, double v, double predictor, double inertial_increment, double increment, double dx_dv,
+HOST_DEVICE NodeState state_after(double x, double v, double predictor, double inertial_increment, double increment, double dx_dv,
                                double beta) {
     const double after = v + increment;
     return {x + dx_dv * (predictor + increment), after, inertial_increment - increment, beta * after / (dx_dv + beta)};
@@ -59,13 +59,13 @@ ANYWHERE NodeState state_after(double x, double v, double predictor, double iner
 // Square of the elastic impulse A_ii x_i / dx_dv of node i, a = A_ii with the mass. The sum over the nodes, times the square of
 // EPSILON, is the square of the rounding error of b.
 template <class A, class X>
-ANYWHERE double elastic_impulse_square(const A* a, const X* x, double mass, double dx_dv) {
+HOST_DEVICE double elastic_impulse_square(const A* a, const X* x, double mass, double dx_dv) {
     const double stiff = ((double)a[0] + a[4] + a[8]) / 3 - mass;
     return stiff > 0 ? stiff * stiff * ((double)x[0] * x[0] + (double)x[1] * x[1] + (double)x[2] * x[2]) / (dx_dv * dx_dv) : 0;
 }
 
 // At the first linearization. norm: |b|; floor: rounding error of b; kind: preconditioner asked for.
-ANYWHERE void start_search(Search& s, double norm, double floor, int kind) {
+HOST_DEVICE void start_search(Search& s, double norm, double floor, int kind) {
     s = Search{};
     s.first = s.norm = norm;
     s.floor = floor;
@@ -73,7 +73,7 @@ ANYWHERE void start_search(Search& s, double norm, double floor, int kind) {
 }
 
 // Adds the result of a linear solve.
-ANYWHERE void record_solve(Search& s, double residual, double seconds, int iterations, int fallbacks, int kind, int status) {
+HOST_DEVICE void record_solve(Search& s, double residual, double seconds, int iterations, int fallbacks, int kind, int status) {
     if (residual > s.residual) s.residual = residual;
     s.seconds += seconds;
     s.iterations += iterations;
@@ -86,7 +86,7 @@ ANYWHERE void record_solve(Search& s, double residual, double seconds, int itera
 
 // Begins the line search along a new direction s. slope: s . A s; norm: |A s|, which is |b| at its start up to the residual of
 // the solve.
-ANYWHERE void begin_line_search(Search& s, double slope, double norm) {
+HOST_DEVICE void begin_line_search(Search& s, double slope, double norm) {
     s.slope = slope;
     s.last = norm;
     ++s.linearizations;
@@ -96,7 +96,7 @@ ANYWHERE void begin_line_search(Search& s, double slope, double norm) {
 }
 
 // Accepts or rejects a trial with norm = |b| and slope = s . b; sets the phase and the scale of the next trial.
-ANYWHERE int evaluate_trial(Search& s, const Limits& most, double norm, double slope) {
+HOST_DEVICE int evaluate_trial(Search& s, const Limits& most, double norm, double slope) {
     const double goal = most.tolerance * s.first;
     const double change = slope < 0 ? -slope : slope, before = s.slope < 0 ? -s.slope : s.slope;
     s.norm = norm;
@@ -120,10 +120,10 @@ ANYWHERE int evaluate_trial(Search& s, const Limits& most, double norm, double s
 
 // A component of the increment after a verdict. NaN if no trial of the first linearization had a finite residual: then y is NaN,
 // too, and the kernel `advance` takes the body back, as after one linearization (backends/cpu/native/pcg.h).
-ANYWHERE double increment_after(const Search& s, double increment, double direction) {
+HOST_DEVICE double increment_after(const Search& s, double increment, double direction) {
     if (s.verdict == LOST && s.linearizations <= 1) return 0 * s.norm;  // |b| is infinite or NaN
     return s.verdict == TAKEN ? increment + s.scale * direction : increment;
 }
 
 // Nonlinear residual at the end over that of the first linearization.
-ANYWHERE double residual_ratio(const Search& s) { return s.first > 0 ? s.norm / s.first : 0; }
+HOST_DEVICE double residual_ratio(const Search& s) { return s.first > 0 ? s.norm / s.first : 0; }

@@ -39,8 +39,8 @@ struct Rotate {
     real h;                    // time step [s]
     local* rotation;           // (n, 3, 3) out: frame of the node: its rotation from rest to now, or the identity
     real* b_material;          // (n, 3) out: R^T b, 0 at fixed nodes
-    real* y;                   // (n, 3) out: where the solve starts: R^T dv, R^T (-v) where the node rests, 0 at fixed nodes
-    int* moving;               // (bodies,) out: 1 where a node does not rest; else left as it is
+    real* y;                   // (n, 3) out: start of the solve: R^T dv; R^T (-v) where the node rests; 0 at fixed nodes
+    int* moving;               // (bodies,) out: set to 1 if a node of the body does not rest
     real* values;              // (blocks, 3, 3) out: R^T A R of the node's own block; the identity's at fixed nodes [kg]
 };
 
@@ -54,7 +54,7 @@ INLINE local_mat3 sum_of_rotations(own<local> mean, index i) {
              2 * (xz - wy), 2 * (yz + wx), ww - xx - yy + zz}};
 }
 
-// Frame of a node: its rotation, the one nearest to the mean of its elements' (Courtecuisse et al. 2010, section 6), or the identity.
+// Frame of a node: the rotation nearest to the mean of its elements' (Courtecuisse et al. 2010, section 6), or the identity.
 INLINE local_mat3 frame_of(const Rotate& p, index i) {
     index warped = at(p.warped, at(p.body, i));
     quaternion<local_number> rest = {local_number{} + 1, {}, {}, {}}, q = rest;
@@ -116,9 +116,9 @@ struct Advance {
     real* before;           // (n, 3) out: x when the step began [m]
 };
 
-// v += dv, x += h v (eq. 2). A body whose forces are no numbers has a y that is none (backends/cpu/native/pcg.h): it goes back to where the
-// step before began, from which the forces were known, and rests there. So no energy comes in, and what does not press it through
-// itself again lets it go on.
+// v += dv, x += h v (eq. 2). If the forces of a body are NaN, so is y (backends/cpu/native/pcg.h): the body goes back to the start
+// of the step before, where forces were finite, and rests there. This adds no energy, and the body moves on unless the same load
+// inverts it again.
 KERNEL(advance, Advance) {
     vec3 y = load3(p.y, i), dv = mul(as<number>(load9(p.rotation, i)), y), before = load3(p.v, i), v = before + dv, zero = {};
     vec3 x = load3(p.x, i);

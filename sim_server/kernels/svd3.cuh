@@ -28,7 +28,7 @@ template <class T, class M> INLINE void part(vec<T>& a, vec<T>& b, vec<T>& p, ve
     q = s * y + c * q;
 }
 
-// Swaps where it is so; the sign keeps V a rotation.
+// Swaps where `where` holds; the sign keeps V a rotation.
 template <class T, class M> INLINE void swap(M where, vec<T>& a, vec<T>& b, vec<T>& p, vec<T>& q) {
     vec<T> x = a, y = p;
     a = chosen(where, b, a);

@@ -52,7 +52,7 @@ def test_one_linearization_comes_to_the_same_as_the_step_shrinks(scheme):
 
 
 def test_each_linearization_takes_the_residual_down():
-    """The residual falls by 30 to 50 each time, not quadratically: the tangent of corotational elements is not exact."""
+    """The residual falls by 30 to 50 each time, not quadratically: the corotational tangent is not exact."""
     left = []
     for most in (2, 3, 4, 5):
         sim = beam(integrator={"linearizations": most, "tolerance": 1e-14, "trials": 0}, tolerance=1e-10)

@@ -151,7 +151,7 @@ __device__ void balance_energy(const EnergyBalance& a, int number) {
     s = sums_of_block(s);
     if (!gather(a, chunk, number, s)) return;
     if (threadIdx.x == 0) {
-        away = take_stock(b, s, a.on_runaway, a.inertia);
+        away = update_balance(b, s, a.on_runaway, a.inertia);
         a.balance[chunk.body] = b;
         write_record(a, b, chunk.body, step - 1);
         a.settled_step[chunk.body] = step;

@@ -93,7 +93,7 @@ static void account(Loop& loop, bool elastic) {
     Energies& e = *loop.energies;
 #pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) if (loop.threads > 1 && loop.bodies > 1)
     for (int i = 0; i < loop.bodies; ++i) {
-        const bool frozen = take_stock(e.balance[i], sums_of(loop, loop.body[i]), e.on_runaway, e.inertia);
+        const bool frozen = update_balance(e.balance[i], sums_of(loop, loop.body[i]), e.on_runaway, e.inertia);
         if (frozen) freeze(loop, loop.body[i]);
     }
     if (elastic) measure_elastic(loop);
