@@ -15,9 +15,7 @@ class NativeEnergies:
     def __init__(self, energies: Energies):
         e = self._energies = energies
         self._parts = [e.parts(elements) for elements in e.elastic]
-        self._bindings = [
-            structs.Binding(params=c.addressof(x.launch.params), items=x.launch.items) for x in e.elastic
-        ]
+        self._bindings = [structs.Binding(params=c.addressof(x.launch.params), items=x.launch.items) for x in e.elastic]
         self._elastic = (structs.Elastic * max(len(e.elastic), 1))()
         for entry, x, parts, binding in zip(self._elastic, e.elastic, self._parts, self._bindings, strict=False):
             entry.launch.kernel, entry.launch.binding = x.launch.function, c.addressof(binding)

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_server.backends.declarations import Declarations
+from sim_server.backends.gpu.cupy_types import DeviceArray
 from sim_server.backends.gpu.device import Gpu
 from sim_server.backends.gpu.inverse.plan import Plan
 from sim_server.backends.gpu.structs import PCG
@@ -160,7 +161,7 @@ class DevicePlan:
         self._params = gpu.cp.asarray(params.reshape(1).view(np.uint8))
         self.address = int(self._params.data.ptr)
 
-    def vectors(self) -> dict[str, Any]:
+    def vectors(self) -> dict[str, DeviceArray]:
         """Allocates the vectors of one body, as flag words (block_group.cuh) with exchange number 0."""
         zeros, n = self.gpu.cp.zeros, self.plan.size + PADDING
         return {

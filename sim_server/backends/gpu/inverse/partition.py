@@ -8,7 +8,7 @@ phases per group without dependencies inside. Runs on the host, once per pattern
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 from protocol.factor import FactorPattern
 from sim_server.arrays import Int64
 
+Count = TypeVar("Count", int, NDArray[Any])
 NODE = 3  # degrees of freedom of a node
 COLUMNS, ROWS = 32, 8  # of a chunk of the stored matrices
 
 
-def padded(count: Any, step: int) -> Any:
+def padded(count: Count, step: int) -> Count:
     """Returns the next multiple of `step`."""
     return -(-count // step) * step
 
