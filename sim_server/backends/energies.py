@@ -11,14 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_server.arrays import Float64, Int32, Int64
-from sim_server.backends.kinds import BALANCE
+from sim_server.backends.kinds import ON_RUNAWAY
 from sim_server.scene.solver_options import OnRunaway
 
-_numbers = BALANCE.enumeration("OnRunaway")
 CODES: dict[OnRunaway | None, int] = {  # None: bodies are not watched at all
-    "freeze": _numbers["FREEZE"],
-    "go_on": _numbers["GO_ON"],
-    None: _numbers["UNWATCHED"],
+    "freeze": ON_RUNAWAY["FREEZE"],
+    "go_on": ON_RUNAWAY["GO_ON"],
+    None: ON_RUNAWAY["UNWATCHED"],
 }
 
 

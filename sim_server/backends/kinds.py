@@ -6,7 +6,9 @@ from enum import IntEnum, auto
 from sim_server.backends.declarations import Declarations
 
 KINDS = Declarations("kernels/kinds.h")
-BALANCE = Declarations("kernels/energy_balance.cuh")
+_balance = Declarations("kernels/energy_balance.cuh")
+ON_RUNAWAY = _balance.enumeration("OnRunaway")
+SLACK_OF_ENERGY: float = _balance.constant("SLACK_OF_ENERGY")
 
 
 class Kind(IntEnum):

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from protocol import messages_pb2 as pb
 from protocol.method import Method
-from sim_server.backends.kinds import BALANCE
+from sim_server.backends.kinds import SLACK_OF_ENERGY
 from sim_server.mechanics.named_points import NamedPoints
 from sim_server.network.link import ServerLink
 from sim_server.recording import messages
@@ -28,7 +28,6 @@ LOOK_PERIOD = 0.02  # s between checks for subscribers
 MAX_BATCH = 4096  # step records sent together at most
 STATISTICS_STEPS = 1000  # last steps that percentiles and means are taken over
 ENERGY_STEPS = 20  # steps between elastic energies in real time: one costs up to a fifth of a step
-SLACK_OF_ENERGY: float = BALANCE.constant("SLACK_OF_ENERGY")
 
 
 class Telemetry:

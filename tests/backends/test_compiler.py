@@ -264,7 +264,7 @@ def _launch(path: str, struct: str, name: str, mailed: bool = False) -> SimpleNa
 def kernels(launches: list[SimpleNamespace], monkeypatch) -> list[tuple[list, frozenset[int]]]:
     """Which launches are put together into one kernel each, and which arrays need no memory there."""
     monkeypatch.setattr(kernel_fusion, "FusedKernel", lambda together, end, private, *_: (together, private))
-    return kernel_fusion.fused(launches)  # type: ignore[arg-type]
+    return kernel_fusion.fuse(launches)  # type: ignore[arg-type]
 
 
 NODES = [

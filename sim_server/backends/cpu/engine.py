@@ -195,7 +195,7 @@ class CpuEngine(Reports):
         nodes: 1 to 64. diagonal: (nodes of the scene,) [kg], as assembled. double: also factors in float64. Before the
         first step only.
         """
-        assert 1 <= nodes <= 64, "MOST in backends/cpu/native/woodbury.h"
+        assert 1 <= nodes <= structs.MAX_CORRECTED
         entry = self._body[body]
         count, width = entry.last - entry.first, -(-3 * nodes // 8) * 8
         room: dict[str, NDArray[Any]] = {

@@ -54,6 +54,7 @@ struct Correction {
     void* columns;          // (3 nodes, width) V, in the values' type, only rows of its supernodes
 };
 
+constexpr int MAX_CORRECTED = 64;              // nodes
 constexpr double NOTHING = 0.004;              // relative to the node's own block: smaller changes are ignored
 constexpr double WEAK = 0.2, WEAK_EACH = 0.02;  // likewise, for the sum of all changes and their mean: below, no correction
 // Larger changes, in blocks, are corrected as this much: one cluster of eigenvalues remains, and rounding stays small. Of a larger
@@ -193,7 +194,7 @@ private:
     // many nodes, or changes too small.
     bool choose() {
         if (c.count < 0) return false;
-        int changed = 0, others = 0, chosen[MOST];
+        int changed = 0, others = 0, chosen[MAX_CORRECTED];
         double together = 0;
         for (int i = 0; i < c.nodes; ++i) {
             const double delta = c.diagonal[i] - c.then[i];
@@ -304,7 +305,6 @@ private:
         return true;
     }
 
-    static constexpr int MOST = 64;
 };
 
 // Records changes of the diagonal after the launches of a step.
