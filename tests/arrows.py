@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Counts what the layout is judged by: `python -m tests.arrows [CHECKOUT]`.
 
-A node is a folder of the product, or a file at the root of a package. An arrow says that a file of one node imports
-something of another, at the top of the file, later or for a type alone; or that a C++ or CUDA text includes a header
-of another. Arrows that point up: the fewest whose removal leaves no cycle.
+A node is a folder of a package with all that is in it, or a file at the root of a package. An arrow says that a file
+of one node imports something of another, at the top of the file, later or for a type alone; or that a C++ or CUDA text
+includes a header of another. Arrows that point up: the fewest whose removal leaves no cycle.
 """
 
 import ast
@@ -36,10 +36,10 @@ def product(root: Path) -> dict[Path, str]:
     return {path: text for package in PACKAGES for path, text in sources(root, package).items()}
 
 
-def node(root: Path, path: Path) -> str:
-    """Node that a file belongs to: "sim_server.backends.gpu", or "sim_server.cli" for a file at the root."""
+def node(root: Path, path: Path, depth: int) -> str:
+    """Node that a file belongs to: "sim_server.backends", or "sim_server.cli" for a file at the root."""
     parts = path.relative_to(root).with_suffix("").parts
-    return ".".join(parts if len(parts) == 2 else parts[:-1])
+    return ".".join(parts if len(parts) == 2 else parts[: min(len(parts) - 1, depth)])
 
 
 def imported(text: str) -> Iterator[str]:
@@ -51,8 +51,8 @@ def imported(text: str) -> Iterator[str]:
             yield from (f"{found.module}.{alias.name}" for alias in found.names)
 
 
-def arrows(root: Path = ROOT) -> Graph:
-    """Nodes that each node of the product depends on."""
+def arrows(root: Path = ROOT, depth: int = 2) -> Graph:
+    """Nodes that each node of the product depends on. depth: 2: folders within folders are no nodes of their own."""
     texts = product(root)
     modules = {".".join(f.relative_to(root).with_suffix("").parts).removesuffix(".__init__"): f for f in texts}
     headers = {f.name: f for f in texts if f.suffix in (".h", ".cuh")} | {f: f for f in texts}
@@ -60,14 +60,14 @@ def arrows(root: Path = ROOT) -> Graph:
     for path, text in texts.items():
         if path.name == "__init__.py" and len(path.relative_to(root).parts) == 2:
             continue  # of a package: empty
-        own = node(root, path)
+        own = node(root, path, depth)
         graph.setdefault(own, set())
         if path.suffix == ".py":
             found = [modules.get(name) or modules.get(name.rpartition(".")[0]) for name in imported(text)]
         else:
             names = re.findall(r'#include "([^"]+)"', text)
             found = [headers.get((path.parent / name).resolve()) or headers.get(Path(name).name) for name in names]
-        graph[own] |= {node(root, f) for f in found if f is not None} - {own}
+        graph[own] |= {node(root, f, depth) for f in found if f is not None} - {own}
     return {name: to & graph.keys() for name, to in graph.items()}
 
 
