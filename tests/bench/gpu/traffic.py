@@ -47,9 +47,9 @@ def factor(size: Size, iterations: float) -> float:
 def assembly(size: Size) -> float:
     """Elements, nodes and blocks before the solve, x and v after it; without the values of A.
 
-    An element reads its corners and 12 constants, leaves 33 numbers (rotation, scaled gradients, push), which the
-    nodes' and blocks' lists (4 and 10 pairs) read again; a node reads and writes about 50 numbers, a block on or above
-    the diagonal reads four indices.
+    An element reads its corners and 12 constants, writes 33 numbers (rotation, scaled gradients, nodal impulses),
+    which the nodes' and blocks' lists (4 and 10 pairs) read again; a node reads and writes about 50 numbers, a
+    block on or above the diagonal reads four indices.
     """
     element = INDEX * (4 + 4 + 2 * 10) + size.real * (12 + 2 * 33 + 1)
     return element * size.tets + 50 * size.real * size.nodes + 4 * INDEX * size.upper

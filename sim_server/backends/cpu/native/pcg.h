@@ -1,15 +1,16 @@
 // SPDX-License-Identifier: MIT
 // Preconditioned conjugate gradients for one body, numbered after Saad, Iterative Methods for Sparse Linear Systems, 2nd
-// edition, algorithm 9.1. What differs from the book:
-//   - a step counts as solved only by its true residual |b - A x| <= tolerance |b|, computed at the end; where the recursive one was
-//     too good the iteration starts again from the true one;
-//   - it starts from the last solution where that is better than zero;
-//   - of a body at rest, whose b is rounding (kernels/nodes.cu says when), x stays what it is at the start: to stand still;
-//   - p'Ap <= 0 and z'r <= 0 are looked for and named; a factor with z'r <= 0 is left for block Jacobi on the spot, and one that
-//     is not a quarter of the way (in decades of the residual) after half the iterations allowed, if these are ENOUGH, is left
-//     then: a useless factor costs iterations and never the answer. Not half of the way: the method speeds up, and an old factor
-//     would be left that still gets there. Of few iterations the first ones tell nothing, and block Jacobi makes nothing of the rest;
-//   - a budget of time makes one iteration at least: zero would leave a body without its forces;
+// edition, algorithm 9.1. Differences from the book:
+//   - a solve has converged only if its true residual, computed at the end, has |b - A x| <= tolerance |b|; if the recursive one was
+//     too small the iteration restarts from the true one;
+//   - it starts from the last solution if that is better than zero;
+//   - for a body at rest, whose b is rounding (criterion: kernels/nodes.cu), x keeps its initial value, so that the body stands still;
+//   - breakdowns p'Ap <= 0 and z'r <= 0 are detected and reported. A factor with z'r <= 0 is replaced by block Jacobi at once; so is
+//     one that has not reduced the residual by a quarter of the decades required after half of max_iterations (if that is at least
+//     ENOUGH): a useless factor costs iterations, but never the answer. A quarter, not half, since convergence speeds up, and an old
+//     factor that still converges would be dropped. With few iterations the first ones tell nothing, and block Jacobi cannot use the
+//     rest;
+//   - a time budget allows at least one iteration: with none a body would miss its forces.
 // An iteration is one application of A after the initial residual.
 #pragma once
 #include "bsr.h"
@@ -73,7 +74,7 @@ struct Preconditioner {
     }
 };
 
-// work: 9 n doubles. x: start in, solution out. rests: the body does. correction: of the factor, or null.
+// Solves A x = b. work: 9 n doubles; x: start in, solution out; rests: the body is at rest; correction: of the factor, or null.
 static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor, const SolveSettings& settings, double* x,
                        double* work, bool rests = false, Correction* correction = nullptr) {
     double start = now();
@@ -147,7 +148,7 @@ static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor,
         if (r2 > goal) continue;
         r2 = residual(A, b, x, r);
         if (r2 <= goal) return finish(CONVERGED, r2, b2);
-        if (!(r2 < 0.25 * last_true)) return finish(MAX_ITERATIONS, r2, b2);     // rounding is reached: more does not help
+        if (!(r2 < 0.25 * last_true)) return finish(MAX_ITERATIONS, r2, b2);     // limited by rounding: more iterations do not help
         last_true = r2;
         restart = true;
     }
