@@ -15,6 +15,8 @@ from sim_server.backends.cpu.device import CpuModule
 from sim_server.backends.gpu import kernel_fusion
 from sim_server.backends.gpu.device import PRECISIONS, own_headers
 from sim_server.backends.gpu.device import options as device_options
+from sim_server.backends.gpu.energies import BALANCE_TEXT
+from sim_server.backends.gpu.engine import EPILOGUE
 from sim_server.backends.kernel_binding import domain_of, members_of
 from tests.support import nvrtc
 
@@ -234,14 +236,25 @@ def test_the_last_kernel_of_a_step_compiles_with_the_end_of_the_step(arch, name,
     if (library := nvrtc.library()) is None:
         pytest.skip("needs the package nvidia-cuda-nvrtc")
     advance = _launch(f"kernels/{name}.cu", "Advance", f"{name}.advance")
-    end = kernel_fusion.Epilogue(
-        (SOURCES / "backends/gpu/step_epilogue.cu").read_text(), "StepEpilogue", "finish_step", np.zeros(())
-    )
+    end = kernel_fusion.Epilogue(EPILOGUE.checked(), "StepEpilogue", "finish_step", np.zeros(()))
     text = tmp_path / "last.cu"
     text.write_text(kernel_fusion.FusedSource([advance], kernel_fusion.BlockShape(32, 1), end).source)  # type: ignore[list-item]
     code, said = nvrtc.compiled(
         library, text, [f"-arch={arch}", "-std=c++17", f"-I{backend.INCLUDE}", f"-I{SOURCES / 'backends/gpu'}"]
     )
+    assert len(code) > 1000 and not said, said
+
+
+def test_the_first_kernel_of_a_step_compiles_with_the_energy_balance(tmp_path):
+    if (library := nvrtc.library()) is None:
+        pytest.skip("needs the package nvidia-cuda-nvrtc")
+    advance = _launch("kernels/time_integration.cu", "Advance", "time_integration.advance")
+    first = kernel_fusion.Prologue(BALANCE_TEXT.checked(), "EnergyBalance", "balance_energy", np.zeros(()), 3)
+    text = tmp_path / "first.cu"
+    shape = kernel_fusion.BlockShape(32, 1)
+    text.write_text(kernel_fusion.FusedSource([advance], shape, prologue=first).source)  # type: ignore[list-item]
+    folders = [f"-I{folder}" for folder in (backend.INCLUDE, SOURCES / "backends/gpu")]
+    code, said = nvrtc.compiled(library, text, ["-arch=sm_90", "-std=c++17", *folders])
     assert len(code) > 1000 and not said, said
 
 
