@@ -31,7 +31,9 @@ def asserted(tmp_path: Path, include: str, *declarations: Declarations) -> Path:
 
 def test_the_compiler_agrees_with_all_that_the_loop_shares(tmp_path):
     source = asserted(tmp_path, "backends/gpu/loop.h", structs.LOOP)
-    assert "GpuLoop.frame_copies" in source.read_text() and "PcgResult.probe" in source.read_text()
+    results = structs.LOOP.assertions("PcgResult", "NewtonResult", "StepTimestamp")
+    source.write_text(source.read_text() + results)
+    assert "GpuLoop.frame_copies" in source.read_text()
     command = [compiler(), "-std=c++17", "-fsyntax-only", "-x", "c++", f"-I{SOURCES}", f"-I{INCLUDE}", str(source)]
     assert subprocess.run(command, capture_output=True, text=True).stderr == ""
 

@@ -11,20 +11,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_server.arrays import Float64, Int32
-from sim_server.backends.cpu.structs import BALANCE
 from sim_server.backends.declarations import Declarations
 from sim_server.backends.energies import CODES, Energies
 from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction
 from sim_server.backends.gpu.device import DeviceLaunch, Gpu, compiled, options, own_headers
 from sim_server.backends.gpu.kernel_fusion import Prologue
 from sim_server.backends.gpu.mailbox import library
-from sim_server.backends.gpu.structs import ENERGY_RECORD
 
 BALANCE_TEXT = Declarations("backends/gpu/energy_balance.cu")
 ELASTIC_TEXT = Declarations("backends/gpu/elastic_energy.cu")
 THREADS: int = ELASTIC_TEXT.constant("THREADS")  # of a thread block of elastic_energy.cu
 NODES = 128  # nodes that a thread block sums over
 ENERGY_BALANCE = BALANCE_TEXT.dtype("EnergyBalance")
+BALANCE, ENERGY_RECORD = BALANCE_TEXT.dtype("Balance"), BALANCE_TEXT.dtype("EnergyRecord")
 NODE_CHUNK = BALANCE_TEXT.dtype("NodeChunk")
 SUMS = BALANCE_TEXT.dtype("Sums").itemsize // 8  # numbers
 ELASTIC_ENERGY = ELASTIC_TEXT.dtype("ElasticEnergy")

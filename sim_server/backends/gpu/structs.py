@@ -8,9 +8,9 @@ from sim_server.backends.declarations import Declarations
 LOOP = Declarations("backends/gpu/loop.h")
 PCG = Declarations("backends/gpu/pcg_structs.cuh")
 ENERGY_RECORD = LOOP.dtype("EnergyRecord")
-PCG_RESULT = LOOP.dtype("PcgResult")
-NEWTON_RESULT = LOOP.dtype("NewtonResult")
-STEP_TIMESTAMP = LOOP.dtype("StepTimestamp")
+PCG_RESULT = PCG.dtype("PcgResult")
+NEWTON_RESULT = PCG.dtype("NewtonResult")
+STEP_TIMESTAMP = PCG.dtype("StepTimestamp")
 _requests = LOOP.enumeration("Request")
 REQUEST_VALUES, REQUEST_POSITIONS = _requests["REQUEST_VALUES"], _requests["REQUEST_POSITIONS"]  # of a BodyReadback
 FRAME_COPIES: int = LOOP.constant("FRAME_COPIES")  # frames under way at most
