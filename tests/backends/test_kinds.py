@@ -2,8 +2,8 @@
 """Kinds of preconditioners and ways for a solve to end have the same numbers in C++, in Python and on the wire."""
 
 from protocol import messages_pb2 as pb
+from sim_server.backends.energies import CODES
 from sim_server.backends.kinds import KINDS, Kind
-from sim_server.mechanics.energy import CODES
 
 
 def test_python_knows_every_preconditioner_of_the_loops():

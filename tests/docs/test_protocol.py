@@ -61,7 +61,7 @@ def test_channels() -> None:
         ("scenes.md", f"{MOST_TETS:,} tetrahedra in all"),
         ("use.md", f"above {recorder.FRAME_BYTES >> 20} MiB"),
         ("use.md", f"above {recorder.TOTAL_BYTES >> 20} MiB all records"),
-        ("use.md", f"up to {cli.WORKERS_JOIN:g} s"),
+        ("use.md", f"up to {cli.WORKER_TIMEOUT:g} s"),
         ("gpu.md", f"{CHANNELS['factor'].bulk >> 30} GiB"),
         ("scenes.md", f"is at most {integrator_options.MAX_STATES}"),
     ],
