@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from sim_server.network.link import ServerLink
 from sim_server.recording import messages
-from sim_server.service.service import NAP
+from sim_server.service.service import ROUND_PERIOD
 from sim_server.service.supervisor import Supervisor
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
@@ -91,7 +91,7 @@ class Served:
             if time.monotonic() > end:
                 raise RuntimeError(f"no factor of a {self._worker} worker came within {PATIENCE:g} s")
             self.driver.pump()
-            time.sleep(NAP)
+            time.sleep(ROUND_PERIOD)
         self._pumped(0.5)
         return self._pumped(seconds)
 
@@ -99,7 +99,7 @@ class Served:
         found, end = [], time.monotonic() + seconds
         while time.monotonic() < end:
             found.append(self.driver.pump())
-            time.sleep(NAP)
+            time.sleep(ROUND_PERIOD)
         return np.concatenate(found)
 
     def publishing(self, seconds: float, on: bool) -> tuple[NDArray[Any], int]:
@@ -116,9 +116,9 @@ class Served:
             if on and wanted is None and self.link.dispatch.ready():
                 wanted = np.empty_like(self.sim.system.values)
                 self.engine.request_matrix(0, wanted)
-            time.sleep(NAP)
+            time.sleep(ROUND_PERIOD)
         while wanted is not None and self.engine.matrix_step(0) < 0:
-            time.sleep(NAP)
+            time.sleep(ROUND_PERIOD)
         return np.concatenate(found), sent
 
 

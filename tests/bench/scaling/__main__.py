@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from sim_server.errors import DeviceError
 from sim_server.network.link import ServerLink
 from sim_server.recording import messages
-from sim_server.service.service import NAP
+from sim_server.service.service import ROUND_PERIOD
 from sim_server.service.supervisor import Supervisor
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
@@ -121,7 +121,7 @@ class Run:
         while len(self.link.dispatch.workers()) < self.workers:
             if time.monotonic() > end:
                 raise RuntimeError(f"{self.workers} workers have not joined within {PATIENCE:g} s")
-            time.sleep(NAP)
+            time.sleep(ROUND_PERIOD)
         self._thread.start()
         begun = time.monotonic()
         while min(t.factors.used for t in self.driver.bodies) == 0 and time.monotonic() < begun + warm:
@@ -140,7 +140,7 @@ class Run:
         if self._failure is not None:
             raise self._failure
         records = self.driver.pump()
-        time.sleep(NAP)
+        time.sleep(ROUND_PERIOD)
         return records
 
     def _used(self) -> int:
