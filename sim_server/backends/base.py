@@ -248,7 +248,7 @@ class Backend(Protocol):
 
     @property
     def name(self) -> str:
-        """The word for it: cpu or gpu."""
+        """Name of the device in scenes and logs: cpu or gpu."""
         ...
 
     def building(self) -> AbstractContextManager[None]:

@@ -97,7 +97,7 @@ class Compilers:
 
     @contextmanager
     def counted(self) -> Iterator[None]:
-        """For a kernel that another compiler makes, within: it counts for `progress`, unless that compiler had it."""
+        """Counts a kernel that another compiler makes within the context, unless it was in that compiler's cache."""
         begun = time.monotonic()
         yield
         if time.monotonic() - begun > KEPT and self.progress is not None:

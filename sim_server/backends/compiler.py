@@ -110,7 +110,7 @@ def begin(source: Path, defines: tuple[str, ...] = (), text: str | None = None) 
 
 
 def used(source: Path, library: Path, stepping: bool = True) -> None:
-    """Notes that this process uses a library. stepping: what a step computes comes out of it."""
+    """Notes that this process uses a library. stepping: True if results of steps depend on it."""
     compiled.append(source.name)
     if stepping:
         libraries.add(library.name)

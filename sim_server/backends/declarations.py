@@ -38,7 +38,7 @@ Struct = TypeVar("Struct", bound=c.Structure)
 
 
 class StructSize(c.Structure):
-    """native/sizes.h"""
+    """Size of a struct by name, as backends/cpu/native/sizes.h exports it."""
 
     _fields_ = [("name", c.c_char_p), ("bytes", c.c_int64)]
 

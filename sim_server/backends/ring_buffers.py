@@ -12,7 +12,7 @@ Reals = NDArray[np.float64]
 
 
 class Reports:
-    """Base of the engines. loop: a ctypes structure with the fields of layouts.Rings.
+    """Base of the engines. loop: a ctypes structure with the fields of structs.Rings.
 
     records: room for so many, four steps at least. frames: memory (capacity, 2, nodes, 3) for x and v of frames, in the
     type that the device has them in.

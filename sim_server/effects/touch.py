@@ -197,7 +197,7 @@ class Touch(Effect):
         return not any(a.stiffness for a in self._applied)
 
     def known_to_workers_at(self, step: int) -> bool:
-        """There was no grab among what the loop had taken up by then, which may be other than it was given last."""
+        """True if no grab was among the interactions that the loop had taken up before `step`; newer ones may wait."""
         for pending, known in reversed(tuple(self._given)):
             if pending is None or 0 <= pending.taken <= step:
                 return known
@@ -229,7 +229,7 @@ class Touch(Effect):
 
     @property
     def applied(self) -> list[Interaction]:
-        """All that the loop was given last, as it was given them."""
+        """Interactions that the loop was given last."""
         return self._applied
 
     def restore(self, interactions: list[Interaction]) -> None:

@@ -307,7 +307,7 @@ def not_finite_lines(simulation: Simulation, records: NDArray[Any], known: set[s
 
 
 def cause_of(r: np.void) -> str:
-    """What showed in a record (layouts.RECORD) that a body had run away."""
+    """Says what a record (structs.RECORD) shows of a body that ran away."""
     if not (np.isfinite(r["kinetic"]) and np.isfinite(r["gravity"])):
         return "its positions or velocities are no finite numbers"
     if r["kinetic"] > SLACK_OF_ENERGY * max(r["budget"], 0.0):

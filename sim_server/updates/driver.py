@@ -75,8 +75,7 @@ class Driver:
         return np.concatenate(out or [self.engine.records()])
 
     def pump(self) -> NDArray[Any]:
-        """Does what belongs beside a loop that runs on its own: records in, factors in, matrices out. Returns the new
-        records."""
+        """Reads records, posts factors and sends matrices while the loop runs on its own. Returns the new records."""
         records = self._new_records()
         if self.wants_factors:
             self.policy.pump()
@@ -141,7 +140,10 @@ class Driver:
             self.fail(name, reason)
 
     def adopt(self, factor: Factor) -> None:
-        """Puts a factor into its body's mailbox, unless a newer one is there or the check refuses it."""
+        """Puts a factor into its body's mailbox, unless a newer one is there or the check refuses it.
+
+        The factor of a frozen body is not checked, since no solve uses it.
+        """
         state = self.by_name[factor.object]
         self.policy.on_job_end()
         matrix = self.snapshots.release(state, factor.step)

@@ -35,7 +35,7 @@ class CpuModule(KernelText):
         return ctypes.CDLL(str(self._path))
 
     def address(self, kernel: str) -> int:
-        """Of a kernel's function."""
+        """Returns the address of a kernel's function."""
         found = ctypes.cast(getattr(self.library, kernel), ctypes.c_void_p).value
         assert found is not None
         return found

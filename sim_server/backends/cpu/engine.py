@@ -69,7 +69,7 @@ class NativeFactor:
 
     @property
     def address(self) -> int:
-        """What mailboxes hold."""
+        """Address of the native struct, which a mailbox takes."""
         return c.addressof(self.native)
 
     def fill(self, values: NDArray[Any], step: int) -> None:
@@ -171,7 +171,7 @@ class CpuEngine(Reports):
         self._native.wf_solve(c.byref(self.loop))
 
     def _begin(self) -> None:
-        """What a scheme makes of the state before the first step."""
+        """Runs the launches of the scheme that come before the first step."""
         if self.step == 0:
             for launch in self.begin:
                 launch()
@@ -236,10 +236,10 @@ class CpuEngine(Reports):
         self._native.wf_post_factor(c.byref(self._body[body]), buffer.address)
 
     def settle_factors(self) -> None:
-        """Sees to it that the next solve uses what was posted; here it does so anyway."""
+        """Blocks until posted factors are in use. No-op on the CPU."""
 
     def _free_buffer(self, body: int, pattern: FactorPattern, dtype: np.dtype) -> NativeFactor:
-        """One that the loop does not have. What still waits is taken back, since a newer one is coming.
+        """Returns a buffer that the loop does not use. A waiting factor is taken back: a newer one comes.
 
         Which one the loop has follows from what the mailbox gives back. Its own pointer would not do: between taking
         a factor out of the mailbox and noting it there the loop has both.

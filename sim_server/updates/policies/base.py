@@ -29,7 +29,7 @@ class UpdatePolicy(ABC):
 
     @abstractmethod
     def step(self) -> None:
-        """Makes one step with what belongs before and after it; none if the loop was stopped."""
+        """Makes one step, with the exchange of factors before and after it; none if the loop was stopped."""
 
     @abstractmethod
     def wants(self, request: UpdateRequest, step: int) -> bool:

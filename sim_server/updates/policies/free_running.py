@@ -136,5 +136,5 @@ class Adaptive(Async):
         return is_worthwhile(request, self.driver.solver.update_threshold)
 
     def max_age(self) -> int:
-        """Returns -1: a factor is kept as long as it does."""
+        """Returns -1: no age makes a factor too old."""
         return -1

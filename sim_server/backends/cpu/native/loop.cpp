@@ -26,8 +26,7 @@ static void run(const Launch& l, int threads) {
     for (int k = 0; k < parts; ++k) l.kernel(l.binding->params, (int)(items * k / parts), (int)(items * (k + 1) / parts));
 }
 
-// The same for the bodies whose search is not over: arguments stay as they are within a step. What is not told apart by bodies
-// runs for all; the next step begins all over.
+// The same for the bodies whose search is not over. A launch whose items are not grouped by body runs for all bodies.
 static void run_for_those_left(const Loop& loop, const Launch& l) {
     const Search* search = loop.newton->search;
     int left = 0;
@@ -38,7 +37,7 @@ static void run_for_those_left(const Loop& loop, const Launch& l) {
         if (search[i].phase != DONE && l.parts[i] < l.parts[i + 1]) l.kernel(l.binding->params, l.parts[i], l.parts[i + 1]);
 }
 
-// Linearizes, solves and tries until every body has what it is to have; then y is its whole change of velocity.
+// Linearizes, solves and tries until the search of every body is over; then y is the whole change of velocity.
 static void search_all(Loop& loop) {
     double begin = now(), solving = 0;
     for (bool left = true; left;) {
@@ -59,8 +58,8 @@ static void take_factor(Body& body) {
     if (const Factor* next = body.mail.exchange(nullptr)) body.factor = next;
 }
 
-// Settings and factor of a step, in this order: who asks for a factor's use has posted it before. What is written to the settings
-// later is for the next step, or a step would be recorded as asked for what it did not have.
+// Takes the settings and then the factor of a step: a factor is posted before settings ask for it. Settings written later apply to
+// the next step, so that the record has those that the step was made with.
 static void take_orders(Body& body) {
     body.now = body.settings;
     take_factor(body);
