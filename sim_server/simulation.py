@@ -175,7 +175,7 @@ class Simulation:
         return sorted(found, key=lambda r: r.time)
 
     def potential_energy(self) -> float:
-        """Of all effects [J]."""
+        """Returns the potential energy of all effects at the present state [J]."""
         self.fetch()
         return sum(e.energy() for e in self.effects.values())
 

@@ -33,7 +33,7 @@ class ModifiedCholesky:
 
     @property
     def pattern(self) -> FactorPattern:
-        """The same for every matrix."""
+        """Pattern of L, the same for every matrix."""
         return self._analysis.pattern
 
     @property

@@ -6,7 +6,7 @@ from importlib.metadata import version as of_package
 
 
 def version() -> str:
-    """Of the package as installed; said so where it runs from its files alone."""
+    """Returns the version of the installed package, or says that it runs from its files alone."""
     try:
         return of_package("warpfactor")
     except PackageNotFoundError:

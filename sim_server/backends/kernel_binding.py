@@ -66,7 +66,7 @@ def structure_of(members: list[Argument]) -> type[ctypes.Structure]:
 def _signature(
     text: str, kernel: str, module: str, types: tuple[tuple[str, str], ...]
 ) -> tuple[list[Argument], str, str]:
-    """Once for each kernel: touch.apply is bound anew whenever clients move what they hold."""
+    """Reads the signature of a kernel. Cached, since touch.apply is bound anew at each move of a grab."""
     found = re.search(rf"^(MAILED_|SUM_)?KERNEL\({kernel}, (\w+)[,)]", text, re.MULTILINE)
     if found is None:
         raise CompileError(f"no kernel {kernel} in {module}.cu")

@@ -73,6 +73,13 @@ class Effect:
     def connect(self, simulation: EffectUpdates) -> None:
         """Called once the loop exists. An effect that changes while steps run keeps `simulation`."""
 
+    def balance_arrays(self) -> dict[str, Float64]:
+        """Returns arrays that the energy balance of a step reads, by their names in backends.energies; {} for most.
+
+        gravity: acceleration (3,) [m/s2]. force (n, 3) [N], spring (n,) [N/m], anchor (n, 3) [m]: of pushes and grabs.
+        """
+        return {}
+
     def energies(self) -> ElementEnergies | None:
         """Potential energies of its elements; None for an effect without."""
         return None

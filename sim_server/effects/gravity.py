@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
+from sim_server.arrays import Float64
 from sim_server.backends.base import Launch
 from sim_server.effects._base import Effect
 from sim_server.mechanics.system import Stencil, System
@@ -43,6 +44,9 @@ class Gravity(Effect):
                 "gravity", w.nodes, mass=w.mass, g=self.g, h=w.force_coefficient, b=system.b
             )
         ]
+
+    def balance_arrays(self) -> dict[str, Float64]:
+        return {"gravity": self.g}
 
     def energy(self) -> float:
         """Potential energy -sum m g . x, zero at the origin [J]."""

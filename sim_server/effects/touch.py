@@ -191,6 +191,9 @@ class Touch(Effect):
         past = max(float(self._system.clock[0]) - push.start, 0.0) if push.start >= 0 else 0.0
         return push if push.duration <= past + ORPHANED_PUSH else replace(push, duration=past + ORPHANED_PUSH)
 
+    def balance_arrays(self) -> dict[str, Float64]:
+        return {"force": self.force, "spring": self.spring, "anchor": self.anchor}
+
     @property
     def known_to_workers(self) -> bool:
         """False while there are grabs: workers do not know them."""

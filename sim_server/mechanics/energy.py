@@ -14,7 +14,10 @@ from sim_server.scene.solver_options import OnRunaway
 
 
 class StoresEnergy(Protocol):
-    """An effect, as far as it stores energy."""
+    """An effect, as far as it takes part in the energy balance."""
+
+    def balance_arrays(self) -> dict[str, Float64]:
+        """Arrays of it that the balance reads, by name."""
 
     def energies(self) -> ElementEnergies | None:
         """Potential energies of its elements, or None for an effect without any."""
@@ -25,9 +28,9 @@ def collected_energies(
     on_runaway: OnRunaway | None,
 ) -> Energies:  # fmt: skip
     """Returns the input of an engine. before, still, on_runaway: as of Energies."""
-    gravity: Float64 = getattr(effects.get("gravity"), "g", np.zeros(3))
+    touch = {name: array for effect in effects.values() for name, array in effect.balance_arrays().items()}
+    gravity = touch.pop("gravity", np.zeros(3))
     world.backend.keep(gravity)
-    touch = effects.get("touch")
     balance = np.zeros(len(world.bodies), structs.BALANCE)
     for body, b in zip(world.bodies, balance, strict=True):
         b["mass"] = world.mass[body.nodes].sum()
@@ -35,7 +38,7 @@ def collected_energies(
     return Energies(
         starts=np.array([*(b.first for b in world.bodies), world.nodes], np.int32),
         mass=world.mass, free=world.free, x=world.x, v=world.v, before=before, still=still, gravity=gravity,
-        touch={} if touch is None else {name: getattr(touch, name) for name in ("force", "spring", "anchor")},
+        touch=touch,
         elastic=[e for x in effects.values() if (e := x.energies()) is not None],
         balance=balance, inertia=world.inertia, on_runaway=on_runaway,
     )  # fmt: skip

@@ -34,7 +34,7 @@ class Parameters(BaseModel):
 
     @property
     def variant(self) -> str:
-        """Of an effect: bodies whose parameters differ in it get other kernels (effects/_base.py, Build)."""
+        """Kernels that an effect needs: bodies with different values are built apart (effects/_base.py, Build)."""
         return ""
 
     @model_validator(mode="wrap")

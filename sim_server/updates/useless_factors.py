@@ -24,7 +24,7 @@ MAX_FALLBACKS = 3  # solves in a row that abandoned their factors, be they sever
 
 
 class Verdict(Enum):
-    """What solves show of a factor."""
+    """Verdict of solves on a factor."""
 
     USEFUL = auto()
     USELESS = auto()

@@ -268,7 +268,7 @@ class CpuEngine(Reports):
         return self._mail[body].buffers
 
     def factor_bytes(self, body: int) -> int:
-        """What an application reads of the factor posted last, values and rows; 0 while there is none."""
+        """Returns the bytes of values and rows that one application of the newest factor reads; 0 without one."""
         mail = self._mail[body]
         newest = mail.waiting or mail.in_use
         return newest.values.nbytes + newest.pattern.rows.nbytes if newest else 0

@@ -10,7 +10,7 @@
 // A group of threads takes tasks one after another from a list; a thread block may have any number of groups. Few large blocks
 // keep few multiprocessors busy; many small ones end soon and leave room for more urgent work. All is float32, and every sum has
 // a fixed order, so results do not depend on the number of blocks or groups.
-#define EDGE 64          // of a tile
+constexpr int EDGE = 64;  // rows and columns of a tile
 #define DEPTH 8          // rows of G that are in shared memory at a time
 #define THREADS 128      // of a group
 #define PITCH 65         // of a finished tile in shared memory

@@ -18,10 +18,10 @@ from sim_server.backends.declarations import Declarations
 from sim_server.backends.gpu.inverse.partition import ROWS, padded
 from sim_server.backends.gpu.inverse.plan import Plan, ranges
 
-EDGE = 64  # rows and columns of a tile of the kernels
+INVERSE = Declarations("backends/gpu/inverse/build_inverse.cu")
+EDGE: int = INVERSE.constant("EDGE")  # rows and columns of a tile of the kernels
 WORKSPACE = 256 << 20  # bytes, unless a single part needs more
 
-INVERSE = Declarations("backends/gpu/inverse/build_inverse.cu")
 PART, COLUMN = INVERSE.dtype("Part"), INVERSE.dtype("Column")
 
 

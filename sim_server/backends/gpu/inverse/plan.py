@@ -55,7 +55,7 @@ class Parts(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """For one pattern and one number of thread blocks. Arrays are int32; [phase, block] means phase * blocks + block.
+    """Plan for one pattern and number of thread blocks. Arrays are int32; [phase, block] means phase * blocks + block.
 
     segments (k, 4): kind, from, count, to: what a block brings into its x area before a phase, `to` entries from its
         beginning; count and to are multiples of 32. kind FORM: s~ at packed positions from.. out of residual and
