@@ -34,6 +34,8 @@ DECLARATION = re.compile(r"(const )?(unsigned(?: short)?|long long|own<\w+>|[\w:
 DECLARATOR = re.compile(r"\s*(\**)\s*(\w+)((?:\[\w+\])*)(?:\s*=.*)?\s*", re.DOTALL)
 FUNCTION = re.compile(r"\w+ \(\*(\w+)\)\(.*\)", re.DOTALL)  # a pointer to one
 
+HAS_OFFSETOF = "!defined(__CUDACC_RTC__) || __CUDACC_VER_MAJOR__ * 100 + __CUDACC_VER_MINOR__ >= 1304"  # 13.2 has not
+
 Struct = TypeVar("Struct", bound=c.Structure)
 
 
@@ -157,18 +159,20 @@ class Declarations:
     def assertions(self, *structs: str) -> str:
         """C++ statements that hold if the compiler lays out these structs as Python does: every offset and size.
 
-        Without names: of all structs that Python has asked for.
+        Without names: of all structs that Python has asked for. An NVRTC that does not know offsetof compares sizes and
+        alignments of the members, in the order of the text.
         """
-        lines = []
+        sizes, offsets = [], []
         for struct in structs or tuple(self._structs):
             made: Any = self._structure(struct)
-            lines += [
-                f"static_assert(__builtin_offsetof({struct}, {name}) == {getattr(made, name).offset}"
-                f' && sizeof({struct}::{name}) == {getattr(made, name).size}, "{struct}.{name}");'
-                for name, _ in made._fields_
-            ]
-            lines.append(f'static_assert(sizeof({struct}) == {c.sizeof(made)}, "{struct}");')
-        return "\n" + "\n".join(lines) + "\n"
+            for name, kind in made._fields_:
+                size, alignment, offset = c.sizeof(kind), c.alignment(kind), getattr(made, name).offset
+                member, at = f"{struct}::{name}", f"__builtin_offsetof({struct}, {name})"
+                found = f"sizeof({member}) == {size} && alignof(decltype({member})) == {alignment}"
+                sizes.append(f'static_assert({found}, "{struct}.{name}");')
+                offsets.append(f'static_assert({at} == {offset}, "{struct}.{name}");')
+            sizes.append(f'static_assert(sizeof({struct}) == {c.sizeof(made)}, "{struct}");')
+        return "\n".join(["", *sizes, f"#if {HAS_OFFSETOF}", *offsets, "#endif", ""])
 
     def checked(self) -> str:
         """The text itself with `assertions` of the structs asked for: a compiler refuses it if it has other layouts."""

@@ -60,7 +60,7 @@ def test_the_compiler_for_gpus_refuses_another_layout(tmp_path):
     if (library := nvrtc.library()) is None:
         pytest.skip("needs the package nvidia-cuda-nvrtc")
     source = asserted(tmp_path, "pcg_structs.cuh", PCG)
-    source.write_text(source.read_text().replace("PcgBody, planes", "PcgBody, plan"))
+    source.write_text(source.read_text().replace("sizeof(PcgBody::planes) == 4", "sizeof(PcgBody::planes) == 8"))
     code, said = nvrtc.compiled(library, source, [*device_options(PRECISIONS["float64"]), *own_headers()])
     assert not code and "PcgBody.planes" in said
 

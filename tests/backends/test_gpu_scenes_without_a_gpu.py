@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: MIT
+"""Scenes are built for a GPU where there is none: every text compiles with the options of a run, launches fit kernels."""
+
+import sys
+
+import numpy as np
+import pytest
+
+from precond_worker.factorization.factorize import Analysis
+from sim_server.backends.gpu import device
+from sim_server.backends.gpu import engine as gpu_engine
+from sim_server.simulation import Simulation
+from tests.backends import fake_cupy
+from tests.support import nvrtc
+
+pytestmark = pytest.mark.slow
+SCENES = {
+    "beam.toml": (),
+    "beam.toml, mixed": ("solver.precision=mixed", "solver.factor_precision=float32"),
+    "beam.toml, float32": ("solver.precision=float32",),
+    "beam.toml, Newton": ("integrator.linearizations=3", "integrator.scheme=newmark"),
+    "springs.toml": (),
+    "fibres.toml": ("integrator.scheme=bdf2",),
+    "equilibrium.toml": (),
+}
+
+
+@pytest.fixture(autouse=True)
+def cupy(tmp_path, monkeypatch):
+    if (library := nvrtc.library()) is None:
+        pytest.skip("needs the package nvidia-cuda-nvrtc")
+    fake = fake_cupy.made(tmp_path, library)
+    monkeypatch.setitem(sys.modules, "cupy", fake)
+    monkeypatch.setattr(gpu_engine, "CudaDevice", fake_cupy.Device)
+    for function in (device.cupy, device.processors):
+        function.cache_clear()
+    yield fake
+    for function in (device.cupy, device.processors):
+        function.cache_clear()
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_a_scene_is_built_and_its_kernels_compile(cupy, name):
+    simulation = Simulation.load(f"deploy/scenes/{name.split(',')[0]}", list(SCENES[name]), "gpu")
+    built = {kernel for kernel, _ in cupy.calls}
+    assert {"fused", "pcg"} <= built
+    engine, world, system = simulation.engine, simulation.world, simulation.system
+    engine.run(3)
+    assert engine.step == 3 and (engine.records()["step"] == np.repeat([1, 2, 3], len(world.bodies))).all()
+    engine.assemble()
+    engine.solve()
+    body = world.bodies[0]
+    row_start, columns = system.body_pattern(body.first, body.last)
+    rows, nodes = np.repeat(np.arange(body.last - body.first), np.diff(row_start)), body.last - body.first
+    values = np.where((rows == columns)[:, None, None], 50 * np.eye(3), -0.5 * np.eye(3))
+    analysis = Analysis(row_start, columns)
+    engine.post_factor(body.index, analysis.pattern, analysis.factorize(values, np.float32), 4)
+    engine.settle_factors()
+    engine.run(1)
+    assert engine.factor_bytes(body.index) > 9 * nodes
