@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Scenes are built for a GPU where there is none: every text compiles with the options of a run, launches fit kernels."""
+"""Scenes are built for a GPU where there is none: texts compile with the options of a run, and launches fit kernels."""
 
 import sys
 
