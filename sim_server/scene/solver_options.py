@@ -31,11 +31,6 @@ class Update(NamedTuple):
     kind: Literal["never", "every", "async", "adaptive", "lockstep"]
     n: int = 0
 
-    @property
-    def free(self) -> bool:
-        """True if no step waits for a factor."""
-        return self.kind in ("async", "adaptive")
-
     def __str__(self) -> str:
         return f"{self.kind}-{self.n}" if self.kind in ("every", "lockstep") else self.kind
 

@@ -26,11 +26,13 @@ class Commands:
     frozen: returns True for an object that has run away and moves no more
     """
 
-    def __init__(self, simulation: Simulation, on_interaction: Callable[[pb.Interaction, float], None]):
+    def __init__(
+        self, simulation: Simulation, on_interaction: Callable[[pb.Interaction, float], None],
+        frozen: Callable[[str], bool] = lambda name: False,
+    ):  # fmt: skip
         self.simulation, self.engine = simulation, simulation.engine
-        self.on_interaction = on_interaction
+        self.on_interaction, self.frozen = on_interaction, frozen
         self.stopping = False
-        self.frozen: Callable[[str], bool] = lambda name: False
         self._owners: set[str] = set()
 
     @property

@@ -23,7 +23,6 @@ from protocol import messages_pb2 as pb
 from protocol.process.nvidia import nvidia_device
 from sim_server.network.link import ServerLink
 from sim_server.recording.recorder import Recorder
-from sim_server.recording.replay_recorder import ReplayRecorder
 from sim_server.service.commands import Commands
 from sim_server.service.pace import LOOK_PERIOD, PaceMonitor
 from sim_server.service.telemetry import Telemetry
@@ -52,11 +51,8 @@ class Service:
         self.engine = simulation.engine
         self.engine.loop.realtime, self.engine.loop.patient = int(realtime), int(not realtime)
         self.driver = Driver(simulation, link.dispatch)
-        self.telemetry = Telemetry(self.driver, link, recorder, patient=not realtime)
-        self.commands = Commands(simulation, self._record_interaction)
-        self.commands.frozen = lambda name: name in self.driver.by_name and self.driver.by_name[name].frozen
-        self.telemetry.commands = self.commands
-        self.telemetry.replay_recorder = ReplayRecorder(self.driver, link, recorder) if recorder else None
+        self.commands = Commands(simulation, self._record_interaction, self._frozen)
+        self.telemetry = Telemetry(self.driver, link, recorder, not realtime, self.commands)
         self._set_intervals()
         self._batches: deque[NDArray[Any]] = deque()
         self._failure: BaseException | None = None
@@ -68,6 +64,10 @@ class Service:
         self.pace = PaceMonitor(simulation.world.dt, self._advice, not self._on_gpu) if realtime else None
         self._loop_alone = not self.driver.wants_factors or self.driver.free  # no step waits for Python
         self.telemetry.open()
+
+    def _frozen(self, name: str) -> bool:
+        """Returns True for an object that has run away and is frozen."""
+        return name in self.driver.by_name and self.driver.by_name[name].frozen
 
     def run(self) -> None:
         """Blocks until the run is over; a KeyboardInterrupt ends the loop first and is then raised."""

@@ -31,13 +31,24 @@ ENERGY_STEPS = 20  # steps between elastic energies in real time: one costs up t
 
 
 class Telemetry:
-    """Turns records and frames of one run into messages. patient: wait for the log; without it, drop."""
+    """Turns records and frames of one run into messages.
 
-    def __init__(self, driver: Driver, link: ServerLink, recorder: Recorder | None, patient: bool):
+    patient: wait for the log; without it, drop
+    commands: whose interactions are in the status; None: there are none
+    """
+
+    def __init__(
+        self,
+        driver: Driver,
+        link: ServerLink,
+        recorder: Recorder | None,
+        patient: bool,
+        commands: Commands | None = None,
+    ):
         self.driver, self.link, self.recorder, self.patient = driver, link, recorder, patient
         self.simulation, self.engine = driver.simulation, driver.engine
-        self.commands: Commands | None = None
-        self.replay_recorder: ReplayRecorder | None = None
+        self.commands = commands
+        self.replay_recorder = ReplayRecorder(driver, link, recorder) if recorder and commands else None
         self.started = time.monotonic()
         self.record_every = self.simulation.scene.record.every if recorder else 0
         self._batch: deque[pb.ObjectStep] = deque(maxlen=MAX_BATCH)
