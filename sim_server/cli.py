@@ -213,7 +213,7 @@ def _describe_objects(say, service: "Service", listen: list[str] | None) -> None
         say(f"  {body.name}: {body.last - body.first} nodes, {size} m, {world.mass[body.nodes].sum():.3g} kg")
     for line in scene_notes(service.simulation):
         say(f"note: {line}")
-    if service.driver.wants_factors and service.driver.free and not service.link.dispatch.workers():
+    if service.driver.wants_factors and service.driver.policy.free and not service.link.dispatch.workers():
         say(
             "no worker is there, so nothing makes factors and solves use block Jacobi; start one in a second terminal, "
             f"{_worker_command(service.link.name, listen)}, or this server with --workers 1"

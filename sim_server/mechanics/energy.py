@@ -13,7 +13,7 @@ from sim_server.mechanics.world import World
 from sim_server.scene.solver_options import OnRunaway
 
 
-class StoresEnergy(Protocol):
+class EnergyContributor(Protocol):
     """An effect, as far as it takes part in the energy balance."""
 
     def balance_arrays(self) -> dict[str, Float64]:
@@ -24,12 +24,12 @@ class StoresEnergy(Protocol):
 
 
 def collected_energies(
-    world: World, effects: Mapping[str, StoresEnergy], before: Float64, still: list[Float64],
+    world: World, effects: Mapping[str, EnergyContributor], before: Float64, still: list[Float64],
     on_runaway: OnRunaway | None,
 ) -> Energies:  # fmt: skip
     """Returns the input of an engine. before, still, on_runaway: as of Energies."""
-    touch = {name: array for effect in effects.values() for name, array in effect.balance_arrays().items()}
-    gravity = touch.pop("gravity", np.zeros(3))
+    arrays = {name: array for effect in effects.values() for name, array in effect.balance_arrays().items()}
+    gravity = arrays.pop("gravity", np.zeros(3))
     world.backend.keep(gravity)
     balance = np.zeros(len(world.bodies), structs.BALANCE)
     for body, b in zip(world.bodies, balance, strict=True):
@@ -38,7 +38,6 @@ def collected_energies(
     return Energies(
         starts=np.array([*(b.first for b in world.bodies), world.nodes], np.int32),
         mass=world.mass, free=world.free, x=world.x, v=world.v, before=before, still=still, gravity=gravity,
-        touch=touch,
-        elastic=[e for x in effects.values() if (e := x.energies()) is not None],
+        touch=arrays, elastic=[e for x in effects.values() if (e := x.energies()) is not None],
         balance=balance, inertia=world.inertia, on_runaway=on_runaway,
     )  # fmt: skip

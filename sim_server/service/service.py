@@ -62,7 +62,7 @@ class Service:
         self._status_due = self._workers_due = self._pace_due = 0.0
         self.check_workers: Callable[[], None] = lambda: None  # called every WORKERS_PERIOD
         self.pace = PaceMonitor(simulation.world.dt, self._advice, not self._on_gpu) if realtime else None
-        self._loop_alone = not self.driver.wants_factors or self.driver.free  # no step waits for Python
+        self._loop_alone = not self.driver.wants_factors or self.driver.policy.free  # no step waits for Python
         self.telemetry.open()
 
     def _frozen(self, name: str) -> bool:

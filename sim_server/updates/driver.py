@@ -47,8 +47,7 @@ class Driver:
         self.inline, self.check = Inline(patterns), FactorCheck(patterns)
         self.source: FactorSource = source or self.inline
         self.policy = make_policy(self)
-        self.free = self.policy.free
-        self.counted = not self.free if counted is None else counted
+        self.counted = not self.policy.free if counted is None else counted
         methods = self.solver.choices(world.backend.name)
         self.bodies = [BodyUpdateState(b, methods, self.counted) for b in world.bodies]
         self.by_name = {s.body.name: s for s in self.bodies}
