@@ -26,7 +26,7 @@ from sim_server.effects import effect
 from sim_server.effects._base import Effect, Refusal
 from sim_server.errors import DeviceError, InputError
 from sim_server.mechanics.energy import collected_energies
-from sim_server.mechanics.integrator import Integrator
+from sim_server.mechanics.rosenbrock import make_integrator
 from sim_server.mechanics.shape_matching import ShapeMatching
 from sim_server.mechanics.static_check import check_held
 from sim_server.mechanics.system import System
@@ -71,7 +71,7 @@ class Simulation:
         self.shape = ShapeMatching(self.world, matched, solver.warp_level) if matched else None
         self.warped = {body.index for body in self.rotated_bodies() + matched}  # whose solve is in the material frame
         self.system.warped[:] = [body.index in self.warped for body in self.world.bodies]
-        self.integrator = Integrator(scene, self.system)
+        self.integrator = make_integrator(scene, self.system)
         if not self.world.inertia:
             check_held(self.world, elements)
         still = [self.world.v, self.system.dv, *self.integrator.still]
@@ -91,9 +91,17 @@ class Simulation:
         arrays: dict[str, NDArray[Any]] = {"row_start": s.row_start, "columns": s.columns, "values": s.values}
         arrays |= {"b": s.b_material, "y": s.y, "x": w.x, "v": w.v, "clock": s.clock, "moving": s.moving}
         names, ranges = [b.name for b in w.bodies], [(b.first, b.last) for b in w.bodies]
+        with w.made_with(w.dt, w.dt):
+            euler = self.launches()[0] if self.integrator.has_stages else []
         assemble, integrate = self.launches()
-        newton = self.integrator.newton(assemble, list(self.effects.values()))
-        return EngineInput(assemble, integrate, names, ranges, w.dt, self.scene.solver, self.energies, newton, arrays)
+        euler = [
+            a if a.mailed else e for a, e in zip(assemble, euler, strict=False)
+        ]  # arguments come to one of the two
+        effects = list(self.effects.values())
+        newton = self.integrator.newton(assemble, effects)
+        stages = self.integrator.stages(assemble, euler, effects)
+        solver, energies = self.scene.solver, self.energies
+        return EngineInput(assemble, integrate, names, ranges, w.dt, solver, energies, newton, stages, arrays)
 
     @classmethod
     def load(cls, path: str | Path, overrides: Sequence[str] = (), device: str = "cpu") -> "Simulation":
@@ -129,7 +137,7 @@ class Simulation:
         if self.shape is not None:
             assemble.append(self.shape.launch(system.mean))
         assemble += system.finish()  # into the material frame (eq. 12 and 13)
-        return assemble, [self.integrator.advance()]
+        return assemble, self.integrator.advance()
 
     def update_effect(self, effect: Effect, launch: Launch) -> PendingUpdate:
         """Gives the mailed launch of an effect other arguments, those of `launch`, from one of the next steps on.

@@ -22,6 +22,7 @@ from sim_server.arrays import Float64
 if TYPE_CHECKING:
     from sim_server.backends.energies import Energies
     from sim_server.backends.newton import Newton
+    from sim_server.backends.rosenbrock import Rosenbrock
     from sim_server.scene.solver_options import SolverOptions
 
 
@@ -229,6 +230,7 @@ class EngineInput:
     dt: time step [s]
     energies: what the energy of each step is summed from
     newton: for several linearizations a step; None for one
+    stages: of a Rosenbrock-W step; None for other schemes
     arrays: of the system by name: row_start, columns, values, b, y, x, v, clock, moving
     """
 
@@ -240,6 +242,7 @@ class EngineInput:
     solver: SolverOptions
     energies: Energies
     newton: Newton | None
+    stages: Rosenbrock | None
     arrays: Mapping[str, NDArray[Any]]
 
 

@@ -55,9 +55,9 @@ class Drag(Effect):
 
 
 def build(world: World, listed: list[tuple[Body, Any]]) -> Drag:
-    """Sets world.beta of the bodies and returns the damping of the mass; a quasi-static scene has neither."""
+    """Sets world.alpha and world.beta of the bodies and returns the damping of the mass; a quasi-static scene has neither."""
     if not world.inertia:
         return Drag(world, np.zeros(world.nodes))
     for body, params in listed:
-        world.beta[body.index] = params.stiffness
+        world.alpha[body.index], world.beta[body.index] = params.mass, params.stiffness
     return Drag(world, per_node(world, listed, "mass"))

@@ -21,8 +21,7 @@ struct Apply {
     const real* free;        // (nodes,) 1, or 0 at fixed nodes
     own<local> block;        // (nodes, 6) what elements have put into the node's own block of A, world frame [kg]
     double dt;               // time step [s]
-    real h;                  // world.force_coefficient: dt in backward Euler [s]
-    real dx_dv;              // world.dx_dv: dt in backward Euler [s]
+    const real* coefficients;  // (2,) h, world.force_coefficient, and dx_dv, world.dx_dv: both dt in backward Euler [s]
     own<real> diagonal;      // (nodes, 1) in, out: += h dx_dv k [kg]
     own<real> b;             // (nodes, 3) in, out: += h f - h dx_dv k predictor [N s]
     real* force;             // (nodes, 3) out: what pushes, and grabs at their limit, exert in this step [N]
@@ -38,6 +37,7 @@ MAILED_KERNEL(apply, Apply) {
     vec3 x = load3(p.x, node), predictor = load3(p.predictor, node), b = load3(p.b, node);
     real diagonal = row_at<1>(p.diagonal, node, 0);
     vec3 force = {}, anchored = {};
+    const real h = p.coefficients[0], dx_dv = p.coefficients[1];
     real springs = 0;
     real inertia = diagonal + (row_at<6>(p.block, node, 0) + row_at<6>(p.block, node, 3) + row_at<6>(p.block, node, 5)) / 3;
     for (int e = p.first[i]; e < p.first[i + 1]; ++e) {
@@ -47,20 +47,20 @@ MAILED_KERNEL(apply, Apply) {
         if (now + p.dt / 2 >= p.start[k] + p.duration[k]) continue;  // a whole number of steps, in spite of rounding
         real share = p.share[k];
         if (p.stiffness[k] == 0) {
-            b = b + (p.h * share) * load3(p.push, k);
+            b = b + (h * share) * load3(p.push, k);
             force = force + share * load3(p.push, k);
             continue;
         }
         real spring = share * p.stiffness[k], limit = share * p.limit[k];
         vec3 goal = load3(p.target, k) + load3(p.offset, e);
-        vec3 pull = spring * (goal - x - p.dx_dv * predictor);
+        vec3 pull = spring * (goal - x - dx_dv * predictor);
         real size = sqrt(dot(pull, pull));
-        if (size > limit * (1 + p.h * p.dx_dv * spring / inertia)) {
-            b = b + (p.h * limit / size) * pull;
+        if (size > limit * (1 + h * dx_dv * spring / inertia)) {
+            b = b + (h * limit / size) * pull;
             force = force + (limit / size) * pull;
         } else {
-            b = b + p.h * pull;
-            diagonal += p.h * p.dx_dv * spring;
+            b = b + h * pull;
+            diagonal += h * dx_dv * spring;
             springs += spring;
             anchored = anchored + spring * (goal - x);
         }

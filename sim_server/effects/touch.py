@@ -349,7 +349,7 @@ class Touch(Effect):
         self._launch = w.backend.module("effects/touch.cu").bind(
             "apply", **self._same[1], start=_each(interactions, "start"), target=_each(interactions, "target"),
             clock=system.clock, x=w.x, predictor=w.predictor, free=w.free, block=system.block, dt=w.dt,
-            h=w.force_coefficient, dx_dv=w.dx_dv, diagonal=system.diagonal, b=system.b, force=self.force,
+            coefficients=w.coefficients, diagonal=system.diagonal, b=system.b, force=self.force,
             spring=self.spring, anchor=self.anchor,
         )  # fmt: skip
         self._applied = self._begun = interactions

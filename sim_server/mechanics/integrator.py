@@ -25,7 +25,7 @@ weights with which it makes p and r of the next step (PredictorWeights, kernels/
 p = d = v, r = 0, and the launches are those of kernels/nodes.cu. Newton-Raphson (kernels/newton_line_search.cuh)
 linearizes again at the state reached; there p = 0.
 
-Order: 1, 2 (gamma = 1/2), 2. One linearization keeps it only where K is the exact slope of the forces; the usual
+The scheme ros2 has two stages of its own (rosenbrock.py). Order: 1, 2 (gamma = 1/2), 2. One linearization keeps it only where K is the exact slope of the forces; the usual
 tangent of corotational elements is not, by as much as they are strained.
 
 Stability with one linearization: a mode of stiffness k with k' in its place in the matrix is stable in Newmark's scheme
@@ -45,6 +45,7 @@ import numpy as np
 from sim_server.arrays import Int32
 from sim_server.backends.base import Launch
 from sim_server.backends.newton import Newton
+from sim_server.backends.rosenbrock import Rosenbrock
 from sim_server.mechanics.system import System
 from sim_server.scene import Scene
 
@@ -118,16 +119,17 @@ class Integrator:
             block=s.block, mean=s.mean,
         )  # fmt: skip
 
-    def advance(self) -> Launch:
+    def advance(self) -> list[Launch]:
         """Advances the state by the solution."""
         s, w = self.system, self.world
         if w.plain:
-            return s.advance(self.before)
-        return self._bind(
+            return [s.advance(self.before)]
+        advance = self._bind(
             "advance", rotation=s.rotation, y=s.y, beta=self.beta, dx_dv=w.dx_dv, v=w.v, x=w.x, dv=s.dv,
             inertial_increment=self.inertial_increment, predictor=w.predictor, damping_velocity=w.damping_velocity,
             before=self.before, **asdict(self._weights),
         )  # fmt: skip
+        return [advance]
 
     def begin(self, assemble: Sequence[Launch]) -> list[Launch]:
         """Launches that make p, d and r from x and v before the first step. assemble: the launches of a step."""
@@ -152,19 +154,31 @@ class Integrator:
         mass = w.mass if w.inertia else np.zeros(w.nodes)
         w.backend.keep(mass)
         starts = np.array([*(b.first for b in w.bodies), w.nodes], dtype=np.int32)
-        rows = [e.elements[:, 0] for e in effects if e.elements is not None]
-        parts = [_items_of_bodies(launch, starts, s.row, rows) for launch in assemble]
+        parts = [items_of_bodies(launch, starts, s.row, rows_of(effects)) for launch in assemble]
         return Newton(
             self.options, w.dx_dv, parts, rotation=s.rotation, mass=mass, beta=self.beta, predictor=w.predictor,
             damping_velocity=w.damping_velocity, inertial_increment=self.inertial_increment,
         )  # fmt: skip
+
+    has_stages = False
+
+    def stages(
+        self, assemble: Sequence[Launch], euler: Sequence[Launch], effects: Sequence[CouplesNodes]
+    ) -> Rosenbrock | None:
+        """Input of a Rosenbrock-W step; None for other schemes. euler: launches that assemble backward Euler."""
+        return None
 
     def _bind(self, kernel: str, **arguments: Any) -> Launch:
         launch: Launch = self.world.backend.module(TEXT).bind(kernel, self.world.nodes, **arguments)
         return launch
 
 
-def _items_of_bodies(launch: Launch, starts: Int32, row: Int32, firsts: list[Int32]) -> Int32 | None:
+def rows_of(effects: Sequence[CouplesNodes]) -> list[Int32]:
+    """Returns one corner of each element, per effect that has some."""
+    return [e.elements[:, 0] for e in effects if e.elements is not None]
+
+
+def items_of_bodies(launch: Launch, starts: Int32, row: Int32, firsts: list[Int32]) -> Int32 | None:
     """First item of each body, (bodies + 1,); None for a launch whose items are not ordered by body.
 
     starts: first node of each body; row: of each block; firsts: one corner of each element, per effect.

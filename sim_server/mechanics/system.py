@@ -41,7 +41,6 @@ class System:
     moving (bodies,): 1 if a node of the body does not rest, so that the step is solved; set by `rotate`
         (kernels/nodes.cu) and cleared by the loop
     extent (n,): diagonal of the box around the node's body at rest [m]
-    inverse_time (n,): 1 / (dx_dv + beta) [1/s]
     rotation (n, 3, 3): frames of the nodes
     warped (bodies,): 1 where frames follow the nodes' rotations, 0 where they stay the identity; set before the
         launches are made
@@ -68,7 +67,8 @@ class System:
         self.warped = np.ones(len(world.bodies), np.int32)
         self.moving = np.zeros(len(world.bodies), np.int32)
         extents = np.array([np.linalg.norm(np.ptp(world.rest[b.nodes], axis=0)) for b in world.bodies])
-        self.extent, self.inverse_time = extents[self.body], 1 / (world.dx_dv + world.beta[self.body])
+        self.extent = extents[self.body]
+        self._inverse_times: dict[float, Float64] = {}  # by world.dx_dv
         self.rotation = np.tile(np.eye(3), (n, 1, 1))
         self.b_material = np.zeros((n, 3))
         self.y = np.zeros((n, 3))
@@ -76,6 +76,12 @@ class System:
         self.clock = np.zeros(1)
         world.backend.keep(self.clock, exact=True)
         world.backend.keep(*(a for o in (world, self) for a in vars(o).values() if isinstance(a, np.ndarray)))
+
+    @property
+    def inverse_time(self) -> Float64:
+        """1 / (dx_dv + beta) at each node, (n,) [1/s]."""
+        w = self.world
+        return self._inverse_times.setdefault(w.dx_dv, 1 / (w.dx_dv + w.beta[self.body]))
 
     def _number(self, n: int) -> None:
         """Numbers the places in block CSR of the blocks above, below and on the diagonal."""

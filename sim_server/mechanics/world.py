@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
 """The objects of a scene, one after another in the same arrays, so that one launch serves all of them."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -46,7 +48,8 @@ class World:
     """State and node data of a scene.
 
     rest (n, 3): before the pose [m]; x (n, 3): positions [m]; v (n, 3): velocities [m/s]; mass (n,): lumped [kg];
-    free (n,): 1, or 0 at fixed nodes; beta (bodies,): Rayleigh damping of the stiffness [s]; dt: time step [s];
+    free (n,): 1, or 0 at fixed nodes; alpha, beta (bodies,): Rayleigh damping of the mass [1/s] and of the stiffness
+    [s]; dt: time step [s];
     projection: of the elements' stiffness, the scene's choice;
     backend: where kernels run.
 
@@ -55,6 +58,7 @@ class World:
 
     force_coefficient [s]: factor of forces in b
     dx_dv [s]: derivative of the positions by the velocities at the end of the step
+    coefficients (2,): force_coefficient and dx_dv as kernels read them whose arguments change while steps run
     stiffness_coefficient (bodies,) [s2]: factor of K in A
     predictor (n, 3) [m/s]: the step moves x by dx_dv (predictor + dv), dv the solution
     damping_velocity (n, 3) [m/s]: (dx_dv predictor + beta v) / (dx_dv + beta). Elements take it for their velocity: the
@@ -77,13 +81,24 @@ class World:
         self.v = np.zeros_like(self.x)
         self.mass = np.concatenate([_lumped(o, mesh) for o, mesh in meshes])
         self.free = np.ones(first)
-        self.beta = np.zeros(len(self.bodies))
+        self.alpha, self.beta = np.zeros(len(self.bodies)), np.zeros(len(self.bodies))
         integrator = scene.integrator
         self.force_coefficient, self.dx_dv = integrator.force_coefficient(self.dt), integrator.dx_dv(self.dt)
+        self.coefficients = np.array([self.force_coefficient, self.dx_dv])
         self.inertia = integrator.scheme != "quasi_static"
         self.plain = integrator.scheme == "backward_euler" and integrator.linearizations == 1
         self.predictor = self.v if self.plain else np.zeros_like(self.v)
         self.damping_velocity = self.v if self.plain else np.zeros_like(self.v)
+
+    @contextmanager
+    def made_with(self, force_coefficient: float, dx_dv: float) -> Iterator[None]:
+        """Launches made inside have these coefficients [s]."""
+        given = self.force_coefficient, self.dx_dv
+        self.force_coefficient, self.dx_dv = force_coefficient, dx_dv
+        try:
+            yield
+        finally:
+            self.force_coefficient, self.dx_dv = given
 
     @property
     def stiffness_coefficient(self) -> Float64:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The [integrator] table of a scene."""
 
+from math import sqrt
 from typing import Literal
 
 from pydantic import Field, model_validator
@@ -9,7 +10,8 @@ from sim_server.errors import InputError
 from sim_server.scene.parameters import Parameters, complaint
 
 MAX_STATES = 1024  # tried in a step on a GPU, whose graph of launches holds them all
-SchemeName = Literal["backward_euler", "newmark", "bdf2", "quasi_static"]
+SchemeName = Literal["backward_euler", "newmark", "bdf2", "quasi_static", "ros2"]
+GAMMA = 1 - sqrt(0.5)  # of ros2 (mechanics/rosenbrock.py)
 
 
 class IntegratorOptions(Parameters):
@@ -23,6 +25,26 @@ class IntegratorOptions(Parameters):
         default=1e-4, gt=0, lt=1, description="of Newton-Raphson: nonlinear residual over the first |b| of the step"
     )
     trials: int = Field(default=8, ge=0, le=100, description="most shorter steps that a line search tries; 0: none")
+
+    solve: Literal["auto", "factor", "iterate"] = Field(
+        default="auto", description="of ros2: by the factor alone where it will do, or always by iterations"
+    )
+    error_bound: float | None = Field(
+        default=None, gt=0, description="of ros2: largest error of a step [m]; default a tenth of the shortest edge"
+    )
+
+    @model_validator(mode="after")
+    def _of_ros2(self) -> "IntegratorOptions":
+        if self.scheme != "ros2":
+            given = ["solve"] * (self.solve != "auto") + ["error_bound"] * (self.error_bound is not None)
+            if given:
+                raise complaint(f"{' and '.join(given)} belong to scheme ros2, not to {self.scheme}")
+        elif self.linearizations > 1:
+            raise complaint(
+                f"ros2 with linearizations = {self.linearizations}: its order does not depend on the matrix, so it has "
+                "no use for more; allowed: 1"
+            )
+        return self
 
     @model_validator(mode="after")
     def _stable(self) -> "IntegratorOptions":
@@ -52,6 +74,8 @@ class IntegratorOptions(Parameters):
         """Coefficient i [s] of the forces in M (v' - V) = i f (integrator.py)."""
         if self.scheme == "newmark":
             return self.newmark[1] * dt
+        if self.scheme == "ros2":
+            return GAMMA * dt
         return 2 * dt / 3 if self.scheme == "bdf2" else dt
 
     def dx_dv(self, dt: float) -> float:

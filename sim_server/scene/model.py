@@ -170,6 +170,23 @@ class Scene(Parameters):
         return self
 
     @model_validator(mode="after")
+    def _factor_alone(self) -> "Scene":
+        solver, solve = self.solver, self.integrator.solve
+        if solve == "factor" and not solver.has_exact_factors:
+            raise complaint(
+                f'integrator.solve = "factor" with solver.preconditioner = "{solver.preconditioner}": the step is '
+                'solved by an exact factor alone; allowed: "auto", "cholesky"'
+            )
+        if self.integrator.scheme == "ros2" and solver.budget:
+            raise complaint(f'solver.budget = {solver.budget:g} with integrator.scheme = "ros2", which solves twice')
+        return self
+
+    @property
+    def uses_factor_alone(self) -> bool:
+        """True if steps may be solved by the factor alone."""
+        return self.integrator.scheme == "ros2" and self.integrator.solve != "iterate" and self.solver.has_exact_factors
+
+    @model_validator(mode="after")
     def _as_the_integrator_needs(self) -> "Scene":
         """Adapts effects whose parameters depend on the scheme: they have a method `under(integrator)`."""
         errors: list[InitErrorDetails] = []

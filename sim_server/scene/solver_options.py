@@ -134,6 +134,11 @@ class SolverOptions(Parameters):
         return self.preconditioner == "auto" or self.preconditioner in FACTORS
 
     @property
+    def has_exact_factors(self) -> bool:
+        """True if factors are exact ones, or may be."""
+        return self.preconditioner in ("auto", "cholesky")
+
+    @property
     def method(self) -> Method:
         """The method by which factors are made; with "auto", the default of its `choices`."""
         if self.preconditioner == "incomplete_cholesky":

@@ -48,7 +48,8 @@ class Driver:
         self.source: FactorSource = source or self.inline
         self.policy = make_policy(self)
         self.counted = not self.policy.free if counted is None else counted
-        methods = self.solver.choices(world.backend.name)
+        alone = simulation.scene.uses_factor_alone  # by an exact factor: nothing to choose from
+        methods = () if alone else self.solver.choices(world.backend.name)
         self.bodies = [BodyUpdateState(b, methods, self.counted) for b in world.bodies]
         self.by_name = {s.body.name: s for s in self.bodies}
         self.wants_factors = self.solver.wants_factors

@@ -21,6 +21,7 @@ from sim_server.backends.cpu import structs
 from sim_server.backends.cpu.device import CpuLaunch
 from sim_server.backends.cpu.energies import NativeEnergies
 from sim_server.backends.newton import Newton
+from sim_server.backends.rosenbrock import Rosenbrock
 from sim_server.backends.ring_buffers import Reports
 
 Reals = NDArray[np.float64]
@@ -113,6 +114,31 @@ class _NativeNewton:
             launch.parts = None if part is None else part.ctypes.data
 
 
+class _NativeStages:
+    """The input of the Rosenbrock-W step and its memory, attached to a loop. number: of each launch by id."""
+
+    def __init__(self, stages: Rosenbrock, loop: structs.Loop, launches: Any, number: dict[int, int]):
+        self._input = stages
+        self._lists = {k: np.array([number[id(x)] for x in getattr(stages, k)], np.int32) for k in ("again", "euler")}
+        self._state = (structs.StageState * loop.bodies)()
+        for state in self._state:
+            state.factor_step = state.checked = -1
+        own = tuple(stages.coefficients.tolist())
+        self.native = structs.Stages(
+            agains=len(stages.again), eulers=len(stages.euler), factor_alone=stages.factor_alone,
+            own_coefficients=own, euler_coefficients=stages.euler_coefficients, state=c.addressof(self._state),
+        )  # fmt: skip
+        for name in ("second", "finish", "restore", "restore_for_euler", "advance_euler"):
+            setattr(self.native, name, number[id(getattr(stages, name))])
+        for name, array in self._lists.items():
+            setattr(self.native, name, array.ctypes.data)
+        for name in ("estimate", "bound", "coefficients"):
+            setattr(self.native, name, getattr(stages, name).ctypes.data)
+        loop.stages = c.addressof(self.native)
+        for key, part in stages.parts.items():
+            launches[number[key]].parts = None if part is None else part.ctypes.data
+
+
 def _binding(launch: CpuLaunch) -> structs.Binding:
     """Arguments of a launch that the loop has not taken up yet."""
     return structs.Binding(params=c.addressof(launch.params), items=launch.items, taken=-1)
@@ -125,7 +151,9 @@ class CpuEngine(Reports):
 
     def __init__(self, given: EngineInput, records: int = 8192, frames: int = 8):
         self._native = _library()
-        launches = cast(list[CpuLaunch], [*given.assemble, *given.integrate])
+        stages = given.stages.launches if given.stages else ()
+        listed = cast(list[CpuLaunch], [*given.assemble, *given.integrate, *stages])
+        launches = list({id(launch): launch for launch in listed}.values())  # some take part in several stages
         arrays, ranges = given.arrays, given.ranges
         nodes, bodies = len(arrays["x"]), len(ranges)
         self.launches = launches
@@ -133,6 +161,7 @@ class CpuEngine(Reports):
         self._launch = (structs.Launch * max(len(launches), 1))()
         for entry, launch, binding in zip(self._launch, launches, self._bindings, strict=False):
             entry.kernel, entry.binding = launch.function, c.addressof(binding)
+            entry.only_matrix = launch.domain == "blocks"
         self._body = (structs.Body * bodies)()
         for entry_body, (first, last) in zip(self._body, ranges, strict=True):
             entry_body.first, entry_body.last, entry_body.snapshot_step = first, last, -1
@@ -144,12 +173,15 @@ class CpuEngine(Reports):
         self._posted: dict[int, Any] = {}
         loop = structs.Loop()
         super().__init__(loop, bodies, given.dt, records, np.zeros((frames, 2, nodes, 3)))
-        loop.launches, loop.before, loop.launch = len(launches), len(given.assemble), c.addressof(self._launch)
+        loop.before, loop.launches = len(given.assemble), len(given.assemble) + len(given.integrate)
+        loop.launch = c.addressof(self._launch)
         loop.bodies, loop.nodes, loop.body = bodies, nodes, c.addressof(self._body)
         for name in ("row_start", "columns", "values", "b", "y", "x", "v", "clock", "moving"):
             setattr(loop, name, arrays[name].ctypes.data)
         loop.work, loop.threads = self._work.ctypes.data, given.solver.threads
         self._newton = given.newton and _NativeNewton(given.newton, loop, self._launch)
+        number = {id(launch): k for k, launch in enumerate(launches)}
+        self._stages = given.stages and _NativeStages(given.stages, loop, self._launch, number)
         self._energies = NativeEnergies(given.energies)
         loop.energies = c.addressof(self._energies.native)
         self.begin: Sequence[Launch] = ()  # before the first step

@@ -68,6 +68,21 @@ class Newton(c.Structure):
 
 
 @LOOP.struct
+class SolveResult(c.Structure):
+    """What became of a solve."""
+
+
+@LOOP.struct
+class StageState(c.Structure):
+    """State of a Rosenbrock-W step of a body."""
+
+
+@LOOP.struct
+class Stages(c.Structure):
+    """Input and memory of the Rosenbrock-W step."""
+
+
+@LOOP.struct
 class Elastic(c.Structure):
     """Energies of the elements of an effect."""
 

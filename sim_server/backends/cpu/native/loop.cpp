@@ -6,6 +6,7 @@
 
 #include "energy.h"
 #include "newton.h"
+#include "rosenbrock.h"
 #include "sizes.h"
 
 static void take_mail(Launch& l, int64_t step) {
@@ -26,26 +27,16 @@ static void run(const Launch& l, int threads) {
     for (int k = 0; k < parts; ++k) l.kernel(l.binding->params, (int)(items * k / parts), (int)(items * (k + 1) / parts));
 }
 
-// The same for the bodies whose search is not over. A launch whose items are not grouped by body runs for all bodies.
-static void run_for_those_left(const Loop& loop, const Launch& l) {
-    const Search* search = loop.newton->search;
-    int left = 0;
-    for (int i = 0; i < loop.bodies; ++i) left += search[i].phase != DONE;
-    if (!l.parts || left == loop.bodies) { run(l, loop.threads); return; }
-#pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) if (loop.threads > 1 && left > 1)
-    for (int i = 0; i < loop.bodies; ++i)
-        if (search[i].phase != DONE && l.parts[i] < l.parts[i + 1]) l.kernel(l.binding->params, l.parts[i], l.parts[i + 1]);
-}
-
 // Linearizes, solves and tries until the search of every body is over; then y is the whole change of velocity.
 static void search_all(Loop& loop) {
     double begin = now(), solving = 0;
+    auto searching = [&](int i) { return loop.newton->search[i].phase != DONE; };
     for (bool left = true; left;) {
         double t = now();
 #pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) if (loop.threads > 1 && loop.bodies > 1)
         for (int i = 0; i < loop.bodies; ++i) solve(loop, i);
         solving += now() - t;
-        for (int i = 0; i < loop.before; ++i) run_for_those_left(loop, loop.launch[i]);
+        for (int i = 0; i < loop.before; ++i) run_for(loop, loop.launch[i], searching);
         left = false;
 #pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) reduction(|| : left) if (loop.threads > 1 && loop.bodies > 1)
         for (int i = 0; i < loop.bodies; ++i) left = judge(loop, i) != DONE || left;
@@ -68,6 +59,7 @@ static void take_orders(Body& body) {
 static void copy_for_worker(Loop& loop, Body& body) {
     double* target = body.snapshot.load(std::memory_order_acquire);
     if (!target) return;
+    if (body.ahead < 0 && loop.stages && !loop.stages->state[&body - loop.body].assembled) return;  // in the next step
     if (body.ahead < 0) {
         int64_t begin = loop.row_start[body.first], end = loop.row_start[body.last];
         std::memcpy(target, loop.values + 9 * begin, 9 * sizeof(double) * (end - begin));
@@ -97,7 +89,24 @@ static int first_bad_node(const Loop& loop, const Body& body) {
     return -1;
 }
 
-static void assemble(Loop* loop) {
+// Runs the launches of the first stage; those that only make A for bodies that need it.
+static void assemble_stage(Loop& loop, bool whole) {
+    auto needs_matrix = [&](int i) { return loop.stages->state[i].assembled != 0; };
+    for (int i = 0; i < loop.bodies; ++i) choose_form(loop, i, whole);
+    for (int i = 0; i < loop.before; ++i) {
+        take_mail(loop.launch[i], loop.rings.step);
+        if (!loop.launch[i].only_matrix) run(loop.launch[i], loop.threads);
+    }
+    for (int i = 0; i < loop.bodies; ++i) {
+        note_changes(loop.body[i].correction, loop.rings.step, loop.body[i].steps == 0);
+        check_corrections(loop, i);
+    }
+    for (int i = 0; i < loop.before; ++i)
+        if (loop.launch[i].only_matrix) run_for(loop, loop.launch[i], needs_matrix);
+}
+
+// whole: A of all bodies is wanted.
+static void assemble(Loop* loop, bool whole) {
     double begin = now();
     Rings& rings = loop->rings;
     loop->cpu_begin = thread_time();
@@ -106,15 +115,16 @@ static void assemble(Loop* loop) {
         take_orders(loop->body[i]);
         loop->moving[i] = 0;
     }
-    for (int i = 0; i < loop->before; ++i) {
-        take_mail(loop->launch[i], rings.step);
-        run(loop->launch[i], loop->threads);
+    if (loop->stages) assemble_stage(*loop, whole);
+    else {
+        for (int i = 0; i < loop->before; ++i) {
+            take_mail(loop->launch[i], rings.step);
+            run(loop->launch[i], loop->threads);
+        }
+        for (int i = 0; i < loop->bodies; ++i)
+            note_changes(loop->body[i].correction, rings.step, loop->body[i].steps == 0);
     }
-    for (int i = 0; i < loop->bodies; ++i) {
-        Body& body = loop->body[i];
-        note_changes(body.correction, rings.step, body.steps == 0);
-        copy_for_worker(*loop, body);
-    }
+    for (int i = 0; i < loop->bodies; ++i) copy_for_worker(*loop, loop->body[i]);
     loop->assemble_begin = begin;
     loop->assemble_seconds = now() - begin;
 }
@@ -129,6 +139,7 @@ static void finish_step(Loop* loop) {
         for (int i = 0; i < loop->bodies; ++i) begin_search(*loop, i);
         search_all(*loop);
     }
+    if (loop->stages) make_stages(*loop);
 #pragma omp parallel for num_threads(loop->threads) schedule(dynamic, 1) if (loop->threads > 1 && loop->bodies > 1)
     for (int i = 0; i < loop->bodies; ++i) {
         Body& body = loop->body[i];
@@ -136,7 +147,9 @@ static void finish_step(Loop* loop) {
         int linearizations = 1;
         double nonlinear = -1;
         SolveResult r;
-        if (loop->newton) {
+        if (loop->stages) {
+            r = loop->stages->state[i].result;
+        } else if (loop->newton) {
             r = as_solve_result(loop->newton->search[i]);
             linearizations = std::max(1, loop->newton->search[i].linearizations);
             nonlinear = residual_ratio(loop->newton->search[i]);
@@ -159,6 +172,10 @@ static void finish_step(Loop* loop) {
         record.bad_node = r.status == NOT_FINITE ? first_bad_node(*loop, body) : -1;
         record.probe = settings.probe;
         record.linearizations = linearizations;
+        if (!loop->stages) continue;
+        record.form = loop->stages->state[i].form;
+        if (record.form == FACTOR && !loop->stages->state[i].check) record.residual = NAN;  // not evaluated
+        record.estimate = loop->stages->state[i].estimate;
     }
     double solved = now();
     for (int i = loop->before; i < loop->launches; ++i) run(loop->launch[i], loop->threads);
@@ -183,12 +200,17 @@ extern "C" {
 
 void wf_assemble(Loop* loop) {
     if (loop->energies) enter(*loop);
-    assemble(loop);
+    assemble(loop, true);
 }
 
 // A factor posted since `wf_assemble` is made from the matrix of this step, or the caller does not mind; likewise settings.
 void wf_solve(Loop* loop) {
-    for (int i = 0; i < loop->bodies; ++i) take_orders(loop->body[i]);
+    for (int i = 0; i < loop->bodies; ++i) {
+        take_orders(loop->body[i]);
+        if (!loop->stages) continue;
+        choose_form(*loop, i, true);
+        check_corrections(*loop, i);
+    }
     finish_step(loop);
     if (loop->energies) leave(*loop);
 }
@@ -200,7 +222,7 @@ int64_t wf_run(Loop* loop, int64_t steps) {
     int64_t done = 0;
     if (loop->energies) enter(*loop);
     for (; done < steps && wf_wait(loop); ++done) {
-        assemble(loop);
+        assemble(loop, false);
         finish_step(loop);
     }
     if (loop->energies) leave(*loop);
@@ -229,7 +251,7 @@ void wf_precondition(Loop* loop, int32_t index, const double* r, double* z, doub
 
 const StructSize* wf_sizes() {
     static const StructSize sizes[] = {SIZE(Launch), SIZE(Body), SIZE(Loop), SIZE(Factor), SIZE(Pattern), SIZE(Record),
-                                       SIZE(Newton), SIZE(Search), SIZE(Elastic), SIZE(Energies), SIZE(Balance), {}};
+                                       SIZE(Newton), SIZE(Search), SIZE(Stages), SIZE(StageState), SIZE(Elastic), SIZE(Energies), SIZE(Balance), {}};
     return sizes;
 }
 }

@@ -4,6 +4,7 @@
 #include "energy_balance.cuh"
 #include "pcg.h"
 #include "newton_line_search.cuh"
+#include "step_form.h"
 
 typedef void (*Kernel)(const void* params, int begin, int end);
 
@@ -18,6 +19,7 @@ struct Launch {
     Binding* binding;
     std::atomic<Binding*> mail;   // the next one, or null
     const int32_t* parts;         // (bodies + 1,) items of each body, or null: not told apart
+    int32_t only_matrix;          // 1: makes blocks of A, and nothing that b depends on
 };
 
 struct Body {
@@ -42,6 +44,34 @@ struct Newton {                        // several linearizations a step (newton.
     double *predictor, *damping_velocity, *inertial_increment;  // (nodes, 3) [m/s]
     double* room;                      // 18 doubles a node
     Search* search;                    // (bodies,)
+};
+
+struct StageState {                    // of a body in the step under way (rosenbrock.h)
+    int32_t form;                      // StepForm of the attempt, or FAILED
+    int32_t accepted;                  // 1: the attempt is the step
+    int32_t assembled;                 // 1: A is that of the step
+    int32_t check;                     // 1: evaluate the residual of the first stage
+    int32_t corrects;                  // 1: the factor is corrected for grabs
+    int32_t patience;                  // steps to come that iterate
+    int64_t factor_step;               // of the last factor
+    int64_t checked;                   // step of its last check, -1: none
+    double estimate;                   // of the last attempt by stages [m]
+    double share;                      // of the residual that the factor left at its last check
+    SolveResult result;                // of all solves of the step
+};
+
+constexpr int FAILED = -1;             // form of an attempt that gave no state
+
+struct Stages {                        // input of the Rosenbrock-W step
+    const int32_t *again, *euler;      // numbers of launches: the forces of the second stage; backward Euler
+    int32_t agains, eulers;
+    int32_t second, finish, restore, restore_for_euler, advance_euler;  // likewise
+    int32_t factor_alone;              // 1: wanted
+    const double* estimate;            // (nodes,) of the last attempt [m]
+    const double* bound;               // (bodies,) [m]
+    double* coefficients;              // (2,) of launches whose arguments change while steps run
+    double own_coefficients[2], euler_coefficients[2];
+    StageState* state;                 // (bodies,)
 };
 
 struct Elastic {                       // potential energies of the elements of an effect
@@ -78,6 +108,7 @@ struct Loop {
     double* v;
     double* work;                      // 27 doubles a node
     Newton* newton;                    // null: one linearization a step
+    Stages* stages;                    // null: another scheme
     double* clock;                     // (1,) s, read by kernels
     int32_t* moving;                   // (bodies,) 0: the body rests (kernels/nodes.cu)
     Energies* energies;                // or null

@@ -36,6 +36,10 @@ struct SolveResult {
     int32_t fallbacks;      // 1: the factor was left in this solve
 };
 
+// Where a solve starts: from zero or from x if that is better, as the settings say; or from x, whose residual is what the tolerance
+// is relative to.
+enum Start { WARM_START = 0, GIVEN_START = 1 };
+
 struct Preconditioner {
     const BlockCsr& A;
     const Factor* factor;
@@ -76,7 +80,7 @@ struct Preconditioner {
 
 // Solves A x = b. work: 9 n doubles; x: start in, solution out; rests: the body is at rest; correction: of the factor, or null.
 static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor, const SolveSettings& settings, double* x,
-                       double* work, bool rests = false, Correction* correction = nullptr) {
+                       double* work, bool rests = false, Correction* correction = nullptr, Start from = WARM_START) {
     double start = now();
     int n = A.size();
     double *r = work, *z = r + n, *p = z + n, *q = p + n, *inverse = q + n, *scratch = inverse + 3 * n;
@@ -95,11 +99,13 @@ static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor,
         for (int i = 0; i < n; ++i) x[i] = NAN;  // the kernel `advance` takes the body back
         return finish(NOT_FINITE, b2, 1);
     }
-    if (b2 == 0) { zero(); return finish(CONVERGED, 0, 0); }
+    if (from == GIVEN_START) b2 = residual(A, b, x, r);
+    else if (b2 == 0) zero();
+    if (b2 == 0) return finish(CONVERGED, 0, 0);
     double goal = settings.tolerance * settings.tolerance * b2;
     if (rests) return finish(CONVERGED, residual(A, b, x, r), b2);
-    double r2 = settings.warm_start ? residual(A, b, x, r) : b2;                 // 1. r = b - A x
-    if (!settings.warm_start || !(r2 < b2)) {
+    double r2 = from == GIVEN_START ? b2 : settings.warm_start ? residual(A, b, x, r) : b2;  // 1. r = b - A x
+    if (from == WARM_START && (!settings.warm_start || !(r2 < b2))) {
         zero();
         for (int i = 0; i < n; ++i) r[i] = b[i];
         r2 = b2;

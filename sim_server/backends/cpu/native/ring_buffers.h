@@ -40,6 +40,8 @@ struct Record {
     int32_t bad_node = -1;      // first node of the body whose b is not finite
     int32_t probe = 0;          // iterations after which the solve was to go over to the other Kind; 0: never
     int32_t linearizations = 1;
+    int32_t form = 0;           // StepForm
+    double estimate = NAN;      // of the error of the step, the largest of a node [m]; NaN: the scheme gives none
 };
 
 // b: Balance or EnergyRecord of the body (kernels/energy_balance.cuh).

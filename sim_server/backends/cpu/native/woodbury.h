@@ -39,6 +39,7 @@ struct Correction {
     int32_t supernodes;     // of V
     int32_t usable;         // W exists and the corrected factor is positive definite
     int32_t used;           // nodes corrected in the last solve with a factor
+    int32_t missed;         // 1: changes that matter are not corrected
     int64_t changes;        // so far
     int64_t forgotten;      // step of the newest change that has left the ring
     int64_t step;           // of the factor that `then` and V are for
@@ -113,6 +114,7 @@ struct Corrected {
     bool prepare() {
         if (c.factor != &factor || c.step != factor.step) take_factor();
         c.used = 0;
+        c.missed = c.count < 0;
         if (!choose()) return false;
         bool same = true;
         for (int k = 0; k < c.count; ++k) {
@@ -122,6 +124,7 @@ struct Corrected {
         }
         if (!same) c.usable = make_inner();
         if (c.usable) c.used = c.count;
+        c.missed = !c.usable;
         return c.usable;
     }
 
@@ -206,6 +209,7 @@ private:
             if (changed < c.capacity) chosen[changed] = i;
             ++changed;
         }
+        c.missed = changed > c.capacity && together >= WEAK;
         if (changed > c.capacity || together < WEAK || together < WEAK_EACH * changed) return false;
         if (others) {
             std::copy(chosen, chosen + changed, c.node);

@@ -1,0 +1,196 @@
+// SPDX-License-Identifier: MIT
+// The Rosenbrock-W step on a CPU (method: mechanics/rosenbrock.py; nodal kernels: kernels/rosenbrock.cu).
+//
+// A step is a list of attempts. All bodies make theirs together, each in its own form; those whose estimate is too large then make
+// another: FACTOR, ITERATE, EULER. Launches run for the bodies that take part.
+#pragma once
+#include <algorithm>
+
+#include "loop.h"
+
+// Runs a launch for the bodies with take_part(i). One whose items are not grouped by body runs for all of them.
+template <class F> static void run_for(const Loop& loop, const Launch& l, F take_part) {
+    int left = 0;
+    for (int i = 0; i < loop.bodies; ++i) left += take_part(i);
+    if (!left) return;
+    if (!l.parts || left == loop.bodies) { run(l, loop.threads); return; }
+#pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) if (loop.threads > 1 && left > 1)
+    for (int i = 0; i < loop.bodies; ++i)
+        if (take_part(i) && l.parts[i] < l.parts[i + 1]) l.kernel(l.binding->params, l.parts[i], l.parts[i + 1]);
+}
+
+static BlockCsr matrix_of(const Loop& loop, const Body& body) {
+    return {body.first, body.last, loop.row_start, loop.columns, loop.values};
+}
+
+// Chooses the form of a body's first attempt, before the step is assembled. whole: A is wanted whatever the form.
+static void choose_form(Loop& loop, int index, bool whole) {
+    const Stages& stages = *loop.stages;
+    const Body& body = loop.body[index];
+    StageState& s = stages.state[index];
+    const Factor* factor = body.factor;
+    if (factor && s.factor_step != factor->step) {  // a new one
+        s.factor_step = factor->step;
+        s.patience = 0;
+        s.checked = -1;
+    }
+    const bool alone = stages.factor_alone && factor && body.now.kind == CHOLESKY && s.patience == 0;
+    const int64_t step = loop.rings.step;
+    s.form = alone ? FACTOR : ITERATE;
+    s.check = alone && (s.checked < 0 || step - s.checked >= CHECK_EVERY);
+    s.assembled = whole || !alone || s.check || (body.snapshot.load(std::memory_order_acquire) && body.ahead < 0);
+    if (s.patience > 0) --s.patience;
+}
+
+// After the forces of the first stage are assembled: whether the factor knows the springs of grabs, or is corrected for them. If it
+// does not, the body iterates in this step.
+static void check_corrections(Loop& loop, int index) {
+    StageState& s = loop.stages->state[index];
+    Body& body = loop.body[index];
+    s.corrects = false;
+    if (s.form != FACTOR || body.correction.capacity == 0) return;
+    s.corrects = Corrected{body.correction, matrix_of(loop, body), *body.factor}.prepare();
+    if (!body.correction.missed) return;
+    s.form = ITERATE;
+    s.assembled = true;
+}
+
+static void note(SolveResult& sum, const SolveResult& r) {
+    sum.seconds += r.seconds;
+    sum.iterations += r.iterations;
+    sum.fallbacks += r.fallbacks;
+    sum.kind = r.kind;
+    if (!(r.residual <= sum.residual)) sum.residual = r.residual;
+    if (r.status != CONVERGED) sum.status = r.status;
+}
+
+// y = P^-1 b. False if P is not positive definite there or, where it is checked, leaves too much of the residual.
+static bool apply_alone(Loop& loop, int index, bool check) {
+    StageState& s = loop.stages->state[index];
+    Body& body = loop.body[index];
+    const BlockCsr A = matrix_of(loop, body);
+    const int n = A.size();
+    const double *b = loop.b + 3 * (int64_t)body.first, begin = now();
+    double *y = loop.y + 3 * (int64_t)body.first, *work = loop.work + 27 * (int64_t)body.first, *r = work, *start = r + n;
+    const double b2 = dot(n, b, b);
+    SolveResult out{0, 0, 0, CONVERGED, CHOLESKY, 0};
+    bool well = true;
+    if (!std::isfinite(b2)) {
+        out.status = NOT_FINITE;
+        out.residual = std::sqrt(b2);
+        for (int i = 0; i < n; ++i) y[i] = NAN;
+    } else if (b2 == 0) {
+        for (int i = 0; i < n; ++i) y[i] = 0;
+    } else {
+        if (check) std::copy(y, y + n, start);
+        Preconditioner P{A, body.factor, CHOLESKY, nullptr, start + n, 1, &body.correction, s.corrects != 0};
+        const double zr = P.apply(b, std::sqrt(b2), y);
+        well = zr > 0 && zr < INFINITY;
+        if (check && well) {
+            const double from = residual(A, b, start, r), left = residual(A, b, y, r);
+            out.residual = from > 0 ? std::sqrt(left / from) : 0;
+            well = out.residual < POOR || left <= body.now.tolerance * body.now.tolerance * b2;
+            s.checked = loop.rings.step;
+            s.share = out.residual;
+        }
+        if (!well) {
+            if (check) std::copy(start, start + n, y);
+            out.fallbacks = 1;
+        }
+    }
+    out.seconds = now() - begin;
+    note(s.result, out);
+    return well;
+}
+
+static void iterate(Loop& loop, int index) {
+    StageState& s = loop.stages->state[index];
+    Body& body = loop.body[index];
+    const int64_t at = 3 * (int64_t)body.first;
+    note(s.result, pcg(matrix_of(loop, body), loop.b + at, body.factor, body.now, loop.y + at, loop.work + 27 * (int64_t)body.first,
+                       !loop.moving[index], &body.correction, s.form == EULER ? WARM_START : GIVEN_START));
+}
+
+// Solves of the bodies that take part. first: of the first stage, whose factor may be checked.
+template <class F> static void solve_stage(Loop& loop, bool first, F take_part) {
+#pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) if (loop.threads > 1 && loop.bodies > 1)
+    for (int i = 0; i < loop.bodies; ++i) {
+        StageState& s = loop.stages->state[i];
+        if (!take_part(i) || s.form == FAILED) continue;
+        if (!loop.moving[i] && s.form != EULER) { s.result.kind = loop.body[i].now.kind; continue; }
+        if (s.form != FACTOR) { iterate(loop, i); continue; }
+        if (apply_alone(loop, i, first && s.check)) continue;
+        s.patience = PATIENCE;
+        if (first && s.check) { s.form = ITERATE; iterate(loop, i); }  // A is there, and b is that of the first stage
+        else s.form = FAILED;
+    }
+}
+
+// One attempt of the bodies that take part, from the first solve on. Returns whether one has to make another.
+template <class F> static bool make_attempt(Loop& loop, F take_part) {
+    const Stages& stages = *loop.stages;
+    auto moves = [&](int i) { return take_part(i) && loop.moving[i]; };
+    solve_stage(loop, true, take_part);
+    run_for(loop, loop.launch[stages.second], take_part);
+    for (int k = 0; k < stages.agains; ++k) run_for(loop, loop.launch[stages.again[k]], moves);
+    solve_stage(loop, false, take_part);
+    run_for(loop, loop.launch[stages.finish], take_part);
+    bool again = false;
+    for (int i = 0; i < loop.bodies; ++i) {
+        if (!take_part(i)) continue;
+        StageState& s = stages.state[i];
+        double most = 0;
+        for (int k = loop.body[i].first; k < loop.body[i].last; ++k)
+            if (!(stages.estimate[k] <= most)) most = stages.estimate[k];  // also NaN
+        s.estimate = most;
+        s.accepted = s.form != FAILED && most <= stages.bound[i];
+        again = again || !s.accepted;
+    }
+    return again;
+}
+
+static void set_coefficients(const Stages& stages, const double (&to)[2]) {
+    stages.coefficients[0] = to[0];
+    stages.coefficients[1] = to[1];
+}
+
+// Makes the step of all bodies, whose first stage is assembled, and integrates.
+static void make_stages(Loop& loop) {
+    const Stages& stages = *loop.stages;
+    for (int i = 0; i < loop.bodies; ++i)
+        stages.state[i].result = SolveResult{0, 0, 0, CONVERGED, loop.body[i].now.kind, 0};
+    auto all = [](int) { return true; };
+    auto left = [&](int i) { return !stages.state[i].accepted; };
+    auto iterates = [&](int i) { return left(i) && stages.state[i].form == ITERATE; };
+    if (!make_attempt(loop, all)) return;
+    bool again = false;
+    for (int i = 0; i < loop.bodies; ++i) {
+        StageState& s = stages.state[i];
+        if (s.accepted || s.form == ITERATE) { if (!s.accepted) s.form = EULER; continue; }
+        s.form = ITERATE;
+        s.patience = PATIENCE;
+        s.result.status = CONVERGED;
+        again = true;
+    }
+    if (again) {
+        run_for(loop, loop.launch[stages.restore], iterates);
+        for (int k = 0; k < loop.before; ++k) run_for(loop, loop.launch[k], iterates);
+        make_attempt(loop, iterates);
+        for (int i = 0; i < loop.bodies; ++i)
+            if (iterates(i)) stages.state[i].form = EULER;
+    }
+    int back = 0;
+    for (int i = 0; i < loop.bodies; ++i) back += left(i);
+    if (!back) return;
+    for (int i = 0; i < loop.bodies; ++i)
+        if (left(i)) {
+            stages.state[i].patience = std::max(stages.state[i].patience, 1);
+            stages.state[i].result.status = CONVERGED;
+        }
+    run_for(loop, loop.launch[stages.restore_for_euler], left);
+    set_coefficients(stages, stages.euler_coefficients);
+    for (int k = 0; k < stages.eulers; ++k) run_for(loop, loop.launch[stages.euler[k]], left);
+    solve_stage(loop, true, left);
+    run_for(loop, loop.launch[stages.advance_euler], left);
+    set_coefficients(stages, stages.own_coefficients);
+}

@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: MIT
+"""The Rosenbrock-W step as input of an engine (method: mechanics/rosenbrock.py)."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from sim_server.arrays import Float64, Int32
+from sim_server.backends.base import Launch
+from sim_server.backends.declarations import Declarations
+
+FORMS = Declarations("kernels/step_form.h").enumeration("StepForm")
+"""Forms of a step by name; the numbers stand in the column `form` of the step record."""
+
+
+@dataclass(frozen=True)
+class Rosenbrock:
+    """Input of the Rosenbrock-W step.
+
+    again: launches that evaluate the forces of the second stage; without those of `assemble` that only make A
+    euler: launches that assemble backward Euler
+    second, finish: nodal kernels after the first and after the second solve
+    restore, restore_for_euler, advance_euler: nodal kernels of an attempt that is made again
+    parts: (bodies + 1,) first item of each body, by id of a launch; None if a launch does not tell bodies apart
+    factor_alone: whether the factor may take the place of A
+    estimate: (n,) of the last attempt [m]
+    bound: (bodies,) largest estimate of a step that is not made again [m]
+    coefficients: (2,) force_coefficient and dx_dv [s], read by launches whose arguments change while steps run
+    euler_coefficients: the same of backward Euler
+    """
+
+    again: Sequence[Launch]
+    euler: Sequence[Launch]
+    second: Launch
+    finish: Launch
+    restore: Launch
+    restore_for_euler: Launch
+    advance_euler: Launch
+    parts: Mapping[int, Int32 | None]
+    factor_alone: bool
+    estimate: Float64
+    bound: Float64
+    coefficients: Float64
+    euler_coefficients: tuple[float, float]
+
+    @property
+    def launches(self) -> list[Launch]:
+        """All launches beside those of `assemble`."""
+        nodal = [self.second, self.finish, self.restore, self.restore_for_euler, self.advance_euler]
+        return [*self.again, *self.euler, *nodal]

@@ -1,0 +1,186 @@
+// SPDX-License-Identifier: MIT
+// Nodal kernels of the second-order Rosenbrock-W step (formulas and symbols: mechanics/rosenbrock.py).
+#define WIDE
+#include "mat3.cuh"
+
+constexpr real GAMMA = 0.29289321881345247559915563789515;  // g = 1 - 1 / sqrt 2
+
+struct RotateForce {
+    int n;                  // nodes
+    const real* free;       // (n,) 1, or 0 at fixed nodes
+    const local* rotation;  // (n, 3, 3) frame of the node at the first stage
+    own<real> b;            // (n, 3) world frame [N s]
+    const real* dv;         // (n, 3) start of the solve, world frame [m/s]
+    real* b_material;       // (n, 3) out: R^T b, 0 at fixed nodes
+    real* y;                // (n, 3) out: start of the solve, material frame
+};
+
+// The right-hand side of the second stage, in the frames of the first: its matrix is that of the first.
+KERNEL(rotate_force, RotateForce) {
+    mat3 Rt = transposed(as<number>(load9(p.rotation, i)));
+    auto fixed = at(p.free, i) == 0;
+    vec3 zero = {}, b = select(fixed, zero, mul(Rt, load3(p.b, i))), y = select(fixed, zero, mul(Rt, load3(p.dv, i)));
+    store3(p.b_material, i, b);
+    store3(p.y, i, y);
+}
+
+struct Prepare {
+    int n;                     // nodes
+    const real* share;         // (n,) theta [-]
+    const real* weight;        // (n,) theta (1 + g h alpha) [-]
+    const real* v;             // (n, 3) [m/s]
+    real* damping_velocity;    // (n, 3) out [m/s]
+    real* inertial_increment;  // (n, 3) out [m/s]
+    real* dv;                  // (n, 3) out: start of the solve [m/s]
+};
+
+// What the first stage is assembled from.
+template <class P, class I> INLINE void prepare_stage(const P& p, I i, vec3 v, vec3 inertial, vec3 start) {
+    number share = at(p.share, i);
+    store3(p.damping_velocity, i, (1 - share) * v);
+    store3(p.inertial_increment, i, inertial + at(p.weight, i) * start);
+    store3(p.dv, i, share * start);
+}
+
+KERNEL(prepare, Prepare) {
+    vec3 v = load3(p.v, i);
+    prepare_stage(p, i, v, vec3{}, v);
+}
+
+struct Second {
+    int n;                     // nodes
+    const local* rotation;     // (n, 3, 3)
+    const real* y;             // (n, 3) solution of the first stage, material frame [m/s]
+    const real* share;         // (n,)
+    const real* weight;        // (n,)
+    real h;                    // time step [s]
+    real* v;                   // (n, 3) in, out [m/s]
+    real* x;                   // (n, 3) in, out [m]
+    real* start_v;             // (n, 3) out: v at the start of the step [m/s]
+    real* start_x;             // (n, 3) out: x at the start of the step [m]
+    real* first;               // (n, 3) out: u_1 [m/s]
+    real* damping_velocity;    // (n, 3) out [m/s]
+    real* inertial_increment;  // (n, 3) out [m/s]
+    real* dv;                  // (n, 3) out: start of the solve [m/s]
+};
+
+// u_1 from the solution of the first stage; state and right-hand side of the second.
+KERNEL(second, Second) {
+    vec3 x = load3(p.x, i), v = load3(p.v, i);
+    vec3 u = mul(as<number>(load9(p.rotation, i)), load3(p.y, i)) - at(p.share, i) * v;
+    vec3 moved = v + (1 / GAMMA) * u, start = (1 / GAMMA - 2) * u - v;
+    store3(p.start_x, i, x);
+    store3(p.start_v, i, v);
+    store3(p.first, i, u);
+    store3(p.x, i, x + p.h * (v + u));
+    store3(p.v, i, moved);
+    prepare_stage(p, i, moved, -2 * u, start);
+}
+
+struct Finish {
+    int n;                     // nodes
+    const int* body;           // (n,) of the node
+    const int* moving;         // (bodies,) 0: the body rests
+    const local* rotation;     // (n, 3, 3)
+    const real* y;             // (n, 3) solution of the second stage, material frame [m/s]
+    const real* share;         // (n,)
+    const real* weight;        // (n,)
+    const real* start_v;       // (n, 3) [m/s]
+    const real* start_x;       // (n, 3) [m]
+    const real* first;         // (n, 3) u_1 [m/s]
+    real h;                    // time step [s]
+    real* v;                   // (n, 3) out [m/s]
+    real* x;                   // (n, 3) out [m]
+    real* before;              // (n, 3) out: x at the start of the step [m]
+    real* estimate;            // (n,) out: error of the step [m]
+    real* damping_velocity;    // (n, 3) out: of the next step, as the next two [m/s]
+    real* inertial_increment;
+    real* dv;
+};
+
+// The state at the end of the step; a body at rest stays where it is.
+KERNEL(finish, Finish) {
+    vec3 x = load3(p.start_x, i), v = load3(p.start_v, i), u = load3(p.first, i), zero = {};
+    vec3 start = (1 / GAMMA - 2) * u - v;
+    vec3 w = mul(as<number>(load9(p.rotation, i)), load3(p.y, i)) - at(p.share, i) * start;
+    vec3 k1 = v + u, k2 = start + w, off = (p.h / 2) * (k1 + k2);
+    auto still = as_number(at(p.moving, at(p.body, i))) == 0;
+    vec3 ended = select(still, zero, v + (1 / (2 * GAMMA)) * (3 * u + w));
+    store3(p.x, i, select(still, x, x + (p.h / 2) * (3 * k1 + k2)));
+    store3(p.v, i, ended);
+    store3(p.before, i, x);
+    put(p.estimate, i, still ? number{} : sqrt(dot(off, off)));
+    prepare_stage(p, i, ended, zero, ended);
+}
+
+struct Restore {
+    int n;                     // nodes
+    const real* share;         // (n,)
+    const real* weight;        // (n,)
+    const real* start_v;       // (n, 3) [m/s]
+    const real* start_x;       // (n, 3) [m]
+    real* v;                   // (n, 3) out [m/s]
+    real* x;                   // (n, 3) out [m]
+    real* damping_velocity;    // (n, 3) out [m/s]
+    real* inertial_increment;  // (n, 3) out [m/s]
+    real* dv;                  // (n, 3) out: start of the solve [m/s]
+};
+
+// Back to the start of the step, for another attempt.
+KERNEL(restore, Restore) {
+    vec3 v = load3(p.start_v, i);
+    store3(p.x, i, load3(p.start_x, i));
+    store3(p.v, i, v);
+    prepare_stage(p, i, v, vec3{}, v);
+}
+
+struct RestoreForEuler {
+    int n;                     // nodes
+    const real* start_v;       // (n, 3) [m/s]
+    const real* start_x;       // (n, 3) [m]
+    real* v;                   // (n, 3) out [m/s]
+    real* x;                   // (n, 3) out [m]
+    real* predictor;           // (n, 3) out [m/s]
+    real* damping_velocity;    // (n, 3) out [m/s]
+    real* inertial_increment;  // (n, 3) out [m/s]
+    real* dv;                  // (n, 3) out: start of the solve [m/s]
+};
+
+// Back to the start of the step, for a step of backward Euler.
+KERNEL(restore_for_euler, RestoreForEuler) {
+    vec3 v = load3(p.start_v, i), zero = {};
+    store3(p.x, i, load3(p.start_x, i));
+    store3(p.v, i, v);
+    store3(p.predictor, i, v);
+    store3(p.damping_velocity, i, v);
+    store3(p.inertial_increment, i, zero);
+    store3(p.dv, i, zero);
+}
+
+struct Euler {
+    int n;                     // nodes
+    const local* rotation;     // (n, 3, 3)
+    const real* y;             // (n, 3) solution, material frame [m/s]
+    const real* share;         // (n,)
+    const real* weight;        // (n,)
+    real h;                    // time step [s]
+    real* v;                   // (n, 3) in, out [m/s]
+    real* x;                   // (n, 3) in, out [m]
+    real* before;              // (n, 3) in, out: x when the step before began [m]
+    real* predictor;           // (n, 3) out: 0 [m/s]
+    real* damping_velocity;    // (n, 3) out: of the next step, as the next two [m/s]
+    real* inertial_increment;
+    real* dv;
+};
+
+// v += dv, x += h v. A body whose forces are NaN goes back and rests there, as in nodes.cu.
+KERNEL(euler, Euler) {
+    vec3 y = load3(p.y, i), x = load3(p.x, i), before = load3(p.before, i), zero = {};
+    auto refused = y.x != y.x;
+    vec3 v = select(refused, zero, load3(p.v, i) + mul(as<number>(load9(p.rotation, i)), y));
+    store3(p.x, i, select(refused, before, x + p.h * v));
+    store3(p.v, i, v);
+    store3(p.before, i, select(refused, before, x));
+    store3(p.predictor, i, zero);
+    prepare_stage(p, i, v, zero, v);
+}

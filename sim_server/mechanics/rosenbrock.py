@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: MIT
+"""A second-order step by a Rosenbrock-W method: two linear solves with one matrix, which may be an older one.
+
+With y = (x, v), M v' = f(x, v), time step h, g = 1 - 1 / sqrt 2 and *any* matrix J, the stages
+
+    (I - g h J) k_1 = F(y),    (I - g h J) k_2 = F(y + h k_1) - 2 k_1,    y += h (3 k_1 + k_2) / 2
+
+are of order 2 (ROS2: Verwer, Spee, Blom and Hundsdorfer 1999), and |h (k_1 + k_2) / 2| estimates the error of the step.
+With J made of a stiffness K = -df/dx and damping -alpha M - beta K, and u_j = g h times the velocity part of k_j,
+
+    A = M (1 + g h alpha) + g h (g h + beta) K                  that of backward Euler with a time step of g h
+    A u_j = g h f(x_j, v_j) + M r_j - (g h)^2 K s_j             s_1 = v,   r_1 = 0
+    x_2 = x + h (v + u_1),   v_2 = v + u_1 / g                  s_2 = (1 / g - 2) u_1 - v,   r_2 = -2 u_1
+    x += h (3 (v + u_1) + s_2 + u_2) / 2,   v += (3 u_1 + u_2) / (2 g),   estimate = h |v + u_1 + s_2 + u_2| / 2
+
+The products with K vanish, since (g h)^2 K s = theta (A - (1 + g h alpha) M) s with theta = g h / (g h + beta):
+
+    A y_j = g h f(x_j, v_j) + M (r_j + w s_j),    u_j = y_j - theta s_j,    w = theta (1 + g h alpha)
+
+so that a solve needs A alone, or instead of it the factor of an older A, warped: whatever P is applied, it *is* the A
+of the step, which keeps its order, without assembly or iterations. Forms of a step, of each body (kernels/step_form.h):
+
+    FACTOR    y_j = P^-1 b_j with the warped factor. Once for each factor, and every CHECK_EVERY steps, A is assembled,
+              too, and the residual of y_1 evaluated: a factor that leaves POOR of |b - A theta s| or more is not used
+    ITERATE   A is assembled at x, and solved with conjugate gradients from theta s, to a residual relative to that of
+              this start, which is the right-hand side of u_j
+    EULER     where the estimate of ITERATE exceeds the bound of the body: backward Euler from the start of the step
+
+A step by FACTOR whose estimate exceeds the bound is made again by ITERATE, and PATIENCE steps after it, too.
+
+Stability: A-stable with J the slope of F, L-stable (R(infinity) = 0). With an older, warped J in place of it see
+docs/bench/rosenbrock.md; without the warp it flies apart.
+
+Sources: Verwer, Spee, Blom and Hundsdorfer, SIAM J. Sci. Comput. 20, 1999; Steihaug and Wolfbrandt, Math. Comp. 33,
+1979 (W-methods); Hairer and Wanner, Solving Ordinary Differential Equations II, section IV.7.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from sim_server.arrays import Float64
+from sim_server.backends.base import Launch
+from sim_server.backends.rosenbrock import Rosenbrock
+from sim_server.mechanics.integrator import CouplesNodes, Integrator, items_of_bodies, rows_of
+from sim_server.mechanics.system import System
+from sim_server.mechanics.world import Body
+from sim_server.scene import Scene
+
+TEXT = "kernels/rosenbrock.cu"
+BOUND = 0.1  # of the shortest edge, for the error of a step
+
+
+class RosenbrockIntegrator(Integrator):
+    """The launches of the stages.
+
+    share (n,): theta; weight (n,): w; first (n, 3): u_1 [m/s]; start_x, start_v (n, 3): x [m] and v [m/s] at the start
+    of the step; estimate (n,) [m]
+    """
+
+    has_stages = True
+
+    def __init__(self, scene: Scene, system: System):
+        super().__init__(scene, system)
+        w = self.world
+        alpha = np.repeat(w.alpha, [b.last - b.first for b in w.bodies])
+        self.share = w.dx_dv / (w.dx_dv + self.beta)
+        self.weight = self.share * (1 + w.dx_dv * alpha)
+        self.start_x, self.start_v, self.first = w.x.copy(), np.zeros_like(w.v), np.zeros_like(w.v)
+        self.estimate = np.zeros(w.nodes)
+        self.bound = np.array([self._bound(b) for b in w.bodies])
+        self.factor_alone = scene.uses_factor_alone
+        w.backend.keep(self.share, self.weight, self.start_x, self.start_v, self.first, self.estimate)
+
+    def _bound(self, body: Body) -> float:
+        if self.options.error_bound is not None:
+            return self.options.error_bound
+        corners = body.mesh.rest[body.mesh.tets]
+        edges = corners[:, [0, 0, 0, 1, 1, 2]] - corners[:, [1, 2, 3, 2, 3, 3]]
+        return BOUND * float(np.sqrt((edges**2).sum(axis=2).min())) if len(edges) else np.inf
+
+    @property
+    def still(self) -> list[Float64]:
+        return [self.world.predictor, self.world.damping_velocity, self.inertial_increment]
+
+    def begin(self, assemble: Sequence[Launch]) -> list[Launch]:
+        return [self._stage("prepare", v=self.world.v, **self._prepared())]
+
+    def advance(self) -> list[Launch]:
+        return []
+
+    def stages(
+        self, assemble: Sequence[Launch], euler: Sequence[Launch], effects: Sequence[CouplesNodes]
+    ) -> Rosenbrock:
+        """Input of the step. assemble, euler: launches that assemble A with g h and with h for the time step."""
+        w, s = self.world, self.system
+        state: dict[str, Any] = {"x": w.x, "v": w.v}
+        started: dict[str, Any] = {"start_x": self.start_x, "start_v": self.start_v}
+        solved: dict[str, Any] = {"rotation": s.rotation, "y": s.y, "h": w.dt}
+        rotate = self._stage(
+            "rotate_force", free=w.free, rotation=s.rotation, b=s.b, dv=s.dv, b_material=s.b_material, y=s.y
+        )
+        forces = [x for x in assemble if x.domain != "blocks" and x.name != "nodes.rotate"]
+        euler_arrays = {**self._prepared(), "predictor": w.predictor}
+        restored = {k: v for k, v in euler_arrays.items() if k not in ("share", "weight")}
+        found = Rosenbrock(
+            again=[*forces, rotate], euler=euler,
+            second=self._stage("second", first=self.first, **solved, **state, **started, **self._prepared()),
+            finish=self._stage(
+                "finish", body=s.body, moving=s.moving, first=self.first, before=self.before, estimate=self.estimate,
+                **solved, **state, **started, **self._prepared(),
+            ),
+            restore=self._stage("restore", **state, **started, **self._prepared()),
+            restore_for_euler=self._stage("restore_for_euler", **state, **started, **restored),
+            advance_euler=self._stage("euler", before=self.before, **solved, **state, **euler_arrays),
+            parts={}, factor_alone=self.factor_alone, estimate=self.estimate, bound=self.bound,
+            coefficients=w.coefficients, euler_coefficients=(w.dt, w.dt),
+        )  # fmt: skip
+        starts, rows = np.array([*(b.first for b in w.bodies), w.nodes], dtype=np.int32), rows_of(effects)
+        nodal = (found.second, found.finish, found.restore, found.restore_for_euler, found.advance_euler)
+        launches = (*assemble, *found.again, *euler, *nodal)
+        found.parts.update({id(x): items_of_bodies(x, starts, s.row, rows) for x in launches})  # type: ignore[attr-defined]
+        return found
+
+    def _prepared(self) -> dict[str, Any]:
+        return {
+            "share": self.share, "weight": self.weight, "damping_velocity": self.world.damping_velocity,
+            "inertial_increment": self.inertial_increment, "dv": self.system.dv,
+        }  # fmt: skip
+
+    def _stage(self, kernel: str, **arguments: Any) -> Launch:
+        launch: Launch = self.world.backend.module(TEXT).bind(kernel, self.world.nodes, **arguments)
+        return launch
+
+
+def make_integrator(scene: Scene, system: System) -> Integrator:
+    """Returns the launches of the scheme that the scene names."""
+    return (RosenbrockIntegrator if scene.integrator.scheme == "ros2" else Integrator)(scene, system)
