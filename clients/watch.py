@@ -35,7 +35,9 @@ def tables(status: pb.Status) -> Group:
     """Tables of a status: summary, objects, workers, and the local workers that the server supervises."""
     local = [_local(status)] if status.local_workers else []
     pace = [Text(status.pace, "bold red")] if status.pace else []
-    return Group(_summary(status), *pace, _objects(status), *_energies(status), _workers(status), *local)
+    return Group(
+        _summary(status), *pace, _objects(status), *_errors(status), *_energies(status), _workers(status), *local
+    )
 
 
 def _summary(status: pb.Status) -> Text:
@@ -64,7 +66,7 @@ def _objects(status: pb.Status) -> Table:
             str(found.nodes),
             str(last.iterations),
             f"{found.mean_iterations:.1f}",
-            f"{last.residual:.1e}",
+            "-" if last.residual < 0 else f"{last.residual:.1e}",
             _status(found),
             f"{_known(found.factor_age)}/{_known(found.factor_age_bound)}",
             last.preconditioner,
@@ -86,6 +88,16 @@ def places(status: pb.Status) -> Table:
 def _status(found: pb.ObjectStatus) -> Text:
     away = found.last.status == pb.RUNAWAY
     return Text("RUNAWAY", style="bold red") if away else Text(status_name(found.last.status))
+
+
+def _errors(status: pb.Status) -> list[Table]:
+    """Table of the objects whose steps have an estimate of their error; empty without such objects."""
+    shown = [o for o in status.objects if o.last.form]
+    table = Table("object", "step by", "error of it [m]", **COMPACT)
+    for found in shown:
+        estimate = f"{found.last.estimate:.1e}" if found.last.HasField("estimate") else "-"
+        _add(table, found.object, pb.StepForm.Name(found.last.form).lower(), estimate)
+    return [table] if shown else []
 
 
 def _energies(status: pb.Status) -> list[Table]:

@@ -17,6 +17,13 @@ class SolveStatus(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     NOT_FINITE: _ClassVar[SolveStatus]
     MAX_LINEARIZATIONS: _ClassVar[SolveStatus]
     RUNAWAY: _ClassVar[SolveStatus]
+
+class StepForm(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    ONE_SOLVE: _ClassVar[StepForm]
+    ITERATE: _ClassVar[StepForm]
+    FACTOR: _ClassVar[StepForm]
+    EULER: _ClassVar[StepForm]
 CONVERGED: SolveStatus
 MAX_ITERATIONS: SolveStatus
 BUDGET: SolveStatus
@@ -25,6 +32,10 @@ BREAKDOWN_PRECONDITIONER: SolveStatus
 NOT_FINITE: SolveStatus
 MAX_LINEARIZATIONS: SolveStatus
 RUNAWAY: SolveStatus
+ONE_SOLVE: StepForm
+ITERATE: StepForm
+FACTOR: StepForm
+EULER: StepForm
 
 class Header(_message.Message):
     __slots__ = ("protocol", "incarnation", "object", "epoch", "sequence")
@@ -241,7 +252,7 @@ class Echo(_message.Message):
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., slot: _Optional[_Union[Slot, _Mapping]] = ..., nonce: _Optional[int] = ..., settled: _Optional[bool] = ...) -> None: ...
 
 class ObjectStep(_message.Message):
-    __slots__ = ("header", "step", "time", "iterations", "residual", "status", "factor_step", "factor_age", "preconditioner", "assemble_seconds", "solve_seconds", "integrate_seconds", "step_seconds", "late_seconds", "cpu_seconds", "fallbacks", "excess", "interactions", "asked", "probe", "factor_age_bound", "linearizations", "nonlinear_residual", "kinetic_energy", "elastic_energy", "gravity_energy", "work", "dissipated")
+    __slots__ = ("header", "step", "time", "iterations", "residual", "status", "factor_step", "factor_age", "preconditioner", "assemble_seconds", "solve_seconds", "integrate_seconds", "step_seconds", "late_seconds", "cpu_seconds", "fallbacks", "excess", "interactions", "asked", "probe", "factor_age_bound", "linearizations", "nonlinear_residual", "kinetic_energy", "elastic_energy", "gravity_energy", "work", "dissipated", "form", "estimate")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     STEP_FIELD_NUMBER: _ClassVar[int]
     TIME_FIELD_NUMBER: _ClassVar[int]
@@ -270,6 +281,8 @@ class ObjectStep(_message.Message):
     GRAVITY_ENERGY_FIELD_NUMBER: _ClassVar[int]
     WORK_FIELD_NUMBER: _ClassVar[int]
     DISSIPATED_FIELD_NUMBER: _ClassVar[int]
+    FORM_FIELD_NUMBER: _ClassVar[int]
+    ESTIMATE_FIELD_NUMBER: _ClassVar[int]
     header: Header
     step: int
     time: float
@@ -298,7 +311,9 @@ class ObjectStep(_message.Message):
     gravity_energy: float
     work: float
     dissipated: float
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., time: _Optional[float] = ..., iterations: _Optional[int] = ..., residual: _Optional[float] = ..., status: _Optional[_Union[SolveStatus, str]] = ..., factor_step: _Optional[int] = ..., factor_age: _Optional[int] = ..., preconditioner: _Optional[str] = ..., assemble_seconds: _Optional[float] = ..., solve_seconds: _Optional[float] = ..., integrate_seconds: _Optional[float] = ..., step_seconds: _Optional[float] = ..., late_seconds: _Optional[float] = ..., cpu_seconds: _Optional[float] = ..., fallbacks: _Optional[int] = ..., excess: _Optional[float] = ..., interactions: _Optional[_Iterable[_Union[Interaction, _Mapping]]] = ..., asked: _Optional[str] = ..., probe: _Optional[int] = ..., factor_age_bound: _Optional[int] = ..., linearizations: _Optional[int] = ..., nonlinear_residual: _Optional[float] = ..., kinetic_energy: _Optional[float] = ..., elastic_energy: _Optional[float] = ..., gravity_energy: _Optional[float] = ..., work: _Optional[float] = ..., dissipated: _Optional[float] = ...) -> None: ...
+    form: StepForm
+    estimate: float
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., time: _Optional[float] = ..., iterations: _Optional[int] = ..., residual: _Optional[float] = ..., status: _Optional[_Union[SolveStatus, str]] = ..., factor_step: _Optional[int] = ..., factor_age: _Optional[int] = ..., preconditioner: _Optional[str] = ..., assemble_seconds: _Optional[float] = ..., solve_seconds: _Optional[float] = ..., integrate_seconds: _Optional[float] = ..., step_seconds: _Optional[float] = ..., late_seconds: _Optional[float] = ..., cpu_seconds: _Optional[float] = ..., fallbacks: _Optional[int] = ..., excess: _Optional[float] = ..., interactions: _Optional[_Iterable[_Union[Interaction, _Mapping]]] = ..., asked: _Optional[str] = ..., probe: _Optional[int] = ..., factor_age_bound: _Optional[int] = ..., linearizations: _Optional[int] = ..., nonlinear_residual: _Optional[float] = ..., kinetic_energy: _Optional[float] = ..., elastic_energy: _Optional[float] = ..., gravity_energy: _Optional[float] = ..., work: _Optional[float] = ..., dissipated: _Optional[float] = ..., form: _Optional[_Union[StepForm, str]] = ..., estimate: _Optional[float] = ...) -> None: ...
 
 class Steps(_message.Message):
     __slots__ = ("header", "steps")
@@ -381,7 +396,7 @@ class TouchSet(_message.Message):
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., interactions: _Optional[_Iterable[_Union[Interaction, _Mapping]]] = ...) -> None: ...
 
 class FactorUse(_message.Message):
-    __slots__ = ("header", "step", "pattern", "checksum", "dtype", "worker", "library", "threads", "seconds", "remedy", "method", "ahead", "later")
+    __slots__ = ("header", "step", "pattern", "checksum", "dtype", "worker", "library", "threads", "seconds", "remedy", "method", "ahead", "later", "exact")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     STEP_FIELD_NUMBER: _ClassVar[int]
     PATTERN_FIELD_NUMBER: _ClassVar[int]
@@ -395,6 +410,7 @@ class FactorUse(_message.Message):
     METHOD_FIELD_NUMBER: _ClassVar[int]
     AHEAD_FIELD_NUMBER: _ClassVar[int]
     LATER_FIELD_NUMBER: _ClassVar[int]
+    EXACT_FIELD_NUMBER: _ClassVar[int]
     header: Header
     step: int
     pattern: int
@@ -408,7 +424,8 @@ class FactorUse(_message.Message):
     method: str
     ahead: float
     later: bool
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., pattern: _Optional[int] = ..., checksum: _Optional[int] = ..., dtype: _Optional[str] = ..., worker: _Optional[str] = ..., library: _Optional[str] = ..., threads: _Optional[int] = ..., seconds: _Optional[float] = ..., remedy: _Optional[str] = ..., method: _Optional[str] = ..., ahead: _Optional[float] = ..., later: _Optional[bool] = ...) -> None: ...
+    exact: bool
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., pattern: _Optional[int] = ..., checksum: _Optional[int] = ..., dtype: _Optional[str] = ..., worker: _Optional[str] = ..., library: _Optional[str] = ..., threads: _Optional[int] = ..., seconds: _Optional[float] = ..., remedy: _Optional[str] = ..., method: _Optional[str] = ..., ahead: _Optional[float] = ..., later: _Optional[bool] = ..., exact: _Optional[bool] = ...) -> None: ...
 
 class Command(_message.Message):
     __slots__ = ("header", "client", "verb", "interaction", "secret")

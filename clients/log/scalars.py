@@ -31,9 +31,16 @@ simulated."""
 OPTIONAL = frozenset(f.name for f in _FIELDS if f.has_presence)  # NaN where they were not recorded
 
 
+ENUMS = {f.name: {v.number: v.name.lower() for v in f.enum_type.values} for f in _FIELDS if f.enum_type is not None}
+
+
 def status_name(value: int) -> str:
     """Names a SolveStatus, e.g. 'converged' or 'max_iterations'; 'unknown_7' if this version does not know it."""
-    return pb.SolveStatus.Name(value).lower() if value in pb.SolveStatus.values() else f"unknown_{value}"  # type: ignore[arg-type]
+    return _named("status", value)
+
+
+def _named(field: str, value: int) -> str:
+    return ENUMS[field].get(value, f"unknown_{value}")
 
 
 def row(message: pb.ObjectStep) -> tuple:
@@ -42,8 +49,8 @@ def row(message: pb.ObjectStep) -> tuple:
 
 
 def _value(message: pb.ObjectStep, name: str) -> object:
-    if name == "status":
-        return status_name(message.status)
+    if name in ENUMS:
+        return _named(name, getattr(message, name))
     return math.nan if name in OPTIONAL and not message.HasField(name) else getattr(message, name)  # type: ignore[arg-type]
 
 

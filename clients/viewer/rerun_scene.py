@@ -21,6 +21,7 @@ PLOTS = {  # entity below /plots -> title
     "iterations": "PCG iterations",
     "residual": "true residual, log10",
     "factor_age": "factor age [steps]",
+    "estimate": "estimated error of a step, log10 m",
     "step_time": "step time [ms]",
     "energy": "energy [J]",
 }
@@ -76,8 +77,11 @@ class RerunScene:
         with np.errstate(divide="ignore", invalid="ignore"):
             residual = np.log10(np.maximum(scalars["residual"], 1e-17))
         self._curve("iterations", name, scalars, scalars["iterations"], np.ones(len(age), bool))
-        self._curve("residual", name, scalars, residual, np.isfinite(residual))
+        self._curve("residual", name, scalars, residual, scalars["residual"] >= 0)
         self._curve("factor_age", name, scalars, age, age >= 0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            estimate = np.log10(scalars["estimate"])
+        self._curve("estimate", name, scalars, estimate, np.isfinite(estimate))
         for energy in ENERGIES:
             values = scalars[energy]
             self._curve(f"energy/{energy.removesuffix('_energy')}", name, scalars, values, np.isfinite(values))

@@ -55,7 +55,7 @@ class Drag(Effect):
 
 
 def build(world: World, listed: list[tuple[Body, Any]]) -> Drag:
-    """Sets world.alpha and world.beta of the bodies and returns the damping of the mass; a quasi-static scene has neither."""
+    """Sets world.alpha and world.beta and returns the damping of the mass; a quasi-static scene has neither."""
     if not world.inertia:
         return Drag(world, np.zeros(world.nodes))
     for body, params in listed:

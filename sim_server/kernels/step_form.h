@@ -7,5 +7,5 @@
 enum StepForm { ONE_SOLVE = 0, ITERATE = 1, FACTOR = 2, EULER = 3 };
 
 constexpr double POOR = 0.5;          // a factor leaves this share of a residual or more: it is not used alone
-constexpr int CHECK_EVERY = 16;       // steps after which the residual of a factor used alone is evaluated again
+constexpr int CHECK_EVERY = 200;      // steps after which the residual of a factor used alone is evaluated again
 constexpr int PATIENCE = 8;           // steps that iterate after one whose factor alone did not do

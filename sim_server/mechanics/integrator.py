@@ -25,8 +25,9 @@ weights with which it makes p and r of the next step (PredictorWeights, kernels/
 p = d = v, r = 0, and the launches are those of kernels/nodes.cu. Newton-Raphson (kernels/newton_line_search.cuh)
 linearizes again at the state reached; there p = 0.
 
-The scheme ros2 has two stages of its own (rosenbrock.py). Order: 1, 2 (gamma = 1/2), 2. One linearization keeps it only where K is the exact slope of the forces; the usual
-tangent of corotational elements is not, by as much as they are strained.
+Order: 1, 2 (gamma = 1/2), 2. One linearization keeps it only where K is the exact slope of the forces; the usual
+tangent of corotational elements is not, by as much as they are strained. The scheme ros2 keeps it with any tangent: it
+has two stages of its own (rosenbrock.py).
 
 Stability with one linearization: a mode of stiffness k with k' in its place in the matrix is stable in Newmark's scheme
 and BDF2 at every h if k' >= k, and grows if k' < k (backward Euler: if k' < k / 2). The usual tangent has k' < k under
@@ -38,6 +39,7 @@ Equations II, section V.1 (BDF2); Baraff and Witkin 1998 (one linearization).
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from math import inf
 from typing import Any, Protocol
 
 import numpy as np
@@ -161,6 +163,11 @@ class Integrator:
         )  # fmt: skip
 
     has_stages = False
+
+    @property
+    def error_bounds(self) -> list[float]:
+        """Largest estimated error of a step of each body that is not made again [m]; infinite without an estimate."""
+        return [inf] * len(self.world.bodies)
 
     def stages(
         self, assemble: Sequence[Launch], euler: Sequence[Launch], effects: Sequence[CouplesNodes]

@@ -20,8 +20,9 @@ The products with K vanish, since (g h)^2 K s = theta (A - (1 + g h alpha) M) s 
 so that a solve needs A alone, or instead of it the factor of an older A, warped: whatever P is applied, it *is* the A
 of the step, which keeps its order, without assembly or iterations. Forms of a step, of each body (kernels/step_form.h):
 
-    FACTOR    y_j = P^-1 b_j with the warped factor. Once for each factor, and every CHECK_EVERY steps, A is assembled,
-              too, and the residual of y_1 evaluated: a factor that leaves POOR of |b - A theta s| or more is not used
+    FACTOR    y_j = P^-1 b_j with the warped factor. A factor that was not checked against its own matrix when it came
+              (updates/factor_check.py) is checked in its first step, and any every CHECK_EVERY steps: A is assembled,
+              too, and the residual of y_1 evaluated. One that leaves POOR of |b - A theta s| or more is not used alone
     ITERATE   A is assembled at x, and solved with conjugate gradients from theta s, to a residual relative to that of
               this start, which is the right-hand side of u_j
     EULER     where the estimate of ITERATE exceeds the bound of the body: backward Euler from the start of the step
@@ -79,6 +80,10 @@ class RosenbrockIntegrator(Integrator):
         corners = body.mesh.rest[body.mesh.tets]
         edges = corners[:, [0, 0, 0, 1, 1, 2]] - corners[:, [1, 2, 3, 2, 3, 3]]
         return BOUND * float(np.sqrt((edges**2).sum(axis=2).min())) if len(edges) else np.inf
+
+    @property
+    def error_bounds(self) -> list[float]:
+        return [float(bound) for bound in self.bound]
 
     @property
     def still(self) -> list[Float64]:

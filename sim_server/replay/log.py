@@ -28,7 +28,10 @@ from sim_server.backends.kinds import Kind
 from sim_server.recording import object_steps
 from sim_server.scene.solver_options import FACTORS
 
-COMPARED = ("iterations", "residual", "status", "kind", "fallbacks", "factor_step", "linearizations", "kinetic", "work")
+COMPARED = (
+    "iterations", "residual", "status", "kind", "fallbacks", "factor_step", "linearizations", "form", "estimate",
+    "kinetic", "work",
+)  # fmt: skip
 INPUTS = ("step", "asked", "probe")
 ROW = np.dtype([(name, "f8" if RECORD[name].kind == "f" else "i8") for name in (*INPUTS, *COMPARED)])
 """Input and result of a solve: columns of the step record, from an ObjectStep."""

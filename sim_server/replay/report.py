@@ -113,6 +113,8 @@ def _same(a: Any, b: Any) -> bool:
 def _shown(name: str, value: Any) -> str:
     if name == "status":
         return pb.SolveStatus.Name(int(value)).lower()
+    if name == "form":
+        return pb.StepForm.Name(int(value)).lower()
     if name == "kind":
         return Kind(int(value)).name.lower()
     return repr(float(value)) if name in ("residual", *OPTIONAL) else str(int(value))

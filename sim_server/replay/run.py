@@ -240,7 +240,8 @@ class Replay:
             if factor is None:
                 self.compared.diverged(step + 1, name, "factor", f"used that of step {made}, which there is not yet")
                 return
-            self.engine.post_factor(index, factor.pattern, factor.values, made)
+            use = self.recording.objects[name].factors.get(made)
+            self.engine.post_factor(index, factor.pattern, factor.values, made, use is not None and use.exact)
             self._in_use[name] = made
         if self._last_use[name, made] == step:
             self._factors.pop((name, made), None)

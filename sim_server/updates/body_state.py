@@ -10,12 +10,15 @@ from numpy.typing import NDArray
 
 from protocol.factor import Factor
 from protocol.method import Method
+from sim_server.backends.rosenbrock import FORMS
 from sim_server.mechanics.world import Body
 from sim_server.updates.autotune.preconditioner import PreconditionerTuner
-from sim_server.updates.scheduler import UpdateRequest, excess
+from sim_server.updates.scheduler import UpdateRequest
 from sim_server.updates.stats import MEMORY, RunningMean, flops
 
 MAX_REMEMBERED = 32  # factors whose method and worker are remembered
+ONE_SOLVE, FACTOR = FORMS["ONE_SOLVE"], FORMS["FACTOR"]
+STAGES = 2  # linear solves of a step of the other forms
 MIN_SECONDS = 1e-6  # s; a factorization is never taken to be faster
 
 
@@ -31,7 +34,7 @@ class SolveStatistics:
     iteration_cost: RunningMean = field(default_factory=RunningMean)  # s, or bytes
     first_excess: RunningMean = field(default_factory=RunningMean)  # of the first solve with a new factor
 
-    def add(self, excess: int, factor_step: int, newest: int) -> None:
+    def add(self, excess: float, factor_step: int, newest: int) -> None:
         """Adds a solve.
 
         factor_step: of its factor, -1: it had none
@@ -123,12 +126,13 @@ class BodyUpdateState:
     """The updates of one body.
 
     methods: by which `auto` may have its factors made; empty: the scene names the preconditioner
+    error_bound: largest estimate of the error of a step that is not made again [m]
     counted: costs are bytes and operations instead of seconds, so that runs repeat exactly. A byte counts like an
         operation, which is about what a core makes of them.
     """
 
-    def __init__(self, body: Body, methods: Sequence[Method] = (), counted: bool = False):
-        self.body, self.counted = body, counted
+    def __init__(self, body: Body, methods: Sequence[Method] = (), counted: bool = False, error_bound: float = np.inf):
+        self.body, self.counted, self.error_bound = body, counted, error_bound
         self.frozen = False  # it has run away and moves no more: needs no factors
         self.solves, self.job, self.failures, self.factors = (
             SolveStatistics(), JobState(), FailureState(), FactorStatistics(),
@@ -210,12 +214,30 @@ class BodyUpdateState:
         cost: of the solve [s, or bytes]
         """
         iterations, factor_step = int(record["iterations"]), int(record["factor_step"])
-        floor *= max(int(record["linearizations"]), 1)
-        self.solves.add(excess(iterations, floor), factor_step, self.factors.newest)
+        form = int(record["form"])
+        if form == FACTOR:
+            lost = float(record["estimate"]) / self.error_bound
+        else:
+            solves = max(int(record["linearizations"]), 1) * (1 if form == ONE_SOLVE else STAGES)
+            lost = max(iterations - floor * solves, 0)
+        self.solves.add(lost, factor_step, self.factors.newest)
         self.failures.refused += int(record["fallbacks"])
         self.solves.iteration_cost.add(cost / (iterations + 1))
         if factor_step >= 0:
             self.solves.max_factor_age = max(self.solves.max_factor_age, int(record["step"]) - 1 - factor_step)
+
+
+def excess(records: Any, floor: int, error_bound: Any) -> Any:
+    """Returns what steps add to the sum by which their objects are ranked for a factor (scheduler.py).
+
+    Of a step that iterates: its iterations above `floor` in each solve. Of a step by the factor alone: the estimate of
+    its error over the bound [m], since it has no iterations, and a factor that ages costs accuracy instead.
+    records: of the loop, of any shape that error_bound is broadcast to
+    """
+    stages = np.where(records["form"] == ONE_SOLVE, 1, STAGES)
+    above = np.maximum(records["iterations"] - floor * stages * np.maximum(records["linearizations"], 1), 0)
+    alone = records["form"] == FACTOR
+    return np.where(alone, np.where(alone, records["estimate"], 0.0) / error_bound, above)
 
 
 def observe_steps(states: Sequence[BodyUpdateState], r: NDArray[Any], floor: int) -> None:
@@ -224,7 +246,7 @@ def observe_steps(states: Sequence[BodyUpdateState], r: NDArray[Any], floor: int
     Each round of the service thread gives a worker one job: with a thousand bodies this function is what it waits for.
     """
     steps, factor = len(r), r["factor_step"]
-    above = np.maximum(r["iterations"] - floor * np.maximum(r["linearizations"], 1), 0)
+    above = excess(r, floor, np.array([state.error_bound for state in states]))
     weights = (1 - MEMORY) ** np.arange(steps - 1, -1, -1)
     each = r["solve"] / (r["iterations"] + 1)
     costs = weights @ each / weights.sum()
@@ -251,7 +273,7 @@ def observe_steps(states: Sequence[BodyUpdateState], r: NDArray[Any], floor: int
             solves.lost += total if made >= 0 else 0
             continue
         for i in range(steps):
-            solves.add(int(above[i, k]), int(factor[i, k]), newest)
+            solves.add(float(above[i, k]), int(factor[i, k]), newest)
 
 
 def _remember(table: dict[int, Any], step: int, value: Any) -> None:

@@ -8,6 +8,7 @@ all of it; a factor that takes off less than block Jacobi does is worth less tha
 
 import ctypes as c
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,23 @@ from sim_server.backends.cpu import structs
 from sim_server.backends.cpu.engine import NativeFactor
 
 Reals = NDArray[np.float64]
+MAX_RESIDUAL = 0.05  # |r - A P^-1 r| / |r| of a factor that may take the place of A without another check
 MIN_SHARE = 0.9  # of what block Jacobi takes off, for a factor to be used; not 1, as one vector is not the space
+
+
+class Probe(NamedTuple):
+    """What an application z = P^-1 r shows; without a matrix only z.r.
+
+    zr: z.r
+    reduction, block_jacobi: (z.r)^2 / z.Az, the energy that an iteration takes off with the factor and with block
+        Jacobi (0 if A is not positive definite)
+    residual: |r - A z| / |r|
+    """
+
+    zr: float
+    reduction: float
+    block_jacobi: float
+    residual: float
 
 
 @cache
@@ -52,7 +69,7 @@ class FactorCheck:
             return f"its size is {factor.pattern.size}, that of the object {3 * nodes}"
         if len(factor.values) != factor.pattern.nonzeros:
             return f"it has {len(factor.values)} values, its pattern {factor.pattern.nonzeros}"
-        zr, reduction, block_jacobi = self.probe(factor, matrix)
+        zr, reduction, block_jacobi, _ = self.probe(factor, matrix)
         if not 0 < zr < np.inf:
             return f"not positive definite or not finite (z.r = {zr:.3g} on a probe vector)"
         if matrix is not None and not reduction >= MIN_SHARE * block_jacobi:
@@ -62,12 +79,12 @@ class FactorCheck:
             )
         return ""
 
-    def probe(self, factor: Factor, matrix: Reals | None) -> tuple[float, float, float]:
-        """Applies a factor, which has the right size, to the probe vector r.
+    def is_exact(self, factor: Factor, matrix: Reals | None) -> bool:
+        """True if a factor that was not rejected is known to be that of its matrix, up to rounding."""
+        return matrix is not None and self.probe(factor, matrix).residual < MAX_RESIDUAL
 
-        Returns z.r, and the energy (z.r)^2 / z.Az that an iteration takes off with the factor and with block Jacobi (0
-        if A is not positive definite).
-        """
+    def probe(self, factor: Factor, matrix: Reals | None) -> Probe:
+        """Applies a factor, which has the right size, to the probe vector r."""
         row_start, columns = self._patterns[factor.object]
         nodes = len(row_start) - 1
         n = 3 * nodes
@@ -75,11 +92,11 @@ class FactorCheck:
             self._arrays[n] = np.random.default_rng(0).standard_normal(n), np.empty(8 * n)
         r, work = self._arrays[n]
         native_factor = NativeFactor(factor.pattern, np.ascontiguousarray(factor.values), factor.step)
-        out = np.zeros(4)
+        out = np.zeros(5)
         values = None if matrix is None else matrix.ctypes.data
         _library().wf_judge(
             c.byref(native_factor.native), nodes, row_start.ctypes.data, columns.ctypes.data, values, r.ctypes.data,
             work.ctypes.data, out.ctypes.data,
         )  # fmt: skip
-        energy = [zr * zr / za if za > 0 else 0.0 for zr, za in (out[:2], out[2:])]
-        return float(out[0]), energy[0], energy[1]
+        energy = [zr * zr / za if za > 0 else 0.0 for zr, za in (out[:2], out[2:4])]
+        return Probe(float(out[0]), energy[0], energy[1], float(out[4]))

@@ -5,7 +5,8 @@ excess       the rule of Courtecuisse et al. 2010, section 4: each object sums u
              the object with the largest sum goes next; a matrix that is sent sets its object's sum back to zero. Two
              things are ours: the sum begins anew when the factor is taken up, since what was summed while it was made
              is what it is for; and sums are compared as they will be a few steps from now if the excess of the last
-             solve goes on, so that an object that has just been seized need not add up its sum first
+             solve goes on, so that an object that has just been seized need not add up its sum first. Steps that do
+             not iterate add the estimate of their error over the bound instead (body_state.excess)
 round_robin  the object whose matrix was sent longest ago
 
 Whatever the rule, an object whose last matrix is `overdue` goes first, so none starves.
@@ -47,11 +48,6 @@ class UpdateRequest:
     lost: float = 0.0
     on_trial: bool = False
     latest: float = 0.0
-
-
-def excess(iterations: int, floor: int) -> int:
-    """Returns the iterations of a solve above the floor, which add to its object's sum."""
-    return max(0, iterations - floor)
 
 
 def expected_excess(request: UpdateRequest) -> float:

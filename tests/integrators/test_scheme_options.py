@@ -19,7 +19,8 @@ mesh = {{ bar = [2, 1, 1], size = [2, 1, 1] }}
 """
 
 BAD = {
-    'scheme = "euler"': "integrator.scheme = 'euler': must be 'backward_euler', 'newmark', 'bdf2' or 'quasi_static'",
+    'scheme = "euler"': "integrator.scheme = 'euler': must be 'backward_euler', 'newmark', 'bdf2', "
+    "'quasi_static' or 'ros2'",
     "beta = 0.25": "beta belong to scheme newmark, not to backward_euler",
     'scheme = "newmark"\nbeta = 0.1': "newmark with beta = 0.1, gamma = 0.5 is stable for small steps only; "
     "allowed: 1/2 <= gamma <= 2 beta",
@@ -27,7 +28,8 @@ BAD = {
     "linearizations = 0": "integrator.linearizations = 0: must be greater than or equal to 1",
     "linearizations = 2.5": "integrator.linearizations = 2.5: must be a whole number",
     "tolerance = 0.0": "integrator.tolerance = 0.0: must be greater than 0",
-    "newton = true": "unknown key .known keys: beta, gamma, linearizations, scheme, tolerance, trials",
+    "newton = true": "unknown key .known keys: beta, error_bound, gamma, linearizations, scheme, solve, tolerance, "
+    "trials",
     "linearizations = 4\n[solver]\nbudget = 0.01": "a budget is for one solve a step; allowed: one of the two",
 }
 

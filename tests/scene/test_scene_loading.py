@@ -46,7 +46,13 @@ def test_defaults_and_resolved(tmp_path):
         "dt": 0.01,
         "name": "small",
         "effects": {},
-        "integrator": {"scheme": "backward_euler", "linearizations": 1, "tolerance": 1e-4, "trials": 8},
+        "integrator": {
+            "scheme": "backward_euler",
+            "linearizations": 1,
+            "tolerance": 1e-4,
+            "trials": 8,
+            "solve": "auto",
+        },
         "solver": {
             "tolerance": 1e-6,
             "max_iterations": 500,

@@ -1,16 +1,19 @@
 # SPDX-License-Identifier: MIT
-"""Whose matrix goes next, and what a solve adds to its object's sum: tables of pure functions."""
+"""Whose matrix goes next, and what a step adds to its object's sum: tables of pure functions."""
 
 import dataclasses
 import math
 from typing import get_args
 
+import numpy as np
 import pytest
 
+from sim_server.backends.cpu.structs import RECORD
+from sim_server.backends.rosenbrock import FORMS
 from sim_server.scene.solver_options import Rule
+from sim_server.updates.body_state import BodyUpdateState, excess
 from sim_server.updates.scheduler import (
     UpdateRequest,
-    excess,
     is_worthwhile,
     max_factor_age,
     overdue_after,
@@ -27,11 +30,34 @@ def requests(*rows: tuple) -> list[UpdateRequest]:
     return [UpdateRequest(*row) for row in rows]
 
 
-@pytest.mark.parametrize(
-    ("iterations", "floor", "expected"), [(0, 3, 0), (3, 3, 0), (4, 3, 1), (100, 3, 97), (5, 0, 5), (2, 10, 0)]
-)
-def test_excess(iterations, floor, expected):
-    assert excess(iterations, floor) == expected
+STEPS = [  # iterations, linearizations, form, estimate; excess above a floor of 3 with an error bound of 0.02 m
+    (0, 1, "ONE_SOLVE", math.nan, 0),
+    (3, 1, "ONE_SOLVE", math.nan, 0),
+    (100, 1, "ONE_SOLVE", math.nan, 97),
+    (9, 2, "ONE_SOLVE", math.nan, 3),
+    (9, 1, "ITERATE", 1e-3, 3),
+    (13, 1, "EULER", 5.0, 7),
+    (0, 1, "FACTOR", 1e-3, 0.05),
+    (0, 1, "FACTOR", 0.02, 1),
+]
+
+
+def steps() -> np.ndarray:
+    rows = np.zeros(len(STEPS), RECORD)
+    for row, (iterations, linearizations, form, estimate, _) in zip(rows, STEPS, strict=True):
+        row["iterations"], row["linearizations"], row["form"] = iterations, linearizations, FORMS[form]
+        row["estimate"], row["factor_step"] = estimate, -1
+    return rows
+
+
+def test_excess():
+    """Of many steps together and of each alone."""
+    expected = [row[-1] for row in STEPS]
+    assert excess(steps(), 3, 0.02).tolist() == pytest.approx(expected)
+    for record, value in zip(steps(), expected, strict=True):
+        state = BodyUpdateState(None, error_bound=0.02)
+        state.observe(record, 3, 1.0)
+        assert state.solves.latest == pytest.approx(value)
 
 
 # lost, cost of an iteration, of a factorization, age of the factor, threshold, on trial

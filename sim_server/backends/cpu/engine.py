@@ -21,8 +21,8 @@ from sim_server.backends.cpu import structs
 from sim_server.backends.cpu.device import CpuLaunch
 from sim_server.backends.cpu.energies import NativeEnergies
 from sim_server.backends.newton import Newton
-from sim_server.backends.rosenbrock import Rosenbrock
 from sim_server.backends.ring_buffers import Reports
+from sim_server.backends.rosenbrock import Rosenbrock
 
 Reals = NDArray[np.float64]
 HISTORY = 1024  # changes of the diagonal that are remembered, of each body
@@ -73,10 +73,10 @@ class NativeFactor:
         """Address of the native struct, which a mailbox takes."""
         return c.addressof(self.native)
 
-    def fill(self, values: NDArray[Any], step: int) -> None:
-        """Copies the values of L made from the matrix of `step`."""
+    def fill(self, values: NDArray[Any], step: int, exact: bool = False) -> None:
+        """Copies the values of L made from the matrix of `step`. exact: known to be so."""
         self.values[:] = values
-        self.native.step = step
+        self.native.step, self.native.exact = step, exact
 
     def apply(self, r: Reals) -> Reals:
         """P^-1 r, (size,), outside of any step. A probe for tests and benchmarks."""
@@ -260,10 +260,12 @@ class CpuEngine(Reports):
 
     # --- mailboxes ----------------------------------------------------------------------------------------------
 
-    def post_factor(self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int) -> None:
+    def post_factor(
+        self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int, exact: bool = False
+    ) -> None:
         """Copies a factor into a free buffer; the loop takes it up before its next solve of the body."""
         buffer = self._free_buffer(body, pattern, values.dtype)
-        buffer.fill(values, step)
+        buffer.fill(values, step, exact)
         self._mail[body].waiting = buffer
         self._native.wf_post_factor(c.byref(self._body[body]), buffer.address)
 

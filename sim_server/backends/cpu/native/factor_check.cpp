@@ -6,7 +6,8 @@
 extern "C" {
 
 // A: of one body, its nodes numbered from 0; values null: unknown. r: probe vector. work: 8 size entries.
-// out: z.r and z.Az with the factor, then both with block Jacobi; without a matrix only the first is written.
+// out: z.r and z.Az with the factor, then both with block Jacobi, and |r - Az| / |r| with the factor; without a matrix only the
+// first is written.
 void wf_judge(const Factor* factor, int32_t nodes, const int32_t* row_start, const int32_t* columns, const double* values,
               const double* r, double* work, double* out) {
     BlockCsr A{0, nodes, row_start, columns, values};
@@ -16,6 +17,9 @@ void wf_judge(const Factor* factor, int32_t nodes, const int32_t* row_start, con
     out[0] = P.apply(r, std::sqrt(dot(n, r, r)), z);
     if (!values) return;
     out[1] = multiply(A, z, q);
+    double left = 0;
+    for (int i = 0; i < n; ++i) left += (r[i] - q[i]) * (r[i] - q[i]);
+    out[4] = std::sqrt(left / dot(n, r, r));
     P.kind = BLOCK_JACOBI;
     P.prepare();
     out[2] = P.apply(r, 1, z);

@@ -29,17 +29,16 @@ static void choose_form(Loop& loop, int index, bool whole) {
     const Body& body = loop.body[index];
     StageState& s = stages.state[index];
     const Factor* factor = body.factor;
+    const int64_t step = loop.rings.step;
     if (factor && s.factor_step != factor->step) {  // a new one
         s.factor_step = factor->step;
         s.patience = 0;
-        s.checked = -1;
+        s.checked = factor->exact ? step : -1;
     }
     const bool alone = stages.factor_alone && factor && body.now.kind == CHOLESKY && s.patience == 0;
-    const int64_t step = loop.rings.step;
     s.form = alone ? FACTOR : ITERATE;
     s.check = alone && (s.checked < 0 || step - s.checked >= CHECK_EVERY);
     s.assembled = whole || !alone || s.check || (body.snapshot.load(std::memory_order_acquire) && body.ahead < 0);
-    if (s.patience > 0) --s.patience;
 }
 
 // After the forces of the first stage are assembled: whether the factor knows the springs of grabs, or is corrected for them. If it
@@ -90,7 +89,7 @@ static bool apply_alone(Loop& loop, int index, bool check) {
             const double from = residual(A, b, start, r), left = residual(A, b, y, r);
             out.residual = from > 0 ? std::sqrt(left / from) : 0;
             well = out.residual < POOR || left <= body.now.tolerance * body.now.tolerance * b2;
-            s.checked = loop.rings.step;
+            s.checked = well ? loop.rings.step.load() : -1;
             s.share = out.residual;
         }
         if (!well) {
@@ -120,7 +119,7 @@ template <class F> static void solve_stage(Loop& loop, bool first, F take_part) 
         if (!loop.moving[i] && s.form != EULER) { s.result.kind = loop.body[i].now.kind; continue; }
         if (s.form != FACTOR) { iterate(loop, i); continue; }
         if (apply_alone(loop, i, first && s.check)) continue;
-        s.patience = PATIENCE;
+        s.patience = PATIENCE + 1;
         if (first && s.check) { s.form = ITERATE; iterate(loop, i); }  // A is there, and b is that of the first stage
         else s.form = FAILED;
     }
@@ -155,7 +154,7 @@ static void set_coefficients(const Stages& stages, const double (&to)[2]) {
 }
 
 // Makes the step of all bodies, whose first stage is assembled, and integrates.
-static void make_stages(Loop& loop) {
+static void make_attempts(Loop& loop) {
     const Stages& stages = *loop.stages;
     for (int i = 0; i < loop.bodies; ++i)
         stages.state[i].result = SolveResult{0, 0, 0, CONVERGED, loop.body[i].now.kind, 0};
@@ -168,7 +167,7 @@ static void make_stages(Loop& loop) {
         StageState& s = stages.state[i];
         if (s.accepted || s.form == ITERATE) { if (!s.accepted) s.form = EULER; continue; }
         s.form = ITERATE;
-        s.patience = PATIENCE;
+        s.patience = PATIENCE + 1;
         s.result.status = CONVERGED;
         again = true;
     }
@@ -184,7 +183,6 @@ static void make_stages(Loop& loop) {
     if (!back) return;
     for (int i = 0; i < loop.bodies; ++i)
         if (left(i)) {
-            stages.state[i].patience = std::max(stages.state[i].patience, 1);
             stages.state[i].result.status = CONVERGED;
         }
     run_for(loop, loop.launch[stages.restore_for_euler], left);
@@ -193,4 +191,12 @@ static void make_stages(Loop& loop) {
     solve_stage(loop, true, left);
     run_for(loop, loop.launch[stages.advance_euler], left);
     set_coefficients(stages, stages.own_coefficients);
+}
+
+static void make_stages(Loop& loop) {
+    make_attempts(loop);
+    for (int i = 0; i < loop.bodies; ++i) {
+        int32_t& patience = loop.stages->state[i].patience;
+        if (patience > 0) --patience;
+    }
 }
