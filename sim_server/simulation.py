@@ -91,15 +91,13 @@ class Simulation:
         arrays: dict[str, NDArray[Any]] = {"row_start": s.row_start, "columns": s.columns, "values": s.values}
         arrays |= {"b": s.b_material, "y": s.y, "x": w.x, "v": w.v, "clock": s.clock, "moving": s.moving}
         names, ranges = [b.name for b in w.bodies], [(b.first, b.last) for b in w.bodies]
-        with w.made_with(w.dt, w.dt):
-            euler = self.launches()[0] if self.integrator.has_stages else []
+        others = self._stage_launches() if self.integrator.has_stages else []
         assemble, integrate = self.launches()
-        euler = [
-            a if a.mailed else e for a, e in zip(assemble, euler, strict=False)
-        ]  # arguments come to one of the two
+        mailed = {x.name: x for x in assemble if x.mailed}  # whose arguments come to one launch, which all lists share
+        lists = [[mailed.get(x.name, x) for x in other] for other in others]
         effects = list(self.effects.values())
         newton = self.integrator.newton(assemble, effects)
-        stages = self.integrator.stages(assemble, euler, effects)
+        stages = self.integrator.stages(assemble, lists, effects)
         solver, energies = self.scene.solver, self.energies
         return EngineInput(assemble, integrate, names, ranges, w.dt, solver, energies, newton, stages, arrays)
 
@@ -120,8 +118,8 @@ class Simulation:
             self.world.backend.fetch(array)
         return self.world
 
-    def launches(self) -> tuple[list[Launch], list[Launch]]:
-        """What a step runs: before and after the solve."""
+    def launches(self, matrix: bool = True) -> tuple[list[Launch], list[Launch]]:
+        """What a step runs: before and after the solve. matrix: takes A into the material frame."""
         system = self.system
         assemble = [self.integrator.start()]
         stencils = iter(system.stencils)
@@ -136,8 +134,29 @@ class Simulation:
             accumulate = accumulate or stencil is not None
         if self.shape is not None:
             assemble.append(self.shape.launch(system.mean))
-        assemble += system.finish()  # into the material frame (eq. 12 and 13)
+        assemble += system.finish(matrix)  # into the material frame (eq. 12 and 13)
         return assemble, self.integrator.advance()
+
+    def _stage_launches(self) -> list[list[Launch]]:
+        """Returns what a Rosenbrock-W step runs beside `launches`: the forces of both stages, and backward Euler."""
+        first, again = self._force_launches(frames=True), self._force_launches(frames=False)
+        with self.world.made_with(self.world.dt, self.world.dt):
+            euler = self.launches()[0]
+        return [first, again, euler]
+
+    def _force_launches(self, frames: bool) -> list[Launch]:
+        """Returns the launches of a stage that needs no A. frames: those of the nodes are made, too."""
+        stencils = iter(self.system.stencils)
+        ordered = sorted(self.effects.values(), key=lambda e: e.elements is None)
+        parts = [
+            e.force_launches(self.system, next(stencils) if e.elements is not None else None, frames) for e in ordered
+        ]
+        if any(part is None for part in parts):  # then all that `launches` has but for the blocks
+            full = [x for x in self.launches(matrix=False)[0] if x.domain != "blocks"]
+            return full if frames else full[:-1] + self.integrator.rotate_force()
+        shape = [self.shape.launch(self.system.mean)] if frames and self.shape is not None else []
+        finish = self.system.finish(matrix=False) if frames else self.integrator.rotate_force()
+        return [self.integrator.start_forces(), *(x for part in parts for x in part or ()), *shape, *finish]
 
     def update_effect(self, effect: Effect, launch: Launch) -> PendingUpdate:
         """Gives the mailed launch of an effect other arguments, those of `launch`, from one of the next steps on.
@@ -172,10 +191,12 @@ class Simulation:
         settings.tolerance, settings.max_iterations = solver.tolerance, solver.max_iterations
         settings.budget, settings.warm_start = solver.budget, int(solver.warm_start)
         settings.kind, settings.omega = KINDS.get(solver.preconditioner, Kind.CHOLESKY), solver.omega
-        corrects = solver.woodbury and solver.wants_factors and "touch" in body.effects
+        alone = self.scene.uses_factor_alone  # then the loop has to know what a factor lacks
+        corrects = (solver.woodbury or alone) and solver.wants_factors and "touch" in body.effects
         if corrects and Capability.LOW_RANK_UPDATE in self.engine.capabilities:
             double = solver.factor_precision == "float64"
-            self.engine.correct(body.index, solver.woodbury, self.system.diagonal, double)
+            block = self.system.block if alone else None
+            self.engine.correct(body.index, solver.woodbury or 1, self.system.diagonal, double, block)
 
     def refusals(self) -> list[Refusal]:
         """Elements in states that their law does not define, by the time at which they had them first."""

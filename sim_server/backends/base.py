@@ -197,11 +197,14 @@ class Engine(Protocol):
         """Returns the number of bytes that an application of the newest factor reads, 0 without one."""
         ...
 
-    def correct(self, body: int, nodes: int, diagonal: Float64, double: bool = False) -> None:
+    def correct(
+        self, body: int, nodes: int, diagonal: Float64, double: bool = False, block: Float64 | None = None
+    ) -> None:
         """Has factors of the body corrected for changes of the diagonal at `nodes` (1 to 64) nodes at most.
 
-        diagonal: (nodes of the scene,) [kg], as assembled. double: for factors in float64. To be called before the
-        first step, and only with LOW_RANK_UPDATE.
+        diagonal: (nodes of the scene,) [kg], as assembled. double: for factors in float64. block: (nodes of the scene,
+        6), upper triangles of the nodes' own blocks [kg]; None: to be read from A, which every step then has. To be
+        called before the first step, and only with LOW_RANK_UPDATE.
         """
         ...
 

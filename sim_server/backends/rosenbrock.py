@@ -12,13 +12,18 @@ FORMS = Declarations("kernels/step_form.h").enumeration("StepForm")
 """Forms of a step by name; the numbers stand in the column `form` of the step record."""
 
 
+NODAL = ("second", "finish", "remember", "restore", "restore_for_euler", "advance_euler")
+
+
 @dataclass(frozen=True)
 class Rosenbrock:
     """Input of the Rosenbrock-W step.
 
-    again: launches that evaluate the forces of the second stage; without those of `assemble` that only make A
+    first: launches that evaluate the forces of the first stage and the frames of the nodes, without A
+    again: launches that evaluate the forces of the second stage
     euler: launches that assemble backward Euler
     second, finish: nodal kernels after the first and after the second solve
+    remember: nodal kernel that keeps the nodes' own blocks of A of a step that iterates, for steps without A
     restore, restore_for_euler, advance_euler: nodal kernels of an attempt that is made again
     parts: (bodies + 1,) first item of each body, by id of a launch; None if a launch does not tell bodies apart
     factor_alone: whether the factor may take the place of A
@@ -28,10 +33,12 @@ class Rosenbrock:
     euler_coefficients: the same of backward Euler
     """
 
+    first: Sequence[Launch]
     again: Sequence[Launch]
     euler: Sequence[Launch]
     second: Launch
     finish: Launch
+    remember: Launch
     restore: Launch
     restore_for_euler: Launch
     advance_euler: Launch
@@ -45,5 +52,5 @@ class Rosenbrock:
     @property
     def launches(self) -> list[Launch]:
         """All launches beside those of `assemble`."""
-        nodal = [self.second, self.finish, self.restore, self.restore_for_euler, self.advance_euler]
-        return [*self.again, *self.euler, *nodal]
+        nodal = [getattr(self, name) for name in NODAL]
+        return [*self.first, *self.again, *self.euler, *nodal]

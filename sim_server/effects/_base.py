@@ -70,6 +70,14 @@ class Effect:
         """
         return []
 
+    def force_launches(self, system: System, stencil: Stencil | None, frames: bool) -> list[Launch] | None:
+        """Launches that add its forces alone to system.b, and what else it adds to .diagonal; None if it has none such.
+
+        For steps that need no A: the launches of `launches` then run in steps that do. They must not read or write
+        .block, .sums. frames: add the rotations of the elements to .mean, too
+        """
+        return self.launches(system, stencil, False) if stencil is None else None
+
     def connect(self, simulation: EffectUpdates) -> None:
         """Called once the loop exists. An effect that changes while steps run keeps `simulation`."""
 

@@ -202,6 +202,24 @@ class Hyperelastic(Tetrahedra):
         )  # fmt: skip
         return [elements, *self.gathers(system, stencil, accumulate)]
 
+    def force_launches(self, system: System, stencil: Stencil | None, frames: bool) -> list[Launch] | None:
+        w, m = self.world, len(self.elements)
+        if self.law.text or w.beta[self.owner].any():  # damping of the stiffness is a product with the tangent
+            return None
+        assert stencil is not None
+        impulses = np.zeros((4, m, 3))
+        w.backend.keep(impulses)
+        forces = w.backend.module(self.law.path).bind(
+            "forces", m, tets=self.elements, x=w.x, gradients=self.gradients, volume=self.volume,
+            constants=self.constants, clock=system.clock, refused=self.refused, h=w.force_coefficient,
+            impulses=impulses, **self._floor(),
+        )  # fmt: skip
+        gather = w.backend.module("kernels/gather_forces.cu").bind(
+            "gather_impulses", w.nodes, elements=m, start=stencil.corner_start, slots=stencil.corners,
+            impulses=impulses, b=system.b,
+        )  # fmt: skip
+        return [forces, gather]
+
     def _floor(self) -> dict[str, Any]:
         return {"floor": self.floor} if self.law.regularizes else {}
 

@@ -35,6 +35,33 @@ KERNEL(elements, CorotationalElements) {
     put_row(p.quaternion, i, p.n, wxyz);
 }
 
+struct CorotationalForces {
+    int n;                               // elements
+    const int* tets;                     // (n, 4) nodes
+    const real* x;                       // (nodes, 3) positions [m]
+    const real* v;                       // (nodes, 3) world.damping_velocity [m/s]
+    const local* gradients;              // (9, n) rest gradients of the shape functions of nodes 1, 2, 3, one after another [1/m]
+    const local* lame;                   // (2, n) lambda V, mu V [Pa m3]
+    const local* stiffness_coefficient;  // (n,) h (c + beta) [s2]
+    local h;                             // world.force_coefficient [s]
+    local* quaternion;                   // (n, 4) in, out: of the last rotation, of this one
+    local* nodal_impulse;                // (n, 4, 3) out: h f_a + h (c + beta) (K v)_a [N s]
+};
+
+// The forces of `elements` alone, without what A is made of.
+KERNEL(forces, CorotationalForces) {
+    index tet[4];
+    local_number near[4];
+    get_item_row(p.tets, i, tet);
+    for (int k = 0; k < 4; ++k) near[k] = at(p.quaternion, 4 * i + k);
+    local_mat3 g = rest_gradients(p.gradients, p.n, i), F = gradient(p.x, tet, g);
+    quaternion<local_number> q = nearest_quaternion(F, {near[0], near[1], near[2], near[3]});
+    local_mat3 R = rotation_matrix(q), Rt = transposed(R), S = mul(Rt, F), T = mul(Rt, gradient(p.v, tet, g));
+    local_number k = at_items(p.stiffness_coefficient, i), lambda = at_items(p.lame, i), mu = at_items(p.lame + p.n, i);
+    put_impulses(p.nodal_impulse, i, p.n, mul(R, hooke(S, T, p.h, k, lambda, mu)), g);
+    put_row(p.quaternion, i, p.n, {q.w, q.x, q.y, q.z});
+}
+
 struct CorotationalEnergy {
     int n;                   // elements
     const int* tets;         // (n, 4)

@@ -127,6 +127,7 @@ class Corotational(Effect):
         m = len(self.elements)
         self.quaternion, self.scaled_gradients = np.zeros((m, 4)), np.zeros((m, 4, 4))
         self.nodal_impulse = np.zeros((m, 4, 3))
+        self.near = np.zeros((m, 4))  # quaternions of `forces`, begun at those of its last state
         self.twist = np.zeros((m if self.variant == "_exact" else 0, 6))
         self._energy = np.zeros(m)
 
@@ -152,6 +153,23 @@ class Corotational(Effect):
             scaled_gradients=self.scaled_gradients, sums=system.sums, **twist,
         )  # fmt: skip
         return [elements, gather, blocks]
+
+    def force_launches(self, system: System, stencil: Stencil | None, frames: bool) -> list[Launch] | None:
+        if self.variant == "_qr":
+            return None
+        assert stencil is not None
+        w = self.world
+        forces = w.backend.module("effects/corotational.cu").bind(
+            "forces", len(self.elements), tets=self.elements, x=w.x, v=w.damping_velocity, gradients=self.gradients,
+            lame=self.lame, stiffness_coefficient=w.stiffness_coefficient[self.owner], h=w.force_coefficient,
+            quaternion=self.near, nodal_impulse=self.nodal_impulse,
+        )  # fmt: skip
+        rotations = {"quaternion": self.near, "mean": system.mean} if frames else {}
+        gather = w.backend.module("effects/corotational_nodes.cu").bind(
+            "gather_frames" if frames else "gather_impulses", w.nodes, start=stencil.corner_start,
+            corners=stencil.corners, nodal_impulse=self.nodal_impulse, b=system.b, **rotations,
+        )  # fmt: skip
+        return [forces, gather]
 
     @property
     def rotation(self) -> Float64:

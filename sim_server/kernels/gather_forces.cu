@@ -25,3 +25,24 @@ INLINE void gather_put(const GatherForces& p, int i, const local* sum) {
 }
 
 SUM_KERNEL(gather, GatherForces, 9)
+
+struct GatherImpulses {
+    int n;                  // nodes
+    int elements;
+    const int* start;       // (n + 1,) into slots
+    const int* slots;       // (start[n],) 4 e + a
+    const local* impulses;  // (4, elements, 3) [N s]
+    own<real> b;            // (n, 3) in, out: right-hand side, world frame [N s]
+};
+
+INLINE void gather_impulses_add(const GatherImpulses& p, int, int k, local* sum) {
+    int slot = p.slots[k];
+    const local* f = p.impulses + 3 * ((long long)p.elements * (slot & 3) + (slot >> 2));
+    for (int m = 0; m < 3; ++m) sum[m] += f[m];
+}
+
+INLINE void gather_impulses_put(const GatherImpulses& p, int i, const local* sum) {
+    for (int m = 0; m < 3; ++m) row_put<3>(p.b, i, m, row_at<3>(p.b, i, m) + sum[m]);
+}
+
+SUM_KERNEL(gather_impulses, GatherImpulses, 3)

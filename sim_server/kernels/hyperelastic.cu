@@ -53,6 +53,39 @@ KERNEL(elements, HyperelasticElements) {
     store_element(B, impulse, v, p.corners, p.edges, p.n, i);
 }
 
+struct HyperelasticForces {
+    int n;                   // elements
+    const int* tets;         // (n, 4) nodes
+    const real* x;           // (nodes, 3) positions [m]
+    const local* gradients;  // (9, n) [1/m]
+    const local* volume;     // (n,) [m3]
+    const local* constants;  // (CONSTANTS, n) of the law
+    const local* floor;      // (n,)
+    local h;                 // factor of the force [s]
+    const double* clock;     // (1,) [s]
+    double* refused;         // (n, 2) in, out
+    local* impulses;         // (4, n, 3) out: h f_a [N s]
+};
+
+// The forces of `elements` alone, without a tangent.
+KERNEL(forces, HyperelasticForces) {
+    index tet[4];
+    Tetrahedron<local_number> t = element_at(p, i, tet);
+    local_number c[CONSTANTS], floor = at_items(p.floor, i);
+    constants_at(p, i, c);
+    mat<local_number> left = mul(t.F, transposed(t.F));
+    Invariants<local_number> q = invariants<HAS>(left, t.J);
+    local_vec3 impulse[4];
+    forces<HAS>(slopes(c, q, floor), q, left, t, -p.h * at_items(p.volume, i), impulse);
+    if constexpr (REFUSES) {
+        auto here = t.J <= 0 && floor == 0;
+        Blocks6<local_number> none = {};
+        note_refusal(here, p.refused, i, p.clock[0], t.J);
+        refuse(here, none, impulse);
+    }
+    UNROLL for (int a = 0; a < 4; ++a) put_row(p.impulses + 3 * (long long)p.n * a, i, p.n, {impulse[a].x, impulse[a].y, impulse[a].z});
+}
+
 struct HyperelasticEnergy {
     int n;                   // elements
     const int* tets;         // (n, 4)

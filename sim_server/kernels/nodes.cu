@@ -37,6 +37,7 @@ struct Rotate {
     const real* extent;        // (n,) of the node's body [m]
     const real* inverse_time;  // (n,) 1 / (c + beta), which makes i K of a block i (c + beta) K; c world.dx_dv [1/s]
     real h;                    // time step [s]
+    int whole;                 // 0: leave out the block of A
     local* rotation;           // (n, 3, 3) out: frame of the node: its rotation from rest to now, or the identity
     real* b_material;          // (n, 3) out: R^T b, 0 at fixed nodes
     real* y;                   // (n, 3) out: start of the solve: R^T dv; R^T (-v) where the node rests; 0 at fixed nodes
@@ -96,6 +97,7 @@ KERNEL(rotate, Rotate) {
     put_row(p.y, i, p.n, {y.x, y.y, y.z});
     mark(p.moving, at(p.body, i), !still);
 
+    if (p.whole == 0) return;
     local_mat3 K = symmetric(k[0], k[1], k[2], k[3], k[4], k[5]);
     mat3 A = as<number>(mul(transposed(R), mul(K, R)));
     // R^T d R = d; symmetric to the last bit

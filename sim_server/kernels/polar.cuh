@@ -91,10 +91,13 @@ template <class T> INLINE quaternion<T> null_vector(T l, const mat<T>& F) {
     return better(q3, q3.z, q, best);
 }
 
+// A unit quaternion, by how much it was turned last, and whether the maximum is beside it.
+template <class T> struct turned { quaternion<T> q; T tangent2, definite; };
+
 // The best turn about Newton's axis: with S = R^T F and H = tr S I - sym S, the axis is w = adj(H) axial S (it needs no
 // division, and H may be singular or indefinite), and tr(Rot(w, t)^T S) = const + c cos t + s sin t is largest at
 // tan t = s / c. So a step never loses, from wherever it starts, and near the optimum it is Newton's.
-template <class T> INLINE quaternion<T> polish(quaternion<T> q, const mat<T>& F) {
+template <class T> INLINE turned<T> turn(quaternion<T> q, const mat<T>& F) {
     mat<T> S = mul(transposed(rotation_matrix(q)), F);
     const T* s = S.m;
     vec<T> g = {s[7] - s[5], s[2] - s[6], s[3] - s[1]};
@@ -108,12 +111,15 @@ template <class T> INLINE quaternion<T> polish(quaternion<T> q, const mat<T>& F)
     const entry<T> none = single<T> ? (entry<T>)1e-18 : (entry<T>)1e-37;  // w = 0: no turn; its square must not be 0
     T u = cosine + root(cosine * cosine + sine * sine * dot(w, w)) + none;
     lift(u, sine);
+    const T tangent2 = sine * sine * dot(w, w), definite = smaller(smaller(a, a * b - d * d), a * A + d * B + e * C);
     T wx = sine * w.x, wy = sine * w.y, wz = sine * w.z;
     quaternion<T> p = {u * q.w - q.x * wx - q.y * wy - q.z * wz, u * q.x + q.w * wx + q.y * wz - q.z * wy,
                     u * q.y + q.w * wy + q.z * wx - q.x * wz, u * q.z + q.w * wz + q.x * wy - q.y * wx};
     T norm = 1 / sqrt(p.w * p.w + p.x * p.x + p.y * p.y + p.z * p.z);
-    return {norm * p.w, norm * p.x, norm * p.y, norm * p.z};
+    return {{norm * p.w, norm * p.x, norm * p.y, norm * p.z}, tangent2 / (u * u), definite};
 }
+
+template <class T> INLINE quaternion<T> polish(quaternion<T> q, const mat<T>& F) { return turn(q, F).q; }
 
 template <class T> INLINE T square(const mat<T>& a) {
     return dot(row(a, 0), row(a, 0)) + dot(row(a, 1), row(a, 1)) + dot(row(a, 2), row(a, 2));
@@ -212,5 +218,22 @@ INLINE quaternion<double> nearest_quaternion(const mat<double>& F) {
 template <class T> INLINE quaternion<T> nearest_quaternion(const mat<T>& F) { return nearest_by_root(F); }
 
 #endif
+
+// The same, begun at a quaternion that is near it, as that of a state shortly before. Where the last turn is so large that another
+// would matter, or it is no maximum (H, above, is not definite), from the root.
+template <class T> INLINE quaternion<T> nearest_quaternion(const mat<T>& F, quaternion<T> near) {
+#ifdef __CUDACC_RTC__
+    return nearest_quaternion(F);
+#else
+    const T scale = 1 / (sqrt(square(F)) + (entry<T>)1e-37);
+    mat<T> G;
+    for (int k = 0; k < 9; ++k) G.m[k] = scale * F.m[k];
+    const turned<T> last = turn(polish(near, G), G);
+    auto off = !(last.tangent2 < (entry<T>)1e-12 && last.definite > (entry<T>)1e-3);
+    if (!any(off)) return last.q;
+    const quaternion<T> q = nearest_by_root(F);
+    return {off ? q.w : last.q.w, off ? q.x : last.q.x, off ? q.y : last.q.y, off ? q.z : last.q.z};
+#endif
+}
 
 template <class T> INLINE mat<T> nearest_rotation(const mat<T>& F) { return rotation_matrix(nearest_quaternion(F)); }

@@ -5,6 +5,35 @@
 
 constexpr real GAMMA = 0.29289321881345247559915563789515;  // g = 1 - 1 / sqrt 2
 
+struct Start {
+    int n;                           // nodes
+    const real* mass;                // (n,) [kg]
+    const real* inertial_increment;  // (n, 3) [m/s]
+    own<real> diagonal;              // (n, 1) out: what goes onto the diagonal of A [kg]
+    own<real> b;                     // (n, 3) out: right-hand side, world frame [N s]
+    own<local> mean;                 // (n, 10) out: sum of q q^T
+    own<local> known;                // (n, 6) nodes' own blocks of the last step that had A [kg]
+    own<local> block;                // (n, 6) out: the same
+};
+
+// Begins the forces of a stage. Touch and rest learn from older blocks how stiff a node is.
+KERNEL(start, Start) {
+    for (int k = 0; k < 6; ++k) row_put<6>(p.block, i, k, row_at<6>(p.known, i, k));
+    row_put<1>(p.diagonal, i, 0, at(p.mass, i));
+    store3(p.b, i, at(p.mass, i) * load3(p.inertial_increment, i));
+    for (int k = 0; k < 10; ++k) row_put<10>(p.mean, i, k, local_number{});
+}
+
+struct Remember {
+    int n;              // nodes
+    own<local> block;   // (n, 6) [kg]
+    own<local> known;   // (n, 6) out
+};
+
+KERNEL(remember, Remember) {
+    for (int k = 0; k < 6; ++k) row_put<6>(p.known, i, k, row_at<6>(p.block, i, k));
+}
+
 struct RotateForce {
     int n;                  // nodes
     const real* free;       // (n,) 1, or 0 at fixed nodes

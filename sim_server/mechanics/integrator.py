@@ -164,15 +164,26 @@ class Integrator:
 
     has_stages = False
 
+    def start_forces(self) -> Launch:
+        """Begins the forces of a stage."""
+        raise NotImplementedError
+
+    def rotate_force(self) -> list[Launch]:
+        """Takes the right-hand side of the second stage into the material frame."""
+        raise NotImplementedError
+
     @property
     def error_bounds(self) -> list[float]:
         """Largest estimated error of a step of each body that is not made again [m]; infinite without an estimate."""
         return [inf] * len(self.world.bodies)
 
     def stages(
-        self, assemble: Sequence[Launch], euler: Sequence[Launch], effects: Sequence[CouplesNodes]
+        self, assemble: Sequence[Launch], lists: Sequence[Sequence[Launch]], effects: Sequence[CouplesNodes]
     ) -> Rosenbrock | None:
-        """Input of a Rosenbrock-W step; None for other schemes. euler: launches that assemble backward Euler."""
+        """Input of a Rosenbrock-W step; None for other schemes.
+
+        lists: launches of the forces of the first and of the second stage, and of backward Euler
+        """
         return None
 
     def _bind(self, kernel: str, **arguments: Any) -> Launch:

@@ -57,7 +57,7 @@ class RosenbrockIntegrator(Integrator):
     """The launches of the stages.
 
     share (n,): theta; weight (n,): w; first (n, 3): u_1 [m/s]; start_x, start_v (n, 3): x [m] and v [m/s] at the start
-    of the step; estimate (n,) [m]
+    of the step; estimate (n,) [m]; known (n, 6): the nodes' own blocks of the last step that iterated [kg]
     """
 
     has_stages = True
@@ -69,10 +69,10 @@ class RosenbrockIntegrator(Integrator):
         self.share = w.dx_dv / (w.dx_dv + self.beta)
         self.weight = self.share * (1 + w.dx_dv * alpha)
         self.start_x, self.start_v, self.first = w.x.copy(), np.zeros_like(w.v), np.zeros_like(w.v)
-        self.estimate = np.zeros(w.nodes)
+        self.estimate, self.known = np.zeros(w.nodes), np.zeros((w.nodes, 6))
         self.bound = np.array([self._bound(b) for b in w.bodies])
         self.factor_alone = scene.uses_factor_alone
-        w.backend.keep(self.share, self.weight, self.start_x, self.start_v, self.first, self.estimate)
+        w.backend.keep(self.share, self.weight, self.start_x, self.start_v, self.first, self.estimate, self.known)
 
     def _bound(self, body: Body) -> float:
         if self.options.error_bound is not None:
@@ -95,27 +95,40 @@ class RosenbrockIntegrator(Integrator):
     def advance(self) -> list[Launch]:
         return []
 
+    def start_forces(self) -> Launch:
+        """Sets b and the diagonal of A to the terms of inertia."""
+        s, w = self.system, self.world
+        return self._stage(
+            "start", mass=w.mass, inertial_increment=self.inertial_increment, diagonal=s.diagonal, b=s.b, mean=s.mean,
+            known=self.known, block=s.block,
+        )  # fmt: skip
+
+    def rotate_force(self) -> list[Launch]:
+        """Takes b of the second stage into the material frame."""
+        s, free = self.system, self.world.free
+        return [
+            self._stage("rotate_force", free=free, rotation=s.rotation, b=s.b, dv=s.dv, b_material=s.b_material, y=s.y)
+        ]
+
     def stages(
-        self, assemble: Sequence[Launch], euler: Sequence[Launch], effects: Sequence[CouplesNodes]
+        self, assemble: Sequence[Launch], lists: Sequence[Sequence[Launch]], effects: Sequence[CouplesNodes]
     ) -> Rosenbrock:
-        """Input of the step. assemble, euler: launches that assemble A with g h and with h for the time step."""
+        """Input of the step. lists: launches of the forces of both stages, and of backward Euler."""
         w, s = self.world, self.system
         state: dict[str, Any] = {"x": w.x, "v": w.v}
         started: dict[str, Any] = {"start_x": self.start_x, "start_v": self.start_v}
         solved: dict[str, Any] = {"rotation": s.rotation, "y": s.y, "h": w.dt}
-        rotate = self._stage(
-            "rotate_force", free=w.free, rotation=s.rotation, b=s.b, dv=s.dv, b_material=s.b_material, y=s.y
-        )
-        forces = [x for x in assemble if x.domain != "blocks" and x.name != "nodes.rotate"]
+        first, again, euler = lists
         euler_arrays = {**self._prepared(), "predictor": w.predictor}
         restored = {k: v for k, v in euler_arrays.items() if k not in ("share", "weight")}
         found = Rosenbrock(
-            again=[*forces, rotate], euler=euler,
+            first=first, again=again, euler=euler,
             second=self._stage("second", first=self.first, **solved, **state, **started, **self._prepared()),
             finish=self._stage(
                 "finish", body=s.body, moving=s.moving, first=self.first, before=self.before, estimate=self.estimate,
                 **solved, **state, **started, **self._prepared(),
             ),
+            remember=self._stage("remember", block=s.block, known=self.known),
             restore=self._stage("restore", **state, **started, **self._prepared()),
             restore_for_euler=self._stage("restore_for_euler", **state, **started, **restored),
             advance_euler=self._stage("euler", before=self.before, **solved, **state, **euler_arrays),
@@ -123,8 +136,7 @@ class RosenbrockIntegrator(Integrator):
             coefficients=w.coefficients, euler_coefficients=(w.dt, w.dt),
         )  # fmt: skip
         starts, rows = np.array([*(b.first for b in w.bodies), w.nodes], dtype=np.int32), rows_of(effects)
-        nodal = (found.second, found.finish, found.restore, found.restore_for_euler, found.advance_euler)
-        launches = (*assemble, *found.again, *euler, *nodal)
+        launches = (*assemble, *found.launches)
         found.parts.update({id(x): items_of_bodies(x, starts, s.row, rows) for x in launches})  # type: ignore[attr-defined]
         return found
 

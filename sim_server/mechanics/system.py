@@ -106,16 +106,21 @@ class System:
             mean=self.mean,
         )  # fmt: skip
 
-    def finish(self) -> list[Launch]:
-        """Takes the system into the material frame, A' = R^T A R and b' = R^T b, and sets the start of the solve."""
+    def finish(self, matrix: bool = True) -> list[Launch]:
+        """Takes the system into the material frame, A' = R^T A R and b' = R^T b, and sets the start of the solve.
+
+        matrix: A', too
+        """
         w = self.world
         velocity = w.v if w.inertia else w.predictor  # without inertia v is only the last displacement over dt
         rotate = self.world.backend.module("kernels/nodes.cu").bind(
             "rotate", w.nodes, free=w.free, body=self.body, warped=self.warped, place=self.own,
             mean=self.mean, b=self.b, diagonal=self.diagonal, block=self.block, dv=self.dv,
-            x=w.x, v=velocity, extent=self.extent, inverse_time=self.inverse_time, h=w.dt, moving=self.moving,
-            rotation=self.rotation, b_material=self.b_material, y=self.y, values=self.values,
+            x=w.x, v=velocity, extent=self.extent, inverse_time=self.inverse_time, h=w.dt, whole=int(matrix),
+            moving=self.moving, rotation=self.rotation, b_material=self.b_material, y=self.y, values=self.values,
         )  # fmt: skip
+        if not matrix:
+            return [rotate]
         rotate_blocks = self.world.backend.module("kernels/rotate_blocks.cu").bind(
             "rotate_blocks", len(self.row), row=self.row, column=self.column, upper=self.upper, lower=self.lower,
             sums=self.sums, rotation=self.rotation, values=self.values,

@@ -22,7 +22,7 @@ from sim_server.backends.cpu.device import CpuLaunch
 from sim_server.backends.cpu.energies import NativeEnergies
 from sim_server.backends.newton import Newton
 from sim_server.backends.ring_buffers import Reports
-from sim_server.backends.rosenbrock import Rosenbrock
+from sim_server.backends.rosenbrock import NODAL, Rosenbrock
 
 Reals = NDArray[np.float64]
 HISTORY = 1024  # changes of the diagonal that are remembered, of each body
@@ -114,21 +114,25 @@ class _NativeNewton:
             launch.parts = None if part is None else part.ctypes.data
 
 
+LISTS = ("first", "again", "euler")  # of launches
+
+
 class _NativeStages:
     """The input of the Rosenbrock-W step and its memory, attached to a loop. number: of each launch by id."""
 
     def __init__(self, stages: Rosenbrock, loop: structs.Loop, launches: Any, number: dict[int, int]):
         self._input = stages
-        self._lists = {k: np.array([number[id(x)] for x in getattr(stages, k)], np.int32) for k in ("again", "euler")}
+        self._lists = {k: np.array([number[id(x)] for x in getattr(stages, k)], np.int32) for k in LISTS}
         self._state = (structs.StageState * loop.bodies)()
         for state in self._state:
             state.factor_step = state.checked = -1
         own = tuple(stages.coefficients.tolist())
         self.native = structs.Stages(
-            agains=len(stages.again), eulers=len(stages.euler), factor_alone=stages.factor_alone,
+            firsts=len(stages.first), agains=len(stages.again), eulers=len(stages.euler),
+            factor_alone=stages.factor_alone,
             own_coefficients=own, euler_coefficients=stages.euler_coefficients, state=c.addressof(self._state),
         )  # fmt: skip
-        for name in ("second", "finish", "restore", "restore_for_euler", "advance_euler"):
+        for name in NODAL:
             setattr(self.native, name, number[id(getattr(stages, name))])
         for name, array in self._lists.items():
             setattr(self.native, name, array.ctypes.data)
@@ -161,7 +165,6 @@ class CpuEngine(Reports):
         self._launch = (structs.Launch * max(len(launches), 1))()
         for entry, launch, binding in zip(self._launch, launches, self._bindings, strict=False):
             entry.kernel, entry.binding = launch.function, c.addressof(binding)
-            entry.only_matrix = launch.domain == "blocks"
         self._body = (structs.Body * bodies)()
         for entry_body, (first, last) in zip(self._body, ranges, strict=True):
             entry_body.first, entry_body.last, entry_body.snapshot_step = first, last, -1
@@ -220,12 +223,12 @@ class CpuEngine(Reports):
         settings: structs.SolveSettings = self._body[body].settings
         return settings
 
-    def correct(self, body: int, nodes: int, diagonal: Reals, double: bool = False) -> None:
+    def correct(self, body: int, nodes: int, diagonal: Reals, double: bool = False, block: Reals | None = None) -> None:
         """Factors of the body are corrected for what has come onto the diagonal since their matrix, or has left it, at
         so many nodes at most (backends/cpu/native/woodbury.h).
 
-        nodes: 1 to 64. diagonal: (nodes of the scene,) [kg], as assembled. double: also factors in float64. Before the
-        first step only.
+        nodes: 1 to 64. diagonal: (nodes of the scene,) [kg], as assembled. double: also factors in float64. block: as
+        in base.Engine. Before the first step only.
         """
         assert 1 <= nodes <= structs.MAX_CORRECTED
         entry = self._body[body]
@@ -242,6 +245,8 @@ class CpuEngine(Reports):
         self._corrections[body] = room
         correction = entry.correction
         correction.capacity, correction.history, correction.nodes, correction.forgotten = nodes, HISTORY, count, -1
+        if block is not None:
+            room["block"] = block[entry.first : entry.last]
         for name, array in room.items():
             setattr(correction, name, array.ctypes.data)
 

@@ -250,7 +250,9 @@ class GpuEngine(DeviceLoop):
         """Returns the bytes of the inverse that one application reads."""
         return self.solver.factor_bytes(body)
 
-    def correct(self, body: int, nodes: int, diagonal: Float64, double: bool = False) -> None:
+    def correct(
+        self, body: int, nodes: int, diagonal: Float64, double: bool = False, block: Float64 | None = None
+    ) -> None:
         """Not on a GPU (Capability.LOW_RANK_UPDATE)."""
         raise NotImplementedError
 

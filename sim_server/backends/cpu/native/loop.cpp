@@ -89,20 +89,20 @@ static int first_bad_node(const Loop& loop, const Body& body) {
     return -1;
 }
 
-// Runs the launches of the first stage; those that only make A for bodies that need it.
+// Runs the launches of the first stage. A body whose factor stands alone has its right-hand side from the same launches in every
+// step, also where A is wanted, too.
 static void assemble_stage(Loop& loop, bool whole) {
-    auto needs_matrix = [&](int i) { return loop.stages->state[i].assembled != 0; };
+    const Stages& stages = *loop.stages;
+    auto needs_matrix = [&](int i) { return stages.state[i].assembled != 0; };
+    auto alone = [&](int i) { return stages.state[i].form == FACTOR; };
     for (int i = 0; i < loop.bodies; ++i) choose_form(loop, i, whole);
     for (int i = 0; i < loop.before; ++i) {
         take_mail(loop.launch[i], loop.rings.step);
-        if (!loop.launch[i].only_matrix) run(loop.launch[i], loop.threads);
+        run_for(loop, loop.launch[i], needs_matrix);
     }
-    for (int i = 0; i < loop.bodies; ++i) {
-        note_changes(loop.body[i].correction, loop.rings.step, loop.body[i].steps == 0);
-        check_corrections(loop, i);
-    }
-    for (int i = 0; i < loop.before; ++i)
-        if (loop.launch[i].only_matrix) run_for(loop, loop.launch[i], needs_matrix);
+    for (int i = 0; i < stages.firsts; ++i) run_for(loop, loop.launch[stages.first[i]], alone);
+    for (int i = 0; i < loop.bodies; ++i) note_changes(loop.body[i].correction, loop.rings.step, loop.body[i].steps == 0);
+    check_corrections(loop);
 }
 
 // whole: A of all bodies is wanted.
@@ -209,8 +209,8 @@ void wf_solve(Loop* loop) {
         take_orders(loop->body[i]);
         if (!loop->stages) continue;
         choose_form(*loop, i, true);
-        check_corrections(*loop, i);
     }
+    if (loop->stages) check_corrections(*loop);
     finish_step(loop);
     if (loop->energies) leave(*loop);
 }

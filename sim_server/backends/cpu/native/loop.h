@@ -19,7 +19,6 @@ struct Launch {
     Binding* binding;
     std::atomic<Binding*> mail;   // the next one, or null
     const int32_t* parts;         // (bodies + 1,) items of each body, or null: not told apart
-    int32_t only_matrix;          // 1: makes blocks of A, and nothing that b depends on
 };
 
 struct Body {
@@ -52,6 +51,7 @@ struct StageState {                    // of a body in the step under way (rosen
     int32_t assembled;                 // 1: A is that of the step
     int32_t check;                     // 1: evaluate the residual of the first stage
     int32_t corrects;                  // 1: the factor is corrected for grabs
+    int32_t misses;                    // 1: it is not, though it should be
     int32_t patience;                  // steps to come that iterate
     int64_t factor_step;               // of the last factor
     int64_t checked;                   // step of its last check, -1: none
@@ -63,9 +63,9 @@ struct StageState {                    // of a body in the step under way (rosen
 constexpr int FAILED = -1;             // form of an attempt that gave no state
 
 struct Stages {                        // input of the Rosenbrock-W step
-    const int32_t *again, *euler;      // numbers of launches: the forces of the second stage; backward Euler
-    int32_t agains, eulers;
-    int32_t second, finish, restore, restore_for_euler, advance_euler;  // likewise
+    const int32_t *first, *again, *euler;  // numbers of launches: the forces of both stages; backward Euler
+    int32_t firsts, agains, eulers;
+    int32_t second, finish, remember, restore, restore_for_euler, advance_euler;  // likewise
     int32_t factor_alone;              // 1: wanted
     const double* estimate;            // (nodes,) of the last attempt [m]
     const double* bound;               // (bodies,) [m]

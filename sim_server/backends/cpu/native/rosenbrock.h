@@ -41,17 +41,20 @@ static void choose_form(Loop& loop, int index, bool whole) {
     s.assembled = whole || !alone || s.check || (body.snapshot.load(std::memory_order_acquire) && body.ahead < 0);
 }
 
-// After the forces of the first stage are assembled: whether the factor knows the springs of grabs, or is corrected for them. If it
+// After the forces of the first stage are evaluated: whether factors know the springs of grabs, or are corrected for them. Where one
 // does not, the body iterates in this step.
-static void check_corrections(Loop& loop, int index) {
-    StageState& s = loop.stages->state[index];
-    Body& body = loop.body[index];
-    s.corrects = false;
-    if (s.form != FACTOR || body.correction.capacity == 0) return;
-    s.corrects = Corrected{body.correction, matrix_of(loop, body), *body.factor}.prepare();
-    if (!body.correction.missed) return;
-    s.form = ITERATE;
-    s.assembled = true;
+static void check_corrections(Loop& loop) {
+    const Stages& stages = *loop.stages;
+    for (int i = 0; i < loop.bodies; ++i) {
+        StageState& s = stages.state[i];
+        Body& body = loop.body[i];
+        s.corrects = s.misses = false;
+        if (s.form != FACTOR || body.correction.capacity == 0) continue;
+        s.corrects = Corrected{body.correction, matrix_of(loop, body), *body.factor}.prepare();
+        s.misses = body.correction.missed;
+        if (s.misses) s.form = ITERATE;
+    }
+    for (int k = 0; k < loop.before; ++k) run_for(loop, loop.launch[k], [&](int i) { return stages.state[i].misses != 0; });
 }
 
 static void note(SolveResult& sum, const SolveResult& r) {
@@ -129,6 +132,7 @@ template <class F> static void solve_stage(Loop& loop, bool first, F take_part) 
 template <class F> static bool make_attempt(Loop& loop, F take_part) {
     const Stages& stages = *loop.stages;
     auto moves = [&](int i) { return take_part(i) && loop.moving[i]; };
+    run_for(loop, loop.launch[stages.remember], [&](int i) { return take_part(i) && stages.state[i].form == ITERATE; });
     solve_stage(loop, true, take_part);
     run_for(loop, loop.launch[stages.second], take_part);
     for (int k = 0; k < stages.agains; ++k) run_for(loop, loop.launch[stages.again[k]], moves);

@@ -46,6 +46,7 @@ struct Correction {
     int64_t step;           // of the factor that `then` and V are for
     const Factor* factor;   // likewise
     const double* diagonal; // (nodes,) of A as assembled now [kg]
+    const double* block;    // (nodes, 6) upper triangles of the nodes' own blocks without it [kg]; null: to be read from A
     double *last, *then;    // (nodes,) of the last step; of the matrix of the factor in use
     Change* change;         // (history,) the ring
     int32_t* node;          // (capacity,) of V
@@ -186,7 +187,11 @@ private:
         while (A.columns[k] != A.first + node) ++k;
         return A.values + 9 * (int64_t)k;
     }
-    double own(int node) const { const double* a = block(node); return (a[0] + a[4] + a[8]) / 3; }
+    double own(int node) const {
+        if (const double* k = c.block ? c.block + 6 * (int64_t)node : nullptr) return (k[0] + k[3] + k[5]) / 3 + c.diagonal[node];
+        const double* a = block(node);
+        return (a[0] + a[4] + a[8]) / 3;
+    }
 
     double bounded(int node) const {
         const double delta = c.diagonal[node] - c.then[node], rest = own(node) - std::fmax(delta, 0);
