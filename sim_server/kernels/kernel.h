@@ -50,7 +50,7 @@ INLINE void mark(int* a, index i, bool mask) { if (mask) a[i] = 1; }
 template <class T> struct own { T* item; };
 #define KERNEL(name, Params) INLINE void name##_item(const Params& p, index i)
 #define MAILED_KERNEL(name, Params) KERNEL(name, Params)
-#define SUM_KERNEL(name, Params, N) static constexpr int name##_sums = N;
+#define SUM_KERNEL(name, Params, N) [[maybe_unused]] static constexpr int name##_sums = N;
 #else
 template <class T> using own = T*;
 #define KERNEL(name, Params)                                                \

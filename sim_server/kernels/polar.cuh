@@ -229,7 +229,8 @@ template <class T> INLINE quaternion<T> nearest_quaternion(const mat<T>& F, quat
     mat<T> G;
     for (int k = 0; k < 9; ++k) G.m[k] = scale * F.m[k];
     const turned<T> last = turn(polish(near, G), G);
-    auto off = !(last.tangent2 < (entry<T>)1e-12 && last.definite > (entry<T>)1e-3);
+    const entry<T> small = (entry<T>)1e-12, least = (entry<T>)1e-3;
+    auto off = !(small > last.tangent2 && last.definite > least);
     if (!any(off)) return last.q;
     const quaternion<T> q = nearest_by_root(F);
     return {off ? q.w : last.q.w, off ? q.x : last.q.x, off ? q.y : last.q.y, off ? q.z : last.q.z};

@@ -4,6 +4,7 @@
 #include "mat3.cuh"
 
 constexpr real GAMMA = 0.29289321881345247559915563789515;  // g = 1 - 1 / sqrt 2
+constexpr real TWO = 2, THREE = 3;  // in the type of the numbers that they multiply
 
 struct Start {
     int n;                           // nodes
@@ -103,7 +104,7 @@ KERNEL(second, Second) {
     store3(p.first, i, u);
     store3(p.x, i, x + p.h * (v + u));
     store3(p.v, i, moved);
-    prepare_stage(p, i, moved, -2 * u, start);
+    prepare_stage(p, i, moved, -TWO * u, start);
 }
 
 struct Finish {
@@ -134,8 +135,8 @@ KERNEL(finish, Finish) {
     vec3 w = mul(as<number>(load9(p.rotation, i)), load3(p.y, i)) - at(p.share, i) * start;
     vec3 k1 = v + u, k2 = start + w, off = (p.h / 2) * (k1 + k2);
     auto still = as_number(at(p.moving, at(p.body, i))) == 0;
-    vec3 ended = select(still, zero, v + (1 / (2 * GAMMA)) * (3 * u + w));
-    store3(p.x, i, select(still, x, x + (p.h / 2) * (3 * k1 + k2)));
+    vec3 ended = select(still, zero, v + (1 / (2 * GAMMA)) * (THREE * u + w));
+    store3(p.x, i, select(still, x, x + (p.h / 2) * (THREE * k1 + k2)));
     store3(p.v, i, ended);
     store3(p.before, i, x);
     put(p.estimate, i, still ? number{} : sqrt(dot(off, off)));
