@@ -92,7 +92,7 @@ static bool apply_alone(Loop& loop, int index, bool check) {
             const double from = residual(A, b, start, r), left = residual(A, b, y, r);
             out.residual = from > 0 ? std::sqrt(left / from) : 0;
             well = out.residual < POOR || left <= body.now.tolerance * body.now.tolerance * b2;
-            s.checked = well ? loop.rings.step.load() : -1;
+            s.checked = loop.rings.step;
             s.share = out.residual;
         }
         if (!well) {
@@ -122,7 +122,7 @@ template <class F> static void solve_stage(Loop& loop, bool first, F take_part) 
         if (!loop.moving[i] && s.form != EULER) { s.result.kind = loop.body[i].now.kind; continue; }
         if (s.form != FACTOR) { iterate(loop, i); continue; }
         if (apply_alone(loop, i, first && s.check)) continue;
-        s.patience = PATIENCE + 1;
+        s.patience = PATIENCE;
         if (first && s.check) { s.form = ITERATE; iterate(loop, i); }  // A is there, and b is that of the first stage
         else s.form = FAILED;
     }
@@ -158,10 +158,13 @@ static void set_coefficients(const Stages& stages, const double (&to)[2]) {
 }
 
 // Makes the step of all bodies, whose first stage is assembled, and integrates.
-static void make_attempts(Loop& loop) {
+static void make_stages(Loop& loop) {
     const Stages& stages = *loop.stages;
-    for (int i = 0; i < loop.bodies; ++i)
-        stages.state[i].result = SolveResult{0, 0, 0, CONVERGED, loop.body[i].now.kind, 0};
+    for (int i = 0; i < loop.bodies; ++i) {
+        StageState& s = stages.state[i];
+        s.result = SolveResult{0, 0, 0, CONVERGED, loop.body[i].now.kind, 0};
+        if (s.patience > 0) --s.patience;
+    }
     auto all = [](int) { return true; };
     auto left = [&](int i) { return !stages.state[i].accepted; };
     auto iterates = [&](int i) { return left(i) && stages.state[i].form == ITERATE; };
@@ -171,7 +174,7 @@ static void make_attempts(Loop& loop) {
         StageState& s = stages.state[i];
         if (s.accepted || s.form == ITERATE) { if (!s.accepted) s.form = EULER; continue; }
         s.form = ITERATE;
-        s.patience = PATIENCE + 1;
+        s.patience = PATIENCE;
         s.result.status = CONVERGED;
         again = true;
     }
@@ -195,12 +198,4 @@ static void make_attempts(Loop& loop) {
     solve_stage(loop, true, left);
     run_for(loop, loop.launch[stages.advance_euler], left);
     set_coefficients(stages, stages.own_coefficients);
-}
-
-static void make_stages(Loop& loop) {
-    make_attempts(loop);
-    for (int i = 0; i < loop.bodies; ++i) {
-        int32_t& patience = loop.stages->state[i].patience;
-        if (patience > 0) --patience;
-    }
 }
