@@ -15,7 +15,8 @@ from tests.scenes import bar, simulation
 
 def swinging(dt: float = 0.02, damping: tuple[float, float] = (0.1, 0.0), **table: Any) -> Simulation:
     """A bar held at one end, let go from horizontal."""
-    held = bar((4, 2, 2), (2, 1, 1), young=2e5, fixed="X < 0.01", damping=damping)
+    touch = {"max_force": 1e6}
+    held = bar((4, 2, 2), (2, 1, 1), young=2e5, fixed="X < 0.01", damping=damping, touch=touch)
     return simulation(held, gravity=(0, -9.81, 0), dt=dt, preconditioner="block_jacobi", max_iterations=2000, **table)
 
 
@@ -25,11 +26,14 @@ def ros2(**options: Any) -> dict[str, Any]:
 
 @pytest.mark.parametrize("damping", [(0.0, 0.0), (0.5, 0.02)])
 def test_with_a_tiny_bound_it_is_backward_euler_bit_for_bit(damping):
-    """Whose solves start from zero: the solution of the step before, by another scheme, is no good start."""
+    """Whose solves start from zero: the solution of the step before, by another scheme, is no good start. A grab begins
+    on the way."""
     back = swinging(damping=damping, integrator=ros2(error_bound=1e-300))
     euler = swinging(damping=damping, warm_start=False)
-    for _ in range(20):
+    for step in range(20):
         for sim in (back, euler):
+            if step == 10:
+                sim.touch.grab("client", "bar", (2, 0.5, 0.5), 0.6, (2, 1, 1), 1e5, 0, 10)
             sim.engine.run(1)
         assert np.array_equal(back.world.x, euler.world.x) and np.array_equal(back.world.v, euler.world.v)
     records, of_euler = back.engine.records(), euler.engine.records()
@@ -73,9 +77,9 @@ def test_the_estimate_is_of_second_order():
 
 
 def parts(names: str, threads: int, update: str) -> tuple[Simulation, NDArray]:
-    """20 steps of the bodies named: a and b swing, w is let go from three times its length, r rests."""
+    """20 steps of the bodies named: a, grabbed, and b swing, w is let go from three times its length, r rests."""
     given = {
-        "a": bar((4, 2, 2), (2, 1, 1), name="a", young=2e5, fixed="X < 0.01"),
+        "a": bar((4, 2, 2), (2, 1, 1), name="a", young=2e5, fixed="X < 0.01", touch={"max_force": 1e6}),
         "w": bar((3, 1, 1), (3, 1, 1), name="w", young=1e6, poisson=0.45, fixed="X < 0.01"),
         "r": bar((2, 1, 1), (2, 1, 1), name="r", young=1e6),
         "b": bar((3, 2, 1), (3, 1, 1), name="b", young=1e6, fixed="X < 0.01", damping=(0.0, 0.01)),
@@ -90,6 +94,8 @@ def parts(names: str, threads: int, update: str) -> tuple[Simulation, NDArray]:
             w.x[body.nodes] = own * [3, 1, 1]
         elif body.name != "r":
             w.v[body.nodes] = np.array([0, 2.0, 1.0]) * own[:, :1] * w.free[body.nodes, None]
+    if "a" in names:
+        sim.touch.grab("client", "a", (2, 0.5, 0.5), 0.6, (2, 1, 1), 1e5, 0, 10)
     return sim, Driver(sim).advance(20)
 
 

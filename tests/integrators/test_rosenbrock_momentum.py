@@ -2,8 +2,8 @@
 """Momentum and angular momentum of a free, vibrating, tumbling bar in Rosenbrock-W steps, 1000 of them.
 
 Whose matrix is that of the step keeps momentum, as each row of K sums to 0. An older K that is warped by rotations that
-differ from node to node does not quite. Angular momentum is lost in any case: the force of the second stage has no torque
-about the positions of that stage, but some about those at the start, as it is resolved there: (w h)^2 h^2 K / m a step.
+differ from node to node does not quite. Angular momentum is lost in any case: the force of the second stage has no
+torque about the positions of that stage, but some about those at the start: a share of (w h)^2 h^2 K / m in each step.
 """
 
 from typing import Any
@@ -30,7 +30,7 @@ def tumbling(dt: float, update: str, solve: str = "auto", **table: Any) -> Simul
     w = sim.world
     arm = w.x - w.mass @ w.x / w.mass.sum()
     axis = 2.0 * np.array([0.3, 1.0, 0.5]) / np.linalg.norm([0.3, 1.0, 0.5])
-    w.v[:] = [1.0, 0.5, -0.3] + np.cross(axis, arm)
+    w.v[:] = np.cross(axis, arm) + [1.0, 0.5, -0.3]
     w.v[:, 1] += 0.3 * arm[:, 0] ** 2
     return sim
 
