@@ -30,7 +30,7 @@ def tumbling(dt: float, update: str, solve: str = "auto", **table: Any) -> Simul
     w = sim.world
     arm = w.x - w.mass @ w.x / w.mass.sum()
     axis = 2.0 * np.array([0.3, 1.0, 0.5]) / np.linalg.norm([0.3, 1.0, 0.5])
-    w.v[:] = np.cross(axis, arm) + [1.0, 0.5, -0.3]
+    w.v[:] = np.array([1.0, 0.5, -0.3]) + np.cross(axis, arm)
     w.v[:, 1] += 0.3 * arm[:, 0] ** 2
     return sim
 

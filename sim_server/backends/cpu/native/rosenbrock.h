@@ -97,6 +97,7 @@ static bool apply_alone(Loop& loop, int index, bool check) {
         }
         if (!well) {
             if (check) std::copy(start, start + n, y);
+            s.checked = -1;  // again before its next use
             out.fallbacks = 1;
         }
     }
