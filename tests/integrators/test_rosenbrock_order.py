@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Order two of the Rosenbrock-W step whatever the tangent, the damping and the age of the factor: by halving the step."""
+"""Order two of Rosenbrock-W steps whatever the tangent, the damping and the age of the factor: by halving the step."""
 
 from functools import cache
 from typing import Any
