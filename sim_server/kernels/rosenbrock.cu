@@ -121,7 +121,8 @@ struct Finish {
     real h;                    // time step [s]
     real* v;                   // (n, 3) out [m/s]
     real* x;                   // (n, 3) out [m]
-    real* before;              // (n, 3) out: x at the start of the step [m]
+    real* before;              // (n, 3) in, out: x at the start of the step [m]
+    real* earlier;             // (n, 3) out: the same of the step before [m]
     real* estimate;            // (n,) out: error of the step [m]
     real* damping_velocity;    // (n, 3) out: of the next step, as the next two [m/s]
     real* inertial_increment;
@@ -138,6 +139,7 @@ KERNEL(finish, Finish) {
     vec3 ended = select(still, zero, v + (1 / (2 * GAMMA)) * (THREE * u + w));
     store3(p.x, i, select(still, x, x + (p.h / 2) * (THREE * k1 + k2)));
     store3(p.v, i, ended);
+    store3(p.earlier, i, load3(p.before, i));
     store3(p.before, i, x);
     put(p.estimate, i, still ? number{} : sqrt(dot(off, off)));
     prepare_stage(p, i, ended, zero, ended);
@@ -149,8 +151,10 @@ struct Restore {
     const real* weight;        // (n,)
     const real* start_v;       // (n, 3) [m/s]
     const real* start_x;       // (n, 3) [m]
+    const real* earlier;       // (n, 3) [m]
     real* v;                   // (n, 3) out [m/s]
     real* x;                   // (n, 3) out [m]
+    real* before;              // (n, 3) out: x when the step before began [m]
     real* damping_velocity;    // (n, 3) out [m/s]
     real* inertial_increment;  // (n, 3) out [m/s]
     real* dv;                  // (n, 3) out: start of the solve [m/s]
@@ -160,6 +164,7 @@ struct Restore {
 KERNEL(restore, Restore) {
     vec3 v = load3(p.start_v, i);
     store3(p.x, i, load3(p.start_x, i));
+    store3(p.before, i, load3(p.earlier, i));
     store3(p.v, i, v);
     prepare_stage(p, i, v, vec3{}, v);
 }
@@ -168,8 +173,10 @@ struct RestoreForEuler {
     int n;                     // nodes
     const real* start_v;       // (n, 3) [m/s]
     const real* start_x;       // (n, 3) [m]
+    const real* earlier;       // (n, 3) [m]
     real* v;                   // (n, 3) out [m/s]
     real* x;                   // (n, 3) out [m]
+    real* before;              // (n, 3) out: x when the step before began [m]
     real* predictor;           // (n, 3) out [m/s]
     real* damping_velocity;    // (n, 3) out [m/s]
     real* inertial_increment;  // (n, 3) out [m/s]
@@ -180,6 +187,7 @@ struct RestoreForEuler {
 KERNEL(restore_for_euler, RestoreForEuler) {
     vec3 v = load3(p.start_v, i), zero = {};
     store3(p.x, i, load3(p.start_x, i));
+    store3(p.before, i, load3(p.earlier, i));
     store3(p.v, i, v);
     store3(p.predictor, i, v);
     store3(p.damping_velocity, i, v);

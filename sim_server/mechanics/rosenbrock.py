@@ -57,7 +57,8 @@ class RosenbrockIntegrator(Integrator):
     """The launches of the stages.
 
     share (n,): theta; weight (n,): w; first (n, 3): u_1 [m/s]; start_x, start_v (n, 3): x [m] and v [m/s] at the start
-    of the step; estimate (n,) [m]; known (n, 6): the nodes' own blocks of the last step that iterated [kg]
+    of the step; earlier (n, 3): x at the start of the step before [m]; estimate (n,) [m]; known (n, 6): the nodes' own
+    blocks of the last step that iterated [kg]
     """
 
     has_stages = True
@@ -69,10 +70,12 @@ class RosenbrockIntegrator(Integrator):
         self.share = w.dx_dv / (w.dx_dv + self.beta)
         self.weight = self.share * (1 + w.dx_dv * alpha)
         self.start_x, self.start_v, self.first = w.x.copy(), np.zeros_like(w.v), np.zeros_like(w.v)
-        self.estimate, self.known = np.zeros(w.nodes), np.zeros((w.nodes, 6))
+        self.earlier, self.estimate, self.known = w.x.copy(), np.zeros(w.nodes), np.zeros((w.nodes, 6))
         self.bound = np.array([self._bound(b) for b in w.bodies])
         self.factor_alone = scene.uses_factor_alone
-        w.backend.keep(self.share, self.weight, self.start_x, self.start_v, self.first, self.estimate, self.known)
+        w.backend.keep(
+            self.share, self.weight, self.start_x, self.start_v, self.first, self.earlier, self.estimate, self.known
+        )
 
     def _bound(self, body: Body) -> float:
         if self.options.error_bound is not None:
@@ -118,6 +121,7 @@ class RosenbrockIntegrator(Integrator):
         state: dict[str, Any] = {"x": w.x, "v": w.v}
         started: dict[str, Any] = {"start_x": self.start_x, "start_v": self.start_v}
         solved: dict[str, Any] = {"rotation": s.rotation, "y": s.y, "h": w.dt}
+        history: dict[str, Any] = {"before": self.before, "earlier": self.earlier}
         first, again, euler = lists
         euler_arrays = {**self._prepared(), "predictor": w.predictor}
         restored = {k: v for k, v in euler_arrays.items() if k not in ("share", "weight")}
@@ -125,12 +129,12 @@ class RosenbrockIntegrator(Integrator):
             first=first, again=again, euler=euler,
             second=self._stage("second", first=self.first, **solved, **state, **started, **self._prepared()),
             finish=self._stage(
-                "finish", body=s.body, moving=s.moving, first=self.first, before=self.before, estimate=self.estimate,
-                **solved, **state, **started, **self._prepared(),
+                "finish", body=s.body, moving=s.moving, first=self.first, estimate=self.estimate,
+                **history, **solved, **state, **started, **self._prepared(),
             ),
             remember=self._stage("remember", block=s.block, known=self.known),
-            restore=self._stage("restore", **state, **started, **self._prepared()),
-            restore_for_euler=self._stage("restore_for_euler", **state, **started, **restored),
+            restore=self._stage("restore", **state, **started, **history, **self._prepared()),
+            restore_for_euler=self._stage("restore_for_euler", **state, **started, **history, **restored),
             advance_euler=self._stage("euler", before=self.before, **solved, **state, **euler_arrays),
             parts={}, factor_alone=self.factor_alone, estimate=self.estimate, bound=self.bound,
             coefficients=w.coefficients, euler_coefficients=(w.dt, w.dt),

@@ -85,6 +85,7 @@ def test_a_poisoned_factor_costs_iterations_but_no_accuracy(how):
     assert np.abs(x[:PATIENCE] - iterated[:PATIENCE]).max() < 1e-5  # to the tolerance of the solves
     assert (records["form"][: PATIENCE + 1] == FORMS["ITERATE"]).all()
     assert (records["iterations"][: PATIENCE + 1] > 0).all()
+    assert (records["residual"][: PATIENCE + 1] <= 1e-6).all()
     assert records["fallbacks"][0] > 0 and (records["status"] == 0).all()
     assert clean() < 5e-3 and error(x) < 2 * clean()
 

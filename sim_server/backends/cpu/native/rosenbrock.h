@@ -66,6 +66,12 @@ static void note(SolveResult& sum, const SolveResult& r) {
     if (r.status != CONVERGED) sum.status = r.status;
 }
 
+// The attempt is made again: what it cost counts, how it ended does not.
+static void forget(SolveResult& sum) {
+    sum.status = CONVERGED;
+    sum.residual = 0;
+}
+
 // y = P^-1 b. False if P is not positive definite there or, where it is checked, leaves too much of the residual.
 static bool apply_alone(Loop& loop, int index, bool check) {
     StageState& s = loop.stages->state[index];
@@ -99,6 +105,7 @@ static bool apply_alone(Loop& loop, int index, bool check) {
             if (check) std::copy(start, start + n, y);
             s.checked = -1;  // again before its next use
             out.fallbacks = 1;
+            out.residual = 0;  // not of what makes the step
         }
     }
     out.seconds = now() - begin;
@@ -145,7 +152,7 @@ template <class F> static bool make_attempt(Loop& loop, F take_part) {
         StageState& s = stages.state[i];
         double most = 0;
         for (int k = loop.body[i].first; k < loop.body[i].last; ++k)
-            if (!(stages.estimate[k] <= most)) most = stages.estimate[k];  // also NaN
+            if (most == most && !(stages.estimate[k] <= most)) most = stages.estimate[k];  // NaN stays
         s.estimate = most;
         s.accepted = s.form != FAILED && most <= stages.bound[i];
         again = again || !s.accepted;
@@ -176,7 +183,7 @@ static void make_stages(Loop& loop) {
         if (s.accepted || s.form == ITERATE) { if (!s.accepted) s.form = EULER; continue; }
         s.form = ITERATE;
         s.patience = PATIENCE;
-        s.result.status = CONVERGED;
+        forget(s.result);
         again = true;
     }
     if (again) {
@@ -191,7 +198,7 @@ static void make_stages(Loop& loop) {
     if (!back) return;
     for (int i = 0; i < loop.bodies; ++i)
         if (left(i)) {
-            stages.state[i].result.status = CONVERGED;
+            forget(stages.state[i].result);
         }
     run_for(loop, loop.launch[stages.restore_for_euler], left);
     set_coefficients(stages, stages.euler_coefficients);
