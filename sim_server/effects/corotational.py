@@ -155,10 +155,11 @@ class Corotational(Effect):
         return [elements, gather, blocks]
 
     def force_launches(self, system: System, stencil: Stencil | None, frames: bool) -> list[Launch] | None:
-        if self.variant == "_qr":
+        w = self.world
+        damped = self.variant == "_exact" and w.beta[self.owner].any()  # by a tangent that `forces` does not have
+        if self.variant == "_qr" or damped:
             return None
         assert stencil is not None
-        w = self.world
         forces = w.backend.module("effects/corotational.cu").bind(
             "forces", len(self.elements), tets=self.elements, x=w.x, v=w.damping_velocity, gradients=self.gradients,
             lame=self.lame, stiffness_coefficient=w.stiffness_coefficient[self.owner], h=w.force_coefficient,

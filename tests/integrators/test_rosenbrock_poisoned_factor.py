@@ -13,7 +13,9 @@ from sim_server.backends.rosenbrock import FORMS
 from sim_server.simulation import Simulation
 from tests.scenes import bar, factor_of, simulation
 
-BEFORE, AFTER, PATIENCE = 10, 30, 8  # steps before the factor comes, after it; kernels/step_form.h
+BEFORE, AFTER = 10, 30  # steps before the factor comes, after it
+FORM = Declarations("kernels/step_form.h")
+PATIENCE, CHECK_EVERY = FORM.constant("PATIENCE"), FORM.constant("CHECK_EVERY")
 POISONS = ["scaled", "column", "permuted", "negative", "nan"]
 
 
@@ -102,11 +104,21 @@ def test_a_good_factor_ends_the_patience():
     run(sim, "permuted")
     sim.engine.assemble()
     sim.engine.post_factor(0, *factor_of(sim, 0, np.float32), sim.engine.step)
+    sim.engine.run(CHECK_EVERY + 1)
+    records = sim.engine.records()
+    alone = records["form"] == FORMS["FACTOR"]
+    assert alone[:20].all() and records["fallbacks"].sum() == 0 and 0 <= records["residual"][0] < 1e-4
+    checked = np.flatnonzero(alone & (records["residual"] >= 0)).tolist()
+    assert checked == [0, CHECK_EVERY][: 1 + alone[-1]], "at first, and then seldom"
+
+
+def test_a_factor_that_is_known_to_be_exact_is_not_checked_at_first():
+    sim = swinging()
+    sim.engine.assemble()
+    sim.engine.post_factor(0, *factor_of(sim, 0, np.float32), sim.engine.step, exact=True)
     sim.engine.run(20)
     records = sim.engine.records()
-    assert (records["form"] == FORMS["FACTOR"]).all() and records["fallbacks"].sum() == 0
-    assert np.flatnonzero(np.isfinite(records["residual"])).tolist() == [0, 16]  # checked at first and after 16 steps
-    assert records["residual"][0] < 1e-4 < records["residual"][16] < 0.5
+    assert (records["form"] == FORMS["FACTOR"]).all() and (records["residual"] == -1).all()
 
 
 def test_patience_is_counted_in_steps_also_in_steps_of_two_halves():
