@@ -2,12 +2,15 @@
 """The CUDA device as the native GPU loop uses it: memory, streams and context of CuPy, functions of the driver."""
 
 import ctypes as c
+from contextlib import AbstractContextManager
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sim_server.backends.gpu import structs
+from sim_server.backends.gpu.conditions import Conditions
 from sim_server.backends.gpu.cupy_types import DeviceArray, Event, Pointer, Stream
 from sim_server.errors import DeviceError
 
@@ -62,6 +65,17 @@ class CudaDevice:
         event: Event = self.cp.cuda.Event(block=True, disable_timing=True)
         self._kept.append(event)
         return int(event.ptr)
+
+    @cached_property
+    def _conditions(self) -> Conditions:
+        return Conditions(self.cp, self._driver, self.context)
+
+    def branch(self, flag: DeviceArray) -> AbstractContextManager[None]:
+        """What is launched inside runs only if `flag` (1,) is not 0. Only while the current stream is captured.
+
+        Raises DeviceError.
+        """
+        return self._conditions.branch(flag)
 
     def error(self, code: int) -> str:
         """Returns text and number of a driver error."""

@@ -25,8 +25,9 @@ from sim_server.backends.gpu.kernel_fusion import DOMAINS, Epilogue, FusedKernel
 from sim_server.backends.gpu.loop import CAPACITY, MANY, DeviceLoop
 from sim_server.backends.gpu.mailbox import DeviceMailbox
 from sim_server.backends.gpu.newton import NewtonIteration, NewtonPhases
+from sim_server.backends.gpu.rosenbrock import ATTEMPTS, RosenbrockStep
 from sim_server.backends.gpu.solver import PCG_BODY, PCG_RESULT, SETTINGS_BYTES, PcgSolver
-from sim_server.backends.gpu.structs import ENERGY_RECORD, NEWTON_RESULT, STEP_TIMESTAMP, Mail
+from sim_server.backends.gpu.structs import ENERGY_RECORD, NEWTON_RESULT, STAGE_RESULT, STEP_TIMESTAMP, Mail
 
 FEW = 16  # largest number of trials in a step for which MANY steps are captured in one graph
 EPILOGUE = Declarations("backends/gpu/step_epilogue.cu")
@@ -64,8 +65,11 @@ class GpuEngine(DeviceLoop):
     def __init__(self, gpu: Gpu, given: EngineInput, records: int = 8192):
         assemble, integrate = (cast(Sequence[DeviceLaunch], part) for part in (given.assemble, given.integrate))
         ranges, arrays, dt, newton = given.ranges, given.arrays, given.dt, given.newton
-        planes = 2 if given.solver.factor_precision == "float32" else 1  # float16 numbers per entry of an inverse
+        stages, precision = given.stages, given.solver.factor_precision
+        fine = precision == "float32" or (precision == "auto" and stages is not None and stages.factor_alone)
+        planes = 2 if fine else 1  # float16 numbers per entry of an inverse
         self.gpu, self.launches, self._arrays = gpu, [*assemble, *integrate], arrays
+        self._touched = [given.energies.touch[name] for name in ("force", "spring") if name in given.energies.touch]
         cp, bodies = gpu.cp, len(ranges)
         device = CudaDevice(cp)
         self._steps = device.step_stream
@@ -74,9 +78,12 @@ class GpuEngine(DeviceLoop):
         self._results = device.pinned(CAPACITY * PCG_RESULT.itemsize * bodies)
         energy_records = device.pinned(CAPACITY * ENERGY_RECORD.itemsize * bodies)
         self._energies = DeviceEnergies(gpu, given.energies, energy_records, self._counter, dt)
-        self._first_launches = self._beginning(assemble)
+        alone = stages is not None and stages.factor_alone
+        self._whole_assembly = self._beginning(assemble)
+        needed = [launch for launch in assemble if launch.domain != "blocks"] if alone else assemble
+        self._first_launches = self._beginning(needed) if alone else self._whole_assembly
         phases = NewtonPhases.initial(gpu, bodies) if newton else None
-        self.solver = PcgSolver(gpu, ranges, arrays, self._counter, CAPACITY, planes, phases or ())
+        self.solver = PcgSolver(gpu, ranges, arrays, self._counter, CAPACITY, planes, phases or (), ATTEMPTS if stages else 0)
         self._newton, newton_results = None, None
         if newton and phases:
             newton_results = device.pinned(CAPACITY * NEWTON_RESULT.itemsize * bodies)
@@ -90,9 +97,10 @@ class GpuEngine(DeviceLoop):
         addresses = {name: int(twin.data.ptr) for name, twin in twins.items()}
         if self._newton:
             addresses["values"] = int(self._newton.first_values.data.ptr)
+        stage_results = device.pinned(CAPACITY * STAGE_RESULT.itemsize * bodies) if stages else None
         super().__init__(
             device, ranges, arrays["row_start"], dt, mailboxes, self._results, self._timestamps, arrays["clock"],
-            records, twins["values"].dtype, newton_results, energy_records, **addresses,
+            records, twins["values"].dtype, newton_results, energy_records, stage_results, **addresses,
         )  # fmt: skip
         self._factor_upload = FactorUpload(gpu, self.solver, self, given.names, self.mailboxes[bodies : 2 * bodies])
         for k in range(bodies):
@@ -102,10 +110,18 @@ class GpuEngine(DeviceLoop):
         self.begin: Sequence[Launch] = ()  # launches before the first step
         self._graphs: list[Graph | None] = []
         self._epilogue = self._epilogue_params(dt)
-        self._integrate = FusedKernel(
-            integrate, Epilogue(EPILOGUE.checked(), "StepEpilogue", "finish_step", self._epilogue)
-        )  # fmt: skip
-        self._stamp_begin = self._integrate.function("stamp_begin")
+        self._integrate, self._stages = None, None
+        if stages and stage_results is not None:
+            spring = given.energies.touch.get("spring")
+            self._stages = RosenbrockStep(
+                gpu, device, stages, assemble, self.solver, self._epilogue, stage_results, spring
+            )  # fmt: skip
+            self._stamp_begin = self._stages.stamp_begin
+        else:
+            epilogue = Epilogue(EPILOGUE.checked(), "StepEpilogue", "finish_step", self._epilogue)
+            self._integrate = FusedKernel(integrate, epilogue)
+            self._stamp_begin = self._integrate.function("stamp_begin")
+        self._matrix = self._matrix_launches(assemble) if alone else ()
         self._capture()
         cp.cuda.get_current_stream().synchronize()  # arrays are complete for the streams of the loop
 
@@ -164,9 +180,12 @@ class GpuEngine(DeviceLoop):
                         self._one_step()
                     self._graphs.append(self._steps.end_capture())
         others = [self._captured(self._energies.launch_balance), self._captured(self._energies.launch_elastic)]
+        if self._matrix:
+            others.append(self._captured(self._assemble_matrix))
         handles = [int(graph.graphExec) if graph else 0 for graph in self._graphs]
         self.use_graphs(handles, *(int(graph.graphExec) for graph in others))
         self._graphs += others  # kept as long as the engine
+        self._second_half = self._captured(self._finish_step) if self._stages else None
 
     def _captured(self, launch: Callable[[], None]) -> Graph:
         """Returns the graph of the work that `launch` appends to the stream."""
@@ -195,6 +214,20 @@ class GpuEngine(DeviceLoop):
         self._energies.threads = first.shape.threads
         return launches
 
+    def _matrix_launches(self, assemble: Sequence[DeviceLaunch]) -> Sequence[Callable[[], None]]:
+        """Returns the launches that make A of the present state between two steps."""
+        return [self._energies.launch_balance, *fuse(assemble)]
+
+    def _assemble_matrix(self) -> None:
+        """Appends the assembly of A between two steps, which leaves no trace: the balance of the last step, which
+        reads what touches exert, comes first, and what the assembly writes for the next one is cleared."""
+        for launch in self._matrix:
+            launch()
+        runtime, stream = self.gpu.cp.cuda.runtime, self.gpu.cp.cuda.get_current_stream().ptr
+        for host in (self._arrays["moving"], *self._touched):
+            twin = self.gpu.twin(host)
+            runtime.memsetAsync(twin.data.ptr, 0, twin.nbytes, stream)
+
     def _one_step(self) -> None:
         """Appends a whole step to the stream."""
         for launch in self._first_launches:
@@ -203,7 +236,11 @@ class GpuEngine(DeviceLoop):
 
     def _finish_step(self) -> None:
         """Appends solve, integration and epilogue."""
+        if self._stages:
+            self._stages.launch()
+            return
         (self._newton or self.solver).launch()
+        assert self._integrate is not None
         self._integrate()
 
     def assemble(self) -> None:
@@ -212,7 +249,7 @@ class GpuEngine(DeviceLoop):
         self.open_step()
         with self._steps:
             self._begin()
-            for launch in self._first_launches:
+            for launch in self._whole_assembly:
                 launch()
             values = self._arrays["values"]
             values[...] = self.gpu.twin(values).get(stream=self._steps)
@@ -221,8 +258,11 @@ class GpuEngine(DeviceLoop):
         """Runs the second half: solve, integration, records."""
         self._factor_upload.settle()
         self.renew_mail()
-        with self._steps:
-            self._finish_step()
+        if self._second_half:  # with branches, which only graphs have
+            self._second_half.launch(self._steps)
+        else:
+            with self._steps:
+                self._finish_step()
         self.close_step()
 
     # --- mailboxes ----------------------------------------------------------------------------------------------

@@ -48,12 +48,14 @@ class Epilogue(NamedTuple):
     """What the thread blocks of a fused kernel do after their items.
 
     text: CUDA source. function: device function in it that is called with the struct. params: values of the struct.
+    reads: True if it reads arrays that the items write
     """
 
     text: str
     struct: str
     function: str
     params: NDArray[Any]
+    reads: bool = False
 
 
 class Prologue(NamedTuple):
@@ -71,10 +73,10 @@ class Prologue(NamedTuple):
 
 
 class PhaseGuard(NamedTuple):
-    """Device addresses of arrays that tell whether a later linearization of a step needs a launch (newton.cu).
+    """Device addresses of arrays that tell whether a later part of a step needs a launch (newton.cu, stages.cuh).
 
-    active: (1,), number of bodies whose iteration is not over
-    phase: (bodies,), phase of each body's iteration
+    active: (1,), number of bodies whose step is not made
+    phase: (bodies,), phase of each body in the step; DONE: it is made
     body: (items,), body of each item; 0 (no address): not known
     """
 
@@ -84,6 +86,7 @@ class PhaseGuard(NamedTuple):
 
 
 DONE = Declarations("kernels/newton_line_search.cuh").enumeration("Phase")["DONE"]
+OPEN_ITEM = f"(!body || phase[body[i]] != {DONE})"
 PHASE_GUARD = [
     "if (*active == 0) return;",
     "if (body && !__syncthreads_or(threadIdx.x < BLOCK_ITEMS && block * BLOCK_ITEMS + threadIdx.x < n &&",
@@ -132,7 +135,8 @@ class FusedSource:
     its entries in registers from one launch to the next.
 
     private: addresses of arrays that need no memory
-    guard: thread blocks return at once if they have no item of a body whose Newton iteration is not over
+    guard: items of bodies whose step is made are left out; thread blocks with no others return at once, unless there
+        is an epilogue
 
     source: the text
     values: of the arguments after the number of items
@@ -142,7 +146,8 @@ class FusedSource:
         self, launches: Sequence[DeviceLaunch], shape: BlockShape, epilogue: Epilogue | None = None,
         private: frozenset[int] = frozenset(), guard: PhaseGuard | None = None, prologue: Prologue | None = None,
     ):  # fmt: skip
-        self._launches, self._private = launches, private
+        self._launches, self._private, self._guarded = launches, private, guard is not None
+        self._restrict = "" if epilogue and epilogue.reads else "__restrict__ "
         self.values: list[np.number[Any]] = [np.uint64(address) for address in guard or ()]
         self._parameters = [f"const int* __restrict__ {name}" for name in guard._fields] if guard else []
         self._setup: list[str] = []
@@ -171,7 +176,7 @@ class FusedSource:
             opening.append(f"if (block < 0) {{ {prologue.function}(prologue, blockIdx.x); return; }}")
         heading = f'extern "C" __global__ void __launch_bounds__({shape.threads}) fused(int n'
         parameters = "".join(f", {p}" for p in self._parameters)
-        opening += PHASE_GUARD if guard else []
+        opening += PHASE_GUARD if guard and not epilogue else []
         lines += [f"{heading}{parameters}) {{", *opening, *self._setup, *body_lines, "}"]
         self.source = "\n".join(lines)
 
@@ -227,13 +232,14 @@ class FusedSource:
         if address not in self._names:
             self._names[address] = f"a{len(self._names)}"
             const = "" if address in self._written else "const "
-            self._parameters.append(f"{const}{kind}* __restrict__ {self._names[address]}")
+            self._parameters.append(f"{const}{kind}* {self._restrict}{self._names[address]}")
             self.values.append(np.uint64(address))
         return self._names[address]
 
     def _items(self) -> list[str]:
         """Returns the lines that do one item of each launch in one thread."""
-        lines = ["const int i = block * BLOCK_ITEMS + threadIdx.x;", "if (threadIdx.x < BLOCK_ITEMS && i < n) {"]
+        taken = f" && {OPEN_ITEM}" if self._guarded else ""
+        lines = ["const int i = block * BLOCK_ITEMS + threadIdx.x;", f"if (threadIdx.x < BLOCK_ITEMS && i < n{taken}) {{"]
         rows: dict[int, str] = {}
         for k, launch, space, kernel in self._each():
             own = list(self._rows(launch, rows, lines))

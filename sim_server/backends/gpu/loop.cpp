@@ -9,6 +9,7 @@
 
 #include "../cpu/native/sizes.h"
 #include "readback.h"
+#include "step_form.h"
 
 // Copies new arguments, settings and factors to the device, in the order of the steps, from memory that stays unchanged meanwhile.
 static bool deliver(GpuLoop& l, StepBatch& batch, int slots) {
@@ -104,6 +105,11 @@ static void report(GpuLoop& l, const StepBatch& batch, int64_t k, double end, do
             record.nonlinear = l.newton_results[slot + i].nonlinear;
             record.linearizations = l.newton_results[slot + i].linearizations;
         }
+        if (l.stage_results) {
+            record.form = l.stage_results[slot + i].form;
+            record.estimate = l.stage_results[slot + i].estimate;
+            if (record.form == FACTOR) record.residual = NAN;  // not evaluated
+        }
         if (l.energy_records) note_energy(record, l.energy_records[slot + i]);
     }
     rings.step.store(step);
@@ -189,7 +195,7 @@ void wf_gpu_start_balance(Balance* balance, const double* sums, double dt, int32
 
 const StructSize* wf_sizes() {
     static const StructSize sizes[] = {SIZE(CudaDriver), SIZE(Mail), SIZE(MailSlot), SIZE(PcgResult), SIZE(StepTimestamp),
-                                       SIZE(NewtonResult), SIZE(BodyReadback), SIZE(GpuLoop), SIZE(Record), SIZE(EnergyRecord),
+                                       SIZE(NewtonResult), SIZE(StageResult), SIZE(BodyReadback), SIZE(GpuLoop), SIZE(Record), SIZE(EnergyRecord),
                                        SIZE(Balance), {}};
     return sizes;
 }

@@ -71,8 +71,10 @@ struct GpuLoop {
     const StepTimestamp* timestamps;       // (capacity,) likewise
     const NewtonResult* newton_results;    // (capacity, bodies) likewise; null: one linearization a step
     const EnergyRecord* energy_records;    // (capacity, bodies) likewise
+    const StageResult* stage_results;      // (capacity, bodies) likewise; null: no scheme with stages
     void* energy_balance;                  // graph that writes the energy record of the last step, unless that has been done
     void* elastic_energy;                  // graph that adds the elastic energy to it
+    void* matrix;                          // graph that makes A between two steps; null: each step makes its own
     int64_t capacity, batch;               // batch: most steps in one; divides the capacity
     Address values, staged;                // A of all bodies; memory of the same size for copies of it
     char* host_matrices;                   // pinned, of the same size
@@ -88,7 +90,7 @@ struct GpuLoop {
     int64_t begun, finished;               // batches
     std::atomic<int64_t> launched;         // steps
     int64_t frames_begun;
-    int64_t matrix_step;                   // of the matrices under way, -1: none
+    int64_t matrix_step;                   // of the matrices or positions under way, -1: none
     std::atomic<int32_t> requested;        // 1: a readback has a request
     int32_t ran_dry;                       // 1: the device had nothing to do since the last launch
     int32_t error;

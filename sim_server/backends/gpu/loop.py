@@ -65,6 +65,7 @@ class DeviceLoop(Reports):
     timestamps: likewise (CAPACITY,) of STEP_TIMESTAMP
     newton_results: likewise (CAPACITY, bodies) of NEWTON_RESULT; None: one linearization a step
     energy_records: likewise (CAPACITY, bodies) of ENERGY_RECORD
+    stage_results: likewise (CAPACITY, bodies) of STAGE_RESULT; None: no scheme with stages
     clock: host array (1,), time of the simulation [s]
     records: capacity of the ring of records
     real: type of values, x and v on the device
@@ -75,7 +76,7 @@ class DeviceLoop(Reports):
         self, device: LoopDevice, ranges: Sequence[tuple[int, int]], row_start: NDArray[Any], dt: float,
         mailboxes: Sequence[tuple[int, int]], results: NDArray[Any], timestamps: NDArray[Any], clock: Float64,
         records: int = 8192, real: DTypeLike = np.float64, newton_results: NDArray[Any] | None = None,
-        energy_records: NDArray[Any] | None = None, **addresses: int,
+        energy_records: NDArray[Any] | None = None, stage_results: NDArray[Any] | None = None, **addresses: int,
     ):  # fmt: skip
         self._device, self._ranges, bodies, nodes = device, ranges, len(ranges), len(row_start) - 1
         self._native = library()
@@ -107,7 +108,8 @@ class DeviceLoop(Reports):
         loop.results, loop.timestamps = results.ctypes.data, timestamps.ctypes.data
         loop.newton_results = None if newton_results is None else newton_results.ctypes.data
         loop.energy_records = None if energy_records is None else energy_records.ctypes.data
-        self._written = (results, timestamps, clock, newton_results, energy_records)
+        loop.stage_results = None if stage_results is None else stage_results.ctypes.data
+        self._written = (results, timestamps, clock, newton_results, energy_records, stage_results)
         self._pinned = self._events_and_memory(loop, sum(-(-size // 16) * 16 for _, size in mailboxes))
 
     def _events_and_memory(self, loop: structs.GpuLoop, upload: int) -> list[NDArray[np.uint8]]:
@@ -121,15 +123,17 @@ class DeviceLoop(Reports):
 
     # --- running ------------------------------------------------------------------------------------------------
 
-    def use_graphs(self, graphs: Sequence[int], energy_balance: int, elastic_energy: int) -> None:
+    def use_graphs(self, graphs: Sequence[int], energy_balance: int, elastic_energy: int, matrix: int = 0) -> None:
         """Sets the handles of the CUDA graphs.
 
         graphs: one step, MANY steps (0: none), then the same two beginning with the kernel that writes the time
         energy_balance: writes the energy record of the last step
         elastic_energy: adds the elastic energy to it
+        matrix: makes A between two steps; 0: each step makes its own
         """
         self.loop.graphs[0][:], self.loop.graphs[1][:] = graphs[:2], graphs[2:]
         self.loop.energy_balance, self.loop.elastic_energy = energy_balance, elastic_energy
+        self.loop.matrix = matrix
 
     def run(self, steps: int) -> int:
         """Runs up to `steps` steps without Python; returns the number done, which is smaller only after `stop`.

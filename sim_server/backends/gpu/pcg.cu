@@ -10,6 +10,9 @@
 #include "partitioned_inverse.cuh"
 #include "clock.cuh"
 #include "spmv.cuh"
+#ifdef STAGES
+#include "stages.cuh"
+#endif
 
 struct BlockMemory {  // static shared memory of a thread block: data that is the same in all threads needs no registers
     double scratch[3 * WARPS][4], totals[4];
@@ -50,6 +53,7 @@ struct PcgSolver {
     bool fresh = false;    // inverse.residual holds d r as it will be after the pending update
     bool fetched = false;  // the copy of the inverse into shared memory has begun
     bool arrived = false;  // and is complete
+    bool given = false;    // the start is given, and the tolerance is relative to its residual (GIVEN_START of pcg.h)
 
     __device__ __forceinline__ void set_up(const RowRange& range) {
         const PcgBody& body = memory.body;
@@ -297,14 +301,15 @@ __device__ __forceinline__ void PcgSolver::solve() {
             restart = true;
             if (!begun) {
                 begun = true;
-                memory.b2 = bb;
                 const bool refused = !isfinite(bb);
+                if (given && !refused) bb = r2;
+                memory.b2 = bb;
                 if (memory.rests && bb > 0 && !refused) {  // b is rounding error: the solution stays as it is, the body rests
                     out.residual = sqrt(r2 / bb);
                     return;
                 }
                 memory.goal = body.tolerance * body.tolerance * bb;
-                if (!body.warm_start || !(r2 < bb)) { alpha = 0; r2 = bb; }
+                if ((!given || refused) && (!body.warm_start || !(r2 < bb))) { alpha = 0; r2 = bb; }
                 else fresh = true;
                 memory.quarter = r2 * sqrt(sqrt(memory.goal / r2));
                 if (refused || r2 <= memory.goal) {
@@ -370,7 +375,23 @@ __device__ __forceinline__ void PcgSolver::solve() {
     }
 }
 
-__device__ __forceinline__ void solve_body(const PcgArguments& s, const RowRange& range) {
+#ifdef STAGES  // an attempt of a Rosenbrock-W step (stages.cuh): solve only the bodies that make it
+#define KIND_OF_STEP , const StageSolve stage
+#define STAGE , stage
+#elif defined(NEWTON_PHASES)  // several linearizations a step: solve only the bodies in phase 0 (newton.cu)
+#define KIND_OF_STEP , const int* __restrict__ active, const int* __restrict__ phase
+#define STAGE
+#else
+#define KIND_OF_STEP
+#define STAGE
+#endif
+#ifdef STAGES
+#define STAGE_PARAMETER , const StageSolve& stage
+#else
+#define STAGE_PARAMETER
+#endif
+
+__device__ __forceinline__ void solve_body(const PcgArguments& s, const RowRange& range STAGE_PARAMETER) {
     const int k = range.body;
     for (int i = threadIdx.x; i < (int)(sizeof(PcgBody) / 4); i += THREADS) ((int*)&memory.body)[i] = ((const int*)(s.bodies + k))[i];
     if (threadIdx.x == THREADS - 1) memory.rests = s.moving[k] == 0;
@@ -381,26 +402,41 @@ __device__ __forceinline__ void solve_body(const PcgArguments& s, const RowRange
     const long long begin = nanoseconds();
     PcgSolver solver = {s, {range.index, memory.body.blocks, s.exchange_number[k], s.block_sums + 8ll * s.grid * k, s.grid, memory.scratch, memory.totals,
                          (int)threadIdx.x % 32, (int)threadIdx.x / 32}};
+#ifdef STAGES
+    solver.given = stage.form == ITERATE;
+#endif
     solver.set_up(range);
     solver.solve();
     if (range.index == 0 && threadIdx.x == 0) {
         PcgResult out = memory.out;
         out.seconds = 1e-9 * (nanoseconds() - begin);
         if (memory.body.plan && (out.asked == CHOLESKY || out.kind == CHOLESKY || out.fallbacks)) out.factor_step = memory.body.factor_step;
-        s.results[(s.step[0] % s.capacity) * s.count + k] = out;
+        PcgResult& result = s.results[(s.step[0] % s.capacity) * s.count + k];
+#ifdef STAGES
+        if (stage.first_of_step) result = no_solve(memory.body);
+        if (stage.first_of_attempt) { result.status = CONVERGED; result.bad_node = -1; }
+        add_solve(result, out);
+#else
+        result = out;
+#endif
         s.exchange_number[k] = solver.group.number;  // read by all blocks before the first exchange
     }
     copies_end<0>();  // the next body uses the same memory
     __syncthreads();
 }
 
-#ifdef NEWTON_PHASES  // several linearizations a step: solve only the bodies in phase 0 (newton.cu)
-#define PHASES , const int* __restrict__ active, const int* __restrict__ phase
-#else
-#define PHASES
+#ifdef STAGES
+// Whether a body takes part in the attempt. One at rest has nothing to solve, except by backward Euler.
+__device__ __forceinline__ bool takes_part(const PcgArguments& s, const StageSolve& stage, const RowRange& range) {
+    const int k = range.body;
+    if (stage.phase[k] == OPEN && stage.state[k].form == stage.form && (s.moving[k] || stage.form == EULER)) return true;
+    if (stage.first_of_step && range.index == 0 && threadIdx.x == 0)
+        s.results[(s.step[0] % s.capacity) * s.count + k] = no_solve(s.bodies[k]);
+    return false;
+}
 #endif
 
-extern "C" __global__ void __launch_bounds__(THREADS, PER_PROCESSOR) pcg(const PcgArguments s PHASES) {
+extern "C" __global__ void __launch_bounds__(THREADS, PER_PROCESSOR) pcg(const PcgArguments s KIND_OF_STEP) {
 #ifdef NEWTON_PHASES
     if (*active == 0) return;
 #endif
@@ -412,11 +448,16 @@ extern "C" __global__ void __launch_bounds__(THREADS, PER_PROCESSOR) pcg(const P
             next = s.bodies[s.order[s.count - s.pooled + memory.next]].first_range;
         }
 #ifdef NEWTON_PHASES
-        if (phase[s.row_ranges[next].body] != 0) {
+        const bool solved = phase[s.row_ranges[next].body] != 0;
+#elif defined(STAGES)
+        const bool solved = !takes_part(s, stage, s.row_ranges[next]);
+#else
+        const bool solved = false;
+#endif
+        if (solved) {
             __syncthreads();  // all threads have read memory.next
             continue;
         }
-#endif
-        solve_body(s, s.row_ranges[next]);
+        solve_body(s, s.row_ranges[next] STAGE);
     }
 }

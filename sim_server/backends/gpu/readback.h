@@ -9,10 +9,15 @@ static int64_t readback_bytes(const BodyReadback& body) { return body.in_flight 
 
 static bool begin_matrices(GpuLoop& l) {
     if (l.matrix_step >= 0 || !l.requested.exchange(0, std::memory_order_acquire)) return true;
+    bool assembled = !l.matrix;
     for (int i = 0; i < l.bodies; ++i) {
         BodyReadback& body = l.readbacks[i];
         body.in_flight = body.requested.exchange(0, std::memory_order_acquire);
         if (!body.in_flight) continue;
+        if (body.in_flight == REQUEST_VALUES && !assembled) {
+            CALL(graph_launch, l.matrix, l.stream);
+            assembled = true;
+        }
         Address from = body.in_flight == REQUEST_VALUES ? l.values + body.values_begin : l.x + body.x_begin;
         CALL(on_device, l.staged + body.values_begin, from, (size_t)readback_bytes(body), l.stream);
     }
@@ -24,15 +29,16 @@ static bool begin_matrices(GpuLoop& l) {
             CALL(to_host, l.host_matrices + body.values_begin, l.staged + body.values_begin, (size_t)readback_bytes(body), l.copy_stream);
     }
     CALL(event_record, l.copied_event, l.copy_stream);
-    l.matrix_step = l.launched - 1;  // steps completed before the matrix was assembled; positions are those after that step
+    l.matrix_step = l.launched - 1;  // steps completed before the matrix of a step was assembled; positions are those after that step
     return true;
 }
 
 static void publish_matrices(GpuLoop& l) {
     for (int i = 0; i < l.bodies; ++i)
         if (l.readbacks[i].in_flight) {
+            const bool between = l.matrix && l.readbacks[i].in_flight == REQUEST_VALUES;  // of the state after that step
             l.readbacks[i].in_flight = 0;
-            l.readbacks[i].copied_step.store(l.matrix_step, std::memory_order_release);
+            l.readbacks[i].copied_step.store(l.matrix_step + between, std::memory_order_release);
         }
     l.matrix_step = -1;
 }

@@ -16,7 +16,7 @@ from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder, Partit
 from sim_server.backends.gpu.inverse.device_plan import DevicePlan, shared_bytes
 from sim_server.backends.gpu.inverse.plan import plan
 from sim_server.backends.gpu.row_partition import SPARED, best_assignment, halo, initial_ranges
-from sim_server.backends.gpu.structs import PCG, PCG_RESULT
+from sim_server.backends.gpu.structs import PCG, PCG_RESULT, STAGES
 
 PCG_BODY = PCG.dtype("PcgBody")
 SETTINGS_BYTES = PCG_BODY.fields["factor_step"][1]  # type: ignore[index]
@@ -40,20 +40,22 @@ class PcgSolver:
     capacity: number of steps whose results are kept
     planes: float16 numbers per entry of an inverse; 1, or 2 for 22 bits
     phases: newton.NewtonPhases; empty: one linearization a step
+    attempts: number of solves that the graph of a Rosenbrock-W step holds (stages.cuh); 0: another scheme
 
     bodies: host rows (PCG_BODY), one per body. The loop uploads the settings (the first SETTINGS_BYTES bytes of a row)
         and the factor (the others) separately.
     results: device ring (capacity, bodies) of PCG_RESULT
-    pool_counter: device array (1,), zero at launch
+    pool_counter: device array, one number for each launch of a step, zero at launch
     spared: multiprocessors that a launch leaves free
     """
 
     def __init__(
         self, gpu: Gpu, ranges: Sequence[tuple[int, int]], arrays: Mapping[str, NDArray[Any]], counter: DeviceArray,
-        capacity: int, planes: int = 1, phases: Sequence[DeviceArray] = (),
+        capacity: int, planes: int = 1, phases: Sequence[DeviceArray] = (), attempts: int = 0,
     ):  # fmt: skip
         cp, processors = gpu.cp, gpu.properties["multiProcessorCount"]
         self.gpu, self.counter, self._capacity, self.planes, self._phases = gpu, counter, capacity, planes, phases
+        self._attempts = attempts
         self._twins = {name: gpu.twin(arrays[name]) for name in ("row_start", "values", "b", "y", "moving")}
         self.real = np.dtype(self._twins["values"].dtype)
         spans = np.array(ranges, np.int64)
@@ -69,7 +71,7 @@ class PcgSolver:
         self.bodies["first_range"] = partition.first
         self._rows = cp.zeros(self.bodies.nbytes, np.uint8)
         self.results: DeviceArray = cp.zeros(capacity * len(ranges) * PCG_RESULT.itemsize, np.uint8)
-        self.pool_counter: DeviceArray = cp.zeros(1, np.uint32)
+        self.pool_counter: DeviceArray = cp.zeros(max(attempts, 1), np.uint32)
         total, ints = len(arrays["row_start"]) - 1, np.int32
         self._work: dict[str, DeviceArray] = {
             "order": cp.asarray(assigned.order.astype(ints)), "row_ranges": cp.asarray(partition.ranges.view(ints)),
@@ -85,8 +87,8 @@ class PcgSolver:
         fixed = 2048  # bytes: shared memory that pcg.cu declares, and the driver's
         self._shared = (gpu.properties["sharedMemPerMultiprocessor"] // blocks - fixed - 1024) // 16 * 16
         self._params = self._arguments(total, assigned.pooled)
-        self._function = self._compiled(blocks)
-        self._function.max_dynamic_shared_size_bytes = self._shared
+        self._function = self._compiled("pcg", blocks)
+        self._application = self._compiled("apply_factor", blocks) if attempts else None
         self._plans: dict[tuple[int, int], DevicePlan] = {}  # by pattern and number of thread blocks
         self._builders: dict[tuple[int, int], InverseBuilder] = {}  # likewise
         self._vectors: dict[tuple[int, int], dict[str, DeviceArray]] = {}  # by body and plan
@@ -97,25 +99,42 @@ class PcgSolver:
         """Address of the rows of the bodies on the device."""
         return int(self._rows.data.ptr)
 
-    def _compiled(self, blocks: int) -> KernelFunction:
-        """Compiles pcg.cu for `blocks` thread blocks a multiprocessor."""
+    def _compiled(self, name: str, blocks: int) -> KernelFunction:
+        """Compiles the kernel of the text <name>.cu for `blocks` thread blocks a multiprocessor."""
+        declared = STAGES if self._attempts else PCG
         numbers = {"THREADS": self.threads, "PER_PROCESSOR": blocks}
         module = self.gpu.cp.RawModule(
-            code=(SOURCES / "backends/gpu/pcg.cu").read_text() + PCG.assertions(),
+            code=(SOURCES / f"backends/gpu/{name}.cu").read_text() + declared.assertions(),
             options=(
                 *options({"real": "float" if self.real == np.float32 else "double"}), *own_headers(),
                 *(f"-D{name}={number}" for name, number in numbers.items()),
-                *(["-DNEWTON_PHASES"] if self._phases else []),
+                *(["-DNEWTON_PHASES"] if self._phases else []), *(["-DSTAGES"] if self._attempts else []),
             ),
             backend="nvrtc",
             enable_cooperative_groups=True,
         )  # fmt: skip
-        return compiled("pcg.cu", module, "pcg")
+        function = compiled(f"{name}.cu", module, name)
+        function.max_dynamic_shared_size_bytes = self._shared
+        return function
 
     def launch(self) -> None:
         """Launches a solve of all bodies."""
         phases = (np.uint64(array.data.ptr) for array in self._phases)
         self._function((self.grid,), (self.threads,), (self._params, *phases), shared_mem=self._shared)
+
+    def iterate(self, number: int, stage: NDArray[Any]) -> None:
+        """Launches solve `number` of a Rosenbrock-W step by iterations. stage: STAGE_SOLVE."""
+        self._launch_stage(self._function, number, stage)
+
+    def apply_factors(self, number: int, stage: NDArray[Any]) -> None:
+        """Launches solve `number` of a Rosenbrock-W step by factors alone (apply_factor.cu)."""
+        assert self._application is not None
+        self._launch_stage(self._application, number, stage)
+
+    def _launch_stage(self, function: KernelFunction, number: int, stage: NDArray[Any]) -> None:
+        params = self._params.copy()
+        params["pool_counter"] += np.uint64(self.pool_counter.dtype.itemsize * number)
+        function((self.grid,), (self.threads,), (params, stage), shared_mem=self._shared)
 
     def plan(self, body: int, pattern: FactorPattern) -> DevicePlan:
         """Returns the plan of the inverse of factors of this pattern for a body.

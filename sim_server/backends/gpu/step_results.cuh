@@ -14,4 +14,9 @@ struct NewtonResult {
     int linearizations;
 };
 
+struct StageResult {      // of a step by stages
+    double estimate;      // of the error of the last attempt by stages, the largest of a node [m]
+    int form;             // StepForm
+};
+
 struct StepTimestamp { long long begin, end; };  // ns of the device's clock

@@ -7,9 +7,12 @@ from sim_server.backends.declarations import Declarations
 
 LOOP = Declarations("backends/gpu/loop.h")
 PCG = Declarations("backends/gpu/pcg_structs.cuh")
+STAGES = Declarations("backends/gpu/stages.cuh")
 ENERGY_RECORD = LOOP.dtype("EnergyRecord")
 PCG_RESULT = PCG.dtype("PcgResult")
 NEWTON_RESULT = PCG.dtype("NewtonResult")
+STAGE_RESULT = PCG.dtype("StageResult")
+STAGE_STATE, STAGE_SOLVE = STAGES.dtype("StageState"), STAGES.dtype("StageSolve")
 STEP_TIMESTAMP = PCG.dtype("StepTimestamp")
 _requests = LOOP.enumeration("Request")
 REQUEST_VALUES, REQUEST_POSITIONS = _requests["REQUEST_VALUES"], _requests["REQUEST_POSITIONS"]  # of a BodyReadback

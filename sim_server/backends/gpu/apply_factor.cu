@@ -1,0 +1,152 @@
+// SPDX-License-Identifier: MIT
+// y = P^-1 b of all bodies whose factor stands in for A (method: mechanics/rosenbrock.py), in one launch: thread blocks, exchanges and
+// the inverse are those of pcg.cu, without a matrix and without iterations.
+//
+// The first application of a step chooses the form of each body's attempt (stages.cuh).
+#include "partitioned_inverse.cuh"
+#include "clock.cuh"
+#include "stages.cuh"
+
+struct ApplicationMemory {  // static shared memory of a thread block
+    double scratch[3 * WARPS][4], totals[4];
+    PcgBody body;
+    DevicePlan plan;
+    StageState state;
+    int next, moving, bad;
+};
+__shared__ ApplicationMemory memory;
+
+// 2^-k with sqrt(a) 2^-k < 1.
+__device__ __forceinline__ float unit_for(double a) {
+    const int k = (((__double2hiint(a) >> 20) & 0x7ff) - 1021) >> 1;  // a < 2^(2 k)
+    return __int_as_float((127 - max(-120, min(120, k))) << 23);
+}
+
+struct FactorApplication {
+    const PcgArguments& s;
+    const RowRange& range;
+    BlockGroup group;
+
+    // Copies the rows of the body into shared memory.
+    template <class T>
+    static __device__ __forceinline__ void bring(T& to, const T* from) {
+        for (int i = threadIdx.x; i < (int)(sizeof(T) / 4); i += THREADS) ((int*)&to)[i] = ((const int*)from)[i];
+    }
+
+    __device__ __forceinline__ void fill(real value) const {
+        const long long begin = 3 * (memory.body.first + (long long)range.begin);
+        for (int k = threadIdx.x; k < 3 * range.own; k += THREADS) s.y[begin + k] = value;
+    }
+
+    // First own node whose b is not finite, else NO_NODE.
+    __device__ __forceinline__ int first_bad_node() const {
+        if (threadIdx.x == 0) memory.bad = 0x7fffffff;
+        __syncthreads();
+        for (int k = threadIdx.x; k < 3 * memory.body.nodes; k += THREADS)
+            if (!isfinite(s.b[3ll * memory.body.first + k])) atomicMin(&memory.bad, k / 3);
+        __syncthreads();
+        return memory.bad == 0x7fffffff ? -1 : memory.bad;
+    }
+
+    // True if a grab pulls at an own node by a spring.
+    static __device__ __forceinline__ bool pulled(const StageSolve& t, const PcgBody& body, const RowRange& range) {
+        bool found = false;
+        if (t.spring)
+            for (int k = threadIdx.x; k < range.own; k += THREADS) found |= t.spring[body.first + range.begin + k] != 0;
+        return found;
+    }
+
+    // Applies the factor; false if a grab pulls at the body, whose y then keeps its values. Only the first application looks.
+    __device__ __forceinline__ bool apply(bool mine_pulled, PcgResult& out) {
+        Arena arena = {shared_memory, shared_memory + s.shared};
+        PartitionedInverse inverse;
+        inverse.reserve(&memory.plan, arena);
+        inverse.set_up(memory.body, &memory.plan, group.index, arena);
+        inverse.fetch();  // beside the exchange
+        const long long begin = 3 * (memory.body.first + (long long)range.begin);
+        const unsigned r_number = group.number;
+        double mine[2] = {0, mine_pulled ? 1.0 : 0.0}, sums[2];
+        for (int k = threadIdx.x; k < 3 * range.own; k += THREADS) {
+            const int at = place(k);
+            const real b = s.b[begin + k];
+            inverse.residual[at].put((float)(inverse.scale[at] * b), r_number);
+            mine[0] += (double)b * (double)b;
+        }
+        for (int k = 16; k; k >>= 1)
+            for (int n = 0; n < 2; ++n) mine[n] += __shfl_xor_sync(ALL, mine[n], k);
+        group.sums<2, 1>(mine, sums);
+        copies_end<0>();
+        __syncthreads();
+        if (sums[1] > 0) return false;
+        if (!isfinite(sums[0])) {
+            out.status = NOT_FINITE;
+            out.residual = sums[0];
+            out.bad_node = first_bad_node();
+            fill((real)(0 * sums[0]));
+            return true;
+        }
+        if (sums[0] == 0) { fill(0); return true; }
+        const double peak = inverse.scale[inverse.size];
+        const float unit = unit_for(sums[0] * peak * peak);
+        ResidualSource from = {inverse.residual, r_number, 0, 0};
+        for (int phase = 0; phase < inverse.phases; ++phase) {
+            inverse.gather(phase, from, group.number, unit);
+            __syncthreads();
+            inverse.multiply(phase, from, group.number, unit);
+            if (phase + 1 < inverse.phases) __syncthreads();  // the vector has been read
+        }
+        for (int k = threadIdx.x; k < 3 * range.own; k += THREADS) {
+            const FlagWord<float>* z = inverse.z + place(k);
+            float value;
+            for (unsigned spins = 0; keep_polling(!z->get(value, group.number), spins);) {}
+            s.y[begin + k] = value;
+        }
+        return true;
+    }
+
+    __device__ __forceinline__ int place(int k) const { return memory.plan.place[range.begin + k / 3] + k % 3; }
+};
+
+__device__ __forceinline__ void apply_to_body(const PcgArguments& s, const StageSolve& t, const RowRange& range) {
+    const int k = range.body;
+    FactorApplication::bring(memory.body, s.bodies + k);
+    FactorApplication::bring(memory.state, t.state + k);
+    if (threadIdx.x == THREADS - 1) memory.moving = s.moving[k];
+    __syncthreads();
+    const PcgBody& body = memory.body;
+    const bool decides = range.index == 0 && threadIdx.x == 0;
+    bool alone = t.first_of_step ? may_use_factor(memory.state, body) : memory.state.form == FACTOR;
+    const bool pulled = t.first_of_step && FactorApplication::pulled(t, body, range);
+    if (pulled) t.state[k].springs = 1;  // all of them write the same
+    PcgResult& sum = s.results[(s.step[0] % s.capacity) * s.count + k];
+    if (decides && t.first_of_step) sum = no_solve(body);
+    if (alone && memory.moving) {
+        FactorApplication::bring(memory.plan, body.plan);
+        __syncthreads();
+        const long long begin = nanoseconds();
+        FactorApplication solver = {s, range, {range.index, body.blocks, s.exchange_number[k], s.block_sums + 8ll * s.grid * k, s.grid,
+                                               memory.scratch, memory.totals, (int)threadIdx.x % 32, (int)threadIdx.x / 32}};
+        PcgResult out = no_solve(body);
+        alone = solver.apply(pulled, out);
+        if (decides) {
+            out.seconds = 1e-9 * (nanoseconds() - begin);
+            add_solve(sum, out);
+            s.exchange_number[k] = solver.group.number + 1;  // no word has it; read by all blocks before the exchange
+        }
+    }
+    if (decides && t.first_of_step) t.state[k].form = alone ? FACTOR : ITERATE;
+    copies_end<0>();  // the next body uses the same memory
+    __syncthreads();
+}
+
+extern "C" __global__ void __launch_bounds__(THREADS, PER_PROCESSOR) apply_factor(const PcgArguments s, const StageSolve t) {
+    for (int next = s.initial_range[blockIdx.x];; next = -1) {
+        if (next < 0) {  // take the next body of the pool
+            if (threadIdx.x == 0) memory.next = s.pooled > 0 ? atomicAdd(s.pool_counter, 1) : s.pooled;
+            __syncthreads();
+            if (memory.next >= s.pooled) return;
+            next = s.bodies[s.order[s.count - s.pooled + memory.next]].first_range;
+        }
+        apply_to_body(s, t, s.row_ranges[next]);
+    }
+}

@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: MIT
+"""Conditional nodes of CUDA graphs: work that a captured graph does only if a number on the device is not 0.
+
+An untaken branch costs a few microseconds, whatever it holds. CuPy has no interface to it, so the driver is called.
+Source: CUDA driver API, graph management (CUDA 12.4 and above).
+"""
+
+import ctypes as c
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+
+from sim_server.backends.compiler import SOURCES
+from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction
+from sim_server.errors import DeviceError
+
+FUNCTIONS = (
+    "cuStreamGetCaptureInfo_v2", "cuGraphConditionalHandleCreate", "cuGraphAddNode",
+    "cuStreamUpdateCaptureDependencies", "cuStreamBeginCaptureToGraph", "cuStreamEndCapture",
+)  # fmt: skip
+CONDITIONAL_NODE, ASSIGN_DEFAULT, SET_DEPENDENCIES, RELAXED = 13, 1, 1, 2  # enumerators of the driver API
+
+
+class ConditionalNodeParams(c.Structure):
+    """CUDA_CONDITIONAL_NODE_PARAMS: type 0 is `if`; graphs: out, of the branch."""
+
+    _fields_ = [
+        ("handle", c.c_uint64), ("type", c.c_int), ("size", c.c_uint), ("graphs", c.POINTER(c.c_void_p)),
+        ("context", c.c_void_p),
+    ]  # fmt: skip
+
+
+class GraphNodeParams(c.Structure):
+    """CUgraphNodeParams, with the member of its union that is used here."""
+
+    _fields_ = [
+        ("type", c.c_int), ("reserved", c.c_int * 3), ("conditional", ConditionalNodeParams),
+        ("rest", c.c_char * (29 * 8 - c.sizeof(ConditionalNodeParams))), ("reserved2", c.c_int64),
+    ]  # fmt: skip
+
+
+class Conditions:
+    """Branches of the graphs that are captured from streams of one context.
+
+    Raises DeviceError if the driver has no conditional nodes.
+    """
+
+    def __init__(self, cp: Any, driver: c.CDLL, context: int):
+        self._cp, self._driver, self._context = cp, driver, context
+        missing = [name for name in FUNCTIONS if not hasattr(driver, name)]
+        if missing:
+            raise DeviceError(
+                f"the NVIDIA driver is too old for scheme ros2: it has no {missing[0]}; CUDA 12.4 or above has it"
+            )
+        self._module, self._set_condition = self._compiled()
+
+    def _compiled(self) -> tuple[Any, KernelFunction]:
+        """Compiles set_condition.cu to PTX, which the driver links with its own function."""
+        cp, name = self._cp, "set_condition.cu"
+        text = (SOURCES / "backends/gpu" / name).read_text()
+        program = cp.cuda.nvrtc.createProgram(text, name, [], [])
+        cp.cuda.nvrtc.compileProgram(program, ["-arch=compute_80", "-rdc=true", "-std=c++17"])
+        module = cp.cuda.function.Module()
+        module.load(cp.cuda.nvrtc.getPTX(program))
+        cp.cuda.nvrtc.destroyProgram(program)
+        return module, module.get_function("set_condition")
+
+    @contextmanager
+    def branch(self, flag: DeviceArray) -> Iterator[None]:
+        """What is launched inside runs only if `flag` (1,) is not 0 then. Only while the current stream is captured."""
+        graph, _, _ = self._capture()
+        handle = c.c_uint64()
+        self._call("cuGraphConditionalHandleCreate", c.byref(handle), graph, self._context, 0, ASSIGN_DEFAULT)
+        self._set_condition((1,), (1,), (np.uint64(handle.value), np.uint64(flag.data.ptr)))
+        body = self._add_node(handle.value)
+        stream, ended = self._cp.cuda.Stream(non_blocking=True), c.c_void_p()
+        self._call("cuStreamBeginCaptureToGraph", stream.ptr, body, None, None, 0, RELAXED)
+        with stream:
+            yield
+        self._call("cuStreamEndCapture", stream.ptr, c.byref(ended))
+
+    def _add_node(self, handle: int) -> c.c_void_p:
+        """Appends a conditional node to the current stream; returns the graph of its branch."""
+        graph, dependencies, count = self._capture()
+        params = GraphNodeParams(type=CONDITIONAL_NODE)
+        params.conditional = ConditionalNodeParams(handle=handle, size=1, context=self._context)
+        node = (c.c_void_p * 1)()
+        self._call("cuGraphAddNode", node, graph, dependencies, count, c.byref(params))
+        self._call("cuStreamUpdateCaptureDependencies", self._stream(), node, 1, SET_DEPENDENCIES)
+        return c.c_void_p(params.conditional.graphs[0])
+
+    def _stream(self) -> int:
+        return int(self._cp.cuda.get_current_stream().ptr)
+
+    def _capture(self) -> tuple[c.c_void_p, c.c_void_p, c.c_size_t]:
+        """Returns graph, last nodes and their number of the capture of the current stream."""
+        status, number, graph, nodes, count = c.c_int(), c.c_uint64(), c.c_void_p(), c.c_void_p(), c.c_size_t()
+        found = (c.byref(x) for x in (status, number, graph, nodes, count))
+        self._call("cuStreamGetCaptureInfo_v2", self._stream(), *found)
+        return graph, nodes, count
+
+    def _call(self, function: str, *arguments: Any) -> None:
+        """Calls the driver; integers are handles, counts or flags."""
+        given = [c.c_void_p(x) if isinstance(x, int) else x for x in arguments]
+        if error := getattr(self._driver, function)(*given):
+            raise DeviceError(f"the NVIDIA driver refused {function}: CUDA error {error}")

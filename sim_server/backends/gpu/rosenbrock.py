@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: MIT
+"""The Rosenbrock-W step on a GPU (stages.cuh): its memory and its launches.
+
+The first attempt is made by the factor alone where the scene allows it. A body without a factor, or whose factor does
+not do, iterates, in a branch of the graph.
+"""
+
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from typing import Any, Protocol, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_server.arrays import Float64
+from sim_server.backends.base import Launch
+from sim_server.backends.declarations import Declarations
+from sim_server.backends.gpu.cupy_types import DeviceArray
+from sim_server.backends.gpu.device import DeviceLaunch, Gpu
+from sim_server.backends.gpu.kernel_fusion import Epilogue, FusedKernel, PhaseGuard, fuse
+from sim_server.backends.gpu.newton import bodies_of
+from sim_server.backends.gpu.solver import PcgSolver
+from sim_server.backends.gpu.structs import STAGE_SOLVE, STAGE_STATE
+from sim_server.backends.rosenbrock import FORMS, Rosenbrock
+
+DECISION = Declarations("backends/gpu/stage_decision.cu")
+STAGE_DECISION = DECISION.dtype("StageDecision")
+ATTEMPTS = 5  # solves in the graph of a step: two by factors, two by iterations, one of backward Euler
+FACTOR, ITERATE, EULER = (FORMS[name] for name in ("FACTOR", "ITERATE", "EULER"))
+
+Launchable = FusedKernel | DeviceLaunch
+
+
+class Branches(Protocol):
+    """A device whose graphs have branches (cuda.CudaDevice)."""
+
+    def branch(self, flag: DeviceArray) -> AbstractContextManager[None]:
+        """What is launched inside runs only if `flag` (1,) is not 0."""
+        ...
+
+
+class RosenbrockStep:
+    """Launches a step whose first stage is assembled: solves, attempts, decisions, and the end of the step.
+
+    stages: launches and arrays of the stages
+    assemble: launches of the first stage
+    end: arguments of the end of the step (StepEpilogue)
+    results: host memory (capacity, bodies) of STAGE_RESULT that the steps write to
+    body: (nodes,) of each node; spring: host array (nodes,) of grabs, None without touch
+
+    alone: True if the first attempt is made by factors alone; A is then assembled only for bodies that iterate
+    """
+
+    def __init__(
+        self, gpu: Gpu, device: Branches, stages: Rosenbrock, assemble: Sequence[DeviceLaunch], solver: PcgSolver,
+        end: NDArray[Any], results: NDArray[Any], spring: Float64 | None,
+    ):  # fmt: skip
+        cp, bodies = gpu.cp, len(stages.bound)
+        self._gpu, self._device, self._stages, self._solver, self._end = gpu, device, stages, solver, end
+        self.alone = stages.factor_alone
+        state = np.zeros(bodies, STAGE_STATE)
+        state["form"], state["factor_step"], state["spring_step"] = ITERATE, -1, -1
+        self._left: DeviceArray = cp.zeros(1, np.int32)
+        finish = cast(DeviceLaunch, stages.finish)
+        self._memory: dict[str, DeviceArray] = {
+            "state": cp.asarray(np.frombuffer(state.tobytes(), np.uint8)), "phase": cp.zeros(bodies, np.int32),
+            "largest": cp.zeros(bodies, np.int64), "bound": cp.asarray(stages.bound),
+            "estimate": gpu.twin(stages.estimate), "body": finish.arrays["body"], "left": self._left,
+        }  # fmt: skip
+        self._spring = None if spring is None else gpu.twin(spring)
+        self._results, self._nodes = results, finish.items
+        self._coefficients = gpu.twin(stages.coefficients)
+        pairs = (stages.coefficients, np.array(stages.euler_coefficients))
+        self._own_pair, self._euler_pair = (cp.asarray(pair.astype(self._coefficients.dtype)) for pair in pairs)
+        self._bodies: list[DeviceArray | None] = []  # of the items of each guarded kernel
+        self._make_kernels(assemble)
+
+    def _make_kernels(self, assemble: Sequence[DeviceLaunch]) -> None:
+        stages = self._stages
+        again, euler = (cast(Sequence[DeviceLaunch], x) for x in (stages.again, stages.euler))
+        self._again = fuse(again)
+        self._first_finish = self._finish(stages.finish, FACTOR if self.alone else ITERATE, None)
+        self._euler = fuse(euler, self._guard)
+        self._back = FusedKernel([cast(DeviceLaunch, stages.restore_for_euler)], guard=self._guard_of(stages.restore_for_euler))
+        self._advance = self._finish(stages.advance_euler, EULER, self._guard_of(stages.advance_euler))
+        if not self.alone:
+            return
+        self._restore = FusedKernel([cast(DeviceLaunch, stages.restore)], guard=self._guard_of(stages.restore))
+        self._assemble = fuse(assemble, self._guard)
+        self._guarded_again = fuse(again, self._guard)
+        self._guarded_second = FusedKernel([cast(DeviceLaunch, stages.second)], guard=self._guard_of(stages.second))
+        self._guarded_finish = self._finish(stages.finish, ITERATE, self._guard_of(stages.finish))
+
+    @property
+    def stamp_begin(self) -> Callable[..., None]:
+        """The kernel that writes the time at which the step begins."""
+        return self._first_finish.function("stamp_begin")
+
+    def _guard(self, group: Sequence[DeviceLaunch]) -> PhaseGuard:
+        parts = self._stages.parts
+        body = bodies_of([parts[id(launch)] for launch in group if not launch.mailed])
+        self._bodies.append(None if body is None else self._gpu.cp.asarray(body))
+        address = 0 if self._bodies[-1] is None else self._bodies[-1].data.ptr
+        return PhaseGuard(self._left.data.ptr, self._memory["phase"].data.ptr, address)
+
+    def _guard_of(self, launch: Launch) -> PhaseGuard:
+        return self._guard([cast(DeviceLaunch, launch)])
+
+    def _finish(self, launch: Launch, attempt: int, guard: PhaseGuard | None) -> FusedKernel:
+        """Returns the kernel that ends an attempt, with the decision."""
+        params = np.zeros((), STAGE_DECISION)
+        params["end"] = self._end
+        for name, array in self._memory.items():
+            params[name] = array.data.ptr
+        params["rows"], params["results"] = self._solver.bodies_device, self._results.ctypes.data
+        params["attempt"], params["nodes"] = attempt, self._nodes
+        epilogue = Epilogue(DECISION.checked(), "StageDecision", "decide", params, reads=True)
+        return FusedKernel([cast(DeviceLaunch, launch)], epilogue, guard=guard)
+
+    def _solve(self, form: int, first_of_step: bool = False, first_of_attempt: bool = False) -> NDArray[Any]:
+        """Returns the arguments of a solve."""
+        stage = np.zeros((), STAGE_SOLVE)
+        stage["state"], stage["phase"] = (self._memory[name].data.ptr for name in ("state", "phase"))
+        stage["spring"] = 0 if self._spring is None else self._spring.data.ptr
+        stage["form"], stage["first_of_step"], stage["first_of_attempt"] = form, first_of_step, first_of_attempt
+        return stage
+
+    def launch(self) -> None:
+        """Appends the step after the assembly of its first stage, while a graph is captured."""
+        if self.alone:
+            self._solver.apply_factors(0, self._solve(FACTOR, first_of_step=True, first_of_attempt=True))
+            _launch(self._stages.second, *self._again)
+            self._solver.apply_factors(1, self._solve(FACTOR))
+            self._first_finish()
+            with self._device.branch(self._left):
+                _launch(self._restore, *self._assemble)
+                self._iterate(False, self._guarded_second, self._guarded_again, self._guarded_finish)
+        else:
+            self._iterate(True, self._stages.second, self._again, self._first_finish)
+
+    def _iterate(
+        self, first_of_step: bool, second: Launch | FusedKernel, again: Sequence[Launchable], finish: FusedKernel
+    ) -> None:
+        """Appends an attempt by iterations, and the branch of backward Euler."""
+        self._solver.iterate(2, self._solve(ITERATE, first_of_step, first_of_attempt=True))
+        _launch(second, *again)
+        self._solver.iterate(3, self._solve(ITERATE))
+        finish()
+        with self._device.branch(self._left):
+            self._back()
+            self._set_coefficients(self._euler_pair)
+            _launch(*self._euler)
+            self._solver.iterate(4, self._solve(EULER, first_of_attempt=True))
+            self._set_coefficients(self._own_pair)
+            self._advance()
+
+    def _set_coefficients(self, pair: DeviceArray) -> None:
+        """Sets the coefficients of launches whose arguments change while steps run."""
+        runtime, stream = self._gpu.cp.cuda.runtime, self._gpu.cp.cuda.get_current_stream().ptr
+        to = self._coefficients
+        runtime.memcpyAsync(to.data.ptr, pair.data.ptr, to.nbytes, runtime.memcpyDeviceToDevice, stream)
+
+
+def _launch(*launches: Launch | FusedKernel) -> None:
+    for launch in launches:
+        launch()
