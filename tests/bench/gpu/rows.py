@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_server.backends.rosenbrock import FORMS
 from tests.bench.gpu import traffic as moved
 from tests.bench.gpu.steps import WITHOUT, Beams, Found
 
@@ -24,7 +25,7 @@ def row(beams: Beams, found: Found) -> Row:
         "tets": problem.tets, "material": problem.material, "beams": problem.beams,
         **_times(records, "us"), "between us": 1e6 * found.between, "host CPU us": 1e6 * found.cpu,
         "solve us": 1e6 * float(np.median(_first(records)["solve"])),
-        "iterations": iterations, "most": int(records["iterations"].max()),
+        **_stages(records), "iterations": iterations, "most": int(records["iterations"].max()),
         "residual": max(found.residuals), "reported residual": float(records["residual"].max()),
         "unconverged": int((records["status"] != pb.CONVERGED).sum()),
         "factor age": float(age.mean()) if len(age) else None, "oldest": int(age.max()) if len(age) else None,
@@ -43,6 +44,14 @@ def phases(beams: Beams) -> int | None:
     if plan is None or beams.analysis is None:
         return None
     return int(plan(0, beams.analysis.pattern).plan.phases)
+
+
+def _stages(records: NDArray[Any]) -> Row:
+    """Shares of steps in %, by form, of a scheme with stages; the largest estimated error of a step."""
+    if not records["form"].any():
+        return {}
+    shares = {name.lower(): 100 * float((records["form"] == form).mean()) for name, form in FORMS.items() if form}
+    return {**{f"by {name} %": share for name, share in shares.items()}, "estimate m": float(records["estimate"].max())}
 
 
 def _first(records: NDArray[Any]) -> NDArray[Any]:
