@@ -21,7 +21,9 @@ SCENES = {
     "beam.toml, Newton": ("integrator.linearizations=3", "integrator.scheme=newmark"),
     "beam.toml, ros2": ("integrator.scheme=ros2", "solver.preconditioner=cholesky"),
     "beam.toml, ros2 in float32": (
-        "integrator.scheme=ros2", "integrator.solve=iterate", "solver.precision=float32",
+        "integrator.scheme=ros2",
+        "integrator.solve=iterate",
+        "solver.precision=float32",
     ),
     "four_beams.toml, ros2": ("integrator.scheme=ros2", "solver.precision=mixed"),
     "springs.toml": (),

@@ -269,7 +269,13 @@ def test_a_useless_factor_does_not_make_the_step(value):
 def test_single_precision(precision):
     loose = EXACT | {"tolerance": 1e-4}
     made = lambda p: scene(  # noqa: E731
-        held(damping=(0.1, 0.01)), dt=0.01, gravity=GRAVITY, integrator=STAGES, update="lockstep-4", precision=p, **loose
+        held(damping=(0.1, 0.01)),
+        dt=0.01,
+        gravity=GRAVITY,
+        integrator=STAGES,
+        update="lockstep-4",
+        precision=p,
+        **loose,
     )
     exact, single = (run("gpu", made(p), 30) for p in ("float64", precision))
     assert exact.records["form"].tolist() == single.records["form"].tolist()

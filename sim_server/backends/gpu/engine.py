@@ -80,10 +80,13 @@ class GpuEngine(DeviceLoop):
         self._energies = DeviceEnergies(gpu, given.energies, energy_records, self._counter, dt)
         alone = stages is not None and stages.factor_alone
         self._whole_assembly = self._beginning(assemble)
-        needed = [launch for launch in assemble if launch.domain != "blocks"] if alone else assemble
-        self._first_launches = self._beginning(needed) if alone else self._whole_assembly
+        forces = cast(Sequence[DeviceLaunch], stages.first) if stages else ()
+        self._first_launches = self._beginning(forces) if alone else self._whole_assembly
+        self._forces = fuse(forces) if alone else ()  # after a whole assembly, whose energy balance is made already
         phases = NewtonPhases.initial(gpu, bodies) if newton else None
-        self.solver = PcgSolver(gpu, ranges, arrays, self._counter, CAPACITY, planes, phases or (), ATTEMPTS if stages else 0)
+        self.solver = PcgSolver(
+            gpu, ranges, arrays, self._counter, CAPACITY, planes, phases or (), ATTEMPTS if stages else 0
+        )
         self._newton, newton_results = None, None
         if newton and phases:
             newton_results = device.pinned(CAPACITY * NEWTON_RESULT.itemsize * bodies)
@@ -249,7 +252,7 @@ class GpuEngine(DeviceLoop):
         self.open_step()
         with self._steps:
             self._begin()
-            for launch in self._whole_assembly:
+            for launch in (*self._whole_assembly, *self._forces):
                 launch()
             values = self._arrays["values"]
             values[...] = self.gpu.twin(values).get(stream=self._steps)

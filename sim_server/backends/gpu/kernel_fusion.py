@@ -239,7 +239,10 @@ class FusedSource:
     def _items(self) -> list[str]:
         """Returns the lines that do one item of each launch in one thread."""
         taken = f" && {OPEN_ITEM}" if self._guarded else ""
-        lines = ["const int i = block * BLOCK_ITEMS + threadIdx.x;", f"if (threadIdx.x < BLOCK_ITEMS && i < n{taken}) {{"]
+        lines = [
+            "const int i = block * BLOCK_ITEMS + threadIdx.x;",
+            f"if (threadIdx.x < BLOCK_ITEMS && i < n{taken}) {{",
+        ]
         rows: dict[int, str] = {}
         for k, launch, space, kernel in self._each():
             own = list(self._rows(launch, rows, lines))

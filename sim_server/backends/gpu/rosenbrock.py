@@ -81,12 +81,14 @@ class RosenbrockStep:
         self._again = fuse(again)
         self._first_finish = self._finish(stages.finish, FACTOR if self.alone else ITERATE, None)
         self._euler = fuse(euler, self._guard)
-        self._back = FusedKernel([cast(DeviceLaunch, stages.restore_for_euler)], guard=self._guard_of(stages.restore_for_euler))
+        self._back = FusedKernel(
+            [cast(DeviceLaunch, stages.restore_for_euler)], guard=self._guard_of(stages.restore_for_euler)
+        )
         self._advance = self._finish(stages.advance_euler, EULER, self._guard_of(stages.advance_euler))
         if not self.alone:
             return
         self._restore = FusedKernel([cast(DeviceLaunch, stages.restore)], guard=self._guard_of(stages.restore))
-        self._assemble = fuse(assemble, self._guard)
+        self._assemble = fuse([*assemble, cast(DeviceLaunch, stages.remember)], self._guard)
         self._guarded_again = fuse(again, self._guard)
         self._guarded_second = FusedKernel([cast(DeviceLaunch, stages.second)], guard=self._guard_of(stages.second))
         self._guarded_finish = self._finish(stages.finish, ITERATE, self._guard_of(stages.finish))
