@@ -38,7 +38,7 @@ struct FactorApplication {
         for (int k = threadIdx.x; k < 3 * range.own; k += THREADS) s.y[begin + k] = value;
     }
 
-    // First own node whose b is not finite, else NO_NODE.
+    // First node of the body whose b is not finite; -1: none, |b|^2 has overflowed.
     __device__ __forceinline__ int first_bad_node() const {
         if (threadIdx.x == 0) memory.bad = 0x7fffffff;
         __syncthreads();
@@ -56,8 +56,24 @@ struct FactorApplication {
         return found;
     }
 
+    // Keeps what the second application needs of the first.
+    __device__ __forceinline__ void keep(const StageSolve& t, int number, long long k, real value) const {
+        t.first_stage[3ll * s.nodes * number + k] = value;
+    }
+
+    // y_1 . (b_1 - A y_1) and y_1 . b_1 of an own degree of freedom; b: of the second stage (stages.cuh).
+    __device__ __forceinline__ void compare(const StageSolve& t, long long k, double b, double sums[2]) const {
+        constexpr double g = ROS2_GAMMA;
+        const long long n = 3ll * s.nodes;
+        const double first_b = t.first_stage[n + k], y = t.first_stage[2 * n + k];
+        const double theta = t.share[k / 3], w = t.weight[k / 3], v = t.first_stage[k] / theta, u = y - theta * v;
+        const double inertia = (1 - g) * w * v + g * (w * ((1 / g - 2) * u - v) - 2 * u) + u;
+        sums[0] += y * ((1 - g) * first_b + g * b - (double)t.mass[k / 3] * inertia);
+        sums[1] += y * first_b;
+    }
+
     // Applies the factor; false if a grab pulls at the body, whose y then keeps its values. Only the first application looks.
-    __device__ __forceinline__ bool apply(bool mine_pulled, PcgResult& out) {
+    __device__ __forceinline__ bool apply(const StageSolve& t, bool mine_pulled, PcgResult& out, double& inconsistency) {
         Arena arena = {shared_memory, shared_memory + s.shared};
         PartitionedInverse inverse;
         inverse.reserve(&memory.plan, arena);
@@ -65,16 +81,23 @@ struct FactorApplication {
         inverse.fetch();  // beside the exchange
         const long long begin = 3 * (memory.body.first + (long long)range.begin);
         const unsigned r_number = group.number;
-        double mine[2] = {0, mine_pulled ? 1.0 : 0.0}, sums[2];
+        double mine[4] = {0, mine_pulled ? 1.0 : 0.0, 0, 0}, sums[4];
         for (int k = threadIdx.x; k < 3 * range.own; k += THREADS) {
             const int at = place(k);
             const real b = s.b[begin + k];
             inverse.residual[at].put((float)(inverse.scale[at] * b), r_number);
             mine[0] += (double)b * (double)b;
+            if (t.first_of_step) {
+                keep(t, 0, begin + k, s.y[begin + k]);
+                keep(t, 1, begin + k, b);
+            } else {
+                compare(t, begin + k, b, mine + 2);
+            }
         }
         for (int k = 16; k; k >>= 1)
-            for (int n = 0; n < 2; ++n) mine[n] += __shfl_xor_sync(ALL, mine[n], k);
-        group.sums<2, 1>(mine, sums);
+            for (int n = 0; n < 4; ++n) mine[n] += __shfl_xor_sync(ALL, mine[n], k);
+        group.sums<4, 1>(mine, sums);
+        inconsistency = sums[3] != 0 ? fabs(sums[2] / sums[3]) : 0;
         copies_end<0>();
         __syncthreads();
         if (sums[1] > 0) return false;
@@ -85,7 +108,12 @@ struct FactorApplication {
             fill((real)(0 * sums[0]));
             return true;
         }
-        if (sums[0] == 0) { fill(0); return true; }
+        if (sums[0] == 0) {
+            fill(0);
+            if (t.first_of_step)
+                for (int k = threadIdx.x; k < 3 * range.own; k += THREADS) keep(t, 2, begin + k, 0);
+            return true;
+        }
         const double peak = inverse.scale[inverse.size];
         const float unit = unit_for(sums[0] * peak * peak);
         ResidualSource from = {inverse.residual, r_number, 0, 0};
@@ -100,6 +128,7 @@ struct FactorApplication {
             float value;
             for (unsigned spins = 0; keep_polling(!z->get(value, group.number), spins);) {}
             s.y[begin + k] = value;
+            if (t.first_of_step) keep(t, 2, begin + k, value);
         }
         return true;
     }
@@ -127,8 +156,10 @@ __device__ __forceinline__ void apply_to_body(const PcgArguments& s, const Stage
         FactorApplication solver = {s, range, {range.index, body.blocks, s.exchange_number[k], s.block_sums + 8ll * s.grid * k, s.grid,
                                                memory.scratch, memory.totals, (int)threadIdx.x % 32, (int)threadIdx.x / 32}};
         PcgResult out = no_solve(body);
-        alone = solver.apply(pulled, out);
+        double inconsistency;
+        alone = solver.apply(t, pulled, out, inconsistency);
         if (decides) {
+            if (!t.first_of_step) t.state[k].inconsistency = inconsistency;
             out.seconds = 1e-9 * (nanoseconds() - begin);
             add_solve(sum, out);
             s.exchange_number[k] = solver.group.number + 1;  // no word has it; read by all blocks before the exchange

@@ -117,7 +117,7 @@ class GpuEngine(DeviceLoop):
         if stages and stage_results is not None:
             spring = given.energies.touch.get("spring")
             self._stages = RosenbrockStep(
-                gpu, device, stages, assemble, self.solver, self._epilogue, stage_results, spring
+                gpu, device, stages, assemble, self.solver, self._epilogue, stage_results, spring, given.energies.mass
             )  # fmt: skip
             self._stamp_begin = self._stages.stamp_begin
         else:

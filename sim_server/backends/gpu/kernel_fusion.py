@@ -98,11 +98,12 @@ class FusedKernel:
     """Launches several kernels over the same items as one.
 
     private: addresses of arrays that need no memory, since only these launches use them (`own`)
+    exact: see FusedSource
     """
 
     def __init__(
         self, launches: Sequence[DeviceLaunch], epilogue: Epilogue | None = None, private: frozenset[int] = frozenset(),
-        guard: PhaseGuard | None = None, prologue: Prologue | None = None,
+        guard: PhaseGuard | None = None, prologue: Prologue | None = None, exact: bool = False,
     ):  # fmt: skip
         self.name = "+".join(launch.name for launch in launches)
         self.items = next(launch.items for launch in launches if not launch.mailed)
@@ -110,7 +111,7 @@ class FusedKernel:
         self.shape = block_shape(launches[0].domain if sums else "elements", self.items, processors())
         self._launches = list(launches)  # keeps their arrays
         self._prologue_blocks = prologue.blocks if prologue else 0
-        text = FusedSource(launches, self.shape, epilogue, private, guard, prologue)
+        text = FusedSource(launches, self.shape, epilogue, private, guard, prologue, exact)
         self._arguments = (np.int32(self.items), *text.values, *(x.params for x in (epilogue, prologue) if x))
         flags = (*options(launches[0].types), *own_headers())
         self._module = cupy().RawModule(code=text.source, options=flags, backend="nvrtc")
@@ -135,8 +136,9 @@ class FusedSource:
     its entries in registers from one launch to the next.
 
     private: addresses of arrays that need no memory
-    guard: items of bodies whose step is made are left out; thread blocks with no others return at once, unless there
-        is an epilogue
+    guard: thread blocks return at once if they have no item of a body whose step is not made, unless there is an
+        epilogue
+    exact: other items of bodies whose step is made are left out, too; not for kernels whose threads write rows together
 
     source: the text
     values: of the arguments after the number of items
@@ -145,8 +147,9 @@ class FusedSource:
     def __init__(
         self, launches: Sequence[DeviceLaunch], shape: BlockShape, epilogue: Epilogue | None = None,
         private: frozenset[int] = frozenset(), guard: PhaseGuard | None = None, prologue: Prologue | None = None,
+        exact: bool = False,
     ):  # fmt: skip
-        self._launches, self._private, self._guarded = launches, private, guard is not None
+        self._launches, self._private, self._exact = launches, private, exact
         self._restrict = "" if epilogue and epilogue.reads else "__restrict__ "
         self.values: list[np.number[Any]] = [np.uint64(address) for address in guard or ()]
         self._parameters = [f"const int* __restrict__ {name}" for name in guard._fields] if guard else []
@@ -238,7 +241,7 @@ class FusedSource:
 
     def _items(self) -> list[str]:
         """Returns the lines that do one item of each launch in one thread."""
-        taken = f" && {OPEN_ITEM}" if self._guarded else ""
+        taken = f" && {OPEN_ITEM}" if self._exact else ""
         lines = [
             "const int i = block * BLOCK_ITEMS + threadIdx.x;",
             f"if (threadIdx.x < BLOCK_ITEMS && i < n{taken}) {{",

@@ -46,14 +46,15 @@ class RosenbrockStep:
     assemble: launches of the first stage
     end: arguments of the end of the step (StepEpilogue)
     results: host memory (capacity, bodies) of STAGE_RESULT that the steps write to
-    body: (nodes,) of each node; spring: host array (nodes,) of grabs, None without touch
+    spring: host array (nodes,) of grabs, None without touch
+    mass: host array (nodes,) [kg]
 
     alone: True if the first attempt is made by factors alone; A is then assembled only for bodies that iterate
     """
 
     def __init__(
         self, gpu: Gpu, device: Branches, stages: Rosenbrock, assemble: Sequence[DeviceLaunch], solver: PcgSolver,
-        end: NDArray[Any], results: NDArray[Any], spring: Float64 | None,
+        end: NDArray[Any], results: NDArray[Any], spring: Float64 | None, mass: Float64,
     ):  # fmt: skip
         cp, bodies = gpu.cp, len(stages.bound)
         self._gpu, self._device, self._stages, self._solver, self._end = gpu, device, stages, solver, end
@@ -67,7 +68,13 @@ class RosenbrockStep:
             "largest": cp.zeros(bodies, np.int64), "bound": cp.asarray(stages.bound),
             "estimate": gpu.twin(stages.estimate), "body": finish.arrays["body"], "left": self._left,
         }  # fmt: skip
-        self._spring = None if spring is None else gpu.twin(spring)
+        self._solve_memory: dict[str, DeviceArray] = {
+            "state": self._memory["state"], "phase": self._memory["phase"], "mass": gpu.twin(mass),
+            "share": finish.arrays["share"], "weight": finish.arrays["weight"],
+            "first_stage": cp.zeros(9 * len(mass), finish.arrays["share"].dtype),
+        }  # fmt: skip
+        if spring is not None:
+            self._solve_memory["spring"] = gpu.twin(spring)
         self._results, self._nodes = results, finish.items
         self._coefficients = gpu.twin(stages.coefficients)
         pairs = (stages.coefficients, np.array(stages.euler_coefficients))
@@ -79,19 +86,17 @@ class RosenbrockStep:
         stages = self._stages
         again, euler = (cast(Sequence[DeviceLaunch], x) for x in (stages.again, stages.euler))
         self._again = fuse(again)
-        self._first_finish = self._finish(stages.finish, FACTOR if self.alone else ITERATE, None)
+        self._first_finish = self._finish(stages.finish, FACTOR if self.alone else ITERATE, guarded=False)
         self._euler = fuse(euler, self._guard)
-        self._back = FusedKernel(
-            [cast(DeviceLaunch, stages.restore_for_euler)], guard=self._guard_of(stages.restore_for_euler)
-        )
-        self._advance = self._finish(stages.advance_euler, EULER, self._guard_of(stages.advance_euler))
+        self._back = self._nodal(stages.restore_for_euler)
+        self._advance = self._finish(stages.advance_euler, EULER)
         if not self.alone:
             return
-        self._restore = FusedKernel([cast(DeviceLaunch, stages.restore)], guard=self._guard_of(stages.restore))
+        self._restore = self._nodal(stages.restore)
         self._assemble = fuse([*assemble, cast(DeviceLaunch, stages.remember)], self._guard)
         self._guarded_again = fuse(again, self._guard)
-        self._guarded_second = FusedKernel([cast(DeviceLaunch, stages.second)], guard=self._guard_of(stages.second))
-        self._guarded_finish = self._finish(stages.finish, ITERATE, self._guard_of(stages.finish))
+        self._guarded_second = self._nodal(stages.second)
+        self._guarded_finish = self._finish(stages.finish, ITERATE)
 
     @property
     def stamp_begin(self) -> Callable[..., None]:
@@ -105,10 +110,12 @@ class RosenbrockStep:
         address = 0 if self._bodies[-1] is None else self._bodies[-1].data.ptr
         return PhaseGuard(self._left.data.ptr, self._memory["phase"].data.ptr, address)
 
-    def _guard_of(self, launch: Launch) -> PhaseGuard:
-        return self._guard([cast(DeviceLaunch, launch)])
+    def _nodal(self, launch: Launch, epilogue: Epilogue | None = None, guarded: bool = True) -> FusedKernel:
+        """Returns the kernel of a nodal launch; guarded: for bodies whose step is not made."""
+        group = [cast(DeviceLaunch, launch)]
+        return FusedKernel(group, epilogue, guard=self._guard(group) if guarded else None, exact=guarded)
 
-    def _finish(self, launch: Launch, attempt: int, guard: PhaseGuard | None) -> FusedKernel:
+    def _finish(self, launch: Launch, attempt: int, guarded: bool = True) -> FusedKernel:
         """Returns the kernel that ends an attempt, with the decision."""
         params = np.zeros((), STAGE_DECISION)
         params["end"] = self._end
@@ -117,13 +124,13 @@ class RosenbrockStep:
         params["rows"], params["results"] = self._solver.bodies_device, self._results.ctypes.data
         params["attempt"], params["nodes"] = attempt, self._nodes
         epilogue = Epilogue(DECISION.checked(), "StageDecision", "decide", params, reads=True)
-        return FusedKernel([cast(DeviceLaunch, launch)], epilogue, guard=guard)
+        return self._nodal(launch, epilogue, guarded)
 
     def _solve(self, form: int, first_of_step: bool = False, first_of_attempt: bool = False) -> NDArray[Any]:
         """Returns the arguments of a solve."""
         stage = np.zeros((), STAGE_SOLVE)
-        stage["state"], stage["phase"] = (self._memory[name].data.ptr for name in ("state", "phase"))
-        stage["spring"] = 0 if self._spring is None else self._spring.data.ptr
+        for name, array in self._solve_memory.items():
+            stage[name] = array.data.ptr
         stage["form"], stage["first_of_step"], stage["first_of_attempt"] = form, first_of_step, first_of_attempt
         return stage
 
