@@ -158,8 +158,8 @@ def _check_starts(starts: NDArray[Any], end: int, name: str, what: str) -> None:
 @dataclass(frozen=True, eq=False)
 class Factor:
     """L of one object at one step. values (pattern.nonzeros,) float32 or float64; seconds: what it took to make;
-    remedy: what was done to a matrix that was not positive definite, in a few words; ahead, later, method, exact:
-    as in FactorUse."""
+    remedy: what was done to a matrix that was not positive definite, in a few words; ahead, later, method: as in
+    FactorUse."""
 
     object: str
     epoch: int
@@ -173,7 +173,6 @@ class Factor:
     ahead: float = 0.0
     later: bool = False
     method: str = ""
-    exact: bool = False
 
 
 def check_values(values: NDArray[Any], pattern: FactorPattern, expected: int | None) -> None:

@@ -396,7 +396,7 @@ class TouchSet(_message.Message):
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., interactions: _Optional[_Iterable[_Union[Interaction, _Mapping]]] = ...) -> None: ...
 
 class FactorUse(_message.Message):
-    __slots__ = ("header", "step", "pattern", "checksum", "dtype", "worker", "library", "threads", "seconds", "remedy", "method", "ahead", "later", "exact")
+    __slots__ = ("header", "step", "pattern", "checksum", "dtype", "worker", "library", "threads", "seconds", "remedy", "method", "ahead", "later")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     STEP_FIELD_NUMBER: _ClassVar[int]
     PATTERN_FIELD_NUMBER: _ClassVar[int]
@@ -410,7 +410,6 @@ class FactorUse(_message.Message):
     METHOD_FIELD_NUMBER: _ClassVar[int]
     AHEAD_FIELD_NUMBER: _ClassVar[int]
     LATER_FIELD_NUMBER: _ClassVar[int]
-    EXACT_FIELD_NUMBER: _ClassVar[int]
     header: Header
     step: int
     pattern: int
@@ -424,8 +423,7 @@ class FactorUse(_message.Message):
     method: str
     ahead: float
     later: bool
-    exact: bool
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., pattern: _Optional[int] = ..., checksum: _Optional[int] = ..., dtype: _Optional[str] = ..., worker: _Optional[str] = ..., library: _Optional[str] = ..., threads: _Optional[int] = ..., seconds: _Optional[float] = ..., remedy: _Optional[str] = ..., method: _Optional[str] = ..., ahead: _Optional[float] = ..., later: _Optional[bool] = ..., exact: _Optional[bool] = ...) -> None: ...
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., pattern: _Optional[int] = ..., checksum: _Optional[int] = ..., dtype: _Optional[str] = ..., worker: _Optional[str] = ..., library: _Optional[str] = ..., threads: _Optional[int] = ..., seconds: _Optional[float] = ..., remedy: _Optional[str] = ..., method: _Optional[str] = ..., ahead: _Optional[float] = ..., later: _Optional[bool] = ...) -> None: ...
 
 class Command(_message.Message):
     __slots__ = ("header", "client", "verb", "interaction", "secret")

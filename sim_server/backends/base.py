@@ -176,13 +176,8 @@ class Engine(Protocol):
         """Returns the solver settings of a body, to be read and set."""
         ...
 
-    def post_factor(
-        self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int, exact: bool = False
-    ) -> None:
-        """Copies a factor of the matrix of `step`; one of the next solves of the body takes it up.
-
-        exact: it is known to be that of its matrix; else a step that uses it alone checks it first
-        """
+    def post_factor(self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int) -> None:
+        """Copies a factor of the matrix of `step`; one of the next solves of the body takes it up."""
         ...
 
     def settle_factors(self) -> None:

@@ -20,14 +20,14 @@ The products with K vanish, since (g h)^2 K s = theta (A - (1 + g h alpha) M) s 
 so that a solve needs A alone, or instead of it the factor of an older A, warped: whatever P is applied, it *is* the A
 of the step, which keeps its order, without assembly or iterations. Forms of a step, of each body (kernels/step_form.h):
 
-    FACTOR    y_j = P^-1 b_j with the warped factor. A factor that was not checked against its own matrix when it came
-              (updates/factor_check.py) is checked in its first step, and any every CHECK_EVERY steps: A is assembled,
-              too, and the residual of y_1 evaluated. One that leaves POOR of |b - A theta s| or more is not used alone
+    FACTOR    y_j = P^-1 b_j with the warped factor. The forces of both stages tell whether P is the A that it should be,
+              in every step (step_form.h)
     ITERATE   A is assembled at x, and solved with conjugate gradients from theta s, to a residual relative to that of
               this start, which is the right-hand side of u_j
     EULER     where the estimate of ITERATE exceeds the bound of the body: backward Euler from the start of the step
 
-A step by FACTOR whose estimate exceeds the bound is made again by ITERATE, and PATIENCE steps after it, too.
+A step by FACTOR whose factor is inconsistent, or whose estimate exceeds the bound, is made again by ITERATE, and
+PATIENCE steps after it, too.
 
 Stability: A-stable with J the slope of F, L-stable (R(infinity) = 0). With an older, warped J in place of it see
 docs/bench/rosenbrock.md; without the warp it flies apart.
@@ -136,7 +136,8 @@ class RosenbrockIntegrator(Integrator):
             restore=self._stage("restore", **state, **started, **history, **self._prepared()),
             restore_for_euler=self._stage("restore_for_euler", **state, **started, **history, **restored),
             advance_euler=self._stage("euler", before=self.before, **solved, **state, **euler_arrays),
-            parts={}, factor_alone=self.factor_alone, estimate=self.estimate, bound=self.bound,
+            parts={}, factor_alone=self.factor_alone, estimate=self.estimate, mass=w.mass, share=self.share,
+            weight=self.weight, bound=self.bound,
             coefficients=w.coefficients, euler_coefficients=(w.dt, w.dt),
         )  # fmt: skip
         starts, rows = np.array([*(b.first for b in w.bodies), w.nodes], dtype=np.int32), rows_of(effects)

@@ -84,5 +84,5 @@ class ReplayRecorder:
             header=pb.Header(object=factor.object, epoch=factor.epoch), step=factor.step, pattern=factor.pattern.id,
             checksum=checksum(factor.values), dtype=factor.values.dtype.name, worker=factor.worker,
             library=library, threads=maker.threads, seconds=factor.seconds, remedy=factor.remedy,
-            method=factor.method, ahead=factor.ahead, later=factor.later, exact=factor.exact,
+            method=factor.method, ahead=factor.ahead, later=factor.later,
         )  # fmt: skip

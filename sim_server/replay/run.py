@@ -240,8 +240,7 @@ class Replay:
             if factor is None:
                 self.compared.diverged(step + 1, name, "factor", f"used that of step {made}, which there is not yet")
                 return
-            use = self.recording.objects[name].factors.get(made)
-            self.engine.post_factor(index, factor.pattern, factor.values, made, use is not None and use.exact)
+            self.engine.post_factor(index, factor.pattern, factor.values, made)
             self._in_use[name] = made
         if self._last_use[name, made] == step:
             self._factors.pop((name, made), None)

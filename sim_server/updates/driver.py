@@ -44,14 +44,12 @@ class Driver:
         self.solver = simulation.scene.solver
         world, system = simulation.world, simulation.system
         patterns = {b.name: system.body_pattern(b.first, b.last) for b in world.bodies}
-        self.inline, self.check = Inline(patterns), FactorCheck(patterns)
+        alone = simulation.scene.uses_factor_alone  # in place of A: it must be exact, so nothing is to choose from
+        self.inline, self.check = Inline(patterns), FactorCheck(patterns, alone)
         self.source: FactorSource = source or self.inline
         self.policy = make_policy(self)
         self.counted = not self.policy.free if counted is None else counted
-        self._alone = (
-            simulation.scene.uses_factor_alone
-        )  # in place of A: it must be exact, so nothing is to choose from
-        methods = () if self._alone else self.solver.choices(world.backend.name)
+        methods = () if alone else self.solver.choices(world.backend.name)
         bounds = simulation.integrator.error_bounds
         self.bodies = [BodyUpdateState(b, methods, self.counted, bounds[b.index]) for b in world.bodies]
         self.by_name = {s.body.name: s for s in self.bodies}
@@ -159,14 +157,12 @@ class Driver:
         # Post it, unless it is older than the newest
         if not state.on_factor(factor, self.engine.step):
             return
-        exact = self._alone and self.check.is_exact(factor, matrix)
-        self.engine.post_factor(state.body.index, factor.pattern, factor.values, factor.step, exact)
+        self.engine.post_factor(state.body.index, factor.pattern, factor.values, factor.step)
         # Tell observers how it was made
         method, extrapolated = state.factors.method(factor.step), state.job.extrapolated
         at_end = Capability.MATRIX_POSITIONS not in self.engine.capabilities
         later = state.job.positions and at_end and factor.worker != self.inline.WORKER
-        notable = extrapolated or later or exact
-        made = replace(factor, ahead=extrapolated, later=later, exact=exact) if notable else factor
+        made = replace(factor, ahead=extrapolated, later=later) if extrapolated or later else factor
         made = replace(made, method=method.name) if method else made
         for observe in self.on_adopt:
             observe(made)

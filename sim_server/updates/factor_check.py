@@ -19,7 +19,7 @@ from sim_server.backends.cpu import structs
 from sim_server.backends.cpu.engine import NativeFactor
 
 Reals = NDArray[np.float64]
-MAX_RESIDUAL = 0.05  # |r - A P^-1 r| / |r| of a factor that may take the place of A without another check
+MAX_RESIDUAL = 0.05  # |r - A P^-1 r| / |r| of a factor that is to take the place of A; exact ones in float32 have 1e-3
 MIN_SHARE = 0.9  # of what block Jacobi takes off, for a factor to be used; not 1, as one vector is not the space
 
 
@@ -48,10 +48,14 @@ def _library() -> c.CDLL:
 
 
 class FactorCheck:
-    """Checks factors of some objects. patterns: row_start and columns of A by object, nodes numbered from 0."""
+    """Checks factors of some objects.
 
-    def __init__(self, patterns: dict[str, tuple[NDArray[np.int32], NDArray[np.int32]]]):
-        self._patterns = patterns
+    patterns: row_start and columns of A by object, nodes numbered from 0
+    alone: factors are to take the place of A, so they must be exact
+    """
+
+    def __init__(self, patterns: dict[str, tuple[NDArray[np.int32], NDArray[np.int32]]], alone: bool = False):
+        self._patterns, self._alone = patterns, alone
         self._arrays: dict[int, tuple[Reals, Reals]] = {}  # by size: probe vector, work
 
     def prepare(self) -> None:
@@ -69,7 +73,7 @@ class FactorCheck:
             return f"its size is {factor.pattern.size}, that of the object {3 * nodes}"
         if len(factor.values) != factor.pattern.nonzeros:
             return f"it has {len(factor.values)} values, its pattern {factor.pattern.nonzeros}"
-        zr, reduction, block_jacobi, _ = self.probe(factor, matrix)
+        zr, reduction, block_jacobi, residual = self.probe(factor, matrix)
         if not 0 < zr < np.inf:
             return f"not positive definite or not finite (z.r = {zr:.3g} on a probe vector)"
         if matrix is not None and not reduction >= MIN_SHARE * block_jacobi:
@@ -77,11 +81,11 @@ class FactorCheck:
                 "worse than block Jacobi on a probe vector: an iteration takes "
                 f"{reduction:.3g} off the energy of the error, with block Jacobi {block_jacobi:.3g}"
             )
+        if self._alone and matrix is not None and not factor.remedy and not residual <= MAX_RESIDUAL:
+            return (
+                f"not that of its matrix: it leaves {residual:.3g} of a residual, at most {MAX_RESIDUAL:g} is allowed"
+            )
         return ""
-
-    def is_exact(self, factor: Factor, matrix: Reals | None) -> bool:
-        """True if a factor that was not rejected is known to be that of its matrix, up to rounding."""
-        return matrix is not None and self.probe(factor, matrix).residual < MAX_RESIDUAL
 
     def probe(self, factor: Factor, matrix: Reals | None) -> Probe:
         """Applies a factor, which has the right size, to the probe vector r."""

@@ -84,7 +84,6 @@ def test_a_step_with_the_factor_of_an_older_matrix_is_that_of_the_older_stiffnes
     records = sim.engine.records()
     assert (records["form"] == FORMS["FACTOR"]).all() and (records["iterations"] == 0).all()
     assert np.abs(now - then).max() > 0.3
-    assert (records["residual"] >= 0).tolist() == [True, True, False, False]
 
 
 def test_it_differs_from_that_of_the_new_stiffness_and_of_the_older_one_as_it_was():

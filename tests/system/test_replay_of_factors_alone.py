@@ -25,15 +25,10 @@ def test_the_same_bit_for_bit(build: str, preconditioner: str, tmp_path: Path) -
     """Nearly all steps are made by the factor alone: only the first ones have none, and a few of those with a new grab
     are not corrected for it."""
     log = recorded(tmp_path, f'build = "{build}"{ROS2}', preconditioner)
-    made, factors = forms(log), messages(log, "factor")
+    made = forms(log)
     assert made["FACTOR"] > 0.8 * STEPS and made["ONE_SOLVE"] == 0, made
     assert all(step.HasField("estimate") and step.estimate < 0.05 for step in messages(log, "step"))
-    if build == "server":
-        assert all(f.exact for f in factors)
-    else:  # matrices of workers are not known here; those with the springs of the grab are made here
-        assert 0 < sum(f.exact for f in factors) < len(factors)
-    unchecked = [s for s in messages(log, "step") if s.form == pb.FACTOR and s.residual == -1]
-    assert len(unchecked) > 0.3 * STEPS
+    assert all(0 <= s.residual < 0.05 for s in messages(log, "step") if s.form == pb.FACTOR)
     found = replayed(log, 0)
     assert found["same"] and found["other_factor"] is None and not found["notes"], found
     assert (found["steps"], found["solves"], found["frames"]) == (STEPS, STEPS, STEPS + 1)

@@ -19,10 +19,11 @@ from tests.scenes import bar, simulation
 from tests.solver.solves import bent, system
 
 
-def check_of(sim: Simulation) -> tuple[FactorCheck, NDArray]:
+def check_of(sim: Simulation, alone: bool = False) -> tuple[FactorCheck, NDArray]:
     body = sim.world.bodies[0]
     pattern = sim.system.body_pattern(body.first, body.last)
-    return FactorCheck({body.name: pattern}), np.ascontiguousarray(sim.system.body_values(body.first, body.last))
+    matrix = np.ascontiguousarray(sim.system.body_values(body.first, body.last))
+    return FactorCheck({body.name: pattern}, alone), matrix
 
 
 def made(sim: Simulation, method: Method | None = None, dtype: type = np.float32) -> Factor:
@@ -89,6 +90,24 @@ def test_bad_ones_do_not(how, method):
     if how in ("nan", "infinite", "zero pivot"):
         assert "not finite" in words
         assert "not finite" in check.reject_reason(changed(made(sim, method), how), None)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_one_that_is_to_take_the_place_of_the_matrix_is_its_factor(dtype):
+    """What may precondition may not do alone: a scale, a wrong sign, what an incomplete factor leaves out."""
+    sim = bent()
+    check, matrix = check_of(sim, alone=True)
+    good = made(sim, dtype=dtype)
+    assert check.reject_reason(good, matrix) == ""
+    assert check.probe(good, matrix).residual < (1e-3 if dtype == np.float32 else 1e-9)
+    flipped = good.values.copy()
+    flipped[good.pattern.diagonal[-3]] *= -1
+    wrong = [dataclasses.replace(good, values=v) for v in (good.values * dtype(1.1), flipped)]
+    for factor in (*wrong, made(sim, GOOD[3], dtype)):
+        words = check.reject_reason(factor, matrix)
+        assert "not that of its matrix: it leaves" in words and "at most 0.05" in words
+    regularized = dataclasses.replace(good, values=good.values * dtype(1.1), remedy="shifted")
+    assert check.reject_reason(regularized, matrix) == "", "it cannot be"
 
 
 def test_of_another_size():

@@ -73,10 +73,10 @@ class NativeFactor:
         """Address of the native struct, which a mailbox takes."""
         return c.addressof(self.native)
 
-    def fill(self, values: NDArray[Any], step: int, exact: bool = False) -> None:
-        """Copies the values of L made from the matrix of `step`. exact: known to be so."""
+    def fill(self, values: NDArray[Any], step: int) -> None:
+        """Copies the values of L made from the matrix of `step`."""
         self.values[:] = values
-        self.native.step, self.native.exact = step, exact
+        self.native.step = step
 
     def apply(self, r: Reals) -> Reals:
         """P^-1 r, (size,), outside of any step. A probe for tests and benchmarks."""
@@ -125,7 +125,7 @@ class _NativeStages:
         self._lists = {k: np.array([number[id(x)] for x in getattr(stages, k)], np.int32) for k in LISTS}
         self._state = (structs.StageState * loop.bodies)()
         for state in self._state:
-            state.factor_step = state.checked = -1
+            state.factor_step = -1
         own = tuple(stages.coefficients.tolist())
         self.native = structs.Stages(
             firsts=len(stages.first), agains=len(stages.again), eulers=len(stages.euler),
@@ -136,7 +136,9 @@ class _NativeStages:
             setattr(self.native, name, number[id(getattr(stages, name))])
         for name, array in self._lists.items():
             setattr(self.native, name, array.ctypes.data)
-        for name in ("estimate", "bound", "coefficients"):
+        self._first_stage = np.zeros((len(stages.mass), 9))
+        self.native.first_stage = self._first_stage.ctypes.data
+        for name in ("estimate", "bound", "coefficients", "mass", "share", "weight"):
             setattr(self.native, name, getattr(stages, name).ctypes.data)
         loop.stages = c.addressof(self.native)
         for key, part in stages.parts.items():
@@ -265,12 +267,10 @@ class CpuEngine(Reports):
 
     # --- mailboxes ----------------------------------------------------------------------------------------------
 
-    def post_factor(
-        self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int, exact: bool = False
-    ) -> None:
+    def post_factor(self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int) -> None:
         """Copies a factor into a free buffer; the loop takes it up before its next solve of the body."""
         buffer = self._free_buffer(body, pattern, values.dtype)
-        buffer.fill(values, step, exact)
+        buffer.fill(values, step)
         self._mail[body].waiting = buffer
         self._native.wf_post_factor(c.byref(self._body[body]), buffer.address)
 

@@ -275,9 +275,7 @@ class GpuEngine(DeviceLoop):
         row = self.solver.bodies[body : body + 1].reshape(())
         return DeviceSettings(row, self.mailboxes[body])
 
-    def post_factor(
-        self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int, exact: bool = False
-    ) -> None:
+    def post_factor(self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int) -> None:
         """Builds the inverse of a factor beside the steps; it is used from the first batch after its completion on."""
         self._factor_upload.post(body, pattern, values, step)
 

@@ -13,13 +13,6 @@
 #include "pcg_structs.cuh"
 #include "step_form.h"
 
-// A factor used alone is checked in every step, at no cost: with the forces of both stages, A y_1 is known as far as they are linear,
-//     b_1 - A y_1 = (1 - g) b_1 + g b_2 - M ((1 - g) w s_1 + g (r_2 + w s_2) + u_1)
-// A y_1 . y_1 differs from b_1 . y_1 by up to 2e-3 of it with factors that are 32 steps old (beams of 540 and 3000 tets, time steps of
-// 10 to 30 ms), and by 1 - 1 / c where the factor is that of c A, which no estimate shows: then nothing moves, as exactly as one likes.
-constexpr double INCONSISTENT = 0.1;
-constexpr double ROS2_GAMMA = 0.29289321881345247559915563789515;  // g = 1 - 1 / sqrt 2
-
 enum StepPhase { OPEN = 0, MADE = 2 };  // of a body in a step; MADE is DONE of newton_line_search.cuh, see kernel_fusion.PhaseGuard
 
 struct StageState {          // of a body

@@ -174,7 +174,6 @@ static void finish_step(Loop* loop) {
         record.linearizations = linearizations;
         if (!loop->stages) continue;
         record.form = loop->stages->state[i].form;
-        if (record.form == FACTOR && !loop->stages->state[i].check) record.residual = -1;
         record.estimate = loop->stages->state[i].estimate;
     }
     double solved = now();

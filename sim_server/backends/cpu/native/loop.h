@@ -49,14 +49,11 @@ struct StageState {                    // of a body in the step under way (rosen
     int32_t form;                      // StepForm of the attempt, or FAILED
     int32_t accepted;                  // 1: the attempt is the step
     int32_t assembled;                 // 1: A is that of the step
-    int32_t check;                     // 1: evaluate the residual of the first stage
     int32_t corrects;                  // 1: the factor is corrected for grabs
     int32_t misses;                    // 1: it is not, though it should be
     int32_t patience;                  // steps to come that iterate
     int64_t factor_step;               // of the last factor
-    int64_t checked;                   // step of its last check, -1: none
     double estimate;                   // of the last attempt by stages [m]
-    double share;                      // of the residual that the factor left at its last check
     SolveResult result;                // of all solves of the step
 };
 
@@ -71,6 +68,8 @@ struct Stages {                        // input of the Rosenbrock-W step
     const double* bound;               // (bodies,) [m]
     double* coefficients;              // (2,) of launches whose arguments change while steps run
     double own_coefficients[2], euler_coefficients[2];
+    const double *mass, *share, *weight;   // (nodes,) of the first stage's check (rosenbrock.h): M, theta, w
+    double* first_stage;               // (nodes, 9) start of the solve, b and y of the first stage
     StageState* state;                 // (bodies,)
 };
 

@@ -16,7 +16,7 @@ struct Record {
     int64_t step = 0;           // steps completed
     int64_t factor_step = -1;   // of the matrix that the factor was made from; -1: no factor used
     double time = 0;            // of the simulation at the end of the step [s]
-    double residual = 0;        // true, |b - A y| / |b|; -1: not evaluated
+    double residual = 0;        // true, |b - A y| / |b|; form FACTOR: |y.(b - A y)| / |y.b| of the first stage (step_form.h)
     double assemble = 0;        // [s], as the next three
     double solve = 0;
     double integrate = 0;

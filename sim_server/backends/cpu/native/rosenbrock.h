@@ -29,16 +29,13 @@ static void choose_form(Loop& loop, int index, bool whole) {
     const Body& body = loop.body[index];
     StageState& s = stages.state[index];
     const Factor* factor = body.factor;
-    const int64_t step = loop.rings.step;
     if (factor && s.factor_step != factor->step) {  // a new one
         s.factor_step = factor->step;
         s.patience = 0;
-        s.checked = factor->exact ? step : -1;
     }
     const bool alone = stages.factor_alone && factor && body.now.kind == CHOLESKY && s.patience == 0;
     s.form = alone ? FACTOR : ITERATE;
-    s.check = alone && (s.checked < 0 || step - s.checked >= CHECK_EVERY);
-    s.assembled = whole || !alone || s.check || (body.snapshot.load(std::memory_order_acquire) && body.ahead < 0);
+    s.assembled = whole || !alone || (body.snapshot.load(std::memory_order_acquire) && body.ahead < 0);
 }
 
 // After the forces of the first stage are evaluated: whether factors know the springs of grabs, or are corrected for them. Where one
@@ -72,42 +69,65 @@ static void forget(SolveResult& sum) {
     sum.residual = 0;
 }
 
-// y = P^-1 b. False if P is not positive definite there or, where it is checked, leaves too much of the residual.
-static bool apply_alone(Loop& loop, int index, bool check) {
+struct FirstStage {  // views of a body's part of Stages::first_stage, (3 n,) each
+    double *start, *b, *y;
+    FirstStage(const Stages& stages, const Body& body) {
+        start = stages.first_stage + 9 * (int64_t)body.first;
+        b = start + 3 * (body.last - body.first);
+        y = b + 3 * (body.last - body.first);
+    }
+};
+
+// |y_1 . (b_1 - A y_1)| / |y_1 . b_1| of the first stage, from the forces of the second, b (kernels/step_form.h).
+static double inconsistency(const Loop& loop, const Body& body, const double* b) {
+    const Stages& stages = *loop.stages;
+    const FirstStage first(stages, body);
+    constexpr double g = ROS2_GAMMA;
+    double off = 0, all = 0;
+    for (int i = 0; i < body.last - body.first; ++i) {
+        const double theta = stages.share[body.first + i], w = stages.weight[body.first + i], mass = stages.mass[body.first + i];
+        for (int k = 3 * i; k < 3 * i + 3; ++k) {
+            const double y = first.y[k], v = first.start[k] / theta, u = y - first.start[k];
+            const double inertia = (1 - g) * w * v + g * (w * ((1 / g - 2) * u - v) - 2 * u) + u;
+            off += y * ((1 - g) * first.b[k] + g * b[k] - mass * inertia);
+            all += y * first.b[k];
+        }
+    }
+    return all != 0 ? std::fabs(off / all) : 0;
+}
+
+// y = P^-1 b. False if P is not positive definite there or, in the second stage, the factor proves inconsistent.
+static bool apply_alone(Loop& loop, int index, bool first) {
     StageState& s = loop.stages->state[index];
     Body& body = loop.body[index];
     const BlockCsr A = matrix_of(loop, body);
     const int n = A.size();
     const double *b = loop.b + 3 * (int64_t)body.first, begin = now();
-    double *y = loop.y + 3 * (int64_t)body.first, *work = loop.work + 27 * (int64_t)body.first, *r = work, *start = r + n;
+    double *y = loop.y + 3 * (int64_t)body.first, *work = loop.work + 27 * (int64_t)body.first;
+    const FirstStage kept(*loop.stages, body);
     const double b2 = dot(n, b, b);
     SolveResult out{0, 0, 0, CONVERGED, CHOLESKY, 0};
     bool well = true;
+    if (first) {
+        std::copy(y, y + n, kept.start);
+        std::copy(b, b + n, kept.b);
+    } else {
+        out.residual = inconsistency(loop, body, b);
+        well = out.residual <= INCONSISTENT;
+    }
     if (!std::isfinite(b2)) {
         out.status = NOT_FINITE;
         out.residual = std::sqrt(b2);
         for (int i = 0; i < n; ++i) y[i] = NAN;
     } else if (b2 == 0) {
         for (int i = 0; i < n; ++i) y[i] = 0;
-    } else {
-        if (check) std::copy(y, y + n, start);
-        Preconditioner P{A, body.factor, CHOLESKY, nullptr, start + n, 1, &body.correction, s.corrects != 0};
+    } else if (well) {
+        Preconditioner P{A, body.factor, CHOLESKY, nullptr, work, 1, &body.correction, s.corrects != 0};
         const double zr = P.apply(b, std::sqrt(b2), y);
         well = zr > 0 && zr < INFINITY;
-        if (check && well) {
-            const double from = residual(A, b, start, r), left = residual(A, b, y, r);
-            out.residual = from > 0 ? std::sqrt(left / from) : 0;
-            well = out.residual < POOR || left <= body.now.tolerance * body.now.tolerance * b2;
-            s.checked = loop.rings.step;
-            s.share = out.residual;
-        }
-        if (!well) {
-            if (check) std::copy(start, start + n, y);
-            s.checked = -1;  // again before its next use
-            out.fallbacks = 1;
-            out.residual = 0;  // not of what makes the step
-        }
     }
+    if (first) std::copy(y, y + n, kept.y);
+    if (!well) out.fallbacks = 1;
     out.seconds = now() - begin;
     note(s.result, out);
     return well;
@@ -121,7 +141,7 @@ static void iterate(Loop& loop, int index) {
                        !loop.moving[index], &body.correction, s.form == EULER ? WARM_START : GIVEN_START));
 }
 
-// Solves of the bodies that take part. first: of the first stage, whose factor may be checked.
+// Solves of the bodies that take part. first: of the first stage.
 template <class F> static void solve_stage(Loop& loop, bool first, F take_part) {
 #pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) if (loop.threads > 1 && loop.bodies > 1)
     for (int i = 0; i < loop.bodies; ++i) {
@@ -129,10 +149,9 @@ template <class F> static void solve_stage(Loop& loop, bool first, F take_part) 
         if (!take_part(i) || s.form == FAILED) continue;
         if (!loop.moving[i] && s.form != EULER) { s.result.kind = loop.body[i].now.kind; continue; }
         if (s.form != FACTOR) { iterate(loop, i); continue; }
-        if (apply_alone(loop, i, first && s.check)) continue;
+        if (apply_alone(loop, i, first)) continue;
         s.patience = PATIENCE;
-        if (first && s.check) { s.form = ITERATE; iterate(loop, i); }  // A is there, and b is that of the first stage
-        else s.form = FAILED;
+        s.form = FAILED;
     }
 }
 

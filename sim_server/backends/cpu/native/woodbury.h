@@ -23,7 +23,6 @@ struct Factor {
     const void* values;
     int64_t step;      // of the matrix it was made from
     int32_t bytes;     // of a value: 4 or 8
-    int32_t exact;     // 1: known to be the factor of its matrix; 0: to be checked before it is used alone
 };
 
 struct Change {        // of the diagonal of a node
