@@ -185,11 +185,11 @@ def test_a_grab_iterates_until_the_factor_knows_that_it_has_gone():
     def grab(sim: Simulation, step: int) -> None:
         touch = sim.effects["touch"]
         if step == 10:
-            held_by.append(touch.grab("me", "bar", (2.0, 0.8, 0.8), 0.3, (2.0, 1.0, 0.8), 400.0, 500.0, 10.0).id)
+            held_by.append(touch.grab("me", "bar", (2.0, 0.8, 0.8), 0.0, (2.0, 1.0, 0.8), 400.0, 500.0, 10.0).id)
         if step == 16:
             touch.release("me", held_by.pop())
         if step == 20:
-            touch.push("me", "bar", (2.0, 0.4, 0.4), 0.3, (0.0, 0.0, 40.0), 0.1)
+            touch.push("me", "bar", (2.0, 0.4, 0.4), 0.0, (0.0, 0.0, 40.0), 0.1)
 
     cpu, gpu = both(make, 34, grab, near=1e-4, forms=False)
     forms, factor = gpu.records["form"], gpu.records["factor_step"]
@@ -238,7 +238,7 @@ def test_a_copy_of_the_matrix_is_made_between_steps_and_leaves_no_trace():
     asked.engine.request_matrix(0, target)
     for sim in (asked, other):
         sim.engine.run(1)
-    assert asked.engine.matrix_step(0) == 6
+    assert asked.engine.matrix_step(0) == 5
     other.engine.assemble()
     assert np.array_equal(target, other.system.values)
     other.engine.solve()

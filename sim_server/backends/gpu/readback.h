@@ -29,16 +29,15 @@ static bool begin_matrices(GpuLoop& l) {
             CALL(to_host, l.host_matrices + body.values_begin, l.staged + body.values_begin, (size_t)readback_bytes(body), l.copy_stream);
     }
     CALL(event_record, l.copied_event, l.copy_stream);
-    l.matrix_step = l.launched - 1;  // steps completed before the matrix of a step was assembled; positions are those after that step
+    l.matrix_step = l.launched - 1;  // steps completed before the matrix was assembled; positions, and matrices of l.matrix, are those after that step
     return true;
 }
 
 static void publish_matrices(GpuLoop& l) {
     for (int i = 0; i < l.bodies; ++i)
         if (l.readbacks[i].in_flight) {
-            const bool between = l.matrix && l.readbacks[i].in_flight == REQUEST_VALUES;  // of the state after that step
             l.readbacks[i].in_flight = 0;
-            l.readbacks[i].copied_step.store(l.matrix_step + between, std::memory_order_release);
+            l.readbacks[i].copied_step.store(l.matrix_step, std::memory_order_release);
         }
     l.matrix_step = -1;
 }

@@ -123,8 +123,6 @@ class Beams:
         for index, target in enumerate(targets):
             self.engine.request_matrix(index, target)
         self.run(1)
-        if self.sim.scene.integrator.scheme == "ros2":  # a copy of the state after the step: its factor is a step older
-            self.run(1)
         end = time.monotonic() + 10
         while any(self.engine.matrix_step(i) < 0 for i in range(len(targets))):
             if time.monotonic() > end:
