@@ -26,6 +26,14 @@ def test_the_same_bit_for_bit(worker: str, pace: str, tmp_path: Path) -> None:
     assert (found["steps"], found["solves"]) == (steps, steps)
 
 
+def test_steps_by_the_factor_alone(tmp_path: Path) -> None:
+    """Matrices are copied between steps, when and for whom does not matter; a grab goes on by iterations."""
+    log = recorded(tmp_path, '[integrator]\nscheme = "ros2"', "cholesky", "--device", "gpu", "--realtime")
+    iterations = [s.iterations for s in messages(log, "step")]
+    assert 0 in iterations and max(iterations) > 2
+    assert replayed(log, 0, timeout=240)["same"]
+
+
 def test_a_run_in_lockstep(tmp_path: Path) -> None:
     log = recorded(tmp_path, 'update = "lockstep-3"', "cholesky", "--device", "gpu")
     assert replayed(log, 0)["same"]

@@ -22,6 +22,7 @@ ITERATE, FACTOR, EULER = (FORMS[name] for name in ("ITERATE", "FACTOR", "EULER")
 GRAVITY = (0.0, -9.81, 0.0)
 EXACT = {"tolerance": 1e-11, "preconditioner": "cholesky", "max_iterations": 4000, "factor_precision": "float32"}
 STAGES = {"scheme": "ros2"}
+STRICT = STAGES | {"error_bound": 5e-3}
 Between = Callable[[Simulation, int], None]
 
 
@@ -85,14 +86,15 @@ def of_law(law: str, **table: Any) -> dict:
 
 BODIES = {
     "corotational": lambda: held(damping=(0.2, 0.01)), "exact": lambda: held(rotation="polar", tangent="exact"),
-    "stable_neo_hookean": lambda: of_law("stable_neo_hookean"), "st_venant_kirchhoff": lambda: of_law("st_venant_kirchhoff"),
+    "stable_neo_hookean": lambda: of_law("stable_neo_hookean"),
+    "st_venant_kirchhoff": lambda: of_law("st_venant_kirchhoff"),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("body", BODIES)
 def test_by_iterations(body):
-    stages = STAGES | {"solve": "iterate"}
-    cpu, gpu = both(lambda: scene(BODIES[body](), dt=0.02, gravity=GRAVITY, integrator=stages, **EXACT), 12)
+    stages, solver = STAGES | {"solve": "iterate"}, EXACT | {"update": "every-3"}
+    cpu, gpu = both(lambda: scene(BODIES[body](), dt=0.02, gravity=GRAVITY, integrator=stages, **solver), 12)
     assert (gpu.records["form"] == ITERATE).all() and (gpu.records["iterations"] > 0).all()
     assert np.abs(gpu.x[-1] - gpu.x[0]).max() > 0.02
     assert np.abs(gpu.records["iterations"] - cpu.records["iterations"]).max() <= 8
@@ -101,9 +103,9 @@ def test_by_iterations(body):
 @pytest.mark.parametrize("body", BODIES)
 def test_by_the_factor_alone(body):
     make = lambda: scene(  # noqa: E731
-        BODIES[body](), dt=0.01, gravity=GRAVITY, integrator=STAGES, update="lockstep-4", **EXACT
+        BODIES[body](), dt=0.01, gravity=GRAVITY, integrator=STAGES, update="every-8", **EXACT
     )
-    cpu, gpu = both(make, 30, near=1e-5)
+    _, gpu = both(make, 30, near=1e-5)
     by_factor = gpu.records["form"] == FACTOR
     assert by_factor.sum() > 20 and np.isnan(gpu.records["residual"][by_factor]).all()
     assert (gpu.records["iterations"][by_factor] == 0).all() and (gpu.records["solve"] > 0).all()
@@ -111,18 +113,19 @@ def test_by_the_factor_alone(body):
 
 
 def test_a_violent_start_goes_back():
-    make = lambda: scene(held(), dt=0.02, gravity=GRAVITY, integrator=STAGES, update="lockstep-3", **EXACT)  # noqa: E731
-    cpu, gpu = both(make, 10, thrown((-8.0, 20.0, 3.0)), near=1e-4)
-    assert (gpu.records["form"][:2] == EULER).all(), gpu.records["form"].tolist()
-    assert (gpu.records["estimate"][:2] > 0.01).all() and (gpu.records["status"] == SolveStatus.CONVERGED).all()
+    make = lambda: scene(held(), dt=0.02, gravity=GRAVITY, integrator=STRICT, update="every-3", **EXACT)  # noqa: E731
+    _, gpu = both(make, 10, thrown((-8.0, 20.0, 3.0)), near=1e-4)
+    back = gpu.records["form"] == EULER
+    assert back.any() and not back.all(), gpu.records["form"].tolist()
+    assert (gpu.records["estimate"][back] > 5e-3).all() and (gpu.records["status"] == SolveStatus.CONVERGED).all()
 
 
 def crowd() -> Scene:
-    """Bodies of which one is thrown, one rests, and one has no factor to begin with."""
+    """Bodies of which one is thrown and one rests."""
     at = [{"name": f"b{k}", "pose": {"translate": [0, 3 * k, 0]}} for k in range(4)]
     return scene(
         bar((2, 1, 1), (1, 0.5, 0.5), young=1e6, **at[0]), held(**at[1]), held(young=1e6, **at[2]),
-        of_law("stable_neo_hookean", **at[3]), dt=0.02, integrator=STAGES, update="lockstep-3", **EXACT,
+        of_law("stable_neo_hookean", **at[3]), dt=0.02, integrator=STRICT, update="every-3", **EXACT,
     )  # fmt: skip
 
 
@@ -135,9 +138,9 @@ def test_bodies_go_back_each_by_itself():
             v[body.nodes] = sim.world.free[body.nodes, None] * np.array([0.3 * speed, speed, 0.0])
         put(sim, sim.world.v, v)
 
-    cpu, gpu = both(crowd, 14, stir, near=1e-4)
+    _, gpu = both(crowd, 14, stir, near=1e-4)
     forms = gpu.records["form"].reshape(-1, 4)
-    assert (forms[0] == [ITERATE, EULER, ITERATE, ITERATE]).all() and (forms[-1, 2:] == FACTOR).all(), forms
+    assert (forms[0] == [FACTOR, EULER, FACTOR, FACTOR]).all() and (forms[-1, 2:] == FACTOR).all(), forms
     idle = gpu.sim.world.bodies[0].nodes
     assert np.array_equal(gpu.x[-1, idle], gpu.x[0, idle])
 
@@ -149,14 +152,14 @@ def test_small_bodies_of_a_pool(bars):
             pose={"translate": [0, 2 * k, 0]})
         for k, cells in enumerate(bars)
     ]  # fmt: skip
-    made = lambda: scene(*objects, dt=0.01, gravity=GRAVITY, integrator=STAGES, update="lockstep-3", **EXACT)  # noqa: E731
-    _, gpu = both(made, 8, near=1e-6)
+    made = lambda: scene(*objects, dt=0.01, gravity=GRAVITY, integrator=STAGES, update="every-3", **EXACT)  # noqa: E731
+    _, gpu = both(made, 8, near=1e-5)
     assert (gpu.records["form"][-len(bars) :] == FACTOR).all()
 
 
 def test_what_is_not_finite_is_told_and_stays_in_its_body():
     at = [{"name": f"b{k}", "pose": {"translate": [0, 3 * k, 0]}} for k in range(3)]
-    make = lambda: scene(*(held(**a) for a in at), dt=0.02, integrator=STAGES, update="lockstep-3", **EXACT)  # noqa: E731
+    make = lambda: scene(*(held(**a) for a in at), dt=0.02, integrator=STAGES, update="every-3", **EXACT)  # noqa: E731
 
     def spoil(sim: Simulation, step: int) -> None:
         if step == 6:
@@ -178,7 +181,12 @@ def test_what_is_not_finite_is_told_and_stays_in_its_body():
 
 def test_a_grab_iterates_until_the_factor_knows_that_it_has_gone():
     make = lambda: scene(  # noqa: E731
-        held(touch={"max_force": 1000.0}), dt=0.02, gravity=GRAVITY, integrator=STAGES, update="lockstep-4", **EXACT
+        held(young=3e5, touch={"max_force": 1000.0}),
+        dt=0.01,
+        gravity=GRAVITY,
+        integrator=STAGES,
+        update="every-5",
+        **EXACT,
     )
     held_by: list[int] = []
 
@@ -191,7 +199,7 @@ def test_a_grab_iterates_until_the_factor_knows_that_it_has_gone():
         if step == 20:
             touch.push("me", "bar", (2.0, 0.4, 0.4), 0.0, (0.0, 0.0, 40.0), 0.1)
 
-    cpu, gpu = both(make, 34, grab, near=1e-4, forms=False)
+    _, gpu = both(make, 34, grab, near=1e-3, forms=False)
     forms, factor = gpu.records["form"], gpu.records["factor_step"]
     assert (forms[10:16] == ITERATE).all() and (forms[7:10] == FACTOR).all(), forms.tolist()
     ungrabbed = factor[16:] > 15

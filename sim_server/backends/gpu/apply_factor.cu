@@ -5,6 +5,7 @@
 // The first application of a step chooses the form of each body's attempt (stages.cuh).
 #include "partitioned_inverse.cuh"
 #include "clock.cuh"
+#include "overlap.cuh"
 #include "stages.cuh"
 
 struct ApplicationMemory {  // static shared memory of a thread block
@@ -22,9 +23,26 @@ __device__ __forceinline__ float unit_for(double a) {
     return __int_as_float((127 - max(-120, min(120, k))) << 23);
 }
 
+struct OwnPlaces {  // of the own degrees of freedom: positions in the packed vectors and scales; in shared memory, if they fit
+    int* position;
+    float* scale;
+
+    __device__ __forceinline__ void set_up(const RowRange& range, const float* scales, Arena& arena) {
+        position = arena.take<int>(3 * range.own);
+        scale = arena.take<float>(3 * range.own);
+        if (!scale) return;
+        for (int k = threadIdx.x; k < 3 * range.own; k += THREADS) {  // read by the same threads
+            position[k] = memory.plan.place[range.begin + k / 3] + k % 3;
+            scale[k] = scales[position[k]];
+        }
+    }
+};
+
 struct FactorApplication {
     const PcgArguments& s;
     const RowRange& range;
+    const PartitionedInverse& inverse;
+    const OwnPlaces& own;
     BlockGroup group;
 
     // Copies the rows of the body into shared memory.
@@ -74,18 +92,13 @@ struct FactorApplication {
 
     // Applies the factor; false if a grab pulls at the body, whose y then keeps its values. Only the first application looks.
     __device__ __forceinline__ bool apply(const StageSolve& t, bool mine_pulled, PcgResult& out, double& inconsistency) {
-        Arena arena = {shared_memory, shared_memory + s.shared};
-        PartitionedInverse inverse;
-        inverse.reserve(&memory.plan, arena);
-        inverse.set_up(memory.body, &memory.plan, group.index, arena);
-        inverse.fetch();  // beside the exchange
         const long long begin = 3 * (memory.body.first + (long long)range.begin);
         const unsigned r_number = group.number;
         double mine[4] = {0, mine_pulled ? 1.0 : 0.0, 0, 0}, sums[4];
         for (int k = threadIdx.x; k < 3 * range.own; k += THREADS) {
             const int at = place(k);
             const real b = s.b[begin + k];
-            inverse.residual[at].put((float)(inverse.scale[at] * b), r_number);
+            inverse.residual[at].put((float)((own.scale ? own.scale[k] : inverse.scale[at]) * b), r_number);
             mine[0] += (double)b * (double)b;
             if (t.first_of_step) {
                 keep(t, 0, begin + k, s.y[begin + k]);
@@ -133,16 +146,32 @@ struct FactorApplication {
         return true;
     }
 
-    __device__ __forceinline__ int place(int k) const { return memory.plan.place[range.begin + k / 3] + k % 3; }
+    __device__ __forceinline__ int place(int k) const {
+        return own.scale ? own.position[k] : memory.plan.place[range.begin + k / 3] + k % 3;
+    }
 };
 
-__device__ __forceinline__ void apply_to_body(const PcgArguments& s, const StageSolve& t, const RowRange& range) {
+// waits: the kernel before this one may still be running. No kernel of a graph writes the factor.
+__device__ __forceinline__ void apply_to_body(const PcgArguments& s, const StageSolve& t, const RowRange& range, bool waits) {
     const int k = range.body;
     FactorApplication::bring(memory.body, s.bodies + k);
+    __syncthreads();
+    const PcgBody& body = memory.body;
+    PartitionedInverse inverse;
+    OwnPlaces own = {nullptr, nullptr};
+    if (body.plan && body.kind == CHOLESKY) {
+        FactorApplication::bring(memory.plan, body.plan);
+        __syncthreads();
+        Arena arena = {shared_memory, shared_memory + s.shared};
+        inverse.reserve(&memory.plan, arena);
+        own.set_up(range, body.scale, arena);
+        inverse.set_up(body, &memory.plan, range.index, arena);
+        inverse.fetch();
+    }
+    if (waits) wait_for_last();
     FactorApplication::bring(memory.state, t.state + k);
     if (threadIdx.x == THREADS - 1) memory.moving = s.moving[k];
     __syncthreads();
-    const PcgBody& body = memory.body;
     const bool decides = range.index == 0 && threadIdx.x == 0;
     bool alone = t.first_of_step ? may_use_factor(memory.state, body) : memory.state.form == FACTOR;
     const bool pulled = t.first_of_step && FactorApplication::pulled(t, body, range);
@@ -150,10 +179,8 @@ __device__ __forceinline__ void apply_to_body(const PcgArguments& s, const Stage
     PcgResult& sum = s.results[(s.step[0] % s.capacity) * s.count + k];
     if (decides && t.first_of_step) sum = no_solve(body);
     if (alone && memory.moving) {
-        FactorApplication::bring(memory.plan, body.plan);
-        __syncthreads();
         const long long begin = nanoseconds();
-        FactorApplication solver = {s, range, {range.index, body.blocks, s.exchange_number[k], s.block_sums + 8ll * s.grid * k, s.grid,
+        FactorApplication solver = {s, range, inverse, own, {range.index, body.blocks, s.exchange_number[k], s.block_sums + 8ll * s.grid * k, s.grid,
                                                memory.scratch, memory.totals, (int)threadIdx.x % 32, (int)threadIdx.x / 32}};
         PcgResult out = no_solve(body);
         double inconsistency;
@@ -171,13 +198,18 @@ __device__ __forceinline__ void apply_to_body(const PcgArguments& s, const Stage
 }
 
 extern "C" __global__ void __launch_bounds__(THREADS, PER_PROCESSOR) apply_factor(const PcgArguments s, const StageSolve t) {
+    let_next_come();
+    bool waits = true;
     for (int next = s.initial_range[blockIdx.x];; next = -1) {
-        if (next < 0) {  // take the next body of the pool
+        if (next < 0) {
+            if (waits) wait_for_last();
+            waits = false;  // take the next body of the pool
             if (threadIdx.x == 0) memory.next = s.pooled > 0 ? atomicAdd(s.pool_counter, 1) : s.pooled;
             __syncthreads();
             if (memory.next >= s.pooled) return;
             next = s.bodies[s.order[s.count - s.pooled + memory.next]].first_range;
         }
-        apply_to_body(s, t, s.row_ranges[next]);
+        apply_to_body(s, t, s.row_ranges[next], waits);
+        waits = false;
     }
 }
