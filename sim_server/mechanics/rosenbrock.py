@@ -20,8 +20,8 @@ The products with K vanish, since (g h)^2 K s = theta (A - (1 + g h alpha) M) s 
 so that a solve needs A alone, or instead of it the factor of an older A, warped: whatever P is applied, it *is* the A
 of the step, which keeps its order, without assembly or iterations. Forms of a step, of each body (kernels/step_form.h):
 
-    FACTOR    y_j = P^-1 b_j with the warped factor. The forces of both stages tell whether P is the A that it should be,
-              in every step (step_form.h)
+    FACTOR    y_j = P^-1 b_j with the warped factor. The forces of both stages tell, in every step, whether P is the A
+              that it should be (step_form.h)
     ITERATE   A is assembled at x, and solved with conjugate gradients from theta s, to a residual relative to that of
               this start, which is the right-hand side of u_j
     EULER     where the estimate of ITERATE exceeds the bound of the body: backward Euler from the start of the step
