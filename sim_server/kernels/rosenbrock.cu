@@ -59,6 +59,7 @@ struct Prepare {
     const real* share;         // (n,) theta [-]
     const real* weight;        // (n,) theta (1 + g h alpha) [-]
     const real* v;             // (n, 3) [m/s]
+    real* predictor;           // (n, 3) out [m/s]
     real* damping_velocity;    // (n, 3) out [m/s]
     real* inertial_increment;  // (n, 3) out [m/s]
     real* dv;                  // (n, 3) out: start of the solve [m/s]
@@ -67,6 +68,7 @@ struct Prepare {
 // What the first stage is assembled from.
 template <class P, class I> INLINE void prepare_stage(const P& p, I i, vec3 v, vec3 inertial, vec3 start) {
     number share = at(p.share, i);
+    store3(p.predictor, i, (1 - share) * start);
     store3(p.damping_velocity, i, (1 - share) * v);
     store3(p.inertial_increment, i, inertial + at(p.weight, i) * start);
     store3(p.dv, i, share * start);
@@ -89,6 +91,7 @@ struct Second {
     real* start_v;             // (n, 3) out: v at the start of the step [m/s]
     real* start_x;             // (n, 3) out: x at the start of the step [m]
     real* first;               // (n, 3) out: u_1 [m/s]
+    real* predictor;           // (n, 3) out [m/s]
     real* damping_velocity;    // (n, 3) out [m/s]
     real* inertial_increment;  // (n, 3) out [m/s]
     real* dv;                  // (n, 3) out: start of the solve [m/s]
@@ -124,7 +127,8 @@ struct Finish {
     real* before;              // (n, 3) in, out: x at the start of the step [m]
     real* earlier;             // (n, 3) out: the same of the step before [m]
     real* estimate;            // (n,) out: error of the step [m]
-    real* damping_velocity;    // (n, 3) out: of the next step, as the next two [m/s]
+    real* predictor;           // (n, 3) out: of the next step, as the next three [m/s]
+    real* damping_velocity;
     real* inertial_increment;
     real* dv;
 };
@@ -155,6 +159,7 @@ struct Restore {
     real* v;                   // (n, 3) out [m/s]
     real* x;                   // (n, 3) out [m]
     real* before;              // (n, 3) out: x when the step before began [m]
+    real* predictor;           // (n, 3) out [m/s]
     real* damping_velocity;    // (n, 3) out [m/s]
     real* inertial_increment;  // (n, 3) out [m/s]
     real* dv;                  // (n, 3) out: start of the solve [m/s]
@@ -205,8 +210,8 @@ struct Euler {
     real* v;                   // (n, 3) in, out [m/s]
     real* x;                   // (n, 3) in, out [m]
     real* before;              // (n, 3) in, out: x when the step before began [m]
-    real* predictor;           // (n, 3) out: 0 [m/s]
-    real* damping_velocity;    // (n, 3) out: of the next step, as the next two [m/s]
+    real* predictor;           // (n, 3) out: of the next step, as the next three [m/s]
+    real* damping_velocity;
     real* inertial_increment;
     real* dv;
 };
@@ -219,6 +224,5 @@ KERNEL(euler, Euler) {
     store3(p.x, i, select(refused, before, x + p.h * v));
     store3(p.v, i, v);
     store3(p.before, i, select(refused, before, x));
-    store3(p.predictor, i, zero);
     prepare_stage(p, i, v, zero, v);
 }

@@ -18,7 +18,9 @@ The products with K vanish, since (g h)^2 K s = theta (A - (1 + g h alpha) M) s 
     A y_j = g h f(x_j, v_j) + M (r_j + w s_j),    u_j = y_j - theta s_j,    w = theta (1 + g h alpha)
 
 so that a solve needs A alone, or instead of it the factor of an older A, warped: whatever P is applied, it *is* the A
-of the step, which keeps its order, without assembly or iterations. Forms of a step, of each body (kernels/step_form.h):
+of the step, which keeps its order, without assembly or iterations. The spring k of a grab (effects/touch.py), which has
+no damping, is in A with (g h)^2 k: of it (1 - theta) (g h)^2 k s_j remains on the right (world.predictor). Forms of a
+step, of each body (kernels/step_form.h):
 
     FACTOR    y_j = P^-1 b_j with the warped factor. The forces of both stages tell, in every step, whether P is the A
               that it should be (step_form.h)
@@ -123,8 +125,7 @@ class RosenbrockIntegrator(Integrator):
         solved: dict[str, Any] = {"rotation": s.rotation, "y": s.y, "h": w.dt}
         history: dict[str, Any] = {"before": self.before, "earlier": self.earlier}
         first, again, euler = lists
-        euler_arrays = {**self._prepared(), "predictor": w.predictor}
-        restored = {k: v for k, v in euler_arrays.items() if k not in ("share", "weight")}
+        restored = {k: v for k, v in self._prepared().items() if k not in ("share", "weight")}
         found = Rosenbrock(
             first=first, again=again, euler=euler,
             second=self._stage("second", first=self.first, **solved, **state, **started, **self._prepared()),
@@ -135,7 +136,7 @@ class RosenbrockIntegrator(Integrator):
             remember=self._stage("remember", block=s.block, known=self.known),
             restore=self._stage("restore", **state, **started, **history, **self._prepared()),
             restore_for_euler=self._stage("restore_for_euler", **state, **started, **history, **restored),
-            advance_euler=self._stage("euler", before=self.before, **solved, **state, **euler_arrays),
+            advance_euler=self._stage("euler", before=self.before, **solved, **state, **self._prepared()),
             parts={}, factor_alone=self.factor_alone, estimate=self.estimate, mass=w.mass, share=self.share,
             weight=self.weight, bound=self.bound,
             coefficients=w.coefficients, euler_coefficients=(w.dt, w.dt),
@@ -147,8 +148,9 @@ class RosenbrockIntegrator(Integrator):
 
     def _prepared(self) -> dict[str, Any]:
         return {
-            "share": self.share, "weight": self.weight, "damping_velocity": self.world.damping_velocity,
-            "inertial_increment": self.inertial_increment, "dv": self.system.dv,
+            "share": self.share, "weight": self.weight, "predictor": self.world.predictor,
+            "damping_velocity": self.world.damping_velocity, "inertial_increment": self.inertial_increment,
+            "dv": self.system.dv,
         }  # fmt: skip
 
     def _stage(self, kernel: str, **arguments: Any) -> Launch:
