@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Rosenbrock-W steps under the update policies: whose factor makes a step, and what the loop copies for the next one."""
+"""Rosenbrock-W steps under the update policies: whose factor makes a step, what the loop copies for the next one."""
 
 import numpy as np
 import pytest
