@@ -28,7 +28,7 @@ class Rosenbrock:
     parts: (bodies + 1,) first item of each body, by id of a launch; None if a launch does not tell bodies apart
     factor_alone: whether the factor may take the place of A
     estimate: (n,) of the last attempt [m]
-    mass [kg], share, weight: (n,) of the check of the first stage (kernels/step_form.h)
+    mass [kg], share, weight, diagonal [kg]: (n,) of the check of the first stage (kernels/step_form.h)
     bound: (bodies,) largest estimate of a step that is not made again [m]
     coefficients: (2,) force_coefficient and dx_dv [s], read by launches whose arguments change while steps run
     euler_coefficients: the same of backward Euler
@@ -49,6 +49,7 @@ class Rosenbrock:
     mass: Float64
     share: Float64
     weight: Float64
+    diagonal: Float64
     bound: Float64
     coefficients: Float64
     euler_coefficients: tuple[float, float]

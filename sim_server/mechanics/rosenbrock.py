@@ -138,7 +138,7 @@ class RosenbrockIntegrator(Integrator):
             restore_for_euler=self._stage("restore_for_euler", **state, **started, **history, **restored),
             advance_euler=self._stage("euler", before=self.before, **solved, **state, **self._prepared()),
             parts={}, factor_alone=self.factor_alone, estimate=self.estimate, mass=w.mass, share=self.share,
-            weight=self.weight, bound=self.bound,
+            weight=self.weight, diagonal=s.diagonal, bound=self.bound,
             coefficients=w.coefficients, euler_coefficients=(w.dt, w.dt),
         )  # fmt: skip
         starts, rows = np.array([*(b.first for b in w.bodies), w.nodes], dtype=np.int32), rows_of(effects)

@@ -26,7 +26,7 @@ def test_the_same_bit_for_bit(build: str, preconditioner: str, tmp_path: Path) -
     are not corrected for it."""
     log = recorded(tmp_path, f'build = "{build}"{ROS2}', preconditioner)
     made = forms(log)
-    assert made["FACTOR"] > 0.8 * STEPS and made["ONE_SOLVE"] == 0, made
+    assert made["FACTOR"] > 0.5 * STEPS and made["ONE_SOLVE"] == 0, made
     assert all(step.HasField("estimate") and step.estimate < 0.05 for step in messages(log, "step"))
     assert all(0 <= s.residual < 0.05 for s in messages(log, "step") if s.form == pb.FACTOR)
     found = replayed(log, 0)
@@ -36,5 +36,5 @@ def test_the_same_bit_for_bit(build: str, preconditioner: str, tmp_path: Path) -
 
 def test_in_lockstep(tmp_path: Path) -> None:
     log = recorded(tmp_path, f'update = "lockstep-3"{ROS2}')
-    assert forms(log)["FACTOR"] > 0.8 * STEPS
+    assert forms(log)["FACTOR"] > 0.5 * STEPS
     assert replayed(log, 0)["same"]

@@ -138,7 +138,7 @@ class _NativeStages:
             setattr(self.native, name, array.ctypes.data)
         self._first_stage = np.zeros((len(stages.mass), 9))
         self.native.first_stage = self._first_stage.ctypes.data
-        for name in ("estimate", "bound", "coefficients", "mass", "share", "weight"):
+        for name in ("estimate", "bound", "coefficients", "mass", "share", "weight", "diagonal"):
             setattr(self.native, name, getattr(stages, name).ctypes.data)
         loop.stages = c.addressof(self.native)
         for key, part in stages.parts.items():

@@ -81,12 +81,10 @@ struct FactorApplication {
 
     // y_1 . (b_1 - A y_1) and y_1 . b_1 of an own degree of freedom; b: of the second stage (stages.cuh).
     __device__ __forceinline__ void compare(const StageSolve& t, long long k, double b, double sums[2]) const {
-        constexpr double g = ROS2_GAMMA;
         const long long n = 3ll * s.nodes;
         const double first_b = t.first_stage[n + k], y = t.first_stage[2 * n + k];
-        const double theta = t.share[k / 3], w = t.weight[k / 3], v = t.first_stage[k] / theta, u = y - theta * v;
-        const double inertia = (1 - g) * w * v + g * (w * ((1 / g - 2) * u - v) - 2 * u) + u;
-        sums[0] += y * ((1 - g) * first_b + g * b - (double)t.mass[k / 3] * inertia);
+        const double theta = t.share[k / 3], w = t.weight[k / 3], mass = t.mass[k / 3];
+        sums[0] += y * first_residual(t.first_stage[k], first_b, b, y, theta, w, mass, mass * w / theta);  // without springs
         sums[1] += y * first_b;
     }
 

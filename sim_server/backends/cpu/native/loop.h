@@ -68,7 +68,7 @@ struct Stages {                        // input of the Rosenbrock-W step
     const double* bound;               // (bodies,) [m]
     double* coefficients;              // (2,) of launches whose arguments change while steps run
     double own_coefficients[2], euler_coefficients[2];
-    const double *mass, *share, *weight;   // (nodes,) of the first stage's check (rosenbrock.h): M, theta, w
+    const double *mass, *share, *weight, *diagonal;  // (nodes,) of the first stage's check (step_form.h): M, theta, w, of A
     double* first_stage;               // (nodes, 9) start of the solve, b and y of the first stage
     StageState* state;                 // (bodies,)
 };

@@ -82,15 +82,13 @@ struct FirstStage {  // views of a body's part of Stages::first_stage, (3 n,) ea
 static double inconsistency(const Loop& loop, const Body& body, const double* b) {
     const Stages& stages = *loop.stages;
     const FirstStage first(stages, body);
-    constexpr double g = ROS2_GAMMA;
     double off = 0, all = 0;
     for (int i = 0; i < body.last - body.first; ++i) {
-        const double theta = stages.share[body.first + i], w = stages.weight[body.first + i], mass = stages.mass[body.first + i];
+        const int node = body.first + i;
         for (int k = 3 * i; k < 3 * i + 3; ++k) {
-            const double y = first.y[k], v = first.start[k] / theta, u = y - first.start[k];
-            const double inertia = (1 - g) * w * v + g * (w * ((1 / g - 2) * u - v) - 2 * u) + u;
-            off += y * ((1 - g) * first.b[k] + g * b[k] - mass * inertia);
-            all += y * first.b[k];
+            off += first.y[k] * first_residual(first.start[k], first.b[k], b[k], first.y[k], stages.share[node], stages.weight[node],
+                                               stages.mass[node], stages.diagonal[node]);
+            all += first.y[k] * first.b[k];
         }
     }
     return all != 0 ? std::fabs(off / all) : 0;
