@@ -15,7 +15,9 @@
 #define __forceinline__ inline
 #define __launch_bounds__(n)
 #define __shared__ static
+#define __align__(n) alignas(n)
 
+struct uint4 { unsigned x, y, z, w; };
 struct Dimension { int x; };
 static thread_local Dimension threadIdx;
 static Dimension blockIdx, blockDim, gridDim;
@@ -30,7 +32,18 @@ static double __longlong_as_double(long long bits) {
 }
 
 static void __threadfence() { std::atomic_thread_fence(std::memory_order_seq_cst); }
-static unsigned atomicAdd(unsigned* a, unsigned by) { return __atomic_fetch_add(a, by, __ATOMIC_SEQ_CST); }
+template <class T> static T atomicAdd(T* a, T by) { return __atomic_fetch_add(a, by, __ATOMIC_SEQ_CST); }
+template <class T> static T __ldcg(const T* a) { return __atomic_load_n(a, __ATOMIC_SEQ_CST); }
+static void atomicMax(long long* a, long long b) {
+    long long seen = __ldcg(a);
+    while (seen < b && !__atomic_compare_exchange_n(a, &seen, b, false, __ATOMIC_SEQ_CST, __ATOMIC_SEQ_CST)) {}
+}
+static int min(int a, int b) { return a < b ? a : b; }
+static long long __double_as_longlong(double a) {
+    long long bits;
+    std::memcpy(&bits, &a, sizeof bits);
+    return bits;
+}
 
 // The value of another lane of the warp; all of them come here.
 template <class T> static T exchange(T value, int from) {
@@ -45,6 +58,18 @@ template <class T> static T exchange(T value, int from) {
     return value;
 }
 template <class T> static T __shfl_xor_sync(unsigned, T a, int by) { return exchange(a, (threadIdx.x % 32) ^ by); }
+
+// Whether it holds in all threads of the thread block.
+static bool __syncthreads_and(bool holds) {
+    static std::atomic<int> others{0};
+    if (!holds) others = 1;
+    __syncthreads();
+    const bool all = others == 0;
+    __syncthreads();
+    if (threadIdx.x == 0) others = 0;
+    __syncthreads();
+    return all;
+}
 
 template <class Kernel> static void launch(int blocks, int threads, Kernel kernel) {
     blockDim.x = threads;

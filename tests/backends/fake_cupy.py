@@ -64,9 +64,6 @@ class Device(FakeDevice):
         super().__init__()
         self.step_stream, self.copy_stream, self.graphs = Stream(), Stream(), {7: lambda: None}
 
-    def launch_overlapping(self, function: Any, grid: int, block: int, arguments: Any, shared: int = 0) -> None:
-        function((grid,), (block,), arguments, shared_mem=shared)
-
     def branch(self, flag: Array) -> Any:
         return nullcontext()
 

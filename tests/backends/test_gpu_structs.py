@@ -17,6 +17,7 @@ from sim_server.backends.gpu.energies import BALANCE_TEXT, ELASTIC_TEXT
 from sim_server.backends.gpu.engine import EPILOGUE
 from sim_server.backends.gpu.inverse.expansion_batches import INVERSE
 from sim_server.backends.gpu.newton import BLOCK_NODES, NEWTON, bodies_of, node_ranges
+from sim_server.backends.gpu.rosenbrock import DECISION
 from sim_server.backends.gpu.solver import threads_and_blocks
 from sim_server.backends.gpu.structs import PCG
 from tests.support import nvrtc
@@ -42,7 +43,8 @@ def test_the_compiler_agrees_with_all_that_the_loop_shares(tmp_path):
     ("text", "declarations"),
     [
         ("pcg_structs.cuh", PCG), ("newton.cu", NEWTON), ("energy_balance.cu", BALANCE_TEXT),
-        ("elastic_energy.cu", ELASTIC_TEXT), ("step_epilogue.cu", EPILOGUE),
+        ("elastic_energy.cu", ELASTIC_TEXT), ("step_epilogue.cu", EPILOGUE), ("stages.cuh", structs.STAGES),
+        ("stage_decision.cu", DECISION),
         ("inverse/build_inverse.cu", INVERSE),
     ],
     ids=lambda value: value if isinstance(value, str) else "layouts",
@@ -51,7 +53,13 @@ def test_the_compiler_for_gpus_agrees(text: str, declarations: Declarations, tmp
     if (library := nvrtc.library()) is None:
         pytest.skip("needs the package nvidia-cuda-nvrtc")
     source = asserted(tmp_path, text, declarations)
-    options = [*device_options(PRECISIONS["float64"]), *own_headers(), "-arch=sm_90", "--Ofast-compile=max"]
+    options = [
+        *device_options(PRECISIONS["float64"]),
+        *own_headers(),
+        "-arch=sm_90",
+        "--Ofast-compile=max",
+        "-DBLOCK_ITEMS=32",
+    ]
     code, said = nvrtc.compiled(library, source, options)
     assert code and not said and "static_assert" in source.read_text(), said
 
@@ -67,7 +75,8 @@ def test_the_compiler_for_gpus_refuses_another_layout(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("threads", "blocks", "more"), [(256, 1, []), (128, 2, []), (64, 4, []), (64, 4, ["-DNEWTON_PHASES"])]
+    ("threads", "blocks", "more"),
+    [(256, 1, []), (128, 2, []), (64, 4, []), (64, 4, ["-DNEWTON_PHASES"]), (256, 1, ["-DSTAGES"])],
 )
 def test_the_solver_spills_no_registers(threads, blocks, more):
     """What does not fit into registers would cost a trip through L2 in each phase: it did, and doubled the time."""
@@ -98,6 +107,27 @@ def test_thread_blocks_take_all_registers():
     assert {pair for (bodies, _), pair in found.items() if bodies <= 124} == {(256, 1)}
     assert {key for key, pair in found.items() if pair == (128, 2)} == {(125, 720), (264, 160), (400, 720), (1000, 300)}
     assert {key for key, pair in found.items() if pair == (64, 4)} == {(265, 160), (1000, 299)}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("threads", "blocks"), [(256, 1), (128, 2), (64, 4)])
+def test_the_application_of_factors_spills_no_registers(threads, blocks):
+    if (library := nvrtc.library()) is None:
+        pytest.skip("needs the package nvidia-cuda-nvrtc")
+    options = [*device_options(PRECISIONS["float64"]), *own_headers(), "--ptxas-options=-v", "-arch=sm_90"]
+    options += [f"-DTHREADS={threads}", f"-DPER_PROCESSOR={blocks}"]
+    code, said = nvrtc.compiled(library, SOURCES / "backends/gpu/apply_factor.cu", options)
+    spilled = [int(n) for n in re.findall(r"(\d+) bytes (?:stack frame|spill stores|spill loads)", said)]
+    assert code and spilled and max(spilled) == 0, said
+
+
+def test_the_condition_of_a_branch_compiles():
+    """To PTX with a function that the driver has, as conditions.py compiles it."""
+    if (library := nvrtc.library()) is None:
+        pytest.skip("needs the package nvidia-cuda-nvrtc")
+    options = ["-arch=sm_80", "-rdc=true", "-std=c++17"]
+    code, said = nvrtc.compiled(library, SOURCES / "backends/gpu/set_condition.cu", options)
+    assert code and not said, said
 
 
 @pytest.mark.slow

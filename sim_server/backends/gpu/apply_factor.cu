@@ -5,7 +5,6 @@
 // The first application of a step chooses the form of each body's attempt (stages.cuh).
 #include "partitioned_inverse.cuh"
 #include "clock.cuh"
-#include "overlap.cuh"
 #include "stages.cuh"
 
 struct ApplicationMemory {  // static shared memory of a thread block
@@ -149,27 +148,13 @@ struct FactorApplication {
     }
 };
 
-// waits: the kernel before this one may still be running. No kernel of a graph writes the factor.
-__device__ __forceinline__ void apply_to_body(const PcgArguments& s, const StageSolve& t, const RowRange& range, bool waits) {
+__device__ __forceinline__ void apply_to_body(const PcgArguments& s, const StageSolve& t, const RowRange& range) {
     const int k = range.body;
     FactorApplication::bring(memory.body, s.bodies + k);
-    __syncthreads();
-    const PcgBody& body = memory.body;
-    PartitionedInverse inverse;
-    OwnPlaces own = {nullptr, nullptr};
-    if (body.plan && body.kind == CHOLESKY) {
-        FactorApplication::bring(memory.plan, body.plan);
-        __syncthreads();
-        Arena arena = {shared_memory, shared_memory + s.shared};
-        inverse.reserve(&memory.plan, arena);
-        own.set_up(range, body.scale, arena);
-        inverse.set_up(body, &memory.plan, range.index, arena);
-        inverse.fetch();
-    }
-    if (waits) wait_for_last();
     FactorApplication::bring(memory.state, t.state + k);
     if (threadIdx.x == THREADS - 1) memory.moving = s.moving[k];
     __syncthreads();
+    const PcgBody& body = memory.body;
     const bool decides = range.index == 0 && threadIdx.x == 0;
     bool alone = t.first_of_step ? may_use_factor(memory.state, body) : memory.state.form == FACTOR;
     const bool pulled = t.first_of_step && FactorApplication::pulled(t, body, range);
@@ -177,9 +162,19 @@ __device__ __forceinline__ void apply_to_body(const PcgArguments& s, const Stage
     PcgResult& sum = s.results[(s.step[0] % s.capacity) * s.count + k];
     if (decides && t.first_of_step) sum = no_solve(body);
     if (alone && memory.moving) {
+        FactorApplication::bring(memory.plan, body.plan);
+        __syncthreads();
         const long long begin = nanoseconds();
-        FactorApplication solver = {s, range, inverse, own, {range.index, body.blocks, s.exchange_number[k], s.block_sums + 8ll * s.grid * k, s.grid,
-                                               memory.scratch, memory.totals, (int)threadIdx.x % 32, (int)threadIdx.x / 32}};
+        Arena arena = {shared_memory, shared_memory + s.shared};
+        PartitionedInverse inverse;
+        OwnPlaces own;
+        inverse.reserve(&memory.plan, arena);
+        own.set_up(range, body.scale, arena);
+        inverse.set_up(body, &memory.plan, range.index, arena);
+        inverse.fetch();  // beside the exchange
+        FactorApplication solver = {s, range, inverse, own,
+                                    {range.index, body.blocks, s.exchange_number[k], s.block_sums + 8ll * s.grid * k, s.grid, memory.scratch,
+                                     memory.totals, (int)threadIdx.x % 32, (int)threadIdx.x / 32}};
         PcgResult out = no_solve(body);
         double inconsistency;
         alone = solver.apply(t, pulled, out, inconsistency);
@@ -196,18 +191,13 @@ __device__ __forceinline__ void apply_to_body(const PcgArguments& s, const Stage
 }
 
 extern "C" __global__ void __launch_bounds__(THREADS, PER_PROCESSOR) apply_factor(const PcgArguments s, const StageSolve t) {
-    let_next_come();
-    bool waits = true;
     for (int next = s.initial_range[blockIdx.x];; next = -1) {
-        if (next < 0) {
-            if (waits) wait_for_last();
-            waits = false;  // take the next body of the pool
+        if (next < 0) {  // take the next body of the pool
             if (threadIdx.x == 0) memory.next = s.pooled > 0 ? atomicAdd(s.pool_counter, 1) : s.pooled;
             __syncthreads();
             if (memory.next >= s.pooled) return;
             next = s.bodies[s.order[s.count - s.pooled + memory.next]].first_range;
         }
-        apply_to_body(s, t, s.row_ranges[next], waits);
-        waits = false;
+        apply_to_body(s, t, s.row_ranges[next]);
     }
 }

@@ -2,7 +2,6 @@
 """The CUDA device as the native GPU loop uses it: memory, streams and context of CuPy, functions of the driver."""
 
 import ctypes as c
-from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from functools import cached_property
 from typing import Any
@@ -12,8 +11,7 @@ from numpy.typing import NDArray
 
 from sim_server.backends.gpu import structs
 from sim_server.backends.gpu.conditions import Conditions
-from sim_server.backends.gpu.cupy_types import DeviceArray, Event, KernelFunction, Pointer, Stream
-from sim_server.backends.gpu.overlap import launch_overlapping
+from sim_server.backends.gpu.cupy_types import DeviceArray, Event, Pointer, Stream
 from sim_server.errors import DeviceError
 
 FUNCTIONS = {
@@ -78,13 +76,6 @@ class CudaDevice:
         Raises DeviceError.
         """
         return self._conditions.branch(flag)
-
-    def launch_overlapping(
-        self, function: KernelFunction, grid: int, block: int, arguments: Sequence[Any], shared: int = 0
-    ) -> None:
-        """Appends a launch to the current stream that overlaps with the one before it (overlap.cuh)."""
-        stream = int(self.cp.cuda.get_current_stream().ptr)
-        launch_overlapping(self._driver, function, grid, block, arguments, shared, stream)
 
     def error(self, code: int) -> str:
         """Returns text and number of a driver error."""

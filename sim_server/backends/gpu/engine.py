@@ -81,7 +81,7 @@ class GpuEngine(DeviceLoop):
         alone = stages is not None and stages.factor_alone
         self._whole_assembly = self._beginning(assemble)
         forces = cast(Sequence[DeviceLaunch], stages.first) if stages else ()
-        self._first_launches = self._beginning(forces, overlaps=True) if alone else self._whole_assembly
+        self._first_launches = self._beginning(forces) if alone else self._whole_assembly
         self._forces = fuse(forces) if alone else ()  # after a whole assembly, whose energy balance is made already
         phases = NewtonPhases.initial(gpu, bodies) if newton else None
         self.solver = PcgSolver(
@@ -201,15 +201,15 @@ class GpuEngine(DeviceLoop):
         """Launches the kernel that writes the time at which the step begins, for an idle device."""
         self._stamp_begin((1,), (1,), (self._epilogue,))
 
-    def _beginning(self, assemble: Sequence[DeviceLaunch], overlaps: bool = False) -> Sequence[Callable[[], None]]:
-        """Fuses the assembly with the energy balance of the step before. overlaps: kernels may overlap.
+    def _beginning(self, assemble: Sequence[DeviceLaunch]) -> Sequence[Callable[[], None]]:
+        """Fuses the assembly with the energy balance of the step before.
 
         The balance is the prologue of a kernel over elements, since these write nothing that it reads. If it freezes a
         body meanwhile, the element results of this body do not matter, since its nodes are fixed then.
         """
         domains = {launch.domain for launch in assemble}
         elements = "elements" in domains and domains <= set(DOMAINS)
-        launches = fuse(assemble, prologue=self._energies.prologue if elements else None, overlaps=overlaps)
+        launches = fuse(assemble, prologue=self._energies.prologue if elements else None)
         if not elements:
             return [self._energies.launch_balance, *launches]
         first = launches[0]
@@ -233,11 +233,8 @@ class GpuEngine(DeviceLoop):
 
     def _one_step(self) -> None:
         """Appends a whole step to the stream."""
-        if self._stages and self._stages.alone:
-            self._stages.launch_assembly(self._first_launches)
-        else:
-            for launch in self._first_launches:
-                launch()
+        for launch in self._first_launches:
+            launch()
         self._finish_step()
 
     def _finish_step(self) -> None:

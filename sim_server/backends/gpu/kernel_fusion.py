@@ -12,7 +12,7 @@ ascending).
 
 import re
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,16 +23,6 @@ from sim_server.backends.gpu.device import DeviceLaunch, compiled, cupy, options
 
 DOMAINS = ("elements", "nodes", "blocks")
 NUMBERS: dict[str, type[np.number[Any]]] = {"int": np.int32, "float": np.float32, "double": np.float64}
-
-
-class Overlaps(Protocol):
-    """A device that launches kernels so that they overlap (cuda.CudaDevice)."""
-
-    def launch_overlapping(
-        self, function: KernelFunction, grid: int, block: int, arguments: Sequence[Any], shared: int = 0
-    ) -> None:
-        """Appends a launch to the current stream that overlaps with the one before it."""
-        ...
 
 
 class BlockShape(NamedTuple):
@@ -108,12 +98,12 @@ class FusedKernel:
     """Launches several kernels over the same items as one.
 
     private: addresses of arrays that need no memory, since only these launches use them (`own`)
-    exact, overlaps: see FusedSource
+    exact: see FusedSource
     """
 
     def __init__(
         self, launches: Sequence[DeviceLaunch], epilogue: Epilogue | None = None, private: frozenset[int] = frozenset(),
-        guard: PhaseGuard | None = None, prologue: Prologue | None = None, exact: bool = False, overlaps: bool = False,
+        guard: PhaseGuard | None = None, prologue: Prologue | None = None, exact: bool = False,
     ):  # fmt: skip
         self.name = "+".join(launch.name for launch in launches)
         self.items = next(launch.items for launch in launches if not launch.mailed)
@@ -121,7 +111,7 @@ class FusedKernel:
         self.shape = block_shape(launches[0].domain if sums else "elements", self.items, processors())
         self._launches = list(launches)  # keeps their arrays
         self._prologue_blocks = prologue.blocks if prologue else 0
-        text = FusedSource(launches, self.shape, epilogue, private, guard, prologue, exact, overlaps)
+        text = FusedSource(launches, self.shape, epilogue, private, guard, prologue, exact)
         self._arguments = (np.int32(self.items), *text.values, *(x.params for x in (epilogue, prologue) if x))
         flags = (*options(launches[0].types), *own_headers())
         self._module = cupy().RawModule(code=text.source, options=flags, backend="nvrtc")
@@ -135,16 +125,8 @@ class FusedKernel:
     def __call__(self) -> None:
         """Appends the launch to the current stream."""
         if self.items or self._has_epilogue:
-            self._function((self._blocks,), (self.shape.threads,), self._arguments)
-
-    @property
-    def _blocks(self) -> int:
-        return self._prologue_blocks + max(1, -(-self.items * self.shape.lanes // self.shape.threads))
-
-    def launch_overlapping(self, device: Overlaps) -> None:
-        """Appends a launch that overlaps with the one before it; only with `overlaps`."""
-        if self.items or self._has_epilogue:
-            device.launch_overlapping(self._function, self._blocks, self.shape.threads, self._arguments)
+            blocks = max(1, -(-self.items * self.shape.lanes // self.shape.threads))
+            self._function((self._prologue_blocks + blocks,), (self.shape.threads,), self._arguments)
 
 
 class FusedSource:
@@ -156,7 +138,6 @@ class FusedSource:
     private: addresses of arrays that need no memory
     guard: thread blocks return at once if they have no item of a body whose step is not made, unless there is an
         epilogue
-    overlaps: the kernel waits for the one before it (overlap.cuh)
     exact: other items of bodies whose step is made are left out, too; not for kernels whose threads write rows together
 
     source: the text
@@ -166,7 +147,7 @@ class FusedSource:
     def __init__(
         self, launches: Sequence[DeviceLaunch], shape: BlockShape, epilogue: Epilogue | None = None,
         private: frozenset[int] = frozenset(), guard: PhaseGuard | None = None, prologue: Prologue | None = None,
-        exact: bool = False, overlaps: bool = False,
+        exact: bool = False,
     ):  # fmt: skip
         self._launches, self._private, self._exact = launches, private, exact
         self._restrict = "" if epilogue and epilogue.reads else "__restrict__ "
@@ -182,9 +163,7 @@ class FusedSource:
         }  # fmt: skip
         lines = ["#define ITEMS_ONLY", f"#define BLOCK_ITEMS {shape.threads // shape.lanes}"]
         headers = [h for text in texts for h in re.findall(r'^#include "[^"]+"', text, re.MULTILINE)]
-        lines += dict.fromkeys(
-            [*headers, '#include "warp_reduce.cuh"', '#include "overlap.cuh"']
-        )  # outside of the texts' namespaces, once
+        lines += dict.fromkeys([*headers, '#include "warp_reduce.cuh"'])  # outside of the texts' namespaces, once
         for text, name in texts.items():
             body = re.sub(r"^#(include|define WIDE).*$", "", text, flags=re.MULTILINE)
             lines += [f"namespace {name} {{", body, "}"]
@@ -193,8 +172,7 @@ class FusedSource:
             lines.append(epilogue.text)
             self._parameters.append(f"const {epilogue.struct} epilogue")
             body_lines.append(f"{epilogue.function}(epilogue);")
-        opening = ["let_next_come();", "wait_for_last();"] if overlaps else []
-        opening += [f"const int block = (int)blockIdx.x - {prologue.blocks if prologue else 0};"]
+        opening = [f"const int block = (int)blockIdx.x - {prologue.blocks if prologue else 0};"]
         if prologue:
             lines.append(prologue.text)
             self._parameters.append(f"const {prologue.struct} prologue")
@@ -303,23 +281,18 @@ def fuse(
     launches: Sequence[DeviceLaunch],
     guard: Callable[[Sequence[DeviceLaunch]], PhaseGuard] | None = None,
     prologue: Prologue | None = None,
-    overlaps: bool = False,
 ) -> list[FusedKernel | DeviceLaunch]:
     """Fuses launches into as few kernels as their domains allow.
 
     guard: makes the guard of a kernel from its launches
     prologue: of the first kernel
-    overlaps: the kernels may be launched so that they overlap
     """
     if any(launch.domain not in DOMAINS for launch in launches):
         return list(launches)
     together = [group for d in DOMAINS for group in _by_items([x for x in launches if x.domain == d])]
     together = [group for group in together if group]
     return [
-        FusedKernel(
-            group, None, _private(group, launches), guard(group) if guard else None, None if k else prologue,
-            overlaps=overlaps,
-        )
+        FusedKernel(group, None, _private(group, launches), guard(group) if guard else None, None if k else prologue)
         for k, group in enumerate(together)
     ]  # fmt: skip
 

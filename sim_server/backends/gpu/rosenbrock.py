@@ -17,7 +17,7 @@ from sim_server.backends.base import Launch
 from sim_server.backends.declarations import Declarations
 from sim_server.backends.gpu.cupy_types import DeviceArray
 from sim_server.backends.gpu.device import DeviceLaunch, Gpu
-from sim_server.backends.gpu.kernel_fusion import Epilogue, FusedKernel, Overlaps, PhaseGuard, fuse
+from sim_server.backends.gpu.kernel_fusion import Epilogue, FusedKernel, PhaseGuard, fuse
 from sim_server.backends.gpu.newton import bodies_of
 from sim_server.backends.gpu.solver import PcgSolver
 from sim_server.backends.gpu.structs import STAGE_SOLVE, STAGE_STATE
@@ -28,11 +28,10 @@ STAGE_DECISION = DECISION.dtype("StageDecision")
 ATTEMPTS = 5  # solves in the graph of a step: two by factors, two by iterations, one of backward Euler
 FACTOR, ITERATE, EULER = (FORMS[name] for name in ("FACTOR", "ITERATE", "EULER"))
 
+Launchable = FusedKernel | DeviceLaunch
 
-Guard = Callable[[Sequence[DeviceLaunch]], PhaseGuard]
 
-
-class Branches(Overlaps, Protocol):
+class Branches(Protocol):
     """A device whose graphs have branches (cuda.CudaDevice)."""
 
     def branch(self, flag: DeviceArray) -> AbstractContextManager[None]:
@@ -86,16 +85,16 @@ class RosenbrockStep:
     def _make_kernels(self, assemble: Sequence[DeviceLaunch]) -> None:
         stages = self._stages
         again, euler = (cast(Sequence[DeviceLaunch], x) for x in (stages.again, stages.euler))
-        self._second, self._again = self._nodal(stages.second, guarded=False), _fused(again, overlaps=True)
+        self._again = fuse(again)
         self._first_finish = self._finish(stages.finish, FACTOR if self.alone else ITERATE, guarded=False)
-        self._euler = _fused(euler, self._guard)
+        self._euler = fuse(euler, self._guard)
         self._back = self._nodal(stages.restore_for_euler)
         self._advance = self._finish(stages.advance_euler, EULER)
         if not self.alone:
             return
         self._restore = self._nodal(stages.restore)
-        self._assemble = _fused([*assemble, cast(DeviceLaunch, stages.remember)], self._guard)
-        self._guarded_again = _fused(again, self._guard)
+        self._assemble = fuse([*assemble, cast(DeviceLaunch, stages.remember)], self._guard)
+        self._guarded_again = fuse(again, self._guard)
         self._guarded_second = self._nodal(stages.second)
         self._guarded_finish = self._finish(stages.finish, ITERATE)
 
@@ -114,8 +113,7 @@ class RosenbrockStep:
     def _nodal(self, launch: Launch, epilogue: Epilogue | None = None, guarded: bool = True) -> FusedKernel:
         """Returns the kernel of a nodal launch; guarded: for bodies whose step is not made."""
         group = [cast(DeviceLaunch, launch)]
-        guard = self._guard(group) if guarded else None
-        return FusedKernel(group, epilogue, guard=guard, exact=guarded, overlaps=not guarded)
+        return FusedKernel(group, epilogue, guard=self._guard(group) if guarded else None, exact=guarded)
 
     def _finish(self, launch: Launch, attempt: int, guarded: bool = True) -> FusedKernel:
         """Returns the kernel that ends an attempt, with the decision."""
@@ -136,31 +134,21 @@ class RosenbrockStep:
         stage["form"], stage["first_of_step"], stage["first_of_attempt"] = form, first_of_step, first_of_attempt
         return stage
 
-    def launch_assembly(self, kernels: Sequence[Callable[[], None]]) -> None:
-        """Appends the assembly of the first stage; its first kernel comes after a branch, which nothing overlaps."""
-        for k, kernel in enumerate(kernels):
-            if k and isinstance(kernel, FusedKernel):
-                kernel.launch_overlapping(self._device)
-            else:
-                kernel()
-
     def launch(self) -> None:
         """Appends the step after the assembly of its first stage, while a graph is captured."""
         if self.alone:
-            device, solver = self._device, self._solver
-            solver.apply_factors(device, 0, self._solve(FACTOR, first_of_step=True, first_of_attempt=True))
-            for kernel in (self._second, *self._again):
-                kernel.launch_overlapping(device)
-            solver.apply_factors(device, 1, self._solve(FACTOR))
-            self._first_finish.launch_overlapping(device)
+            self._solver.apply_factors(0, self._solve(FACTOR, first_of_step=True, first_of_attempt=True))
+            _launch(self._stages.second, *self._again)
+            self._solver.apply_factors(1, self._solve(FACTOR))
+            self._first_finish()
             with self._device.branch(self._left):
                 _launch(self._restore, *self._assemble)
                 self._iterate(False, self._guarded_second, self._guarded_again, self._guarded_finish)
         else:
-            self._iterate(True, self._second, self._again, self._first_finish)
+            self._iterate(True, self._stages.second, self._again, self._first_finish)
 
     def _iterate(
-        self, first_of_step: bool, second: FusedKernel, again: Sequence[FusedKernel], finish: FusedKernel
+        self, first_of_step: bool, second: Launch | FusedKernel, again: Sequence[Launchable], finish: FusedKernel
     ) -> None:
         """Appends an attempt by iterations, and the branch of backward Euler."""
         self._solver.iterate(2, self._solve(ITERATE, first_of_step, first_of_attempt=True))
@@ -182,13 +170,6 @@ class RosenbrockStep:
         runtime.memcpyAsync(to.data.ptr, pair.data.ptr, to.nbytes, runtime.memcpyDeviceToDevice, stream)
 
 
-def _fused(launches: Sequence[DeviceLaunch], guard: Guard | None = None, overlaps: bool = False) -> list[FusedKernel]:
-    """Fuses launches, all of which have domains that can be fused."""
-    found = fuse(launches, guard, overlaps=overlaps)
-    assert all(isinstance(kernel, FusedKernel) for kernel in found), [kernel.name for kernel in found]
-    return cast(list[FusedKernel], found)
-
-
-def _launch(*launches: FusedKernel) -> None:
+def _launch(*launches: Launch | FusedKernel) -> None:
     for launch in launches:
         launch()

@@ -15,7 +15,6 @@ from sim_server.backends.gpu.device import Gpu, compiled, options, own_headers
 from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder, PartitionedInverse
 from sim_server.backends.gpu.inverse.device_plan import DevicePlan, shared_bytes
 from sim_server.backends.gpu.inverse.plan import plan
-from sim_server.backends.gpu.kernel_fusion import Overlaps
 from sim_server.backends.gpu.row_partition import SPARED, best_assignment, halo, initial_ranges
 from sim_server.backends.gpu.structs import PCG, PCG_RESULT, STAGES
 
@@ -23,8 +22,6 @@ PCG_BODY = PCG.dtype("PcgBody")
 SETTINGS_BYTES = PCG_BODY.fields["factor_step"][1]  # type: ignore[index]
 """Bytes of a PCG_BODY before the factor: the settings."""
 PCG_ARGUMENTS = PCG.dtype("PcgArguments")
-BESIDE = 28 * 1024
-"""Bytes of shared memory of a multiprocessor left to kernels beside which a factor is copied there (apply_factor.cu)."""
 
 
 def threads_and_blocks(nodes: Int64, processors: int) -> tuple[int, int]:
@@ -127,20 +124,17 @@ class PcgSolver:
 
     def iterate(self, number: int, stage: NDArray[Any]) -> None:
         """Launches solve `number` of a Rosenbrock-W step by iterations. stage: STAGE_SOLVE."""
-        params = self._stage_arguments(number)
-        self._function((self.grid,), (self.threads,), (params, stage), shared_mem=self._shared)
+        self._launch_stage(self._function, number, stage)
 
-    def apply_factors(self, device: Overlaps, number: int, stage: NDArray[Any]) -> None:
+    def apply_factors(self, number: int, stage: NDArray[Any]) -> None:
         """Launches solve `number` of a Rosenbrock-W step by factors alone (apply_factor.cu)."""
         assert self._application is not None
-        params, shared = self._stage_arguments(number), self._shared - BESIDE
-        params["shared"] = shared
-        device.launch_overlapping(self._application, self.grid, self.threads, (params, stage), shared)
+        self._launch_stage(self._application, number, stage)
 
-    def _stage_arguments(self, number: int) -> NDArray[Any]:
+    def _launch_stage(self, function: KernelFunction, number: int, stage: NDArray[Any]) -> None:
         params = self._params.copy()
         params["pool_counter"] += np.uint64(self.pool_counter.dtype.itemsize * number)
-        return params
+        function((self.grid,), (self.threads,), (params, stage), shared_mem=self._shared)
 
     def plan(self, body: int, pattern: FactorPattern) -> DevicePlan:
         """Returns the plan of the inverse of factors of this pattern for a body.
@@ -150,12 +144,11 @@ class PcgSolver:
         blocks = int(self.bodies[body]["blocks"])
         key = (pattern.id, blocks)
         if key not in self._plans:
-            shared = self._shared - (BESIDE if self._attempts else 0)
-            found = plan(pattern, blocks, planes=self.planes, shared=shared)
-            if (needed := shared_bytes(found)) > shared:
+            found = plan(pattern, blocks, planes=self.planes, shared=self._shared)
+            if (needed := shared_bytes(found)) > self._shared:
                 raise ValueError(
                     f"{pattern.size} degrees of freedom in {blocks} thread blocks need {needed} bytes of shared memory "
-                    f"each, allowed: {shared}"
+                    f"each, allowed: {self._shared}"
                 )
             device_plan = DevicePlan(self.gpu, found, self.threads // 32)
             self._builders[key] = InverseBuilder(self.gpu, pattern, found)
