@@ -94,7 +94,8 @@ class SolverOptions(Parameters):
         default="float64", description="of the kernels: mixed = elements in float32, the rest in float64"
     )
     factor_precision: FactorPrecision = Field(
-        default="auto", description="of the factor as applied; auto: float16 on a GPU, float32 on a CPU"
+        default="auto",
+        description="of the factor as applied; auto: float32 on a CPU and where it is used alone (ros2), else float16",
     )
     budget: float = Field(default=0.0, ge=0, description="wall time per solve [s]; 0 = none")
     on_runaway: OnRunaway = Field(

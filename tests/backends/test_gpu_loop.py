@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 
 from sim_server.backends.gpu.loop import BATCH, CAPACITY, FRAMES
-from sim_server.backends.gpu.structs import NEWTON_RESULT
+from sim_server.backends.gpu.structs import NEWTON_RESULT, STAGE_RESULT
+from sim_server.backends.rosenbrock import FORMS
 from sim_server.errors import DeviceLost
 from tests.backends.fake_cuda import BALANCE_GRAPH, ELASTIC_GRAPH, NOT_READY, STEPS, TIMED, FakeScene, number
 
+MATRIX_GRAPH = 13
 ONE_STEP = next(graph for graph, steps in STEPS.items() if steps == 1 and graph not in TIMED)
 
 
@@ -65,6 +67,33 @@ def test_what_a_search_has_come_to_is_reported_where_there_is_one():
     assert (records["nonlinear"] == 0.5).all()
     records = once.loop.records()
     assert (records["linearizations"] == 1).all() and (records["nonlinear"] == -1).all()
+
+
+def test_form_and_estimate_are_reported_where_there_are_stages():
+    scene, found = FakeScene(bodies=2), np.zeros((CAPACITY, 2), STAGE_RESULT)
+    slots = np.arange(2 * CAPACITY).reshape(-1, 2)
+    found["form"], found["estimate"] = slots % 3 + 1, 1e-3 * slots
+    scene.loop.loop.stage_results = found.ctypes.data
+    scene.loop.run(100)
+    records = scene.loop.records()
+    slot = 2 * ((records["step"] - 1) % CAPACITY) + records["body"]
+    assert records["form"].tolist() == (slot % 3 + 1).tolist() and (records["estimate"] == 1e-3 * slot).all()
+    by_factor = records["form"] == FORMS["FACTOR"]
+    assert np.isnan(records["residual"][by_factor]).all() and np.isfinite(records["residual"][~by_factor]).all()
+
+
+def test_a_matrix_is_made_between_steps_only_for_a_copy():
+    scene, made, target = FakeScene(bodies=2), [], np.zeros((2, 3, 3))
+    scene.device.graphs[MATRIX_GRAPH] = lambda: (made.append(scene.done), scene.values.fill(100 + scene.done))
+    scene.loop.loop.matrix = MATRIX_GRAPH
+    scene.loop.run(5)
+    positions = np.zeros((2, 3))
+    scene.loop.request_positions(0, positions)
+    scene.loop.run(5)
+    assert not made and scene.loop.matrix_step(0) == 5 and (positions == 6).all()
+    scene.loop.request_matrix(1, target)
+    scene.loop.run(5)
+    assert made == [11] and scene.loop.matrix_step(1) == 10 and (target == 111).all()
 
 
 def test_the_elastic_energy_is_evaluated_after_the_steps_where_it_is_wanted():

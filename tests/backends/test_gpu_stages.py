@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Decisions of the Rosenbrock-W step on a GPU, made by threads of the processor: estimates, next attempts, end of step."""
+"""Decisions of the Rosenbrock-W step on a GPU, made by threads of the processor."""
 
 import ctypes as c
 import subprocess
