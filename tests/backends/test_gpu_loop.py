@@ -82,7 +82,7 @@ def test_form_and_estimate_are_reported_where_there_are_stages():
     assert np.isnan(records["residual"][by_factor]).all() and np.isfinite(records["residual"][~by_factor]).all()
 
 
-def test_a_matrix_is_made_between_steps_only_for_a_copy():
+def test_a_matrix_that_no_step_makes_is_made_before_the_step_for_a_copy():
     scene, made, target = FakeScene(bodies=2), [], np.zeros((2, 3, 3))
     scene.device.graphs[MATRIX_GRAPH] = lambda: (made.append(scene.done), scene.values.fill(100 + scene.done))
     scene.loop.loop.matrix = MATRIX_GRAPH
@@ -93,7 +93,13 @@ def test_a_matrix_is_made_between_steps_only_for_a_copy():
     assert not made and scene.loop.matrix_step(0) == 5 and (positions == 6).all()
     scene.loop.request_matrix(1, target)
     scene.loop.run(5)
-    assert made == [11] and scene.loop.matrix_step(1) == 10 and (target == 111).all()
+    assert made == [10] and scene.loop.matrix_step(1) == 10 and (target == 110).all()
+    scene.loop.request_positions(0, positions)
+    scene.loop.request_matrix(1, target)
+    for _ in range(2):  # one kind of copy at a time
+        scene.loop.run(5)
+    assert made == [10, 15] and scene.loop.matrix_step(1) == 15 and (target == 115).all()
+    assert scene.loop.matrix_step(0) == 20 and (positions == 21).all()
 
 
 def test_the_elastic_energy_is_evaluated_after_the_steps_where_it_is_wanted():

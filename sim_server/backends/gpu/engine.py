@@ -218,12 +218,12 @@ class GpuEngine(DeviceLoop):
         return launches
 
     def _matrix_launches(self, assemble: Sequence[DeviceLaunch]) -> Sequence[Callable[[], None]]:
-        """Returns the launches that make A of the present state between two steps."""
+        """Returns the launches that make A of the next step, for a copy."""
         return [self._energies.launch_balance, *fuse(assemble)]
 
     def _assemble_matrix(self) -> None:
-        """Appends the assembly of A between two steps, which leaves no trace: the balance of the last step, which
-        reads what touches exert, comes first, and what the assembly writes for the next one is cleared."""
+        """Appends the assembly of A of the next step, which leaves no trace: the balance of the last step, which reads
+        what touches exert, comes first, and what the assembly leaves for the balance and the solve is cleared."""
         for launch in self._matrix:
             launch()
         runtime, stream = self.gpu.cp.cuda.runtime, self.gpu.cp.cuda.get_current_stream().ptr

@@ -44,7 +44,7 @@ static bool count(GpuLoop& l, int64_t steps) {
     const bool energy = energy_due(l.rings, l.launched), frame = frame_due(l.rings, l.launched);
     if (energy || frame) CALL(graph_launch, l.energy_balance, l.stream);  // a frame shows frozen bodies at their last valid state
     if (energy) CALL(graph_launch, l.elastic_energy, l.stream);
-    return begin_matrices(l) && copy_frame(l);
+    return begin_matrices(l, false) && copy_frame(l);
 }
 
 static bool close_batch(GpuLoop& l) {
@@ -73,6 +73,7 @@ static bool launch_batch(GpuLoop& l, int64_t steps) {
         bool undisturbed = none_within(l, l.rings.frame_every.load(), n) && none_within(l, l.rings.energy_every.load(), n);
         bool wanted = l.requested.load(std::memory_order_relaxed) && l.matrix_step < 0;
         if (!l.graphs[0][1] || left < n || !undisturbed || wanted) n = 1;
+        if (wanted && !begin_matrices(l, true)) return false;
         CALL(graph_launch, l.graphs[l.ran_dry][n > 1], l.stream);
         l.ran_dry = 0;
         if (!count(l, n)) return false;
@@ -174,7 +175,7 @@ int32_t wf_gpu_wait(GpuLoop* loop) { return wait(*loop); }
 
 // One step whose kernels the caller launches, between `open` and `close`. `renew` reads the slots of settings and factors again, with
 // nothing under way; these slots come first. Arguments of launches that have run wait for the next step.
-int32_t wf_gpu_open(GpuLoop* loop) { return begin(*loop) && open_batch(*loop); }
+int32_t wf_gpu_open(GpuLoop* loop) { return begin(*loop) && open_batch(*loop) && begin_matrices(*loop, true); }
 int32_t wf_gpu_renew(GpuLoop* loop) { return deliver(*loop, loop->batches[loop->begun % STEP_BATCHES], 2 * loop->bodies); }
 int32_t wf_gpu_close(GpuLoop* loop) {
     GpuLoop& l = *loop;

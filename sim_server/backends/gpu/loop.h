@@ -74,7 +74,7 @@ struct GpuLoop {
     const StageResult* stage_results;      // (capacity, bodies) likewise; null: no scheme with stages
     void* energy_balance;                  // graph that writes the energy record of the last step, unless that has been done
     void* elastic_energy;                  // graph that adds the elastic energy to it
-    void* matrix;                          // graph that makes A between two steps; null: each step makes its own
+    void* matrix;                          // graph that makes A of the next step, for a copy; null: each step makes its own
     int64_t capacity, batch;               // batch: most steps in one; divides the capacity
     Address values, staged;                // A of all bodies; memory of the same size for copies of it
     char* host_matrices;                   // pinned, of the same size

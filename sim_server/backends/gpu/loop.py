@@ -129,7 +129,7 @@ class DeviceLoop(Reports):
         graphs: one step, MANY steps (0: none), then the same two beginning with the kernel that writes the time
         energy_balance: writes the energy record of the last step
         elastic_energy: adds the elastic energy to it
-        matrix: makes A between two steps; 0: each step makes its own
+        matrix: makes A of the next step, for a copy; 0: each step makes its own
         """
         self.loop.graphs[0][:], self.loop.graphs[1][:] = graphs[:2], graphs[2:]
         self.loop.energy_balance, self.loop.elastic_energy = energy_balance, elastic_energy

@@ -7,20 +7,29 @@
 // Bytes of the copy under way. Positions use the staging memory of the blocks, of which each node has at least one.
 static int64_t readback_bytes(const BodyReadback& body) { return body.in_flight == REQUEST_VALUES ? body.values_bytes : body.x_bytes; }
 
-static bool begin_matrices(GpuLoop& l) {
-    if (l.matrix_step >= 0 || !l.requested.exchange(0, std::memory_order_acquire)) return true;
-    bool assembled = !l.matrix;
+// Whether a request is met before a step: a matrix that no step makes by itself is made then. All others are met after a step.
+static bool met_before(const GpuLoop& l, int32_t request) { return l.matrix && request == REQUEST_VALUES; }
+
+// Begins the copies that are met before, or after, the step launched next, or last.
+static bool begin_matrices(GpuLoop& l, bool before) {
+    if (l.matrix_step >= 0 || (before && !l.matrix) || !l.requested.exchange(0, std::memory_order_acquire)) return true;
+    bool any = false, others = false;
     for (int i = 0; i < l.bodies; ++i) {
         BodyReadback& body = l.readbacks[i];
-        body.in_flight = body.requested.exchange(0, std::memory_order_acquire);
-        if (!body.in_flight) continue;
-        if (body.in_flight == REQUEST_VALUES && !assembled) {
-            CALL(graph_launch, l.matrix, l.stream);
-            assembled = true;
+        int32_t request = body.requested.load(std::memory_order_acquire);
+        if (!request) continue;
+        if (met_before(l, request) != before || !body.requested.compare_exchange_strong(request, 0)) {
+            others = true;
+            continue;
         }
-        Address from = body.in_flight == REQUEST_VALUES ? l.values + body.values_begin : l.x + body.x_begin;
+        body.in_flight = request;
+        if (before && !any) CALL(graph_launch, l.matrix, l.stream);
+        any = true;
+        Address from = request == REQUEST_VALUES ? l.values + body.values_begin : l.x + body.x_begin;
         CALL(on_device, l.staged + body.values_begin, from, (size_t)readback_bytes(body), l.stream);
     }
+    if (others) l.requested.store(1, std::memory_order_release);
+    if (!any) return true;
     CALL(event_record, l.staged_event, l.stream);
     CALL(stream_wait, l.copy_stream, l.staged_event, 0);
     for (int i = 0; i < l.bodies; ++i) {
@@ -29,7 +38,7 @@ static bool begin_matrices(GpuLoop& l) {
             CALL(to_host, l.host_matrices + body.values_begin, l.staged + body.values_begin, (size_t)readback_bytes(body), l.copy_stream);
     }
     CALL(event_record, l.copied_event, l.copy_stream);
-    l.matrix_step = l.launched - 1;  // steps completed before the matrix was assembled; positions, and matrices of l.matrix, are those after that step
+    l.matrix_step = before ? l.launched.load() : l.launched - 1;  // steps completed before the matrix was assembled; positions are those after that step
     return true;
 }
 

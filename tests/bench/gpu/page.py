@@ -110,6 +110,7 @@ def _steps(report: Report, data: Data) -> None:
         "us p50", "us p99", "us max", "between us", "host CPU us", "solve us", "iterations", "most", "residual",
         "factor age", "oldest", "factor ms", "expansion ms", "library", "CG us", "CG iterations", "block Jacobi us",
         "block Jacobi iterations", "unconverged",
+        *(c for c in ("by factor %", "by iterate %", "by euler %", "estimate m") if any(c in r for r in rows)),
     )  # fmt: skip
     if single := [r for r in rows if r["beams"] == 1]:
         report.say("## One beam")

@@ -158,8 +158,8 @@ def renewed(beams: Beams, found: Found) -> None:
         found.made.append(1e3 * (middle - begin) / len(factors))
         found.taken.append(1e3 * (time.perf_counter() - middle) / beams.problem.beams)
         found.sample = beams.sample(matrices[0], factors[0])
-    between = beams.sim.scene.integrator.scheme == "ros2"  # no system of a step is left then
-    found.residuals.append(np.nan if between else found.sample.residual(found.sample.solution))
+    stages = beams.sim.scene.integrator.scheme == "ros2"  # b and y are those of the second one
+    found.residuals.append(np.nan if stages else found.sample.residual(found.sample.solution))
 
 
 def rounds(beams: Beams, count: int, without: int) -> Found:
