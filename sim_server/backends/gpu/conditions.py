@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Conditional nodes of CUDA graphs: work that a captured graph does only if a number on the device is not 0.
 
-An untaken branch costs as much as half a dozen empty kernels, whatever it holds. CuPy has no interface to it, so the driver is called.
+An untaken branch costs as much as half a dozen empty kernels, whatever it holds. CuPy has no interface to it, so the
+driver is called.
 Source: CUDA driver API, graph management (CUDA 12.4 and above).
 """
 
