@@ -106,7 +106,7 @@ def test_by_the_factor_alone(body):
     )
     _, gpu = both(make, 30, near=1e-5)
     by_factor = gpu.records["form"] == FACTOR
-    assert by_factor.sum() > 20 and np.isnan(gpu.records["residual"][by_factor]).all()
+    assert by_factor.sum() > 20 and (gpu.records["residual"][by_factor] < 0.1).all()
     assert (gpu.records["iterations"][by_factor] == 0).all() and (gpu.records["solve"] > 0).all()
     assert (gpu.records["estimate"] > 0).all()
 

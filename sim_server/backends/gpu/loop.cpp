@@ -109,7 +109,7 @@ static void report(GpuLoop& l, const StepBatch& batch, int64_t k, double end, do
         if (l.stage_results) {
             record.form = l.stage_results[slot + i].form;
             record.estimate = l.stage_results[slot + i].estimate;
-            if (record.form == FACTOR) record.residual = NAN;  // not evaluated
+            if (record.form == FACTOR) record.residual = l.stage_results[slot + i].inconsistency;
         }
         if (l.energy_records) note_energy(record, l.energy_records[slot + i]);
     }

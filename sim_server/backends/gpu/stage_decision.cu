@@ -4,6 +4,10 @@
 #include "stages.cuh"
 #include "step_epilogue.cuh"
 
+#ifndef BLOCK_ITEMS
+#define BLOCK_ITEMS 128  // where this text is compiled alone
+#endif
+
 struct StageDecision {
     StepEpilogue end;
     StageState* state;             // (bodies,)
@@ -48,7 +52,7 @@ __device__ void decide(const StageDecision& t) {
         const double estimate = __longlong_as_double(__ldcg(t.largest + k));
         t.largest[k] = 0;
         if (judge(s, t.rows[k], t.attempt, estimate, t.bound[k], t.end.moving[k] != 0, step)) {
-            t.results[slot + k] = {s.estimate, s.form};
+            t.results[slot + k] = {s.estimate, s.inconsistency, s.form};
             t.phase[k] = MADE;
         } else {
             atomicAdd(&left, 1);

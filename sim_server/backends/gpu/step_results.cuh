@@ -14,9 +14,10 @@ struct NewtonResult {
     int linearizations;
 };
 
-struct StageResult {      // of a step by stages
-    double estimate;      // of the error of the last attempt by stages, the largest of a node [m]
-    int form;             // StepForm
+struct StageResult {       // of a step by stages
+    double estimate;       // of the error of the last attempt by stages, the largest of a node [m]
+    double inconsistency;  // of the factor that stood alone (step_form.h)
+    int form;              // StepForm
 };
 
 struct StepTimestamp { long long begin, end; };  // ns of the device's clock
