@@ -18,7 +18,8 @@ from tests.state import put
 CELLS = {  # by number of tetrahedra
     162: (3, 3, 3), 540: (3, 3, 10), 3000: (5, 5, 20), 24_000: (10, 10, 40), 98_304: (16, 16, 64),
 }  # fmt: skip
-LENGTH = 4.0  # m
+SIZE = (1.0, 1.0, 4.0)  # m
+LENGTH = SIZE[2]
 BANDS = (("Z < 1.3334", 5.0), ("Z < 2.6667", 0.25), (None, 0.05))  # of E: 1000:50:10 from the held end
 FRAME = 0.04  # s between two frames that are compared
 NOT_FINITE, RUNAWAY = 5, 7  # statuses of a solve
@@ -41,6 +42,7 @@ class Bar:
     beta: float = 0.0
     gravity: bool = True
     held: bool = True
+    tangent: str = "default"  # of corotational
 
     @property
     def material(self) -> str:
@@ -49,7 +51,7 @@ class Bar:
 
     def table(self, dt: float, method: "Method") -> dict[str, Any]:
         """The scene."""
-        mesh = {"bar": list(CELLS[self.tets]), "size": [1.0, 1.0, LENGTH], "split": "mirrored"}
+        mesh = {"bar": list(CELLS[self.tets]), "size": list(SIZE), "split": "mirrored"}
         effects: dict[str, Any] = {self.model: self._law()}
         if self.damping or self.beta:
             effects["rayleigh"] = {"mass": self.damping, "stiffness": self.beta}
@@ -66,7 +68,8 @@ class Bar:
         young: Any = self.young
         if self.bands:
             young = [{"young": share * self.young} | ({"where": where} if where else {}) for where, share in BANDS]
-        return {"young": young} | ({} if self.model == "mass_spring" else {"poisson": self.poisson})
+        tangent = {} if self.tangent == "default" else {"tangent": self.tangent}
+        return {"young": young, **tangent} | ({} if self.model == "mass_spring" else {"poisson": self.poisson})
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from tests.bench.rosenbrock.bars import (
     Method,
     Reals,
     Row,
+    Start,
     energy,
     load,
     momenta,
@@ -29,16 +30,25 @@ UNDAMPED = (EULER, ROS2_ITERATE, ROS2_FACTOR.aged(10))
 FREE = (EULER, NEWMARK, BDF2, ROS2_ITERATE, *(ROS2_FACTOR.aged(latency) for latency in LATENCIES))
 
 
+def _noting(energies: list[float]) -> Start:
+    def start(sim: Simulation) -> None:
+        energies.append(energy(sim))
+
+    return start
+
+
 def undamped(tets: int, device: str, dt: float, seconds: float) -> list[Row]:
     """The beam let go from horizontal without damping: kinetic energy of the last quarter over that of the first."""
     found: list[Row] = []
     for method in UNDAMPED:
-        one = run(Bar(tets, damping=0.0), method, dt, seconds, device, frames=False)
+        at_start: list[float] = []
+        one = run(Bar(tets, damping=0.0), method, dt, seconds, device, _noting(at_start), frames=False)
         quarter = len(one.records) // 4
         kinetic = one.records["kinetic"]
         found.append({
             "device": device, "dt ms": 1e3 * dt, "method": method.name,
             "last over first quarter": float(kinetic[-quarter:].mean() / kinetic[:quarter].mean()),
+            "change of energy": (energy(one.sim) - at_start[0]) / float(kinetic.max()),
             "holds": "yes" if one.well else "no", "by factor": one.share("FACTOR"), "euler": one.share("EULER"),
         })  # fmt: skip
     return found

@@ -11,6 +11,7 @@ from tests.bench.rosenbrock.stability import groups
 
 Tables = dict[str, list[Row]]
 MAIN = 3000  # tetrahedra of the first picture, if there are such rows
+VARIED = ("start", "model", "E MPa", "Poisson", "dt ms", "latency", "tangent", "bound / edge")  # of stability
 REMEMBERED = ("3e-03", "1e-03")  # errors of the key figures
 
 
@@ -156,10 +157,9 @@ def _stability(report: Report, device: str, rows: list[Row]) -> None:
     report.remember(total, ("varied",), ("hold",))
     for group in groups():
         if several := [row for row in rows if row["varied"] == group]:
-            names = [n for n in ("start", "model", "E MPa", "Poisson", "dt ms", "latency") if _differs(several, n)]
-            names = names or ["start", "dt ms"]
+            names = [n for n in VARIED if _differs(several, n)] or ["start"]
             report.say(f"### {group}, {device.upper()}")
-            hidden = {"device", "varied", "start", "model", "E MPa", "Poisson", "dt ms", "latency"}
+            hidden = {"device", "varied", *VARIED}
             report.table(several, [*names, *(n for n in several[0] if n not in hidden)])
 
 

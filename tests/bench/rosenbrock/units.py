@@ -11,7 +11,18 @@ from tests.bench.rosenbrock.bars import Bar
 KEYS = {  # what tells the rows of a table apart
     "precision": ("device", "tets", "material", "E MPa", "method", "dt ms"),
     "ages": ("device", "matrix", "latency", "dt ms"),
-    "stability": ("device", "varied", "start", "model", "E MPa", "Poisson", "dt ms", "latency"),
+    "stability": (
+        "device",
+        "varied",
+        "start",
+        "model",
+        "E MPa",
+        "Poisson",
+        "dt ms",
+        "latency",
+        "tangent",
+        "bound / edge",
+    ),
     "undamped": ("device", "dt ms", "method"),
     "free": ("device", "dt ms", "method"),
     "times": ("device", "tets", "material", "method"),
@@ -19,7 +30,6 @@ KEYS = {  # what tells the rows of a table apart
 }
 SIZES = (540, 3000, 24_000)
 STIFFNESSES = (1e5, 1e6, 1e7)  # Pa
-LARGE = 24_000  # tetrahedra from which on runs are short
 SMALL = 540  # of all parts but precision and times
 
 
@@ -33,10 +43,12 @@ def units(device: str, sizes: tuple[int, ...], quick: bool) -> list[Unit]:
 
 def _precision(device: str, sizes: tuple[int, ...], quick: bool) -> Iterator[Unit]:
     for tets in sizes:
-        large = tets >= LARGE
+        large = tets >= precision.LARGE
         seconds = 0.4 if quick else 1.0 if large else 2.0
         steps = (0.04, 0.02) if quick else (0.02, 0.01, 0.005) if large else precision.TIME_STEPS
-        methods = (precision.METHODS[0], precision.METHODS[-3], precision.OURS) if quick else precision.METHODS
+        methods = (
+            (precision.METHODS[0], precision.METHODS[-3], precision.OURS) if quick else precision.methods_for(tets)
+        )
         for bands in (False, True):
             for young in (1e6,) if quick or large or (bands and tets > SMALL) else STIFFNESSES:
                 bar = Bar(tets, young, bands=bands)
