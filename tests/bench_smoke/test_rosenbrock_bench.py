@@ -37,11 +37,19 @@ def test_a_large_time_step_that_costs_more_is_not_taken() -> None:
     points = line("one", 2, 1.6e-2, 1.0)
     points[0]["ms / s"] = 80.0  # made again, so that it is dearer than that at 20 ms
     assert cost_at(points, 0.5) == pytest.approx(50)
+    assert cost_at(points, 2e-3) == pytest.approx(1e3 / (40 * np.sqrt(2e-3 / 1.6e-2)))
+
+
+def test_errors_near_the_difference_of_the_references_are_left_out() -> None:
+    points = line(OURS.name, 2, 1.6e-2, 1.0, apart=2e-4) + line("euler", 1, 2e-2, 1.0, apart=2e-4)
+    assert [row["error / L"] for row in cheapest(points)] == ["3e-02", "1e-02", "3e-03", "1e-03"]
 
 
 def test_ratio_is_that_of_the_best_other_scheme() -> None:
-    points = line("euler", 1, 2e-2, 1.0) + line("newmark", 2, 8e-3, 4.0) + line(OURS.name, 2, 1.6e-2, 1.0)
-    points += line("ros2, iterate", 2, 1.6e-2, 1.5)
+    points = [
+        *line("euler", 1, 2e-2, 1.0, apart=1e-6), *line("newmark", 2, 8e-3, 4.0, apart=1e-6),
+        *line(OURS.name, 2, 1.6e-2, 1.0, apart=1e-6), *line("ros2, iterate", 2, 1.6e-2, 1.5, apart=1e-6),
+    ]  # fmt: skip
     costs = {row["error / L"]: row for row in cheapest(points)}
     assert costs["3e-02"]["best other"] == "euler" and costs["3e-02"]["best other / ros2"] == pytest.approx(1)
     assert costs["1e-03"]["best other"] == "newmark"

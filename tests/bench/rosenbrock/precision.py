@@ -21,6 +21,7 @@ OURS = ROS2_FACTOR.aged(10)
 METHODS = (*OTHERS, OURS, ROS2_FACTOR.aged(3))
 LARGE = 24_000  # tetrahedra from which on there are fewer methods and time steps, and shorter runs
 TIME_STEPS = (0.04, 0.02, 0.01, 0.005, 0.0025)  # s
+FLOOR = 3.0  # times the distance of the references: errors below it are not compared
 ERRORS = (3e-2, 1e-2, 3e-3, 1e-3, 3e-4, 1e-4)  # of L
 
 
@@ -52,8 +53,8 @@ def cost_at(points: list[Row], error: float) -> float:
 
     Between two measured steps: logarithms of cost and error on straight lines. nan: no step is exact enough.
     """
-    line = sorted(((p["error / L"], p["ms / s"]) for p in points if p["error / L"] is not None), key=lambda p: p[1])
-    line = [p for p in line if np.isfinite(p[0])]
+    known = [p for p in points if p["error / L"] is not None and np.isfinite(p["error / L"])]
+    line = [(p["error / L"], p["ms / s"]) for p in sorted(known, key=lambda p: p["dt ms"])]
     costs = [cost for e, cost in line if e <= error]
     for (e1, c1), (e2, c2) in pairwise(line):
         if (e1 - error) * (e2 - error) < 0:
@@ -66,7 +67,10 @@ def cheapest(points: list[Row]) -> list[Row]:
     """For each error what every method costs, and the cheapest other method over OURS. points: of one bar."""
     names = list(dict.fromkeys(p["method"] for p in points))
     found: list[Row] = []
+    apart = points[0]["apart"]
     for error in ERRORS:
+        if apart is None or not error >= FLOOR * apart:
+            continue
         costs = {n: cost_at([p for p in points if p["method"] == n], error) for n in names}
         others = {n: c for n, c in costs.items() if not n.startswith("ros2") and np.isfinite(c)}
         best = min(others, key=lambda n: others[n], default="none")

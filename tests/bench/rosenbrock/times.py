@@ -26,6 +26,7 @@ LIMITS: dict[str, tuple[Bar, float, str]] = {  # by what is varied: bar, dt, sta
     "base case: E 1 MPa, 20 ms": (Bar(), 0.02, "let go"),
     "dt 40 ms": (Bar(), 0.04, "let go"),
     "dt 80 ms": (Bar(), 0.08, "let go"),
+    "3000 tetrahedra, E 0.1 MPa, dt 40 ms": (Bar(3000, 1e5), 0.04, "let go"),
     "damping of the stiffness 0.01 s": (Bar(beta=0.01), 0.02, "let go"),
     "damping of the stiffness 0.05 s": (Bar(beta=0.05), 0.02, "let go"),
     "damping of the stiffness 0.2 s": (Bar(beta=0.2), 0.02, "let go"),
@@ -34,6 +35,7 @@ LIMITS: dict[str, tuple[Bar, float, str]] = {  # by what is varied: bar, dt, sta
     "stable_neo_hookean": (Bar(model="stable_neo_hookean"), 0.02, "let go"),
     "stretched to three times its length": (Bar(gravity=False, damping=1.0), 0.02, "stretched"),
     "spun at 20 rad/s": (Bar(gravity=False, damping=1.0), 0.02, "spun"),
+    "Poisson's ratio 0.499, tangent exact": (Bar(poisson=0.499, tangent="exact"), 0.02, "let go"),
     "162 tetrahedra": (Bar(162), 0.02, "let go"),
 }
 

@@ -84,7 +84,7 @@ def _conserved(device: str, quick: bool) -> Iterator[Unit]:
 
 def _times(device: str, sizes: tuple[int, ...], quick: bool) -> Iterator[Unit]:
     for tets in sizes:
-        steps = 30 if quick else 200
+        steps = 30 if quick else 50 if tets >= precision.LARGE else 100
         for bands in (False,) if quick else (False, True):
             bar = Bar(tets, bands=bands)
             name = f"{tets}, {bar.material}, {device}"
