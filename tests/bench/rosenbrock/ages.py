@@ -19,20 +19,20 @@ from tests.bench.rosenbrock.bars import (
 
 LATENCIES = (1, 3, 10, 30, 100)
 TIME_STEPS = (0.005, 0.01, 0.02, 0.04)  # s
-KINDS = {  # of the factor
-    "warped": {}, "warped, float64": {"factor_precision": "float64"}, "not warped": {"warp": False},
-}  # fmt: skip
+KINDS = {  # of the factor by device: its usual precision, a finer one, and without the warp
+    "cpu": {"warped": {}, "warped, float64": {"factor_precision": "float64"}, "not warped": {"warp": False}},
+    "gpu": {"warped": {}, "warped, float32": {"factor_precision": "float32"}, "not warped": {"warp": False}},
+}
 
 
 def rows(bar: Bar, device: str, seconds: float, steps: tuple[float, ...], latencies: tuple[int, ...]) -> list[Row]:
     """All ages, precisions and time steps, beside backward Euler and the iterating form."""
     reference = run(bar, REFERENCE, REFERENCE_STEP, seconds, device)
-    kinds = {k: v for k, v in KINDS.items() if device == "cpu" or v.get("factor_precision") != "float64"}
     found: list[Row] = []
     for dt in steps:
         for method in (EULER, ROS2_ITERATE):
             found.append(_row(run(bar, method, dt, seconds, device), reference, method.name, None))
-        for name, solver in kinds.items():
+        for name, solver in KINDS[device].items():
             for latency in latencies:
                 method = Method(name, ROS2_FACTOR.integrator, solver, latency)
                 found.append(_row(run(bar, method, dt, seconds, device), reference, name, latency))
