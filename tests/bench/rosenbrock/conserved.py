@@ -27,7 +27,12 @@ TIME_STEPS = (0.005, 0.01, 0.02)  # s
 FREE_TIME_STEPS = (0.01, 0.02)  # s
 LATENCIES = (1, 5, 10)
 UNDAMPED = (EULER, ROS2_ITERATE, ROS2_FACTOR.aged(10))
-FREE = (EULER, NEWMARK, BDF2, ROS2_ITERATE, *(ROS2_FACTOR.aged(latency) for latency in LATENCIES))
+NEWTON = {"linearizations": 10}
+FREE = (
+    EULER, NEWMARK, BDF2, Method("backward Euler, Newton", NEWTON),
+    Method("newmark, Newton", {"scheme": "newmark", **NEWTON}), ROS2_ITERATE,
+    *(ROS2_FACTOR.aged(latency) for latency in LATENCIES),
+)  # fmt: skip
 
 
 def _noting(energies: list[float]) -> Start:

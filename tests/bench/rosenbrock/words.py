@@ -65,7 +65,8 @@ have changed by, over the largest kinetic energy of the run: below 0 a loss."""
 FREE = """\
 A bar of 540 tetrahedra that nothing holds and no gravity acts on, 20 s: it moves off, tumbles at about 2 rad/s and
 vibrates along. *linear*, *angular*: largest change of the momentum (angular: about the origin) in the run over the
-momentum at the start. Loss of energy is that of the vibration and of the spin."""
+momentum at the start. *energy at the end*: kinetic and potential over that at the start: of the vibration, which may
+die away, and of the spin, which should not. *Newton*: up to ten linearizations a step."""
 
 LIMITS = """\
 *Not with time steps too large for the motion.* The estimate then exceeds the bound (a tenth of the shortest edge)
@@ -83,8 +84,9 @@ nothing, as it assembles nothing.
 *Not with much damping of the stiffness.* There backward Euler is more exact than either form.
 
 *Not for the momenta of free bodies that turn fast.* Backward Euler with one linearization keeps the angular
-momentum of a free body closely; neither `ros2` nor `newmark` nor `bdf2` do at large time steps. A factor older than
-a step lets linear momentum drift, too, as the warp turns nodes differently (the table of the free body).
+momentum of a free body closely, and so does `newmark` with Newton-Raphson; `ros2` at large time steps loses it as
+backward Euler with Newton-Raphson does. A warped factor lets linear momentum drift, too, since it turns each node
+by another rotation (the table of the free body).
 
 *Little for small bodies.* Conjugate gradients need few iterations there, and a step by the factor evaluates forces
 twice.
