@@ -45,7 +45,7 @@ def _precision(device: str, sizes: tuple[int, ...], quick: bool) -> Iterator[Uni
     for tets in sizes:
         large = tets >= precision.LARGE
         seconds = 0.4 if quick else 0.8 if large else 2.0
-        steps = (0.04, 0.02) if quick else (0.02, 0.01, 0.005) if large else precision.TIME_STEPS
+        steps = (0.04, 0.02) if quick else precision.TIME_STEPS[:4] if large else precision.TIME_STEPS
         methods = (
             (precision.METHODS[0], precision.METHODS[-3], precision.OURS) if quick else precision.methods_for(tets)
         )
