@@ -11,6 +11,7 @@ from tests.bench.rosenbrock.stability import groups
 
 Tables = dict[str, list[Row]]
 MAIN = 3000  # tetrahedra of the first picture, if there are such rows
+COLOURS = {"backward Euler": "C0", "newmark": "C2", "bdf2": "C4", "ros2, iterate": "C1", "ros2, factor": "k"}
 VARIED = ("start", "model", "E MPa", "Poisson", "dt ms", "latency", "tangent", "bound / edge")  # of stability
 REMEMBERED = ("3e-03", "1e-03")  # errors of the key figures
 
@@ -90,30 +91,41 @@ def _line(name: str, points: list[Row]) -> Row:
     return found
 
 
+def _looks(names: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Colour by scheme, marker by its settings."""
+    seen: list[str] = []
+    found = {}
+    for name in names:
+        scheme = next((known for known in COLOURS if name.startswith(known)), "")
+        found[name] = {"color": COLOURS.get(scheme, "C7"), "marker": "os^D"[seen.count(scheme) % 4]}
+        seen.append(scheme)
+    return found
+
+
 def _picture(by_bar: dict[tuple[Any, ...], list[Row]]) -> Any:
     plt = plots()
     columns = min(3, len(by_bar))
     lines = -(-len(by_bar) // columns)
     figure, axes = plt.subplots(
-        lines, columns, figsize=(1 + 4.2 * columns, 4.0 * lines), squeeze=False, layout="constrained"
+        lines, columns, figsize=(3 + 3.9 * columns, 3.8 * lines), squeeze=False, layout="constrained"
     )
     for axis in axes.flat[len(by_bar) :]:
         axis.set_visible(False)
     for axis, (key, points) in zip(axes.flat, by_bar.items(), strict=False):
-        for k, ((name,), line) in enumerate(_by(points, "method").items()):
-            line = [p for p in sorted(line, key=lambda p: p["dt ms"]) if p["error / L"]]
-            ours = name.startswith("ros2, factor")
-            axis.loglog(
-                [p["error / L"] for p in line], [p["ms / s"] for p in line], marker="o", ms=3, lw=2.2 if ours else 1,
-                color="k" if name == precision.OURS.name else f"C{k % 10}", label=name, ls="-" if ours else "--",
-            )  # fmt: skip
+        by_method = {name: several for (name,), several in _by(points, "method").items()}
+        looks = _looks(list(by_method))
+        for name, line in by_method.items():
+            known = [p for p in sorted(line, key=lambda p: p["dt ms"]) if p["error / L"]]
+            width = 2.2 if name.startswith("ros2, factor") else 1
+            errors, costs = ([p[column] for p in known] for column in ("error / L", "ms / s"))
+            axis.loglog(errors, costs, ms=4, lw=width, label=name, **looks[name])
         _, material, young = key
         axis.set(title=f"{'bands, ' if material == 'bands' else ''}E = {young:g} MPa", xlabel="rms error / L")
         axis.invert_xaxis()
         axis.grid(True, which="both", alpha=0.3)
     for axis in axes[:, 0]:
         axis.set_ylabel("ms a simulated second")
-    axes[0, 0].legend(fontsize=6)
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside right upper", fontsize=7)
     return figure
 
 
