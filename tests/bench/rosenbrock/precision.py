@@ -41,7 +41,7 @@ def rows(bar: Bar, device: str, seconds: float, steps: tuple[float, ...], method
         for dt in steps:
             one = run(bar, method, dt, seconds, device)
             found.append({
-                "device": device, "tets": bar.tets, "material": bar.material, "E MPa": 1e-6 * bar.young,
+                "device": device, "tets": bar.tets, "material": bar.material, "E MPa": bar.young / 1e6,
                 "method": method.name, "dt ms": 1e3 * dt, "error / L": one.error(reference), "ms / s": one.cost(),
                 "iterations": one.iterations, "by factor": one.share("FACTOR"), "apart": apart, "seconds": seconds,
             })  # fmt: skip

@@ -50,7 +50,7 @@ class Case:
     def row(self) -> Row:
         """What tells it apart."""
         poisson = 0.25 if self.model == "mass_spring" else self.poisson
-        named = {"start": self.start, "model": self.model, "E MPa": 1e-6 * self.young, "Poisson": poisson}
+        named = {"start": self.start, "model": self.model, "E MPa": self.young / 1e6, "Poisson": poisson}
         return {
             **named, "dt ms": 1e3 * self.dt, "latency": self.latency, "tangent": self.tangent,
             "bound / edge": self.bound,

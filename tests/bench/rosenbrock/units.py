@@ -52,7 +52,7 @@ def _precision(device: str, sizes: tuple[int, ...], quick: bool) -> Iterator[Uni
         for bands in (False, True):
             for young in (1e6,) if quick or large or (bands and tets > SMALL) else STIFFNESSES:
                 bar = Bar(tets, young, bands=bands)
-                name = f"{tets}, {bar.material}, {1e-6 * young:g} MPa, {device}"
+                name = f"{tets}, {bar.material}, {young / 1e6:g} MPa, {device}"
                 measure = partial(precision.rows, bar, device, seconds, steps, methods)
                 yield Unit("precision", name, 5 + tets / 150, measure)
 
