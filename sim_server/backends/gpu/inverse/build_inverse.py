@@ -71,11 +71,14 @@ class InverseBuilder:
         }
         self._graphs: dict[int | None, Graph] = {}
         self._generation = -1
+        cp.cuda.get_current_stream().synchronize()  # the tables are there for the stream of builds, which does not wait
 
     def storage(self) -> InverseStorage:
         """Allocates memory for one inverse, set to zero."""
         cp, p = self._gpu.cp, self.plan
-        return InverseStorage(cp.zeros((p.chunks, ROWS, COLUMNS), np.float16), cp.zeros(p.size + 1, np.float32))
+        made = InverseStorage(cp.zeros((p.chunks, ROWS, COLUMNS), np.float16), cp.zeros(p.size + 1, np.float32))
+        cp.cuda.get_current_stream().synchronize()  # zero before a build writes, in its own stream
+        return made
 
     def build(
         self, values: NDArray[np.floating], storage: InverseStorage, multiprocessors: int | None = None
