@@ -30,6 +30,9 @@ def options() -> argparse.Namespace:
     parser.add_argument(
         "--sizes", type=int, nargs="+", choices=list(CELLS), default=list(SIZES), help="of precision and times"
     )
+    parser.add_argument(
+        "--rounds", type=int, default=1, help="of each run of precision; the least time of a step counts"
+    )
     arguments_of_units(parser, f"{', '.join(KEYS)}, 'precision 3000, one E'")
     parser.add_argument("--quick", action="store_true", help="a small smoke run")
     arguments_of_pieces(parser)
@@ -43,8 +46,10 @@ def main() -> None:
         page.write(merged, {name: merged.rows(name, keys) for name, keys in KEYS.items()})
         return
     sizes = QUICK_SIZES if o.quick else tuple(o.sizes)
-    arguments: dict[str, Any] = {"device": o.device, "sizes": sizes} | ({"quick": True} if o.quick else {})
-    wanted = chosen(units(o.device, sizes, o.quick), o)
+    arguments: dict[str, Any] = {"device": o.device, "sizes": sizes, "rounds": o.rounds} | (
+        {"quick": True} if o.quick else {}
+    )
+    wanted = chosen(units(o.device, sizes, max(1, o.rounds), o.quick), o)
     report = Piece("rosenbrock", TITLE, arguments | asked_for(o), o.out, o.quick)
     page.write(report, measure(wanted, Limit(o.limit), report))
 

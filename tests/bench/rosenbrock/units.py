@@ -33,15 +33,15 @@ STIFFNESSES = (1e5, 1e6, 1e7)  # Pa
 SMALL = 540  # of all parts but precision and times
 
 
-def units(device: str, sizes: tuple[int, ...], quick: bool) -> list[Unit]:
+def units(device: str, sizes: tuple[int, ...], rounds: int, quick: bool) -> list[Unit]:
     """All of them."""
     return [
-        *_precision(device, sizes, quick), *_ages(device, quick), *_stability(device, quick),
+        *_precision(device, sizes, rounds, quick), *_ages(device, quick), *_stability(device, quick),
         *_conserved(device, quick), *_times(device, sizes, quick), *_limits(device, quick),
     ]  # fmt: skip
 
 
-def _precision(device: str, sizes: tuple[int, ...], quick: bool) -> Iterator[Unit]:
+def _precision(device: str, sizes: tuple[int, ...], rounds: int, quick: bool) -> Iterator[Unit]:
     for tets in sizes:
         large = tets >= precision.LARGE
         seconds = 0.4 if quick else 0.8 if large else 2.0
@@ -53,7 +53,7 @@ def _precision(device: str, sizes: tuple[int, ...], quick: bool) -> Iterator[Uni
             for young in (1e6,) if quick or large or (bands and tets > SMALL) else STIFFNESSES:
                 bar = Bar(tets, young, bands=bands)
                 name = f"{tets}, {bar.material}, {young / 1e6:g} MPa, {device}"
-                measure = partial(precision.rows, bar, device, seconds, steps, methods)
+                measure = partial(precision.rows, bar, device, seconds, steps, methods, rounds)
                 yield Unit("precision", name, 5 + tets / 150, measure)
 
 
