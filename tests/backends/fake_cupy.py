@@ -69,9 +69,21 @@ class Device(FakeDevice):
 
 
 def made(folder: Path, library: Any) -> ModuleType:
-    """The module. `calls`: (kernel, number of arguments) of each launch; texts are compiled in `folder`."""
+    """The module. Texts are compiled in `folder`.
+
+    calls: (kernel, number of arguments) of each launch
+    pending: arrays that were made since the host last waited for the current stream, and may not be there yet
+    """
     cp: Any = ModuleType("cupy")
-    cp.calls, compiled = [], set()
+    cp.calls, cp.pending, compiled = [], 0, set()
+
+    class CurrentStream(Stream):
+        def synchronize(self) -> None:
+            cp.pending = 0
+
+    def array(values: np.ndarray) -> np.ndarray:
+        cp.pending += 1
+        return values.view(Array)
 
     class Function:
         def __init__(self, kernel: str, arguments: int | None):
@@ -101,11 +113,11 @@ def made(folder: Path, library: Any) -> ModuleType:
         "name": b"Fake", "multiProcessorCount": 132, "sharedMemPerMultiprocessor": 233472,
         "sharedMemPerBlockOptin": 232448,
     }  # fmt: skip
-    cp.RawModule, cp.asarray = RawModule, lambda x: np.array(x).view(Array)
-    cp.zeros = lambda shape, dtype=np.float64: np.zeros(shape, dtype).view(Array)
-    cp.ones = lambda shape, dtype=np.float64: np.ones(shape, dtype).view(Array)
-    cp.full = lambda shape, value, dtype: np.full(shape, value, dtype).view(Array)
-    cp.empty_like = lambda array: np.empty_like(array).view(Array)
+    cp.RawModule, cp.asarray = RawModule, lambda x: array(np.array(x))
+    cp.zeros = lambda shape, dtype=np.float64: array(np.zeros(shape, dtype))
+    cp.ones = lambda shape, dtype=np.float64: array(np.ones(shape, dtype))
+    cp.full = lambda shape, value, dtype: array(np.full(shape, value, dtype))
+    cp.empty_like = lambda like: array(np.empty_like(like))
     cp.cuda = SimpleNamespace(
         runtime=SimpleNamespace(
             getDeviceCount=lambda: 1, CUDARuntimeError=type("CUDARuntimeError", (RuntimeError,), {}),
@@ -113,7 +125,7 @@ def made(folder: Path, library: Any) -> ModuleType:
             runtimeGetVersion=lambda: 13000, **memory,
         ),
         Device=lambda *a: SimpleNamespace(id=0, compute_capability="90", attributes={"MultiProcessorCount": 132}),
-        Stream=Stream, get_current_stream=Stream, memory=SimpleNamespace(OutOfMemoryError=MemoryError),
+        Stream=Stream, get_current_stream=CurrentStream, memory=SimpleNamespace(OutOfMemoryError=MemoryError),
         alloc_pinned_memory=lambda size: np.zeros(max(size, 1), np.uint8),
         compiler=SimpleNamespace(CompileException=CompileException),
     )  # fmt: skip

@@ -9,9 +9,13 @@ import pytest
 from precond_worker.factorization.factorize import Analysis
 from sim_server.backends.gpu import device
 from sim_server.backends.gpu import engine as gpu_engine
+from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder
+from sim_server.backends.gpu.inverse.plan import plan
+from sim_server.backends.gpu.inverse.workspace import workspace
 from sim_server.simulation import Simulation
 from tests.backends import fake_cupy
 from tests.support import nvrtc
+from tests.worker.block_matrices import bar_edges, pattern
 
 pytestmark = pytest.mark.slow
 SCENES = {
@@ -39,10 +43,10 @@ def cupy(tmp_path, monkeypatch):
     fake = fake_cupy.made(tmp_path, library)
     monkeypatch.setitem(sys.modules, "cupy", fake)
     monkeypatch.setattr(gpu_engine, "CudaDevice", fake_cupy.Device)
-    for function in (device.cupy, device.processors):
+    for function in (device.cupy, device.processors, workspace):
         function.cache_clear()
     yield fake
-    for function in (device.cupy, device.processors):
+    for function in (device.cupy, device.processors, workspace):
         function.cache_clear()
 
 
@@ -65,3 +69,17 @@ def test_a_scene_is_built_and_its_kernels_compile(cupy, name):
     engine.settle_factors()
     engine.run(1)
     assert engine.factor_bytes(body.index) > 9 * nodes
+
+
+def test_what_a_build_of_an_inverse_reads_is_there_before_its_own_stream_runs(cupy):
+    """Also where its workspace is large enough already, so that nothing else waits."""
+    gpu = device.Gpu()
+    for cells in ((3, 2, 2), (2, 1, 1)):
+        graph = pattern(int(np.prod(np.add(cells, 1))), bar_edges(*cells), np.arange(0))
+        shape = Analysis(*graph).pattern
+        cupy.zeros(1)
+        assert cupy.pending
+        builder = InverseBuilder(gpu, shape, plan(shape, 4))
+        assert not cupy.pending
+        builder.storage()
+        assert not cupy.pending
