@@ -2,8 +2,9 @@
 // Nodal kernels of the second-order Rosenbrock-W step (formulas and symbols: mechanics/rosenbrock.py).
 #define WIDE
 #include "mat3.cuh"
+#include "step_form.h"
 
-constexpr real GAMMA = 0.29289321881345247559915563789515;  // g = 1 - 1 / sqrt 2
+constexpr real GAMMA = ROS2_GAMMA;
 constexpr real TWO = 2, THREE = 3;  // in the type of the numbers that they multiply
 
 struct Start {

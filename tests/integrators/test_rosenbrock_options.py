@@ -4,8 +4,10 @@
 import numpy as np
 import pytest
 
+from sim_server.backends.declarations import Declarations
 from sim_server.errors import InputError
 from sim_server.scene import load
+from sim_server.scene.integrator_options import GAMMA
 from sim_server.simulation import Simulation
 from tests.scenes import bar, scene, simulation
 
@@ -76,3 +78,7 @@ def test_other_schemes_have_no_stages():
         sim.engine.run(2)
         records = sim.engine.records()
         assert not sim.integrator.has_stages and not records["form"].any() and np.isnan(records["estimate"]).all()
+
+
+def test_the_coefficient_of_the_method_is_that_of_the_kernels():
+    assert Declarations("kernels/step_form.h").constant("ROS2_GAMMA") == GAMMA
