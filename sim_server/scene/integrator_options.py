@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: MIT
 """The [integrator] table of a scene."""
 
-from math import sqrt
 from typing import Literal
 
 from pydantic import Field, model_validator
@@ -11,7 +10,7 @@ from sim_server.scene.parameters import Parameters, complaint
 
 MAX_STATES = 1024  # tried in a step on a GPU, whose graph of launches holds them all
 SchemeName = Literal["backward_euler", "newmark", "bdf2", "quasi_static", "ros2"]
-GAMMA = 1 - sqrt(0.5)  # of ros2 (mechanics/rosenbrock.py)
+GAMMA = 0.29289321881345247559915563789515  # 1 - 1 / sqrt 2, of ros2 (mechanics/rosenbrock.py)
 
 
 class IntegratorOptions(Parameters):
