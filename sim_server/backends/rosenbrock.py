@@ -12,7 +12,7 @@ FORMS = Declarations("kernels/step_form.h").enumeration("StepForm")
 """Forms of a step by name; the numbers stand in the column `form` of the step record."""
 
 
-NODAL = ("second", "finish", "remember", "restore", "restore_for_euler", "advance_euler")
+NODAL = ("second", "finish", "prepare", "remember", "restore", "restore_for_euler", "advance_euler")
 
 
 @dataclass(frozen=True)
@@ -23,12 +23,15 @@ class Rosenbrock:
     again: launches that evaluate the forces of the second stage
     euler: launches that assemble backward Euler
     second, finish: nodal kernels after the first and after the second solve
+    prepare: nodal kernel that makes what the next step is assembled from, from v
     remember: nodal kernel that keeps the nodes' own blocks of A of a step that iterates, for steps without A
     restore, restore_for_euler, advance_euler: nodal kernels of an attempt that is made again
     parts: (bodies + 1,) first item of each body, by id of a launch; None if a launch does not tell bodies apart
     factor_alone: whether the factor may take the place of A
     estimate: (n,) of the last attempt [m]
     mass [kg], share, weight, diagonal [kg]: (n,) of the check of the first stage (kernels/step_form.h)
+    start_x [m], start_v [m/s], b [N s], inertial_increment [m/s]: (n, 3); unheld: (bodies,) 1 where no node is fixed:
+        of the momenta of free bodies (backends/cpu/native/momentum.h)
     bound: (bodies,) largest estimate of a step that is not made again [m]
     coefficients: (2,) force_coefficient and dx_dv [s], read by launches whose arguments change while steps run
     euler_coefficients: the same of backward Euler
@@ -39,6 +42,7 @@ class Rosenbrock:
     euler: Sequence[Launch]
     second: Launch
     finish: Launch
+    prepare: Launch
     remember: Launch
     restore: Launch
     restore_for_euler: Launch
@@ -50,6 +54,11 @@ class Rosenbrock:
     share: Float64
     weight: Float64
     diagonal: Float64
+    start_x: Float64
+    start_v: Float64
+    b: Float64
+    inertial_increment: Float64
+    unheld: Int32
     bound: Float64
     coefficients: Float64
     euler_coefficients: tuple[float, float]

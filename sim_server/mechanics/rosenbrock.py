@@ -31,6 +31,9 @@ step, of each body (kernels/step_form.h):
 A step by FACTOR whose factor is inconsistent, or whose estimate exceeds the bound, is made again by ITERATE, and
 PATIENCE steps after it, too.
 
+On a CPU a body without fixed nodes or springs of grabs then gets the momenta that its forces make
+(backends/cpu/native/momentum.h): the stages alone lose angular momentum of stiff bodies that turn.
+
 Stability: A-stable with J the slope of F, L-stable (R(infinity) = 0). With an older, warped J in place of it see
 docs/bench/rosenbrock.md; without the warp it flies apart.
 
@@ -74,6 +77,7 @@ class RosenbrockIntegrator(Integrator):
         self.start_x, self.start_v, self.first = w.x.copy(), np.zeros_like(w.v), np.zeros_like(w.v)
         self.earlier, self.estimate, self.known = w.x.copy(), np.zeros(w.nodes), np.zeros((w.nodes, 6))
         self.bound = np.array([self._bound(b) for b in w.bodies])
+        self.unheld = np.array([(w.free[b.nodes] > 0).all() for b in w.bodies], np.int32)
         self.factor_alone = scene.uses_factor_alone
         w.backend.keep(
             self.share, self.weight, self.start_x, self.start_v, self.first, self.earlier, self.estimate, self.known
@@ -133,12 +137,14 @@ class RosenbrockIntegrator(Integrator):
                 "finish", body=s.body, moving=s.moving, first=self.first, estimate=self.estimate,
                 **history, **solved, **state, **started, **self._prepared(),
             ),
+            prepare=self._stage("prepare", v=w.v, **self._prepared()),
             remember=self._stage("remember", block=s.block, known=self.known),
             restore=self._stage("restore", **state, **started, **history, **self._prepared()),
             restore_for_euler=self._stage("restore_for_euler", **state, **started, **history, **restored),
             advance_euler=self._stage("euler", before=self.before, **solved, **state, **self._prepared()),
             parts={}, factor_alone=self.factor_alone, estimate=self.estimate, mass=w.mass, share=self.share,
-            weight=self.weight, diagonal=s.diagonal, bound=self.bound,
+            weight=self.weight, diagonal=s.diagonal, start_x=self.start_x, start_v=self.start_v, b=s.b,
+            inertial_increment=self.inertial_increment, unheld=self.unheld, bound=self.bound,
             coefficients=w.coefficients, euler_coefficients=(w.dt, w.dt),
         )  # fmt: skip
         starts, rows = np.array([*(b.first for b in w.bodies), w.nodes], dtype=np.int32), rows_of(effects)

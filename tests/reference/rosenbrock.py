@@ -2,7 +2,8 @@
 """A step of ROS2 as a W-method with dense matrices, in the form with K (Verwer, Spee, Blom and Hundsdorfer 1999).
 
 A = M - g h D - (g h)^2 J with J = -K the slope of the forces and D = -alpha M - beta K; K and A are those of the step,
-or any other.
+or any other. A body that nothing holds then gets the momenta that its forces make (sim_server/backends/cpu/native/
+momentum.h), found here as the least change of v.
 """
 
 from dataclasses import replace
@@ -53,5 +54,28 @@ def step(solid: Solid, stiffness: Array | None = None) -> tuple[Array, Array, Ar
     k2v = solve(force(solid, x1, v1) - 2 * m * k1v - g * h * K @ s)
     k2x = s + g * h * k2v
     estimate = np.linalg.norm((h * (k1x + k2x) / 2).reshape(-1, 3), axis=1)
-    ended = x + h * (3 * k1x + k2x) / 2, v + h * (3 * k1v + k2v) / 2
-    return ended[0].reshape(-1, 3), ended[1].reshape(-1, 3), estimate
+    ended = (x + h * (3 * k1x + k2x) / 2).reshape(-1, 3), (v + h * (3 * k1v + k2v) / 2).reshape(-1, 3)
+    if free.all():
+        stages = [(at.reshape(-1, 3), force(solid, at, v_at).reshape(-1, 3)) for at, v_at in ((x, v), (x1, v1))]
+        linear, angular = momenta(solid.mass, solid.x, solid.v)
+        linear = linear + h / 2 * sum(f.sum(axis=0) for _, f in stages)
+        angular = angular + h / 2 * sum(np.cross(at, f).sum(axis=0) for at, f in stages)
+        ended = ended[0], with_momenta(solid.mass, *ended, linear, angular)
+    return *ended, estimate
+
+
+def momenta(mass: Array, x: Array, v: Array) -> tuple[Array, Array]:
+    """Linear and angular momentum about the origin."""
+    return mass @ v, (mass[:, None] * np.cross(x, v)).sum(axis=0)
+
+
+def with_momenta(mass: Array, x: Array, v: Array, linear: Array, angular: Array) -> Array:
+    """v with these momenta: the least change in the norm of the masses, which is a rigid motion."""
+    rows = np.concatenate([np.kron(np.ones(len(x)), np.eye(3)), np.hstack([skew(p) for p in x])])
+    m = np.repeat(mass, 3)
+    missing = np.concatenate([linear, angular]) - rows @ (m * v.ravel())
+    return v + (rows.T @ np.linalg.solve(rows @ (m[:, None] * rows.T), missing)).reshape(-1, 3)
+
+
+def skew(a: Array) -> Array:
+    return np.array([[0, -a[2], a[1]], [a[2], 0, -a[0]], [-a[1], a[0], 0]])

@@ -138,7 +138,8 @@ class _NativeStages:
             setattr(self.native, name, array.ctypes.data)
         self._first_stage = np.zeros((len(stages.mass), 9))
         self.native.first_stage = self._first_stage.ctypes.data
-        for name in ("estimate", "bound", "coefficients", "mass", "share", "weight", "diagonal"):
+        for name in ("estimate", "bound", "coefficients", "mass", "share", "weight", "diagonal",
+                     "start_x", "start_v", "b", "inertial_increment", "unheld"):  # fmt: skip
             setattr(self.native, name, getattr(stages, name).ctypes.data)
         loop.stages = c.addressof(self.native)
         for key, part in stages.parts.items():

@@ -83,10 +83,9 @@ nothing, as it assembles nothing.
 
 *Not with much damping of the stiffness.* There backward Euler is more exact than either form.
 
-*Not for the momenta of free bodies that turn fast.* Backward Euler with one linearization keeps the angular
-momentum of a free body closely, and so does `newmark` with Newton-Raphson; `ros2` at large time steps loses it as
-backward Euler with Newton-Raphson does. A warped factor lets linear momentum drift, too, since it turns each node
-by another rotation (the table of the free body).
+*Not for free bodies that turn fast, on a GPU.* The stages alone lose angular momentum, and a warped factor lets
+linear momentum drift, since it turns each node by another rotation. On a CPU bodies that nothing holds get the momenta
+that their forces make (the table of the free body); on a GPU they do not.
 
 *Little for small bodies.* Conjugate gradients need few iterations there, and a step by the factor evaluates forces
 twice.

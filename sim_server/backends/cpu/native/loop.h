@@ -51,6 +51,8 @@ struct StageState {                    // of a body in the step under way (rosen
     int32_t assembled;                 // 1: A is that of the step
     int32_t corrects;                  // 1: the factor is corrected for grabs
     int32_t misses;                    // 1: it is not, though it should be
+    int32_t free;                      // 1: nothing holds the body in the step (momentum.h)
+    double impulse[6];                 // of the forces of both stages and of their torques
     int32_t patience;                  // steps to come that iterate
     int64_t factor_step;               // of the last factor
     double estimate;                   // of the last attempt by stages [m]
@@ -62,13 +64,15 @@ constexpr int FAILED = -1;             // form of an attempt that gave no state
 struct Stages {                        // input of the Rosenbrock-W step
     const int32_t *first, *again, *euler;  // numbers of launches: the forces of both stages; backward Euler
     int32_t firsts, agains, eulers;
-    int32_t second, finish, remember, restore, restore_for_euler, advance_euler;  // likewise
+    int32_t second, finish, prepare, remember, restore, restore_for_euler, advance_euler;  // likewise
     int32_t factor_alone;              // 1: wanted
     const double* estimate;            // (nodes,) of the last attempt [m]
     const double* bound;               // (bodies,) [m]
     double* coefficients;              // (2,) of launches whose arguments change while steps run
     double own_coefficients[2], euler_coefficients[2];
     const double *mass, *share, *weight, *diagonal;  // (nodes,) of the first stage's check (step_form.h): M, theta, w, of A
+    const double *start_x, *start_v, *b, *inertial_increment;  // (nodes, 3) of the momenta; b: world frame (momentum.h)
+    const int32_t* unheld;             // (bodies,) 1: no node is fixed
     double* first_stage;               // (nodes, 9) start of the solve, b and y of the first stage
     StageState* state;                 // (bodies,)
 };

@@ -7,6 +7,7 @@
 #include <algorithm>
 
 #include "loop.h"
+#include "momentum.h"
 
 // Runs a launch for the bodies with take_part(i). One whose items are not grouped by body runs for all of them.
 template <class F> static void run_for(const Loop& loop, const Launch& l, F take_part) {
@@ -158,9 +159,17 @@ template <class F> static bool make_attempt(Loop& loop, F take_part) {
     const Stages& stages = *loop.stages;
     auto moves = [&](int i) { return take_part(i) && loop.moving[i]; };
     run_for(loop, loop.launch[stages.remember], [&](int i) { return take_part(i) && stages.state[i].form == ITERATE; });
+    for (int i = 0; i < loop.bodies; ++i) {
+        StageState& s = stages.state[i];
+        if (!take_part(i)) continue;
+        std::fill(s.impulse, s.impulse + 6, 0.0);
+        s.free = stages.unheld[i] && loop.moving[i] && add_impulses(loop, loop.body[i], s.impulse);
+    }
     solve_stage(loop, true, take_part);
     run_for(loop, loop.launch[stages.second], take_part);
     for (int k = 0; k < stages.agains; ++k) run_for(loop, loop.launch[stages.again[k]], moves);
+    for (int i = 0; i < loop.bodies; ++i)
+        if (take_part(i) && stages.state[i].free) stages.state[i].free = add_impulses(loop, loop.body[i], stages.state[i].impulse);
     solve_stage(loop, false, take_part);
     run_for(loop, loop.launch[stages.finish], take_part);
     bool again = false;
@@ -173,7 +182,9 @@ template <class F> static bool make_attempt(Loop& loop, F take_part) {
         s.estimate = most;
         s.accepted = s.form != FAILED && most <= stages.bound[i];
         again = again || !s.accepted;
+        if (s.accepted && s.free) set_momenta(loop, loop.body[i], s.impulse);
     }
+    run_for(loop, loop.launch[stages.prepare], [&](int i) { return take_part(i) && stages.state[i].accepted && stages.state[i].free; });
     return again;
 }
 
