@@ -14,7 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from clients.client import Client
-from clients.log.scalars import status_name
+from clients.log.scalars import enum_name, status_name
 from protocol import messages_pb2 as pb
 
 PERIOD = 0.5  # s between two readings
@@ -66,7 +66,7 @@ def _objects(status: pb.Status) -> Table:
             str(found.nodes),
             str(last.iterations),
             f"{found.mean_iterations:.1f}",
-            "-" if last.residual < 0 else f"{last.residual:.1e}",
+            f"{last.residual:.1e}",
             _status(found),
             f"{_known(found.factor_age)}/{_known(found.factor_age_bound)}",
             last.preconditioner,
@@ -96,7 +96,7 @@ def _errors(status: pb.Status) -> list[Table]:
     table = Table("object", "step by", "error of it [m]", **COMPACT)
     for found in shown:
         estimate = f"{found.last.estimate:.1e}" if found.last.HasField("estimate") else "-"
-        _add(table, found.object, pb.StepForm.Name(found.last.form).lower(), estimate)
+        _add(table, found.object, enum_name("form", found.last.form), estimate)
     return [table] if shown else []
 
 

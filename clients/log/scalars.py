@@ -36,10 +36,11 @@ ENUMS = {f.name: {v.number: v.name.lower() for v in f.enum_type.values} for f in
 
 def status_name(value: int) -> str:
     """Names a SolveStatus, e.g. 'converged' or 'max_iterations'; 'unknown_7' if this version does not know it."""
-    return _named("status", value)
+    return enum_name("status", value)
 
 
-def _named(field: str, value: int) -> str:
+def enum_name(field: str, value: int) -> str:
+    """Names a value of an enumerated scalar, as `status_name` does."""
     return ENUMS[field].get(value, f"unknown_{value}")
 
 
@@ -50,7 +51,7 @@ def row(message: pb.ObjectStep) -> tuple:
 
 def _value(message: pb.ObjectStep, name: str) -> object:
     if name in ENUMS:
-        return _named(name, getattr(message, name))
+        return enum_name(name, getattr(message, name))
     return math.nan if name in OPTIONAL and not message.HasField(name) else getattr(message, name)  # type: ignore[arg-type]
 
 

@@ -77,7 +77,7 @@ class RerunScene:
         with np.errstate(divide="ignore", invalid="ignore"):
             residual = np.log10(np.maximum(scalars["residual"], 1e-17))
         self._curve("iterations", name, scalars, scalars["iterations"], np.ones(len(age), bool))
-        self._curve("residual", name, scalars, residual, scalars["residual"] >= 0)
+        self._curve("residual", name, scalars, residual, np.isfinite(residual))
         self._curve("factor_age", name, scalars, age, age >= 0)
         with np.errstate(divide="ignore", invalid="ignore"):
             estimate = np.log10(scalars["estimate"])

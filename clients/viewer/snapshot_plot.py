@@ -70,8 +70,7 @@ def _draw_curves(figure: Figure, grid: Any, log: Log) -> None:
         scalars = log.scalars(name)
         time, age = scalars["time"], scalars["factor_age"]
         plots[0].plot(time, scalars["iterations"], label=name)
-        residual = scalars["residual"]
-        plots[1].plot(time, np.where(residual >= 0, np.maximum(residual, 1e-17), np.nan))
+        plots[1].plot(time, np.maximum(scalars["residual"], 1e-17))
         plots[2].plot(time, np.where(age >= 0, age, np.nan))
         if number == 0:
             plots[3].plot(time, scalars["step_seconds"] * 1e3)
