@@ -46,7 +46,7 @@ from typing import Any
 
 import numpy as np
 
-from sim_server.arrays import Float64
+from sim_server.arrays import Float64, Int32
 from sim_server.backends.base import Launch
 from sim_server.backends.rosenbrock import Rosenbrock
 from sim_server.mechanics.integrator import CouplesNodes, Integrator, items_of_bodies, rows_of
@@ -130,6 +130,7 @@ class RosenbrockIntegrator(Integrator):
         history: dict[str, Any] = {"before": self.before, "earlier": self.earlier}
         first, again, euler = lists
         restored = {k: v for k, v in self._prepared().items() if k not in ("share", "weight")}
+        parts: dict[int, Int32 | None] = {}
         found = Rosenbrock(
             first=first, again=again, euler=euler,
             second=self._stage("second", first=self.first, **solved, **state, **started, **self._prepared()),
@@ -142,14 +143,14 @@ class RosenbrockIntegrator(Integrator):
             restore=self._stage("restore", **state, **started, **history, **self._prepared()),
             restore_for_euler=self._stage("restore_for_euler", **state, **started, **history, **restored),
             advance_euler=self._stage("euler", before=self.before, **solved, **state, **self._prepared()),
-            parts={}, factor_alone=self.factor_alone, estimate=self.estimate, mass=w.mass, share=self.share,
+            parts=parts, factor_alone=self.factor_alone, estimate=self.estimate, mass=w.mass, share=self.share,
             weight=self.weight, diagonal=s.diagonal, start_x=self.start_x, start_v=self.start_v, b=s.b,
             inertial_increment=self.inertial_increment, unheld=self.unheld, bound=self.bound,
             coefficients=w.coefficients, euler_coefficients=(w.dt, w.dt),
         )  # fmt: skip
         starts, rows = np.array([*(b.first for b in w.bodies), w.nodes], dtype=np.int32), rows_of(effects)
         launches = (*assemble, *found.launches)
-        found.parts.update({id(x): items_of_bodies(x, starts, s.row, rows) for x in launches})  # type: ignore[attr-defined]
+        parts.update({id(x): items_of_bodies(x, starts, s.row, rows) for x in launches})
         return found
 
     def _prepared(self) -> dict[str, Any]:

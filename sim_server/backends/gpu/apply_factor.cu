@@ -16,12 +16,6 @@ struct ApplicationMemory {  // static shared memory of a thread block
 };
 __shared__ ApplicationMemory memory;
 
-// 2^-k with sqrt(a) 2^-k < 1.
-__device__ __forceinline__ float unit_for(double a) {
-    const int k = (((__double2hiint(a) >> 20) & 0x7ff) - 1021) >> 1;  // a < 2^(2 k)
-    return __int_as_float((127 - max(-120, min(120, k))) << 23);
-}
-
 struct OwnPlaces {  // of the own degrees of freedom: positions in the packed vectors and scales; in shared memory, if they fit
     int* position;
     float* scale;
@@ -53,16 +47,6 @@ struct FactorApplication {
     __device__ __forceinline__ void fill(real value) const {
         const long long begin = 3 * (memory.body.first + (long long)range.begin);
         for (int k = threadIdx.x; k < 3 * range.own; k += THREADS) s.y[begin + k] = value;
-    }
-
-    // First node of the body whose b is not finite; -1: none, |b|^2 has overflowed.
-    __device__ __forceinline__ int first_bad_node() const {
-        if (threadIdx.x == 0) memory.bad = 0x7fffffff;
-        __syncthreads();
-        for (int k = threadIdx.x; k < 3 * memory.body.nodes; k += THREADS)
-            if (!isfinite(s.b[3ll * memory.body.first + k])) atomicMin(&memory.bad, k / 3);
-        __syncthreads();
-        return memory.bad == 0x7fffffff ? -1 : memory.bad;
     }
 
     // True if a grab pulls at an own node by a spring.
@@ -114,7 +98,7 @@ struct FactorApplication {
         if (!isfinite(sums[0])) {
             out.status = NOT_FINITE;
             out.residual = sums[0];
-            out.bad_node = first_bad_node();
+            out.bad_node = first_bad_node(memory.body, s.b, memory.bad);
             fill((real)(0 * sums[0]));
             return true;
         }

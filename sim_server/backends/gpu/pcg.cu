@@ -38,12 +38,6 @@ __device__ __forceinline__ double inverse_of(double a) {
     return y * (2 - a * y);
 }
 
-// 2^-k with sqrt(a) 2^-k < 1.
-__device__ __forceinline__ float unit_for(double a) {
-    const int k = (((__double2hiint(a) >> 20) & 0x7ff) - 1021) >> 1;  // a < 2^(2 k)
-    return __int_as_float((127 - max(-120, min(120, k))) << 23);
-}
-
 struct PcgSolver {
     const PcgArguments& s;
     BlockGroup group;
@@ -269,16 +263,6 @@ struct PcgSolver {
         }
     }
 
-    // First node of the body whose b is not finite; -1: none, |b|^2 has overflowed.
-    __device__ __forceinline__ int first_bad_node() const {
-        if (threadIdx.x == 0) memory.bad = 0x7fffffff;
-        __syncthreads();
-        for (int k = threadIdx.x; k < 3 * memory.body.nodes; k += THREADS)
-            if (!isfinite(s.b[3ll * memory.body.first + k])) atomicMin(&memory.bad, k / 3);
-        __syncthreads();
-        return memory.bad == 0x7fffffff ? -1 : memory.bad;
-    }
-
     __device__ __forceinline__ void solve();
 };
 
@@ -315,7 +299,7 @@ __device__ __forceinline__ void PcgSolver::solve() {
                 if (refused || r2 <= memory.goal) {
                     if (refused) {
                         out.status = NOT_FINITE;
-                        out.bad_node = first_bad_node();
+                        out.bad_node = first_bad_node(memory.body, s.b, memory.bad);
                     }
                     if (alpha == 0) give(refused, (real)(0 * bb));  // NaN: `advance` restores the body; else the scene has x already
                     out.residual = refused ? bb : bb > 0 ? sqrt(r2 / bb) : 0;

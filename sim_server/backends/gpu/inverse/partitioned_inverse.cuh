@@ -16,6 +16,22 @@ constexpr int TILE_SUMS = 64;  // most partial products of shared tiles in a pha
 #define FEW 3         // segments that a warp loads at a time, for short lists
 #define MANY 8        // 2304 entries in one trip through L2 with 8 warps
 
+// 2^-k with sqrt(a) 2^-k < 1.
+__device__ __forceinline__ float unit_for(double a) {
+    const int k = (((__double2hiint(a) >> 20) & 0x7ff) - 1021) >> 1;  // a < 2^(2 k)
+    return __int_as_float((127 - max(-120, min(120, k))) << 23);
+}
+
+// First node of the body whose b is not finite; -1: none, |b|^2 has overflowed. bad: in shared memory.
+__device__ __forceinline__ int first_bad_node(const PcgBody& body, const real* b, int& bad) {
+    if (threadIdx.x == 0) bad = 0x7fffffff;
+    __syncthreads();
+    for (int k = threadIdx.x; k < 3 * body.nodes; k += THREADS)
+        if (!isfinite(b[3ll * body.first + k])) atomicMin(&bad, k / 3);
+    __syncthreads();
+    return bad == 0x7fffffff ? -1 : bad;
+}
+
 struct SplitVector { unsigned short *high, *low; };  // of a phase, in shared memory
 
 __device__ __forceinline__ unsigned short half_of(float v) {
