@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: MIT
 // Obstacles in motion, and what of a surface may touch them in a step (contact.py).
 #include "kernel.h"
-#include "shapes.cuh"
+#include "contact_law.cuh"
 
 // What decides about the pose of an obstacle.
 enum Motion { FIXED = 0, KEYFRAMES = 1, CLIENT = 2 };
@@ -162,22 +162,6 @@ INLINE Candidate candidate_of(const ObstacleTable& t, int o, const double* x, co
     for (int k = 0; k < 3; ++k) c.point[k] = from[k] - away * c.normal[k];
     c.obstacle = o;
     return c;
-}
-
-// Turns v by the smallest rotation from the normal `before` to `now`, and takes what is left of it along `now` away.
-INLINE void turn_with(const double* before, const double* now, double* v) {
-    const double axis[3] = {before[1] * now[2] - before[2] * now[1], before[2] * now[0] - before[0] * now[2],
-                            before[0] * now[1] - before[1] * now[0]};
-    const double cosine = dot3(before, now);
-    if (cosine > -0.999) {
-        const double along = dot3(axis, v) / (1 + cosine);
-        const double turned[3] = {cosine * v[0] + axis[1] * v[2] - axis[2] * v[1] + along * axis[0],
-                                  cosine * v[1] + axis[2] * v[0] - axis[0] * v[2] + along * axis[1],
-                                  cosine * v[2] + axis[0] * v[1] - axis[1] * v[0] + along * axis[2]};
-        for (int k = 0; k < 3; ++k) v[k] = turned[k];
-    }
-    const double out = dot3(now, v);
-    for (int k = 0; k < 3; ++k) v[k] -= out * now[k];
 }
 
 // What a row remembers of the last step.

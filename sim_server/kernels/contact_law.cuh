@@ -53,3 +53,19 @@ HOST_DEVICE void contact_stiffness(const ContactRow& row, const ContactForce& f,
         for (int j = i; j < 3; ++j)
             k[m++] = (normal - tangential) * n[i] * n[j] + (i == j ? tangential : 0) - along * f.traction[i] * f.traction[j];
 }
+
+// Turns v by the smallest rotation from the normal `before` to `now`, and takes what is left of it along `now` away.
+HOST_DEVICE void turn_with(const double* before, const double* now, double* v) {
+    const double axis[3] = {before[1] * now[2] - before[2] * now[1], before[2] * now[0] - before[0] * now[2],
+                            before[0] * now[1] - before[1] * now[0]};
+    const double cosine = dot3(before, now);
+    if (cosine > -0.999) {
+        const double along = dot3(axis, v) / (1 + cosine);
+        const double turned[3] = {cosine * v[0] + axis[1] * v[2] - axis[2] * v[1] + along * axis[0],
+                                  cosine * v[1] + axis[2] * v[0] - axis[0] * v[2] + along * axis[1],
+                                  cosine * v[2] + axis[0] * v[1] - axis[1] * v[0] + along * axis[2]};
+        for (int k = 0; k < 3; ++k) v[k] = turned[k];
+    }
+    const double out = dot3(now, v);
+    for (int k = 0; k < 3; ++k) v[k] -= out * now[k];
+}

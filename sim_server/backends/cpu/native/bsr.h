@@ -12,7 +12,7 @@ struct BlockCsr {
     const int32_t* row_start;   // (nodes + 1,) of the scene, into columns and values
     const int32_t* columns;     // node numbers in the scene
     const double* values;       // (blocks, 3, 3)
-    const BodyRows* rows = nullptr;  // of contacts that A has beside its values, or null
+    const Rows* rows = nullptr;  // of contacts that A has beside its values, or null
     int size() const { return 3 * (last - first); }
 };
 
@@ -84,7 +84,7 @@ static void invert_diagonal(const BlockCsr& A, bool whole, double* inverse) {
         double* block = inverse + 9 * (int64_t)(i - A.first);
         for (int m = 0; m < 9; ++m) block[m] = A.values[9 * (int64_t)k + m];
     }
-    if (A.rows) A.rows->add_diagonal(inverse);
+    if (A.rows) A.rows->add_diagonal(inverse, A.last);
     for (int i = 0; i < A.last - A.first; ++i) {
         double block[9];
         for (int m = 0; m < 9; ++m) block[m] = inverse[9 * (int64_t)i + m];

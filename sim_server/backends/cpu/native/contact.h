@@ -17,6 +17,7 @@
 #include <algorithm>
 #include <cmath>
 
+#include "island.h"
 #include "loop.h"
 
 constexpr double FIRST = 0.02, EARLY = 0.01, SHORT_OF = 0.9;
@@ -24,35 +25,53 @@ constexpr double SAME_PLANE = 0.995;  // cosine of the angle between normals
 constexpr double HARDER = 10;
 constexpr int ROUNDS = 3;
 
-// The passes of one body; allocates nothing.
+// The passes of an island, bodies that touch each other and are solved as one system, or of one body; allocates nothing. Vectors are of
+// the whole scene's nodes, of which it uses those of its bodies.
 struct Passes {
     Loop& loop;
     Contact& c;
-    Body& body;
-    const BodyRows rows;
-    BlockCsr A;                          // with the rows
+    const int32_t* bodies;
+    const int32_t count;
+    const bool pairs;                    // rows between bodies count
+    Rows rows;
+    int32_t* const active;               // its rows that act
     const double* b;
-    double *y, *work;
-    double *left, *r, *dy, *before;      // b - A y; with contact; solution of a pass; r before its solve
+    double* y;
+    double *left, *r, *dy, *before, *rest;  // b - A y; with contact; solution of a pass; r before its solve; residual of its solve
     const double scale2;                 // i c, of S
     ContactReport report = {0, 0, 0, NAN, 0};
     SolveResult result;
     double given;                        // what |r| is relative to
 
-    Passes(Loop& loop, int index)
-        : loop(loop), c(*loop.contact), body(loop.body[index]),
-          rows{c, body.first, c.body_start[index], c.body_start[index + 1]},
-          A{body.first, body.last, loop.row_start, loop.columns, loop.values, &rows},
-          b(loop.b + 3 * (int64_t)body.first), y(loop.y + 3 * (int64_t)body.first), work(loop.work + 27 * (int64_t)body.first),
-          scale2(c.dx_dv * c.force_coefficient), result{0, 0, 0, CONVERGED, body.now.kind, 0} {
-        const int64_t n = A.size();
-        left = c.room + 12 * (int64_t)body.first;
-        r = left + n; dy = r + n; before = dy + n;
+    Passes(Loop& loop, int island)
+        : loop(loop), c(*loop.contact), bodies(c.island + c.island_start[island]),
+          count(c.island_start[island + 1] - c.island_start[island]), pairs(c.pair_first >= 0),
+          rows{c, 0, c.active + c.island_rows[island], 0}, active(c.active + c.island_rows[island]), b(loop.b), y(loop.y),
+          scale2(c.dx_dv * c.force_coefficient), result{0, 0, 0, CONVERGED, loop.body[bodies[0]].now.kind, 0} {
+        const int64_t n = 3 * (int64_t)loop.nodes;
+        left = c.room;
+        r = left + n; dy = r + n; before = dy + n; rest = before + n;
     }
 
+    template <class F> void each_entry(F f) const {
+        for (int m = 0; m < count; ++m) {
+            const Body& body = loop.body[bodies[m]];
+            for (int64_t k = 3 * (int64_t)body.first; k < 3 * (int64_t)body.last; ++k) f(k);
+        }
+    }
+    // f(first, last) of the rows of each body, those with its own vertices
+    template <class F> void each_range(F f) const {
+        for (int m = 0; m < count; ++m) {
+            const int first = c.body_start[bodies[m]], last = c.body_start[bodies[m] + 1];
+            f(first, last);
+            if (pairs) f(c.pair_first + first, c.pair_first + last);
+        }
+    }
     template <class F> void each_row(F f) const {
-        for (int k = rows.first; k < rows.last; ++k)
-            if (!rows.empty(k)) f(k, c.state[k]);
+        each_range([&](int first, int last) {
+            for (int k = first; k < last; ++k)
+                if (!rows.empty(k)) f(k, c.state[k]);
+        });
     }
 
     // Displacements of the points by velocities y.
@@ -80,34 +99,33 @@ struct Passes {
     }
 
     // Forces and stiffness of the rows as they are. set: those marked count as closed. Returns whether a row has either.
-    bool apply_law(bool set) const {
-        bool any = false;
+    bool apply_law(bool set) {
+        rows.actives = 0;
         each_row([&](int k, RowState& s) {
             const ContactRow row = rows.row(k);
             s.force = contact_force(row, s.s, s.limit, set && s.in_set);
             contact_stiffness(row, s.force, scale2, s.stiffness);
-            any = any || rows.acts(k);
+            if (rows.acts(k)) active[rows.actives++] = k;
         });
-        return any;
+        return rows.actives > 0;
     }
 
     // r = left + i H^T f, given = the larger one of |b| and |b + i H^T f|, which is 0 at rest; returns |r|.
     double balance() {
-        const int n = A.size();
-        std::fill(r, r + n, 0.0);
+        each_entry([&](int64_t k) { r[k] = 0; });
         each_row([&](int k, RowState& s) {
             double f[3];
             for (int m = 0; m < 3; ++m) f[m] = c.force_coefficient * (s.force.normal * c.normal[3 * k + m] + s.force.traction[m]);
             rows.scatter(k, f, r);
         });
         double all = 0, own = 0, sum = 0;
-        for (int k = 0; k < n; ++k) {
+        each_entry([&](int64_t k) {
             const double f = r[k];
             all += (b[k] + f) * (b[k] + f);
             own += b[k] * b[k];
             r[k] = left[k] + f;
             sum += r[k] * r[k];
-        }
+        });
         given = std::sqrt(std::max(all, own));
         return std::sqrt(sum);
     }
@@ -148,20 +166,34 @@ struct Passes {
     }
 
     SolveSettings settings_for(double tolerance) const {
-        SolveSettings s = body.now;
+        SolveSettings s = loop.body[bodies[0]].now;
         s.tolerance = tolerance;
         s.warm_start = 0;
-        if (s.probe > 0) s.probe = 0;
+        s.probe = 0;
         if (s.budget > 0) s.budget = std::max(s.budget - result.seconds, 1e-9);
         if (s.budget < 0) s.budget = std::min(-1.0, s.budget + result.iterations);
         return s;
     }
 
+    // dy of (A + H^T S H) dy = r, and its residual.
+    SolveResult solve_linear(double tolerance) {
+        const SolveSettings settings = settings_for(tolerance);
+        if (count > 1) return IslandSolver{loop, c, bodies, count, rows}.solve(r, settings, dy, rest);
+        Body& body = loop.body[bodies[0]];
+        const int64_t at = 3 * (int64_t)body.first;
+        Rows own = rows;
+        own.node_first = body.first;
+        const BlockCsr A{body.first, body.last, loop.row_start, loop.columns, loop.values, &own};
+        double* work = loop.work + 27 * (int64_t)body.first;
+        const SolveResult solved = pcg(A, r + at, body.factor, settings, dy + at, work, false, &body.correction);
+        std::copy(work, work + A.size(), rest + at);  // where pcg leaves its residual
+        return solved;
+    }
+
     // Solves (A + H^T S H) dy = r and moves y by alpha dy, left accordingly. tolerance: of |r|. exactly: alpha is 1.
     void pass(double tolerance, bool exactly) {
-        const int n = A.size();
-        std::copy(r, r + n, before);
-        const SolveResult solved = pcg(A, r, body.factor, settings_for(tolerance), dy, work, false, &body.correction);
+        each_entry([&](int64_t k) { before[k] = r[k]; });
+        const SolveResult solved = solve_linear(tolerance);
         ++report.passes;
         result.seconds += solved.seconds;
         result.iterations += solved.iterations;
@@ -170,25 +202,25 @@ struct Passes {
         result.status = solved.status;
         result.residual = solved.residual;  // of |r|; of what is given at the end of the step
         if (solved.status == NOT_FINITE) return;
-        // A dy = r - (residual of the solve) - H^T S H dy: no more product with A. pcg leaves its residual in work.
-        std::fill(r, r + n, 0.0);
+        // A dy = r - (residual of the solve) - H^T S H dy: no more product with A.
+        each_entry([&](int64_t k) { r[k] = 0; });
         rows.add_product(dy, r);
         double dot_left = 0, curvature = 0;
-        for (int k = 0; k < n; ++k) {
-            r[k] = before[k] - work[k] - r[k];  // A dy
+        each_entry([&](int64_t k) {
+            r[k] = before[k] - rest[k] - r[k];  // A dy
             dot_left += dy[k] * left[k];
             curvature += dy[k] * r[k];
-        }
+        });
         each_row([&](int k, RowState& s) {
             double u[3] = {0, 0, 0};
             rows.gather(k, dy, u);
             for (int m = 0; m < 3; ++m) s.step[m] = c.dx_dv * u[m];
         });
         const double alpha = exactly ? 1 : line_search(dot_left, curvature);
-        for (int k = 0; k < n; ++k) {
+        each_entry([&](int64_t k) {
             y[k] += alpha * dy[k];
             left[k] -= alpha * r[k];
-        }
+        });
         each_row([&](int, RowState& s) {
             for (int m = 0; m < 3; ++m) s.s[m] += alpha * s.step[m];
         });
@@ -218,7 +250,7 @@ struct Passes {
             if (!std::isfinite(size)) { result.status = NOT_FINITE; return; }
             report.residual = given > 0 ? size / given : 0;
             if (last) break;
-            const double goal = body.now.tolerance * given;
+            const double goal = loop.body[bodies[0]].now.tolerance * given;
             const bool by_law = k > 0 || !set || set_is_law();
             last = by_law && size <= c.tolerance * given;
             if (last && size <= goal) {  // there is nothing left to solve
@@ -242,25 +274,43 @@ struct Passes {
         return balance();
     }
 
+    // left = b - A y
+    void leave() const {
+        for (int m = 0; m < count; ++m) {
+            const Body& body = loop.body[bodies[m]];
+            const int64_t at = 3 * (int64_t)body.first;
+            residual(matrix_of(loop, body), b + at, y + at, left + at);
+        }
+    }
+
     // Begins with the better one of the last solution and zero; left = b - A y.
     void start() {
-        const int n = A.size();
         auto zero = [&] {
-            std::fill(y, y + n, 0.0);
-            std::copy(b, b + n, left);
+            each_entry([&](int64_t k) {
+                y[k] = 0;
+                left[k] = b[k];
+            });
         };
-        if (!body.now.warm_start) { zero(); move_points(); return; }
-        BlockCsr plain = A;
-        plain.rows = nullptr;
-        residual(plain, b, y, left);
+        if (!loop.body[bodies[0]].now.warm_start) { zero(); move_points(); return; }
+        leave();
         const double warm = size_at();
-        std::copy(y, y + n, dy);
-        std::copy(left, left + n, before);
+        each_entry([&](int64_t k) {
+            dy[k] = y[k];
+            before[k] = left[k];
+        });
         zero();
         if (size_at() <= warm || !(warm < INFINITY)) return;
-        std::copy(dy, dy + n, y);
-        std::copy(before, before + n, left);
+        each_entry([&](int64_t k) {
+            y[k] = dy[k];
+            left[k] = before[k];
+        });
         move_points();
+    }
+
+    // f(k) of the first row against obstacles of each point
+    template <class F> void each_site(F f) const {
+        for (int m = 0; m < count; ++m)
+            for (int k = c.body_start[bodies[m]]; k < c.body_start[bodies[m] + 1]; k += 2) f(k);
     }
 
     // Point of a site, at the start of the step and moved by y. Both rows of a node have the same.
@@ -303,7 +353,7 @@ struct Passes {
     // Gives points that y moves into an obstacle a row there. Rows come in pairs, of one point each. Returns whether there are such.
     bool sweep() const {
         bool found = false;
-        for (int k = rows.first; k < rows.last; k += 2) {
+        each_site([&](int k) {
             double from[3], to[3], begin[3], end[3];
             path(k, from, to);
             for (int o = 0; o < c.obstacle_count; ++o) {
@@ -312,7 +362,7 @@ struct Passes {
                 take_row(k, o, from, begin, end, near <= 1 ? near : 0);
                 found = true;
             }
-        }
+        });
         if (found) move_points();
         return found;
     }
@@ -338,10 +388,10 @@ struct Passes {
 
     // Sets points that y moves into an obstacle back, to a part of the way.
     void clip() {
-        for (int k = rows.first; k < rows.last; k += 2) {
-            const int node = c.corner[3 * k];
+        each_site([&](int k) {
+            const int node = c.corner[CORNERS * k];
             double from[3], to[3], begin[3], end[3], back[3], earliest = 2;
-            if (c.free[node] == 0) continue;
+            if (c.free[node] == 0) return;
             path(k, from, to);
             for (int o = 0; o < c.obstacle_count; ++o) {
                 const double t = swept(o, 0, from, to, begin, end);
@@ -350,75 +400,156 @@ struct Passes {
                 for (int m = 0; m < 3; ++m) back[m] = begin[m] + SHORT_OF * t * (end[m] - begin[m]);
                 world_point(c.obstacles.end + 7 * o, back, back);
             }
-            if (earliest > 1) continue;
+            if (earliest > 1) return;
             ++report.clipped;
             double dv[3];
             for (int m = 0; m < 3; ++m) dv[m] = (back[m] - from[m]) / c.dx_dv - c.predictor[3 * (int64_t)node + m];
-            rotated_back(c.rotation + 9 * (int64_t)node, dv, y + 3 * (node - body.first));
+            rotated_back(c.rotation + 9 * (int64_t)node, dv, y + 3 * (int64_t)node);
+        });
+    }
+
+    // Keeps the forces for the next step, and reports on each body.
+    void finish() {
+        const bool well = result.status != NOT_FINITE;
+        for (int m = 0; m < count; ++m) {
+            ContactReport& report = c.report[bodies[m]];
+            report = this->report;
+            double* reaction = c.reaction + 6 * (int64_t)c.obstacle_count * bodies[m];
+            std::fill(reaction, reaction + 6 * c.obstacle_count, 0.0);
+        }
+        each_range([&](int first, int last) {
+            for (int k = first; k < last; ++k) keep(k, well && !rows.empty(k) && c.state[k].force.normal > 0);
+        });
+        for (int m = 0; m < count; ++m) {
+            ContactReport& report = c.report[bodies[m]];
+            if (!report.contacts && !report.passes) report.residual = NAN;
+            const bool balanced = result.status != CONTACT && !report.clipped;  // else the forces are more than what acted
+            if (!balanced && report.work < 0) report.work = 0;
         }
     }
 
-    // Keeps the forces for the next step, and what they did in this one. index: of the body.
-    void finish(int index) {
-        double* reaction = c.reaction + 6 * (int64_t)c.obstacle_count * index;
-        std::fill(reaction, reaction + 6 * c.obstacle_count, 0.0);
-        const bool well = result.status != NOT_FINITE;
-        for (int k = rows.first; k < rows.last; ++k) {
-            const RowState& s = c.state[k];
-            const bool closed = well && !rows.empty(k) && s.force.normal > 0;
-            c.force[k] = closed ? s.force.normal : 0;
-            double f[3], at[3], p[3], arm[3];
-            for (int m = 0; m < 3; ++m) {
-                c.traction[3 * k + m] = closed ? s.force.traction[m] : 0;
-                f[m] = c.force[k] * c.normal[3 * k + m] + c.traction[3 * k + m];
-            }
-            if (!closed) continue;
-            ++report.contacts;
-            report.work += dot3(f, s.s);
-            rows.at_point(k, loop.x, p);
-            double* sum = reaction + 6 * c.obstacle[k];
-            for (int m = 0; m < 3; ++m) {
-                at[m] = p[m] + s.s[m];
-                arm[m] = at[m] - c.obstacles.end[7 * c.obstacle[k] + m];
-                sum[m] -= f[m];
-            }
-            sum[3] -= arm[1] * f[2] - arm[2] * f[1];
-            sum[4] -= arm[2] * f[0] - arm[0] * f[2];
-            sum[5] -= arm[0] * f[1] - arm[1] * f[0];
+    void keep(int k, bool closed) const {
+        const RowState& s = c.state[k];
+        double f[3];
+        c.force[k] = closed ? s.force.normal : 0;
+        for (int m = 0; m < 3; ++m) {
+            c.traction[3 * k + m] = closed ? s.force.traction[m] : 0;
+            f[m] = c.force[k] * c.normal[3 * k + m] + c.traction[3 * k + m];
         }
-        if (!report.contacts && !report.passes) report.residual = NAN;
-        const bool balanced = result.status != CONTACT && !report.clipped;  // else the forces are more than what acted
-        if (!balanced && report.work < 0) report.work = 0;
-        c.report[index] = report;
+        if (!closed) return;
+        double displacement[2][3] = {};
+        for (int a = 0; a < CORNERS; ++a) {
+            const int node = c.corner[CORNERS * k + a];
+            if (node < 0) continue;
+            double u[3];
+            rotated(c.rotation + 9 * (int64_t)node, y + 3 * (int64_t)node, u);
+            for (int m = 0; m < 3; ++m)
+                displacement[a > 0][m] += c.weight[CORNERS * k + a] * c.dx_dv * (c.predictor[3 * (int64_t)node + m] + u[m]);
+        }
+        const int body = c.site_body[(c.pair_first >= 0 && k >= c.pair_first ? k - c.pair_first : k) / 2];
+        ++c.report[body].contacts;
+        c.report[body].work += dot3(f, displacement[0]);
+        if (k >= c.pair_first && c.pair_first >= 0) {
+            ++c.report[c.obstacle[k]].contacts;
+            c.report[c.obstacle[k]].work += dot3(f, displacement[1]);
+        } else {
+            react(k, f, c.reaction + 6 * ((int64_t)c.obstacle_count * body + c.obstacle[k]));
+        }
+    }
+
+    // Force and torque of row k on its obstacle.
+    void react(int k, const double* f, double* sum) const {
+        double p[3], arm[3];
+        rows.at_point(k, loop.x, p);
+        for (int m = 0; m < 3; ++m) {
+            arm[m] = p[m] + c.state[k].s[m] - c.obstacles.end[7 * c.obstacle[k] + m];
+            sum[m] -= f[m];
+        }
+        sum[3] -= arm[1] * f[2] - arm[2] * f[1];
+        sum[4] -= arm[2] * f[0] - arm[0] * f[2];
+        sum[5] -= arm[0] * f[1] - arm[1] * f[0];
     }
 };
 
-// The step of a body whose rows are detected: as without contact where nothing is touched.
-static SolveResult solve_in_contact(Loop& loop, int index) {
-    Passes p(loop, index);
-    const Body& body = loop.body[index];
-    const int64_t at = 3 * (int64_t)body.first, n = p.A.size();
-    if (p.choose_set()) {
+// The step of an island whose rows are detected; of a body alone as without contact where nothing is touched.
+static void solve_island(Loop& loop, int island) {
+    Passes p(loop, island);
+    const int set = p.choose_set(), first = p.bodies[0];
+    if (set || p.count > 1) {
+        if (p.count > 1) IslandSolver::make_modes(loop, p.c, p.bodies, p.count);
         p.start();
         p.solve(true);
     } else {
-        BlockCsr A = p.A;
-        A.rows = nullptr;
-        p.result = pcg(A, loop.b + at, body.factor, body.now, p.y, p.work, !loop.moving[index], &loop.body[index].correction);
+        Body& body = loop.body[first];
+        const int64_t at = 3 * (int64_t)body.first;
+        p.result = pcg(matrix_of(loop, body), loop.b + at, body.factor, body.now, loop.y + at, loop.work + 27 * (int64_t)body.first,
+                       !loop.moving[first], &body.correction);
         if (p.result.status != NOT_FINITE) {
             p.move_points();
             const bool acts = p.apply_law(false);
             if (p.sweep() || acts) {
-                residual(A, p.b, p.y, p.left);
+                p.leave();
                 p.solve(false);
             }
         }
     }
     for (int k = 0; k < ROUNDS && p.result.status != NOT_FINITE && p.sweep(); ++k) p.solve(false);
-    if (p.result.status == NOT_FINITE) std::fill(p.y, p.y + n, NAN);  // the kernel `advance` takes the body back
+    if (p.result.status == NOT_FINITE) p.each_entry([&](int64_t k) { p.y[k] = NAN; });  // the kernel `advance` takes the bodies back
     else p.clip();
-    p.finish(index);
-    return p.result;
+    p.finish();
+    for (int m = 0; m < p.count; ++m) p.c.result[p.bodies[m]] = p.result;
+}
+
+// Groups the bodies that have rows with each other, each group's by number. Bodies whose forces are NaN are left alone.
+static void find_islands(Loop& loop) {
+    Contact& c = *loop.contact;
+    int32_t* parent = c.mode;  // free until an island is solved
+    for (int i = 0; i < loop.bodies; ++i) parent[i] = i;
+    auto root = [&](int i) {
+        while (parent[i] != i) i = parent[i] = parent[parent[i]];
+        return i;
+    };
+    auto finite = [&](int i) {
+        const Body& body = loop.body[i];
+        const int64_t at = 3 * (int64_t)body.first;
+        return std::isfinite(dot(3 * (body.last - body.first), loop.b + at, loop.b + at));
+    };
+    for (int i = 0; c.pair_first >= 0 && i < loop.bodies; ++i) {
+        if (!c.near[i]) continue;
+        const bool well = finite(i);
+        for (int k = c.pair_first + c.body_start[i]; k < c.pair_first + c.body_start[i + 1]; ++k) {
+            const int other = c.obstacle[k];
+            if (other < 0) continue;
+            if (!well || !finite(other)) { c.obstacle[k] = -1; continue; }
+            const int a = root(i), b = root(other);
+            parent[std::max(a, b)] = std::min(a, b);
+        }
+    }
+    c.islands = 0;
+    int bodies = 0, rows = 0;
+    for (int i = 0; i < loop.bodies; ++i) {
+        if (root(i) != i) continue;
+        c.island_start[c.islands] = bodies;
+        c.island_rows[c.islands++] = rows;
+        for (int j = i; j < loop.bodies; ++j) {
+            if (root(j) != i) continue;
+            c.island[bodies++] = j;
+            rows += (c.pair_first >= 0 ? 2 : 1) * (c.body_start[j + 1] - c.body_start[j]);
+        }
+    }
+    c.island_start[c.islands] = bodies;
+}
+
+// Solves all bodies, those that touch others first.
+static void solve_in_contact(Loop& loop) {
+    Contact& c = *loop.contact;
+    find_islands(loop);
+    auto size = [&](int i) { return c.island_start[i + 1] - c.island_start[i]; };
+    for (int i = 0; i < c.islands; ++i)
+        if (size(i) > 1) solve_island(loop, i);
+#pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) if (loop.threads > 1)
+    for (int i = 0; i < c.islands; ++i)
+        if (size(i) == 1) solve_island(loop, i);
 }
 
 // Adds the stiffness of contacts that carried force in the last step to a copy of a body's blocks, so that a factor made from it knows
@@ -426,19 +557,26 @@ static SolveResult solve_in_contact(Loop& loop, int index) {
 static void add_contacts(const Loop& loop, const Body& body, double* target) {
     const Contact& c = *loop.contact;
     const int index = (int)(&body - loop.body), begin = loop.row_start[body.first];
-    const BodyRows rows{c, body.first, c.body_start[index], c.body_start[index + 1]};
-    for (int k = rows.first; k < rows.last; ++k) {
-        if (rows.empty(k) || !(c.force[k] > 0)) continue;
+    const Rows rows{c, 0, nullptr, 0};
+    auto block_of = [&](int i, int j) -> double* {
+        if (i < body.first || i >= body.last) return nullptr;
+        for (int m = loop.row_start[i]; m < loop.row_start[i + 1]; ++m)
+            if (loop.columns[m] == j) return target + 9 * (int64_t)(m - begin);
+        return nullptr;
+    };
+    auto add = [&](int k) {
+        if (rows.empty(k) || !(c.force[k] > 0)) return;
         ContactForce f = {c.force[k], {0, 0, 0}, 0, true};
         const double* t = c.traction + 3 * k;
         if (dot3(t, t) < 0.98 * square(c.friction[k] * c.force[k])) f.slip = 1;
         double s[6];
         c.state[k].hardening = 1;
         contact_stiffness(rows.row(k), f, c.dx_dv * c.force_coefficient, s);
-        rows.add_blocks(k, s, [&](int i, int j) -> double* {
-            for (int m = loop.row_start[i]; m < loop.row_start[i + 1]; ++m)
-                if (loop.columns[m] == j) return target + 9 * (int64_t)(m - begin);
-            return nullptr;
-        });
-    }
+        rows.add_blocks(k, s, block_of);
+    };
+    for (int k = c.body_start[index]; k < c.body_start[index + 1]; ++k) add(k);
+    if (c.pair_first < 0 || !c.near[index]) return;
+    for (int i = 0; i < loop.bodies; ++i)
+        for (int k = c.pair_first + c.body_start[i]; c.near[i] && k < c.pair_first + c.body_start[i + 1]; ++k)
+            if (i == index || c.obstacle[k] == index) add(k);
 }

@@ -1,13 +1,15 @@
 // SPDX-License-Identifier: MIT
-// Rows of contacts in a body's system on a CPU: forces, and the product with their stiffness. They are never part of the stored A,
+// Rows of contacts in the system of bodies on a CPU: forces, and the product with their stiffness. They are never part of the stored A,
 // whose pattern follows from the mesh. Input: backends/contact.py; law: kernels/contact_law.cuh.
 #pragma once
 #include <cstdint>
 
 #include "contact_law.cuh"
 
+constexpr int CORNERS = 4;        // of a row, at most
+
 struct RowState {                 // of a row in the step under way
-    double s[3];                  // displacement of its point by the velocities reached [m]
+    double s[3];                  // displacement of its point by the velocities reached, relative to the other surface [m]
     double step[3];               // by the solution of the pass [m]
     double limit;                 // normal force that limits friction, held in a pass [N]
     double hardening;             // of the row's stiffness in this step
@@ -24,24 +26,47 @@ struct ContactReport {            // of a body in a step
     double work;                  // of contact on the body [J]
 };
 
+struct SolveResult;
+
+struct Box {
+    double low[3], high[3];
+};
+
 struct Contact {
     ObstacleTable obstacles;
     int32_t obstacle_count;
     int32_t passes;
     double tolerance;
     double dx_dv, force_coefficient;              // [s]
-    const int32_t* body_start;                    // (bodies + 1,) rows
-    const int32_t* corner;                        // (rows, 3)
-    const double* weight;                         // (rows, 3)
-    int32_t* obstacle;                            // (rows,)
+    const int32_t* body_start;                    // (bodies + 1,) rows against obstacles
+    int32_t* corner;                              // (rows, 4)
+    double* weight;                               // (rows, 4)
+    int32_t* obstacle;                            // (rows,) obstacle or other body
     double *normal, *gap, *drift, *entry;         // (rows, 3), (rows,), (rows, 3), (rows,)
-    const double *stiffness, *friction, *thickness;  // (rows,)
+    double *stiffness, *friction, *thickness;     // (rows,)
     double *force, *traction;                     // (rows,), (rows, 3)
     const double *rotation, *predictor, *free;    // (nodes, 3, 3), (nodes, 3), (nodes,)
     RowState* state;                              // (rows,)
-    double* room;                                 // 12 doubles a node
+    int32_t* active;                              // (rows,) rows that act, those of an island one after another
+    double* room;                                 // 24 doubles a node
     ContactReport* report;                        // (bodies,)
     double* reaction;                             // (bodies, obstacles, 6) force and torque on each obstacle
+    int32_t pair_first;                           // row of the first one between bodies; -1: bodies do not touch each other
+    const int32_t *site_body, *node_site;         // (sites,), (nodes,) or -1
+    const int32_t* triangle;                      // (triangles, 3) nodes
+    const int32_t *tree_start, *tree_child;       // (bodies + 1,), (tree, 2): two children, or ~ of a triangle (pairs.h)
+    Box *tree_box, *body_box;                     // (tree,), (bodies,)
+    int32_t *near, *was_near;                     // (bodies,) 1: its box meets another's; in the last step
+    const double* pair_friction;                  // (bodies, bodies)
+    const double* gravity;                        // (3,)
+    int32_t *island, *island_start;               // (bodies,) bodies by island; (bodies + 1,)
+    int32_t* island_rows;                         // (bodies,) first entry in `active` of each island
+    int32_t islands;
+    SolveResult* result;                          // (bodies,)
+    int32_t most_modes;                           // of the coarse space of an island; 0: none
+    double *modes, *coarse, *lever;               // (nodes, 18), (most_modes + 4, most_modes), (rows, 8): island.h
+    int32_t* mode;                                // (bodies,) first mode of a body; -1: it has none
+    const int32_t* unheld;                        // (bodies,) 1: no node is fixed
 };
 
 static void rotated(const double* R, const double* v, double* out) {
@@ -51,10 +76,12 @@ static void rotated_back(const double* R, const double* v, double* out) {
     for (int i = 0; i < 3; ++i) out[i] = R[i] * v[0] + R[3 + i] * v[1] + R[6 + i] * v[2];
 }
 
-// The rows of one body. Vectors below are of its nodes, material frame, unless said.
-struct BodyRows {
+// Rows of one system. Vectors are nodal, material frame, and begin at node `node_first`.
+struct Rows {
     const Contact& c;
-    int32_t node_first, first, last;  // first node of the body; rows [first, last)
+    int32_t node_first;
+    const int32_t* active;      // rows that act; of the last `apply_law`
+    int32_t actives;
 
     ContactRow row(int r) const {
         return {c.normal + 3 * r, c.drift + 3 * r, c.traction + 3 * r, c.gap[r], c.thickness[r],
@@ -62,32 +89,35 @@ struct BodyRows {
     }
     bool empty(int r) const { return c.obstacle[r] < 0; }
 
+    // f(node, weight) of the corners that may move
+    template <class F> void each_corner(int r, F f) const {
+        for (int a = 0; a < CORNERS; ++a) {
+            const int node = c.corner[CORNERS * r + a];
+            if (node >= 0 && c.free[node] != 0) f(node, c.weight[CORNERS * r + a]);
+        }
+    }
     // out += sum_a weight_a R_a v_a, world frame
     void gather(int r, const double* v, double* out) const {
-        for (int a = 0; a < 3; ++a) {
-            const int node = c.corner[3 * r + a];
-            if (node < 0 || c.free[node] == 0) continue;
+        each_corner(r, [&](int node, double weight) {
             double w[3];
-            rotated(c.rotation + 9 * (int64_t)node, v + 3 * (node - node_first), w);
-            for (int k = 0; k < 3; ++k) out[k] += c.weight[3 * r + a] * w[k];
-        }
+            rotated(c.rotation + 9 * (int64_t)node, v + 3 * (int64_t)(node - node_first), w);
+            for (int k = 0; k < 3; ++k) out[k] += weight * w[k];
+        });
     }
     // to_a += weight_a R_a^T f, f in the world frame
     void scatter(int r, const double* f, double* to) const {
-        for (int a = 0; a < 3; ++a) {
-            const int node = c.corner[3 * r + a];
-            if (node < 0 || c.free[node] == 0) continue;
+        each_corner(r, [&](int node, double weight) {
             double w[3];
             rotated_back(c.rotation + 9 * (int64_t)node, f, w);
-            for (int k = 0; k < 3; ++k) to[3 * (node - node_first) + k] += c.weight[3 * r + a] * w[k];
-        }
+            for (int k = 0; k < 3; ++k) to[3 * (int64_t)(node - node_first) + k] += weight * w[k];
+        });
     }
     // sum_a weight_a field_a of nodal vectors in the world frame, (nodes, 3)
     void at_point(int r, const double* field, double* out) const {
         out[0] = out[1] = out[2] = 0;
-        for (int a = 0; a < 3; ++a) {
-            const int node = c.corner[3 * r + a];
-            for (int k = 0; k < 3 && node >= 0; ++k) out[k] += c.weight[3 * r + a] * field[3 * (int64_t)node + k];
+        for (int a = 0; a < CORNERS; ++a) {
+            const int node = c.corner[CORNERS * r + a];
+            for (int k = 0; k < 3 && node >= 0; ++k) out[k] += c.weight[CORNERS * r + a] * field[3 * (int64_t)node + k];
         }
     }
     static void stiff(const double* k, const double* u, double* out) {
@@ -97,13 +127,13 @@ struct BodyRows {
     }
     bool acts(int r) const {
         const RowState& s = c.state[r];
-        return !empty(r) && (s.force.closed || s.force.slip > 0);
+        return s.force.closed || s.force.slip > 0;
     }
     // y += H^T S H x; returns x . H^T S H x
     double add_product(const double* x, double* y) const {
         double sum = 0;
-        for (int r = first; r < last; ++r) {
-            if (!acts(r)) continue;
+        for (int k = 0; k < actives; ++k) {
+            const int r = active[k];
             double u[3] = {0, 0, 0}, f[3];
             gather(r, x, u);
             stiff(c.state[r].stiffness, u, f);
@@ -112,27 +142,27 @@ struct BodyRows {
         }
         return sum;
     }
-    // Adds the parts on the nodes' own blocks. blocks: (nodes, 9)
-    void add_diagonal(double* blocks) const {
-        for (int r = first; r < last; ++r)
-            if (acts(r)) add_blocks(r, c.state[r].stiffness, [&](int i, int j) { return i == j ? blocks + 9 * (int64_t)(i - node_first) : nullptr; });
+    // Adds the parts on the nodes' own blocks, those of nodes up to `last`. blocks: (nodes, 9)
+    void add_diagonal(double* blocks, int last) const {
+        auto own = [&](int i, int j) { return i == j && i >= node_first && i < last ? blocks + 9 * (int64_t)(i - node_first) : nullptr; };
+        for (int k = 0; k < actives; ++k) add_blocks(active[k], c.state[active[k]].stiffness, own);
     }
     // Adds w_a w_b R_a^T S R_b to block_of(i, j), which may be null, over all pairs of the row's nodes.
     template <class F> void add_blocks(int r, const double* s, F block_of) const {
         const double S[9] = {s[0], s[1], s[2], s[1], s[3], s[4], s[2], s[4], s[5]};
-        for (int a = 0; a < 3; ++a)
-            for (int b = 0; b < 3; ++b) {
-                const int i = c.corner[3 * r + a], j = c.corner[3 * r + b];
-                double* block = i < 0 || j < 0 || c.free[i] == 0 || c.free[j] == 0 ? nullptr : block_of(i, j);
-                if (!block) continue;
-                const double *Ri = c.rotation + 9 * (int64_t)i, *Rj = c.rotation + 9 * (int64_t)j, w = c.weight[3 * r + a] * c.weight[3 * r + b];
+        each_corner(r, [&](int i, double wi) {
+            each_corner(r, [&](int j, double wj) {
+                double* block = block_of(i, j);
+                if (!block) return;
+                const double *Ri = c.rotation + 9 * (int64_t)i, *Rj = c.rotation + 9 * (int64_t)j;
                 for (int k = 0; k < 3; ++k)
                     for (int l = 0; l < 3; ++l) {
                         double sum = 0;
                         for (int m = 0; m < 3; ++m)
                             for (int n = 0; n < 3; ++n) sum += Ri[3 * m + k] * S[3 * m + n] * Rj[3 * n + l];
-                        block[3 * k + l] += w * sum;
+                        block[3 * k + l] += wi * wj * sum;
                     }
-            }
+            });
+        });
     }
 };

@@ -7,6 +7,7 @@
 #include "contact.h"
 #include "energy.h"
 #include "newton.h"
+#include "pairs.h"
 #include "rosenbrock.h"
 #include "sizes.h"
 
@@ -126,6 +127,7 @@ static void assemble(Loop* loop, bool whole) {
         for (int i = 0; i < loop->bodies; ++i)
             note_changes(loop->body[i].correction, rings.step, loop->body[i].steps == 0);
     }
+    if (loop->contact && loop->contact->pair_first >= 0) PairDetection{*loop, *loop->contact}.run();
     for (int i = 0; i < loop->bodies; ++i) copy_for_worker(*loop, loop->body[i]);
     loop->assemble_begin = begin;
     loop->assemble_seconds = now() - begin;
@@ -153,6 +155,7 @@ static void finish_step(Loop* loop) {
         search_all(*loop);
     }
     if (loop->stages) make_stages(*loop);
+    if (loop->contact) solve_in_contact(*loop);
 #pragma omp parallel for num_threads(loop->threads) schedule(dynamic, 1) if (loop->threads > 1 && loop->bodies > 1)
     for (int i = 0; i < loop->bodies; ++i) {
         Body& body = loop->body[i];
@@ -167,7 +170,7 @@ static void finish_step(Loop* loop) {
             linearizations = std::max(1, loop->newton->search[i].linearizations);
             nonlinear = residual_ratio(loop->newton->search[i]);
         } else if (loop->contact) {
-            r = solve_in_contact(*loop, i);
+            r = loop->contact->result[i];
         } else {
             BlockCsr A{body.first, body.last, loop->row_start, loop->columns, loop->values};
             r = pcg(A, loop->b + 3 * body.first, body.factor, settings, loop->y + 3 * body.first,
@@ -267,7 +270,7 @@ void wf_precondition(Loop* loop, int32_t index, const double* r, double* z, doub
 const StructSize* wf_sizes() {
     static const StructSize sizes[] = {SIZE(Launch), SIZE(Body), SIZE(Loop), SIZE(Factor), SIZE(Pattern), SIZE(Record),
                                        SIZE(Newton), SIZE(Search), SIZE(Stages), SIZE(StageState), SIZE(Elastic), SIZE(Energies), SIZE(Balance),
-                                       SIZE(Contact), SIZE(RowState), SIZE(ContactReport), {}};
+                                       SIZE(Contact), SIZE(RowState), SIZE(ContactReport), SIZE(Box), {}};
     return sizes;
 }
 }

@@ -122,3 +122,7 @@ struct Loop {
     double cpu_begin;
     Rings rings;
 };
+
+static BlockCsr matrix_of(const Loop& loop, const Body& body) {
+    return {body.first, body.last, loop.row_start, loop.columns, loop.values};
+}

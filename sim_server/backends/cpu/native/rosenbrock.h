@@ -20,10 +20,6 @@ template <class F> static void run_for(const Loop& loop, const Launch& l, F take
         if (take_part(i) && l.parts[i] < l.parts[i + 1]) l.kernel(l.binding->params, l.parts[i], l.parts[i + 1]);
 }
 
-static BlockCsr matrix_of(const Loop& loop, const Body& body) {
-    return {body.first, body.last, loop.row_start, loop.columns, loop.values};
-}
-
 // Chooses the form of a body's first attempt, before the step is assembled. whole: A is wanted whatever the form.
 static void choose_form(Loop& loop, int index, bool whole) {
     const Stages& stages = *loop.stages;

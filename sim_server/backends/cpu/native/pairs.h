@@ -1,0 +1,204 @@
+// SPDX-License-Identifier: MIT
+// Detection of contacts between bodies on a CPU: each vertex of a surface against the triangles of the others, along the paths that
+// gravity alone would make (kernels/vertex_triangle.cuh). A vertex has two rows, for the two bodies that it meets first, or is nearest
+// to; a row remembers its forces as long as the vertex touches the same body, on whichever triangle.
+//
+// A body has a tree of boxes over its triangles, made once, whose boxes are fitted anew in each step in which its own box meets
+// another's. Children come after their parents.
+#pragma once
+#include <algorithm>
+#include <cmath>
+
+#include "loop.h"
+#include "vertex_triangle.cuh"
+
+
+static const Box NOWHERE = {{INFINITY, INFINITY, INFINITY}, {-INFINITY, -INFINITY, -INFINITY}};
+
+static void include(Box& box, const double* x, double margin) {
+    for (int k = 0; k < 3; ++k) {
+        box.low[k] = std::fmin(box.low[k], x[k] - margin);
+        box.high[k] = std::fmax(box.high[k], x[k] + margin);
+    }
+}
+static Box joined(const Box& a, const Box& b) {
+    Box box = a;
+    include(box, b.low, 0);
+    include(box, b.high, 0);
+    return box;
+}
+static bool meet(const Box& a, const Box& b) {
+    for (int k = 0; k < 3; ++k)
+        if (!(a.low[k] <= b.high[k] && b.low[k] <= a.high[k])) return false;
+    return true;
+}
+
+struct Meeting {
+    int32_t other;       // body; -1: none
+    int32_t triangle;
+    Touch touch;
+};
+
+static bool comes_before(const Meeting& a, const Meeting& b) {
+    if (b.other < 0) return a.other >= 0;
+    return a.other >= 0 && (a.touch.entry < b.touch.entry || (a.touch.entry == b.touch.entry && a.touch.distance < b.touch.distance));
+}
+
+struct PairDetection {
+    const Loop& loop;
+    Contact& c;
+
+    const double* x(int node) const { return loop.x + 3 * (int64_t)node; }
+    // Displacement of a node in the step under gravity alone.
+    void drifted(int node, double* s) const {
+        for (int k = 0; k < 3; ++k) {
+            const double g = c.free[node] == 0 ? 0 : c.force_coefficient * c.gravity[k];
+            s[k] = c.dx_dv * (c.predictor[3 * (int64_t)node + k] + g);
+        }
+    }
+    Box box_of(int node, double margin) const {
+        Box box = NOWHERE;
+        double s[3], end[3];
+        drifted(node, s);
+        for (int k = 0; k < 3; ++k) end[k] = x(node)[k] + s[k];
+        include(box, x(node), margin);
+        include(box, end, margin);
+        return box;
+    }
+    int sites(int body) const { return c.body_start[body] / 2; }
+    int node_of(int site) const { return c.corner[CORNERS * 2 * site]; }
+    double thickness_of(int body) const { return c.body_start[body] < c.body_start[body + 1] ? c.thickness[c.body_start[body]] : 0; }
+
+    void fit_body(int body) const {
+        Box box = NOWHERE;
+        for (int site = sites(body); site < sites(body + 1); ++site) box = joined(box, box_of(node_of(site), thickness_of(body)));
+        c.body_box[body] = box;
+    }
+    void fit_tree(int body) const {
+        for (int k = c.tree_start[body + 1] - 1; k >= c.tree_start[body]; --k) {
+            const int left = c.tree_child[2 * k], right = c.tree_child[2 * k + 1];
+            if (left >= 0) { c.tree_box[k] = joined(c.tree_box[left], c.tree_box[right]); continue; }
+            Box box = NOWHERE;
+            for (int a = 0; a < 3; ++a) box = joined(box, box_of(c.triangle[3 * ~left + a], thickness_of(body)));
+            c.tree_box[k] = box;
+        }
+    }
+
+    // The first touch of a vertex with a body.
+    Meeting first_touch(int node, int body, double thickness) const {
+        Meeting best = {-1, -1, {}};
+        double s[3];
+        drifted(node, s);
+        const Box box = box_of(node, thickness);
+        int32_t stack[64];
+        int depth = 0;
+        stack[depth++] = c.tree_start[body];
+        while (depth) {
+            const int k = stack[--depth], left = c.tree_child[2 * k];
+            if (!meet(c.tree_box[k], box)) continue;
+            if (left >= 0) {
+                stack[depth++] = left;
+                stack[depth++] = c.tree_child[2 * k + 1];
+                continue;
+            }
+            consider(node, s, body, ~left, thickness, best);
+        }
+        return best;
+    }
+    void consider(int node, const double* s, int body, int triangle, double thickness, Meeting& best) const {
+        const int32_t* t = c.triangle + 3 * triangle;
+        double path[3] = {s[0], s[1], s[2]};
+        for (int a = 0; a < 3; ++a) {
+            double d[3];
+            drifted(t[a], d);
+            for (int k = 0; k < 3; ++k) path[k] -= d[k] / 3;
+        }
+        Meeting here = {body, triangle, {}};
+        if (!meet(x(node), path, x(t[0]), x(t[1]), x(t[2]), thickness, here.touch)) return;
+        const double apart = std::fabs(here.touch.distance) - std::fabs(best.touch.distance);
+        const bool as_near = best.other >= 0 && std::fabs(apart) <= 1e-9 * thickness;
+        if (as_near ? here.touch.certainty > best.touch.certainty : best.other < 0 || comes_first(here.touch, best.touch, thickness)) best = here;
+    }
+    // A vertex that is near, or inside, has the nearest triangle; another one that which its path meets first.
+    static bool comes_first(const Touch& a, const Touch& b, double thickness) {
+        if (a.distance <= thickness || b.distance <= thickness || a.entry == b.entry) return std::fabs(a.distance) < std::fabs(b.distance);
+        return a.entry < b.entry;
+    }
+
+    struct Memory {
+        int32_t other;
+        double force, normal[3], traction[3];
+    };
+    Memory memory_of(int row) const {
+        Memory m = {c.obstacle[row], c.force[row], {}, {}};
+        for (int k = 0; k < 3; ++k) {
+            m.normal[k] = c.normal[3 * row + k];
+            m.traction[k] = c.traction[3 * row + k];
+        }
+        return m;
+    }
+    void put_row(int row, int site, const Meeting& t, const Memory* last) const {
+        c.obstacle[row] = t.other;
+        c.force[row] = 0;
+        c.entry[row] = NEVER;
+        for (int k = 0; k < 3; ++k) c.traction[3 * row + k] = 0;
+        if (t.other < 0) return;
+        const int node = node_of(site), body = c.site_body[site];
+        int32_t* corner = c.corner + CORNERS * row;
+        double *weight = c.weight + CORNERS * row, *normal = c.normal + 3 * row, gap = 0, stiffness = 0;
+        corner[0] = node;
+        weight[0] = 1;
+        for (int a = 0; a < 3; ++a) {
+            corner[a + 1] = c.triangle[3 * t.triangle + a];
+            weight[a + 1] = -t.touch.weight[a];
+            stiffness += t.touch.weight[a] * c.stiffness[2 * c.node_site[corner[a + 1]]];
+        }
+        for (int k = 0; k < 3; ++k) {
+            normal[k] = t.touch.normal[k];
+            for (int a = 0; a < CORNERS; ++a) gap += normal[k] * weight[a] * x(corner[a])[k];
+        }
+        const double own = c.stiffness[2 * site];
+        c.gap[row] = gap;
+        c.entry[row] = t.touch.entry;
+        c.stiffness[row] = 2 * own * stiffness / (own + stiffness);
+        c.friction[row] = c.pair_friction[body * loop.bodies + t.other];
+        c.thickness[row] = 0.5 * (thickness_of(body) + thickness_of(t.other));
+        for (int r = 0; r < 2; ++r) {
+            if (last[r].other != t.other) continue;
+            c.force[row] = last[r].force;
+            for (int k = 0; k < 3; ++k) c.traction[3 * row + k] = last[r].traction[k];
+            turn_with(last[r].normal, normal, c.traction + 3 * row);
+        }
+    }
+
+    void detect_site(int site) const {
+        const int node = node_of(site), body = c.site_body[site], row = c.pair_first + 2 * site;
+        Meeting first = {-1, -1, {}}, second = first;
+        const Box box = c.free[node] == 0 ? NOWHERE : box_of(node, thickness_of(body));
+        for (int other = 0; other < loop.bodies; ++other) {
+            if (other == body || !c.near[other] || !meet(box, c.body_box[other])) continue;
+            const Meeting t = first_touch(node, other, 0.5 * (thickness_of(body) + thickness_of(other)));
+            if (comes_before(t, first)) { second = first; first = t; }
+            else if (comes_before(t, second)) second = t;
+        }
+        const Memory last[2] = {memory_of(row), memory_of(row + 1)};
+        put_row(row, site, first, last);
+        put_row(row + 1, site, second, last);
+    }
+
+    void run() const {
+        for (int i = 0; i < loop.bodies; ++i) { fit_body(i); c.near[i] = 0; }
+        for (int i = 0; i < loop.bodies; ++i)
+            for (int j = 0; j < i; ++j)
+                if (meet(c.body_box[i], c.body_box[j])) c.near[i] = c.near[j] = 1;
+#pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) if (loop.threads > 1)
+        for (int i = 0; i < loop.bodies; ++i)
+            if (c.near[i]) fit_tree(i);
+#pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) if (loop.threads > 1)
+        for (int i = 0; i < loop.bodies; ++i) {
+            if (!c.near[i] && !c.was_near[i]) continue;
+            for (int site = sites(i); site < sites(i + 1); ++site) detect_site(site);
+        }
+        std::copy(c.near, c.near + loop.bodies, c.was_near);
+    }
+};
