@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The tangent of corotational bodies in Rosenbrock-W steps: exact by default, its damping without blocks, its energy."""
+"""The tangent of corotational bodies in Rosenbrock-W steps: the default, its damping without blocks, spun bodies."""
 
 from typing import Any
 
