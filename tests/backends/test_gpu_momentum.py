@@ -28,13 +28,15 @@ GPU = """
 #define index node_index  // the system has a function of this name
 #include "momentum.cu"
 extern "C" void keep(int blocks, const FreeBodies* t) { launch(blocks, BLOCK_ITEMS, [&] { keep_forces(*t); }); }
-extern "C" void end_attempt(int blocks, const FreeBodies* t) { launch(blocks, BLOCK_ITEMS, [&] { sum_and_decide(*t); }); }
+extern "C" void end_attempt(int blocks, const FreeBodies* t) {
+    launch(blocks, BLOCK_ITEMS, [&] { sum_and_decide(*t); });
+}
 extern "C" void end_step(int chunks, const FreeBodies* t) { launch(chunks, BLOCK_ITEMS, [&] { set_momenta(*t); }); }
 """
 CPU = """
 #include "momentum.h"
-extern "C" int momenta(int n, const double* mass, const double* share, const double* weight, const double* diagonal, double* states[4],
-                       double* b[2], double* inertia[2], double* ends[2]) {
+extern "C" int momenta(int n, const double* mass, const double* share, const double* weight, const double* diagonal,
+                       double* states[4], double* b[2], double* inertia[2], double* ends[2]) {
     Stages stages = {};
     stages.mass = mass, stages.share = share, stages.weight = weight, stages.diagonal = diagonal;
     stages.start_x = states[0], stages.start_v = states[1];
@@ -111,7 +113,11 @@ class Bodies:
         self.state["form"], self.rows["kind"] = ITERATE, Kind.BLOCK_JACOBI
         self.phase, self.largest, self.bound = np.zeros(count, np.int32), np.zeros(count, "i8"), np.ones(count)
         self.estimate, self.moving, self.left = np.full(n, 0.5), np.ones(count, np.int32), np.zeros(1, np.int32)
-        self.results, self.step, self.finished = np.zeros((2, count), STAGE_RESULT), np.zeros(1, "i8"), np.zeros(1, "u4")
+        self.results, self.step, self.finished = (
+            np.zeros((2, count), STAGE_RESULT),
+            np.zeros(1, "i8"),
+            np.zeros(1, "u4"),
+        )
         self.clock, self.stamps, self.counters = np.zeros(1), np.zeros((2, 2), "i8"), np.zeros(5, "u4")
         self.solves = np.zeros((2, count), PCG_RESULT)
 
