@@ -142,19 +142,19 @@ class Bodies:
             params[name] = array.ctypes.data
         return params
 
-    def _call(self, function: Any, blocks: int, stage: int, attempt: int) -> None:
+    def call(self, function: Any, blocks: int, stage: int, attempt: int) -> None:
         b = np.einsum("nji,nj->ni", self.rotation, self.world_b[stage])
         params = self.params(b, attempt)
         function(blocks, c.c_void_p(params.ctypes.data))
 
     def attempt(self, gpu: c.CDLL, form: int) -> None:
         blocks = -(-len(self.body) // BLOCK)
-        self._call(gpu.keep, blocks, 0, form)
-        self._call(gpu.end_attempt, blocks, 1, form)
+        self.call(gpu.keep, blocks, 0, form)
+        self.call(gpu.end_attempt, blocks, 1, form)
 
     def end(self, gpu: c.CDLL) -> None:
         assert self.step[0] == 1 and self.left[0] == 0 and not self.moving.any()
-        self._call(gpu.end_step, len(self.chunks), 1, EULER)
+        self.call(gpu.end_step, len(self.chunks), 1, EULER)
 
     def on_cpu(self, cpu: c.CDLL, body: int) -> NDArray | None:
         """v at the end of the step, None if a spring holds the body."""
@@ -224,9 +224,9 @@ def test_bodies_that_something_holds_are_left_alone(gpu, cpu):
     assert 1 not in bodies.chunks["body"]
     bodies.moving[4] = 0
     bodies.spring[85] = 3.0
-    bodies._call(gpu.keep, -(-190 // BLOCK), 0, ITERATE)
+    bodies.call(gpu.keep, -(-190 // BLOCK), 0, ITERATE)
     bodies.spring[85], bodies.spring[155] = 0.0, 2.0
-    bodies._call(gpu.end_attempt, -(-190 // BLOCK), 1, ITERATE)
+    bodies.call(gpu.end_attempt, -(-190 // BLOCK), 1, ITERATE)
     bodies.end(gpu)
     bodies.check(before, cpu, [True, False, False, False, False, True])
     before.spring[155] = 2.0
