@@ -83,10 +83,6 @@ the factor nothing, as it assembles nothing, but where the stiffness damps.
 
 *Not with much damping of the stiffness.* There backward Euler is more exact than either form.
 
-*Not for free bodies that turn fast, on a GPU.* The stages alone lose angular momentum, and a warped factor lets
-linear momentum drift, since it turns each node by another rotation. On a CPU bodies that nothing holds get the momenta
-that their forces make (the table of the free body); on a GPU they do not.
-
 *Little for small bodies.* Conjugate gradients need few iterations there, and a step by the factor evaluates forces
 twice.
 
