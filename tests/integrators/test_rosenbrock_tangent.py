@@ -39,7 +39,7 @@ def stirred(size: float, damping: tuple[float, float]) -> Simulation:
 def impulses(sim: Simulation, frames: bool, v: NDArray) -> NDArray:
     """b of the forces alone, with a given velocity of the damping by the stiffness."""
     sim.world.damping_velocity[:] = v
-    for launch in sim._force_launches(frames):
+    for launch in sim.force_launches(frames):
         launch()
     return sim.system.b.copy()
 
@@ -50,7 +50,7 @@ def test_damping_without_blocks_is_the_product_with_the_assembled_matrix(size, f
     """Elements with clamped and with positive twists; the tangent of the usual kind would not do."""
     sim = stirred(size, (0.0, 0.03))
     assert 0 < clamped(sim) < len(elastic(sim).elements)
-    names = {launch.name for launch in sim._force_launches(frames)}
+    names = {launch.name for launch in sim.force_launches(frames)}
     assert "corotational_exact.forces" in names and not any("blocks" in n or "exact_nodes" in n for n in names)
     sim.engine.assemble()
     w = sim.world
@@ -75,7 +75,7 @@ def test_without_damping_of_the_stiffness_forces_need_no_tangent():
         sim = simulation(bar((4, 2, 2), (2, 1, 1), damping=(0.3, 0.0), tangent=tangent), integrator=STAGES)
         stir(sim, 0.1)
         found.append(impulses(sim, True, np.zeros_like(sim.world.v)))
-        assert "corotational.forces" in {launch.name for launch in sim._force_launches(True)}
+        assert "corotational.forces" in {launch.name for launch in sim.force_launches(True)}
     assert np.array_equal(*found) and np.abs(found[0]).max() > 0
 
 
