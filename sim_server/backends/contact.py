@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: MIT
+"""Contact of surfaces with obstacles as input of an engine (law: kernels/contact_law.cuh, method: docs/contact.md)."""
+
+from dataclasses import dataclass
+
+from sim_server.arrays import Float64, Int32
+
+
+@dataclass(frozen=True)
+class Obstacles:
+    """Rigid shapes and their poses in the step under way (functions: kernels/shapes.cuh).
+
+    kind: (m,) ShapeKind. size: (m, 4) [m]. grid: all signed distances of GRIDs [m]; place: (m,) first entry of its own;
+    cells: (m, 3) its nodes along x, y, z. begin, end: (m, 7) poses at the start and the end of the step, position [m]
+    and unit quaternion w, x, y, z
+    """
+
+    kind: Int32
+    size: Float64
+    grid: Float64
+    place: Int32
+    cells: Int32
+    begin: Float64
+    end: Float64
+
+
+@dataclass(frozen=True)
+class Contact:
+    """Rows of contacts, which launches among `assemble` fill in each step, and options.
+
+    A row is a place where a surface may touch an obstacle: a point of the surface, sum_a weight_a x_{corner_a}, against
+    a plane that stands for the obstacle in this step. Its two rows per surface node come first.
+
+    body_start: (bodies + 1,) rows of each body; rows ascend by body
+    corner: (rows, 3) nodes of the scene; -1: fewer. weight: (rows, 3)
+    obstacle: (rows,) number of the obstacle; -1: the row is empty
+    normal: (rows, 3) unit, out of the obstacle, world frame
+    gap: (rows,) signed distance of the point at the start of the step from where the plane is at the end of it [m]
+    drift: (rows, 3) displacement in the step of the obstacle's point that is touched [m]
+    entry: (rows,) when the point as predicted first comes nearer than the thickness, as a part of the step, 0 to 1;
+        2: it does not
+    stiffness: (rows,) [N/m]. friction: (rows,) coefficient
+    thickness: (rows,) [m]
+    force: (rows,) normal force lambda [N]; traction: (rows, 3) friction force [N]. In: of the last step, for the same
+        obstacle (0 for another), traction turned with the normal. Out: of this step
+    predictor: (nodes, 3), dx_dv, force_coefficient, free: (nodes,) of the world (mechanics/world.py)
+    passes: most solves of a step. tolerance: of the contact residual
+    """
+
+    obstacles: Obstacles
+    body_start: Int32
+    corner: Int32
+    weight: Float64
+    obstacle: Int32
+    normal: Float64
+    gap: Float64
+    drift: Float64
+    entry: Float64
+    stiffness: Float64
+    friction: Float64
+    thickness: Float64
+    force: Float64
+    traction: Float64
+    predictor: Float64
+    free: Float64
+    dx_dv: float
+    force_coefficient: float
+    passes: int
+    tolerance: float
