@@ -144,12 +144,12 @@ class Simulation:
 
     def _stage_launches(self) -> list[list[Launch]]:
         """Returns what a Rosenbrock-W step runs beside `launches`: the forces of both stages, and backward Euler."""
-        first, again = self._force_launches(frames=True), self._force_launches(frames=False)
+        first, again = self.force_launches(frames=True), self.force_launches(frames=False)
         with self.world.made_with(self.world.dt, self.world.dt):
             euler = self.launches()[0]
         return [first, again, euler]
 
-    def _force_launches(self, frames: bool) -> list[Launch]:
+    def force_launches(self, frames: bool) -> list[Launch]:
         """Returns the launches of a stage that needs no A. frames: those of the nodes are made, too."""
         stencils = iter(self.system.stencils)
         ordered = sorted(self.effects.values(), key=lambda e: e.elements is None)

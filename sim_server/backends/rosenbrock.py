@@ -31,7 +31,7 @@ class Rosenbrock:
     estimate: (n,) of the last attempt [m]
     mass [kg], share, weight, diagonal [kg]: (n,) of the check of the first stage (kernels/step_form.h)
     start_x [m], start_v [m/s], b [N s], inertial_increment [m/s]: (n, 3); unheld: (bodies,) 1 where no node is fixed:
-        of the momenta of free bodies (backends/cpu/native/momentum.h)
+        of the momenta of free bodies (kernels/rigid_motion.h)
     bound: (bodies,) largest estimate of a step that is not made again [m]
     coefficients: (2,) force_coefficient and dx_dv [s], read by launches whose arguments change while steps run
     euler_coefficients: the same of backward Euler

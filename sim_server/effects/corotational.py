@@ -25,9 +25,10 @@ eigenvalues h (sums of two stretches) of tr(S) I - S, the twists t have the eige
     usual + sum e t t^T,   t = R [u]x / sqrt 2,   e = 2 mu + (lambda (tr S - 3) - 2 mu) 2 / h,  not below 0
 
 so Newton's iteration converges quadratically where no e is clamped (tension); where all are (compression) it is the
-usual one. For a quarter more work a step (on a CPU); it needs "polar". "auto" (default) is "exact" in Newmark's scheme
-and BDF2 with one linearization, where the usual one, softer than the forces under tension, lets the energy grow without
-bound (integrator.py); "usual" otherwise.
+usual one. For a quarter more work a step that assembles (on a CPU); it needs "polar". "auto" (default) is "exact" in
+Newmark's scheme and BDF2 with one linearization, where the usual one, softer than the forces under tension, lets the
+energy grow without bound (integrator.py), and with "polar" in ros2, where the usual one feeds vibrations of bodies with
+Poisson's ratio from 0.49 on that turn fast; "usual" otherwise.
 
 Large rotations are exact, strains are linear: good to about 10-20 % strain. `young` may be one value or a list of
 regions; in each region `where` is asked at the centroid of the element, at rest and before the pose; the first
@@ -70,7 +71,7 @@ class Params(Regional):
     )
     rotation: Literal["polar", "qr"] = Field(default="polar", description="of the elements")
     tangent: Literal["auto", "usual", "exact"] = Field(
-        default="auto", description="whether it knows how rotations change; auto: where the integrator needs it"
+        default="auto", description="whether it knows how rotations change; auto: where the integrator gains by it"
     )
 
     @model_validator(mode="after")
@@ -91,7 +92,8 @@ class Params(Regional):
             )
         if self.tangent != "auto":
             return self
-        return self.model_copy(update={"tangent": "exact" if integrator.needs_stiff_matrix else "usual"})
+        exact = integrator.needs_stiff_matrix or (integrator.scheme == "ros2" and self.rotation == "polar")
+        return self.model_copy(update={"tangent": "exact" if exact else "usual"})
 
     @property
     def variant(self) -> str:
@@ -156,11 +158,11 @@ class Corotational(Effect):
 
     def force_launches(self, system: System, stencil: Stencil | None, frames: bool) -> list[Launch] | None:
         w = self.world
-        damped = self.variant == "_exact" and w.beta[self.owner].any()  # by a tangent that `forces` does not have
-        if self.variant == "_qr" or damped:
+        if self.variant == "_qr":
             return None
         assert stencil is not None
-        forces = w.backend.module("effects/corotational.cu").bind(
+        damped = self.variant == "_exact" and w.beta[self.owner].any()  # by the tangent: without it both have one force
+        forces = w.backend.module(f"effects/corotational{'_exact' if damped else ''}.cu").bind(
             "forces", len(self.elements), tets=self.elements, x=w.x, v=w.damping_velocity, gradients=self.gradients,
             lame=self.lame, stiffness_coefficient=w.stiffness_coefficient[self.owner], h=w.force_coefficient,
             quaternion=self.near, nodal_impulse=self.nodal_impulse,

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: MIT
 // Nodal kernels of the second-order Rosenbrock-W step (formulas and symbols: mechanics/rosenbrock.py).
 #define WIDE
-#include "mat3.cuh"
+#include "prepare_stage.cuh"
 #include "step_form.h"
 
 constexpr real GAMMA = ROS2_GAMMA;
@@ -65,15 +65,6 @@ struct Prepare {
     real* inertial_increment;  // (n, 3) out [m/s]
     real* dv;                  // (n, 3) out: start of the solve [m/s]
 };
-
-// What the first stage is assembled from.
-template <class P, class I> INLINE void prepare_stage(const P& p, I i, vec3 v, vec3 inertial, vec3 start) {
-    number share = at(p.share, i);
-    store3(p.predictor, i, (1 - share) * start);
-    store3(p.damping_velocity, i, (1 - share) * v);
-    store3(p.inertial_increment, i, inertial + at(p.weight, i) * start);
-    store3(p.dv, i, share * start);
-}
 
 KERNEL(prepare, Prepare) {
     vec3 v = load3(p.v, i);

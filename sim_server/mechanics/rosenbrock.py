@@ -31,8 +31,8 @@ step, of each body (kernels/step_form.h):
 A step by FACTOR whose factor is inconsistent, or whose estimate exceeds the bound, is made again by ITERATE, and
 PATIENCE steps after it, too.
 
-On a CPU a body without fixed nodes or springs of grabs then gets the momenta that its forces make
-(backends/cpu/native/momentum.h): the stages alone lose angular momentum of stiff bodies that turn.
+After a step by stages a body without fixed nodes or springs of grabs gets the momenta that its forces make
+(kernels/rigid_motion.h): the stages alone lose angular momentum of stiff bodies that turn.
 
 Stability: A-stable with J the slope of F, L-stable (R(infinity) = 0). With an older, warped J in place of it see
 docs/bench/rosenbrock.md; without the warp it flies apart.

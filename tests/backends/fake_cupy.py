@@ -72,10 +72,12 @@ def made(folder: Path, library: Any) -> ModuleType:
     """The module. Texts are compiled in `folder`.
 
     calls: (kernel, number of arguments) of each launch
+    compiled: (text, options) of each module
     pending: arrays that were made since the host last waited for the current stream, and may not be there yet
     """
     cp: Any = ModuleType("cupy")
-    cp.calls, cp.pending, compiled = [], 0, set()
+    cp.calls, cp.pending, cp.compiled = [], 0, set()
+    compiled = cp.compiled
 
     class CurrentStream(Stream):
         def synchronize(self) -> None:

@@ -14,6 +14,7 @@ from sim_server.backends.gpu.inverse.plan import plan
 from sim_server.backends.gpu.inverse.workspace import workspace
 from sim_server.simulation import Simulation
 from tests.backends import fake_cupy
+from tests.scenes import bar, scene
 from tests.support import nvrtc
 from tests.worker.block_matrices import bar_edges, pattern
 
@@ -69,6 +70,25 @@ def test_a_scene_is_built_and_its_kernels_compile(cupy, name):
     engine.settle_factors()
     engine.run(1)
     assert engine.factor_bytes(body.index) > 9 * nodes
+
+
+@pytest.mark.parametrize(
+    ("fixed", "solve", "precision"),
+    [(None, "auto", "mixed"), (None, "iterate", "float32"), ("X < 0.01", "auto", "float64")],
+)
+def test_momenta_are_set_where_a_body_may_be_free(cupy, fixed, solve, precision):
+    """By one more launch beside three of pcg; where all bodies are held neither launches nor texts know of it."""
+    bars = [
+        bar((2, 1, 1), name="held", fixed="X < 0.01"),
+        bar((3, 2, 2), name="other", touch={"max_force": 9.0}, **({"fixed": fixed} if fixed else {})),
+    ]
+    stages = {"scheme": "ros2", "solve": solve}
+    made = scene(*bars, dt=0.01, integrator=stages, preconditioner="cholesky", precision=precision)
+    Simulation(made, "gpu")
+    assert any("FreeBodies" in text for text, _ in cupy.compiled) == (fixed is None)
+    launched = [kernel for kernel, _ in cupy.calls]
+    assert 3 * launched.count("set_momenta") == (launched.count("pcg") if fixed is None else 0)
+    assert ("apply_factor" in launched) == (solve == "auto")
 
 
 def test_what_a_build_of_an_inverse_reads_is_there_before_its_own_stream_runs(cupy):

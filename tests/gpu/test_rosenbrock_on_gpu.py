@@ -85,7 +85,8 @@ def of_law(law: str, **table: Any) -> dict:
 
 
 BODIES = {
-    "corotational": lambda: held(damping=(0.2, 0.01)), "exact": lambda: held(rotation="polar", tangent="exact"),
+    "corotational, usual tangent": lambda: held(damping=(0.2, 0.01), tangent="usual"),
+    "corotational": held, "corotational, damped by the tangent": lambda: held(damping=(0.2, 0.01)),
     "stable_neo_hookean": lambda: of_law("stable_neo_hookean"),
     "st_venant_kirchhoff": lambda: of_law("st_venant_kirchhoff"),
 }  # fmt: skip

@@ -64,10 +64,13 @@ def test_a_step_with_its_own_matrix_is_that_of_the_form_with_the_stiffness(dampi
 
 
 @pytest.mark.parametrize("precision, tolerance", [("float64", 1e-9), ("float32", 3e-5)])
+@pytest.mark.parametrize("tangent", ["usual", "exact"])
 @pytest.mark.parametrize("damping", DAMPING)
-def test_a_step_with_the_factor_of_an_older_matrix_is_that_of_the_older_stiffness_warped(damping, precision, tolerance):
+def test_a_step_with_the_factor_of_an_older_matrix_is_that_of_the_older_stiffness_warped(
+    damping, tangent, precision, tolerance
+):
     """The residual of the first stage is checked in the first of the two steps, and A is assembled only there."""
-    sim = bodies(damping, factor_precision=precision)
+    sim = bodies(damping, tangent, factor_precision=precision)
     bend(sim, 0.02, 0.0)
     sim.engine.assemble()
     then, older = sim.system.rotation.copy(), [solid(sim, b.index).tangent() for b in sim.world.bodies]

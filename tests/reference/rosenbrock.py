@@ -2,8 +2,8 @@
 """A step of ROS2 as a W-method with dense matrices, in the form with K (Verwer, Spee, Blom and Hundsdorfer 1999).
 
 A = M - g h D - (g h)^2 J with J = -K the slope of the forces and D = -alpha M - beta K; K and A are those of the step,
-or any other. A body that nothing holds then gets the momenta that its forces make (sim_server/backends/cpu/native/
-momentum.h), found here as the least change of v.
+or any other. A body that nothing holds then gets the momenta that its forces make (sim_server/kernels/rigid_motion.h),
+found here as the least change of v.
 """
 
 from dataclasses import replace

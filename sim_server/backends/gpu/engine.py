@@ -115,9 +115,9 @@ class GpuEngine(DeviceLoop):
         self._epilogue = self._epilogue_params(dt)
         self._integrate, self._stages = None, None
         if stages and stage_results is not None:
-            spring = given.energies.touch.get("spring")
             self._stages = RosenbrockStep(
-                gpu, device, stages, assemble, self.solver, self._epilogue, stage_results, spring, given.energies.mass
+                gpu, device, stages, assemble, self.solver, self._epilogue, stage_results, given.energies,
+                gpu.twin(arrays["b"]),
             )  # fmt: skip
             self._stamp_begin = self._stages.stamp_begin
         else:

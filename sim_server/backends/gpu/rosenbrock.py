@@ -2,7 +2,7 @@
 """The Rosenbrock-W step on a GPU (stages.cuh): its memory and its launches.
 
 The first attempt is made by the factor alone where the scene allows it. A body without a factor, or whose factor does
-not do, iterates, in a branch of the graph.
+not do, iterates, in a branch of the graph. Where a body has no fixed nodes one more launch ends the step (momentum.cu).
 """
 
 from collections.abc import Callable, Sequence
@@ -12,12 +12,13 @@ from typing import Any, Protocol, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_server.arrays import Float64
 from sim_server.backends.base import Launch
 from sim_server.backends.declarations import Declarations
+from sim_server.backends.energies import Energies
 from sim_server.backends.gpu.cupy_types import DeviceArray
-from sim_server.backends.gpu.device import DeviceLaunch, Gpu
-from sim_server.backends.gpu.kernel_fusion import Epilogue, FusedKernel, PhaseGuard, fuse
+from sim_server.backends.gpu.device import DeviceLaunch, Gpu, processors
+from sim_server.backends.gpu.kernel_fusion import Epilogue, FusedKernel, PhaseGuard, block_shape, fuse
+from sim_server.backends.gpu.momentum import FreeMomenta
 from sim_server.backends.gpu.newton import bodies_of
 from sim_server.backends.gpu.solver import PcgSolver
 from sim_server.backends.gpu.structs import STAGE_SOLVE, STAGE_STATE
@@ -46,15 +47,15 @@ class RosenbrockStep:
     assemble: launches of the first stage
     end: arguments of the end of the step (StepEpilogue)
     results: host memory (capacity, bodies) of STAGE_RESULT that the steps write to
-    spring: host array (nodes,) of grabs, None without touch
-    mass: host array (nodes,) [kg]
+    energies: arrays of the scene
+    b: device array (nodes, 3) of the right-hand sides
 
     alone: True if the first attempt is made by factors alone; A is then assembled only for bodies that iterate
     """
 
     def __init__(
         self, gpu: Gpu, device: Branches, stages: Rosenbrock, assemble: Sequence[DeviceLaunch], solver: PcgSolver,
-        end: NDArray[Any], results: NDArray[Any], spring: Float64 | None, mass: Float64,
+        end: NDArray[Any], results: NDArray[Any], energies: Energies, b: DeviceArray,
     ):  # fmt: skip
         cp, bodies = gpu.cp, len(stages.bound)
         self._gpu, self._device, self._stages, self._solver, self._end = gpu, device, stages, solver, end
@@ -69,23 +70,26 @@ class RosenbrockStep:
             "estimate": gpu.twin(stages.estimate), "body": finish.arrays["body"], "left": self._left,
         }  # fmt: skip
         self._solve_memory: dict[str, DeviceArray] = {
-            "state": self._memory["state"], "phase": self._memory["phase"], "mass": gpu.twin(mass),
+            "state": self._memory["state"], "phase": self._memory["phase"], "mass": gpu.twin(energies.mass),
             "share": finish.arrays["share"], "weight": finish.arrays["weight"],
-            "first_stage": cp.zeros(9 * len(mass), finish.arrays["share"].dtype),
+            "first_stage": cp.zeros(9 * finish.items, finish.arrays["share"].dtype),
         }  # fmt: skip
-        if spring is not None:
-            self._solve_memory["spring"] = gpu.twin(spring)
+        if "spring" in energies.touch:
+            self._solve_memory["spring"] = gpu.twin(energies.touch["spring"])
         self._results, self._nodes = results, finish.items
         self._coefficients = gpu.twin(stages.coefficients)
         pairs = (stages.coefficients, np.array(stages.euler_coefficients))
         self._own_pair, self._euler_pair = (cp.asarray(pair.astype(self._coefficients.dtype)) for pair in pairs)
         self._bodies: list[DeviceArray | None] = []  # of the items of each guarded kernel
+        items = block_shape("elements", finish.items, processors()).threads
+        self._free = FreeMomenta(gpu, stages, energies, b, items) if stages.unheld.any() else None
         self._make_kernels(assemble)
 
     def _make_kernels(self, assemble: Sequence[DeviceLaunch]) -> None:
         stages = self._stages
         again, euler = (cast(Sequence[DeviceLaunch], x) for x in (stages.again, stages.euler))
         self._again = fuse(again)
+        self._second = self._keeping(stages.second, guarded=False) if self._free else stages.second
         self._first_finish = self._finish(stages.finish, FACTOR if self.alone else ITERATE, guarded=False)
         self._euler = fuse(euler, self._guard)
         self._back = self._nodal(stages.restore_for_euler)
@@ -95,7 +99,7 @@ class RosenbrockStep:
         self._restore = self._nodal(stages.restore)
         self._assemble = fuse([*assemble, cast(DeviceLaunch, stages.remember)], self._guard)
         self._guarded_again = fuse(again, self._guard)
-        self._guarded_second = self._nodal(stages.second)
+        self._guarded_second = self._keeping(stages.second)
         self._guarded_finish = self._finish(stages.finish, ITERATE)
 
     @property
@@ -117,14 +121,25 @@ class RosenbrockStep:
 
     def _finish(self, launch: Launch, attempt: int, guarded: bool = True) -> FusedKernel:
         """Returns the kernel that ends an attempt, with the decision."""
+        params = self._decision(attempt)
+        if self._free:
+            return self._nodal(launch, self._free.epilogue("sum_and_decide", params), guarded)
+        return self._nodal(launch, Epilogue(DECISION.checked(), "StageDecision", "decide", params, reads=True), guarded)
+
+    def _keeping(self, launch: Launch, guarded: bool = True) -> FusedKernel:
+        """Returns the kernel `second`, which keeps the forces of the first stage where a body may be free."""
+        epilogue = self._free.epilogue("keep_forces", self._decision(ITERATE)) if self._free else None
+        return self._nodal(launch, epilogue, guarded)
+
+    def _decision(self, attempt: int) -> NDArray[Any]:
+        """Returns the arguments of the decision."""
         params = np.zeros((), STAGE_DECISION)
         params["end"] = self._end
         for name, array in self._memory.items():
             params[name] = array.data.ptr
         params["rows"], params["results"] = self._solver.bodies_device, self._results.ctypes.data
         params["attempt"], params["nodes"] = attempt, self._nodes
-        epilogue = Epilogue(DECISION.checked(), "StageDecision", "decide", params, reads=True)
-        return self._nodal(launch, epilogue, guarded)
+        return params
 
     def _solve(self, form: int, first_of_step: bool = False, first_of_attempt: bool = False) -> NDArray[Any]:
         """Returns the arguments of a solve."""
@@ -138,14 +153,16 @@ class RosenbrockStep:
         """Appends the step after the assembly of its first stage, while a graph is captured."""
         if self.alone:
             self._solver.apply_factors(0, self._solve(FACTOR, first_of_step=True, first_of_attempt=True))
-            _launch(self._stages.second, *self._again)
+            _launch(self._second, *self._again)
             self._solver.apply_factors(1, self._solve(FACTOR))
             self._first_finish()
             with self._device.branch(self._left):
                 _launch(self._restore, *self._assemble)
                 self._iterate(False, self._guarded_second, self._guarded_again, self._guarded_finish)
         else:
-            self._iterate(True, self._stages.second, self._again, self._first_finish)
+            self._iterate(True, self._second, self._again, self._first_finish)
+        if self._free:
+            self._free.launch(self._first_finish.function("set_momenta"), self._decision(EULER))
 
     def _iterate(
         self, first_of_step: bool, second: Launch | FusedKernel, again: Sequence[Launchable], finish: FusedKernel

@@ -7,6 +7,7 @@
 //                              forces, pcg, finish, [EULER: restore_for_euler, assembly, pcg, euler]]
 //     solve by iterations      assembly, pcg, second, forces, pcg, finish, [EULER]
 //
+// Where a body has no fixed nodes one more launch ends the step, after the branches: momentum.cu.
 // In the first attempt by the factor the bodies that have to iterate do nothing of use; in the branches only bodies whose step is
 // not made yet take part.
 #pragma once

@@ -8,12 +8,12 @@ without assembly and iterations ([how](../scenes.md#a-step-without-iterations)).
 schemes.
 
 A bar of 1 x 1 x 4 m (L = 4 m), 1000 kg/m3, held at one end, cells split as `mirrored`, linear corotational
-tetrahedra, E = 1 MPa, Poisson's ratio 0.45, damping of the mass 0.1/s, let go from horizontal, where nothing else
-is said. *bands*: 5 E, E / 4 and E / 20 in three parts of equal length, stiffest at the held end. Factors are made
-by `lockstep-D`, which repeats exactly: the first of the first matrix, the next ones D to 2 D - 1 steps old when
-used, by default with D = 10 for all schemes. They are made outside of the steps and not counted, and are the same
-work for all schemes with the same D. Their values are float32 on a CPU and float16 on a GPU, where nothing else is
-said."""
+tetrahedra with the tangent that each scheme has by default, E = 1 MPa, Poisson's ratio 0.45, damping of the mass
+0.1/s, let go from horizontal, where nothing else is said. *bands*: 5 E, E / 4 and E / 20 in three parts of equal
+length, stiffest at the held end. Factors are made by `lockstep-D`, which repeats exactly: the first of the first
+matrix, the next ones D to 2 D - 1 steps old when used, by default with D = 10 for all schemes. They are made
+outside of the steps and not counted, and are the same work for all schemes with the same D. Their values are
+float32 on a CPU and float16 on a GPU, where nothing else is said."""
 
 PRECISION = """\
 Error: root mean square of the distances of all nodes from where they are in the reference, over all frames of the
@@ -78,14 +78,10 @@ while it lasts.
 
 *Not for nearly incompressible bodies at large time steps.* Their errors are larger than those of backward Euler.
 With the usual tangent of `corotational` one that turns fast goes on to vibrate, fed by the step and held down by
-backward Euler alone (the last table of stability); `tangent = "exact"` ends that, and costs a step by the factor
-nothing, as it assembles nothing.
+backward Euler alone (the last table of stability); the exact one, the default here, ends that, and costs a step by
+the factor nothing, as it assembles nothing, but where the stiffness damps.
 
 *Not with much damping of the stiffness.* There backward Euler is more exact than either form.
-
-*Not for free bodies that turn fast, on a GPU.* The stages alone lose angular momentum, and a warped factor lets
-linear momentum drift, since it turns each node by another rotation. On a CPU bodies that nothing holds get the momenta
-that their forces make (the table of the free body); on a GPU they do not.
 
 *Little for small bodies.* Conjugate gradients need few iterations there, and a step by the factor evaluates forces
 twice.

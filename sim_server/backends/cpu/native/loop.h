@@ -4,6 +4,7 @@
 #include "energy_balance.cuh"
 #include "pcg.h"
 #include "newton_line_search.cuh"
+#include "rigid_motion.h"
 #include "step_form.h"
 
 typedef void (*Kernel)(const void* params, int begin, int end);
@@ -52,7 +53,7 @@ struct StageState {                    // of a body in the step under way (rosen
     int32_t corrects;                  // 1: the factor is corrected for grabs
     int32_t misses;                    // 1: it is not, though it should be
     int32_t free;                      // 1: nothing holds the body in the step (momentum.h)
-    double impulse[6];                 // of the forces of both stages and of their torques
+    MomentumSums missing;              // impulses of both stages (rigid_motion.h)
     int32_t patience;                  // steps to come that iterate
     int64_t factor_step;               // of the last factor
     double estimate;                   // of the last attempt by stages [m]

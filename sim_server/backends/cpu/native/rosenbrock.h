@@ -158,14 +158,16 @@ template <class F> static bool make_attempt(Loop& loop, F take_part) {
     for (int i = 0; i < loop.bodies; ++i) {
         StageState& s = stages.state[i];
         if (!take_part(i)) continue;
-        std::fill(s.impulse, s.impulse + 6, 0.0);
-        s.free = stages.unheld[i] && loop.moving[i] && add_impulses(loop, loop.body[i], s.impulse);
+        s.missing = {};
+        s.free = stages.unheld[i] && loop.moving[i] && add_impulses(loop, loop.body[i], loop.x, s.missing);
     }
     solve_stage(loop, true, take_part);
     run_for(loop, loop.launch[stages.second], take_part);
     for (int k = 0; k < stages.agains; ++k) run_for(loop, loop.launch[stages.again[k]], moves);
-    for (int i = 0; i < loop.bodies; ++i)
-        if (take_part(i) && stages.state[i].free) stages.state[i].free = add_impulses(loop, loop.body[i], stages.state[i].impulse);
+    for (int i = 0; i < loop.bodies; ++i) {
+        StageState& s = stages.state[i];
+        if (take_part(i) && s.free) s.free = add_impulses(loop, loop.body[i], stages.start_x, s.missing);
+    }
     solve_stage(loop, false, take_part);
     run_for(loop, loop.launch[stages.finish], take_part);
     bool again = false;
@@ -178,7 +180,7 @@ template <class F> static bool make_attempt(Loop& loop, F take_part) {
         s.estimate = most;
         s.accepted = s.form != FAILED && most <= stages.bound[i];
         again = again || !s.accepted;
-        if (s.accepted && s.free) set_momenta(loop, loop.body[i], s.impulse);
+        if (s.accepted && s.free) set_momenta(loop, loop.body[i], s.missing);
     }
     run_for(loop, loop.launch[stages.prepare], [&](int i) { return take_part(i) && stages.state[i].accepted && stages.state[i].free; });
     return again;
