@@ -25,26 +25,48 @@ class Obstacles:
 
 
 @dataclass(frozen=True)
+class Surfaces:
+    """What bodies need to touch each other (detection: backends/cpu/native/pairs.h).
+
+    site_body: (surface nodes,). node_site: (nodes,) number of a node among the surface nodes, -1: it is none
+    triangle: (triangles, 3) nodes of the scene, outward; those of a body are together
+    tree_start: (bodies + 1,) and tree_child: (boxes, 2) of each body's tree: two later boxes, or ~ of a triangle, twice
+    friction: (bodies, bodies) coefficients. gravity: (3,) [m/s2]
+    """
+
+    site_body: Int32
+    node_site: Int32
+    triangle: Int32
+    tree_start: Int32
+    tree_child: Int32
+    friction: Float64
+    gravity: Float64
+
+
+@dataclass(frozen=True)
 class Contact:
     """Rows of contacts, which launches among `assemble` fill in each step, and options.
 
-    A row is a place where a surface may touch an obstacle: a point of the surface, sum_a weight_a x_{corner_a}, against
-    a plane that stands for the obstacle in this step. Its two rows per surface node come first.
+    A row is a place where a surface may touch something: sum_a weight_a x_{corner_a}, against a plane that stands for
+    it in this step. The first rows are against obstacles, two for each surface node: the node, with weight 1. As many
+    rows between bodies follow if there are `surfaces`: a node with weight 1 and a triangle of another body with weights
+    below 0, which the loop sets.
 
-    body_start: (bodies + 1,) rows of each body; rows ascend by body
-    corner: (rows, 3) nodes of the scene; -1: fewer. weight: (rows, 3)
-    obstacle: (rows,) number of the obstacle; -1: the row is empty
+    body_start: (bodies + 1,) rows of each body against obstacles; rows ascend by body
+    corner: (rows, 4) nodes of the scene; -1: fewer. weight: (rows, 4)
+    obstacle: (rows,) number of the obstacle, or of the other body; -1: the row is empty
     normal: (rows, 3) unit, out of the obstacle, world frame
     gap: (rows,) signed distance of the point at the start of the step from where the plane is at the end of it [m]
     drift: (rows, 3) displacement in the step of the obstacle's point that is touched [m]
     entry: (rows,) when the point as predicted first comes nearer than the thickness, as a part of the step, 0 to 1;
         2: it does not
-    stiffness: (rows,) [N/m]. friction: (rows,) coefficient
+    stiffness: (rows,) [N/m], of rows between bodies set by the loop. friction: (rows,) coefficient
     thickness: (rows,) [m]
     force: (rows,) normal force lambda [N]; traction: (rows, 3) friction force [N]. In: of the last step, for the same
         obstacle (0 for another), traction turned with the normal. Out: of this step
     predictor: (nodes, 3), dx_dv, force_coefficient, free: (nodes,) of the world (mechanics/world.py)
     passes: most solves of a step. tolerance: of the contact residual
+    surfaces: None where bodies do not touch each other
     """
 
     obstacles: Obstacles
@@ -67,3 +89,4 @@ class Contact:
     force_coefficient: float
     passes: int
     tolerance: float
+    surfaces: Surfaces | None

@@ -32,13 +32,14 @@ from pydantic import BeforeValidator, Field
 from sim_server.arrays import Float64, Int32
 from sim_server.backends.base import Launch
 from sim_server.backends.contact import Contact as ContactInput
-from sim_server.backends.contact import Obstacles
+from sim_server.backends.contact import Obstacles, Surfaces
 from sim_server.backends.declarations import Declarations
 from sim_server.effects._base import Effect, EffectUpdates
 from sim_server.errors import InputError
 from sim_server.mechanics.signed_distance import signed_distance_grid
 from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.world import Body, World
+from sim_server.mesh.box_tree import box_tree
 from sim_server.mesh.surface import surface_triangles
 from sim_server.scene.obstacles import Obstacle
 from sim_server.scene.parameters import NotNegative, Parameters, Positive, as_tuple
@@ -56,9 +57,9 @@ MOTION = {"fixed": 0, "keyframes": 1, "client": 2}  # Motion of contact.cu
 
 
 class PairFriction(Parameters):
-    """Friction of one object on one obstacle."""
+    """Friction of one object on an obstacle, or on another object."""
 
-    between: Annotated[tuple[str, str], BeforeValidator(as_tuple)] = Field(description="an object and an obstacle")
+    between: Annotated[tuple[str, str], BeforeValidator(as_tuple)] = Field(description="an object, and an obstacle or another object")
     value: NotNegative = Field(description="coefficient [-]")
 
 
@@ -70,6 +71,7 @@ class Params(Parameters):
     passes: int = Field(default=16, ge=1, le=1000, description="most solves of a step")
     tolerance: float = Field(default=1e-3, gt=0, lt=1, description="of the contact residual over the right-hand side")
     friction: list[PairFriction] | None = Field(default=None, description="of pairs, instead of the geometric mean")
+    between: bool = Field(default=True, description="objects touch each other, too")
 
 
 class ContactError(ValueError):
@@ -99,17 +101,19 @@ class Contact(Effect):
         bounds = [_thickness(params, body) for body in world.bodies]
         self._shapes(max(bounds))
         self._poses()
-        rows = 2 * len(self.node)
-        corner = np.full((rows, 3), -1, np.int32)
-        corner[:, 0] = np.repeat(self.node, 2)
-        weight = np.zeros((rows, 3))
+        touching = len(world.bodies) > 1 and params.between
+        rows = (4 if touching else 2) * len(self.node)
+        corner, weight = np.full((rows, 4), -1, np.int32), np.zeros((rows, 4))
+        corner[: 2 * len(self.node), 0] = np.repeat(self.node, 2)
         weight[:, 0] = 1
+        thickness = np.tile(np.repeat(np.array(bounds)[self.body], 2), 2 if touching else 1)
         start = np.concatenate([[0], np.cumsum([2 * len(s) for s in surfaces])]).astype(np.int32)
         self._input = ContactInput(
             self._table, start, corner, weight, np.full(rows, -1, np.int32), np.zeros((rows, 3)), np.zeros(rows),
             np.zeros((rows, 3)), np.full(rows, 2.0), np.zeros(rows), np.zeros(rows),
-            np.repeat(np.array(bounds)[self.body], 2), np.zeros(rows), np.zeros((rows, 3)),
+            thickness, np.zeros(rows), np.zeros((rows, 3)),
             world.predictor, world.free, world.dx_dv, world.force_coefficient, params.passes, params.tolerance,
+            _surfaces(world, params, self.node, self.body) if touching else None,
         )  # fmt: skip
         self.dropped = np.zeros(len(self.node), np.int32)
         self._pair_friction = _pair_friction(world, params)
@@ -183,7 +187,7 @@ class Contact(Effect):
         )  # fmt: skip
         launch()
         distance, nearest = launch.fetch("distance"), launch.fetch("nearest")
-        inside = distance < -self._input.thickness[::2]
+        inside = distance < -self._input.thickness[: 2 * n : 2]
         for body in w.bodies:
             if (found := np.flatnonzero(inside & (self.body == body.index))).size:
                 worst = found[distance[found].argmin()]
@@ -258,6 +262,29 @@ def _surface(world: World, body: Body) -> Int32:
     """Returns the free nodes of a body's surface, in numbers of the scene, ascending."""
     nodes = np.unique(surface_triangles(body.mesh.tets)) + body.first
     return nodes[world.free[nodes] > 0].astype(np.int32)
+
+
+def _surfaces(world: World, params: Params, node: Int32, body: Int32) -> Surfaces:
+    """Returns what bodies need to touch each other. node, body: surface nodes and their bodies."""
+    site = np.full(world.nodes, -1, np.int32)
+    site[node] = np.arange(len(node), dtype=np.int32)
+    triangles = [surface_triangles(b.mesh.tets) + np.int32(b.first) for b in world.bodies]
+    trees = [box_tree(world.rest[t].mean(axis=1)) for t in triangles]
+    boxes, first = np.cumsum([0, *map(len, trees)]), np.cumsum([0, *map(len, triangles)])
+    shifted = [np.where(t < 0, t - k, t + box) for t, box, k in zip(trees, boxes, first, strict=False)]
+    return Surfaces(
+        body, site, np.concatenate(triangles).astype(np.int32), boxes.astype(np.int32),
+        np.concatenate(shifted).astype(np.int32), _friction_of_bodies(world, params), np.array(world.gravity),
+    )  # fmt: skip
+
+
+def _friction_of_bodies(world: World, params: Params) -> Float64:
+    """Returns the coefficient of each body on each other, (bodies, bodies)."""
+    listed = {frozenset(pair.between): pair.value for pair in params.friction or ()}
+    return np.array([
+        [listed.get(frozenset((a.name, b.name)), (a.friction * b.friction) ** 0.5) for b in world.bodies]
+        for a in world.bodies
+    ])  # fmt: skip
 
 
 def _thickness(params: Params, body: Body) -> float:

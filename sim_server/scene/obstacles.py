@@ -101,8 +101,8 @@ def contact_errors(
         if obstacles:
             yield _error("objects touch it by the effect contact: list contact = true under [effects]", "obstacle", 0)
         return
-    if not obstacles:
-        yield _error("there is nothing to touch; needed: an [[obstacle]] at least", "effects", "contact")
+    if not obstacles and (len(objects) < 2 or not contact.between):
+        yield _error("there is nothing to touch; needed: an [[obstacle]], or another object", "effects", "contact")
     if integrator.scheme != "backward_euler" or integrator.linearizations > 1:
         found = f"{integrator.scheme!r} with linearizations = {integrator.linearizations}"
         text = f"contact with integrator.scheme = {found}; allowed: 'backward_euler' with linearizations = 1"
@@ -118,8 +118,8 @@ def _wrong_pair(pair: set[str], objects: list[str], obstacles: list[str], earlie
     for name in sorted(pair):
         if name not in objects and name not in obstacles:
             return f"no object or obstacle {name!r}" + nearest(name, [*objects, *obstacles], "names")
-    if len(pair & set(objects)) != 1 or len(pair & set(obstacles)) != 1:
-        return f"{' and '.join(sorted(pair))}: must be an object and an obstacle"
+    if len(pair) != 2 or not pair & set(objects):
+        return f"{' and '.join(sorted(pair))}: must be an object, and an obstacle or another object"
     return f"{' and '.join(sorted(pair))} stand in the list already" if pair in earlier else ""
 
 

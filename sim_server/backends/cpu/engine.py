@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from protocol.factor import FactorPattern
 from sim_server.backends.base import Capability, EngineInput, Launch
 from sim_server.backends.compiler import native
-from sim_server.backends.contact import Contact
+from sim_server.backends.contact import Contact, Surfaces
 from sim_server.backends.cpu import structs
 from sim_server.backends.cpu.device import CpuLaunch
 from sim_server.backends.cpu.energies import NativeEnergies
@@ -147,28 +147,60 @@ class _NativeStages:
             launches[number[key]].parts = None if part is None else part.ctypes.data
 
 
+MOST_MODES = 600  # of the coarse space of an island of bodies
+
+
 class _NativeContact:
     """The input of contact and its memory, attached to a loop. arrays: of the system."""
 
     def __init__(self, contact: Contact, loop: structs.Loop, arrays: Mapping[str, NDArray[Any]]):
         self._input, obstacles = contact, contact.obstacles
-        rows, count = len(contact.obstacle), len(obstacles.kind)
+        rows, count, bodies = len(contact.obstacle), len(obstacles.kind), loop.bodies
         self._state = (structs.RowState * max(rows, 1))()
-        self._report = (structs.ContactReport * loop.bodies)()
-        self._room = np.zeros((loop.nodes, 12))
-        self._reaction = np.zeros((loop.bodies, count, 6))
+        self._report = (structs.ContactReport * bodies)()
+        self._result = (structs.SolveResult * bodies)()
+        self._own = {
+            "active": np.zeros(rows, np.int32), "room": np.zeros((8, loop.nodes, 3)),
+            "reaction": np.zeros((bodies, count, 6)), "mode": np.zeros(bodies, np.int32),
+            "island": np.zeros(bodies, np.int32), "island_start": np.zeros(bodies + 1, np.int32),
+            "island_rows": np.zeros(bodies, np.int32), "near": np.zeros(bodies, np.int32),
+            "was_near": np.zeros(bodies, np.int32), "site_body": self._site_body(contact),
+        }  # fmt: skip
         self.native = structs.Contact(
             obstacle_count=count, passes=contact.passes, tolerance=contact.tolerance, dx_dv=contact.dx_dv,
-            force_coefficient=contact.force_coefficient, state=c.addressof(self._state),
-            report=c.addressof(self._report), room=self._room.ctypes.data, reaction=self._reaction.ctypes.data,
+            force_coefficient=contact.force_coefficient, state=c.addressof(self._state), pair_first=-1,
+            report=c.addressof(self._report), result=c.addressof(self._result),
         )  # fmt: skip
+        if contact.surfaces:
+            self._touch(contact.surfaces, contact.free, rows, loop)
         for name in ("kind", "size", "grid", "place", "cells", "begin", "end"):
             setattr(self.native.obstacles, name, getattr(obstacles, name).ctypes.data)
         for name in ("body_start", "corner", "weight", "obstacle", "normal", "gap", "drift", "entry", "stiffness",
                      "friction", "thickness", "force", "traction", "predictor", "free"):  # fmt: skip
             setattr(self.native, name, getattr(contact, name).ctypes.data)
+        for name, array in self._own.items():
+            setattr(self.native, name, array.ctypes.data)
         self.native.rotation = arrays["rotation"].ctypes.data
         loop.contact = c.addressof(self.native)
+
+    @staticmethod
+    def _site_body(contact: Contact) -> NDArray[np.int32]:
+        counts = np.diff(contact.body_start) // 2
+        return np.repeat(np.arange(len(counts), dtype=np.int32), counts)
+
+    def _touch(self, surfaces: Surfaces, free: Reals, rows: int, loop: structs.Loop) -> None:
+        """Adds what bodies need to touch each other."""
+        most = min(6 * loop.bodies, MOST_MODES)
+        ranges = [(b.first, b.last) for b in c.cast(loop.body, c.POINTER(structs.Body))[: loop.bodies]]
+        self._boxes = [(structs.Box * max(n, 1))() for n in (len(surfaces.tree_child), loop.bodies)]
+        self._own |= {
+            "node_site": surfaces.node_site, "triangle": surfaces.triangle, "tree_start": surfaces.tree_start,
+            "tree_child": surfaces.tree_child, "pair_friction": surfaces.friction, "gravity": surfaces.gravity,
+            "modes": np.zeros((loop.nodes, 18)), "coarse": np.zeros((most + 4, most)), "lever": np.zeros((rows, 8)),
+            "unheld": np.array([bool((free[first:last] > 0).all()) for first, last in ranges], np.int32),
+        }  # fmt: skip
+        self.native.tree_box, self.native.body_box = map(c.addressof, self._boxes)
+        self.native.pair_first, self.native.most_modes = rows // 2, most
 
 
 def _binding(launch: CpuLaunch) -> structs.Binding:

@@ -98,6 +98,11 @@ class RowState(c.Structure):
 
 
 @LOOP.struct
+class Box(c.Structure):
+    """A box of a surface's tree."""
+
+
+@LOOP.struct
 class ContactReport(c.Structure):
     """What became of the contacts of a body."""
 

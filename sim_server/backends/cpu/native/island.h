@@ -50,16 +50,17 @@ struct IslandSolver {
     int modes = 0;
     double *E, *c1, *c2;                // dense factor; coefficients
     double *z, *p, *q;                  // of all nodes
-    std::vector<Preconditioner>& single;
+    std::vector<BlockCsr>& matrices;
+    std::vector<Preconditioner>& single;  // of each body; they refer to `matrices`
 
     IslandSolver(Loop& loop, Contact& c, const int32_t* bodies, int count, const Rows& rows)
-        : loop(loop), c(c), bodies(bodies), count(count), rows(rows), single(memory()) {
+        : loop(loop), c(c), bodies(bodies), count(count), rows(rows), matrices(memory<BlockCsr>()), single(memory<Preconditioner>()) {
         const int64_t n = 3 * (int64_t)loop.nodes;
         z = c.room + 5 * n; p = z + n; q = p + n;
         E = c.coarse; c1 = E + (int64_t)c.most_modes * c.most_modes; c2 = c1 + c.most_modes;
     }
-    static std::vector<Preconditioner>& memory() {
-        static thread_local std::vector<Preconditioner> kept;
+    template <class T> static std::vector<T>& memory() {
+        static thread_local std::vector<T> kept;
         return kept;
     }
 
@@ -257,11 +258,13 @@ struct IslandSolver {
     // Bodies without a factor have block Jacobi, with the diagonal parts of contacts.
     void prepare() {
         single.clear();
-        each_body([&](Body& body, int) {
+        matrices.clear();
+        each_body([&](Body& body, int) { matrices.push_back(matrix_of(loop, body)); });
+        each_body([&](Body& body, int m) {
             double* work = loop.work + 27 * (int64_t)body.first;
             const int n = 3 * (body.last - body.first);
             const int kind = body.now.kind == CHOLESKY && body.factor ? CHOLESKY : BLOCK_JACOBI;
-            single.push_back({matrix_of(loop, body), body.factor, kind, work, work + 3 * n, 1, &body.correction});
+            single.push_back({matrices[m], body.factor, kind, work, work + 3 * n, 1, &body.correction});
             single.back().prepare();
         });
         // block Jacobi knows contacts: the inverses are made anew where rows act
@@ -292,18 +295,21 @@ struct IslandSolver {
         single[m].prepare();
     }
 
-    // to = P^-1 r by the bodies' own; false if one is not positive definite (it is left for block Jacobi then).
-    bool apply_single(const double* r, double* to) {
+    // to = P^-1 r by the bodies' own. A factor that is not positive definite is left for block Jacobi; false if that is not, either.
+    bool apply_single(const double* r, double* to, int& fallbacks) {
         bool well = true;
         each_body([&](const Body& body, int m) {
             const int64_t at = 3 * (int64_t)body.first;
             const int n = 3 * (body.last - body.first);
             const double norm = std::sqrt(dot(n, r + at, r + at));
             if (norm == 0) { std::fill(to + at, to + at + n, 0.0); return; }
-            const double zr = single[m].apply(r + at, norm, to + at);
-            if (zr > 0 && zr < INFINITY) return;
-            well = false;
-            leave_factor(m);
+            double zr = single[m].apply(r + at, norm, to + at);
+            if (!(zr > 0 && zr < INFINITY) && single[m].kind == CHOLESKY) {
+                leave_factor(m);
+                ++fallbacks;
+                zr = single[m].apply(r + at, norm, to + at);
+            }
+            well = well && zr > 0 && zr < INFINITY;
         });
         return well;
     }
@@ -317,7 +323,7 @@ struct IslandSolver {
             solve_dense(E, modes, modes, c1);
             subtract_motion(c1, r, scratch);
         }
-        while (!apply_single(modes ? scratch : r, to)) ++fallbacks;
+        if (!apply_single(modes ? scratch : r, to, fallbacks)) return NAN;
         if (modes) {
             project_product(to, c2);
             solve_dense(E, modes, modes, c2);

@@ -144,6 +144,7 @@ struct PairDetection {
         for (int k = 0; k < 3; ++k) c.traction[3 * row + k] = 0;
         if (t.other < 0) return;
         const int node = node_of(site), body = c.site_body[site];
+        const double own = c.stiffness[2 * site];
         int32_t* corner = c.corner + CORNERS * row;
         double *weight = c.weight + CORNERS * row, *normal = c.normal + 3 * row, gap = 0, stiffness = 0;
         corner[0] = node;
@@ -151,13 +152,13 @@ struct PairDetection {
         for (int a = 0; a < 3; ++a) {
             corner[a + 1] = c.triangle[3 * t.triangle + a];
             weight[a + 1] = -t.touch.weight[a];
-            stiffness += t.touch.weight[a] * c.stiffness[2 * c.node_site[corner[a + 1]]];
+            const int32_t facing = c.node_site[corner[a + 1]];
+            stiffness += t.touch.weight[a] * (facing < 0 ? own : c.stiffness[2 * facing]);  // a fixed node has none
         }
         for (int k = 0; k < 3; ++k) {
             normal[k] = t.touch.normal[k];
             for (int a = 0; a < CORNERS; ++a) gap += normal[k] * weight[a] * x(corner[a])[k];
         }
-        const double own = c.stiffness[2 * site];
         c.gap[row] = gap;
         c.entry[row] = t.touch.entry;
         c.stiffness[row] = 2 * own * stiffness / (own + stiffness);
