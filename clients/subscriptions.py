@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Subscriptions to the states and steps of a server: a slow reader gets the newest and never a backlog."""
+"""Subscriptions to the states, steps and poses of a server: a slow reader gets the newest and never a backlog."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import logging
 import zenoh
 
 from clients.log.frames import Frame, frame_of
+from clients.log.obstacles import ObstacleFrame, obstacle_frame_of
 from protocol import messages_pb2 as pb
 from protocol.channels import CHANNELS, key
 from protocol.refused import Refused
@@ -41,6 +42,31 @@ class States:
             except Refused as error:
                 log.warning("a frame was left out: %s", error)
         return frames
+
+
+class Poses:
+    """The newest pose of each obstacle, in a ring of one sample per obstacle."""
+
+    def __init__(self, session: zenoh.Session, server: str, obstacles: list[str]) -> None:
+        self._rings = {
+            name: session.declare_subscriber(key("pose", server, object=name), zenoh.handlers.RingChannel(1))
+            for name in obstacles
+        }
+
+    def newest(self) -> list[ObstacleFrame]:
+        """Returns the poses that came since the last call, one per obstacle at most; never waits."""
+        found = []
+        for name, ring in self._rings.items():
+            sample = ring.try_recv()
+            if sample is None:
+                continue
+            try:
+                pose = parse(pb.ObstaclePose, sample.payload, CHANNELS["pose"].limit)
+                check_header(pose, object=name)
+                found.append(obstacle_frame_of(pose))
+            except Refused as error:
+                log.warning("a pose was left out: %s", error)
+        return found
 
 
 class Steps:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import signal
 import time
 from typing import Any
@@ -36,8 +37,9 @@ def tables(status: pb.Status) -> Group:
     local = [_local(status)] if status.local_workers else []
     pace = [Text(status.pace, "bold red")] if status.pace else []
     return Group(
-        _summary(status), *pace, _objects(status), *_errors(status), *_energies(status), _workers(status), *local
-    )
+        _summary(status), *pace, _objects(status), *_errors(status), *_contacts(status), *_energies(status),
+        _workers(status), *local,
+    )  # fmt: skip
 
 
 def _summary(status: pb.Status) -> Text:
@@ -97,6 +99,18 @@ def _errors(status: pb.Status) -> list[Table]:
     for found in shown:
         estimate = f"{found.last.estimate:.1e}" if found.last.HasField("estimate") else "-"
         _add(table, found.object, enum_name("form", found.last.form), estimate)
+    return [table] if shown else []
+
+
+def _contacts(status: pb.Status) -> list[Table]:
+    """Table of contacts with obstacles; empty if the scene has none."""
+    shown = [o for o in status.objects if o.last.HasField("contact_residual")]
+    table = Table("object", "contacts", "passes", "contact residual", "clipped", "force on [N]", **COMPACT)
+    for found in shown:
+        last = found.last
+        forces = (f"{r.obstacle} {math.hypot(r.force.x, r.force.y, r.force.z):.3g}" for r in last.reactions)
+        numbers = (str(last.contacts), str(last.passes), f"{last.contact_residual:.1e}", str(found.clipped))
+        _add(table, found.object, *numbers, ", ".join(forces) or "-")
     return [table] if shown else []
 
 

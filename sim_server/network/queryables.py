@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Answers the queries of clients and workers: status, scene, topology, shared memory probes, commands."""
+"""Answers the queries of clients and workers: status, scene, topology, obstacles, shared memory probes, commands."""
 
 import logging
 from collections.abc import Callable
@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 
 MAX_QUERIES = 256  # queries of a channel that may wait for its thread; beyond that the oldest is dropped
 MAX_WARNED_WORKERS = 64  # workers of another wire version that are warned of one by one
-QUERYABLES = ("command", "status", "scene", "topology", "echo")  # channels
+QUERYABLES = ("command", "status", "scene", "topology", "obstacle", "echo")  # channels
 
 
 class Queryables:

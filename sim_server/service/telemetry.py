@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from protocol import messages_pb2 as pb
 from protocol.method import Method
+from sim_server.arrays import Float64
 from sim_server.backends.kinds import SLACK_OF_ENERGY
 from sim_server.mechanics.named_points import NamedPoints
 from sim_server.network.link import ServerLink
@@ -57,12 +58,14 @@ class Telemetry:
         ]  # iterations
         self.seconds: deque[float] = deque(maxlen=STATISTICS_STEPS)
         self._last: NDArray[Any] = np.zeros(len(self._window), self.engine.records_dtype)
+        self._last_reactions: Float64 | None = None  # of the same records; None: there are no obstacles
         self._not_finite: set[str] = set()  # objects of which it was said
         self.solves = 0
         self.pace = ""  # why the run does not keep pace with the clock; empty: it does, or need not
         self.unconverged: Counter[str] = Counter()  # solves by status, of those that did not converge
         self._energy: dict[int, float] = {}  # by body, kinetic + elastic + gravity of the last step with all three [J]
         self.runaways: Counter[int] = Counter()  # steps by body
+        self.clipped: Counter[int] = Counter()  # nodes by body, summed over steps
         self._has_listeners = False
         self._due = {"steps": 0.0, "state": 0.0, "status": 0.0, "look": 0.0}
         self._has_viewers = False
@@ -92,14 +95,19 @@ class Telemetry:
         self._due[what] = now + period
         return True
 
-    def records(self, records: NDArray[Any]) -> None:
-        """Sends step records, each to the log, in batches to subscribers."""
+    def records(self, records: NDArray[Any], reactions: Float64 | None = None) -> None:
+        """Sends step records, each to the log, in batches to subscribers.
+
+        reactions: (k, obstacles, 6), of each record on obstacles, force [N] and torque [N m]; None: there are none
+        """
+        if reactions is not None and not reactions.shape[1]:
+            reactions = None
         if self.replay_recorder:
             self.replay_recorder.write(self.patient)
         if len(records):
             self.seconds.extend(records["whole"][records["body"] == 0].tolist())
-            self.update_summary(records)
-            steps = self._messages(records)
+            self.update_summary(records, reactions)
+            steps = self._messages(records, reactions)
             self._add_interactions(steps)
             if self.recorder:
                 for step in steps:
@@ -110,22 +118,30 @@ class Telemetry:
                 self.link.publish_steps(pb.Steps(steps=self._batch))
             self._batch.clear()
 
-    def update_summary(self, records: NDArray[Any]) -> None:
-        """Keeps what the status tells of steps: the last record of each body, iterations and energies."""
+    def update_summary(self, records: NDArray[Any], reactions: Float64 | None = None) -> None:
+        """Keeps what the status tells of steps: the last record of each body, its reactions, iterations and energies."""
         order = np.argsort(records["body"], kind="stable")
         present, first = np.unique(records["body"][order], return_index=True)
         iterations = records["iterations"][order].tolist()
         ends = [*first[1:].tolist(), len(order)]
-        self._last[present] = records[order[np.array(ends) - 1]]
+        newest = order[np.array(ends) - 1]
+        self._last[present] = records[newest]
+        if reactions is not None:
+            if self._last_reactions is None:
+                self._last_reactions = np.zeros((len(self._window), *reactions.shape[1:]))
+            self._last_reactions[present] = reactions[newest]
         for body, begin, end in zip(present.tolist(), first.tolist(), ends, strict=True):
             self._window[body].extend(iterations[begin:end])
         for r in records[np.isfinite(records["elastic"])]:
             self._energy[int(r["body"])] = float(r["kinetic"] + r["elastic"] + r["gravity"])
 
-    def _messages(self, records: NDArray[Any]) -> list[pb.ObjectStep]:
+    def _messages(self, records: NDArray[Any], reactions: Float64 | None) -> list[pb.ObjectStep]:
         """Makes messages for the log and for subscribers only: it is the most expensive part of telemetry."""
-        wanted = records if self.recorder else records[-MAX_BATCH:] if self.link.wants_steps() else records[:0]
-        steps = messages.steps(self.simulation, wanted, self._method)
+        most = len(records) if self.recorder else MAX_BATCH if self.link.wants_steps() else 0
+        wanted = slice(max(len(records) - most, 0), None)
+        steps = messages.steps(
+            self.simulation, records[wanted], self._method, None if reactions is None else reactions[wanted]
+        )
         bound = self.driver.age_bound() if steps else -1
         for step in steps:
             step.excess = self.driver.by_name[step.header.object].solves.excess
@@ -139,7 +155,8 @@ class Telemetry:
     def _latest(self, body: int, bound: int) -> pb.ObjectStep | None:
         if not self._window[body]:
             return None
-        message = messages.steps(self.simulation, self._last[body : body + 1], self._method)[0]
+        reactions = None if self._last_reactions is None else self._last_reactions[body : body + 1]
+        message = messages.steps(self.simulation, self._last[body : body + 1], self._method, reactions)[0]
         message.excess, message.factor_age_bound = self.driver.bodies[body].solves.excess, bound
         return message
 
@@ -236,6 +253,7 @@ class Telemetry:
                     factor_age_bound=bound,
                     runaway_steps=self.runaways[body.index],
                     total_energy=self._energy.get(body.index),
+                    clipped=self.clipped[body.index],
                 )
             )
         if where:
@@ -270,10 +288,25 @@ class Telemetry:
             return []
         r, status = failed[0], next(iter(self.unconverged))
         name = self.simulation.world.bodies[int(r["body"])].name
+        column = "contact_residual" if r["status"] == pb.CONTACT else "residual"
         return [
-            f"object {name!r}, step {int(r['step'])}: not converged ({status}, residual {float(r['residual']):.1e}); "
+            f"object {name!r}, step {int(r['step'])}: not converged ({status}, residual {float(r[column]):.1e}); "
             "further ones are counted"
         ]
+
+    def count_clipped(self, records: NDArray[Any]) -> list[str]:
+        """Counts nodes that were held back at obstacles after the passes; returns a line for each new object."""
+        lines = []
+        for r in records[records["clipped"] > 0]:
+            body = self.simulation.world.bodies[int(r["body"])]
+            if body.index not in self.clipped:
+                lines.append(
+                    f"object {body.name!r}, step {int(r['step'])}: {int(r['clipped'])} nodes would have passed into an "
+                    "obstacle and were held back, so momentum is not exact; further ones are counted. A smaller dt or "
+                    "more passes (effects.contact) may help"
+                )
+            self.clipped[body.index] += int(r["clipped"])
+        return lines
 
     def not_finite(self, records: NDArray[Any]) -> list[str]:
         """Returns a line for each object whose solve met numbers that are not finite for the first time."""
