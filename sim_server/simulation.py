@@ -36,6 +36,7 @@ from sim_server.scene import Scene, load
 if TYPE_CHECKING:
     from scipy.sparse import csc_array
 
+    from sim_server.effects.contact import Contact  # imported where a scene lists it
     from sim_server.effects.touch import Touch  # imported where a scene lists it
 
 KINDS = {"none": Kind.NONE, "jacobi": Kind.JACOBI, "block_jacobi": Kind.BLOCK_JACOBI, "ssor": Kind.SSOR}
@@ -90,6 +91,7 @@ class Simulation:
         w, s = self.world, self.system
         arrays: dict[str, NDArray[Any]] = {"row_start": s.row_start, "columns": s.columns, "values": s.values}
         arrays |= {"b": s.b_material, "y": s.y, "x": w.x, "v": w.v, "clock": s.clock, "moving": s.moving}
+        arrays["rotation"] = s.rotation
         names, ranges = [b.name for b in w.bodies], [(b.first, b.last) for b in w.bodies]
         others = self._stage_launches() if self.integrator.has_stages else []
         assemble, integrate = self.launches()
@@ -98,8 +100,9 @@ class Simulation:
         effects = list(self.effects.values())
         newton = self.integrator.newton(assemble, effects)
         stages = self.integrator.stages(assemble, lists, effects)
+        contact = self.contact.contact_input() if self.contact else None
         solver, energies = self.scene.solver, self.energies
-        return EngineInput(assemble, integrate, names, ranges, w.dt, solver, energies, newton, stages, arrays)
+        return EngineInput(assemble, integrate, names, ranges, w.dt, solver, energies, newton, stages, contact, arrays)
 
     @classmethod
     def load(cls, path: str | Path, overrides: Sequence[str] = (), device: str = "cpu") -> "Simulation":
@@ -172,6 +175,11 @@ class Simulation:
     def touch(self) -> "Touch | None":
         """Pushes and grabs, if the scene lists them."""
         return cast("Touch | None", self.effects.get("touch"))
+
+    @property
+    def contact(self) -> "Contact | None":
+        """Contact with obstacles, if the scene lists it."""
+        return cast("Contact | None", self.effects.get("contact"))
 
     def rotated_bodies(self) -> list[Body]:
         """Bodies whose rotations for the warp are those of elements."""

@@ -20,6 +20,7 @@ from protocol.factor import FactorPattern
 from sim_server.arrays import Float64
 
 if TYPE_CHECKING:
+    from sim_server.backends.contact import Contact
     from sim_server.backends.energies import Energies
     from sim_server.backends.newton import Newton
     from sim_server.backends.rosenbrock import Rosenbrock
@@ -168,6 +169,10 @@ class Engine(Protocol):
         """Returns the step records since the last call, one for each body and step, oldest first."""
         ...
 
+    def records_and_reactions(self) -> tuple[NDArray[np.void], Float64]:
+        """Returns the records, and with each the force [N] and torque [N m] on each obstacle, (k, obstacles, 6)."""
+        ...
+
     def frames(self) -> list[tuple[int, Float64, Float64]]:
         """Returns the frames since the last call: step, x (n, 3) [m] and v (n, 3) [m/s]."""
         ...
@@ -234,7 +239,8 @@ class EngineInput:
     energies: what the energy of each step is summed from
     newton: for several linearizations a step; None for one
     stages: of a Rosenbrock-W step; None for other schemes
-    arrays: of the system by name: row_start, columns, values, b, y, x, v, clock, moving
+    contact: rows that launches among `assemble` fill in; None: nothing can be touched
+    arrays: of the system by name: row_start, columns, values, b, y, x, v, clock, moving, rotation
     """
 
     assemble: Sequence[Launch]
@@ -246,6 +252,7 @@ class EngineInput:
     energies: Energies
     newton: Newton | None
     stages: Rosenbrock | None
+    contact: Contact | None
     arrays: Mapping[str, NDArray[Any]]
 
 

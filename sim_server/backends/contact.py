@@ -43,6 +43,7 @@ class Contact:
     thickness: (rows,) [m]
     force: (rows,) normal force lambda [N]; traction: (rows, 3) friction force [N]. In: of the last step, for the same
         obstacle (0 for another), traction turned with the normal. Out: of this step
+    predictor: (nodes, 3), dx_dv, force_coefficient, free: (nodes,) of the world (mechanics/world.py)
     passes: most solves of a step. tolerance: of the contact residual
     """
 
@@ -60,5 +61,9 @@ class Contact:
     thickness: Float64
     force: Float64
     traction: Float64
+    predictor: Float64
+    free: Float64
+    dx_dv: float
+    force_coefficient: float
     passes: int
     tolerance: float

@@ -29,16 +29,28 @@ class Reports:
         loop.records, loop.record_capacity = self._records.ctypes.data, len(self._records)
         loop.frames, loop.frame_steps = self._frames.ctypes.data, self._frame_steps.ctypes.data
         loop.frame_capacity = len(frames)
+        self._reactions = np.zeros((len(self._records), 0, 6))
 
     @property
     def step(self) -> int:
         """Steps completed."""
         return int(self.loop.step)
 
+    def report_reactions(self, obstacles: int) -> None:
+        """Has records come with the force and torque on each obstacle."""
+        self._reactions = np.zeros((len(self._records), obstacles, 6))
+        self.loop.reactions = self._reactions.ctypes.data
+
     def records(self) -> NDArray[Any]:
         """New records since the last call, oldest first, (k,) of RECORD."""
+        return self.records_and_reactions()[0]
+
+    def records_and_reactions(self) -> tuple[NDArray[Any], Reals]:
+        """New records since the last call, and what each body exerted on each obstacle, (k, obstacles, 6): force [N],
+        then torque about the obstacle's position at the end of the step [N m]. No obstacles without contact."""
         head, tail, size = int(self.loop.record_head), int(self.loop.record_tail), len(self._records)
-        out = self._records[np.arange(tail, head) % size]
+        slots = np.arange(tail, head) % size
+        out = self._records[slots], self._reactions[slots]
         self.loop.record_tail = head
         return out
 

@@ -2,7 +2,7 @@
 // Energy balance of a body from step to step, and the criterion of a runaway; shared by both devices (backends/cpu/native/energy.h,
 // backends/gpu/energy_balance.cu).
 //
-//     kinetic  sum m v.v / 2          gravity  -sum m g.x          work  of pushes and grabs since the start
+//     kinetic  sum m v.v / 2          gravity  -sum m g.x          work  of pushes, grabs and contact since the start
 //     budget   kinetic + elastic before the first step, + work, + what gravity has done since, sum m g.dx (g may change)
 //
 // Elasticity and damping only take from the budget, so that kinetic <= budget up to the errors of the time step. A body runs away

@@ -6,7 +6,7 @@ reads what the loop has left in its rings, and may be called from another thread
 """
 
 import ctypes as c
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, cast
@@ -20,6 +20,7 @@ from sim_server.backends.compiler import native
 from sim_server.backends.cpu import structs
 from sim_server.backends.cpu.device import CpuLaunch
 from sim_server.backends.cpu.energies import NativeEnergies
+from sim_server.backends.contact import Contact
 from sim_server.backends.newton import Newton
 from sim_server.backends.ring_buffers import Reports
 from sim_server.backends.rosenbrock import NODAL, Rosenbrock
@@ -146,6 +147,30 @@ class _NativeStages:
             launches[number[key]].parts = None if part is None else part.ctypes.data
 
 
+class _NativeContact:
+    """The input of contact and its memory, attached to a loop. arrays: of the system."""
+
+    def __init__(self, contact: Contact, loop: structs.Loop, arrays: Mapping[str, NDArray[Any]]):
+        self._input, obstacles = contact, contact.obstacles
+        rows, count = len(contact.obstacle), len(obstacles.kind)
+        self._state = (structs.RowState * max(rows, 1))()
+        self._report = (structs.ContactReport * loop.bodies)()
+        self._room = np.zeros((loop.nodes, 12))
+        self._reaction = np.zeros((loop.bodies, count, 6))
+        self.native = structs.Contact(
+            obstacle_count=count, passes=contact.passes, tolerance=contact.tolerance, dx_dv=contact.dx_dv,
+            force_coefficient=contact.force_coefficient, state=c.addressof(self._state),
+            report=c.addressof(self._report), room=self._room.ctypes.data, reaction=self._reaction.ctypes.data,
+        )  # fmt: skip
+        for name in ("kind", "size", "grid", "place", "cells", "begin", "end"):
+            setattr(self.native.obstacles, name, getattr(obstacles, name).ctypes.data)
+        for name in ("body_start", "corner", "weight", "obstacle", "normal", "gap", "drift", "entry", "stiffness",
+                     "friction", "thickness", "force", "traction", "predictor", "free"):  # fmt: skip
+            setattr(self.native, name, getattr(contact, name).ctypes.data)
+        self.native.rotation = arrays["rotation"].ctypes.data
+        loop.contact = c.addressof(self.native)
+
+
 def _binding(launch: CpuLaunch) -> structs.Binding:
     """Arguments of a launch that the loop has not taken up yet."""
     return structs.Binding(params=c.addressof(launch.params), items=launch.items, taken=-1)
@@ -188,6 +213,9 @@ class CpuEngine(Reports):
         self._newton = given.newton and _NativeNewton(given.newton, loop, self._launch)
         number = {id(launch): k for k, launch in enumerate(launches)}
         self._stages = given.stages and _NativeStages(given.stages, loop, self._launch, number)
+        self._contact = given.contact and _NativeContact(given.contact, loop, arrays)
+        if given.contact:
+            self.report_reactions(len(given.contact.obstacles.kind))
         self._energies = NativeEnergies(given.energies)
         loop.energies = c.addressof(self._energies.native)
         self.begin: Sequence[Launch] = ()  # before the first step

@@ -83,6 +83,31 @@ class Stages(c.Structure):
 
 
 @LOOP.struct
+class ObstacleTable(c.Structure):
+    """Shapes and poses of obstacles: kernels/shapes.cuh."""
+
+
+@LOOP.struct
+class ContactForce(c.Structure):
+    """Force of a row of contact: kernels/contact_law.cuh."""
+
+
+@LOOP.struct
+class RowState(c.Structure):
+    """State of a row of contact in the step under way."""
+
+
+@LOOP.struct
+class ContactReport(c.Structure):
+    """What became of the contacts of a body."""
+
+
+@LOOP.struct
+class Contact(c.Structure):
+    """Input and memory of contact."""
+
+
+@LOOP.struct
 class Elastic(c.Structure):
     """Energies of the elements of an effect."""
 

@@ -4,6 +4,7 @@
 #include <cmath>
 #include <cstdint>
 
+#include "contact_rows.h"
 #include "invert3.cuh"
 
 struct BlockCsr {
@@ -11,6 +12,7 @@ struct BlockCsr {
     const int32_t* row_start;   // (nodes + 1,) of the scene, into columns and values
     const int32_t* columns;     // node numbers in the scene
     const double* values;       // (blocks, 3, 3)
+    const BodyRows* rows = nullptr;  // of contacts that A has beside its values, or null
     int size() const { return 3 * (last - first); }
 };
 
@@ -31,7 +33,7 @@ static double multiply(const BlockCsr& A, const double* x, double* y) {
         w[0] = y0; w[1] = y1; w[2] = y2;
         sum += u[0] * y0 + u[1] * y1 + u[2] * y2;
     }
-    return sum;
+    return A.rows ? sum + A.rows->add_product(x, y) : sum;
 }
 
 static double dot(int n, const double* a, const double* b) {
@@ -79,7 +81,14 @@ static void invert_diagonal(const BlockCsr& A, bool whole, double* inverse) {
     for (int i = A.first; i < A.last; ++i) {
         int k = A.row_start[i];
         while (A.columns[k] != i) ++k;
-        invert3(A.values + 9 * (int64_t)k, whole, inverse + 9 * (i - A.first));
+        double* block = inverse + 9 * (int64_t)(i - A.first);
+        for (int m = 0; m < 9; ++m) block[m] = A.values[9 * (int64_t)k + m];
+    }
+    if (A.rows) A.rows->add_diagonal(inverse);
+    for (int i = 0; i < A.last - A.first; ++i) {
+        double block[9];
+        for (int m = 0; m < 9; ++m) block[m] = inverse[9 * (int64_t)i + m];
+        invert3(block, whole, inverse + 9 * (int64_t)i);
     }
 }
 

@@ -22,6 +22,7 @@ static Sums sums_of(const Loop& loop, const Body& body) {
         s.work += work_on(force, spring, anchor, from, step);
         force[0] = force[1] = force[2] = spring = 0;  // until something touches the node again
     }
+    if (loop.contact) s.work += loop.contact->report[&body - loop.body].work;
     return s;
 }
 

@@ -4,6 +4,7 @@
 // go of Python's lock, so no Python code, network, worker or disk can delay a step.
 #include <cstring>
 
+#include "contact.h"
 #include "energy.h"
 #include "newton.h"
 #include "rosenbrock.h"
@@ -63,6 +64,7 @@ static void copy_for_worker(Loop& loop, Body& body) {
     if (body.ahead < 0) {
         int64_t begin = loop.row_start[body.first], end = loop.row_start[body.last];
         std::memcpy(target, loop.values + 9 * begin, 9 * sizeof(double) * (end - begin));
+        if (loop.contact) add_contacts(loop, body, target);
     } else {
         for (int64_t k = 3 * (int64_t)body.first; k < 3 * (int64_t)body.last; ++k)
             *target++ = loop.x[k] + body.ahead * loop.v[k];
@@ -129,6 +131,17 @@ static void assemble(Loop* loop, bool whole) {
     loop->assemble_seconds = now() - begin;
 }
 
+static void note_contact(Loop& loop, int index, int64_t slot) {
+    const ContactReport& report = loop.contact->report[index];
+    Record& record = loop.rings.records[slot];
+    record.contacts = report.contacts;
+    record.passes = report.passes;
+    record.clipped = report.clipped;
+    record.contact_residual = report.residual;
+    const int64_t size = 6 * (int64_t)loop.contact->obstacle_count;
+    std::memcpy(loop.rings.reactions + size * slot, loop.contact->reaction + size * index, sizeof(double) * size);
+}
+
 static void finish_step(Loop* loop) {
     Rings& rings = loop->rings;
     int64_t first = rings.record_head.load(), step = rings.step + 1;
@@ -153,6 +166,8 @@ static void finish_step(Loop* loop) {
             r = as_solve_result(loop->newton->search[i]);
             linearizations = std::max(1, loop->newton->search[i].linearizations);
             nonlinear = residual_ratio(loop->newton->search[i]);
+        } else if (loop->contact) {
+            r = solve_in_contact(*loop, i);
         } else {
             BlockCsr A{body.first, body.last, loop->row_start, loop->columns, loop->values};
             r = pcg(A, loop->b + 3 * body.first, body.factor, settings, loop->y + 3 * body.first,
@@ -172,6 +187,7 @@ static void finish_step(Loop* loop) {
         record.bad_node = r.status == NOT_FINITE ? first_bad_node(*loop, body) : -1;
         record.probe = settings.probe;
         record.linearizations = linearizations;
+        if (loop->contact) note_contact(*loop, i, (first + i) % rings.record_capacity);
         if (!loop->stages) continue;
         record.form = loop->stages->state[i].form;
         record.estimate = loop->stages->state[i].estimate;
@@ -250,7 +266,8 @@ void wf_precondition(Loop* loop, int32_t index, const double* r, double* z, doub
 
 const StructSize* wf_sizes() {
     static const StructSize sizes[] = {SIZE(Launch), SIZE(Body), SIZE(Loop), SIZE(Factor), SIZE(Pattern), SIZE(Record),
-                                       SIZE(Newton), SIZE(Search), SIZE(Stages), SIZE(StageState), SIZE(Elastic), SIZE(Energies), SIZE(Balance), {}};
+                                       SIZE(Newton), SIZE(Search), SIZE(Stages), SIZE(StageState), SIZE(Elastic), SIZE(Energies), SIZE(Balance),
+                                       SIZE(Contact), SIZE(RowState), SIZE(ContactReport), {}};
     return sizes;
 }
 }

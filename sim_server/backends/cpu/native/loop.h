@@ -112,6 +112,7 @@ struct Loop {
     double* work;                      // 27 doubles a node
     Newton* newton;                    // null: one linearization a step
     Stages* stages;                    // null: another scheme
+    Contact* contact;                  // null: nothing can be touched
     double* clock;                     // (1,) s, read by kernels
     int32_t* moving;                   // (bodies,) 0: the body rests (kernels/nodes.cu)
     Energies* energies;                // or null

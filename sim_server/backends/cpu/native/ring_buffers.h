@@ -42,6 +42,10 @@ struct Record {
     int32_t linearizations = 1;
     int32_t form = 0;           // StepForm
     double estimate = NAN;      // of the error of the step, the largest of a node [m]; NaN: the scheme gives none
+    double contact_residual = NAN;  // relative, with the law of contact at the end of the step; NaN: nothing was touched
+    int32_t contacts = 0;       // that carry force
+    int32_t passes = 0;         // solves for them
+    int32_t clipped = 0;        // nodes held back at an obstacle beside the law
 };
 
 // b: Balance or EnergyRecord of the body (kernels/energy_balance.cuh).
@@ -65,6 +69,7 @@ struct Rings {
     std::atomic<int64_t> step;             // completed
     Record* records;
     int64_t record_capacity;
+    double* reactions;                     // (record_capacity, obstacles, 6) of each record; null: no contact
     std::atomic<int64_t> record_head, record_tail;
     double* frames;                        // (capacity, 2, nodes, 3): x, v
     int64_t* frame_steps;

@@ -1,0 +1,135 @@
+// SPDX-License-Identifier: MIT
+// Rows of contacts in a body's system on a CPU: forces, and the product with their stiffness. They are never part of the stored A,
+// whose pattern follows from the mesh. Input: backends/contact.py; law: kernels/contact_law.cuh.
+#pragma once
+#include <cstdint>
+
+#include "contact_law.cuh"
+
+struct RowState {                 // of a row in the step under way
+    double s[3];                  // displacement of its point by the velocities reached [m]
+    double step[3];               // by the solution of the pass [m]
+    double limit;                 // normal force that limits friction, held in a pass [N]
+    double stiffness[6];          // upper triangle of the force's slope times h^2, world frame [kg]
+    ContactForce force;
+};
+
+struct ContactReport {            // of a body in a step
+    int32_t contacts;             // rows that carry force
+    int32_t passes;               // solves
+    int32_t clipped;              // nodes held back at an obstacle, beside the law
+    double residual;              // of the system with the law as it is at the end, relative; NaN: nothing was touched
+    double work;                  // of contact on the body [J]
+};
+
+struct Contact {
+    ObstacleTable obstacles;
+    int32_t obstacle_count;
+    int32_t passes;
+    double tolerance;
+    double dx_dv, force_coefficient;              // [s]
+    const int32_t* body_start;                    // (bodies + 1,) rows
+    const int32_t* corner;                        // (rows, 3)
+    const double* weight;                         // (rows, 3)
+    int32_t* obstacle;                            // (rows,)
+    double *normal, *gap, *drift, *entry;         // (rows, 3), (rows,), (rows, 3), (rows,)
+    const double *stiffness, *friction, *thickness;  // (rows,)
+    double *force, *traction;                     // (rows,), (rows, 3)
+    const double *rotation, *predictor, *free;    // (nodes, 3, 3), (nodes, 3), (nodes,)
+    RowState* state;                              // (rows,)
+    double* room;                                 // 12 doubles a node
+    ContactReport* report;                        // (bodies,)
+    double* reaction;                             // (bodies, obstacles, 6) force and torque on each obstacle
+};
+
+static void rotated(const double* R, const double* v, double* out) {
+    for (int i = 0; i < 3; ++i) out[i] = R[3 * i] * v[0] + R[3 * i + 1] * v[1] + R[3 * i + 2] * v[2];
+}
+static void rotated_back(const double* R, const double* v, double* out) {
+    for (int i = 0; i < 3; ++i) out[i] = R[i] * v[0] + R[3 + i] * v[1] + R[6 + i] * v[2];
+}
+
+// The rows of one body. Vectors below are of its nodes, material frame, unless said.
+struct BodyRows {
+    const Contact& c;
+    int32_t node_first, first, last;  // first node of the body; rows [first, last)
+
+    ContactRow row(int r) const {
+        return {c.normal + 3 * r, c.drift + 3 * r, c.traction + 3 * r, c.gap[r], c.thickness[r], c.stiffness[r], c.friction[r]};
+    }
+    bool empty(int r) const { return c.obstacle[r] < 0; }
+
+    // out += sum_a weight_a R_a v_a, world frame
+    void gather(int r, const double* v, double* out) const {
+        for (int a = 0; a < 3; ++a) {
+            const int node = c.corner[3 * r + a];
+            if (node < 0 || c.free[node] == 0) continue;
+            double w[3];
+            rotated(c.rotation + 9 * (int64_t)node, v + 3 * (node - node_first), w);
+            for (int k = 0; k < 3; ++k) out[k] += c.weight[3 * r + a] * w[k];
+        }
+    }
+    // to_a += weight_a R_a^T f, f in the world frame
+    void scatter(int r, const double* f, double* to) const {
+        for (int a = 0; a < 3; ++a) {
+            const int node = c.corner[3 * r + a];
+            if (node < 0 || c.free[node] == 0) continue;
+            double w[3];
+            rotated_back(c.rotation + 9 * (int64_t)node, f, w);
+            for (int k = 0; k < 3; ++k) to[3 * (node - node_first) + k] += c.weight[3 * r + a] * w[k];
+        }
+    }
+    // sum_a weight_a field_a of nodal vectors in the world frame, (nodes, 3)
+    void at_point(int r, const double* field, double* out) const {
+        out[0] = out[1] = out[2] = 0;
+        for (int a = 0; a < 3; ++a) {
+            const int node = c.corner[3 * r + a];
+            for (int k = 0; k < 3 && node >= 0; ++k) out[k] += c.weight[3 * r + a] * field[3 * (int64_t)node + k];
+        }
+    }
+    static void stiff(const double* k, const double* u, double* out) {
+        out[0] = k[0] * u[0] + k[1] * u[1] + k[2] * u[2];
+        out[1] = k[1] * u[0] + k[3] * u[1] + k[4] * u[2];
+        out[2] = k[2] * u[0] + k[4] * u[1] + k[5] * u[2];
+    }
+    bool acts(int r) const {
+        const RowState& s = c.state[r];
+        return !empty(r) && (s.force.closed || s.force.slip > 0);
+    }
+    // y += H^T S H x; returns x . H^T S H x
+    double add_product(const double* x, double* y) const {
+        double sum = 0;
+        for (int r = first; r < last; ++r) {
+            if (!acts(r)) continue;
+            double u[3] = {0, 0, 0}, f[3];
+            gather(r, x, u);
+            stiff(c.state[r].stiffness, u, f);
+            scatter(r, f, y);
+            sum += dot3(u, f);
+        }
+        return sum;
+    }
+    // Adds the parts on the nodes' own blocks. blocks: (nodes, 9)
+    void add_diagonal(double* blocks) const {
+        for (int r = first; r < last; ++r)
+            if (acts(r)) add_blocks(r, c.state[r].stiffness, [&](int i, int j) { return i == j ? blocks + 9 * (int64_t)(i - node_first) : nullptr; });
+    }
+    // Adds w_a w_b R_a^T S R_b to block_of(i, j), which may be null, over all pairs of the row's nodes.
+    template <class F> void add_blocks(int r, const double* s, F block_of) const {
+        const double S[9] = {s[0], s[1], s[2], s[1], s[3], s[4], s[2], s[4], s[5]};
+        for (int a = 0; a < 3; ++a)
+            for (int b = 0; b < 3; ++b) {
+                const int i = c.corner[3 * r + a], j = c.corner[3 * r + b];
+                double* block = i < 0 || j < 0 || c.free[i] == 0 || c.free[j] == 0 ? nullptr : block_of(i, j);
+                if (!block) continue;
+                const double *Ri = c.rotation + 9 * (int64_t)i, *Rj = c.rotation + 9 * (int64_t)j, w = c.weight[3 * r + a] * c.weight[3 * r + b];
+                for (int k = 0; k < 3; ++k)
+                    for (int l = 0; l < 3; ++l) {
+                        double sum = 0;
+                        for (int m = 0; m < 3; ++m)
+                            for (int n = 0; n < 3; ++n) sum += Ri[3 * m + k] * S[3 * m + n] * Rj[3 * n + l];
+                        block[3 * k + l] += w * sum;
+                    }
+            }
+    }
+};
