@@ -103,15 +103,21 @@ def _errors(status: pb.Status) -> list[Table]:
 
 
 def _contacts(status: pb.Status) -> list[Table]:
-    """Table of contacts with obstacles; empty if the scene has none."""
-    shown = [o for o in status.objects if o.last.HasField("contact_residual")]
+    """Tables of contacts with obstacles, and of where these are; none if there are no obstacles."""
+    if not status.obstacles:
+        return []
     table = Table("object", "contacts", "passes", "contact residual", "clipped", "force on [N]", **COMPACT)
-    for found in shown:
+    for found in status.objects:
         last = found.last
         forces = (f"{r.obstacle} {math.hypot(r.force.x, r.force.y, r.force.z):.3g}" for r in last.reactions)
-        numbers = (str(last.contacts), str(last.passes), f"{last.contact_residual:.1e}", str(found.clipped))
+        residual = f"{last.contact_residual:.1e}" if last.HasField("contact_residual") else "-"
+        numbers = str(last.contacts), str(last.passes), residual, str(found.clipped)
         _add(table, found.object, *numbers, ", ".join(forces) or "-")
-    return [table] if shown else []
+    where = Table("obstacle", "at [m]", "turned by [degrees]", **COMPACT)
+    for pose in status.obstacles:
+        p, w = pose.position, min(abs(pose.rotation.w), 1.0)
+        _add(where, pose.header.object, f"{p.x:.3g} {p.y:.3g} {p.z:.3g}", f"{math.degrees(2 * math.acos(w)):.3g}")
+    return [table, where]
 
 
 def _energies(status: pb.Status) -> list[Table]:

@@ -604,7 +604,7 @@ class LocalWorker(_message.Message):
     def __init__(self, worker: _Optional[str] = ..., state: _Optional[str] = ..., pid: _Optional[int] = ..., restarts: _Optional[int] = ..., exit_code: _Optional[int] = ...) -> None: ...
 
 class Status(_message.Message):
-    __slots__ = ("header", "scene", "state", "step", "time", "dt", "step_p50", "step_p99", "step_max", "late_steps", "objects", "workers", "clients", "bulk_shared", "bulk_copied", "refused", "frames_dropped", "device", "pid", "uptime", "records_dropped", "records_lost", "recording_failure", "commands_refused", "moves_replaced", "bulk_bytes_out", "bulk_bytes_in", "local_workers", "pace")
+    __slots__ = ("header", "scene", "state", "step", "time", "dt", "step_p50", "step_p99", "step_max", "late_steps", "objects", "workers", "clients", "bulk_shared", "bulk_copied", "refused", "frames_dropped", "device", "pid", "uptime", "records_dropped", "records_lost", "recording_failure", "commands_refused", "moves_replaced", "bulk_bytes_out", "bulk_bytes_in", "local_workers", "obstacles", "pace")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     SCENE_FIELD_NUMBER: _ClassVar[int]
     STATE_FIELD_NUMBER: _ClassVar[int]
@@ -633,6 +633,7 @@ class Status(_message.Message):
     BULK_BYTES_OUT_FIELD_NUMBER: _ClassVar[int]
     BULK_BYTES_IN_FIELD_NUMBER: _ClassVar[int]
     LOCAL_WORKERS_FIELD_NUMBER: _ClassVar[int]
+    OBSTACLES_FIELD_NUMBER: _ClassVar[int]
     PACE_FIELD_NUMBER: _ClassVar[int]
     header: Header
     scene: str
@@ -662,5 +663,6 @@ class Status(_message.Message):
     bulk_bytes_out: int
     bulk_bytes_in: int
     local_workers: _containers.RepeatedCompositeFieldContainer[LocalWorker]
+    obstacles: _containers.RepeatedCompositeFieldContainer[ObstaclePose]
     pace: str
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., scene: _Optional[str] = ..., state: _Optional[str] = ..., step: _Optional[int] = ..., time: _Optional[float] = ..., dt: _Optional[float] = ..., step_p50: _Optional[float] = ..., step_p99: _Optional[float] = ..., step_max: _Optional[float] = ..., late_steps: _Optional[int] = ..., objects: _Optional[_Iterable[_Union[ObjectStatus, _Mapping]]] = ..., workers: _Optional[_Iterable[_Union[WorkerInfo, _Mapping]]] = ..., clients: _Optional[_Iterable[str]] = ..., bulk_shared: _Optional[int] = ..., bulk_copied: _Optional[int] = ..., refused: _Optional[int] = ..., frames_dropped: _Optional[int] = ..., device: _Optional[str] = ..., pid: _Optional[int] = ..., uptime: _Optional[float] = ..., records_dropped: _Optional[int] = ..., records_lost: _Optional[int] = ..., recording_failure: _Optional[str] = ..., commands_refused: _Optional[int] = ..., moves_replaced: _Optional[int] = ..., bulk_bytes_out: _Optional[int] = ..., bulk_bytes_in: _Optional[int] = ..., local_workers: _Optional[_Iterable[_Union[LocalWorker, _Mapping]]] = ..., pace: _Optional[str] = ...) -> None: ...
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., scene: _Optional[str] = ..., state: _Optional[str] = ..., step: _Optional[int] = ..., time: _Optional[float] = ..., dt: _Optional[float] = ..., step_p50: _Optional[float] = ..., step_p99: _Optional[float] = ..., step_max: _Optional[float] = ..., late_steps: _Optional[int] = ..., objects: _Optional[_Iterable[_Union[ObjectStatus, _Mapping]]] = ..., workers: _Optional[_Iterable[_Union[WorkerInfo, _Mapping]]] = ..., clients: _Optional[_Iterable[str]] = ..., bulk_shared: _Optional[int] = ..., bulk_copied: _Optional[int] = ..., refused: _Optional[int] = ..., frames_dropped: _Optional[int] = ..., device: _Optional[str] = ..., pid: _Optional[int] = ..., uptime: _Optional[float] = ..., records_dropped: _Optional[int] = ..., records_lost: _Optional[int] = ..., recording_failure: _Optional[str] = ..., commands_refused: _Optional[int] = ..., moves_replaced: _Optional[int] = ..., bulk_bytes_out: _Optional[int] = ..., bulk_bytes_in: _Optional[int] = ..., local_workers: _Optional[_Iterable[_Union[LocalWorker, _Mapping]]] = ..., obstacles: _Optional[_Iterable[_Union[ObstaclePose, _Mapping]]] = ..., pace: _Optional[str] = ...) -> None: ...

@@ -144,16 +144,19 @@ class RerunScene:
         )
 
     def _contact(self, name: str, scalars: Columns) -> None:
-        """Logs what a run with contact has beside the others."""
+        """Logs what a run with obstacles has beside the others."""
+        if not self._has_contact:
+            return
         known = np.isfinite(scalars["contact_residual"])
         residual = np.log10(np.maximum(scalars["contact_residual"], 1e-17))
         self._curve("contact_residual", name, scalars, residual, known)
-        self._curve("contacts", name, scalars, scalars["contacts"], known)
+        every = np.ones(len(known), bool)
+        self._curve("contacts", name, scalars, scalars["contacts"], every)
         for column in scalars:
             if column.startswith(REACTION) and column.endswith("/force_x"):
                 pair = column.removesuffix("/force_x")
                 force = np.linalg.norm([scalars[f"{pair}/force_{axis}"] for axis in "xyz"], axis=0)
-                self._curve("reaction", f"{name} on {pair.removeprefix(REACTION)}", scalars, force, known)
+                self._curve("reaction", f"{name} on {pair.removeprefix(REACTION)}", scalars, force, every)
 
     def _extend(self, points: NDArray, values: NDArray) -> None:
         self._low, self._high = np.minimum(self._low, points.min(axis=0)), np.maximum(self._high, points.max(axis=0))

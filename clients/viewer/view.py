@@ -71,12 +71,12 @@ def show_log(log: Log, recording: rr.RecordingStream, coloring: Coloring) -> Non
                 skipped += not scene.frame(frame, log.mesh(name, frame.epoch))
                 done += 1
                 progress(done)
-    for number, name in enumerate(sorted(log.objects)):
-        scene.steps(name, log.scalars(name), step_time=number == 0)
     for obstacle in log.obstacles.values():
         scene.obstacle(obstacle)
         for pose in log.poses.get(obstacle.name, ()):
             scene.pose(pose)
+    for number, name in enumerate(sorted(log.objects)):
+        scene.steps(name, log.scalars(name), step_time=number == 0)
     if skipped:
         say(f"{log.path}: {skipped} frames with NaN or infinite positions are not shown")
     recording.send_blueprint(scene.blueprint())

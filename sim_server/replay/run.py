@@ -74,6 +74,7 @@ class Replay:
         self._factors: dict[tuple[str, int], Factor] = {}
         self._in_use: dict[str, int] = {}
         self._touch_sets: dict[int, pb.TouchSet] = {t.step: t for t in recording.touch}
+        self._targets: dict[int, pb.ObstacleTargets] = {t.step: t for t in recording.targets}
         self._nodes: dict[int, tuple[NDArray[np.int32], Float64]] = {}  # nodes and offsets of interactions, by id
         self._inline = self._library()
         self._positions: dict[str, Float64] = {}  # sent instead of a matrix, and not those of its step, by body
@@ -88,6 +89,7 @@ class Replay:
         self._compare_frames(0)
         for step in range(self.recording.steps):
             self._restore_interactions(step)
+            self._restore_targets(step)
             for body in self.bodies:
                 self._apply_settings(body.index, body.name, step)
                 self._use_factor(body.index, body.name, step, fresh=False)
@@ -156,6 +158,19 @@ class Replay:
             touch.restore([self._interaction(m) for m in self._touch_sets[step].interactions])
         except Refused as error:
             raise BadLog(f"{self.recording.path}: interactions of step {step}: {error}") from error
+
+    def _restore_targets(self, step: int) -> None:
+        """Has obstacles go where the loop had them go from this step on."""
+        found = self._targets.get(step, pb.ObstacleTargets()).targets
+        contact = self.simulation.contact
+        if found and contact is None:
+            raise BadLog(f"{self.recording.path}: moved obstacles in a scene that has none")
+        for target in found:
+            p, q = target.position, target.rotation
+            try:
+                contact.move(target.obstacle, (p.x, p.y, p.z), (q.w, q.x, q.y, q.z))
+            except ValueError as error:
+                raise BadLog(f"{self.recording.path}: obstacles moved at step {step}: {error}") from error
 
     def _interaction(self, m: pb.Interaction) -> Interaction:
         from sim_server.effects.touch import Interaction

@@ -16,6 +16,7 @@ from sim_server.backends.kinds import SLACK_OF_ENERGY
 from sim_server.mechanics.named_points import NamedPoints
 from sim_server.network.link import ServerLink
 from sim_server.recording import messages
+from sim_server.recording.obstacles import obstacle_messages, pose_messages
 from sim_server.recording.recorder import Recorder
 from sim_server.recording.replay_recorder import ReplayRecorder
 from sim_server.service.commands import Commands
@@ -84,6 +85,10 @@ class Telemetry:
             self.link.announce(topology)
             if self.recorder:
                 self.recorder.topology(topology)
+        for obstacle in obstacle_messages(self.simulation):
+            self.link.set_obstacle(obstacle)
+            if self.recorder:
+                self.recorder.obstacle(obstacle)
         if self.recorder:
             self._record_frame(0, self.simulation.world.x, self.simulation.world.v)
         self.publish_status("running")
@@ -182,7 +187,7 @@ class Telemetry:
             del self._interactions[id]
 
     def frames(self) -> None:
-        """Sends states, to the log at the scene's rate, the newest one to viewers."""
+        """Sends states and poses of obstacles, to the log at the scene's rate, the newest ones to viewers."""
         frames = self.engine.frames()
         for step, x, v in frames:
             if self.record_every and step % self.record_every == 0:
@@ -192,11 +197,14 @@ class Telemetry:
             for body in self.simulation.world.bodies:
                 if self.link.wants_state(body.name):
                     self.link.publish_state(messages.state(body, step, step * self.simulation.world.dt, x, v))
+            for pose in pose_messages(self.simulation, step):
+                self.link.publish_pose(pose)
 
     def frame_interval(self) -> int:
         """Returns the steps between frames that the loop should copy out; 0 for none."""
         if self._is_due("look", LOOK_PERIOD):
-            self._has_viewers = self.link.wants_state()
+            moving = self.simulation.contact is not None
+            self._has_viewers = self.link.wants_state() or (moving and self.link.wants_pose())
             self._has_listeners = self.link.wants_steps() or bool(self.link.clients())
         return self.record_every or (max(1, round(STATE_PERIOD / self.simulation.world.dt)) if self._has_viewers else 0)
 
@@ -214,6 +222,8 @@ class Telemetry:
         for body in self.simulation.world.bodies:
             message = messages.state(body, step, step * self.simulation.world.dt, x, v)
             self.recorder.state(message, block=self.patient)
+        for pose in pose_messages(self.simulation, step):
+            self.recorder.pose(pose, block=self.patient)
 
     def publish_status(self, state: str, force: bool = True, where: bool = False) -> None:
         """Publishes the status of the scene. where: with the places of its objects, which are fetched from a GPU."""
@@ -256,6 +266,7 @@ class Telemetry:
                     clipped=self.clipped[body.index],
                 )
             )
+        status.obstacles.extend(pose_messages(self.simulation, status.step, fixed=True))
         if where:
             messages.add_places(self._places(), status)
         self.link.publish_status(status)

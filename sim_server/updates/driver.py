@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from protocol.factor import Factor
 from sim_server.arrays import Float64
-from sim_server.backends.base import Capability, Engine
+from sim_server.backends.base import Capability
 from sim_server.simulation import Simulation
 from sim_server.updates.body_state import BodyUpdateState
 from sim_server.updates.factor_check import FactorCheck
@@ -77,7 +77,7 @@ class Driver:
             else:
                 self.engine.run(1)
             out.append((self._new_records(), self.reactions))
-        records, reactions = zip(*(out or [records_and_reactions(self.engine)]), strict=True)
+        records, reactions = zip(*(out or [self.engine.records_and_reactions()]), strict=True)
         self.reactions = np.concatenate(reactions)
         return np.concatenate(records)
 
@@ -106,7 +106,7 @@ class Driver:
         self.engine.solve()
 
     def _new_records(self) -> NDArray[Any]:
-        records, self.reactions = records_and_reactions(self.engine)
+        records, self.reactions = self.engine.records_and_reactions()
         self.observe(records)
         return records
 
@@ -202,13 +202,3 @@ class Driver:
     def age_bound(self) -> int:
         """Returns the age [steps] that no factor exceeds while all goes well, by what was measured; -1: not known."""
         return self.policy.max_age() if self.wants_factors else -1
-
-
-def records_and_reactions(engine: Engine) -> tuple[NDArray[Any], Float64]:
-    """Returns new step records and their reactions on obstacles, which there are none of without contact."""
-    fetch = getattr(engine, "records_and_reactions", None)
-    if fetch is not None:
-        records, reactions = fetch()
-        return records, reactions
-    records = engine.records()
-    return records, np.zeros((len(records), 0, 6))
