@@ -113,7 +113,7 @@ def _contacts(status: pb.Status) -> list[Table]:
         residual = f"{last.contact_residual:.1e}" if last.HasField("contact_residual") else "-"
         numbers = str(last.contacts), str(last.passes), residual, str(found.clipped)
         _add(table, found.object, *numbers, ", ".join(forces) or "-")
-    where = Table("obstacle", "at [m]", "turned by [degrees]", **COMPACT)
+    where = Table("obstacle", "at [m]", "turned by [°]", **COMPACT)
     for pose in status.obstacles:
         p, w = pose.position, min(abs(pose.rotation.w), 1.0)
         _add(where, pose.header.object, f"{p.x:.3g} {p.y:.3g} {p.z:.3g}", f"{math.degrees(2 * math.acos(w)):.3g}")
