@@ -192,7 +192,7 @@ def grab(
 
 @app.command("move-obstacle")
 def move_obstacle(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Obstacle of the scene with moved = \"client\".")],
+    name: Annotated[str, typer.Argument(metavar="NAME", help='Obstacle of the scene with moved = "client".')],
     to: Annotated[Triple, typer.Option(metavar="X Y Z", help="Where its own origin goes, m.")],
     rotate: Annotated[
         Triple | None,

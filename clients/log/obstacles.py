@@ -67,7 +67,9 @@ def obstacle_of(message: pb.Obstacle) -> Obstacle:
     name = f"Obstacle {message.header.object!r}"
     size = tuple(message.size)
     if SIZES.get(message.shape) != len(size) or not all(0 <= value < math.inf for value in size):
-        raise Refused(f"{name}: a {message.shape!r} of {size} m; allowed: {SIZES}, shapes with numbers of sizes", "shape")
+        raise Refused(
+            f"{name}: a {message.shape!r} of {size} m; allowed: {SIZES}, shapes with numbers of sizes", "shape"
+        )
     vertices = array(message.vertices, np.float64, (-1, 3), f"{name}: vertices", finite=True)
     triangles = array(message.triangles, np.int32, (-1, 3), f"{name}: triangles")
     check_range(triangles, 0, len(vertices), f"{name}: triangles")

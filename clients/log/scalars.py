@@ -16,7 +16,9 @@ from protocol import messages_pb2 as pb
 Columns = dict[str, NDArray]
 
 INPUTS = ("asked", "probe")  # of a solve: for replays only
-REACTION = "reaction/"  # columns reaction/OBSTACLE/force_x to torque_z [N, N m], of obstacles that the object has touched
+REACTION = (
+    "reaction/"  # columns reaction/OBSTACLE/force_x to torque_z [N, N m], of obstacles that the object has touched
+)
 REACTIONS = ("force_x", "force_y", "force_z", "torque_x", "torque_y", "torque_z")
 
 

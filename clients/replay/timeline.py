@@ -28,7 +28,9 @@ _PACK = struct.Struct("<qiiqq")  # of a PLACE
 
 
 class Timeline:
-    """Scene, topologies, steps, states, obstacles and their poses of a log. Raises BadInput for a file without a scene, or that is no log.
+    """Scene, topologies, steps, states, obstacles and their poses of a log.
+
+    Raises BadInput for a file without a scene, or that is no log.
 
     notes: one sentence for each gap. end: simulated time of the last record [s].
     """

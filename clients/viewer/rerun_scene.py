@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Meshes and scalars of a run as rerun entities.
 
-/world/OBJECT holds the surface, also of an obstacle, /plots/QUANTITY/OBJECT a curve, /plots/energy/KIND/OBJECT curves of energies;
-timelines are `step` and `time` (simulated).
+/world/OBJECT holds the surface, /world/OBSTACLE too, /plots/QUANTITY/OBJECT a curve, /plots/energy/KIND/OBJECT curves
+of energies; timelines are `step` and `time` (simulated).
 """
 
 from __future__ import annotations

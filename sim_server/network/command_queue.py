@@ -13,7 +13,12 @@ from sim_server.network.rate_limiter import RateLimiter
 
 CAPACITY = 64  # commands with a rate limit that may wait; for the other verbs there is as much capacity again
 MAX_DEFERRED = 1024  # moves that may wait for a token of their client or for capacity
-LIMITED = ("push", "grab", "move", "move_obstacle")  # verbs; with the others a client may owe a burst: it can always let go and stop
+LIMITED = (
+    "push",
+    "grab",
+    "move",
+    "move_obstacle",
+)  # verbs; with the others a client may owe a burst: it can always let go and stop
 
 ReplyFunction = Callable[[Reply], None]
 PendingCommand = tuple[Command, ReplyFunction]

@@ -37,7 +37,7 @@ class Publishers:
         return _matched(self._publisher(key(channel, self._server, **names)))
 
     def put(self, channel: str, message: Published, **names: str) -> None:
-        """Sends a message if there are subscribers. A state, pose or status replaces one that still waits to be sent."""
+        """Sends a message if there are subscribers. A state, pose or status replaces one that waits to be sent."""
         name = key(channel, self._server, **names)
         publisher = self._publisher(name)
         if not _matched(publisher):

@@ -65,9 +65,11 @@ def object_step(record: dict[str, Any], name: str, kinds: dict[Kind, str]) -> pb
 
 
 def add_reactions(step: pb.ObjectStep, reactions: Float64, obstacles: Sequence[str]) -> None:
-    """Adds to a step what its object exerts on obstacles. reactions: (obstacles, 6), force [N] and torque [N m] of each;
-    those that are 0 are left out."""
-    for number in np.flatnonzero(reactions.any(axis=1)):
+    """Adds to a step what its object exerts on obstacles, but for what is 0.
+
+    reactions: (obstacles, 6), force [N] and torque [N m] on each
+    """
+    for number in np.flatnonzero(reactions.any(axis=1)).tolist():
         fx, fy, fz, tx, ty, tz = reactions[number].tolist()
         force, torque = pb.Vector(x=fx, y=fy, z=fz), pb.Vector(x=tx, y=ty, z=tz)
         step.reactions.add(obstacle=obstacles[number], force=force, torque=torque)

@@ -45,7 +45,8 @@ class Recorder:
     """Writes scene, topologies, states, steps, interactions and obstacles to an MCAP file from a thread of its own.
 
     Messages are stored under /scene, /topology/OBJECT, /state/OBJECT, /step/OBJECT, /interaction/OBJECT, /touch,
-    /factor/OBJECT, /obstacle/OBSTACLE, /pose/OBSTACLE and /targets with `log_time` = simulation time and `publish_time` = wall clock, both in ns.
+    /factor/OBJECT, /obstacle/OBSTACLE, /pose/OBSTACLE and /targets with `log_time` = simulation time and
+    `publish_time` = wall clock, both in ns.
 
     Appending does not wait for the disk unless `block` is true (for runs without a pace). While more than FRAME_BYTES
     wait, states are dropped and counted in `dropped`; other records are kept up to TOTAL_BYTES, and counted in `lost`

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Carries out commands of clients on a running simulation: push, grab, move, release, move_obstacle, pause, resume, stop."""
+"""Carries out commands of clients on a running simulation: of pushes, grabs and obstacles, pause, resume, stop."""
 
 import math
 from collections.abc import Callable

@@ -124,7 +124,7 @@ class Telemetry:
             self._batch.clear()
 
     def update_summary(self, records: NDArray[Any], reactions: Float64 | None = None) -> None:
-        """Keeps what the status tells of steps: the last record of each body, its reactions, iterations and energies."""
+        """Keeps what the status tells of steps: the last records and reactions of bodies, iterations and energies."""
         order = np.argsort(records["body"], kind="stable")
         present, first = np.unique(records["body"][order], return_index=True)
         iterations = records["iterations"][order].tolist()

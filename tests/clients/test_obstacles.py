@@ -179,7 +179,9 @@ def test_a_replay_sends_obstacles_and_poses(log: Log) -> None:
         replay = Player(timeline, server, math.inf, begin=2 * DT)  # type: ignore[arg-type]
         replay.play()
     assert server.offered["obstacle", "bowl"] == obstacle("bowl") and ("obstacle", "floor") in server.offered
-    assert [m for c, o, m in server.sent if (c, o) == ("pose", "tool")] == [pose("tool", s) for s in range(2, STEPS + 1)]
+    assert [m for c, o, m in server.sent if (c, o) == ("pose", "tool")] == [
+        pose("tool", s) for s in range(2, STEPS + 1)
+    ]
     assert replay.states == STEPS - 1 and replay.steps == STEPS - 1
     status = server.offered["status", ""]
     assert isinstance(status, pb.Status) and status.objects[0].clipped == 1
@@ -205,7 +207,9 @@ def test_surfaces_are_where_the_shape_says(name: str) -> None:
     elif name == "floor":
         assert (vertices[:, 1] == 0).all()
         middle = shape.start.matrix() @ vertices.mean(axis=0) + shape.start.position
-        np.testing.assert_allclose(middle[:2], [1, 0], atol=1e-12)  # this plane is z = 0, so below the middle in x and y
+        np.testing.assert_allclose(
+            middle[:2], [1, 0], atol=1e-12
+        )  # this plane is z = 0, so below the middle in x and y
     if name in ("ball", "tool", "block"):
         assert _volume(vertices, triangles) == pytest.approx(_known_volume(shape), rel=0.03), "outward normals"
 
@@ -236,9 +240,7 @@ def test_the_viewer_gets_obstacles_poses_and_forces(log: Log, tmp_path: Path) ->
     assert contacts == [0, 0, 3, 4, 5, 6]
 
 
-def test_a_picture_without_vulkan_shows_obstacles(
-    log: Log, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_picture_without_vulkan_shows_obstacles(log: Log, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("matplotlib")
     monkeypatch.setattr(view, "has_vulkan_driver", lambda: False)
     view.save_screenshot(log, tmp_path / "with.png", "displacement")
