@@ -39,7 +39,7 @@ def scene(simulation: Simulation) -> pb.Scene:
         objects=[b.name for b in simulation.world.bodies],
         device=simulation.world.backend.name,
         build=simulation.world.backend.build(),
-        obstacles=[o.name for o in s.obstacles or ()],
+        obstacles=[o.name for o in simulation.world.obstacles],
     )
 
 
@@ -119,7 +119,7 @@ def steps(
         for row in rows(records)
     ]
     if reactions is not None:
-        obstacles = [o.name for o in simulation.scene.obstacles or ()]
+        obstacles = [o.name for o in simulation.world.obstacles]
         for step, each in zip(found, reactions, strict=True):
             add_reactions(step, each, obstacles)
     return found

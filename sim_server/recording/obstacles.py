@@ -1,31 +1,31 @@
 # SPDX-License-Identifier: MIT
 """Converts obstacles, their poses and where clients want them to messages."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from protocol import messages_pb2 as pb
 from sim_server.arrays import Float64
+from sim_server.mesh.signed_distance import read_surface
 from sim_server.scene.obstacles import Obstacle
 from sim_server.simulation import Simulation
 
 
 def obstacle_messages(simulation: Simulation) -> list[pb.Obstacle]:
     """Converts all obstacles, with their poses as they are now. Call it before the first step."""
-    contact = simulation.contact
-    if contact is None:
+    if simulation.contact is None:
         return []
     found = []
-    for number, (obstacle, at) in enumerate(zip(_obstacles(simulation), _poses(simulation), strict=True)):
+    for obstacle, at in zip(simulation.world.obstacles, _poses(simulation), strict=True):
         position, rotation = pose_message(at)
         message = pb.Obstacle(
             header=pb.Header(object=obstacle.name), shape=obstacle.shape, size=_size(obstacle),
             moved="keyframes" if obstacle.keyframes else obstacle.moved or "", position=position, rotation=rotation,
         )  # fmt: skip
-        if obstacle.shape == "grid":
-            vertices, triangles = contact.surface(number)
-            message.vertices = np.ascontiguousarray(vertices, "<f8").tobytes()
+        if obstacle.file is not None:
+            points, triangles = read_surface(obstacle.file)
+            message.vertices = np.ascontiguousarray(points * (obstacle.scale or 1.0), "<f8").tobytes()
             message.triangles = np.ascontiguousarray(triangles, "<i4").tobytes()
         found.append(message)
     return found
@@ -36,7 +36,7 @@ def pose_messages(simulation: Simulation, step: int, fixed: bool = False) -> lis
     if simulation.contact is None:
         return []
     found = []
-    for obstacle, at in zip(_obstacles(simulation), _poses(simulation), strict=True):
+    for obstacle, at in zip(simulation.world.obstacles, _poses(simulation), strict=True):
         if fixed or obstacle.keyframes or obstacle.moved:
             position, rotation = pose_message(at)
             header, time = pb.Header(object=obstacle.name), step * simulation.world.dt
@@ -50,8 +50,23 @@ def pose_message(pose: Float64) -> tuple[pb.Vector, pb.Quaternion]:
     return pb.Vector(x=px, y=py, z=pz), pb.Quaternion(w=w, x=x, y=y, z=z)
 
 
-def _obstacles(simulation: Simulation) -> Sequence[Obstacle]:
-    return simulation.scene.obstacles or ()
+def target_messages(step: int, targets: Mapping[str, Float64]) -> pb.ObstacleTargets:
+    """Converts the poses (7,) that clients want, which the loop took up after `step` steps."""
+    found = pb.ObstacleTargets(step=step)
+    for name, pose in targets.items():
+        position, rotation = pose_message(pose)
+        found.targets.add(obstacle=name, position=position, rotation=rotation)
+    return found
+
+
+def targets_of(message: pb.ObstacleTargets) -> dict[str, Float64]:
+    """Returns the poses of `target_messages` (7,)."""
+    return {
+        t.obstacle: np.array(
+            [t.position.x, t.position.y, t.position.z, t.rotation.w, t.rotation.x, t.rotation.y, t.rotation.z]
+        )
+        for t in message.targets
+    }
 
 
 def _poses(simulation: Simulation) -> Float64:

@@ -10,7 +10,6 @@ matrix and its maker; step records tell which one a solve used.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
@@ -18,6 +17,7 @@ import numpy as np
 from protocol import messages_pb2 as pb
 from protocol.factor import Factor
 from protocol.validate import checksum
+from sim_server.arrays import Float64
 from sim_server.backends.base import PendingUpdate
 from sim_server.effects._base import Effect
 from sim_server.network.link import ServerLink
@@ -28,7 +28,6 @@ from sim_server.updates.driver import Driver
 from sim_server.updates.factor_source import EXACT
 
 if TYPE_CHECKING:
-    from sim_server.effects.contact import Target
     from sim_server.effects.touch import Interaction
 
 
@@ -56,7 +55,7 @@ class ReplayRecorder:
         self._driver, self._link, self._recorder = driver, link, recorder
         self._factors: deque[Factor] = deque()  # appended by the thread that posts them, maybe the loop's
         self._touched: Updates[list[Interaction]] = deque()
-        self._moved: Updates[Mapping[str, Target]] = deque()
+        self._moved: Updates[dict[str, Float64]] = deque()
         self._with_nodes: set[int] = set()  # ids whose nodes the log holds
         self._workers: dict[str, pb.WorkerInfo] = {}
         driver.on_adopt.append(self._factors.append)
@@ -67,7 +66,7 @@ class ReplayRecorder:
         if self._touch is not None and effect is self._touch:
             self._touched.append((pending, self._touch.applied))
         elif self._contact is not None and effect is self._contact:
-            self._moved.append((pending, dict(self._contact.targets)))
+            self._moved.append((pending, self._contact.targets))
 
     def write(self, block: bool) -> None:
         """Writes all that was taken up since the last call; so a log that is cut off holds the inputs of its steps."""

@@ -74,6 +74,7 @@ class Recording:
         self.scene = pb.Scene()
         self.objects: dict[str, RecordedObject] = {}
         self.touch: list[pb.TouchSet] = []
+        self.obstacles: dict[str, pb.Obstacle] = {}
         self.targets: list[pb.ObstacleTargets] = []
         self.touched = False
         self.notes: list[str] = []
@@ -125,7 +126,9 @@ class Recording:
             self.touch.append(pb.TouchSet.FromString(message.data))
         elif message.topic == "/targets":
             self.targets.append(pb.ObstacleTargets.FromString(message.data))
-        elif message.kind not in ("obstacle", "pose"):  # which follow from the scene and the targets
+        elif message.kind == "obstacle":
+            self.obstacles[message.object] = pb.Obstacle.FromString(message.data)
+        elif message.kind != "pose":  # which follow from the scene and the targets
             self._keep_of_object(message)
 
     def _keep_of_object(self, message: LogMessage) -> None:

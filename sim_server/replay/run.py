@@ -26,6 +26,7 @@ from sim_server.arrays import Float64
 from sim_server.errors import DeviceError
 from sim_server.mechanics.world import Body
 from sim_server.recording import messages
+from sim_server.recording.obstacles import obstacle_messages, targets_of
 from sim_server.replay.log import Recording
 from sim_server.replay.report import Comparison
 from sim_server.scene import Scene, deleted
@@ -68,6 +69,7 @@ class Replay:
         self.engine, self.bodies = self.simulation.engine, self.simulation.world.bodies
         self.compared = Comparison(recording)
         self._same_meshes()
+        self._same_obstacles()
         self._taken = {b.name: taken_up(self._rows(b.name)) for b in self.bodies}
         self._last_use = self._last_uses()
         self._needed = set(self._last_use)  # (object, step) of matrices whose factor the loop used
@@ -130,6 +132,15 @@ class Replay:
                     f"({', '.join(other)}){f'; was {file} changed?' if file else ''}"
                 )
 
+    def _same_obstacles(self) -> None:
+        for now in obstacle_messages(self.simulation):
+            then = self.recording.obstacles.get(now.header.object)
+            if then is not None and (now.vertices, now.triangles) != (then.vertices, then.triangles):
+                raise BadLog(
+                    f"{self.recording.path}: the surface of obstacle {now.header.object!r} is not the recorded one; "
+                    "was its file changed?"
+                )
+
     def _library(self) -> Inline:
         """Returns a source of factors that uses the library named in the log, if it is installed."""
         system = self.simulation.system
@@ -161,16 +172,15 @@ class Replay:
 
     def _restore_targets(self, step: int) -> None:
         """Has obstacles go where the loop had them go from this step on."""
-        found = self._targets.get(step, pb.ObstacleTargets()).targets
-        contact = self.simulation.contact
-        if found and contact is None:
+        if step not in self._targets:
+            return
+        contact, targets = self.simulation.contact, targets_of(self._targets[step])
+        if contact is None:
             raise BadLog(f"{self.recording.path}: moved obstacles in a scene that has none")
-        for target in found:
-            p, q = target.position, target.rotation
-            try:
-                contact.move(target.obstacle, (p.x, p.y, p.z), (q.w, q.x, q.y, q.z))
-            except ValueError as error:
-                raise BadLog(f"{self.recording.path}: obstacles moved at step {step}: {error}") from error
+        try:
+            contact.restore(targets)
+        except ValueError as error:
+            raise BadLog(f"{self.recording.path}: obstacles moved at step {step}: {error}") from error
 
     def _interaction(self, m: pb.Interaction) -> Interaction:
         from sim_server.effects.touch import Interaction

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from sim_server.effects.touch import Interaction, Touch  # imported where a scene lists it
 
 
-FARTHEST = 1e6  # m, of an obstacle from the origin
 UNIT = 1e-6  # that the length of a quaternion may differ from 1 by
 
 
@@ -111,12 +110,13 @@ class Commands:
         return pb.Reply(interaction=messages.interaction(self._touch().release(command.client, command.interaction.id)))
 
     def _move_obstacle(self, command: pb.Command) -> pb.Reply:
-        target = command.target
-        position, rotation = _tuple(target.position), target.rotation
-        if not all(abs(value) <= FARTHEST for value in position):
-            raise BadCommand(f"position = {position} m: at most {FARTHEST:g} m from the origin along each axis")
-        turn = _unit(rotation) if target.HasField("rotation") else None
-        self._contact().move(target.obstacle, position, turn)
+        target, contact = command.target, self._contact()
+        if target.HasField("rotation"):
+            rotation = _unit(target.rotation)
+        else:
+            now = contact.targets.get(target.obstacle)
+            rotation = (1.0, 0.0, 0.0, 0.0) if now is None else tuple(now[3:].tolist())
+        contact.move(target.obstacle, _tuple(target.position), rotation)
         return pb.Reply()
 
     def _pause(self, command: pb.Command) -> pb.Reply:
