@@ -7,7 +7,6 @@ import numpy as np
 
 from protocol import messages_pb2 as pb
 from sim_server.arrays import Float64
-from sim_server.mesh.signed_distance import read_surface
 from sim_server.scene.obstacles import Obstacle
 from sim_server.simulation import Simulation
 
@@ -24,6 +23,8 @@ def obstacle_messages(simulation: Simulation) -> list[pb.Obstacle]:
             moved="keyframes" if obstacle.keyframes else obstacle.moved or "", position=position, rotation=rotation,
         )  # fmt: skip
         if obstacle.file is not None:
+            from sim_server.mesh.signed_distance import read_surface
+
             points, triangles = read_surface(obstacle.file)
             message.vertices = np.ascontiguousarray(points * (obstacle.scale or 1.0), "<f8").tobytes()
             message.triangles = np.ascontiguousarray(triangles, "<i4").tobytes()
@@ -46,7 +47,7 @@ def pose_messages(simulation: Simulation, step: int, fixed: bool = False) -> lis
 
 def pose_message(pose: Float64) -> tuple[pb.Vector, pb.Quaternion]:
     """Converts a pose, position [m] and unit quaternion w, x, y, z (7,)."""
-    px, py, pz, w, x, y, z = map(float, pose)
+    px, py, pz, w, x, y, z = pose.tolist()
     return pb.Vector(x=px, y=py, z=pz), pb.Quaternion(w=w, x=x, y=y, z=z)
 
 
@@ -70,9 +71,11 @@ def targets_of(message: pb.ObstacleTargets) -> dict[str, Float64]:
 
 
 def _poses(simulation: Simulation) -> Float64:
-    """Poses (m, 7) at the end of the last step."""
+    """Poses (m, 7) at the end of the step that the loop has begun last, which may be changing as they are read."""
     assert simulation.contact is not None
-    return simulation.world.backend.fetch(simulation.contact.contact_input().obstacles.end)
+    poses = simulation.world.backend.fetch(simulation.contact.contact_input().obstacles.end).copy()
+    poses[:, 3:] /= np.linalg.norm(poses[:, 3:], axis=1)[:, None]
+    return poses
 
 
 def _size(obstacle: Obstacle) -> Sequence[float]:

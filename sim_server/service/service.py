@@ -194,7 +194,8 @@ class Service:
 
     def _report(self, records: NDArray[Any], reactions: Float64) -> None:
         """Passes on new step records and their reactions on obstacles, and new frames."""
-        for line in [*self.telemetry.count_unconverged(records), *self.telemetry.count_clipped(records)]:
+        unsolved = [*self.telemetry.count_unconverged(records), *self.telemetry.count_clipped(records)]
+        for line in [*unsolved, *self.telemetry.crowded_nodes()]:
             log.warning("%s", line)
         for line in [*self.telemetry.count_runaways(records), *self.telemetry.not_finite(records)]:
             log.error("%s", line)

@@ -66,9 +66,10 @@ class Telemetry:
         self.unconverged: Counter[str] = Counter()  # solves by status, of those that did not converge
         self._energy: dict[int, float] = {}  # by body, kinetic + elastic + gravity of the last step with all three [J]
         self.runaways: Counter[int] = Counter()  # steps by body
+        self._crowded: set[int] = set()  # bodies of which it was said that a node had too many obstacles near
         self.clipped: Counter[int] = Counter()  # nodes by body, summed over steps
         self._has_listeners = False
-        self._due = {"steps": 0.0, "state": 0.0, "status": 0.0, "look": 0.0}
+        self._due = {"steps": 0.0, "state": 0.0, "status": 0.0, "look": 0.0, "rows": 0.0}
         self._has_viewers = False
         self._interactions: dict[int, pb.Interaction] = {}
         self._points: list[NamedPoints] = []
@@ -318,6 +319,20 @@ class Telemetry:
                 )
             self.clipped[body.index] += int(r["clipped"])
         return lines
+
+    def crowded_nodes(self) -> list[str]:
+        """Returns a line for each new object with nodes that had more obstacles near than they have rows for."""
+        contact = self.simulation.contact
+        if contact is None or not self._is_due("rows", STATUS_PERIOD):
+            return []
+        dropped = self.simulation.world.backend.fetch(contact.dropped)
+        found = set(contact.body[dropped > 0].tolist()) - self._crowded
+        self._crowded |= found
+        return [
+            f"object {self.simulation.world.bodies[body].name!r}: some nodes had more than two obstacles near at a time; "
+            "they touch the nearest two only"
+            for body in sorted(found)
+        ]
 
     def not_finite(self, records: NDArray[Any]) -> list[str]:
         """Returns a line for each object whose solve met numbers that are not finite for the first time."""

@@ -23,7 +23,7 @@ from sim_server.updates.factor_check import FactorCheck
 from sim_server.updates.factor_source import FactorSource, Inline, Job
 from sim_server.updates.policies import make_policy
 from sim_server.updates.scheduler import UpdateRequest
-from sim_server.updates.snapshots import SnapshotPool
+from sim_server.updates.snapshots import SnapshotPool, request_matrices
 from sim_server.updates.solve_observer import SolveObserver
 from sim_server.updates.useless_factors import UselessFactors
 
@@ -95,11 +95,14 @@ class Driver:
 
     def solve_with_fresh_factors(self) -> None:
         """Makes a step that waits for the factors of its own matrices, made in this process."""
+        copies = request_matrices(self.simulation, self.simulation.world.bodies)
         self.engine.assemble()
         step = self.engine.step
         for state in self.bodies:
             if not state.frozen:
-                values = self.simulation.system.body_values(state.body.first, state.body.last)
+                values = copies.get(state.body.index)
+                if values is None:
+                    values = self.simulation.system.body_values(state.body.first, state.body.last)
                 state.job.matrix = step, values
                 self.inline.submit(self._job(state, step, values))
         self.receive(self.inline, self.adopt)
