@@ -20,7 +20,7 @@ from clients.log.obstacles import obstacle_of
 from clients.obstacle import Obstacle
 from clients.queries import Queries, read
 from clients.queries import send as send_query
-from clients.subscriptions import Poses, States, Steps
+from clients.subscriptions import REACTIONS, Poses, States, Steps
 from protocol import messages_pb2 as pb
 from protocol.channels import PROTOCOL, ROOT, SERVER_NAME, check_name, key
 from protocol.client_name import new_client
@@ -185,6 +185,13 @@ class Client:
     def steps(self) -> Steps:
         """Subscribes to the scalars per step of all objects; a reader that falls behind loses the oldest."""
         return Steps(self._session.zenoh, self.name)
+
+    def reactions(self) -> Steps:
+        """Subscribes to what objects exert on obstacles in each step, which comes within about a millisecond.
+
+        The ObjectSteps that it returns hold object, step, time, contacts and reactions alone.
+        """
+        return Steps(self._session.zenoh, self.name, "reactions", REACTIONS)
 
     def command(
         self, verb: str, interaction: pb.Interaction | None = None, target: pb.ObstacleTarget | None = None

@@ -15,6 +15,7 @@ from protocol.refused import Refused
 from protocol.validate import check_header, parse
 
 BATCHES = 64  # batches of steps that are kept, about 3 s
+REACTIONS = 1024  # batches of reactions, about 1 s
 
 log = logging.getLogger(__name__)
 
@@ -70,17 +71,18 @@ class Poses:
 
 
 class Steps:
-    """Batches of scalars per step."""
+    """Batches of scalars per step. channel: steps or reactions. batches: that are kept."""
 
-    def __init__(self, session: zenoh.Session, server: str) -> None:
-        self._ring = session.declare_subscriber(key("steps", server), zenoh.handlers.RingChannel(BATCHES))
+    def __init__(self, session: zenoh.Session, server: str, channel: str = "steps", batches: int = BATCHES) -> None:
+        self._channel = channel
+        self._ring = session.declare_subscriber(key(channel, server), zenoh.handlers.RingChannel(batches))
 
     def new(self) -> list[pb.ObjectStep]:
         """Returns the steps that came since the last call, oldest first; never waits."""
         steps: list[pb.ObjectStep] = []
         while (sample := self._ring.try_recv()) is not None:
             try:
-                batch = parse(pb.Steps, sample.payload, CHANNELS["steps"].limit)
+                batch = parse(pb.Steps, sample.payload, CHANNELS[self._channel].limit)
                 check_header(batch)
                 steps.extend(batch.steps)
             except Refused as error:

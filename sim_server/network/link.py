@@ -189,6 +189,14 @@ class ServerLink:
         """True if somebody subscribed to the pose of an obstacle; "*": of any."""
         return self._publishers.has_subscribers("pose", object=obstacle)
 
+    def wants_reactions(self) -> bool:
+        """True if somebody subscribed to reactions of obstacles."""
+        return self._publishers.has_subscribers("reactions")
+
+    def publish_reactions(self, steps: Steps) -> None:
+        """Sends what objects exert on obstacles in each step to subscribers."""
+        self._publishers.put("reactions", steps)
+
     def publish_steps(self, steps: Steps) -> None:
         """Sends step records to their subscribers."""
         self._publishers.put("steps", steps)

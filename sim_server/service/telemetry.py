@@ -16,6 +16,7 @@ from sim_server.backends.kinds import SLACK_OF_ENERGY
 from sim_server.mechanics.named_points import NamedPoints
 from sim_server.network.link import ServerLink
 from sim_server.recording import messages
+from sim_server.recording.object_steps import add_reactions
 from sim_server.recording.obstacles import obstacle_messages, pose_messages
 from sim_server.recording.recorder import Recorder
 from sim_server.recording.replay_recorder import ReplayRecorder
@@ -70,7 +71,7 @@ class Telemetry:
         self.clipped: Counter[int] = Counter()  # nodes by body, summed over steps
         self._has_listeners = False
         self._due = {"steps": 0.0, "state": 0.0, "status": 0.0, "look": 0.0, "rows": 0.0}
-        self._has_viewers = False
+        self._has_viewers = self._wants_reactions = False
         self._interactions: dict[int, pb.Interaction] = {}
         self._points: list[NamedPoints] = []
 
@@ -113,6 +114,7 @@ class Telemetry:
         if len(records):
             self.seconds.extend(records["whole"][records["body"] == 0].tolist())
             self.update_summary(records, reactions)
+            self._publish_reactions(records, reactions)
             steps = self._messages(records, reactions)
             self._add_interactions(steps)
             if self.recorder:
@@ -123,6 +125,18 @@ class Telemetry:
             if self.link.wants_steps():
                 self.link.publish_steps(pb.Steps(steps=self._batch))
             self._batch.clear()
+
+    def _publish_reactions(self, records: NDArray[Any], reactions: Float64 | None) -> None:
+        """Sends what objects exert on obstacles at once, and nothing else of the steps: for force feedback."""
+        if reactions is None or not self._wants_reactions:
+            return
+        world = self.simulation.world
+        obstacles, steps = [o.name for o in world.obstacles], []
+        for r, each in zip(records[-MAX_BATCH:], reactions[-MAX_BATCH:], strict=True):
+            header = pb.Header(object=world.bodies[int(r["body"])].name, epoch=1)
+            steps.append(pb.ObjectStep(header=header, step=r["step"], time=r["time"], contacts=r["contacts"]))
+            add_reactions(steps[-1], each, obstacles)
+        self.link.publish_reactions(pb.Steps(steps=steps))
 
     def update_summary(self, records: NDArray[Any], reactions: Float64 | None = None) -> None:
         """Keeps what the status tells of steps: the last records and reactions of bodies, iterations and energies."""
@@ -204,8 +218,9 @@ class Telemetry:
     def frame_interval(self) -> int:
         """Returns the steps between frames that the loop should copy out; 0 for none."""
         if self._is_due("look", LOOK_PERIOD):
-            moving = self.simulation.contact is not None
-            self._has_viewers = self.link.wants_state() or (moving and self.link.wants_pose())
+            touchable = self.simulation.contact is not None
+            self._has_viewers = self.link.wants_state() or (touchable and self.link.wants_pose())
+            self._wants_reactions = touchable and self.link.wants_reactions()
             self._has_listeners = self.link.wants_steps() or bool(self.link.clients())
         return self.record_every or (max(1, round(STATE_PERIOD / self.simulation.world.dt)) if self._has_viewers else 0)
 
@@ -329,8 +344,8 @@ class Telemetry:
         found = set(contact.body[dropped > 0].tolist()) - self._crowded
         self._crowded |= found
         return [
-            f"object {self.simulation.world.bodies[body].name!r}: some nodes had more than two obstacles near at a time; "
-            "they touch the nearest two only"
+            f"object {self.simulation.world.bodies[body].name!r}: some nodes had more than two obstacles near at a "
+            "time; they touch the nearest two only"
             for body in sorted(found)
         ]
 

@@ -112,6 +112,28 @@ def test_the_log_tells_poses_contacts_and_reactions(log: Path, tmp_path: Path) -
     assert "reaction/tool/force_y" in out.read_text().splitlines()[0]
 
 
+def test_forces_of_each_step_come_to_a_client(tmp_path: Path) -> None:
+    """The cube rests on the floor; no step is left out, and what they hold is what the log says."""
+    stage, log = Stage(tmp_path), tmp_path / "run.mcap"
+    (tmp_path / "contact.toml").write_text(SCENE)
+    found: list[pb.ObjectStep] = []
+    try:
+        server = stage.server(tmp_path / "contact.toml", "--steps", "300", "--record", str(log), *CPU)
+        with stage.client() as client:
+            reactions = client.reactions()
+            until(lambda: found.extend(reactions.new()) or (found and found[-1].step > found[0].step + 50), "steps")
+        assert server.wait() == 0, server.output()
+    finally:
+        stage.close()
+    assert [step.step for step in found] == list(range(found[0].step, found[-1].step + 1))
+    steps = {step.step: step for step in logged(log, "step")}
+    for step in found:
+        told = steps[step.step]
+        assert (step.header.object, step.time, step.contacts) == ("cube", told.time, told.contacts)
+        assert list(step.reactions) == list(told.reactions) and not step.iterations
+    assert found[-1].reactions[0].obstacle == "floor" and found[-1].reactions[0].force.y < -100
+
+
 def test_a_live_viewer_gets_obstacles_and_poses(tmp_path: Path) -> None:
     stage = Stage(tmp_path)
     (tmp_path / "contact.toml").write_text(SCENE)
