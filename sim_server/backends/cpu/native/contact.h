@@ -8,10 +8,11 @@
 //   - y += alpha dy, alpha the exact minimum along dy of the convex function of which -r is the gradient;
 //   - the normal force found is what limits friction in the next pass; 0 in a row that the solve did not take as closed: a force
 //     that no solve has balanced would glue.
-// It ends when |r| <= Contact::tolerance |b + i H^T f| with the law as it is then; a last solve to the tolerance of the step follows.
+// It ends when |r| <= Contact::tolerance max(|b|, |b + i H^T f|) with the law as it is then; a last solve to the tolerance of the step follows.
 //
-// The path of each point of the surface is then swept against all obstacles. Those that pass into one get a row where they enter,
-// and the passes go on, at most ROUNDS times; what is still left is set to SHORT_OF of the way and counted as clipped.
+// The path of each point of the surface is then swept against all obstacles. Those that pass into one get a row where they enter, or a
+// stiffer one where they have it, for this step only, and the passes go on, at most ROUNDS times; what is still left is set to
+// SHORT_OF of the way and counted as clipped.
 #pragma once
 #include <algorithm>
 #include <cmath>
@@ -20,7 +21,8 @@
 
 constexpr double FIRST = 0.02, EARLY = 0.01, SHORT_OF = 0.9;
 constexpr double SAME_PLANE = 0.995;  // cosine of the angle between normals
-constexpr int ROUNDS = 2;
+constexpr double HARDER = 10;
+constexpr int ROUNDS = 3;
 
 // The passes of one body; allocates nothing.
 struct Passes {
@@ -35,7 +37,7 @@ struct Passes {
     const double scale2;                 // i c, of S
     ContactReport report = {0, 0, 0, NAN, 0};
     SolveResult result;
-    double given;                        // |b + i H^T f|
+    double given;                        // what |r| is relative to
 
     Passes(Loop& loop, int index)
         : loop(loop), c(*loop.contact), body(loop.body[index]),
@@ -70,8 +72,9 @@ struct Passes {
         each_row([&](int k, RowState&) { earliest = std::min(earliest, c.entry[k]); });
         each_row([&](int k, RowState& s) {
             s.limit = c.force[k];
-            s.force.closed = c.force[k] > 0 || (c.entry[k] <= 1 && c.entry[k] <= earliest + FIRST);
-            closed += s.force.closed;
+            s.hardening = 1;
+            s.in_set = c.force[k] > 0 || (c.entry[k] <= 1 && c.entry[k] <= earliest + FIRST);
+            closed += s.in_set;
         });
         return closed;
     }
@@ -81,14 +84,14 @@ struct Passes {
         bool any = false;
         each_row([&](int k, RowState& s) {
             const ContactRow row = rows.row(k);
-            s.force = contact_force(row, s.s, s.limit, set && s.force.closed);
+            s.force = contact_force(row, s.s, s.limit, set && s.in_set);
             contact_stiffness(row, s.force, scale2, s.stiffness);
             any = any || rows.acts(k);
         });
         return any;
     }
 
-    // r = left + i H^T f, given = |b + i H^T f|; returns |r|.
+    // r = left + i H^T f, given = the larger one of |b| and |b + i H^T f|, which is 0 at rest; returns |r|.
     double balance() {
         const int n = A.size();
         std::fill(r, r + n, 0.0);
@@ -97,14 +100,15 @@ struct Passes {
             for (int m = 0; m < 3; ++m) f[m] = c.force_coefficient * (s.force.normal * c.normal[3 * k + m] + s.force.traction[m]);
             rows.scatter(k, f, r);
         });
-        double all = 0, sum = 0;
+        double all = 0, own = 0, sum = 0;
         for (int k = 0; k < n; ++k) {
             const double f = r[k];
             all += (b[k] + f) * (b[k] + f);
+            own += b[k] * b[k];
             r[k] = left[k] + f;
             sum += r[k] * r[k];
         }
-        given = std::sqrt(all);
+        given = std::sqrt(std::max(all, own));
         return std::sqrt(sum);
     }
 
@@ -201,7 +205,7 @@ struct Passes {
     // True if the rows that count as closed are those that the law closes.
     bool set_is_law() const {
         bool same = true;
-        each_row([&](int k, RowState& s) { same = same && s.force.closed == contact_force(rows.row(k), s.s, 0, false).closed; });
+        each_row([&](int k, RowState& s) { same = same && s.in_set == contact_force(rows.row(k), s.s, 0, false).closed; });
         return same;
     }
 
@@ -231,15 +235,32 @@ struct Passes {
         if (report.residual > c.tolerance && result.status == CONVERGED) result.status = CONTACT;
     }
 
-    // The better one of the last solution and zero; left = b - A y.
+    // |r| at the state y with the set closed.
+    double size_at() {
+        move_points();
+        apply_law(true);
+        return balance();
+    }
+
+    // Begins with the better one of the last solution and zero; left = b - A y.
     void start() {
         const int n = A.size();
+        auto zero = [&] {
+            std::fill(y, y + n, 0.0);
+            std::copy(b, b + n, left);
+        };
+        if (!body.now.warm_start) { zero(); move_points(); return; }
         BlockCsr plain = A;
         plain.rows = nullptr;
-        double b2 = dot(n, b, b);
-        if (body.now.warm_start && residual(plain, b, y, left) < b2) return;
-        std::fill(y, y + n, 0.0);
-        std::copy(b, b + n, left);
+        residual(plain, b, y, left);
+        const double warm = size_at();
+        std::copy(y, y + n, dy);
+        std::copy(left, left + n, before);
+        zero();
+        if (size_at() <= warm || !(warm < INFINITY)) return;
+        std::copy(dy, dy + n, y);
+        std::copy(before, before + n, left);
+        move_points();
     }
 
     // Point of a site, at the start of the step and moved by y. Both rows of a node have the same.
@@ -279,24 +300,25 @@ struct Passes {
         c.entry[k] = t;
     }
 
-    // Gives points that y moves into an obstacle a row there. Rows come in pairs, of one point each. Returns whether any row is new.
+    // Gives points that y moves into an obstacle a row there. Rows come in pairs, of one point each. Returns whether there are such.
     bool sweep() const {
-        bool added = false;
+        bool found = false;
         for (int k = rows.first; k < rows.last; k += 2) {
             double from[3], to[3], begin[3], end[3];
             path(k, from, to);
             for (int o = 0; o < c.obstacle_count; ++o) {
                 if (swept(o, 0, from, to, begin, end) > 1) continue;
                 const double near = entry_time(c.obstacles, o, begin, end, c.thickness[k]);
-                added = take_row(k, o, from, begin, end, near <= 1 ? near : 0) || added;
+                take_row(k, o, from, begin, end, near <= 1 ? near : 0);
+                found = true;
             }
         }
-        if (added) move_points();
-        return added;
+        if (found) move_points();
+        return found;
     }
 
     // One of a pair's rows: the obstacle's own, an empty one, or the one that carries less.
-    bool take_row(int pair, int obstacle, const double* from, const double* begin, const double* end, double t) const {
+    void take_row(int pair, int obstacle, const double* from, const double* begin, const double* end, double t) const {
         int k = pair;
         if (c.obstacle[pair] != obstacle) {
             const bool other = c.obstacle[pair + 1] == obstacle || rows.empty(pair + 1);
@@ -305,10 +327,13 @@ struct Passes {
         const bool same = c.obstacle[k] == obstacle;
         const double *n = c.normal + 3 * k, normal[3] = {n[0], n[1], n[2]}, gap = c.gap[k];
         set_plane(k, obstacle, from, begin, end, t);
-        if (same && dot3(normal, c.normal + 3 * k) > SAME_PLANE && std::fabs(gap - c.gap[k]) < 0.1 * c.thickness[k]) return false;
+        if (same && dot3(normal, c.normal + 3 * k) > SAME_PLANE && std::fabs(gap - c.gap[k]) < 0.1 * c.thickness[k]) {
+            c.state[k].hardening *= HARDER;
+            return;
+        }
         c.state[k].limit = 0;
+        c.state[k].hardening = 1;
         std::fill(c.traction + 3 * k, c.traction + 3 * k + 3, 0.0);
-        return true;
     }
 
     // Sets points that y moves into an obstacle back, to a part of the way.
@@ -373,7 +398,6 @@ static SolveResult solve_in_contact(Loop& loop, int index) {
     const int64_t at = 3 * (int64_t)body.first, n = p.A.size();
     if (p.choose_set()) {
         p.start();
-        p.move_points();
         p.solve(true);
     } else {
         BlockCsr A = p.A;
@@ -407,6 +431,7 @@ static void add_contacts(const Loop& loop, const Body& body, double* target) {
         const double* t = c.traction + 3 * k;
         if (dot3(t, t) < 0.98 * square(c.friction[k] * c.force[k])) f.slip = 1;
         double s[6];
+        c.state[k].hardening = 1;
         contact_stiffness(rows.row(k), f, c.dx_dv * c.force_coefficient, s);
         rows.add_blocks(k, s, [&](int i, int j) -> double* {
             for (int m = loop.row_start[i]; m < loop.row_start[i + 1]; ++m)

@@ -10,6 +10,8 @@ struct RowState {                 // of a row in the step under way
     double s[3];                  // displacement of its point by the velocities reached [m]
     double step[3];               // by the solution of the pass [m]
     double limit;                 // normal force that limits friction, held in a pass [N]
+    double hardening;             // of the row's stiffness in this step
+    int32_t in_set;               // 1: counts as closed in the first pass
     double stiffness[6];          // upper triangle of the force's slope times h^2, world frame [kg]
     ContactForce force;
 };
@@ -55,7 +57,8 @@ struct BodyRows {
     int32_t node_first, first, last;  // first node of the body; rows [first, last)
 
     ContactRow row(int r) const {
-        return {c.normal + 3 * r, c.drift + 3 * r, c.traction + 3 * r, c.gap[r], c.thickness[r], c.stiffness[r], c.friction[r]};
+        return {c.normal + 3 * r, c.drift + 3 * r, c.traction + 3 * r, c.gap[r], c.thickness[r],
+                c.state[r].hardening * c.stiffness[r], c.friction[r]};
     }
     bool empty(int r) const { return c.obstacle[r] < 0; }
 
