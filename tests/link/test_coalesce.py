@@ -116,3 +116,10 @@ def test_each_of_a_round_is_answered_once(queryables: Queryables, counters: Coun
     assert wrong.answers[0].error == "Vector.x is nan; allowed: finite"
     assert not elsewhere.answers and elsewhere.dropped == 1
     assert counters.moves_replaced == 39 and counters.refused == 3
+
+
+def test_names_of_obstacles_that_wait_are_short(queryables: Queryables) -> None:
+    given = [Query(moved("n" * length).SerializeToString()) for length in (64, 65, 60_000)]
+    queryables.serve_all(given, None)  # type: ignore[arg-type]
+    assert [command.target.obstacle for command, _ in queryables.commands()] == ["n" * 64]
+    assert "ObstacleTarget.obstacle has 65 characters; allowed: 64" in given[1].answers[0].error
