@@ -1,0 +1,43 @@
+# SPDX-License-Identifier: MIT
+"""Scenes of contact made in a test: a block over obstacles."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from numpy.typing import ArrayLike
+
+from sim_server.scene.model import Scene
+from sim_server.simulation import Simulation
+from tests.scenes import bar
+
+CELLS, SIZE = (4, 3, 4), (0.1, 0.06, 0.1)  # of the block [m]
+YOUNG = 3e5  # Pa
+D = 0.002  # thickness, a tenth of the shortest edge of the surface [m]
+LOCKSTEP: dict[str, Any] = {"preconditioner": "cholesky", "update": "lockstep-3"}
+
+
+def floor(friction: float = 0.5, **table: Any) -> dict:
+    """An [[obstacle]]: the half-space y < 0."""
+    return {"name": "floor", "shape": "plane", "friction": friction, **table}
+
+
+def block(friction: float = 0.5, cells: Sequence[int] = CELLS, size: Sequence[float] = SIZE, **table: Any) -> dict:
+    """An [[object]] with its lowest corner at `at`."""
+    pose = {"translate": list(table.pop("at", (0, D, 0))), "rotate": list(table.pop("rotate", (0, 0, 0)))}
+    return bar(tuple(cells), tuple(size), young=table.pop("young", YOUNG), friction=friction, pose=pose, **table)
+
+
+def over(
+    *obstacles: dict, objects: Sequence[dict] = (), velocity: ArrayLike = (0, 0, 0), dt: float = 1 / 60,
+    gravity: Sequence[float] = (0, -9.81, 0), contact: Any = True, solver: dict | None = None, device: str = "cpu",
+    **table: Any,
+) -> Simulation:  # fmt: skip
+    """A block, or other objects, over obstacles. velocity: at the start [m/s]; other arguments are the block's."""
+    effects = {"gravity": {"g": list(gravity)}, "contact": {"thickness": D} if contact is True else contact}
+    scene = {
+        "name": "test", "dt": dt, "effects": effects, "solver": LOCKSTEP if solver is None else solver,
+        "object": list(objects) or [block(**table)], "obstacle": list(obstacles) or [floor()],
+    }  # fmt: skip
+    sim = Simulation(Scene.model_validate(scene, context={"folder": "."}), device)
+    sim.world.v[:] = velocity
+    return sim
