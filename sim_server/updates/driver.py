@@ -23,7 +23,7 @@ from sim_server.updates.factor_check import FactorCheck
 from sim_server.updates.factor_source import FactorSource, Inline, Job
 from sim_server.updates.policies import make_policy
 from sim_server.updates.scheduler import UpdateRequest
-from sim_server.updates.snapshots import SnapshotPool, request_matrices
+from sim_server.updates.snapshots import SnapshotPool
 from sim_server.updates.solve_observer import SolveObserver
 from sim_server.updates.useless_factors import UselessFactors
 
@@ -95,7 +95,7 @@ class Driver:
 
     def solve_with_fresh_factors(self) -> None:
         """Makes a step that waits for the factors of its own matrices, made in this process."""
-        copies = request_matrices(self.simulation, self.simulation.world.bodies)
+        copies = self.snapshots.request_matrices(state.body for state in self.bodies if not state.frozen)
         self.engine.assemble()
         step = self.engine.step
         for state in self.bodies:

@@ -47,6 +47,10 @@ class SnapshotPool:
             job.copy = self._allocate(self._simulation.system.body_values(body.first, body.last).shape)
             engine.request_matrix(body.index, job.copy)
 
+    def request_matrices(self, bodies: Iterable[Body]) -> dict[int, NDArray[np.float64]]:
+        """The function of this name, with memory of the pool: that of jobs whose factors are made in the step."""
+        return request_matrices(self._simulation, bodies, self._allocate)
+
     def step(self, state: BodyUpdateState) -> int:
         """Returns the steps completed before the one whose matrix was copied; -1: the copy is not there yet."""
         step: int = self._simulation.engine.matrix_step(state.body.index)
@@ -102,14 +106,17 @@ class SnapshotPool:
         return min(self._solver.extrapolate, self._expected_latency(state) * self._simulation.scene.dt)
 
 
-def request_matrices(simulation: Simulation, bodies: Iterable[Body]) -> dict[int, NDArray[np.float64]]:
+def request_matrices(
+    simulation: Simulation, bodies: Iterable[Body],
+    allocate: Callable[[tuple[int, ...]], NDArray[np.float64]] = np.zeros,
+) -> dict[int, NDArray[np.float64]]:  # fmt: skip
     """Asks the loop for copies of matrices with what contact adds to them, which System.body_values lack.
 
     Returns the copies by number of the body, filled in by the next `assemble`; {} in a scene without contact.
     """
     if simulation.contact is None:
         return {}
-    copies = {b.index: np.empty_like(simulation.system.body_values(b.first, b.last)) for b in bodies}
+    copies = {b.index: allocate(simulation.system.body_values(b.first, b.last).shape) for b in bodies}
     for index, copy in copies.items():
         simulation.engine.request_matrix(index, copy)
     return copies
