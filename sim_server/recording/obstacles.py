@@ -7,7 +7,8 @@ import numpy as np
 
 from protocol import messages_pb2 as pb
 from sim_server.arrays import Float64
-from sim_server.scene.obstacles import Obstacle
+from sim_server.scene.obstacles import Keyframe, Obstacle
+from sim_server.scene.pose import quaternion
 from sim_server.simulation import Simulation
 
 
@@ -33,14 +34,17 @@ def obstacle_messages(simulation: Simulation) -> list[pb.Obstacle]:
 
 
 def pose_messages(simulation: Simulation, step: int, fixed: bool = False) -> list[pb.ObstaclePose]:
-    """Converts the poses as they are now of obstacles that move. step: number of completed steps. fixed: of all."""
+    """Converts the poses of obstacles that move, after `step` steps. fixed: of all.
+
+    Of an obstacle that clients move it is the pose as it is now: a loop may have gone on meanwhile.
+    """
     if simulation.contact is None:
         return []
-    found = []
+    found, time = [], step * simulation.world.dt
     for obstacle, at in zip(simulation.world.obstacles, _poses(simulation), strict=True):
         if fixed or obstacle.keyframes or obstacle.moved:
-            position, rotation = pose_message(at)
-            header, time = pb.Header(object=obstacle.name), step * simulation.world.dt
+            position, rotation = pose_message(_at(obstacle.keyframes, time) if obstacle.keyframes else at)
+            header = pb.Header(object=obstacle.name)
             found.append(pb.ObstaclePose(header=header, step=step, time=time, position=position, rotation=rotation))
     return found
 
@@ -76,6 +80,21 @@ def _poses(simulation: Simulation) -> Float64:
     poses = simulation.world.backend.fetch(simulation.contact.contact_input().obstacles.end).copy()
     poses[:, 3:] /= np.linalg.norm(poses[:, 3:], axis=1)[:, None]
     return poses
+
+
+def _at(keyframes: Sequence[Keyframe], time: float) -> Float64:
+    """Pose (7,) between keyframes at a time [s], as `pose_at` in effects/contact.cu has it."""
+    after = next((k for k, key in enumerate(keyframes) if key.time > time), len(keyframes))
+    a, b = keyframes[max(after - 1, 0)], keyframes[min(after, len(keyframes) - 1)]
+    part = (time - a.time) / (b.time - a.time) if a is not b else 0.0
+    position = np.array(a.translate) + part * (np.array(b.translate) - np.array(a.translate))
+    p, q = np.array(quaternion(a.rotate)), np.array(quaternion(b.rotate))
+    q = -q if p @ q < 0 else q
+    aside = q - (p @ q) * p
+    size = float(np.linalg.norm(aside))
+    angle = part * float(np.arctan2(size, p @ q))
+    rotation = np.cos(angle) * p + (np.sin(angle) / size * aside if size > 0 else 0.0)
+    return np.concatenate([position, rotation / np.linalg.norm(rotation)])
 
 
 def _size(obstacle: Obstacle) -> Sequence[float]:

@@ -14,7 +14,7 @@ from sim_server.service.commands import Commands
 from sim_server.service.telemetry import Telemetry
 from sim_server.updates.driver import Driver
 from sim_server.updates.snapshots import request_matrices
-from tests.contact_scene import DT, contact_simulation
+from tests.contact_scene import DT, FLOOR, PADDLE, contact_simulation
 from tests.scenes import bar, simulation
 
 HALF = 0.5**0.5
@@ -92,6 +92,25 @@ def test_obstacles_as_messages(commands: Commands) -> None:
     assert (paddle.shape, list(paddle.size), paddle.moved) == ("box", [0.1, 0.4, 0.4], "keyframes")
     assert paddle.position == pb.Vector(x=1, y=0.2, z=0.15)
     assert [p.header.object for p in pose_messages(commands.simulation, 0)] == ["tool", "paddle"], "what moves"
+
+
+def test_poses_on_keyframes_are_those_of_the_loop() -> None:
+    """At the time that is asked for, whatever the loop has come to."""
+    frames = [(0.02, [10, 200, 30], [0, 0, 0]), (0.05, [190, 20, -50], [1, 2, 3]), (0.07, [0, 0, 0], [0, 1, 0])]
+    paddle = PADDLE | {"keyframes": [{"time": t, "rotate": r, "translate": x} for t, r, x in frames]}
+    sim = contact_simulation(FLOOR, paddle)
+    assert sim.contact is not None
+    loop = []
+    for _ in range(9):
+        sim.engine.run(1)
+        loop.append(sim.contact.contact_input().obstacles.end[1].copy())
+    for step, pose in enumerate(loop, 1):
+        (found,) = pose_messages(sim, step)
+        p, q = found.position, found.rotation
+        np.testing.assert_allclose([p.x, p.y, p.z], pose[:3], atol=1e-14)
+        rotation = np.array([q.w, q.x, q.y, q.z])
+        np.testing.assert_allclose(rotation * np.sign(rotation @ pose[3:]), pose[3:], atol=1e-14)
+        assert (found.step, found.time) == (step, step * DT)
 
 
 def test_targets_come_back_bit_for_bit() -> None:

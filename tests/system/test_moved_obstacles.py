@@ -13,6 +13,7 @@ from clients.errors import BadInput
 from clients.log.reader import Log
 from protocol import messages_pb2 as pb
 from tests.contact_scene import DT
+from tests.system.link_helpers import free_endpoint
 from tests.system.server_process import Stage, fresh, run, until
 from tests.system.test_replay_of_a_server import CPU, copied, replayed
 from tests.system.test_replay_of_a_server import messages as logged
@@ -84,6 +85,25 @@ def test_the_same_bit_for_bit(log: Path) -> None:
     found = replayed(log, 0)
     assert found["same"] and found["first"] is None and not found["notes"]
     assert (found["steps"], found["frames"]) == (STEPS, STEPS + 1)
+
+
+@pytest.mark.parametrize("update", ["every-7", "lockstep-3", "never"])
+def test_the_same_whatever_the_policy(tmp_path: Path, update: str) -> None:
+    """As fast as it goes, the cube lands while a paddle on keyframes comes up to it."""
+    log, scene = tmp_path / "run.mcap", tmp_path / "contact.toml"
+    paddle = (
+        "{ time = 0, translate = [0.6, 0.2, 0.15] }, { time = 0.5, translate = [0.33, 0.2, 0.15], rotate = [0, 20, 0] }"
+    )
+    box = f'[[obstacle]]\nname = "paddle"\nshape = "box"\nsize = [0.1, 0.4, 0.4]\nkeyframes = [{paddle}]\n'
+    scene.write_text(SCENE.replace("moved", "# moved").replace("max_speed", "# max_speed") + box)
+    options = ("--free-run", "--steps", "60", "--record", str(log), "--set", f"solver.update={update}", *CPU)
+    result = run("sim_server", str(scene), *options, "--listen", free_endpoint())
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert replayed(log, 0)["same"] and not logged(log, "targets")
+    touched = {r.obstacle for step in logged(log, "step") for r in step.reactions}
+    x = [pose.position.x for pose in logged(log, "pose")]
+    np.testing.assert_allclose(x, np.linspace(0.6, 0.33, 51).tolist() + 10 * [0.33], atol=1e-12)
+    assert touched == {"floor", "paddle"} and len({s.factor_step for s in logged(log, "step")}) > (update != "never")
 
 
 def test_without_one_of_the_targets_it_diverges(log: Path, tmp_path: Path) -> None:
