@@ -231,6 +231,30 @@ def test_a_thin_plate_is_found_at_any_speed(module, speed, dt):
         np.testing.assert_allclose(shape.ask(module, start, start + along, inflate)["entry"], expected, rtol=1e-9)
 
 
+@pytest.mark.parametrize("speed", [1.0, 100.0, 1e4])
+def test_a_thin_plate_in_a_grid_is_found_at_any_speed(module, speed):
+    """2 mm at a spacing of 0.7 mm, from both sides, straight and aslant."""
+    half, spacing = np.array([0.02, 0.001, 0.02]), 0.0007
+    count = 2 * np.ceil((half + 0.004) / spacing).astype(int) + 2
+    first = -spacing * (count - 1) / 2
+    nodes = np.stack(
+        np.meshgrid(*(f + spacing * np.arange(n) for f, n in zip(first, count, strict=True)), indexing="ij")
+    )
+    values = reference.box(nodes.reshape(3, -1).T, half).reshape(count)
+    shape = Shape("GRID", (*first, spacing), lambda p: reference.grid(p, first, spacing, values), values)
+    random, dt = np.random.default_rng(10), 1 / 60
+    for side in (-1, 1):
+        start = np.stack([random.uniform(-0.01, 0.01, 300), side * random.uniform(0.0015, 0.01, 300),
+                          random.uniform(-0.01, 0.01, 300)], axis=1)  # fmt: skip
+        along = np.stack([random.normal(size=300) * 0.2, np.full(300, -side), random.normal(size=300) * 0.2], 1)
+        entry = shape.ask(module, start, start + speed * dt * along, 0.0003)["entry"]
+        exact = (np.abs(start[:, 1]) - 0.0013) / (speed * dt)
+        reaches = exact <= 1
+        assert reaches.sum() > 10
+        np.testing.assert_allclose(entry[reaches] * speed * dt, exact[reaches] * speed * dt, atol=1e-9)
+        assert (entry[~reaches] == NEVER).all()
+
+
 NUMBER = st.floats(-2, 2)
 POINT = st.tuples(NUMBER, NUMBER, NUMBER)
 
