@@ -194,8 +194,9 @@ class Service:
 
     def _report(self, records: NDArray[Any], reactions: Float64) -> None:
         """Passes on new step records and their reactions on obstacles, and new frames."""
-        unsolved = [*self.telemetry.count_unconverged(records), *self.telemetry.count_clipped(records)]
-        for line in [*unsolved, *self.telemetry.crowded_nodes()]:
+        contact = self.telemetry.contact
+        undone = [*contact.count_clipped(records), *contact.crowded_nodes()]
+        for line in [*self.telemetry.count_unconverged(records), *undone]:
             log.warning("%s", line)
         for line in [*self.telemetry.count_runaways(records), *self.telemetry.not_finite(records)]:
             log.error("%s", line)

@@ -16,11 +16,11 @@ from sim_server.backends.kinds import SLACK_OF_ENERGY
 from sim_server.mechanics.named_points import NamedPoints
 from sim_server.network.link import ServerLink
 from sim_server.recording import messages
-from sim_server.recording.object_steps import add_reactions
-from sim_server.recording.obstacles import obstacle_messages, pose_messages
+from sim_server.recording.obstacles import pose_messages
 from sim_server.recording.recorder import Recorder
 from sim_server.recording.replay_recorder import ReplayRecorder
 from sim_server.service.commands import Commands
+from sim_server.service.contact_telemetry import ContactTelemetry
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
 
@@ -38,6 +38,8 @@ class Telemetry:
 
     patient: wait for the log; without it, drop
     commands: whose interactions are in the status; None: there are none
+
+    contact: the part that tells of obstacles
     """
 
     def __init__(
@@ -51,6 +53,7 @@ class Telemetry:
         self.driver, self.link, self.recorder, self.patient = driver, link, recorder, patient
         self.simulation, self.engine = driver.simulation, driver.engine
         self.commands = commands
+        self.contact = ContactTelemetry(self.simulation, link, recorder)
         self.replay_recorder = ReplayRecorder(driver, link, recorder) if recorder and commands else None
         self.started = time.monotonic()
         self.record_every = self.simulation.scene.record.every if recorder else 0
@@ -67,11 +70,9 @@ class Telemetry:
         self.unconverged: Counter[str] = Counter()  # solves by status, of those that did not converge
         self._energy: dict[int, float] = {}  # by body, kinetic + elastic + gravity of the last step with all three [J]
         self.runaways: Counter[int] = Counter()  # steps by body
-        self._crowded: set[int] = set()  # bodies of which it was said that a node had too many obstacles near
-        self.clipped: Counter[int] = Counter()  # nodes by body, summed over steps
         self._has_listeners = False
-        self._due = {"steps": 0.0, "state": 0.0, "status": 0.0, "look": 0.0, "rows": 0.0}
-        self._has_viewers = self._wants_reactions = False
+        self._due = {"steps": 0.0, "state": 0.0, "status": 0.0, "look": 0.0}
+        self._has_viewers = False
         self._interactions: dict[int, pb.Interaction] = {}
         self._points: list[NamedPoints] = []
 
@@ -87,10 +88,7 @@ class Telemetry:
             self.link.announce(topology)
             if self.recorder:
                 self.recorder.topology(topology)
-        for obstacle in obstacle_messages(self.simulation):
-            self.link.set_obstacle(obstacle)
-            if self.recorder:
-                self.recorder.obstacle(obstacle)
+        self.contact.open()
         if self.recorder:
             self._record_frame(0, self.simulation.world.x, self.simulation.world.v)
         self.publish_status("running")
@@ -114,7 +112,7 @@ class Telemetry:
         if len(records):
             self.seconds.extend(records["whole"][records["body"] == 0].tolist())
             self.update_summary(records, reactions)
-            self._publish_reactions(records, reactions)
+            self.contact.publish_reactions(records, reactions)
             steps = self._messages(records, reactions)
             self._add_interactions(steps)
             if self.recorder:
@@ -125,18 +123,6 @@ class Telemetry:
             if self.link.wants_steps():
                 self.link.publish_steps(pb.Steps(steps=self._batch))
             self._batch.clear()
-
-    def _publish_reactions(self, records: NDArray[Any], reactions: Float64 | None) -> None:
-        """Sends what objects exert on obstacles at once, and nothing else of the steps: for force feedback."""
-        if reactions is None or not self._wants_reactions:
-            return
-        world = self.simulation.world
-        obstacles, steps = [o.name for o in world.obstacles], []
-        for r, each in zip(records[-MAX_BATCH:], reactions[-MAX_BATCH:], strict=True):
-            header = pb.Header(object=world.bodies[int(r["body"])].name, epoch=1)
-            steps.append(pb.ObjectStep(header=header, step=r["step"], time=r["time"], contacts=r["contacts"]))
-            add_reactions(steps[-1], each, obstacles)
-        self.link.publish_reactions(pb.Steps(steps=steps))
 
     def update_summary(self, records: NDArray[Any], reactions: Float64 | None = None) -> None:
         """Keeps what the status tells of steps: the last records and reactions of bodies, iterations and energies."""
@@ -212,15 +198,13 @@ class Telemetry:
             for body in self.simulation.world.bodies:
                 if self.link.wants_state(body.name):
                     self.link.publish_state(messages.state(body, step, step * self.simulation.world.dt, x, v))
-            for pose in pose_messages(self.simulation, step):
-                self.link.publish_pose(pose)
+            self.contact.publish_poses(step)
 
     def frame_interval(self) -> int:
         """Returns the steps between frames that the loop should copy out; 0 for none."""
         if self._is_due("look", LOOK_PERIOD):
-            touchable = self.simulation.contact is not None
-            self._has_viewers = self.link.wants_state() or (touchable and self.link.wants_pose())
-            self._wants_reactions = touchable and self.link.wants_reactions()
+            wants_poses = self.contact.look()
+            self._has_viewers = self.link.wants_state() or wants_poses
             self._has_listeners = self.link.wants_steps() or bool(self.link.clients())
         return self.record_every or (max(1, round(STATE_PERIOD / self.simulation.world.dt)) if self._has_viewers else 0)
 
@@ -238,8 +222,7 @@ class Telemetry:
         for body in self.simulation.world.bodies:
             message = messages.state(body, step, step * self.simulation.world.dt, x, v)
             self.recorder.state(message, block=self.patient)
-        for pose in pose_messages(self.simulation, step):
-            self.recorder.pose(pose, block=self.patient)
+        self.contact.record_poses(step, block=self.patient)
 
     def publish_status(self, state: str, force: bool = True, where: bool = False) -> None:
         """Publishes the status of the scene. where: with the places of its objects, which are fetched from a GPU."""
@@ -279,7 +262,7 @@ class Telemetry:
                     factor_age_bound=bound,
                     runaway_steps=self.runaways[body.index],
                     total_energy=self._energy.get(body.index),
-                    clipped=self.clipped[body.index],
+                    clipped=self.contact.clipped[body.index],
                 )
             )
         status.obstacles.extend(pose_messages(self.simulation, status.step, fixed=True))
@@ -319,34 +302,6 @@ class Telemetry:
         return [
             f"object {name!r}, step {int(r['step'])}: not converged ({status}, residual {float(r[column]):.1e}); "
             "further ones are counted"
-        ]
-
-    def count_clipped(self, records: NDArray[Any]) -> list[str]:
-        """Counts nodes that were held back at obstacles after the passes; returns a line for each new object."""
-        lines = []
-        for r in records[records["clipped"] > 0]:
-            body = self.simulation.world.bodies[int(r["body"])]
-            if body.index not in self.clipped:
-                lines.append(
-                    f"object {body.name!r}, step {int(r['step'])}: {int(r['clipped'])} nodes would have passed into an "
-                    "obstacle and were held back, so momentum is not exact; further ones are counted. A smaller dt or "
-                    "more passes (effects.contact) may help"
-                )
-            self.clipped[body.index] += int(r["clipped"])
-        return lines
-
-    def crowded_nodes(self) -> list[str]:
-        """Returns a line for each new object with nodes that had more obstacles near than they have rows for."""
-        contact = self.simulation.contact
-        if contact is None or not self._is_due("rows", STATUS_PERIOD):
-            return []
-        dropped = self.simulation.world.backend.fetch(contact.dropped)
-        found = set(contact.body[dropped > 0].tolist()) - self._crowded
-        self._crowded |= found
-        return [
-            f"object {self.simulation.world.bodies[body].name!r}: some nodes had more than two obstacles near at a "
-            "time; they touch the nearest two only"
-            for body in sorted(found)
         ]
 
     def not_finite(self, records: NDArray[Any]) -> list[str]:

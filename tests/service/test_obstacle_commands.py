@@ -143,23 +143,23 @@ def test_bodies_that_touch_nothing_log_the_same_bytes_as_ever() -> None:
 
 
 def test_what_contact_leaves_undone_is_said_once_for_each_object(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sim_server.service.telemetry.STATUS_PERIOD", 0.0)
+    monkeypatch.setattr("sim_server.service.contact_telemetry.ROWS_PERIOD", 0.0)
     sim = contact_simulation()
     link: Any = SimpleNamespace(dispatch=None)
     telemetry = Telemetry(Driver(sim), link, None, patient=False)
     sim.engine.run(3)
     records, _ = sim.engine.records_and_reactions()
-    assert telemetry.count_clipped(records) == [] and telemetry.crowded_nodes() == []
+    assert telemetry.contact.count_clipped(records) == [] and telemetry.contact.crowded_nodes() == []
     records["clipped"][1:] = 2, 5
-    (line,) = telemetry.count_clipped(records)
+    (line,) = telemetry.contact.count_clipped(records)
     assert line.startswith("object 'cube', step 2: 2 nodes would have passed into an obstacle")
-    assert telemetry.count_clipped(records) == [] and telemetry.clipped[0] == 14
+    assert telemetry.contact.count_clipped(records) == [] and telemetry.contact.clipped[0] == 14
     records["status"][2], records["contact_residual"][2] = pb.CONTACT, 0.25
     assert "not converged (contact, residual 2.5e-01)" in telemetry.count_unconverged(records)[0]
     assert sim.contact is not None
     sim.contact.dropped[7] = 1
-    assert "more than two obstacles near" in telemetry.crowded_nodes()[0]
-    assert telemetry.crowded_nodes() == []
+    assert "more than two obstacles near" in telemetry.contact.crowded_nodes()[0]
+    assert telemetry.contact.crowded_nodes() == []
 
 
 def test_matrices_for_factors_made_in_the_step_know_contacts() -> None:
