@@ -261,3 +261,32 @@ KERNEL(detect, Detect) {
     put_row(p, t, i, 2 * i, first, x, last);
     put_row(p, t, i, 2 * i + 1, second, x, last);
 }
+
+struct Distances {
+    int n;                // surface nodes
+    int obstacles;        // their number, m
+    const int* kind;      // (m,) as ObstacleTable in shapes.cuh has them, up to `end`
+    const double* size;   // (m, 4)
+    const double* grid;
+    const int* place;     // (m,)
+    const int* cells;     // (m, 3)
+    const double* begin;  // (m, 7)
+    const double* end;    // (m, 7)
+    const int* node;      // (n,) of the scene
+    const real* x;        // (nodes, 3) [m]
+    double* distance;     // (n,) out: from the nearest obstacle where that is at the end of the step [m]
+    int* nearest;         // (n,) out: its number
+};
+
+KERNEL(distances, Distances) {
+    const ObstacleTable t = {p.kind, p.size, p.grid, p.place, p.cells, p.begin, p.end};
+    double x[3], local_x[3], normal[3];
+    for (int k = 0; k < 3; ++k) x[k] = p.x[3 * p.node[i] + k];
+    for (int o = 0; o < p.obstacles; ++o) {
+        local_point(t.end + 7 * o, x, local_x);
+        const double distance = distance_to(t, o, local_x, normal);
+        if (o > 0 && !(distance < p.distance[i])) continue;
+        p.distance[i] = distance;
+        p.nearest[i] = o;
+    }
+}

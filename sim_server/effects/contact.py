@@ -21,6 +21,7 @@ Usual values: a thickness of a tenth of the shortest edge of the surface (the de
 steel) to 1 (rubber).
 """
 
+import logging
 from collections.abc import Sequence
 from math import dist, hypot
 from typing import Annotated, Any
@@ -42,6 +43,8 @@ from sim_server.mesh.surface import surface_triangles
 from sim_server.scene.obstacles import Obstacle
 from sim_server.scene.parameters import NotNegative, Parameters, Positive, as_tuple
 from sim_server.scene.pose import quaternion
+
+log = logging.getLogger(__name__)
 
 SCOPE = "scene"
 TEXT = "effects/contact.cu"
@@ -169,6 +172,26 @@ class Contact(Effect):
 
     def connect(self, simulation: EffectUpdates) -> None:
         self._simulation = simulation
+        self._warn_of_nodes_inside()
+
+    def _warn_of_nodes_inside(self) -> None:
+        """Logs which objects begin deeper in an obstacle than their thickness: they are pushed out, fast."""
+        w, n = self.world, len(self.node)
+        launch = w.backend.module(TEXT).bind(
+            "distances", n, obstacles=len(self.obstacles), **vars(self._table), node=self.node, x=w.x,
+            distance=np.zeros(n), nearest=np.zeros(n, np.int32),
+        )  # fmt: skip
+        launch()
+        distance, nearest = launch.fetch("distance"), launch.fetch("nearest")
+        inside = distance < -self._input.thickness[::2]
+        for body in w.bodies:
+            if (found := np.flatnonzero(inside & (self.body == body.index))).size:
+                worst = found[distance[found].argmin()]
+                log.warning(
+                    "object %r begins inside obstacle %r: node %d is %.3g m deep (%d such nodes); it is thrown out",
+                    body.name, self.obstacles[nearest[worst]].name, self.node[worst] - body.first, -distance[worst],
+                    found.size,
+                )  # fmt: skip
 
     @property
     def targets(self) -> dict[str, Float64]:

@@ -136,6 +136,15 @@ def test_only_free_surface_nodes_have_rows():
     assert effect.contact_input().obstacle[6] == -1
 
 
+def test_an_object_that_begins_inside_an_obstacle_is_told_with_its_deepest_node(caplog):
+    bars = [bar((2, 2, 2), (1, 1, 1)), bar((2, 2, 2), (1, 1, 1), name="sunk", pose={"translate": [0, -0.3, 5]})]
+    made(FLOOR, {"name": "ball", "shape": "sphere", "radius": 1, "pose": {"translate": [0, 9, 0]}}, bars=bars)
+    (told,) = [record.message for record in caplog.records]
+    assert told == (
+        "object 'sunk' begins inside obstacle 'floor': node 0 is 0.3 m deep (9 such nodes); it is thrown out"
+    )
+
+
 @pytest.mark.parametrize("speed", [1.0, 10.0, 100.0])
 @pytest.mark.parametrize("thick", [0.002, 0.02])
 @pytest.mark.parametrize("moving", [False, True])

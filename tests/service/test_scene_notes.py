@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sim_server.scene.model import Scene
 from sim_server.service.scene_notes import scene_notes
 from sim_server.simulation import Simulation
 from tests.scenes import bar, jittered_bar, mesh_file, simulation
@@ -29,6 +30,13 @@ def test_free_fall_is_said_once_for_all_bodies():
     assert scene_notes(simulation(small("a", touch={}), gravity=GRAVITY)) == [f"object 'a' {FALLING}"]
     assert scene_notes(simulation(*bodies)) == []  # nothing pulls
     assert scene_notes(simulation(small("a", fixed="X < 0.1"), gravity=GRAVITY)) == []
+
+
+def test_nothing_is_said_of_bodies_that_fall_onto_an_obstacle():
+    effects = {"gravity": {"g": list(GRAVITY)}, "contact": {}}
+    floor = {"name": "floor", "shape": "plane"}
+    table = {"name": "test", "dt": 0.02, "effects": effects, "object": [small("a")], "obstacle": [floor]}
+    assert scene_notes(Simulation(Scene.model_validate(table, context={"folder": "."}))) == []
 
 
 def test_a_body_without_elasticity_is_said():
