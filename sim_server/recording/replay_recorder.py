@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from sim_server.effects.touch import Interaction
 
 
+PENDING = 1024  # updates kept after the last that the loop took up; in a pause each one replaces the one before
+
 T = TypeVar("T")
 Updates = deque[tuple[PendingUpdate, T]]  # what the loop was given, oldest first
 
@@ -54,8 +56,8 @@ class ReplayRecorder:
     def __init__(self, driver: Driver, link: ServerLink, recorder: Recorder):
         self._driver, self._link, self._recorder = driver, link, recorder
         self._factors: deque[Factor] = deque()  # appended by the thread that posts them, maybe the loop's
-        self._touched: Updates[list[Interaction]] = deque()
-        self._moved: Updates[dict[str, Float64]] = deque()
+        self._touched: Updates[list[Interaction]] = deque(maxlen=PENDING)
+        self._moved: Updates[dict[str, Float64]] = deque(maxlen=PENDING)
         self._with_nodes: set[int] = set()  # ids whose nodes the log holds
         self._workers: dict[str, pb.WorkerInfo] = {}
         driver.on_adopt.append(self._factors.append)

@@ -48,7 +48,8 @@ max_speed = 0.4
 
 
 def press(client: Client) -> None:
-    """Sends the tool down into the cube, about 1000 times a second, and lifts it again; a push in between."""
+    """Sends the tool down into the cube, about 1000 times a second, and lifts it again, the last time in a pause; a push
+    in between."""
     tool = client.obstacle("tool")
     for k in range(300):
         tool.move((0.15, 0.45 - 0.0004 * k, 0.15))
@@ -56,6 +57,10 @@ def press(client: Client) -> None:
         if k == 150:
             client.push("cube", at="top", force=(0.5, 0, 0), duration=0.1)
     tool.move((0.1, 0.45, 0.15), rotation=(0.8, 0, 0.6, 0), wait=True)
+    client.pause()
+    for k in range(5):
+        tool.move((0.1 + 0.01 * k, 0.45, 0.15), wait=True)
+    client.resume()
 
 
 @pytest.fixture(scope="module")
