@@ -187,7 +187,7 @@ class Client:
         return Steps(self._session.zenoh, self.name)
 
     def reactions(self) -> Steps:
-        """Subscribes to what objects exert on obstacles in each step, which comes within about a millisecond.
+        """Subscribes to what objects exert on obstacles in each step, sent each millisecond.
 
         The ObjectSteps that it returns hold object, step, time, contacts and reactions alone.
         """
