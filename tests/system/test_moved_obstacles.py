@@ -48,7 +48,7 @@ max_speed = 0.4
 
 
 def press(client: Client) -> None:
-    """Sends the tool into the cube, about 1000 times a second, and lifts it again, last in a pause; a push in between."""
+    """Sends the tool into the cube about 1000 times a second and lifts it, last in a pause; a push in between."""
     tool = client.obstacle("tool")
     for k in range(300):
         tool.move((0.15, 0.45 - 0.0004 * k, 0.15))
