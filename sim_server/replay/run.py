@@ -26,12 +26,14 @@ from sim_server.arrays import Float64
 from sim_server.errors import DeviceError
 from sim_server.mechanics.world import Body
 from sim_server.recording import messages
+from sim_server.recording.obstacles import obstacle_messages, targets_of
 from sim_server.replay.log import Recording
 from sim_server.replay.report import Comparison
 from sim_server.scene import Scene, deleted
 from sim_server.scene.messages import readable
 from sim_server.simulation import Simulation
 from sim_server.updates.factor_source import Inline, Job
+from sim_server.updates.snapshots import request_matrices
 from sim_server.updates.worker_assembly import Assembly
 
 if TYPE_CHECKING:
@@ -68,15 +70,18 @@ class Replay:
         self.engine, self.bodies = self.simulation.engine, self.simulation.world.bodies
         self.compared = Comparison(recording)
         self._same_meshes()
+        self._same_obstacles()
         self._taken = {b.name: taken_up(self._rows(b.name)) for b in self.bodies}
         self._last_use = self._last_uses()
         self._needed = set(self._last_use)  # (object, step) of matrices whose factor the loop used
         self._factors: dict[tuple[str, int], Factor] = {}
         self._in_use: dict[str, int] = {}
         self._touch_sets: dict[int, pb.TouchSet] = {t.step: t for t in recording.touch}
+        self._targets: dict[int, pb.ObstacleTargets] = {t.step: t for t in recording.targets}
         self._nodes: dict[int, tuple[NDArray[np.int32], Float64]] = {}  # nodes and offsets of interactions, by id
         self._inline = self._library()
         self._positions: dict[str, Float64] = {}  # sent instead of a matrix, and not those of its step, by body
+        self._copies: dict[int, Float64] = {}  # of matrices with contact, by number of the body
         self._assemblies: dict[str, Assembly] = {}
         if self.simulation.world.backend.build() != recording.scene.build and recording.scene.build:
             self.compared.notes.append(
@@ -88,10 +93,12 @@ class Replay:
         self._compare_frames(0)
         for step in range(self.recording.steps):
             self._restore_interactions(step)
+            self._restore_targets(step)
             for body in self.bodies:
                 self._apply_settings(body.index, body.name, step)
                 self._use_factor(body.index, body.name, step, fresh=False)
             self._request_positions(step)
+            self._request_matrices(step)
             self.engine.assemble()
             self._make_factors(step)
             for body in self.bodies:
@@ -128,6 +135,15 @@ class Replay:
                     f"({', '.join(other)}){f'; was {file} changed?' if file else ''}"
                 )
 
+    def _same_obstacles(self) -> None:
+        for now in obstacle_messages(self.simulation):
+            then = self.recording.obstacles.get(now.header.object)
+            if then is not None and (now.vertices, now.triangles) != (then.vertices, then.triangles):
+                raise BadLog(
+                    f"{self.recording.path}: the surface of obstacle {now.header.object!r} is not the recorded one; "
+                    "was its file changed?"
+                )
+
     def _library(self) -> Inline:
         """Returns a source of factors that uses the library named in the log, if it is installed."""
         system = self.simulation.system
@@ -157,6 +173,18 @@ class Replay:
         except Refused as error:
             raise BadLog(f"{self.recording.path}: interactions of step {step}: {error}") from error
 
+    def _restore_targets(self, step: int) -> None:
+        """Has obstacles go where the loop had them go from this step on."""
+        if step not in self._targets:
+            return
+        contact, targets = self.simulation.contact, targets_of(self._targets[step])
+        if contact is None:
+            raise BadLog(f"{self.recording.path}: moved obstacles in a scene that has none")
+        try:
+            contact.restore(targets)
+        except ValueError as error:
+            raise BadLog(f"{self.recording.path}: obstacles moved at step {step}: {error}") from error
+
     def _interaction(self, m: pb.Interaction) -> Interaction:
         from sim_server.effects.touch import Interaction
 
@@ -183,6 +211,11 @@ class Replay:
                 self._positions[body.name] = np.empty((body.last - body.first, 3))
                 self.engine.request_positions(body.index, self._positions[body.name], use.ahead)
 
+    def _request_matrices(self, step: int) -> None:
+        """Requests the matrices of this step whose factors the loop used, unless positions were sent."""
+        made = [body for body in self.bodies if (body.name, step) in self._needed and body.name not in self._positions]
+        self._copies = request_matrices(self.simulation, made)
+
     def _make_factors(self, step: int) -> None:
         """Makes the factors of this step, and those of the last one whose positions were sent at its end."""
         for body in self.bodies:
@@ -197,7 +230,9 @@ class Replay:
 
     def _submit(self, body: Body, made: int) -> None:
         warped = body.index in self.simulation.warped
-        values, solver = self.simulation.system.body_values(body.first, body.last), self.simulation.scene.solver
+        values, solver = self._copies.get(body.index), self.simulation.scene.solver
+        if values is None:
+            values = self.simulation.system.body_values(body.first, body.last)
         if body.name in self._positions:
             if body.name not in self._assemblies:
                 topology = messages.topology(self.simulation, body)

@@ -305,7 +305,7 @@ class GpuEngine(DeviceLoop):
         self.gpu.cp.cuda.get_current_stream().synchronize()  # its arrays are complete
         return self.mailboxes[self._mailed[launch]].post(cast(DeviceLaunch, new).params.tobytes(), keep=new)
 
-    def records(self) -> NDArray[Any]:
-        """Returns the records since the last call, oldest first; also begins to build inverses that were queued."""
+    def records_and_reactions(self) -> tuple[NDArray[Any], Float64]:
+        """Returns what came since the last call, oldest first; also begins to build inverses that were queued."""
         self._factor_upload.advance()
-        return super().records()
+        return super().records_and_reactions()
