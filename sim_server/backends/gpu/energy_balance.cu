@@ -4,13 +4,9 @@
 // prologue of the kernel over elements that begins the next step (kernel_fusion.py), or by itself after the last step of a batch. A
 // step is settled once: later launches for it do nothing.
 #include "energy_record.cuh"
+#include "node_chunk.cuh"
 
 constexpr int STILL = 5, WARPS = 4;  // most arrays that are 0 at rest; most warps of a thread block
-
-struct NodeChunk {
-    int body, begin, end;  // nodes
-    int first, chunks;     // of the body
-};
 
 struct EnergyBalance {
     const int* first_node;      // (bodies + 1,) node of each body
