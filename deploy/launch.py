@@ -80,6 +80,10 @@ def part_of(scene: Scene, part: Part) -> str:
     """Writes the scene file of a part."""
     table = scene.resolved()
     table["object"] = [table["object"][index] for index in part.objects]
+    contact, names = table["effects"].get("contact"), {o["name"] for o in table["object"]}
+    if contact and contact["friction"]:
+        obstacles = {o["name"] for o in table["obstacle"]}
+        contact["friction"] = [pair for pair in contact["friction"] if {*pair["between"]} <= names | obstacles]
     return "".join(f"{key} = {toml(value)}\n" for key, value in table.items())
 
 

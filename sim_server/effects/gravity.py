@@ -36,6 +36,7 @@ class Gravity(Effect):
 
     def __init__(self, world: World, g: tuple[float, float, float]):
         self.world, self.g = world, np.array(g, dtype=float)
+        world.gravity = g
 
     def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
         w = self.world

@@ -142,7 +142,8 @@ HOST_DEVICE double distance_to(const ObstacleTable& t, int obstacle, const doubl
 }
 
 // The same where the path from -> to is at time s.
-HOST_DEVICE double distance_at(const ObstacleTable& t, int obstacle, const double* from, const double* along, double s, double* normal) {
+HOST_DEVICE double distance_at(const ObstacleTable& t, int obstacle, const double* from, const double* along, double s,
+                               double* normal) {
     const double p[3] = {from[0] + s * along[0], from[1] + s * along[1], from[2] + s * along[2]};
     return distance_to(t, obstacle, p, normal);
 }
@@ -152,7 +153,7 @@ HOST_DEVICE double distance_at(const ObstacleTable& t, int obstacle, const doubl
 HOST_DEVICE double entry_of_convex(const ObstacleTable& t, int obstacle, const double* from, const double* along, double above,
                                    double slope, double inflate) {
     double scale = inflate, s = 0, normal[3];
-    for (int k = 0; k < 3; ++k) scale += fabs(from[k]) + fabs(along[k]) + (t.kind[obstacle] == PLANE ? 0 : t.size[4 * obstacle + k]);
+    for (int k = 0; k < 3; ++k) scale += fabs(from[k]) + fabs(along[k]) + t.size[4 * obstacle + k];  // unused sizes are 0
     const double rounding = 1e-15 * scale;
     for (int trial = 0; trial < 100 && slope < 0 && above > rounding; ++trial) {
         s -= above / slope;
@@ -164,8 +165,8 @@ HOST_DEVICE double entry_of_convex(const ObstacleTable& t, int obstacle, const d
 }
 
 // Part [first, last] of the path in the grid's box, grown by `grow`; outside of it the distance is more than that.
-HOST_DEVICE bool part_within(const ObstacleTable& t, int obstacle, const double* from, const double* along, double grow, double* first,
-                             double* last) {
+HOST_DEVICE bool part_within(const ObstacleTable& t, int obstacle, const double* from, const double* along, double grow,
+                             double* first, double* last) {
     const double* size = t.size + 4 * obstacle;
     *first = 0;
     *last = 1;

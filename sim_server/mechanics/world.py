@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The objects of a scene, one after another in the same arrays, so that one launch serves all of them."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -14,11 +14,12 @@ from sim_server.errors import InputError
 from sim_server.mesh import Mesh, posed
 from sim_server.mesh.surface import volumes
 from sim_server.scene import Scene, SceneObject
+from sim_server.scene.obstacles import Obstacle
 
 
 @dataclass(frozen=True)
 class Body:
-    """The part of the arrays that belongs to one object: nodes [first, last)."""
+    """The part of the arrays that belongs to one object: nodes [first, last). friction: of its surface; 0 if unused."""
 
     index: int
     name: str
@@ -26,6 +27,7 @@ class Body:
     first: int
     last: int
     effects: dict[str, Any]
+    friction: float = 0.0
 
     @property
     def nodes(self) -> slice:
@@ -51,6 +53,7 @@ class World:
     free (n,): 1, or 0 at fixed nodes; alpha, beta (bodies,): Rayleigh damping of the mass [1/s] and of the stiffness
     [s]; dt: time step [s];
     projection: of the elements' stiffness, the scene's choice;
+    obstacles: of the scene; gravity: acceleration, 0 without the effect [m/s2];
     backend: where kernels run.
 
     Effects use the following of the integrator in place of dt and v (formulas: integrator.py; symbols:
@@ -74,8 +77,11 @@ class World:
         meshes = [(o, o.load_mesh()) for o in scene.objects]
         first = 0
         for o, mesh in meshes:
-            self.bodies.append(Body(len(self.bodies), o.name, mesh, first, first + len(mesh.rest), dict(o.effects)))
-            first += len(mesh.rest)
+            last = first + len(mesh.rest)
+            self.bodies.append(Body(len(self.bodies), o.name, mesh, first, last, dict(o.effects), o.friction or 0.0))
+            first = last
+        self.obstacles: Sequence[Obstacle] = scene.obstacles or []
+        self.gravity = (0.0, 0.0, 0.0)
         self.rest = np.concatenate([mesh.rest for _, mesh in meshes])
         self.x = np.concatenate([posed(mesh.rest, o.pose.rotate, o.pose.translate) for o, mesh in meshes])
         self.v = np.zeros_like(self.x)

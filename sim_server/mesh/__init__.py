@@ -93,7 +93,7 @@ def read(path: str | Path) -> Mesh:
     path = Path(path)
     if not isfile(path):
         raise InputError(f"mesh {path}: no such file")
-    data = _meshio_read(path)
+    data = meshio_read(path)
     rest = np.asarray(data.points, dtype=np.float64)
     if rest.shape[1:] != (3,):
         raise InputError(f"mesh {path}: node coordinates have shape {rest.shape}: must be (n, 3)")
@@ -114,7 +114,7 @@ def read(path: str | Path) -> Mesh:
     return Mesh(rest[used], number[tets].astype(np.int32), path.name, dropped)
 
 
-def _meshio_read(path: Path) -> Any:
+def meshio_read(path: Path) -> Any:
     import meshio
     from meshio._helpers import extension_to_filetypes
 

@@ -21,6 +21,7 @@ MESSAGES = {
     "model_type": "must be a table",
     "model_attributes_type": "must be a table",
 }
+NAMED = ("object", "obstacle")  # lists of tables that have names
 MAX_VALUE = 80  # characters of a value in a message
 
 
@@ -35,10 +36,11 @@ def _line(error: Any, table: dict[str, Any]) -> str:
     message = deleted.advice(key, error["input"]) or _message(error)
     if path == ["object"] and error["type"] == "missing":
         message = "a scene needs at least one [[object]]"
-    elif path == ["object"] and isinstance(error["input"], dict):
-        message = "write [[object]] with double brackets, once per object"
+    elif path in [[kind] for kind in NAMED] and isinstance(error["input"], dict) and error["type"] == "list_type":
+        message = f"write [[{path[0]}]] with double brackets, once per {path[0]}"
     place = _place(path, table)
-    if error["type"] != "missing" and not isinstance(error["input"], dict) and path[:1] and path != ["object"]:
+    whole = len(path) == 1 and path[0] in NAMED
+    if error["type"] != "missing" and not isinstance(error["input"], dict) and path[:1] and not whole:
         place += f" = {_toml(error['input'])}"
     return f"{place}: {message}"
 
@@ -52,16 +54,16 @@ def _message(error: Any) -> str:
 
 
 def _place(path: list[str | int], table: dict[str, Any]) -> str:
-    if len(path) >= 2 and path[0] == "object" and isinstance(path[1], int):
-        where = [_object(path[1], table), _dotted(path[2:])]
+    if len(path) >= 2 and path[0] in NAMED and isinstance(path[1], int):
+        where = [_named(path[0], path[1], table), _dotted(path[2:])]
         return ", ".join(part for part in where if part)
     return _dotted(path)
 
 
-def _object(index: int, table: dict[str, Any]) -> str:
-    entry = table["object"][index]
+def _named(kind: str, index: int, table: dict[str, Any]) -> str:
+    entry = table[kind][index]
     name = entry.get("name") if isinstance(entry, dict) else None
-    return f"object {name!r}" if isinstance(name, str) and name else f"object {index + 1}"
+    return f"{kind} {name!r}" if isinstance(name, str) and name else f"{kind} {index + 1}"
 
 
 def _dotted(path: list[str | int]) -> str:

@@ -19,21 +19,14 @@ from pydantic import (
 )
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from protocol.channels import check_name
-from protocol.refused import Refused
 from sim_server.errors import InputError
 from sim_server.mesh import Mesh, bar, check, read
 from sim_server.scene.effect_tables import checked_effects
 from sim_server.scene.integrator_options import IntegratorOptions
-from sim_server.scene.parameters import Count, Counts, File, Parameters, Positive, Sizes, Vector, complaint
+from sim_server.scene.obstacles import FRICTION, Obstacle, contact_errors
+from sim_server.scene.parameters import Count, Counts, File, Name, NotNegative, Parameters, Positive, Sizes, complaint
+from sim_server.scene.pose import Pose
 from sim_server.scene.solver_options import SolverOptions
-
-
-class Pose(Parameters):
-    """Pose of an object: rotation about the fixed axes x, then y, then z, followed by a translation."""
-
-    rotate: Vector = Field(default=(0.0, 0.0, 0.0), description="angles [degrees]")
-    translate: Vector = Field(default=(0.0, 0.0, 0.0), description="[m]")
 
 
 class MeshSource(Parameters):
@@ -61,13 +54,6 @@ class MeshSource(Parameters):
         return self
 
 
-def _object_name(name: str) -> str:
-    try:
-        return check_name(name, "name")  # it becomes part of a channel's key
-    except Refused:
-        raise complaint("must be 1 to 64 characters of A-Z a-z 0-9 _ . -") from None
-
-
 def _effects(scope: str) -> tuple[PlainValidator, PlainSerializer]:
     """Returns the validator and the serializer of a table of effects of one scope."""
     return PlainValidator(partial(_effects_of, scope)), PlainSerializer(_dumped_effects)
@@ -84,13 +70,16 @@ def _dumped_effects(effects: dict[str, BaseModel]) -> dict[str, Any]:
 class SceneObject(Parameters):
     """One deformable object."""
 
-    name: Annotated[str, AfterValidator(_object_name)]
+    name: Name
     mesh: MeshSource
     pose: Pose = Pose()
     density: Positive | None = Field(default=None, description="[kg/m3]; 1000 if neither density nor mass is given")
     mass: Positive | None = Field(default=None, description="of the whole object, instead of density [kg]")
     masses: Literal["volume", "equal"] = Field(
         default="volume", description="nodal masses: a quarter of each adjacent element, or the same for every node"
+    )
+    friction: NotNegative | None = Field(
+        default=None, description="coefficient of its surface [-]; 0.5 where the scene lists contact"
     )
     effects: Annotated[dict[str, BaseModel], *_effects("object")] = Field(default_factory=dict)
 
@@ -156,6 +145,7 @@ class Scene(Parameters):
     solver: SolverOptions = SolverOptions()
     record: RecordOptions = RecordOptions()
     objects: Annotated[list[SceneObject], AfterValidator(_some_objects)] = Field(alias="object")
+    obstacles: list[Obstacle] | None = Field(default=None, alias="obstacle", min_length=1)
 
     _path: Path = PrivateAttr(Path())
     _text: str = PrivateAttr("")
@@ -199,6 +189,18 @@ class Scene(Parameters):
                     errors.append(InitErrorDetails(type=error, loc=place, input={}))
         if errors:
             raise ValidationError.from_exception_data("Scene", errors)
+        return self
+
+    @model_validator(mode="after")
+    def _as_contact_needs(self) -> "Scene":
+        """Checks obstacles and contact, and fills in the friction of objects where the scene lists contact."""
+        given = self.effects.get("contact"), self.objects, self.obstacles or []
+        if errors := list(contact_errors(*given, self.integrator)):
+            raise ValidationError.from_exception_data("Scene", errors)
+        if "contact" in self.effects:
+            for index, o in enumerate(self.objects):
+                if o.friction is None:
+                    self.objects[index] = o.model_copy(update={"friction": FRICTION})
         return self
 
     @property

@@ -10,7 +10,8 @@ from sim_server.scene.parameters import nearest
 
 
 def apply(override: str, table: dict[str, Any]) -> None:
-    """Sets one value of a parsed scene: ``solver.tolerance=1e-8``, ``object.NAME.effects.corotational.young=1e6``.
+    """Sets one value of a parsed scene: ``solver.tolerance=1e-8``, ``object.NAME.effects.corotational.young=1e6``,
+    ``obstacle.NAME.friction=0.2``.
 
     Missing tables on the way are created, so that an override may list an effect. The validation of the scene finds
     unknown keys. Raises InputError for an unknown object or a key below a value that is no table.
@@ -20,8 +21,10 @@ def apply(override: str, table: dict[str, Any]) -> None:
     if not equals or not key or not all(key.split(".")):
         raise InputError("must be KEY=VALUE, as solver.tolerance=1e-8 or object.beam.density=900")
     place = table
-    if key == "object" or key.startswith("object."):
-        place, key = _object(key.removeprefix("object").lstrip("."), table)
+    for kind in ("object", "obstacle"):
+        if key == kind or key.startswith(f"{kind}."):
+            place, key = _named(kind, key.removeprefix(kind).lstrip("."), table)
+            break
     *parents, last = key.split(".")
     for depth, part in enumerate(parents):
         below = place.get(part)
@@ -44,15 +47,18 @@ def _tables(value: Any) -> bool:
     return isinstance(value, list) and bool(value) and all(isinstance(v, dict) for v in value)
 
 
-def _object(key: str, table: dict[str, Any]) -> tuple[dict[str, Any], str]:
-    """Returns the table of an object and the key inside it. Names may hold dots, so the longest matching name wins."""
-    entries = table.get("object")
+def _named(kind: str, key: str, table: dict[str, Any]) -> tuple[dict[str, Any], str]:
+    """Returns the table of an object (or obstacle) and the key inside it.
+
+    Names may hold dots, so the longest matching name wins.
+    """
+    entries = table.get(kind)
     entries = [e for e in entries if isinstance(e, dict)] if isinstance(entries, list) else []
     named = {e["name"]: e for e in entries if isinstance(e.get("name"), str)}
     fitting = [name for name in named if key.startswith(name + ".")]
     if not fitting:
         wanted = key.split(".")[0]
-        raise InputError(f"no object {wanted!r} with a key after it" + nearest(wanted, list(named), "objects"))
+        raise InputError(f"no {kind} {wanted!r} with a key after it" + nearest(wanted, list(named), f"{kind}s"))
     name = max(fitting, key=len)
     return named[name], key[len(name) + 1 :]
 

@@ -23,6 +23,8 @@ from pydantic import (
 from pydantic_core import InitErrorDetails, PydanticCustomError
 from pydantic_core.core_schema import ValidatorFunctionWrapHandler
 
+from protocol.channels import check_name
+from protocol.refused import Refused
 from sim_server.errors import InputError
 from sim_server.scene import where
 
@@ -91,6 +93,14 @@ def _found(name: str, info: ValidationInfo) -> str:
     return str(path.resolve())
 
 
+def _name(name: str) -> str:
+    try:
+        return check_name(name, "name")  # it becomes part of a channel's key
+    except Refused:
+        raise complaint("must be 1 to 64 characters of A-Z a-z 0-9 _ . -") from None
+
+
+Name = Annotated[str, AfterValidator(_name)]
 Vector = Annotated[tuple[float, float, float], BeforeValidator(as_tuple)]
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]

@@ -67,7 +67,7 @@ class Assembly:
 
 
 def single_object_scene(resolved: str, name: str, mesh: Mesh) -> Scene:
-    """Returns the scene of one object alone, on a CPU, with this mesh.
+    """Returns the scene of one object alone, on a CPU, with this mesh; without contact, which A does not hold.
 
     resolved: Scene.resolved
     name: of the object
@@ -77,6 +77,8 @@ def single_object_scene(resolved: str, name: str, mesh: Mesh) -> Scene:
         table: dict[str, Any] = json.loads(resolved)
         listed = [o for o in table["object"] if o["name"] == name]
         table["solver"] = {**table["solver"], **WORKER_SETTINGS}
+        table["effects"] = {name: given for name, given in table["effects"].items() if name != "contact"}
+        table.pop("obstacle", None)
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise Refused(f"Scene.resolved is no scene: {type(error).__name__}", "malformed") from error
     if len(listed) != 1:

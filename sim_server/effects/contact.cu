@@ -1,0 +1,262 @@
+// SPDX-License-Identifier: MIT
+// Obstacles in motion, and what of a surface may touch them in a step (contact.py).
+#include "kernel.h"
+#include "shapes.cuh"
+
+// What decides about the pose of an obstacle.
+enum Motion { FIXED = 0, KEYFRAMES = 1, CLIENT = 2 };
+
+struct Place {
+    int n;                 // obstacles
+    const double* clock;   // (1,) t at the start of the step [s]
+    double dt;             // time step [s]
+    const int* motion;     // (n,) Motion
+    const int* first;      // (n + 1,) into the keyframes
+    const double* time;    // (first[n],) of each keyframe, ascending [s]
+    const double* frame;   // (first[n], 7) its pose
+    const double* target;  // (n, 7) poses that clients want
+    const double* speed;   // (n,) greatest speed towards them [m/s]
+    const double* turn;    // (n,) greatest angular velocity [rad/s]
+    const double* ball;    // (n, 4) centre and radius of a sphere around the shape, in its frame; radius < 0: it has no end
+    double* placed;        // (n,) t for which begin and end are; negative at first [s]
+    double* begin;         // (n, 7) out: pose at t
+    double* end;           // (n, 7) in, out: pose at t + dt
+    double* swept;         // (n, 4) out: centre and radius of a sphere around the ball at both poses; radius < 0: it has no end
+};
+
+// Turns from the rotation of pose a to that of b, by part s of the angle between them and at most `most` [rad]. Returns the angle.
+INLINE double turn_between(const double* a, const double* b, double s, double most, double* out) {
+    double w = 0, size = 0, between[4];
+    for (int k = 3; k < 7; ++k) w += a[k] * b[k];
+    const double sign = w < 0 ? -1 : 1;
+    for (int k = 0; k < 4; ++k) {  // the part of b that is not along a
+        between[k] = sign * b[3 + k] - sign * w * a[3 + k];
+        size += between[k] * between[k];
+    }
+    size = sqrt(size);
+    const double half = atan2(size, sign * w);
+    const double angle = 2 * s * half < most ? s * half : most / 2;
+    const double along = cos(angle), aside = size > 0 ? sin(angle) / size : 0;
+    double length = 0;
+    for (int k = 0; k < 4; ++k) {
+        out[3 + k] = along * a[3 + k] + aside * between[k];
+        length += out[3 + k] * out[3 + k];
+    }
+    length = sqrt(length);
+    for (int k = 3; k < 7; ++k) out[k] /= length;
+    return 2 * half;
+}
+
+// Pose between the keyframes [first, last) at time t: straight, and by the shortest rotation at constant angular velocity.
+INLINE void pose_at(const Place& p, int first, int last, double t, double* out) {
+    int next = first;
+    while (next < last && p.time[next] <= t) ++next;
+    const double *b = p.frame + 7 * (next < last ? next : last - 1), *a = next > first ? b - (next < last ? 7 : 0) : b;
+    const double s = a == b ? 0 : (t - p.time[next - 1]) / (p.time[next] - p.time[next - 1]);
+    for (int k = 0; k < 3; ++k) out[k] = a[k] + s * (b[k] - a[k]);
+    turn_between(a, b, s, 10, out);
+}
+
+// Goes from a pose towards a target, at most `far` [m] and `most` [rad].
+INLINE void approach(const double* from, const double* target, double far, double most, double* out) {
+    double way[3];
+    for (int k = 0; k < 3; ++k) way[k] = target[k] - from[k];
+    const double length = sqrt(dot3(way, way)), part = length > far ? far / length : 1;
+    for (int k = 0; k < 3; ++k) out[k] = part == 1 ? target[k] : from[k] + part * way[k];
+    if (turn_between(from, target, 1, most, out) <= most)
+        for (int k = 3; k < 7; ++k) out[k] = target[k];
+}
+
+// A second call for the same t leaves `begin` as it is.
+MAILED_KERNEL(place, Place) {
+    const double t = p.clock[0];
+    double *begin = p.begin + 7 * i, *end = p.end + 7 * i;
+    if (p.placed[i] != t)
+        for (int k = 0; k < 7; ++k) begin[k] = end[k];
+    p.placed[i] = t;
+    if (p.motion[i] == KEYFRAMES) {
+        pose_at(p, p.first[i], p.first[i + 1], t, begin);
+        pose_at(p, p.first[i], p.first[i + 1], t + p.dt, end);
+    } else if (p.motion[i] == CLIENT) {
+        approach(begin, p.target + 7 * i, p.speed[i] * p.dt, p.turn[i] * p.dt, end);
+    }
+    double before[3], after[3], way[3];
+    world_point(begin, p.ball + 4 * i, before);
+    world_point(end, p.ball + 4 * i, after);
+    for (int k = 0; k < 3; ++k) {
+        way[k] = after[k] - before[k];
+        p.swept[4 * i + k] = before[k] + way[k] / 2;
+    }
+    const double radius = p.ball[4 * i + 3];
+    p.swept[4 * i + 3] = radius < 0 ? -1 : radius + sqrt(dot3(way, way)) / 2;
+}
+
+struct Detect {
+    int n;                   // surface nodes, two rows each
+    int obstacles;           // their number, m
+    const int* kind;         // (m,) as ObstacleTable in shapes.cuh has them, up to `end`
+    const double* size;      // (m, 4)
+    const double* grid;
+    const int* place;        // (m,)
+    const int* cells;        // (m, 3)
+    const double* begin;     // (m, 7)
+    const double* end;       // (m, 7)
+    const double* swept;     // (m, 4) sphere around each in this step; radius < 0: it has no end
+    const double* pair_friction;  // (bodies, m) coefficient of friction of each body on each obstacle
+    const int* node;         // (n,) of the scene, ascending
+    const int* body;         // (n,)
+    const real* x;           // (nodes, 3) [m]
+    const real* predictor;   // (nodes, 3) world.predictor: the step moves x by dx_dv (predictor + dv) [m/s]
+    const real* free;        // (nodes,) 1, or 0 at fixed nodes
+    const real* mass;        // (nodes,) [kg]
+    const local* block;      // (nodes, 6) what elements have put into the node's own block of A [kg]
+    const double* gravity;   // (3,) acceleration [m/s2]
+    double force_coefficient;  // world.force_coefficient [s]
+    double dx_dv;            // world.dx_dv [s]
+    double kappa;            // stiffness of a contact over that of its node
+    const double* thickness; // (2 n,) [m]
+    int* obstacle;           // (2 n,) in, out: number of the obstacle of a row; -1: the row is empty
+    double* normal;          // (2 n, 3) in, out
+    double* gap;             // (2 n,) out [m]
+    double* drift;           // (2 n, 3) out [m]
+    double* entry;           // (2 n,) out
+    double* stiffness;       // (2 n,) in, out: set in the first step [N/m]
+    double* friction;        // (2 n,) out
+    double* force;           // (2 n,) in, out [N]
+    double* traction;        // (2 n, 3) in, out [N]
+    int* dropped;            // (n,) in, out: obstacles that there was no row for, summed over the steps
+};
+
+// A place where a node may touch an obstacle: the plane that stands for it.
+struct Candidate {
+    int obstacle;       // -1: none
+    double entry;       // as a part of the step; NEVER
+    double distance;    // at the start of the step [m]
+    double point[3];    // touched, in the obstacle's frame
+    double normal[3];   // there, too
+};
+
+INLINE bool comes_first(const Candidate& a, const Candidate& b) {
+    return b.obstacle < 0 || a.entry < b.entry || (a.entry == b.entry && a.distance < b.distance);
+}
+
+// Looks for the plane of an obstacle for the path x -> x + s; obstacle -1 where the path stays away.
+INLINE Candidate candidate_of(const ObstacleTable& t, int o, const double* x, const double* s, double thickness) {
+    Candidate c = {-1, NEVER, 0, {}, {}};
+    double from[3], to[3], way[3], stop[3];
+    for (int k = 0; k < 3; ++k) stop[k] = x[k] + s[k];
+    local_point(t.begin + 7 * o, x, from);
+    local_point(t.end + 7 * o, stop, to);
+    for (int k = 0; k < 3; ++k) way[k] = to[k] - from[k];
+    c.distance = distance_to(t, o, from, c.normal);
+    const double steepest = t.kind[o] == GRID ? 1.7320508075688772 : 1;  // slope of the distance
+    if (!(c.distance - steepest * sqrt(dot3(way, way)) < 2 * thickness)) return c;
+    double away = c.distance;
+    c.entry = entry_time(t, o, from, to, thickness);
+    if (c.entry <= 1) {
+        for (int k = 0; k < 3; ++k) from[k] += c.entry * way[k];
+        away = distance_to(t, o, from, c.normal);
+    } else if (!(c.distance < 2 * thickness)) {
+        return c;
+    }
+    for (int k = 0; k < 3; ++k) c.point[k] = from[k] - away * c.normal[k];
+    c.obstacle = o;
+    return c;
+}
+
+// Turns v by the smallest rotation from the normal `before` to `now`, and takes what is left of it along `now` away.
+INLINE void turn_with(const double* before, const double* now, double* v) {
+    const double axis[3] = {before[1] * now[2] - before[2] * now[1], before[2] * now[0] - before[0] * now[2],
+                            before[0] * now[1] - before[1] * now[0]};
+    const double cosine = dot3(before, now);
+    if (cosine > -0.999) {
+        const double along = dot3(axis, v) / (1 + cosine);
+        const double turned[3] = {cosine * v[0] + axis[1] * v[2] - axis[2] * v[1] + along * axis[0],
+                                  cosine * v[1] + axis[2] * v[0] - axis[0] * v[2] + along * axis[1],
+                                  cosine * v[2] + axis[0] * v[1] - axis[1] * v[0] + along * axis[2]};
+        for (int k = 0; k < 3; ++k) v[k] = turned[k];
+    }
+    const double out = dot3(now, v);
+    for (int k = 0; k < 3; ++k) v[k] -= out * now[k];
+}
+
+// What a row remembers of the last step.
+struct Memory {
+    int obstacle;
+    double force, normal[3], traction[3];
+};
+
+INLINE Memory memory_of(const Detect& p, int row) {
+    Memory m;
+    m.obstacle = p.obstacle[row];
+    m.force = p.force[row];
+    for (int k = 0; k < 3; ++k) {
+        m.normal[k] = p.normal[3 * row + k];
+        m.traction[k] = p.traction[3 * row + k];
+    }
+    return m;
+}
+
+INLINE void put_row(const Detect& p, const ObstacleTable& t, int i, int row, const Candidate& c, const double* x,
+                    const Memory* last) {
+    double *normal = p.normal + 3 * row, *drift = p.drift + 3 * row, *traction = p.traction + 3 * row, from[3], to[3];
+    p.obstacle[row] = c.obstacle;
+    p.force[row] = p.gap[row] = p.friction[row] = 0;
+    p.entry[row] = NEVER;
+    for (int k = 0; k < 3; ++k) traction[k] = drift[k] = 0;
+    if (c.obstacle < 0) return;
+    world_vector(t.end + 7 * c.obstacle, c.normal, normal);
+    world_point(t.begin + 7 * c.obstacle, c.point, from);
+    world_point(t.end + 7 * c.obstacle, c.point, to);
+    double gap = 0;
+    for (int k = 0; k < 3; ++k) {
+        drift[k] = to[k] - from[k];
+        gap += normal[k] * (x[k] - to[k]);
+    }
+    p.gap[row] = gap;
+    p.entry[row] = c.entry;
+    p.friction[row] = p.pair_friction[p.body[i] * p.obstacles + c.obstacle];
+    for (int r = 0; r < 2; ++r) {
+        if (last[r].obstacle != c.obstacle) continue;
+        p.force[row] = last[r].force;
+        for (int k = 0; k < 3; ++k) traction[k] = last[r].traction[k];
+        turn_with(last[r].normal, normal, traction);
+    }
+}
+
+KERNEL(detect, Detect) {
+    const int node = p.node[i];
+    const ObstacleTable t = {p.kind, p.size, p.grid, p.place, p.cells, p.begin, p.end};
+    const double thickness = p.thickness[2 * i];
+    double x[3], s[3], middle[3];
+    for (int k = 0; k < 3; ++k) {  // where the node would go under gravity alone
+        x[k] = p.x[3 * node + k];
+        s[k] = p.dx_dv * (p.predictor[3 * node + k] + p.force_coefficient * p.gravity[k]);
+        middle[k] = x[k] + s[k] / 2;
+    }
+    if (p.stiffness[2 * i] == 0) {
+        const double own = p.mass[node] + (p.block[6 * node] + p.block[6 * node + 3] + p.block[6 * node + 5]) / 3;
+        p.stiffness[2 * i] = p.stiffness[2 * i + 1] = p.kappa * own / (p.force_coefficient * p.dx_dv);
+    }
+    const double reach = sqrt(dot3(s, s)) / 2 + 2 * thickness;
+    Candidate first = {-1, NEVER, 0, {}, {}}, second = first;
+    int found = 0;
+    for (int o = 0; o < p.obstacles && p.free[node] != 0; ++o) {
+        const double* ball = p.swept + 4 * o;
+        const double off[3] = {middle[0] - ball[0], middle[1] - ball[1], middle[2] - ball[2]}, bound = reach + ball[3];
+        if (ball[3] >= 0 && !(dot3(off, off) <= bound * bound)) continue;
+        const Candidate c = candidate_of(t, o, x, s, thickness);
+        if (c.obstacle < 0) continue;
+        ++found;
+        if (comes_first(c, first)) {
+            second = first;
+            first = c;
+        } else if (comes_first(c, second)) {
+            second = c;
+        }
+    }
+    if (found > 2) p.dropped[i] += found - 2;
+    const Memory last[2] = {memory_of(p, 2 * i), memory_of(p, 2 * i + 1)};
+    put_row(p, t, i, 2 * i, first, x, last);
+    put_row(p, t, i, 2 * i + 1, second, x, last);
+}

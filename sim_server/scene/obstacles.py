@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: MIT
+"""The [[obstacle]] tables of a scene, and what contact needs of the scene as a whole."""
+
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+from typing import Annotated, Any, Literal, Protocol
+
+from pydantic import Field, model_validator
+from pydantic_core import InitErrorDetails
+
+from sim_server.scene.integrator_options import IntegratorOptions
+from sim_server.scene.parameters import File, Name, NotNegative, Parameters, Positive, Sizes, complaint, nearest
+from sim_server.scene.pose import Pose
+
+FRICTION = 0.5  # coefficient of a surface of which nothing is said
+KEYS = {  # of each shape: those that it must have
+    "plane": (), "sphere": ("radius",), "box": ("size",), "capsule": ("radius", "length"), "grid": ("file", "spacing"),
+}  # fmt: skip
+CLIENT = {"max_speed": 1.0, "max_turn": 3.0}  # defaults of an obstacle that a client moves
+
+
+class Keyframe(Pose):
+    """Pose at a time."""
+
+    time: NotNegative = Field(description="of the simulation [s]")
+
+
+class Obstacle(Parameters):
+    """A rigid shape that objects touch: fixed, moved along keyframes, or moved by a client."""
+
+    name: Name
+    shape: Literal["plane", "sphere", "box", "capsule", "grid"]
+    radius: Positive | None = Field(default=None, description="of a sphere or a capsule [m]")
+    size: Sizes | None = Field(default=None, description="of a box along x, y, z [m]")
+    length: Positive | None = Field(default=None, description="of the axis of a capsule, along y [m]")
+    file: File | None = Field(default=None, description="a closed surface, in a file that meshio reads")
+    scale: Positive | None = Field(default=None, description="scale of the coordinates in the file")
+    spacing: Positive | None = Field(default=None, description="of the grid of distances from the surface [m]")
+    friction: NotNegative = Field(default=FRICTION, description="coefficient of its surface [-]")
+    pose: Pose = Pose()
+    keyframes: Annotated[list[Keyframe], Field(min_length=1)] | None = Field(
+        default=None, description="poses at ascending times, held before the first and after the last"
+    )
+    moved: Literal["client"] | None = None
+    max_speed: Positive | None = Field(default=None, description="at which it goes to a client's pose [m/s]")
+    max_turn: Positive | None = Field(default=None, description="at which it turns to a client's pose [rad/s]")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _bounded_by_default(cls, table: Any) -> Any:
+        if not isinstance(table, dict) or table.get("moved") != "client":
+            return table
+        return {**table, **{key: value for key, value in CLIENT.items() if table.get(key) is None}}
+
+    @model_validator(mode="after")
+    def _keys_of_its_shape(self) -> "Obstacle":
+        all_keys = sorted({key for keys in KEYS.values() for key in keys} | {"scale"})
+        needed, given = KEYS[self.shape], [key for key in all_keys if getattr(self, key) is not None]
+        allowed = [*needed, *(["scale"] if self.shape == "grid" else [])]
+        if missing := [key for key in needed if key not in given]:
+            raise complaint(f"shape {self.shape!r} needs {' and '.join(missing)}")
+        if others := [key for key in given if key not in allowed]:
+            raise complaint(
+                f"shape {self.shape!r} has no {' and no '.join(others)}; allowed: {', '.join(allowed) or 'none'}"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _one_motion(self) -> "Obstacle":
+        if self.keyframes is not None and self.moved is not None:
+            raise complaint("keyframes and moved: allowed is one of the two")
+        if self.keyframes is not None and self.pose != Pose():
+            raise complaint("keyframes and pose: the first keyframe says where it is at the start; leave pose out")
+        if self.moved is None and (given := [key for key in CLIENT if getattr(self, key) is not None]):
+            raise complaint(" and ".join(given) + ' without moved = "client", whose poses they bound')
+        for before, after in pairwise(self.keyframes or ()):
+            if not before.time < after.time:
+                raise complaint(f"keyframes: time {after.time:g} s after {before.time:g} s; times must ascend")
+        return self
+
+
+class HasName(Protocol):
+    """An object of a scene, as far as contact names it."""
+
+    name: str
+
+
+def contact_errors(
+    contact: Any, objects: Sequence[HasName], obstacles: Sequence[Obstacle], integrator: IntegratorOptions
+) -> Iterator[InitErrorDetails]:
+    """Yields what is wrong with obstacles and contact as a whole.
+
+    contact: parameters of the effect, None without it
+    """
+    names, shapes = [o.name for o in objects], [o.name for o in obstacles]
+    for index, name in enumerate(shapes):
+        if name in names or name in shapes[:index]:
+            text = f"names must differ, also those of objects and obstacles; more than once: {name}"
+            yield _error(text, "obstacle", index)
+    if contact is None:
+        if obstacles:
+            yield _error("objects touch it by the effect contact: list contact = true under [effects]", "obstacle", 0)
+        return
+    if not obstacles:
+        yield _error("there is nothing to touch; needed: an [[obstacle]] at least", "effects", "contact")
+    if integrator.scheme != "backward_euler" or integrator.linearizations > 1:
+        found = f"{integrator.scheme!r} with linearizations = {integrator.linearizations}"
+        text = f"contact with integrator.scheme = {found}; allowed: 'backward_euler' with linearizations = 1"
+        yield _error(text, "effects", "contact")
+    pairs: list[set[str]] = []
+    for index, pair in enumerate(contact.friction or ()):
+        if text := _wrong_pair(set(pair.between), names, shapes, pairs):
+            yield _error(text, "effects", "contact", "friction", index, "between")
+        pairs.append(set(pair.between))
+
+
+def _wrong_pair(pair: set[str], objects: list[str], obstacles: list[str], earlier: list[set[str]]) -> str:
+    for name in sorted(pair):
+        if name not in objects and name not in obstacles:
+            return f"no object or obstacle {name!r}" + nearest(name, [*objects, *obstacles], "names")
+    if len(pair & set(objects)) != 1 or len(pair & set(obstacles)) != 1:
+        return f"{' and '.join(sorted(pair))}: must be an object and an obstacle"
+    return f"{' and '.join(sorted(pair))} stand in the list already" if pair in earlier else ""
+
+
+def _error(message: str, *place: str | int) -> InitErrorDetails:
+    return InitErrorDetails(type=complaint(message), loc=place, input={})
