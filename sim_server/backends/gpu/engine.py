@@ -87,7 +87,8 @@ class GpuEngine(DeviceLoop):
         energy_records = device.pinned(CAPACITY * ENERGY_RECORD.itemsize * bodies)
         self._energies = DeviceEnergies(gpu, given.energies, energy_records, self._counter, dt)
         alone = stages is not None and stages.factor_alone
-        self._whole_assembly = self._beginning(assemble)
+        detection = [x for x in assemble if x.domain not in DOMAINS] if given.contact else []  # reads what the others make
+        self._whole_assembly = self._beginning([x for x in assemble if x not in detection], detection)
         forces = cast(Sequence[DeviceLaunch], stages.first) if stages else ()
         self._first_launches = self._beginning(forces) if alone else self._whole_assembly
         self._forces = fuse(forces) if alone else ()  # after a whole assembly, whose energy balance is made already
@@ -220,15 +221,17 @@ class GpuEngine(DeviceLoop):
         """Launches the kernel that writes the time at which the step begins, for an idle device."""
         self._stamp_begin((1,), (1,), (self._epilogue,))
 
-    def _beginning(self, assemble: Sequence[DeviceLaunch]) -> Sequence[Callable[[], None]]:
-        """Fuses the assembly with the energy balance of the step before; launches of no domain come last.
+    def _beginning(
+        self, assemble: Sequence[DeviceLaunch], after: Sequence[DeviceLaunch] = ()
+    ) -> Sequence[Callable[[], None]]:
+        """Fuses the assembly with the energy balance of the step before. after: launches that follow, one by one.
 
         The balance is the prologue of a kernel over elements, since these write nothing that it reads. If it freezes a
         body meanwhile, the element results of this body do not matter, since its nodes are fixed then.
         """
         domains = {launch.domain for launch in assemble}
         elements = "elements" in domains and domains <= set(DOMAINS)
-        launches = fuse(assemble, prologue=self._energies.prologue if elements else None)
+        launches = fuse(assemble, prologue=self._energies.prologue if elements else None, after=after)
         if not elements:
             return [self._energies.launch_balance, *launches]
         first = launches[0]
@@ -324,7 +327,8 @@ class GpuEngine(DeviceLoop):
         self.gpu.cp.cuda.get_current_stream().synchronize()  # its arrays are complete
         return self.mailboxes[self._mailed[launch]].post(cast(DeviceLaunch, new).params.tobytes(), keep=new)
 
-    def records(self) -> NDArray[Any]:
-        """Returns the records since the last call, oldest first; also begins to build inverses that were queued."""
+    def records_and_reactions(self) -> tuple[NDArray[Any], Float64]:
+        """Returns the records since the last call, oldest first, and reactions of obstacles (Reports); also begins to
+        build inverses that were queued."""
         self._factor_upload.advance()
-        return super().records()
+        return super().records_and_reactions()
