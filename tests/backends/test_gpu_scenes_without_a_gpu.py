@@ -14,6 +14,7 @@ from sim_server.backends.gpu.inverse.plan import plan
 from sim_server.backends.gpu.inverse.workspace import workspace
 from sim_server.simulation import Simulation
 from tests.backends import fake_cupy
+from tests.contact.scenes import FLOOR, RAM, block_on
 from tests.support import nvrtc
 from tests.worker.block_matrices import bar_edges, pattern
 
@@ -69,6 +70,30 @@ def test_a_scene_is_built_and_its_kernels_compile(cupy, name):
     engine.settle_factors()
     engine.run(1)
     assert engine.factor_bytes(body.index) > 9 * nodes
+
+
+@pytest.mark.parametrize("precision", ["float64", "mixed", "float32"])
+def test_a_scene_with_contact_is_built(cupy, tmp_path, precision):
+    path = block_on(tmp_path, (RAM, FLOOR), solver=f'preconditioner = "cholesky"\nprecision = "{precision}"')
+    simulation = Simulation.load(path, [], "gpu")
+    names = [kernel for kernel, _ in cupy.calls]
+    one_pass = ["contact_forces", "pcg", "contact_search"]
+    step = ["place", "detect", "begin_contact", *one_pass, *one_pass, "finish_contact", "fused"]
+    first = names.index("place")
+    assert names[first : first + len(step)] == step
+    engine = simulation.engine
+    engine.run(3)
+    records, reactions = engine.records_and_reactions()
+    assert records["step"].tolist() == [1, 2, 3] and reactions.shape == (3, 2, 6)
+    exact = vars(simulation.contact.contact_input())
+    twins = {name: engine.gpu.twin(array) for name, array in exact.items() if name in ("gap", "force", "normal")}
+    assert {twin.dtype for twin in twins.values()} == {np.dtype("f8")}
+
+
+def test_a_scene_without_contact_has_nothing_of_it(cupy):
+    engine = Simulation.load("deploy/scenes/beam.toml", [], "gpu").engine
+    assert not any("contact" in kernel for kernel, _ in cupy.calls)
+    assert engine._contact is None and engine.records_and_reactions()[1].shape == (0, 0, 6)
 
 
 def test_what_a_build_of_an_inverse_reads_is_there_before_its_own_stream_runs(cupy):

@@ -439,7 +439,7 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) contact_search(con
     const NodeChunk here = c.chunks[blockIdx.x];
     ContactState state = c.state[here.body];
     const int phase = state.phase, i = here.begin + threadIdx.x;
-    if (phase == OVER) return;
+    if (phase == OVER || phase == READY) return;  // READY: only the start was chosen
     double sum[CONTACT_SUMS] = {};
     if (i < here.end && phase != LOST) {
         const SurfaceNode n = SurfaceNode::at(c, i);

@@ -45,3 +45,33 @@ struct ContactSolve {   // what a solve has beside PcgArguments
     double tolerance;     // of the contact residual
     int passes, first_of_step;
 };
+
+// What becomes of a body that is READY. r2: square of the residual before the pass. goal2: of that which the last pass is to reach.
+HOST_DEVICE int outcome_of(const ContactState& c, const ContactSolve& pass, double r2, double goal2) {
+    const bool last = c.by_law && r2 <= pass.tolerance * pass.tolerance * c.given2;
+    if (last) return r2 <= goal2 ? ENDED : LAST_PASSED;
+    return c.passes >= pass.passes ? ENDED : PASSED;
+}
+
+// Adds a solve to a body's state and to the result of its step.
+HOST_DEVICE void note_pass(ContactState& c, const ContactSolve& pass, int outcome, PcgResult& sum, const PcgResult& out) {
+    c.phase = out.status == NOT_FINITE ? LOST : outcome;
+    if (c.phase == ENDED) {
+        c.residual = out.residual;
+        if (c.by_law && out.residual <= pass.tolerance) sum.residual = out.residual;
+        return;
+    }
+    if (pass.first_of_step) {
+        sum = out;
+        return;
+    }
+    ++c.passes;
+    sum.seconds += out.seconds;
+    sum.iterations += out.iterations;
+    sum.fallbacks += out.fallbacks;
+    sum.kind = out.kind;
+    sum.status = out.status;
+    sum.bad_node = out.bad_node;
+    sum.residual = out.residual;
+    if (out.factor_step >= 0) sum.factor_step = out.factor_step;
+}

@@ -287,11 +287,11 @@ struct PcgSolver {
             return true;
         }
         if (c.phase == WITHOUT) return false;
-        const bool last = c.by_law && r2 <= pass.tolerance * pass.tolerance * c.given2, ends = last ? r2 <= memory.goal : c.passes >= pass.passes;
-        memory.outcome = ends ? ENDED : last ? LAST_PASSED : PASSED;
-        if (ends) memory.out.residual = c.given2 > 0 ? sqrt(r2 / c.given2) : 0;
-        else if (!last) memory.goal = fmax(memory.goal, EARLY * EARLY * r2);
-        return ends;
+        const int outcome = outcome_of(c, pass, r2, memory.goal);
+        memory.outcome = outcome;
+        if (outcome == ENDED) memory.out.residual = c.given2 > 0 ? sqrt(r2 / c.given2) : 0;
+        if (outcome == PASSED) memory.goal = fmax(memory.goal, EARLY * EARLY * r2);
+        return outcome == ENDED;
     }
 #endif
 
@@ -400,33 +400,6 @@ __device__ __forceinline__ void PcgSolver::solve() {
     }
 }
 
-#ifdef CONTACT_PASSES
-// Adds what became of a body to its state and its result. In one thread.
-__device__ __forceinline__ void note_pass(const ContactSolve& pass, int body, PcgResult& sum, const PcgResult& out) {
-    ContactState& c = pass.state[body];
-    const int phase = out.status == NOT_FINITE ? LOST : memory.outcome;
-    c.phase = phase;
-    if (phase == ENDED) {
-        c.residual = out.residual;
-        if (c.residual <= pass.tolerance && c.by_law) sum.residual = out.residual;
-        return;
-    }
-    if (pass.first_of_step) {
-        sum = out;
-        return;
-    }
-    ++c.passes;
-    sum.seconds += out.seconds;
-    sum.iterations += out.iterations;
-    sum.fallbacks += out.fallbacks;
-    sum.kind = out.kind;
-    sum.status = out.status;
-    sum.bad_node = out.bad_node;
-    sum.residual = out.residual;
-    if (out.factor_step >= 0) sum.factor_step = out.factor_step;
-}
-#endif
-
 #ifdef STAGES  // an attempt of a Rosenbrock-W step (stages.cuh): solve only the bodies that make it
 #define KIND_OF_STEP , const StageSolve stage
 #define STAGE , stage
@@ -488,7 +461,7 @@ __device__ __forceinline__ void solve_body(const PcgArguments& s, const RowRange
         if (stage.first_of_attempt) { result.status = CONVERGED; result.bad_node = -1; }
         add_solve(result, out);
 #elif defined(CONTACT_PASSES)
-        note_pass(pass, k, result, out);
+        note_pass(pass.state[k], pass, memory.outcome, result, out);
 #else
         result = out;
 #endif
