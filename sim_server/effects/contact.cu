@@ -256,6 +256,7 @@ KERNEL(detect, Detect) {
         }
     }
     if (found > 2) p.dropped[i] += found - 2;
+    if (first.obstacle < 0 && p.obstacle[2 * i] < 0 && p.obstacle[2 * i + 1] < 0) return;  // the rows are empty already
     const Memory last[2] = {memory_of(p, 2 * i), memory_of(p, 2 * i + 1)};
     put_row(p, t, i, 2 * i, first, x, last);
     put_row(p, t, i, 2 * i + 1, second, x, last);

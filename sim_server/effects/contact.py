@@ -105,8 +105,8 @@ class Contact(Effect):
         self._input = ContactInput(
             self._table, start, corner, weight, np.full(rows, -1, np.int32), np.zeros((rows, 3)), np.zeros(rows),
             np.zeros((rows, 3)), np.full(rows, 2.0), np.zeros(rows), np.zeros(rows),
-            np.repeat(np.array(bounds)[self.body], 2), np.zeros(rows), np.zeros((rows, 3)), world.predictor,
-            world.free, world.dx_dv, world.force_coefficient, params.passes, params.tolerance,
+            np.repeat(np.array(bounds)[self.body], 2), np.zeros(rows), np.zeros((rows, 3)),
+            world.predictor, world.free, world.dx_dv, world.force_coefficient, params.passes, params.tolerance,
         )  # fmt: skip
         self.dropped = np.zeros(len(self.node), np.int32)
         self._pair_friction = _pair_friction(world, params)

@@ -14,7 +14,7 @@ from sim_server.backends.gpu.inverse.plan import plan
 from sim_server.backends.gpu.inverse.workspace import workspace
 from sim_server.simulation import Simulation
 from tests.backends import fake_cupy
-from tests.contact.scenes import FLOOR, RAM, block_on
+from tests.contact.scenes import floor, over, ram
 from tests.support import nvrtc
 from tests.worker.block_matrices import bar_edges, pattern
 
@@ -73,9 +73,9 @@ def test_a_scene_is_built_and_its_kernels_compile(cupy, name):
 
 
 @pytest.mark.parametrize("precision", ["float64", "mixed", "float32"])
-def test_a_scene_with_contact_is_built(cupy, tmp_path, precision):
-    path = block_on(tmp_path, (RAM, FLOOR), solver=f'preconditioner = "cholesky"\nprecision = "{precision}"')
-    simulation = Simulation.load(path, [], "gpu")
+def test_a_scene_with_contact_is_built(cupy, precision):
+    solver = {"preconditioner": "cholesky", "precision": precision}
+    simulation = over(ram(), floor(), solver=solver, device="gpu")
     names = [kernel for kernel, _ in cupy.calls]
     one_pass = ["contact_forces", "pcg", "contact_search"]
     step = ["place", "detect", "begin_contact", *one_pass, *one_pass, "finish_contact", "fused"]

@@ -1,45 +1,51 @@
 # SPDX-License-Identifier: MIT
-"""Scenes of contact for tests of both devices."""
+"""Scenes of contact made in a test: a block over obstacles."""
 
 from collections.abc import Sequence
-from pathlib import Path
+from typing import Any
 
-BLOCK = """
-[[object]]
-name = "block"
-mesh = {{ bar = {bar}, size = [0.1, 0.06, 0.1] }}
-pose = {{ translate = [0, {height}, 0] }}
-density = 1000.0
-friction = {friction}
-effects = {{ corotational = {{ young = 3e5, poisson = 0.45 }} }}
-"""
-FLOOR = """
-[[obstacle]]
-name = "floor"
-shape = "plane"
-friction = 0.5
-"""
-RAM = """
-[[obstacle]]
-name = "ram"
-shape = "box"
-size = [0.3, 0.02, 0.3]
-keyframes = [
-    { time = 0, translate = [0, -0.3, 0] }, { time = 0.04, translate = [0, 0.1, 0] },
-    { time = 1, translate = [0, 0.1, 0], rotate = [0, 0, 20] },
-]
-"""  # at 10 m/s
+from numpy.typing import ArrayLike
+
+from sim_server.scene.model import Scene
+from sim_server.simulation import Simulation
+from tests.scenes import bar
+from tests.state import put
+
+CELLS, SIZE = (4, 3, 4), (0.1, 0.06, 0.1)  # of the block [m]
+YOUNG = 3e5  # Pa
+D = 0.002  # thickness, a tenth of the shortest edge of the surface [m]
+LOCKSTEP: dict[str, Any] = {"preconditioner": "cholesky", "update": "lockstep-3"}
 
 
-def block_on(
-    folder: Path, obstacles: Sequence[str] = (FLOOR,), bar: str = "[3, 2, 3]", height: float = 0.02, friction: float = 0.5,
-    gravity: str = "[0, -9.81, 0]", solver: str = 'preconditioner = "block_jacobi"', contact: str = "{}",
-) -> Path:  # fmt: skip
-    """Writes a scene of a block, 0.1 x 0.06 x 0.1 m, whose lower side is at `height` [m]; returns its file."""
-    path = folder / "block.toml"
-    path.write_text(
-        f"dt = 0.016666666666666666\n[effects]\ngravity = {{ g = {gravity} }}\ncontact = {contact}\n[solver]\n{solver}\n"
-        + BLOCK.format(bar=bar, height=height, friction=friction)
-        + "".join(obstacles)
-    )
-    return path
+def floor(friction: float = 0.5, **table: Any) -> dict:
+    """An [[obstacle]]: the half-space y < 0."""
+    return {"name": "floor", "shape": "plane", "friction": friction, **table}
+
+
+def ram() -> dict:
+    """An [[obstacle]]: a plate that comes from below at 10 m/s, stops 0.12 m above the floor, and turns there."""
+    keys = [(0, -0.3, 0), (0.04, 0.1, 0), (1, 0.1, 20)]
+    frames = [{"time": t, "translate": [0, y, 0], "rotate": [0, 0, degrees]} for t, y, degrees in keys]
+    return {"name": "ram", "shape": "box", "size": [0.3, 0.02, 0.3], "friction": 0.5, "keyframes": frames}
+
+
+def block(friction: float = 0.5, cells: Sequence[int] = CELLS, size: Sequence[float] = SIZE, **table: Any) -> dict:
+    """An [[object]] with its lowest corner at `at`."""
+    pose = {"translate": list(table.pop("at", (0, D, 0))), "rotate": list(table.pop("rotate", (0, 0, 0)))}
+    return bar(tuple(cells), tuple(size), young=table.pop("young", YOUNG), friction=friction, pose=pose, **table)
+
+
+def over(
+    *obstacles: dict, objects: Sequence[dict] = (), velocity: ArrayLike = (0, 0, 0), dt: float = 1 / 60,
+    gravity: Sequence[float] = (0, -9.81, 0), contact: Any = True, solver: dict | None = None, device: str = "cpu",
+    **table: Any,
+) -> Simulation:  # fmt: skip
+    """A block, or other objects, over obstacles. velocity: at the start [m/s]; other arguments are the block's."""
+    effects = {"gravity": {"g": list(gravity)}, "contact": {"thickness": D} if contact is True else contact}
+    scene = {
+        "name": "test", "dt": dt, "effects": effects, "solver": LOCKSTEP if solver is None else solver,
+        "object": list(objects) or [block(**table)], "obstacle": list(obstacles) or [floor()],
+    }  # fmt: skip
+    sim = Simulation(Scene.model_validate(scene, context={"folder": "."}), device)
+    put(sim, sim.world.v, velocity)
+    return sim

@@ -29,7 +29,8 @@ struct Probe {
     double* matrix;          // (n, 6) out
 };
 KERNEL(probe, Probe) {
-    const ContactRow row = {p.normal + 3 * i, p.drift + 3 * i, p.anchor + 3 * i, p.gap[i], p.thickness, p.stiffness, p.friction};
+    const ContactRow row = {p.normal + 3 * i, p.drift + 3 * i, p.anchor + 3 * i,
+                            p.gap[i], p.thickness, p.stiffness, p.friction};
     const ContactForce f = contact_force(row, p.s + 3 * i, p.limit, p.closed != 0);
     for (int k = 0; k < 3; ++k) p.force[3 * i + k] = f.normal * row.normal[k] + f.traction[k];
     p.normal_force[i] = f.normal;

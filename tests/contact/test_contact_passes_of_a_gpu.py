@@ -18,7 +18,7 @@ from sim_server.backends.gpu import contact as gpu_contact
 from sim_server.backends.gpu.contact import ContactPasses
 from sim_server.backends.gpu.structs import CONTACT_RESULT, CONTACT_STATE, PCG_RESULT
 from sim_server.simulation import Simulation
-from tests.contact.scenes import BLOCK, FLOOR, RAM, block_on
+from tests.contact.scenes import block, floor, over, ram
 
 OUT_OF_PASSES = Declarations("kernels/kinds.h").enumeration("Status")["CONTACT"]
 ROUNDS = Declarations("kernels/contact_passes.cuh").constant("ROUNDS")
@@ -238,15 +238,18 @@ class Beside:
         return records[0]
 
 
-def test_a_block_falls_and_comes_to_rest(library, tmp_path, monkeypatch):
-    beside = Beside(library, Simulation.load(block_on(tmp_path), [], "cpu"), monkeypatch)
+SMALL: dict[str, Any] = {"cells": (3, 2, 3), "solver": {"preconditioner": "block_jacobi"}}
+
+
+def test_a_block_falls_and_comes_to_rest(library, monkeypatch):
+    beside = Beside(library, over(at=(0, 0.02, 0), **SMALL), monkeypatch)
     records = [beside.compare(1e-7) for _ in range(12)]
     assert records[0]["contacts"] == 0 and records[-1]["contacts"] == 16 and max(r["passes"] for r in records) > 2
 
 
-def test_a_copy_of_the_matrix_knows_contacts(library, tmp_path, monkeypatch):
+def test_a_copy_of_the_matrix_knows_contacts(library, monkeypatch):
     """With all of their stiffness where they stick."""
-    beside = Beside(library, Simulation.load(block_on(tmp_path, height=0.003), [], "cpu"), monkeypatch)
+    beside = Beside(library, over(**SMALL), monkeypatch)
     for _ in range(3):
         beside.compare(1e-7)
     contact, a = beside.contact, beside.arrays
@@ -260,34 +263,31 @@ def test_a_copy_of_the_matrix_knows_contacts(library, tmp_path, monkeypatch):
     assert not np.delete(added, place, axis=0).any()
 
 
-def test_a_block_slides(library, tmp_path, monkeypatch):
-    path = block_on(tmp_path, height=0.003, friction=0.1, gravity="[4, -9, 0]")
-    beside = Beside(library, Simulation.load(path, [], "cpu"), monkeypatch)
-    records = [beside.compare(1e-6) for _ in range(10)]
+def test_a_block_slides(library, monkeypatch):
+    beside = Beside(library, over(velocity=(2, 0, 0), friction=0.1, **SMALL), monkeypatch)
+    for _ in range(10):
+        record = beside.compare(1e-6)
     force, traction = beside.contact.force, np.linalg.norm(beside.contact.traction, axis=1)
     limit = (0.1 * 0.5) ** 0.5 * force
-    assert records[-1]["contacts"] == (force > 0).sum() > 8 and (traction > 0.9 * limit)[force > 0].any()
+    assert record["contacts"] == (force > 0).sum() > 8 and (traction > 0.9 * limit)[force > 0].any()
 
 
-def test_an_obstacle_hits_a_block_at_10_m_per_s(library, tmp_path, monkeypatch):
-    beside = Beside(library, Simulation.load(block_on(tmp_path, (RAM, FLOOR)), [], "cpu"), monkeypatch)
+def test_an_obstacle_hits_a_block_at_10_m_per_s(library, monkeypatch):
+    beside = Beside(library, over(ram(), floor(), at=(0, 0.02, 0), **SMALL), monkeypatch)
     records = [beside.compare(1e-6) for _ in range(5)]
     assert max(r["contacts"] for r in records) == 16 and max(r["passes"] for r in records) > 8
 
 
-@pytest.mark.parametrize("short", ["{ passes = 2 }", "{ passes = 1, stiffness = 0.05 }"])
-def test_points_are_held_back_where_passes_run_out(library, tmp_path, monkeypatch, short):
-    path = block_on(tmp_path, (RAM, FLOOR), contact=short)
-    beside = Beside(library, Simulation.load(path, [], "cpu"), monkeypatch)
+@pytest.mark.parametrize("short", [{"passes": 2}, {"passes": 1, "stiffness": 0.05}], ids=str)
+def test_points_are_held_back_where_passes_run_out(library, monkeypatch, short):
+    beside = Beside(library, over(ram(), floor(), at=(0, 0.02, 0), contact=short, **SMALL), monkeypatch)
     records = [beside.compare(1e-6) for _ in range(3)]
     assert beside.rounds == ROUNDS and max(r["clipped"] for r in records) > 0
     assert OUT_OF_PASSES in [r["status"] for r in records]
 
 
-def test_bodies_go_their_own_ways(library, tmp_path, monkeypatch):
-    path = block_on(tmp_path, bar="[2, 1, 2]", height=0.004)
-    other = BLOCK.format(bar="[3, 2, 3]", height=0.02, friction=0.3).replace('"block"', '"other"')
-    path.write_text(path.read_text() + other)
-    beside = Beside(library, Simulation.load(path, [], "cpu"), monkeypatch)
+def test_bodies_go_their_own_ways(library, monkeypatch):
+    objects = [block(cells=(2, 1, 2), at=(0, 0.004, 0)), block(0.3, (3, 2, 3), at=(0.3, 0.02, 0), name="other")]
+    beside = Beside(library, over(objects=objects, solver=SMALL["solver"]), monkeypatch)
     for _ in range(6):
         beside.compare(1e-6)

@@ -11,7 +11,9 @@ from pydantic.fields import FieldInfo
 
 from sim_server import effects
 from sim_server.scene.integrator_options import IntegratorOptions
-from sim_server.scene.model import MeshSource, Pose, RecordOptions, Scene, SceneObject
+from sim_server.scene.model import MeshSource, RecordOptions, Scene, SceneObject
+from sim_server.scene.obstacles import Obstacle
+from sim_server.scene.pose import Pose
 from sim_server.scene.solver_options import PRECONDITIONERS, SolverOptions
 from tests.docs.figures import DOCS, Row, table_under
 
@@ -24,6 +26,11 @@ BY_HAND = {
     ("[solver]", "preconditioner"): (None, ", ".join(f"`{p}`" for p in PRECONDITIONERS)),
     ("[solver]", "update"): (None, "`never`, `every-N`, `async`, `adaptive`, `lockstep-D`; N and D: 1 to 999,999"),
     ("Objects", "density"): ("1000", None),
+    ("Objects", "friction"): ("0.5", None),
+    ("Obstacles", "scale"): ("1", None),
+    ("Obstacles", "max_speed"): ("1", None),
+    ("Obstacles", "max_turn"): ("3", None),
+    ("Obstacles", "keyframes"): (None, "at least one"),
     ("Objects", "mesh.split"): ('"kuhn"', None),
     ("Objects", "mesh.scale"): ("1", None),
 }
@@ -129,7 +136,7 @@ def test_keys_of_a_table(heading: str, fields: dict[str, FieldInfo]) -> None:
 
 def test_no_table_is_missing() -> None:
     tables = {field.alias or name for name, field in Scene.model_fields.items()} - {"dt", "name"}
-    assert tables == {"effects", "integrator", "solver", "record", "object"}
+    assert tables == {"effects", "integrator", "solver", "record", "object", "obstacle"}
 
 
 def test_keys_of_an_object() -> None:
@@ -137,6 +144,12 @@ def test_keys_of_an_object() -> None:
     fields |= {f"mesh.{name}": field for name, field in MeshSource.model_fields.items()}
     fields |= {f"pose.{name}": field for name, field in Pose.model_fields.items()}
     check("Objects", rows_of("Objects"), fields)
+
+
+def test_keys_of_an_obstacle() -> None:
+    fields = {name: field for name, field in Obstacle.model_fields.items() if name != "pose"}
+    fields |= {f"pose.{name}": field for name, field in Pose.model_fields.items()}
+    check("Obstacles", rows_of("Obstacles"), fields)
 
 
 KEY = re.compile(r"`(\w+)`(?: \((.+?)\))?(?: \[(.+?)\])?(?:,|$)")

@@ -63,7 +63,11 @@ SCENES = {  # lines of the scene and of its object, effects listed, texts that r
         "", "neo_hookean = { young = 1e5, poisson = 0.3 }\n", ["neo_hookean"],
         ["neo_hookean", "gather_forces", "gather_blocks", "shape_matching"], [],
     ),
-    "everything": (
+    "contact": (
+        'contact = true\n[[obstacle]]\nname = "floor"\nshape = "plane"', COROTATIONAL, ["contact", "corotational"],
+        ["contact", "corotational"], ["signed_distance", *OTHERS],
+    ),
+    "everything but contact": (
         "gravity = true", COROTATIONAL + 'rayleigh = { mass = 0.1 }\nfixed = { where = "X < 0.01" }\ntouch = true\n',
         ["corotational", "fixed", "gravity", "rayleigh", "touch"], ["corotational", "gravity", "rayleigh", "touch"],
         OTHERS,

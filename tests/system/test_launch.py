@@ -80,6 +80,18 @@ def test_a_part_is_a_scene_with_its_objects_as_they_were(tmp_path: Path) -> None
     assert objects == [whole.resolved()["object"][k] for k in (0, 2)]
 
 
+def test_a_part_keeps_obstacles_and_the_friction_of_its_own_objects(tmp_path: Path) -> None:
+    pairs = ", ".join(f'{{ between = ["bar{k}", "floor"], value = 0.{k + 1} }}' for k in range(3))
+    given = scene(tmp_path, [2, 3, 4])
+    contact = f'gravity = true\ncontact = {{ friction = [{pairs}] }}\n[[obstacle]]\nname = "floor"\nshape = "plane"\n'
+    given.write_text(given.read_text().replace("gravity = { g = [0, -9.81, 0] }\n", contact))
+    launch, whole, part = module(), load(given), tmp_path / "part.toml"
+    part.write_text(launch.part_of(whole, launch.Part((0, 2), 0)))
+    resolved = load(part).resolved()
+    assert resolved["obstacle"] == whole.resolved()["obstacle"]
+    assert [pair["between"][0] for pair in resolved["effects"]["contact"]["friction"]] == ["bar0", "bar2"]
+
+
 @pytest.mark.parametrize(
     ("visible", "expected"),
     [

@@ -4,12 +4,15 @@
 import json
 from dataclasses import replace
 
+import meshio
 import numpy as np
 import pytest
 
 from protocol import messages_pb2 as pb
 from protocol.refused import Refused
+from sim_server.mesh import bar as bar_mesh
 from sim_server.recording import messages
+from sim_server.scene.model import Scene
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
 from sim_server.updates.factor_source import Inline, Job
@@ -57,6 +60,23 @@ def test_the_same_matrix_under_any_integrator(scheme):
     Driver(sim).advance(5)
     sim.engine.assemble()
     assert Assembly(*described(sim)).matrix(sim.world.x.copy()).tobytes() == sim.system.values.tobytes()
+
+
+def test_the_same_matrix_beside_obstacles_which_the_worker_leaves_out(tmp_path):
+    """Also where their files are not there: contact adds nothing to A."""
+    path, cube = tmp_path / "cube.vtk", bar_mesh((2, 2, 2), (1, 1, 1))
+    meshio.Mesh(cube.rest, [("tetra", cube.tets)]).write(path)
+    obstacles = [{"name": "floor", "shape": "plane"}, {"name": "a", "shape": "grid", "file": str(path), "spacing": 0.2}]
+    effects = {"contact": {"friction": [{"between": ["b", "floor"], "value": 0.1}]}}
+    bars = [bar((4, 2, 2)), bar((1, 1, 1), name="b")]
+    table = {"name": "test", "dt": 0.02, "effects": effects, "object": bars, "obstacle": obstacles}
+    sim = Simulation(Scene.model_validate(table, context={"folder": "."}))
+    path.unlink()
+    deformed(sim)
+    sim.engine.assemble()
+    body = sim.world.bodies[0]
+    values = Assembly(*described(sim)).matrix(sim.world.x[body.nodes].copy())
+    np.testing.assert_allclose(values, sim.system.body_values(body.first, body.last), rtol=1e-12, atol=1e-12)
 
 
 def test_each_of_several_bodies_by_itself():

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from protocol.factor import FactorPattern
 from sim_server.backends.base import Capability, EngineInput, Launch
 from sim_server.backends.compiler import native
+from sim_server.backends.contact import Contact
 from sim_server.backends.cpu import structs
 from sim_server.backends.cpu.device import CpuLaunch
 from sim_server.backends.cpu.energies import NativeEnergies
-from sim_server.backends.contact import Contact
 from sim_server.backends.newton import Newton
 from sim_server.backends.ring_buffers import Reports
 from sim_server.backends.rosenbrock import NODAL, Rosenbrock

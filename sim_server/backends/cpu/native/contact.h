@@ -387,6 +387,8 @@ struct Passes {
             sum[5] -= arm[0] * f[1] - arm[1] * f[0];
         }
         if (!report.contacts && !report.passes) report.residual = NAN;
+        const bool balanced = result.status != CONTACT && !report.clipped;  // else the forces are more than what acted
+        if (!balanced && report.work < 0) report.work = 0;
         c.report[index] = report;
     }
 };
