@@ -197,7 +197,7 @@ class Replay:
 
     def _submit(self, body: Body, made: int) -> None:
         warped = body.index in self.simulation.warped
-        values, solver = self.simulation.system.body_values(body.first, body.last), self.simulation.scene.solver
+        values, solver = self.engine.factor_matrix(body.index), self.simulation.scene.solver
         if body.name in self._positions:
             if body.name not in self._assemblies:
                 topology = messages.topology(self.simulation, body)

@@ -93,7 +93,7 @@ class Driver:
         step = self.engine.step
         for state in self.bodies:
             if not state.frozen:
-                values = self.simulation.system.body_values(state.body.first, state.body.last)
+                values = self.engine.factor_matrix(state.body.index)
                 state.job.matrix = step, values
                 self.inline.submit(self._job(state, step, values))
         self.receive(self.inline, self.adopt)

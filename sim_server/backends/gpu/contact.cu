@@ -52,6 +52,7 @@ struct ContactArguments {
     const real* last;           // (nodes, 3) and after it
     real* values;               // (blocks, 3, 3)
     real* base;                 // (rows / 2, 3, 3) own blocks without contact
+    real* known;                // (rows / 2, 3, 3) and as a factor is to know them
     DeviceRow* row;             // (rows,)
     int* list;                  // (rows,) those of a body that are not empty, from its first row on
     ContactState* state;        // (bodies,)
@@ -235,11 +236,28 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) begin_contact(cons
     const int rows = list_rows(c, body);
     if (threadIdx.x > 0) return;
     const double unknown = __longlong_as_double(0x7ff8000000000000ll);
-    c.state[body] = {0, 0, 1, unknown, closed[0] > 0 ? CHOOSE_START : WITHOUT, 0, 0, 1, 0, 0, 0, rows};
+    c.state[body] = {0, 0, 1, unknown, closed[0] > 0 ? CHOOSE_START : WITHOUT, 0, 0, 1, 0, 0, rows};
     if (body == 0) *c.active = c.count;
 }
 
 // --- forces -------------------------------------------------------------------------------------------------------------------------
+
+// Keeps a node's own block without contact, and with contacts that carried force in the last step: a factor that is made from a copy
+// of A is to know them.
+__device__ void keep_block(const ContactArguments& c, const SurfaceNode& n) {
+    const int pair = c.pair[n.node];
+    if (pair < 0) return;
+    double S[9] = {};
+    for (int r = n.pair; n.pair >= 0 && r < n.pair + 2; ++r)
+        if (used(c, r) && c.force[r] > 0)
+            n.add_stiffness(c, row_at(c, r, 1), lasting_contact(c.friction[r], c.force[r], c.traction + 3 * r), S);
+    const real* own = c.values + 9ll * c.place[n.node];
+    for (int k = 0; k < 9; ++k) {
+        const long long to = 9ll * (pair / 2) + k;
+        c.base[to] = own[k];
+        c.known[to] = (real)((double)own[k] + S[k]);
+    }
+}
 
 // Before the solver: in CHOOSE_START b' = b + i H^T f at y and the size of the same at 0, for READY what a pass needs.
 extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) contact_forces(const ContactArguments c) {
@@ -247,13 +265,16 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) contact_forces(con
     const int i = here.begin + threadIdx.x;
     const ContactState state = c.state[here.body];
     if (blockIdx.x == 0 && threadIdx.x == 0) *c.pool_counter = 0;
-    if (state.phase == WITHOUT && i < here.end)
+    if (state.phase == WITHOUT && i < here.end) {
+        keep_block(c, SurfaceNode::at(c, i));
         for (long long k = 3ll * i; k < 3ll * i + 3; ++k) c.contact_b[k] = c.b[k];
+    }
     if (state.phase != CHOOSE_START && state.phase != READY) return;
     double sum[CONTACT_SUMS] = {};
     if (i < here.end) {
         const bool starts = state.phase == CHOOSE_START;
         const SurfaceNode n = SurfaceNode::at(c, i);
+        if (starts) keep_block(c, n);
         double b[3], y[3], f[3] = {0, 0, 0}, other[3] = {0, 0, 0}, S[9] = {};
         load3(c.b, i, b);
         load3(c.y, i, y);
@@ -290,10 +311,7 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) contact_forces(con
         }
         if (n.pair >= 0 && !starts) {
             real *own = c.values + 9ll * c.place[i], *base = c.base + 9ll * (n.pair / 2);
-            for (int k = 0; k < 9; ++k) {
-                if (!state.kept) base[k] = own[k];
-                own[k] = (real)((double)base[k] + S[k]);
-            }
+            for (int k = 0; k < 9; ++k) own[k] = (real)((double)base[k] + S[k]);
         }
     }
     if (!sum_body(c, here, sum) || threadIdx.x > 0) return;
@@ -304,7 +322,6 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) contact_forces(con
     }
     to.given2 = sum[1] > sum[0] ? sum[1] : sum[0];
     to.by_law = sum[2] == 0;
-    to.kept = 1;
 }
 
 // --- after the solver ---------------------------------------------------------------------------------------------------------------
@@ -513,16 +530,6 @@ __device__ void keep_forces(const ContactArguments& c, const SurfaceNode& n, boo
     }
 }
 
-// Leaves contacts that carry force in A, so that a factor made from a copy of it knows them.
-__device__ void leave_stiffness(const ContactArguments& c, const SurfaceNode& n) {
-    double S[9] = {};
-    for (int r = n.pair; r < n.pair + 2; ++r)
-        if (used(c, r) && c.force[r] > 0)
-            n.add_stiffness(c, row_at(c, r, 1), lasting_contact(c.friction[r], c.force[r], c.traction + 3 * r), S);
-    real *own = c.values + 9ll * c.place[n.node], *base = c.base + 9ll * (n.pair / 2);
-    for (int k = 0; k < 9; ++k) own[k] = (real)((double)base[k] + S[k]);
-}
-
 // Force and torque of a body on each obstacle, to the host. Done by a whole thread block.
 __device__ void write_reactions(const ContactArguments& c, int body, int rows, long long slot) {
     const int* list = c.list + c.body_start[body];
@@ -563,7 +570,7 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) finish_contact(con
         if (n.pair >= 0) {
             if (well) sum[2] += clip(c, n);
             keep_forces(c, n, well, sum);
-            if (state.kept) leave_stiffness(c, n);
+            for (int k = 0; k < 9; ++k) c.values[9ll * c.place[i] + k] = c.known[9ll * (n.pair / 2) + k];  // copies are made after the step
         } else if (c.pair[i] >= 0) {  // of a fixed node
             for (int r = c.pair[i]; r < c.pair[i] + 2; ++r) c.force[r] = c.traction[3 * r] = c.traction[3 * r + 1] = c.traction[3 * r + 2] = 0;
         }

@@ -79,16 +79,18 @@ class ContactPasses:
         starts = np.array([first for first, _ in ranges] + [nodes], np.int32)
         chunks, rows, real = node_chunks(starts, THREADS), len(contact.obstacle), solver.real
         self._grid, names = len(chunks), ("values", "b", "y", "x", "rotation")
+        own, pair = own_blocks(arrays["row_start"], arrays["columns"]), pairs_of(contact, nodes)
+        self._surface = own[contact.corner[::2, 0]]  # places of the nodes that have rows
         exact = {name: getattr(contact, name) for name in ROWS}
         self._memory: dict[str, DeviceArray] = {name: gpu.twin(arrays[name]) for name in names}
         self._memory |= {name: gpu.twin(host, dtype=host.dtype) for name, host in exact.items()}
         self._memory |= {name: gpu.twin(getattr(contact, name)) for name in ("predictor", "free")}
         self._memory |= {
-            "pair": cp.asarray(pairs_of(contact, nodes)), "node": cp.asarray(contact.corner[:, 0].copy()),
-            "place": cp.asarray(own_blocks(arrays["row_start"], arrays["columns"])),
+            "pair": cp.asarray(pair), "node": cp.asarray(contact.corner[:, 0].copy()), "place": cp.asarray(own),
             "contact_b": cp.zeros((nodes, 3), real), "start": cp.zeros((nodes, 3), real),
             "first": cp.zeros((nodes, 3), real), "last": cp.zeros((nodes, 3), real),
-            "base": cp.zeros(9 * max(rows // 2, 1), real), "row": cp.zeros(max(rows, 1) * DEVICE_ROW.itemsize, np.uint8),
+            "base": cp.zeros((max(rows // 2, 1), 3, 3), real), "known": cp.zeros((max(rows // 2, 1), 3, 3), real),
+            "row": cp.zeros(max(rows, 1) * DEVICE_ROW.itemsize, np.uint8),
             "list": cp.zeros(max(rows, 1), np.int32), "active": self._active,
             "state": cp.zeros(self._bodies * CONTACT_STATE.itemsize, np.uint8),
             "chunks": cp.asarray(chunks.view(np.int32)), "partial_sums": cp.zeros((len(chunks), SUMS)),
@@ -127,15 +129,27 @@ class ContactPasses:
     def _launch(self, kernel: str, blocks: int) -> None:
         self._kernels[kernel]((blocks,), (THREADS,), (self._params,))
 
-    def launch(self) -> None:
-        """Appends the solves of a step whose rows are detected, while a graph is captured."""
+    def begin(self) -> None:
+        """Appends what comes before the first solve of a step whose rows are detected."""
         self._launch("begin_contact", self._bodies)
-        self._one_pass(self._first)
+        self._launch("contact_forces", self._grid)
+
+    def launch(self) -> None:
+        """Appends the solves of such a step, while a graph is captured."""
+        self.begin()
+        self._solve_and_search(self._first)
         with self._device.repeat(self._active):
-            self._one_pass(self._pass)
+            self._launch("contact_forces", self._grid)
+            self._solve_and_search(self._pass)
         self._launch("finish_contact", self._grid)
 
-    def _one_pass(self, solve: NDArray[Any]) -> None:
-        self._launch("contact_forces", self._grid)
+    def _solve_and_search(self, solve: NDArray[Any]) -> None:
         self._solver.solve_contact(self._memory["contact_b"], solve)
         self._launch("contact_search", self._grid)
+
+    def known(self, values: Float64) -> Float64:
+        """Returns a copy of the values of A of a step that has begun, with the contacts that a factor is to know."""
+        out = values.copy()
+        if len(self._surface):
+            out[self._surface] = self._memory["known"].get()
+        return out

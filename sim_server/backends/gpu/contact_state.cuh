@@ -34,8 +34,8 @@ struct ContactState {   // of a body
     int set;            // 1: rows with in_set count as closed
     int by_law;         // 1: the rows that count as closed are those that the law closes
     int hold;           // 1: there was a pass since limits were set
-    int kept;           // 1: ContactArguments.base has the blocks of A without contact
     int rows;           // number of rows that are not empty
+    int unused;
 };
 
 struct ContactSolve {   // what a solve has beside PcgArguments

@@ -93,7 +93,8 @@ class DeviceEnergies:
     @property
     def balance(self) -> DeviceArray:
         """Balances of the bodies (BALANCE) on the device."""
-        return self._balance
+        balance: DeviceArray = self._balance
+        return balance
 
     def launch_balance(self) -> None:
         """Launches the energy balance of the last step; does nothing on the device if it was settled before."""

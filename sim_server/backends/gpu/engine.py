@@ -87,7 +87,9 @@ class GpuEngine(DeviceLoop):
         energy_records = device.pinned(CAPACITY * ENERGY_RECORD.itemsize * bodies)
         self._energies = DeviceEnergies(gpu, given.energies, energy_records, self._counter, dt)
         alone = stages is not None and stages.factor_alone
-        detection = [x for x in assemble if x.domain not in DOMAINS] if given.contact else []  # reads what the others make
+        detection = (
+            [x for x in assemble if x.domain not in DOMAINS] if given.contact else []
+        )  # reads what the others make
         self._whole_assembly = self._beginning([x for x in assemble if x not in detection], detection)
         forces = cast(Sequence[DeviceLaunch], stages.first) if stages else ()
         self._first_launches = self._beginning(forces) if alone else self._whole_assembly
@@ -107,9 +109,10 @@ class GpuEngine(DeviceLoop):
             obstacles = len(given.contact.obstacles.kind)
             reactions = device.pinned(CAPACITY * bodies * obstacles * 48).view(np.float64)
             reactions = reactions.reshape(CAPACITY, bodies, obstacles, 6)
+            balance = self._energies.balance
             self._contact = ContactPasses(
-                gpu, device, given.contact, ranges, arrays, self.solver, self._energies.balance, contact_results, reactions
-            )  # fmt: skip
+                gpu, device, given.contact, ranges, arrays, self.solver, balance, contact_results, reactions
+            )
         row, first = PCG_BODY.itemsize, self.solver.bodies_device
         mailboxes = [(first + row * k, SETTINGS_BYTES) for k in range(bodies)]
         mailboxes += [(first + row * k + SETTINGS_BYTES, row - SETTINGS_BYTES) for k in range(bodies)]
@@ -144,6 +147,7 @@ class GpuEngine(DeviceLoop):
             epilogue = Epilogue(EPILOGUE.checked(), "StepEpilogue", "finish_step", self._epilogue)
             self._integrate = FusedKernel(integrate, epilogue)
             self._stamp_begin = self._integrate.function("stamp_begin")
+        self._known: Float64 = arrays["values"]  # as a factor is to know them
         self._matrix = self._matrix_launches(assemble) if alone else ()
         self._capture()
         cp.cuda.get_current_stream().synchronize()  # arrays are complete for the streams of the loop
@@ -276,8 +280,17 @@ class GpuEngine(DeviceLoop):
             self._begin()
             for launch in (*self._whole_assembly, *self._forces):
                 launch()
+            if self._contact:
+                self._contact.begin()
             values = self._arrays["values"]
             values[...] = self.gpu.twin(values).get(stream=self._steps)
+        self._known = self._contact.known(values) if self._contact else values
+
+    def factor_matrix(self, body: int) -> Float64:
+        """Returns the values of A as last assembled, with the contacts that a factor is to know, (blocks, 3, 3)."""
+        first, last = self._ranges[body]
+        start = self._arrays["row_start"]
+        return cast(Float64, self._known[start[first] : start[last]])
 
     def solve(self) -> None:
         """Runs the second half: solve, integration, records."""
