@@ -33,7 +33,6 @@ from sim_server.scene import Scene, deleted
 from sim_server.scene.messages import readable
 from sim_server.simulation import Simulation
 from sim_server.updates.factor_source import Inline, Job
-from sim_server.updates.snapshots import request_matrices
 from sim_server.updates.worker_assembly import Assembly
 
 if TYPE_CHECKING:
@@ -81,7 +80,6 @@ class Replay:
         self._nodes: dict[int, tuple[NDArray[np.int32], Float64]] = {}  # nodes and offsets of interactions, by id
         self._inline = self._library()
         self._positions: dict[str, Float64] = {}  # sent instead of a matrix, and not those of its step, by body
-        self._copies: dict[int, Float64] = {}  # of matrices with contact, by number of the body
         self._assemblies: dict[str, Assembly] = {}
         if self.simulation.world.backend.build() != recording.scene.build and recording.scene.build:
             self.compared.notes.append(
@@ -98,7 +96,6 @@ class Replay:
                 self._apply_settings(body.index, body.name, step)
                 self._use_factor(body.index, body.name, step, fresh=False)
             self._request_positions(step)
-            self._request_matrices(step)
             self.engine.assemble()
             self._make_factors(step)
             for body in self.bodies:
@@ -211,11 +208,6 @@ class Replay:
                 self._positions[body.name] = np.empty((body.last - body.first, 3))
                 self.engine.request_positions(body.index, self._positions[body.name], use.ahead)
 
-    def _request_matrices(self, step: int) -> None:
-        """Requests the matrices of this step whose factors the loop used, unless positions were sent."""
-        made = [body for body in self.bodies if (body.name, step) in self._needed and body.name not in self._positions]
-        self._copies = request_matrices(self.simulation, made)
-
     def _make_factors(self, step: int) -> None:
         """Makes the factors of this step, and those of the last one whose positions were sent at its end."""
         for body in self.bodies:
@@ -230,9 +222,7 @@ class Replay:
 
     def _submit(self, body: Body, made: int) -> None:
         warped = body.index in self.simulation.warped
-        values, solver = self._copies.get(body.index), self.simulation.scene.solver
-        if values is None:
-            values = self.simulation.system.body_values(body.first, body.last)
+        values, solver = self.engine.factor_matrix(body.index), self.simulation.scene.solver
         if body.name in self._positions:
             if body.name not in self._assemblies:
                 topology = messages.topology(self.simulation, body)

@@ -95,14 +95,11 @@ class Driver:
 
     def solve_with_fresh_factors(self) -> None:
         """Makes a step that waits for the factors of its own matrices, made in this process."""
-        copies = self.snapshots.request_matrices(state.body for state in self.bodies if not state.frozen)
         self.engine.assemble()
         step = self.engine.step
         for state in self.bodies:
             if not state.frozen:
-                values = copies.get(state.body.index)
-                if values is None:
-                    values = self.simulation.system.body_values(state.body.first, state.body.last)
+                values = self.engine.factor_matrix(state.body.index)
                 state.job.matrix = step, values
                 self.inline.submit(self._job(state, step, values))
         self.receive(self.inline, self.adopt)
