@@ -209,11 +209,11 @@ class Beside:
         self.balance["work"] = 0
         system = System(
             a["row_start"].ctypes.data, a["columns"].ctypes.data, self.ranges.ctypes.data,
-            sim.scene.solver.tolerance, sim.scene.solver.max_iterations, len(self.ranges), self.passes._grid,
+            sim.scene.solver.tolerance, sim.scene.solver.max_iterations, len(self.ranges), self.passes.grid,
         )  # fmt: skip
-        given = [c.c_void_p(x.ctypes.data) for x in (self.passes._params, self.passes._first, self.passes._pass)]
+        given = [c.c_void_p(x.ctypes.data) for x in (self.passes.params, self.passes.first, self.passes.later)]
         loops = self.library.step(*given, c.byref(system))
-        assert loops < 100 and not self.passes._active[0]
+        assert loops < 100 and not self.passes.active[0]
         sim.engine.solve()
         return self.gpu.twin(a["y"]), a["y"]
 
@@ -238,7 +238,7 @@ class Beside:
         assert np.abs(self.balance["work"] - work).max() <= 10 * rel * max(np.abs(work).max(), 1e-9)
         self.work = records["work"].copy()
         self.counter += 1
-        self.rounds = max(self.rounds, int(self.passes._memory["state"].view(CONTACT_STATE)["rounds"].max()))
+        self.rounds = max(self.rounds, int(self.passes.memory["state"].view(CONTACT_STATE)["rounds"].max()))
         return records[0]
 
 

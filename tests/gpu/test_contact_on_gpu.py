@@ -120,7 +120,7 @@ def test_points_are_held_back_where_passes_run_out():
     short = {"thickness": 0.002, "passes": 2}
     (g, c), apart, _ = both(CASES["is hit from below"], 4, contact=short)
     assert g["clipped"].max() > 0 and (g["clipped"] == c["clipped"]).all() and OUT_OF_PASSES in g["status"]
-    assert apart.max() < 1e-4
+    assert apart[:3].max() < 1e-9 and apart.max() < 1e-3  # such steps are not solved, so that they differ more and more
 
 
 @pytest.mark.parametrize("count", [3, 400])

@@ -474,12 +474,13 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) contact_search(con
         state.alpha = search_along(c, here.body, state.rows, sum[0], sum[1]);
     } else {
         state.alpha = 1;
-        again = again && (entered || (phase == SOLVED && sum[0] > 0));
         if (phase == LAST_PASSED) {
             const double given2 = sum[2] > sum[1] ? sum[2] : sum[1];
             state.residual = given2 > 0 ? sqrt(sum[0] / given2) : 0;
         }
-        if (phase != SOLVED && again) ++state.rounds;
+        const bool changed = phase == LAST_PASSED && state.residual > c.tolerance;  // the last solve may have changed the law again
+        if (phase != SOLVED && again && entered) ++state.rounds;
+        again = again && (entered || changed || (phase == SOLVED && sum[0] > 0));
         if (again && entered) state.rows = list_rows(c, here.body);
     }
     state.hold = phase == PASSED;

@@ -67,6 +67,10 @@ class ContactPasses:
     balance: energy balances of the bodies on the device, which get the work of contact
     results, reactions: host memory (capacity, bodies) of CONTACT_RESULT and (capacity, bodies, obstacles, 6) that the
         steps write to
+
+    Tests run its kernels with what it keeps: grid (thread blocks), params (arguments of the kernels), first and later
+    (of the solver, in the first solve of a step and in passes), active (bodies that are not over), memory (arrays by
+    name).
     """
 
     def __init__(
@@ -75,31 +79,31 @@ class ContactPasses:
         reactions: Float64,
     ):  # fmt: skip
         cp, nodes, self._bodies = gpu.cp, len(arrays["x"]), len(ranges)
-        self._device, self._solver, self._active = device, solver, cp.zeros(1, np.int32)
+        self._device, self._solver, self.active = device, solver, cp.zeros(1, np.int32)
         starts = np.array([first for first, _ in ranges] + [nodes], np.int32)
         chunks, rows, real = node_chunks(starts, THREADS), len(contact.obstacle), solver.real
-        self._grid, names = len(chunks), ("values", "b", "y", "x", "rotation")
+        self.grid, names = len(chunks), ("values", "b", "y", "x", "rotation")
         own, pair = own_blocks(arrays["row_start"], arrays["columns"]), pairs_of(contact, nodes)
         self._surface = own[contact.corner[::2, 0]]  # places of the nodes that have rows
         exact = {name: getattr(contact, name) for name in ROWS}
-        self._memory: dict[str, DeviceArray] = {name: gpu.twin(arrays[name]) for name in names}
-        self._memory |= {name: gpu.twin(host, dtype=host.dtype) for name, host in exact.items()}
-        self._memory |= {name: gpu.twin(getattr(contact, name)) for name in ("predictor", "free")}
-        self._memory |= {
+        self.memory: dict[str, DeviceArray] = {name: gpu.twin(arrays[name]) for name in names}
+        self.memory |= {name: gpu.twin(host, dtype=host.dtype) for name, host in exact.items()}
+        self.memory |= {name: gpu.twin(getattr(contact, name)) for name in ("predictor", "free")}
+        self.memory |= {
             "pair": cp.asarray(pair), "node": cp.asarray(contact.corner[:, 0].copy()), "place": cp.asarray(own),
             "contact_b": cp.zeros((nodes, 3), real), "start": cp.zeros((nodes, 3), real),
             "first": cp.zeros((nodes, 3), real), "last": cp.zeros((nodes, 3), real),
             "base": cp.zeros((max(rows // 2, 1), 3, 3), real), "known": cp.zeros((max(rows // 2, 1), 3, 3), real),
             "row": cp.zeros(max(rows, 1) * DEVICE_ROW.itemsize, np.uint8),
-            "list": cp.zeros(max(rows, 1), np.int32), "active": self._active,
+            "list": cp.zeros(max(rows, 1), np.int32), "active": self.active,
             "state": cp.zeros(self._bodies * CONTACT_STATE.itemsize, np.uint8),
             "chunks": cp.asarray(chunks.view(np.int32)), "partial_sums": cp.zeros((len(chunks), SUMS)),
             "finished_chunks": cp.zeros(self._bodies, np.uint32), "pool_counter": solver.pool_counter,
             "results": solver.results, "step": solver.counter, "balance": balance,
         }  # fmt: skip
         self._table = {n: gpu.twin(a, dtype=a.dtype) for n in TABLE for a in [getattr(contact.obstacles, n)]}
-        self._params = self._arguments(contact, results, reactions)
-        self._first, self._pass = self._solve(contact, 1), self._solve(contact, 0)
+        self.params = self._arguments(contact, results, reactions)
+        self.first, self.later = self._solve(contact, 1), self._solve(contact, 0)
         module = cp.RawModule(
             code=TEXT.checked(), options=(*options(gpu.types), *own_headers()), backend="nvrtc"
         )  # fmt: skip
@@ -108,7 +112,7 @@ class ContactPasses:
     def _arguments(self, contact: Contact, results: NDArray[Any], reactions: Float64) -> NDArray[Any]:
         """Returns the arguments of all kernels."""
         params: Any = np.zeros((), CONTACT_ARGUMENTS)
-        for name, array in self._memory.items():
+        for name, array in self.memory.items():
             params[name] = array.data.ptr
         for name, array in self._table.items():
             params["obstacles"][name] = array.data.ptr
@@ -122,34 +126,34 @@ class ContactPasses:
         """Returns the arguments of a solve."""
         solve = np.zeros((), CONTACT_SOLVE)
         for name in ("state", "first", "last"):
-            solve[name] = self._memory[name].data.ptr
+            solve[name] = self.memory[name].data.ptr
         solve["tolerance"], solve["passes"], solve["first_of_step"] = contact.tolerance, contact.passes, first_of_step
         return solve
 
     def _launch(self, kernel: str, blocks: int) -> None:
-        self._kernels[kernel]((blocks,), (THREADS,), (self._params,))
+        self._kernels[kernel]((blocks,), (THREADS,), (self.params,))
 
     def begin(self) -> None:
         """Appends what comes before the first solve of a step whose rows are detected."""
         self._launch("begin_contact", self._bodies)
-        self._launch("contact_forces", self._grid)
+        self._launch("contact_forces", self.grid)
 
     def launch(self) -> None:
         """Appends the solves of such a step, while a graph is captured."""
         self.begin()
-        self._solve_and_search(self._first)
-        with self._device.repeat(self._active):
-            self._launch("contact_forces", self._grid)
-            self._solve_and_search(self._pass)
-        self._launch("finish_contact", self._grid)
+        self._solve_and_search(self.first)
+        with self._device.repeat(self.active):
+            self._launch("contact_forces", self.grid)
+            self._solve_and_search(self.later)
+        self._launch("finish_contact", self.grid)
 
     def _solve_and_search(self, solve: NDArray[Any]) -> None:
-        self._solver.solve_contact(self._memory["contact_b"], solve)
-        self._launch("contact_search", self._grid)
+        self._solver.solve_contact(self.memory["contact_b"], solve)
+        self._launch("contact_search", self.grid)
 
     def known(self, values: Float64) -> Float64:
         """Returns a copy of the values of A of a step that has begun, with the contacts that a factor is to know."""
         out = values.copy()
         if len(self._surface):
-            out[self._surface] = self._memory["known"].get()
+            out[self._surface] = self.memory["known"].get()
         return out
