@@ -190,6 +190,32 @@ def grab(
     print("released")
 
 
+@app.command("move-obstacle")
+def move_obstacle(
+    name: Annotated[str, typer.Argument(metavar="NAME", help='Obstacle of the scene with moved = "client".')],
+    to: Annotated[Triple, typer.Option(metavar="X Y Z", help="Where its own origin goes, m.")],
+    rotate: Annotated[
+        Triple | None,
+        typer.Option(metavar="A B C", help="Degrees about the fixed axes x, then y, then z; else it is not turned."),
+    ] = None,
+    connect: Connect = None,
+    server: Server = SERVER_NAME,
+) -> None:
+    """Move an obstacle; it goes there at the speeds that the scene allows, and stays.
+
+    \b
+    Examples:
+      sim-client move-obstacle tool --to 0 0.2 0
+      sim-client move-obstacle tool --to 0 0.2 0 --rotate 0 0 90
+    """
+    from clients.client import Client
+    from clients.obstacle import turned
+
+    with Client(server, connect) as client:
+        client.obstacle(name).move(to, None if rotate is None else turned(rotate), wait=True)
+    print(f"{name} goes to ({', '.join(f'{value:.4g}' for value in to)})")
+
+
 def _await_end(client: Client, push: pb.Interaction) -> None:
     """Waits until a push is over; releases it on Ctrl-C."""
     from protocol import messages_pb2 as pb

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The client library: read the state of a running server, push and grab its objects, pause it."""
+"""The client library: read the state of a running server, push and grab its objects, move its obstacles, pause it."""
 
 from __future__ import annotations
 
@@ -15,9 +15,12 @@ from google.protobuf.message import Message
 from clients.errors import BadInput, ClientError
 from clients.grab import Grab
 from clients.log.frames import Mesh, mesh_of
+from clients.log.obstacles import Obstacle as ObstacleShape
+from clients.log.obstacles import obstacle_of
+from clients.obstacle import Obstacle
 from clients.queries import Queries, read
 from clients.queries import send as send_query
-from clients.subscriptions import States, Steps
+from clients.subscriptions import REACTIONS, Poses, States, Steps
 from protocol import messages_pb2 as pb
 from protocol.channels import PROTOCOL, ROOT, SERVER_NAME, check_name, key
 from protocol.client_name import new_client
@@ -94,6 +97,27 @@ class Client:
         except Refused as error:
             raise ClientError(f"server {self.name!r} sent a mesh that cannot be used: {error}") from None
 
+    def obstacles(self) -> dict[str, ObstacleShape]:
+        """Returns all obstacles, with their poses at the start."""
+        names = {name for scene in self._query("scene", pb.Scene) for name in scene.obstacles}
+        if not names:
+            return {}
+        found = self._query("obstacle", pb.Obstacle, complete=lambda all: names <= {o.header.object for o in all})
+        try:
+            return {shape.name: shape for shape in map(obstacle_of, found)}
+        except Refused as error:
+            raise ClientError(f"server {self.name!r} sent an obstacle that cannot be used: {error}") from None
+
+    def obstacle(self, name: str) -> Obstacle:
+        """Returns the handle of an obstacle that clients move. Raises BadInput if there is none of this name.
+
+        >>> client.obstacle("tool").move((0, 0.2, 0), rotation=(1, 0, 0, 0))
+        """
+        shapes = self.obstacles()
+        if name not in shapes:
+            raise BadInput(f"no obstacle {name!r}; there is {', '.join(sorted(shapes)) or 'none'}")
+        return Obstacle(self, shapes[name])
+
     def push(
         self, object: str, at: Point | str, force: Point, radius: float = 0.0, duration: float = 0.1
     ) -> pb.Interaction:
@@ -154,13 +178,26 @@ class Client:
         """Subscribes to frames of the named objects (all by default); only the newest of each is kept."""
         return States(self._session.zenoh, self.name, list(objects or self.scene().objects))
 
+    def poses(self, obstacles: Sequence[str] | None = None) -> Poses:
+        """Subscribes to poses of obstacles that move (all by default); only the newest of each is kept."""
+        return Poses(self._session.zenoh, self.name, list(obstacles or self.scene().obstacles))
+
     def steps(self) -> Steps:
         """Subscribes to the scalars per step of all objects; a reader that falls behind loses the oldest."""
         return Steps(self._session.zenoh, self.name)
 
-    def command(self, verb: str, interaction: pb.Interaction | None = None) -> pb.Reply:
+    def reactions(self) -> Steps:
+        """Subscribes to what objects exert on obstacles in each step, sent each millisecond.
+
+        The ObjectSteps that it returns hold object, step, time, contacts and reactions alone.
+        """
+        return Steps(self._session.zenoh, self.name, "reactions", REACTIONS)
+
+    def command(
+        self, verb: str, interaction: pb.Interaction | None = None, target: pb.ObstacleTarget | None = None
+    ) -> pb.Reply:
         """Sends a command and waits for the reply. Raises BadInput if the server refuses it."""
-        found = self._query("command", pb.Reply, self._command(verb, interaction))
+        found = self._query("command", pb.Reply, self._command(verb, interaction, target))
         if not found:
             raise self._no_server()
         if found[0].error:
@@ -170,6 +207,7 @@ class Client:
     def send(
         self, verb: str, interaction: pb.Interaction | None = None,
         answered: Callable[[pb.Reply | None], None] = lambda reply: None,
+        target: pb.ObstacleTarget | None = None,
     ) -> None:  # fmt: skip
         """Sends a command without waiting for the reply, e.g. to move a grab 1000 times a second.
 
@@ -194,7 +232,7 @@ class Client:
                 answered(others[0] if others else None)
 
         try:
-            payload = self._command(verb, interaction)
+            payload = self._command(verb, interaction, target)
             handler = zenoh.handlers.Callback(take, done)
             send_query(self._session.zenoh, self.name, "command", payload, self.timeout, handler)
         except zenoh.ZError as error:
@@ -211,11 +249,13 @@ class Client:
     ) -> None:
         self.close()
 
-    def _command(self, verb: str, interaction: pb.Interaction | None) -> bytes:
+    def _command(self, verb: str, interaction: pb.Interaction | None, target: pb.ObstacleTarget | None) -> bytes:
         if interaction is not None:
             interaction.client = self.id
         header = pb.Header(protocol=PROTOCOL)
-        command = pb.Command(header=header, client=self.id, secret=self.secret, verb=verb, interaction=interaction)
+        command = pb.Command(
+            header=header, client=self.id, secret=self.secret, verb=verb, interaction=interaction, target=target
+        )
         return command.SerializeToString()
 
     def _query(

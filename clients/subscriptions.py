@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Subscriptions to the states and steps of a server: a slow reader gets the newest and never a backlog."""
+"""Subscriptions to the states, steps and poses of a server: a slow reader gets the newest and never a backlog."""
 
 from __future__ import annotations
 
@@ -8,12 +8,14 @@ import logging
 import zenoh
 
 from clients.log.frames import Frame, frame_of
+from clients.log.obstacles import ObstacleFrame, obstacle_frame_of
 from protocol import messages_pb2 as pb
 from protocol.channels import CHANNELS, key
 from protocol.refused import Refused
 from protocol.validate import check_header, parse
 
 BATCHES = 64  # batches of steps that are kept, about 3 s
+REACTIONS = 1024  # batches of reactions, about 1 s
 
 log = logging.getLogger(__name__)
 
@@ -43,18 +45,44 @@ class States:
         return frames
 
 
-class Steps:
-    """Batches of scalars per step."""
+class Poses:
+    """The newest pose of each obstacle, in a ring of one sample per obstacle."""
 
-    def __init__(self, session: zenoh.Session, server: str) -> None:
-        self._ring = session.declare_subscriber(key("steps", server), zenoh.handlers.RingChannel(BATCHES))
+    def __init__(self, session: zenoh.Session, server: str, obstacles: list[str]) -> None:
+        self._rings = {
+            name: session.declare_subscriber(key("pose", server, object=name), zenoh.handlers.RingChannel(1))
+            for name in obstacles
+        }
+
+    def newest(self) -> list[ObstacleFrame]:
+        """Returns the poses that came since the last call, one per obstacle at most; never waits."""
+        found = []
+        for name, ring in self._rings.items():
+            sample = ring.try_recv()
+            if sample is None:
+                continue
+            try:
+                pose = parse(pb.ObstaclePose, sample.payload, CHANNELS["pose"].limit)
+                check_header(pose, object=name)
+                found.append(obstacle_frame_of(pose))
+            except Refused as error:
+                log.warning("a pose was left out: %s", error)
+        return found
+
+
+class Steps:
+    """Batches of scalars per step. channel: steps or reactions. batches: that are kept."""
+
+    def __init__(self, session: zenoh.Session, server: str, channel: str = "steps", batches: int = BATCHES) -> None:
+        self._channel = channel
+        self._ring = session.declare_subscriber(key(channel, server), zenoh.handlers.RingChannel(batches))
 
     def new(self) -> list[pb.ObjectStep]:
         """Returns the steps that came since the last call, oldest first; never waits."""
         steps: list[pb.ObjectStep] = []
         while (sample := self._ring.try_recv()) is not None:
             try:
-                batch = parse(pb.Steps, sample.payload, CHANNELS["steps"].limit)
+                batch = parse(pb.Steps, sample.payload, CHANNELS[self._channel].limit)
                 check_header(batch)
                 steps.extend(batch.steps)
             except Refused as error:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import signal
 import time
 from typing import Any
@@ -36,8 +37,9 @@ def tables(status: pb.Status) -> Group:
     local = [_local(status)] if status.local_workers else []
     pace = [Text(status.pace, "bold red")] if status.pace else []
     return Group(
-        _summary(status), *pace, _objects(status), *_errors(status), *_energies(status), _workers(status), *local
-    )
+        _summary(status), *pace, _objects(status), *_errors(status), *_contacts(status), *_energies(status),
+        _workers(status), *local,
+    )  # fmt: skip
 
 
 def _summary(status: pb.Status) -> Text:
@@ -98,6 +100,24 @@ def _errors(status: pb.Status) -> list[Table]:
         estimate = f"{found.last.estimate:.1e}" if found.last.HasField("estimate") else "-"
         _add(table, found.object, enum_name("form", found.last.form), estimate)
     return [table] if shown else []
+
+
+def _contacts(status: pb.Status) -> list[Table]:
+    """Tables of contacts with obstacles, and of where these are; none if there are no obstacles."""
+    if not status.obstacles:
+        return []
+    table = Table("object", "contacts", "passes", "contact residual", "clipped", "force on [N]", **COMPACT)
+    for found in status.objects:
+        last = found.last
+        forces = (f"{r.obstacle} {math.hypot(r.force.x, r.force.y, r.force.z):.3g}" for r in last.reactions)
+        residual = f"{last.contact_residual:.1e}" if last.HasField("contact_residual") else "-"
+        numbers = str(last.contacts), str(last.passes), residual, str(found.clipped)
+        _add(table, found.object, *numbers, ", ".join(forces) or "-")
+    where = Table("obstacle", "at [m]", "turned by [°]", **COMPACT)
+    for pose in status.obstacles:
+        p, w = pose.position, min(abs(pose.rotation.w), 1.0)
+        _add(where, pose.header.object, f"{p.x:.3g} {p.y:.3g} {p.z:.3g}", f"{math.degrees(2 * math.acos(w)):.3g}")
+    return [table, where]
 
 
 def _energies(status: pb.Status) -> list[Table]:

@@ -40,7 +40,12 @@ CHANNELS: dict[str, Channel] = {
     "worker": Channel("worker/{worker}", "WorkerInfo", "worker", "5 Hz", 16 * KIB, 0, "hello, then heartbeat"),
     "echo": Channel("echo/{worker}", "Echo", "worker", "query, at join", 4 * KIB, 0, "does shared memory work?"),
     "steps": Channel("steps", "Steps", "server", "20 Hz batches", 8 * MIB, 0, "iterations, residuals, times"),
+    "reactions": Channel(
+        "reactions", "Steps", "server", "each millisecond", MIB, 0, "forces on obstacles, of each step"
+    ),
     "state": Channel("state/{object}", "State", "server", "at most 30 Hz", 256 * MIB, 0, "positions, velocities"),
+    "obstacle": Channel("obstacle/{object}", "Obstacle", "server", "queryable", 256 * MIB, 0, "shape, where it starts"),
+    "pose": Channel("pose/{object}", "ObstaclePose", "server", "at most 30 Hz", 4 * KIB, 0, "where it is now"),
     "command": Channel("command", "Command", "client", "query", 64 * KIB, 0, "push, grab, pause, ..."),
     "reply": Channel("command", "Reply", "server", "per command", MIB, 0, "what became of a command"),
     "alive_server": Channel("alive/server/{incarnation}", "", "server", "liveliness", 0, 0, "the server lives"),

@@ -17,6 +17,7 @@ class SolveStatus(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     NOT_FINITE: _ClassVar[SolveStatus]
     MAX_LINEARIZATIONS: _ClassVar[SolveStatus]
     RUNAWAY: _ClassVar[SolveStatus]
+    CONTACT: _ClassVar[SolveStatus]
 
 class StepForm(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -32,6 +33,7 @@ BREAKDOWN_PRECONDITIONER: SolveStatus
 NOT_FINITE: SolveStatus
 MAX_LINEARIZATIONS: SolveStatus
 RUNAWAY: SolveStatus
+CONTACT: SolveStatus
 ONE_SOLVE: StepForm
 ITERATE: StepForm
 FACTOR: StepForm
@@ -64,7 +66,7 @@ class Slot(_message.Message):
     def __init__(self, segment: _Optional[str] = ..., offset: _Optional[int] = ..., capacity: _Optional[int] = ..., generation: _Optional[int] = ...) -> None: ...
 
 class Scene(_message.Message):
-    __slots__ = ("header", "name", "toml", "resolved", "dt", "started_ns", "software", "objects", "server", "device", "build")
+    __slots__ = ("header", "name", "toml", "resolved", "dt", "started_ns", "software", "objects", "server", "device", "build", "obstacles")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     NAME_FIELD_NUMBER: _ClassVar[int]
     TOML_FIELD_NUMBER: _ClassVar[int]
@@ -76,6 +78,7 @@ class Scene(_message.Message):
     SERVER_FIELD_NUMBER: _ClassVar[int]
     DEVICE_FIELD_NUMBER: _ClassVar[int]
     BUILD_FIELD_NUMBER: _ClassVar[int]
+    OBSTACLES_FIELD_NUMBER: _ClassVar[int]
     header: Header
     name: str
     toml: str
@@ -87,7 +90,8 @@ class Scene(_message.Message):
     server: str
     device: str
     build: str
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., name: _Optional[str] = ..., toml: _Optional[str] = ..., resolved: _Optional[str] = ..., dt: _Optional[float] = ..., started_ns: _Optional[int] = ..., software: _Optional[str] = ..., objects: _Optional[_Iterable[str]] = ..., server: _Optional[str] = ..., device: _Optional[str] = ..., build: _Optional[str] = ...) -> None: ...
+    obstacles: _containers.RepeatedScalarFieldContainer[str]
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., name: _Optional[str] = ..., toml: _Optional[str] = ..., resolved: _Optional[str] = ..., dt: _Optional[float] = ..., started_ns: _Optional[int] = ..., software: _Optional[str] = ..., objects: _Optional[_Iterable[str]] = ..., server: _Optional[str] = ..., device: _Optional[str] = ..., build: _Optional[str] = ..., obstacles: _Optional[_Iterable[str]] = ...) -> None: ...
 
 class Topology(_message.Message):
     __slots__ = ("header", "nodes", "rest", "tets", "triangles", "row_start", "columns", "fixed", "young", "poisson", "reference")
@@ -252,7 +256,7 @@ class Echo(_message.Message):
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., slot: _Optional[_Union[Slot, _Mapping]] = ..., nonce: _Optional[int] = ..., settled: _Optional[bool] = ...) -> None: ...
 
 class ObjectStep(_message.Message):
-    __slots__ = ("header", "step", "time", "iterations", "residual", "status", "factor_step", "factor_age", "preconditioner", "assemble_seconds", "solve_seconds", "integrate_seconds", "step_seconds", "late_seconds", "cpu_seconds", "fallbacks", "excess", "interactions", "asked", "probe", "factor_age_bound", "linearizations", "nonlinear_residual", "kinetic_energy", "elastic_energy", "gravity_energy", "work", "dissipated", "form", "estimate")
+    __slots__ = ("header", "step", "time", "iterations", "residual", "status", "factor_step", "factor_age", "preconditioner", "assemble_seconds", "solve_seconds", "integrate_seconds", "step_seconds", "late_seconds", "cpu_seconds", "fallbacks", "excess", "interactions", "asked", "probe", "factor_age_bound", "linearizations", "nonlinear_residual", "kinetic_energy", "elastic_energy", "gravity_energy", "work", "dissipated", "form", "estimate", "contacts", "passes", "clipped", "contact_residual", "reactions")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     STEP_FIELD_NUMBER: _ClassVar[int]
     TIME_FIELD_NUMBER: _ClassVar[int]
@@ -283,6 +287,11 @@ class ObjectStep(_message.Message):
     DISSIPATED_FIELD_NUMBER: _ClassVar[int]
     FORM_FIELD_NUMBER: _ClassVar[int]
     ESTIMATE_FIELD_NUMBER: _ClassVar[int]
+    CONTACTS_FIELD_NUMBER: _ClassVar[int]
+    PASSES_FIELD_NUMBER: _ClassVar[int]
+    CLIPPED_FIELD_NUMBER: _ClassVar[int]
+    CONTACT_RESIDUAL_FIELD_NUMBER: _ClassVar[int]
+    REACTIONS_FIELD_NUMBER: _ClassVar[int]
     header: Header
     step: int
     time: float
@@ -313,7 +322,12 @@ class ObjectStep(_message.Message):
     dissipated: float
     form: StepForm
     estimate: float
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., time: _Optional[float] = ..., iterations: _Optional[int] = ..., residual: _Optional[float] = ..., status: _Optional[_Union[SolveStatus, str]] = ..., factor_step: _Optional[int] = ..., factor_age: _Optional[int] = ..., preconditioner: _Optional[str] = ..., assemble_seconds: _Optional[float] = ..., solve_seconds: _Optional[float] = ..., integrate_seconds: _Optional[float] = ..., step_seconds: _Optional[float] = ..., late_seconds: _Optional[float] = ..., cpu_seconds: _Optional[float] = ..., fallbacks: _Optional[int] = ..., excess: _Optional[float] = ..., interactions: _Optional[_Iterable[_Union[Interaction, _Mapping]]] = ..., asked: _Optional[str] = ..., probe: _Optional[int] = ..., factor_age_bound: _Optional[int] = ..., linearizations: _Optional[int] = ..., nonlinear_residual: _Optional[float] = ..., kinetic_energy: _Optional[float] = ..., elastic_energy: _Optional[float] = ..., gravity_energy: _Optional[float] = ..., work: _Optional[float] = ..., dissipated: _Optional[float] = ..., form: _Optional[_Union[StepForm, str]] = ..., estimate: _Optional[float] = ...) -> None: ...
+    contacts: int
+    passes: int
+    clipped: int
+    contact_residual: float
+    reactions: _containers.RepeatedCompositeFieldContainer[Reaction]
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., time: _Optional[float] = ..., iterations: _Optional[int] = ..., residual: _Optional[float] = ..., status: _Optional[_Union[SolveStatus, str]] = ..., factor_step: _Optional[int] = ..., factor_age: _Optional[int] = ..., preconditioner: _Optional[str] = ..., assemble_seconds: _Optional[float] = ..., solve_seconds: _Optional[float] = ..., integrate_seconds: _Optional[float] = ..., step_seconds: _Optional[float] = ..., late_seconds: _Optional[float] = ..., cpu_seconds: _Optional[float] = ..., fallbacks: _Optional[int] = ..., excess: _Optional[float] = ..., interactions: _Optional[_Iterable[_Union[Interaction, _Mapping]]] = ..., asked: _Optional[str] = ..., probe: _Optional[int] = ..., factor_age_bound: _Optional[int] = ..., linearizations: _Optional[int] = ..., nonlinear_residual: _Optional[float] = ..., kinetic_energy: _Optional[float] = ..., elastic_energy: _Optional[float] = ..., gravity_energy: _Optional[float] = ..., work: _Optional[float] = ..., dissipated: _Optional[float] = ..., form: _Optional[_Union[StepForm, str]] = ..., estimate: _Optional[float] = ..., contacts: _Optional[int] = ..., passes: _Optional[int] = ..., clipped: _Optional[int] = ..., contact_residual: _Optional[float] = ..., reactions: _Optional[_Iterable[_Union[Reaction, _Mapping]]] = ...) -> None: ...
 
 class Steps(_message.Message):
     __slots__ = ("header", "steps")
@@ -348,6 +362,82 @@ class Vector(_message.Message):
     y: float
     z: float
     def __init__(self, x: _Optional[float] = ..., y: _Optional[float] = ..., z: _Optional[float] = ...) -> None: ...
+
+class Quaternion(_message.Message):
+    __slots__ = ("w", "x", "y", "z")
+    W_FIELD_NUMBER: _ClassVar[int]
+    X_FIELD_NUMBER: _ClassVar[int]
+    Y_FIELD_NUMBER: _ClassVar[int]
+    Z_FIELD_NUMBER: _ClassVar[int]
+    w: float
+    x: float
+    y: float
+    z: float
+    def __init__(self, w: _Optional[float] = ..., x: _Optional[float] = ..., y: _Optional[float] = ..., z: _Optional[float] = ...) -> None: ...
+
+class Reaction(_message.Message):
+    __slots__ = ("obstacle", "force", "torque")
+    OBSTACLE_FIELD_NUMBER: _ClassVar[int]
+    FORCE_FIELD_NUMBER: _ClassVar[int]
+    TORQUE_FIELD_NUMBER: _ClassVar[int]
+    obstacle: str
+    force: Vector
+    torque: Vector
+    def __init__(self, obstacle: _Optional[str] = ..., force: _Optional[_Union[Vector, _Mapping]] = ..., torque: _Optional[_Union[Vector, _Mapping]] = ...) -> None: ...
+
+class Obstacle(_message.Message):
+    __slots__ = ("header", "shape", "size", "vertices", "triangles", "moved", "position", "rotation")
+    HEADER_FIELD_NUMBER: _ClassVar[int]
+    SHAPE_FIELD_NUMBER: _ClassVar[int]
+    SIZE_FIELD_NUMBER: _ClassVar[int]
+    VERTICES_FIELD_NUMBER: _ClassVar[int]
+    TRIANGLES_FIELD_NUMBER: _ClassVar[int]
+    MOVED_FIELD_NUMBER: _ClassVar[int]
+    POSITION_FIELD_NUMBER: _ClassVar[int]
+    ROTATION_FIELD_NUMBER: _ClassVar[int]
+    header: Header
+    shape: str
+    size: _containers.RepeatedScalarFieldContainer[float]
+    vertices: bytes
+    triangles: bytes
+    moved: str
+    position: Vector
+    rotation: Quaternion
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., shape: _Optional[str] = ..., size: _Optional[_Iterable[float]] = ..., vertices: _Optional[bytes] = ..., triangles: _Optional[bytes] = ..., moved: _Optional[str] = ..., position: _Optional[_Union[Vector, _Mapping]] = ..., rotation: _Optional[_Union[Quaternion, _Mapping]] = ...) -> None: ...
+
+class ObstaclePose(_message.Message):
+    __slots__ = ("header", "step", "time", "position", "rotation")
+    HEADER_FIELD_NUMBER: _ClassVar[int]
+    STEP_FIELD_NUMBER: _ClassVar[int]
+    TIME_FIELD_NUMBER: _ClassVar[int]
+    POSITION_FIELD_NUMBER: _ClassVar[int]
+    ROTATION_FIELD_NUMBER: _ClassVar[int]
+    header: Header
+    step: int
+    time: float
+    position: Vector
+    rotation: Quaternion
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., time: _Optional[float] = ..., position: _Optional[_Union[Vector, _Mapping]] = ..., rotation: _Optional[_Union[Quaternion, _Mapping]] = ...) -> None: ...
+
+class ObstacleTarget(_message.Message):
+    __slots__ = ("obstacle", "position", "rotation")
+    OBSTACLE_FIELD_NUMBER: _ClassVar[int]
+    POSITION_FIELD_NUMBER: _ClassVar[int]
+    ROTATION_FIELD_NUMBER: _ClassVar[int]
+    obstacle: str
+    position: Vector
+    rotation: Quaternion
+    def __init__(self, obstacle: _Optional[str] = ..., position: _Optional[_Union[Vector, _Mapping]] = ..., rotation: _Optional[_Union[Quaternion, _Mapping]] = ...) -> None: ...
+
+class ObstacleTargets(_message.Message):
+    __slots__ = ("header", "step", "targets")
+    HEADER_FIELD_NUMBER: _ClassVar[int]
+    STEP_FIELD_NUMBER: _ClassVar[int]
+    TARGETS_FIELD_NUMBER: _ClassVar[int]
+    header: Header
+    step: int
+    targets: _containers.RepeatedCompositeFieldContainer[ObstacleTarget]
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., targets: _Optional[_Iterable[_Union[ObstacleTarget, _Mapping]]] = ...) -> None: ...
 
 class Interaction(_message.Message):
     __slots__ = ("id", "client", "object", "kind", "point", "radius", "force", "duration", "target", "stiffness", "max_force", "nodes", "start", "held", "offsets", "at")
@@ -426,18 +516,20 @@ class FactorUse(_message.Message):
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., pattern: _Optional[int] = ..., checksum: _Optional[int] = ..., dtype: _Optional[str] = ..., worker: _Optional[str] = ..., library: _Optional[str] = ..., threads: _Optional[int] = ..., seconds: _Optional[float] = ..., remedy: _Optional[str] = ..., method: _Optional[str] = ..., ahead: _Optional[float] = ..., later: _Optional[bool] = ...) -> None: ...
 
 class Command(_message.Message):
-    __slots__ = ("header", "client", "verb", "interaction", "secret")
+    __slots__ = ("header", "client", "verb", "interaction", "secret", "target")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     CLIENT_FIELD_NUMBER: _ClassVar[int]
     VERB_FIELD_NUMBER: _ClassVar[int]
     INTERACTION_FIELD_NUMBER: _ClassVar[int]
     SECRET_FIELD_NUMBER: _ClassVar[int]
+    TARGET_FIELD_NUMBER: _ClassVar[int]
     header: Header
     client: str
     verb: str
     interaction: Interaction
     secret: bytes
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., client: _Optional[str] = ..., verb: _Optional[str] = ..., interaction: _Optional[_Union[Interaction, _Mapping]] = ..., secret: _Optional[bytes] = ...) -> None: ...
+    target: ObstacleTarget
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., client: _Optional[str] = ..., verb: _Optional[str] = ..., interaction: _Optional[_Union[Interaction, _Mapping]] = ..., secret: _Optional[bytes] = ..., target: _Optional[_Union[ObstacleTarget, _Mapping]] = ...) -> None: ...
 
 class Reply(_message.Message):
     __slots__ = ("header", "error", "interaction", "status", "unchanged")
@@ -454,7 +546,7 @@ class Reply(_message.Message):
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., error: _Optional[str] = ..., interaction: _Optional[_Union[Interaction, _Mapping]] = ..., status: _Optional[_Union[Status, _Mapping]] = ..., unchanged: _Optional[bool] = ...) -> None: ...
 
 class ObjectStatus(_message.Message):
-    __slots__ = ("object", "nodes", "tets", "last", "mean_iterations", "excess", "factors_used", "factors_refused", "in_flight", "factor_age", "factor_age_max", "factor_age_bound", "factors_mended", "refusal", "low", "high", "tip", "runaway_steps", "total_energy")
+    __slots__ = ("object", "nodes", "tets", "last", "mean_iterations", "excess", "factors_used", "factors_refused", "in_flight", "factor_age", "factor_age_max", "factor_age_bound", "factors_mended", "refusal", "low", "high", "tip", "runaway_steps", "total_energy", "clipped")
     OBJECT_FIELD_NUMBER: _ClassVar[int]
     NODES_FIELD_NUMBER: _ClassVar[int]
     TETS_FIELD_NUMBER: _ClassVar[int]
@@ -474,6 +566,7 @@ class ObjectStatus(_message.Message):
     TIP_FIELD_NUMBER: _ClassVar[int]
     RUNAWAY_STEPS_FIELD_NUMBER: _ClassVar[int]
     TOTAL_ENERGY_FIELD_NUMBER: _ClassVar[int]
+    CLIPPED_FIELD_NUMBER: _ClassVar[int]
     object: str
     nodes: int
     tets: int
@@ -493,7 +586,8 @@ class ObjectStatus(_message.Message):
     tip: Vector
     runaway_steps: int
     total_energy: float
-    def __init__(self, object: _Optional[str] = ..., nodes: _Optional[int] = ..., tets: _Optional[int] = ..., last: _Optional[_Union[ObjectStep, _Mapping]] = ..., mean_iterations: _Optional[float] = ..., excess: _Optional[float] = ..., factors_used: _Optional[int] = ..., factors_refused: _Optional[int] = ..., in_flight: _Optional[bool] = ..., factor_age: _Optional[int] = ..., factor_age_max: _Optional[int] = ..., factor_age_bound: _Optional[int] = ..., factors_mended: _Optional[int] = ..., refusal: _Optional[str] = ..., low: _Optional[_Union[Vector, _Mapping]] = ..., high: _Optional[_Union[Vector, _Mapping]] = ..., tip: _Optional[_Union[Vector, _Mapping]] = ..., runaway_steps: _Optional[int] = ..., total_energy: _Optional[float] = ...) -> None: ...
+    clipped: int
+    def __init__(self, object: _Optional[str] = ..., nodes: _Optional[int] = ..., tets: _Optional[int] = ..., last: _Optional[_Union[ObjectStep, _Mapping]] = ..., mean_iterations: _Optional[float] = ..., excess: _Optional[float] = ..., factors_used: _Optional[int] = ..., factors_refused: _Optional[int] = ..., in_flight: _Optional[bool] = ..., factor_age: _Optional[int] = ..., factor_age_max: _Optional[int] = ..., factor_age_bound: _Optional[int] = ..., factors_mended: _Optional[int] = ..., refusal: _Optional[str] = ..., low: _Optional[_Union[Vector, _Mapping]] = ..., high: _Optional[_Union[Vector, _Mapping]] = ..., tip: _Optional[_Union[Vector, _Mapping]] = ..., runaway_steps: _Optional[int] = ..., total_energy: _Optional[float] = ..., clipped: _Optional[int] = ...) -> None: ...
 
 class LocalWorker(_message.Message):
     __slots__ = ("worker", "state", "pid", "restarts", "exit_code")
@@ -510,7 +604,7 @@ class LocalWorker(_message.Message):
     def __init__(self, worker: _Optional[str] = ..., state: _Optional[str] = ..., pid: _Optional[int] = ..., restarts: _Optional[int] = ..., exit_code: _Optional[int] = ...) -> None: ...
 
 class Status(_message.Message):
-    __slots__ = ("header", "scene", "state", "step", "time", "dt", "step_p50", "step_p99", "step_max", "late_steps", "objects", "workers", "clients", "bulk_shared", "bulk_copied", "refused", "frames_dropped", "device", "pid", "uptime", "records_dropped", "records_lost", "recording_failure", "commands_refused", "moves_replaced", "bulk_bytes_out", "bulk_bytes_in", "local_workers", "pace")
+    __slots__ = ("header", "scene", "state", "step", "time", "dt", "step_p50", "step_p99", "step_max", "late_steps", "objects", "workers", "clients", "bulk_shared", "bulk_copied", "refused", "frames_dropped", "device", "pid", "uptime", "records_dropped", "records_lost", "recording_failure", "commands_refused", "moves_replaced", "bulk_bytes_out", "bulk_bytes_in", "local_workers", "obstacles", "pace")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     SCENE_FIELD_NUMBER: _ClassVar[int]
     STATE_FIELD_NUMBER: _ClassVar[int]
@@ -539,6 +633,7 @@ class Status(_message.Message):
     BULK_BYTES_OUT_FIELD_NUMBER: _ClassVar[int]
     BULK_BYTES_IN_FIELD_NUMBER: _ClassVar[int]
     LOCAL_WORKERS_FIELD_NUMBER: _ClassVar[int]
+    OBSTACLES_FIELD_NUMBER: _ClassVar[int]
     PACE_FIELD_NUMBER: _ClassVar[int]
     header: Header
     scene: str
@@ -568,5 +663,6 @@ class Status(_message.Message):
     bulk_bytes_out: int
     bulk_bytes_in: int
     local_workers: _containers.RepeatedCompositeFieldContainer[LocalWorker]
+    obstacles: _containers.RepeatedCompositeFieldContainer[ObstaclePose]
     pace: str
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., scene: _Optional[str] = ..., state: _Optional[str] = ..., step: _Optional[int] = ..., time: _Optional[float] = ..., dt: _Optional[float] = ..., step_p50: _Optional[float] = ..., step_p99: _Optional[float] = ..., step_max: _Optional[float] = ..., late_steps: _Optional[int] = ..., objects: _Optional[_Iterable[_Union[ObjectStatus, _Mapping]]] = ..., workers: _Optional[_Iterable[_Union[WorkerInfo, _Mapping]]] = ..., clients: _Optional[_Iterable[str]] = ..., bulk_shared: _Optional[int] = ..., bulk_copied: _Optional[int] = ..., refused: _Optional[int] = ..., frames_dropped: _Optional[int] = ..., device: _Optional[str] = ..., pid: _Optional[int] = ..., uptime: _Optional[float] = ..., records_dropped: _Optional[int] = ..., records_lost: _Optional[int] = ..., recording_failure: _Optional[str] = ..., commands_refused: _Optional[int] = ..., moves_replaced: _Optional[int] = ..., bulk_bytes_out: _Optional[int] = ..., bulk_bytes_in: _Optional[int] = ..., local_workers: _Optional[_Iterable[_Union[LocalWorker, _Mapping]]] = ..., pace: _Optional[str] = ...) -> None: ...
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., scene: _Optional[str] = ..., state: _Optional[str] = ..., step: _Optional[int] = ..., time: _Optional[float] = ..., dt: _Optional[float] = ..., step_p50: _Optional[float] = ..., step_p99: _Optional[float] = ..., step_max: _Optional[float] = ..., late_steps: _Optional[int] = ..., objects: _Optional[_Iterable[_Union[ObjectStatus, _Mapping]]] = ..., workers: _Optional[_Iterable[_Union[WorkerInfo, _Mapping]]] = ..., clients: _Optional[_Iterable[str]] = ..., bulk_shared: _Optional[int] = ..., bulk_copied: _Optional[int] = ..., refused: _Optional[int] = ..., frames_dropped: _Optional[int] = ..., device: _Optional[str] = ..., pid: _Optional[int] = ..., uptime: _Optional[float] = ..., records_dropped: _Optional[int] = ..., records_lost: _Optional[int] = ..., recording_failure: _Optional[str] = ..., commands_refused: _Optional[int] = ..., moves_replaced: _Optional[int] = ..., bulk_bytes_out: _Optional[int] = ..., bulk_bytes_in: _Optional[int] = ..., local_workers: _Optional[_Iterable[_Union[LocalWorker, _Mapping]]] = ..., obstacles: _Optional[_Iterable[_Union[ObstaclePose, _Mapping]]] = ..., pace: _Optional[str] = ...) -> None: ...

@@ -54,8 +54,6 @@ class Simulation:
         self.scene = scene
         scene.solver.check_device(device)
         scene.integrator.check_device(device)
-        if device == "gpu" and "contact" in scene.effects:
-            raise InputError("effects.contact is for the CPU only so far; allowed: --device cpu")
         backend = backends.create(device, scene.solver.precision)
         if scene.solver.wants_factors:
             ahead("backends/cpu/native/factor_check.cpp")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A recorded run: scene, meshes, frames, per-step scalars, interactions.
+"""A recorded run: scene, meshes, frames, per-step scalars, interactions, obstacles.
 
 A log that was cut off or damaged is read as far as it goes; `notes` says what is missing. Frames stay on disk and are
 decoded when asked for, so a log may be larger than memory.
@@ -16,6 +16,7 @@ from google.protobuf.message import DecodeError
 from clients.errors import BadInput
 from clients.log.bad_log import bad_log_is_bad_input
 from clients.log.frames import Frame, Mesh, frame_of, mesh_of
+from clients.log.obstacles import Obstacle, ObstacleFrame, obstacle_frame_of, obstacle_of
 from clients.log.scalars import Columns, columns, row
 from protocol import messages_pb2 as pb
 from protocol.log_file import LogFile, LogMessage
@@ -50,6 +51,8 @@ class Log:
         self.path = Path(path)
         self.scene: pb.Scene | None = None
         self.objects: dict[str, ObjectLog] = {}
+        self.obstacles: dict[str, Obstacle] = {}
+        self.poses: dict[str, list[ObstacleFrame]] = {}  # of obstacles that move, at recorded frames
         self._malformed: list[str] = []
         with bad_log_is_bad_input():
             self._file = LogFile.open(self.path)
@@ -61,6 +64,8 @@ class Log:
                 raise
         for found in self.objects.values():
             found.frames.sort()
+        for poses in self.poses.values():
+            poses.sort(key=lambda pose: pose.step)
 
     @property
     def complete(self) -> bool:
@@ -131,8 +136,11 @@ class Log:
         if message.topic == "/scene":
             self.scene = pb.Scene.FromString(message.data)
             return
-        if message.topic == "/touch":
+        if message.topic in ("/touch", "/targets"):
             return  # for replays that simulate
+        if message.kind in ("obstacle", "pose") and message.object:
+            self._decode_obstacle(message)
+            return
         if message.kind not in ("topology", "state", "step", "interaction", "factor") or not message.object:
             raise Refused("a message of an unknown channel")
         found = self.objects.setdefault(message.object, ObjectLog(message.object))
@@ -146,3 +154,10 @@ class Log:
             found.rows.append(row(pb.ObjectStep.FromString(message.data)))
         elif message.kind == "interaction":
             found.interactions.append((message.time / 1e9, pb.Interaction.FromString(message.data)))
+
+    def _decode_obstacle(self, message: LogMessage) -> None:
+        if message.kind == "obstacle":
+            self.obstacles[message.object] = obstacle_of(pb.Obstacle.FromString(message.data))
+        else:
+            pose = obstacle_frame_of(pb.ObstaclePose.FromString(message.data))
+            self.poses.setdefault(message.object, []).append(pose)

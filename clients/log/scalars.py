@@ -16,6 +16,10 @@ from protocol import messages_pb2 as pb
 Columns = dict[str, NDArray]
 
 INPUTS = ("asked", "probe")  # of a solve: for replays only
+REACTION = (
+    "reaction/"  # columns reaction/OBSTACLE/force_x to torque_z [N, N m], of obstacles that the object has touched
+)
+REACTIONS = ("force_x", "force_y", "force_z", "torque_x", "torque_y", "torque_z")
 
 
 def _dtype(field: Any) -> str:
@@ -45,8 +49,13 @@ def enum_name(field: str, value: int) -> str:
 
 
 def row(message: pb.ObjectStep) -> tuple:
-    """Returns the values of one step in the order of DTYPES."""
-    return tuple(_value(message, name) for name in DTYPES)
+    """Returns the values of one step in the order of DTYPES, and then its reactions by obstacle."""
+    reactions = {r.obstacle: (*_three(r.force), *_three(r.torque)) for r in message.reactions}
+    return *(_value(message, name) for name in DTYPES), reactions
+
+
+def _three(v: pb.Vector) -> tuple[float, float, float]:
+    return v.x, v.y, v.z
 
 
 def _value(message: pb.ObjectStep, name: str) -> object:
@@ -57,5 +66,10 @@ def _value(message: pb.ObjectStep, name: str) -> object:
 
 def columns(rows: Iterable[tuple]) -> Columns:
     """Returns one array per scalar, ascending in step."""
-    table = list(zip(*sorted(rows, key=lambda r: r[0]), strict=True)) or [()] * len(DTYPES)
-    return {name: np.array(values, dtype) for (name, dtype), values in zip(DTYPES.items(), table, strict=True)}
+    *table, reactions = list(zip(*sorted(rows, key=lambda r: r[0]), strict=True)) or [()] * (len(DTYPES) + 1)
+    found = {name: np.array(values, dtype) for (name, dtype), values in zip(DTYPES.items(), table, strict=True)}
+    none = (0.0,) * len(REACTIONS)
+    for obstacle in sorted(set().union(*reactions)):
+        values = np.array([each.get(obstacle, none) for each in reactions])
+        found |= {f"{REACTION}{obstacle}/{name}": values[:, k] for k, name in enumerate(REACTIONS)}
+    return found

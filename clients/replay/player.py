@@ -42,7 +42,7 @@ class Player:
         self._time, self._at = self.begin, self._started  # simulated time, and when it is due
         self._due = {"steps": 0.0, "status": 0.0}
         self._batch: list[pb.ObjectStep] = []
-        self._newest: dict[str, pb.State] = {}  # not sent yet
+        self._newest: dict[str, pb.State | pb.ObstaclePose] = {}  # not sent yet
         self._sent_at: dict[str, float] = {}
         self._status = pb.Status(scene=timeline.scene.name, dt=timeline.scene.dt, pid=os.getpid())
         self._status.device = f"replay of {timeline.path.name}"
@@ -51,7 +51,7 @@ class Player:
         self._seconds: deque[float] = deque(maxlen=WINDOW)
         server.offer("scene", timeline.scene)
         for _, name, message in timeline.between(math.inf, 0):  # queryable from the start
-            self._topology(name, message)
+            self._offer(name, message)
         self._publish_status("running")
 
     def play(self, loop: bool = False) -> None:
@@ -70,11 +70,11 @@ class Player:
         for when, name, message in self.timeline.between(self.begin, self.end):
             if not self._wait(when):
                 return
-            if isinstance(message, pb.Topology):
-                self._topology(name, message)
+            if isinstance(message, pb.Topology | pb.Obstacle):
+                self._offer(name, message)
             elif isinstance(message, pb.ObjectStep):
                 self._step(name, message)
-            elif isinstance(message, pb.State):
+            elif isinstance(message, pb.State | pb.ObstaclePose):
                 self._newest[name] = message
                 self._send_states(hold=self.speed < math.inf)
         self._send_states(hold=False)
@@ -128,7 +128,10 @@ class Player:
 
     # --- messages -----------------------------------------------------------------------------------------------
 
-    def _topology(self, name: str, message: object) -> None:
+    def _offer(self, name: str, message: object) -> None:
+        if isinstance(message, pb.Obstacle):
+            self.server.offer("obstacle", message, object=name)
+            return
         assert isinstance(message, pb.Topology)
         self.server.offer("topology", message, object=name)
         self.server.put("topology", message, wait=True, object=name)
@@ -139,6 +142,7 @@ class Player:
         self._batch.append(message)
         if name in self._objects:
             self._objects[name].last.CopyFrom(message)
+            self._objects[name].clipped += message.clipped
             self._iterations[name].append(message.iterations)
             if name == self.timeline.scene.objects[0]:
                 self._seconds.append(message.step_seconds)
@@ -158,8 +162,9 @@ class Player:
         for name, message in list(self._newest.items()):
             if hold and now - self._sent_at.get(name, -math.inf) < 0.9 * STATE_PERIOD:
                 continue
-            self.server.put("state", message, wait=self.speed == math.inf, object=name)
-            self.states += 1
+            channel = "state" if isinstance(message, pb.State) else "pose"
+            self.server.put(channel, message, wait=self.speed == math.inf, object=name)
+            self.states += channel == "state"
             self._sent_at[name] = now
             del self._newest[name]
 

@@ -18,13 +18,19 @@ from clients.log.bad_log import bad_log_is_bad_input
 from protocol import messages_pb2 as pb
 from protocol.log_file import LogFile
 
-KINDS: list[tuple[str, type[Message]]] = [("topology", pb.Topology), ("step", pb.ObjectStep), ("state", pb.State)]
+KINDS: list[tuple[str, type[Message]]] = [
+    ("topology", pb.Topology), ("obstacle", pb.Obstacle), ("step", pb.ObjectStep), ("state", pb.State),
+    ("pose", pb.ObstaclePose),
+]  # fmt: skip
+ONCE = [name in ("topology", "obstacle") for name, _ in KINDS]  # sent before the rest, wherever a replay begins
 PLACE = np.dtype([("time", "i8"), ("kind", "i4"), ("number", "i4"), ("offset", "i8"), ("object", "i8")])
 _PACK = struct.Struct("<qiiqq")  # of a PLACE
 
 
 class Timeline:
-    """Scene, topologies, steps and states of a log. Raises BadInput for a file without a scene, or that is no log.
+    """Scene, topologies, steps, states, obstacles and their poses of a log.
+
+    Raises BadInput for a file without a scene, or that is no log.
 
     notes: one sentence for each gap. end: simulated time of the last record [s].
     """
@@ -52,10 +58,11 @@ class Timeline:
         return float(self._places["time"].max(initial=0)) / 1e9
 
     def between(self, begin: float, end: float) -> Iterator[tuple[float, str, Message]]:
-        """Yields (time [s], object, message) with begin <= time <= end in order, after the topologies before it."""
+        """Yields (time [s], object or obstacle, message) with begin <= time <= end in order, after the topologies and
+        obstacles before it."""
         places = self._places
         times = places["time"] / 1e9
-        wanted = ((times >= begin) | (places["kind"] == 0)) & (times <= end)
+        wanted = ((times >= begin) | np.array(ONCE)[places["kind"]]) & (times <= end)
         for place in places[wanted]:
             data = self._file.data(int(place["offset"]), int(place["number"]))
             try:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Meshes and scalars of a run as rerun entities.
 
-/world/OBJECT holds the surface, /plots/QUANTITY/OBJECT a curve, /plots/energy/KIND/OBJECT curves of energies;
-timelines are `step` and `time` (simulated).
+/world/OBJECT holds the surface, /world/OBSTACLE too, /plots/QUANTITY/OBJECT a curve, /plots/energy/KIND/OBJECT curves
+of energies; timelines are `step` and `time` (simulated).
 """
 
 from __future__ import annotations
@@ -13,8 +13,10 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from clients.log.frames import Frame, Mesh
-from clients.log.scalars import Columns
+from clients.log.obstacles import Obstacle, ObstacleFrame, Pose
+from clients.log.scalars import REACTION, Columns
 from clients.viewer.colors import colors
+from clients.viewer.obstacle_surface import COLOR, obstacle_surface
 from clients.viewer.surface import Coloring, Surface, legend
 
 PLOTS = {  # entity below /plots -> title
@@ -24,6 +26,11 @@ PLOTS = {  # entity below /plots -> title
     "estimate": "estimated error of a step, log10 m",
     "step_time": "step time [ms]",
     "energy": "energy [J]",
+}
+CONTACT_PLOTS = {  # of runs with contact
+    "contacts": "places in contact",
+    "contact_residual": "contact residual, log10",
+    "reaction": "force on obstacles [N]",
 }
 ENERGIES = ("kinetic_energy", "elastic_energy", "gravity_energy", "work", "dissipated")
 
@@ -37,6 +44,7 @@ class RerunScene:
         self._surfaces: dict[tuple[str, int], Surface] = {}
         self._shown: dict[str, int] = {}  # object -> epoch whose triangles were logged last
         self._top, self._grow = top, grow
+        self._has_contact = False
         self._low = np.full(3, np.inf)
         self._high = np.full(3, -np.inf)
         recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Y_UP, static=True)
@@ -71,6 +79,25 @@ class RerunScene:
         self._recording.log(_entity("world", frame.object), shape)
         return True
 
+    def obstacle(self, obstacle: Obstacle) -> None:
+        """Logs the shape of an obstacle and where it is at the start; a plane as large as the bodies logged so far."""
+        self._has_contact, known = True, np.isfinite(self._low).all()
+        low, high = (self._low, self._high) if known else (np.zeros(3), np.ones(3))
+        vertices, triangles = obstacle_surface(obstacle, low, high)
+        shape = rr.Mesh3D(vertex_positions=vertices, triangle_indices=triangles, albedo_factor=COLOR)
+        entity, start = _entity("world", obstacle.name), _transform(obstacle.start)
+        self._recording.log(entity, shape, static=True)
+        if obstacle.moved:
+            self._recording.set_time("step", sequence=0)
+            self._recording.set_time("time", duration=0.0)
+        self._recording.log(entity, start, static=not obstacle.moved)
+
+    def pose(self, frame: ObstacleFrame) -> None:
+        """Logs where an obstacle is after a step."""
+        self._recording.set_time("step", sequence=frame.step)
+        self._recording.set_time("time", duration=frame.time)
+        self._recording.log(_entity("world", frame.obstacle), _transform(frame.pose))
+
     def steps(self, name: str, scalars: Columns, step_time: bool) -> None:
         """Logs scalars per step (k,) as curves. step_time: also the step time, which all objects share."""
         age = scalars["factor_age"]
@@ -85,6 +112,7 @@ class RerunScene:
         for energy in ENERGIES:
             values = scalars[energy]
             self._curve(f"energy/{energy.removesuffix('_energy')}", name, scalars, values, np.isfinite(values))
+        self._contact(name, scalars)
         if step_time:
             self._curve("step_time", "all", scalars, scalars["step_seconds"] * 1e3, np.ones(len(age), bool))
 
@@ -102,8 +130,9 @@ class RerunScene:
             rrb.TextDocumentView(origin="/legend", name="colour"),
             row_shares=[8, 1],
         )
+        plotted = PLOTS | CONTACT_PLOTS if self._has_contact else PLOTS
         plots = rrb.Vertical(
-            *(rrb.TimeSeriesView(origin=f"/plots/{quantity}", name=title) for quantity, title in PLOTS.items())
+            *(rrb.TimeSeriesView(origin=f"/plots/{quantity}", name=title) for quantity, title in plotted.items())
         )
         return rrb.Blueprint(
             rrb.Horizontal(bodies, plots, column_shares=[3, 2]),
@@ -113,6 +142,21 @@ class RerunScene:
             rrb.TimePanel(state="collapsed", timeline="time"),
             auto_views=False,
         )
+
+    def _contact(self, name: str, scalars: Columns) -> None:
+        """Logs what a run with obstacles has beside the others."""
+        if not self._has_contact:
+            return
+        known = np.isfinite(scalars["contact_residual"])
+        residual = np.log10(np.maximum(scalars["contact_residual"], 1e-17))
+        self._curve("contact_residual", name, scalars, residual, known)
+        every = np.ones(len(known), bool)
+        self._curve("contacts", name, scalars, scalars["contacts"], every)
+        for column in scalars:
+            if column.startswith(REACTION) and column.endswith("/force_x"):
+                pair = column.removesuffix("/force_x")
+                force = np.linalg.norm([scalars[f"{pair}/force_{axis}"] for axis in "xyz"], axis=0)
+                self._curve("reaction", f"{name} on {pair.removeprefix(REACTION)}", scalars, force, every)
 
     def _extend(self, points: NDArray, values: NDArray) -> None:
         self._low, self._high = np.minimum(self._low, points.min(axis=0)), np.maximum(self._high, points.max(axis=0))
@@ -133,6 +177,11 @@ class RerunScene:
                 ],
                 rr.Scalars.columns(scalars=values[used].astype(np.float64)),
             )
+
+
+def _transform(pose: Pose) -> rr.Transform3D:
+    w, x, y, z = pose.rotation
+    return rr.Transform3D(translation=pose.position, quaternion=rr.Quaternion(xyzw=[x, y, z, w]))
 
 
 def _entity(parent: str, name: str) -> str:

@@ -7,10 +7,12 @@ from io import BytesIO
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clients.errors import ClientError
 from clients.log.reader import Log
 from clients.viewer.colors import colors
+from clients.viewer.obstacle_surface import COLOR, obstacle_surface
 from clients.viewer.surface import Coloring, Surface, legend
 from protocol.process.extras import to_install
 
@@ -48,19 +50,31 @@ def _draw_bodies(axes: Any, log: Log, coloring: Coloring, top: float) -> None:
         if not np.isfinite(frame.x).all():
             continue
         surface = Surface(log.mesh(name, frame.epoch), coloring)
-        points = surface.points(frame.x)[:, [0, 2, 1]] * [1, -1, 1]  # matplotlib has z up
-        shade = 0.6 + 0.4 * np.abs(surface.normals(surface.points(frame.x)) @ (LIGHT / np.linalg.norm(LIGHT)))
+        points = surface.points(frame.x)
+        shade = 0.6 + 0.4 * np.abs(surface.normals(points) @ (LIGHT / np.linalg.norm(LIGHT)))
         rgba = colors(surface.values(frame.x), top) / 255
         rgba[:, :3] *= shade[:, None]
         faces = rgba[surface.triangles].mean(axis=1)
-        axes.add_collection3d(Poly3DCollection(points[surface.triangles], facecolors=faces, edgecolors="none"))
+        triangles = _upright(points[surface.triangles])
+        axes.add_collection3d(Poly3DCollection(triangles, facecolors=faces, edgecolors="none"))
         low, high = np.minimum(low, points.min(axis=0)), np.maximum(high, points.max(axis=0))
         last = max(last, frame.time)
     if np.isfinite(low).all():
+        for obstacle in log.obstacles.values():
+            vertices, drawn = obstacle_surface(obstacle, low, high)
+            pose = log.poses[obstacle.name][-1].pose if obstacle.name in log.poses else obstacle.start
+            triangles = _upright((vertices @ pose.matrix().T + pose.position)[drawn])
+            axes.add_collection3d(Poly3DCollection(triangles, facecolors=np.array(COLOR) / 255, alpha=0.3))
+        low, high = np.sort(_upright(np.array([low, high])), axis=0)
         axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
         axes.set_box_aspect(np.maximum(high - low, 1e-3 * (high - low).max() + 1e-12))
     axes.set(xlabel="x [m]", ylabel="-z [m]", zlabel="y [m]")
     axes.set_title(f"t = {last:.3g} s, {legend(coloring, top)}")
+
+
+def _upright(points: NDArray) -> NDArray:
+    """Returns points (..., 3) with y turned up, as matplotlib has z."""
+    return points[..., [0, 2, 1]] * [1, -1, 1]
 
 
 def _draw_curves(figure: Figure, grid: Any, log: Log) -> None:

@@ -71,6 +71,10 @@ def show_log(log: Log, recording: rr.RecordingStream, coloring: Coloring) -> Non
                 skipped += not scene.frame(frame, log.mesh(name, frame.epoch))
                 done += 1
                 progress(done)
+    for obstacle in log.obstacles.values():
+        scene.obstacle(obstacle)
+        for pose in log.poses.get(obstacle.name, ()):
+            scene.pose(pose)
     for number, name in enumerate(sorted(log.objects)):
         scene.steps(name, log.scalars(name), step_time=number == 0)
     if skipped:
@@ -148,8 +152,8 @@ def view_live(client: Client, coloring: Coloring, web: bool) -> None:
 
 def follow(client: Client, scene: RerunScene, viewer: Viewer, recording: rr.RecordingStream) -> None:
     """Logs states and steps of a server to a recording until the viewer is closed."""
-    meshes = client.meshes()
-    states, steps = client.states(), client.steps()
+    meshes, obstacles = client.meshes(), client.obstacles()
+    states, steps, poses = client.states(), client.steps(), client.poses()
     first = min(meshes, default="")
     laid_out = False
     while viewer.running():
@@ -167,8 +171,12 @@ def follow(client: Client, scene: RerunScene, viewer: Viewer, recording: rr.Reco
         for name, rows in by_object.items():
             scene.steps(name, columns(rows), step_time=name == first)
         if frames and not laid_out:
+            for obstacle in obstacles.values():
+                scene.obstacle(obstacle)
             recording.send_blueprint(scene.blueprint())
             laid_out = True
+        for pose in poses.newest():
+            scene.pose(pose)
         time.sleep(LIVE_PERIOD)
 
 

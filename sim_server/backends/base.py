@@ -169,6 +169,10 @@ class Engine(Protocol):
         """Returns the step records since the last call, one for each body and step, oldest first."""
         ...
 
+    def factor_matrix(self, body: int) -> Float64:
+        """Returns A as last assembled, (blocks, 3, 3), with contacts that a factor is to know; before `solve`."""
+        ...
+
     def records_and_reactions(self) -> tuple[NDArray[np.void], Float64]:
         """Returns the records, and with each the force [N] and torque [N m] on each obstacle, (k, obstacles, 6)."""
         ...

@@ -86,6 +86,7 @@ class Contact(Effect):
     """Obstacles of a scene, and two rows for each free surface node: the obstacles that it may touch in a step.
 
     dropped (surface nodes,): how often an obstacle found no row since there were nearer ones
+    frames (keyframes, 7): poses of the keyframes of all obstacles
     """
 
     def __init__(self, world: World, params: Params):
@@ -148,7 +149,7 @@ class Contact(Effect):
         self._motion = np.array([MOTION[way] for way in ways], np.int32)
         self._first = np.concatenate([[0], np.cumsum([len(keys) for keys in frames])]).astype(np.int32)
         self._time = np.array([time for keys in frames for time, _ in keys])
-        self._frame = np.array([pose for keys in frames for _, pose in keys])
+        self.frames = np.array([pose for keys in frames for _, pose in keys])
         self._speed = np.array([o.max_speed or 0.0 for o in self.obstacles])
         self._turn = np.array([o.max_turn or 0.0 for o in self.obstacles])
         self._placed = np.full(len(self.obstacles), -1.0)
@@ -252,7 +253,7 @@ class Contact(Effect):
         assert self._system is not None
         launch: Launch = self.world.backend.module(TEXT).bind(
             "place", len(self.obstacles), clock=self._system.clock, dt=self.world.dt, motion=self._motion,
-            first=self._first, time=self._time, frame=self._frame, target=target, speed=self._speed, turn=self._turn,
+            first=self._first, time=self._time, frame=self.frames, target=target, speed=self._speed, turn=self._turn,
             ball=self._ball, placed=self._placed, begin=self._table.begin, end=self._table.end, swept=self._swept,
         )  # fmt: skip
         return launch

@@ -8,11 +8,17 @@ from collections.abc import Callable, Hashable
 
 from protocol.counters import Counters
 from protocol.messages_pb2 import Command, Reply
+from sim_server.network.coalesce import moved_by
 from sim_server.network.rate_limiter import RateLimiter
 
 CAPACITY = 64  # commands with a rate limit that may wait; for the other verbs there is as much capacity again
 MAX_DEFERRED = 1024  # moves that may wait for a token of their client or for capacity
-LIMITED = ("push", "grab", "move")  # verbs; with the others a client may owe a burst: it can always let go and stop
+LIMITED = (
+    "push",
+    "grab",
+    "move",
+    "move_obstacle",
+)  # verbs; with the others a client may owe a burst: it can always let go and stop
 
 ReplyFunction = Callable[[Reply], None]
 PendingCommand = tuple[Command, ReplyFunction]
@@ -22,8 +28,8 @@ class CommandQueue:
     """Takes commands from the network's threads (`put`) for the service thread (`take_all`); neither waits.
 
     A command over the rate limit of its client, or beyond the capacity, is refused and counted (commands_refused). A
-    move is deferred instead: the newest move of each grab waits until the limit admits it and answers for those before
-    it (moves_replaced), so that a grab that stops moving ends where it stopped.
+    move is deferred instead: the newest move of each grab and obstacle waits until the limit admits it and answers for
+    those before it (moves_replaced), so that what stops moving ends where it stopped.
     """
 
     def __init__(
@@ -62,8 +68,8 @@ class CommandQueue:
 
     def _place(self, command: Command, reply: ReplyFunction) -> tuple[ReplyFunction | None, str]:
         """Returns the reply function of the move that this one replaces, and the reason for a refusal ("": none)."""
-        move = command.verb == "move"
-        key: Hashable = (command.client, command.interaction.id) if move else object()
+        moved = moved_by(command)
+        key: Hashable = object() if moved is None else moved
         for pending in (self._queue, self._deferred):
             if key in pending:
                 _, older = pending[key]
@@ -78,7 +84,7 @@ class CommandQueue:
         else:
             self._queue[key] = command, reply
             return None, ""
-        if move and len(self._deferred) < MAX_DEFERRED:
+        if moved is not None and len(self._deferred) < MAX_DEFERRED:
             self._deferred[key] = command, reply
             return None, ""
         return None, refusal

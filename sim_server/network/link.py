@@ -17,7 +17,18 @@ from zenoh.handlers import RingChannel
 
 from protocol.channels import PROTOCOL, SERVER_NAME, check_name, key, name_in
 from protocol.counters import Counters
-from protocol.messages_pb2 import Command, LocalWorker, Reply, Scene, State, Status, Steps, Topology
+from protocol.messages_pb2 import (
+    Command,
+    LocalWorker,
+    Obstacle,
+    ObstaclePose,
+    Reply,
+    Scene,
+    State,
+    Status,
+    Steps,
+    Topology,
+)
 from protocol.network.session import open_session
 from protocol.refused import Refused
 from protocol.shared_memory.limits import POOL_LIMIT
@@ -33,7 +44,7 @@ log = logging.getLogger(__name__)
 TOKENS = 4096  # liveliness tokens of clients that may wait to be read
 REPLIES = 1024  # replies to commands that may wait to be sent
 
-Stamped = Scene | State | Status | Steps | Topology  # messages with a header of the server
+Stamped = Obstacle | ObstaclePose | Scene | State | Status | Steps | Topology  # messages with a header of the server
 
 
 class ServerLink:
@@ -143,6 +154,11 @@ class ServerLink:
         """Sets the answer to queries for the scene."""
         self._queryables.set_answer(key("scene", self.name), self._encoded(scene))
 
+    def set_obstacle(self, obstacle: Obstacle) -> None:
+        """Sets the answer to queries for an obstacle."""
+        name = check_name(obstacle.header.object, "Obstacle.header.object")
+        self._queryables.set_answer(key("obstacle", self.name, object=name), self._encoded(obstacle))
+
     def clients(self) -> list[str]:
         """Returns the names of the clients that are connected."""
         while (sample := self._client_tokens.try_recv()) is not None:
@@ -169,6 +185,18 @@ class ServerLink:
         """True if somebody subscribed to the state of an object; "*": of any object."""
         return self._publishers.has_subscribers("state", object=object)
 
+    def wants_pose(self, obstacle: str = "*") -> bool:
+        """True if somebody subscribed to the pose of an obstacle; "*": of any."""
+        return self._publishers.has_subscribers("pose", object=obstacle)
+
+    def wants_reactions(self) -> bool:
+        """True if somebody subscribed to reactions of obstacles."""
+        return self._publishers.has_subscribers("reactions")
+
+    def publish_reactions(self, steps: Steps) -> None:
+        """Sends what objects exert on obstacles in each step to subscribers."""
+        self._publishers.put("reactions", steps)
+
     def publish_steps(self, steps: Steps) -> None:
         """Sends step records to their subscribers."""
         self._publishers.put("steps", steps)
@@ -176,6 +204,10 @@ class ServerLink:
     def publish_state(self, state: State) -> None:
         """Sends positions and velocities to their subscribers; replaces a state that still waits to be sent."""
         self._publishers.put("state", state, object=state.header.object)
+
+    def publish_pose(self, pose: ObstaclePose) -> None:
+        """Sends where an obstacle is to subscribers; replaces a pose that still waits to be sent."""
+        self._publishers.put("pose", pose, object=pose.header.object)
 
     def publish_status(self, status: Status) -> None:
         """Fills in workers, clients and counts, sends the status to its subscribers and sets the answer to queries."""

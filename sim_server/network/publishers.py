@@ -8,10 +8,10 @@ import zenoh
 
 from protocol.channels import key
 from protocol.counters import Counters
-from protocol.messages_pb2 import State, Status, Steps
+from protocol.messages_pb2 import ObstaclePose, State, Status, Steps
 from sim_server.network.send_queue import SendQueue
 
-Published = State | Status | Steps
+Published = ObstaclePose | State | Status | Steps
 
 
 class Publishers:
@@ -37,7 +37,7 @@ class Publishers:
         return _matched(self._publisher(key(channel, self._server, **names)))
 
     def put(self, channel: str, message: Published, **names: str) -> None:
-        """Sends a message if there are subscribers. A state or status replaces one that still waits to be sent."""
+        """Sends a message if there are subscribers. A state, pose or status replaces one that waits to be sent."""
         name = key(channel, self._server, **names)
         publisher = self._publisher(name)
         if not _matched(publisher):
@@ -45,7 +45,7 @@ class Publishers:
         self._sequence[name] += 1
         self._stamp(message, self._sequence[name])
         data = message.SerializeToString()
-        latest = name if channel in ("state", "status") else None
+        latest = name if channel in ("state", "pose", "status") else None
         if not self._queue.post(lambda: publisher.put(data), latest):
             self._counters.add("frames_dropped")
 

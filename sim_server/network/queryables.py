@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Answers the queries of clients and workers: status, scene, topology, shared memory probes, commands."""
+"""Answers the queries of clients and workers: status, scene, topology, obstacles, shared memory probes, commands."""
 
 import logging
 from collections.abc import Callable
@@ -24,8 +24,9 @@ from sim_server.network.send_queue import SendQueue
 log = logging.getLogger(__name__)
 
 MAX_QUERIES = 256  # queries of a channel that may wait for its thread; beyond that the oldest is dropped
+LONGEST_NAME = 64  # characters of the name of an obstacle
 MAX_WARNED_WORKERS = 64  # workers of another wire version that are warned of one by one
-QUERYABLES = ("command", "status", "scene", "topology", "echo")  # channels
+QUERYABLES = ("command", "status", "scene", "topology", "obstacle", "echo")  # channels
 
 
 class Queryables:
@@ -154,6 +155,7 @@ class Queryables:
     def _check(self, command: Command) -> None:
         check_header(command, incarnation=self._incarnation if command.header.incarnation else None)
         check_strings(command)
+        check_strings(command.target, LONGEST_NAME)
         check_numbers(command)
         check_client(command.client, command.secret)
 

@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 from protocol import messages_pb2 as pb
 from protocol.method import Method
 from protocol.process.version import version
+from sim_server.arrays import Float64
 from sim_server.backends.kinds import Kind
 from sim_server.mechanics.named_points import NamedPoints
 from sim_server.mechanics.world import Body
 from sim_server.mesh import posed
 from sim_server.mesh.surface import surface_triangles
-from sim_server.recording.object_steps import object_step, rows
+from sim_server.recording.object_steps import add_reactions, object_step, rows
 from sim_server.scene.solver_options import FACTORS
 from sim_server.simulation import Simulation
 
@@ -38,6 +39,7 @@ def scene(simulation: Simulation) -> pb.Scene:
         objects=[b.name for b in simulation.world.bodies],
         device=simulation.world.backend.name,
         build=simulation.world.backend.build(),
+        obstacles=[o.name for o in simulation.world.obstacles],
     )
 
 
@@ -99,17 +101,28 @@ def interaction(a: Any) -> pb.Interaction:
 
 
 def steps(
-    simulation: Simulation, records: NDArray[Any], methods: Callable[[int, int], Method | None] | None = None
-) -> list[pb.ObjectStep]:
-    """Step records (structs.RECORD) as messages. methods: of body and step, how that factor was made ("auto")."""
+    simulation: Simulation, records: NDArray[Any], methods: Callable[[int, int], Method | None] | None = None,
+    reactions: Float64 | None = None,
+) -> list[pb.ObjectStep]:  # fmt: skip
+    """Step records (structs.RECORD) as messages.
+
+    methods: of body and step, how that factor was made ("auto"). reactions: (records, obstacles, 6), force [N] and
+    torque [N m] of each object on each obstacle
+    """
     names = [b.name for b in simulation.world.bodies]
     kinds = preconditioner_names(simulation)
-    if methods is None or simulation.scene.solver.preconditioner != "auto":
-        return [object_step(row, names[row["body"]], kinds) for row in rows(records)]
-    return [
-        object_step(row, names[row["body"]], kinds | _factor_name(methods(row["body"], row["factor_step"])))
+    known = methods if simulation.scene.solver.preconditioner == "auto" else None
+    found = [
+        object_step(
+            row, names[row["body"]], kinds | _factor_name(known(row["body"], row["factor_step"])) if known else kinds
+        )
         for row in rows(records)
     ]
+    if reactions is not None:
+        obstacles = [o.name for o in simulation.world.obstacles]
+        for step, each in zip(found, reactions, strict=True):
+            add_reactions(step, each, obstacles)
+    return found
 
 
 def preconditioner_names(simulation: Simulation) -> dict[Kind, str]:

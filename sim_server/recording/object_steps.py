@@ -5,11 +5,14 @@ A column of struct Record (backends/cpu/native/ring_buffers.h) is the field of t
 column without a field is not sent. NaN leaves an `optional` field unset.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from protocol import messages_pb2 as pb
+from sim_server.arrays import Float64
 from sim_server.backends.cpu.structs import RECORD
 from sim_server.backends.kinds import Kind
 
@@ -43,7 +46,7 @@ def rows(records: NDArray[Any]) -> list[dict[str, Any]]:
 
 
 def object_step(record: dict[str, Any], name: str, kinds: dict[Kind, str]) -> pb.ObjectStep:
-    """Makes the message of one record. name: of the object. kinds: names of preconditioners."""
+    """Makes the message of one record, but for reactions. name: of the object. kinds: names of preconditioners."""
     made, kind, asked = record["factor_step"], record["kind"], record["asked"]
     values = {field: record[column] for column, field in COPIED.items()}
     values["dissipated"] = record["budget"] - record["kinetic"] - record["elastic"]
@@ -59,3 +62,14 @@ def object_step(record: dict[str, Any], name: str, kinds: dict[Kind, str]) -> pb
         asked=kinds[Kind(asked)] if asked != kind else "",
         **values,
     )
+
+
+def add_reactions(step: pb.ObjectStep, reactions: Float64, obstacles: Sequence[str]) -> None:
+    """Adds to a step what its object exerts on obstacles, but for what is 0.
+
+    reactions: (obstacles, 6), force [N] and torque [N m] on each
+    """
+    for number in np.flatnonzero(reactions.any(axis=1)).tolist():
+        fx, fy, fz, tx, ty, tz = reactions[number].tolist()
+        force, torque = pb.Vector(x=fx, y=fy, z=fz), pb.Vector(x=tx, y=ty, z=tz)
+        step.reactions.add(obstacle=obstacles[number], force=force, torque=torque)

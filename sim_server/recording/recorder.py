@@ -42,10 +42,11 @@ class _Record:
 
 
 class Recorder:
-    """Writes scene, topologies, states, steps and interactions to an MCAP file from a thread of its own.
+    """Writes scene, topologies, states, steps, interactions and obstacles to an MCAP file from a thread of its own.
 
-    Messages are stored under /scene, /topology/OBJECT, /state/OBJECT, /step/OBJECT, /interaction/OBJECT, /touch and
-    /factor/OBJECT with `log_time` = simulation time and `publish_time` = wall clock, both in ns.
+    Messages are stored under /scene, /topology/OBJECT, /state/OBJECT, /step/OBJECT, /interaction/OBJECT, /touch,
+    /factor/OBJECT, /obstacle/OBSTACLE, /pose/OBSTACLE and /targets with `log_time` = simulation time and
+    `publish_time` = wall clock, both in ns.
 
     Appending does not wait for the disk unless `block` is true (for runs without a pace). While more than FRAME_BYTES
     wait, states are dropped and counted in `dropped`; other records are kept up to TOTAL_BYTES, and counted in `lost`
@@ -87,6 +88,17 @@ class Recorder:
 
     def topology(self, message: pb.Topology, block: bool = False) -> None:
         self._append(f"/topology/{message.header.object}", message, self._time, message.header.epoch, block)
+
+    def obstacle(self, message: pb.Obstacle, block: bool = False) -> None:
+        self._append(f"/obstacle/{message.header.object}", message, self._time, 0, block)
+
+    def pose(self, message: pb.ObstaclePose, block: bool = False) -> None:
+        """Appends where an obstacle is at a frame."""
+        self._append(f"/pose/{message.header.object}", message, self._stamp(message.time), message.step, block)
+
+    def targets(self, message: pb.ObstacleTargets, time: float, block: bool = False) -> None:
+        """Appends where clients want obstacles to be, as the loop works with it from `time` [s of simulation] on."""
+        self._append("/targets", message, self._stamp(time), message.step, block)
 
     def state(self, message: pb.State, block: bool = False) -> None:
         """Appends a frame; the only kind that is dropped when the disk falls behind."""

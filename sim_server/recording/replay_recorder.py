@@ -2,24 +2,27 @@
 """Records the inputs of a run that records and frames lack, so that it can be repeated bit for bit (replay/run.py).
 
 The loop decides at which step a push, a move or a release takes effect, when it reads its mailbox; so the whole list
-of interactions is written with the step at which the loop took it up. Each factor is written with the step of its
+of interactions is written with the step at which the loop took it up, and so are the poses that clients gave to
+obstacles. Each factor is written with the step of its
 matrix and its maker; step records tell which one a solve used.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
 from protocol import messages_pb2 as pb
 from protocol.factor import Factor
 from protocol.validate import checksum
+from sim_server.arrays import Float64
 from sim_server.backends.base import PendingUpdate
 from sim_server.effects._base import Effect
 from sim_server.network.link import ServerLink
 from sim_server.recording import messages
+from sim_server.recording.obstacles import target_messages
 from sim_server.recording.recorder import Recorder
 from sim_server.updates.driver import Driver
 from sim_server.updates.factor_source import EXACT
@@ -28,8 +31,24 @@ if TYPE_CHECKING:
     from sim_server.effects.touch import Interaction
 
 
+PENDING = 1024  # updates kept after the last that the loop took up; in a pause each one replaces the one before
+
+T = TypeVar("T")
+Updates = deque[tuple[PendingUpdate, T]]  # what the loop was given, oldest first
+
+
+def _taken(updates: Updates[T]) -> list[tuple[int, T]]:
+    """Removes the updates up to the newest that the loop has taken up; returns those that it has, with the step.
+
+    The others were replaced before the loop saw them.
+    """
+    taken = [i for i, (pending, _) in enumerate(updates) if pending.taken >= 0]
+    removed = [updates.popleft() for _ in range(taken[-1] + 1 if taken else 0)]
+    return [(removed[i][0].taken, removed[i][1]) for i in taken]
+
+
 class ReplayRecorder:
-    """Collects factors and interactions as the loop gets them.
+    """Collects factors, interactions and moves of obstacles as the loop gets them.
 
     Call `write` before the steps that they act in are recorded.
     """
@@ -37,26 +56,28 @@ class ReplayRecorder:
     def __init__(self, driver: Driver, link: ServerLink, recorder: Recorder):
         self._driver, self._link, self._recorder = driver, link, recorder
         self._factors: deque[Factor] = deque()  # appended by the thread that posts them, maybe the loop's
-        self._updates: deque[tuple[PendingUpdate, list[Interaction]]] = deque()
+        self._touched: Updates[list[Interaction]] = deque(maxlen=PENDING)
+        self._moved: Updates[dict[str, Float64]] = deque(maxlen=PENDING)
         self._with_nodes: set[int] = set()  # ids whose nodes the log holds
         self._workers: dict[str, pb.WorkerInfo] = {}
         driver.on_adopt.append(self._factors.append)
-        self._touch = driver.simulation.touch
+        self._touch, self._contact = driver.simulation.touch, driver.simulation.contact
         driver.simulation.on_effect_update.append(self._on_update)
 
     def _on_update(self, effect: Effect, pending: PendingUpdate) -> None:
         if self._touch is not None and effect is self._touch:
-            self._updates.append((pending, self._touch.applied))
+            self._touched.append((pending, self._touch.applied))
+        elif self._contact is not None and effect is self._contact:
+            self._moved.append((pending, self._contact.targets))
 
     def write(self, block: bool) -> None:
         """Writes all that was taken up since the last call; so a log that is cut off holds the inputs of its steps."""
         for _ in range(len(self._factors)):
             self._recorder.factor(self._factor(self._factors.popleft()), block)
-        taken = [i for i, (pending, _) in enumerate(self._updates) if pending.taken >= 0]
-        for i in range(taken[-1] + 1 if taken else 0):
-            pending, interactions = self._updates.popleft()
-            if i in taken:  # the others were replaced before the loop saw them
-                self._recorder.touch_set(self._touch_set(pending.taken, interactions), self._dt * pending.taken, block)
+        for step, interactions in _taken(self._touched):
+            self._recorder.touch_set(self._touch_set(step, interactions), self._dt * step, block)
+        for step, targets in _taken(self._moved):
+            self._recorder.targets(target_messages(step, targets), self._dt * step, block)
 
     @property
     def _dt(self) -> float:

@@ -30,14 +30,14 @@ from sim_server.scene.solver_options import FACTORS
 
 COMPARED = (
     "iterations", "residual", "status", "kind", "fallbacks", "factor_step", "linearizations", "form", "estimate",
-    "kinetic", "work",
+    "kinetic", "work", "contacts", "passes", "clipped", "contact_residual",
 )  # fmt: skip
 INPUTS = ("step", "asked", "probe")
 ROW = np.dtype([(name, "f8" if RECORD[name].kind == "f" else "i8") for name in (*INPUTS, *COMPARED)])
 """Input and result of a solve: columns of the step record, from an ObjectStep."""
 FIELDS = {name: (object_steps.COPIED | object_steps.KINDS)[name] for name in ROW.names or ()}
 OPTIONAL = tuple(name for name in COMPARED if FIELDS[name] in object_steps.OPTIONAL)
-"""NaN in logs of versions that did not record them."""
+"""NaN in logs of versions that did not record them, and in steps without a value."""
 _PACK = struct.Struct("<" + "".join("d" if ROW[name].kind == "f" else "q" for name in ROW.names or ()))
 _KINDS = {kind.name.lower(): int(kind) for kind in Kind} | dict.fromkeys(FACTORS, int(Kind.CHOLESKY))
 
@@ -74,6 +74,8 @@ class Recording:
         self.scene = pb.Scene()
         self.objects: dict[str, RecordedObject] = {}
         self.touch: list[pb.TouchSet] = []
+        self.obstacles: dict[str, pb.Obstacle] = {}
+        self.targets: list[pb.ObstacleTargets] = []
         self.touched = False
         self.notes: list[str] = []
         self._file = LogFile.open(self.path)
@@ -122,7 +124,11 @@ class Recording:
             self.scene = pb.Scene.FromString(message.data)
         elif message.topic == "/touch":
             self.touch.append(pb.TouchSet.FromString(message.data))
-        else:
+        elif message.topic == "/targets":
+            self.targets.append(pb.ObstacleTargets.FromString(message.data))
+        elif message.kind == "obstacle":
+            self.obstacles[message.object] = pb.Obstacle.FromString(message.data)
+        elif message.kind != "pose":  # which follow from the scene and the targets
             self._keep_of_object(message)
 
     def _keep_of_object(self, message: LogMessage) -> None:

@@ -26,6 +26,7 @@ from sim_server.arrays import Float64
 from sim_server.errors import DeviceError
 from sim_server.mechanics.world import Body
 from sim_server.recording import messages
+from sim_server.recording.obstacles import obstacle_messages, targets_of
 from sim_server.replay.log import Recording
 from sim_server.replay.report import Comparison
 from sim_server.scene import Scene, deleted
@@ -68,12 +69,14 @@ class Replay:
         self.engine, self.bodies = self.simulation.engine, self.simulation.world.bodies
         self.compared = Comparison(recording)
         self._same_meshes()
+        self._same_obstacles()
         self._taken = {b.name: taken_up(self._rows(b.name)) for b in self.bodies}
         self._last_use = self._last_uses()
         self._needed = set(self._last_use)  # (object, step) of matrices whose factor the loop used
         self._factors: dict[tuple[str, int], Factor] = {}
         self._in_use: dict[str, int] = {}
         self._touch_sets: dict[int, pb.TouchSet] = {t.step: t for t in recording.touch}
+        self._targets: dict[int, pb.ObstacleTargets] = {t.step: t for t in recording.targets}
         self._nodes: dict[int, tuple[NDArray[np.int32], Float64]] = {}  # nodes and offsets of interactions, by id
         self._inline = self._library()
         self._positions: dict[str, Float64] = {}  # sent instead of a matrix, and not those of its step, by body
@@ -88,6 +91,7 @@ class Replay:
         self._compare_frames(0)
         for step in range(self.recording.steps):
             self._restore_interactions(step)
+            self._restore_targets(step)
             for body in self.bodies:
                 self._apply_settings(body.index, body.name, step)
                 self._use_factor(body.index, body.name, step, fresh=False)
@@ -128,6 +132,15 @@ class Replay:
                     f"({', '.join(other)}){f'; was {file} changed?' if file else ''}"
                 )
 
+    def _same_obstacles(self) -> None:
+        for now in obstacle_messages(self.simulation):
+            then = self.recording.obstacles.get(now.header.object)
+            if then is not None and (now.vertices, now.triangles) != (then.vertices, then.triangles):
+                raise BadLog(
+                    f"{self.recording.path}: the surface of obstacle {now.header.object!r} is not the recorded one; "
+                    "was its file changed?"
+                )
+
     def _library(self) -> Inline:
         """Returns a source of factors that uses the library named in the log, if it is installed."""
         system = self.simulation.system
@@ -156,6 +169,18 @@ class Replay:
             touch.restore([self._interaction(m) for m in self._touch_sets[step].interactions])
         except Refused as error:
             raise BadLog(f"{self.recording.path}: interactions of step {step}: {error}") from error
+
+    def _restore_targets(self, step: int) -> None:
+        """Has obstacles go where the loop had them go from this step on."""
+        if step not in self._targets:
+            return
+        contact, targets = self.simulation.contact, targets_of(self._targets[step])
+        if contact is None:
+            raise BadLog(f"{self.recording.path}: moved obstacles in a scene that has none")
+        try:
+            contact.restore(targets)
+        except ValueError as error:
+            raise BadLog(f"{self.recording.path}: obstacles moved at step {step}: {error}") from error
 
     def _interaction(self, m: pb.Interaction) -> Interaction:
         from sim_server.effects.touch import Interaction
@@ -197,7 +222,7 @@ class Replay:
 
     def _submit(self, body: Body, made: int) -> None:
         warped = body.index in self.simulation.warped
-        values, solver = self.simulation.system.body_values(body.first, body.last), self.simulation.scene.solver
+        values, solver = self.engine.factor_matrix(body.index), self.simulation.scene.solver
         if body.name in self._positions:
             if body.name not in self._assemblies:
                 topology = messages.topology(self.simulation, body)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Carries out commands of clients on a running simulation: push, grab, move, release, pause, resume, stop."""
+"""Carries out commands of clients on a running simulation: of pushes, grabs and obstacles, pause, resume, stop."""
 
 import math
 from collections.abc import Callable
@@ -12,7 +12,11 @@ from sim_server.recording import messages
 from sim_server.simulation import Simulation
 
 if TYPE_CHECKING:
+    from sim_server.effects.contact import Contact
     from sim_server.effects.touch import Interaction, Touch  # imported where a scene lists it
+
+
+UNIT = 1e-6  # that the length of a quaternion may differ from 1 by
 
 
 class BadCommand(ValueError):
@@ -52,7 +56,7 @@ class Commands:
             if verb is None:
                 raise BadCommand(f"unknown verb {command.verb!r}; known: {', '.join(sorted(VERBS))}")
             return verb(self, command)
-        except ValueError as error:  # BadCommand and TouchError
+        except ValueError as error:  # BadCommand, TouchError and ContactError
             return pb.Reply(error=str(error))
 
     def together(self) -> AbstractContextManager[None]:
@@ -105,6 +109,16 @@ class Commands:
     def _release(self, command: pb.Command) -> pb.Reply:
         return pb.Reply(interaction=messages.interaction(self._touch().release(command.client, command.interaction.id)))
 
+    def _move_obstacle(self, command: pb.Command) -> pb.Reply:
+        target, contact = command.target, self._contact()
+        if target.HasField("rotation"):
+            rotation = _unit(target.rotation)
+        else:
+            now = contact.targets.get(target.obstacle)
+            rotation = (1.0, 0.0, 0.0, 0.0) if now is None else tuple(now[3:].tolist())
+        contact.move(target.obstacle, _tuple(target.position), rotation)
+        return pb.Reply()
+
     def _pause(self, command: pb.Command) -> pb.Reply:
         unchanged, loop = self.engine_paused, self.engine.loop
         if not unchanged and not loop.realtime:
@@ -152,6 +166,13 @@ class Commands:
             )
         return self.simulation.touch
 
+    def _contact(self) -> "Contact":
+        """Returns the contact of the scene. Raises BadCommand."""
+        contact = self.simulation.contact
+        if contact is None:
+            raise BadCommand("the scene does not list the effect contact, so it has no obstacles")
+        return contact
+
     def _point(self, i: pb.Interaction) -> tuple[float, float, float]:
         """Returns the point at which a push or grab begins [m]."""
         return self._touch(i.object).points(i.object).named(i.at) if i.at else _tuple(i.point)
@@ -159,6 +180,14 @@ class Commands:
 
 def _tuple(v: pb.Vector) -> tuple[float, float, float]:
     return (v.x, v.y, v.z)
+
+
+def _unit(q: pb.Quaternion) -> tuple[float, float, float, float]:
+    """Returns the quaternion with length 1. Raises BadCommand if its length is another."""
+    length = math.hypot(q.w, q.x, q.y, q.z)
+    if not abs(length - 1) <= UNIT:
+        raise BadCommand(f"rotation = {q.w, q.x, q.y, q.z} of length {length:.9g}: must be a quaternion of length 1")
+    return (q.w / length, q.x / length, q.y / length, q.z / length)
 
 
 def _finite(i: pb.Interaction, *names: str) -> None:
@@ -171,5 +200,6 @@ def _finite(i: pb.Interaction, *names: str) -> None:
 
 VERBS: dict[str, Callable[[Commands, pb.Command], pb.Reply]] = {
     "push": Commands._push, "grab": Commands._grab, "move": Commands._move, "release": Commands._release,
+    "move_obstacle": Commands._move_obstacle,
     "pause": Commands._pause, "resume": Commands._resume, "stop": Commands._stop,
 }  # fmt: skip

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from protocol import messages_pb2 as pb
 from protocol.process.nvidia import nvidia_device
+from sim_server.arrays import Float64
 from sim_server.network.link import ServerLink
 from sim_server.recording.recorder import Recorder
 from sim_server.service.commands import Commands
@@ -54,7 +55,7 @@ class Service:
         self.commands = Commands(simulation, self._record_interaction, self._frozen)
         self.telemetry = Telemetry(self.driver, link, recorder, not realtime, self.commands)
         self._set_intervals()
-        self._batches: deque[NDArray[Any]] = deque()
+        self._batches: deque[tuple[NDArray[Any], Float64]] = deque()  # step records and their reactions
         self._failure: BaseException | None = None
         self._status_replies: list[Callable[[pb.Reply], None]] = []  # of clients that requested a status
         # deadline, reply and answer of each `pause` and `stop`
@@ -98,7 +99,7 @@ class Service:
                 self.engine.run(ENDLESS if self.steps is None else self.steps)
                 return
             while not self.engine.loop.stop and (self.steps is None or self.engine.step < self.steps):
-                self._batches.append(self.driver.advance(1))
+                self._batches.append((self.driver.advance(1), self.driver.reactions))
         except BaseException as error:
             self._failure = error
 
@@ -184,17 +185,24 @@ class Service:
 
     def _drain(self) -> None:
         if self._loop_alone:
-            records = self.driver.pump()
-        else:
-            batches = [self._batches.popleft() for _ in range(len(self._batches))]
-            records = np.concatenate(batches) if batches else np.zeros(0, self.engine.records_dtype)
-        for line in self.telemetry.count_unconverged(records):
+            self._report(self.driver.pump(), self.driver.reactions)
+            return
+        batches = [self._batches.popleft() for _ in range(len(self._batches))]
+        none = np.zeros(0, self.engine.records_dtype), np.zeros((0, 0, 6))
+        records, reactions = zip(*(batches or [none]), strict=True)
+        self._report(np.concatenate(records), np.concatenate(reactions))
+
+    def _report(self, records: NDArray[Any], reactions: Float64) -> None:
+        """Passes on new step records and their reactions on obstacles, and new frames."""
+        contact = self.telemetry.contact
+        undone = [*contact.count_clipped(records), *contact.crowded_nodes()]
+        for line in [*self.telemetry.count_unconverged(records), *undone]:
             log.warning("%s", line)
         for line in [*self.telemetry.count_runaways(records), *self.telemetry.not_finite(records)]:
             log.error("%s", line)
         if self.pace is not None and len(records):
             self.pace.add(records)
-        self.telemetry.records(records)
+        self.telemetry.records(records, reactions)
         self.telemetry.frames()
         self._set_intervals()
 

@@ -11,13 +11,16 @@ from numpy.typing import NDArray
 
 from protocol import messages_pb2 as pb
 from protocol.method import Method
+from sim_server.arrays import Float64
 from sim_server.backends.kinds import SLACK_OF_ENERGY
 from sim_server.mechanics.named_points import NamedPoints
 from sim_server.network.link import ServerLink
 from sim_server.recording import messages
+from sim_server.recording.obstacles import pose_messages
 from sim_server.recording.recorder import Recorder
 from sim_server.recording.replay_recorder import ReplayRecorder
 from sim_server.service.commands import Commands
+from sim_server.service.contact_telemetry import ContactTelemetry
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
 
@@ -35,6 +38,8 @@ class Telemetry:
 
     patient: wait for the log; without it, drop
     commands: whose interactions are in the status; None: there are none
+
+    contact: the part that tells of obstacles
     """
 
     def __init__(
@@ -48,6 +53,7 @@ class Telemetry:
         self.driver, self.link, self.recorder, self.patient = driver, link, recorder, patient
         self.simulation, self.engine = driver.simulation, driver.engine
         self.commands = commands
+        self.contact = ContactTelemetry(self.simulation, link, recorder)
         self.replay_recorder = ReplayRecorder(driver, link, recorder) if recorder and commands else None
         self.started = time.monotonic()
         self.record_every = self.simulation.scene.record.every if recorder else 0
@@ -57,6 +63,7 @@ class Telemetry:
         ]  # iterations
         self.seconds: deque[float] = deque(maxlen=STATISTICS_STEPS)
         self._last: NDArray[Any] = np.zeros(len(self._window), self.engine.records_dtype)
+        self._last_reactions: Float64 | None = None  # of the same records; None: there are no obstacles
         self._not_finite: set[str] = set()  # objects of which it was said
         self.solves = 0
         self.pace = ""  # why the run does not keep pace with the clock; empty: it does, or need not
@@ -81,6 +88,7 @@ class Telemetry:
             self.link.announce(topology)
             if self.recorder:
                 self.recorder.topology(topology)
+        self.contact.open()
         if self.recorder:
             self._record_frame(0, self.simulation.world.x, self.simulation.world.v)
         self.publish_status("running")
@@ -92,14 +100,20 @@ class Telemetry:
         self._due[what] = now + period
         return True
 
-    def records(self, records: NDArray[Any]) -> None:
-        """Sends step records, each to the log, in batches to subscribers."""
+    def records(self, records: NDArray[Any], reactions: Float64 | None = None) -> None:
+        """Sends step records, each to the log, in batches to subscribers.
+
+        reactions: (k, obstacles, 6), of each record on obstacles, force [N] and torque [N m]; None: there are none
+        """
+        if reactions is not None and not reactions.shape[1]:
+            reactions = None
         if self.replay_recorder:
             self.replay_recorder.write(self.patient)
         if len(records):
             self.seconds.extend(records["whole"][records["body"] == 0].tolist())
-            self.update_summary(records)
-            steps = self._messages(records)
+            self.update_summary(records, reactions)
+            self.contact.publish_reactions(records, reactions)
+            steps = self._messages(records, reactions)
             self._add_interactions(steps)
             if self.recorder:
                 for step in steps:
@@ -110,22 +124,30 @@ class Telemetry:
                 self.link.publish_steps(pb.Steps(steps=self._batch))
             self._batch.clear()
 
-    def update_summary(self, records: NDArray[Any]) -> None:
-        """Keeps what the status tells of steps: the last record of each body, iterations and energies."""
+    def update_summary(self, records: NDArray[Any], reactions: Float64 | None = None) -> None:
+        """Keeps what the status tells of steps: the last records and reactions of bodies, iterations and energies."""
         order = np.argsort(records["body"], kind="stable")
         present, first = np.unique(records["body"][order], return_index=True)
         iterations = records["iterations"][order].tolist()
         ends = [*first[1:].tolist(), len(order)]
-        self._last[present] = records[order[np.array(ends) - 1]]
+        newest = order[np.array(ends) - 1]
+        self._last[present] = records[newest]
+        if reactions is not None:
+            if self._last_reactions is None:
+                self._last_reactions = np.zeros((len(self._window), *reactions.shape[1:]))
+            self._last_reactions[present] = reactions[newest]
         for body, begin, end in zip(present.tolist(), first.tolist(), ends, strict=True):
             self._window[body].extend(iterations[begin:end])
         for r in records[np.isfinite(records["elastic"])]:
             self._energy[int(r["body"])] = float(r["kinetic"] + r["elastic"] + r["gravity"])
 
-    def _messages(self, records: NDArray[Any]) -> list[pb.ObjectStep]:
+    def _messages(self, records: NDArray[Any], reactions: Float64 | None) -> list[pb.ObjectStep]:
         """Makes messages for the log and for subscribers only: it is the most expensive part of telemetry."""
-        wanted = records if self.recorder else records[-MAX_BATCH:] if self.link.wants_steps() else records[:0]
-        steps = messages.steps(self.simulation, wanted, self._method)
+        most = len(records) if self.recorder else MAX_BATCH if self.link.wants_steps() else 0
+        wanted = slice(max(len(records) - most, 0), None)
+        steps = messages.steps(
+            self.simulation, records[wanted], self._method, None if reactions is None else reactions[wanted]
+        )
         bound = self.driver.age_bound() if steps else -1
         for step in steps:
             step.excess = self.driver.by_name[step.header.object].solves.excess
@@ -139,7 +161,8 @@ class Telemetry:
     def _latest(self, body: int, bound: int) -> pb.ObjectStep | None:
         if not self._window[body]:
             return None
-        message = messages.steps(self.simulation, self._last[body : body + 1], self._method)[0]
+        reactions = None if self._last_reactions is None else self._last_reactions[body : body + 1]
+        message = messages.steps(self.simulation, self._last[body : body + 1], self._method, reactions)[0]
         message.excess, message.factor_age_bound = self.driver.bodies[body].solves.excess, bound
         return message
 
@@ -165,7 +188,7 @@ class Telemetry:
             del self._interactions[id]
 
     def frames(self) -> None:
-        """Sends states, to the log at the scene's rate, the newest one to viewers."""
+        """Sends states and poses of obstacles, to the log at the scene's rate, the newest ones to viewers."""
         frames = self.engine.frames()
         for step, x, v in frames:
             if self.record_every and step % self.record_every == 0:
@@ -175,11 +198,13 @@ class Telemetry:
             for body in self.simulation.world.bodies:
                 if self.link.wants_state(body.name):
                     self.link.publish_state(messages.state(body, step, step * self.simulation.world.dt, x, v))
+            self.contact.publish_poses(step)
 
     def frame_interval(self) -> int:
         """Returns the steps between frames that the loop should copy out; 0 for none."""
         if self._is_due("look", LOOK_PERIOD):
-            self._has_viewers = self.link.wants_state()
+            wants_poses = self.contact.look()
+            self._has_viewers = self.link.wants_state() or wants_poses
             self._has_listeners = self.link.wants_steps() or bool(self.link.clients())
         return self.record_every or (max(1, round(STATE_PERIOD / self.simulation.world.dt)) if self._has_viewers else 0)
 
@@ -197,6 +222,7 @@ class Telemetry:
         for body in self.simulation.world.bodies:
             message = messages.state(body, step, step * self.simulation.world.dt, x, v)
             self.recorder.state(message, block=self.patient)
+        self.contact.record_poses(step, block=self.patient)
 
     def publish_status(self, state: str, force: bool = True, where: bool = False) -> None:
         """Publishes the status of the scene. where: with the places of its objects, which are fetched from a GPU."""
@@ -236,8 +262,10 @@ class Telemetry:
                     factor_age_bound=bound,
                     runaway_steps=self.runaways[body.index],
                     total_energy=self._energy.get(body.index),
+                    clipped=self.contact.clipped[body.index],
                 )
             )
+        status.obstacles.extend(pose_messages(self.simulation, status.step, fixed=True))
         if where:
             messages.add_places(self._places(), status)
         self.link.publish_status(status)
@@ -270,8 +298,9 @@ class Telemetry:
             return []
         r, status = failed[0], next(iter(self.unconverged))
         name = self.simulation.world.bodies[int(r["body"])].name
+        column = "contact_residual" if r["status"] == pb.CONTACT else "residual"
         return [
-            f"object {name!r}, step {int(r['step'])}: not converged ({status}, residual {float(r['residual']):.1e}); "
+            f"object {name!r}, step {int(r['step'])}: not converged ({status}, residual {float(r[column]):.1e}); "
             "further ones are counted"
         ]
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import Factor
+from sim_server.arrays import Float64
 from sim_server.backends.base import Capability
 from sim_server.simulation import Simulation
 from sim_server.updates.body_state import BodyUpdateState
@@ -35,6 +36,8 @@ class Driver:
     """Runs one simulation under its scene's update policy.
 
     source: makes factors; None: this process does
+    reactions: (k, obstacles, 6) force [N] and torque [N m] on each obstacle by the object of each record that was
+        returned last
     counted: the scheduler and `auto` reckon with bytes and operations instead of seconds, so that a run repeats
         exactly; None: unless no step waits for a factor
     """
@@ -56,6 +59,7 @@ class Driver:
         self.wants_factors = self.solver.wants_factors
         if self.wants_factors:
             self.check.prepare()
+        self.reactions: Float64 = np.zeros((0, 0, 6))
         self.on_adopt: list[Callable[[Factor], Any]] = []  # called with every factor that the loop is given
         self.snapshots = SnapshotPool(simulation, self.source, self.policy.expected_latency)
         self.useless_factors = UselessFactors(self)
@@ -66,14 +70,16 @@ class Driver:
 
     def advance(self, steps: int) -> NDArray[Any]:
         """Makes steps; returns their records (structs.RECORD)."""
-        out: list[NDArray[Any]] = []
+        out: list[tuple[NDArray[Any], Float64]] = []
         for _ in range(steps):
             if self.wants_factors:
                 self.policy.step()
             else:
                 self.engine.run(1)
-            out.append(self._new_records())
-        return np.concatenate(out or [self.engine.records()])
+            out.append((self._new_records(), self.reactions))
+        records, reactions = zip(*(out or [self.engine.records_and_reactions()]), strict=True)
+        self.reactions = np.concatenate(reactions)
+        return np.concatenate(records)
 
     def pump(self) -> NDArray[Any]:
         """Reads records, posts factors and sends matrices while the loop runs on its own. Returns the new records."""
@@ -93,14 +99,14 @@ class Driver:
         step = self.engine.step
         for state in self.bodies:
             if not state.frozen:
-                values = self.simulation.system.body_values(state.body.first, state.body.last)
+                values = self.engine.factor_matrix(state.body.index)
                 state.job.matrix = step, values
                 self.inline.submit(self._job(state, step, values))
         self.receive(self.inline, self.adopt)
         self.engine.solve()
 
     def _new_records(self) -> NDArray[Any]:
-        records: NDArray[Any] = self.engine.records()
+        records, self.reactions = self.engine.records_and_reactions()
         self.observe(records)
         return records
 

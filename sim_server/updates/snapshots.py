@@ -87,9 +87,11 @@ class SnapshotPool:
             self._free[copy.shape].append(copy)
 
     def _workers_assemble(self, state: BodyUpdateState) -> bool:
-        """True if workers can assemble the matrix from positions: all effects are known to them, and fewer than
-        MAX_FAILED_ASSEMBLIES attempts in a row have failed."""
-        if self._solver.build != "worker" or state.failures.assemblies >= MAX_FAILED_ASSEMBLIES:
+        """True if workers can assemble the matrix from positions: all effects are known to them, there is no contact,
+        and fewer than MAX_FAILED_ASSEMBLIES attempts in a row have failed."""
+        if self._solver.build != "worker" or self._simulation.contact is not None:
+            return False
+        if state.failures.assemblies >= MAX_FAILED_ASSEMBLIES:
             return False
         known = all(e.known_to_workers for e in self._simulation.effects.values())
         return known and self._source.assembles_matrices()

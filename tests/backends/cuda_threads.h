@@ -13,6 +13,7 @@
 #define __device__
 #define __global__
 #define __forceinline__ inline
+#define __noinline__
 #define __launch_bounds__(n)
 #define __shared__ static
 #define __align__(n) alignas(n)
@@ -33,7 +34,13 @@ static double __longlong_as_double(long long bits) {
 
 static void __threadfence() { std::atomic_thread_fence(std::memory_order_seq_cst); }
 template <class T> static T atomicAdd(T* a, T by) { return __atomic_fetch_add(a, by, __ATOMIC_SEQ_CST); }
-template <class T> static T __ldcg(const T* a) { return __atomic_load_n(a, __ATOMIC_SEQ_CST); }
+template <class T> static T atomicSub(T* a, T by) { return __atomic_fetch_sub(a, by, __ATOMIC_SEQ_CST); }
+template <class T> static T __ldcg(const T* a) {
+    T found;
+    __atomic_load(const_cast<T*>(a), &found, __ATOMIC_SEQ_CST);
+    return found;
+}
+template <class T> static void __stcg(T* a, T value) { __atomic_store(a, &value, __ATOMIC_SEQ_CST); }
 static void atomicMax(long long* a, long long b) {
     long long seen = __ldcg(a);
     while (seen < b && !__atomic_compare_exchange_n(a, &seen, b, false, __ATOMIC_SEQ_CST, __ATOMIC_SEQ_CST)) {}

@@ -67,6 +67,8 @@ class Device(FakeDevice):
     def branch(self, flag: Array) -> Any:
         return nullcontext()
 
+    repeat = branch
+
 
 def made(folder: Path, library: Any) -> ModuleType:
     """The module. Texts are compiled in `folder`.

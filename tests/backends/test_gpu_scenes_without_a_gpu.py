@@ -14,6 +14,7 @@ from sim_server.backends.gpu.inverse.plan import plan
 from sim_server.backends.gpu.inverse.workspace import workspace
 from sim_server.simulation import Simulation
 from tests.backends import fake_cupy
+from tests.contact.scenes import floor, over, ram
 from tests.scenes import bar, scene
 from tests.support import nvrtc
 from tests.worker.block_matrices import bar_edges, pattern
@@ -89,6 +90,30 @@ def test_momenta_are_set_where_a_body_may_be_free(cupy, fixed, solve, precision)
     launched = [kernel for kernel, _ in cupy.calls]
     assert 3 * launched.count("set_momenta") == (launched.count("pcg") if fixed is None else 0)
     assert ("apply_factor" in launched) == (solve == "auto")
+
+
+@pytest.mark.parametrize("precision", ["float64", "mixed", "float32"])
+def test_a_scene_with_contact_is_built(cupy, precision):
+    solver = {"preconditioner": "cholesky", "precision": precision}
+    simulation = over(ram(), floor(), solver=solver, device="gpu")
+    names = [kernel for kernel, _ in cupy.calls]
+    one_pass = ["contact_forces", "pcg", "contact_search"]
+    step = ["place", "detect", "begin_contact", *one_pass, *one_pass, "finish_contact", "fused"]
+    first = names.index("place")
+    assert names[first : first + len(step)] == step
+    engine = simulation.engine
+    engine.run(3)
+    records, reactions = engine.records_and_reactions()
+    assert records["step"].tolist() == [1, 2, 3] and reactions.shape == (3, 2, 6)
+    exact = vars(simulation.contact.contact_input())
+    twins = {name: engine.gpu.twin(array) for name, array in exact.items() if name in ("gap", "force", "normal")}
+    assert {twin.dtype for twin in twins.values()} == {np.dtype("f8")}
+
+
+def test_a_scene_without_contact_has_nothing_of_it(cupy):
+    engine = Simulation.load("deploy/scenes/beam.toml", [], "gpu").engine
+    assert not any("contact" in kernel for kernel, _ in cupy.calls)
+    assert engine.records_and_reactions()[1].shape == (0, 0, 6)
 
 
 def test_what_a_build_of_an_inverse_reads_is_there_before_its_own_stream_runs(cupy):

@@ -11,6 +11,7 @@ import pytest
 from sim_server.backends.compiler import INCLUDE, SOURCES, compiler
 from sim_server.backends.declarations import Declarations
 from sim_server.backends.gpu import structs
+from sim_server.backends.gpu.contact import TEXT as CONTACT_TEXT
 from sim_server.backends.gpu.device import PRECISIONS, own_headers
 from sim_server.backends.gpu.device import options as device_options
 from sim_server.backends.gpu.energies import BALANCE_TEXT, ELASTIC_TEXT
@@ -33,7 +34,7 @@ def asserted(tmp_path: Path, include: str, *declarations: Declarations) -> Path:
 
 def test_the_compiler_agrees_with_all_that_the_loop_shares(tmp_path):
     source = asserted(tmp_path, "backends/gpu/loop.h", structs.LOOP)
-    results = structs.LOOP.assertions("PcgResult", "NewtonResult", "StepTimestamp")
+    results = structs.LOOP.assertions("PcgResult", "NewtonResult", "ContactResult", "StepTimestamp")
     source.write_text(source.read_text() + results)
     assert "GpuLoop.frame_copies" in source.read_text()
     command = [compiler(), "-std=c++17", "-fsyntax-only", "-x", "c++", f"-I{SOURCES}", f"-I{INCLUDE}", str(source)]
@@ -46,6 +47,7 @@ def test_the_compiler_agrees_with_all_that_the_loop_shares(tmp_path):
         ("pcg_structs.cuh", PCG), ("newton.cu", NEWTON), ("energy_balance.cu", BALANCE_TEXT),
         ("elastic_energy.cu", ELASTIC_TEXT), ("step_epilogue.cu", EPILOGUE), ("stages.cuh", structs.STAGES),
         ("stage_decision.cu", DECISION), ("momentum.cu", MOMENTUM),
+        ("stage_decision.cu", DECISION), ("contact_state.cuh", structs.CONTACT), ("contact.cu", CONTACT_TEXT),
         ("inverse/build_inverse.cu", INVERSE),
     ],
     ids=lambda value: value if isinstance(value, str) else "layouts",
@@ -77,8 +79,9 @@ def test_the_compiler_for_gpus_refuses_another_layout(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("threads", "blocks", "more"),
-    [(256, 1, []), (128, 2, []), (64, 4, []), (64, 4, ["-DNEWTON_PHASES"]), (256, 1, ["-DSTAGES"])],
-)
+    [(256, 1, []), (128, 2, []), (64, 4, []), (64, 4, ["-DNEWTON_PHASES"]), (256, 1, ["-DSTAGES"]),
+     (256, 1, ["-DCONTACT_PASSES"]), (128, 2, ["-DCONTACT_PASSES"]), (64, 4, ["-DCONTACT_PASSES"])],
+)  # fmt: skip
 def test_the_solver_spills_no_registers(threads, blocks, more):
     """What does not fit into registers would cost a trip through L2 in each phase: it did, and doubled the time."""
     if (library := nvrtc.library()) is None:
@@ -146,6 +149,17 @@ def test_the_search_compiles_and_spills_no_registers(precision, arch):
     code, said = nvrtc.compiled(library, SOURCES / "backends/gpu/newton.cu", options)
     spilled = [int(n) for n in re.findall(r"(\d+) bytes (?:stack frame|spill stores|spill loads)", said)]
     assert code and len(spilled) >= 12 and max(spilled) == 0, said
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("arch", ["sm_80", "sm_90"])
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_contact_compiles(precision, arch):
+    if (library := nvrtc.library()) is None:
+        pytest.skip("needs the package nvidia-cuda-nvrtc")
+    options = [*device_options(PRECISIONS[precision]), *own_headers(), *nvrtc.arch(arch)]
+    code, said = nvrtc.compiled(library, SOURCES / "backends/gpu/contact.cu", options)
+    assert code and not said, said
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)

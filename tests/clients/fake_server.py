@@ -8,20 +8,24 @@ from types import TracebackType
 from typing import Self
 
 import zenoh
+from google.protobuf.message import Message
 
 from protocol import messages_pb2 as pb
 from protocol.channels import everything, key
 from protocol.network.session import open_session
 from tests.ports import free_port
+from tests.sample_contact import MOVED, obstacle, pose
 from tests.sample_run import DT, header, object_step, scene, state, topology
 
 LOW, TIP = pb.Vector(x=-1, y=0, z=0), pb.Vector(x=1, y=2, z=3)
 
 
 class FakeServer:
-    def __init__(self, name: str = "sim", objects: tuple[str, ...] = ("beam", "liver")) -> None:
+    def __init__(
+        self, name: str = "sim", objects: tuple[str, ...] = ("beam", "liver"), obstacles: tuple[str, ...] = ()
+    ) -> None:
         self.endpoint = f"tcp/127.0.0.1:{free_port()}"
-        self.name, self.objects = name, objects
+        self.name, self.objects, self.obstacles = name, objects, obstacles
         self.commands: list[pb.Command] = []
         self.state = "running"
         self.silent = False
@@ -47,6 +51,8 @@ class FakeServer:
         for name in self.objects:
             data = state(name, step).SerializeToString()
             self._session.zenoh.put(key("state", self.name, object=name), data)
+        for name in MOVED.keys() & set(self.obstacles):
+            self._session.zenoh.put(key("pose", self.name, object=name), pose(name, step).SerializeToString())
         batch = pb.Steps(header=header(), steps=[object_step(name, step) for name in self.objects])
         self._session.zenoh.put(key("steps", self.name), batch.SerializeToString())
 
@@ -68,7 +74,7 @@ class FakeServer:
             for name, message in self._answers(query):
                 query.reply(name, message.SerializeToString())
 
-    def _answers(self, query: zenoh.Query) -> list[tuple[str, pb.Status | pb.Scene | pb.Topology | pb.Reply]]:
+    def _answers(self, query: zenoh.Query) -> list[tuple[str, Message]]:
         asked = str(query.key_expr)
         if asked == key("command", self.name):
             assert query.payload is not None
@@ -76,7 +82,11 @@ class FakeServer:
         if asked == key("status", self.name):
             return [(asked, self.status())]
         if asked == key("scene", self.name):
-            return [(asked, scene(list(self.objects)))]
+            found = scene(list(self.objects))
+            found.obstacles.extend(self.obstacles)
+            return [(asked, found)]
+        if asked == key("obstacle", self.name):
+            return [(key("obstacle", self.name, object=name), obstacle(name)) for name in self.obstacles]
         if asked == key("topology", self.name):
             return [(key("topology", self.name, object=name), topology(name)) for name in self.objects]
         return []
@@ -87,6 +97,8 @@ class FakeServer:
         wanted = command.interaction
         if command.verb in ("push", "grab") and wanted.object not in self.objects:
             return pb.Reply(header=header(), error=f"no object {wanted.object!r}; there is {', '.join(self.objects)}")
+        if command.verb == "move_obstacle" and command.target.obstacle not in MOVED:
+            return pb.Reply(header=header(), error=f"obstacle {command.target.obstacle!r} is fixed")
         if command.verb in ("pause", "resume"):
             state = "paused" if command.verb == "pause" else "running"
             unchanged, self.state = self.state == state, state

@@ -197,7 +197,9 @@ def test_errors(arguments: tuple[str, ...], code: int, said: str) -> None:
     assert found == code and said in out + err
 
 
-@pytest.mark.parametrize("command", ["status", "watch", "push", "grab", "pause", "resume", "stop", "view", "export"])
+@pytest.mark.parametrize(
+    "command", ["status", "watch", "push", "grab", "move-obstacle", "pause", "resume", "stop", "view", "export"]
+)
 def test_help_has_examples(command: str) -> None:
     code, out, _ = run(command, "--help")
     assert code == 0 and f"Examples:\n    sim-client {command}" in out

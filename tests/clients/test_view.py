@@ -275,7 +275,8 @@ def test_live_frames_and_curves(tmp_path: Path) -> None:
 
     recording = rr.RecordingStream("test")
     recording.save(tmp_path / "live.rrd")
-    with FakeServer(objects=("beam",)) as server, Client(connect=[server.endpoint]) as client:
+    obstacles = ("floor", "tool")
+    with FakeServer(objects=("beam",), obstacles=obstacles) as server, Client(connect=[server.endpoint]) as client:
         done = threading.Event()
 
         def publish() -> None:
@@ -300,6 +301,8 @@ def test_live_frames_and_curves(tmp_path: Path) -> None:
         np.testing.assert_array_equal(values, positions(step).astype(np.float32))
     assert len(rrd.column("/plots/iterations/beam", "scalars")) >= len(frames)
     assert len(rrd.column("/world/beam", "triangle_indices")) == 1
+    poses = rrd.column("/world/tool", ":translation")
+    assert len(poses) > 2 and all(at[0][1] == -1 + step / 8 for step, _, at in poses), "and at step 0 the start"
 
 
 @pytest.mark.slow

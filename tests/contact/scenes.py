@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 from sim_server.scene.model import Scene
 from sim_server.simulation import Simulation
 from tests.scenes import bar
+from tests.state import put
 
 CELLS, SIZE = (4, 3, 4), (0.1, 0.06, 0.1)  # of the block [m]
 YOUNG = 3e5  # Pa
@@ -19,6 +20,13 @@ LOCKSTEP: dict[str, Any] = {"preconditioner": "cholesky", "update": "lockstep-3"
 def floor(friction: float = 0.5, **table: Any) -> dict:
     """An [[obstacle]]: the half-space y < 0."""
     return {"name": "floor", "shape": "plane", "friction": friction, **table}
+
+
+def ram() -> dict:
+    """An [[obstacle]]: a plate that comes from below at 10 m/s, stops 0.12 m above the floor, and turns there."""
+    keys = [(0, -0.3, 0), (0.04, 0.1, 0), (1, 0.1, 20)]
+    frames = [{"time": t, "translate": [0, y, 0], "rotate": [0, 0, degrees]} for t, y, degrees in keys]
+    return {"name": "ram", "shape": "box", "size": [0.3, 0.02, 0.3], "friction": 0.5, "keyframes": frames}
 
 
 def block(friction: float = 0.5, cells: Sequence[int] = CELLS, size: Sequence[float] = SIZE, **table: Any) -> dict:
@@ -39,5 +47,5 @@ def over(
         "object": list(objects) or [block(**table)], "obstacle": list(obstacles) or [floor()],
     }  # fmt: skip
     sim = Simulation(Scene.model_validate(scene, context={"folder": "."}), device)
-    sim.world.v[:] = velocity
+    put(sim, sim.world.v, velocity)
     return sim

@@ -81,7 +81,7 @@ def _commands() -> dict[str, str]:
     return {
         name: row["its options (default)"]
         for row in table_under(TEXT, "sim-client COMMAND")
-        for name in re.findall(r"`([a-z]+)[^`]*`", row["command"])
+        for name in re.findall(r"`([a-z-]+)[^`]*`", row["command"])
     }
 
 

@@ -404,7 +404,7 @@ def test_detection_turns_with_the_scene():
         sim = made(*listed, thickness=0.02, gravity=tuple(R @ np.array(G)))
         effect = contact_of(sim)
         q = Rotation.from_matrix(R)
-        for pose in effect._frame:  # the poses of keyframes
+        for pose in effect.frames:  # the poses of keyframes
             pose[:3], pose[3:] = R @ pose[:3], (q * Rotation.from_quat(pose[[4, 5, 6, 3]])).as_quat()[[3, 0, 1, 2]]
         if x is None:
             x, v = sim.world.x + random.normal(0, 0.03, sim.world.x.shape), random.normal(0, 10, sim.world.v.shape)

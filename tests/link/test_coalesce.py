@@ -9,7 +9,7 @@ import pytest
 
 from protocol.channels import PROTOCOL, key
 from protocol.counters import Counters
-from protocol.messages_pb2 import Command, Header, Interaction, Reply, Vector
+from protocol.messages_pb2 import Command, Header, Interaction, ObstacleTarget, Reply, Vector
 from protocol.refused import Refused
 from sim_server.network.coalesce import coalesce_moves
 from sim_server.network.queryables import Queryables
@@ -20,6 +20,11 @@ NAN = float("nan")
 def command(verb: str, client: str = "anna", id: int = 0, x: float = 0.0, protocol: int = PROTOCOL) -> Command:
     interaction = Interaction(id=id, target=Vector(x=x))
     return Command(header=Header(protocol=protocol), client=client, verb=verb, interaction=interaction)
+
+
+def moved(obstacle: str, client: str = "anna") -> Command:
+    target = ObstacleTarget(obstacle=obstacle, position=Vector(x=1.0))
+    return Command(header=Header(protocol=PROTOCOL), client=client, verb="move_obstacle", target=target)
 
 
 def sorted_out(*commands: Command) -> tuple[list[int], list[int], list[int], list[int]]:
@@ -46,6 +51,11 @@ def test_other_commands_and_other_grabs_keep_their_order() -> None:
         command("release", id=7), command("move", "ben", 7), command("move", id=7),
     ]  # fmt: skip
     assert sorted_out(*given) == ([0, 3, 4, 5, 6, 7], [], [2, 1], [0, 3, 4, 5, 6, 7])
+
+
+def test_moves_of_obstacles_are_told_apart_by_obstacle_and_client() -> None:
+    given = [moved("tool"), moved("spoon"), command("move", id=0), moved("tool", "ben"), moved("tool"), command("move")]
+    assert sorted_out(*given) == ([1, 3, 4, 5], [], [2, 0], [1, 3, 4, 5])
 
 
 def test_a_malformed_move_replaces_nothing() -> None:
@@ -106,3 +116,10 @@ def test_each_of_a_round_is_answered_once(queryables: Queryables, counters: Coun
     assert wrong.answers[0].error == "Vector.x is nan; allowed: finite"
     assert not elsewhere.answers and elsewhere.dropped == 1
     assert counters.moves_replaced == 39 and counters.refused == 3
+
+
+def test_names_of_obstacles_that_wait_are_short(queryables: Queryables) -> None:
+    given = [Query(moved("n" * length).SerializeToString()) for length in (64, 65, 60_000)]
+    queryables.serve_all(given, None)  # type: ignore[arg-type]
+    assert [command.target.obstacle for command, _ in queryables.commands()] == ["n" * 64]
+    assert "ObstacleTarget.obstacle has 65 characters; allowed: 64" in given[1].answers[0].error

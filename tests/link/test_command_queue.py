@@ -4,7 +4,7 @@
 import logging
 
 from protocol.counters import Counters
-from protocol.messages_pb2 import Command, Interaction, Reply, Vector
+from protocol.messages_pb2 import Command, Interaction, ObstacleTarget, Reply, Vector
 from sim_server.network.command_queue import MAX_DEFERRED, CommandQueue
 from sim_server.network.rate_limiter import RateLimiter, TokenBucket
 
@@ -117,6 +117,21 @@ def test_the_last_move_over_the_rate_waits_and_is_not_lost() -> None:
     assert harness.take_all() == [("move", "anna", 399.0)], "where the hand stopped"
     assert harness.take_all() == [] and len(harness.replies) == 400 and set(harness.replies.values()) == {""}
     assert harness.counters.commands_refused == 0 and harness.counters.moves_replaced == 400 - len(done) - 1
+
+
+def test_the_newest_move_of_an_obstacle_waits_and_is_not_lost() -> None:
+    harness = Harness(rate=10.0, burst=1.0)
+    for x, name in enumerate(("tool", "tool", "spoon", "tool", "spoon")):
+        target = ObstacleTarget(obstacle=name, position=Vector(x=x))
+        reply = harness.replies.setdefault
+        harness.queue.put(
+            Command(client="anna", verb="move_obstacle", target=target), lambda r, x=x, reply=reply: reply(x, r.error)
+        )
+    taken = [(c.target.obstacle, c.target.position.x) for c, _ in harness.queue.take_all()]
+    assert taken == [("tool", 3.0)] and harness.replies == {0: "", 1: "", 2: ""}, "two wait, three were replaced"
+    harness.now = 0.2
+    assert [(c.target.obstacle, c.target.position.x) for c, _ in harness.queue.take_all()] == [("spoon", 4.0)]
+    assert harness.counters.commands_refused == 0 and harness.counters.moves_replaced == 3
 
 
 def test_a_full_queue_refuses_all_but_the_newest_moves() -> None:

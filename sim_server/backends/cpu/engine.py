@@ -36,7 +36,7 @@ def _library() -> c.CDLL:
         "backends/cpu/native/loop.cpp",
         {
             "wf_assemble": (None, [loop]), "wf_solve": (None, [loop]), "wf_run": (c.c_int64, [loop, c.c_int64]),
-            "wf_wait": (c.c_int32, [loop]),
+            "wf_wait": (c.c_int32, [loop]), "wf_copy_matrix": (None, [loop, c.c_int32, p]),
             "wf_post_factor": (p, [c.POINTER(structs.Body), p]), "wf_post_binding": (p, [c.POINTER(structs.Launch), p]),
             "wf_apply_factor": (None, [c.POINTER(structs.Factor), p, p, p]),
             "wf_precondition": (None, [loop, c.c_int32, p, p, p]),
@@ -263,6 +263,19 @@ class CpuEngine(Reports):
         """First half of one step: the system matrix and right-hand side."""
         self._begin()
         self._native.wf_assemble(c.byref(self.loop))
+
+    def factor_matrix(self, body: int) -> Reals:
+        """Returns the values of A as last assembled, with the contacts that a factor is to know, (blocks, 3, 3).
+
+        To be called between `assemble` and `solve`.
+        """
+        entry, start = self._body[body], self._arrays["row_start"]
+        values: Reals = self._arrays["values"][start[entry.first] : start[entry.last]]
+        if not self._contact:
+            return values
+        out = np.empty_like(values)
+        self._native.wf_copy_matrix(c.byref(self.loop), body, out.ctypes.data)
+        return out[:]  # a view, which is not recycled as the copies that were asked for are (updates/snapshots.py)
 
     def solve(self) -> None:
         """Second half: solve, integrate, report."""

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: MIT
-"""Conditional nodes of CUDA graphs: work that a captured graph does only if a number on the device is not 0.
+"""Conditional nodes of CUDA graphs: work that a captured graph does only if, or as long as, a number on the device is
+not 0.
 
 An untaken branch costs as much as half a dozen empty kernels, whatever it holds. CuPy has no interface to it, so the
 driver is called.
@@ -21,11 +22,12 @@ FUNCTIONS = (
     "cuStreamGetCaptureInfo_v2", "cuGraphConditionalHandleCreate", "cuGraphAddNode",
     "cuStreamUpdateCaptureDependencies", "cuStreamBeginCaptureToGraph", "cuStreamEndCapture",
 )  # fmt: skip
+IF, WHILE = 0, 1  # types of conditional nodes
 CONDITIONAL_NODE, ASSIGN_DEFAULT, SET_DEPENDENCIES, RELAXED = 13, 1, 1, 2  # enumerators of the driver API
 
 
 class ConditionalNodeParams(c.Structure):
-    """CUDA_CONDITIONAL_NODE_PARAMS: type 0 is `if`; graphs: out, of the branch."""
+    """CUDA_CONDITIONAL_NODE_PARAMS: type is IF or WHILE; graphs: out, of the branch."""
 
     _fields_ = [
         ("handle", c.c_uint64), ("type", c.c_int), ("size", c.c_uint), ("graphs", c.POINTER(c.c_void_p)),
@@ -53,7 +55,8 @@ class Conditions:
         missing = [name for name in FUNCTIONS if not hasattr(driver, name)]
         if missing:
             raise DeviceError(
-                f"the NVIDIA driver is too old for scheme ros2: it has no {missing[0]}; CUDA 12.4 or above has it"
+                f"the NVIDIA driver is too old for scheme ros2 and for contact: it has no {missing[0]}; CUDA 12.4 or "
+                "above has it"
             )
         self._module, self._set_condition = self._compiled()
 
@@ -69,24 +72,29 @@ class Conditions:
         return module, module.get_function("set_condition")
 
     @contextmanager
-    def branch(self, flag: DeviceArray) -> Iterator[None]:
-        """What is launched inside runs only if `flag` (1,) is not 0 then. Only while the current stream is captured."""
+    def branch(self, flag: DeviceArray, repeats: bool = False) -> Iterator[None]:
+        """What is launched inside runs only if `flag` (1,) is not 0 then. Only while the current stream is captured.
+
+        repeats: it runs again and again as long as the flag is not 0 at its end
+        """
         graph, _, _ = self._capture()
         handle = c.c_uint64()
         self._call("cuGraphConditionalHandleCreate", c.byref(handle), graph, self._context, 0, ASSIGN_DEFAULT)
         self._set_condition((1,), (1,), (np.uint64(handle.value), np.uint64(flag.data.ptr)))
-        body = self._add_node(handle.value)
+        body = self._add_node(handle.value, WHILE if repeats else IF)
         stream, ended = self._cp.cuda.Stream(non_blocking=True), c.c_void_p()
         self._call("cuStreamBeginCaptureToGraph", stream.ptr, body, None, None, 0, RELAXED)
         with stream:
             yield
+            if repeats:
+                self._set_condition((1,), (1,), (np.uint64(handle.value), np.uint64(flag.data.ptr)))
         self._call("cuStreamEndCapture", stream.ptr, c.byref(ended))
 
-    def _add_node(self, handle: int) -> c.c_void_p:
+    def _add_node(self, handle: int, kind: int) -> c.c_void_p:
         """Appends a conditional node to the current stream; returns the graph of its branch."""
         graph, dependencies, count = self._capture()
         params = GraphNodeParams(type=CONDITIONAL_NODE)
-        params.conditional = ConditionalNodeParams(handle=handle, size=1, context=self._context)
+        params.conditional = ConditionalNodeParams(handle=handle, type=kind, size=1, context=self._context)
         node = (c.c_void_p * 1)()
         self._call("cuGraphAddNode", node, graph, dependencies, count, c.byref(params))
         self._call("cuStreamUpdateCaptureDependencies", self._stream(), node, 1, SET_DEPENDENCIES)

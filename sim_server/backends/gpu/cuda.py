@@ -77,6 +77,10 @@ class CudaDevice:
         """
         return self._conditions.branch(flag)
 
+    def repeat(self, flag: DeviceArray) -> AbstractContextManager[None]:
+        """What is launched inside runs as long as `flag` (1,) is not 0, likewise."""
+        return self._conditions.branch(flag, repeats=True)
+
     def error(self, code: int) -> str:
         """Returns text and number of a driver error."""
         text = c.c_char_p()

@@ -90,6 +90,12 @@ class DeviceEnergies:
             made.append((launch, array, params))
         return made
 
+    @property
+    def balance(self) -> DeviceArray:
+        """Balances of the bodies (BALANCE) on the device."""
+        balance: DeviceArray = self._balance
+        return balance
+
     def launch_balance(self) -> None:
         """Launches the energy balance of the last step; does nothing on the device if it was settled before."""
         self._balance_kernel((self.prologue.blocks,), (self.threads,), (self._params,))

@@ -16,6 +16,7 @@ from protocol.factor import FactorPattern
 from sim_server.arrays import Float64
 from sim_server.backends.base import Capability, EngineInput, Launch
 from sim_server.backends.declarations import Declarations
+from sim_server.backends.gpu.contact import ContactPasses
 from sim_server.backends.gpu.cuda import CudaDevice
 from sim_server.backends.gpu.cupy_types import DeviceArray, Graph
 from sim_server.backends.gpu.device import DeviceLaunch, Gpu
@@ -27,7 +28,14 @@ from sim_server.backends.gpu.mailbox import DeviceMailbox
 from sim_server.backends.gpu.newton import NewtonIteration, NewtonPhases
 from sim_server.backends.gpu.rosenbrock import ATTEMPTS, RosenbrockStep
 from sim_server.backends.gpu.solver import PCG_BODY, PCG_RESULT, SETTINGS_BYTES, PcgSolver
-from sim_server.backends.gpu.structs import ENERGY_RECORD, NEWTON_RESULT, STAGE_RESULT, STEP_TIMESTAMP, Mail
+from sim_server.backends.gpu.structs import (
+    CONTACT_RESULT,
+    ENERGY_RECORD,
+    NEWTON_RESULT,
+    STAGE_RESULT,
+    STEP_TIMESTAMP,
+    Mail,
+)
 
 FEW = 16  # largest number of trials in a step for which MANY steps are captured in one graph
 EPILOGUE = Declarations("backends/gpu/step_epilogue.cu")
@@ -79,18 +87,32 @@ class GpuEngine(DeviceLoop):
         energy_records = device.pinned(CAPACITY * ENERGY_RECORD.itemsize * bodies)
         self._energies = DeviceEnergies(gpu, given.energies, energy_records, self._counter, dt)
         alone = stages is not None and stages.factor_alone
-        self._whole_assembly = self._beginning(assemble)
+        detection = (
+            [x for x in assemble if x.domain not in DOMAINS] if given.contact else []
+        )  # reads what the others make
+        self._whole_assembly = self._beginning([x for x in assemble if x not in detection], detection)
         forces = cast(Sequence[DeviceLaunch], stages.first) if stages else ()
         self._first_launches = self._beginning(forces) if alone else self._whole_assembly
         self._forces = fuse(forces) if alone else ()  # after a whole assembly, whose energy balance is made already
         phases = NewtonPhases.initial(gpu, bodies) if newton else None
         self.solver = PcgSolver(
-            gpu, ranges, arrays, self._counter, CAPACITY, planes, phases or (), ATTEMPTS if stages else 0
-        )
+            gpu, ranges, arrays, self._counter, CAPACITY, planes, phases or (), ATTEMPTS if stages else 0,
+            given.contact is not None,
+        )  # fmt: skip
         self._newton, newton_results = None, None
         if newton and phases:
             newton_results = device.pinned(CAPACITY * NEWTON_RESULT.itemsize * bodies)
             self._newton = NewtonIteration(gpu, newton, assemble, ranges, arrays, phases, self.solver, newton_results)
+        self._contact, contact_results, reactions = None, None, None
+        if given.contact:
+            contact_results = device.pinned(CAPACITY * CONTACT_RESULT.itemsize * bodies)
+            obstacles = len(given.contact.obstacles.kind)
+            reactions = device.pinned(CAPACITY * bodies * obstacles * 48).view(np.float64)
+            reactions = reactions.reshape(CAPACITY, bodies, obstacles, 6)
+            balance = self._energies.balance
+            self._contact = ContactPasses(
+                gpu, device, given.contact, ranges, arrays, self.solver, balance, contact_results, reactions
+            )
         row, first = PCG_BODY.itemsize, self.solver.bodies_device
         mailboxes = [(first + row * k, SETTINGS_BYTES) for k in range(bodies)]
         mailboxes += [(first + row * k + SETTINGS_BYTES, row - SETTINGS_BYTES) for k in range(bodies)]
@@ -103,7 +125,8 @@ class GpuEngine(DeviceLoop):
         stage_results = device.pinned(CAPACITY * STAGE_RESULT.itemsize * bodies) if stages else None
         super().__init__(
             device, ranges, arrays["row_start"], dt, mailboxes, self._results, self._timestamps, arrays["clock"],
-            records, twins["values"].dtype, newton_results, energy_records, stage_results, **addresses,
+            records, twins["values"].dtype, newton_results, energy_records, stage_results,
+            contact_results, reactions, **addresses,
         )  # fmt: skip
         self._factor_upload = FactorUpload(gpu, self.solver, self, given.names, self.mailboxes[bodies : 2 * bodies])
         for k in range(bodies):
@@ -124,6 +147,7 @@ class GpuEngine(DeviceLoop):
             epilogue = Epilogue(EPILOGUE.checked(), "StepEpilogue", "finish_step", self._epilogue)
             self._integrate = FusedKernel(integrate, epilogue)
             self._stamp_begin = self._integrate.function("stamp_begin")
+        self._known: Float64 = arrays["values"]  # as a factor is to know them
         self._matrix = self._matrix_launches(assemble) if alone else ()
         self._capture()
         cp.cuda.get_current_stream().synchronize()  # arrays are complete for the streams of the loop
@@ -188,7 +212,7 @@ class GpuEngine(DeviceLoop):
         handles = [int(graph.graphExec) if graph else 0 for graph in self._graphs]
         self.use_graphs(handles, *(int(graph.graphExec) for graph in others))
         self._graphs += others  # kept as long as the engine
-        self._second_half = self._captured(self._finish_step) if self._stages else None
+        self._second_half = self._captured(self._finish_step) if self._stages or self._contact else None
 
     def _captured(self, launch: Callable[[], None]) -> Graph:
         """Returns the graph of the work that `launch` appends to the stream."""
@@ -201,15 +225,17 @@ class GpuEngine(DeviceLoop):
         """Launches the kernel that writes the time at which the step begins, for an idle device."""
         self._stamp_begin((1,), (1,), (self._epilogue,))
 
-    def _beginning(self, assemble: Sequence[DeviceLaunch]) -> Sequence[Callable[[], None]]:
-        """Fuses the assembly with the energy balance of the step before.
+    def _beginning(
+        self, assemble: Sequence[DeviceLaunch], after: Sequence[DeviceLaunch] = ()
+    ) -> Sequence[Callable[[], None]]:
+        """Fuses the assembly with the energy balance of the step before. after: launches that follow, one by one.
 
         The balance is the prologue of a kernel over elements, since these write nothing that it reads. If it freezes a
         body meanwhile, the element results of this body do not matter, since its nodes are fixed then.
         """
         domains = {launch.domain for launch in assemble}
         elements = "elements" in domains and domains <= set(DOMAINS)
-        launches = fuse(assemble, prologue=self._energies.prologue if elements else None)
+        launches = fuse(assemble, prologue=self._energies.prologue if elements else None, after=after)
         if not elements:
             return [self._energies.launch_balance, *launches]
         first = launches[0]
@@ -242,7 +268,7 @@ class GpuEngine(DeviceLoop):
         if self._stages:
             self._stages.launch()
             return
-        (self._newton or self.solver).launch()
+        (self._newton or self._contact or self.solver).launch()
         assert self._integrate is not None
         self._integrate()
 
@@ -254,8 +280,17 @@ class GpuEngine(DeviceLoop):
             self._begin()
             for launch in (*self._whole_assembly, *self._forces):
                 launch()
+            if self._contact:
+                self._contact.begin()
             values = self._arrays["values"]
             values[...] = self.gpu.twin(values).get(stream=self._steps)
+        self._known = self._contact.known(values) if self._contact else values
+
+    def factor_matrix(self, body: int) -> Float64:
+        """Returns the values of A as last assembled, with the contacts that a factor is to know, (blocks, 3, 3)."""
+        first, last = self._ranges[body]
+        start = self._arrays["row_start"]
+        return cast(Float64, self._known[start[first] : start[last]])
 
     def solve(self) -> None:
         """Runs the second half: solve, integration, records."""
@@ -305,7 +340,8 @@ class GpuEngine(DeviceLoop):
         self.gpu.cp.cuda.get_current_stream().synchronize()  # its arrays are complete
         return self.mailboxes[self._mailed[launch]].post(cast(DeviceLaunch, new).params.tobytes(), keep=new)
 
-    def records(self) -> NDArray[Any]:
-        """Returns the records since the last call, oldest first; also begins to build inverses that were queued."""
+    def records_and_reactions(self) -> tuple[NDArray[Any], Float64]:
+        """Returns the records since the last call, oldest first, and reactions of obstacles (Reports); also begins to
+        build inverses that were queued."""
         self._factor_upload.advance()
-        return super().records()
+        return super().records_and_reactions()

@@ -281,20 +281,24 @@ def fuse(
     launches: Sequence[DeviceLaunch],
     guard: Callable[[Sequence[DeviceLaunch]], PhaseGuard] | None = None,
     prologue: Prologue | None = None,
+    after: Sequence[DeviceLaunch] = (),
 ) -> list[FusedKernel | DeviceLaunch]:
     """Fuses launches into as few kernels as their domains allow.
 
     guard: makes the guard of a kernel from its launches
     prologue: of the first kernel
+    after: launches that follow, one by one
     """
     if any(launch.domain not in DOMAINS for launch in launches):
-        return list(launches)
+        return [*launches, *after]
     together = [group for d in DOMAINS for group in _by_items([x for x in launches if x.domain == d])]
     together = [group for group in together if group]
-    return [
-        FusedKernel(group, None, _private(group, launches), guard(group) if guard else None, None if k else prologue)
+    every = [*launches, *after]
+    fused = [
+        FusedKernel(group, None, _private(group, every), guard(group) if guard else None, None if k else prologue)
         for k, group in enumerate(together)
     ]  # fmt: skip
+    return [*fused, *after]
 
 
 def _by_items(launches: Sequence[DeviceLaunch]) -> list[list[DeviceLaunch]]:

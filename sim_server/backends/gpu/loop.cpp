@@ -82,6 +82,17 @@ static bool launch_batch(GpuLoop& l, int64_t steps) {
     return close_batch(l);
 }
 
+// from: of the body in the results. place: of the record.
+static void note_contact(GpuLoop& l, int64_t from, Record& record, int64_t place) {
+    const ContactResult& r = l.contact_results[from];
+    record.contacts = r.contacts;
+    record.passes = r.passes;
+    record.clipped = r.clipped;
+    record.contact_residual = r.residual;
+    const int64_t numbers = 6 * l.obstacles;
+    std::memcpy(l.rings.reactions + numbers * place, l.contact_reactions + numbers * from, sizeof(double) * numbers);
+}
+
 static void report(GpuLoop& l, const StepBatch& batch, int64_t k, double end, double cpu) {
     Rings& rings = l.rings;
     const StepTimestamp &stamp = l.timestamps[(batch.first + k) % l.capacity];
@@ -111,6 +122,7 @@ static void report(GpuLoop& l, const StepBatch& batch, int64_t k, double end, do
             record.estimate = l.stage_results[slot + i].estimate;
             if (record.form == FACTOR) record.residual = l.stage_results[slot + i].inconsistency;
         }
+        if (l.contact_results) note_contact(l, slot + i, record, (head + i) % rings.record_capacity);
         if (l.energy_records) note_energy(record, l.energy_records[slot + i]);
     }
     rings.step.store(step);
@@ -196,7 +208,7 @@ void wf_gpu_start_balance(Balance* balance, const double* sums, double dt, int32
 
 const StructSize* wf_sizes() {
     static const StructSize sizes[] = {SIZE(CudaDriver), SIZE(Mail), SIZE(MailSlot), SIZE(PcgResult), SIZE(StepTimestamp),
-                                       SIZE(NewtonResult), SIZE(StageResult), SIZE(BodyReadback), SIZE(GpuLoop), SIZE(Record), SIZE(EnergyRecord),
+                                       SIZE(NewtonResult), SIZE(StageResult), SIZE(ContactResult), SIZE(BodyReadback), SIZE(GpuLoop), SIZE(Record), SIZE(EnergyRecord),
                                        SIZE(Balance), {}};
     return sizes;
 }

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: MIT
-// Nodes of a body that one thread block sums over.
+// Nodes of a body that a thread block sums over (energies.node_chunks).
 #pragma once
 
 struct NodeChunk {

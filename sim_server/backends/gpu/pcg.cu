@@ -13,6 +13,9 @@
 #ifdef STAGES
 #include "stages.cuh"
 #endif
+#ifdef CONTACT_PASSES
+#include "contact_state.cuh"
+#endif
 
 struct BlockMemory {  // static shared memory of a thread block: data that is the same in all threads needs no registers
     double scratch[3 * WARPS][4], totals[4];
@@ -26,6 +29,10 @@ struct BlockMemory {  // static shared memory of a thread block: data that is th
     int next, bad, rests;
     double b2, goal, quarter, rz;  // of the iteration; all threads write the same values
     PcgResult out;
+#ifdef CONTACT_PASSES
+    ContactState contact;          // before the solve
+    int outcome;                   // ContactPhase after it
+#endif
 };
 __shared__ BlockMemory memory;
 
@@ -48,6 +55,9 @@ struct PcgSolver {
     bool fetched = false;  // the copy of the inverse into shared memory has begun
     bool arrived = false;  // and is complete
     bool given = false;    // the start is given, and the tolerance is relative to its residual (GIVEN_START of pcg.h)
+#ifdef CONTACT_PASSES
+    const ContactSolve& pass;
+#endif
 
     __device__ __forceinline__ void set_up(const RowRange& range) {
         const PcgBody& body = memory.body;
@@ -109,7 +119,7 @@ struct PcgSolver {
 
     // 1. r = b - A x for the x of the scene, as a pending update by alpha = 1: x = 0 + 1 x, r = b - 1 (A x). With alpha = 0 the
     // solve starts from zero instead. Returns |r|^2; |b|^2 in `b2`.
-    __device__ __forceinline__ double residual(double& b2) {
+    __device__ __forceinline__ double residual(double& b2, [[maybe_unused]] bool first_of_solve) {
         const BlockRows& rows = memory.rows;
         const long long first = memory.body.first, begin = 3 * (first + rows.begin);
 #pragma unroll 4
@@ -126,6 +136,10 @@ struct PcgSolver {
             rows.x[k] = 0;
             rows.r[k] = bk;
             rows.q[k] = qk;
+#ifdef CONTACT_PASSES
+            if (given) pass.last[begin + k] = (real)rk;
+            if (given && first_of_solve) pass.first[begin + k] = (real)rk;
+#endif
             if (!packed) return;
             publish(turn, k, bk);
             publish(1 - turn, k, (real)rk);  // not b - A x from float words, which near the solution would be rounding errors
@@ -263,6 +277,24 @@ struct PcgSolver {
         }
     }
 
+#ifdef CONTACT_PASSES
+    // Whether there is nothing to solve; else the goal of a pass. r2: |r|^2 at the start.
+    __device__ __forceinline__ bool ends_before(double r2) {
+        const ContactState& c = memory.contact;
+        if (c.phase == CHOOSE_START) {
+            if (!memory.body.warm_start || c.zero2 <= r2) give(0, 0);
+            memory.outcome = READY;
+            return true;
+        }
+        if (c.phase == WITHOUT) return false;
+        const int outcome = outcome_of(c, pass, r2, memory.goal);
+        memory.outcome = outcome;
+        if (outcome == ENDED) memory.out.residual = c.given2 > 0 ? sqrt(r2 / c.given2) : 0;
+        if (outcome == PASSED) memory.goal = fmax(memory.goal, EARLY * EARLY * r2);
+        return outcome == ENDED;
+    }
+#endif
+
     __device__ __forceinline__ void solve();
 };
 
@@ -279,14 +311,20 @@ __device__ __forceinline__ void PcgSolver::solve() {
     for (;;) {
         if (measure) {  // the true residual
             double bb;
-            r2 = residual(bb);
+            r2 = residual(bb, !begun);
             measure = false;
             alpha = 1;
             restart = true;
             if (!begun) {
                 begun = true;
+#ifdef CONTACT_PASSES
+                const bool refused = !isfinite(bb) || (given && !isfinite(r2));
+                if (refused) bb = r2 = bb + r2;
+                else if (given) bb = memory.contact.given2;
+#else
                 const bool refused = !isfinite(bb);
                 if (given && !refused) bb = r2;
+#endif
                 memory.b2 = bb;
                 if (memory.rests && bb > 0 && !refused) {  // b is rounding error: the solution stays as it is, the body rests
                     out.residual = sqrt(r2 / bb);
@@ -295,6 +333,9 @@ __device__ __forceinline__ void PcgSolver::solve() {
                 memory.goal = body.tolerance * body.tolerance * bb;
                 if ((!given || refused) && (!body.warm_start || !(r2 < bb))) { alpha = 0; r2 = bb; }
                 else fresh = true;
+#ifdef CONTACT_PASSES
+                if (!refused && ends_before(r2)) return;
+#endif
                 memory.quarter = r2 * sqrt(sqrt(memory.goal / r2));
                 if (refused || r2 <= memory.goal) {
                     if (refused) {
@@ -365,12 +406,17 @@ __device__ __forceinline__ void PcgSolver::solve() {
 #elif defined(NEWTON_PHASES)  // several linearizations a step: solve only the bodies in phase 0 (newton.cu)
 #define KIND_OF_STEP , const int* __restrict__ active, const int* __restrict__ phase
 #define STAGE
+#elif defined(CONTACT_PASSES)  // contact: in the first solve of a step all bodies, then those that are READY (contact_state.cuh)
+#define KIND_OF_STEP , const ContactSolve pass
+#define STAGE , pass
 #else
 #define KIND_OF_STEP
 #define STAGE
 #endif
 #ifdef STAGES
 #define STAGE_PARAMETER , const StageSolve& stage
+#elif defined(CONTACT_PASSES)
+#define STAGE_PARAMETER , const ContactSolve& pass
 #else
 #define STAGE_PARAMETER
 #endif
@@ -379,13 +425,27 @@ __device__ __forceinline__ void solve_body(const PcgArguments& s, const RowRange
     const int k = range.body;
     for (int i = threadIdx.x; i < (int)(sizeof(PcgBody) / 4); i += THREADS) ((int*)&memory.body)[i] = ((const int*)(s.bodies + k))[i];
     if (threadIdx.x == THREADS - 1) memory.rests = s.moving[k] == 0;
+#ifdef CONTACT_PASSES
+    if (threadIdx.x == 0) memory.contact = pass.state[k];
+#endif
     __syncthreads();
+#ifdef CONTACT_PASSES
+    if (threadIdx.x == 0) {
+        memory.outcome = SOLVED;
+        if (memory.contact.phase != WITHOUT) memory.rests = 0;
+        if (memory.contact.phase == READY) memory.body.probe = 0;
+    }
+#endif
     if (memory.body.plan)
         for (int i = threadIdx.x; i < (int)(sizeof(DevicePlan) / 4); i += THREADS) ((int*)&memory.plan)[i] = ((const int*)memory.body.plan)[i];
     __syncthreads();
     const long long begin = nanoseconds();
     PcgSolver solver = {s, {range.index, memory.body.blocks, s.exchange_number[k], s.block_sums + 8ll * s.grid * k, s.grid, memory.scratch, memory.totals,
-                         (int)threadIdx.x % 32, (int)threadIdx.x / 32}};
+                         (int)threadIdx.x % 32, (int)threadIdx.x / 32}
+#ifdef CONTACT_PASSES
+                        , 0, 0, 0, 0, false, false, false, false, memory.contact.phase == READY, pass
+#endif
+    };
 #ifdef STAGES
     solver.given = stage.form == ITERATE;
 #endif
@@ -400,6 +460,8 @@ __device__ __forceinline__ void solve_body(const PcgArguments& s, const RowRange
         if (stage.first_of_step) result = no_solve(memory.body);
         if (stage.first_of_attempt) { result.status = CONVERGED; result.bad_node = -1; }
         add_solve(result, out);
+#elif defined(CONTACT_PASSES)
+        note_pass(pass.state[k], pass, memory.outcome, result, out);
 #else
         result = out;
 #endif
@@ -435,6 +497,8 @@ extern "C" __global__ void __launch_bounds__(THREADS, PER_PROCESSOR) pcg(const P
         const bool solved = phase[s.row_ranges[next].body] != 0;
 #elif defined(STAGES)
         const bool solved = !takes_part(s, stage, s.row_ranges[next]);
+#elif defined(CONTACT_PASSES)
+        const bool solved = !pass.first_of_step && pass.state[s.row_ranges[next].body].phase != READY;
 #else
         const bool solved = false;
 #endif

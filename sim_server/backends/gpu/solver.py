@@ -16,7 +16,7 @@ from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder, Partit
 from sim_server.backends.gpu.inverse.device_plan import DevicePlan, shared_bytes
 from sim_server.backends.gpu.inverse.plan import plan
 from sim_server.backends.gpu.row_partition import SPARED, best_assignment, halo, initial_ranges
-from sim_server.backends.gpu.structs import PCG, PCG_RESULT, STAGES
+from sim_server.backends.gpu.structs import CONTACT, PCG, PCG_RESULT, STAGES
 
 PCG_BODY = PCG.dtype("PcgBody")
 SETTINGS_BYTES = PCG_BODY.fields["factor_step"][1]  # type: ignore[index]
@@ -41,6 +41,7 @@ class PcgSolver:
     planes: float16 numbers per entry of an inverse; 1, or 2 for 22 bits
     phases: newton.NewtonPhases; empty: one linearization a step
     attempts: number of solves that the graph of a Rosenbrock-W step holds (stages.cuh); 0: another scheme
+    contact: True for a scene with contact (contact_state.cuh)
 
     bodies: host rows (PCG_BODY), one per body. The loop uploads the settings (the first SETTINGS_BYTES bytes of a row)
         and the factor (the others) separately.
@@ -51,11 +52,11 @@ class PcgSolver:
 
     def __init__(
         self, gpu: Gpu, ranges: Sequence[tuple[int, int]], arrays: Mapping[str, NDArray[Any]], counter: DeviceArray,
-        capacity: int, planes: int = 1, phases: Sequence[DeviceArray] = (), attempts: int = 0,
+        capacity: int, planes: int = 1, phases: Sequence[DeviceArray] = (), attempts: int = 0, contact: bool = False,
     ):  # fmt: skip
         cp, processors = gpu.cp, gpu.properties["multiProcessorCount"]
         self.gpu, self.counter, self._capacity, self.planes, self._phases = gpu, counter, capacity, planes, phases
-        self._attempts = attempts
+        self._attempts, self._contact = attempts, contact
         self._twins = {name: gpu.twin(arrays[name]) for name in ("row_start", "values", "b", "y", "moving")}
         self.real = np.dtype(self._twins["values"].dtype)
         spans = np.array(ranges, np.int64)
@@ -101,7 +102,7 @@ class PcgSolver:
 
     def _compiled(self, name: str, blocks: int) -> KernelFunction:
         """Compiles the kernel of the text <name>.cu for `blocks` thread blocks a multiprocessor."""
-        declared = STAGES if self._attempts else PCG
+        declared = STAGES if self._attempts else CONTACT if self._contact else PCG
         numbers = {"THREADS": self.threads, "PER_PROCESSOR": blocks}
         module = self.gpu.cp.RawModule(
             code=(SOURCES / f"backends/gpu/{name}.cu").read_text() + declared.assertions(),
@@ -109,6 +110,7 @@ class PcgSolver:
                 *options({"real": "float" if self.real == np.float32 else "double"}), *own_headers(),
                 *(f"-D{name}={number}" for name, number in numbers.items()),
                 *(["-DNEWTON_PHASES"] if self._phases else []), *(["-DSTAGES"] if self._attempts else []),
+                *(["-DCONTACT_PASSES"] if self._contact else []),
             ),
             backend="nvrtc",
             enable_cooperative_groups=True,
@@ -121,6 +123,15 @@ class PcgSolver:
         """Launches a solve of all bodies."""
         phases = (np.uint64(array.data.ptr) for array in self._phases)
         self._function((self.grid,), (self.threads,), (self._params, *phases), shared_mem=self._shared)
+
+    def solve_contact(self, b: DeviceArray, contact: NDArray[Any]) -> None:
+        """Launches a solve of a step with contact (contact_state.cuh).
+
+        b: (nodes, 3), right-hand side. contact: CONTACT_SOLVE
+        """
+        params = self._params.copy()
+        params["b"] = b.data.ptr
+        self._function((self.grid,), (self.threads,), (params, contact), shared_mem=self._shared)
 
     def iterate(self, number: int, stage: NDArray[Any]) -> None:
         """Launches solve `number` of a Rosenbrock-W step by iterations. stage: STAGE_SOLVE."""

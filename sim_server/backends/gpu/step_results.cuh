@@ -20,4 +20,11 @@ struct StageResult {       // of a step by stages
     int form;              // StepForm
 };
 
+struct ContactResult {     // of a step with contact
+    double residual;       // of the system with the law as it is at the end, relative; NaN: nothing was touched
+    int contacts;          // rows that carry force
+    int passes;            // solves
+    int clipped;           // nodes held back at an obstacle beside the law
+};
+
 struct StepTimestamp { long long begin, end; };  // ns of the device's clock

@@ -31,10 +31,10 @@ def convergence(records: NDArray[Any], solver: SolverOptions) -> tuple[NDArray[n
     """Returns shortfall and used (Convergence) of solves (records of a loop, of any shape).
 
     In a step with several linear solves the largest residual counts, and the mean use. A step whose nonlinear equation
-    is not solved (MAX_LINEARIZATIONS) counts as converged, since its linear solves are.
+    is not solved (MAX_LINEARIZATIONS, CONTACT) counts as converged, since its linear solves are.
     """
     solves = np.maximum(records["linearizations"], 1)
-    converged = np.isin(records["status"], (pb.CONVERGED, pb.MAX_LINEARIZATIONS))
+    converged = np.isin(records["status"], (pb.CONVERGED, pb.MAX_LINEARIZATIONS, pb.CONTACT))
     wanted = max(-math.log10(solver.tolerance), MIN_DECADES)
     residual = np.where(records["residual"] > 0, records["residual"], 1.0)  # NaN counts as 1
     gained = np.clip(-np.log10(residual), MIN_DECADES, wanted)

@@ -58,14 +58,19 @@ static void take_orders(Body& body) {
     take_factor(body);
 }
 
+// Copies A of a body as a factor is to know it.
+static void copy_matrix(const Loop& loop, const Body& body, double* target) {
+    const int64_t begin = loop.row_start[body.first], end = loop.row_start[body.last];
+    std::memcpy(target, loop.values + 9 * begin, 9 * sizeof(double) * (end - begin));
+    if (loop.contact) add_contacts(loop, body, target);
+}
+
 static void copy_for_worker(Loop& loop, Body& body) {
     double* target = body.snapshot.load(std::memory_order_acquire);
     if (!target) return;
     if (body.ahead < 0 && loop.stages && !loop.stages->state[&body - loop.body].assembled) return;  // in the next step
     if (body.ahead < 0) {
-        int64_t begin = loop.row_start[body.first], end = loop.row_start[body.last];
-        std::memcpy(target, loop.values + 9 * begin, 9 * sizeof(double) * (end - begin));
-        if (loop.contact) add_contacts(loop, body, target);
+        copy_matrix(loop, body, target);
     } else {
         for (int64_t k = 3 * (int64_t)body.first; k < 3 * (int64_t)body.last; ++k)
             *target++ = loop.x[k] + body.ahead * loop.v[k];
@@ -233,6 +238,7 @@ void wf_solve(Loop* loop) {
     if (loop->energies) leave(*loop);
 }
 
+void wf_copy_matrix(Loop* loop, int32_t body, double* target) { copy_matrix(*loop, loop->body[body], target); }
 int32_t wf_wait(Loop* loop) { return wait_until_due(loop->rings, [] { return false; }); }
 
 // Runs until `steps` are done or `stop` is set; returns the steps done.

@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: MIT
+"""Contact with obstacles on a GPU (contact_state.cuh): memory and launches of its kernels, between assembly and
+integration."""
+
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_server.arrays import Float64, Int32
+from sim_server.backends.contact import Contact
+from sim_server.backends.declarations import Declarations
+from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction
+from sim_server.backends.gpu.device import Gpu, compiled, options, own_headers
+from sim_server.backends.gpu.energies import node_chunks
+from sim_server.backends.gpu.solver import PcgSolver
+from sim_server.backends.gpu.structs import CONTACT_SOLVE, CONTACT_STATE
+
+TEXT = Declarations("backends/gpu/contact.cu")
+THREADS: int = TEXT.constant("CONTACT_THREADS")  # of a thread block, each with a node
+SUMS: int = TEXT.constant("CONTACT_SUMS")
+CONTACT_ARGUMENTS, DEVICE_ROW = TEXT.dtype("ContactArguments"), TEXT.dtype("DeviceRow")
+KERNELS = ("begin_contact", "contact_forces", "contact_search", "finish_contact")
+TABLE = ("kind", "size", "grid", "place", "cells", "begin", "end")  # arrays of obstacles
+ROWS = (
+    "body_start", "obstacle", "normal", "gap", "drift", "entry", "stiffness", "friction", "thickness", "force",
+    "traction",
+)  # fmt: skip
+
+
+class Loops(Protocol):
+    """A device whose graphs have loops (cuda.CudaDevice)."""
+
+    def repeat(self, flag: DeviceArray) -> AbstractContextManager[None]:
+        """What is launched inside runs as long as `flag` (1,) is not 0."""
+        ...
+
+
+def pairs_of(contact: Contact, nodes: int) -> Int32:
+    """Returns the first of the two rows of each node, (nodes,); -1: it has none.
+
+    Raises ValueError for rows that are not pairs of one node.
+    """
+    node = contact.corner[:, 0]
+    alone = (contact.corner[:, 1:] < 0).all() and (contact.weight[:, 0] == 1).all()
+    if len(node) % 2 or not alone or (node[::2] != node[1::2]).any():
+        raise ValueError("rows of contact on a GPU come in pairs, of one node each")
+    pair = np.full(nodes, -1, np.int32)
+    pair[node[::2]] = np.arange(0, len(node), 2)
+    return pair
+
+
+def own_blocks(row_start: Int32, columns: Int32) -> Int32:
+    """Returns the place of each node's own block among the values of A, (nodes,)."""
+    rows = np.repeat(np.arange(len(row_start) - 1), np.diff(row_start))
+    return np.flatnonzero(rows == columns).astype(np.int32)
+
+
+class ContactPasses:
+    """Launches the solves of a step with contact.
+
+    contact: rows, and options
+    ranges: nodes [first, last) of each body
+    arrays: host arrays by name (row_start, columns, values, b, y, x, rotation)
+    balance: energy balances of the bodies on the device, which get the work of contact
+    results, reactions: host memory (capacity, bodies) of CONTACT_RESULT and (capacity, bodies, obstacles, 6) that the
+        steps write to
+
+    Tests run its kernels with what it keeps: grid (thread blocks), params (arguments of the kernels), first and later
+    (of the solver, in the first solve of a step and in passes), active (bodies that are not over), memory (arrays by
+    name).
+    """
+
+    def __init__(
+        self, gpu: Gpu, device: Loops, contact: Contact, ranges: Sequence[tuple[int, int]],
+        arrays: Mapping[str, NDArray[Any]], solver: PcgSolver, balance: DeviceArray, results: NDArray[Any],
+        reactions: Float64,
+    ):  # fmt: skip
+        cp, nodes, self._bodies = gpu.cp, len(arrays["x"]), len(ranges)
+        self._device, self._solver, self.active = device, solver, cp.zeros(1, np.int32)
+        starts = np.array([first for first, _ in ranges] + [nodes], np.int32)
+        chunks, rows, real = node_chunks(starts, THREADS), len(contact.obstacle), solver.real
+        self.grid, names = len(chunks), ("values", "b", "y", "x", "rotation")
+        own, pair = own_blocks(arrays["row_start"], arrays["columns"]), pairs_of(contact, nodes)
+        self._surface = own[contact.corner[::2, 0]]  # places of the nodes that have rows
+        exact = {name: getattr(contact, name) for name in ROWS}
+        self.memory: dict[str, DeviceArray] = {name: gpu.twin(arrays[name]) for name in names}
+        self.memory |= {name: gpu.twin(host, dtype=host.dtype) for name, host in exact.items()}
+        self.memory |= {name: gpu.twin(getattr(contact, name)) for name in ("predictor", "free")}
+        self.memory |= {
+            "pair": cp.asarray(pair), "node": cp.asarray(contact.corner[:, 0].copy()), "place": cp.asarray(own),
+            "contact_b": cp.zeros((nodes, 3), real), "start": cp.zeros((nodes, 3), real),
+            "first": cp.zeros((nodes, 3), real), "last": cp.zeros((nodes, 3), real),
+            "base": cp.zeros((max(rows // 2, 1), 3, 3), real), "known": cp.zeros((max(rows // 2, 1), 3, 3), real),
+            "row": cp.zeros(max(rows, 1) * DEVICE_ROW.itemsize, np.uint8),
+            "list": cp.zeros(max(rows, 1), np.int32), "active": self.active,
+            "state": cp.zeros(self._bodies * CONTACT_STATE.itemsize, np.uint8),
+            "chunks": cp.asarray(chunks.view(np.int32)), "partial_sums": cp.zeros((len(chunks), SUMS)),
+            "finished_chunks": cp.zeros(self._bodies, np.uint32), "pool_counter": solver.pool_counter,
+            "results": solver.results, "step": solver.counter, "balance": balance,
+        }  # fmt: skip
+        self._table = {n: gpu.twin(a, dtype=a.dtype) for n in TABLE for a in [getattr(contact.obstacles, n)]}
+        self.params = self._arguments(contact, results, reactions)
+        self.first, self.later = self._solve(contact, 1), self._solve(contact, 0)
+        module = cp.RawModule(
+            code=TEXT.checked(), options=(*options(gpu.types), *own_headers()), backend="nvrtc"
+        )  # fmt: skip
+        self._kernels: dict[str, KernelFunction] = {name: compiled("contact.cu", module, name) for name in KERNELS}
+
+    def _arguments(self, contact: Contact, results: NDArray[Any], reactions: Float64) -> NDArray[Any]:
+        """Returns the arguments of all kernels."""
+        params: Any = np.zeros((), CONTACT_ARGUMENTS)
+        for name, array in self.memory.items():
+            params[name] = array.data.ptr
+        for name, array in self._table.items():
+            params["obstacles"][name] = array.data.ptr
+        params["contact_results"], params["reactions"] = results.ctypes.data, reactions.ctypes.data
+        params["dx_dv"], params["force_coefficient"] = contact.dx_dv, contact.force_coefficient
+        params["tolerance"], params["obstacle_count"] = contact.tolerance, len(contact.obstacles.kind)
+        params["count"], params["capacity"] = self._bodies, len(reactions)
+        return params  # type: ignore[no-any-return]
+
+    def _solve(self, contact: Contact, first_of_step: int) -> NDArray[Any]:
+        """Returns the arguments of a solve."""
+        solve = np.zeros((), CONTACT_SOLVE)
+        for name in ("state", "first", "last"):
+            solve[name] = self.memory[name].data.ptr
+        solve["tolerance"], solve["passes"], solve["first_of_step"] = contact.tolerance, contact.passes, first_of_step
+        return solve
+
+    def _launch(self, kernel: str, blocks: int) -> None:
+        self._kernels[kernel]((blocks,), (THREADS,), (self.params,))
+
+    def begin(self) -> None:
+        """Appends what comes before the first solve of a step whose rows are detected."""
+        self._launch("begin_contact", self._bodies)
+        self._launch("contact_forces", self.grid)
+
+    def launch(self) -> None:
+        """Appends the solves of such a step, while a graph is captured."""
+        self.begin()
+        self._solve_and_search(self.first)
+        with self._device.repeat(self.active):
+            self._launch("contact_forces", self.grid)
+            self._solve_and_search(self.later)
+        self._launch("finish_contact", self.grid)
+
+    def _solve_and_search(self, solve: NDArray[Any]) -> None:
+        self._solver.solve_contact(self.memory["contact_b"], solve)
+        self._launch("contact_search", self.grid)
+
+    def known(self, values: Float64) -> Float64:
+        """Returns a copy of the values of A of a step that has begun, with the contacts that a factor is to know."""
+        out = values.copy()
+        if len(self._surface):
+            out[self._surface] = self.memory["known"].get()
+        return out

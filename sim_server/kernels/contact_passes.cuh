@@ -1,0 +1,77 @@
+// SPDX-License-Identifier: MIT
+// What the solves of contact share on both devices (method: backends/cpu/native/contact.h): numbers, the exact line search, and paths of
+// points past obstacles.
+#pragma once
+#include "contact_law.cuh"
+
+// Rows that are hit within FIRST of the step after the first one count as closed in the first pass; a pass is solved to EARLY of its
+// residual; a point that is held back stops at SHORT_OF of its way; a row that does not hold becomes HARDER times as stiff.
+constexpr double FIRST = 0.02, EARLY = 0.01, SHORT_OF = 0.9, HARDER = 10;
+constexpr double SAME_PLANE = 0.995;  // cosine of the angle between normals
+constexpr int ROUNDS = 3;             // of passes after a sweep of the paths
+
+// Zero of a slope that ascends: 1 where it is zero there but for rounding. slope(alpha) is the derivative along a solution.
+template <class Slope> HOST_DEVICE double minimum_along(Slope slope) {
+    const double start = slope(0.0);
+    double low = 0, high = 1, at_low = start, at_high = slope(1.0);
+    if (!(start < 0)) return 1;  // rounding
+    if (fabs(at_high) <= 1e-9 * -start) return 1;
+    while (at_high < 0 && high < 8) {
+        low = high;
+        at_low = at_high;
+        high *= 2;
+        at_high = slope(high);
+    }
+    if (at_high < 0) return high;
+    for (int k = 0; k < 60 && high - low > 1e-10 * high; ++k) {
+        double mid = k % 3 == 2 ? 0.5 * (low + high) : low + (high - low) * at_low / (at_low - at_high);
+        if (!(mid > low && mid < high)) mid = 0.5 * (low + high);
+        const double here = slope(mid);
+        if (here == 0) return mid;
+        if (here < 0) {
+            low = mid;
+            at_low = here;
+        } else {
+            high = mid;
+            at_high = here;
+        }
+    }
+    return 0.5 * (low + high);
+}
+
+// The part of the way from -> to (world frame, at the start and the end of the step) at which a point comes as near as `inflate` to an
+// obstacle; NEVER: it does not, or it was inside. begin, end: out, the way in the frame of the obstacle.
+HOST_DEVICE double entry_of_way(const ObstacleTable& t, int obstacle, double inflate, const double* from, const double* to, double* begin,
+                                double* end) {
+    local_point(t.begin + 7 * obstacle, from, begin);
+    local_point(t.end + 7 * obstacle, to, end);
+    double n[3];
+    const double way[3] = {end[0] - begin[0], end[1] - begin[1], end[2] - begin[2]}, distance = distance_to(t, obstacle, begin, n);
+    if (!(distance > 0) || distance - inflate > sqrt(dot3(way, way))) return NEVER;
+    return entry_time(t, obstacle, begin, end, inflate);
+}
+
+// Plane that stands for an obstacle where a point is at part `time` of its way: its normal and its drift, world frame; returns the
+// gap of the point at the start of the step. begin, end: as of entry_of_way.
+HOST_DEVICE double plane_on_way(const ObstacleTable& t, int obstacle, const double* from, const double* begin, const double* end, double time,
+                                double* normal, double* drift) {
+    double p[3], n[3], q[3], at_begin[3], at_end[3], gap = 0;
+    for (int m = 0; m < 3; ++m) p[m] = begin[m] + time * (end[m] - begin[m]);
+    const double distance = distance_to(t, obstacle, p, n);
+    for (int m = 0; m < 3; ++m) q[m] = p[m] - distance * n[m];
+    world_point(t.begin + 7 * obstacle, q, at_begin);
+    world_point(t.end + 7 * obstacle, q, at_end);
+    world_vector(t.end + 7 * obstacle, n, normal);
+    for (int m = 0; m < 3; ++m) {
+        drift[m] = at_end[m] - at_begin[m];
+        gap += normal[m] * (from[m] - at_end[m]);
+    }
+    return gap;
+}
+
+// Stiffness of a row as a factor is to know it: one that slid counts with its normal stiffness alone. force, traction: of the row.
+HOST_DEVICE ContactForce lasting_contact(double friction, double force, const double* traction) {
+    ContactForce f = {force, {0, 0, 0}, 0, true};
+    if (dot3(traction, traction) < 0.98 * (friction * force) * (friction * force)) f.slip = 1;
+    return f;
+}

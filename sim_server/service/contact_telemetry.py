@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: MIT
+"""What contact adds to telemetry: obstacles, their poses, forces on them, and lines about what was left undone."""
+
+import time
+from collections import Counter
+from typing import Any
+
+from numpy.typing import NDArray
+
+from protocol import messages_pb2 as pb
+from sim_server.arrays import Float64
+from sim_server.network.link import ServerLink
+from sim_server.recording.object_steps import add_reactions
+from sim_server.recording.obstacles import obstacle_messages, pose_messages
+from sim_server.recording.recorder import Recorder
+from sim_server.simulation import Simulation
+
+ROWS_PERIOD = 1.0  # s between checks for nodes without enough rows
+MAX_STEPS = 4096  # whose reactions are sent together at most
+
+
+class ContactTelemetry:
+    """The obstacles of one run; of a scene without contact nothing is sent and nothing is said.
+
+    clipped: by body, number of nodes that were held back at obstacles, summed over steps
+    """
+
+    def __init__(self, simulation: Simulation, link: ServerLink, recorder: Recorder | None):
+        self._simulation, self._link, self._recorder = simulation, link, recorder
+        self._wants_reactions = False
+        self._rows_due = 0.0
+        self._crowded: set[int] = set()  # bodies of which it was said
+        self.clipped: Counter[int] = Counter()
+
+    def open(self) -> None:
+        """Sends the obstacles to log and network."""
+        for obstacle in obstacle_messages(self._simulation):
+            self._link.set_obstacle(obstacle)
+            if self._recorder:
+                self._recorder.obstacle(obstacle)
+
+    def look(self) -> bool:
+        """Checks for subscribers. True if somebody wants poses."""
+        if self._simulation.contact is None:
+            return False
+        self._wants_reactions = self._link.wants_reactions()
+        return self._link.wants_pose()
+
+    def publish_poses(self, step: int) -> None:
+        """Sends the poses after a step to subscribers."""
+        for pose in pose_messages(self._simulation, step):
+            self._link.publish_pose(pose)
+
+    def record_poses(self, step: int, block: bool) -> None:
+        """Sends the poses after a step to the log."""
+        assert self._recorder is not None
+        for pose in pose_messages(self._simulation, step):
+            self._recorder.pose(pose, block)
+
+    def publish_reactions(self, records: NDArray[Any], reactions: Float64 | None) -> None:
+        """Sends what objects exert on obstacles at once, and nothing else of the steps: for force feedback."""
+        if reactions is None or not self._wants_reactions:
+            return
+        world, steps = self._simulation.world, []
+        obstacles = [o.name for o in world.obstacles]
+        for r, each in zip(records[-MAX_STEPS:], reactions[-MAX_STEPS:], strict=True):
+            header = pb.Header(object=world.bodies[int(r["body"])].name, epoch=1)
+            steps.append(pb.ObjectStep(header=header, step=r["step"], time=r["time"], contacts=r["contacts"]))
+            add_reactions(steps[-1], each, obstacles)
+        self._link.publish_reactions(pb.Steps(steps=steps))
+
+    def count_clipped(self, records: NDArray[Any]) -> list[str]:
+        """Counts nodes that were held back at obstacles after the passes; returns a line for each new object."""
+        lines = []
+        for r in records[records["clipped"] > 0]:
+            body = self._simulation.world.bodies[int(r["body"])]
+            if body.index not in self.clipped:
+                lines.append(
+                    f"object {body.name!r}, step {int(r['step'])}: {int(r['clipped'])} nodes would have passed into an "
+                    "obstacle and were held back, so momentum is not exact; further ones are counted. A smaller dt or "
+                    "more passes (effects.contact) may help"
+                )
+            self.clipped[body.index] += int(r["clipped"])
+        return lines
+
+    def crowded_nodes(self) -> list[str]:
+        """Returns a line for each new object with nodes that had more obstacles near than they have rows for."""
+        contact = self._simulation.contact
+        if contact is None or time.monotonic() < self._rows_due:
+            return []
+        self._rows_due = time.monotonic() + ROWS_PERIOD
+        dropped = self._simulation.world.backend.fetch(contact.dropped)
+        found = set(contact.body[dropped > 0].tolist()) - self._crowded
+        self._crowded |= found
+        return [
+            f"object {self._simulation.world.bodies[body].name!r}: some nodes had more than two obstacles near at a "
+            "time; they touch the nearest two only"
+            for body in sorted(found)
+        ]
