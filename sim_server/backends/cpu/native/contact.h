@@ -217,7 +217,8 @@ struct Passes {
             const double size = balance();
             if (!std::isfinite(size)) { result.status = NOT_FINITE; return; }
             report.residual = given > 0 ? size / given : 0;
-            if (last) break;
+            const bool more = report.residual > c.tolerance && report.passes < c.passes && result.status != BUDGET;
+            if (last && !more) break;  // else the last solve has changed what the law says
             const double goal = body.now.tolerance * given;
             const bool by_law = k > 0 || !set || set_is_law();
             last = by_law && size <= c.tolerance * given;
