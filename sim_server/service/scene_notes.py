@@ -17,14 +17,14 @@ def scene_notes(simulation: Simulation) -> list[str]:
     """Returns at most two lines: bodies that fall apart or fall freely, and nearly incompressible materials.
 
     A body falls if gravity acts on it and no element connects it to a fixed node, even if clients may grab it. In a
-    quasi-static scene such a body is refused.
+    quasi-static scene such a body is refused. Nothing is said where there are obstacles to fall on.
     """
     return [line for line in (_loose(simulation), _incompressible(simulation)) if line]
 
 
 def _loose(simulation: Simulation) -> str:
     world, gravity = simulation.world, simulation.effects.get("gravity")
-    pulled = world.inertia and gravity is not None and bool(np.any(gravity.g))  # type: ignore[attr-defined]
+    pulled = simulation.contact is None and world.inertia and gravity is not None and bool(np.any(gravity.g))  # type: ignore[attr-defined]
     part, elastic = _parts(simulation)
     held = np.isin(part, part[world.free == 0])
     apart, falling, partly = [], [], []
