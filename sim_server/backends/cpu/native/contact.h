@@ -301,13 +301,48 @@ struct Passes {
         c.entry[k] = t;
     }
 
+    // The box of the body's points, at the start of the step and moved by y: middle and radius of the spheres around both.
+    struct Ways {
+        double from[3], to[3], from_radius, to_radius;
+    };
+    Ways ways() const {
+        double low[6], high[6];
+        for (int m = 0; m < 6; ++m) { low[m] = INFINITY; high[m] = -INFINITY; }
+        for (int k = rows.first; k < rows.last; k += 2) {
+            double p[6];
+            path(k, p, p + 3);
+            for (int m = 0; m < 6; ++m) { low[m] = std::min(low[m], p[m]); high[m] = std::max(high[m], p[m]); }
+        }
+        Ways w;
+        double half[6];
+        for (int m = 0; m < 6; ++m) {
+            (m < 3 ? w.from[m] : w.to[m - 3]) = 0.5 * (low[m] + high[m]);
+            half[m] = 0.5 * (high[m] - low[m]);
+        }
+        w.from_radius = std::sqrt(dot3(half, half));
+        w.to_radius = std::sqrt(dot3(half + 3, half + 3));
+        return w;
+    }
+
+    // True if no point of the body can come to the obstacle: the paths of any two points differ by both radii at most.
+    bool far_away(int obstacle, const Ways& w) const {
+        double begin[3], end[3], n[3];
+        local_point(c.obstacles.begin + 7 * obstacle, w.from, begin);
+        local_point(c.obstacles.end + 7 * obstacle, w.to, end);
+        const double distance = distance_to(c.obstacles, obstacle, begin, n);
+        for (int m = 0; m < 3; ++m) end[m] -= begin[m];
+        return distance > std::sqrt(dot3(end, end)) + 2 * w.from_radius + w.to_radius;
+    }
+
     // Gives points that y moves into an obstacle a row there. Rows come in pairs, of one point each. Returns whether there are such.
     bool sweep() const {
         bool found = false;
-        for (int k = rows.first; k < rows.last; k += 2) {
-            double from[3], to[3], begin[3], end[3];
-            path(k, from, to);
-            for (int o = 0; o < c.obstacle_count; ++o) {
+        const Ways w = ways();
+        for (int o = 0; o < c.obstacle_count; ++o) {
+            if (far_away(o, w)) continue;
+            for (int k = rows.first; k < rows.last; k += 2) {
+                double from[3], to[3], begin[3], end[3];
+                path(k, from, to);
                 if (swept(o, 0, from, to, begin, end) > 1) continue;
                 const double near = entry_time(c.obstacles, o, begin, end, c.thickness[k]);
                 take_row(k, o, from, begin, end, near <= 1 ? near : 0);
@@ -399,6 +434,7 @@ static SolveResult solve_in_contact(Loop& loop, int index) {
     Passes p(loop, index);
     const Body& body = loop.body[index];
     const int64_t at = 3 * (int64_t)body.first, n = p.A.size();
+    bool outside = false;  // y was swept and enters nothing
     if (p.choose_set()) {
         p.start();
         p.solve(true);
@@ -409,15 +445,19 @@ static SolveResult solve_in_contact(Loop& loop, int index) {
         if (p.result.status != NOT_FINITE) {
             p.move_points();
             const bool acts = p.apply_law(false);
-            if (p.sweep() || acts) {
+            outside = !p.sweep() && !acts;
+            if (!outside) {
                 residual(A, p.b, p.y, p.left);
                 p.solve(false);
             }
         }
     }
-    for (int k = 0; k < ROUNDS && p.result.status != NOT_FINITE && p.sweep(); ++k) p.solve(false);
+    for (int k = 0; k < ROUNDS && !outside && p.result.status != NOT_FINITE; ++k) {
+        outside = !p.sweep();
+        if (!outside) p.solve(false);
+    }
     if (p.result.status == NOT_FINITE) std::fill(p.y, p.y + n, NAN);  // the kernel `advance` takes the body back
-    else p.clip();
+    else if (!outside) p.clip();
     p.finish(index);
     return p.result;
 }
