@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from sim_server.simulation import Simulation
-from sim_server.updates.driver import Driver
 from tests.bench.contact.bodies import LOCKSTEP, Row
+from tests.bench.contact.cost import begun
 from tests.bench.harness.report import ROOT
 
 SCENE = ROOT / "deploy" / "scenes" / "stairs.toml"
@@ -28,7 +28,7 @@ def rows(steps: int = 180) -> list[Row]:
     edge = front[((mesh[front, :2] < low + 1e-9) | (mesh[front, :2] > high - 1e-9)).any(axis=1)]
     around = mesh[edge, :2] - (low + high) / 2
     edge = edge[np.argsort(np.arctan2(around[:, 1], around[:, 0]))]
-    driver, shapes, records = Driver(sim), [], []
+    driver, shapes, records = begun(sim), [], []
     for step in range(steps + 1):
         if step in SHOWN:
             shapes.append({"time": step * sim.world.dt, "x": sim.world.x[edge, 0].tolist(),

@@ -67,7 +67,7 @@ def _cost(sizes: tuple[int, ...], quick: bool) -> Iterator[Unit]:
 def _others(quick: bool) -> Iterator[Unit]:
     for contacts in (10,) if quick else (10, 100, 1000):
         yield Unit("goals", f"{contacts}", contacts / 30 + 3, partial(cost.goals, contacts, short=quick))
-    yield Unit("own", "cost", 10, partial(cost.own_cost, 5 if quick else 150))
+    yield Unit("own", "cost", 10, partial(cost.own_cost, 2 if quick else 30))
     yield Unit("stairs", "picture", 5, partial(picture.rows, 20 if quick else 180))
 
 
