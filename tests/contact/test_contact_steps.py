@@ -137,3 +137,14 @@ def test_a_factor_learns_of_contact():
         return float(Driver(sim).advance(40)["iterations"][15:].mean())
 
     assert iterations("lockstep-2") <= 0.6 * iterations("never")
+
+
+def test_a_body_at_rest_whose_edge_is_lifted_needs_one_solve_a_step():
+    """Nodes a little further off than the thickness would be hit without the forces that are there."""
+    angle = np.arctan(0.5) - np.radians(0.5)
+    sim = over(
+        gravity=(9.81 * np.sin(angle), -9.81 * np.cos(angle), 0), cells=(8, 5, 8), at=(0, 0.00125, 0), contact={}
+    )
+    driver = Driver(sim)
+    driver.advance(90)
+    assert driver.advance(10)["passes"].max() <= 1

@@ -3,7 +3,8 @@
 //
 // Elasticity is linearized once, as without contact; the law of contact is solved with it, by a semi-smooth Newton method. A pass is
 //   - the rows in the state reached: force f, stiffness S. In the first pass the rows that carried force in the last step and those
-//     that are hit first (FIRST) count as closed, with the force of a spring that may pull; afterwards the law decides;
+//     that are hit first (FIRST) count as closed, with the force of a spring that may pull, unless the law holds already; afterwards
+//     the law decides;
 //   - (A + H^T S H) dy = r, r = b - A y + i H^T f, solved to EARLY of |r|;
 //   - y += alpha dy, alpha the exact minimum along dy of the convex function of which -r is the gradient;
 //   - the normal force found is what limits friction in the next pass; 0 in a row that the solve did not take as closed: a force
@@ -264,6 +265,13 @@ struct Passes {
         move_points();
     }
 
+    // True if the law holds where it begins, so that rows that would be hit without it need not count as closed.
+    bool rests() {
+        apply_law(false);
+        const double size = balance();
+        return size <= c.tolerance * given;
+    }
+
     // Point of a site, at the start of the step and moved by y. Both rows of a node have the same.
     void path(int k, double* from, double* to) const {
         double u[3] = {0, 0, 0}, p[3];
@@ -437,7 +445,7 @@ static SolveResult solve_in_contact(Loop& loop, int index) {
     bool outside = false;  // y was swept and enters nothing
     if (p.choose_set()) {
         p.start();
-        p.solve(true);
+        p.solve(!p.rests());
     } else {
         BlockCsr A = p.A;
         A.rows = nullptr;
