@@ -93,3 +93,26 @@ def test_a_node_between_two_plates_that_close():
     weight = sim.world.mass.sum() * 9.81
     assert forces[-1, 0, 1] + forces[-1, 1, 1] == pytest.approx(-weight, rel=1e-2)
     assert forces[-1, 1, 1] > weight
+
+
+@pytest.mark.parametrize("away", [0.5, 10.0])
+def test_a_plate_that_comes_from_far_away_in_one_step(away):
+    dt = 1 / 60
+    keys = [{"time": 3 * dt, "translate": [0, -away, 0]}, {"time": 4 * dt, "translate": [0, 0.05, 0]}]
+    table = {"name": "plate", "shape": "box", "size": [4, 0.002, 4], "keyframes": keys}
+    sim = over(table, at=(0, 0.02, 0), gravity=(0, 0, 0), dt=dt, **SMALL)
+    sim.engine.run(4)
+    assert (surface(sim)[:, 1] > 0.051).all()
+
+
+def test_obstacles_far_away_change_nothing_to_the_bit():
+    balls = [
+        {"name": f"ball{k}", "shape": "sphere", "radius": 0.1, "pose": {"translate": [5 + k, 0, 0]}} for k in range(5)
+    ]
+
+    def tumbled(*obstacles: dict) -> np.ndarray:
+        sim = over(*obstacles, at=(0, 0.05, 0), rotate=(30, 20, 40), velocity=(0, -3, 0))
+        sim.engine.run(40)
+        return sim.world.x
+
+    assert np.array_equal(tumbled(plate(0.02)), tumbled(plate(0.02), *balls))

@@ -220,6 +220,11 @@ def test_the_folder_is_the_registry():
         ("springs", [768, 12]),
         ("vibration", [864]),
         ("equilibrium", [768]),
+        ("floor_drop", [1536]),
+        ("incline", [648] * 2),
+        ("stairs", [1728]),
+        ("gripper", [1296]),
+        ("tool_on_organ", [2304]),
     ],
 )
 def test_shipped_scenes(name, elements):

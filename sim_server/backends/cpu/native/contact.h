@@ -3,7 +3,8 @@
 //
 // Elasticity is linearized once, as without contact; the law of contact is solved with it, by a semi-smooth Newton method. A pass is
 //   - the rows in the state reached: force f, stiffness S. In the first pass the rows that carried force in the last step and those
-//     that are hit first (FIRST) count as closed, with the force of a spring that may pull; afterwards the law decides;
+//     that are hit first (FIRST) count as closed, with the force of a spring that may pull, unless the law holds already; afterwards
+//     the law decides;
 //   - (A + H^T S H) dy = r, r = b - A y + i H^T f, solved to EARLY of |r|;
 //   - y += alpha dy, alpha the exact minimum along dy of the convex function of which -r is the gradient;
 //   - the normal force found is what limits friction in the next pass; 0 in a row that the solve did not take as closed: a force
@@ -307,6 +308,13 @@ struct Passes {
         move_points();
     }
 
+    // True if the law holds where it begins, so that rows that would be hit without it need not count as closed.
+    bool rests() {
+        apply_law(false);
+        const double size = balance();
+        return size <= c.tolerance * given;
+    }
+
     // f(k) of the first row against obstacles of each point
     template <class F> void each_site(F f) const {
         for (int m = 0; m < count; ++m)
@@ -350,20 +358,61 @@ struct Passes {
         c.entry[k] = t;
     }
 
+    // The box of a body's points, at the start of the step and moved by y: middle and radius of the spheres around both.
+    struct Ways {
+        double from[3], to[3], from_radius, to_radius;
+    };
+    Ways ways(int body) const {
+        double low[6], high[6];
+        for (int m = 0; m < 6; ++m) { low[m] = INFINITY; high[m] = -INFINITY; }
+        for (int k = c.body_start[body]; k < c.body_start[body + 1]; k += 2) {
+            double p[6];
+            path(k, p, p + 3);
+            for (int m = 0; m < 6; ++m) { low[m] = std::min(low[m], p[m]); high[m] = std::max(high[m], p[m]); }
+        }
+        Ways w;
+        double half[6];
+        for (int m = 0; m < 6; ++m) {
+            (m < 3 ? w.from[m] : w.to[m - 3]) = 0.5 * (low[m] + high[m]);
+            half[m] = 0.5 * (high[m] - low[m]);
+        }
+        w.from_radius = std::sqrt(dot3(half, half));
+        w.to_radius = std::sqrt(dot3(half + 3, half + 3));
+        return w;
+    }
+
+    // True if no point of the body can come to the obstacle: the paths of any two points differ by both radii at most.
+    bool far_away(int obstacle, const Ways& w) const {
+        double begin[3], end[3], n[3];
+        local_point(c.obstacles.begin + 7 * obstacle, w.from, begin);
+        local_point(c.obstacles.end + 7 * obstacle, w.to, end);
+        const double distance = distance_to(c.obstacles, obstacle, begin, n);
+        for (int m = 0; m < 3; ++m) end[m] -= begin[m];
+        return distance > std::sqrt(dot3(end, end)) + 2 * w.from_radius + w.to_radius;
+    }
+
     // Gives points that y moves into an obstacle a row there. Rows come in pairs, of one point each. Returns whether there are such.
     bool sweep() const {
         bool found = false;
-        each_site([&](int k) {
+        for (int m = 0; m < count && c.obstacle_count > 0; ++m) {
+            const Ways w = ways(bodies[m]);
+            for (int o = 0; o < c.obstacle_count; ++o)
+                if (!far_away(o, w)) found = sweep(bodies[m], o) || found;
+        }
+        if (found) move_points();
+        return found;
+    }
+    bool sweep(int body, int obstacle) const {
+        bool found = false;
+        for (int k = c.body_start[body]; k < c.body_start[body + 1]; k += 2) {
+            if (c.free[c.corner[CORNERS * k]] == 0) continue;  // of a frozen body
             double from[3], to[3], begin[3], end[3];
             path(k, from, to);
-            for (int o = 0; o < c.obstacle_count; ++o) {
-                if (swept(o, 0, from, to, begin, end) > 1) continue;
-                const double near = entry_time(c.obstacles, o, begin, end, c.thickness[k]);
-                take_row(k, o, from, begin, end, near <= 1 ? near : 0);
-                found = true;
-            }
-        });
-        if (found) move_points();
+            if (swept(obstacle, 0, from, to, begin, end) > 1) continue;
+            const double near = entry_time(c.obstacles, obstacle, begin, end, c.thickness[k]);
+            take_row(k, obstacle, from, begin, end, near <= 1 ? near : 0);
+            found = true;
+        }
         return found;
     }
 
@@ -475,10 +524,11 @@ struct Passes {
 static void solve_island(Loop& loop, int island) {
     Passes p(loop, island);
     const int set = p.choose_set(), first = p.bodies[0];
+    bool outside = false;  // y was swept and enters nothing
     if (set || p.count > 1) {
         if (p.count > 1) IslandSolver::make_modes(loop, p.c, p.bodies, p.count);
         p.start();
-        p.solve(true);
+        p.solve(!p.rests());
     } else {
         Body& body = loop.body[first];
         const int64_t at = 3 * (int64_t)body.first;
@@ -487,15 +537,19 @@ static void solve_island(Loop& loop, int island) {
         if (p.result.status != NOT_FINITE) {
             p.move_points();
             const bool acts = p.apply_law(false);
-            if (p.sweep() || acts) {
+            outside = !p.sweep() && !acts;
+            if (!outside) {
                 p.leave();
                 p.solve(false);
             }
         }
     }
-    for (int k = 0; k < ROUNDS && p.result.status != NOT_FINITE && p.sweep(); ++k) p.solve(false);
+    for (int k = 0; k < ROUNDS && !outside && p.result.status != NOT_FINITE; ++k) {
+        outside = !p.sweep();
+        if (!outside) p.solve(false);
+    }
     if (p.result.status == NOT_FINITE) p.each_entry([&](int64_t k) { p.y[k] = NAN; });  // the kernel `advance` takes the bodies back
-    else p.clip();
+    else if (!outside) p.clip();
     p.finish();
     for (int m = 0; m < p.count; ++m) p.c.result[p.bodies[m]] = p.result;
 }
