@@ -59,7 +59,9 @@ MOTION = {"fixed": 0, "keyframes": 1, "client": 2}  # Motion of contact.cu
 class PairFriction(Parameters):
     """Friction of one object on an obstacle, or on another object."""
 
-    between: Annotated[tuple[str, str], BeforeValidator(as_tuple)] = Field(description="an object, and an obstacle or another object")
+    between: Annotated[tuple[str, str], BeforeValidator(as_tuple)] = Field(
+        description="an object, and an obstacle or another object"
+    )
     value: NotNegative = Field(description="coefficient [-]")
 
 
