@@ -20,11 +20,8 @@
 
 #include "island.h"
 #include "loop.h"
+#include "pairs.h"
 
-constexpr double FIRST = 0.02, EARLY = 0.01, SHORT_OF = 0.9;
-constexpr double SAME_PLANE = 0.995;  // cosine of the angle between normals
-constexpr double HARDER = 10;
-constexpr int ROUNDS = 3;
 
 // The passes of an island, bodies that touch each other and are solved as one system, or of one body; allocates nothing. Vectors are of
 // the whole scene's nodes, of which it uses those of its bodies.
@@ -457,6 +454,12 @@ struct Passes {
         });
     }
 
+    // Goes on with what an earlier solve of the step has come to. An island that grew counts what its first body has.
+    void take_up() {
+        result = c.result[bodies[0]];
+        report = c.report[bodies[0]];
+    }
+
     // Keeps the forces for the next step, and reports on each body.
     void finish() {
         const bool well = result.status != NOT_FINITE;
@@ -521,11 +524,17 @@ struct Passes {
 };
 
 // The step of an island whose rows are detected; of a body alone as without contact where nothing is touched.
-static void solve_island(Loop& loop, int island) {
+static void solve_island(Loop& loop, int island, bool resumes) {
     Passes p(loop, island);
-    const int set = p.choose_set(), first = p.bodies[0];
+    const int first = p.bodies[0], set = resumes ? 0 : p.choose_set();
     bool outside = false;  // y was swept and enters nothing
-    if (set || p.count > 1) {
+    if (resumes) {
+        p.take_up();
+        if (p.count > 1) IslandSolver::make_modes(loop, p.c, p.bodies, p.count);
+        p.leave();
+        p.move_points();
+        p.solve(false);
+    } else if (set || p.count > 1) {
         if (p.count > 1) IslandSolver::make_modes(loop, p.c, p.bodies, p.count);
         p.start();
         p.solve(!p.rests());
@@ -550,8 +559,10 @@ static void solve_island(Loop& loop, int island) {
     }
     if (p.result.status == NOT_FINITE) p.each_entry([&](int64_t k) { p.y[k] = NAN; });  // the kernel `advance` takes the bodies back
     else if (!outside) p.clip();
-    p.finish();
-    for (int m = 0; m < p.count; ++m) p.c.result[p.bodies[m]] = p.result;
+    for (int m = 0; m < p.count; ++m) {
+        p.c.result[p.bodies[m]] = p.result;
+        p.c.report[p.bodies[m]] = p.report;
+    }
 }
 
 // Groups the bodies that have rows with each other, each group's by number. Bodies whose forces are NaN are left alone.
@@ -594,16 +605,38 @@ static void find_islands(Loop& loop) {
     c.island_start[c.islands] = bodies;
 }
 
-// Solves all bodies, those that touch others first.
+// Solves islands, those of several bodies first. resumes: only those that a sweep has given rows.
+static void solve_islands(Loop& loop, bool resumes) {
+    Contact& c = *loop.contact;
+    auto size = [&](int i) { return c.island_start[i + 1] - c.island_start[i]; };
+    auto wanted = [&](int i) {
+        bool any = !resumes;
+        for (int k = c.island_start[i]; k < c.island_start[i + 1] && !any; ++k) any = c.touched[c.island[k]];
+        return any;
+    };
+    for (int i = 0; i < c.islands; ++i)
+        if (size(i) > 1 && wanted(i)) solve_island(loop, i, resumes);
+    if (resumes) return;
+#pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) if (loop.threads > 1)
+    for (int i = 0; i < c.islands; ++i)
+        if (size(i) == 1) solve_island(loop, i, false);
+}
+
+// Solves all bodies. Those that pass through each other then get rows where they do, and are solved again.
 static void solve_in_contact(Loop& loop) {
     Contact& c = *loop.contact;
     find_islands(loop);
-    auto size = [&](int i) { return c.island_start[i + 1] - c.island_start[i]; };
-    for (int i = 0; i < c.islands; ++i)
-        if (size(i) > 1) solve_island(loop, i);
-#pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) if (loop.threads > 1)
-    for (int i = 0; i < c.islands; ++i)
-        if (size(i) == 1) solve_island(loop, i);
+    solve_islands(loop, false);
+    for (int k = 0; k < ROUNDS && c.pair_first >= 0; ++k) {
+        if (!PairDetection{loop, c, loop.y}.sweep(c.room)) break;
+        find_islands(loop);
+        solve_islands(loop, true);
+    }
+    for (int i = 0; i < c.islands; ++i) {
+        Passes p(loop, i);
+        p.take_up();
+        p.finish();
+    }
 }
 
 // Adds the stiffness of contacts that carried force in the last step to a copy of a body's blocks, so that a factor made from it knows

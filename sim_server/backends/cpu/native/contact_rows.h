@@ -6,6 +6,11 @@
 
 #include "contact_law.cuh"
 
+constexpr double FIRST = 0.02, EARLY = 0.01, SHORT_OF = 0.9;
+constexpr double SAME_PLANE = 0.995;  // cosine of the angle between normals
+constexpr double HARDER = 10;
+constexpr int ROUNDS = 3;
+
 constexpr int CORNERS = 4;        // of a row, at most
 
 struct RowState {                 // of a row in the step under way
@@ -56,7 +61,7 @@ struct Contact {
     const int32_t* triangle;                      // (triangles, 3) nodes
     const int32_t *tree_start, *tree_child;       // (bodies + 1,), (tree, 2): two children, or ~ of a triangle (pairs.h)
     Box *tree_box, *body_box;                     // (tree,), (bodies,)
-    int32_t *near, *was_near;                     // (bodies,) 1: its box meets another's; in the last step
+    int32_t *near, *was_near, *touched;           // (bodies,) 1: its box meets another's; in the last step; it got rows by a sweep
     const double* pair_friction;                  // (bodies, bodies)
     const double* gravity;                        // (3,)
     int32_t *island, *island_start;               // (bodies,) bodies by island; (bodies + 1,)

@@ -44,13 +44,24 @@ static bool comes_before(const Meeting& a, const Meeting& b) {
     return a.other >= 0 && (a.touch.entry < b.touch.entry || (a.touch.entry == b.touch.entry && a.touch.distance < b.touch.distance));
 }
 
+constexpr double THROUGH = 1e-3;  // thicknesses: a vertex whose path comes so near passes the triangle
+constexpr double INSIDE = 3;  // thicknesses over DEEP: how deep a vertex may have come in one step to be sent back
+
 struct PairDetection {
     const Loop& loop;
     Contact& c;
+    const double* y = nullptr;  // solution found, material frame; null: before the solve
+    const double* reached = nullptr;  // (nodes, 3) positions that nothing moves any more; null: those at the start of the step
 
-    const double* x(int node) const { return loop.x + 3 * (int64_t)node; }
-    // Displacement of a node in the step under gravity alone.
+    const double* x(int node) const { return (reached ? reached : loop.x) + 3 * (int64_t)node; }
+    // Displacement of a node in the step: under gravity alone, or by the solution.
     void drifted(int node, double* s) const {
+        if (reached) { s[0] = s[1] = s[2] = 0; return; }
+        if (y) {
+            rotated(c.rotation + 9 * (int64_t)node, y + 3 * (int64_t)node, s);
+            for (int k = 0; k < 3; ++k) s[k] = c.dx_dv * (c.predictor[3 * (int64_t)node + k] + s[k]);
+            return;
+        }
         for (int k = 0; k < 3; ++k) {
             const double g = c.free[node] == 0 ? 0 : c.force_coefficient * c.gravity[k];
             s[k] = c.dx_dv * (c.predictor[3 * (int64_t)node + k] + g);
@@ -86,7 +97,7 @@ struct PairDetection {
 
     // The first touch of a vertex with a body.
     Meeting first_touch(int node, int body, double thickness) const {
-        Meeting best = {-1, -1, {}};
+        Meeting best = {-1, -1, {NEVER, 0, 0, {}, {}}};
         double s[3];
         drifted(node, s);
         const Box box = box_of(node, thickness);
@@ -157,7 +168,7 @@ struct PairDetection {
         }
         for (int k = 0; k < 3; ++k) {
             normal[k] = t.touch.normal[k];
-            for (int a = 0; a < CORNERS; ++a) gap += normal[k] * weight[a] * x(corner[a])[k];
+            for (int a = 0; a < CORNERS; ++a) gap += normal[k] * weight[a] * loop.x[3 * (int64_t)corner[a] + k];
         }
         c.gap[row] = gap;
         c.entry[row] = t.touch.entry;
@@ -187,14 +198,70 @@ struct PairDetection {
         put_row(row + 1, site, second, last);
     }
 
-    void run() const {
-        for (int i = 0; i < loop.bodies; ++i) { fit_body(i); c.near[i] = 0; }
+    // Gives vertices that the solution moves through a triangle, or into a body that they were outside of, a row there, or makes theirs
+    // stiffer. True if there are such. ends: (nodes, 3) memory for where nodes come to.
+    bool sweep(double* ends) const {
+        fit();
+        for (int i = 0; i < loop.bodies; ++i)
+            for (int node = loop.body[i].first; c.near[i] && node < loop.body[i].last; ++node) {
+                drifted(node, ends + 3 * (int64_t)node);
+                for (int k = 0; k < 3; ++k) ends[3 * (int64_t)node + k] += x(node)[k];
+            }
+        bool found = false;
+        for (int i = 0; i < loop.bodies; ++i)
+            for (int site = sites(i); c.near[i] && site < sites(i + 1); ++site) found = sweep_site(site, ends) || found;
+        return found;
+    }
+    bool sweep_site(int site, const double* ends) const {
+        const int node = node_of(site), body = c.site_body[site];
+        if (c.free[node] == 0) return false;
+        const Box box = box_of(node, thickness_of(body));
+        bool found = false;
+        for (int other = 0; other < loop.bodies; ++other) {
+            if (other == body || !c.near[other] || !meet(box, c.body_box[other])) continue;
+            const double thickness = 0.5 * (thickness_of(body) + thickness_of(other));
+            const bool passes = first_touch(node, other, THROUGH * thickness).touch.entry <= 1;
+            const PairDetection end{loop, c, y, ends};
+            const Meeting there = end.first_touch(node, other, INSIDE * thickness), t = first_touch(node, other, thickness);
+            const bool enters = there.other >= 0 && there.touch.distance < 0 && (t.other < 0 || t.touch.distance >= 0);
+            if (passes && t.other >= 0) take_row(c.pair_first + 2 * site, site, t);
+            else if (enters) end.take_row(c.pair_first + 2 * site, site, there);
+            else continue;
+            c.touched[body] = c.touched[other] = 1;
+            found = true;
+        }
+        return found;
+    }
+    void take_row(int pair, int site, const Meeting& t) const {
+        int k = pair;
+        if (c.obstacle[pair] != t.other) {
+            const bool next = c.obstacle[pair + 1] == t.other || c.obstacle[pair + 1] < 0;
+            k += next || (c.obstacle[pair] >= 0 && c.state[pair + 1].force.normal < c.state[pair].force.normal);
+        }
+        const bool same = c.obstacle[k] == t.other;
+        const double n[3] = {c.normal[3 * k], c.normal[3 * k + 1], c.normal[3 * k + 2]};
+        RowState& state = c.state[k];
+        if (same && dot3(n, t.touch.normal) > SAME_PLANE) { state.hardening *= HARDER; return; }
+        const Memory none[2] = {{-1, 0, {}, {}}, {-1, 0, {}, {}}};
+        put_row(k, site, t, none);
+        state.limit = 0;
+        state.hardening = 1;
+        state.in_set = 0;
+    }
+
+    void fit() const {
+        for (int i = 0; i < loop.bodies; ++i) { fit_body(i); c.near[i] = c.touched[i] = 0; }
         for (int i = 0; i < loop.bodies; ++i)
             for (int j = 0; j < i; ++j)
                 if (meet(c.body_box[i], c.body_box[j])) c.near[i] = c.near[j] = 1;
 #pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) if (loop.threads > 1)
         for (int i = 0; i < loop.bodies; ++i)
             if (c.near[i]) fit_tree(i);
+    }
+
+    // Sets the rows of a step.
+    void run() const {
+        fit();
 #pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) if (loop.threads > 1)
         for (int i = 0; i < loop.bodies; ++i) {
             if (!c.near[i] && !c.was_near[i]) continue;

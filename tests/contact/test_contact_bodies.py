@@ -1,0 +1,181 @@
+# SPDX-License-Identifier: MIT
+"""Bodies that touch each other: momentum, stacks, islands, preconditioners, replays to the bit."""
+
+import numpy as np
+import pytest
+
+from sim_server.backends.kinds import KINDS
+from sim_server.simulation import Simulation
+from sim_server.updates.driver import Driver
+from tests.contact.scenes import D, block, floor, over
+
+STATUS = KINDS.enumeration("Status")
+HEIGHT = 0.06
+JACOBI = {"preconditioner": "block_jacobi"}
+FAR = floor(pose={"translate": [0, -100, 0]})
+
+
+def stack(count: int, **table) -> Simulation:
+    """Blocks one over another, each a little aside."""
+    blocks = [block(name=f"b{i}", at=(0.003 * (i % 2), D + i * (HEIGHT + D), 0.002 * (i % 2))) for i in range(count)]
+    return over(objects=blocks, **table)
+
+
+def collision(speed: float, friction: float = 0.5, solver: dict | None = None, contact=True) -> Simulation:
+    """Two blocks that meet in free space, one turned."""
+    one = block(name="one", friction=friction, at=(0, 0, 0))
+    other = block(name="other", friction=friction, at=(0.03, 0.1, 0.02), rotate=(10, 30, 5))
+    sim = over(FAR, objects=[one, other], gravity=(0, 0, 0), solver=solver, contact=contact)
+    first, second = sim.world.bodies
+    sim.world.v[first.nodes], sim.world.v[second.nodes] = (0, speed, 0), (0.2 * speed, -speed, 0)
+    return sim
+
+
+def momenta(sim: Simulation) -> tuple[np.ndarray, np.ndarray]:
+    """Linear, and angular about the origin."""
+    w = sim.world
+    return w.mass @ w.v, (w.mass[:, None] * np.cross(w.x, w.v)).sum(axis=0)
+
+
+def inside(sim: Simulation, one: int, other: int) -> int:
+    """Number of nodes of a body within elements of another."""
+    corners = sim.world.x[sim.world.bodies[other].tets]
+    edges = np.linalg.inv((corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1))
+    from_first = sim.world.x[sim.world.bodies[one].nodes][:, None] - corners[None, :, 0]
+    weights = np.einsum("tij,ntj->nti", edges, from_first)
+    return int(((weights > 1e-9).all(axis=2) & (weights.sum(axis=2) < 1 - 1e-9)).any(axis=1).sum())
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.5])
+@pytest.mark.parametrize("speed", [0.5, 5.0])
+def test_bodies_that_collide_keep_their_momentum_and_stay_out_of_each_other(speed, friction):
+    """Off centre, so that they turn and pass each other."""
+    contact = {"thickness": D, "tolerance": 1e-6, "passes": 200}
+    sim = collision(speed, friction, JACOBI | {"tolerance": 1e-12, "max_iterations": 3000}, contact)
+    linear, angular = momenta(sim)
+    size = sim.world.mass.sum() * speed
+    for _ in range(int(0.3 / speed / sim.world.dt) + 4):
+        sim.engine.run(1)
+        assert inside(sim, 0, 1) == inside(sim, 1, 0) == 0
+    records = sim.engine.records()
+    assert records["contacts"].any() and not records["clipped"].any()
+    after, turned = momenta(sim)
+    assert abs(after - linear).max() <= 1e-9 * size
+    assert abs(turned - angular).max() <= 0.1 * size * 0.1  # as much as backward Euler keeps of it
+    relative = [np.diff([m[b.nodes].mean(axis=0) for b in sim.world.bodies], axis=0) for m in (sim.world.v,)]
+    assert np.linalg.norm(relative) < 1.9 * speed  # it was a collision
+
+
+@pytest.mark.parametrize("count", [2, 4])
+def test_a_stack_stands_and_each_body_carries_those_above(count):
+    sim = stack(count)
+    Driver(sim).advance(200)
+    sim.engine.run(1)
+    _, forces = sim.engine.records_and_reactions()
+    weight = sim.world.mass.sum() * 9.81
+    assert -forces[:, 0, 1].sum() == pytest.approx(weight, rel=1e-5)
+    assert abs(forces[:, 0, [0, 2]].sum(axis=0)).max() <= 1e-4 * weight
+    rows = sim.contact.contact_input()
+    site = np.repeat(rows.surfaces.site_body, 2)
+    force = rows.force[len(rows.force) // 2 :, None] * rows.normal[len(rows.force) // 2 :]
+    force = force + rows.traction[len(rows.force) // 2 :]
+    other = rows.obstacle[len(rows.obstacle) // 2 :]
+    for level in range(1, count):  # what passes from body `level` down to the next one
+        down = force[(site == level - 1) & (other == level)].sum(axis=0) - force[(site == level) & (other == level - 1)].sum(axis=0)
+        assert -down[1] == pytest.approx(weight * (count - level) / count, rel=1e-3)
+    low = [sim.world.x[b.nodes, 1].min() for b in sim.world.bodies]
+    assert np.allclose(np.diff(low), HEIGHT + D, rtol=0, atol=0.5 * D)
+    assert abs(sim.world.v).max() <= 1e-4
+
+
+def test_it_costs_few_iterations_at_rest():
+    """Rigid motions in the preconditioner: a stack of four costs little more than a block."""
+    sim = stack(4)
+    records = Driver(sim).advance(200)
+    assert records["iterations"][-80:].mean() <= 4
+    assert not records["status"].any()
+
+
+def test_preconditioners_do_not_change_the_motion():
+    def end(solver: dict) -> np.ndarray:
+        contact = {"thickness": D, "tolerance": 1e-8, "passes": 300}
+        sim = collision(1.0, 0.3, solver | {"tolerance": 1e-10, "max_iterations": 3000}, contact)
+        assert not Driver(sim).advance(25)["status"].any()
+        return sim.world.x.copy()
+
+    ends = [end(JACOBI), end({"preconditioner": "cholesky", "update": "lockstep-2"})]
+    ends.append(end({"preconditioner": "cholesky", "update": "never"}))
+    for other in ends[1:]:
+        assert abs(other - ends[0]).max() <= 1e-6
+
+
+def test_bodies_that_do_not_touch_others_are_left_alone_to_the_bit():
+    """A block on the floor moves the same whether or not a stack stands far away."""
+    alone = over(objects=[block(name="a"), block(name="b", at=(9, 30, 0))], velocity=(1, 0, 0))
+    beside = over(
+        objects=[block(name="a"), block(name="b", at=(9, D, 0)), block(name="c", at=(9, 2 * D + HEIGHT, 0))],
+        velocity=(1, 0, 0),
+    )  # fmt: skip
+    Driver(alone).advance(60)
+    Driver(beside).advance(60)
+    nodes = alone.world.bodies[0].nodes
+    assert np.array_equal(alone.world.x[nodes], beside.world.x[nodes])
+
+
+def test_between_false_lets_them_pass():
+    sim = collision(1.0, contact={"thickness": D, "between": False})
+    records = Driver(sim).advance(30)
+    assert not records["contacts"].any()
+    first, second = sim.world.bodies
+    assert sim.world.v[first.nodes, 1].mean() == pytest.approx(1.0)
+
+
+def test_friction_of_two_objects_by_name():
+    pair = [{"between": ["a", "b"], "value": 0.0}]
+    sim = over(
+        objects=[block(name="a"), block(name="b", at=(0, 2 * D + HEIGHT, 0))],
+        contact={"thickness": D, "friction": pair},
+    )  # fmt: skip
+    sim.world.v[sim.world.bodies[1].nodes] = (0.3, 0, 0)
+    Driver(sim).advance(4)
+    assert sim.world.v[sim.world.bodies[1].nodes, 0].mean() == pytest.approx(0.3, rel=0.01)
+
+
+def test_one_that_is_held_carries_another():
+    """The lower block is fixed at its base and has no rigid motions of its own."""
+    held = block(name="held", fixed="Y < 0.001", at=(0, 1, 0))
+    sim = over(objects=[held, block(name="free", at=(0, 1 + HEIGHT + D, 0))])
+    Driver(sim).advance(150)
+    assert abs(sim.world.v).max() <= 1e-5
+    low = sim.world.x[sim.world.bodies[1].nodes, 1].min()
+    assert low == pytest.approx(1 + HEIGHT + D, abs=0.5 * D)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_it_repeats_to_the_bit(threads):
+    ends = []
+    for _ in range(2):
+        sim = collision(3.0, solver=JACOBI | {"threads": threads})
+        Driver(sim).advance(30)
+        ends.append(sim.world.x.copy())
+    assert np.array_equal(*ends)
+
+
+def test_energy_does_not_grow():
+    sim = collision(5.0)
+    sim.engine.loop.energy_every = 1
+    records = Driver(sim).advance(60)
+    energy = (records["kinetic"] + records["elastic"]).reshape(-1, 2).sum(axis=1)
+    assert energy.max() <= energy[0] * (1 + 1e-6)
+    assert not (records["status"] == STATUS["RUNAWAY"]).any()
+
+
+def test_a_body_thrown_fast_does_not_pass_another():
+    """Its vertices meet the other's triangles on their way, however fast."""
+    wall = block(name="wall", cells=(4, 2, 4), size=(0.2, 0.02, 0.2), fixed="X < 0.001", at=(-0.05, 0, -0.05), young=1e7)
+    ball = block(name="ball", at=(0, 0.05, 0))
+    for speed in (1.0, 10.0, 40.0):
+        sim = over(FAR, objects=[wall, ball], gravity=(0, 0, 0), solver=JACOBI)
+        sim.world.v[sim.world.bodies[1].nodes] = (0, -speed, 0)
+        Driver(sim).advance(3)
+        assert sim.world.x[sim.world.bodies[1].nodes, 1].mean() > 0.02, speed
