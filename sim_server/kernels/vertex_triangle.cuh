@@ -30,6 +30,9 @@ HOST_DEVICE bool normal_of(const double* a, const double* b, const double* c, do
     return make_unit(n) > 0;
 }
 
+// Cosine of the angle between a face's normal and the way from its nearest point. Below it the nearest point is on a convex edge or at a
+// corner, and the vertex outside: from within, nearest points are inside of faces (reentrant edges apart).
+constexpr double CORNER = 0.9;
 constexpr double DEEP = 5;  // thicknesses: a vertex further inside is not pushed out, since its nearest triangle may be on the other side
 
 struct Touch {          // where a vertex may touch a triangle in a step
@@ -50,8 +53,9 @@ HOST_DEVICE bool meet(const double* p, const double* path, const double* a, cons
         q[k] = t.weight[0] * a[k] + t.weight[1] * b[k] + t.weight[2] * c[k];
         off[k] = p[k] - q[k];
     }
-    const double away = sqrt(dot3(off, off)), side = dot3(face, off);
-    t.certainty = away > 0 ? fabs(side) / away : 1;
+    const double away = sqrt(dot3(off, off)), height = dot3(face, off);
+    t.certainty = away > 0 ? fabs(height) / away : 1;
+    const double side = t.certainty < CORNER ? away : height;
     t.distance = side < 0 ? -away : away;
     t.entry = NEVER;
     const bool along_face = away < 1e-3 * thickness || side < 0;
@@ -61,7 +65,7 @@ HOST_DEVICE bool meet(const double* p, const double* path, const double* a, cons
         if (approach < 0) t.entry = 0;
         return true;
     }
-    const double height = p[0] * face[0] + p[1] * face[1] + p[2] * face[2] - dot3(a, face), sink = dot3(face, path);
+    const double sink = dot3(face, path);
     if (height < 0 || !(height + sink < thickness)) return side >= 0 && away <= 2 * thickness;
     const double when = height > thickness ? (height - thickness) / -sink : 0;
     double there[3], weight[3], gap[3];
