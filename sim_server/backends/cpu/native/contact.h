@@ -212,14 +212,13 @@ struct Passes {
 
     // set: begin with the rows marked by choose_set.
     void solve(bool set) {
-        bool last = false;
+        bool last = false, spent = false;
         for (int k = 0;; ++k) {
             apply_law(set && k == 0);
             const double size = balance();
             if (!std::isfinite(size)) { result.status = NOT_FINITE; return; }
             report.residual = given > 0 ? size / given : 0;
-            const bool more = report.residual > c.tolerance && report.passes < c.passes && result.status != BUDGET;
-            if (last && !more) break;  // else the last solve has changed what the law says
+            if (spent || (last && report.residual <= c.tolerance)) break;  // the last solve may have changed the law again
             const double goal = body.now.tolerance * given;
             const bool by_law = k > 0 || !set || set_is_law();
             last = by_law && size <= c.tolerance * given;
@@ -231,7 +230,7 @@ struct Passes {
             pass(last ? goal / size : std::max(goal / size, EARLY), last);
             result.residual *= given > 0 ? size / given : 0;
             if (result.status == NOT_FINITE) return;
-            if (result.status == BUDGET) last = true;
+            spent = result.status == BUDGET;
             hold_limits();
         }
         if (report.residual > c.tolerance && result.status == CONVERGED) result.status = CONTACT;
