@@ -16,15 +16,15 @@ NAMED = 3  # objects named in a line
 def scene_notes(simulation: Simulation) -> list[str]:
     """Returns at most two lines: bodies that fall apart or fall freely, and nearly incompressible materials.
 
-    A body falls if gravity acts on it and no element connects it to a fixed node, even if clients may grab it. In a
-    quasi-static scene such a body is refused. Nothing is said where there are obstacles to fall on.
+    A body falls if gravity acts on it and no element connects it to a fixed node, even if clients may grab it; not
+    where there are obstacles, on which it may land. In a quasi-static scene such a body is refused.
     """
     return [line for line in (_loose(simulation), _incompressible(simulation)) if line]
 
 
 def _loose(simulation: Simulation) -> str:
-    world, gravity = simulation.world, simulation.effects.get("gravity")
-    pulled = simulation.contact is None and world.inertia and gravity is not None and bool(np.any(gravity.g))  # type: ignore[attr-defined]
+    world = simulation.world
+    pulled = world.inertia and not world.obstacles and any(world.gravity)
     part, elastic = _parts(simulation)
     held = np.isin(part, part[world.free == 0])
     apart, falling, partly = [], [], []

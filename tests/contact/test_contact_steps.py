@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Steps with contact solve the equations with the law, whatever the preconditioner; without it they are as ever."""
+"""Steps with contact solve the equations with the law, with any preconditioner; without it they are as ever."""
 
 import numpy as np
 import pytest
