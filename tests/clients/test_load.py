@@ -199,7 +199,7 @@ def test_ctrl_c_leaves_nothing_behind(tmp_path: Path) -> None:
     process = start(*TINY[:-4], "--seconds", "600", "--workers", "1", "--out", str(tmp_path))
     log = tmp_path / "load.mcap"
     deadline = time.monotonic() + 60
-    while not (log.exists() and log.stat().st_size > 3000) and time.monotonic() < deadline:
+    while not (log.exists() and log.stat().st_size > 30_000) and time.monotonic() < deadline:
         time.sleep(0.05)
     time.sleep(1)
     process.send_signal(signal.SIGINT)

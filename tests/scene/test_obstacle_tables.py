@@ -154,7 +154,10 @@ REFUSED = [
     (swap('"tool"', '"a tool"'), ["obstacle 'a tool', name = 'a tool'", "1 to 64 characters"]),
     (swap("contact = true", ""), ["obstacle 'floor'", "list contact = true under [effects]"]),
     (swap("contact = true", "contact = false"), ["obstacle 'floor'", "list contact = true under [effects]"]),
-    (GOOD[: GOOD.index("[[obstacle]]")], ["effects.contact", "needed: an [[obstacle]]"]),
+    (
+        GOOD[: GOOD.index("[[obstacle]]")].replace("contact = true", "contact = { between = false }"),
+        ["effects.contact", "needed: an [[obstacle]], or another object"],
+    ),
     (
         swap('[[object]]\nname = "beam"', '[integrator]\nscheme = "bdf2"\n[[object]]\nname = "beam"'),
         ["effects.contact", "'bdf2'", "'backward_euler' with linearizations = 1"],
@@ -172,16 +175,12 @@ REFUSED = [
         ["effects.contact.friction[1].between", "no object or obstacle 'flor'", "'floor'"],
     ),
     (
-        swap("contact = true", 'contact = { friction = [{ between = ["beam", "other"], value = 1 }] }'),
-        ["beam and other: must be an object and an obstacle"],
-    ),
-    (
         swap("contact = true", 'contact = { friction = [{ between = ["tool", "floor"], value = 1 }] }'),
-        ["floor and tool: must be an object and an obstacle"],
+        ["floor and tool: must be an object, and an obstacle or another object"],
     ),
     (
         swap("contact = true", 'contact = { friction = [{ between = ["beam", "beam"], value = 1 }] }'),
-        ["must be an object and an obstacle"],
+        ["must be an object, and an obstacle or another object"],
     ),
     (
         swap("contact = true", 'contact = { friction = [{ between = ["beam", "floor"], value = -1 }] }'),
