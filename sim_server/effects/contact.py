@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Contact of the objects' surfaces with obstacles, with friction.
+"""Contact of the objects' surfaces with obstacles and with each other, with friction.
 
-Each surface node is kept away from obstacles by a force that grows as it comes nearer than a thickness d::
+Each surface node is kept away from what it touches by a force that grows as it comes nearer than a thickness d::
 
     lambda = max(0, k (d - g)),    |tau| <= mu lambda
 
@@ -14,8 +14,11 @@ first comes nearer than d, on the side from which it comes, so that no speed tak
 the nearest point, if that is nearer than 2 d. Obstacles (`[[obstacle]]`) are fixed, move along keyframes, or go to the
 poses that a client gives, no faster than `max_speed` and `max_turn`.
 
-Only nodes are kept out: a corner or an edge of an obstacle that is smaller than the triangles of the surface may pass
-between them. Friction of a pair is the geometric mean of both, unless `friction` names the pair.
+With `between` a node is kept away from the triangles of other objects in the same way; what touches is solved as one
+system (backends/cpu/native/pairs.h and island.h).
+
+Only nodes are kept out: a corner or an edge that is smaller than the triangles of the surface may pass between them.
+Friction of a pair is the geometric mean of both, unless `friction` names the pair.
 
 Usual values: a thickness of a tenth of the shortest edge of the surface (the default); friction 0.1 (wet tissue on
 steel) to 1 (rubber).

@@ -82,7 +82,9 @@ def test_a_stack_stands_and_each_body_carries_those_above(count):
     force = force + rows.traction[len(rows.force) // 2 :]
     other = rows.obstacle[len(rows.obstacle) // 2 :]
     for level in range(1, count):  # what passes from body `level` down to the next one
-        down = force[(site == level - 1) & (other == level)].sum(axis=0) - force[(site == level) & (other == level - 1)].sum(axis=0)
+        down = force[(site == level - 1) & (other == level)].sum(axis=0) - force[
+            (site == level) & (other == level - 1)
+        ].sum(axis=0)
         assert -down[1] == pytest.approx(weight * (count - level) / count, rel=1e-3)
     low = [sim.world.x[b.nodes, 1].min() for b in sim.world.bodies]
     assert np.allclose(np.diff(low), HEIGHT + D, rtol=0, atol=0.5 * D)
@@ -174,7 +176,9 @@ def test_energy_does_not_pass_that_of_the_start():
 
 def test_a_body_thrown_fast_does_not_pass_another():
     """Its vertices meet the other's triangles on their way, however fast."""
-    wall = block(name="wall", cells=(4, 2, 4), size=(0.2, 0.02, 0.2), fixed="X < 0.001", at=(-0.05, 0, -0.05), young=1e7)
+    wall = block(
+        name="wall", cells=(4, 2, 4), size=(0.2, 0.02, 0.2), fixed="X < 0.001", at=(-0.05, 0, -0.05), young=1e7
+    )
     ball = block(name="ball", at=(0, 0.05, 0))
     for speed in (1.0, 10.0, 40.0):
         sim = over(FAR, objects=[wall, ball], gravity=(0, 0, 0), solver=JACOBI)

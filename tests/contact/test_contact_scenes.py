@@ -11,7 +11,7 @@ from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
 
 SCENES = Path(__file__).resolve().parents[2] / "deploy" / "scenes"
-NAMES = ("floor_drop", "incline", "stairs", "gripper", "tool_on_organ")
+NAMES = ("floor_drop", "incline", "stairs", "gripper", "tool_on_organ", "heap")
 STATUS = KINDS.enumeration("Status")
 
 
@@ -111,3 +111,18 @@ def test_the_tool_presses_in_feels_it_and_leaves():
     records = driver.advance(160)
     assert not records["status"].any() and not records["clipped"].any()
     assert not rows.force.any() and abs(sim.world.x - rest).max() <= 1e-3
+
+
+def test_the_heap_comes_to_rest_within_its_walls():
+    sim = loaded("heap")
+    records = Driver(sim).advance(170)
+    count = len(sim.world.bodies)
+    assert not records["status"][100 * count :].any() and not records["clipped"].any()
+    assert abs(sim.world.v).max() <= 5e-3
+    sim.engine.run(1)
+    forces = sim.engine.records_and_reactions()[1].sum(axis=0)
+    assert -forces[0, 1] == pytest.approx(weight(sim), rel=0.02)
+    low, high = sim.world.x.min(axis=0), sim.world.x.max(axis=0)
+    assert (low > [-0.06, 0, -0.06]).all() and (high[[0, 2]] < [0.3, 0.28]).all()
+    lowest = sorted(sim.world.x[b.nodes, 1].min() for b in sim.world.bodies)
+    assert lowest[-1] > 0.05, "some lie on others"
