@@ -235,7 +235,7 @@ def test_a_vertex_is_held_by_a_face_all_of_whose_corners_are_fixed():
 
 @pytest.mark.parametrize("beyond", [2.1, 3.0, 4.5])
 def test_a_vertex_beside_an_edge_is_outside_although_it_is_below_the_other_face(beyond):
-    """The face above has its nearest point nearer than DEEP, and the vertex on its other side, which stops before it."""
+    """The face above is nearer than DEEP, and the vertex, which stops before it reaches the block, is behind it."""
     found = over_a_block((0.08 + beyond * D, -0.5 * D, 0))
     found.sim.world.v[found.sim.world.bodies[0].nodes] = [-(beyond - 1.5) * D / H, 0, 0]
     assert found.assemble() == {}
