@@ -23,11 +23,13 @@ HOST_DEVICE void nearest_on_triangle(const double* p, const double* a, const dou
     weight[0] = 1 - v - w; weight[1] = v; weight[2] = w;
 }
 
+constexpr double FLAT = 1e-10;  // sine of a triangle's angle that is no more than rounding
+
 // Unit normal of a triangle by the right-hand rule; false if it has no area.
 HOST_DEVICE bool normal_of(const double* a, const double* b, const double* c, double* n) {
     const double u[3] = {b[0] - a[0], b[1] - a[1], b[2] - a[2]}, v[3] = {c[0] - a[0], c[1] - a[1], c[2] - a[2]};
     n[0] = u[1] * v[2] - u[2] * v[1]; n[1] = u[2] * v[0] - u[0] * v[2]; n[2] = u[0] * v[1] - u[1] * v[0];
-    return make_unit(n) > 0;
+    return make_unit(n) > FLAT * sqrt(dot3(u, u) * dot3(v, v));
 }
 
 // Cosine of the angle between a face's normal and the way from its nearest point. Below it the nearest point is on a convex edge or at a
@@ -43,17 +45,22 @@ struct Touch {          // where a vertex may touch a triangle in a step
     double weight[3];   // of its corners, at the point touched
 };
 
-// p: the vertex; path: its displacement in the step less that of the triangle. A vertex outside that comes from further away is
-// met where its path meets the triangle, whatever its speed; one that is near has the nearest point. False: neither, or too deep.
+// Distance of p from the triangle; out: weights of its nearest point, and the way from there to p.
+HOST_DEVICE double apart(const double* p, const double* a, const double* b, const double* c, double* weight, double* off) {
+    nearest_on_triangle(p, a, b, c, weight);
+    for (int k = 0; k < 3; ++k) off[k] = p[k] - (weight[0] * a[k] + weight[1] * b[k] + weight[2] * c[k]);
+    return sqrt(dot3(off, off));
+}
+
+constexpr int MOST_STEPS = 40;  // of Newton's method towards a time of entry
+
+// p: the vertex; path: its displacement in the step less that of the triangle. A vertex that is near, or inside, has the nearest
+// point; one in front of the triangle that comes nearer than the thickness has the point where it does so, whatever its speed.
+// False: neither, and further away than DEEP thicknesses. True with entry NEVER: it says on which side of the body the vertex is.
 HOST_DEVICE bool meet(const double* p, const double* path, const double* a, const double* b, const double* c, double thickness, Touch& t) {
-    double face[3], q[3], off[3];
+    double face[3], off[3], weight[3], there[3];
     if (!normal_of(a, b, c, face)) return false;
-    nearest_on_triangle(p, a, b, c, t.weight);
-    for (int k = 0; k < 3; ++k) {
-        q[k] = t.weight[0] * a[k] + t.weight[1] * b[k] + t.weight[2] * c[k];
-        off[k] = p[k] - q[k];
-    }
-    const double away = sqrt(dot3(off, off)), height = dot3(face, off);
+    const double away = apart(p, a, b, c, t.weight, off), height = dot3(face, off);
     t.certainty = away > 0 ? fabs(height) / away : 1;
     const double side = t.certainty < CORNER ? away : height;
     t.distance = side < 0 ? -away : away;
@@ -65,18 +72,23 @@ HOST_DEVICE bool meet(const double* p, const double* path, const double* a, cons
         if (approach < 0) t.entry = 0;
         return true;
     }
-    const double sink = dot3(face, path);
-    if (height < 0 || !(height + sink < thickness)) return side >= 0 && away <= 2 * thickness;
-    const double when = height > thickness ? (height - thickness) / -sink : 0;
-    double there[3], weight[3], gap[3];
-    for (int k = 0; k < 3; ++k) there[k] = p[k] + when * path[k];
-    nearest_on_triangle(there, a, b, c, weight);
-    for (int k = 0; k < 3; ++k) gap[k] = there[k] - (weight[0] * a[k] + weight[1] * b[k] + weight[2] * c[k]);
-    if (!(sqrt(dot3(gap, gap)) <= thickness * (1 + 1e-9))) return away <= 2 * thickness;
-    t.entry = when;
-    for (int k = 0; k < 3; ++k) {
-        t.normal[k] = face[k];
-        t.weight[k] = weight[k];
+    if (side < 0) return false;
+    // The distance along a straight path is convex, so steps of Newton's method never pass the entry.
+    double when = 0, gap = away;
+    for (int step = 0; step < MOST_STEPS; ++step) {
+        const double slope = dot3(off, path) / gap;
+        if (!(slope < 0)) break;
+        when -= (gap - thickness) / slope;
+        if (!(when <= 1)) break;
+        for (int k = 0; k < 3; ++k) there[k] = p[k] + when * path[k];
+        gap = apart(there, a, b, c, weight, off);
+        if (gap > thickness * (1 + 1e-6)) continue;
+        t.entry = when;
+        for (int k = 0; k < 3; ++k) {
+            t.normal[k] = off[k] / gap;
+            t.weight[k] = weight[k];
+        }
+        return true;
     }
-    return true;
+    return away <= DEEP * thickness;
 }

@@ -83,6 +83,11 @@ struct PairDetection {
     void fit_body(int body) const {
         Box box = NOWHERE;
         for (int site = sites(body); site < sites(body + 1); ++site) box = joined(box, box_of(node_of(site), thickness_of(body)));
+        for (int k = c.tree_start[body]; k < c.tree_start[body + 1]; ++k)
+            for (int a = 0; a < 3 && c.tree_child[2 * k] < 0; ++a) {
+                const int node = c.triangle[3 * ~c.tree_child[2 * k] + a];
+                if (c.node_site[node] < 0) box = joined(box, box_of(node, thickness_of(body)));  // a fixed node
+            }
         c.body_box[body] = box;
     }
     void fit_tree(int body) const {
@@ -95,12 +100,12 @@ struct PairDetection {
         }
     }
 
-    // The first touch of a vertex with a body.
-    Meeting first_touch(int node, int body, double thickness) const {
-        Meeting best = {-1, -1, {NEVER, 0, 0, {}, {}}};
+    // Where a vertex touches a body: on the nearest triangle if it is near, or inside, else where its path first comes near.
+    Meeting touch_of(int node, int body, double thickness) const {
+        Meeting nearest = {-1, -1, {}}, first = nearest;
         double s[3];
         drifted(node, s);
-        const Box box = box_of(node, thickness);
+        const Box box = box_of(node, DEEP * thickness);  // only the nearest triangle of all tells inside from outside
         int32_t stack[64];
         int depth = 0;
         stack[depth++] = c.tree_start[body];
@@ -112,11 +117,14 @@ struct PairDetection {
                 stack[depth++] = c.tree_child[2 * k + 1];
                 continue;
             }
-            consider(node, s, body, ~left, thickness, best);
+            consider(node, s, body, ~left, thickness, nearest, first);
         }
-        return best;
+        const double distance = nearest.touch.distance;
+        if (nearest.other < 0 || distance <= thickness) return nearest;
+        if (first.other >= 0 || distance > 2 * thickness) return first;
+        return nearest;
     }
-    void consider(int node, const double* s, int body, int triangle, double thickness, Meeting& best) const {
+    void consider(int node, const double* s, int body, int triangle, double thickness, Meeting& nearest, Meeting& first) const {
         const int32_t* t = c.triangle + 3 * triangle;
         double path[3] = {s[0], s[1], s[2]};
         for (int a = 0; a < 3; ++a) {
@@ -126,14 +134,10 @@ struct PairDetection {
         }
         Meeting here = {body, triangle, {}};
         if (!meet(x(node), path, x(t[0]), x(t[1]), x(t[2]), thickness, here.touch)) return;
-        const double apart = std::fabs(here.touch.distance) - std::fabs(best.touch.distance);
-        const bool as_near = best.other >= 0 && std::fabs(apart) <= 1e-9 * thickness;
-        if (as_near ? here.touch.certainty > best.touch.certainty : best.other < 0 || comes_first(here.touch, best.touch, thickness)) best = here;
-    }
-    // A vertex that is near, or inside, has the nearest triangle; another one that which its path meets first.
-    static bool comes_first(const Touch& a, const Touch& b, double thickness) {
-        if (a.distance <= thickness || b.distance <= thickness || a.entry == b.entry) return std::fabs(a.distance) < std::fabs(b.distance);
-        return a.entry < b.entry;
+        const double farther = std::fabs(here.touch.distance) - std::fabs(nearest.touch.distance);
+        const bool as_near = std::fabs(farther) <= 1e-9 * thickness;
+        if (nearest.other < 0 || (as_near ? here.touch.certainty > nearest.touch.certainty : farther < 0)) nearest = here;
+        if (here.touch.distance > 0 && here.touch.entry <= 1 && comes_before(here, first)) first = here;
     }
 
     struct Memory {
@@ -189,7 +193,7 @@ struct PairDetection {
         const Box box = c.free[node] == 0 ? NOWHERE : box_of(node, thickness_of(body));
         for (int other = 0; other < loop.bodies; ++other) {
             if (other == body || !c.near[other] || !meet(box, c.body_box[other])) continue;
-            const Meeting t = first_touch(node, other, 0.5 * (thickness_of(body) + thickness_of(other)));
+            const Meeting t = touch_of(node, other, 0.5 * (thickness_of(body) + thickness_of(other)));
             if (comes_before(t, first)) { second = first; first = t; }
             else if (comes_before(t, second)) second = t;
         }
@@ -220,9 +224,10 @@ struct PairDetection {
         for (int other = 0; other < loop.bodies; ++other) {
             if (other == body || !c.near[other] || !meet(box, c.body_box[other])) continue;
             const double thickness = 0.5 * (thickness_of(body) + thickness_of(other));
-            const bool passes = first_touch(node, other, THROUGH * thickness).touch.entry <= 1;
+            const Meeting through = touch_of(node, other, THROUGH * thickness);
+            const bool passes = through.other >= 0 && through.touch.entry <= 1;
             const PairDetection end{loop, c, y, ends};
-            const Meeting there = end.first_touch(node, other, INSIDE * thickness), t = first_touch(node, other, thickness);
+            const Meeting there = end.touch_of(node, other, INSIDE * thickness), t = touch_of(node, other, thickness);
             const bool enters = there.other >= 0 && there.touch.distance < 0 && (t.other < 0 || t.touch.distance >= 0);
             if (passes && t.other >= 0) take_row(c.pair_first + 2 * site, site, t);
             else if (enters) end.take_row(c.pair_first + 2 * site, site, there);
