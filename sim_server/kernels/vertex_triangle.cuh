@@ -32,9 +32,6 @@ HOST_DEVICE bool normal_of(const double* a, const double* b, const double* c, do
     return make_unit(n) > FLAT * sqrt(dot3(u, u) * dot3(v, v));
 }
 
-// Cosine of the angle between a face's normal and the way from its nearest point. Below it the nearest point is on a convex edge or at a
-// corner, and the vertex outside: from within, nearest points are inside of faces (reentrant edges apart).
-constexpr double CORNER = 0.9;
 constexpr double DEEP = 5;  // thicknesses: a vertex further inside is not pushed out, since its nearest triangle may be on the other side
 
 struct Touch {          // where a vertex may touch a triangle in a step
@@ -60,9 +57,8 @@ constexpr int MOST_STEPS = 40;  // of Newton's method towards a time of entry
 HOST_DEVICE bool meet(const double* p, const double* path, const double* a, const double* b, const double* c, double thickness, Touch& t) {
     double face[3], off[3], weight[3], there[3];
     if (!normal_of(a, b, c, face)) return false;
-    const double away = apart(p, a, b, c, t.weight, off), height = dot3(face, off);
-    t.certainty = away > 0 ? fabs(height) / away : 1;
-    const double side = t.certainty < CORNER ? away : height;
+    const double away = apart(p, a, b, c, t.weight, off), side = dot3(face, off);
+    t.certainty = away > 0 ? fabs(side) / away : 1;
     t.distance = side < 0 ? -away : away;
     t.entry = NEVER;
     const bool along_face = away < 1e-3 * thickness || side < 0;

@@ -121,7 +121,7 @@ def test_the_heap_comes_to_rest_within_its_walls():
     assert abs(sim.world.v).max() <= 5e-3
     sim.engine.run(1)
     forces = sim.engine.records_and_reactions()[1].sum(axis=0)
-    assert -forces[0, 1] == pytest.approx(weight(sim), rel=0.02)
+    assert -forces[:, 1].sum() == pytest.approx(weight(sim), rel=0.01)  # walls carry some by friction
     low, high = sim.world.x.min(axis=0), sim.world.x.max(axis=0)
     assert (low > [-0.06, 0, -0.06]).all() and (high[[0, 2]] < [0.3, 0.28]).all()
     lowest = sorted(sim.world.x[b.nodes, 1].min() for b in sim.world.bodies)
