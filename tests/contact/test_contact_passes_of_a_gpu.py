@@ -59,8 +59,12 @@ static void solve(const ContactArguments& c, const ContactSolve& pass, const Sys
     int outcome = SOLVED;
     double goal = s.tolerance * s.tolerance * (state.phase == READY ? state.given2 : b2);
     if (state.phase == CHOOSE_START) {
-        if (state.zero2 <= r2) for (int k = 0; k < 3 * n; ++k) y[k] = 0;
-        note_pass(state, pass, READY, sum, out);
+        const bool zero = state.zero2 <= r2;
+        for (int k = 0; k < 3 * n; ++k) {
+            pass.last[3 * first + k] = -q[k];
+            if (zero) y[k] = 0;
+        }
+        note_pass(state, pass, zero ? FROM_ZERO : FROM_START, sum, out);
         return;
     }
     if (state.phase == WITHOUT && !(r2 < b2)) {
@@ -270,6 +274,17 @@ def test_a_block_slides(library, monkeypatch):
     force, traction = beside.contact.force, np.linalg.norm(beside.contact.traction, axis=1)
     limit = (0.1 * 0.5) ** 0.5 * force
     assert record["contacts"] == (force > 0).sum() > 8 and (traction > 0.9 * limit)[force > 0].any()
+
+
+def test_a_block_at_rest_whose_edge_is_lifted_needs_one_solve_a_step(library, monkeypatch):
+    """Nodes a little further off than the thickness would be hit without the forces that are there."""
+    low = floor(pose={"translate": (0, -5e-5, 0)})
+    plate = {"name": "plate", "shape": "box", "size": (0.13, 0.02, 0.3), "pose": {"translate": (0.015, -0.01, 0)}}
+    beside = Beside(library, over(low, plate, **SMALL), monkeypatch)
+    records = [beside.compare(1e-6) for _ in range(9)]
+    hit = beside.contact.entry <= 1
+    assert (hit & (beside.contact.force == 0)).sum() >= 4 and records[-1]["contacts"] == 16
+    assert max(r["passes"] for r in records[-2:]) <= 1
 
 
 def test_an_obstacle_hits_a_block_at_10_m_per_s(library, monkeypatch):
