@@ -18,7 +18,7 @@ from sim_server.backends.gpu import contact as gpu_contact
 from sim_server.backends.gpu.contact import ContactPasses
 from sim_server.backends.gpu.structs import CONTACT_RESULT, CONTACT_STATE, PCG_RESULT
 from sim_server.simulation import Simulation
-from tests.contact.scenes import block, floor, over, ram
+from tests.contact.scenes import D, block, floor, over, ram
 
 OUT_OF_PASSES = Declarations("kernels/kinds.h").enumeration("Status")["CONTACT"]
 ROUNDS = Declarations("kernels/contact_passes.cuh").constant("ROUNDS")
@@ -303,6 +303,7 @@ def test_points_are_held_back_where_passes_run_out(library, monkeypatch, short):
 
 def test_bodies_go_their_own_ways(library, monkeypatch):
     objects = [block(cells=(2, 1, 2), at=(0, 0.004, 0)), block(0.3, (3, 2, 3), at=(0.3, 0.02, 0), name="other")]
-    beside = Beside(library, over(objects=objects, solver=SMALL["solver"]), monkeypatch)
+    apart = {"thickness": D, "between": False}
+    beside = Beside(library, over(objects=objects, contact=apart, solver=SMALL["solver"]), monkeypatch)
     for _ in range(6):
         beside.compare(1e-6)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sim_server.backends.declarations import Declarations
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
-from tests.contact.scenes import LOCKSTEP, block, floor, over, ram
+from tests.contact.scenes import LOCKSTEP, D, block, floor, over, ram
 from tests.system.server_process import Stage
 from tests.system.test_replay_of_a_server import replayed
 
@@ -129,7 +129,11 @@ def test_many_bodies(count):
     objects = [
         block(cells=(1 + k % 2, 1, 1), at=(0.2 * k, 0.003 + 0.001 * (k % 7), 0), name=f"b{k}") for k in range(count)
     ]
-    made = {d: over(objects=objects, solver={"preconditioner": "block_jacobi"}, device=d) for d in ("gpu", "cpu")}
+    table: dict[str, Any] = {
+        "contact": {"thickness": D, "between": False},
+        "solver": {"preconditioner": "block_jacobi"},
+    }
+    made = {d: over(objects=objects, device=d, **table) for d in ("gpu", "cpu")}
     for sim in made.values():
         sim.engine.run(20)
     g, c = (sim.engine.records() for sim in made.values())
