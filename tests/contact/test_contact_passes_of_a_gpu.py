@@ -18,7 +18,7 @@ from sim_server.backends.gpu import contact as gpu_contact
 from sim_server.backends.gpu.contact import ContactPasses
 from sim_server.backends.gpu.structs import CONTACT_RESULT, CONTACT_STATE, PCG_RESULT
 from sim_server.simulation import Simulation
-from tests.contact.scenes import D, block, floor, over, ram
+from tests.contact.scenes import D, block, edge, floor, over, ram
 
 OUT_OF_PASSES = Declarations("kernels/kinds.h").enumeration("Status")["CONTACT"]
 ROUNDS = Declarations("kernels/contact_passes.cuh").constant("ROUNDS")
@@ -278,9 +278,7 @@ def test_a_block_slides(library, monkeypatch):
 
 def test_a_block_at_rest_whose_edge_is_lifted_needs_one_solve_a_step(library, monkeypatch):
     """Nodes a little further off than the thickness would be hit without the forces that are there."""
-    low = floor(pose={"translate": (0, -5e-5, 0)})
-    plate = {"name": "plate", "shape": "box", "size": (0.13, 0.02, 0.3), "pose": {"translate": (0.015, -0.01, 0)}}
-    beside = Beside(library, over(low, plate, **SMALL), monkeypatch)
+    beside = Beside(library, over(*edge(), **SMALL), monkeypatch)
     records = [beside.compare(1e-6) for _ in range(9)]
     hit = beside.contact.entry <= 1
     assert (hit & (beside.contact.force == 0)).sum() >= 4 and records[-1]["contacts"] == 16

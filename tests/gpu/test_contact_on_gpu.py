@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sim_server.backends.declarations import Declarations
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
-from tests.contact.scenes import LOCKSTEP, D, block, floor, over, ram
+from tests.contact.scenes import LOCKSTEP, D, block, edge, floor, over, ram
 from tests.system.server_process import Stage
 from tests.system.test_replay_of_a_server import replayed
 
@@ -29,6 +29,7 @@ CASES: dict[str, Callable[..., Simulation]] = {
     "tumbles": lambda **table: over(at=(0, 0.05, 0), rotate=(20, 0, 35), velocity=(1, -2, 0), **table),
     "is thrown down": lambda **table: over(at=(0, 0.02, 0), velocity=(0, -10, 0), **table),
     "is thrown down obliquely": lambda **table: over(at=(0, 0.02, 0), velocity=(7, -7, 0), **table),
+    "rests with an edge lifted": lambda **table: over(*edge(), **table),
     "is hit from below": lambda **table: over(ram(), floor(), at=(0, 0.02, 0), **table),
 }
 
