@@ -19,7 +19,6 @@
 #include <algorithm>
 #include <cmath>
 
-#include "contact_passes.cuh"
 #include "island.h"
 #include "loop.h"
 

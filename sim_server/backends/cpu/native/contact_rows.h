@@ -4,7 +4,7 @@
 #pragma once
 #include <cstdint>
 
-#include "contact_law.cuh"
+#include "contact_passes.cuh"
 
 constexpr int CORNERS = 4;        // of a row, at most
 
