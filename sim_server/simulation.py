@@ -52,8 +52,7 @@ class Simulation:
 
     def __init__(self, scene: Scene, device: str = "cpu", watched: bool = True):
         self.scene = scene
-        scene.solver.check_device(device)
-        scene.integrator.check_device(device)
+        scene.check_device(device)
         backend = backends.create(device, scene.solver.precision)
         if scene.solver.wants_factors:
             ahead("backends/cpu/native/factor_check.cpp")

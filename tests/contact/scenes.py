@@ -29,6 +29,12 @@ def ram() -> dict:
     return {"name": "ram", "shape": "box", "size": [0.3, 0.02, 0.3], "friction": 0.5, "keyframes": frames}
 
 
+def edge() -> list[dict]:
+    """[[obstacle]] tables: a plate under two thirds of a block, and a floor 50 micrometres lower under the rest."""
+    low = floor(pose={"translate": (0, -5e-5, 0)})
+    return [low, {"name": "plate", "shape": "box", "size": (0.13, 0.02, 0.3), "pose": {"translate": (0.015, -0.01, 0)}}]
+
+
 def block(friction: float = 0.5, cells: Sequence[int] = CELLS, size: Sequence[float] = SIZE, **table: Any) -> dict:
     """An [[object]] with its lowest corner at `at`."""
     pose = {"translate": list(table.pop("at", (0, D, 0))), "rotate": list(table.pop("rotate", (0, 0, 0)))}

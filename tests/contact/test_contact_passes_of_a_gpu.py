@@ -18,7 +18,7 @@ from sim_server.backends.gpu import contact as gpu_contact
 from sim_server.backends.gpu.contact import ContactPasses
 from sim_server.backends.gpu.structs import CONTACT_RESULT, CONTACT_STATE, PCG_RESULT
 from sim_server.simulation import Simulation
-from tests.contact.scenes import block, floor, over, ram
+from tests.contact.scenes import D, block, edge, floor, over, ram
 
 OUT_OF_PASSES = Declarations("kernels/kinds.h").enumeration("Status")["CONTACT"]
 ROUNDS = Declarations("kernels/contact_passes.cuh").constant("ROUNDS")
@@ -59,8 +59,12 @@ static void solve(const ContactArguments& c, const ContactSolve& pass, const Sys
     int outcome = SOLVED;
     double goal = s.tolerance * s.tolerance * (state.phase == READY ? state.given2 : b2);
     if (state.phase == CHOOSE_START) {
-        if (state.zero2 <= r2) for (int k = 0; k < 3 * n; ++k) y[k] = 0;
-        note_pass(state, pass, READY, sum, out);
+        const bool zero = state.zero2 <= r2;
+        for (int k = 0; k < 3 * n; ++k) {
+            pass.last[3 * first + k] = -q[k];
+            if (zero) y[k] = 0;
+        }
+        note_pass(state, pass, zero ? FROM_ZERO : FROM_START, sum, out);
         return;
     }
     if (state.phase == WITHOUT && !(r2 < b2)) {
@@ -272,6 +276,15 @@ def test_a_block_slides(library, monkeypatch):
     assert record["contacts"] == (force > 0).sum() > 8 and (traction > 0.9 * limit)[force > 0].any()
 
 
+def test_a_block_at_rest_whose_edge_is_lifted_needs_one_solve_a_step(library, monkeypatch):
+    """Nodes a little further off than the thickness would be hit without the forces that are there."""
+    beside = Beside(library, over(*edge(), **SMALL), monkeypatch)
+    records = [beside.compare(1e-6) for _ in range(9)]
+    hit = beside.contact.entry <= 1
+    assert (hit & (beside.contact.force == 0)).sum() >= 4 and records[-1]["contacts"] == 16
+    assert max(r["passes"] for r in records[-2:]) <= 1
+
+
 def test_an_obstacle_hits_a_block_at_10_m_per_s(library, monkeypatch):
     beside = Beside(library, over(ram(), floor(), at=(0, 0.02, 0), **SMALL), monkeypatch)
     records = [beside.compare(1e-6) for _ in range(5)]
@@ -288,6 +301,7 @@ def test_points_are_held_back_where_passes_run_out(library, monkeypatch, short):
 
 def test_bodies_go_their_own_ways(library, monkeypatch):
     objects = [block(cells=(2, 1, 2), at=(0, 0.004, 0)), block(0.3, (3, 2, 3), at=(0.3, 0.02, 0), name="other")]
-    beside = Beside(library, over(objects=objects, solver=SMALL["solver"]), monkeypatch)
+    apart = {"thickness": D, "between": False}
+    beside = Beside(library, over(objects=objects, contact=apart, solver=SMALL["solver"]), monkeypatch)
     for _ in range(6):
         beside.compare(1e-6)

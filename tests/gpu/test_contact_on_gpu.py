@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sim_server.backends.declarations import Declarations
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
-from tests.contact.scenes import LOCKSTEP, block, floor, over, ram
+from tests.contact.scenes import LOCKSTEP, D, block, edge, floor, over, ram
 from tests.system.server_process import Stage
 from tests.system.test_replay_of_a_server import replayed
 
@@ -29,6 +29,7 @@ CASES: dict[str, Callable[..., Simulation]] = {
     "tumbles": lambda **table: over(at=(0, 0.05, 0), rotate=(20, 0, 35), velocity=(1, -2, 0), **table),
     "is thrown down": lambda **table: over(at=(0, 0.02, 0), velocity=(0, -10, 0), **table),
     "is thrown down obliquely": lambda **table: over(at=(0, 0.02, 0), velocity=(7, -7, 0), **table),
+    "rests with an edge lifted": lambda **table: over(*edge(), **table),
     "is hit from below": lambda **table: over(ram(), floor(), at=(0, 0.02, 0), **table),
 }
 
@@ -129,7 +130,11 @@ def test_many_bodies(count):
     objects = [
         block(cells=(1 + k % 2, 1, 1), at=(0.2 * k, 0.003 + 0.001 * (k % 7), 0), name=f"b{k}") for k in range(count)
     ]
-    made = {d: over(objects=objects, solver={"preconditioner": "block_jacobi"}, device=d) for d in ("gpu", "cpu")}
+    table: dict[str, Any] = {
+        "contact": {"thickness": D, "between": False},
+        "solver": {"preconditioner": "block_jacobi"},
+    }
+    made = {d: over(objects=objects, device=d, **table) for d in ("gpu", "cpu")}
     for sim in made.values():
         sim.engine.run(20)
     g, c = (sim.engine.records() for sim in made.values())

@@ -49,7 +49,7 @@ struct ContactArguments {
     real* y;                    // (nodes, 3)
     real* start;                // (nodes, 3) y before the pass
     const real* first;          // (nodes, 3) residual before the pass
-    const real* last;           // (nodes, 3) and after it
+    const real* last;           // (nodes, 3) and after it; -A y where a start is chosen
     real* values;               // (blocks, 3, 3)
     real* base;                 // (rows / 2, 3, 3) own blocks without contact
     real* known;                // (rows / 2, 3, 3) and as a factor is to know them
@@ -385,6 +385,26 @@ __device__ void look_for_touch(const ContactArguments& c, const SurfaceNode& n, 
     sum[1] += sweep(c, n, y);
 }
 
+// Evaluates the law at the start that the solver chose. sum[0]: square of the residual with it, b - A y + i H^T f; sum[1], sum[2]: of
+// b + i H^T f and b.
+__device__ void evaluate_start(const ContactArguments& c, const SurfaceNode& n, const double* y, bool zero, double* sum) {
+    double product[3], b[3], s[3], f[3] = {0, 0, 0};
+    load3(c.last, n.node, product);
+    load3(c.b, n.node, b);
+    if (n.pair >= 0) n.displacement(c, y, s);
+    for (int r = n.pair; n.pair >= 0 && r < n.pair + 2; ++r) {
+        if (!used(c, r)) continue;
+        evaluate(c, r, s, false, false);
+        n.add_force(c, r, c.row[r].force, f);
+    }
+    for (int k = 0; k < 3; ++k) {
+        const double all = b[k] + f[k], left = zero ? all : all + product[k];
+        sum[0] += left * left;
+        sum[1] += all * all;
+        sum[2] += b[k] * b[k];
+    }
+}
+
 // Sums of the line search, with r and r' the residuals of the pass: sum[0] dy . (b - A y) = dy . (r - i H^T f),
 // sum[1] dy . A dy = dy . (r - r' - H^T S H dy).
 __device__ void project(const ContactArguments& c, const SurfaceNode& n, const double* y, double* sum) {
@@ -451,17 +471,19 @@ __device__ double search_along(const ContactArguments& c, int body, int rows, do
     });
 }
 
-// Decides what comes after a solve: the part of the solution that is taken, another pass, or the end.
+// Decides what comes after a solve: the rows that count as closed, the part of the solution that is taken, another pass, or the end.
 extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) contact_search(const ContactArguments c) {
     const NodeChunk here = c.chunks[blockIdx.x];
     ContactState state = c.state[here.body];
     const int phase = state.phase, i = here.begin + threadIdx.x;
-    if (phase == OVER || phase == READY) return;  // READY: only the start was chosen
+    if (phase == OVER) return;
+    const bool starts = phase == FROM_START || phase == FROM_ZERO;
     double sum[CONTACT_SUMS] = {};
     if (i < here.end && phase != LOST) {
         const SurfaceNode n = SurfaceNode::at(c, i);
         double y[3];
         load3(c.y, i, y);
+        if (starts) evaluate_start(c, n, y, phase == FROM_ZERO, sum);
         if (phase == SOLVED && n.pair >= 0) look_for_touch(c, n, y, sum);
         if (phase == PASSED) project(c, n, y, sum);
         if (phase == LAST_PASSED) evaluate_end(c, n, y, sum);
@@ -470,7 +492,11 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) contact_search(con
     if (!sum_body(c, here, sum)) return;
     const bool entered = sum[phase == SOLVED ? 1 : 3] > 0;
     bool again = phase != LOST;
-    if (phase == PASSED) {
+    state.set = 0;
+    if (starts) {  // rows that would be hit without the law need not count as closed where it holds
+        const double given2 = sum[2] > sum[1] ? sum[2] : sum[1];
+        state.set = !(sum[0] <= c.tolerance * c.tolerance * given2);
+    } else if (phase == PASSED) {
         state.alpha = search_along(c, here.body, state.rows, sum[0], sum[1]);
     } else {
         state.alpha = 1;
@@ -484,7 +510,6 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) contact_search(con
         if (again && entered) state.rows = list_rows(c, here.body);
     }
     state.hold = phase == PASSED;
-    state.set = 0;
     state.phase = again ? READY : OVER;
     if (threadIdx.x > 0) return;
     c.state[here.body] = state;
@@ -517,6 +542,9 @@ __device__ bool clip(const ContactArguments& c, const SurfaceNode& n) {
 
 // Keeps the forces of a node's rows for the next step: sum[0] rows that carry force, sum[1] their work.
 __device__ void keep_forces(const ContactArguments& c, const SurfaceNode& n, bool well, double* sum) {
+    double y[3], s[3];  // of a point that was set back too
+    load3(c.y, n.node, y);
+    n.displacement(c, y, s);
     for (int r = n.pair; r < n.pair + 2; ++r) {
         const DeviceRow& row = c.row[r];
         const bool closed = well && used(c, r) && row.force.normal > 0;
@@ -527,7 +555,7 @@ __device__ void keep_forces(const ContactArguments& c, const SurfaceNode& n, boo
             f[k] = c.force[r] * c.normal[3 * r + k] + c.traction[3 * r + k];
         }
         sum[0] += closed;
-        if (closed) sum[1] += dot3(f, row.s);
+        if (closed) sum[1] += dot3(f, s);
     }
 }
 

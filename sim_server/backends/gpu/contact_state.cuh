@@ -5,8 +5,8 @@
 //     while a body is not OVER (conditions.py): contact_forces, pcg, contact_search
 //     finish_contact, integration
 //
-// Each body goes its own way (method: backends/cpu/native/contact.h): CHOOSE_START or WITHOUT, then READY and one of the next three once
-// per pass, and OVER. A row acts on the block of one node only, so contact_forces adds its stiffness to the values of A. With
+// Each body goes its own way (method: backends/cpu/native/contact.h): CHOOSE_START or WITHOUT and what follows from it, then READY and
+// PASSED, LAST_PASSED or ENDED once per pass, and OVER. A row acts on the block of one node only, so contact_forces adds its stiffness to the values of A. With
 //     K = A + H^T S H,   b' = b + i H^T f + H^T S H y
 // a pass is K y' = b', solved from y: the first residual that the solver finds is that of the step with the law.
 #pragma once
@@ -16,13 +16,15 @@
 enum ContactPhase {
     CHOOSE_START = 0,  // the solver looks which start is the better one
     WITHOUT = 1,       // it solves as without contact
-    SOLVED = 2,        // it has done so; contact_search looks whether anything is touched
-    READY = 3,         // forces and stiffness are evaluated next, then there is a pass
-    PASSED = 4,        // the solver has made a pass
-    LAST_PASSED = 5,   // and the last one
-    ENDED = 6,         // it had nothing to solve any more, or there are no passes left
-    LOST = 7,          // forces are not finite
-    OVER = 8
+    FROM_START = 2,    // it begins from y as it was; contact_search looks whether the law holds there
+    FROM_ZERO = 3,     // or from zero
+    SOLVED = 4,        // it has solved as without contact; contact_search looks whether anything is touched
+    READY = 5,         // forces and stiffness are evaluated next, then there is a pass
+    PASSED = 6,        // the solver has made a pass
+    LAST_PASSED = 7,   // and the last one
+    ENDED = 8,         // it had nothing to solve any more, or there are no passes left
+    LOST = 9,          // forces are not finite
+    OVER = 10
 };
 
 struct ContactState {   // of a body
@@ -41,7 +43,7 @@ struct ContactState {   // of a body
 struct ContactSolve {   // what a solve has beside PcgArguments
     ContactState* state;  // (bodies,)
     real* first;          // (nodes, 3) residual before the pass
-    real* last;           // (nodes, 3) and after it
+    real* last;           // (nodes, 3) and after it; -A y in the first solve of a step
     double tolerance;     // of the contact residual
     int passes, first_of_step;
 };

@@ -137,7 +137,7 @@ struct PcgSolver {
             rows.r[k] = bk;
             rows.q[k] = qk;
 #ifdef CONTACT_PASSES
-            if (given) pass.last[begin + k] = (real)rk;
+            pass.last[begin + k] = given ? (real)rk : -qk;
             if (given && first_of_solve) pass.first[begin + k] = (real)rk;
 #endif
             if (!packed) return;
@@ -282,8 +282,8 @@ struct PcgSolver {
     __device__ __forceinline__ bool ends_before(double r2) {
         const ContactState& c = memory.contact;
         if (c.phase == CHOOSE_START) {
-            if (!memory.body.warm_start || c.zero2 <= r2) give(0, 0);
-            memory.outcome = READY;
+            memory.outcome = memory.body.warm_start && r2 < c.zero2 ? FROM_START : FROM_ZERO;
+            if (memory.outcome == FROM_ZERO) give(0, 0);
             return true;
         }
         if (c.phase == WITHOUT) return false;
@@ -331,11 +331,11 @@ __device__ __forceinline__ void PcgSolver::solve() {
                     return;
                 }
                 memory.goal = body.tolerance * body.tolerance * bb;
-                if ((!given || refused) && (!body.warm_start || !(r2 < bb))) { alpha = 0; r2 = bb; }
-                else fresh = true;
 #ifdef CONTACT_PASSES
                 if (!refused && ends_before(r2)) return;
 #endif
+                if ((!given || refused) && (!body.warm_start || !(r2 < bb))) { alpha = 0; r2 = bb; }
+                else fresh = true;
                 memory.quarter = r2 * sqrt(sqrt(memory.goal / r2));
                 if (refused || r2 <= memory.goal) {
                     if (refused) {

@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: MIT
-// A step of a body that touches obstacles, on a CPU (law: kernels/contact_law.cuh; what it is for: docs/contact.md).
+// A step of a body that touches obstacles, on a CPU (law: kernels/contact_law.cuh; numbers, line search and planes:
+// kernels/contact_passes.cuh; what it is for: docs/contact.md).
 //
 // Elasticity is linearized once, as without contact; the law of contact is solved with it, by a semi-smooth Newton method. A pass is
 //   - the rows in the state reached: force f, stiffness S. In the first pass the rows that carried force in the last step and those
@@ -21,7 +22,6 @@
 #include "island.h"
 #include "loop.h"
 #include "pairs.h"
-
 
 // The passes of an island, bodies that touch each other and are solved as one system, or of one body; allocates nothing. Vectors are of
 // the whole scene's nodes, of which it uses those of its bodies.
@@ -141,28 +141,6 @@ struct Passes {
         return sum;
     }
 
-    // Minimum along dy: 1 where the law does not change along it.
-    double line_search(double dot_left, double curvature) const {
-        const double start = slope(0, dot_left, curvature);
-        double low = 0, high = 1, at_low = start, at_high = slope(1, dot_left, curvature);
-        if (!(start < 0)) return 1;  // rounding
-        if (std::fabs(at_high) <= 1e-9 * -start) return 1;
-        while (at_high < 0 && high < 8) {
-            low = high; at_low = at_high;
-            high *= 2;
-            at_high = slope(high, dot_left, curvature);
-        }
-        if (at_high < 0) return high;
-        for (int k = 0; k < 60 && high - low > 1e-10 * high; ++k) {
-            double mid = k % 3 == 2 ? 0.5 * (low + high) : low + (high - low) * at_low / (at_low - at_high);
-            if (!(mid > low && mid < high)) mid = 0.5 * (low + high);
-            const double here = slope(mid, dot_left, curvature);
-            if (here == 0) return mid;
-            if (here < 0) { low = mid; at_low = here; } else { high = mid; at_high = here; }
-        }
-        return 0.5 * (low + high);
-    }
-
     SolveSettings settings_for(double tolerance) const {
         SolveSettings s = loop.body[bodies[0]].now;
         s.tolerance = tolerance;
@@ -214,7 +192,7 @@ struct Passes {
             rows.gather(k, dy, u);
             for (int m = 0; m < 3; ++m) s.step[m] = c.dx_dv * u[m];
         });
-        const double alpha = exactly ? 1 : line_search(dot_left, curvature);
+        const double alpha = exactly ? 1 : minimum_along([&](double at) { return slope(at, dot_left, curvature); });
         each_entry([&](int64_t k) {
             y[k] += alpha * dy[k];
             left[k] -= alpha * r[k];
@@ -327,30 +305,9 @@ struct Passes {
         for (int m = 0; m < 3; ++m) to[m] = from[m] + c.dx_dv * (p[m] + u[m]);
     }
 
-    // The part of the way at which the point of row k enters the obstacle; 2: it does not.
-    double swept(int obstacle, double inflate, const double* from, const double* to, double* begin, double* end) const {
-        local_point(c.obstacles.begin + 7 * obstacle, from, begin);
-        local_point(c.obstacles.end + 7 * obstacle, to, end);
-        double n[3], way[3] = {end[0] - begin[0], end[1] - begin[1], end[2] - begin[2]};
-        const double distance = distance_to(c.obstacles, obstacle, begin, n);
-        if (!(distance > 0) || distance - inflate > std::sqrt(dot3(way, way))) return 2;
-        return entry_time(c.obstacles, obstacle, begin, end, inflate);
-    }
-
     // Gives row k the plane at which the point of its path enters the obstacle.
     void set_plane(int k, int obstacle, const double* from, const double* begin, const double* end, double t) const {
-        double p[3], n[3], q[3], at_begin[3], at_end[3], *normal = c.normal + 3 * k, *drift = c.drift + 3 * k;
-        for (int m = 0; m < 3; ++m) p[m] = begin[m] + t * (end[m] - begin[m]);
-        const double distance = distance_to(c.obstacles, obstacle, p, n);
-        for (int m = 0; m < 3; ++m) q[m] = p[m] - distance * n[m];
-        world_point(c.obstacles.begin + 7 * obstacle, q, at_begin);
-        world_point(c.obstacles.end + 7 * obstacle, q, at_end);
-        world_vector(c.obstacles.end + 7 * obstacle, n, normal);
-        c.gap[k] = 0;
-        for (int m = 0; m < 3; ++m) {
-            drift[m] = at_end[m] - at_begin[m];
-            c.gap[k] += normal[m] * (from[m] - at_end[m]);
-        }
+        c.gap[k] = plane_on_way(c.obstacles, obstacle, from, begin, end, t, c.normal + 3 * k, c.drift + 3 * k);
         c.obstacle[k] = obstacle;
         c.entry[k] = t;
     }
@@ -405,7 +362,7 @@ struct Passes {
             if (c.free[c.corner[CORNERS * k]] == 0) continue;  // of a frozen body
             double from[3], to[3], begin[3], end[3];
             path(k, from, to);
-            if (swept(obstacle, 0, from, to, begin, end) > 1) continue;
+            if (entry_of_way(c.obstacles, obstacle, 0, from, to, begin, end) > 1) continue;
             const double near = entry_time(c.obstacles, obstacle, begin, end, c.thickness[k]);
             take_row(k, obstacle, from, begin, end, near <= 1 ? near : 0);
             found = true;
@@ -440,7 +397,7 @@ struct Passes {
             if (c.free[node] == 0) return;
             path(k, from, to);
             for (int o = 0; o < c.obstacle_count; ++o) {
-                const double t = swept(o, 0, from, to, begin, end);
+                const double t = entry_of_way(c.obstacles, o, 0, from, to, begin, end);
                 if (t > 1 || t >= earliest) continue;
                 earliest = t;
                 for (int m = 0; m < 3; ++m) back[m] = begin[m] + SHORT_OF * t * (end[m] - begin[m]);
@@ -653,9 +610,7 @@ static void add_contacts(const Loop& loop, const Body& body, double* target) {
     };
     auto add = [&](int k) {
         if (rows.empty(k) || !(c.force[k] > 0)) return;
-        ContactForce f = {c.force[k], {0, 0, 0}, 0, true};
-        const double* t = c.traction + 3 * k;
-        if (dot3(t, t) < 0.98 * square(c.friction[k] * c.force[k])) f.slip = 1;
+        const ContactForce f = lasting_contact(c.friction[k], c.force[k], c.traction + 3 * k);
         double s[6];
         c.state[k].hardening = 1;
         contact_stiffness(rows.row(k), f, c.dx_dv * c.force_coefficient, s);

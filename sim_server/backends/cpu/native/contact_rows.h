@@ -4,12 +4,7 @@
 #pragma once
 #include <cstdint>
 
-#include "contact_law.cuh"
-
-constexpr double FIRST = 0.02, EARLY = 0.01, SHORT_OF = 0.9;
-constexpr double SAME_PLANE = 0.995;  // cosine of the angle between normals
-constexpr double HARDER = 10;
-constexpr int ROUNDS = 3;
+#include "contact_passes.cuh"
 
 constexpr int CORNERS = 4;        // of a row, at most
 
