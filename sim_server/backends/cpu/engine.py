@@ -164,7 +164,8 @@ class _NativeContact:
             "reaction": np.zeros((bodies, count, 6)), "mode": np.zeros(bodies, np.int32),
             "island": np.zeros(bodies, np.int32), "island_start": np.zeros(bodies + 1, np.int32),
             "island_rows": np.zeros(bodies, np.int32), "near": np.zeros(bodies, np.int32),
-            "was_near": np.zeros(bodies, np.int32), "touched": np.zeros(bodies, np.int32), "site_body": self._site_body(contact),
+            "was_near": np.zeros(bodies, np.int32),
+            "touched": np.zeros(bodies, np.int32), "site_body": self._site_body(contact),
         }  # fmt: skip
         self.native = structs.Contact(
             obstacle_count=count, passes=contact.passes, tolerance=contact.tolerance, dx_dv=contact.dx_dv,
