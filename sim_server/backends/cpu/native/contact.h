@@ -2,6 +2,9 @@
 // A step of a body that touches obstacles, on a CPU (law: kernels/contact_law.cuh; numbers, line search and planes:
 // kernels/contact_passes.cuh; what it is for: docs/contact.md).
 //
+// A pass that its factor has not solved after PATIENT iterations goes on with block Jacobi, and so do the passes after it: contacts that
+// the factor does not know, or knows although they are gone, may cost it many iterations, each of which costs several of block Jacobi.
+//
 // Elasticity is linearized once, as without contact; the law of contact is solved with it, by a semi-smooth Newton method. A pass is
 //   - the rows in the state reached: force f, stiffness S. In the first pass the rows that carried force in the last step and those
 //     that are hit first (FIRST) count as closed, with the force of a spring that may pull, unless the law holds already; afterwards
@@ -22,6 +25,8 @@
 #include "island.h"
 #include "loop.h"
 #include "pairs.h"
+
+constexpr int PATIENT = 40;  // iterations of a pass with a factor
 
 // The passes of an island, bodies that touch each other and are solved as one system, or of one body; allocates nothing. Vectors are of
 // the whole scene's nodes, of which it uses those of its bodies.
@@ -145,7 +150,8 @@ struct Passes {
         SolveSettings s = loop.body[bodies[0]].now;
         s.tolerance = tolerance;
         s.warm_start = 0;
-        s.probe = 0;
+        if (report.passes > 0 && result.kind == BLOCK_JACOBI) s.kind = BLOCK_JACOBI;
+        s.probe = s.kind == CHOLESKY ? PATIENT : 0;
         if (s.budget > 0) s.budget = std::max(s.budget - result.seconds, 1e-9);
         if (s.budget < 0) s.budget = std::min(-1.0, s.budget + result.iterations);
         return s;
