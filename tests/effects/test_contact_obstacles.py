@@ -80,7 +80,7 @@ def test_rows_are_those_of_the_reference(seed, moving):
             contact_rows.row(k, SHAPES[str(name)][1], table.begin[k], table.end[k], world.x[node], s[node], 0.02)
             for k, name in enumerate(names)
         ])  # fmt: skip
-        assert rows.corner[2 * i].tolist() == [node, -1, -1]
+        assert rows.corner[2 * i].tolist() == [node, -1, -1, -1]
         assert rows.obstacle[2 * i : 2 * i + 2].tolist() == [r.obstacle for r in expected] + [-1] * (2 - len(expected))
         for k, r in zip((2 * i, 2 * i + 1), expected, strict=False):
             assert rows.entry[k] == pytest.approx(r.entry, abs=1e-8)
@@ -112,9 +112,10 @@ def test_a_thickness_is_a_tenth_of_the_shortest_edge_of_each_surface():
     sim = made(FLOOR, bars=bars)
     rows = contact_of(sim).contact_input()
     starts = rows.body_start
-    assert rows.thickness[: starts[1]] == pytest.approx(0.05) and rows.thickness[starts[1] :] == pytest.approx(0.01)
-    assert len(rows.thickness) == starts[2] == len(rows.corner)
-    bodies = np.searchsorted([b.last for b in sim.world.bodies], rows.corner[:, 0], side="right")
+    end = starts[2]
+    assert rows.thickness[: starts[1]] == pytest.approx(0.05) and rows.thickness[starts[1] : end] == pytest.approx(0.01)
+    assert len(rows.thickness) == len(rows.corner) == 2 * end, "as many rows between bodies"
+    bodies = np.searchsorted([b.last for b in sim.world.bodies], rows.corner[:end, 0], side="right")
     assert np.array_equal(np.repeat([0, 1], np.diff(starts)), bodies)
     sim.world.x[:, 1] = 0.001
     sim.engine.assemble()
