@@ -214,6 +214,8 @@ struct PairDetection {
         bool found = false;
         for (int i = 0; i < loop.bodies; ++i)
             for (int site = sites(i); c.near[i] && site < sites(i + 1); ++site) found = sweep_site(site, ends) || found;
+        // rows of this step, whether found before the solve or here, count in its islands and are looked at again in the next one
+        for (int i = 0; i < loop.bodies; ++i) c.near[i] = c.was_near[i] = c.near[i] || c.was_near[i];
         return found;
     }
     bool sweep_site(int site, const double* ends) const {
