@@ -203,3 +203,26 @@ def test_rows_that_a_sweep_has_found_end_when_the_bodies_part():
     sim.engine.run(1)
     assert (of_pairs < 0).all()
     assert not rows.force[len(rows.obstacle) // 2 :].any()
+
+
+@pytest.mark.parametrize("speed", [0.5, 3.0])
+def test_a_step_that_the_budget_ended_repeats_to_the_bit(speed):
+    """A block comes down on the floor with one above it; other solves follow the one that was ended."""
+
+    def fall(spent: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """spent: iterations of each step and body, at which it ends; empty: it ends by time."""
+        blocks = [block(name=f"b{i}", at=(0.003 * i, 0.01 + i * (HEIGHT + D), 0)) for i in range(2)]
+        sim = over(objects=blocks, velocity=(0, -speed, 0), solver=JACOBI | {"budget": 1e-9, "on_runaway": "go_on"})
+        used, x = [], []
+        for k in range(4):
+            for i in range(2 if spent else 0):
+                sim.engine.settings(i).budget = -float(spent[k][i] + 1)
+            sim.engine.run(1)
+            records = sim.engine.records()
+            used.append(records["iterations"].copy())
+            x.append(sim.world.x.copy())
+            assert records["passes"].any()
+        return used, x
+
+    used, expected = fall([])
+    assert np.array_equal(fall(used)[1], expected)

@@ -146,6 +146,10 @@ struct Passes {
         return sum;
     }
 
+    // True if the budget has ended a solve. Those that follow in the step have one iteration each, which are not counted, so that a
+    // replay knows from the count where the budget ended.
+    bool cut() const { return result.status == BUDGET; }
+
     SolveSettings settings_for(double tolerance) const {
         SolveSettings s = loop.body[bodies[0]].now;
         s.tolerance = tolerance;
@@ -153,7 +157,7 @@ struct Passes {
         if (report.passes > 0 && result.kind == BLOCK_JACOBI) s.kind = BLOCK_JACOBI;
         s.probe = s.kind == CHOLESKY ? PATIENT : 0;
         if (s.budget > 0) s.budget = std::max(s.budget - result.seconds, 1e-9);
-        if (s.budget < 0) s.budget = std::min(-1.0, s.budget + result.iterations);
+        if (s.budget < 0) s.budget = cut() ? -2 : std::min(-1.0, s.budget + result.iterations);
         return s;
     }
 
@@ -178,10 +182,10 @@ struct Passes {
         const SolveResult solved = solve_linear(tolerance);
         ++report.passes;
         result.seconds += solved.seconds;
-        result.iterations += solved.iterations;
+        if (!cut()) result.iterations += solved.iterations;
         result.fallbacks += solved.fallbacks;
         result.kind = solved.kind;
-        result.status = solved.status;
+        if (!cut() || solved.status == NOT_FINITE) result.status = solved.status;
         result.residual = solved.residual;  // of |r|; of what is given at the end of the step
         if (solved.status == NOT_FINITE) return;
         // A dy = r - (residual of the solve) - H^T S H dy: no more product with A.
@@ -243,7 +247,7 @@ struct Passes {
             pass(last ? goal / size : std::max(goal / size, EARLY), last);
             result.residual *= given > 0 ? size / given : 0;
             if (result.status == NOT_FINITE) return;
-            spent = result.status == BUDGET;
+            spent = cut();
             hold_limits();
         }
         if (report.residual > c.tolerance && result.status == CONVERGED) result.status = CONTACT;
