@@ -382,11 +382,7 @@ struct Passes {
 
     // One of a pair's rows: the obstacle's own, an empty one, or the one that carries less.
     void take_row(int pair, int obstacle, const double* from, const double* begin, const double* end, double t) const {
-        int k = pair;
-        if (c.obstacle[pair] != obstacle) {
-            const bool other = c.obstacle[pair + 1] == obstacle || rows.empty(pair + 1);
-            k += other || (!rows.empty(pair) && c.state[pair + 1].force.normal < c.state[pair].force.normal);
-        }
+        const int k = row_for(c, pair, obstacle);
         const bool same = c.obstacle[k] == obstacle;
         const double *n = c.normal + 3 * k, normal[3] = {n[0], n[1], n[2]}, gap = c.gap[k];
         set_plane(k, obstacle, from, begin, end, t);
@@ -465,10 +461,10 @@ struct Passes {
             for (int m = 0; m < 3; ++m)
                 displacement[a > 0][m] += c.weight[CORNERS * k + a] * c.dx_dv * (c.predictor[3 * (int64_t)node + m] + u[m]);
         }
-        const int body = c.site_body[(c.pair_first >= 0 && k >= c.pair_first ? k - c.pair_first : k) / 2];
+        const int body = body_of_row(c, k, false);
         ++c.report[body].contacts;
         c.report[body].work += dot3(f, displacement[0]);
-        if (k >= c.pair_first && c.pair_first >= 0) {
+        if (is_pair(c, k)) {
             ++c.report[c.obstacle[k]].contacts;
             c.report[c.obstacle[k]].work += dot3(f, displacement[1]);
         } else {
@@ -495,14 +491,13 @@ static void solve_island(Loop& loop, int island, bool resumes) {
     Passes p(loop, island);
     const int first = p.bodies[0], set = resumes ? 0 : p.choose_set();
     bool outside = false;  // y was swept and enters nothing
+    if (p.count > 1) IslandSolver::make_modes(loop, p.c, p.bodies, p.count);
     if (resumes) {
         p.take_up();
-        if (p.count > 1) IslandSolver::make_modes(loop, p.c, p.bodies, p.count);
         p.leave();
         p.move_points();
         p.solve(false);
     } else if (set || p.count > 1) {
-        if (p.count > 1) IslandSolver::make_modes(loop, p.c, p.bodies, p.count);
         p.start();
         p.solve(!p.rests());
     } else {
@@ -535,7 +530,7 @@ static void solve_island(Loop& loop, int island, bool resumes) {
 // Groups the bodies that have rows with each other, each group's by number. Bodies whose forces are NaN are left alone.
 static void find_islands(Loop& loop) {
     Contact& c = *loop.contact;
-    int32_t* parent = c.mode;  // free until an island is solved
+    int32_t *parent = c.mode, *well = c.island_rows;  // free until an island is solved; until islands are numbered
     for (int i = 0; i < loop.bodies; ++i) parent[i] = i;
     auto root = [&](int i) {
         while (parent[i] != i) i = parent[i] = parent[parent[i]];
@@ -546,13 +541,13 @@ static void find_islands(Loop& loop) {
         const int64_t at = 3 * (int64_t)body.first;
         return std::isfinite(dot(3 * (body.last - body.first), loop.b + at, loop.b + at));
     };
+    for (int i = 0; c.pair_first >= 0 && i < loop.bodies; ++i) well[i] = finite(i);
     for (int i = 0; c.pair_first >= 0 && i < loop.bodies; ++i) {
         if (!c.near[i]) continue;
-        const bool well = finite(i);
         for (int k = c.pair_first + c.body_start[i]; k < c.pair_first + c.body_start[i + 1]; ++k) {
             const int other = c.obstacle[k];
             if (other < 0) continue;
-            if (!well || !finite(other)) { c.obstacle[k] = -1; continue; }
+            if (!well[i] || !well[other]) { c.obstacle[k] = -1; continue; }
             const int a = root(i), b = root(other);
             parent[std::max(a, b)] = std::min(a, b);
         }

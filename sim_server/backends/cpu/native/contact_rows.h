@@ -76,6 +76,20 @@ static void rotated_back(const double* R, const double* v, double* out) {
     for (int i = 0; i < 3; ++i) out[i] = R[i] * v[0] + R[3 + i] * v[1] + R[6 + i] * v[2];
 }
 
+inline bool is_pair(const Contact& c, int row) { return c.pair_first >= 0 && row >= c.pair_first; }
+
+// Body of a row's vertex; other: that of its triangle, of a row between bodies.
+inline int body_of_row(const Contact& c, int row, bool other) {
+    return other ? c.obstacle[row] : c.site_body[(is_pair(c, row) ? row - c.pair_first : row) / 2];
+}
+
+// Which of a point's two rows, `pair` and the next one, something that it enters gets: its own, an empty one, or the one that carries less.
+inline int row_for(const Contact& c, int pair, int other) {
+    if (c.obstacle[pair] == other) return pair;
+    const bool next = c.obstacle[pair + 1] == other || c.obstacle[pair + 1] < 0;
+    return pair + (next || (c.obstacle[pair] >= 0 && c.state[pair + 1].force.normal < c.state[pair].force.normal));
+}
+
 // Rows of one system. Vectors are nodal, material frame, and begin at node `node_first`.
 struct Rows {
     const Contact& c;

@@ -122,7 +122,7 @@ struct IslandSolver {
             for (int a = 0; a < CORNERS; ++a) {
                 const int node = c.corner[CORNERS * r + a];
                 if (node < 0 || c.free[node] == 0) continue;
-                const Body& body = loop.body[body_of(r, a > 0)];
+                const Body& body = loop.body[body_of_row(c, r, a > 0)];
                 const double w = c.weight[CORNERS * r + a], *x = loop.x + 3 * (int64_t)node, *o = loop.x + 3 * (int64_t)body.first;
                 double* side = lever + 4 * (a > 0);
                 side[0] += w;
@@ -130,14 +130,10 @@ struct IslandSolver {
             }
         }
     }
-    bool is_pair(int r) const { return c.pair_first >= 0 && r >= c.pair_first; }
-    int body_of(int r, bool other) const {
-        return other ? c.obstacle[r] : c.site_body[(is_pair(r) ? r - c.pair_first : r) / 2];
-    }
     // f(side, first mode) of the sides of a row whose bodies have modes
     template <class F> void each_side(int r, F f) const {
-        for (int side = 0; side < (is_pair(r) ? 2 : 1); ++side) {
-            const int mode = c.mode[body_of(r, side)];
+        for (int side = 0; side < (is_pair(c, r) ? 2 : 1); ++side) {
+            const int mode = c.mode[body_of_row(c, r, side)];
             if (mode >= 0) f(c.lever + 8 * (int64_t)r + 4 * side, mode);
         }
     }
@@ -286,7 +282,7 @@ struct IslandSolver {
         list.clear();
         for (int k = 0; k < rows.actives; ++k) {
             const int r = rows.active[k];
-            if (body_of(r, false) == body || (is_pair(r) && body_of(r, true) == body)) list.push_back(r);
+            if (body_of_row(c, r, false) == body || (is_pair(c, r) && body_of_row(c, r, true) == body)) list.push_back(r);
         }
         return list;
     }

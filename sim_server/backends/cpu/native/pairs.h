@@ -12,7 +12,6 @@
 #include "loop.h"
 #include "vertex_triangle.cuh"
 
-
 static const Box NOWHERE = {{INFINITY, INFINITY, INFINITY}, {-INFINITY, -INFINITY, -INFINITY}};
 
 static void include(Box& box, const double* x, double margin) {
@@ -240,11 +239,7 @@ struct PairDetection {
         return found;
     }
     void take_row(int pair, int site, const Meeting& t) const {
-        int k = pair;
-        if (c.obstacle[pair] != t.other) {
-            const bool next = c.obstacle[pair + 1] == t.other || c.obstacle[pair + 1] < 0;
-            k += next || (c.obstacle[pair] >= 0 && c.state[pair + 1].force.normal < c.state[pair].force.normal);
-        }
+        const int k = row_for(c, pair, t.other);
         const bool same = c.obstacle[k] == t.other;
         const double n[3] = {c.normal[3 * k], c.normal[3 * k + 1], c.normal[3 * k + 2]};
         RowState& state = c.state[k];
