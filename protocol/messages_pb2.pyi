@@ -330,12 +330,28 @@ class ObjectStep(_message.Message):
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., time: _Optional[float] = ..., iterations: _Optional[int] = ..., residual: _Optional[float] = ..., status: _Optional[_Union[SolveStatus, str]] = ..., factor_step: _Optional[int] = ..., factor_age: _Optional[int] = ..., preconditioner: _Optional[str] = ..., assemble_seconds: _Optional[float] = ..., solve_seconds: _Optional[float] = ..., integrate_seconds: _Optional[float] = ..., step_seconds: _Optional[float] = ..., late_seconds: _Optional[float] = ..., cpu_seconds: _Optional[float] = ..., fallbacks: _Optional[int] = ..., excess: _Optional[float] = ..., interactions: _Optional[_Iterable[_Union[Interaction, _Mapping]]] = ..., asked: _Optional[str] = ..., probe: _Optional[int] = ..., factor_age_bound: _Optional[int] = ..., linearizations: _Optional[int] = ..., nonlinear_residual: _Optional[float] = ..., kinetic_energy: _Optional[float] = ..., elastic_energy: _Optional[float] = ..., gravity_energy: _Optional[float] = ..., work: _Optional[float] = ..., dissipated: _Optional[float] = ..., form: _Optional[_Union[StepForm, str]] = ..., estimate: _Optional[float] = ..., contacts: _Optional[int] = ..., passes: _Optional[int] = ..., clipped: _Optional[int] = ..., contact_residual: _Optional[float] = ..., reactions: _Optional[_Iterable[_Union[Reaction, _Mapping]]] = ...) -> None: ...
 
 class Steps(_message.Message):
-    __slots__ = ("header", "steps")
+    __slots__ = ("header", "steps", "moves")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     STEPS_FIELD_NUMBER: _ClassVar[int]
+    MOVES_FIELD_NUMBER: _ClassVar[int]
     header: Header
     steps: _containers.RepeatedCompositeFieldContainer[ObjectStep]
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., steps: _Optional[_Iterable[_Union[ObjectStep, _Mapping]]] = ...) -> None: ...
+    moves: _containers.RepeatedCompositeFieldContainer[MoveTaken]
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., steps: _Optional[_Iterable[_Union[ObjectStep, _Mapping]]] = ..., moves: _Optional[_Iterable[_Union[MoveTaken, _Mapping]]] = ...) -> None: ...
+
+class MoveTaken(_message.Message):
+    __slots__ = ("client", "obstacle", "grab", "move", "step")
+    CLIENT_FIELD_NUMBER: _ClassVar[int]
+    OBSTACLE_FIELD_NUMBER: _ClassVar[int]
+    GRAB_FIELD_NUMBER: _ClassVar[int]
+    MOVE_FIELD_NUMBER: _ClassVar[int]
+    STEP_FIELD_NUMBER: _ClassVar[int]
+    client: str
+    obstacle: str
+    grab: int
+    move: int
+    step: int
+    def __init__(self, client: _Optional[str] = ..., obstacle: _Optional[str] = ..., grab: _Optional[int] = ..., move: _Optional[int] = ..., step: _Optional[int] = ...) -> None: ...
 
 class State(_message.Message):
     __slots__ = ("header", "step", "time", "nodes", "x", "v")
@@ -376,14 +392,20 @@ class Quaternion(_message.Message):
     def __init__(self, w: _Optional[float] = ..., x: _Optional[float] = ..., y: _Optional[float] = ..., z: _Optional[float] = ...) -> None: ...
 
 class Reaction(_message.Message):
-    __slots__ = ("obstacle", "force", "torque")
+    __slots__ = ("obstacle", "object", "grab", "force", "torque", "point")
     OBSTACLE_FIELD_NUMBER: _ClassVar[int]
+    OBJECT_FIELD_NUMBER: _ClassVar[int]
+    GRAB_FIELD_NUMBER: _ClassVar[int]
     FORCE_FIELD_NUMBER: _ClassVar[int]
     TORQUE_FIELD_NUMBER: _ClassVar[int]
+    POINT_FIELD_NUMBER: _ClassVar[int]
     obstacle: str
+    object: str
+    grab: int
     force: Vector
     torque: Vector
-    def __init__(self, obstacle: _Optional[str] = ..., force: _Optional[_Union[Vector, _Mapping]] = ..., torque: _Optional[_Union[Vector, _Mapping]] = ...) -> None: ...
+    point: Vector
+    def __init__(self, obstacle: _Optional[str] = ..., object: _Optional[str] = ..., grab: _Optional[int] = ..., force: _Optional[_Union[Vector, _Mapping]] = ..., torque: _Optional[_Union[Vector, _Mapping]] = ..., point: _Optional[_Union[Vector, _Mapping]] = ...) -> None: ...
 
 class Obstacle(_message.Message):
     __slots__ = ("header", "shape", "size", "vertices", "triangles", "moved", "position", "rotation")

@@ -100,8 +100,11 @@ class Simulation:
         newton = self.integrator.newton(assemble, effects)
         stages = self.integrator.stages(assemble, lists, effects)
         contact = self.contact.contact_input() if self.contact else None
-        solver, energies = self.scene.solver, self.energies
-        return EngineInput(assemble, integrate, names, ranges, w.dt, solver, energies, newton, stages, contact, arrays)
+        touch = assemble[self._mailed[self.touch]] if self.touch else None
+        return EngineInput(
+            assemble, integrate, names, ranges, w.dt, self.scene.solver, self.energies, newton, stages, contact, touch,
+            arrays,
+        )  # fmt: skip
 
     @classmethod
     def load(cls, path: str | Path, overrides: Sequence[str] = (), device: str = "cpu") -> "Simulation":

@@ -101,7 +101,7 @@ class LoopState(Protocol):
     realtime, patient, stop, pause: 0 or 1, set by others
     frame_every, energy_every: steps between those that are reported, 0: none
     deadline: 0 while the loop stands still in a pause [s]
-    late_steps, frames_dropped, records_dropped: numbers of each so far
+    late_steps, frames_dropped, records_dropped, others_dropped (reactions on what is no obstacle): numbers so far
     """
 
     realtime: int
@@ -114,6 +114,7 @@ class LoopState(Protocol):
     late_steps: int
     frames_dropped: int
     records_dropped: int
+    others_dropped: int
 
 
 class Engine(Protocol):
@@ -175,6 +176,11 @@ class Engine(Protocol):
 
     def records_and_reactions(self) -> tuple[NDArray[np.void], Float64]:
         """Returns the records, and with each the force [N] and torque [N m] on each obstacle, (k, obstacles, 6)."""
+        ...
+
+    def other_reactions(self) -> NDArray[np.void]:
+        """Returns what bodies exerted on grabs and on other bodies since the last call, up to the newest record that was
+        returned: struct Reaction of kernels/reaction.h, in the order of steps."""
         ...
 
     def frames(self) -> list[tuple[int, Float64, Float64]]:
@@ -244,6 +250,7 @@ class EngineInput:
     newton: for several linearizations a step; None for one
     stages: of a Rosenbrock-W step; None for other schemes
     contact: rows that launches among `assemble` fill in; None: nothing can be touched
+    touch: the one of `assemble` that pushes and grabs (effects/touch.cu); None: no object lists the effect
     arrays: of the system by name: row_start, columns, values, b, y, x, v, clock, moving, rotation
     """
 
@@ -257,6 +264,7 @@ class EngineInput:
     newton: Newton | None
     stages: Rosenbrock | None
     contact: Contact | None
+    touch: Launch | None
     arrays: Mapping[str, NDArray[Any]]
 
 

@@ -6,9 +6,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_server.backends.cpu.structs import RECORD
+from sim_server.backends.cpu.structs import REACTION, RECORD
 
 Reals = NDArray[np.float64]
+OTHERS = 1 << 15  # reactions on grabs and other bodies that may wait to be read
 
 
 class Reports:
@@ -30,6 +31,9 @@ class Reports:
         loop.frames, loop.frame_steps = self._frames.ctypes.data, self._frame_steps.ctypes.data
         loop.frame_capacity = len(frames)
         self._reactions = np.zeros((len(self._records), 0, 6))
+        self._others = np.zeros(OTHERS, REACTION)
+        loop.others, loop.other_capacity = self._others.ctypes.data, OTHERS
+        self._reported = 0  # step of the newest record that was read
 
     @property
     def step(self) -> int:
@@ -52,6 +56,16 @@ class Reports:
         slots = np.arange(tail, head) % size
         out = self._records[slots], self._reactions[slots]
         self.loop.record_tail = head
+        if head > tail:
+            self._reported = int(out[0]["step"][-1])
+        return out
+
+    def other_reactions(self) -> NDArray[Any]:
+        """What bodies exerted on grabs and on each other, (k,) of REACTION, up to the newest record that was read."""
+        head, tail = int(self.loop.other_head), int(self.loop.other_tail)
+        out = self._others[np.arange(tail, head) % OTHERS]
+        out = out[: np.searchsorted(out["step"], self._reported, "right")]
+        self.loop.other_tail = tail + len(out)
         return out
 
     def frames(self) -> list[tuple[int, Reals, Reals]]:

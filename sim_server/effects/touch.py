@@ -345,9 +345,10 @@ class Touch(Effect):
         assert system is not None
         ids = [a.id for a in interactions]
         if self._same is None or self._same[0] != ids:
-            self._same = ids, _unmoved(interactions)
+            self._same = ids, _unmoved(w, interactions)
         self._launch = w.backend.module("effects/touch.cu").bind(
             "apply", **self._same[1], start=_each(interactions, "start"), target=_each(interactions, "target"),
+            pull=np.zeros((len(self._same[1]["held"]), 4)),
             clock=system.clock, x=w.x, predictor=w.predictor, free=w.free, block=system.block, dt=w.dt,
             coefficients=w.coefficients, diagonal=system.diagonal, b=system.b, force=self.force,
             spring=self.spring, anchor=self.anchor,
@@ -364,9 +365,9 @@ def _each(interactions: list[Interaction], value: str) -> Float64:
     return np.array([getattr(a, value) for a in interactions], dtype=float)
 
 
-def _unmoved(interactions: list[Interaction]) -> dict[str, Any]:
+def _unmoved(world: World, interactions: list[Interaction]) -> dict[str, Any]:
     """Arguments of a launch that no move changes: all but start times and targets."""
-    n, count = len(interactions), [len(a.nodes) for a in interactions]
+    n, count, bodies = len(interactions), [len(a.nodes) for a in interactions], {b.name: b.index for b in world.bodies}
     nodes = np.concatenate([a.nodes for a in interactions]) if n else np.zeros(0, np.int32)
     order = np.argsort(nodes, kind="stable")
     touched, first = np.unique(nodes[order], return_index=True)
@@ -374,7 +375,10 @@ def _unmoved(interactions: list[Interaction]) -> dict[str, Any]:
     return {
         "n": len(touched), "node": touched.astype(np.int32), "first": np.append(first, len(nodes)).astype(np.int32),
         "entry": np.repeat(np.arange(n, dtype=np.int32), count)[order], "offset": np.ascontiguousarray(offset),
-        "share": 1.0 / np.array(count, dtype=float),
+        "share": 1.0 / np.array(count, dtype=float), "interactions": n,
+        "whose": np.array([(a.id, bodies[a.object]) for a in interactions], np.int32).reshape(n, 2),
+        "held_start": np.append(0, np.cumsum(count)).astype(np.int32),
+        "held": np.stack([np.argsort(order), nodes], axis=1).astype(np.int32),
         **{value: _each(interactions, value) for value in ("duration", "stiffness", "limit")},
         "push": _each(interactions, "force"),
     }  # fmt: skip

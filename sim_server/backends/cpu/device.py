@@ -52,10 +52,11 @@ class CpuModule(KernelText):
 
 
 class CpuLaunch(BoundKernel):
-    """One kernel with its arguments: what the native loop calls, `items` times. arrays: kept alive."""
+    """One kernel with its arguments: what the native loop calls, `items` times. arrays: kept alive. module: its text."""
 
     def __init__(self, module: CpuModule, kernel: str, given: dict[str, Any]):
         super().__init__(module, kernel, given)
+        self.module = module
         self._address = partial(module.address, kernel)
         self.params = module.layout(kernel, self.fields)()
         self.arrays: dict[str, NDArray[Any]] = {}

@@ -249,6 +249,10 @@ class CpuEngine(Reports):
         self._contact = given.contact and _NativeContact(given.contact, loop, arrays)
         if given.contact:
             self.report_reactions(len(given.contact.obstacles.kind))
+        if given.touch is not None:
+            touch = cast(CpuLaunch, given.touch)
+            loop.touch = c.addressof(self._launch[number[id(touch)]])
+            loop.react = touch.module.address("react")
         self._energies = NativeEnergies(given.energies)
         loop.energies = c.addressof(self._energies.native)
         self.begin: Sequence[Launch] = ()  # before the first step

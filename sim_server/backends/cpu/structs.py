@@ -7,6 +7,8 @@ from sim_server.backends.declarations import Declarations
 
 LOOP = Declarations("backends/cpu/native/loop.h")
 RECORD = LOOP.dtype("Record")  # one body, one step: native/ring_buffers.h
+REACTION = LOOP.dtype("Reaction")  # of a body on a grab or on another body: kernels/reaction.h
+REACTION_KINDS = LOOP.enumeration("ReactionKind")
 CHANGE = LOOP.dtype("Change")  # of a diagonal entry: native/woodbury.h
 MAX_CORRECTED: int = LOOP.constant("MAX_CORRECTED")  # nodes of a Correction
 BALANCE = LOOP.dtype("Balance")  # kernels/energy_balance.cuh

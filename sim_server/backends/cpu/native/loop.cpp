@@ -3,6 +3,7 @@
 // through mailboxes: an atomic pointer or flag each, looked at between solves, never waited for. The caller (ctypes) has let
 // go of Python's lock, so no Python code, network, worker or disk can delay a step.
 #include <cstring>
+#include <vector>
 
 #include "contact.h"
 #include "energy.h"
@@ -149,6 +150,18 @@ static void note_contact(Loop& loop, int index, int64_t slot) {
     std::memcpy(loop.rings.reactions + size * slot, loop.contact->reaction + size * index, sizeof(double) * size);
 }
 
+// Reports what bodies exert on grabs after a step.
+static void report_reactions(Loop& loop, int64_t step) {
+    static thread_local std::vector<Reaction> found;
+    found.clear();
+    if (loop.touch) {
+        const void* params = loop.touch->binding->params;
+        found.resize(loop.react(params, step, nullptr));
+        if (!found.empty()) found.resize(loop.react(params, step, found.data()));
+    }
+    put_reactions(loop.rings, found.data(), (int64_t)found.size(), [] { return true; });
+}
+
 static void finish_step(Loop* loop) {
     Rings& rings = loop->rings;
     int64_t first = rings.record_head.load(), step = rings.step + 1;
@@ -214,6 +227,7 @@ static void finish_step(Loop* loop) {
             record.cpu = cpu;
             if (loop->energies) note_energy(record, loop->energies->balance[i]);
         }
+        report_reactions(*loop, step);
         rings.record_head.store(first + loop->bodies, std::memory_order_release);
     }
     write_frame(*loop);
@@ -276,7 +290,7 @@ void wf_precondition(Loop* loop, int32_t index, const double* r, double* z, doub
 const StructSize* wf_sizes() {
     static const StructSize sizes[] = {SIZE(Launch), SIZE(Body), SIZE(Loop), SIZE(Factor), SIZE(Pattern), SIZE(Record),
                                        SIZE(Newton), SIZE(Search), SIZE(Stages), SIZE(StageState), SIZE(Elastic), SIZE(Energies), SIZE(Balance),
-                                       SIZE(Contact), SIZE(RowState), SIZE(ContactReport), SIZE(Box), {}};
+                                       SIZE(Contact), SIZE(RowState), SIZE(ContactReport), SIZE(Box), SIZE(Reaction), {}};
     return sizes;
 }
 }

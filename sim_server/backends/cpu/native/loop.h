@@ -8,6 +8,7 @@
 #include "step_form.h"
 
 typedef void (*Kernel)(const void* params, int begin, int end);
+typedef int (*React)(const void* params, long long step, Reaction* out);  // effects/touch.cu
 
 struct Binding {           // arguments of a launch, replaceable between steps
     const void* params;
@@ -101,6 +102,8 @@ struct Energies {                      // energy.h
 struct Loop {
     int32_t launches, before;          // launches; how many of them assemble (the others integrate)
     Launch* launch;
+    const Launch* touch;               // pushes and grabs, or null
+    React react;
     int32_t bodies, nodes;
     Body* body;
     const int32_t* row_start;

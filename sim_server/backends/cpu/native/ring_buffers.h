@@ -9,6 +9,7 @@
 
 #include "energy_balance.cuh"
 #include "kinds.h"
+#include "reaction.h"
 
 // The step record: one body, one step. Python reads its columns from here; ObjectStep of protocol/messages.proto has those of the
 // same name. On a GPU only the solve is timed apart: assemble and integrate are 0 there, whole is the step's time on the device.
@@ -71,6 +72,9 @@ struct Rings {
     int64_t record_capacity;
     double* reactions;                     // (record_capacity, obstacles, 6) of each record; null: no contact
     std::atomic<int64_t> record_head, record_tail;
+    Reaction* others;                      // (other_capacity,) on grabs and other bodies, in the order of steps; there before the step's records
+    int64_t other_capacity;
+    std::atomic<int64_t> other_head, other_tail, others_dropped;
     double* frames;                        // (capacity, 2, nodes, 3): x, v
     int64_t* frame_steps;
     int64_t frame_capacity;
@@ -143,6 +147,19 @@ static bool has_room(const Rings& rings, int64_t head, const std::atomic<int64_t
 template <class Meanwhile>
 static bool room_for_records(const Rings& rings, int64_t count, Meanwhile meanwhile) {
     return has_room(rings, rings.record_head.load(), rings.record_tail, rings.record_capacity, count, meanwhile);
+}
+
+// Puts the reactions of a step into their ring; counts them as dropped where it is full.
+template <class Meanwhile>
+static void put_reactions(Rings& rings, const Reaction* found, int64_t count, Meanwhile meanwhile) {
+    const int64_t head = rings.other_head.load();
+    if (!count) return;
+    if (count > rings.other_capacity || !has_room(rings, head, rings.other_tail, rings.other_capacity, count, meanwhile)) {
+        rings.others_dropped += count;
+        return;
+    }
+    for (int64_t k = 0; k < count; ++k) rings.others[(head + k) % rings.other_capacity] = found[k];
+    rings.other_head.store(head + count, std::memory_order_release);
 }
 
 // Slot of the ring that the frame after `step` steps goes to, where `head` frames came before it; -1: none is wanted, or it is
