@@ -8,6 +8,7 @@
 #include "contact.h"
 #include "energy.h"
 #include "newton.h"
+#include "pair_reactions.h"
 #include "pairs.h"
 #include "rosenbrock.h"
 #include "sizes.h"
@@ -150,7 +151,7 @@ static void note_contact(Loop& loop, int index, int64_t slot) {
     std::memcpy(loop.rings.reactions + size * slot, loop.contact->reaction + size * index, sizeof(double) * size);
 }
 
-// Reports what bodies exert on grabs after a step.
+// Reports what bodies exert on grabs and on each other after a step.
 static void report_reactions(Loop& loop, int64_t step) {
     static thread_local std::vector<Reaction> found;
     found.clear();
@@ -159,6 +160,7 @@ static void report_reactions(Loop& loop, int64_t step) {
         found.resize(loop.react(params, step, nullptr));
         if (!found.empty()) found.resize(loop.react(params, step, found.data()));
     }
+    if (loop.contact && loop.contact->pair_first >= 0) add_pair_reactions(loop, step, found);
     put_reactions(loop.rings, found.data(), (int64_t)found.size(), [] { return true; });
 }
 
