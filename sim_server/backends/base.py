@@ -121,10 +121,13 @@ class Engine(Protocol):
     """The loop over the steps of one scene.
 
     loop: memory shared with the running loop
+    frame_poses: of the frames returned last, by step: position [m] and quaternion w, x, y, z of each obstacle
+        (obstacles, 7)
     begin: launches that make the state before the first step; set before it
     """
 
     loop: LoopState
+    frame_poses: dict[int, Float64]
     begin: Sequence[Launch]
 
     @property

@@ -17,6 +17,8 @@ class Reports:
 
     records: room for so many, four steps at least. frames: memory (capacity, 2, nodes, 3) for x and v of frames, in the
     type that the device has them in.
+
+    frame_poses: of the frames returned last, by step: position [m] and quaternion of each obstacle (obstacles, 7)
     """
 
     records_dtype = RECORD
@@ -33,6 +35,8 @@ class Reports:
         self._reactions = np.zeros((len(self._records), 0, 6))
         self._others = np.zeros(OTHERS, REACTION)
         loop.others, loop.other_capacity = self._others.ctypes.data, OTHERS
+        self._frame_poses = np.zeros((len(frames), 0, 7))
+        self.frame_poses: dict[int, Reals] = {}
         self._reported = 0  # step of the newest record that was read
 
     @property
@@ -40,10 +44,15 @@ class Reports:
         """Steps completed."""
         return int(self.loop.step)
 
-    def report_reactions(self, obstacles: int) -> None:
-        """Has records come with the force and torque on each obstacle."""
+    def report_reactions(self, obstacles: int, poses: Reals | None = None) -> None:
+        """Has records come with the force and torque on each obstacle, and frames with where these are.
+
+        poses: memory (frames, obstacles, 7) for that; None: ordinary one
+        """
         self._reactions = np.zeros((len(self._records), obstacles, 6))
         self.loop.reactions = self._reactions.ctypes.data
+        self._frame_poses = np.zeros((len(self._frames), obstacles, 7)) if poses is None else poses
+        self.loop.frame_poses = self._frame_poses.ctypes.data
 
     def records(self) -> NDArray[Any]:
         """New records since the last call, oldest first, (k,) of RECORD."""
@@ -72,9 +81,11 @@ class Reports:
         """New frames since the last call: (step, x (n, 3), v (n, 3)), copied."""
         head, tail = int(self.loop.frame_head), int(self.loop.frame_tail)
         out = []
+        self.frame_poses = {}
         for k in range(tail, head):
             slot = k % len(self._frame_steps)
             x, v = (part.astype(np.float64) for part in self._frames[slot])  # copies
             out.append((int(self._frame_steps[slot]), x, v))
+            self.frame_poses[out[-1][0]] = self._frame_poses[slot].copy()
             self.loop.frame_tail = k + 1
         return out

@@ -91,6 +91,8 @@ class ServerLink:
             self._job_queue, self._telemetry_queue = SendQueue("jobs", 64), SendQueue("telemetry", 64)
             self._reply_queue = SendQueue("replies", REPLIES)
             closing.callback(self._reply_queue.close, finish=True)
+            self._urgent_queue = SendQueue("urgent", 64)
+            closing.callback(self._urgent_queue.close)
             closing.callback(self._telemetry_queue.close)
             closing.callback(self._job_queue.close)
             self._declare(probe_slot, silence, clock)
@@ -104,7 +106,9 @@ class ServerLink:
         self._queryables = Queryables(
             self._session, self.name, self.incarnation, self.counters, probe_slot, self._reply_queue, self._claim
         )
-        self._publishers = Publishers(session, self.name, self._telemetry_queue, self.counters, self._stamp)
+        self._publishers = Publishers(
+            session, self.name, self._telemetry_queue, self._urgent_queue, self.counters, self._stamp
+        )
         self._clients: set[str] = set()
         self._client_tokens = session.liveliness().declare_subscriber(
             key("alive_client", self.name), RingChannel(TOKENS), history=True
@@ -190,11 +194,11 @@ class ServerLink:
         return self._publishers.has_subscribers("pose", object=obstacle)
 
     def wants_reactions(self) -> bool:
-        """True if somebody subscribed to reactions of obstacles."""
+        """True if somebody subscribed to what objects exert in each step."""
         return self._publishers.has_subscribers("reactions")
 
     def publish_reactions(self, steps: Steps) -> None:
-        """Sends what objects exert on obstacles in each step to subscribers."""
+        """Sends what objects exert in steps to subscribers."""
         self._publishers.put("reactions", steps)
 
     def publish_steps(self, steps: Steps) -> None:

@@ -19,7 +19,7 @@ from sim_server.mechanics.named_points import NamedPoints
 from sim_server.mechanics.world import Body
 from sim_server.mesh import posed
 from sim_server.mesh.surface import surface_triangles
-from sim_server.recording.object_steps import add_reactions, object_step, rows
+from sim_server.recording.object_steps import Reactions, object_step, rows
 from sim_server.scene.solver_options import FACTORS
 from sim_server.simulation import Simulation
 
@@ -102,12 +102,11 @@ def interaction(a: Any) -> pb.Interaction:
 
 def steps(
     simulation: Simulation, records: NDArray[Any], methods: Callable[[int, int], Method | None] | None = None,
-    reactions: Float64 | None = None,
+    reactions: Reactions | None = None,
 ) -> list[pb.ObjectStep]:  # fmt: skip
     """Step records (structs.RECORD) as messages.
 
-    methods: of body and step, how that factor was made ("auto"). reactions: (records, obstacles, 6), force [N] and
-    torque [N m] of each object on each obstacle
+    methods: of body and step, how that factor was made ("auto"). reactions: of the same records
     """
     names = [b.name for b in simulation.world.bodies]
     kinds = preconditioner_names(simulation)
@@ -119,10 +118,14 @@ def steps(
         for row in rows(records)
     ]
     if reactions is not None:
-        obstacles = [o.name for o in simulation.world.obstacles]
-        for step, each in zip(found, reactions, strict=True):
-            add_reactions(step, each, obstacles)
+        reactions.add_to(found)
     return found
+
+
+def reactions(simulation: Simulation, on_obstacles: Float64, others: NDArray[Any]) -> Reactions:
+    """What objects exerted in the steps of records, as an engine tells it."""
+    obstacles = [o.name for o in simulation.world.obstacles] if on_obstacles.shape[1] else []
+    return Reactions(on_obstacles, others, obstacles, [b.name for b in simulation.world.bodies])
 
 
 def preconditioner_names(simulation: Simulation) -> dict[Kind, str]:

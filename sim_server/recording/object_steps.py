@@ -6,6 +6,7 @@ column without a field is not sent. NaN leaves an `optional` field unset.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from protocol import messages_pb2 as pb
 from sim_server.arrays import Float64
-from sim_server.backends.cpu.structs import RECORD
+from sim_server.backends.cpu.structs import REACTION, REACTION_KINDS, RECORD
 from sim_server.backends.kinds import Kind
 
 FIELDS = {  # of ObjectStep by column, where names differ
@@ -36,6 +37,53 @@ COPIED = {  # field by column, where the value is the same
     if column not in KINDS and (field := FIELDS.get(column, column)) in KNOWN
 }
 OPTIONAL = tuple(field for field in (*COPIED.values(), "dissipated") if KNOWN[field].has_presence)
+
+
+@dataclass(frozen=True)
+class Reactions:
+    """What objects exerted in the steps of some records.
+
+    on_obstacles: (records, obstacles, 6), force [N] and torque [N m]
+    others: (k,) of structs.REACTION, in the order of steps
+    obstacles, bodies: their names
+    """
+
+    on_obstacles: Float64
+    others: NDArray[Any]
+    obstacles: Sequence[str]
+    bodies: Sequence[str]
+
+    @property
+    def any(self) -> bool:
+        """True if there is something that reactions could be on."""
+        return bool(self.obstacles) or len(self.others) > 0
+
+    def __getitem__(self, of: Any) -> "Reactions":
+        """Returns the same of some of the records. of: a slice, or numbers of records."""
+        return Reactions(self.on_obstacles[of], self.others, self.obstacles, self.bodies)
+
+    def add_to(self, steps: Sequence[pb.ObjectStep]) -> None:
+        """Adds to the steps of the records what their objects exert."""
+        if not self.any:
+            return
+        for step, each in zip(steps, self.on_obstacles, strict=True):
+            add_reactions(step, each, self.obstacles)
+        if not len(self.others):
+            return
+        of = {(step.step, step.header.object): step for step in steps}
+        for other in self.others:
+            found = of.get((int(other["step"]), self.bodies[other["body"]]))
+            if found is not None:
+                self._add(found.reactions.add(), other)
+
+    def _add(self, message: pb.Reaction, other: np.void) -> None:
+        if other["kind"] == REACTION_KINDS["ON_GRAB"]:
+            message.grab = int(other["number"])
+        else:
+            message.object = self.bodies[other["number"]]
+        for name in ("force", "torque", "point"):
+            x, y, z = other[name].tolist()
+            getattr(message, name).CopyFrom(pb.Vector(x=x, y=y, z=z))
 
 
 def rows(records: NDArray[Any]) -> list[dict[str, Any]]:

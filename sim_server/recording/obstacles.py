@@ -33,15 +33,19 @@ def obstacle_messages(simulation: Simulation) -> list[pb.Obstacle]:
     return found
 
 
-def pose_messages(simulation: Simulation, step: int, fixed: bool = False) -> list[pb.ObstaclePose]:
+def pose_messages(
+    simulation: Simulation, step: int, poses: Float64 | None = None, fixed: bool = False
+) -> list[pb.ObstaclePose]:
     """Converts the poses of obstacles that move, after `step` steps. fixed: of all.
 
-    Of an obstacle that clients move it is the pose as it is now: a loop may have gone on meanwhile.
+    poses: (m, 7) of the frame of that step. None: of an obstacle that clients move it is the pose as it is now; a loop
+    may have gone on meanwhile.
     """
     if simulation.contact is None:
         return []
     found, time = [], step * simulation.world.dt
-    for obstacle, at in zip(simulation.world.obstacles, _poses(simulation), strict=True):
+    now = _poses(simulation) if poses is None else _unit(poses)
+    for obstacle, at in zip(simulation.world.obstacles, now, strict=True):
         if fixed or obstacle.keyframes or obstacle.moved:
             position, rotation = pose_message(_at(obstacle.keyframes, time) if obstacle.keyframes else at)
             header = pb.Header(object=obstacle.name)
@@ -77,9 +81,12 @@ def targets_of(message: pb.ObstacleTargets) -> dict[str, Float64]:
 def _poses(simulation: Simulation) -> Float64:
     """Poses (m, 7) at the end of the step that the loop has begun last, which may be changing as they are read."""
     assert simulation.contact is not None
-    poses = simulation.world.backend.fetch(simulation.contact.contact_input().obstacles.end).copy()
-    poses[:, 3:] /= np.linalg.norm(poses[:, 3:], axis=1)[:, None]
-    return poses
+    return _unit(simulation.world.backend.fetch(simulation.contact.contact_input().obstacles.end))
+
+
+def _unit(poses: Float64) -> Float64:
+    """Returns poses (m, 7) with rotations of length 1."""
+    return np.concatenate([poses[:, :3], poses[:, 3:] / np.linalg.norm(poses[:, 3:], axis=1)[:, None]], axis=1)
 
 
 def _at(keyframes: Sequence[Keyframe], time: float) -> Float64:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What contact adds to telemetry: obstacles, their poses, forces on them, and lines about what was left undone."""
+"""What contact adds to telemetry: obstacles, their poses, and lines about what was left undone."""
 
 import time
 from collections import Counter
@@ -7,16 +7,13 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from protocol import messages_pb2 as pb
 from sim_server.arrays import Float64
 from sim_server.network.link import ServerLink
-from sim_server.recording.object_steps import add_reactions
 from sim_server.recording.obstacles import obstacle_messages, pose_messages
 from sim_server.recording.recorder import Recorder
 from sim_server.simulation import Simulation
 
 ROWS_PERIOD = 1.0  # s between checks for nodes without enough rows
-MAX_STEPS = 4096  # whose reactions are sent together at most
 
 
 class ContactTelemetry:
@@ -27,7 +24,6 @@ class ContactTelemetry:
 
     def __init__(self, simulation: Simulation, link: ServerLink, recorder: Recorder | None):
         self._simulation, self._link, self._recorder = simulation, link, recorder
-        self._wants_reactions = False
         self._rows_due = 0.0
         self._crowded: set[int] = set()  # bodies of which it was said
         self.clipped: Counter[int] = Counter()
@@ -40,34 +36,19 @@ class ContactTelemetry:
                 self._recorder.obstacle(obstacle)
 
     def look(self) -> bool:
-        """Checks for subscribers. True if somebody wants poses."""
-        if self._simulation.contact is None:
-            return False
-        self._wants_reactions = self._link.wants_reactions()
-        return self._link.wants_pose()
+        """Returns True if somebody wants poses."""
+        return self._simulation.contact is not None and self._link.wants_pose()
 
-    def publish_poses(self, step: int) -> None:
-        """Sends the poses after a step to subscribers."""
-        for pose in pose_messages(self._simulation, step):
+    def publish_poses(self, step: int, poses: Float64) -> None:
+        """Sends the poses (obstacles, 7) after a step to subscribers."""
+        for pose in pose_messages(self._simulation, step, poses):
             self._link.publish_pose(pose)
 
-    def record_poses(self, step: int, block: bool) -> None:
-        """Sends the poses after a step to the log."""
+    def record_poses(self, step: int, poses: Float64 | None, block: bool) -> None:
+        """Sends the poses (obstacles, 7) after a step to the log. None: those before the first step, as they are."""
         assert self._recorder is not None
-        for pose in pose_messages(self._simulation, step):
+        for pose in pose_messages(self._simulation, step, poses):
             self._recorder.pose(pose, block)
-
-    def publish_reactions(self, records: NDArray[Any], reactions: Float64 | None) -> None:
-        """Sends what objects exert on obstacles at once, and nothing else of the steps: for force feedback."""
-        if reactions is None or not self._wants_reactions:
-            return
-        world, steps = self._simulation.world, []
-        obstacles = [o.name for o in world.obstacles]
-        for r, each in zip(records[-MAX_STEPS:], reactions[-MAX_STEPS:], strict=True):
-            header = pb.Header(object=world.bodies[int(r["body"])].name, epoch=1)
-            steps.append(pb.ObjectStep(header=header, step=r["step"], time=r["time"], contacts=r["contacts"]))
-            add_reactions(steps[-1], each, obstacles)
-        self._link.publish_reactions(pb.Steps(steps=steps))
 
     def count_clipped(self, records: NDArray[Any]) -> list[str]:
         """Counts nodes that were held back at obstacles after the passes; returns a line for each new object."""

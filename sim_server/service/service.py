@@ -22,7 +22,9 @@ from numpy.typing import NDArray
 from protocol import messages_pb2 as pb
 from protocol.process.nvidia import nvidia_device
 from sim_server.arrays import Float64
+from sim_server.backends.cpu.structs import REACTION
 from sim_server.network.link import ServerLink
+from sim_server.recording import messages
 from sim_server.recording.recorder import Recorder
 from sim_server.service.commands import Commands
 from sim_server.service.pace import LOOK_PERIOD, PaceMonitor
@@ -55,7 +57,7 @@ class Service:
         self.commands = Commands(simulation, self._record_interaction, self._frozen)
         self.telemetry = Telemetry(self.driver, link, recorder, not realtime, self.commands)
         self._set_intervals()
-        self._batches: deque[tuple[NDArray[Any], Float64]] = deque()  # step records and their reactions
+        self._batches: deque[tuple[NDArray[Any], Float64, NDArray[Any]]] = deque()  # records and their reactions
         self._failure: BaseException | None = None
         self._status_replies: list[Callable[[pb.Reply], None]] = []  # of clients that requested a status
         # deadline, reply and answer of each `pause` and `stop`
@@ -99,7 +101,7 @@ class Service:
                 self.engine.run(ENDLESS if self.steps is None else self.steps)
                 return
             while not self.engine.loop.stop and (self.steps is None or self.engine.step < self.steps):
-                self._batches.append((self.driver.advance(1), self.driver.reactions))
+                self._batches.append((self.driver.advance(1), self.driver.reactions, self.driver.other_reactions))
         except BaseException as error:
             self._failure = error
 
@@ -122,7 +124,8 @@ class Service:
         waiting = self.link.commands()
         if not waiting:
             return
-        answers = []
+        answers: list[tuple[Callable[[pb.Reply], None], pb.Reply]] = []
+        done: list[pb.Command] = []
         with self.commands.together():
             for command, reply in waiting:
                 if command.verb == "status":
@@ -133,6 +136,9 @@ class Service:
                     self._halts.append((time.monotonic() + HALT_TIMEOUT, reply, answer))
                 else:
                     answers.append((reply, answer))
+                    if not answer.error:
+                        done.append(command)
+        self.telemetry.reactions.moved(done)
         for reply, answer in answers:
             reply(answer)
 
@@ -185,15 +191,17 @@ class Service:
 
     def _drain(self) -> None:
         if self._loop_alone:
-            self._report(self.driver.pump(), self.driver.reactions)
+            self._report(self.driver.pump(), self.driver.reactions, self.driver.other_reactions)
             return
         batches = [self._batches.popleft() for _ in range(len(self._batches))]
-        none = np.zeros(0, self.engine.records_dtype), np.zeros((0, 0, 6))
-        records, reactions = zip(*(batches or [none]), strict=True)
-        self._report(np.concatenate(records), np.concatenate(reactions))
+        if batches:
+            self._report(*(np.concatenate(part) for part in zip(*batches, strict=True)))
+        else:
+            none = np.zeros((0, len(self.simulation.world.obstacles), 6))
+            self._report(np.zeros(0, self.engine.records_dtype), none, np.zeros(0, REACTION))
 
-    def _report(self, records: NDArray[Any], reactions: Float64) -> None:
-        """Passes on new step records and their reactions on obstacles, and new frames."""
+    def _report(self, records: NDArray[Any], on_obstacles: Float64, others: NDArray[Any]) -> None:
+        """Passes on new step records with what objects exerted on obstacles and others, and new frames."""
         contact = self.telemetry.contact
         undone = [*contact.count_clipped(records), *contact.crowded_nodes()]
         for line in [*self.telemetry.count_unconverged(records), *undone]:
@@ -202,7 +210,7 @@ class Service:
             log.error("%s", line)
         if self.pace is not None and len(records):
             self.pace.add(records)
-        self.telemetry.records(records, reactions)
+        self.telemetry.records(records, messages.reactions(self.simulation, on_obstacles, others))
         self.telemetry.frames()
         self._set_intervals()
 

@@ -16,11 +16,13 @@ from sim_server.backends.kinds import SLACK_OF_ENERGY
 from sim_server.mechanics.named_points import NamedPoints
 from sim_server.network.link import ServerLink
 from sim_server.recording import messages
+from sim_server.recording.object_steps import Reactions
 from sim_server.recording.obstacles import pose_messages
 from sim_server.recording.recorder import Recorder
 from sim_server.recording.replay_recorder import ReplayRecorder
 from sim_server.service.commands import Commands
 from sim_server.service.contact_telemetry import ContactTelemetry
+from sim_server.service.reaction_telemetry import ReactionTelemetry
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
 
@@ -40,6 +42,7 @@ class Telemetry:
     commands: whose interactions are in the status; None: there are none
 
     contact: the part that tells of obstacles
+    reactions: the part that sends forces as they come
     """
 
     def __init__(
@@ -54,6 +57,7 @@ class Telemetry:
         self.simulation, self.engine = driver.simulation, driver.engine
         self.commands = commands
         self.contact = ContactTelemetry(self.simulation, link, recorder)
+        self.reactions = ReactionTelemetry(self.simulation, link)
         self.replay_recorder = ReplayRecorder(driver, link, recorder) if recorder and commands else None
         self.started = time.monotonic()
         self.record_every = self.simulation.scene.record.every if recorder else 0
@@ -63,7 +67,7 @@ class Telemetry:
         ]  # iterations
         self.seconds: deque[float] = deque(maxlen=STATISTICS_STEPS)
         self._last: NDArray[Any] = np.zeros(len(self._window), self.engine.records_dtype)
-        self._last_reactions: Float64 | None = None  # of the same records; None: there are no obstacles
+        self._last_reactions: dict[int, Reactions] = {}  # of the same records, by body
         self._not_finite: set[str] = set()  # objects of which it was said
         self.solves = 0
         self.pace = ""  # why the run does not keep pace with the clock; empty: it does, or need not
@@ -100,19 +104,14 @@ class Telemetry:
         self._due[what] = now + period
         return True
 
-    def records(self, records: NDArray[Any], reactions: Float64 | None = None) -> None:
-        """Sends step records, each to the log, in batches to subscribers.
-
-        reactions: (k, obstacles, 6), of each record on obstacles, force [N] and torque [N m]; None: there are none
-        """
-        if reactions is not None and not reactions.shape[1]:
-            reactions = None
+    def records(self, records: NDArray[Any], reactions: Reactions) -> None:
+        """Sends step records, each to the log, in batches to subscribers. reactions: of these records."""
         if self.replay_recorder:
             self.replay_recorder.write(self.patient)
         if len(records):
             self.seconds.extend(records["whole"][records["body"] == 0].tolist())
             self.update_summary(records, reactions)
-            self.contact.publish_reactions(records, reactions)
+            self.reactions.publish(records, reactions)
             steps = self._messages(records, reactions)
             self._add_interactions(steps)
             if self.recorder:
@@ -124,7 +123,7 @@ class Telemetry:
                 self.link.publish_steps(pb.Steps(steps=self._batch))
             self._batch.clear()
 
-    def update_summary(self, records: NDArray[Any], reactions: Float64 | None = None) -> None:
+    def update_summary(self, records: NDArray[Any], reactions: Reactions | None = None) -> None:
         """Keeps what the status tells of steps: the last records and reactions of bodies, iterations and energies."""
         order = np.argsort(records["body"], kind="stable")
         present, first = np.unique(records["body"][order], return_index=True)
@@ -133,21 +132,18 @@ class Telemetry:
         newest = order[np.array(ends) - 1]
         self._last[present] = records[newest]
         if reactions is not None:
-            if self._last_reactions is None:
-                self._last_reactions = np.zeros((len(self._window), *reactions.shape[1:]))
-            self._last_reactions[present] = reactions[newest]
+            for body, record in zip(present.tolist(), newest.tolist(), strict=True):
+                self._last_reactions[body] = reactions[record : record + 1]
         for body, begin, end in zip(present.tolist(), first.tolist(), ends, strict=True):
             self._window[body].extend(iterations[begin:end])
         for r in records[np.isfinite(records["elastic"])]:
             self._energy[int(r["body"])] = float(r["kinetic"] + r["elastic"] + r["gravity"])
 
-    def _messages(self, records: NDArray[Any], reactions: Float64 | None) -> list[pb.ObjectStep]:
+    def _messages(self, records: NDArray[Any], reactions: Reactions) -> list[pb.ObjectStep]:
         """Makes messages for the log and for subscribers only: it is the most expensive part of telemetry."""
         most = len(records) if self.recorder else MAX_BATCH if self.link.wants_steps() else 0
         wanted = slice(max(len(records) - most, 0), None)
-        steps = messages.steps(
-            self.simulation, records[wanted], self._method, None if reactions is None else reactions[wanted]
-        )
+        steps = messages.steps(self.simulation, records[wanted], self._method, reactions[wanted])
         bound = self.driver.age_bound() if steps else -1
         for step in steps:
             step.excess = self.driver.by_name[step.header.object].solves.excess
@@ -161,7 +157,7 @@ class Telemetry:
     def _latest(self, body: int, bound: int) -> pb.ObjectStep | None:
         if not self._window[body]:
             return None
-        reactions = None if self._last_reactions is None else self._last_reactions[body : body + 1]
+        reactions = self._last_reactions.get(body)
         message = messages.steps(self.simulation, self._last[body : body + 1], self._method, reactions)[0]
         message.excess, message.factor_age_bound = self.driver.bodies[body].solves.excess, bound
         return message
@@ -192,17 +188,18 @@ class Telemetry:
         frames = self.engine.frames()
         for step, x, v in frames:
             if self.record_every and step % self.record_every == 0:
-                self._record_frame(step, x, v)
+                self._record_frame(step, x, v, self.engine.frame_poses[step])
         if frames and self._is_due("state", STATE_PERIOD):
             step, x, v = frames[-1]
             for body in self.simulation.world.bodies:
                 if self.link.wants_state(body.name):
                     self.link.publish_state(messages.state(body, step, step * self.simulation.world.dt, x, v))
-            self.contact.publish_poses(step)
+            self.contact.publish_poses(step, self.engine.frame_poses[step])
 
     def frame_interval(self) -> int:
         """Returns the steps between frames that the loop should copy out; 0 for none."""
         if self._is_due("look", LOOK_PERIOD):
+            self.reactions.look()
             wants_poses = self.contact.look()
             self._has_viewers = self.link.wants_state() or wants_poses
             self._has_listeners = self.link.wants_steps() or bool(self.link.clients())
@@ -217,12 +214,12 @@ class Telemetry:
             return self.record_every
         return ENERGY_STEPS if self.recorder or self._has_listeners else 0
 
-    def _record_frame(self, step: int, x: NDArray[np.float64], v: NDArray[np.float64]) -> None:
+    def _record_frame(self, step: int, x: Float64, v: Float64, poses: Float64 | None = None) -> None:
         assert self.recorder is not None
         for body in self.simulation.world.bodies:
             message = messages.state(body, step, step * self.simulation.world.dt, x, v)
             self.recorder.state(message, block=self.patient)
-        self.contact.record_poses(step, block=self.patient)
+        self.contact.record_poses(step, poses, block=self.patient)
 
     def publish_status(self, state: str, force: bool = True, where: bool = False) -> None:
         """Publishes the status of the scene. where: with the places of its objects, which are fetched from a GPU."""
@@ -238,7 +235,7 @@ class Telemetry:
             pid=os.getpid(), uptime=time.monotonic() - self.started, pace=self.pace,
         )  # fmt: skip
         dropped = loop.frames_dropped + (self.recorder.dropped if self.recorder else 0)
-        status.frames_dropped, status.records_dropped = dropped, loop.records_dropped
+        status.frames_dropped, status.records_dropped = dropped, loop.records_dropped + loop.others_dropped
         status.records_lost = self.recorder.lost if self.recorder else 0
         status.recording_failure = self.recorder.failure[:400] if self.recorder else ""
         bound = self.driver.age_bound()

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from protocol.factor import Factor
 from sim_server.arrays import Float64
+from sim_server.backends.cpu.structs import REACTION
 from sim_server.backends.base import Capability
 from sim_server.simulation import Simulation
 from sim_server.updates.body_state import BodyUpdateState
@@ -38,6 +39,7 @@ class Driver:
     source: makes factors; None: this process does
     reactions: (k, obstacles, 6) force [N] and torque [N m] on each obstacle by the object of each record that was
         returned last
+    other_reactions: (k,) of struct Reaction, on grabs and other objects, in the steps of those records
     counted: the scheduler and `auto` reckon with bytes and operations instead of seconds, so that a run repeats
         exactly; None: unless no step waits for a factor
     """
@@ -60,6 +62,7 @@ class Driver:
         if self.wants_factors:
             self.check.prepare()
         self.reactions: Float64 = np.zeros((0, 0, 6))
+        self.other_reactions: NDArray[Any] = np.zeros(0, REACTION)
         self.on_adopt: list[Callable[[Factor], Any]] = []  # called with every factor that the loop is given
         self.snapshots = SnapshotPool(simulation, self.source, self.policy.expected_latency)
         self.useless_factors = UselessFactors(self)
@@ -70,15 +73,17 @@ class Driver:
 
     def advance(self, steps: int) -> NDArray[Any]:
         """Makes steps; returns their records (structs.RECORD)."""
-        out: list[tuple[NDArray[Any], Float64]] = []
+        out: list[tuple[NDArray[Any], Float64, NDArray[Any]]] = []
         for _ in range(steps):
             if self.wants_factors:
                 self.policy.step()
             else:
                 self.engine.run(1)
-            out.append((self._new_records(), self.reactions))
-        records, reactions = zip(*(out or [self.engine.records_and_reactions()]), strict=True)
-        self.reactions = np.concatenate(reactions)
+            out.append((self._new_records(), self.reactions, self.other_reactions))
+        if not out:
+            out.append((*self.engine.records_and_reactions(), self.engine.other_reactions()))
+        records, reactions, others = zip(*out, strict=True)
+        self.reactions, self.other_reactions = np.concatenate(reactions), np.concatenate(others)
         return np.concatenate(records)
 
     def pump(self) -> NDArray[Any]:
@@ -107,6 +112,7 @@ class Driver:
 
     def _new_records(self) -> NDArray[Any]:
         records, self.reactions = self.engine.records_and_reactions()
+        self.other_reactions = self.engine.other_reactions()
         self.observe(records)
         return records
 

@@ -121,8 +121,8 @@ def test_targets_come_back_bit_for_bit() -> None:
 def test_steps_tell_contacts_and_reactions(commands: Commands) -> None:
     sim = commands.simulation
     sim.engine.run(80)
-    records, reactions = sim.engine.records_and_reactions()
-    steps = messages.steps(sim, records, reactions=reactions)
+    records, on_obstacles = sim.engine.records_and_reactions()
+    steps = messages.steps(sim, records, reactions=messages.reactions(sim, on_obstacles, sim.engine.other_reactions()))
     free, resting = steps[0], steps[-1]
     assert not free.HasField("contact_residual") and (free.contacts, free.passes, len(free.reactions)) == (0, 0, 0)
     assert resting.contacts == 16 and resting.passes > 0 and resting.contact_residual <= 1e-3

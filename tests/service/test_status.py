@@ -8,6 +8,7 @@ from rich.console import Console
 
 from clients.watch import tables
 from protocol import messages_pb2 as pb
+from sim_server.recording import messages
 from sim_server.service.telemetry import Telemetry
 from sim_server.updates.driver import Driver
 from tests.scenes import bar, simulation
@@ -68,7 +69,8 @@ def test_the_status_and_the_log_tell_the_age_of_factors_and_its_bound():
     telemetry.publish_status("running")
     assert [(o.factor_age, o.factor_age_max, o.factor_age_bound) for o in found[0].objects] == [(-1, -1, -1)] * 3
     for _ in range(40):
-        telemetry.records(driver.advance(1))
+        records = driver.advance(1)
+        telemetry.records(records, messages.reactions(sim, driver.reactions, driver.other_reactions))
     telemetry.publish_status("running")
     bound = driver.age_bound()
     assert 0 < bound < 40

@@ -86,7 +86,9 @@ def told(listening: bool, monkeypatch) -> tuple[list[pb.Steps], list[pb.Status],
     monkeypatch.setattr(messages, "steps", lambda sim, records, *more: made.extend(records) or plain(sim, records))
     link = SimpleNamespace(wants_steps=lambda: listening, publish_steps=sent.append, publish_status=statuses.append)
     telemetry = Telemetry(driver, link, None, patient=False)  # type: ignore[arg-type]
-    telemetry.records(solves(np.random.default_rng(0), 0, 10).ravel())
+    records = solves(np.random.default_rng(0), 0, 10).ravel()
+    none = messages.reactions(driver.simulation, np.zeros((len(records), 0, 6)), driver.other_reactions)
+    telemetry.records(records, none)
     before = len(made)
     telemetry.publish_status("running")
     return sent, statuses, before

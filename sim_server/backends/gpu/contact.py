@@ -132,6 +132,11 @@ class ContactPasses:
         solve["tolerance"], solve["passes"], solve["first_of_step"] = contact.tolerance, contact.passes, first_of_step
         return solve
 
+    @property
+    def poses(self) -> int:
+        """Device address of where obstacles are at the end of a step, (obstacles, 7)."""
+        return int(self._table["end"].data.ptr)
+
     def _launch(self, kernel: str, blocks: int) -> None:
         self._kernels[kernel]((blocks,), (THREADS,), (self.params,))
 

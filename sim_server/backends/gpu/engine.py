@@ -120,6 +120,8 @@ class GpuEngine(DeviceLoop):
         mailboxes += [(self.launches[k].mail_address, self.launches[k].params.nbytes) for k in self._mailed]
         twins = {name: gpu.twin(arrays[name]) for name in ("values", "x", "v")}
         addresses = {name: int(twin.data.ptr) for name, twin in twins.items()}
+        if self._contact:
+            addresses["poses"] = self._contact.poses
         if self._newton:
             addresses["values"] = int(self._newton.first_values.data.ptr)
         stage_results = device.pinned(CAPACITY * STAGE_RESULT.itemsize * bodies) if stages else None

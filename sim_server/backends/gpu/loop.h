@@ -84,6 +84,8 @@ struct GpuLoop {
     void *staged_event, *copied_event;     // of the matrices under way: copied on the device, copied to the host
     Address x, v, frame_staging;           // frame_staging: memory for FRAME_COPIES frames
     int64_t frame_bytes;                   // of x
+    Address poses, pose_staging;           // of obstacles, likewise; nothing without contact
+    int64_t pose_bytes;                    // of all obstacles; 0 without contact
     double* clock;                         // (1,) time of the simulation [s], for readers on the host
     double batch_seconds;                  // largest aim for the duration of a batch [s]
     double poll;                           // [s] between queries of an event that is nearly due

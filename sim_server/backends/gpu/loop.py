@@ -71,7 +71,7 @@ class DeviceLoop(Reports):
     clock: host array (1,), time of the simulation [s]
     records: capacity of the ring of records
     real: type of values, x and v on the device
-    addresses: device addresses of values, x and v
+    addresses: device addresses of values, x and v, and with contact poses (obstacles, 7) of float64
     """
 
     def __init__(
@@ -117,7 +117,10 @@ class DeviceLoop(Reports):
         if contact_results is not None and contact_reactions is not None:
             loop.contact_results, loop.contact_reactions = contact_results.ctypes.data, contact_reactions.ctypes.data
             loop.obstacles = contact_reactions.shape[2]
-            self.report_reactions(loop.obstacles)
+            poses = device.pinned(FRAMES * loop.obstacles * 56).view(np.float64).reshape(FRAMES, loop.obstacles, 7)
+            self.report_reactions(loop.obstacles, poses)
+            loop.pose_bytes = 56 * loop.obstacles
+            loop.pose_staging = device.memory(max(FRAME_COPIES * loop.pose_bytes, 16))
         self._pinned = self._events_and_memory(loop, sum(-(-size // 16) * 16 for _, size in mailboxes))
 
     def _events_and_memory(self, loop: structs.GpuLoop, upload: int) -> list[NDArray[np.uint8]]:

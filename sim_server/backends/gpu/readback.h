@@ -64,7 +64,7 @@ static bool finish_oldest_frame(GpuLoop& l) {
     return true;
 }
 
-// Begins to copy x and v of the last step launched to the ring of frames, if they are wanted.
+// Begins to copy x, v and poses of obstacles of the last step launched to the ring of frames, if they are wanted.
 static bool copy_frame(GpuLoop& l) {
     const int64_t bytes = l.frame_bytes;
     const int64_t slot = begin_frame(l.rings, l.frames_begun, l.launched, [&] {
@@ -79,9 +79,12 @@ static bool copy_frame(GpuLoop& l) {
     Address staging = l.frame_staging + 2 * bytes * (l.frames_begun % FRAME_COPIES);
     CALL(on_device, staging, l.x, (size_t)bytes, l.stream);
     CALL(on_device, staging + bytes, l.v, (size_t)bytes, l.stream);
+    const Address poses = l.pose_staging + l.pose_bytes * (l.frames_begun % FRAME_COPIES);
+    if (l.pose_bytes) CALL(on_device, poses, l.poses, (size_t)l.pose_bytes, l.stream);
     CALL(event_record, copy.taken, l.stream);
     CALL(stream_wait, l.copy_stream, copy.taken, 0);
     CALL(to_host, (char*)l.rings.frames + 2 * bytes * slot, staging, (size_t)(2 * bytes), l.copy_stream);
+    if (l.pose_bytes) CALL(to_host, (char*)l.rings.frame_poses + l.pose_bytes * slot, poses, (size_t)l.pose_bytes, l.copy_stream);
     CALL(event_record, copy.arrived, l.copy_stream);
     ++l.frames_begun;
     return true;

@@ -89,6 +89,10 @@ static void write_frame(Loop& loop) {
     double* frame = rings.frames + 2 * size * slot;
     std::memcpy(frame, loop.x, sizeof(double) * size);
     std::memcpy(frame + size, loop.v, sizeof(double) * size);
+    if (loop.contact) {
+        const int64_t poses = 7 * (int64_t)loop.contact->obstacle_count;
+        std::memcpy(rings.frame_poses + poses * slot, loop.contact->obstacles.end, sizeof(double) * poses);
+    }
     rings.frame_head.fetch_add(1, std::memory_order_release);
 }
 

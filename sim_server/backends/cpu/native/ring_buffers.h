@@ -76,6 +76,7 @@ struct Rings {
     int64_t other_capacity;
     std::atomic<int64_t> other_head, other_tail, others_dropped;
     double* frames;                        // (capacity, 2, nodes, 3): x, v
+    double* frame_poses;                   // (frame_capacity, obstacles, 7) where obstacles are in each; null: no contact
     int64_t* frame_steps;
     int64_t frame_capacity;
     std::atomic<int64_t> frame_every;      // 0: none; set from outside as viewers come and go
