@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from types import TracebackType
@@ -13,6 +14,7 @@ import zenoh
 from google.protobuf.message import Message
 
 from clients.errors import BadInput, ClientError
+from clients.forces import Forces, Load
 from clients.grab import Grab
 from clients.log.frames import Mesh, mesh_of
 from clients.log.obstacles import Obstacle as ObstacleShape
@@ -47,6 +49,8 @@ class Client:
         self.name = name
         self.id, self.secret = new_client()
         self.timeout = timeout
+        self._numbers = itertools.count(1)  # of commands
+        self._forces: Forces | None = None
         try:
             check_name(name, "server name")
             connect = list(connect or usual_endpoints())
@@ -160,7 +164,7 @@ class Client:
         _begin(wanted, at)
         if target is not None or not isinstance(at, str):
             wanted.target.CopyFrom(vector(at if target is None else target, "target"))  # type: ignore[arg-type]
-        return Grab(self.command, self.command("grab", wanted).interaction)
+        return Grab(self, self.command("grab", wanted).interaction)
 
     def pause(self) -> pb.Reply:
         """Pauses the simulation. The reply comes after the present step; its status has the number of that step."""
@@ -187,17 +191,28 @@ class Client:
         return Steps(self._session.zenoh, self.name)
 
     def reactions(self) -> Steps:
-        """Subscribes to what objects exert on obstacles in each step, sent each millisecond.
+        """Subscribes to what objects exert on obstacles, grabs and each other in each step, sent each millisecond.
 
         The ObjectSteps that it returns hold object, step, time, contacts and reactions alone.
         """
         return Steps(self._session.zenoh, self.name, "reactions", REACTIONS)
 
+    @property
+    def forces(self) -> Forces:
+        """The forces of the newest step; subscribes to them at the first call."""
+        if self._forces is None:
+            self._forces = Forces(self._session.zenoh, self.name)
+        return self._forces
+
+    def contact_force(self, first: str, second: str) -> Load:
+        """Returns what object `first` exerts on object `second` in the newest step. Raises ClientError."""
+        return self.forces.between(first, second, self.timeout)
+
     def command(
         self, verb: str, interaction: pb.Interaction | None = None, target: pb.ObstacleTarget | None = None
     ) -> pb.Reply:
         """Sends a command and waits for the reply. Raises BadInput if the server refuses it."""
-        found = self._query("command", pb.Reply, self._command(verb, interaction, target))
+        found = self._query("command", pb.Reply, self._command(verb, interaction, target).SerializeToString())
         if not found:
             raise self._no_server()
         if found[0].error:
@@ -208,10 +223,10 @@ class Client:
         self, verb: str, interaction: pb.Interaction | None = None,
         answered: Callable[[pb.Reply | None], None] = lambda reply: None,
         target: pb.ObstacleTarget | None = None,
-    ) -> None:  # fmt: skip
+    ) -> int:  # fmt: skip
         """Sends a command without waiting for the reply, e.g. to move a grab 1000 times a second.
 
-        answered: is called with the reply, or None at the time-out, in a thread of zenoh's.
+        Returns its number, by which MoveTaken tells of a move. answered: is called with the reply, or None at the time-out, in a thread of zenoh's.
         """
         others: list[pb.Reply] = []  # of another incarnation, as the server may have been restarted
         done_once: list[bool] = []
@@ -232,9 +247,11 @@ class Client:
                 answered(others[0] if others else None)
 
         try:
-            payload = self._command(verb, interaction, target)
+            command = self._command(verb, interaction, target)
             handler = zenoh.handlers.Callback(take, done)
+            payload = command.SerializeToString()
             send_query(self._session.zenoh, self.name, "command", payload, self.timeout, handler)
+            return command.header.sequence
         except zenoh.ZError as error:
             raise ClientError(f"lost the server {self.name!r} at {self._where}: {error}") from None
 
@@ -249,14 +266,17 @@ class Client:
     ) -> None:
         self.close()
 
-    def _command(self, verb: str, interaction: pb.Interaction | None, target: pb.ObstacleTarget | None) -> bytes:
+    def listen(self, on_batch: Callable[[pb.Steps, float], None]) -> Forces:
+        """Subscribes to the forces of each step. on_batch: as of Forces; close what is returned when it is done with."""
+        return Forces(self._session.zenoh, self.name, on_batch)
+
+    def _command(self, verb: str, interaction: pb.Interaction | None, target: pb.ObstacleTarget | None) -> pb.Command:
         if interaction is not None:
             interaction.client = self.id
-        header = pb.Header(protocol=PROTOCOL)
-        command = pb.Command(
+        header = pb.Header(protocol=PROTOCOL, sequence=next(self._numbers))
+        return pb.Command(
             header=header, client=self.id, secret=self.secret, verb=verb, interaction=interaction, target=target
         )
-        return command.SerializeToString()
 
     def _query(
         self, channel: str, kind: type[M], payload: bytes | None = None,

@@ -8,19 +8,25 @@ from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from clients.errors import BadInput
+from clients.forces import Forces, Vector
 from clients.log.obstacles import Obstacle as Shape
 from protocol import messages_pb2 as pb
 
 
 class Sender(Protocol):
-    """The commands of a Client."""
+    """What an obstacle uses of a Client."""
+
+    timeout: float
+
+    @property
+    def forces(self) -> Forces: ...
 
     def command(self, verb: str, interaction: None = None, target: pb.ObstacleTarget | None = None) -> pb.Reply: ...
 
     def send(
         self, verb: str, interaction: None = None, answered: Callable[[pb.Reply | None], None] = ...,
         target: pb.ObstacleTarget | None = None,
-    ) -> None: ...  # fmt: skip
+    ) -> int: ...  # fmt: skip
 
 
 class Obstacle:
@@ -32,11 +38,12 @@ class Obstacle:
         self.name = shape.name
         self._refusal = ""  # of a move that was not waited for
 
-    def move(self, position: Sequence[float], rotation: Sequence[float] | None = None, wait: bool = False) -> None:
+    def move(self, position: Sequence[float], rotation: Sequence[float] | None = None, wait: bool = False) -> int | None:
         """Has the obstacle go to `position` [m] and turn to `rotation`, a unit quaternion w, x, y, z; None: as before.
 
         It goes at the speeds that the scene allows, max_speed and max_turn. Does not wait for the answer unless `wait`,
-        so that it may be called 1000 times a second; a refusal is then raised by the next call. Raises BadInput.
+        so that it may be called 1000 times a second: returns the number of the move, and a refusal is raised by the
+        next call. Raises BadInput.
         """
         if self._refusal:
             refusal, self._refusal = self._refusal, ""
@@ -46,8 +53,18 @@ class Obstacle:
             target.rotation.CopyFrom(_quaternion(rotation))
         if wait:
             self._sender.command("move_obstacle", target=target)
-        else:
-            self._sender.send("move_obstacle", answered=self._answered, target=target)
+            return None
+        return self._sender.send("move_obstacle", answered=self._answered, target=target)
+
+    @property
+    def force(self) -> Vector:
+        """What all objects exert on it in the newest step [N]. The first call waits for one. Raises ClientError."""
+        return self._sender.forces.obstacle(self.name, self._sender.timeout).force
+
+    @property
+    def torque(self) -> Vector:
+        """As `force`, about its position at the end of the step [N m]."""
+        return self._sender.forces.obstacle(self.name, self._sender.timeout).torque
 
     def _answered(self, reply: pb.Reply | None) -> None:
         if reply is not None and reply.error:

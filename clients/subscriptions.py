@@ -4,6 +4,9 @@
 from __future__ import annotations
 
 import logging
+import threading
+import time
+from collections.abc import Callable
 
 import zenoh
 
@@ -12,7 +15,7 @@ from clients.log.obstacles import ObstacleFrame, obstacle_frame_of
 from protocol import messages_pb2 as pb
 from protocol.channels import CHANNELS, key
 from protocol.refused import Refused
-from protocol.validate import check_header, parse
+from protocol.validate import check_header, check_numbers, parse
 
 BATCHES = 64  # batches of steps that are kept, about 3 s
 REACTIONS = 1024  # batches of reactions, about 1 s
@@ -70,12 +73,65 @@ class Poses:
         return found
 
 
+class Gaps:
+    """Counts messages of a channel that did not come, by their sequence numbers."""
+
+    def __init__(self, channel: str) -> None:
+        self.lost = 0
+        self._channel = channel
+        self._incarnation = self._next = 0
+
+    def note(self, header: pb.Header) -> None:
+        """Takes the header of the next message; the first loss is logged."""
+        if header.incarnation == self._incarnation and header.sequence > self._next:
+            if not self.lost:
+                log.warning("messages of the channel %s did not come in time; further ones are counted", self._channel)
+            self.lost += header.sequence - self._next
+        self._incarnation, self._next = header.incarnation, header.sequence + 1
+
+
+class ReactionBatches:
+    """Every message of the channel reactions as it comes. take: called with it and time.monotonic(), by zenoh."""
+
+    def __init__(self, session: zenoh.Session, server: str, take: Callable[[pb.Steps, float], None]) -> None:
+        self._take, self._gaps = take, Gaps("reactions")
+        self._lock = threading.Lock()
+        self._subscriber = session.declare_subscriber(key("reactions", server), self._read)
+
+    @property
+    def lost(self) -> int:
+        """Messages that did not come."""
+        return self._gaps.lost
+
+    def close(self) -> None:
+        """Ends the subscription."""
+        self._subscriber.undeclare()  # type: ignore[no-untyped-call]
+
+    def _read(self, sample: zenoh.Sample) -> None:
+        now = time.monotonic()
+        try:
+            batch = parse(pb.Steps, sample.payload, CHANNELS["reactions"].limit)
+            check_header(batch)
+            check_numbers(batch)
+        except Refused as error:
+            log.warning("forces were left out: %s", error)
+            return
+        with self._lock:
+            self._gaps.note(batch.header)
+            self._take(batch, now)
+
+
 class Steps:
     """Batches of scalars per step. channel: steps or reactions. batches: that are kept."""
 
     def __init__(self, session: zenoh.Session, server: str, channel: str = "steps", batches: int = BATCHES) -> None:
-        self._channel = channel
+        self._channel, self._gaps = channel, Gaps(channel)
         self._ring = session.declare_subscriber(key(channel, server), zenoh.handlers.RingChannel(batches))
+
+    @property
+    def lost(self) -> int:
+        """Messages that did not come, or were dropped here since `new` was called too seldom."""
+        return self._gaps.lost
 
     def new(self) -> list[pb.ObjectStep]:
         """Returns the steps that came since the last call, oldest first; never waits."""
@@ -84,6 +140,7 @@ class Steps:
             try:
                 batch = parse(pb.Steps, sample.payload, CHANNELS[self._channel].limit)
                 check_header(batch)
+                self._gaps.note(batch.header)
                 steps.extend(batch.steps)
             except Refused as error:
                 log.warning("steps were left out: %s", error)

@@ -15,7 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from clients.client import Client
-from clients.log.scalars import enum_name, status_name
+from clients.log.scalars import enum_name, reaction_name, status_name
 from protocol import messages_pb2 as pb
 
 PERIOD = 0.5  # s between two readings
@@ -103,13 +103,13 @@ def _errors(status: pb.Status) -> list[Table]:
 
 
 def _contacts(status: pb.Status) -> list[Table]:
-    """Tables of contacts with obstacles, and of where these are; none if there are no obstacles."""
-    if not status.obstacles:
+    """Tables of contacts and forces, and of where obstacles are; none if there is no contact and no grab."""
+    if not status.obstacles and not any(found.last.reactions for found in status.objects):
         return []
     table = Table("object", "contacts", "passes", "contact residual", "clipped", "force on [N]", **COMPACT)
     for found in status.objects:
         last = found.last
-        forces = (f"{r.obstacle} {math.hypot(r.force.x, r.force.y, r.force.z):.3g}" for r in last.reactions)
+        forces = (f"{reaction_name(r)} {math.hypot(r.force.x, r.force.y, r.force.z):.3g}" for r in last.reactions)
         residual = f"{last.contact_residual:.1e}" if last.HasField("contact_residual") else "-"
         numbers = str(last.contacts), str(last.passes), residual, str(found.clipped)
         _add(table, found.object, *numbers, ", ".join(forces) or "-")
@@ -117,7 +117,7 @@ def _contacts(status: pb.Status) -> list[Table]:
     for pose in status.obstacles:
         p, w = pose.position, min(abs(pose.rotation.w), 1.0)
         _add(where, pose.header.object, f"{p.x:.3g} {p.y:.3g} {p.z:.3g}", f"{math.degrees(2 * math.acos(w)):.3g}")
-    return [table, where]
+    return [table, where] if status.obstacles else [table]
 
 
 def _energies(status: pb.Status) -> list[Table]:

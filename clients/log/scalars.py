@@ -16,10 +16,9 @@ from protocol import messages_pb2 as pb
 Columns = dict[str, NDArray]
 
 INPUTS = ("asked", "probe")  # of a solve: for replays only
-REACTION = (
-    "reaction/"  # columns reaction/OBSTACLE/force_x to torque_z [N, N m], of obstacles that the object has touched
-)
-REACTIONS = ("force_x", "force_y", "force_z", "torque_x", "torque_y", "torque_z")
+REACTION = "reaction/"  # columns reaction/WHAT/force_x to torque_z [N, N m] and point_z [m]
+REACTIONS = ("force_x", "force_y", "force_z", "torque_x", "torque_y", "torque_z", "point_x", "point_y", "point_z")
+"""Of what the object exerts on WHAT (`reaction_name`); the point only where the torque is about one of its own."""
 
 
 def _dtype(field: Any) -> str:
@@ -49,9 +48,19 @@ def enum_name(field: str, value: int) -> str:
 
 
 def row(message: pb.ObjectStep) -> tuple:
-    """Returns the values of one step in the order of DTYPES, and then its reactions by obstacle."""
-    reactions = {r.obstacle: (*_three(r.force), *_three(r.torque)) for r in message.reactions}
+    """Returns the values of one step in the order of DTYPES, and then its reactions by what they are on."""
+    reactions = {reaction_name(r): _reaction(r) for r in message.reactions}
     return *(_value(message, name) for name in DTYPES), reactions
+
+
+def reaction_name(message: pb.Reaction) -> str:
+    """Names what a reaction is on: an obstacle or another object by its name, a grab as "grab:ID"."""
+    return f"grab:{message.grab}" if message.HasField("grab") else message.object or message.obstacle
+
+
+def _reaction(message: pb.Reaction) -> tuple[float, ...]:
+    point = _three(message.point) if message.HasField("point") else ()
+    return *_three(message.force), *_three(message.torque), *point
 
 
 def _three(v: pb.Vector) -> tuple[float, float, float]:
@@ -68,8 +77,9 @@ def columns(rows: Iterable[tuple]) -> Columns:
     """Returns one array per scalar, ascending in step."""
     *table, reactions = list(zip(*sorted(rows, key=lambda r: r[0]), strict=True)) or [()] * (len(DTYPES) + 1)
     found = {name: np.array(values, dtype) for (name, dtype), values in zip(DTYPES.items(), table, strict=True)}
-    none = (0.0,) * len(REACTIONS)
-    for obstacle in sorted(set().union(*reactions)):
-        values = np.array([each.get(obstacle, none) for each in reactions])
-        found |= {f"{REACTION}{obstacle}/{name}": values[:, k] for k, name in enumerate(REACTIONS)}
+    for what in sorted(set().union(*reactions)):
+        width = max(len(each.get(what, ())) for each in reactions)
+        none = (0.0,) * 6 + (math.nan,) * (width - 6)
+        values = np.array([each.get(what, none) for each in reactions])
+        found |= {f"{REACTION}{what}/{name}": values[:, k] for k, name in enumerate(REACTIONS[:width])}
     return found

@@ -30,7 +30,7 @@ PLOTS = {  # entity below /plots -> title
 CONTACT_PLOTS = {  # of runs with contact
     "contacts": "places in contact",
     "contact_residual": "contact residual, log10",
-    "reaction": "force on obstacles [N]",
+    "reaction": "force on obstacles, objects and hands [N]",
 }
 ENERGIES = ("kinetic_energy", "elastic_energy", "gravity_energy", "work", "dissipated")
 
