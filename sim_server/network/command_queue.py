@@ -9,7 +9,7 @@ from collections.abc import Callable, Hashable
 from protocol.counters import Counters
 from protocol.messages_pb2 import Command, Reply
 from sim_server.network.coalesce import moved_by
-from sim_server.network.rate_limiter import RateLimiter
+from sim_server.network.rate_limiter import MoveLimiter, RateLimiter
 
 CAPACITY = 64  # commands with a rate limit that may wait; for the other verbs there is as much capacity again
 MAX_DEFERRED = 1024  # moves that may wait for a token of their client or for capacity
@@ -34,10 +34,11 @@ class CommandQueue:
 
     def __init__(
         self, counters: Counters, limiter: RateLimiter | None = None, capacity: int = CAPACITY,
-        clock: Callable[[], float] = time.monotonic,
+        clock: Callable[[], float] = time.monotonic, moves: MoveLimiter | None = None,
     ):  # fmt: skip
         self._counters, self._capacity, self._clock = counters, capacity, clock
         self._limiter = RateLimiter() if limiter is None else limiter
+        self._moves = MoveLimiter(self._limiter) if moves is None else moves
         self._lock = threading.Lock()
         self._queue: OrderedDict[Hashable, PendingCommand] = OrderedDict()  # in the order of arrival
         self._deferred: OrderedDict[Hashable, PendingCommand] = OrderedDict()  # moves, in the order of arrival
@@ -60,7 +61,7 @@ class CommandQueue:
             for key in list(self._deferred):
                 if len(self._queue) >= self._capacity:
                     break
-                if self._limiter.allow(self._deferred[key][0].client, now):
+                if self._moves.allow(self._deferred[key][0].client, now):
                     self._queue[key] = self._deferred.pop(key)
             taken = list(self._queue.values())
             self._queue.clear()
@@ -79,7 +80,7 @@ class CommandQueue:
         debt, capacity = (0.0, self._capacity) if limited else (self._limiter.burst, 2 * self._capacity)
         if len(self._queue) >= capacity:
             refusal = f"the server is busy: {capacity} commands wait already"
-        elif not self._limiter.allow(command.client, self._clock(), debt):
+        elif not self._admits(command, moved is not None, debt):
             refusal = f"client {command.client!r} sends too much: at most {self._limiter.rate:g} commands a second"
         else:
             self._queue[key] = command, reply
@@ -88,3 +89,8 @@ class CommandQueue:
             self._deferred[key] = command, reply
             return None, ""
         return None, refusal
+
+    def _admits(self, command: Command, moves: bool, debt: float) -> bool:
+        """Takes a token for the command; False if the client has none left."""
+        now = self._clock()
+        return self._moves.allow(command.client, now) if moves else self._limiter.allow(command.client, now, debt)

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 RATE = 200.0  # commands per second that each client may send without end
 BURST = 100.0  # commands that a client may send at once after a rest
 CLIENTS = 256  # clients with a bucket of their own; all others share one
+MOVES = 1000.0  # moves per second of each client beside its commands: one a step of 1 ms, for haptic devices
+ALL_MOVES = 4000.0  # of all clients together
 
 
 @dataclass
@@ -33,6 +35,26 @@ class TokenBucket:
     def _fill(self, now: float) -> None:
         self.tokens = min(self.burst, self.tokens + self.rate * max(now - self.filled, 0.0))
         self.filled = max(now, self.filled)
+
+
+class MoveLimiter:
+    """Admits moves: each client's own MOVES, out of ALL_MOVES of all, and beyond these as many as its commands.
+
+    So a few devices have each of their moves carried out, and a crowd has what it has without.
+    """
+
+    def __init__(
+        self, commands: "RateLimiter", rate: float = MOVES, rate_of_all: float = ALL_MOVES, burst: float = BURST
+    ):
+        self._commands = commands
+        self._own = RateLimiter(rate, burst)
+        self._all = TokenBucket(rate_of_all, burst, burst, 0.0)
+
+    def allow(self, client: str, now: float) -> bool:
+        """Takes a token for a move of the client at time `now` [s]; False if it must wait."""
+        if self._own.allow(client, now) and self._all.take(now):
+            return True
+        return self._commands.allow(client, now)
 
 
 class RateLimiter:

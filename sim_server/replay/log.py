@@ -21,7 +21,7 @@ from protocol import messages_pb2 as pb
 from protocol.log_chunks import BadLog
 from protocol.log_file import LogFile, LogMessage
 from protocol.refused import Refused
-from protocol.validate import array
+from protocol.validate import array, checksum
 from sim_server.arrays import Float64
 from sim_server.backends.cpu.structs import RECORD
 from sim_server.backends.kinds import Kind
@@ -50,6 +50,7 @@ class RecordedObject:
     frames: (offset, number) of each (log_file.py), by step
     factors: by the step whose matrix they were made from
     rows: of type ROW; rows[k] is of step k + 1
+    reactions: by step and kind, digests of those that there are
     """
 
     topology: pb.Topology | None = None
@@ -57,6 +58,7 @@ class RecordedObject:
     frames: dict[int, tuple[int, int]] = field(default_factory=dict)
     factors: dict[int, pb.FactorUse] = field(default_factory=dict)
     rows: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, ROW))
+    reactions: dict[tuple[int, str], int] = field(default_factory=dict)
 
 
 class Recording:
@@ -148,6 +150,7 @@ class Recording:
         elif kind == "step":
             s = pb.ObjectStep.FromString(data)
             found.packed += _PACK.pack(*_row(s).values())
+            found.reactions |= {(s.step, kind): digest for kind, digest in reaction_digests(s).items()}
 
     def _complete(self) -> int:
         """Sorts the rows; returns the last step up to which no object lacks a row."""
@@ -186,6 +189,15 @@ class Recording:
                 f"{self.path}: written by an older version, which did not record the build, the steps at which pushes "
                 "and grabs took effect, and probes of the automatic preconditioner: only runs without these repeat"
             )
+
+
+def reaction_digests(message: pb.ObjectStep) -> dict[str, int]:
+    """Returns a digest of the reactions of a step by kind: obstacle, object, grab."""
+    kinds: dict[str, bytes] = {}
+    for reaction in message.reactions:
+        kind = reaction.WhichOneof("on") or ""
+        kinds[kind] = kinds.get(kind, b"") + reaction.SerializeToString(deterministic=True)
+    return {kind: checksum(data) for kind, data in kinds.items()}
 
 
 def _row(message: pb.ObjectStep) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from protocol import messages_pb2 as pb
 from sim_server.arrays import Float64
 from sim_server.backends.kinds import Kind
-from sim_server.replay.log import COMPARED, OPTIONAL, Recording
+from sim_server.replay.log import COMPARED, OPTIONAL, Recording, reaction_digests
 
 Pair = tuple[Float64, Float64]
 
@@ -33,6 +33,7 @@ class Comparison:
         self.other_factor: dict[str, Any] | None = None
         self.solves_compared = self.solves_different = 0
         self.frames_compared = self.frames_different = 0
+        self._kinds = {kind for each in recording.objects.values() for _, kind in each.reactions}
 
     @property
     def same(self) -> bool:
@@ -59,6 +60,15 @@ class Comparison:
                 self.solves_different += 1
                 detail = ", ".join(f"{n} {_shown(n, record[n])}, recorded {_shown(n, row[n])}" for n in different)
                 self.diverged(int(row["step"]), name, "solve", detail)
+
+    def reactions(self, steps: list[pb.ObjectStep]) -> None:
+        """Compares what objects exerted in a step, of the kinds that the log has."""
+        for step in steps:
+            name = step.header.object
+            now, then = reaction_digests(step), self.recording.objects[name].reactions
+            for kind in sorted(self._kinds):
+                if now.get(kind) != then.get((step.step, kind)):
+                    self.diverged(step.step, name, "reaction", f"other forces on {kind}s than recorded")
 
     def frame(self, step: int, name: str, recorded: Pair, now: Pair) -> None:
         """Compares positions and velocities (nodes, 3) of one object after a step."""

@@ -2,19 +2,24 @@
 """The queue of commands: rate limits by a given clock, bounded capacity, the newest move of each grab."""
 
 import logging
+from collections import Counter
 
 from protocol.counters import Counters
 from protocol.messages_pb2 import Command, Interaction, ObstacleTarget, Reply, Vector
 from sim_server.network.command_queue import MAX_DEFERRED, CommandQueue
-from sim_server.network.rate_limiter import RateLimiter, TokenBucket
+from sim_server.network.rate_limiter import MoveLimiter, RateLimiter, TokenBucket
 
 
 class Harness:
     """A queue, its clock and the replies that came out of it."""
 
-    def __init__(self, rate: float = 10.0, burst: float = 3.0, capacity: int = 64):
+    def __init__(
+        self, rate: float = 10.0, burst: float = 3.0, capacity: int = 64, moves: tuple[float, float] = (0.0, 0.0)
+    ):
         self.now, self.counters, self.replies = 0.0, Counters(logging.getLogger("test")), {}
-        self.queue = CommandQueue(self.counters, RateLimiter(rate, burst), capacity, lambda: self.now)
+        limiter = RateLimiter(rate, burst)
+        admitted = MoveLimiter(limiter, *moves, burst=min(burst, *moves))
+        self.queue = CommandQueue(self.counters, limiter, capacity, lambda: self.now, admitted)
         self._count = 0
 
     def put(self, verb: str, client: str = "anna", id: int = 0, x: float = 0.0) -> int:
@@ -117,6 +122,29 @@ def test_the_last_move_over_the_rate_waits_and_is_not_lost() -> None:
     assert harness.take_all() == [("move", "anna", 399.0)], "where the hand stopped"
     assert harness.take_all() == [] and len(harness.replies) == 400 and set(harness.replies.values()) == {""}
     assert harness.counters.commands_refused == 0 and harness.counters.moves_replaced == 400 - len(done) - 1
+
+
+def test_a_device_has_each_of_its_moves_carried_out_and_its_commands_beside() -> None:
+    harness = Harness(rate=10.0, burst=3.0, moves=(1000.0, 4000.0))
+    done = []
+    for i in range(400):  # 1 kHz for 0.4 s
+        harness.now = 0.001 * i
+        harness.put("move", id=7, x=float(i))
+        done += harness.take_all()
+    assert len(done) == 400 and harness.counters.moves_replaced == 0
+    assert [harness.replies.get(harness.put("push")) for _ in range(3)] == [None] * 3, "moves take no commands away"
+
+
+def test_a_crowd_of_devices_shares_what_all_may_move() -> None:
+    harness, seconds = Harness(rate=10.0, burst=3.0, moves=(1000.0, 2000.0)), 1.0
+    done = Counter()
+    for i in range(int(1000 * seconds)):
+        harness.now = 0.001 * i
+        for client in range(8):
+            harness.put("move", f"c{client}", 1, float(i))
+        done.update(client for _, client, _ in harness.take_all())
+    assert 2000 * seconds <= done.total() <= 2000 * seconds + 8 * (10 * seconds + 3) + 3
+    assert all(done[f"c{client}"] >= 10 for client in range(8)), "each has at least what it has as commands"
 
 
 def test_the_newest_move_of_an_obstacle_waits_and_is_not_lost() -> None:
