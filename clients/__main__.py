@@ -216,6 +216,42 @@ def move_obstacle(
     print(f"{name} goes to ({', '.join(f'{value:.4g}' for value in to)})")
 
 
+@app.command()
+def haptics(
+    name: Annotated[str, typer.Argument(metavar="NAME", help='Obstacle of the scene with moved = "client".')],
+    press: Annotated[Triple, typer.Option(metavar="X Y Z", help="How far the hand goes from where it is, m.")],
+    rate: Annotated[float, typer.Option(metavar="HZ", help="How often it goes there and back.")] = 0.5,
+    stiffness: Annotated[float, typer.Option(help="Of the coupling between hand and obstacle, N/m.")] = 500.0,
+    delay: Annotated[float, typer.Option(metavar="S", help="Expected of forces; 0: three time steps.")] = 0.0,
+    seconds: Annotated[float, typer.Option(metavar="S", help="For how long.")] = 10.0,
+    as_json: Json = False,
+    connect: Connect = None,
+    server: Server = SERVER_NAME,
+) -> None:
+    """Move an obstacle at 1 kHz with a scripted hand that feels it, and report how late the forces are.
+
+    An example for a haptic device (clients/haptics), which takes the hand's place.
+
+    \b
+    Examples:
+      sim-client haptics tool --press 0 -0.025 0
+      sim-client haptics tool --press 0 -0.025 0 --rate 1 --stiffness 1000 --seconds 30 --json
+    """
+    from clients.client import Client, number
+    from clients.haptics.run import run, tables
+
+    for what, value in (("rate", rate), ("stiffness", stiffness), ("seconds", seconds)):
+        number(value, what, positive=True)
+    with Client(server, connect) as client:
+        found = run(client, name, press, rate, stiffness, number(delay, "delay"), seconds)
+    if as_json:
+        print(json.dumps(found))
+        return
+    from rich.console import Console
+
+    Console().print(tables(found))
+
+
 def _await_end(client: Client, push: pb.Interaction) -> None:
     """Waits until a push is over; releases it on Ctrl-C."""
     from protocol import messages_pb2 as pb

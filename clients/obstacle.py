@@ -38,7 +38,9 @@ class Obstacle:
         self.name = shape.name
         self._refusal = ""  # of a move that was not waited for
 
-    def move(self, position: Sequence[float], rotation: Sequence[float] | None = None, wait: bool = False) -> int | None:
+    def move(
+        self, position: Sequence[float], rotation: Sequence[float] | None = None, wait: bool = False
+    ) -> int | None:
         """Has the obstacle go to `position` [m] and turn to `rotation`, a unit quaternion w, x, y, z; None: as before.
 
         It goes at the speeds that the scene allows, max_speed and max_turn. Does not wait for the answer unless `wait`,

@@ -106,12 +106,12 @@ def _contacts(status: pb.Status) -> list[Table]:
     """Tables of contacts and forces, and of where obstacles are; none if there is no contact and no grab."""
     if not status.obstacles and not any(found.last.reactions for found in status.objects):
         return []
-    table = Table("object", "contacts", "passes", "contact residual", "clipped", "force on [N]", **COMPACT)
+    table = Table("object", "contacts", "passes", "contact residual", "clipped", "no row", "force on [N]", **COMPACT)
     for found in status.objects:
         last = found.last
         forces = (f"{reaction_name(r)} {math.hypot(r.force.x, r.force.y, r.force.z):.3g}" for r in last.reactions)
         residual = f"{last.contact_residual:.1e}" if last.HasField("contact_residual") else "-"
-        numbers = str(last.contacts), str(last.passes), residual, str(found.clipped)
+        numbers = str(last.contacts), str(last.passes), residual, str(found.clipped), str(found.crowded)
         _add(table, found.object, *numbers, ", ".join(forces) or "-")
     where = Table("obstacle", "at [m]", "turned by [°]", **COMPACT)
     for pose in status.obstacles:

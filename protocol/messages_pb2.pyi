@@ -568,7 +568,7 @@ class Reply(_message.Message):
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., error: _Optional[str] = ..., interaction: _Optional[_Union[Interaction, _Mapping]] = ..., status: _Optional[_Union[Status, _Mapping]] = ..., unchanged: _Optional[bool] = ...) -> None: ...
 
 class ObjectStatus(_message.Message):
-    __slots__ = ("object", "nodes", "tets", "last", "mean_iterations", "excess", "factors_used", "factors_refused", "in_flight", "factor_age", "factor_age_max", "factor_age_bound", "factors_mended", "refusal", "low", "high", "tip", "runaway_steps", "total_energy", "clipped")
+    __slots__ = ("object", "nodes", "tets", "last", "mean_iterations", "excess", "factors_used", "factors_refused", "in_flight", "factor_age", "factor_age_max", "factor_age_bound", "factors_mended", "refusal", "low", "high", "tip", "runaway_steps", "total_energy", "clipped", "crowded")
     OBJECT_FIELD_NUMBER: _ClassVar[int]
     NODES_FIELD_NUMBER: _ClassVar[int]
     TETS_FIELD_NUMBER: _ClassVar[int]
@@ -589,6 +589,7 @@ class ObjectStatus(_message.Message):
     RUNAWAY_STEPS_FIELD_NUMBER: _ClassVar[int]
     TOTAL_ENERGY_FIELD_NUMBER: _ClassVar[int]
     CLIPPED_FIELD_NUMBER: _ClassVar[int]
+    CROWDED_FIELD_NUMBER: _ClassVar[int]
     object: str
     nodes: int
     tets: int
@@ -609,7 +610,8 @@ class ObjectStatus(_message.Message):
     runaway_steps: int
     total_energy: float
     clipped: int
-    def __init__(self, object: _Optional[str] = ..., nodes: _Optional[int] = ..., tets: _Optional[int] = ..., last: _Optional[_Union[ObjectStep, _Mapping]] = ..., mean_iterations: _Optional[float] = ..., excess: _Optional[float] = ..., factors_used: _Optional[int] = ..., factors_refused: _Optional[int] = ..., in_flight: _Optional[bool] = ..., factor_age: _Optional[int] = ..., factor_age_max: _Optional[int] = ..., factor_age_bound: _Optional[int] = ..., factors_mended: _Optional[int] = ..., refusal: _Optional[str] = ..., low: _Optional[_Union[Vector, _Mapping]] = ..., high: _Optional[_Union[Vector, _Mapping]] = ..., tip: _Optional[_Union[Vector, _Mapping]] = ..., runaway_steps: _Optional[int] = ..., total_energy: _Optional[float] = ..., clipped: _Optional[int] = ...) -> None: ...
+    crowded: int
+    def __init__(self, object: _Optional[str] = ..., nodes: _Optional[int] = ..., tets: _Optional[int] = ..., last: _Optional[_Union[ObjectStep, _Mapping]] = ..., mean_iterations: _Optional[float] = ..., excess: _Optional[float] = ..., factors_used: _Optional[int] = ..., factors_refused: _Optional[int] = ..., in_flight: _Optional[bool] = ..., factor_age: _Optional[int] = ..., factor_age_max: _Optional[int] = ..., factor_age_bound: _Optional[int] = ..., factors_mended: _Optional[int] = ..., refusal: _Optional[str] = ..., low: _Optional[_Union[Vector, _Mapping]] = ..., high: _Optional[_Union[Vector, _Mapping]] = ..., tip: _Optional[_Union[Vector, _Mapping]] = ..., runaway_steps: _Optional[int] = ..., total_energy: _Optional[float] = ..., clipped: _Optional[int] = ..., crowded: _Optional[int] = ...) -> None: ...
 
 class LocalWorker(_message.Message):
     __slots__ = ("worker", "state", "pid", "restarts", "exit_code")

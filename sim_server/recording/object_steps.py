@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from protocol import messages_pb2 as pb
 from sim_server.arrays import Float64
-from sim_server.backends.cpu.structs import REACTION, REACTION_KINDS, RECORD
+from sim_server.backends.cpu.structs import REACTION_KINDS, RECORD
 from sim_server.backends.kinds import Kind
 
 FIELDS = {  # of ObjectStep by column, where names differ

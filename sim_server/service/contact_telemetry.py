@@ -5,6 +5,7 @@ import time
 from collections import Counter
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from sim_server.arrays import Float64
@@ -20,6 +21,7 @@ class ContactTelemetry:
     """The obstacles of one run; of a scene without contact nothing is sent and nothing is said.
 
     clipped: by body, number of nodes that were held back at obstacles, summed over steps
+    crowded: likewise, of obstacles that had no row at a node as nearer ones had them
     """
 
     def __init__(self, simulation: Simulation, link: ServerLink, recorder: Recorder | None):
@@ -27,6 +29,7 @@ class ContactTelemetry:
         self._rows_due = 0.0
         self._crowded: set[int] = set()  # bodies of which it was said
         self.clipped: Counter[int] = Counter()
+        self.crowded: Counter[int] = Counter()
 
     def open(self) -> None:
         """Sends the obstacles to log and network."""
@@ -71,10 +74,12 @@ class ContactTelemetry:
             return []
         self._rows_due = time.monotonic() + ROWS_PERIOD
         dropped = self._simulation.world.backend.fetch(contact.dropped)
-        found = set(contact.body[dropped > 0].tolist()) - self._crowded
+        sums = np.bincount(contact.body, dropped, len(self._simulation.world.bodies)).astype(int)
+        self.crowded = Counter({body: count for body, count in enumerate(sums.tolist()) if count})
+        found = set(self.crowded) - self._crowded
         self._crowded |= found
         return [
             f"object {self._simulation.world.bodies[body].name!r}: some nodes had more than two obstacles near at a "
-            "time; they touch the nearest two only"
+            "time; they touch the nearest two only; further ones are counted"
             for body in sorted(found)
         ]

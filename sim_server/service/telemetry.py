@@ -260,6 +260,7 @@ class Telemetry:
                     runaway_steps=self.runaways[body.index],
                     total_energy=self._energy.get(body.index),
                     clipped=self.contact.clipped[body.index],
+                    crowded=self.contact.crowded[body.index],
                 )
             )
         status.obstacles.extend(pose_messages(self.simulation, status.step, fixed=True))

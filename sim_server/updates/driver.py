@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from protocol.factor import Factor
 from sim_server.arrays import Float64
-from sim_server.backends.cpu.structs import REACTION
 from sim_server.backends.base import Capability
+from sim_server.backends.cpu.structs import REACTION
 from sim_server.simulation import Simulation
 from sim_server.updates.body_state import BodyUpdateState
 from sim_server.updates.factor_check import FactorCheck

@@ -156,9 +156,13 @@ def test_what_contact_leaves_undone_is_said_once_for_each_object(monkeypatch: py
     records["status"][2], records["contact_residual"][2] = pb.CONTACT, 0.25
     assert "not converged (contact, residual 2.5e-01)" in telemetry.count_unconverged(records)[0]
     assert sim.contact is not None
-    sim.contact.dropped[7] = 1
+    sim.contact.dropped[7:9] = 1, 4
     assert "more than two obstacles near" in telemetry.contact.crowded_nodes()[0]
-    assert telemetry.contact.crowded_nodes() == []
+    assert telemetry.contact.crowded_nodes() == [] and telemetry.contact.crowded == {0: 5}
+    statuses: list[pb.Status] = []
+    link.publish_status = statuses.append
+    telemetry.publish_status("running")
+    assert [found.crowded for found in statuses[0].objects] == [5]
 
 
 def test_matrices_for_factors_made_in_the_step_know_contacts() -> None:
