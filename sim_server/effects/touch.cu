@@ -135,7 +135,7 @@ INLINE bool held_reaction(const Apply& p, int g, long long step, const double* s
 }
 
 #ifdef __CUDACC_RTC__
-constexpr int HOLDING_THREADS = 128;
+constexpr int HOLDING_THREADS = 128;  // GRAB_THREADS of backends/gpu/engine.py
 
 // Writes the reactions on grabs after a step to the host, those of slot `step - 1`, with their number: of an interaction that is no grab, or
 // does not act, `number` is -1. out: (capacity, most); counts: (capacity,). A thread block sums over the nodes of a grab in a fixed order.

@@ -9,13 +9,14 @@ import weakref
 import numpy as np
 import pytest
 
+from sim_server.backends.cpu.structs import REACTION, REACTION_KINDS
 from sim_server.backends.gpu.loop import BATCH, CAPACITY, FRAMES
 from sim_server.backends.gpu.structs import NEWTON_RESULT, STAGE_RESULT
 from sim_server.backends.rosenbrock import FORMS
 from sim_server.errors import DeviceLost
 from tests.backends.fake_cuda import BALANCE_GRAPH, ELASTIC_GRAPH, NOT_READY, STEPS, TIMED, FakeScene, number
 
-MATRIX_GRAPH = 13
+MATRIX_GRAPH, GRABS_GRAPH = 13, 14
 ONE_STEP = next(graph for graph, steps in STEPS.items() if steps == 1 and graph not in TIMED)
 
 
@@ -439,3 +440,55 @@ def _recorded(scene: FakeScene) -> int:
     event = scene.device.event()
     scene.device.event_record(event, scene.device.stream)
     return event
+
+
+def held_scene(most: int = 4) -> FakeScene:
+    """A scene whose last mailbox says how many interactions there are; the first of them is a push."""
+    scene = FakeScene()
+    reactions, counts = np.zeros((CAPACITY, most), REACTION), np.zeros(CAPACITY, np.int64)
+
+    def tell() -> None:
+        slot, count = (scene.done - 1) % CAPACITY, int(scene.argument[0])
+        counts[slot] = count
+        told = reactions[slot, :count]
+        told["number"] = np.arange(count)[:most]
+        told["number"][:1] = -1
+        told["step"], told["kind"] = scene.done, REACTION_KINDS["ON_GRAB"]
+
+    scene.device.graphs[GRABS_GRAPH] = tell
+    scene.loop.report_grabs(GRABS_GRAPH, len(scene.loop.mailboxes) - 1, reactions, counts)
+    return scene
+
+
+def test_forces_on_grabs_are_asked_for_only_while_something_is_held():
+    scene = held_scene()
+    graphs = launched(scene)
+    scene.loop.run(20)
+    assert GRABS_GRAPH not in graphs
+    scene.loop.mailboxes[-1].post(number(3))
+    scene.loop.run(3 * CAPACITY)
+    scene.loop.mailboxes[-1].post(number(0))
+    scene.loop.run(20)
+    assert graphs.count(GRABS_GRAPH) == 3 * CAPACITY
+    assert scene.loop.records()["step"].tolist() == list(range(1, 3 * CAPACITY + 41))
+    told = scene.loop.other_reactions()
+    assert told["step"].tolist() == np.repeat(np.arange(21, 21 + 3 * CAPACITY), 2).tolist()
+    assert told["number"].tolist() == [1, 2] * 3 * CAPACITY
+    assert scene.loop.loop.others_dropped == 0 and len(scene.loop.other_reactions()) == 0
+
+
+def test_forces_on_more_grabs_than_there_is_room_for_are_counted():
+    scene = held_scene(most=4)
+    scene.loop.mailboxes[-1].post(number(6))
+    scene.loop.run(10)
+    scene.loop.records()
+    assert len(scene.loop.other_reactions()) == 10 * 3 and scene.loop.loop.others_dropped == 10 * 2
+
+
+def test_forces_wait_for_the_record_of_their_step():
+    scene = held_scene()
+    scene.loop.mailboxes[-1].post(number(2))
+    scene.loop.run(5)
+    assert len(scene.loop.other_reactions()) == 0
+    scene.loop.records()
+    assert scene.loop.other_reactions()["step"].tolist() == [1, 2, 3, 4, 5]

@@ -123,10 +123,12 @@ class DeviceLaunch(BoundKernel):
     """A kernel with its arguments on the device.
 
     arrays: twins of the arrays, by argument. The arguments of a mailed launch are in device memory and may be replaced.
+    module: its text
     """
 
     def __init__(self, module: DeviceModule, kernel: str, given: dict[str, Any]):
         super().__init__(module, kernel, given, converts=True)
+        self.module = module
         self.params = np.zeros((), dtype=structure_of(self.fields))
         self.arrays: dict[str, DeviceArray] = {}
         for f, value in zip(self.fields, self.values, strict=True):

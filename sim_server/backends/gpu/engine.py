@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from protocol.factor import FactorPattern
 from sim_server.arrays import Float64
 from sim_server.backends.base import Capability, EngineInput, Launch
+from sim_server.backends.cpu.structs import REACTION
 from sim_server.backends.declarations import Declarations
 from sim_server.backends.gpu.contact import ContactPasses
 from sim_server.backends.gpu.cuda import CudaDevice
@@ -37,6 +38,8 @@ from sim_server.backends.gpu.structs import (
     Mail,
 )
 
+MOST_GRABS = 1024  # pushes and grabs at a time, of which forces are told
+GRAB_BLOCKS, GRAB_THREADS = 32, 128  # of the kernel react (effects/touch.cu)
 FEW = 16  # largest number of trials in a step for which MANY steps are captured in one graph
 EPILOGUE = Declarations("backends/gpu/step_epilogue.cu")
 STEP_EPILOGUE = EPILOGUE.dtype("StepEpilogue")
@@ -152,6 +155,8 @@ class GpuEngine(DeviceLoop):
         self._known: Float64 = arrays["values"]  # as a factor is to know them
         self._matrix = self._matrix_launches(assemble) if alone else ()
         self._capture()
+        if given.touch is not None:
+            self._report_grabs(device, cast(DeviceLaunch, given.touch))
         cp.cuda.get_current_stream().synchronize()  # arrays are complete for the streams of the loop
 
     def _epilogue_params(self, dt: float) -> NDArray[Any]:
@@ -215,6 +220,17 @@ class GpuEngine(DeviceLoop):
         self.use_graphs(handles, *(int(graph.graphExec) for graph in others))
         self._graphs += others  # kept as long as the engine
         self._second_half = self._captured(self._finish_step) if self._stages or self._contact else None
+
+    def _report_grabs(self, device: CudaDevice, touch: DeviceLaunch) -> None:
+        """Captures the kernel that writes the forces on grabs, which follows a step only while there are some."""
+        reactions = device.pinned(CAPACITY * MOST_GRABS * REACTION.itemsize).view(REACTION).reshape(CAPACITY, MOST_GRABS)
+        counts = device.pinned(CAPACITY * 8).view(np.int64)
+        addresses = touch.mail_address, self._counter.data.ptr, reactions.ctypes.data, counts.ctypes.data
+        arguments = (*map(np.uint64, addresses), np.int32(MOST_GRABS), np.int32(CAPACITY))
+        kernel = touch.module.function("react")
+        graph = self._captured(lambda: kernel((GRAB_BLOCKS,), (GRAB_THREADS,), arguments))
+        self._graphs.append(graph)
+        self.report_grabs(int(graph.graphExec), self._mailed[self.launches.index(touch)], reactions, counts)
 
     def _captured(self, launch: Callable[[], None]) -> Graph:
         """Returns the graph of the work that `launch` appends to the stream."""

@@ -6,6 +6,7 @@
 #include <sys/prctl.h>
 
 #include <algorithm>
+#include <vector>
 
 #include "../cpu/native/sizes.h"
 #include "readback.h"
@@ -21,6 +22,7 @@ static bool deliver(GpuLoop& l, StepBatch& batch, int slots) {
         std::memcpy(next, slot.pending->bytes, slot.size);
         CALL(to_device, slot.target, next, (size_t)slot.size, l.stream);
         next += (slot.size + 15) / 16 * 16;
+        if (&slot == l.touch) std::memcpy(&l.touched, slot.pending->bytes, sizeof l.touched);  // n, its first member
         int64_t number = slot.pending->number;
         slot.pending->taken.store(l.launched, std::memory_order_release);
         slot.pending = nullptr;
@@ -34,13 +36,16 @@ static bool open_batch(GpuLoop& l) {
     batch.first = l.launched;
     batch.steps = 0;
     batch.late = l.rings.late;
-    return deliver(l, batch, l.mail_slot_count);
+    if (!deliver(l, batch, l.mail_slot_count)) return false;
+    batch.touched = l.grabs && l.touched;
+    return true;
 }
 
-// Counts steps that were launched, and launches what follows them: energies, copies of matrices and frames.
+// Counts steps that were launched, and launches what follows them: forces on grabs, energies, copies of matrices and frames.
 static bool count(GpuLoop& l, int64_t steps) {
     l.launched += steps;
     l.batches[l.begun % STEP_BATCHES].steps += steps;
+    if (l.batches[l.begun % STEP_BATCHES].touched) CALL(graph_launch, l.grabs, l.stream);
     const bool energy = energy_due(l.rings, l.launched), frame = frame_due(l.rings, l.launched);
     if (energy || frame) CALL(graph_launch, l.energy_balance, l.stream);  // a frame shows frozen bodies at their last valid state
     if (energy) CALL(graph_launch, l.elastic_energy, l.stream);
@@ -72,7 +77,7 @@ static bool launch_batch(GpuLoop& l, int64_t steps) {
         int64_t n = l.many;
         bool undisturbed = none_within(l, l.rings.frame_every.load(), n) && none_within(l, l.rings.energy_every.load(), n);
         bool wanted = l.requested.load(std::memory_order_relaxed) && l.matrix_step < 0;
-        if (!l.graphs[0][1] || left < n || !undisturbed || wanted) n = 1;
+        if (!l.graphs[0][1] || left < n || !undisturbed || wanted || l.batches[l.begun % STEP_BATCHES].touched) n = 1;
         if (wanted && !begin_matrices(l, true)) return false;
         CALL(graph_launch, l.graphs[l.ran_dry][n > 1], l.stream);
         l.ran_dry = 0;
@@ -91,6 +96,19 @@ static void note_contact(GpuLoop& l, int64_t from, Record& record, int64_t place
     record.contact_residual = r.residual;
     const int64_t numbers = 6 * l.obstacles;
     std::memcpy(l.rings.reactions + numbers * place, l.contact_reactions + numbers * from, sizeof(double) * numbers);
+}
+
+// Puts what bodies exerted on grabs in a step into the ring. from: place of the step in the results.
+static void report_grabs(GpuLoop& l, int64_t from) {
+    static thread_local std::vector<Reaction> found;
+    found.clear();
+    const int64_t count = std::min(l.grab_counts[from], l.most_grabs);
+    for (int64_t k = 0; k < count; ++k) {
+        const Reaction& r = l.grab_reactions[from * l.most_grabs + k];
+        if (r.number >= 0) found.push_back(r);
+    }
+    l.rings.others_dropped += l.grab_counts[from] - count;
+    put_reactions(l.rings, found.data(), (int64_t)found.size(), [&] { publish(l); return true; });
 }
 
 static void report(GpuLoop& l, const StepBatch& batch, int64_t k, double end, double cpu) {
@@ -127,6 +145,7 @@ static void report(GpuLoop& l, const StepBatch& batch, int64_t k, double end, do
     }
     rings.step.store(step);
     *l.clock = rings.start_time + step * rings.dt;
+    if (keep && batch.touched) report_grabs(l, (batch.first + k) % l.capacity);
     if (keep) rings.record_head.store(head + l.bodies, std::memory_order_release);
     else rings.records_dropped += l.bodies;
 }
@@ -209,7 +228,7 @@ void wf_gpu_start_balance(Balance* balance, const double* sums, double dt, int32
 const StructSize* wf_sizes() {
     static const StructSize sizes[] = {SIZE(CudaDriver), SIZE(Mail), SIZE(MailSlot), SIZE(PcgResult), SIZE(StepTimestamp),
                                        SIZE(NewtonResult), SIZE(StageResult), SIZE(ContactResult), SIZE(BodyReadback), SIZE(GpuLoop), SIZE(Record), SIZE(EnergyRecord),
-                                       SIZE(Balance), {}};
+                                       SIZE(Balance), SIZE(Reaction), {}};
     return sizes;
 }
 }

@@ -53,6 +53,7 @@ struct StepBatch {                     // steps whose results are looked at toge
     void* done;            // event
     int64_t first, steps;  // steps completed before the batch; steps in it
     double late;
+    int32_t touched;       // 1: something is pushed or held in it
 };
 
 struct FrameCopy { void *taken, *arrived; };  // events: copied on the device, copied to the host
@@ -75,6 +76,12 @@ struct GpuLoop {
     const ContactResult* contact_results;  // (capacity, bodies) likewise; null: no contact
     const double* contact_reactions;       // (capacity, bodies, obstacles, 6) likewise
     int64_t obstacles;
+    void* grabs;                           // graph that writes what bodies exert on grabs after a step; null: nothing can be touched
+    const MailSlot* touch;                 // arguments of pushes and grabs
+    const Reaction* grab_reactions;        // (capacity, most_grabs) pinned, written by `grabs`; number -1: no grab
+    const int64_t* grab_counts;            // (capacity,) likewise
+    int64_t most_grabs;
+    int32_t touched;                       // 1: the arguments delivered last push or hold something
     void* energy_balance;                  // graph that writes the energy record of the last step, unless that has been done
     void* elastic_energy;                  // graph that adds the elastic energy to it
     void* matrix;                          // graph that makes A of the next step, for a copy; null: each step makes its own

@@ -132,6 +132,17 @@ class DeviceLoop(Reports):
         loop.staged_event, loop.copied_event = self._device.event(), self._device.event()
         return memory
 
+    def report_grabs(self, graph: int, mailbox: int, reactions: NDArray[Any], counts: NDArray[Any]) -> None:
+        """Has records come with what bodies exert on grabs.
+
+        graph: handle of the CUDA graph that writes it after a step. mailbox: number of that of pushes and grabs.
+        reactions: (CAPACITY, most) of structs.REACTION in host memory. counts: (CAPACITY,) likewise
+        """
+        loop, self._grabs_written = self.loop, (reactions, counts)
+        loop.grabs, loop.touch = graph, c.addressof(self._slots[mailbox])
+        loop.grab_reactions, loop.grab_counts = reactions.ctypes.data, counts.ctypes.data
+        loop.most_grabs = reactions.shape[1]
+
     # --- running ------------------------------------------------------------------------------------------------
 
     def use_graphs(self, graphs: Sequence[int], energy_balance: int, elastic_energy: int, matrix: int = 0) -> None:
