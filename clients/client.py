@@ -201,7 +201,7 @@ class Client:
     def forces(self) -> Forces:
         """The forces of the newest step; subscribes to them at the first call."""
         if self._forces is None:
-            self._forces = Forces(self._session.zenoh, self.name)
+            self._forces = self.listen(None)
         return self._forces
 
     def contact_force(self, first: str, second: str) -> Load:
@@ -226,7 +226,8 @@ class Client:
     ) -> int:  # fmt: skip
         """Sends a command without waiting for the reply, e.g. to move a grab 1000 times a second.
 
-        Returns its number, by which MoveTaken tells of a move. answered: is called with the reply, or None at the time-out, in a thread of zenoh's.
+        Returns its number, by which MoveTaken tells of a move. answered: is called with the reply, or None at the
+        time-out, in a thread of zenoh's.
         """
         others: list[pb.Reply] = []  # of another incarnation, as the server may have been restarted
         done_once: list[bool] = []
@@ -266,9 +267,9 @@ class Client:
     ) -> None:
         self.close()
 
-    def listen(self, on_batch: Callable[[pb.Steps, float], None]) -> Forces:
-        """Subscribes to the forces of each step. on_batch: as of Forces; close what is returned when it is done with."""
-        return Forces(self._session.zenoh, self.name, on_batch)
+    def listen(self, on_batch: Callable[[pb.Steps, float], None] | None) -> Forces:
+        """Subscribes to the forces of each step. on_batch: as of Forces; close what is returned after use."""
+        return Forces(self._session.zenoh, self.name, lambda: self._queries.incarnation, on_batch)
 
     def _command(self, verb: str, interaction: pb.Interaction | None, target: pb.ObstacleTarget | None) -> pb.Command:
         if interaction is not None:

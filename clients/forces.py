@@ -29,17 +29,19 @@ class Load(NamedTuple):
 class Forces:
     """Listens to the channel `reactions`, and keeps the newest step of each object.
 
+    incarnation: returns that of the server
     on_batch: called in a thread of zenoh's with each message as it comes, and the time.monotonic() of that
     """
 
     def __init__(
-        self, session: zenoh.Session, server: str, on_batch: Callable[[pb.Steps, float], None] | None = None
-    ) -> None:
+        self, session: zenoh.Session, server: str, incarnation: Callable[[], int],
+        on_batch: Callable[[pb.Steps, float], None] | None = None,
+    ) -> None:  # fmt: skip
         self._newest: dict[str, pb.ObjectStep] = {}
         self._step = -1
         self._changed = threading.Condition()
         self._on_batch = on_batch
-        self._batches = ReactionBatches(session, server, self._take)
+        self._batches = ReactionBatches(session, server, self._take, incarnation)
 
     @property
     def lost(self) -> int:

@@ -57,7 +57,7 @@ class Grab:
     def force(self) -> Vector:
         """What the spring pulls the object with in the newest step [N]; the hand feels the contrary.
 
-        The first call waits for a step with the grab. Raises ClientError.
+        The first call waits for a step with the grab. Of a grab that is released there is none. Raises ClientError.
         """
         x, y, z = self._load().force
         return -x, -y, -z
@@ -70,6 +70,8 @@ class Grab:
         return point
 
     def _load(self) -> Load:
+        if self.released:
+            raise ClientError("the grab is released")
         return self._sender.forces.grab(self.interaction.id, self._sender.timeout)
 
     def release(self) -> None:

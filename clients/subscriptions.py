@@ -91,10 +91,17 @@ class Gaps:
 
 
 class ReactionBatches:
-    """Every message of the channel reactions as it comes. take: called with it and time.monotonic(), by zenoh."""
+    """Every message of the channel reactions as it comes.
 
-    def __init__(self, session: zenoh.Session, server: str, take: Callable[[pb.Steps, float], None]) -> None:
-        self._take, self._gaps = take, Gaps("reactions")
+    take: called with it and time.monotonic(), by zenoh
+    incarnation: returns that of the server whose messages count; anybody may send some in its name
+    """
+
+    def __init__(
+        self, session: zenoh.Session, server: str, take: Callable[[pb.Steps, float], None],
+        incarnation: Callable[[], int],
+    ) -> None:  # fmt: skip
+        self._take, self._gaps, self._incarnation = take, Gaps("reactions"), incarnation
         self._lock = threading.Lock()
         self._subscriber = session.declare_subscriber(key("reactions", server), self._read)
 
@@ -111,7 +118,7 @@ class ReactionBatches:
         now = time.monotonic()
         try:
             batch = parse(pb.Steps, sample.payload, CHANNELS["reactions"].limit)
-            check_header(batch)
+            check_header(batch, incarnation=self._incarnation())
             check_numbers(batch)
         except Refused as error:
             log.warning("forces were left out: %s", error)

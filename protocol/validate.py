@@ -115,12 +115,15 @@ def check_strings(message: Message, limit: int = 4096) -> None:
 
 
 def check_numbers(message: Message) -> None:
-    """Raises Refused if a number in the message, or in a message within it, is NaN or infinite."""
+    """Raises Refused if a number in the message, or in messages within it, is NaN or infinite."""
     for field, value in message.ListFields():
         if isinstance(value, float) and not math.isfinite(value):
             raise Refused(f"{message.DESCRIPTOR.name}.{field.name} is {value}; allowed: finite", "not_finite")
         if isinstance(value, Message):
             check_numbers(value)
+        elif field.message_type is not None:  # repeated
+            for each in value:
+                check_numbers(each)
 
 
 def checksum(values: NDArray[Any] | bytes) -> int:

@@ -2,10 +2,10 @@
 """A virtual coupling between a haptic device and an obstacle that is moved with it.
 
 Between the device at d and a proxy at p, where the obstacle is sent, is a spring of stiffness k; the hand feels
-f = k (p - d). The proxy has no mass: it goes where the spring and the force F on the obstacle that came last balance the
-damping b, b dp/dt = k (d - p) + F. It is integrated implicitly. What the simulation does between two of its steps, and
-how late F is, reaches the hand only through the spring (Colgate, Stanley and Brown, Issues in the haptic display of tool
-use, IROS 1995).
+f = k (p - d). The proxy has no mass: it goes where the spring and the force F on the obstacle that came last balance
+the damping b, b dp/dt = k (d - p) + F. It is integrated implicitly. What the simulation does between two of its steps,
+and how late F is, reaches the hand only through the spring (Colgate, Stanley and Brown, Issues in the haptic display of
+tool use, IROS 1995).
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ Point = tuple[float, float, float]
 def largest_stiffness(damping: float, period: float) -> float:
     """Returns the stiffness [N/m] that a device of this damping [N s/m] may render at this period [s].
 
-    A sampled spring is passive up to k = 2 b / T (Colgate and Schenkel, Passivity of a class of sampled-data systems, 1997).
+    A sampled spring is passive up to k = 2 b / T (Colgate and Schenkel, Passivity of a class of sampled-data systems,
+    1997).
     """
     return 2 * damping / period
 

@@ -76,7 +76,7 @@ def tables(found: dict[str, Any]) -> Table:
         )
     table.caption = (
         f"{found['moves']} moves felt; {found['steps']} steps came, {found['missing']} did not, "
-        f"{found.get('steps_per_second', 0.0):.0f} a second; {found['late_periods']} of {found['periods']} periods late; "
+        f"{found.get('steps_per_second', 0.0):.0f} a second; {found['late_periods']} of {found['periods']} periods late, "
         f"at most {found['most_felt']:.3g} N"
     )
     return table

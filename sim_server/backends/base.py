@@ -182,8 +182,10 @@ class Engine(Protocol):
         ...
 
     def other_reactions(self) -> NDArray[np.void]:
-        """Returns what bodies exerted on grabs and on other bodies since the last call, up to the newest record that was
-        returned: struct Reaction of kernels/reaction.h, in the order of steps."""
+        """Returns what bodies exerted on grabs and on each other: struct Reaction of kernels/reaction.h, by step.
+
+        Since the last call, up to the newest record that was returned.
+        """
         ...
 
     def frames(self) -> list[tuple[int, Float64, Float64]]:

@@ -56,7 +56,7 @@ class Publishers:
         if name not in self._publishers:
             priority = zenoh.Priority.INTERACTIVE_HIGH if urgent else zenoh.Priority.DATA_LOW
             self._publishers[name] = self._session.declare_publisher(
-                name, congestion_control=zenoh.CongestionControl.DROP, priority=priority, express=urgent
+                name, congestion_control=zenoh.CongestionControl.DROP, priority=priority
             )
         return self._publishers[name]
 

@@ -52,7 +52,10 @@ class CpuModule(KernelText):
 
 
 class CpuLaunch(BoundKernel):
-    """One kernel with its arguments: what the native loop calls, `items` times. arrays: kept alive. module: its text."""
+    """One kernel with its arguments: what the native loop calls, `items` times.
+
+    arrays: kept alive. module: its text
+    """
 
     def __init__(self, module: CpuModule, kernel: str, given: dict[str, Any]):
         super().__init__(module, kernel, given)

@@ -223,7 +223,8 @@ class GpuEngine(DeviceLoop):
 
     def _report_grabs(self, device: CudaDevice, touch: DeviceLaunch) -> None:
         """Captures the kernel that writes the forces on grabs, which follows a step only while there are some."""
-        reactions = device.pinned(CAPACITY * MOST_GRABS * REACTION.itemsize).view(REACTION).reshape(CAPACITY, MOST_GRABS)
+        reactions = device.pinned(CAPACITY * MOST_GRABS * REACTION.itemsize).view(REACTION)
+        reactions = reactions.reshape(CAPACITY, MOST_GRABS)
         counts = device.pinned(CAPACITY * 8).view(np.int64)
         addresses = touch.mail_address, self._counter.data.ptr, reactions.ctypes.data, counts.ctypes.data
         arguments = (*map(np.uint64, addresses), np.int32(MOST_GRABS), np.int32(CAPACITY))
