@@ -5,7 +5,7 @@ Between the device at d and a proxy at p, where the obstacle is sent, is a sprin
 f = k (p - d). The proxy has no mass: it goes where the spring and the force F on the obstacle that came last balance
 the damping b, b dp/dt = k (d - p) + F. It is integrated implicitly. What the simulation does between two of its steps,
 and how late F is, reaches the hand only through the spring (Colgate, Stanley and Brown, Issues in the haptic display of
-tool use, IROS 1995).
+tool use, IROS 1995). In the air, where no force has come for a while, b is small, so that the hand feels no drag.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from clients.errors import BadInput
 
 Point = tuple[float, float, float]
+HELD = 5.0  # delays after the last force for which the proxy is damped on: it may only have bounced
 
 
 def largest_stiffness(damping: float, period: float) -> float:
@@ -29,8 +30,9 @@ def largest_stiffness(damping: float, period: float) -> float:
 class VirtualCoupling:
     """The spring and the proxy.
 
-    stiffness [N/m] of the spring. delay [s]: of the force, from the move that it answers; the damping of the proxy is
-    stiffness times that, with which it stands still on tissue up to as stiff as the spring. period [s]: of the device.
+    stiffness [N/m] of the spring. delay [s]: of the force, from the move that it answers; the damping of a proxy that
+    touches is stiffness times that, with which it comes to rest on what is as stiff as the spring, or softer.
+    period [s]: of the device.
     device_damping [N s/m]: what the device and the hand have of their own; bounds the stiffness.
     speed [m/s]: that the obstacle is moved with at most (max_speed of the scene).
     Raises BadInput for a stiffness above `largest_stiffness`, or numbers that are not above 0.
@@ -49,7 +51,8 @@ class VirtualCoupling:
                 f"{most:g} N/m each {period:g} s without giving off energy"
             )
         self.stiffness, self.period, self.speed = stiffness, period, speed
-        self.damping = stiffness * max(delay, period)
+        self.delay = max(delay, period)
+        self._air = HELD * self.delay  # time since a force came [s]
         self.proxy: Point | None = None
 
     def update(self, device: Sequence[float], force: Sequence[float]) -> Point:
@@ -57,7 +60,9 @@ class VirtualCoupling:
 
         device: where it is [m]. force: on the obstacle, that came last [N]
         """
-        k, b, h = self.stiffness, self.damping, self.period
+        k, h = self.stiffness, self.period
+        self._air = 0.0 if any(force) else self._air + h
+        b = k * (self.delay if self._air < HELD * self.delay else h)
         at = self.proxy or (device[0], device[1], device[2])
         aim = [(b * p + h * (k * d + f)) / (b + h * k) for p, d, f in zip(at, device, force, strict=True)]
         move = [a - p for a, p in zip(aim, at, strict=True)]

@@ -75,8 +75,8 @@ def tables(found: dict[str, Any]) -> Table:
             what, *(f"{found[f'{key}_{p}']:.2f}" if f"{key}_{p}" in found else "-" for p in ("p50", "p99", "max"))
         )
     table.caption = (
-        f"{found['moves']} moves felt; {found['steps']} steps came, {found['missing']} did not, "
-        f"{found.get('steps_per_second', 0.0):.0f} a second; {found['late_periods']} of {found['periods']} periods late, "
+        f"{found['moves']} moves felt; {found['steps']} steps came, {found.get('steps_per_second', 0.0):.0f} a second, "
+        f"{found['missing']} did not; {found['late_periods']} of {found['periods']} periods late; "
         f"at most {found['most_felt']:.3g} N"
     )
     return table

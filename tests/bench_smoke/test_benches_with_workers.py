@@ -7,7 +7,7 @@ import pytest
 
 from tests.bench_smoke.quickly import writes_its_report
 
-BENCHES = ("build", "cpu", "faults", "figure4", "scaling")
+BENCHES = ("build", "cpu", "faults", "figure4", "haptics", "scaling")
 pytestmark = [pytest.mark.system, pytest.mark.slow]
 
 

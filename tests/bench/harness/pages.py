@@ -12,7 +12,18 @@ from tests.bench.harness.report import ROOT
 from tests.docs import figures
 
 FIRST = ("cpu", "gpu", "models", "paper", "figure4", "warp", "preconditioners", "build")
-PAGES = (*FIRST, "rosenbrock", "contact", "verification", "accuracy", "hard_cases", "scheduler", "scaling", "faults")
+PAGES = (
+    *FIRST,
+    "rosenbrock",
+    "contact",
+    "verification",
+    "accuracy",
+    "hard_cases",
+    "scheduler",
+    "scaling",
+    "haptics",
+    "faults",
+)
 
 
 def copied(name: str, out: Path, docs: Path) -> bool:
