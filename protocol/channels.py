@@ -41,7 +41,7 @@ CHANNELS: dict[str, Channel] = {
     "echo": Channel("echo/{worker}", "Echo", "worker", "query, at join", 4 * KIB, 0, "does shared memory work?"),
     "steps": Channel("steps", "Steps", "server", "20 Hz batches", 8 * MIB, 0, "iterations, residuals, times"),
     "reactions": Channel(
-        "reactions", "Steps", "server", "each millisecond", MIB, 0, "forces on obstacles, of each step"
+        "reactions", "Steps", "server", "each millisecond", MIB, 0, "forces of each step, for force feedback"
     ),
     "state": Channel("state/{object}", "State", "server", "at most 30 Hz", 256 * MIB, 0, "positions, velocities"),
     "obstacle": Channel("obstacle/{object}", "Obstacle", "server", "queryable", 256 * MIB, 0, "shape, where it starts"),

@@ -27,6 +27,8 @@ def sample(name: str) -> Message:
 
 def _fill(message: Message, depth: int) -> None:
     for field in message.DESCRIPTOR.fields:
+        if field.containing_oneof is not None and field is not field.containing_oneof.fields[0]:
+            continue  # only one of them may be set
         if field.type == FieldDescriptor.TYPE_MESSAGE:
             if depth > 0:
                 inner = getattr(message, field.name)
