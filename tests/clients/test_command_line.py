@@ -198,7 +198,8 @@ def test_errors(arguments: tuple[str, ...], code: int, said: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "command", ["status", "watch", "push", "grab", "haptics", "move-obstacle", "pause", "resume", "stop", "view", "export"]
+    "command",
+    ["status", "watch", "push", "grab", "haptics", "move-obstacle", "pause", "resume", "stop", "view", "export"],
 )
 def test_help_has_examples(command: str) -> None:
     code, out, _ = run(command, "--help")
