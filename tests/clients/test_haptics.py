@@ -60,7 +60,7 @@ def test_a_spring_in_the_air_gives_back_no_more_than_it_got() -> None:
 def test_the_stiffness_is_bounded_by_damping_and_period() -> None:
     assert largest_stiffness(1.0, 1e-3) == 2000.0
     VirtualCoupling(1999.0, 0.01, 1e-3, device_damping=1.0)
-    with pytest.raises(BadInput, match="2000 N/m each 0.001 s"):
+    with pytest.raises(BadInput, match=r"2000 N/m each 0\.001 s"):
         VirtualCoupling(2001.0, 0.01, 1e-3, device_damping=1.0)
     for wrong in ({"stiffness": 0.0}, {"delay": -1.0}, {"period": 0.0}, {"speed": 0.0}, {"stiffness": math.nan}):
         with pytest.raises(BadInput, match="above 0"):

@@ -256,10 +256,14 @@ def shown(status: pb.Status) -> str:
 
 
 def test_watch_shows_contacts_only_with_obstacles() -> None:
-    touched = pb.ObjectStatus(object="beam", last=touching_step("beam", 5), clipped=9)
+    touched = pb.ObjectStatus(object="beam", last=touching_step("beam", 5), clipped=9, crowded=4)
     free = pb.ObjectStatus(object="liver", last=touching_step("liver", 1))
     assert "contact residual" not in shown(pb.Status(objects=[free]))
+    held = pb.ObjectStatus(object="liver", last=touching_step("liver", 1))
+    held.last.reactions.add(grab=7, force=pb.Vector(x=3.0, y=4.0))
+    held.last.reactions.add(object="beam", force=pb.Vector(z=-2.0))
+    assert "grab:7 5, beam 2" in shown(pb.Status(objects=[held]))
     text = shown(pb.Status(objects=[touched, free], obstacles=[pose("tool", 4)]))
     rows = [line.split() for line in text.splitlines()]
-    assert ["beam", "5", "2", "2.5e-02", "9", "tool", "20.2,", "floor", "7"] in rows
-    assert ["liver", "0", "0", "-", "0", "-"] in rows and ["tool", "0", "-0.5", "0", "90"] in rows
+    assert ["beam", "5", "2", "2.5e-02", "9", "4", "tool", "20.2,", "floor", "7"] in rows
+    assert ["liver", "0", "0", "-", "0", "0", "-"] in rows and ["tool", "0", "-0.5", "0", "90"] in rows

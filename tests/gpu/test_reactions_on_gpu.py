@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What bodies exert on grabs on a GPU: the spring's law, as on a CPU, in every step and only while something is held."""
+"""What bodies exert on grabs on a GPU: the spring's law, as on a CPU, in every step while something is held."""
 
 import numpy as np
 import pytest
@@ -22,8 +22,10 @@ def held(device: str) -> Simulation:
     assert touch is not None
     end = sim.fetch().x[:, 0].max()
     x = sim.world.x[sim.world.x[:, 0] > end - 1e-9].mean(axis=0)
-    touch.grab("anna", sim.world.bodies[0].name, tuple(x), 0.3, tuple(x + [0.0, 0.1, 0.05]), 500.0, 1e4, np.inf)
-    touch.grab("ben", sim.world.bodies[0].name, tuple(x), 0.3, tuple(x - [0.0, 5.0, 0.0]), 500.0, 2.0, np.inf)
+    touch.grab(
+        "anna", sim.world.bodies[0].name, tuple(x), 0.3, tuple(x + np.array([0.0, 0.1, 0.05])), 500.0, 1e4, np.inf
+    )
+    touch.grab("ben", sim.world.bodies[0].name, tuple(x), 0.3, tuple(x - np.array([0.0, 5.0, 0.0])), 500.0, 2.0, np.inf)
     return sim
 
 

@@ -153,8 +153,7 @@ def test_a_hanging_body_pulls_with_its_weight(stage: Stage, tmp_path: Path) -> N
 
 def test_every_step_comes_to_who_reads_and_losses_are_told_to_who_does_not(stage: Stage, tmp_path: Path) -> None:
     stage.server(tmp_path / "scene.toml", "--set", "dt=0.004", *CPU)
-    with stage.client() as client:
-        session = client._session.zenoh
+    with stage.client() as client, open_session("client", connect=[stage.endpoint], shared_memory=False) as other:
         reader = client.reactions()
         batches: list[pb.Steps] = []
         listener = client.listen(lambda batch, now: batches.append(batch))
@@ -165,7 +164,7 @@ def test_every_step_comes_to_who_reads_and_losses_are_told_to_who_does_not(stage
             steps = [s.step for s in found if s.header.object == name]
             assert steps == list(range(steps[0], steps[-1] + 1))
         assert all(not s.iterations and not s.preconditioner for s in found)
-        lazy = Steps(session, client.name, "reactions", batches=4)
+        lazy = Steps(other.zenoh, client.name, "reactions", batches=4)
         count = len(batches)
         until(lambda: len(batches) > count + 30, "messages that nobody reads")
         assert len({s.step for s in lazy.new()}) >= 4
