@@ -23,6 +23,7 @@ class Comparison:
     first: step, object, kind and details of the first difference
     largest: step, object, node and distance [m] of the largest difference of positions
     other_factor: step, object and details of the first factor that is not the recorded one
+    kinds: of reactions that the log has and a replay is to repeat
     """
 
     def __init__(self, recording: Recording):
@@ -33,7 +34,7 @@ class Comparison:
         self.other_factor: dict[str, Any] | None = None
         self.solves_compared = self.solves_different = 0
         self.frames_compared = self.frames_different = 0
-        self._kinds = {kind for each in recording.objects.values() for _, kind in each.reactions}
+        self.kinds = {kind for each in recording.objects.values() for _, kind in each.reactions}
 
     @property
     def same(self) -> bool:
@@ -66,7 +67,7 @@ class Comparison:
         for step in steps:
             name = step.header.object
             now, then = reaction_digests(step), self.recording.objects[name].reactions
-            for kind in sorted(self._kinds):
+            for kind in sorted(self.kinds):
                 if now.get(kind) != then.get((step.step, kind)):
                     self.diverged(step.step, name, "reaction", f"other forces on {kind}s than recorded")
 

@@ -103,8 +103,9 @@ class Replay:
             self.engine.solve()
             records, on_obstacles = self.engine.records_and_reactions()
             self.compared.solves(records, [self._rows(b.name)[step] for b in self.bodies])
-            exerted = messages.reactions(self.simulation, on_obstacles, self.engine.other_reactions())
-            self.compared.reactions(messages.steps(self.simulation, records, reactions=exerted))
+            if self.compared.kinds:
+                exerted = messages.reactions(self.simulation, on_obstacles, self.engine.other_reactions())
+                self.compared.reactions(messages.steps(self.simulation, records, reactions=exerted))
             self._compare_frames(step + 1)
             progress(step + 1)
         return self.compared

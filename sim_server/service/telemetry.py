@@ -67,7 +67,7 @@ class Telemetry:
         ]  # iterations
         self.seconds: deque[float] = deque(maxlen=STATISTICS_STEPS)
         self._last: NDArray[Any] = np.zeros(len(self._window), self.engine.records_dtype)
-        self._last_reactions: dict[int, Reactions] = {}  # of the same records, by body
+        self._last_reactions: dict[int, tuple[Reactions, int]] = {}  # by body, and the number of its record in them
         self._not_finite: set[str] = set()  # objects of which it was said
         self.solves = 0
         self.pace = ""  # why the run does not keep pace with the clock; empty: it does, or need not
@@ -131,9 +131,9 @@ class Telemetry:
         ends = [*first[1:].tolist(), len(order)]
         newest = order[np.array(ends) - 1]
         self._last[present] = records[newest]
-        if reactions is not None:
+        if reactions is not None and reactions.any:
             for body, record in zip(present.tolist(), newest.tolist(), strict=True):
-                self._last_reactions[body] = reactions[record : record + 1]
+                self._last_reactions[body] = reactions, record
         for body, begin, end in zip(present.tolist(), first.tolist(), ends, strict=True):
             self._window[body].extend(iterations[begin:end])
         for r in records[np.isfinite(records["elastic"])]:
@@ -157,8 +157,9 @@ class Telemetry:
     def _latest(self, body: int, bound: int) -> pb.ObjectStep | None:
         if not self._window[body]:
             return None
-        reactions = self._last_reactions.get(body)
-        message = messages.steps(self.simulation, self._last[body : body + 1], self._method, reactions)[0]
+        reactions, at = self._last_reactions.get(body, (None, 0))
+        own = None if reactions is None else reactions[at : at + 1]
+        message = messages.steps(self.simulation, self._last[body : body + 1], self._method, own)[0]
         message.excess, message.factor_age_bound = self.driver.bodies[body].solves.excess, bound
         return message
 
