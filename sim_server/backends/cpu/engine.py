@@ -159,6 +159,7 @@ class _NativeContact:
         self._state = (structs.RowState * max(rows, 1))()
         self._report = (structs.ContactReport * bodies)()
         self._result = (structs.SolveResult * bodies)()
+        self._choice = (structs.PassChoice * bodies)()
         self._own = {
             "active": np.zeros(rows, np.int32), "room": np.zeros((8, loop.nodes, 3)),
             "reaction": np.zeros((bodies, count, 6)), "mode": np.zeros(bodies, np.int32),
@@ -171,6 +172,7 @@ class _NativeContact:
             obstacle_count=count, passes=contact.passes, tolerance=contact.tolerance, dx_dv=contact.dx_dv,
             force_coefficient=contact.force_coefficient, state=c.addressof(self._state), pair_first=-1,
             report=c.addressof(self._report), result=c.addressof(self._result),
+            choice=c.addressof(self._choice),
         )  # fmt: skip
         if contact.surfaces:
             self._touch(contact.surfaces, contact.free, rows, loop)

@@ -98,6 +98,11 @@ class RowState(c.Structure):
 
 
 @LOOP.struct
+class PassChoice(c.Structure):
+    """What is known of the preconditioners of a body in passes of contact."""
+
+
+@LOOP.struct
 class Box(c.Structure):
     """A box of a surface's tree."""
 
