@@ -27,6 +27,7 @@ from sim_server.backends.rosenbrock import NODAL, Rosenbrock
 
 Reals = NDArray[np.float64]
 HISTORY = 1024  # changes of the diagonal that are remembered, of each body
+KNOWN_CONTACTS = 16384  # blocks of contacts that are remembered, of each body
 
 
 @cache
@@ -316,7 +317,7 @@ class CpuEngine(Reports):
             "last": np.full(count, 0.0), "then": np.full(count, 0.0),
             "change": np.zeros(HISTORY, structs.CHANGE),
             "node": np.full(nodes, 0, np.int32), "supernode": np.full(3 * count, 0, np.int32),
-            "marked": np.full(3 * count, 0, np.uint8), "delta": np.full(nodes, 0.0),
+            "marked": np.full(3 * count, 0, np.uint8), "delta": np.full((nodes, 6), 0.0),
             "small": np.full(4 * width**2 + 2 * width, 0.0),
             "columns": np.zeros((3 * count, width), np.float64 if double else np.float32),  # touched by the first grab
             "diagonal": diagonal[entry.first : entry.last],
@@ -326,6 +327,12 @@ class CpuEngine(Reports):
         correction.capacity, correction.history, correction.nodes, correction.forgotten = nodes, HISTORY, count, -1
         if block is not None:
             room["block"] = block[entry.first : entry.last]
+        if self._contact:
+            correction.touches, correction.touch_lost = KNOWN_CONTACTS, -1
+            room |= {
+                "touch": np.zeros(KNOWN_CONTACTS, structs.KNOWN_CONTACT), "touch_now": np.zeros((count, 6)),
+                "touch_then": np.zeros((count, 6)),
+            }  # fmt: skip
         for name, array in room.items():
             setattr(correction, name, array.ctypes.data)
 

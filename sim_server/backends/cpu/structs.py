@@ -8,6 +8,7 @@ from sim_server.backends.declarations import Declarations
 LOOP = Declarations("backends/cpu/native/loop.h")
 RECORD = LOOP.dtype("Record")  # one body, one step: native/ring_buffers.h
 CHANGE = LOOP.dtype("Change")  # of a diagonal entry: native/woodbury.h
+KNOWN_CONTACT = LOOP.dtype("KnownContact")  # contacts of a node: native/woodbury.h
 MAX_CORRECTED: int = LOOP.constant("MAX_CORRECTED")  # nodes of a Correction
 BALANCE = LOOP.dtype("Balance")  # kernels/energy_balance.cuh
 
