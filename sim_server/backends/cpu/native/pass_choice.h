@@ -15,6 +15,7 @@
 constexpr int PATIENT = 20;            // iterations with a factor, where nothing is known of block Jacobi
 constexpr int MIN_WAIT = 4, MAX_WAIT = 256;
 constexpr double FACTOR_BYTES = 2;     // what a byte of a factor costs, read in a chain of triangular solves, where one of A is 1
+constexpr double LASTS = 8;            // passes over which the cost of a correction is spread
 constexpr double GIVE_UP = 1.5;
 constexpr double CHEAPER = 0.9;
 constexpr double HARDER_PASS = 2;      // cost over `reference` at which the other one is tried at once
@@ -60,12 +61,15 @@ struct ChoiceOfPass {
     }
 
     // Takes note of a pass. r: of its solve, `settings`: those it had.
-    void end(const SolveSettings& settings, const SolveResult& r) {
+    // spent: on the factor's correction, which lasts for more than a pass: a part is taken off [bytes]
+    void end(const SolveSettings& settings, const SolveResult& r, double& spent) {
         const int first = settings.kind == BLOCK_JACOBI, second = 1 - first;
         if (r.status == BUDGET || r.status == NOT_FINITE || r.iterations == 0) return;
         const bool over = r.switched_after > 0;
-        note(first, over ? r.switched_after : r.iterations, 1, over ? r.residual_then : r.residual);
-        if (over) note(second, r.iterations - r.switched_after, r.residual_then, r.residual);
+        const double charged = first && !over ? 0 : spent / LASTS, extra[2] = {charged / cost[0], 0};
+        spent -= charged;
+        note(first, (over ? r.switched_after : r.iterations) + extra[first], 1, over ? r.residual_then : r.residual);
+        if (over) note(second, r.iterations - r.switched_after + extra[second], r.residual_then, r.residual);
         const int used = choice.jacobi, other = 1 - used;
         const bool known = choice.rate[used] > 0 && choice.rate[other] > 0;
         const bool better = known && choice.rate[other] * cost[other] < CHEAPER * choice.rate[used] * cost[used];
@@ -82,7 +86,7 @@ struct ChoiceOfPass {
         }
     }
 
-    void note(int which, int iterations, double from, double to) {
+    void note(int which, double iterations, double from, double to) {
         const double reached = std::log10(from / to);
         const double rate = reached > 1e-2 ? iterations / reached : 100.0 * iterations;
         if (iterations > 0 && std::isfinite(rate)) choice.rate[which] = rate;

@@ -126,7 +126,7 @@ struct Passes : IslandRows {
             ChoiceOfPass choice(c.choice[bodies[0]], A, *body.factor);
             choice.begin(settings);
             solved = solve_by();
-            choice.end(settings, solved);
+            choice.end(settings, solved, body.correction.spent);
         } else {
             solved = solve_by();
         }

@@ -60,6 +60,7 @@ struct Correction {
     double* delta;          // (capacity, 6) as W was made with, upper triangles [kg]
     double* small;          // 4 width^2 + 2 width
     void* columns;          // (3 nodes, width) V, in the values' type, only rows of its supernodes
+    double spent;           // on V and W, not yet charged to a solve, as much as reading so many bytes of A
     int32_t touches;        // most entries of `touch`; 0: there is no contact
     int32_t in_contact;     // 1: touch_now is what A has beside its values
     int32_t touch_known;    // 1: touch_then is what the matrix of the factor in use had there
@@ -76,6 +77,9 @@ constexpr double WEAK = 0.2, WEAK_EACH = 0.02;  // likewise, for the sum of all 
 // spring that has gone 1e-4 remains.
 constexpr double STIFF = 1e5;
 constexpr double LEAST = 1e-6;  // pivot of G
+// What V costs for a byte of L and for each column, V'V for each of its entries and columns, and W for each of d^3, where to read a byte
+// of A is 1.
+constexpr double PANEL_BYTES = 50, COLUMN_BYTES = 0.5, GRAM_BYTES = 2, INNER_BYTES = 15;
 
 // Number of columns of V, padded with zeros to a whole number of vectors.
 inline int width_of(int nodes) { return (3 * nodes + 7) / 8 * 8; }
@@ -140,6 +144,7 @@ struct Corrected {
             }
         }
         if (!same) c.usable = make_inner();
+        if (!same) c.spent += INNER_BYTES * (27.0 * c.count * c.count * c.count);
         if (c.usable) c.used = c.count;
         c.missed = !c.usable;
         return c.usable;
@@ -269,6 +274,7 @@ private:
             std::fill(c.delta, c.delta + 6 * changed, NAN);
             if (factor.bytes == 4) make_columns<float>();
             else make_columns<double>();
+            c.spent += column_bytes();
         }
         return true;
     }
@@ -296,6 +302,18 @@ private:
             for (int64_t k = p.row_start[s] + p.super_start[s + 1] - p.super_start[s]; k < p.row_start[s + 1]; ++k)
                 c.marked[of(p.rows[k])] = 1;
         }
+    }
+
+    double column_bytes() const {
+        const Pattern& p = pattern();
+        double entries = 0, rows = 0;
+        for (int k = 0; k < c.supernodes; ++k) {
+            const int s = c.supernode[k];
+            const double n = p.super_start[s + 1] - p.super_start[s], h = p.row_start[s + 1] - p.row_start[s];
+            entries += n * (h - 0.5 * n);
+            rows += n;
+        }
+        return (PANEL_BYTES + COLUMN_BYTES * width()) * factor.bytes * entries + GRAM_BYTES * rows * width() * width();
     }
 
     template <class T>
