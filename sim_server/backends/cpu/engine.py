@@ -27,7 +27,7 @@ from sim_server.backends.rosenbrock import NODAL, Rosenbrock
 
 Reals = NDArray[np.float64]
 HISTORY = 1024  # changes of the diagonal that are remembered, of each body
-KNOWN_CONTACTS = 16384  # blocks of contacts that are remembered, of each body
+KNOWN_CONTACTS = 32, 16384  # blocks of contacts that are remembered: of each surface node of a body, and of all at most
 
 
 @cache
@@ -187,6 +187,11 @@ class _NativeContact:
         self.native.rotation = arrays["rotation"].ctypes.data
         loop.contact = c.addressof(self.native)
 
+    def surface_nodes(self, body: int) -> int:
+        """Returns the number of a body's surface nodes."""
+        start = self._input.body_start
+        return int(start[body + 1] - start[body]) // 2
+
     @staticmethod
     def _site_body(contact: Contact) -> NDArray[np.int32]:
         counts = np.diff(contact.body_start) // 2
@@ -328,9 +333,11 @@ class CpuEngine(Reports):
         if block is not None:
             room["block"] = block[entry.first : entry.last]
         if self._contact:
-            correction.touches, correction.touch_lost = KNOWN_CONTACTS, -1
+            each, most = KNOWN_CONTACTS
+            touches = min(each * self._contact.surface_nodes(body), most)
+            correction.touches, correction.touch_lost = touches, -1
             room |= {
-                "touch": np.zeros(KNOWN_CONTACTS, structs.KNOWN_CONTACT), "touch_now": np.zeros((count, 6)),
+                "touch": np.zeros(touches, structs.KNOWN_CONTACT), "touch_now": np.zeros((count, 6)),
                 "touch_then": np.zeros((count, 6)),
             }  # fmt: skip
         for name, array in room.items():
