@@ -1,15 +1,16 @@
 // SPDX-License-Identifier: MIT
-// Low-rank correction of a factor for changes of the diagonal of A since its matrix. Grabs of clients (effects/touch.py) begin
-// from one step to the next; their stiff springs are missing from the factor until one arrives that was made with them.
-// With U the columns of the identity at the nodes concerned and C the difference of their diagonals,
+// Low-rank correction of a factor for changes of the nodes' own blocks of A since its matrix. Grabs of clients (effects/touch.py) and
+// contacts with obstacles begin and end from one step to the next; a factor lacks them, or has them too long, until one arrives that was
+// made of a later matrix. With U the columns of the identity at the nodes concerned and C the difference of their blocks,
 //     (P + U C U')^-1 = L^-T (I - V W V') L^-1,    V = L^-1 U,  W = (C^-1 + V'V)^-1,
 // the Sherman-Morrison-Woodbury formula between the two triangular solves. V has entries only in the supernodes on the paths
 // from these nodes to the root, so that it costs a few applications of the factor. With V'V = K K' and
 // G = I + K'C K,  W = C - C K G^-1 K'C  for C of any sign, including 0; the result is positive definite if and only
-// if G is. Multiples of the identity are the same in all frames, so the warp does not change them.
+// if G is. Springs are multiples of the identity, the same in all frames, so the warp does not change them; blocks of contacts are in the
+// material frame, as A is, each in that of its own step.
 //
 // The diagonal of an older matrix follows from a list of changes, read backwards to the step of the factor; so a factor made
-// with the spring is not corrected for it. (Hager, Updating the inverse of a matrix, SIAM Review 31, 1989.)
+// with the spring is not corrected for it. What the matrix of a step had of contacts is remembered as it is. (Hager, Updating the inverse of a matrix, SIAM Review 31, 1989.)
 #pragma once
 #include <algorithm>
 #include <cmath>
