@@ -30,9 +30,8 @@ struct SolveResult;
 struct PassChoice {         // of a body, kept from step to step (pass_choice.h)
     double rate[2];         // iterations a decade of the residual, of the factor and of block Jacobi; 0: not known
     double reference;       // what the one in use cost when the other one was tried last, a decade
-    int64_t factor_step;    // of the factor in the last trial of one
+    int64_t factor_step;    // of the factor in use when the other one was tried last
     int32_t jacobi;         // 1: block Jacobi is in use, 0: the factor
-    int32_t trial;          // the pass under way tries the other one
     int32_t wait, waited;   // passes between trials; since the last one
 };
 

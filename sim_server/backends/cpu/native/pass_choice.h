@@ -13,11 +13,12 @@
 #include "pcg.h"
 
 constexpr int PATIENT = 20;            // iterations with a factor, where nothing is known of block Jacobi
-constexpr int MIN_WAIT = 4, MAX_WAIT = 256;
+constexpr int MIN_WAIT = 4, MAX_WAIT = 256;  // passes between trials
+constexpr int MOST_WAIT_OF_NEW = 32;   // likewise, of a factor that has not been tried
 constexpr double FACTOR_BYTES = 2;     // what a byte of a factor costs, read in a chain of triangular solves, where one of A is 1
 constexpr double LASTS = 8;            // passes over which the cost of a correction is spread
-constexpr double GIVE_UP = 1.5;
-constexpr double CHEAPER = 0.9;
+constexpr double GIVE_UP = 1.5;        // times what is expected of the other one, at which a pass goes over to it
+constexpr double CHEAPER = 0.9;        // of the cost of the one in use: the other one takes its place
 constexpr double HARDER_PASS = 2;      // cost over `reference` at which the other one is tried at once
 constexpr double LEAST_TRIED[2] = {2, 8};  // iterations that the cost of a pass has to be worth, of the one to be tried
 
@@ -25,7 +26,8 @@ struct ChoiceOfPass {
     PassChoice& choice;
     const Factor& factor;
     double cost[2];         // of an iteration, of the factor and of block Jacobi [bytes]
-    double decades = 0;
+    double decades = 0;     // that the pass is to reach
+    bool trial = false;     // the pass tries the other one
 
     ChoiceOfPass(PassChoice& choice, const BlockCsr& A, const Factor& factor) : choice(choice), factor(factor) {
         const Pattern& p = *factor.pattern;
@@ -41,12 +43,12 @@ struct ChoiceOfPass {
     // Sets which preconditioner a pass begins with, and after how many iterations it goes over to the other one.
     void begin(SolveSettings& s) {
         const int used = choice.jacobi, other = 1 - used;
-        decades = -std::log10(s.tolerance);
-        choice.trial = wants_trial();
-        const int first = choice.trial ? other : used;
+        decades = std::min(-std::log10(s.tolerance), 16.0);
+        trial = wants_trial();
+        const int first = trial ? other : used;
         s.kind = first ? BLOCK_JACOBI : CHOLESKY;
         s.probe = used ? 0 : PATIENT;
-        if (choice.trial) s.probe = limit(expected(used) / cost[other]);
+        if (trial) s.probe = limit(expected(used) / cost[other]);
         else if (choice.rate[other] > 0) s.probe = limit(GIVE_UP * expected(other) / cost[used]);
     }
     static int limit(double iterations) { return (int)std::min(std::max(std::ceil(iterations), 1.0), 1e9); }
@@ -56,7 +58,8 @@ struct ChoiceOfPass {
         ++choice.waited;
         const double own = expected(used);
         if (own < LEAST_TRIED[other] * cost[other]) return false;
-        if (choice.rate[other] == 0 || choice.waited >= choice.wait) return true;
+        const bool renewed = other == 0 && choice.factor_step != factor.step;
+        if (choice.rate[other] == 0 || choice.waited >= (renewed ? std::min(choice.wait, MOST_WAIT_OF_NEW) : choice.wait)) return true;
         return own > HARDER_PASS * choice.reference * decades && choice.reference > 0;
     }
 
@@ -73,7 +76,7 @@ struct ChoiceOfPass {
         const int used = choice.jacobi, other = 1 - used;
         const bool known = choice.rate[used] > 0 && choice.rate[other] > 0;
         const bool better = known && choice.rate[other] * cost[other] < CHEAPER * choice.rate[used] * cost[used];
-        if (choice.trial) {
+        if (trial) {
             choice.wait = better ? MIN_WAIT : std::min(2 * std::max(choice.wait, MIN_WAIT / 2), MAX_WAIT);
             choice.waited = 0;
             choice.factor_step = factor.step;

@@ -10,7 +10,8 @@
 // material frame, as A is, each in that of its own step.
 //
 // The diagonal of an older matrix follows from a list of changes, read backwards to the step of the factor; so a factor made
-// with the spring is not corrected for it. What the matrix of a step had of contacts is remembered as it is. (Hager, Updating the inverse of a matrix, SIAM Review 31, 1989.)
+// with the spring is not corrected for it. What the matrix of a step had of contacts is remembered as it is.
+// (Hager, Updating the inverse of a matrix, SIAM Review 31, 1989.)
 #pragma once
 #include <algorithm>
 #include <cmath>
