@@ -202,7 +202,7 @@ class Simulation:
         settings.budget, settings.warm_start = solver.budget, int(solver.warm_start)
         settings.kind, settings.omega = KINDS.get(solver.preconditioner, Kind.CHOLESKY), solver.omega
         alone = self.scene.uses_factor_alone  # then the loop has to know what a factor lacks
-        corrects = (solver.woodbury or alone) and solver.wants_factors and "touch" in body.effects
+        corrects = (solver.woodbury or alone) and solver.wants_factors and ("touch" in body.effects or self.contact)
         if corrects and Capability.LOW_RANK_UPDATE in self.engine.capabilities:
             double = solver.factor_precision == "float64"
             block = self.system.block if alone else None

@@ -27,6 +27,7 @@ from sim_server.backends.rosenbrock import NODAL, Rosenbrock
 
 Reals = NDArray[np.float64]
 HISTORY = 1024  # changes of the diagonal that are remembered, of each body
+KNOWN_CONTACTS = 32, 16384  # blocks of contacts that are remembered: of each surface node of a body, and of all at most
 
 
 @cache
@@ -159,6 +160,7 @@ class _NativeContact:
         self._state = (structs.RowState * max(rows, 1))()
         self._report = (structs.ContactReport * bodies)()
         self._result = (structs.SolveResult * bodies)()
+        self._choice = (structs.PassChoice * bodies)()
         self._own = {
             "active": np.zeros(rows, np.int32), "room": np.zeros((8, loop.nodes, 3)),
             "reaction": np.zeros((bodies, count, 6)), "mode": np.zeros(bodies, np.int32),
@@ -171,6 +173,7 @@ class _NativeContact:
             obstacle_count=count, passes=contact.passes, tolerance=contact.tolerance, dx_dv=contact.dx_dv,
             force_coefficient=contact.force_coefficient, state=c.addressof(self._state), pair_first=-1,
             report=c.addressof(self._report), result=c.addressof(self._result),
+            choice=c.addressof(self._choice),
         )  # fmt: skip
         if contact.surfaces:
             self._touch(contact.surfaces, contact.free, rows, loop)
@@ -183,6 +186,11 @@ class _NativeContact:
             setattr(self.native, name, array.ctypes.data)
         self.native.rotation = arrays["rotation"].ctypes.data
         loop.contact = c.addressof(self.native)
+
+    def surface_nodes(self, body: int) -> int:
+        """Returns the number of a body's surface nodes."""
+        start = self._input.body_start
+        return int(start[body + 1] - start[body]) // 2
 
     @staticmethod
     def _site_body(contact: Contact) -> NDArray[np.int32]:
@@ -318,7 +326,7 @@ class CpuEngine(Reports):
             "last": np.full(count, 0.0), "then": np.full(count, 0.0),
             "change": np.zeros(HISTORY, structs.CHANGE),
             "node": np.full(nodes, 0, np.int32), "supernode": np.full(3 * count, 0, np.int32),
-            "marked": np.full(3 * count, 0, np.uint8), "delta": np.full(nodes, 0.0),
+            "marked": np.full(3 * count, 0, np.uint8), "delta": np.full((nodes, 6), 0.0),
             "small": np.full(4 * width**2 + 2 * width, 0.0),
             "columns": np.zeros((3 * count, width), np.float64 if double else np.float32),  # touched by the first grab
             "diagonal": diagonal[entry.first : entry.last],
@@ -328,6 +336,14 @@ class CpuEngine(Reports):
         correction.capacity, correction.history, correction.nodes, correction.forgotten = nodes, HISTORY, count, -1
         if block is not None:
             room["block"] = block[entry.first : entry.last]
+        if self._contact:
+            each, most = KNOWN_CONTACTS
+            touches = min(each * self._contact.surface_nodes(body), most)
+            correction.touches, correction.touch_lost = touches, -1
+            room |= {
+                "touch": np.zeros(touches, structs.KNOWN_CONTACT), "touch_now": np.zeros((count, 6)),
+                "touch_then": np.zeros((count, 6)),
+            }  # fmt: skip
         for name, array in room.items():
             setattr(correction, name, array.ctypes.data)
 

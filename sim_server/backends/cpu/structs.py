@@ -10,6 +10,7 @@ RECORD = LOOP.dtype("Record")  # one body, one step: native/ring_buffers.h
 REACTION = LOOP.dtype("Reaction")  # of a body on a grab or on another body: kernels/reaction.h
 REACTION_KINDS = LOOP.enumeration("ReactionKind")
 CHANGE = LOOP.dtype("Change")  # of a diagonal entry: native/woodbury.h
+KNOWN_CONTACT = LOOP.dtype("KnownContact")  # contacts of a node: native/woodbury.h
 MAX_CORRECTED: int = LOOP.constant("MAX_CORRECTED")  # nodes of a Correction
 BALANCE = LOOP.dtype("Balance")  # kernels/energy_balance.cuh
 
@@ -97,6 +98,11 @@ class ContactForce(c.Structure):
 @LOOP.struct
 class RowState(c.Structure):
     """State of a row of contact in the step under way."""
+
+
+@LOOP.struct
+class PassChoice(c.Structure):
+    """What is known of the preconditioners of a body in passes of contact."""
 
 
 @LOOP.struct

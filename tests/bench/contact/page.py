@@ -15,7 +15,7 @@ def write(report: Report, tables: Tables) -> None:
     report.say(words.SETUP)
     shown = {
         "stairs": _stairs, "answers": _answers, "wall": _wall, "hertz": _hertz, "belt": _belt, "paths": _paths,
-        "passes": _passes, "cost": _cost, "impact": _impact, "goals": _goals, "own": _own,
+        "passes": _passes, "cost": _cost, "few": _few, "impact": _impact, "goals": _goals, "own": _own,
     }  # fmt: skip
     for name, show in shown.items():
         if rows := tables.get(name, []):
@@ -94,6 +94,13 @@ def _cost(report: Report, rows: list[Row]) -> None:
         report.table(mine, [name for name in mine[0] if name not in ("tets", "kappa")])
     kept = [row for row in rows if row["kappa"] == 1 and row["preconditioner"] == FACTOR]
     report.remember(kept, ("tets", "situation"), ("iterations", "p50 ms"))
+
+
+def _few(report: Report, rows: list[Row]) -> None:
+    report.say("## A few contacts", words.FEW)
+    rows = sorted(rows, key=lambda row: (row["nodes"], row["body"], row["kappa"], row["lockstep"]))
+    report.table(rows)
+    report.remember(rows, ("body", "nodes", "kappa", "lockstep", "preconditioner"), ("iterations", "mean ms"))
 
 
 def _impact(report: Report, rows: list[Row]) -> None:

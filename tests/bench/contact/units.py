@@ -4,7 +4,7 @@
 from collections.abc import Iterator
 from functools import partial
 
-from tests.bench.contact import cost, known, ladder, passes, picture
+from tests.bench.contact import cost, few, known, ladder, passes, picture
 from tests.bench.contact.bodies import SITUATIONS, TUMBLING, Row
 from tests.bench.harness.units import Unit
 
@@ -16,6 +16,7 @@ KEYS = {  # what tells the rows of a table apart
     "paths": ("obstacle", "dt ms", "speed"),
     "passes": ("passes, at most",),
     "cost": ("tets", "kappa", "situation", "preconditioner"),
+    "few": ("body", "nodes", "kappa", "lockstep", "preconditioner"),
     "impact": ("tets", "preconditioner"),
     "goals": ("situation", "bodies", "contacts"),
     "own": ("case",),
@@ -63,6 +64,10 @@ def _cost(sizes: tuple[int, ...], quick: bool) -> Iterator[Unit]:
                     continue  # takes many minutes
                 measure = partial(cost.rows, tets, kappa, situation, quick)
                 yield Unit("cost", f"{tets}, kappa {kappa:g}, {situation.name}", tets / 800, measure)
+    for name, tooled in [("beam", few.SMALL)] if quick else few.BODIES.items():
+        for kappa, age in ((1.0, 3),) if quick else ((1.0, 3), (1.0, 20), (10.0, 3), (10.0, 20)):
+            measure = partial(few.rows, tooled, kappa, age, 12 if quick else few.STEPS)
+            yield Unit("few", f"{name}, kappa {kappa:g}, lockstep-{age}", 60 if name == "large slab" else 5, measure)
     yield Unit("impact", "curves", 3, partial(cost.impact_curves, min(3000, max(sizes))))
 
 

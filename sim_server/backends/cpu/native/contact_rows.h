@@ -27,6 +27,14 @@ struct ContactReport {            // of a body in a step
 
 struct SolveResult;
 
+struct PassChoice {         // of a body, kept from step to step (pass_choice.h)
+    double rate[2];         // iterations a decade of the residual, of the factor and of block Jacobi; 0: not known
+    double reference;       // what the one in use cost when the other one was tried last, a decade
+    int64_t factor_step;    // of the factor in use when the other one was tried last
+    int32_t jacobi;         // 1: block Jacobi is in use, 0: the factor
+    int32_t wait, waited;   // passes between trials; since the last one
+};
+
 struct Contact {
     ObstacleTable obstacles;
     int32_t obstacle_count;
@@ -58,6 +66,7 @@ struct Contact {
     int32_t* island_rows;                         // (bodies,) first entry in `active` of each island
     int32_t islands;
     SolveResult* result;                          // (bodies,)
+    PassChoice* choice;                           // (bodies,)
     int32_t most_modes;                           // of the coarse space of an island; 0: none
     double *modes, *coarse, *lever;               // (nodes, 18), (most_modes + 4, most_modes), (rows, 8): island.h
     int32_t* mode;                                // (bodies,) first mode of a body; -1: it has none

@@ -260,6 +260,7 @@ struct IslandSolver {
             double* work = loop.work + 27 * (int64_t)body.first;
             const int n = 3 * (body.last - body.first);
             const int kind = body.now.kind == CHOLESKY && body.factor ? CHOLESKY : BLOCK_JACOBI;
+            body.correction.in_contact = 0;
             single.push_back({matrices[m], body.factor, kind, work, work + 3 * n, 1, &body.correction});
             single.back().prepare();
         });

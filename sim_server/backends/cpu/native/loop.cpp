@@ -139,6 +139,7 @@ static void assemble(Loop* loop, bool whole) {
             note_changes(loop->body[i].correction, rings.step, loop->body[i].steps == 0);
     }
     if (loop->contact && loop->contact->pair_first >= 0) PairDetection(*loop, *loop->contact).run();
+    for (int i = 0; i < loop->bodies && loop->contact; ++i) note_touches(*loop, loop->body[i]);
     for (int i = 0; i < loop->bodies; ++i) copy_for_worker(*loop, loop->body[i]);
     loop->assemble_begin = begin;
     loop->assemble_seconds = now() - begin;
@@ -294,9 +295,9 @@ void wf_precondition(Loop* loop, int32_t index, const double* r, double* z, doub
 }
 
 const StructSize* wf_sizes() {
-    static const StructSize sizes[] = {SIZE(Launch), SIZE(Body), SIZE(Loop), SIZE(Factor), SIZE(Pattern), SIZE(Record),
+    static const StructSize sizes[] = {SIZE(Launch), SIZE(Body), SIZE(Loop), SIZE(Factor), SIZE(KnownContact), SIZE(Pattern), SIZE(Record),
                                        SIZE(Newton), SIZE(Search), SIZE(Stages), SIZE(StageState), SIZE(Elastic), SIZE(Energies), SIZE(Balance),
-                                       SIZE(Contact), SIZE(RowState), SIZE(ContactReport), SIZE(Box), SIZE(Reaction), {}};
+                                       SIZE(Contact), SIZE(RowState), SIZE(PassChoice), SIZE(ContactReport), SIZE(Box), SIZE(Reaction), {}};
     return sizes;
 }
 }

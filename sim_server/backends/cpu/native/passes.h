@@ -1,16 +1,13 @@
 // SPDX-License-Identifier: MIT
 // The passes of contact over an island (method: contact.h); allocates nothing.
-//
-// A pass that its factor has not solved after PATIENT iterations goes on with block Jacobi, and so do the passes after it: contacts that
-// the factor does not know, or knows although they are gone, may cost it many iterations, each of which costs several of block Jacobi.
 #pragma once
 #include <algorithm>
 #include <cmath>
 
+#include "contact_copies.h"
 #include "island.h"
 #include "island_rows.h"
-
-constexpr int PATIENT = 40;  // iterations of a pass with a factor
+#include "pass_choice.h"
 
 struct Passes : IslandRows {
     double *left, *r, *dy, *before, *rest;  // b - A y; with contact; solution of a pass; r before its solve; residual of its solve
@@ -93,16 +90,28 @@ struct Passes : IslandRows {
         SolveSettings s = loop.body[bodies[0]].now;
         s.tolerance = tolerance;
         s.warm_start = 0;
-        if (report.passes > 0 && result.kind == BLOCK_JACOBI) s.kind = BLOCK_JACOBI;
-        s.probe = s.kind == CHOLESKY ? PATIENT : 0;
+        s.probe = 0;
         if (s.budget > 0) s.budget = std::max(s.budget - result.seconds, 1e-9);
         if (s.budget < 0) s.budget = cut() ? -2 : std::min(-1.0, s.budget + result.iterations);
         return s;
     }
 
+    // Tells the factor's correction which contacts A has.
+    void tell_correction(Body& body) const {
+        Correction& t = body.correction;
+        if (!t.touches) return;
+        t.in_contact = 1;
+        std::fill(t.touch_now, t.touch_now + 6 * (int64_t)t.nodes, 0.0);
+        for (int k = 0; k < rows.actives; ++k) {
+            double block[6];
+            const int node = own_block(c, body, active[k], c.state[active[k]].stiffness, block);
+            for (int m = 0; m < 6; ++m) t.touch_now[6 * (int64_t)node + m] += block[m];
+        }
+    }
+
     // dy of (A + H^T S H) dy = r, and its residual.
     SolveResult solve_linear(double tolerance) {
-        const SolveSettings settings = settings_for(tolerance);
+        SolveSettings settings = settings_for(tolerance);
         if (count > 1) return IslandSolver{loop, c, bodies, count, rows}.solve(r, settings, dy, rest);
         Body& body = loop.body[bodies[0]];
         const int64_t at = 3 * (int64_t)body.first;
@@ -110,7 +119,17 @@ struct Passes : IslandRows {
         own.node_first = body.first;
         const BlockCsr A{body.first, body.last, loop.row_start, loop.columns, loop.values, &own};
         double* work = loop.work + 27 * (int64_t)body.first;
-        const SolveResult solved = pcg(A, r + at, body.factor, settings, dy + at, work, false, &body.correction);
+        tell_correction(body);
+        auto solve_by = [&] { return pcg(A, r + at, body.factor, settings, dy + at, work, false, &body.correction); };
+        SolveResult solved;
+        if (settings.kind == CHOLESKY && body.factor) {
+            ChoiceOfPass choice(c.choice[bodies[0]], A, *body.factor);
+            choice.begin(settings);
+            solved = solve_by();
+            choice.end(settings, solved, body.correction.spent);
+        } else {
+            solved = solve_by();
+        }
         std::copy(work, work + A.size(), rest + at);  // where pcg leaves its residual
         return solved;
     }

@@ -34,6 +34,8 @@ struct SolveResult {
     int32_t iterations, status;
     int32_t kind;           // used at the end
     int32_t fallbacks;      // 1: the factor was left in this solve
+    int32_t switched_after; // iterations before a probe went over to the other kind, 0: it did not
+    double residual_then;   // recursive, relative
 };
 
 // Where a solve starts: from zero or from x if that is better, as the settings say; or from x, whose residual is what the tolerance
@@ -84,7 +86,7 @@ static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor,
     double start = now();
     int n = A.size();
     double *r = work, *z = r + n, *p = z + n, *q = p + n, *inverse = q + n, *scratch = inverse + 3 * n;
-    SolveResult out{0, 0, 0, CONVERGED, settings.kind, 0};
+    SolveResult out{0, 0, 0, CONVERGED, settings.kind, 0, 0, 0};
     if (out.kind == CHOLESKY && !factor) out.kind = BLOCK_JACOBI;
     auto finish = [&](int status, double r2, double b2) {
         out.status = status;
@@ -141,6 +143,8 @@ static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor,
         if (out.iterations == settings.probe && settings.probe > 0 && factor && (P.kind == BLOCK_JACOBI || P.kind == CHOLESKY) && !switched) {
             P.kind = out.kind = P.kind == CHOLESKY ? BLOCK_JACOBI : CHOLESKY;
             P.prepare();
+            out.switched_after = out.iterations;
+            out.residual_then = std::sqrt(r2 / b2);
             switched = restart = true;
             continue;
         }

@@ -1,15 +1,17 @@
 // SPDX-License-Identifier: MIT
-// Low-rank correction of a factor for changes of the diagonal of A since its matrix. Grabs of clients (effects/touch.py) begin
-// from one step to the next; their stiff springs are missing from the factor until one arrives that was made with them.
-// With U the columns of the identity at the nodes concerned and C the difference of their diagonals,
+// Low-rank correction of a factor for changes of the nodes' own blocks of A since its matrix. Grabs of clients (effects/touch.py) and
+// contacts with obstacles begin and end from one step to the next; a factor lacks them, or has them too long, until one arrives that was
+// made of a later matrix. With U the columns of the identity at the nodes concerned and C the difference of their blocks,
 //     (P + U C U')^-1 = L^-T (I - V W V') L^-1,    V = L^-1 U,  W = (C^-1 + V'V)^-1,
 // the Sherman-Morrison-Woodbury formula between the two triangular solves. V has entries only in the supernodes on the paths
 // from these nodes to the root, so that it costs a few applications of the factor. With V'V = K K' and
 // G = I + K'C K,  W = C - C K G^-1 K'C  for C of any sign, including 0; the result is positive definite if and only
-// if G is. Multiples of the identity are the same in all frames, so the warp does not change them.
+// if G is. Springs are multiples of the identity, the same in all frames, so the warp does not change them; blocks of contacts are in the
+// material frame, as A is, each in that of its own step.
 //
 // The diagonal of an older matrix follows from a list of changes, read backwards to the step of the factor; so a factor made
-// with the spring is not corrected for it. (Hager, Updating the inverse of a matrix, SIAM Review 31, 1989.)
+// with the spring is not corrected for it. What the matrix of a step had of contacts is remembered as it is.
+// (Hager, Updating the inverse of a matrix, SIAM Review 31, 1989.)
 #pragma once
 #include <algorithm>
 #include <cmath>
@@ -29,6 +31,12 @@ struct Change {        // of the diagonal of a node
     int64_t step;      // whose matrix is the first with the new value
     double before;     // the old one [kg]
     int32_t node;
+};
+
+struct KnownContact {  // what a copy of A for a worker would know of the contacts of a node
+    int64_t step;
+    double block[6];   // upper triangle, material frame [kg]
+    int32_t node;      // -1: of the body; it has contacts that no node's own block has
 };
 
 struct Correction {
@@ -51,9 +59,17 @@ struct Correction {
     int32_t* node;          // (capacity,) of V
     int32_t* supernode;     // (3 nodes,) of V, ascending
     uint8_t* marked;        // (3 nodes,)
-    double* delta;          // (capacity,) as W was made with [kg]
+    double* delta;          // (capacity, 6) as W was made with, upper triangles [kg]
     double* small;          // 4 width^2 + 2 width
     void* columns;          // (3 nodes, width) V, in the values' type, only rows of its supernodes
+    double spent;           // on V and W, not yet charged to a solve, as much as reading so many bytes of A
+    int32_t touches;        // most entries of `touch`; 0: there is no contact
+    int32_t in_contact;     // 1: touch_now is what A has beside its values
+    int32_t touch_known;    // 1: touch_then is what the matrix of the factor in use had there
+    int64_t touched;        // entries of `touch` so far
+    int64_t touch_lost;     // step of the newest one that has left the ring
+    KnownContact* touch;    // (touches,) the ring
+    double *touch_now, *touch_then;  // (nodes, 6)
 };
 
 constexpr int MAX_CORRECTED = 64;              // nodes
@@ -63,6 +79,9 @@ constexpr double WEAK = 0.2, WEAK_EACH = 0.02;  // likewise, for the sum of all 
 // spring that has gone 1e-4 remains.
 constexpr double STIFF = 1e5;
 constexpr double LEAST = 1e-6;  // pivot of G
+// What V costs for a byte of L and for each column, V'V for each of its entries and columns, and W for each of d^3, where to read a byte
+// of A is 1.
+constexpr double PANEL_BYTES = 50, COLUMN_BYTES = 0.5, GRAM_BYTES = 2, INNER_BYTES = 15;
 
 // Number of columns of V, padded with zeros to a whole number of vectors.
 inline int width_of(int nodes) { return (3 * nodes + 7) / 8 * 8; }
@@ -119,11 +138,15 @@ struct Corrected {
         if (!choose()) return false;
         bool same = true;
         for (int k = 0; k < c.count; ++k) {
-            double delta = bounded(c.node[k]);
-            same = same && delta == c.delta[k];
-            c.delta[k] = delta;
+            double delta[6];
+            difference(c.node[k], bounded(c.node[k]), delta);
+            for (int m = 0; m < 6; ++m) {
+                same = same && delta[m] == c.delta[6 * k + m];
+                c.delta[6 * k + m] = delta[m];
+            }
         }
         if (!same) c.usable = make_inner();
+        if (!same) c.spent += INNER_BYTES * (27.0 * c.count * c.count * c.count);
         if (c.usable) c.used = c.count;
         c.missed = !c.usable;
         return c.usable;
@@ -179,6 +202,34 @@ private:
             c.then[change.node] = change.before;
         }
         if (c.forgotten > factor.step) std::copy(c.diagonal, c.diagonal + c.nodes, c.then), c.count = -1;
+        if (c.touches) take_touches();
+    }
+
+    // What the factor knows of contacts.
+    void take_touches() {
+        c.touch_known = c.touch_lost < factor.step;
+        std::fill(c.touch_then, c.touch_then + 6 * (int64_t)c.nodes, 0.0);
+        for (int64_t k = c.touched; k > std::max<int64_t>(0, c.touched - c.touches); --k) {
+            const KnownContact& touch = c.touch[(k - 1) % c.touches];
+            if (touch.step < factor.step) break;
+            if (touch.step > factor.step) continue;
+            if (touch.node < 0) c.touch_known = 0;
+            else for (int m = 0; m < 6; ++m) c.touch_then[6 * (int64_t)touch.node + m] += touch.block[m];
+        }
+    }
+
+    bool contacts() const { return c.in_contact && c.touch_known; }
+
+    // Difference of a node's block from that of the factor's matrix; diagonal: its part from springs. Returns its size.
+    double difference(int node, double diagonal, double* out) const {
+        const double *now = c.touch_now + 6 * (int64_t)node, *then = c.touch_then + 6 * (int64_t)node;
+        double size = 0;
+        for (int m = 0; m < 6; ++m) {
+            out[m] = contacts() ? now[m] - then[m] : 0;
+            if (m == 0 || m == 3 || m == 5) out[m] += diagonal;
+            size = std::fmax(size, std::fabs(out[m]));
+        }
+        return size;
     }
 
     const double* block(int node) const {
@@ -205,9 +256,11 @@ private:
         int changed = 0, others = 0, chosen[MAX_CORRECTED];
         double together = 0;
         for (int i = 0; i < c.nodes; ++i) {
-            const double delta = c.diagonal[i] - c.then[i];
+            const double spring = c.diagonal[i] - c.then[i];
+            double delta = spring, block[6];
+            if (contacts()) delta = difference(i, spring, block);
             if (delta == 0) continue;
-            const double share = std::fabs(delta) / (own(i) - std::fmax(delta, 0));
+            const double share = std::fabs(delta) / (own(i) - std::fmax(spring, 0));
             if (!(share > NOTHING)) continue;
             together += share;
             others += std::find(c.node, c.node + c.count, i) == c.node + c.count;
@@ -217,13 +270,23 @@ private:
         c.missed = changed > c.capacity && together >= WEAK;
         if (changed > c.capacity || together < WEAK || together < WEAK_EACH * changed) return false;
         if (others) {
+            if (contacts() && others + c.count <= c.capacity) changed = with_present(chosen, changed);
             std::copy(chosen, chosen + changed, c.node);
             c.count = changed;
-            std::fill(c.delta, c.delta + changed, NAN);
+            std::fill(c.delta, c.delta + 6 * changed, NAN);
             if (factor.bytes == 4) make_columns<float>();
             else make_columns<double>();
+            c.spent += column_bytes();
         }
         return true;
+    }
+
+    // Keeps the nodes of V, as contacts come and go. Returns how many are chosen then.
+    int with_present(int* chosen, int changed) const {
+        const int first = changed;
+        for (int k = 0; k < c.count; ++k)
+            if (std::find(chosen, chosen + first, c.node[k]) == chosen + first) chosen[changed++] = c.node[k];
+        return changed;
     }
 
     // Supernodes that L^-1 U reaches, ascending.
@@ -241,6 +304,18 @@ private:
             for (int64_t k = p.row_start[s] + p.super_start[s + 1] - p.super_start[s]; k < p.row_start[s + 1]; ++k)
                 c.marked[of(p.rows[k])] = 1;
         }
+    }
+
+    double column_bytes() const {
+        const Pattern& p = pattern();
+        double entries = 0, rows = 0;
+        for (int k = 0; k < c.supernodes; ++k) {
+            const int s = c.supernode[k];
+            const double n = p.super_start[s + 1] - p.super_start[s], h = p.row_start[s + 1] - p.row_start[s];
+            entries += n * (h - 0.5 * n);
+            rows += n;
+        }
+        return (PANEL_BYTES + COLUMN_BYTES * width()) * factor.bytes * entries + GRAM_BYTES * rows * width() * width();
     }
 
     template <class T>
@@ -279,7 +354,8 @@ private:
     bool make_inner() {
         const int w = width(), d = 3 * c.count;
         double *W = inner(), *K = W + (int64_t)w * w, *G = K + (int64_t)w * w;
-        auto C = [&](int i) { return c.delta[i / 3]; };
+        static constexpr int place[3][3] = {{0, 1, 2}, {1, 3, 4}, {2, 4, 5}};
+        auto C = [&](int i, int j) { return c.delta[6 * (i / 3) + place[i % 3][j % 3]]; };  // within a block
         std::copy(gram(), gram() + (int64_t)w * w, K);
         if (!cholesky(K, d, w, 0)) return false;
         for (int i = 0; i < d; ++i)
@@ -287,8 +363,9 @@ private:
         std::fill(G, G + (int64_t)w * w, 0.0);
         for (int i = 0; i < d; ++i) {
             G[i * w + i] += 1;
-            for (int a = 0; a <= i; ++a) {
-                const double f = C(i) * K[i * w + a];
+            const int block = i - i % 3;
+            for (int a = 0; a < block + 3; ++a) {
+                const double f = C(i, block) * K[block * w + a] + C(i, block + 1) * K[(block + 1) * w + a] + C(i, block + 2) * K[(block + 2) * w + a];
                 for (int b = 0; b <= i; ++b) G[a * w + b] += f * K[i * w + b];
             }
         }
@@ -297,7 +374,10 @@ private:
         for (int i = 0; i < d; ++i)
             for (int j = 0; j < i; ++j) std::swap(K[i * w + j], K[j * w + i]);
         for (int i = 0; i < d; ++i) {
-            for (int j = 0; j < d; ++j) K[i * w + j] *= C(j);
+            for (int j = 0; j < d; j += 3) {
+                const double k[3] = {K[i * w + j], K[i * w + j + 1], K[i * w + j + 2]};
+                for (int m = 0; m < 3; ++m) K[i * w + j + m] = k[0] * C(j, j + m) + k[1] * C(j + 1, j + m) + k[2] * C(j + 2, j + m);
+            }
             for (int k = 0; k < i; ++k) {
                 const double f = G[i * w + k];
                 for (int j = 0; j < d; ++j) K[i * w + j] -= f * K[k * w + j];
@@ -305,7 +385,8 @@ private:
             for (int j = 0; j < d; ++j) K[i * w + j] /= G[i * w + i];
         }
         std::fill(W, W + (int64_t)w * w, 0.0);
-        for (int i = 0; i < d; ++i) W[i * w + i] = C(i);
+        for (int i = 0; i < d; ++i)
+            for (int j = i - i % 3; j < i - i % 3 + 3; ++j) W[i * w + j] = C(i, j);
         for (int k = 0; k < d; ++k)
             for (int i = 0; i < d; ++i) {
                 const double f = K[k * w + i];
