@@ -113,7 +113,7 @@ def impacts() -> list[Row]:
     return found
 
 
-def energies(steps: int = 2000) -> list[Row]:
+def energies(steps: int = 10_000) -> list[Row]:
     """Kinetic, elastic, gravity and what contacts store."""
     starts: dict[str, dict[str, Any]] = {
         "slides": {"velocity": (3, 0, 0)}, "tumbles": {"at": (0, 0.1, 0), "rotate": (30, 20, 40)},

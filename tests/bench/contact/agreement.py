@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: MIT
+"""The same again: on a GPU as on a CPU, and from a log."""
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from sim_server.updates.driver import Driver
+from tests.bench.contact.bodies import Row
+from tests.bench.contact.ladder import line
+from tests.bench.harness.schemes import SCENES
+from tests.contact.scenes import D, over
+from tests.system.server_process import Stage
+from tests.system.test_replay_of_a_server import replayed
+
+STARTS: dict[str, dict[str, Any]] = {
+    "slides": {"velocity": (2, 0, 0), "friction": 0.1},
+    "tumbles": {"at": (0, 0.05, 0), "rotate": (20, 0, 35), "velocity": (1, -2, 0)},
+    "is thrown down": {"at": (0, 0.02, 0), "velocity": (0, -10, 0)},
+}
+TIGHT = {"thickness": D, "tolerance": 1e-8, "passes": 200}
+EXACT = {"preconditioner": "block_jacobi", "tolerance": 1e-10, "max_iterations": 2000}
+
+
+def devices() -> list[Row]:
+    """A GPU beside the CPU: as by default, and where both solve exactly."""
+    found = []
+    for start, table in STARTS.items():
+        name = f"block that {start}: GPU against CPU, "
+        found.append(line(name + "40 steps, positions [m]", 0, _apart(40, table), 2e-5))
+        exact = _apart(15, table | {"contact": TIGHT, "solver": EXACT})
+        found.append(line(name + "tight tolerances, 15 steps, positions [m]", 0, exact, 1e-8))
+    return found
+
+
+def _apart(steps: int, table: dict[str, Any]) -> float:
+    """Largest difference of positions in any step."""
+    sims = [over(device=device, **table) for device in ("gpu", "cpu")]
+    drivers, apart = [Driver(sim) for sim in sims], 0.0
+    for _ in range(steps):
+        for driver in drivers:
+            driver.advance(1)
+        apart = max(apart, float(np.abs(sims[0].fetch().x - sims[1].world.x).max()))
+    return apart
+
+
+def replays(device: str = "cpu", steps: int = 300) -> list[Row]:
+    """Servers and workers in processes of their own, as fast as they go; their logs are simulated again."""
+    found = []
+    for name in ("stairs", "gripper") + (("two_organs",) if device == "cpu" else ()):
+        with TemporaryDirectory() as folder:
+            stage, log = Stage(Path(folder)), Path(folder) / "run.mcap"
+            try:
+                server = stage.server(
+                    SCENES / f"{name}.toml", "--steps", str(steps), "--record", str(log), "--workers", "1",
+                    "--device", device, "--free-run",
+                )  # fmt: skip
+                if server.wait() != 0:
+                    raise RuntimeError(server.output()[-500:])
+            finally:
+                stage.close()
+            told = replayed(log, 0, timeout=600)
+            same = float(told["steps"] if told["same"] else 0)
+            case = f"{name}.toml with a worker process, {device}: steps of {steps} repeated from the log to the bit"
+            found.append(line(case, steps, same, 0.0))
+    return found
