@@ -16,6 +16,7 @@ from tests.bench.harness.pieces import Piece
 
 PEER = """
 import json, sys
+import numpy as np
 
 problem = json.load(open(sys.argv[1]))
 x = np.array([body["x"] for body in problem["bodies"]]).reshape(-1, 3)
