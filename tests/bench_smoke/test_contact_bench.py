@@ -121,5 +121,5 @@ def test_the_page_begins_with_answers(tmp_path: Path) -> None:
     page.write(Piece("contact", "Contact", {"device": "cpu"}, tmp_path, quick=True), tables)
     text = (tmp_path / "contact.md").read_text()
     assert text.index("| Is it right? |") < text.index("## Known answers") < text.index("## Beside others")
-    assert "Left out here, as they were not installed: MuJoCo, Newton VBD." in text
+    assert "Not measured here: MuJoCo, Newton VBD." in text
     assert "| at | no factor while in contact | 6 | 30 | 30 | 7 | 7 | 7 |" in text

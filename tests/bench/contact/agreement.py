@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The same again: on a GPU as on a CPU, and from a log."""
 
+import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -47,22 +48,31 @@ def _apart(steps: int, table: dict[str, Any]) -> float:
 
 
 def replays(device: str = "cpu", steps: int = 300) -> list[Row]:
-    """Servers and workers in processes of their own, as fast as they go; their logs are simulated again."""
-    found = []
-    for name in ("stairs", "gripper") + (("two_organs",) if device == "cpu" else ()):
-        with TemporaryDirectory() as folder:
-            stage, log = Stage(Path(folder)), Path(folder) / "run.mcap"
-            try:
-                server = stage.server(
-                    SCENES / f"{name}.toml", "--steps", str(steps), "--record", str(log), "--workers", "1",
-                    "--device", device, "--free-run",
-                )  # fmt: skip
-                if server.wait() != 0:
-                    raise RuntimeError(server.output()[-500:])
-            finally:
-                stage.close()
-            told = replayed(log, 0, timeout=600)
-            same = float(told["steps"] if told["same"] else 0)
-            case = f"{name}.toml with a worker process, {device}: steps of {steps} repeated from the log to the bit"
-            found.append(line(case, steps, same, 0.0))
-    return found
+    """Servers and workers in processes of their own, one of which is killed; their logs are simulated again."""
+    names = ("stairs", "gripper") + (("two_organs",) if device == "cpu" else ())
+    found = [_replay(name, device, steps, killed=False) for name in names]
+    return [*found, _replay("stairs", device, steps, killed=True)]
+
+
+def _replay(name: str, device: str, steps: int, killed: bool) -> Row:
+    """As fast as it goes, or in real time with a worker that is killed after a third of the steps."""
+    with TemporaryDirectory() as folder:
+        stage, log = Stage(Path(folder)), Path(folder) / "run.mcap"
+        options = ("--steps", str(steps), "--record", str(log), "--device", device)
+        try:
+            scene = SCENES / f"{name}.toml"
+            server = stage.server(scene, *options, *(() if killed else ("--workers", "1", "--free-run")))
+            if killed:
+                worker = stage.worker()
+                with stage.client() as client:
+                    while client.status().step < steps / 3:
+                        time.sleep(0.01)
+                worker.kill()
+            if server.wait() != 0:
+                raise RuntimeError(server.output()[-500:])
+        finally:
+            stage.close()
+        told = replayed(log, 0, timeout=600)
+    how = "a worker killed on the way" if killed else "a worker process"
+    case = f"{name}.toml with {how}, {device}: steps of {steps} repeated from the log to the bit"
+    return line(case, steps, float(told["steps"] if told["same"] else 0), 0.0)

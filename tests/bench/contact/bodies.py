@@ -74,23 +74,11 @@ TUMBLING = Situation("tumbling", 60, height=0.15, rotate=(30, 20, 40))
 SITUATIONS = (REST, SLIDING, IMPACT, TUMBLING)
 
 
-def run_with_forces(sim: Simulation, steps: int, driver: Driver | None = None) -> tuple[NDArray[Any], Reals]:
-    """Makes steps; returns their records, and force and torque on the first obstacle, (steps, 6)."""
-    driver = driver or Driver(sim)
-    records, forces = [], []
-    for _ in range(steps):
-        records.append(driver.advance(1))
-        forces.append(reaction(sim))
-    return np.concatenate(records), np.array(forces)
-
-
-def reaction(sim: Simulation) -> Reals:
-    """Force and torque about its own position on the first obstacle in the last step, (6,)."""
-    rows = sim.contact.contact_input()
-    mine = (rows.obstacle == 0) & (rows.force > 0)
-    f = rows.force[mine, None] * rows.normal[mine] + rows.traction[mine]
-    arm = sim.world.x[rows.corner[mine, 0]] - rows.obstacles.end[0, :3]
-    return -np.concatenate([f.sum(axis=0), np.cross(arm, f).sum(axis=0)])
+def run_with_forces(sim: Simulation, steps: int) -> tuple[NDArray[Any], Reals]:
+    """Makes steps; returns their records, and force and torque on the first obstacle by the first body, (steps, 6)."""
+    driver = Driver(sim)
+    records = driver.advance(steps)
+    return records, driver.reactions[:: len(sim.world.bodies), 0]
 
 
 def times(records: NDArray[Any], device: str = "cpu") -> Reals:

@@ -56,7 +56,7 @@ def rest() -> list[Row]:
     Driver(sim).advance(150)
     _, forces = run_with_forces(sim, 1)
     rows = sim.contact.contact_input()
-    on = rows.force > 0
+    on = (rows.force > 0) & (rows.corner[:, 1] < 0)
     low = sim.world.x[rows.corner[on, 0], 1]
     apart = abs(low - (D - rows.force[on] / rows.stiffness[on])).max() / D
     return [

@@ -28,6 +28,7 @@ KEYS = {  # what tells the rows of a table apart
 SIZES = (540, 3000, 24_000)
 KAPPAS = (1.0, 10.0, 100.0)
 ENERGY = 30  # weight of a run of 1e4 steps
+SECONDS = {"MuJoCo": 10, "Newton VBD": 40}  # weight of a case of others, by bodies
 CASES: dict[str, tuple[float, Callable[[], list[Row]]]] = {
     **{name: (ENERGY if name == "energies" else 2, case) for name, case in ladder.CASES.items()},
     "collisions": (2, pairs.collisions), "stacks": (10, pairs.stacks), "replays": (20, agreement.replays),
@@ -103,7 +104,7 @@ def _peers(device: str, quick: bool, python: Path | None) -> Iterator[Unit]:
             continue
         for case in peers.CASES[:1] if quick else peers.CASES:
             measure = partial(_one, peers.row, case, way, device, str(python))
-            seconds = case.bodies * (1 if not way.script else 60 if case.bodies > 1 else 15)
+            seconds = case.bodies * SECONDS.get(way.who, 1)
             yield Unit("peers", f"{way.who}, {way.name}, {case.name}, {device}", seconds, measure)
     for who, why in out.items():
         if why:

@@ -85,8 +85,8 @@ The same block of 540 tetrahedra (nodes, tetrahedra, masses, E = 0.3 MPa, Poisso
 four of them over each other, in MuJoCo (flex) and Newton (SolverVBD), friction 0.5. Contact begins 1 mm from a node
 in all of them, and depths are told from there: a node 1 mm deep is at the floor itself. *drop*: from 50 mm; *at
 rest*: after 1.5 s. *stop*: way from 1 m/s; known: v^2 / (2 mu g) - v dt / 2, which steps of dt make of it. *creep*:
-of a block held by friction on a slope so much below the limit, over the second second; known: 0. *between blocks*:
-lowest node over the top face below. A frame is 1/60 s.
+of a block held by friction on a slope so much below the limit, from one second on, over half a second; known: 0.
+*between blocks*: lowest node over the top face below. A frame is 1/60 s.
 
 Laws differ: ours is linear corotational in float64, contact stiff as a node is, friction with a memory. MuJoCo's
 flex is St. Venant-Kirchhoff in float64; its contacts are soft by design and regularized in friction, so that all
@@ -94,10 +94,13 @@ creep a little. It runs with `integrator="discrete"`, which takes elasticity imp
 cones and `impratio="100"` as its documentation advises against slow slip (its `noslip` pass is refused with flexes
 there), `solref` and `solimp` of its own example of a soft bar on a floor; MuJoCo raises a time constant of contact
 to twice the time step. Newton's VBD is Neo-Hookean in float32, contact a penalty of 1e5 N/m without damping as in
-its examples of soft bodies, friction smoothed below 0.01 m/s, its default: what slides slower than that is not held.
-Ten steps a frame and ten iterations are what its examples take, fifty come nearer to its converged answer; what few
-iterations leave over acts as a force from outside, as the speed without friction shows. All run in one thread on a
-CPU. *warnings* are MuJoCo's own."""
+its examples of soft bodies, friction smoothed below `friction_epsilon`, 0.01 m/s by default and 0.001 m/s in
+*sharper friction*: what slides slower than that is not held. Ten steps a frame and ten iterations are what its
+examples take, fifty come nearer to its converged answer; what few iterations leave over acts as a force from
+outside, as the speed without friction shows. Times are medians of frames; on a CPU processor time of the whole
+process, ours with all that makes factors, in one thread; on a GPU Newton's wall time of a frame as a CUDA graph, and
+ours by the clock of the device. *the loop alone*: ours without what makes factors, which workers do elsewhere.
+*warnings* are MuJoCo's own."""
 
 STAIRS = """\
 deploy/scenes/stairs.toml: the block on its way down, iterations and passes of each step and contacts that carry
