@@ -21,6 +21,7 @@ def write(report: Report, tables: Tables) -> None:
     shown = {
         "stairs": _stairs, "answers": _answers, "paths": _paths, "goals": _goals, "impact": _impact, "own": _own,
         "pile": _pile, "peers": _peers, "wall": _wall, "hertz": _hertz, "belt": _belt, "passes": _passes, "cost": _cost,
+        "few": _few,
     }  # fmt: skip
     for name, show in shown.items():
         if rows := tables.get(name, []):
@@ -99,6 +100,13 @@ def _cost(report: Report, rows: list[Row]) -> None:
         report.table(mine, [name for name in mine[0] if name not in ("device", "tets", "kappa")])
     kept = [row for row in rows if row["kappa"] == 1 and row["preconditioner"] == FACTOR]
     report.remember(kept, ("device", "tets", "situation"), ("iterations", "p50 ms"))
+
+
+def _few(report: Report, rows: list[Row]) -> None:
+    report.say("## A few contacts", words.FEW)
+    rows = sorted(rows, key=lambda row: (row["nodes"], row["body"], row["kappa"], row["lockstep"]))
+    report.table(rows)
+    report.remember(rows, ("body", "nodes", "kappa", "lockstep", "preconditioner"), ("iterations", "mean ms"))
 
 
 def _where(device: str) -> str:

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
-from tests.bench.contact import agreement, cost, impact, known, ladder, pairs, passes, peers, picture, pile
+from tests.bench.contact import agreement, cost, few, impact, known, ladder, pairs, passes, peers, picture, pile
 from tests.bench.contact.bodies import SITUATIONS, TUMBLING, Row
 from tests.bench.harness.pieces import say
 from tests.bench.harness.units import Unit
@@ -18,6 +18,7 @@ KEYS = {  # what tells the rows of a table apart
     "paths": ("obstacle", "dt ms", "speed"),
     "passes": ("passes, at most",),
     "cost": ("device", "tets", "kappa", "situation", "preconditioner"),
+    "few": ("body", "nodes", "kappa", "lockstep", "preconditioner"),
     "impact": ("device", "tets", "preconditioner"),
     "goals": ("device", "situation", "bodies", "contacts"),
     "own": ("device", "case"),
@@ -41,7 +42,7 @@ def units(device: str, sizes: tuple[int, ...], quick: bool, python: Path | None)
     if device == "gpu":
         replays = partial(agreement.replays, "gpu")
         return [Unit("answers", "gpu", 10, agreement.devices), Unit("answers", "replays, gpu", 20, replays), *there]
-    return [*_answers(quick), *_paths(quick), *_passes(quick), *there]
+    return [*_answers(quick), *_paths(quick), *_passes(quick), *_few(quick), *there]
 
 
 def _answers(quick: bool) -> Iterator[Unit]:
@@ -66,6 +67,13 @@ def _paths(quick: bool) -> Iterator[Unit]:
 def _passes(quick: bool) -> Iterator[Unit]:
     for most in passes.AT_MOST[-1:] if quick else passes.AT_MOST:
         yield Unit("passes", f"{most}", 7, partial(_one, passes.row, most, 0.2 if quick else 1.0))
+
+
+def _few(quick: bool) -> Iterator[Unit]:
+    for name, tooled in [("beam", few.SMALL)] if quick else few.BODIES.items():
+        for kappa, age in ((1.0, 3),) if quick else ((1.0, 3), (1.0, 20), (10.0, 3), (10.0, 20)):
+            measure = partial(few.rows, tooled, kappa, age, 12 if quick else few.STEPS)
+            yield Unit("few", f"{name}, kappa {kappa:g}, lockstep-{age}", 60 if name == "large slab" else 5, measure)
 
 
 def _cost(device: str, sizes: tuple[int, ...], quick: bool) -> Iterator[Unit]:

@@ -48,13 +48,18 @@ step, to the solver's tolerance, comes on top."""
 
 COST = """\
 *factor*: factors that learn of contact (`lockstep-3`; at 24,000 tetrahedra `lockstep-20`, as old as those of a
-worker are there). *first factor*: that of the first matrix for ever, which knows of no contact. *block Jacobi*: no
-factor while in contact. *iterations* and *passes* are sums and numbers of solves of a step. *rest*: from one second
-on. *sliding*: at 3 m/s, friction 0.3. *impact without friction*: flat, 3 m/s from 0.3 m above; *at*: the first six
-steps with passes, *after*: until step 40. *tumbling*: falls on a corner from 0.15 m, 60 steps. *not converged*:
-steps with another status than `converged`. A factor may be the wrong choice: one that knows contacts that are gone,
-or does not know stiff ones, needs more iterations, and each costs several of block Jacobi. Left out: tumbling at
-24,000 tetrahedra with kappa 100."""
+worker are there). *first factor*: that of the first matrix for ever, which knows of no contact. Both leave passes to
+block Jacobi that it is expected to solve for less; its iterations, each of which costs a fraction of one with a
+factor, count alike. *block Jacobi*: no factor at all. *iterations* and *passes* are sums and numbers of solves of a
+step. *rest*: from one second on. *sliding*: at 3 m/s, friction 0.3. *impact without friction*: flat, 3 m/s from 0.3 m
+above; *at*: the first six steps with passes, *after*: until step 40. *tumbling*: falls on a corner from 0.15 m,
+60 steps. *not converged*: steps with another status than `converged`. Left out: tumbling at 24,000 tetrahedra with
+kappa 100."""
+
+FEW = """\
+A round tool presses into a body, strokes it and leaves: steps in which it touches, of 100. *lockstep*: steps from a
+matrix to its factor. *corrected*: for contacts that came or went since its matrix (`woodbury`, on by default); both
+kinds of factors go over to block Jacobi in passes that it is expected to solve for less."""
 
 IMPACT = """\
 A block falls flat on a floor at 3 m/s, without friction, kappa 1. *at*: the first six steps with passes; *after*:
@@ -67,7 +72,8 @@ GOALS = """\
 3,000 tetrahedra a body. What was aimed at, and what came out: at rest the median, else the worst step of 40. About
 10 contacts: on a pillar that is narrower than the block, so that its corners press into it; 100: on a floor; 1,000:
 eight blocks on a floor, on a CPU one after another in one thread (iterations: of the worst body). Flat impact at 3
-m/s from 0.12 m above; oblique: with 3 m/s along the floor, friction 0.5. *reached*: what of both was."""
+m/s from 0.12 m above; oblique: with 3 m/s along the floor, friction 0.5. The goals of iterations are of those with a
+factor; here those of block Jacobi count alike, though one costs a fraction."""
 
 OWN = """\
 A block of 3,000 tetrahedra, held at its top, hangs at rest, so that steps need next to no iterations. Contacts: a
