@@ -2,15 +2,19 @@
 """The same again: on a GPU as on a CPU, and from a log."""
 
 import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
+from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
 from tests.bench.contact.bodies import Row
 from tests.bench.contact.ladder import line
+from tests.bench.contact.pairs import stack
 from tests.bench.harness.schemes import SCENES
 from tests.contact.scenes import D, over
 from tests.system.server_process import Stage
@@ -36,9 +40,19 @@ def devices() -> list[Row]:
     return found
 
 
-def _apart(steps: int, table: dict[str, Any]) -> float:
+def stacks() -> list[Row]:
+    """The same for bodies that touch each other."""
+    exact = {"contact": TIGHT, "solver": EXACT}
+    return [
+        line(f"stack of {n}: GPU against CPU, tight tolerances, 15 steps, positions [m]", 0,
+             _apart(15, exact, partial(stack, n)), 1e-7)
+        for n in (2, 4)
+    ]  # fmt: skip
+
+
+def _apart(steps: int, table: dict[str, Any], make: Callable[..., Simulation] = over) -> float:
     """Largest difference of positions in any step."""
-    sims = [over(device=device, **table) for device in ("gpu", "cpu")]
+    sims = [make(device=device, **table) for device in ("gpu", "cpu")]
     drivers, apart = [Driver(sim) for sim in sims], 0.0
     for _ in range(steps):
         for driver in drivers:

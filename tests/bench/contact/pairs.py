@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Bodies that touch each other: momentum of two that collide, what each level of a stack carries."""
 
+from typing import Any
+
 import numpy as np
 
 from sim_server.simulation import Simulation
@@ -37,11 +39,10 @@ def collisions() -> list[Row]:
     return found
 
 
-def stack(count: int) -> Simulation:
+def stack(count: int, **table: Any) -> Simulation:
     """Blocks one over another, each a little aside."""
-    return over(objects=[
-        block(name=f"b{i}", at=(0.003 * (i % 2), D + i * (SIZE[1] + D), 0.002 * (i % 2))) for i in range(count)
-    ])  # fmt: skip
+    blocks = [block(name=f"b{i}", at=(0.003 * (i % 2), D + i * (SIZE[1] + D), 0.002 * (i % 2))) for i in range(count)]
+    return over(objects=blocks, **table)
 
 
 def carried(sim: Simulation, level: int) -> Reals:

@@ -41,7 +41,10 @@ def units(device: str, sizes: tuple[int, ...], quick: bool, python: Path | None)
     there = [*_cost(device, sizes, quick), *_others(device, quick), *_peers(device, quick, python)]
     if device == "gpu":
         replays = partial(agreement.replays, "gpu")
-        return [Unit("answers", "gpu", 10, agreement.devices), Unit("answers", "replays, gpu", 20, replays), *there]
+        return [
+            Unit("answers", "gpu", 10, agreement.devices), Unit("answers", "stacks, gpu", 5, agreement.stacks),
+            Unit("answers", "replays, gpu", 20, replays), *there,
+        ]  # fmt: skip
     return [*_answers(quick), *_paths(quick), *_passes(quick), *_few(quick), *there]
 
 
