@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from sim_server.updates.driver import Driver
-from tests.bench.contact import impact, page, pairs, peers, summary
+from tests.bench.contact import impact, ladder, page, pairs, peers, summary
 from tests.bench.contact.bodies import DT, G, Row
 from tests.bench.contact.units import KEYS, units
 from tests.bench.harness.pieces import Piece
@@ -102,6 +102,19 @@ def test_phases_of_an_impact() -> None:
     before, at, after = impact.phases(curve(impact.FACTOR, 9.0))
     assert [line["steps"] for line in (before, at, after)] == [4, 6, 10]
     assert (before["most"], at["most"], after["most ms"]) == (0, 30, 2.0) and at["p99 ms"] == 9.0
+
+
+def test_pieces_may_come_in_any_order() -> None:
+    lines = [
+        {"device": "cpu", "tets": 540, "kappa": 1.0, "situation": situation, "preconditioner": way}
+        for situation in ("rest", "impact without friction, before", "impact without friction, at", "tumbling")
+        for way in (impact.FACTOR, impact.JACOBI)
+    ]
+    lines[3], lines[4] = lines[4], lines[3]  # of each way, what comes before the impact stands first
+    assert page.ordered("cost", lines[::-1]) == lines
+    thrown = [{"obstacle": name, "dt ms": 5.0, "speed": v} for name in ladder.OBSTACLES for v in ladder.SPEEDS]
+    assert page.ordered("paths", thrown[::-1]) == thrown
+    assert page.ordered("answers", lines[::-1]) == lines[::-1]
 
 
 def test_the_page_begins_with_answers(tmp_path: Path) -> None:

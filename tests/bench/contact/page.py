@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: MIT
 """The page of bench contact: a section for each part that there are rows of."""
 
-from tests.bench.contact import impact, passes, peers, picture, summary, words
-from tests.bench.contact.bodies import FACTOR, Row
+from collections.abc import Callable
+from typing import Any
+
+from tests.bench.contact import impact, ladder, passes, peers, picture, summary, words
+from tests.bench.contact.bodies import FACTOR, SITUATIONS, Row
 from tests.bench.harness.report import Report, plots
 
 Tables = dict[str, list[Row]]
@@ -13,6 +16,7 @@ COLOURS = {
 
 def write(report: Report, tables: Tables) -> None:
     """Page, pictures and JSON. tables: rows by the name of their table."""
+    tables = {name: ordered(name, rows) for name, rows in tables.items()}
     report.data |= {name: rows for name, rows in tables.items() if rows}
     if found := summary.rows(tables):
         report.say(words.SHORT)
@@ -27,6 +31,12 @@ def write(report: Report, tables: Tables) -> None:
         if rows := tables.get(name, []):
             show(report, rows)
     report.write()
+
+
+def ordered(name: str, rows: list[Row]) -> list[Row]:
+    """Rows of a table, which pieces may have in any order."""
+    by = ORDER.get(name)
+    return sorted(rows, key=by) if by else rows
 
 
 def _stairs(report: Report, rows: list[Row]) -> None:
@@ -63,7 +73,6 @@ def _wall(report: Report, rows: list[Row]) -> None:
 
 def _hertz(report: Report, rows: list[Row]) -> None:
     report.say("## Hertz", words.HERTZ)
-    rows = sorted(rows, key=lambda row: row["tets"])
     report.table(rows)
     report.remember(rows[-1:], ("tets", "depth mm"), ("force over Hertz",))
 
@@ -93,7 +102,6 @@ def _passes(report: Report, rows: list[Row]) -> None:
 
 def _cost(report: Report, rows: list[Row]) -> None:
     report.say("## Cost of a step", words.COST)
-    rows = sorted(rows, key=lambda row: (row["device"], row["tets"], row["kappa"]))
     for key in dict.fromkeys((row["device"], row["tets"], row["kappa"]) for row in rows):
         mine = [row for row in rows if (row["device"], row["tets"], row["kappa"]) == key]
         report.say(f"### {key[1]:,} tetrahedra, kappa {key[2]:g}{_where(key[0])}")
@@ -104,7 +112,6 @@ def _cost(report: Report, rows: list[Row]) -> None:
 
 def _few(report: Report, rows: list[Row]) -> None:
     report.say("## A few contacts", words.FEW)
-    rows = sorted(rows, key=lambda row: (row["nodes"], row["body"], row["kappa"], row["lockstep"]))
     report.table(rows)
     report.remember(rows, ("body", "nodes", "kappa", "lockstep", "preconditioner"), ("iterations", "mean ms"))
 
@@ -116,7 +123,6 @@ def _where(device: str) -> str:
 
 def _impact(report: Report, rows: list[Row]) -> None:
     report.say("## An impact, step by step", words.IMPACT)
-    rows = sorted(rows, key=lambda row: (row["device"], row["tets"]))
     drawn = [row for row in rows if row["device"] == rows[0]["device"] and row["tets"] == rows[0]["tets"]]
     plt = plots()
     figure, axes = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
@@ -139,7 +145,7 @@ def _impact(report: Report, rows: list[Row]) -> None:
 
 def _goals(report: Report, rows: list[Row]) -> None:
     report.say("## What was aimed at", words.GOALS)
-    report.table(sorted(rows, key=lambda row: row["device"]))
+    report.table(rows)
 
 
 def _own(report: Report, rows: list[Row]) -> None:
@@ -150,7 +156,7 @@ def _own(report: Report, rows: list[Row]) -> None:
 
 def _pile(report: Report, rows: list[Row]) -> None:
     report.say("## A pile", words.PILE)
-    report.table(sorted(rows, key=lambda row: (row["device"], row["bodies"])))
+    report.table(rows)
     report.remember(rows, ("device", "bodies"), ("rest: p50 ms",))
 
 
@@ -177,6 +183,28 @@ def _beside(rows: list[Row], columns: dict[str, tuple[str, str]]) -> list[Row]:
     return [{name: line.get(name) for name in names} for line in found.values()]
 
 
+def _phase(row: Row) -> tuple[int, int]:
+    """Of a row of the cost of a step: its situation, and the part of the impact."""
+    situation, _, phase = row["situation"].partition(", ")
+    return [each.name for each in SITUATIONS].index(situation), ("", "before", "at", "after").index(phase)
+
+
+WAYS = [(way.who, way.name) for way in peers.WAYS]
+ORDER: dict[str, Callable[[Row], Any]] = {
+    "hertz": lambda row: (row["tets"], row["depth mm"]),
+    "belt": lambda row: row["friction"],
+    "paths": lambda row: (list(ladder.OBSTACLES).index(row["obstacle"]), row["dt ms"], row["speed"]),
+    "passes": lambda row: row["passes, at most"],
+    "cost": lambda row: (row["device"], row["tets"], row["kappa"], _phase(row)[0], list(COLOURS).index(row[SOLVER]),
+                         _phase(row)[1]),
+    "few": lambda row: (row["nodes"], row["body"], row["kappa"], row["lockstep"]),
+    "impact": lambda row: (row["device"], row["tets"], impact.WAYS.index(row[SOLVER])),
+    "goals": lambda row: (row["device"], row["bodies"], row["contacts"] > 50, row["goal"]),
+    "own": lambda row: row["device"],
+    "pile": lambda row: (row["device"], row["bodies"]),
+    "peers": lambda row: (row["device"], WAYS.index((row["who"], row["settings"]))),
+}  # fmt: skip
+SOLVER = "preconditioner"
 SHOWN = 40  # steps in the picture of the impact
 _DROP, _SLIDE, _FREE = peers.DROP.name, peers.SLIDE.name, peers.FREE.name
 _STEEP, _FLAT, _STACK = peers.STEEP.name, peers.FLAT.name, peers.STACK.name
