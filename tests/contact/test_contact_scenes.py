@@ -11,7 +11,7 @@ from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
 
 SCENES = Path(__file__).resolve().parents[2] / "deploy" / "scenes"
-NAMES = ("floor_drop", "incline", "stairs", "gripper", "tool_on_organ", "heap")
+NAMES = ("floor_drop", "incline", "stairs", "gripper", "tool_on_organ", "two_organs", "heap", "pile")
 STATUS = KINDS.enumeration("Status")
 
 
@@ -111,6 +111,34 @@ def test_the_tool_presses_in_feels_it_and_leaves():
     records = driver.advance(160)
     assert not records["status"].any() and not records["clipped"].any()
     assert not rows.force.any() and abs(sim.world.x - rest).max() <= 1e-3
+
+
+def test_the_tool_presses_one_organ_into_the_other():
+    """What the tool gives goes through the kidney into the tissue, and through that into the table."""
+    sim = loaded("two_organs")
+    driver, rest = Driver(sim), sim.world.x.copy()
+    tissue, kidney = sim.world.bodies
+    surface = np.arange(tissue.first, tissue.last)
+    surface = surface[rest[surface, 1] > rest[surface, 1].max() - 1e-6]
+    records = driver.advance(139)
+    low = sim.world.x[surface, 1].min()
+    pressed = driver.advance(1)
+    table, tool = driver.reactions.sum(axis=0)[:, :3]
+    assert tool[1] > 3 and -table[1] == pytest.approx(weight(sim) + tool[1], rel=1e-3)
+    assert abs(table + tool)[[0, 2]].max() <= 2e-3 * tool[1], "all else is at rest"
+    assert rest[surface, 1].min() - low > 0.002, "the kidney dents the tissue"
+    assert sim.world.x[kidney.nodes, 1].min() > low, "and stays above it"
+    stroked = driver.advance(80)
+    x = sim.world.x[kidney.nodes].mean(axis=0) - rest[kidney.nodes].mean(axis=0)
+    assert 1e-3 < x[0] < 5e-3, "friction takes it along a little"
+    left = driver.advance(80)
+    every = np.concatenate([records, pressed, stroked, left])
+    assert not every["clipped"].any()
+    assert (every["status"] == STATUS["CONTACT"]).sum() == (every["status"] != 0).sum() <= 4
+    assert not driver.reactions[-2:, 1].any(), "the tool is away"
+    assert -driver.reactions[-2:, 0, 1].sum() == pytest.approx(weight(sim), rel=1e-3)
+    assert abs(sim.world.v).max() <= 1e-3
+    assert abs(middle(sim, 1) - rest[kidney.nodes].mean(axis=0))[[0, 2]].max() <= 1e-3
 
 
 def test_the_heap_comes_to_rest_within_its_walls():

@@ -225,7 +225,9 @@ def test_the_folder_is_the_registry():
         ("stairs", [1728]),
         ("gripper", [1296]),
         ("tool_on_organ", [2304]),
+        ("two_organs", [864, 972]),
         ("heap", [180] * 12),
+        ("pile", [540] * 50),
     ],
 )
 def test_shipped_scenes(name, elements):

@@ -52,16 +52,19 @@ class Situation:
     rotate: tuple[float, float, float] = (0, 0, 0)
 
     def simulation(
-        self, tets: int, solver: dict[str, Any], kappa: float = 1.0, obstacle: Row | None = None, bodies: int = 1
-    ) -> Simulation:
-        """On a floor, if nothing else is given."""
+        self, tets: int, solver: dict[str, Any], kappa: float = 1.0, obstacle: Row | None = None, bodies: int = 1,
+        device: str = "cpu",
+    ) -> Simulation:  # fmt: skip
+        """On a floor, if nothing else is given. Several bodies stand apart."""
         bottom = obstacle or floor(self.friction)
         blocks = [
             block(self.friction, CELLS[tets], SIZE, name=f"b{k}", rotate=self.rotate,
                   at=(0, thickness(tets) + self.height, 0.3 * k))
             for k in range(bodies)
         ]  # fmt: skip
-        return over(bottom, objects=blocks, velocity=self.velocity, dt=DT, contact={"stiffness": kappa}, solver=solver)
+        contact = {"stiffness": kappa} | ({"between": False} if device == "gpu" else {})
+        return over(bottom, objects=blocks, velocity=self.velocity, dt=DT, contact=contact, solver=solver,
+                    device=device)  # fmt: skip
 
 
 REST = Situation("rest", 60, skipped=60)
@@ -71,33 +74,26 @@ TUMBLING = Situation("tumbling", 60, height=0.15, rotate=(30, 20, 40))
 SITUATIONS = (REST, SLIDING, IMPACT, TUMBLING)
 
 
-def run_with_forces(sim: Simulation, steps: int, driver: Driver | None = None) -> tuple[NDArray[Any], Reals]:
-    """Makes steps; returns their records, and force and torque on the first obstacle, (steps, 6)."""
-    driver = driver or Driver(sim)
-    records, forces = [], []
-    for _ in range(steps):
-        records.append(driver.advance(1))
-        forces.append(reaction(sim))
-    return np.concatenate(records), np.array(forces)
+def run_with_forces(sim: Simulation, steps: int) -> tuple[NDArray[Any], Reals]:
+    """Makes steps; returns their records, and force and torque on the first obstacle by the first body, (steps, 6)."""
+    driver = Driver(sim)
+    records = driver.advance(steps)
+    return records, driver.reactions[:: len(sim.world.bodies), 0]
 
 
-def reaction(sim: Simulation) -> Reals:
-    """Force and torque about its own position on the first obstacle in the last step, (6,)."""
-    rows = sim.contact.contact_input()
-    mine = (rows.obstacle == 0) & (rows.force > 0)
-    f = rows.force[mine, None] * rows.normal[mine] + rows.traction[mine]
-    arm = sim.world.x[rows.corner[mine, 0]] - rows.obstacles.end[0, :3]
-    return -np.concatenate([f.sum(axis=0), np.cross(arm, f).sum(axis=0)])
+def times(records: NDArray[Any], device: str = "cpu") -> Reals:
+    """Of steps [ms]: of the loop's thread by its own clock, on a GPU of the device."""
+    return 1e3 * np.asarray(records["cpu" if device == "cpu" else "whole"], dtype=float)
 
 
-def milliseconds(records: NDArray[Any]) -> Row:
-    """Processor time of the loop's thread."""
-    cpu = 1e3 * records["cpu"]
-    return {
-        "p50 ms": float(np.median(cpu)),
-        "p99 ms": float(np.percentile(cpu, 99)),
-        "most ms": float(cpu.max()),
-    }
+def milliseconds(records: NDArray[Any], device: str = "cpu") -> Row:
+    """What a step takes."""
+    return of_times(times(records, device))
+
+
+def of_times(ms: Reals) -> Row:
+    """p50, p99 and the most."""
+    return {"p50 ms": float(np.median(ms)), "p99 ms": float(np.percentile(ms, 99)), "most ms": float(ms.max())}
 
 
 def several(records: NDArray[Any], bodies: int) -> NDArray[Any]:

@@ -1,26 +1,42 @@
 # SPDX-License-Identifier: MIT
 """The page of bench contact: a section for each part that there are rows of."""
 
-from tests.bench.contact import passes, picture, words
-from tests.bench.contact.bodies import FACTOR, Row
+from collections.abc import Callable
+from typing import Any
+
+from tests.bench.contact import impact, ladder, passes, peers, picture, summary, words
+from tests.bench.contact.bodies import FACTOR, SITUATIONS, Row
 from tests.bench.harness.report import Report, plots
 
 Tables = dict[str, list[Row]]
-COLOURS = {"factor": "k", "first factor": "C1", "block Jacobi": "C0"}
+COLOURS = {
+    "factor": "k", impact.UNCORRECTED: "0.6", impact.NONE_IN_CONTACT: "C2", "first factor": "C1", "block Jacobi": "C0"
+}  # fmt: skip
 
 
 def write(report: Report, tables: Tables) -> None:
     """Page, pictures and JSON. tables: rows by the name of their table."""
+    tables = {name: ordered(name, rows) for name, rows in tables.items()}
     report.data |= {name: rows for name, rows in tables.items() if rows}
+    if found := summary.rows(tables):
+        report.say(words.SHORT)
+        report.table(found)
     report.say(words.SETUP)
     shown = {
-        "stairs": _stairs, "answers": _answers, "wall": _wall, "hertz": _hertz, "belt": _belt, "paths": _paths,
-        "passes": _passes, "cost": _cost, "few": _few, "impact": _impact, "goals": _goals, "own": _own,
+        "stairs": _stairs, "answers": _answers, "paths": _paths, "goals": _goals, "impact": _impact, "own": _own,
+        "pile": _pile, "peers": _peers, "wall": _wall, "hertz": _hertz, "belt": _belt, "passes": _passes, "cost": _cost,
+        "few": _few,
     }  # fmt: skip
     for name, show in shown.items():
         if rows := tables.get(name, []):
             show(report, rows)
     report.write()
+
+
+def ordered(name: str, rows: list[Row]) -> list[Row]:
+    """Rows of a table, which pieces may have in any order."""
+    by = ORDER.get(name)
+    return sorted(rows, key=by) if by else rows
 
 
 def _stairs(report: Report, rows: list[Row]) -> None:
@@ -57,7 +73,6 @@ def _wall(report: Report, rows: list[Row]) -> None:
 
 def _hertz(report: Report, rows: list[Row]) -> None:
     report.say("## Hertz", words.HERTZ)
-    rows = sorted(rows, key=lambda row: row["tets"])
     report.table(rows)
     report.remember(rows[-1:], ("tets", "depth mm"), ("force over Hertz",))
 
@@ -87,37 +102,45 @@ def _passes(report: Report, rows: list[Row]) -> None:
 
 def _cost(report: Report, rows: list[Row]) -> None:
     report.say("## Cost of a step", words.COST)
-    rows = sorted(rows, key=lambda row: (row["tets"], row["kappa"]))
-    for key in dict.fromkeys((row["tets"], row["kappa"]) for row in rows):
-        mine = [row for row in rows if (row["tets"], row["kappa"]) == key]
-        report.say(f"### {key[0]:,} tetrahedra, kappa {key[1]:g}")
-        report.table(mine, [name for name in mine[0] if name not in ("tets", "kappa")])
+    for key in dict.fromkeys((row["device"], row["tets"], row["kappa"]) for row in rows):
+        mine = [row for row in rows if (row["device"], row["tets"], row["kappa"]) == key]
+        report.say(f"### {key[1]:,} tetrahedra, kappa {key[2]:g}{_where(key[0])}")
+        report.table(mine, [name for name in mine[0] if name not in ("device", "tets", "kappa")])
     kept = [row for row in rows if row["kappa"] == 1 and row["preconditioner"] == FACTOR]
-    report.remember(kept, ("tets", "situation"), ("iterations", "p50 ms"))
+    report.remember(kept, ("device", "tets", "situation"), ("iterations", "p50 ms"))
 
 
 def _few(report: Report, rows: list[Row]) -> None:
     report.say("## A few contacts", words.FEW)
-    rows = sorted(rows, key=lambda row: (row["nodes"], row["body"], row["kappa"], row["lockstep"]))
     report.table(rows)
     report.remember(rows, ("body", "nodes", "kappa", "lockstep", "preconditioner"), ("iterations", "mean ms"))
 
 
+def _where(device: str) -> str:
+    """What a title says of it."""
+    return "" if device == "cpu" else ", on a GPU"
+
+
 def _impact(report: Report, rows: list[Row]) -> None:
+    report.say("## An impact, step by step", words.IMPACT)
+    drawn = [row for row in rows if row["device"] == rows[0]["device"] and row["tets"] == rows[0]["tets"]]
     plt = plots()
     figure, axes = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
-    for row in rows:
+    for row in drawn:
         for axis, name in zip(axes, ("iterations", "ms"), strict=True):
             values = [max(value, 0.5) if name == "iterations" else value for value in row[name]]
-            axis.semilogy(row["step"], values, "o-", ms=3, color=COLOURS[row["preconditioner"]],
+            axis.semilogy(row["step"][:SHOWN], values[:SHOWN], "o-", ms=3, color=COLOURS[row["preconditioner"]],
                           label=row["preconditioner"])  # fmt: skip
     axes[0].set(xlabel="step", ylabel="iterations of a step (0 drawn as 0.5)")
-    axes[1].set(xlabel="step", ylabel="processor time of a step [ms]")
+    axes[1].set(xlabel="step", ylabel="time of a step [ms]")
     axes[0].legend(fontsize=8)
     for axis in axes:
         axis.grid(True, which="both", alpha=0.3)
-    report.say("## An impact, step by step", words.IMPACT)
-    report.figure(figure, "contact_impact.png", f"An impact without friction, {rows[0]['tets']:,} tetrahedra.")
+    report.figure(figure, "contact_impact.png", f"An impact without friction, {drawn[0]['tets']:,} tetrahedra.")
+    for key in dict.fromkeys((row["device"], row["tets"]) for row in rows):
+        mine = [line for row in rows if (row["device"], row["tets"]) == key for line in impact.phases(row)]
+        report.say(f"### Impact of {key[1]:,} tetrahedra{_where(key[0])}")
+        report.table(sorted(mine, key=lambda line: ("before", "at", "after").index(line["impact"])))
 
 
 def _goals(report: Report, rows: list[Row]) -> None:
@@ -128,4 +151,80 @@ def _goals(report: Report, rows: list[Row]) -> None:
 def _own(report: Report, rows: list[Row]) -> None:
     report.say("## The effect itself", words.OWN)
     report.table(rows)
-    report.remember(rows, ("case",), ("p50 ms",))
+    report.remember(rows, ("device", "case"), ("p50 ms",))
+
+
+def _pile(report: Report, rows: list[Row]) -> None:
+    report.say("## A pile", words.PILE)
+    report.table(rows)
+    report.remember(rows, ("device", "bodies"), ("rest: p50 ms",))
+
+
+def _peers(report: Report, rows: list[Row]) -> None:
+    report.say("## Beside others", words.PEERS)
+    there = {row["who"] for row in rows}
+    if left_out := sorted({way.who for way in peers.WAYS} - there):
+        report.say(f"Not measured here: {', '.join(left_out)}.")
+    for title, columns in PEERS.items():
+        report.say(f"### {title}")
+        report.table(_beside(rows, columns))
+    ours = [row for row in rows if row["who"] == peers.OURS and row["settings"] == "default"]
+    report.remember(ours, ("device", "case"), ("ms a frame",))
+
+
+def _beside(rows: list[Row], columns: dict[str, tuple[str, str]]) -> list[Row]:
+    """A line for each way; columns: case and its column by the name in this table."""
+    found: dict[tuple[str, ...], Row] = {}
+    for row in rows:
+        key = (row["who"], row["settings"], row["device"])
+        line = found.setdefault(key, {"by": row["who"], "settings": row["settings"], "device": row["device"]})
+        line |= {name: row[of] for name, (case, of) in columns.items() if case == row["case"] and of in row}
+    names = ("by", "settings", "device", *columns)
+    return [{name: line.get(name) for name in names} for line in found.values()]
+
+
+def _phase(row: Row) -> tuple[int, int]:
+    """Of a row of the cost of a step: its situation, and the part of the impact."""
+    situation, _, phase = row["situation"].partition(", ")
+    return [each.name for each in SITUATIONS].index(situation), ("", "before", "at", "after").index(phase)
+
+
+WAYS = [(way.who, way.name) for way in peers.WAYS]
+ORDER: dict[str, Callable[[Row], Any]] = {
+    "hertz": lambda row: (row["tets"], row["depth mm"]),
+    "belt": lambda row: row["friction"],
+    "paths": lambda row: (list(ladder.OBSTACLES).index(row["obstacle"]), row["dt ms"], row["speed"]),
+    "passes": lambda row: row["passes, at most"],
+    "cost": lambda row: (row["device"], row["tets"], row["kappa"], _phase(row)[0], list(COLOURS).index(row[SOLVER]),
+                         _phase(row)[1]),
+    "few": lambda row: (row["nodes"], row["body"], row["kappa"], row["lockstep"]),
+    "impact": lambda row: (row["device"], row["tets"], impact.WAYS.index(row[SOLVER])),
+    "goals": lambda row: (row["device"], row["bodies"], row["contacts"] > 50, row["goal"]),
+    "own": lambda row: row["device"],
+    "pile": lambda row: (row["device"], row["bodies"]),
+    "peers": lambda row: (row["device"], WAYS.index((row["who"], row["settings"]))),
+}  # fmt: skip
+SOLVER = "preconditioner"
+SHOWN = 40  # steps in the picture of the impact
+_DROP, _SLIDE, _FREE = peers.DROP.name, peers.SLIDE.name, peers.FREE.name
+_STEEP, _FLAT, _STACK = peers.STEEP.name, peers.FLAT.name, peers.STACK.name
+PEERS: dict[str, dict[str, tuple[str, str]]] = {
+    "Friction": {
+        "stop m": (_SLIDE, "stop m"), "known m": (_SLIDE, "known m"), "error": (_SLIDE, "error"),
+        "creep at -5 degrees mm/s": (_FLAT, "creep mm/s"), "creep at -0.5 degrees mm/s": (_STEEP, "creep mm/s"),
+        "speed without friction m/s": (_FREE, "speed m/s"), "known m/s": (_FREE, "known m/s"),
+    },
+    "Penetration": {
+        "drop: deepest mm": (_DROP, "deepest mm"), "at rest mm": (_DROP, "at rest mm"),
+        "force on the floor over weight": (_DROP, "floor / weight"), "stack: floor mm": (_STACK, "floor mm"),
+        "between blocks mm": (_STACK, "between mm"), "creep of the top mm/s": (_STACK, "creep of the top mm/s"),
+        "stands": (_STACK, "stands"),
+    },
+    "Time": {
+        "dt ms": (_DROP, "dt ms"), "drop: ms a step": (_DROP, "ms a step"), "ms a frame": (_DROP, "ms a frame"),
+        "most ms a frame": (_DROP, "most ms a frame"), "the loop alone": (_DROP, "loop ms a frame"),
+        "slide: ms a frame": (_SLIDE, "ms a frame"),
+        "stack: ms a step": (_STACK, "ms a step"), "stack: ms a frame": (_STACK, "ms a frame"),
+        "version": (_DROP, "version"), "warnings": (_DROP, "notes"),
+    },
+}  # fmt: skip

@@ -1,13 +1,16 @@
 # SPDX-License-Identifier: MIT
 """What the page of bench contact says. Figures stand in its tables."""
 
+SHORT = """\
+[How it works](../contact.md); the sections below say how each of these was measured."""
+
 SETUP = """\
-Bodies against obstacles, with friction, on a CPU in float64 ([how it works](../contact.md)). Where nothing else is
-said: a block of 0.1 x 0.06 x 0.1 m, corotational tetrahedra, 1000 kg/m3, E = 0.3 MPa, Poisson's ratio 0.3, no
-damping, friction 0.5, gravity 9.81 m/s2, backward Euler with steps of 1/60 s, `stiffness` (kappa) 1, at most 16
-passes, contact tolerance 1e-3, solver tolerance 1e-6, at most 5,000 iterations a solve, factors by `lockstep-3`,
-which repeats exactly. Times are milliseconds of processor time of the loop's thread; both cores of the machine were
-busy with other work, so that they are above what an idle machine needs."""
+Bodies against obstacles and each other, with friction, in float64. Where nothing else is said: a block of 0.1 x 0.06
+x 0.1 m, corotational tetrahedra, 1000 kg/m3, E = 0.3 MPa, Poisson's ratio 0.3, no damping, friction 0.5, gravity
+9.81 m/s2, backward Euler with steps of 1/60 s, `stiffness` (kappa) 1, at most 16 passes, contact tolerance 1e-3,
+solver tolerance 1e-6, at most 5,000 iterations a solve, factors by `lockstep-3`, which repeats exactly. Times of
+steps: on a CPU processor time of the loop's thread, on a GPU from the first to the last kernel, each by its own
+clock."""
 
 ANSWERS = """\
 Each line is computed when this page is made, by the simulation as it runs. *error*: relative, or absolute where 0 is
@@ -58,20 +61,52 @@ A round tool presses into a body, strokes it and leaves: steps in which it touch
 matrix to its factor. *corrected*: for contacts that came or went since its matrix (`woodbury`, on by default); both
 kinds of factors go over to block Jacobi in passes that it is expected to solve for less."""
 
-IMPACT = "Iterations and processor time of each step of the impact, kappa 1. Each preconditioner makes the same motion."
+IMPACT = """\
+A block falls flat on a floor at 3 m/s, without friction, kappa 1. *at*: the first six steps with passes; *after*:
+the rest. Each way makes the same motion. *factor*: as it is by default, on a CPU corrected for contacts that came or
+went since its matrix where that pays (`woodbury`); *not corrected*: `woodbury = 0`. *no factor while in contact*:
+block Jacobi in steps after one that touched something, as Courtecuisse et al. 2010 put a factor aside after cuts,
+until one comes that knows them. *first factor*: that of the first matrix for ever."""
 
 GOALS = """\
 3,000 tetrahedra a body. What was aimed at, and what came out: at rest the median, else the worst step of 40. About
 10 contacts: on a pillar that is narrower than the block, so that its corners press into it; 100: on a floor; 1,000:
-eight blocks on a floor, one after another in one thread (iterations: of the worst body). Flat impact at 3 m/s from
-0.12 m above; oblique: with 3 m/s along the floor, friction 0.5. The goals of iterations are of those with a factor;
-here those of block Jacobi count alike, though one costs a fraction."""
+eight blocks on a floor, on a CPU one after another in one thread (iterations: of the worst body). Flat impact at 3
+m/s from 0.12 m above; oblique: with 3 m/s along the floor, friction 0.5. The goals of iterations are of those with a
+factor; here those of block Jacobi count alike, though one costs a fraction."""
 
 OWN = """\
 A block of 3,000 tetrahedra, held at its top, hangs at rest, so that steps need next to no iterations. Contacts: a
 pillar below presses on so many nodes. Obstacles far away are balls half a metre off. Cases take turns, five rounds
-of 30 steps; times are the least of the medians of the rounds, *assemble* (wall time) has the search for what may
-touch."""
+of 30 steps in one run; times are the least of the medians of the rounds, *assemble* (wall time) has the search for
+what may touch."""
+
+PILE = """\
+The lowest blocks of deploy/scenes/pile.toml, 540 tetrahedra each, between four walls; the loop in one thread,
+factors made beside it. *falling*: the first 90 steps; *rest*: steps 150 to 210. *in real time*: 99 of 100 steps take
+less than dt, while they fall, or only at rest."""
+
+PEERS = """\
+The same block of 540 tetrahedra (nodes, tetrahedra, masses, E = 0.3 MPa, Poisson's ratio 0.3, no damping), one or
+four of them over each other, in MuJoCo (flex) and Newton (SolverVBD), friction 0.5. Contact begins 1 mm from a node
+in all of them, and depths are told from there: a node 1 mm deep is at the floor itself. *drop*: from 50 mm; *at
+rest*: after 1.5 s. *stop*: way from 1 m/s; known: v^2 / (2 mu g) - v dt / 2, which steps of dt make of it. *creep*:
+of a block held by friction on a slope so much below the limit, from one second on, over half a second; known: 0.
+*between blocks*: lowest node over the top face below. A frame is 1/60 s.
+
+Laws differ: ours is linear corotational in float64, contact stiff as a node is, friction with a memory. MuJoCo's
+flex is St. Venant-Kirchhoff in float64; its contacts are soft by design and regularized in friction, so that all
+creep a little. It runs with `integrator="discrete"`, which takes elasticity implicitly, the Newton solver, elliptic
+cones and `impratio="100"` as its documentation advises against slow slip (its `noslip` pass is refused with flexes
+there), `solref` and `solimp` of its own example of a soft bar on a floor; MuJoCo raises a time constant of contact
+to twice the time step. Newton's VBD is Neo-Hookean in float32, contact a penalty of 1e5 N/m without damping as in
+its examples of soft bodies, friction smoothed below `friction_epsilon`, 0.01 m/s by default and 0.001 m/s in
+*sharper friction*: what slides slower than that is not held. Ten steps a frame and ten iterations are what its
+examples take, fifty come nearer to its converged answer; what few iterations leave over acts as a force from
+outside, as the speed without friction shows. Times are medians of frames; on a CPU processor time of the whole
+process, ours with all that makes factors, in one thread; on a GPU Newton's wall time of a frame as a CUDA graph, and
+ours by the clock of the device. *the loop alone*: ours without what makes factors, which workers do elsewhere.
+*warnings* are MuJoCo's own."""
 
 STAIRS = """\
 deploy/scenes/stairs.toml: the block on its way down, iterations and passes of each step and contacts that carry

@@ -11,47 +11,23 @@ import os
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-import argparse
-from typing import Any
-
-from tests.bench.harness.pieces import Limit, Merged, Piece, arguments_of_pieces
-from tests.bench.harness.units import arguments_of_units, asked_for, chosen, measure
+from tests.bench.harness.main import Bench
 from tests.bench.rosenbrock import page
 from tests.bench.rosenbrock.bars import CELLS
 from tests.bench.rosenbrock.units import KEYS, SIZES, units
 
-TITLE = "A step without iterations"
 QUICK_SIZES = (162,)
 
 
-def options() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
-    parser.add_argument("--device", choices=("cpu", "gpu"), default="cpu")
-    parser.add_argument(
-        "--sizes", type=int, nargs="+", choices=list(CELLS), default=list(SIZES), help="of precision and times"
-    )
+def main() -> None:
+    bench = Bench("rosenbrock", "A step without iterations", KEYS, page.write)
+    parser = bench.options(__doc__, "'precision 3000, one E'", list(CELLS), SIZES, "of precision and times")
     parser.add_argument(
         "--rounds", type=int, default=1, help="of each run of precision; the least time of a step counts"
     )
-    arguments_of_units(parser, f"{', '.join(KEYS)}, 'precision 3000, one E'")
-    parser.add_argument("--quick", action="store_true", help="a small smoke run")
-    arguments_of_pieces(parser)
-    return parser.parse_args()
-
-
-def main() -> None:
-    o = options()
-    if o.merge:
-        merged = Merged("rosenbrock", TITLE, o.merge, o.out)
-        page.write(merged, {name: merged.rows(name, keys) for name, keys in KEYS.items()})
-        return
-    sizes = QUICK_SIZES if o.quick else tuple(o.sizes)
-    arguments: dict[str, Any] = {"device": o.device, "sizes": sizes, "rounds": o.rounds} | (
-        {"quick": True} if o.quick else {}
-    )
-    wanted = chosen(units(o.device, sizes, max(1, o.rounds), o.quick), o)
-    report = Piece("rosenbrock", TITLE, arguments | asked_for(o), o.out, o.quick)
-    page.write(report, measure(wanted, Limit(o.limit), report))
+    o = parser.parse_args()
+    sizes, rounds = QUICK_SIZES if o.quick else tuple(o.sizes), max(1, o.rounds)
+    bench.run(o, {"sizes": sizes, "rounds": o.rounds}, lambda: units(o.device, sizes, rounds, o.quick))
 
 
 if __name__ == "__main__":
