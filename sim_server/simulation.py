@@ -58,6 +58,7 @@ class Simulation:
             ahead("backends/cpu/native/factor_check.cpp")
         self.on_effect_update: list[Callable[[Effect, PendingUpdate], None]] = []
         self._mailed: dict[Effect, int] = {}  # numbers of their launches whose arguments may change
+        self._detection = slice(0)  # numbers of those that detect contacts
         with backend.building():
             self._build(backend, watched)
 
@@ -92,18 +93,19 @@ class Simulation:
         arrays |= {"b": s.b_material, "y": s.y, "x": w.x, "v": w.v, "clock": s.clock, "moving": s.moving}
         arrays["rotation"] = s.rotation
         names, ranges = [b.name for b in w.bodies], [(b.first, b.last) for b in w.bodies]
-        others = self._stage_launches() if self.integrator.has_stages else []
+        others = self._other_launches()
         assemble, integrate = self.launches()
         mailed = {x.name: x for x in assemble if x.mailed}  # whose arguments come to one launch, which all lists share
-        lists = [[mailed.get(x.name, x) for x in other] for other in others]
-        effects = list(self.effects.values())
+        *lists, euler_launches = [[mailed.get(x.name, x) for x in other] for other in others]
+        effects, numbers = list(self.effects.values()), self._detection
         newton = self.integrator.newton(assemble, effects)
         stages = self.integrator.stages(assemble, lists, effects)
+        euler = self.integrator.euler_form([*assemble, *integrate], assemble[numbers], euler_launches, effects)
         contact = self.contact.contact_input() if self.contact else None
         touch = assemble[self._mailed[self.touch]] if self.touch else None
         return EngineInput(
-            assemble, integrate, names, ranges, w.dt, self.scene.solver, self.energies, newton, stages, contact, touch,
-            arrays,
+            assemble, integrate, names, ranges, w.dt, self.scene.solver, self.energies, newton, stages, euler, contact,
+            touch, arrays,
         )  # fmt: skip
 
     @classmethod
@@ -123,15 +125,22 @@ class Simulation:
             self.world.backend.fetch(array)
         return self.world
 
-    def launches(self, matrix: bool = True) -> tuple[list[Launch], list[Launch]]:
-        """What a step runs: before and after the solve. matrix: takes A into the material frame."""
+    def launches(self, matrix: bool = True, detect: bool = True) -> tuple[list[Launch], list[Launch]]:
+        """What a step runs: before and after the solve.
+
+        matrix: takes A into the material frame; detect: detects contacts
+        """
         system = self.system
         assemble = [self.integrator.start()]
         stencils = iter(system.stencils)
         accumulate = False
         for e in sorted(self.effects.values(), key=lambda e: e.elements is None):  # touch asks what the elements added
             stencil = next(stencils) if e.elements is not None else None
+            if e is self.contact and not detect:
+                continue
             added = e.launches(system, stencil, accumulate)  # f and K, M, B of each effect
+            if e is self.contact:
+                self._detection = slice(len(assemble), len(assemble) + len(added))
             for number, launch in enumerate(added, len(assemble)):
                 if launch.mailed:
                     self._mailed[e] = number
@@ -142,12 +151,16 @@ class Simulation:
         assemble += system.finish(matrix)  # into the material frame (eq. 12 and 13)
         return assemble, self.integrator.advance()
 
-    def _stage_launches(self) -> list[list[Launch]]:
-        """Returns what a Rosenbrock-W step runs beside `launches`: the forces of both stages, and backward Euler."""
-        first, again = self.force_launches(frames=True), self.force_launches(frames=False)
-        with self.world.made_with(self.world.dt, self.world.dt):
-            euler = self.launches()[0]
-        return [first, again, euler]
+    def _other_launches(self) -> list[list[Launch]]:
+        """Returns what steps run beside `launches`: the forces of the stages of ros2, and backward Euler.
+
+        Where bodies touch, with the tangent that backward Euler has by default: the exact one would take their spin.
+        """
+        stages = [self.force_launches(frames) for frames in (True, False)] if self.integrator.has_stages else []
+        if not self.integrator.takes_euler:
+            return [*stages, []]
+        with self.world.made_with(self.world.dt, self.world.dt, usual_tangent=self.integrator.touches):
+            return [*stages, self.launches(detect=False)[0]]
 
     def force_launches(self, frames: bool) -> list[Launch]:
         """Returns the launches of a stage that needs no A. frames: those of the nodes are made, too."""
@@ -157,7 +170,7 @@ class Simulation:
             e.force_launches(self.system, next(stencils) if e.elements is not None else None, frames) for e in ordered
         ]
         if any(part is None for part in parts):  # then all that `launches` has but for the blocks
-            full = [x for x in self.launches(matrix=False)[0] if x.domain != "blocks"]
+            full = [x for x in self.launches(matrix=False, detect=False)[0] if x.domain != "blocks"]
             return full if frames else full[:-1] + self.integrator.rotate_force()
         shape = [self.shape.launch(self.system.mean)] if frames and self.shape is not None else []
         finish = self.system.finish(matrix=False) if frames else self.integrator.rotate_force()

@@ -22,6 +22,7 @@ from sim_server.arrays import Float64
 if TYPE_CHECKING:
     from sim_server.backends.contact import Contact
     from sim_server.backends.energies import Energies
+    from sim_server.backends.euler_form import EulerForm
     from sim_server.backends.newton import Newton
     from sim_server.backends.rosenbrock import Rosenbrock
     from sim_server.scene.solver_options import SolverOptions
@@ -254,6 +255,7 @@ class EngineInput:
     energies: what the energy of each step is summed from
     newton: for several linearizations a step; None for one
     stages: of a Rosenbrock-W step; None for other schemes
+    euler: steps of backward Euler that single bodies take; None: all bodies take those of the scheme
     contact: rows that launches among `assemble` fill in; None: nothing can be touched
     touch: the one of `assemble` that pushes and grabs (effects/touch.cu); None: no object lists the effect
     arrays: of the system by name: row_start, columns, values, b, y, x, v, clock, moving, rotation
@@ -268,6 +270,7 @@ class EngineInput:
     energies: Energies
     newton: Newton | None
     stages: Rosenbrock | None
+    euler: EulerForm | None
     contact: Contact | None
     touch: Launch | None
     arrays: Mapping[str, NDArray[Any]]

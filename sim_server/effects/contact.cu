@@ -106,13 +106,14 @@ struct Detect {
     const int* node;         // (n,) of the scene, ascending
     const int* body;         // (n,)
     const real* x;           // (nodes, 3) [m]
-    const real* predictor;   // (nodes, 3) world.predictor: the step moves x by dx_dv (predictor + dv) [m/s]
+    const real* predictor;   // (nodes, 3) v: the step moves x by dx_dv (predictor + dv) [m/s]
     const real* free;        // (nodes,) 1, or 0 at fixed nodes
     const real* mass;        // (nodes,) [kg]
     const local* block;      // (nodes, 6) what elements have put into the node's own block of A [kg]
+    const double* block_scale;  // (bodies,) of K in A of backward Euler over that in `block`
     const double* gravity;   // (3,) acceleration [m/s2]
-    double force_coefficient;  // world.force_coefficient [s]
-    double dx_dv;            // world.dx_dv [s]
+    double force_coefficient;  // of backward Euler, which bodies take where they touch [s]
+    double dx_dv;            // likewise [s]
     double kappa;            // stiffness of a contact over that of its node
     const double* thickness; // (2 n,) [m]
     int* obstacle;           // (2 n,) in, out: number of the obstacle of a row; -1: the row is empty
@@ -219,7 +220,8 @@ KERNEL(detect, Detect) {
         middle[k] = x[k] + s[k] / 2;
     }
     if (p.stiffness[2 * i] == 0) {
-        const double own = p.mass[node] + (p.block[6 * node] + p.block[6 * node + 3] + p.block[6 * node + 5]) / 3;
+        const double stiff = (p.block[6 * node] + p.block[6 * node + 3] + p.block[6 * node + 5]) / 3;
+        const double own = p.mass[node] + p.block_scale[p.body[i]] * stiff;
         p.stiffness[2 * i] = p.stiffness[2 * i + 1] = p.kappa * own / (p.force_coefficient * p.dx_dv);
     }
     const double reach = sqrt(dot3(s, s)) / 2 + 2 * thickness;

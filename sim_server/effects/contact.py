@@ -118,7 +118,7 @@ class Contact(Effect):
             self._table, start, corner, weight, np.full(rows, -1, np.int32), np.zeros((rows, 3)), np.zeros(rows),
             np.zeros((rows, 3)), np.full(rows, 2.0), np.zeros(rows), np.zeros(rows),
             thickness, np.zeros(rows), np.zeros((rows, 3)),
-            world.predictor, world.free, world.dx_dv, world.force_coefficient, params.passes, params.tolerance,
+            world.v, world.free, world.dt, world.dt, params.passes, params.tolerance,
             _surfaces(world, params, self.node, self.body) if touching else None,
         )  # fmt: skip
         self.dropped = np.zeros(len(self.node), np.int32)
@@ -168,17 +168,20 @@ class Contact(Effect):
     def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
         self._system = system
         w, rows, table = self.world, self._input, self._table
-        gravity = np.array(w.gravity)
-        w.backend.keep(gravity, exact=True)
+        gravity, block_scale = np.array(w.gravity), w.euler_block_scale
+        w.backend.keep(gravity, block_scale, exact=True)
         detect = w.backend.module(TEXT).bind(
             "detect", len(self.node), obstacles=len(self.obstacles), **vars(table), swept=self._swept,
-            pair_friction=self._pair_friction, node=self.node, body=self.body, x=w.x, predictor=w.predictor,
-            free=w.free, mass=w.mass, block=system.block, gravity=gravity, force_coefficient=w.force_coefficient,
-            dx_dv=w.dx_dv, kappa=self.params.stiffness, thickness=rows.thickness, obstacle=rows.obstacle,
+            pair_friction=self._pair_friction, node=self.node, body=self.body, x=w.x, predictor=w.v, free=w.free,
+            mass=w.mass, block=system.block, block_scale=block_scale, gravity=gravity, force_coefficient=w.dt,
+            dx_dv=w.dt, kappa=self.params.stiffness, thickness=rows.thickness, obstacle=rows.obstacle,
             normal=rows.normal, gap=rows.gap, drift=rows.drift, entry=rows.entry, stiffness=rows.stiffness,
             friction=rows.friction, force=rows.force, traction=rows.traction, dropped=self.dropped,
         )  # fmt: skip
         return [self._place(self._target), detect]
+
+    def force_launches(self, system: System, stencil: Stencil | None, frames: bool) -> list[Launch]:
+        return []  # contacts are detected once a step
 
     def connect(self, simulation: EffectUpdates) -> None:
         self._simulation = simulation

@@ -136,7 +136,8 @@ class Corotational(Effect):
     def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
         assert stencil is not None
         w, m = self.world, len(self.elements)
-        text, exact = f"effects/corotational{self.variant}", self.variant == "_exact"
+        exact = self.variant == "_exact" and not w.usual_tangent
+        text = f"effects/corotational{'' if self.variant == '_exact' and not exact else self.variant}"
         twist = {"twist": self.twist} if exact else {}
         sums = text if exact else "effects/corotational"
         elements = w.backend.module(f"{text}.cu").bind(

@@ -166,32 +166,6 @@ KERNEL(restore, Restore) {
     prepare_stage(p, i, v, vec3{}, v);
 }
 
-struct RestoreForEuler {
-    int n;                     // nodes
-    const real* start_v;       // (n, 3) [m/s]
-    const real* start_x;       // (n, 3) [m]
-    const real* earlier;       // (n, 3) [m]
-    real* v;                   // (n, 3) out [m/s]
-    real* x;                   // (n, 3) out [m]
-    real* before;              // (n, 3) out: x when the step before began [m]
-    real* predictor;           // (n, 3) out [m/s]
-    real* damping_velocity;    // (n, 3) out [m/s]
-    real* inertial_increment;  // (n, 3) out [m/s]
-    real* dv;                  // (n, 3) out: start of the solve [m/s]
-};
-
-// Back to the start of the step, for a step of backward Euler.
-KERNEL(restore_for_euler, RestoreForEuler) {
-    vec3 v = load3(p.start_v, i), zero = {};
-    store3(p.x, i, load3(p.start_x, i));
-    store3(p.before, i, load3(p.earlier, i));
-    store3(p.v, i, v);
-    store3(p.predictor, i, v);
-    store3(p.damping_velocity, i, v);
-    store3(p.inertial_increment, i, zero);
-    store3(p.dv, i, zero);
-}
-
 struct Euler {
     int n;                     // nodes
     const local* rotation;     // (n, 3, 3)

@@ -4,7 +4,8 @@
 #include "host_device.cuh"
 
 // ONE_SOLVE: by a scheme without stages. ITERATE, FACTOR: by the stages of a Rosenbrock-W method, whose matrix is that of the step,
-// solved by iterations, or an older one, whose factor is applied once. EULER: by backward Euler, since the estimate was too large.
+// solved by iterations, or an older one, whose factor is applied once. EULER: by backward Euler, since the
+// estimate was too large, or the body touches something.
 enum StepForm { ONE_SOLVE = 0, ITERATE = 1, FACTOR = 2, EULER = 3 };
 
 constexpr int PATIENCE = 8;  // steps that iterate after one whose factor alone did not do

@@ -108,3 +108,66 @@ KERNEL(advance, Advance) {
     store3(p.damping_velocity, i, select(refused, zero, damping_velocity_of(predictor, v, p.dx_dv, at(p.beta, i))));
     store3(p.inertial_increment, i, select(refused, zero, p.inertia_from_force * force_increment + p.inertia_from_dv * dv));
 }
+
+struct RestoreForEuler {
+    int n;                     // nodes
+    const real* start_v;       // (n, 3) [m/s]
+    const real* start_x;       // (n, 3) [m]
+    const real* earlier;       // (n, 3) [m]
+    real* v;                   // (n, 3) out [m/s]
+    real* x;                   // (n, 3) out [m]
+    real* before;              // (n, 3) out: x when the step before began [m]
+    real* predictor;           // (n, 3) out [m/s]
+    real* damping_velocity;    // (n, 3) out [m/s]
+    real* inertial_increment;  // (n, 3) out [m/s]
+    real* dv;                  // (n, 3) out: start of the solve [m/s]
+};
+
+// Back to the start of the step, for a step of backward Euler of a body in a scene of another scheme (backends/euler_form.py).
+KERNEL(restore_for_euler, RestoreForEuler) {
+    vec3 v = load3(p.start_v, i), zero = {};
+    store3(p.x, i, load3(p.start_x, i));
+    store3(p.before, i, load3(p.earlier, i));
+    store3(p.v, i, v);
+    store3(p.predictor, i, v);
+    store3(p.damping_velocity, i, v);
+    store3(p.inertial_increment, i, zero);
+    store3(p.dv, i, zero);
+}
+
+struct AdvanceEuler {
+    int n;                     // nodes
+    const local* rotation;     // (n, 3, 3)
+    const real* y;             // (n, 3) solution in the material frame [m/s]
+    const real* beta;          // (n,) [s]
+    real h;                    // time step [s]
+    real dx_dv;                // of the scheme, as the next six [s]
+    real force_coefficient;    // [s]
+    real from_velocity;        // weights of `advance`
+    real from_step;
+    real from_force;
+    real inertia_from_force;
+    real inertia_from_dv;
+    real* inertial_increment;  // (n, 3) out: of the next step, as the next two [m/s]
+    real* predictor;
+    real* damping_velocity;
+    real* dv;                  // (n, 3) out: R y [m/s]
+    real* v;                   // (n, 3) in, out [m/s]
+    real* x;                   // (n, 3) in, out [m]
+    real* before;              // (n, 3) in, out: x when the step before began [m]
+};
+
+// v += dv, x += h v, and what the next step of the scheme begins from: as if it had made this one, with the acceleration dv / h.
+KERNEL(advance_euler, AdvanceEuler) {
+    vec3 y = load3(p.y, i), dv = mul(as<number>(load9(p.rotation, i)), y), x = load3(p.x, i), before = load3(p.before, i), zero = {};
+    vec3 v = load3(p.v, i) + dv, force_increment = (p.force_coefficient / p.h) * dv;
+    vec3 predictor = p.from_velocity * v + (p.from_step * p.h / p.dx_dv) * v + p.from_force * force_increment;
+    auto refused = y.x != y.x;
+    store3(p.dv, i, select(refused, zero, dv));
+    store3(p.v, i, select(refused, zero, v));
+    store3(p.x, i, select(refused, before, x + p.h * v));
+    store3(p.before, i, select(refused, before, x));
+    store3(p.predictor, i, select(refused, zero, predictor));
+    store3(p.damping_velocity, i, select(refused, zero, damping_velocity_of(predictor, v, p.dx_dv, at(p.beta, i))));
+    store3(p.inertial_increment, i, select(refused, zero, p.inertia_from_force * force_increment + p.inertia_from_dv * dv));
+}

@@ -29,6 +29,9 @@ Order: 1, 2 (gamma = 1/2), 2. One linearization keeps it only where K is the exa
 tangent of corotational elements is not, by as much as they are strained. The scheme ros2 keeps it with any tangent: it
 has two stages of its own (rosenbrock.py).
 
+Where a body touches something its step is one of backward Euler, whatever the scheme (docs/contact.md); the history of
+the next step is then that of this one, (x' - x) / c = h v' / c and V = v' + (1 - g) dv, as if dv / h had been a.
+
 Stability with one linearization: a mode of stiffness k with k' in its place in the matrix is stable in Newmark's scheme
 and BDF2 at every h if k' >= k, and grows if k' < k (backward Euler: if k' < k / 2). The usual tangent has k' < k under
 tension; the exact one leaves out what compression takes from k, as springs do, and projections add to it, so k' >= k.
@@ -37,7 +40,7 @@ Sources: Newmark 1959; Hughes, The Finite Element Method, section 9.1; Hairer an
 Equations II, section V.1 (BDF2); Baraff and Witkin 1998 (one linearization).
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from math import inf
 from typing import Any, Protocol
@@ -46,6 +49,7 @@ import numpy as np
 
 from sim_server.arrays import Int32
 from sim_server.backends.base import Launch
+from sim_server.backends.euler_form import EulerForm
 from sim_server.backends.newton import Newton
 from sim_server.backends.rosenbrock import Rosenbrock
 from sim_server.mechanics.system import System
@@ -93,6 +97,9 @@ class Integrator:
 
     inertial_increment (n, 3) [m/s]: r, above; none in backward Euler. beta (n,): damping of the stiffness at nodes [s].
     before (n, 3) [m]: x at the start of the last step, to which a body goes back whose forces are NaN.
+    touches: whether the scene has contact, and another scheme than backward Euler with one linearization.
+    takes_euler: whether single bodies may take steps of backward Euler in place of those of the scheme. For these
+    start_x [m], start_v [m/s] (n, 3): state at the start of the step; earlier (n, 3): `before` there.
     """
 
     def __init__(self, scene: Scene, system: System):
@@ -102,6 +109,11 @@ class Integrator:
         self.beta = np.repeat(w.beta, [b.last - b.first for b in w.bodies]) if not w.plain else np.zeros(0)
         self.before = w.x.copy()
         w.backend.keep(self.inertial_increment, self.beta, self.before)
+        self.touches = "contact" in scene.effects and not w.plain
+        self.takes_euler = self.touches or self.has_stages
+        n = w.nodes if self.takes_euler else 0
+        self.start_x, self.start_v, self.earlier = w.x[:n].copy(), np.zeros((n, 3)), w.x[:n].copy()
+        w.backend.keep(self.start_x, self.start_v, self.earlier)
         self._weights, self._initial = _weights_of(scene)
 
     @property
@@ -155,12 +167,52 @@ class Integrator:
             return None
         mass = w.mass if w.inertia else np.zeros(w.nodes)
         w.backend.keep(mass)
-        starts = np.array([*(b.first for b in w.bodies), w.nodes], dtype=np.int32)
-        parts = [items_of_bodies(launch, starts, s.row, rows_of(effects)) for launch in assemble]
+        parts = list(self.parts_of(assemble, effects).values())
         return Newton(
             self.options, w.dx_dv, parts, rotation=s.rotation, mass=mass, beta=self.beta, predictor=w.predictor,
             damping_velocity=w.damping_velocity, inertial_increment=self.inertial_increment,
         )  # fmt: skip
+
+    def euler_form(
+        self, step: Sequence[Launch], detect: Sequence[Launch], euler: Sequence[Launch],
+        effects: Sequence[CouplesNodes],
+    ) -> EulerForm | None:  # fmt: skip
+        """Input of steps of backward Euler that single bodies take; None if none do.
+
+        step: launches of a step of the scheme; detect: those among them that detect contacts; euler: launches that
+        assemble backward Euler
+        """
+        if not self.takes_euler:
+            return None
+        w, dv = self.world, self.system.dv
+        start: dict[str, Any] = {"start_x": self.start_x, "start_v": self.start_v, "earlier": self.earlier}
+        restore = self._bind(
+            "restore_for_euler", x=w.x, v=w.v, before=self.before, predictor=w.predictor,
+            damping_velocity=w.damping_velocity, inertial_increment=self.inertial_increment, dv=dv, **start,
+        )  # fmt: skip
+        advance = self.advance_euler()
+        return EulerForm(
+            assemble=euler, detect=detect, restore=restore, advance=advance, before=self.before, **start,
+            parts=self.parts_of((*step, *euler, restore, advance), effects),
+            diagonal=self.system.diagonal, block_scale=w.euler_block_scale,
+            coefficients=w.coefficients, euler_coefficients=(w.dt, w.dt),
+        )  # fmt: skip
+
+    def advance_euler(self) -> Launch:
+        """Advances the state by the solution of a step of backward Euler, and begins the next one of the scheme."""
+        s, w = self.system, self.world
+        weights = {k: v for k, v in asdict(self._weights).items() if k != "keeps_velocity"}
+        return self._bind(
+            "advance_euler", rotation=s.rotation, y=s.y, beta=self.beta, dx_dv=w.dx_dv, h=w.dt,
+            force_coefficient=w.force_coefficient, v=w.v, x=w.x, dv=s.dv, inertial_increment=self.inertial_increment,
+            predictor=w.predictor, damping_velocity=w.damping_velocity, before=self.before, **weights,
+        )  # fmt: skip
+
+    def parts_of(self, launches: Iterable[Launch], effects: Sequence[CouplesNodes]) -> dict[int, Int32 | None]:
+        """Returns the first item of each body, (bodies + 1,), by the id of a launch; None if it tells none apart."""
+        w, rows = self.world, rows_of(effects)
+        starts = np.array([*(b.first for b in w.bodies), w.nodes], dtype=np.int32)
+        return {id(x): items_of_bodies(x, starts, self.system.row, rows) for x in launches}
 
     has_stages = False
 
@@ -182,7 +234,7 @@ class Integrator:
     ) -> Rosenbrock | None:
         """Input of a Rosenbrock-W step; None for other schemes.
 
-        lists: launches of the forces of the first and of the second stage, and of backward Euler
+        lists: launches of the forces of the first and of the second stage
         """
         return None
 

@@ -26,7 +26,8 @@ step, of each body (kernels/step_form.h):
               that it should be (step_form.h)
     ITERATE   A is assembled at x, and solved with conjugate gradients from theta s, to a residual relative to that of
               this start, which is the right-hand side of u_j
-    EULER     where the estimate of ITERATE exceeds the bound of the body: backward Euler from the start of the step
+    EULER     where the estimate of ITERATE exceeds the bound of the body, or the body touches something
+              (docs/contact.md): backward Euler from the start of the step
 
 A step by FACTOR whose factor is inconsistent, or whose estimate exceeds the bound, is made again by ITERATE, and
 PATIENCE steps after it, too.
@@ -46,10 +47,10 @@ from typing import Any
 
 import numpy as np
 
-from sim_server.arrays import Float64, Int32
+from sim_server.arrays import Float64
 from sim_server.backends.base import Launch
 from sim_server.backends.rosenbrock import Rosenbrock
-from sim_server.mechanics.integrator import CouplesNodes, Integrator, items_of_bodies, rows_of
+from sim_server.mechanics.integrator import CouplesNodes, Integrator
 from sim_server.mechanics.system import System
 from sim_server.mechanics.world import Body
 from sim_server.scene import Scene
@@ -61,9 +62,8 @@ BOUND = 0.1  # of the shortest edge, for the error of a step
 class RosenbrockIntegrator(Integrator):
     """The launches of the stages.
 
-    share (n,): theta; weight (n,): w; first (n, 3): u_1 [m/s]; start_x, start_v (n, 3): x [m] and v [m/s] at the start
-    of the step; earlier (n, 3): x at the start of the step before [m]; estimate (n,) [m]; known (n, 6): the nodes' own
-    blocks of the last step that iterated [kg]
+    share (n,): theta; weight (n,): w; first (n, 3): u_1 [m/s]; estimate (n,) [m]; known (n, 6): the nodes' own blocks
+    of the last step that iterated [kg]
     """
 
     has_stages = True
@@ -74,14 +74,11 @@ class RosenbrockIntegrator(Integrator):
         alpha = np.repeat(w.alpha, [b.last - b.first for b in w.bodies])
         self.share = w.dx_dv / (w.dx_dv + self.beta)
         self.weight = self.share * (1 + w.dx_dv * alpha)
-        self.start_x, self.start_v, self.first = w.x.copy(), np.zeros_like(w.v), np.zeros_like(w.v)
-        self.earlier, self.estimate, self.known = w.x.copy(), np.zeros(w.nodes), np.zeros((w.nodes, 6))
+        self.first, self.estimate, self.known = np.zeros_like(w.v), np.zeros(w.nodes), np.zeros((w.nodes, 6))
         self.bound = np.array([self._bound(b) for b in w.bodies])
         self.unheld = np.array([(w.free[b.nodes] > 0).all() for b in w.bodies], np.int32)
         self.factor_alone = scene.uses_factor_alone
-        w.backend.keep(
-            self.share, self.weight, self.start_x, self.start_v, self.first, self.earlier, self.estimate, self.known
-        )
+        w.backend.keep(self.share, self.weight, self.first, self.estimate, self.known)
 
     def _bound(self, body: Body) -> float:
         if self.options.error_bound is not None:
@@ -99,7 +96,8 @@ class RosenbrockIntegrator(Integrator):
         return [self.world.predictor, self.world.damping_velocity, self.inertial_increment]
 
     def begin(self, assemble: Sequence[Launch]) -> list[Launch]:
-        return [self._stage("prepare", v=self.world.v, **self._prepared())]
+        prepare = self._stage("prepare", v=self.world.v, **self._prepared())
+        return [prepare, *assemble] if self.touches else [prepare]  # detection needs the nodes' own blocks
 
     def advance(self) -> list[Launch]:
         return []
@@ -122,17 +120,15 @@ class RosenbrockIntegrator(Integrator):
     def stages(
         self, assemble: Sequence[Launch], lists: Sequence[Sequence[Launch]], effects: Sequence[CouplesNodes]
     ) -> Rosenbrock:
-        """Input of the step. lists: launches of the forces of both stages, and of backward Euler."""
+        """Input of the step. lists: launches of the forces of both stages."""
         w, s = self.world, self.system
         state: dict[str, Any] = {"x": w.x, "v": w.v}
         started: dict[str, Any] = {"start_x": self.start_x, "start_v": self.start_v}
         solved: dict[str, Any] = {"rotation": s.rotation, "y": s.y, "h": w.dt}
         history: dict[str, Any] = {"before": self.before, "earlier": self.earlier}
-        first, again, euler = lists
-        restored = {k: v for k, v in self._prepared().items() if k not in ("share", "weight")}
-        parts: dict[int, Int32 | None] = {}
+        first, again = lists
         found = Rosenbrock(
-            first=first, again=again, euler=euler,
+            first=first, again=again,
             second=self._stage("second", first=self.first, **solved, **state, **started, **self._prepared()),
             finish=self._stage(
                 "finish", body=s.body, moving=s.moving, first=self.first, estimate=self.estimate,
@@ -141,17 +137,18 @@ class RosenbrockIntegrator(Integrator):
             prepare=self._stage("prepare", v=w.v, **self._prepared()),
             remember=self._stage("remember", block=s.block, known=self.known),
             restore=self._stage("restore", **state, **started, **history, **self._prepared()),
-            restore_for_euler=self._stage("restore_for_euler", **state, **started, **history, **restored),
-            advance_euler=self._stage("euler", before=self.before, **solved, **state, **self._prepared()),
-            parts=parts, factor_alone=self.factor_alone, estimate=self.estimate, mass=w.mass, share=self.share,
+            parts={}, factor_alone=self.factor_alone, estimate=self.estimate, mass=w.mass, share=self.share,
             weight=self.weight, diagonal=s.diagonal, start_x=self.start_x, start_v=self.start_v, b=s.b,
             inertial_increment=self.inertial_increment, unheld=self.unheld, bound=self.bound,
-            coefficients=w.coefficients, euler_coefficients=(w.dt, w.dt),
         )  # fmt: skip
-        starts, rows = np.array([*(b.first for b in w.bodies), w.nodes], dtype=np.int32), rows_of(effects)
-        launches = (*assemble, *found.launches)
-        parts.update({id(x): items_of_bodies(x, starts, s.row, rows) for x in launches})
+        found.parts.update(self.parts_of((*assemble, *found.launches), effects))
         return found
+
+    def advance_euler(self) -> Launch:
+        w, s = self.world, self.system
+        return self._stage(
+            "euler", before=self.before, rotation=s.rotation, y=s.y, h=w.dt, x=w.x, v=w.v, **self._prepared()
+        )
 
     def _prepared(self) -> dict[str, Any]:
         return {

@@ -63,6 +63,7 @@ class World:
     dx_dv [s]: derivative of the positions by the velocities at the end of the step
     coefficients (2,): force_coefficient and dx_dv as kernels read them whose arguments change while steps run
     stiffness_coefficient (bodies,) [s2]: factor of K in A
+    usual_tangent: an exact tangent of corotational elements is not wanted in the launches that are made
     predictor (n, 3) [m/s]: the step moves x by dx_dv (predictor + dv), dv the solution
     damping_velocity (n, 3) [m/s]: (dx_dv predictor + beta v) / (dx_dv + beta). Elements take it for their velocity: the
         impulse stiffness_coefficient (K damping_velocity) then holds displacement and damping
@@ -90,6 +91,7 @@ class World:
         self.alpha, self.beta = np.zeros(len(self.bodies)), np.zeros(len(self.bodies))
         integrator = scene.integrator
         self.force_coefficient, self.dx_dv = integrator.force_coefficient(self.dt), integrator.dx_dv(self.dt)
+        self.usual_tangent = False
         self.coefficients = np.array([self.force_coefficient, self.dx_dv])
         self.inertia = integrator.scheme != "quasi_static"
         self.plain = integrator.scheme == "backward_euler" and integrator.linearizations == 1
@@ -97,19 +99,24 @@ class World:
         self.damping_velocity = self.v if self.plain else np.zeros_like(self.v)
 
     @contextmanager
-    def made_with(self, force_coefficient: float, dx_dv: float) -> Iterator[None]:
-        """Launches made inside have these coefficients [s]."""
-        given = self.force_coefficient, self.dx_dv
-        self.force_coefficient, self.dx_dv = force_coefficient, dx_dv
+    def made_with(self, force_coefficient: float, dx_dv: float, usual_tangent: bool) -> Iterator[None]:
+        """Launches made inside have these coefficients [s], and usual_tangent."""
+        given = self.force_coefficient, self.dx_dv, self.usual_tangent
+        self.force_coefficient, self.dx_dv, self.usual_tangent = force_coefficient, dx_dv, usual_tangent
         try:
             yield
         finally:
-            self.force_coefficient, self.dx_dv = given
+            self.force_coefficient, self.dx_dv, self.usual_tangent = given
 
     @property
     def stiffness_coefficient(self) -> Float64:
         """force_coefficient (dx_dv + beta) of each body [s2]: factor of K in A."""
         return self.force_coefficient * (self.dx_dv + self.beta)
+
+    @property
+    def euler_block_scale(self) -> Float64:
+        """Factor of K in A of backward Euler over that of the scheme, of each body [-]."""
+        return self.dt * (self.dt + self.beta) / self.stiffness_coefficient
 
     @property
     def nodes(self) -> int:

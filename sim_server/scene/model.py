@@ -157,6 +157,11 @@ class Scene(Parameters):
                 f"solver.budget = {self.solver.budget:g} with integrator.linearizations = "
                 f"{self.integrator.linearizations}: a budget is for one solve a step; allowed: one of the two"
             )
+        if self.solver.budget and "contact" in self.effects and self.integrator.scheme != "backward_euler":
+            raise complaint(
+                f"solver.budget = {self.solver.budget:g} with contact and integrator.scheme = "
+                f'"{self.integrator.scheme}", which may make a step twice; allowed: "backward_euler"'
+            )
         return self
 
     @model_validator(mode="after")
@@ -208,7 +213,7 @@ class Scene(Parameters):
         self.solver.check_device(device)
         self.integrator.check_device(device)
         if "contact" in self.effects:
-            check_contact_on(device, self.effects["contact"], self.objects)
+            check_contact_on(device, self.effects["contact"], self.objects, self.integrator)
 
     @property
     def projection(self) -> Literal["excess", "clamp", "absolute", "none"]:

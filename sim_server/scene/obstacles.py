@@ -104,10 +104,11 @@ def contact_errors(
         return
     if not obstacles and (len(objects) < 2 or not contact.between):
         yield _error("there is nothing to touch; needed: an [[obstacle]], or another object", "effects", "contact")
-    if integrator.scheme != "backward_euler" or integrator.linearizations > 1:
+    linearized = integrator.scheme == "backward_euler" and integrator.linearizations > 1
+    if integrator.scheme == "quasi_static" or linearized:
         found = f"{integrator.scheme!r} with linearizations = {integrator.linearizations}"
-        text = f"contact with integrator.scheme = {found}; allowed: 'backward_euler' with linearizations = 1"
-        yield _error(text, "effects", "contact")
+        allowed = "'backward_euler' with linearizations = 1, 'newmark', 'bdf2', 'ros2'"
+        yield _error(f"contact with integrator.scheme = {found}; allowed: {allowed}", "effects", "contact")
     pairs: list[set[str]] = []
     for index, pair in enumerate(contact.friction or ()):
         if text := _wrong_pair(set(pair.between), names, shapes, pairs):
@@ -115,11 +116,16 @@ def contact_errors(
         pairs.append(set(pair.between))
 
 
-def check_contact_on(device: str, contact: Any, objects: Sequence[HasName]) -> None:
+def check_contact_on(device: str, contact: Any, objects: Sequence[HasName], integrator: IntegratorOptions) -> None:
     """Raises InputError for contact that the device ("cpu" or "gpu") does not have.
 
     contact: parameters of the effect
     """
+    if device == "gpu" and integrator.scheme != "backward_euler":
+        raise InputError(
+            f"effects.contact with integrator.scheme = {integrator.scheme!r} on a GPU; allowed: 'backward_euler', or "
+            "--device cpu"
+        )
     if device == "gpu" and len(objects) > 1 and contact.between:
         raise InputError(
             f"effects.contact.between = true with {len(objects)} objects: on a GPU they touch obstacles, not each "

@@ -44,14 +44,21 @@ def block(friction: float = 0.5, cells: Sequence[int] = CELLS, size: Sequence[fl
 def over(
     *obstacles: dict, objects: Sequence[dict] = (), velocity: ArrayLike = (0, 0, 0), dt: float = 1 / 60,
     gravity: Sequence[float] = (0, -9.81, 0), contact: Any = True, solver: dict | None = None, device: str = "cpu",
-    **table: Any,
+    integrator: dict | None = None, **table: Any,
 ) -> Simulation:  # fmt: skip
-    """A block, or other objects, over obstacles. velocity: at the start [m/s]; other arguments are the block's."""
-    effects = {"gravity": {"g": list(gravity)}, "contact": {"thickness": D} if contact is True else contact}
+    """A block, or other objects, over obstacles. velocity: at the start [m/s]; other arguments are the block's.
+
+    contact: parameters, True: of a thickness D, None: without the effect, and without obstacles
+    """
+    effects: dict[str, Any] = {"gravity": {"g": list(gravity)}}
+    if contact is not None:
+        effects["contact"] = {"thickness": D} if contact is True else contact
     scene = {
         "name": "test", "dt": dt, "effects": effects, "solver": LOCKSTEP if solver is None else solver,
-        "object": list(objects) or [block(**table)], "obstacle": list(obstacles) or [floor()],
+        "object": list(objects) or [block(**table)], "integrator": integrator or {},
     }  # fmt: skip
+    if contact is not None:
+        scene["obstacle"] = list(obstacles) or [floor()]
     sim = Simulation(Scene.model_validate(scene, context={"folder": "."}), device)
     put(sim, sim.world.v, velocity)
     return sim

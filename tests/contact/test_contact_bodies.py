@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Bodies that touch each other: momentum, stacks, islands, preconditioners, replays to the bit."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -21,11 +23,13 @@ def stack(count: int, **table) -> Simulation:
     return over(objects=blocks, **table)
 
 
-def collision(speed: float, friction: float = 0.5, solver: dict | None = None, contact=True) -> Simulation:
+def collision(
+    speed: float, friction: float = 0.5, solver: dict | None = None, contact: Any = True, **table: Any
+) -> Simulation:
     """Two blocks that meet in free space, one turned."""
     one = block(name="one", friction=friction, at=(0, 0, 0))
     other = block(name="other", friction=friction, at=(0.03, 0.1, 0.02), rotate=(10, 30, 5))
-    sim = over(FAR, objects=[one, other], gravity=(0, 0, 0), solver=solver, contact=contact)
+    sim = over(FAR, objects=[one, other], gravity=(0, 0, 0), solver=solver, contact=contact, **table)
     first, second = sim.world.bodies
     sim.world.v[first.nodes], sim.world.v[second.nodes] = (0, speed, 0), (0.2 * speed, -speed, 0)
     return sim

@@ -127,6 +127,15 @@ def test_on_a_gpu_objects_must_not_touch_each_other(tmp_path):
     read(tmp_path, GOOD[:start] + GOOD[end:]).check_device("gpu")  # one object touches no other
 
 
+@pytest.mark.parametrize("scheme", ["newmark", "bdf2", "ros2"])
+def test_on_a_gpu_bodies_in_contact_take_backward_euler_alone(tmp_path, scheme):
+    one = swap("contact = true", f'contact = {{ between = false }}\n[integrator]\nscheme = "{scheme}"')
+    scene = read(tmp_path, one)
+    scene.check_device("cpu")
+    with pytest.raises(InputError, match=f"integrator.scheme = '{scheme}' on a GPU; .* --device cpu"):
+        scene.check_device("gpu")
+
+
 TOOL = 'shape = "sphere"\nradius = 0.1\n'
 REFUSED = [
     (swap("radius = 0.1", "radius = -1"), ["obstacle 'tool', radius = -1", "greater than 0"]),
@@ -172,12 +181,19 @@ REFUSED = [
         ["effects.contact", "needed: an [[obstacle]], or another object"],
     ),
     (
-        swap('[[object]]\nname = "beam"', '[integrator]\nscheme = "bdf2"\n[[object]]\nname = "beam"'),
-        ["effects.contact", "'bdf2'", "'backward_euler' with linearizations = 1"],
+        swap('[[object]]\nname = "beam"', '[integrator]\nscheme = "quasi_static"\n[[object]]\nname = "beam"'),
+        ["effects.contact", "'quasi_static'", "'backward_euler' with linearizations = 1, 'newmark', 'bdf2', 'ros2'"],
     ),
     (
         swap('[[object]]\nname = "beam"', '[integrator]\nlinearizations = 2\n[[object]]\nname = "beam"'),
         ["effects.contact", "linearizations = 2", "'backward_euler' with linearizations = 1"],
+    ),
+    (
+        swap(
+            '[[object]]\nname = "beam"',
+            '[integrator]\nscheme = "bdf2"\n[solver]\nbudget = 0.1\n[[object]]\nname = "beam"',
+        ),
+        ["solver.budget = 0.1 with contact", '"bdf2"', '"backward_euler"'],
     ),
     (swap("contact = true", "contact = { thickness = 0 }"), ["effects.contact.thickness = 0", "greater than 0"]),
     (swap("contact = true", "contact = { passes = 0 }"), ["effects.contact.passes = 0", "1"]),

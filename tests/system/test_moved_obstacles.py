@@ -2,7 +2,6 @@
 """A tool that a client moves at 1 kHz into a body, with real processes: logged, and repeated bit for bit."""
 
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -62,11 +61,10 @@ def press(client: Client) -> None:
     client.resume()
 
 
-@pytest.fixture(scope="module")
-def log(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    folder = tmp_path_factory.mktemp("contact")
+def recorded(folder: Path, scene: str) -> Path:
+    """Returns the log of a run with a worker and a client that presses."""
     stage, log = Stage(folder), folder / "run.mcap"
-    (folder / "contact.toml").write_text(SCENE)
+    (folder / "contact.toml").write_text(scene)
     try:
         server = stage.server(
             folder / "contact.toml", "--steps", str(STEPS), "--record", str(log), "--workers", "1", *CPU
@@ -82,7 +80,12 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         assert status.moves_replaced > 0 and status.commands_refused == 0
     finally:
         stage.close()
-    yield log
+    return log
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return recorded(tmp_path_factory.mktemp("contact"), SCENE)
 
 
 def test_the_same_bit_for_bit(log: Path) -> None:
@@ -91,8 +94,26 @@ def test_the_same_bit_for_bit(log: Path) -> None:
     assert (found["steps"], found["frames"]) == (STEPS, STEPS + 1)
 
 
-@pytest.mark.parametrize("update", ["every-7", "lockstep-3", "never"])
-def test_the_same_whatever_the_policy(tmp_path: Path, update: str) -> None:
+@pytest.mark.parametrize("scheme", ["ros2", "bdf2"])
+def test_the_same_bit_for_bit_with_other_schemes(scheme: str, tmp_path: Path) -> None:
+    """The cube falls by its own scheme, and lies by backward Euler."""
+    scene = SCENE.replace("contact = true", 'contact = true\n[integrator]\nscheme = "' + scheme + '"')
+    raised = scene.replace("size = [0.3, 0.3, 0.3] }", "size = [0.3, 0.3, 0.3] }\npose = { translate = [0, 0.05, 0] }")
+    log = recorded(tmp_path, raised)
+    found = replayed(log, 0)
+    assert found["same"] and found["first"] is None and not found["notes"]
+    forms = [step.form for step in logged(log, "step")]
+    assert forms[0] != pb.EULER and forms[-1] == pb.EULER
+
+
+@pytest.mark.parametrize(
+    ("update", "scheme"),
+    [
+        ("every-7", "backward_euler"), ("lockstep-3", "backward_euler"), ("never", "backward_euler"),
+        ("every-7", "ros2"), ("lockstep-3", "ros2"), ("lockstep-3", "newmark"),
+    ],
+)  # fmt: skip
+def test_the_same_whatever_the_policy(tmp_path: Path, update: str, scheme: str) -> None:
     """As fast as it goes, the cube lands while a paddle on keyframes comes up to it."""
     log, scene = tmp_path / "run.mcap", tmp_path / "contact.toml"
     paddle = (
@@ -100,7 +121,8 @@ def test_the_same_whatever_the_policy(tmp_path: Path, update: str) -> None:
     )
     box = f'[[obstacle]]\nname = "paddle"\nshape = "box"\nsize = [0.1, 0.4, 0.4]\nkeyframes = [{paddle}]\n'
     scene.write_text(SCENE.replace("moved", "# moved").replace("max_speed", "# max_speed") + box)
-    options = ("--free-run", "--steps", "60", "--record", str(log), "--set", f"solver.update={update}", *CPU)
+    options = ("--free-run", "--steps", "60", "--record", str(log), "--set", f"solver.update={update}")
+    options += ("--set", f"integrator.scheme={scheme}", *CPU)
     result = run("sim_server", str(scene), *options, "--listen", free_endpoint())
     assert result.returncode == 0, result.stdout + result.stderr
     assert replayed(log, 0)["same"] and not logged(log, "targets")

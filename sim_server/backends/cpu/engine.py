@@ -15,12 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import FactorPattern
+from sim_server.arrays import Int32
 from sim_server.backends.base import Capability, EngineInput, Launch
 from sim_server.backends.compiler import native
 from sim_server.backends.contact import Contact, Surfaces
 from sim_server.backends.cpu import structs
 from sim_server.backends.cpu.device import CpuLaunch
 from sim_server.backends.cpu.energies import NativeEnergies
+from sim_server.backends.euler_form import EulerForm
 from sim_server.backends.newton import Newton
 from sim_server.backends.ring_buffers import Reports
 from sim_server.backends.rosenbrock import NODAL, Rosenbrock
@@ -116,7 +118,7 @@ class _NativeNewton:
             launch.parts = None if part is None else part.ctypes.data
 
 
-LISTS = ("first", "again", "euler")  # of launches
+LISTS = ("first", "again")  # of launches
 
 
 class _NativeStages:
@@ -127,12 +129,10 @@ class _NativeStages:
         self._lists = {k: np.array([number[id(x)] for x in getattr(stages, k)], np.int32) for k in LISTS}
         self._state = (structs.StageState * loop.bodies)()
         for state in self._state:
-            state.factor_step = -1
-        own = tuple(stages.coefficients.tolist())
+            state.factor_step = state.euler_step = -1
         self.native = structs.Stages(
-            firsts=len(stages.first), agains=len(stages.again), eulers=len(stages.euler),
-            factor_alone=stages.factor_alone,
-            own_coefficients=own, euler_coefficients=stages.euler_coefficients, state=c.addressof(self._state),
+            firsts=len(stages.first), agains=len(stages.again), factor_alone=stages.factor_alone,
+            state=c.addressof(self._state),
         )  # fmt: skip
         for name in NODAL:
             setattr(self.native, name, number[id(getattr(stages, name))])
@@ -140,12 +140,43 @@ class _NativeStages:
             setattr(self.native, name, array.ctypes.data)
         self._first_stage = np.zeros((len(stages.mass), 9))
         self.native.first_stage = self._first_stage.ctypes.data
-        for name in ("estimate", "bound", "coefficients", "mass", "share", "weight", "diagonal",
+        for name in ("estimate", "bound", "mass", "share", "weight", "diagonal",
                      "start_x", "start_v", "b", "inertial_increment", "unheld"):  # fmt: skip
             setattr(self.native, name, getattr(stages, name).ctypes.data)
         loop.stages = c.addressof(self.native)
-        for key, part in stages.parts.items():
-            launches[number[key]].parts = None if part is None else part.ctypes.data
+        _tell_bodies_apart(stages.parts, launches, number)
+
+
+def _tell_bodies_apart(parts: Mapping[int, Int32 | None], launches: Any, number: dict[int, int]) -> None:
+    """Gives launches the first item of each body. parts: by id of a launch; number: of each launch by id."""
+    for key, part in parts.items():
+        launches[number[key]].parts = None if part is None else part.ctypes.data
+
+
+class _NativeEuler:
+    """The input of steps of backward Euler in a scene of another scheme, attached to a loop."""
+
+    def __init__(self, euler: EulerForm, loop: structs.Loop, launches: Any, number: dict[int, int]):
+        self._input, detect = euler, [number[id(x)] for x in euler.detect]
+        self._launch = np.array([number[id(x)] for x in euler.assemble], np.int32)
+        self._result = (structs.SolveResult * loop.bodies)()
+        self._own = {
+            "end_x": np.zeros_like(euler.start_x), "takes": np.zeros(loop.bodies, np.int32),
+            "assembled": np.zeros(loop.bodies, np.int32), "launch": self._launch,
+            "touching": np.zeros(loop.bodies, np.int32), "solution": np.zeros_like(euler.start_x),
+        }  # fmt: skip
+        self.native = structs.EulerForm(
+            launches=len(self._launch), detect=min(detect, default=0), detects=len(detect),
+            restore=number[id(euler.restore)], advance=number[id(euler.advance)],
+            own_coefficients=tuple(euler.coefficients.tolist()), euler_coefficients=euler.euler_coefficients,
+            result=c.addressof(self._result),
+        )  # fmt: skip
+        for name, array in self._own.items():
+            setattr(self.native, name, array.ctypes.data)
+        for name in ("coefficients", "start_x", "start_v", "before", "earlier", "diagonal", "block_scale"):
+            setattr(self.native, name, getattr(euler, name).ctypes.data)
+        loop.euler = c.addressof(self.native)
+        _tell_bodies_apart(euler.parts, launches, number)
 
 
 MOST_MODES = 600  # of the coarse space of an island of bodies
@@ -224,8 +255,8 @@ class CpuEngine(Reports):
 
     def __init__(self, given: EngineInput, records: int = 8192, frames: int = 8):
         self._native = _library()
-        stages = given.stages.launches if given.stages else ()
-        listed = cast(list[CpuLaunch], [*given.assemble, *given.integrate, *stages])
+        stages, euler = (part.launches if part else () for part in (given.stages, given.euler))
+        listed = cast(list[CpuLaunch], [*given.assemble, *given.integrate, *stages, *euler])
         launches = list({id(launch): launch for launch in listed}.values())  # some take part in several stages
         arrays, ranges = given.arrays, given.ranges
         nodes, bodies = len(arrays["x"]), len(ranges)
@@ -254,7 +285,10 @@ class CpuEngine(Reports):
         self._newton = given.newton and _NativeNewton(given.newton, loop, self._launch)
         number = {id(launch): k for k, launch in enumerate(launches)}
         self._stages = given.stages and _NativeStages(given.stages, loop, self._launch, number)
+        self._euler = given.euler and _NativeEuler(given.euler, loop, self._launch, number)
         self._contact = given.contact and _NativeContact(given.contact, loop, arrays)
+        if self._contact and given.euler:  # bodies whose step is made have the velocities of its end
+            self._contact.native.predictor = given.euler.start_v.ctypes.data
         if given.contact:
             self.report_reactions(len(given.contact.obstacles.kind))
         if given.touch is not None:

@@ -86,6 +86,11 @@ class Stages(c.Structure):
 
 
 @LOOP.struct
+class EulerForm(c.Structure):
+    """Input and memory of steps of backward Euler in scenes of other schemes."""
+
+
+@LOOP.struct
 class ObstacleTable(c.Structure):
     """Shapes and poses of obstacles: kernels/shapes.cuh."""
 

@@ -142,9 +142,9 @@ class GpuEngine(DeviceLoop):
         self._graphs: list[Graph | None] = []
         self._epilogue = self._epilogue_params(dt)
         self._integrate, self._stages = None, None
-        if stages and stage_results is not None:
+        if stages and given.euler and stage_results is not None:
             self._stages = RosenbrockStep(
-                gpu, device, stages, assemble, self.solver, self._epilogue, stage_results, given.energies,
+                gpu, device, stages, given.euler, assemble, self.solver, self._epilogue, stage_results, given.energies,
                 gpu.twin(arrays["b"]),
             )  # fmt: skip
             self._stamp_begin = self._stages.stamp_begin

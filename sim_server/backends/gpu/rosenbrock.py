@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from sim_server.backends.base import Launch
 from sim_server.backends.declarations import Declarations
 from sim_server.backends.energies import Energies
+from sim_server.backends.euler_form import EulerForm
 from sim_server.backends.gpu.cupy_types import DeviceArray
 from sim_server.backends.gpu.device import DeviceLaunch, Gpu, processors
 from sim_server.backends.gpu.kernel_fusion import Epilogue, FusedKernel, PhaseGuard, block_shape, fuse
@@ -44,6 +45,7 @@ class RosenbrockStep:
     """Launches a step whose first stage is assembled: solves, attempts, decisions, and the end of the step.
 
     stages: launches and arrays of the stages
+    euler: those of steps of backward Euler
     assemble: launches of the first stage
     end: arguments of the end of the step (StepEpilogue)
     results: host memory (capacity, bodies) of STAGE_RESULT that the steps write to
@@ -54,11 +56,12 @@ class RosenbrockStep:
     """
 
     def __init__(
-        self, gpu: Gpu, device: Branches, stages: Rosenbrock, assemble: Sequence[DeviceLaunch], solver: PcgSolver,
-        end: NDArray[Any], results: NDArray[Any], energies: Energies, b: DeviceArray,
+        self, gpu: Gpu, device: Branches, stages: Rosenbrock, euler: EulerForm, assemble: Sequence[DeviceLaunch],
+        solver: PcgSolver, end: NDArray[Any], results: NDArray[Any], energies: Energies, b: DeviceArray,
     ):  # fmt: skip
         cp, bodies = gpu.cp, len(stages.bound)
         self._gpu, self._device, self._stages, self._solver, self._end = gpu, device, stages, solver, end
+        self._euler_form = euler
         self.alone = stages.factor_alone
         state = np.zeros(bodies, STAGE_STATE)
         state["form"], state["factor_step"], state["spring_step"] = ITERATE, -1, -1
@@ -77,8 +80,8 @@ class RosenbrockStep:
         if "spring" in energies.touch:
             self._solve_memory["spring"] = gpu.twin(energies.touch["spring"])
         self._results, self._nodes = results, finish.items
-        self._coefficients = gpu.twin(stages.coefficients)
-        pairs = (stages.coefficients, np.array(stages.euler_coefficients))
+        self._coefficients = gpu.twin(euler.coefficients)
+        pairs = (euler.coefficients, np.array(euler.euler_coefficients))
         self._own_pair, self._euler_pair = (cp.asarray(pair.astype(self._coefficients.dtype)) for pair in pairs)
         self._bodies: list[DeviceArray | None] = []  # of the items of each guarded kernel
         items = block_shape("elements", finish.items, processors()).threads
@@ -87,13 +90,13 @@ class RosenbrockStep:
 
     def _make_kernels(self, assemble: Sequence[DeviceLaunch]) -> None:
         stages = self._stages
-        again, euler = (cast(Sequence[DeviceLaunch], x) for x in (stages.again, stages.euler))
+        again, euler = (cast(Sequence[DeviceLaunch], x) for x in (stages.again, self._euler_form.assemble))
         self._again = fuse(again)
         self._second = self._keeping(stages.second, guarded=False) if self._free else stages.second
         self._first_finish = self._finish(stages.finish, FACTOR if self.alone else ITERATE, guarded=False)
         self._euler = fuse(euler, self._guard)
-        self._back = self._nodal(stages.restore_for_euler)
-        self._advance = self._finish(stages.advance_euler, EULER)
+        self._back = self._nodal(self._euler_form.restore)
+        self._advance = self._finish(self._euler_form.advance, EULER)
         if not self.alone:
             return
         self._restore = self._nodal(stages.restore)
@@ -108,7 +111,7 @@ class RosenbrockStep:
         return self._first_finish.function("stamp_begin")
 
     def _guard(self, group: Sequence[DeviceLaunch]) -> PhaseGuard:
-        parts = self._stages.parts
+        parts = {**self._stages.parts, **self._euler_form.parts}
         body = bodies_of([parts[id(launch)] for launch in group if not launch.mailed])
         self._bodies.append(None if body is None else self._gpu.cp.asarray(body))
         address = 0 if self._bodies[-1] is None else self._bodies[-1].data.ptr

@@ -83,13 +83,15 @@ static void solve_islands(Loop& loop, bool resumes) {
         if (size(i) == 1) solve_island(loop, i, false);
 }
 
-// Solves all bodies. Those that pass through each other then get rows where they do, and are solved again.
-static void solve_in_contact(Loop& loop) {
+// Solves all bodies whose step is not made. Those that pass through each other then get rows where they do, and are solved again. True
+// if one whose step is made is among them: then nothing is done yet.
+static bool solve_in_contact(Loop& loop) {
     Contact& c = *loop.contact;
     find_islands(loop);
     solve_islands(loop, false);
     for (int k = 0; k < ROUNDS && c.pair_first >= 0; ++k) {
         if (!PairDetection(loop, c, loop.y).sweep(c.room)) break;
+        if (unmake_touched(loop)) return true;
         find_islands(loop);
         solve_islands(loop, true);
     }
@@ -98,4 +100,5 @@ static void solve_in_contact(Loop& loop) {
         p.take_up();
         ContactEnd(p, p.result, p.report).finish();
     }
+    return false;
 }

@@ -6,7 +6,33 @@
 
 #include "loop.h"
 
-// Groups the bodies that have rows with each other, each group's by number. Bodies whose forces are NaN are left alone.
+// True if a body's step is made, by a scheme other than backward Euler (euler_form.h).
+static bool is_made(const Loop& loop, int i) { return loop.euler && !loop.euler->takes[i]; }
+
+// Has bodies that a sweep has given rows take backward Euler. True if a step was made.
+static bool unmake_touched(Loop& loop) {
+    bool any = false;
+    for (int i = 0; i < loop.bodies; ++i) {
+        if (!loop.contact->touched[i] || !is_made(loop, i)) continue;
+        loop.euler->takes[i] = 1;
+        any = true;
+    }
+    return any;
+}
+
+// Each body by itself.
+static void single_islands(Loop& loop) {
+    Contact& c = *loop.contact;
+    c.islands = loop.bodies;
+    for (int i = 0; i <= loop.bodies; ++i) c.island_start[i] = i;
+    for (int i = 0; i < loop.bodies; ++i) {
+        c.island[i] = i;
+        c.island_rows[i] = (c.pair_first >= 0 ? 2 : 1) * c.body_start[i];
+    }
+}
+
+// Groups the bodies that have rows with each other, each group's by number. Bodies whose forces are NaN are left alone, and so are those
+// whose step is made.
 static void find_islands(Loop& loop) {
     Contact& c = *loop.contact;
     int32_t *parent = c.mode, *well = c.island_rows;  // free until an island is solved; until islands are numbered
@@ -20,9 +46,9 @@ static void find_islands(Loop& loop) {
         const int64_t at = 3 * (int64_t)body.first;
         return std::isfinite(dot(3 * (body.last - body.first), loop.b + at, loop.b + at));
     };
-    for (int i = 0; c.pair_first >= 0 && i < loop.bodies; ++i) well[i] = finite(i);
+    for (int i = 0; c.pair_first >= 0 && i < loop.bodies; ++i) well[i] = !is_made(loop, i) && finite(i);
     for (int i = 0; c.pair_first >= 0 && i < loop.bodies; ++i) {
-        if (!c.near[i]) continue;
+        if (!c.near[i] || is_made(loop, i)) continue;
         for (int k = c.pair_first + c.body_start[i]; k < c.pair_first + c.body_start[i + 1]; ++k) {
             const int other = c.obstacle[k];
             if (other < 0) continue;
@@ -34,7 +60,7 @@ static void find_islands(Loop& loop) {
     c.islands = 0;
     int bodies = 0, rows = 0;
     for (int i = 0; i < loop.bodies; ++i) {
-        if (root(i) != i) continue;
+        if (root(i) != i || is_made(loop, i)) continue;
         c.island_start[c.islands] = bodies;
         c.island_rows[c.islands++] = rows;
         for (int j = i; j < loop.bodies; ++j) {

@@ -5,12 +5,10 @@
 #include <cstring>
 #include <vector>
 
-#include "contact.h"
 #include "energy.h"
+#include "euler_form.h"
 #include "newton.h"
 #include "pair_reactions.h"
-#include "pairs.h"
-#include "rosenbrock.h"
 #include "sizes.h"
 
 static void take_mail(Launch& l, int64_t step) {
@@ -31,21 +29,29 @@ static void run(const Launch& l, int threads) {
     for (int k = 0; k < parts; ++k) l.kernel(l.binding->params, (int)(items * k / parts), (int)(items * (k + 1) / parts));
 }
 
-// Linearizes, solves and tries until the search of every body is over; then y is the whole change of velocity.
+// Linearizes, solves and tries until the search of every body is over; then y is the whole change of velocity. Bodies that take backward
+// Euler have none.
 static void search_all(Loop& loop) {
     double begin = now(), solving = 0;
+    auto own = [&](int i) { return !loop.euler || is_made(loop, i); };
+    for (int i = 0; i < loop.bodies; ++i) {
+        loop.newton->search[i].phase = DONE;
+        if (own(i)) begin_search(loop, i);
+    }
     auto searching = [&](int i) { return loop.newton->search[i].phase != DONE; };
     for (bool left = true; left;) {
         double t = now();
 #pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) if (loop.threads > 1 && loop.bodies > 1)
         for (int i = 0; i < loop.bodies; ++i) solve(loop, i);
         solving += now() - t;
-        for (int i = 0; i < loop.before; ++i) run_for(loop, loop.launch[i], searching);
+        for (int i = 0; i < loop.before; ++i)
+            if (!detects(loop, i)) run_for(loop, loop.launch[i], searching);
         left = false;
 #pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) reduction(|| : left) if (loop.threads > 1 && loop.bodies > 1)
         for (int i = 0; i < loop.bodies; ++i) left = judge(loop, i) != DONE || left;
     }
-    for (int i = 0; i < loop.bodies; ++i) end_search(loop, i);
+    for (int i = 0; i < loop.bodies; ++i)
+        if (own(i)) end_search(loop, i);
     loop.assemble_seconds += now() - begin - solving;
 }
 
@@ -60,17 +66,24 @@ static void take_orders(Body& body) {
     take_factor(body);
 }
 
-// Copies A of a body as a factor is to know it.
+// Copies A of a body as a factor is to know it, with contacts. Where steps may be made by the factor alone it is that of the scheme,
+// without contacts, but for bodies that touch something for long.
 static void copy_matrix(const Loop& loop, const Body& body, double* target) {
     const int64_t begin = loop.row_start[body.first], end = loop.row_start[body.last];
     std::memcpy(target, loop.values + 9 * begin, 9 * sizeof(double) * (end - begin));
-    if (loop.contact) add_contacts(loop, body, target);
+    if (!loop.contact) return;
+    const int index = (int)(&body - loop.body);
+    const bool of_euler = loop.euler && copied_as_of_euler(loop, index);
+    if (of_euler) as_of_euler(loop, index, target);
+    if (of_euler || !loop.stages) add_contacts(loop, body, target);
 }
 
 static void copy_for_worker(Loop& loop, Body& body) {
     double* target = body.snapshot.load(std::memory_order_acquire);
     if (!target) return;
-    if (body.ahead < 0 && loop.stages && !loop.stages->state[&body - loop.body].assembled) return;  // in the next step
+    const int64_t index = &body - loop.body;
+    const bool assembled = loop.stages ? loop.stages->state[index].assembled : !loop.euler || loop.euler->assembled[index];
+    if (body.ahead < 0 && !assembled) return;  // in the next step
     if (body.ahead < 0) {
         copy_matrix(loop, body, target);
     } else {
@@ -103,6 +116,16 @@ static int first_bad_node(const Loop& loop, const Body& body) {
     return -1;
 }
 
+// Runs the launches before the solve, but for those that detect contacts where that is done already.
+template <class F> static void run_assembly(Loop& loop, F take_part) {
+    for (int i = 0; i < loop.before; ++i) {
+        if (detects(loop, i)) continue;
+        take_mail(loop.launch[i], loop.rings.step);
+        if (loop.stages || loop.euler) run_for(loop, loop.launch[i], take_part);
+        else run(loop.launch[i], loop.threads);
+    }
+}
+
 // Runs the launches of the first stage. A body whose factor stands alone has its right-hand side from the same launches in every
 // step, also where A is wanted, too.
 static void assemble_stage(Loop& loop, bool whole) {
@@ -110,13 +133,21 @@ static void assemble_stage(Loop& loop, bool whole) {
     auto needs_matrix = [&](int i) { return stages.state[i].assembled != 0; };
     auto alone = [&](int i) { return stages.state[i].form == FACTOR; };
     for (int i = 0; i < loop.bodies; ++i) choose_form(loop, i, whole);
-    for (int i = 0; i < loop.before; ++i) {
-        take_mail(loop.launch[i], loop.rings.step);
-        run_for(loop, loop.launch[i], needs_matrix);
-    }
+    run_assembly(loop, needs_matrix);
     for (int i = 0; i < stages.firsts; ++i) run_for(loop, loop.launch[stages.first[i]], alone);
-    for (int i = 0; i < loop.bodies; ++i) note_changes(loop.body[i].correction, loop.rings.step, loop.body[i].steps == 0);
+    for (int i = 0; i < loop.bodies; ++i)
+        if (needs_matrix(i) || alone(i)) note_changes(loop.body[i].correction, loop.rings.step, loop.body[i].steps == 0);
     check_corrections(loop);
+}
+
+// Runs the launches of the step of bodies that take that of the scheme, or of which a copy of A is wanted.
+static void assemble_single(Loop& loop, bool whole) {
+    EulerForm* e = loop.euler;
+    for (int i = 0; e && i < loop.bodies; ++i) e->assembled[i] = whole || !e->takes[i] || copy_wanted(loop.body[i]);
+    auto needs_matrix = [&](int i) { return !e || e->assembled[i]; };
+    run_assembly(loop, needs_matrix);
+    for (int i = 0; i < loop.bodies; ++i)
+        if (needs_matrix(i)) note_changes(loop.body[i].correction, loop.rings.step, loop.body[i].steps == 0);
 }
 
 // whole: A of all bodies is wanted.
@@ -128,17 +159,12 @@ static void assemble(Loop* loop, bool whole) {
     for (int i = 0; i < loop->bodies; ++i) {
         take_orders(loop->body[i]);
         loop->moving[i] = 0;
+        if (loop->euler) loop->euler->takes[i] = 0;
     }
+    if (loop->euler && loop->contact) detect_contacts(*loop);
     if (loop->stages) assemble_stage(*loop, whole);
-    else {
-        for (int i = 0; i < loop->before; ++i) {
-            take_mail(loop->launch[i], rings.step);
-            run(loop->launch[i], loop->threads);
-        }
-        for (int i = 0; i < loop->bodies; ++i)
-            note_changes(loop->body[i].correction, rings.step, loop->body[i].steps == 0);
-    }
-    if (loop->contact && loop->contact->pair_first >= 0) PairDetection(*loop, *loop->contact).run();
+    else assemble_single(*loop, whole);
+    if (loop->contact && !loop->euler && loop->contact->pair_first >= 0) PairDetection(*loop, *loop->contact).run();
     for (int i = 0; i < loop->bodies && loop->contact; ++i) note_touches(*loop, loop->body[i]);
     for (int i = 0; i < loop->bodies; ++i) copy_for_worker(*loop, loop->body[i]);
     loop->assemble_begin = begin;
@@ -175,12 +201,9 @@ static void finish_step(Loop* loop) {
     double entered = now();
     bool keep = room_for_records(rings, loop->bodies, [] { return true; });
     double waited = now() - entered;  // no part of the step
-    if (loop->newton) {
-        for (int i = 0; i < loop->bodies; ++i) begin_search(*loop, i);
-        search_all(*loop);
-    }
-    if (loop->stages) make_stages(*loop);
-    if (loop->contact) solve_in_contact(*loop);
+    if (loop->newton && !loop->euler) search_all(*loop);
+    if (loop->euler) make_step(*loop);
+    else if (loop->contact) solve_in_contact(*loop);
 #pragma omp parallel for num_threads(loop->threads) schedule(dynamic, 1) if (loop->threads > 1 && loop->bodies > 1)
     for (int i = 0; i < loop->bodies; ++i) {
         Body& body = loop->body[i];
@@ -188,12 +211,12 @@ static void finish_step(Loop* loop) {
         int linearizations = 1;
         double nonlinear = -1;
         SolveResult r;
-        if (loop->stages) {
-            r = loop->stages->state[i].result;
-        } else if (loop->newton) {
+        if (loop->newton && (!loop->euler || is_made(*loop, i))) {
             r = as_solve_result(loop->newton->search[i]);
             linearizations = std::max(1, loop->newton->search[i].linearizations);
             nonlinear = residual_ratio(loop->newton->search[i]);
+        } else if (loop->euler) {
+            r = step_result(*loop, i);
         } else if (loop->contact) {
             r = loop->contact->result[i];
         } else {
@@ -216,12 +239,13 @@ static void finish_step(Loop* loop) {
         record.probe = settings.probe;
         record.linearizations = linearizations;
         if (loop->contact) note_contact(*loop, i, (first + i) % rings.record_capacity);
+        if (loop->euler && loop->euler->takes[i]) record.form = EULER;
         if (!loop->stages) continue;
         record.form = loop->stages->state[i].form;
         record.estimate = loop->stages->state[i].estimate;
     }
     double solved = now();
-    for (int i = loop->before; i < loop->launches; ++i) run(loop->launch[i], loop->threads);
+    for (int i = loop->before; i < loop->launches && !loop->euler; ++i) run(loop->launch[i], loop->threads);
     if (loop->energies) account(*loop, energy_due(rings, step));
     double end = now(), cpu = thread_time() - loop->cpu_begin;
     ++rings.step;
@@ -296,7 +320,7 @@ void wf_precondition(Loop* loop, int32_t index, const double* r, double* z, doub
 
 const StructSize* wf_sizes() {
     static const StructSize sizes[] = {SIZE(Launch), SIZE(Body), SIZE(Loop), SIZE(Factor), SIZE(KnownContact), SIZE(Pattern), SIZE(Record),
-                                       SIZE(Newton), SIZE(Search), SIZE(Stages), SIZE(StageState), SIZE(Elastic), SIZE(Energies), SIZE(Balance),
+                                       SIZE(Newton), SIZE(Search), SIZE(Stages), SIZE(StageState), SIZE(EulerForm), SIZE(Elastic), SIZE(Energies), SIZE(Balance),
                                        SIZE(Contact), SIZE(RowState), SIZE(PassChoice), SIZE(ContactReport), SIZE(Box), SIZE(Reaction), {}};
     return sizes;
 }

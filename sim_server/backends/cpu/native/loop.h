@@ -57,6 +57,9 @@ struct StageState {                    // of a body in the step under way (rosen
     MomentumSums missing;              // impulses of both stages (rigid_motion.h)
     int32_t patience;                  // steps to come that iterate
     int64_t factor_step;               // of the last factor
+    int32_t of_euler;                  // 1: it is of backward Euler, and cannot stand for A
+    int64_t euler_step;                // last step in which copies of A were to be of backward Euler, -1: none
+    uint64_t euler_copies;             // bit k: they were k steps ago
     double estimate;                   // of the last attempt by stages [m]
     SolveResult result;                // of all solves of the step
 };
@@ -64,19 +67,37 @@ struct StageState {                    // of a body in the step under way (rosen
 constexpr int FAILED = -1;             // form of an attempt that gave no state
 
 struct Stages {                        // input of the Rosenbrock-W step
-    const int32_t *first, *again, *euler;  // numbers of launches: the forces of both stages; backward Euler
-    int32_t firsts, agains, eulers;
-    int32_t second, finish, prepare, remember, restore, restore_for_euler, advance_euler;  // likewise
+    const int32_t *first, *again;      // numbers of launches: the forces of both stages
+    int32_t firsts, agains;
+    int32_t second, finish, prepare, remember, restore;  // likewise
     int32_t factor_alone;              // 1: wanted
     const double* estimate;            // (nodes,) of the last attempt [m]
     const double* bound;               // (bodies,) [m]
-    double* coefficients;              // (2,) of launches whose arguments change while steps run
-    double own_coefficients[2], euler_coefficients[2];
     const double *mass, *share, *weight, *diagonal;  // (nodes,) of the first stage's check (step_form.h): M, theta, w, of A
     const double *start_x, *start_v, *b, *inertial_increment;  // (nodes, 3) of the momenta; b: world frame (momentum.h)
     const int32_t* unheld;             // (bodies,) 1: no node is fixed
     double* first_stage;               // (nodes, 9) start of the solve, b and y of the first stage
     StageState* state;                 // (bodies,)
+};
+
+struct EulerForm {                     // steps of backward Euler in scenes of other schemes (euler_form.h)
+    const int32_t* launch;             // numbers of launches that assemble them
+    int32_t launches;
+    int32_t detect, detects;           // first and number of the launches that detect contacts
+    int32_t restore, advance;          // numbers of launches: back to the start of the step; the end of it
+    double* coefficients;              // (2,) of launches whose arguments change while steps run
+    double own_coefficients[2], euler_coefficients[2];
+    double *start_x, *start_v;         // (nodes, 3) at the start of the step
+    const double* before;              // (nodes, 3) x at the start of the last step
+    double* earlier;                   // (nodes, 3) and of the one before
+    double* end_x;                     // (nodes, 3) of bodies whose step is made
+    double* solution;                  // (nodes, 3) of the last step by backward Euler, world frame
+    const double* diagonal;            // (nodes,) of A [kg]
+    const double* block_scale;         // (bodies,) of K in A of backward Euler over that of the scheme
+    int32_t* takes;                    // (bodies,) 1: the body takes this step by backward Euler
+    int32_t* touching;                 // (bodies,) steps in a row in which it has touched something from the start
+    int32_t* assembled;                // (bodies,) 1: A is that of the step of the scheme
+    SolveResult* result;               // (bodies,) of the step, without stages
 };
 
 struct Elastic {                       // potential energies of the elements of an effect
@@ -116,6 +137,7 @@ struct Loop {
     double* work;                      // 27 doubles a node
     Newton* newton;                    // null: one linearization a step
     Stages* stages;                    // null: another scheme
+    EulerForm* euler;                  // null: all bodies take the steps of the scheme
     Contact* contact;                  // null: nothing can be touched
     double* clock;                     // (1,) s, read by kernels
     int32_t* moving;                   // (bodies,) 0: the body rests (kernels/nodes.cu)

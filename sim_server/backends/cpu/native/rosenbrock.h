@@ -2,7 +2,7 @@
 // The Rosenbrock-W step on a CPU (method: mechanics/rosenbrock.py; nodal kernels: kernels/rosenbrock.cu).
 //
 // A step is a list of attempts. All bodies make theirs together, each in its own form; those whose estimate is too large then make
-// another: FACTOR, ITERATE, EULER. Launches run for the bodies that take part.
+// another: FACTOR, ITERATE, EULER (euler_form.h). Launches run for the bodies that take part.
 #pragma once
 #include <algorithm>
 
@@ -20,6 +20,17 @@ template <class F> static void run_for(const Loop& loop, const Launch& l, F take
         if (take_part(i) && l.parts[i] < l.parts[i + 1]) l.kernel(l.binding->params, l.parts[i], l.parts[i + 1]);
 }
 
+static bool copy_wanted(const Body& body) { return body.snapshot.load(std::memory_order_acquire) && body.ahead < 0; }
+
+// True if a copy of A in this step is to be of backward Euler, with contacts: of bodies that have touched something for long.
+static bool copied_as_of_euler(const Loop& loop, int index) { return loop.euler->touching[index] > (loop.stages ? PATIENCE : 0); }
+
+// True if a factor is of such a copy, or may be: it is known of the last 64 steps.
+static bool is_of_euler(const StageState& s, int64_t factor_step, int64_t now) {
+    const int64_t age = now - factor_step;
+    return age < 64 ? s.euler_copies >> age & 1 : factor_step <= s.euler_step;
+}
+
 // Chooses the form of a body's first attempt, before the step is assembled. whole: A is wanted whatever the form.
 static void choose_form(Loop& loop, int index, bool whole) {
     const Stages& stages = *loop.stages;
@@ -29,10 +40,11 @@ static void choose_form(Loop& loop, int index, bool whole) {
     if (factor && s.factor_step != factor->step) {  // a new one
         s.factor_step = factor->step;
         s.patience = 0;
+        s.of_euler = is_of_euler(s, factor->step, loop.rings.step);
     }
-    const bool alone = stages.factor_alone && factor && body.now.kind == CHOLESKY && s.patience == 0;
-    s.form = alone ? FACTOR : ITERATE;
-    s.assembled = whole || !alone || (body.snapshot.load(std::memory_order_acquire) && body.ahead < 0);
+    const bool alone = stages.factor_alone && factor && body.now.kind == CHOLESKY && s.patience == 0 && !s.of_euler;
+    s.form = loop.euler->takes[index] ? EULER : alone ? FACTOR : ITERATE;
+    s.assembled = whole || s.form == ITERATE || copy_wanted(body);
 }
 
 // After the forces of the first stage are evaluated: whether factors know the springs of grabs, or are corrected for them. Where one
@@ -186,23 +198,21 @@ template <class F> static bool make_attempt(Loop& loop, F take_part) {
     return again;
 }
 
-static void set_coefficients(const Stages& stages, const double (&to)[2]) {
-    stages.coefficients[0] = to[0];
-    stages.coefficients[1] = to[1];
-}
-
-// Makes the step of all bodies, whose first stage is assembled, and integrates.
+// Makes the steps by stages of bodies that touch nothing, whose first stage is assembled, and integrates. Those that are to take
+// backward Euler are marked.
 static void make_stages(Loop& loop) {
     const Stages& stages = *loop.stages;
+    int32_t* takes = loop.euler->takes;
     for (int i = 0; i < loop.bodies; ++i) {
         StageState& s = stages.state[i];
         s.result = SolveResult{0, 0, 0, CONVERGED, loop.body[i].now.kind, 0};
         if (s.patience > 0) --s.patience;
+        if (takes[i]) s.estimate = NAN;
+        s.accepted = takes[i];
     }
-    auto all = [](int) { return true; };
     auto left = [&](int i) { return !stages.state[i].accepted; };
     auto iterates = [&](int i) { return left(i) && stages.state[i].form == ITERATE; };
-    if (!make_attempt(loop, all)) return;
+    if (!make_attempt(loop, [&](int i) { return !takes[i]; })) return;
     bool again = false;
     for (int i = 0; i < loop.bodies; ++i) {
         StageState& s = stages.state[i];
@@ -219,17 +229,6 @@ static void make_stages(Loop& loop) {
         for (int i = 0; i < loop.bodies; ++i)
             if (iterates(i)) stages.state[i].form = EULER;
     }
-    int back = 0;
-    for (int i = 0; i < loop.bodies; ++i) back += left(i);
-    if (!back) return;
     for (int i = 0; i < loop.bodies; ++i)
-        if (left(i)) {
-            forget(stages.state[i].result);
-        }
-    run_for(loop, loop.launch[stages.restore_for_euler], left);
-    set_coefficients(stages, stages.euler_coefficients);
-    for (int k = 0; k < stages.eulers; ++k) run_for(loop, loop.launch[stages.euler[k]], left);
-    solve_stage(loop, true, left);
-    run_for(loop, loop.launch[stages.advance_euler], left);
-    set_coefficients(stages, stages.own_coefficients);
+        if (left(i)) takes[i] = 1;
 }
