@@ -14,6 +14,7 @@ from sim_server.errors import InputError
 from sim_server.mesh import Mesh, posed
 from sim_server.mesh.surface import volumes
 from sim_server.scene import Scene, SceneObject
+from sim_server.scene.holders import Holder
 from sim_server.scene.obstacles import Obstacle
 
 
@@ -53,7 +54,7 @@ class World:
     free (n,): 1, or 0 at fixed nodes; alpha, beta (bodies,): Rayleigh damping of the mass [1/s] and of the stiffness
     [s]; dt: time step [s];
     projection: of the elements' stiffness, the scene's choice;
-    obstacles: of the scene; gravity: acceleration, 0 without the effect [m/s2];
+    obstacles, holders: of the scene; gravity: acceleration, 0 without the effect [m/s2];
     backend: where kernels run.
 
     Effects use the following of the integrator in place of dt and v (formulas: integrator.py; symbols:
@@ -81,6 +82,7 @@ class World:
             self.bodies.append(Body(len(self.bodies), o.name, mesh, first, last, dict(o.effects), o.friction or 0.0))
             first = last
         self.obstacles: Sequence[Obstacle] = scene.obstacles or []
+        self.holders: Sequence[Holder] = scene.holders or []
         self.gravity = (0.0, 0.0, 0.0)
         self.rest = np.concatenate([mesh.rest for _, mesh in meshes])
         self.x = np.concatenate([posed(mesh.rest, o.pose.rotate, o.pose.translate) for o, mesh in meshes])

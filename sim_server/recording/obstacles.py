@@ -7,7 +7,8 @@ import numpy as np
 
 from protocol import messages_pb2 as pb
 from sim_server.arrays import Float64
-from sim_server.scene.obstacles import Keyframe, Obstacle
+from sim_server.scene.motion import Keyframe
+from sim_server.scene.obstacles import Obstacle
 from sim_server.scene.pose import quaternion
 from sim_server.simulation import Simulation
 

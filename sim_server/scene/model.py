@@ -22,6 +22,7 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 from sim_server.errors import InputError
 from sim_server.mesh import Mesh, bar, check, read
 from sim_server.scene.effect_tables import checked_effects
+from sim_server.scene.holders import Holder, holder_errors
 from sim_server.scene.integrator_options import IntegratorOptions
 from sim_server.scene.obstacles import FRICTION, Obstacle, check_contact_on, contact_errors
 from sim_server.scene.parameters import Count, Counts, File, Name, NotNegative, Parameters, Positive, Sizes, complaint
@@ -146,6 +147,7 @@ class Scene(Parameters):
     record: RecordOptions = RecordOptions()
     objects: Annotated[list[SceneObject], AfterValidator(_some_objects)] = Field(alias="object")
     obstacles: list[Obstacle] | None = Field(default=None, alias="obstacle", min_length=1)
+    holders: list[Holder] | None = Field(default=None, alias="holder", min_length=1)
 
     _path: Path = PrivateAttr(Path())
     _text: str = PrivateAttr("")
@@ -201,6 +203,13 @@ class Scene(Parameters):
             for index, o in enumerate(self.objects):
                 if o.friction is None:
                     self.objects[index] = o.model_copy(update={"friction": FRICTION})
+        return self
+
+    @model_validator(mode="after")
+    def _as_holders_need(self) -> "Scene":
+        shapes = [o.name for o in self.obstacles or []]
+        if errors := list(holder_errors(self.holders or [], self.objects, shapes, self.integrator)):
+            raise ValidationError.from_exception_data("Scene", errors)
         return self
 
     def check_device(self, device: str) -> None:

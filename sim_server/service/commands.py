@@ -56,7 +56,7 @@ class Commands:
             if verb is None:
                 raise BadCommand(f"unknown verb {command.verb!r}; known: {', '.join(sorted(VERBS))}")
             return verb(self, command)
-        except ValueError as error:  # BadCommand, TouchError and ContactError
+        except ValueError as error:  # BadCommand, TouchError and MoveError
             return pb.Reply(error=str(error))
 
     def together(self) -> AbstractContextManager[None]:
