@@ -36,18 +36,18 @@ class Reports:
         """Steps completed."""
         return int(self.loop.step)
 
-    def report_reactions(self, obstacles: int) -> None:
-        """Has records come with the force and torque on each obstacle."""
-        self._reactions = np.zeros((len(self._records), obstacles, 6))
-        self.loop.reactions = self._reactions.ctypes.data
+    def report_reactions(self, count: int) -> None:
+        """Has records come with the force and torque on each obstacle, and then each holder; count: of all."""
+        self._reactions = np.zeros((len(self._records), count, 6))
+        self.loop.reactions, self.loop.reaction_count = self._reactions.ctypes.data, count
 
     def records(self) -> NDArray[Any]:
         """New records since the last call, oldest first, (k,) of RECORD."""
         return self.records_and_reactions()[0]
 
     def records_and_reactions(self) -> tuple[NDArray[Any], Reals]:
-        """New records since the last call, and what each body exerted on each obstacle, (k, obstacles, 6): force [N],
-        then torque about the obstacle's position at the end of the step [N m]. No obstacles without contact."""
+        """New records since the last call, and what each body exerted on each obstacle (with contact) and then each
+        holder, (k, count, 6): force [N], then torque about its position at the end of the step [N m]."""
         head, tail, size = int(self.loop.record_head), int(self.loop.record_tail), len(self._records)
         slots = np.arange(tail, head) % size
         out = self._records[slots], self._reactions[slots]

@@ -3,7 +3,6 @@
 
 from collections.abc import Sequence
 from math import dist, hypot
-from typing import Protocol
 
 import numpy as np
 
@@ -12,7 +11,7 @@ from sim_server.backends.base import Launch
 from sim_server.effects._base import Effect, EffectUpdates
 from sim_server.mechanics.system import System
 from sim_server.mechanics.world import World
-from sim_server.scene.motion import Keyframe
+from sim_server.scene.motion import Moved
 from sim_server.scene.pose import Pose, quaternion
 
 REACH = 1e3  # sizes of the scene: how far from it a client's pose may be
@@ -26,37 +25,23 @@ class MoveError(ValueError):
     """A pose that is refused; the text is for the client."""
 
 
-class Listed(Protocol):
-    """A table of the scene, as far as it says what moves."""
-
-    @property
-    def name(self) -> str: ...
-    @property
-    def keyframes(self) -> list[Keyframe] | None: ...
-    @property
-    def moved(self) -> str | None: ...
-    @property
-    def max_speed(self) -> float | None: ...
-    @property
-    def max_turn(self) -> float | None: ...
-
-
 class Movable(Effect):
     """Effect with m rigid frames, whose poses are (7,): position [m], unit quaternion w, x, y, z.
 
-    kind: what they are, for messages. listed: their tables. given: times [s] and poses of each, one at least: where it
+    kind: what they are, for messages. given: times [s] and poses of each, one at least: where it
     begins, or all keyframes
 
-    begin, end (m, 7): poses at the start and the end of the step. frames (keyframes, 7): given poses of all
+    listed: their tables. begin, end (m, 7): poses at the start and the end of the step
+    frames (keyframes, 7): given poses of all
     ball (m, 4): centre and radius [m] of a sphere around each, in its frame; radius < 0: without end
     swept (m, 4): the same around both poses
     """
 
     def __init__(
-        self, world: World, kind: str, listed: Sequence[Listed],
+        self, world: World, kind: str, listed: Sequence[Moved],
         given: Sequence[Sequence[tuple[float, Sequence[float]]]],
     ):  # fmt: skip
-        self.world, self._kind, self._listed = world, kind, listed
+        self.world, self._kind, self.listed = world, kind, listed
         self._simulation: EffectUpdates | None = None
         self._system: System | None = None
         low, high = world.x.min(axis=0), world.x.max(axis=0)
@@ -81,7 +66,7 @@ class Movable(Effect):
     @property
     def targets(self) -> dict[str, Float64]:
         """Poses (7,) that clients want, as the loop was given them last, by the names of what they move."""
-        return {o.name: self._target[k].copy() for k, o in enumerate(self._listed) if o.moved == "client"}
+        return {o.name: self._target[k].copy() for k, o in enumerate(self.listed) if o.moved == "client"}
 
     def move(self, name: str, position: Point, rotation: Rotation) -> None:
         """Has a frame go to a pose, at most at its `max_speed` and `max_turn`.
@@ -117,8 +102,8 @@ class Movable(Effect):
 
     def _check_name(self, name: str) -> int:
         """Returns the number of a frame that a client may move. Raises MoveError."""
-        movable = [o.name for o in self._listed if o.moved == "client"]
-        found = next((k for k, o in enumerate(self._listed) if o.name == name), None)
+        movable = [o.name for o in self.listed if o.moved == "client"]
+        found = next((k for k, o in enumerate(self.listed) if o.name == name), None)
         said = f'with moved = "client": {", ".join(movable) or "none"}'
         if found is None:
             raise MoveError(f"no {self._kind} {name[:80]!r}; {self._kind}s {said}")
@@ -126,11 +111,27 @@ class Movable(Effect):
             raise MoveError(f"{self._kind} {name!r} is not moved by clients; {self._kind}s {said}")
         return found
 
+    def pose_at(self, name: str, time: float) -> Float64:
+        """Returns the pose (7,) between keyframes at a time [s], as `pose_at` in kernels/motion.cu has it."""
+        number = next(k for k, o in enumerate(self.listed) if o.name == name)
+        keys = slice(self._first[number], self._first[number + 1])
+        times, poses = self._time[keys], self.frames[keys]
+        after = int(np.searchsorted(times, time, "right"))
+        k, last = max(after - 1, 0), min(after, len(times) - 1)
+        a, b = poses[k], poses[last]
+        part = (time - times[k]) / (times[last] - times[k]) if k != last else 0.0
+        p, q = a[3:], b[3:] if a[3:] @ b[3:] >= 0 else -b[3:]
+        aside = q - (p @ q) * p
+        size = float(np.linalg.norm(aside))
+        angle = part * float(np.arctan2(size, p @ q))
+        rotation = np.cos(angle) * p + (np.sin(angle) / size * aside if size > 0 else 0.0)
+        return np.concatenate([a[:3] + part * (b[:3] - a[:3]), rotation / np.linalg.norm(rotation)])
+
     def place(self, system: System) -> Launch:
         """Returns the launch that makes the poses of a step."""
         self._system = system
         launch: Launch = self.world.backend.module("kernels/motion.cu").bind(
-            "place", len(self._listed), clock=system.clock, dt=self.world.dt, motion=self._motion,
+            "place", len(self.listed), clock=system.clock, dt=self.world.dt, motion=self._motion,
             first=self._first, time=self._time, frame=self.frames, target=self._target, speed=self._speed,
             turn=self._turn, ball=self.ball, placed=self._placed, begin=self.begin, end=self.end, swept=self.swept,
         )  # fmt: skip

@@ -39,7 +39,7 @@ def scene(simulation: Simulation) -> pb.Scene:
         objects=[b.name for b in simulation.world.bodies],
         device=simulation.world.backend.name,
         build=simulation.world.backend.build(),
-        obstacles=[o.name for o in simulation.world.obstacles],
+        obstacles=simulation.posed_names,
     )
 
 
@@ -107,7 +107,7 @@ def steps(
     """Step records (structs.RECORD) as messages.
 
     methods: of body and step, how that factor was made ("auto"). reactions: (records, obstacles, 6), force [N] and
-    torque [N m] of each object on each obstacle
+    torque [N m] of each object on each of `Simulation.reaction_names`
     """
     names = [b.name for b in simulation.world.bodies]
     kinds = preconditioner_names(simulation)
@@ -119,7 +119,7 @@ def steps(
         for row in rows(records)
     ]
     if reactions is not None:
-        obstacles = [o.name for o in simulation.world.obstacles]
+        obstacles = simulation.reaction_names
         for step, each in zip(found, reactions, strict=True):
             add_reactions(step, each, obstacles)
     return found

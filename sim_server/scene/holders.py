@@ -9,14 +9,13 @@ from pydantic_core import InitErrorDetails
 from sim_server.scene.integrator_options import IntegratorOptions
 from sim_server.scene.motion import Moved
 from sim_server.scene.obstacles import HasName
-from sim_server.scene.parameters import Name, Vector, Where, complaint, nearest
+from sim_server.scene.parameters import Vector, Where, complaint, nearest
 from sim_server.scene.pose import Pose
 
 
 class Holder(Moved):
     """Nodes of an object that keep their distances: fixed, moved along keyframes, or moved by a client."""
 
-    name: Name
     object: str = Field(description="of which it holds nodes")
     where: Where = Field(description="nodes to hold: an expression in X, Y, Z, the rest coordinates [m]")
     center: Vector | None = Field(
@@ -43,10 +42,9 @@ def holder_errors(
             yield _error(text, index)
         if holder.object not in names:
             yield _error(f"no object {holder.object!r}" + nearest(holder.object, names, "objects"), index, "object")
-        if integrator.scheme == "ros2" and (holder.keyframes or holder.moved):
-            allowed = "'backward_euler', 'newmark', 'bdf2', 'quasi_static'"
-            text = f"a holder that moves with integrator.scheme = 'ros2'; allowed: {allowed}, or a holder at rest"
-            yield _error(text, index)
+        if integrator.scheme == "ros2":
+            allowed = "'backward_euler', 'newmark', 'bdf2', 'quasi_static', or the effect fixed in place of the holder"
+            yield _error(f"a holder with integrator.scheme = 'ros2'; allowed: {allowed}", index)
 
 
 def _error(message: str, index: int, *place: str) -> InitErrorDetails:

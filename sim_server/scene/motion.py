@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from sim_server.scene.parameters import NotNegative, Parameters, Positive, complaint
+from sim_server.scene.parameters import Name, NotNegative, Parameters, Positive, complaint
 from sim_server.scene.pose import Pose
 
 CLIENT = {"max_speed": 1.0, "max_turn": 3.0}  # defaults of what a client moves
@@ -21,6 +21,7 @@ class Keyframe(Pose):
 class Moved(Parameters):
     """Base of what is fixed, moved along keyframes, or moved by a client."""
 
+    name: Name
     keyframes: Annotated[list[Keyframe], Field(min_length=1)] | None = Field(
         default=None, description="poses at ascending times, held before the first and after the last"
     )

@@ -10,7 +10,7 @@ from pydantic_core import InitErrorDetails
 from sim_server.errors import InputError
 from sim_server.scene.integrator_options import IntegratorOptions
 from sim_server.scene.motion import Moved
-from sim_server.scene.parameters import File, Name, NotNegative, Positive, Sizes, complaint, nearest
+from sim_server.scene.parameters import File, NotNegative, Positive, Sizes, complaint, nearest
 from sim_server.scene.pose import Pose
 
 FRICTION = 0.5  # coefficient of a surface of which nothing is said
@@ -22,7 +22,6 @@ KEYS = {  # of each shape: those that it must have
 class Obstacle(Moved):
     """A rigid shape that objects touch: fixed, moved along keyframes, or moved by a client."""
 
-    name: Name
     shape: Literal["plane", "sphere", "box", "capsule", "grid"]
     radius: Positive | None = Field(default=None, description="of a sphere or a capsule [m]")
     size: Sizes | None = Field(default=None, description="of a box along x, y, z [m]")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What contact adds to telemetry: obstacles, their poses, forces on them, and lines about what was left undone."""
+"""What contact and holders add to telemetry: poses, forces, and lines about what was left undone."""
 
 import time
 from collections import Counter
@@ -20,7 +20,7 @@ MAX_STEPS = 4096  # whose reactions are sent together at most
 
 
 class ContactTelemetry:
-    """The obstacles of one run; of a scene without contact nothing is sent and nothing is said.
+    """The obstacles and holders of one run; of a scene without any nothing is sent and nothing is said.
 
     clipped: by body, number of nodes that were held back at obstacles, summed over steps
     """
@@ -41,7 +41,7 @@ class ContactTelemetry:
 
     def look(self) -> bool:
         """Checks for subscribers. True if somebody wants poses."""
-        if self._simulation.contact is None:
+        if not self._simulation.reaction_names:
             return False
         self._wants_reactions = self._link.wants_reactions()
         return self._link.wants_pose()
@@ -62,7 +62,7 @@ class ContactTelemetry:
         if reactions is None or not self._wants_reactions:
             return
         world, steps = self._simulation.world, []
-        obstacles = [o.name for o in world.obstacles]
+        obstacles = self._simulation.reaction_names
         for r, each in zip(records[-MAX_STEPS:], reactions[-MAX_STEPS:], strict=True):
             header = pb.Header(object=world.bodies[int(r["body"])].name, epoch=1)
             steps.append(pb.ObjectStep(header=header, step=r["step"], time=r["time"], contacts=r["contacts"]))

@@ -225,6 +225,7 @@ def test_the_folder_is_the_registry():
         ("stairs", [1728]),
         ("gripper", [1296]),
         ("tool_on_organ", [2304]),
+        ("needle_holder", [1728]),
         ("heap", [180] * 12),
     ],
 )

@@ -247,8 +247,11 @@ class CpuEngine(Reports):
         number = {id(launch): k for k, launch in enumerate(launches)}
         self._stages = given.stages and _NativeStages(given.stages, loop, self._launch, number)
         self._contact = given.contact and _NativeContact(given.contact, loop, arrays)
-        if given.contact:
-            self.report_reactions(len(given.contact.obstacles.kind))
+        obstacles = len(given.contact.obstacles.kind) if given.contact else 0
+        if given.held is not None:
+            loop.holders, loop.held_reaction = given.held.shape[1], given.held.ctypes.data
+        self._held = given.held
+        self.report_reactions(obstacles + loop.holders)
         self._energies = NativeEnergies(given.energies)
         loop.energies = c.addressof(self._energies.native)
         self.begin: Sequence[Launch] = ()  # before the first step

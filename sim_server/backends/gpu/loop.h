@@ -74,7 +74,8 @@ struct GpuLoop {
     const StageResult* stage_results;      // (capacity, bodies) likewise; null: no scheme with stages
     const ContactResult* contact_results;  // (capacity, bodies) likewise; null: no contact
     const double* contact_reactions;       // (capacity, bodies, obstacles, 6) likewise
-    int64_t obstacles;
+    const double* held_reactions;          // (capacity, bodies, holders, 6) likewise
+    int64_t obstacles, holders;
     void* energy_balance;                  // graph that writes the energy record of the last step, unless that has been done
     void* elastic_energy;                  // graph that adds the elastic energy to it
     void* matrix;                          // graph that makes A of the next step, for a copy; null: each step makes its own

@@ -146,7 +146,14 @@ static void note_contact(Loop& loop, int index, int64_t slot) {
     record.clipped = report.clipped;
     record.contact_residual = report.residual;
     const int64_t size = 6 * (int64_t)loop.contact->obstacle_count;
-    std::memcpy(loop.rings.reactions + size * slot, loop.contact->reaction + size * index, sizeof(double) * size);
+    double* target = loop.rings.reactions + 6 * loop.rings.reaction_count * slot;
+    std::memcpy(target, loop.contact->reaction + size * index, sizeof(double) * size);
+}
+
+static void note_holders(const Loop& loop, int index, int64_t slot) {
+    const int64_t held = 6 * (int64_t)loop.holders;
+    double* end = loop.rings.reactions + 6 * loop.rings.reaction_count * (slot + 1);
+    std::memcpy(end - held, loop.held_reaction + held * index, sizeof(double) * held);
 }
 
 static void finish_step(Loop* loop) {
@@ -213,6 +220,7 @@ static void finish_step(Loop* loop) {
             record.whole = end - loop->assemble_begin - waited;  // with a factorization that the step waited for
             record.cpu = cpu;
             if (loop->energies) note_energy(record, loop->energies->balance[i]);
+            if (loop->holders) note_holders(*loop, i, (first + i) % rings.record_capacity);
         }
         rings.record_head.store(first + loop->bodies, std::memory_order_release);
     }

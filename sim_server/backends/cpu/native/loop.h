@@ -114,6 +114,8 @@ struct Loop {
     Newton* newton;                    // null: one linearization a step
     Stages* stages;                    // null: another scheme
     Contact* contact;                  // null: nothing can be touched
+    int32_t holders;
+    const double* held_reaction;       // (bodies, holders, 6) force [N] and torque [N m] on each; launches that integrate set it
     double* clock;                     // (1,) s, read by kernels
     int32_t* moving;                   // (bodies,) 0: the body rests (kernels/nodes.cu)
     Energies* energies;                // or null

@@ -69,7 +69,8 @@ struct Rings {
     std::atomic<int64_t> step;             // completed
     Record* records;
     int64_t record_capacity;
-    double* reactions;                     // (record_capacity, obstacles, 6) of each record; null: no contact
+    double* reactions;                     // (record_capacity, reaction_count, 6) of each record
+    int64_t reaction_count;                // obstacles, and then holders
     std::atomic<int64_t> record_head, record_tail;
     double* frames;                        // (capacity, 2, nodes, 3): x, v
     int64_t* frame_steps;
