@@ -31,6 +31,7 @@ from sim_server.mechanics.rosenbrock import make_integrator
 from sim_server.mechanics.shape_matching import ShapeMatching
 from sim_server.mechanics.static_check import check_held
 from sim_server.mechanics.system import System
+from sim_server.mechanics.ties import make_ties, ties_alone
 from sim_server.mechanics.world import Body, World
 from sim_server.scene import Scene, load
 
@@ -68,6 +69,7 @@ class Simulation:
         scene, solver = self.scene, self.scene.solver
         self.world = World(scene, backend)
         self.effects = build_effects(scene, self.world)
+        self.ties = self.contact.contact_input().ties if self.contact else make_ties(self.world)
         if self.holders and self.touch:
             self.holders.use_load(self.touch.force)
         elements = [e.elements for e in self.effects.values() if e.elements is not None]
@@ -104,8 +106,10 @@ class Simulation:
         effects = list(self.effects.values())
         newton = self.integrator.newton(assemble, effects)
         stages = self.integrator.stages(assemble, lists, effects)
-        contact = self.contact.contact_input() if self.contact else None
-        held = self.holders.reaction if self.holders else None
+        contact = ties_alone(w, self.ties) if self.ties else None
+        if self.contact:
+            contact = self.contact.contact_input()
+        held = w.reaction if w.reaction.size else None
         solver, energies = self.scene.solver, self.energies
         return EngineInput(
             assemble, integrate, names, ranges, w.dt, solver, energies, newton, stages, contact, held, arrays
@@ -216,7 +220,8 @@ class Simulation:
     @property
     def reaction_names(self) -> list[str]:
         """Names of what objects exert forces on, in the order of the engine's reactions."""
-        return self.posed_names
+        w = self.world
+        return [*self.posed_names, *(a.name for a in w.attachments), *(s.name for s in w.springs)]
 
     def rotated_bodies(self) -> list[Body]:
         """Bodies whose rotations for the warp are those of elements."""

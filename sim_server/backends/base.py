@@ -244,7 +244,7 @@ class EngineInput:
     newton: for several linearizations a step; None for one
     stages: of a Rosenbrock-W step; None for other schemes
     contact: rows that launches among `assemble` fill in; None: nothing can be touched
-    held: (bodies, holders, 6) force [N] and torque [N m] on each holder, which `integrate` sets; None: there are none
+    held: (bodies, k, 6) force [N] and torque [N m] on each holder, attachment and spring; None: there are none
     arrays: of the system by name: row_start, columns, values, b, y, x, v, clock, moving, rotation
     """
 

@@ -34,8 +34,7 @@ class Holders(Movable):
     """All holders of a scene. It is made before the effects of objects, which ask which nodes are free.
 
     node (n,): held nodes, holder by holder, ascending. holder (n,): of each
-    force (n, 3): on each node in the last step [N]. reaction (bodies, holders, 6): force [N] and torque about the
-    holder's centre at the end of the step [N m] that each body exerted on each holder
+    force (n, 3): on each node in the last step [N]. They are summed to world.reaction, torques about centres
     load (nodes, 3): the array `force` of the energy balance, of the effect touch where the scene has it
     """
 
@@ -58,8 +57,8 @@ class Holders(Movable):
         self._bodies = [world.body(h.object) for h in holders]
         n = len(self.node)
         self.next, self.later, self.velocity, self.force = self.start.copy(), *(np.zeros((n, 3)) for _ in range(3))
-        self.reaction = np.zeros((len(world.bodies), len(holders), 6))
-        self._place = np.array([b.index * len(holders) + k for k, b in enumerate(self._bodies)], np.int32)
+        columns = world.reaction.shape[1]
+        self._place = np.array([b.index * columns + k for k, b in enumerate(self._bodies)], np.int32)
         self.load, self._own_load = np.zeros((world.nodes, 3)), True
         exact = [a for a in vars(self).values() if isinstance(a, np.ndarray) and a is not self.load]
         world.backend.keep(*exact, exact=True)
@@ -111,7 +110,7 @@ class Holders(Movable):
         )  # fmt: skip
         total = text.bind(
             "total", len(self.first) - 1, first=self.first, place=self._place, end=self.end, next=self.next,
-            force=self.force, reaction=self.reaction,
+            force=self.force, reaction=w.reaction,
         )  # fmt: skip
         return [settle, total]
 

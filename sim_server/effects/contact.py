@@ -42,6 +42,7 @@ from sim_server.effects._movable import Movable, pose_of
 from sim_server.errors import InputError
 from sim_server.mechanics.signed_distance import signed_distance_grid
 from sim_server.mechanics.system import Stencil, System
+from sim_server.mechanics.ties import make_ties
 from sim_server.mechanics.world import Body, World
 from sim_server.mesh.box_tree import box_tree
 from sim_server.mesh.surface import surface_triangles
@@ -95,18 +96,23 @@ class Contact(Movable):
         bounds = [_thickness(params, body) for body in world.bodies]
         self._shapes(max(bounds))
         touching = len(world.bodies) > 1 and params.between
-        rows = (4 if touching else 2) * len(self.node)
+        ties = make_ties(world)
+        own = (4 if touching else 2) * len(self.node)
+        rows = own + (len(ties.corner) if ties else 0)
         corner, weight = np.full((rows, 4), -1, np.int32), np.zeros((rows, 4))
         corner[: 2 * len(self.node), 0] = np.repeat(self.node, 2)
         weight[:, 0] = 1
-        thickness = np.tile(np.repeat(np.array(bounds)[self.body], 2), 2 if touching else 1)
+        thickness = np.zeros(rows)
+        thickness[:own] = np.tile(np.repeat(np.array(bounds)[self.body], 2), 2 if touching else 1)
+        if ties:
+            corner[own:], weight[own:] = ties.corner, ties.weight
         start = np.concatenate([[0], np.cumsum([2 * len(s) for s in surfaces])]).astype(np.int32)
         self._input = ContactInput(
             self._table, start, corner, weight, np.full(rows, -1, np.int32), np.zeros((rows, 3)), np.zeros(rows),
             np.zeros((rows, 3)), np.full(rows, 2.0), np.zeros(rows), np.zeros(rows),
             thickness, np.zeros(rows), np.zeros((rows, 3)),
             world.predictor, world.free, world.dx_dv, world.force_coefficient, params.passes, params.tolerance,
-            _surfaces(world, params, self.node, self.body) if touching else None,
+            _surfaces(world, params, self.node, self.body) if touching else None, ties,
         )  # fmt: skip
         self.dropped = np.zeros(len(self.node), np.int32)
         self._pair_friction = _pair_friction(world, params)

@@ -16,6 +16,7 @@ from sim_server.mesh.surface import volumes
 from sim_server.scene import Scene, SceneObject
 from sim_server.scene.holders import Holder
 from sim_server.scene.obstacles import Obstacle
+from sim_server.scene.ties import Attachment, Spring
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,9 @@ class World:
     free (n,): 1, or 0 at fixed nodes; held (n,): 1 at nodes of holders, which are fixed, too; alpha, beta (bodies,):
     Rayleigh damping of the mass [1/s] and of the stiffness [s]; dt: time step [s];
     projection: of the elements' stiffness, the scene's choice;
-    obstacles, holders: of the scene; gravity: acceleration, 0 without the effect [m/s2];
+    obstacles, holders, attachments, springs: of the scene; reaction (bodies, k, 6): force [N] and torque [N m] of each
+    body on each of the k holders, attachments and springs in the last step; gravity: acceleration, 0 without the effect
+    [m/s2];
     backend: where kernels run.
 
     Effects use the following of the integrator in place of dt and v (formulas: integrator.py; symbols:
@@ -84,6 +87,11 @@ class World:
             first = last
         self.obstacles: Sequence[Obstacle] = scene.obstacles or []
         self.holders: Sequence[Holder] = scene.holders or []
+        self.attachments: Sequence[Attachment] = scene.attachments or []
+        self.springs: Sequence[Spring] = scene.springs or []
+        columns = len(self.holders) + len(self.attachments) + len(self.springs)
+        self.reaction = np.zeros((len(self.bodies), columns, 6))
+        backend.keep(self.reaction, exact=True)
         self.gravity = (0.0, 0.0, 0.0)
         self.rest = np.concatenate([mesh.rest for _, mesh in meshes])
         self.x = np.concatenate([posed(mesh.rest, o.pose.rotate, o.pose.translate) for o, mesh in meshes])

@@ -31,6 +31,7 @@ class ContactTelemetry:
         self._rows_due = 0.0
         self._crowded: set[int] = set()  # bodies of which it was said
         self.clipped: Counter[int] = Counter()
+        self._broken: set[int] = set()  # attachments and springs of which it was said
 
     def open(self) -> None:
         """Sends the obstacles to log and network."""
@@ -81,6 +82,24 @@ class ContactTelemetry:
                     "more passes (effects.contact) may help"
                 )
             self.clipped[body.index] += int(r["clipped"])
+        return lines
+
+    def broken_ties(self) -> list[str]:
+        """Returns a line for each attachment or spring of which something broke, at the first time."""
+        ties, world = self._simulation.ties, self._simulation.world
+        if ties is None:
+            return []
+        names, lines = self._simulation.reaction_names[-ties.tables :], []
+        for table in set(ties.table[ties.broken > 0].tolist()) - self._broken:
+            self._broken.add(table)
+            step, rows = (
+                int(ties.broken[(ties.table == table) & (ties.broken > 0)].min()),
+                int((ties.table == table).sum()),
+            )
+            lines.append(
+                f"{names[table]!r} breaks, at step {step} ({step * world.dt:.4g} s)"
+                + (f", the first of its {rows} nodes; forces on it tell of the others" if rows > 1 else "")
+            )
         return lines
 
     def crowded_nodes(self) -> list[str]:

@@ -80,7 +80,8 @@ def single_object_scene(resolved: str, name: str, mesh: Mesh) -> Scene:
         listed = [o for o in table["object"] if o["name"] == name]
         table["solver"] = {**table["solver"], **WORKER_SETTINGS}
         table["effects"] = {name: given for name, given in table["effects"].items() if name != "contact"}
-        table.pop("obstacle", None)
+        for kind in ("obstacle", "attachment", "spring"):
+            table.pop(kind, None)
         held = [{k: v for k, v in h.items() if k not in MOTION} for h in table.pop("holder", []) if h["object"] == name]
         table |= {"holder": held} if held else {}
     except (ValueError, KeyError, TypeError, RecursionError) as error:

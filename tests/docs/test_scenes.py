@@ -10,12 +10,13 @@ from annotated_types import Ge, Gt, Le, Lt, MaxLen, MinLen
 from pydantic.fields import FieldInfo
 
 from sim_server import effects
+from sim_server.scene.holders import Holder
 from sim_server.scene.integrator_options import IntegratorOptions
 from sim_server.scene.model import MeshSource, RecordOptions, Scene, SceneObject
-from sim_server.scene.holders import Holder
 from sim_server.scene.obstacles import Obstacle
 from sim_server.scene.pose import Pose
 from sim_server.scene.solver_options import PRECONDITIONERS, SolverOptions
+from sim_server.scene.ties import Attachment, Spring
 from tests.docs.figures import DOCS, Row, table_under
 
 TEXT = (DOCS / "scenes.md").read_text()
@@ -35,6 +36,7 @@ BY_HAND = {
     ("Holders", "max_speed"): ("1", None),
     ("Holders", "max_turn"): ("3", None),
     ("Holders", "keyframes"): (None, "at least one"),
+    ("Springs", "between"): (None, "two of"),
     ("Objects", "mesh.split"): ('"kuhn"', None),
     ("Objects", "mesh.scale"): ("1", None),
 }
@@ -140,7 +142,17 @@ def test_keys_of_a_table(heading: str, fields: dict[str, FieldInfo]) -> None:
 
 def test_no_table_is_missing() -> None:
     tables = {field.alias or name for name, field in Scene.model_fields.items()} - {"dt", "name"}
-    assert tables == {"effects", "integrator", "solver", "record", "object", "obstacle", "holder"}
+    assert tables == {
+        "effects",
+        "integrator",
+        "solver",
+        "record",
+        "object",
+        "obstacle",
+        "holder",
+        "attachment",
+        "spring",
+    }
 
 
 def test_keys_of_an_object() -> None:
@@ -158,6 +170,11 @@ def test_keys_of_an_obstacle() -> None:
 
 def test_keys_of_a_holder() -> None:
     check("Holders", rows_of("Holders"), dict(Holder.model_fields))
+
+
+def test_keys_of_attachments_and_springs() -> None:
+    check("Attachments", rows_of("Attachments"), dict(Attachment.model_fields))
+    check("Springs", rows_of("Springs"), dict(Spring.model_fields))
 
 
 KEY = re.compile(r"`(\w+)`(?: \((.+?)\))?(?: \[(.+?)\])?(?:,|$)")

@@ -108,6 +108,11 @@ class ContactReport(c.Structure):
 
 
 @LOOP.struct
+class Ties(c.Structure):
+    """Attachments and springs."""
+
+
+@LOOP.struct
 class Contact(c.Structure):
     """Input and memory of contact."""
 
