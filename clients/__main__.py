@@ -192,7 +192,7 @@ def grab(
 
 @app.command("move-obstacle")
 def move_obstacle(
-    name: Annotated[str, typer.Argument(metavar="NAME", help='Obstacle of the scene with moved = "client".')],
+    name: Annotated[str, typer.Argument(metavar="NAME", help='Obstacle or holder with moved = "client".')],
     to: Annotated[Triple, typer.Option(metavar="X Y Z", help="Where its own origin goes, m.")],
     rotate: Annotated[
         Triple | None,
@@ -201,7 +201,7 @@ def move_obstacle(
     connect: Connect = None,
     server: Server = SERVER_NAME,
 ) -> None:
-    """Move an obstacle; it goes there at the speeds that the scene allows, and stays.
+    """Move an obstacle or a holder; it goes there at the speeds that the scene allows, and stays.
 
     \b
     Examples:

@@ -102,7 +102,7 @@ class Client:
             raise ClientError(f"server {self.name!r} sent a mesh that cannot be used: {error}") from None
 
     def obstacles(self) -> dict[str, ObstacleShape]:
-        """Returns all obstacles, with their poses at the start."""
+        """Returns all obstacles and holders, with their poses at the start."""
         names = {name for scene in self._query("scene", pb.Scene) for name in scene.obstacles}
         if not names:
             return {}
@@ -113,7 +113,7 @@ class Client:
             raise ClientError(f"server {self.name!r} sent an obstacle that cannot be used: {error}") from None
 
     def obstacle(self, name: str) -> Obstacle:
-        """Returns the handle of an obstacle that clients move. Raises BadInput if there is none of this name.
+        """Returns the handle of an obstacle or holder that clients move. Raises BadInput if there is none of this name.
 
         >>> client.obstacle("tool").move((0, 0.2, 0), rotation=(1, 0, 0, 0))
         """

@@ -12,6 +12,7 @@ record  service/telemetry.py fetches those of the engine (`records`) for recordi
 """
 
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -30,12 +31,15 @@ from sim_server.mechanics.rosenbrock import make_integrator
 from sim_server.mechanics.shape_matching import ShapeMatching
 from sim_server.mechanics.static_check import check_held
 from sim_server.mechanics.system import System
+from sim_server.mechanics.ties import make_ties, ties_alone
 from sim_server.mechanics.world import Body, World
 from sim_server.scene import Scene, load
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_array
 
+    from sim_server.effects._holders import Holders  # imported where a scene has them
+    from sim_server.effects._movable import Movable
     from sim_server.effects.contact import Contact  # imported where a scene lists it
     from sim_server.effects.touch import Touch  # imported where a scene lists it
 
@@ -66,6 +70,9 @@ class Simulation:
         scene, solver = self.scene, self.scene.solver
         self.world = World(scene, backend)
         self.effects = build_effects(scene, self.world)
+        self.ties = self.contact.contact_input().ties if self.contact else make_ties(self.world)
+        if self.holders and self.touch:
+            self.holders.use_load(self.touch.force)
         elements = [e.elements for e in self.effects.values() if e.elements is not None]
         self.system = System(self.world, elements)
         matched = self._matched()
@@ -80,7 +87,7 @@ class Simulation:
         self.energies = collected_energies(self.world, self.effects, self.integrator.before, still, on_runaway)
         given = self.engine_input()
         self.engine = backend.engine(given)
-        self.engine.begin = self.integrator.begin(given.assemble)
+        self.engine.begin = self.integrator.begin(given.assemble[len(self._held_launches) :])
         for e in self.effects.values():
             e.connect(self)
         for body in self.world.bodies:
@@ -101,11 +108,14 @@ class Simulation:
         newton = self.integrator.newton(assemble, effects)
         stages = self.integrator.stages(assemble, lists, effects)
         euler = self.integrator.euler_form([*assemble, *integrate], assemble[numbers], euler_launches, effects)
-        contact = self.contact.contact_input() if self.contact else None
+        contact = ties_alone(w, self.ties) if self.ties else None
+        if self.contact:
+            contact = self.contact.contact_input()
         touch = assemble[self._mailed[self.touch]] if self.touch else None
+        held = w.reaction if w.reaction.size else None
         return EngineInput(
             assemble, integrate, names, ranges, w.dt, self.scene.solver, self.energies, newton, stages, euler, contact,
-            touch, arrays,
+            touch, held, arrays,
         )  # fmt: skip
 
     @classmethod
@@ -131,7 +141,9 @@ class Simulation:
         matrix: takes A into the material frame; detect: detects contacts
         """
         system = self.system
-        assemble = [self.integrator.start()]
+        assemble = [*self._held_launches, self.integrator.start()]
+        if self.holders and self._held_launches:
+            self._mailed[self.holders] = 0
         stencils = iter(system.stencils)
         accumulate = False
         for e in sorted(self.effects.values(), key=lambda e: e.elements is None):  # touch asks what the elements added
@@ -149,7 +161,15 @@ class Simulation:
         if self.shape is not None:
             assemble.append(self.shape.launch(system.mean))
         assemble += system.finish(matrix)  # into the material frame (eq. 12 and 13)
-        return assemble, self.integrator.advance()
+        settled = self.holders.last_launches(system) if self.holders else []
+        return assemble, [*settled, *self.integrator.advance()]
+
+    @cached_property
+    def _held_launches(self) -> list[Launch]:
+        """The launches that move holders and their nodes; the first is the one that is mailed."""
+        if self.holders is None:
+            return []
+        return self.holders.first_launches(self.system, self.integrator.beta, self.integrator.inertial_increment)
 
     def _other_launches(self) -> list[list[Launch]]:
         """Returns what steps run beside `launches`: the forces of the stages of ros2, and backward Euler.
@@ -195,6 +215,27 @@ class Simulation:
     def contact(self) -> "Contact | None":
         """Contact with obstacles, if the scene lists it."""
         return cast("Contact | None", self.effects.get("contact"))
+
+    @property
+    def holders(self) -> "Holders | None":
+        """Groups of nodes that move as rigid bodies, if the scene has them."""
+        return cast("Holders | None", self.effects.get("holders"))
+
+    def movable(self, name: str) -> "Movable | None":
+        """Returns the effect that moves the obstacle or holder of this name; an unknown name may be any's."""
+        named = name in {h.name for h in self.world.holders}
+        return self.holders if named or self.contact is None else self.contact
+
+    @property
+    def posed_names(self) -> list[str]:
+        """Names of what has a pose and is no object: obstacles, then holders."""
+        return [each.name for each in (*self.world.obstacles, *self.world.holders)]
+
+    @property
+    def reaction_names(self) -> list[str]:
+        """Names of what objects exert forces on, in the order of the engine's reactions."""
+        w = self.world
+        return [*self.posed_names, *(a.name for a in w.attachments), *(s.name for s in w.springs)]
 
     def rotated_bodies(self) -> list[Body]:
         """Bodies whose rotations for the warp are those of elements."""
@@ -249,6 +290,10 @@ class Simulation:
 def build_effects(scene: Scene, world: World) -> dict[str, Effect]:
     """The effects that the scene lists, and no others, by name (and variant)."""
     built: dict[str, Effect] = {}
+    if world.holders:
+        from sim_server.effects._holders import Holders
+
+        built["holders"] = Holders(world)
     for name in sorted({n for o in scene.objects for n in o.effects}):
         variants: dict[str, list[tuple[Body, Any]]] = {}
         for body, params in world.with_effect(name):

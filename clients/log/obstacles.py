@@ -13,8 +13,9 @@ from protocol import messages_pb2 as pb
 from protocol.refused import Refused
 from protocol.validate import array, check_range
 
-SIZES = {"plane": 0, "sphere": 1, "box": 3, "capsule": 2, "grid": 0}
-"""Shapes, and how many sizes [m] each has: radius; lengths along x, y, z; radius and length of the axis along y."""
+SIZES = {"plane": 0, "sphere": 1, "box": 3, "capsule": 2, "grid": 0, "holder": 0}
+"""Shapes, and how many sizes [m] each has: radius; lengths along x, y, z; radius and length of the axis along y. A
+holder is a group of an object's nodes, and has no surface."""
 
 Position = tuple[float, float, float]
 Rotation = tuple[float, float, float, float]

@@ -24,7 +24,7 @@ class ObstacleSurface(NamedTuple):
 
 def obstacle_surface(obstacle: Obstacle, low: NDArray, high: NDArray) -> ObstacleSurface:
     """Returns the surface. low, high (3,): of a box around the bodies [m], below which a plane is drawn as a square."""
-    if obstacle.shape == "grid":
+    if obstacle.shape in ("grid", "holder"):
         return ObstacleSurface(obstacle.vertices, obstacle.triangles)
     if obstacle.shape == "plane":
         return _square(obstacle, low, high)

@@ -86,7 +86,8 @@ class RerunScene:
         vertices, triangles = obstacle_surface(obstacle, low, high)
         shape = rr.Mesh3D(vertex_positions=vertices, triangle_indices=triangles, albedo_factor=COLOR)
         entity, start = _entity("world", obstacle.name), _transform(obstacle.start)
-        self._recording.log(entity, shape, static=True)
+        if len(vertices):
+            self._recording.log(entity, shape, static=True)
         if obstacle.moved:
             self._recording.set_time("step", sequence=0)
             self._recording.set_time("time", duration=0.0)

@@ -62,6 +62,8 @@ def _draw_bodies(axes: Any, log: Log, coloring: Coloring, top: float) -> None:
     if np.isfinite(low).all():
         for obstacle in log.obstacles.values():
             vertices, drawn = obstacle_surface(obstacle, low, high)
+            if not len(drawn):
+                continue
             pose = log.poses[obstacle.name][-1].pose if obstacle.name in log.poses else obstacle.start
             triangles = _upright((vertices @ pose.matrix().T + pose.position)[drawn])
             axes.add_collection3d(Poly3DCollection(triangles, facecolors=np.array(COLOR) / 255, alpha=0.3))

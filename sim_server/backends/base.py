@@ -258,6 +258,7 @@ class EngineInput:
     euler: steps of backward Euler that single bodies take; None: all bodies take those of the scheme
     contact: rows that launches among `assemble` fill in; None: nothing can be touched
     touch: the one of `assemble` that pushes and grabs (effects/touch.cu); None: no object lists the effect
+    held: (bodies, k, 6) force [N] and torque [N m] on each holder, attachment and spring; None: there are none
     arrays: of the system by name: row_start, columns, values, b, y, x, v, clock, moving, rotation
     """
 
@@ -273,6 +274,7 @@ class EngineInput:
     euler: EulerForm | None
     contact: Contact | None
     touch: Launch | None
+    held: Float64 | None
     arrays: Mapping[str, NDArray[Any]]
 
 

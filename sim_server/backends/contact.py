@@ -4,6 +4,7 @@
 from dataclasses import dataclass
 
 from sim_server.arrays import Float64, Int32
+from sim_server.backends.ties import Ties
 
 
 @dataclass(frozen=True)
@@ -67,6 +68,7 @@ class Contact:
     predictor: (nodes, 3), dx_dv, force_coefficient, free: (nodes,) of the world (mechanics/world.py)
     passes: most solves of a step. tolerance: of the contact residual
     surfaces: None where bodies do not touch each other
+    ties: attachments and springs, which have the last rows; None: there are none
     """
 
     obstacles: Obstacles
@@ -90,3 +92,4 @@ class Contact:
     passes: int
     tolerance: float
     surfaces: Surfaces | None
+    ties: Ties | None = None

@@ -44,13 +44,13 @@ class Reports:
         """Steps completed."""
         return int(self.loop.step)
 
-    def report_reactions(self, obstacles: int, poses: Reals | None = None) -> None:
-        """Has records come with the force and torque on each obstacle, and frames with where these are.
+    def report_reactions(self, count: int, obstacles: int, poses: Reals | None = None) -> None:
+        """Has records come with the force and torque on each obstacle, and then each holder; count: of all.
 
-        poses: memory (frames, obstacles, 7) for that; None: ordinary one
+        Frames come with where obstacles are. poses: memory (frames, obstacles, 7) for that; None: ordinary one
         """
-        self._reactions = np.zeros((len(self._records), obstacles, 6))
-        self.loop.reactions = self._reactions.ctypes.data
+        self._reactions = np.zeros((len(self._records), count, 6))
+        self.loop.reactions, self.loop.reaction_count = self._reactions.ctypes.data, count
         self._frame_poses = np.zeros((len(self._frames), obstacles, 7)) if poses is None else poses
         self.loop.frame_poses = self._frame_poses.ctypes.data
 
@@ -59,8 +59,8 @@ class Reports:
         return self.records_and_reactions()[0]
 
     def records_and_reactions(self) -> tuple[NDArray[Any], Reals]:
-        """New records since the last call, and what each body exerted on each obstacle, (k, obstacles, 6): force [N],
-        then torque about the obstacle's position at the end of the step [N m]. No obstacles without contact."""
+        """New records since the last call, and what each body exerted on each obstacle (with contact) and then each
+        holder, (k, count, 6): force [N], then torque about its position at the end of the step [N m]."""
         head, tail, size = int(self.loop.record_head), int(self.loop.record_tail), len(self._records)
         slots = np.arange(tail, head) % size
         out = self._records[slots], self._reactions[slots]

@@ -167,7 +167,7 @@ class Tetrahedra(Effect):
             b=system.b, block=system.block,
         )  # fmt: skip
         blocks = w.backend.module("kernels/gather_blocks.cu").bind(
-            "gather", len(system.row), elements=m, accumulate=int(accumulate), start=stencil.pair_start,
+            "gather", len(system.sums), elements=m, accumulate=int(accumulate), start=stencil.pair_start,
             pairs=stencil.pairs, edges=self.edges, sums=system.sums,
         )  # fmt: skip
         return [gather, blocks]

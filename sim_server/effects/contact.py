@@ -26,7 +26,7 @@ steel) to 1 (rubber).
 
 import logging
 from collections.abc import Sequence
-from math import dist, hypot
+from math import hypot
 from typing import Annotated, Any
 
 import numpy as np
@@ -37,26 +37,25 @@ from sim_server.backends.base import Launch
 from sim_server.backends.contact import Contact as ContactInput
 from sim_server.backends.contact import Obstacles, Surfaces
 from sim_server.backends.declarations import Declarations
-from sim_server.effects._base import Effect, EffectUpdates
+from sim_server.effects._base import EffectUpdates
+from sim_server.effects._movable import Movable, pose_of
 from sim_server.errors import InputError
 from sim_server.mechanics.signed_distance import signed_distance_grid
 from sim_server.mechanics.system import Stencil, System
+from sim_server.mechanics.ties import make_ties
 from sim_server.mechanics.world import Body, World
 from sim_server.mesh.box_tree import box_tree
 from sim_server.mesh.surface import surface_triangles
 from sim_server.scene.obstacles import Obstacle
 from sim_server.scene.parameters import NotNegative, Parameters, Positive, as_tuple
-from sim_server.scene.pose import quaternion
 
 log = logging.getLogger(__name__)
 
 SCOPE = "scene"
 TEXT = "effects/contact.cu"
-REACH = 1e3  # sizes of the scene: how far from it a client's pose may be
 DEFAULT_THICKNESS, LARGEST_THICKNESS = 0.1, 0.5  # of the shortest edge of a surface
 
 ShapeKind = Declarations("kernels/shapes.cuh").enumeration("ShapeKind")
-MOTION = {"fixed": 0, "keyframes": 1, "client": 2}  # Motion of contact.cu
 
 
 class PairFriction(Parameters):
@@ -79,15 +78,7 @@ class Params(Parameters):
     between: bool = Field(default=True, description="objects touch each other, too")
 
 
-class ContactError(ValueError):
-    """A pose that is refused; the text is for the client."""
-
-
-Point = tuple[float, float, float]
-Rotation = tuple[float, float, float, float]
-
-
-class Contact(Effect):
+class Contact(Movable):
     """Obstacles of a scene, and two rows for each free surface node: the obstacles that it may touch in a step.
 
     dropped (surface nodes,): how often an obstacle found no row since there were nearer ones
@@ -95,31 +86,33 @@ class Contact(Effect):
     """
 
     def __init__(self, world: World, params: Params):
-        self.world, self.params = world, params
+        self.params = params
         self.obstacles: Sequence[Obstacle] = world.obstacles
-        self._simulation: EffectUpdates | None = None
-        self._system: System | None = None
-        low, high = world.x.min(axis=0), world.x.max(axis=0)
-        self._center, self._size = (low + high) / 2, float(np.linalg.norm(high - low))
+        frames = [[(k.time, pose_of(k)) for k in o.keyframes or ()] or [(0.0, pose_of(o.pose))] for o in self.obstacles]
+        super().__init__(world, "obstacle", self.obstacles, frames)
         surfaces = [_surface(world, body) for body in world.bodies]
         self.node = np.concatenate(surfaces)
         self.body = np.repeat(np.arange(len(surfaces), dtype=np.int32), [len(s) for s in surfaces])
         bounds = [_thickness(params, body) for body in world.bodies]
         self._shapes(max(bounds))
-        self._poses()
         touching = len(world.bodies) > 1 and params.between
-        rows = (4 if touching else 2) * len(self.node)
+        ties = make_ties(world)
+        own = (4 if touching else 2) * len(self.node)
+        rows = own + (len(ties.corner) if ties else 0)
         corner, weight = np.full((rows, 4), -1, np.int32), np.zeros((rows, 4))
         corner[: 2 * len(self.node), 0] = np.repeat(self.node, 2)
         weight[:, 0] = 1
-        thickness = np.tile(np.repeat(np.array(bounds)[self.body], 2), 2 if touching else 1)
+        thickness = np.zeros(rows)
+        thickness[:own] = np.tile(np.repeat(np.array(bounds)[self.body], 2), 2 if touching else 1)
+        if ties:
+            corner[own:], weight[own:] = ties.corner, ties.weight
         start = np.concatenate([[0], np.cumsum([2 * len(s) for s in surfaces])]).astype(np.int32)
         self._input = ContactInput(
             self._table, start, corner, weight, np.full(rows, -1, np.int32), np.zeros((rows, 3)), np.zeros(rows),
             np.zeros((rows, 3)), np.full(rows, 2.0), np.zeros(rows), np.zeros(rows),
             thickness, np.zeros(rows), np.zeros((rows, 3)),
             world.v, world.free, world.dt, world.dt, params.passes, params.tolerance,
-            _surfaces(world, params, self.node, self.body) if touching else None,
+            _surfaces(world, params, self.node, self.body) if touching else None, ties,
         )  # fmt: skip
         self.dropped = np.zeros(len(self.node), np.int32)
         self._pair_friction = _pair_friction(world, params)
@@ -129,62 +122,42 @@ class Contact(Effect):
     def _shapes(self, thickness: float) -> None:
         """Makes the table of shapes, and spheres around them."""
         m = len(self.obstacles)
-        size, self._ball, grids, place = np.zeros((m, 4)), np.zeros((m, 4)), [np.zeros(0)], np.zeros(m, np.int32)
+        size, grids, place = np.zeros((m, 4)), [np.zeros(0)], np.zeros(m, np.int32)
         nodes = np.zeros((m, 3), np.int32)
         for k, o in enumerate(self.obstacles):
             if o.shape == "grid":
                 grid = _grid(o, thickness)
                 size[k], nodes[k], place[k] = [*grid.first, grid.spacing], grid.values.shape, sum(map(len, grids))
-                self._ball[k] = [*grid.center, grid.radius]
+                self.ball[k] = [*grid.center, grid.radius]
                 grids.append(grid.values.ravel())
             else:
-                size[k], self._ball[k, 3] = _size(o)
+                size[k], self.ball[k, 3] = _size(o)
         kind = np.array([ShapeKind[o.shape.upper()] for o in self.obstacles], np.int32)
-        self._table = Obstacles(kind, size, np.concatenate(grids), place, nodes, np.zeros((m, 7)), np.zeros((m, 7)))
-
-    def _poses(self) -> None:
-        """Makes the poses at the start, and what they change by."""
-        frames = [
-            [(key.time, _pose(key)) for key in o.keyframes] if o.keyframes else [(0.0, _pose(o.pose))]
-            for o in self.obstacles
-        ]
-        for k, keys in enumerate(frames):
-            self._table.begin[k] = self._table.end[k] = keys[0][1]
-        ways = ["keyframes" if o.keyframes else o.moved or "fixed" for o in self.obstacles]
-        self._motion = np.array([MOTION[way] for way in ways], np.int32)
-        self._first = np.concatenate([[0], np.cumsum([len(keys) for keys in frames])]).astype(np.int32)
-        self._time = np.array([time for keys in frames for time, _ in keys])
-        self.frames = np.array([pose for keys in frames for _, pose in keys])
-        self._speed = np.array([o.max_speed or 0.0 for o in self.obstacles])
-        self._turn = np.array([o.max_turn or 0.0 for o in self.obstacles])
-        self._placed = np.full(len(self.obstacles), -1.0)
-        self._swept = np.zeros((len(self.obstacles), 4))
-        self._target: Float64 = self._table.end.copy()
+        self._table = Obstacles(kind, size, np.concatenate(grids), place, nodes, self.begin, self.end)
 
     def contact_input(self) -> ContactInput:
         """Returns the rows, which the launches fill in each step, and options of the solve."""
         return self._input
 
     def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
-        self._system = system
         w, rows, table = self.world, self._input, self._table
         gravity, block_scale = np.array(w.gravity), w.euler_block_scale
         w.backend.keep(gravity, block_scale, exact=True)
         detect = w.backend.module(TEXT).bind(
-            "detect", len(self.node), obstacles=len(self.obstacles), **vars(table), swept=self._swept,
+            "detect", len(self.node), obstacles=len(self.obstacles), **vars(table), swept=self.swept,
             pair_friction=self._pair_friction, node=self.node, body=self.body, x=w.x, predictor=w.v, free=w.free,
             mass=w.mass, block=system.block, block_scale=block_scale, gravity=gravity, force_coefficient=w.dt,
             dx_dv=w.dt, kappa=self.params.stiffness, thickness=rows.thickness, obstacle=rows.obstacle,
             normal=rows.normal, gap=rows.gap, drift=rows.drift, entry=rows.entry, stiffness=rows.stiffness,
             friction=rows.friction, force=rows.force, traction=rows.traction, dropped=self.dropped,
         )  # fmt: skip
-        return [self._place(self._target), detect]
+        return [self.place(system), detect]
 
     def force_launches(self, system: System, stencil: Stencil | None, frames: bool) -> list[Launch]:
         return []  # contacts are detected once a step
 
     def connect(self, simulation: EffectUpdates) -> None:
-        self._simulation = simulation
+        super().connect(simulation)
         self._warn_of_nodes_inside()
 
     def _warn_of_nodes_inside(self) -> None:
@@ -205,66 +178,6 @@ class Contact(Effect):
                     body.name, self.obstacles[nearest[worst]].name, self.node[worst] - body.first, -distance[worst],
                     found.size,
                 )  # fmt: skip
-
-    @property
-    def targets(self) -> dict[str, Float64]:
-        """Poses that clients want, as the loop was given them last, by the names of the obstacles that they move.
-
-        A pose is (7,): position [m], unit quaternion w, x, y, z.
-        """
-        return {o.name: self._target[k].copy() for k, o in enumerate(self.obstacles) if o.moved == "client"}
-
-    def move(self, name: str, position: Point, rotation: Rotation) -> None:
-        """Has an obstacle go to a pose, at most at its `max_speed` and `max_turn`.
-
-        position: of the obstacle's frame [m]. rotation: quaternion w, x, y, z of any length but 0.
-        Raises ContactError.
-        """
-        self._check_name(name)
-        if not np.isfinite([*position, *rotation]).all():
-            raise ContactError(f"obstacle {name!r}: position and rotation must be finite numbers")
-        away, far, length = dist(position, self._center), REACH * self._size, hypot(*rotation)
-        if not away <= far:
-            raise ContactError(
-                f"obstacle {name!r}: position {away:.4g} m from the middle of the scene: at most {far:.4g} m, "
-                f"{REACH:g} times its size"
-            )
-        if not 1e-6 < length < 1e6:
-            raise ContactError(f"obstacle {name!r}: rotation has length {length:.4g}: a quaternion w, x, y, z of 1")
-        self.restore({name: np.array([*position, *(q / length for q in rotation)])})
-
-    def restore(self, targets: dict[str, Float64]) -> None:
-        """Has the loop work with these poses, (7,) by name, from its next step on; the others stay.
-
-        Raises ContactError.
-        """
-        target = self._target.copy()
-        for name, pose in targets.items():
-            target[self._check_name(name)] = pose
-        self._target = target
-        assert self._simulation is not None
-        self._simulation.update_effect(self, self._place(target))
-
-    def _check_name(self, name: str) -> int:
-        """Returns the number of an obstacle that a client may move. Raises ContactError."""
-        movable = [o.name for o in self.obstacles if o.moved == "client"]
-        found = next((k for k, o in enumerate(self.obstacles) if o.name == name), None)
-        said = f'with moved = "client": {", ".join(movable) or "none"}'
-        if found is None:
-            raise ContactError(f"no obstacle {name[:80]!r}; obstacles {said}")
-        if name not in movable:
-            raise ContactError(f"obstacle {name!r} is not moved by clients; obstacles {said}")
-        return found
-
-    def _place(self, target: Float64) -> Launch:
-        """Returns the launch that moves the obstacles."""
-        assert self._system is not None
-        launch: Launch = self.world.backend.module(TEXT).bind(
-            "place", len(self.obstacles), clock=self._system.clock, dt=self.world.dt, motion=self._motion,
-            first=self._first, time=self._time, frame=self.frames, target=target, speed=self._speed, turn=self._turn,
-            ball=self._ball, placed=self._placed, begin=self._table.begin, end=self._table.end, swept=self._swept,
-        )  # fmt: skip
-        return launch
 
 
 def _surface(world: World, body: Body) -> Int32:
@@ -329,11 +242,6 @@ def _size(o: Obstacle) -> tuple[list[float], float]:
     assert o.radius is not None
     half_axis = (o.length or 0.0) / 2
     return [o.radius, half_axis, 0.0, 0.0], o.radius + half_axis
-
-
-def _pose(given: Any) -> list[float]:
-    """Returns position and quaternion of a pose of the scene, (7,)."""
-    return [*given.translate, *quaternion(given.rotate)]
 
 
 def _pair_friction(world: World, params: Params) -> Float64:

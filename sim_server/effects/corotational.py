@@ -152,7 +152,7 @@ class Corotational(Effect):
             mean=system.mean, **twist,
         )  # fmt: skip
         blocks = w.backend.module(f"{sums}_blocks.cu").bind(
-            "blocks", len(system.row), accumulate=int(accumulate), start=stencil.pair_start, pairs=stencil.pairs,
+            "blocks", len(system.sums), accumulate=int(accumulate), start=stencil.pair_start, pairs=stencil.pairs,
             scaled_gradients=self.scaled_gradients, sums=system.sums, **twist,
         )  # fmt: skip
         return [elements, gather, blocks]

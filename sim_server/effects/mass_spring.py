@@ -147,7 +147,7 @@ class MassSpring(Effect):
             tangent=self.tangent, b=system.b, block=system.block,
         )  # fmt: skip
         blocks = w.backend.module("effects/mass_spring_blocks.cu").bind(
-            "blocks", len(system.row), accumulate=int(accumulate), start=stencil.pair_start, pairs=stencil.pairs,
+            "blocks", len(system.sums), accumulate=int(accumulate), start=stencil.pair_start, pairs=stencil.pairs,
             tangent=self.tangent, sums=system.sums,
         )  # fmt: skip
         return [springs, gather, blocks]

@@ -40,6 +40,9 @@ class System:
 
     moving (bodies,): 1 if a node of the body does not rest, so that the step is solved; set by `rotate`
         (kernels/nodes.cu) and cleared by the loop
+    row, column: nodes of the blocks above the diagonal
+    sums (blocks, 3, 3): these, world frame, and after them those that couple nodes of holders to free ones, which are
+        not in A; held_columns (blocks,): their free nodes
     extent (n,): diagonal of the box around the node's body at rest [m]
     rotation (n, 3, 3): frames of the nodes
     warped (bodies,): 1 where frames follow the nodes' rotations, 0 where they stay the identity; set before the
@@ -49,13 +52,16 @@ class System:
     def __init__(self, world: World, elements: list[Int32]):
         n = world.nodes
         self.world = world
-        couplings = [_couplings(e, world.free, n) for e in elements]
-        above = np.unique(np.concatenate([np.zeros(0, np.int64), *(keys for keys, _ in couplings)]))
-        self.row, self.column = (part.astype(np.int32) for part in np.divmod(above, n))
+        couplings = [_couplings(e, world, n) for e in elements]
+        keys = np.unique(np.concatenate([np.zeros(0, np.int64), *(keys for keys, _ in couplings)]))
+        rows, columns = (part.astype(np.int32) for part in np.divmod(keys, n))
+        above = rows < n
+        self.row, self.column = rows[above], columns[above]
+        self.held_rows, self.held_columns = rows - np.int32(n), columns
         self._number(n)
-        self.stencils = [_stencil(e, c, n, above) for e, c in zip(elements, couplings, strict=True)]
+        self.stencils = [_stencil(e, c, n, keys) for e, c in zip(elements, couplings, strict=True)]
 
-        self.sums = np.zeros((len(above), 3, 3))
+        self.sums = np.zeros((len(keys), 3, 3))
         self.values = np.zeros((len(self.columns), 3, 3))
         self.diagonal = np.zeros(n)
         self.block = np.zeros((n, 6))
@@ -82,6 +88,11 @@ class System:
         """1 / (dx_dv + beta) at each node, (n,) [1/s]."""
         w = self.world
         return self._inverse_times.setdefault(w.dx_dv, 1 / (w.dx_dv + w.beta[self.body]))
+
+    def held_couplings(self, node: Int32) -> tuple[Int32, Int32]:
+        """Returns where in `sums` the blocks of held nodes begin and end, (len(node),) each."""
+        first, last = (np.searchsorted(self.held_rows, node, side) for side in ("left", "right"))
+        return first.astype(np.int32), last.astype(np.int32)
 
     def _number(self, n: int) -> None:
         """Numbers the places in block CSR of the blocks above, below and on the diagonal."""
@@ -154,9 +165,13 @@ def _runs(group: Int32, begin: Int64, count: Int64) -> Int32:
     return (np.arange(len(group)) - first[group] + begin[group]).astype(np.int32)
 
 
-def _couplings(elements: Int32, free: Float64, n: int) -> tuple[Int64, Int32]:
-    """Keys row * n + column and pairs c c e + c a + b of all couplings above the diagonal between free corners."""
+def _couplings(elements: Int32, world: World, n: int) -> tuple[Int64, Int32]:
+    """Keys row * n + column and pairs c c e + c a + b of all couplings above the diagonal between free corners.
+
+    Those of a held row and a free column have the key (row + n) * n + column, so they come last.
+    """
     keys, pairs = [], []
+    free, held = world.free, world.held
     corners = elements.shape[1]
     element = corners**2 * np.arange(len(elements), dtype=np.int32)
     for a in range(corners):
@@ -165,13 +180,17 @@ def _couplings(elements: Int32, free: Float64, n: int) -> tuple[Int64, Int32]:
             here = (i < j) & (free[i] > 0) & (free[j] > 0)
             keys.append(i[here].astype(np.int64) * n + j[here])
             pairs.append((element + np.int32(corners * a + b))[here])
+            if held.any():
+                here = (held[i] > 0) & (free[j] > 0)
+                keys.append((i[here].astype(np.int64) + n) * n + j[here])
+                pairs.append((element + np.int32(corners * a + b))[here])
     return np.concatenate(keys), np.concatenate(pairs)
 
 
-def _stencil(elements: Int32, couplings: tuple[Int64, Int32], n: int, above: Int64) -> Stencil:
+def _stencil(elements: Int32, couplings: tuple[Int64, Int32], n: int, blocks: Int64) -> Stencil:
     corners = np.argsort(elements.ravel(), kind="stable").astype(np.int32)
     corner_start = np.concatenate([[0], np.cumsum(np.bincount(elements.ravel(), minlength=n))]).astype(np.int32)
     keys, pairs = couplings
     order = np.lexsort((pairs, keys))
-    pair_start = np.searchsorted(keys[order], np.append(above, np.int64(n) * n)).astype(np.int32)
+    pair_start = np.searchsorted(keys[order], np.append(blocks, 2 * np.int64(n) * n)).astype(np.int32)
     return Stencil(corner_start, corners, pair_start, pairs[order])

@@ -14,7 +14,9 @@ from sim_server.errors import InputError
 from sim_server.mesh import Mesh, posed
 from sim_server.mesh.surface import volumes
 from sim_server.scene import Scene, SceneObject
+from sim_server.scene.holders import Holder
 from sim_server.scene.obstacles import Obstacle
+from sim_server.scene.ties import Attachment, Spring
 
 
 @dataclass(frozen=True)
@@ -50,10 +52,12 @@ class World:
     """State and node data of a scene.
 
     rest (n, 3): before the pose [m]; x (n, 3): positions [m]; v (n, 3): velocities [m/s]; mass (n,): lumped [kg];
-    free (n,): 1, or 0 at fixed nodes; alpha, beta (bodies,): Rayleigh damping of the mass [1/s] and of the stiffness
-    [s]; dt: time step [s];
+    free (n,): 1, or 0 at fixed nodes; held (n,): 1 at nodes of holders, which are fixed, too; alpha, beta (bodies,):
+    Rayleigh damping of the mass [1/s] and of the stiffness [s]; dt: time step [s];
     projection: of the elements' stiffness, the scene's choice;
-    obstacles: of the scene; gravity: acceleration, 0 without the effect [m/s2];
+    obstacles, holders, attachments, springs: of the scene; reaction (bodies, k, 6): force [N] and torque [N m] of each
+    body on each of the k holders, attachments and springs in the last step; gravity: acceleration, 0 without the effect
+    [m/s2];
     backend: where kernels run.
 
     Effects use the following of the integrator in place of dt and v (formulas: integrator.py; symbols:
@@ -67,7 +71,8 @@ class World:
     predictor (n, 3) [m/s]: the step moves x by dx_dv (predictor + dv), dv the solution
     damping_velocity (n, 3) [m/s]: (dx_dv predictor + beta v) / (dx_dv + beta). Elements take it for their velocity: the
         impulse stiffness_coefficient (K damping_velocity) then holds displacement and damping
-    inertia: False in a quasi-static scene
+    inertia: False in a quasi-static scene. searches: True with several linearizations a step. plain: True for backward
+        Euler with one
     """
 
     def __init__(self, scene: Scene, backend: Backend):
@@ -82,19 +87,26 @@ class World:
             self.bodies.append(Body(len(self.bodies), o.name, mesh, first, last, dict(o.effects), o.friction or 0.0))
             first = last
         self.obstacles: Sequence[Obstacle] = scene.obstacles or []
+        self.holders: Sequence[Holder] = scene.holders or []
+        self.attachments: Sequence[Attachment] = scene.attachments or []
+        self.springs: Sequence[Spring] = scene.springs or []
+        columns = len(self.holders) + len(self.attachments) + len(self.springs)
+        self.reaction = np.zeros((len(self.bodies), columns, 6))
+        backend.keep(self.reaction, exact=True)
         self.gravity = (0.0, 0.0, 0.0)
         self.rest = np.concatenate([mesh.rest for _, mesh in meshes])
         self.x = np.concatenate([posed(mesh.rest, o.pose.rotate, o.pose.translate) for o, mesh in meshes])
         self.v = np.zeros_like(self.x)
         self.mass = np.concatenate([_lumped(o, mesh) for o, mesh in meshes])
-        self.free = np.ones(first)
+        self.free, self.held = np.ones(first), np.zeros(first, np.int32)
         self.alpha, self.beta = np.zeros(len(self.bodies)), np.zeros(len(self.bodies))
         integrator = scene.integrator
         self.force_coefficient, self.dx_dv = integrator.force_coefficient(self.dt), integrator.dx_dv(self.dt)
         self.usual_tangent = False
         self.coefficients = np.array([self.force_coefficient, self.dx_dv])
         self.inertia = integrator.scheme != "quasi_static"
-        self.plain = integrator.scheme == "backward_euler" and integrator.linearizations == 1
+        self.searches = integrator.linearizations > 1
+        self.plain = integrator.scheme == "backward_euler" and not self.searches
         self.predictor = self.v if self.plain else np.zeros_like(self.v)
         self.damping_velocity = self.v if self.plain else np.zeros_like(self.v)
 

@@ -39,7 +39,7 @@ def scene(simulation: Simulation) -> pb.Scene:
         objects=[b.name for b in simulation.world.bodies],
         device=simulation.world.backend.name,
         build=simulation.world.backend.build(),
-        obstacles=[o.name for o in simulation.world.obstacles],
+        obstacles=simulation.posed_names,
     )
 
 
@@ -124,7 +124,7 @@ def steps(
 
 def reactions(simulation: Simulation, on_obstacles: Float64, others: NDArray[Any]) -> Reactions:
     """What objects exerted in the steps of records, as an engine tells it."""
-    obstacles = [o.name for o in simulation.world.obstacles] if on_obstacles.shape[1] else []
+    obstacles = simulation.reaction_names if on_obstacles.shape[1] else []
     return Reactions(on_obstacles, others, obstacles, [b.name for b in simulation.world.bodies])
 
 

@@ -1,23 +1,24 @@
 # SPDX-License-Identifier: MIT
-"""Converts obstacles, their poses and where clients want them to messages."""
+"""Converts obstacles and holders, their poses and where clients want them to messages."""
 
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from protocol import messages_pb2 as pb
 from sim_server.arrays import Float64
-from sim_server.scene.obstacles import Keyframe, Obstacle
-from sim_server.scene.pose import quaternion
+from sim_server.scene.obstacles import Obstacle
 from sim_server.simulation import Simulation
+
+if TYPE_CHECKING:
+    from sim_server.effects._movable import Movable
 
 
 def obstacle_messages(simulation: Simulation) -> list[pb.Obstacle]:
-    """Converts all obstacles, with their poses as they are now. Call it before the first step."""
-    if simulation.contact is None:
-        return []
-    found = []
-    for obstacle, at in zip(simulation.world.obstacles, _poses(simulation), strict=True):
+    """Converts all obstacles and holders, with their poses as they are now. Call it before the first step."""
+    found = [_holder_message(*each) for each in _placed(simulation, simulation.holders)]
+    for obstacle, at in _placed(simulation, simulation.contact):
         position, rotation = pose_message(at)
         message = pb.Obstacle(
             header=pb.Header(object=obstacle.name), shape=obstacle.shape, size=_size(obstacle),
@@ -36,20 +37,19 @@ def obstacle_messages(simulation: Simulation) -> list[pb.Obstacle]:
 def pose_messages(
     simulation: Simulation, step: int, poses: Float64 | None = None, fixed: bool = False
 ) -> list[pb.ObstaclePose]:
-    """Converts the poses of obstacles that move, after `step` steps. fixed: of all.
+    """Converts the poses of obstacles and holders that move, after `step` steps. fixed: of all.
 
-    poses: (m, 7) of the frame of that step. None: of an obstacle that clients move it is the pose as it is now; a loop
-    may have gone on meanwhile.
+    poses: (m, 7) of the obstacles in the frame of that step. None, and holders: of what clients move it is the pose as
+    it is now; a loop may have gone on meanwhile.
     """
-    if simulation.contact is None:
-        return []
     found, time = [], step * simulation.world.dt
-    now = _poses(simulation) if poses is None else _unit(poses)
-    for obstacle, at in zip(simulation.world.obstacles, now, strict=True):
-        if fixed or obstacle.keyframes or obstacle.moved:
-            position, rotation = pose_message(_at(obstacle.keyframes, time) if obstacle.keyframes else at)
-            header = pb.Header(object=obstacle.name)
-            found.append(pb.ObstaclePose(header=header, step=step, time=time, position=position, rotation=rotation))
+    for mover, of_frame in ((simulation.contact, poses), (simulation.holders, None)):
+        for listed, at in _placed(simulation, mover, of_frame):
+            if fixed or listed.keyframes or listed.moved:
+                assert mover is not None
+                position, rotation = pose_message(mover.pose_at(listed.name, time) if listed.keyframes else at)
+                header = pb.Header(object=listed.name)
+                found.append(pb.ObstaclePose(header=header, step=step, time=time, position=position, rotation=rotation))
     return found
 
 
@@ -78,30 +78,25 @@ def targets_of(message: pb.ObstacleTargets) -> dict[str, Float64]:
     }
 
 
-def _poses(simulation: Simulation) -> Float64:
-    """Poses (m, 7) at the end of the step that the loop has begun last, which may be changing as they are read."""
-    assert simulation.contact is not None
-    return _unit(simulation.world.backend.fetch(simulation.contact.contact_input().obstacles.end))
+def _holder_message(holder: Any, at: Float64) -> pb.Obstacle:
+    position, rotation = pose_message(at)
+    moved = "keyframes" if holder.keyframes else holder.moved or ""
+    return pb.Obstacle(
+        header=pb.Header(object=holder.name), shape="holder", moved=moved, position=position, rotation=rotation
+    )
 
 
-def _unit(poses: Float64) -> Float64:
-    """Returns poses (m, 7) with rotations of length 1."""
-    return np.concatenate([poses[:, :3], poses[:, 3:] / np.linalg.norm(poses[:, 3:], axis=1)[:, None]], axis=1)
+def _placed(simulation: Simulation, mover: "Movable | None", poses: Float64 | None = None) -> list[tuple[Any, Float64]]:
+    """Tables of what an effect moves, each with its pose (7,).
 
-
-def _at(keyframes: Sequence[Keyframe], time: float) -> Float64:
-    """Pose (7,) between keyframes at a time [s], as `pose_at` in effects/contact.cu has it."""
-    after = next((k for k, key in enumerate(keyframes) if key.time > time), len(keyframes))
-    a, b = keyframes[max(after - 1, 0)], keyframes[min(after, len(keyframes) - 1)]
-    part = (time - a.time) / (b.time - a.time) if a is not b else 0.0
-    position = np.array(a.translate) + part * (np.array(b.translate) - np.array(a.translate))
-    p, q = np.array(quaternion(a.rotate)), np.array(quaternion(b.rotate))
-    q = -q if p @ q < 0 else q
-    aside = q - (p @ q) * p
-    size = float(np.linalg.norm(aside))
-    angle = part * float(np.arctan2(size, p @ q))
-    rotation = np.cos(angle) * p + (np.sin(angle) / size * aside if size > 0 else 0.0)
-    return np.concatenate([position, rotation / np.linalg.norm(rotation)])
+    poses: (m, 7) of all. None: at the end of the step that the loop has begun last, which may be changing as it is
+    read.
+    """
+    if mover is None:
+        return []
+    poses = (simulation.world.backend.fetch(mover.end) if poses is None else poses).copy()
+    poses[:, 3:] /= np.linalg.norm(poses[:, 3:], axis=1)[:, None]
+    return list(zip(mover.listed, poses, strict=True))
 
 
 def _size(obstacle: Obstacle) -> Sequence[float]:

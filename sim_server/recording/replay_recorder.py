@@ -3,7 +3,7 @@
 
 The loop decides at which step a push, a move or a release takes effect, when it reads its mailbox; so the whole list
 of interactions is written with the step at which the loop took it up, and so are the poses that clients gave to
-obstacles. Each factor is written with the step of its
+obstacles and holders. Each factor is written with the step of its
 matrix and its maker; step records tell which one a solve used.
 """
 
@@ -28,6 +28,7 @@ from sim_server.updates.driver import Driver
 from sim_server.updates.factor_source import EXACT
 
 if TYPE_CHECKING:
+    from sim_server.effects._movable import Movable
     from sim_server.effects.touch import Interaction
 
 
@@ -48,7 +49,7 @@ def _taken(updates: Updates[T]) -> list[tuple[int, T]]:
 
 
 class ReplayRecorder:
-    """Collects factors, interactions and moves of obstacles as the loop gets them.
+    """Collects factors, interactions and moves of obstacles and holders as the loop gets them.
 
     Call `write` before the steps that they act in are recorded.
     """
@@ -57,18 +58,20 @@ class ReplayRecorder:
         self._driver, self._link, self._recorder = driver, link, recorder
         self._factors: deque[Factor] = deque()  # appended by the thread that posts them, maybe the loop's
         self._touched: Updates[list[Interaction]] = deque(maxlen=PENDING)
-        self._moved: Updates[dict[str, Float64]] = deque(maxlen=PENDING)
+        movers = [m for m in (driver.simulation.contact, driver.simulation.holders) if m is not None]
+        self._movers: dict[Movable, Updates[dict[str, Float64]]] = {m: deque(maxlen=PENDING) for m in movers}
         self._with_nodes: set[int] = set()  # ids whose nodes the log holds
         self._workers: dict[str, pb.WorkerInfo] = {}
         driver.on_adopt.append(self._factors.append)
-        self._touch, self._contact = driver.simulation.touch, driver.simulation.contact
+        self._touch = driver.simulation.touch
         driver.simulation.on_effect_update.append(self._on_update)
 
     def _on_update(self, effect: Effect, pending: PendingUpdate) -> None:
         if self._touch is not None and effect is self._touch:
             self._touched.append((pending, self._touch.applied))
-        elif self._contact is not None and effect is self._contact:
-            self._moved.append((pending, self._contact.targets))
+        for mover, moved in self._movers.items():
+            if effect is mover:
+                moved.append((pending, mover.targets))
 
     def write(self, block: bool) -> None:
         """Writes all that was taken up since the last call; so a log that is cut off holds the inputs of its steps."""
@@ -76,7 +79,8 @@ class ReplayRecorder:
             self._recorder.factor(self._factor(self._factors.popleft()), block)
         for step, interactions in _taken(self._touched):
             self._recorder.touch_set(self._touch_set(step, interactions), self._dt * step, block)
-        for step, targets in _taken(self._moved):
+        taken = [each for moved in self._movers.values() for each in _taken(moved)]
+        for step, targets in sorted(taken, key=lambda each: each[0]):
             self._recorder.targets(target_messages(step, targets), self._dt * step, block)
 
     @property

@@ -76,7 +76,9 @@ class Replay:
         self._factors: dict[tuple[str, int], Factor] = {}
         self._in_use: dict[str, int] = {}
         self._touch_sets: dict[int, pb.TouchSet] = {t.step: t for t in recording.touch}
-        self._targets: dict[int, pb.ObstacleTargets] = {t.step: t for t in recording.targets}
+        self._targets: dict[int, list[pb.ObstacleTargets]] = {}
+        for t in recording.targets:
+            self._targets.setdefault(t.step, []).append(t)
         self._nodes: dict[int, tuple[NDArray[np.int32], Float64]] = {}  # nodes and offsets of interactions, by id
         self._inline = self._library()
         self._positions: dict[str, Float64] = {}  # sent instead of a matrix, and not those of its step, by body
@@ -175,16 +177,15 @@ class Replay:
             raise BadLog(f"{self.recording.path}: interactions of step {step}: {error}") from error
 
     def _restore_targets(self, step: int) -> None:
-        """Has obstacles go where the loop had them go from this step on."""
-        if step not in self._targets:
-            return
-        contact, targets = self.simulation.contact, targets_of(self._targets[step])
-        if contact is None:
-            raise BadLog(f"{self.recording.path}: moved obstacles in a scene that has none")
-        try:
-            contact.restore(targets)
-        except ValueError as error:
-            raise BadLog(f"{self.recording.path}: obstacles moved at step {step}: {error}") from error
+        """Has obstacles and holders go where the loop had them go from this step on."""
+        for targets in map(targets_of, self._targets.get(step, ())):
+            mover = self.simulation.movable(next(iter(targets), ""))
+            if mover is None:
+                raise BadLog(f"{self.recording.path}: moved obstacles in a scene that has none")
+            try:
+                mover.restore(targets)
+            except ValueError as error:
+                raise BadLog(f"{self.recording.path}: obstacles moved at step {step}: {error}") from error
 
     def _interaction(self, m: pb.Interaction) -> Interaction:
         from sim_server.effects.touch import Interaction

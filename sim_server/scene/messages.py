@@ -21,7 +21,7 @@ MESSAGES = {
     "model_type": "must be a table",
     "model_attributes_type": "must be a table",
 }
-NAMED = ("object", "obstacle")  # lists of tables that have names
+NAMED = ("object", "obstacle", "holder", "attachment", "spring")  # lists of tables that have names
 MAX_VALUE = 80  # characters of a value in a message
 
 

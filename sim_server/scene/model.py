@@ -22,11 +22,13 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 from sim_server.errors import InputError
 from sim_server.mesh import Mesh, bar, check, read
 from sim_server.scene.effect_tables import checked_effects
+from sim_server.scene.holders import Holder, holder_errors
 from sim_server.scene.integrator_options import IntegratorOptions
 from sim_server.scene.obstacles import FRICTION, Obstacle, check_contact_on, contact_errors
 from sim_server.scene.parameters import Count, Counts, File, Name, NotNegative, Parameters, Positive, Sizes, complaint
 from sim_server.scene.pose import Pose
 from sim_server.scene.solver_options import SolverOptions
+from sim_server.scene.ties import Attachment, Spring, check_ties_on, tie_errors
 
 
 class MeshSource(Parameters):
@@ -146,6 +148,9 @@ class Scene(Parameters):
     record: RecordOptions = RecordOptions()
     objects: Annotated[list[SceneObject], AfterValidator(_some_objects)] = Field(alias="object")
     obstacles: list[Obstacle] | None = Field(default=None, alias="obstacle", min_length=1)
+    holders: list[Holder] | None = Field(default=None, alias="holder", min_length=1)
+    attachments: list[Attachment] | None = Field(default=None, alias="attachment", min_length=1)
+    springs: list[Spring] | None = Field(default=None, alias="spring", min_length=1)
 
     _path: Path = PrivateAttr(Path())
     _text: str = PrivateAttr("")
@@ -208,10 +213,27 @@ class Scene(Parameters):
                     self.objects[index] = o.model_copy(update={"friction": FRICTION})
         return self
 
+    @model_validator(mode="after")
+    def _as_holders_need(self) -> "Scene":
+        shapes = [o.name for o in self.obstacles or []]
+        if errors := list(holder_errors(self.holders or [], self.objects, shapes, self.integrator)):
+            raise ValidationError.from_exception_data("Scene", errors)
+        return self
+
+    @model_validator(mode="after")
+    def _as_ties_need(self) -> "Scene":
+        objects, shapes = [o.name for o in self.objects], [o.name for o in self.obstacles or []]
+        taken = [*objects, *shapes, *(h.name for h in self.holders or [])]
+        given = self.attachments or [], self.springs or [], objects, shapes, taken, self.integrator
+        if errors := list(tie_errors(*given)):
+            raise ValidationError.from_exception_data("Scene", errors)
+        return self
+
     def check_device(self, device: str) -> None:
         """Raises InputError for what the device ("cpu" or "gpu") does not have."""
         self.solver.check_device(device)
         self.integrator.check_device(device)
+        check_ties_on(device, self.attachments or [], self.springs or [])
         if "contact" in self.effects:
             check_contact_on(device, self.effects["contact"], self.objects, self.integrator)
 

@@ -2,34 +2,26 @@
 """The [[obstacle]] tables of a scene, and what contact needs of the scene as a whole."""
 
 from collections.abc import Iterator, Sequence
-from itertools import pairwise
-from typing import Annotated, Any, Literal, Protocol
+from typing import Any, Literal, Protocol
 
 from pydantic import Field, model_validator
 from pydantic_core import InitErrorDetails
 
 from sim_server.errors import InputError
 from sim_server.scene.integrator_options import IntegratorOptions
-from sim_server.scene.parameters import File, Name, NotNegative, Parameters, Positive, Sizes, complaint, nearest
+from sim_server.scene.motion import Moved
+from sim_server.scene.parameters import File, NotNegative, Positive, Sizes, complaint, nearest
 from sim_server.scene.pose import Pose
 
 FRICTION = 0.5  # coefficient of a surface of which nothing is said
 KEYS = {  # of each shape: those that it must have
     "plane": (), "sphere": ("radius",), "box": ("size",), "capsule": ("radius", "length"), "grid": ("file", "spacing"),
 }  # fmt: skip
-CLIENT = {"max_speed": 1.0, "max_turn": 3.0}  # defaults of an obstacle that a client moves
 
 
-class Keyframe(Pose):
-    """Pose at a time."""
-
-    time: NotNegative = Field(description="of the simulation [s]")
-
-
-class Obstacle(Parameters):
+class Obstacle(Moved):
     """A rigid shape that objects touch: fixed, moved along keyframes, or moved by a client."""
 
-    name: Name
     shape: Literal["plane", "sphere", "box", "capsule", "grid"]
     radius: Positive | None = Field(default=None, description="of a sphere or a capsule [m]")
     size: Sizes | None = Field(default=None, description="of a box along x, y, z [m]")
@@ -39,19 +31,6 @@ class Obstacle(Parameters):
     spacing: Positive | None = Field(default=None, description="of the grid of distances from the surface [m]")
     friction: NotNegative = Field(default=FRICTION, description="coefficient of its surface [-]")
     pose: Pose = Pose()
-    keyframes: Annotated[list[Keyframe], Field(min_length=1)] | None = Field(
-        default=None, description="poses at ascending times, held before the first and after the last"
-    )
-    moved: Literal["client"] | None = None
-    max_speed: Positive | None = Field(default=None, description="at which it goes to a client's pose [m/s]")
-    max_turn: Positive | None = Field(default=None, description="at which it turns to a client's pose [rad/s]")
-
-    @model_validator(mode="before")
-    @classmethod
-    def _bounded_by_default(cls, table: Any) -> Any:
-        if not isinstance(table, dict) or table.get("moved") != "client":
-            return table
-        return {**table, **{key: value for key, value in CLIENT.items() if table.get(key) is None}}
 
     @model_validator(mode="after")
     def _keys_of_its_shape(self) -> "Obstacle":
@@ -67,16 +46,9 @@ class Obstacle(Parameters):
         return self
 
     @model_validator(mode="after")
-    def _one_motion(self) -> "Obstacle":
-        if self.keyframes is not None and self.moved is not None:
-            raise complaint("keyframes and moved: allowed is one of the two")
+    def _starts_once(self) -> "Obstacle":
         if self.keyframes is not None and self.pose != Pose():
             raise complaint("keyframes and pose: the first keyframe says where it is at the start; leave pose out")
-        if self.moved is None and (given := [key for key in CLIENT if getattr(self, key) is not None]):
-            raise complaint(" and ".join(given) + ' without moved = "client", whose poses they bound')
-        for before, after in pairwise(self.keyframes or ()):
-            if not before.time < after.time:
-                raise complaint(f"keyframes: time {after.time:g} s after {before.time:g} s; times must ascend")
         return self
 
 

@@ -6,6 +6,7 @@ import tomllib
 from typing import Any
 
 from sim_server.errors import InputError
+from sim_server.scene.messages import NAMED
 from sim_server.scene.parameters import nearest
 
 
@@ -21,7 +22,7 @@ def apply(override: str, table: dict[str, Any]) -> None:
     if not equals or not key or not all(key.split(".")):
         raise InputError("must be KEY=VALUE, as solver.tolerance=1e-8 or object.beam.density=900")
     place = table
-    for kind in ("object", "obstacle"):
+    for kind in NAMED:
         if key == kind or key.startswith(f"{kind}."):
             place, key = _named(kind, key.removeprefix(kind).lstrip("."), table)
             break
@@ -48,7 +49,7 @@ def _tables(value: Any) -> bool:
 
 
 def _named(kind: str, key: str, table: dict[str, Any]) -> tuple[dict[str, Any], str]:
-    """Returns the table of an object (or obstacle) and the key inside it.
+    """Returns the table of an object (or obstacle, or holder) and the key inside it.
 
     Names may hold dots, so the longest matching name wins.
     """

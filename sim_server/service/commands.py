@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Carries out commands of clients on a running simulation: of pushes, grabs and obstacles, pause, resume, stop."""
+"""Carries out commands of clients on a running simulation: to push, grab, move, pause, resume and stop."""
 
 import math
 from collections.abc import Callable
@@ -12,7 +12,7 @@ from sim_server.recording import messages
 from sim_server.simulation import Simulation
 
 if TYPE_CHECKING:
-    from sim_server.effects.contact import Contact
+    from sim_server.effects._movable import Movable
     from sim_server.effects.touch import Interaction, Touch  # imported where a scene lists it
 
 
@@ -56,7 +56,7 @@ class Commands:
             if verb is None:
                 raise BadCommand(f"unknown verb {command.verb!r}; known: {', '.join(sorted(VERBS))}")
             return verb(self, command)
-        except ValueError as error:  # BadCommand, TouchError and ContactError
+        except ValueError as error:  # BadCommand, TouchError and MoveError
             return pb.Reply(error=str(error))
 
     def together(self) -> AbstractContextManager[None]:
@@ -110,13 +110,13 @@ class Commands:
         return pb.Reply(interaction=messages.interaction(self._touch().release(command.client, command.interaction.id)))
 
     def _move_obstacle(self, command: pb.Command) -> pb.Reply:
-        target, contact = command.target, self._contact()
+        target, mover = command.target, self._mover(command.target.obstacle)
         if target.HasField("rotation"):
             rotation = _unit(target.rotation)
         else:
-            now = contact.targets.get(target.obstacle)
+            now = mover.targets.get(target.obstacle)
             rotation = (1.0, 0.0, 0.0, 0.0) if now is None else tuple(now[3:].tolist())
-        contact.move(target.obstacle, _tuple(target.position), rotation)
+        mover.move(target.obstacle, _tuple(target.position), rotation)
         return pb.Reply()
 
     def _pause(self, command: pb.Command) -> pb.Reply:
@@ -166,12 +166,12 @@ class Commands:
             )
         return self.simulation.touch
 
-    def _contact(self) -> "Contact":
-        """Returns the contact of the scene. Raises BadCommand."""
-        contact = self.simulation.contact
-        if contact is None:
-            raise BadCommand("the scene does not list the effect contact, so it has no obstacles")
-        return contact
+    def _mover(self, name: str) -> "Movable":
+        """Returns the effect that moves an obstacle or a holder. Raises BadCommand."""
+        mover = self.simulation.movable(name)
+        if mover is None:
+            raise BadCommand("the scene does not list the effect contact, so it has no obstacles, and no holders")
+        return mover
 
     def _point(self, i: pb.Interaction) -> tuple[float, float, float]:
         """Returns the point at which a push or grab begins [m]."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What contact adds to telemetry: obstacles, their poses, and lines about what was left undone."""
+"""What contact and holders add to telemetry: obstacles, poses, and lines about what was left undone."""
 
 import time
 from collections import Counter
@@ -18,7 +18,7 @@ ROWS_PERIOD = 1.0  # s between checks for nodes without enough rows
 
 
 class ContactTelemetry:
-    """The obstacles of one run; of a scene without contact nothing is sent and nothing is said.
+    """The obstacles and holders of one run; of a scene without any nothing is sent and nothing is said.
 
     clipped: by body, number of nodes that were held back at obstacles, summed over steps
     crowded: likewise, of obstacles that had no row at a node as nearer ones had them
@@ -30,6 +30,7 @@ class ContactTelemetry:
         self._crowded: set[int] = set()  # bodies of which it was said
         self.clipped: Counter[int] = Counter()
         self.crowded: Counter[int] = Counter()
+        self._broken: set[int] = set()  # attachments and springs of which it was said
 
     def open(self) -> None:
         """Sends the obstacles to log and network."""
@@ -40,7 +41,7 @@ class ContactTelemetry:
 
     def look(self) -> bool:
         """Returns True if somebody wants poses."""
-        return self._simulation.contact is not None and self._link.wants_pose()
+        return bool(self._simulation.reaction_names) and self._link.wants_pose()
 
     def publish_poses(self, step: int, poses: Float64) -> None:
         """Sends the poses (obstacles, 7) after a step to subscribers."""
@@ -65,6 +66,24 @@ class ContactTelemetry:
                     "more passes (effects.contact) may help"
                 )
             self.clipped[body.index] += int(r["clipped"])
+        return lines
+
+    def broken_ties(self) -> list[str]:
+        """Returns a line for each attachment or spring of which something broke, at the first time."""
+        ties, world = self._simulation.ties, self._simulation.world
+        if ties is None:
+            return []
+        names, lines = self._simulation.reaction_names[-ties.tables :], []
+        for table in set(ties.table[ties.broken > 0].tolist()) - self._broken:
+            self._broken.add(table)
+            step, rows = (
+                int(ties.broken[(ties.table == table) & (ties.broken > 0)].min()),
+                int((ties.table == table).sum()),
+            )
+            lines.append(
+                f"{names[table]!r} breaks, at step {step} ({step * world.dt:.4g} s)"
+                + (f", the first of its {rows} nodes; forces on it tell of the others" if rows > 1 else "")
+            )
         return lines
 
     def crowded_nodes(self) -> list[str]:

@@ -24,7 +24,7 @@ def scene_notes(simulation: Simulation) -> list[str]:
 
 def _loose(simulation: Simulation) -> str:
     world = simulation.world
-    pulled = world.inertia and not world.obstacles and any(world.gravity)
+    pulled = world.inertia and not (world.obstacles or world.attachments or world.springs) and any(world.gravity)
     part, elastic = _parts(simulation)
     held = np.isin(part, part[world.free == 0])
     apart, falling, partly = [], [], []

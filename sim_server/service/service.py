@@ -203,7 +203,7 @@ class Service:
     def _report(self, records: NDArray[Any], on_obstacles: Float64, others: NDArray[Any]) -> None:
         """Passes on new step records with what objects exerted on obstacles and others, and new frames."""
         contact = self.telemetry.contact
-        undone = [*contact.count_clipped(records), *contact.crowded_nodes()]
+        undone = [*contact.count_clipped(records), *contact.crowded_nodes(), *contact.broken_ties()]
         for line in [*self.telemetry.count_unconverged(records), *undone]:
             log.warning("%s", line)
         for line in [*self.telemetry.count_runaways(records), *self.telemetry.not_finite(records)]:

@@ -24,6 +24,7 @@ from sim_server.simulation import Simulation
 # Settings of the server's device, and what a worker has in their place
 WORKER_SETTINGS = {"precision": "float64", "factor_precision": "auto", "threads": 1, "budget": 0.0, "build": "server",
         "extrapolate": 0.0, "woodbury": 0}  # fmt: skip
+MOTION = ("keyframes", "moved", "max_speed", "max_turn")  # of a holder: positions come with each job
 
 
 class Assembly:
@@ -67,7 +68,8 @@ class Assembly:
 
 
 def single_object_scene(resolved: str, name: str, mesh: Mesh) -> Scene:
-    """Returns the scene of one object alone, on a CPU, with this mesh; without contact, which A does not hold.
+    """Returns the scene of one object alone, on a CPU, with this mesh; without contact, which A does not hold, and
+    with holders at rest.
 
     resolved: Scene.resolved
     name: of the object
@@ -78,7 +80,10 @@ def single_object_scene(resolved: str, name: str, mesh: Mesh) -> Scene:
         listed = [o for o in table["object"] if o["name"] == name]
         table["solver"] = {**table["solver"], **WORKER_SETTINGS}
         table["effects"] = {name: given for name, given in table["effects"].items() if name != "contact"}
-        table.pop("obstacle", None)
+        for kind in ("obstacle", "attachment", "spring"):
+            table.pop(kind, None)
+        held = [{k: v for k, v in h.items() if k not in MOTION} for h in table.pop("holder", []) if h["object"] == name]
+        table |= {"holder": held} if held else {}
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise Refused(f"Scene.resolved is no scene: {type(error).__name__}", "malformed") from error
     if len(listed) != 1:

@@ -15,6 +15,7 @@ from sim_server.backends.gpu.inverse.workspace import workspace
 from sim_server.simulation import Simulation
 from tests.backends import fake_cupy
 from tests.contact.scenes import floor, over, ram
+from tests.holders.holder_scenes import held_bar, left, right
 from tests.scenes import bar, scene
 from tests.support import nvrtc
 from tests.worker.block_matrices import bar_edges, pattern
@@ -128,3 +129,21 @@ def test_what_a_build_of_an_inverse_reads_is_there_before_its_own_stream_runs(cu
         assert not cupy.pending
         builder.storage()
         assert not cupy.pending
+
+
+@pytest.mark.parametrize("integrator", [{}, {"linearizations": 3}])
+@pytest.mark.parametrize("precision", ["float64", "mixed", "float32"])
+def test_a_scene_with_holders_is_built(cupy, precision, integrator):
+    """Their launches come after the energy balance, which reads velocities, and around the solve; once a step."""
+    keys = [{"time": 1.0, "translate": [0.1, 0, 0]}]
+    solver = {"preconditioner": "cholesky", "precision": precision}
+    engine = held_bar(left(), right(keyframes=keys), integrator=integrator, solver=solver, device="gpu").engine
+    names = [kernel for kernel, _ in cupy.calls]
+    first = names.index("place")
+    assert names[first - 1] == "energy_balance" and names[first : first + 2] == ["place", "hold"]
+    last = names.index("settle")
+    assert names[last : last + 4] == ["settle", "total", "report_held", "fused"]
+    assert names.count("place") == names.count("settle") == names.count("report_held")
+    engine.run(3)
+    records, reactions = engine.records_and_reactions()
+    assert records["step"].tolist() == [1, 2, 3] and reactions.shape == (3, 2, 6)

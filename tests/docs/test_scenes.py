@@ -10,11 +10,13 @@ from annotated_types import Ge, Gt, Le, Lt, MaxLen, MinLen
 from pydantic.fields import FieldInfo
 
 from sim_server import effects
+from sim_server.scene.holders import Holder
 from sim_server.scene.integrator_options import IntegratorOptions
 from sim_server.scene.model import MeshSource, RecordOptions, Scene, SceneObject
 from sim_server.scene.obstacles import Obstacle
 from sim_server.scene.pose import Pose
 from sim_server.scene.solver_options import PRECONDITIONERS, SolverOptions
+from sim_server.scene.ties import Attachment, Spring
 from tests.docs.figures import DOCS, Row, table_under
 
 TEXT = (DOCS / "scenes.md").read_text()
@@ -31,6 +33,10 @@ BY_HAND = {
     ("Obstacles", "max_speed"): ("1", None),
     ("Obstacles", "max_turn"): ("3", None),
     ("Obstacles", "keyframes"): (None, "at least one"),
+    ("Holders", "max_speed"): ("1", None),
+    ("Holders", "max_turn"): ("3", None),
+    ("Holders", "keyframes"): (None, "at least one"),
+    ("Springs", "between"): (None, "two of"),
     ("Objects", "mesh.split"): ('"kuhn"', None),
     ("Objects", "mesh.scale"): ("1", None),
 }
@@ -136,7 +142,17 @@ def test_keys_of_a_table(heading: str, fields: dict[str, FieldInfo]) -> None:
 
 def test_no_table_is_missing() -> None:
     tables = {field.alias or name for name, field in Scene.model_fields.items()} - {"dt", "name"}
-    assert tables == {"effects", "integrator", "solver", "record", "object", "obstacle"}
+    assert tables == {
+        "effects",
+        "integrator",
+        "solver",
+        "record",
+        "object",
+        "obstacle",
+        "holder",
+        "attachment",
+        "spring",
+    }
 
 
 def test_keys_of_an_object() -> None:
@@ -150,6 +166,15 @@ def test_keys_of_an_obstacle() -> None:
     fields = {name: field for name, field in Obstacle.model_fields.items() if name != "pose"}
     fields |= {f"pose.{name}": field for name, field in Pose.model_fields.items()}
     check("Obstacles", rows_of("Obstacles"), fields)
+
+
+def test_keys_of_a_holder() -> None:
+    check("Holders", rows_of("Holders"), dict(Holder.model_fields))
+
+
+def test_keys_of_attachments_and_springs() -> None:
+    check("Attachments", rows_of("Attachments"), dict(Attachment.model_fields))
+    check("Springs", rows_of("Springs"), dict(Spring.model_fields))
 
 
 KEY = re.compile(r"`(\w+)`(?: \((.+?)\))?(?: \[(.+?)\])?(?:,|$)")

@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from sim_server.backends.base import PendingUpdate
 from sim_server.effects._base import Effect
-from sim_server.effects.contact import Contact, ContactError
+from sim_server.effects._movable import MoveError
+from sim_server.effects.contact import Contact
 from sim_server.errors import InputError
 from sim_server.mesh.surface import surface_triangles
 from sim_server.scene.model import Scene
@@ -370,7 +371,7 @@ REFUSED = {
 def test_poses_that_cannot_be_are_refused_and_change_nothing(given, message):
     sim = made(FLOOR, TOOL)
     effect = contact_of(sim)
-    with pytest.raises(ContactError, match=message):
+    with pytest.raises(MoveError, match=message):
         effect.move(*given)
     assert effect.targets["tool"].tolist() == [3, 0, 0, 1, 0, 0, 0]
 

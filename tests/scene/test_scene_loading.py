@@ -226,6 +226,8 @@ def test_the_folder_is_the_registry():
         ("gripper", [1296]),
         ("tool_on_organ", [2304]),
         ("two_organs", [864, 972]),
+        ("needle_holder", [1728]),
+        ("graft", [972, 648]),
         ("heap", [180] * 12),
         ("pile", [540] * 50),
     ],

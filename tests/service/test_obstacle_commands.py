@@ -77,7 +77,7 @@ def test_a_rotation_that_was_rounded_is_made_a_unit(commands: Commands) -> None:
 
 def test_a_scene_without_contact_says_so() -> None:
     commands = Commands(simulation(bar(fixed="X < 0.01")), lambda interaction, time: None)
-    assert move(commands) == "the scene does not list the effect contact, so it has no obstacles"
+    assert move(commands) == "the scene does not list the effect contact, so it has no obstacles, and no holders"
     assert obstacle_messages(commands.simulation) == [] and pose_messages(commands.simulation, 0, fixed=True) == []
     assert not messages.scene(commands.simulation).obstacles
 

@@ -26,6 +26,7 @@ from sim_server.backends.euler_form import EulerForm
 from sim_server.backends.newton import Newton
 from sim_server.backends.ring_buffers import Reports
 from sim_server.backends.rosenbrock import NODAL, Rosenbrock
+from sim_server.backends.ties import Ties
 
 Reals = NDArray[np.float64]
 HISTORY = 1024  # changes of the diagonal that are remembered, of each body
@@ -206,8 +207,12 @@ class _NativeContact:
             report=c.addressof(self._report), result=c.addressof(self._result),
             choice=c.addressof(self._choice),
         )  # fmt: skip
+        if contact.surfaces or contact.ties:
+            self._join(contact.free, rows, loop)
         if contact.surfaces:
-            self._touch(contact.surfaces, contact.free, rows, loop)
+            self._touch(contact.surfaces, (rows - (len(contact.ties.corner) if contact.ties else 0)) // 2, loop)
+        if contact.ties:
+            self._tie(contact.ties, rows - len(contact.ties.corner), loop.nodes)
         for name in ("kind", "size", "grid", "place", "cells", "begin", "end"):
             setattr(self.native.obstacles, name, getattr(obstacles, name).ctypes.data)
         for name in ("body_start", "corner", "weight", "obstacle", "normal", "gap", "drift", "entry", "stiffness",
@@ -228,19 +233,54 @@ class _NativeContact:
         counts = np.diff(contact.body_start) // 2
         return np.repeat(np.arange(len(counts), dtype=np.int32), counts)
 
-    def _touch(self, surfaces: Surfaces, free: Reals, rows: int, loop: structs.Loop) -> None:
-        """Adds what bodies need to touch each other."""
+    def _join(self, free: Reals, rows: int, loop: structs.Loop) -> None:
+        """Adds what bodies need that are solved as one system."""
         most = min(6 * loop.bodies, MOST_MODES)
         ranges = [(b.first, b.last) for b in c.cast(loop.body, c.POINTER(structs.Body))[: loop.bodies]]
+        self._own |= {
+            "modes": np.zeros((loop.nodes, 18)), "coarse": np.zeros((most + 4, most)), "lever": np.zeros((rows, 8)),
+            "unheld": np.array([bool((free[first:last] > 0).all()) for first, last in ranges], np.int32),
+        }  # fmt: skip
+        self.native.most_modes = most
+
+    def _tie(self, ties: Ties, first: int, nodes: int) -> None:
+        """Adds attachments and springs, whose rows begin at `first`."""
+        bodies = len(ties.reaction)
+        start = np.searchsorted(ties.body[:, 0], np.arange(bodies + 1)).astype(np.int32)
+        n = len(ties.corner)
+        self._ties: dict[str, NDArray[Any]] = {
+            "start": start, "order": np.argsort(ties.table, kind="stable").astype(np.int32),
+            "start_force": np.zeros((n, 3)), "slope": np.zeros((n, 6)), "bound": np.zeros(nodes, np.int32),
+        }  # fmt: skip
+        named = (
+            "body",
+            "obstacle",
+            "table",
+            "point",
+            "kappa",
+            "rest",
+            "breaking",
+            "stiffness",
+            "force",
+            "broken",
+            "reaction",
+        )
+        self._ties |= {name: getattr(ties, name) for name in named}
+        native = self.native.ties
+        native.first, native.count, native.tables = first, n, ties.tables
+        native.columns, native.column_first = ties.reaction.shape[1], ties.column
+        for name, array in self._ties.items():
+            setattr(native, name, array.ctypes.data)
+
+    def _touch(self, surfaces: Surfaces, first: int, loop: structs.Loop) -> None:
+        """Adds what bodies need to touch each other. first: row of the first one between bodies."""
         self._boxes = [(structs.Box * max(n, 1))() for n in (len(surfaces.tree_child), loop.bodies)]
         self._own |= {
             "node_site": surfaces.node_site, "triangle": surfaces.triangle, "tree_start": surfaces.tree_start,
             "tree_child": surfaces.tree_child, "pair_friction": surfaces.friction, "gravity": surfaces.gravity,
-            "modes": np.zeros((loop.nodes, 18)), "coarse": np.zeros((most + 4, most)), "lever": np.zeros((rows, 8)),
-            "unheld": np.array([bool((free[first:last] > 0).all()) for first, last in ranges], np.int32),
         }  # fmt: skip
         self.native.tree_box, self.native.body_box = map(c.addressof, self._boxes)
-        self.native.pair_first, self.native.most_modes = rows // 2, most
+        self.native.pair_first = first
 
 
 def _binding(launch: CpuLaunch) -> structs.Binding:
@@ -289,8 +329,11 @@ class CpuEngine(Reports):
         self._contact = given.contact and _NativeContact(given.contact, loop, arrays)
         if self._contact and given.euler:  # bodies whose step is made have the velocities of its end
             self._contact.native.predictor = given.euler.start_v.ctypes.data
-        if given.contact:
-            self.report_reactions(len(given.contact.obstacles.kind))
+        obstacles = len(given.contact.obstacles.kind) if given.contact else 0
+        if given.held is not None:
+            loop.holders, loop.held_reaction = given.held.shape[1], given.held.ctypes.data
+        self._held = given.held
+        self.report_reactions(obstacles + loop.holders, obstacles)
         if given.touch is not None:
             touch = cast(CpuLaunch, given.touch)
             loop.touch = c.addressof(self._launch[number[id(touch)]])

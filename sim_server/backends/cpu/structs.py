@@ -121,6 +121,11 @@ class ContactReport(c.Structure):
 
 
 @LOOP.struct
+class Ties(c.Structure):
+    """Attachments and springs."""
+
+
+@LOOP.struct
 class Contact(c.Structure):
     """Input and memory of contact."""
 

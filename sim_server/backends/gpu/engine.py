@@ -23,6 +23,7 @@ from sim_server.backends.gpu.cupy_types import DeviceArray, Graph
 from sim_server.backends.gpu.device import DeviceLaunch, Gpu
 from sim_server.backends.gpu.energies import DeviceEnergies
 from sim_server.backends.gpu.factor_upload import FactorUpload
+from sim_server.backends.gpu.held import HeldForces, leading
 from sim_server.backends.gpu.kernel_fusion import DOMAINS, Epilogue, FusedKernel, fuse
 from sim_server.backends.gpu.loop import CAPACITY, MANY, DeviceLoop
 from sim_server.backends.gpu.mailbox import DeviceMailbox
@@ -37,6 +38,7 @@ from sim_server.backends.gpu.structs import (
     STEP_TIMESTAMP,
     Mail,
 )
+from sim_server.backends.newton import Newton
 
 MOST_GRABS = 1024  # pushes and grabs at a time, of which forces are told
 GRAB_BLOCKS, GRAB_THREADS = 32, 128  # of the kernel react (effects/touch.cu)
@@ -75,11 +77,14 @@ class GpuEngine(DeviceLoop):
 
     def __init__(self, gpu: Gpu, given: EngineInput, records: int = 8192):
         assemble, integrate = (cast(Sequence[DeviceLaunch], part) for part in (given.assemble, given.integrate))
+        self.launches, self._first = [*assemble, *integrate], assemble[: leading(assemble)]
+        assemble, settled = assemble[len(self._first) :], integrate[: leading(integrate)]
+        integrate = integrate[len(settled) :]
         ranges, arrays, dt, newton = given.ranges, given.arrays, given.dt, given.newton
         stages, precision = given.stages, given.solver.factor_precision
         fine = precision == "float32" or (precision == "auto" and stages is not None and stages.factor_alone)
         planes = 2 if fine else 1  # float16 numbers per entry of an inverse
-        self.gpu, self.launches, self._arrays = gpu, [*assemble, *integrate], arrays
+        self.gpu, self._arrays = gpu, arrays
         self._touched = [given.energies.touch[name] for name in ("force", "spring") if name in given.energies.touch]
         cp, bodies = gpu.cp, len(ranges)
         device = CudaDevice(cp)
@@ -93,7 +98,7 @@ class GpuEngine(DeviceLoop):
         detection = (
             [x for x in assemble if x.domain not in DOMAINS] if given.contact else []
         )  # reads what the others make
-        self._whole_assembly = self._beginning([x for x in assemble if x not in detection], detection)
+        self._whole_assembly = self._beginning([x for x in assemble if x not in detection], detection, settled)
         forces = cast(Sequence[DeviceLaunch], stages.first) if stages else ()
         self._first_launches = self._beginning(forces) if alone else self._whole_assembly
         self._forces = fuse(forces) if alone else ()  # after a whole assembly, whose energy balance is made already
@@ -105,6 +110,8 @@ class GpuEngine(DeviceLoop):
         self._newton, newton_results = None, None
         if newton and phases:
             newton_results = device.pinned(CAPACITY * NEWTON_RESULT.itemsize * bodies)
+            parts = newton.parts[len(self._first) :]
+            newton = Newton(newton.options, newton.dx_dv, parts, **newton.arrays)
             self._newton = NewtonIteration(gpu, newton, assemble, ranges, arrays, phases, self.solver, newton_results)
         self._contact, contact_results, reactions = None, None, None
         if given.contact:
@@ -116,6 +123,10 @@ class GpuEngine(DeviceLoop):
             self._contact = ContactPasses(
                 gpu, device, given.contact, ranges, arrays, self.solver, balance, contact_results, reactions
             )
+        self._held, held = None, None
+        if given.held is not None:
+            held = device.pinned(CAPACITY * given.held.nbytes).view(np.float64).reshape(CAPACITY, *given.held.shape)
+            self._held = HeldForces(gpu, settled, given.held, held, self._counter)
         row, first = PCG_BODY.itemsize, self.solver.bodies_device
         mailboxes = [(first + row * k, SETTINGS_BYTES) for k in range(bodies)]
         mailboxes += [(first + row * k + SETTINGS_BYTES, row - SETTINGS_BYTES) for k in range(bodies)]
@@ -131,7 +142,7 @@ class GpuEngine(DeviceLoop):
         super().__init__(
             device, ranges, arrays["row_start"], dt, mailboxes, self._results, self._timestamps, arrays["clock"],
             records, twins["values"].dtype, newton_results, energy_records, stage_results,
-            contact_results, reactions, **addresses,
+            contact_results, reactions, held, **addresses,
         )  # fmt: skip
         self._factor_upload = FactorUpload(gpu, self.solver, self, given.names, self.mailboxes[bodies : 2 * bodies])
         for k in range(bodies):
@@ -245,18 +256,19 @@ class GpuEngine(DeviceLoop):
         self._stamp_begin((1,), (1,), (self._epilogue,))
 
     def _beginning(
-        self, assemble: Sequence[DeviceLaunch], after: Sequence[DeviceLaunch] = ()
+        self, assemble: Sequence[DeviceLaunch], after: Sequence[DeviceLaunch] = (), readers: Sequence[DeviceLaunch] = ()
     ) -> Sequence[Callable[[], None]]:
         """Fuses the assembly with the energy balance of the step before. after: launches that follow, one by one.
+        readers: later ones that read what it makes.
 
         The balance is the prologue of a kernel over elements, since these write nothing that it reads. If it freezes a
         body meanwhile, the element results of this body do not matter, since its nodes are fixed then.
         """
         domains = {launch.domain for launch in assemble}
-        elements = "elements" in domains and domains <= set(DOMAINS)
-        launches = fuse(assemble, prologue=self._energies.prologue if elements else None, after=after)
+        elements = "elements" in domains and domains <= set(DOMAINS) and not self._first  # which change v
+        launches = fuse(assemble, prologue=self._energies.prologue if elements else None, after=after, readers=readers)
         if not elements:
-            return [self._energies.launch_balance, *launches]
+            return [self._energies.launch_balance, *self._first, *launches]
         first = launches[0]
         assert isinstance(first, FusedKernel)
         self._energies.threads = first.shape.threads
@@ -288,6 +300,8 @@ class GpuEngine(DeviceLoop):
             self._stages.launch()
             return
         (self._newton or self._contact or self.solver).launch()
+        if self._held:
+            self._held.launch()
         assert self._integrate is not None
         self._integrate()
 

@@ -282,18 +282,20 @@ def fuse(
     guard: Callable[[Sequence[DeviceLaunch]], PhaseGuard] | None = None,
     prologue: Prologue | None = None,
     after: Sequence[DeviceLaunch] = (),
+    readers: Sequence[DeviceLaunch] = (),
 ) -> list[FusedKernel | DeviceLaunch]:
     """Fuses launches into as few kernels as their domains allow.
 
     guard: makes the guard of a kernel from its launches
     prologue: of the first kernel
     after: launches that follow, one by one
+    readers: launches elsewhere that read what these write
     """
     if any(launch.domain not in DOMAINS for launch in launches):
         return [*launches, *after]
     together = [group for d in DOMAINS for group in _by_items([x for x in launches if x.domain == d])]
     together = [group for group in together if group]
-    every = [*launches, *after]
+    every = [*launches, *after, *readers]
     fused = [
         FusedKernel(group, None, _private(group, every), guard(group) if guard else None, None if k else prologue)
         for k, group in enumerate(together)

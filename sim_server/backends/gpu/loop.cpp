@@ -95,7 +95,14 @@ static void note_contact(GpuLoop& l, int64_t from, Record& record, int64_t place
     record.clipped = r.clipped;
     record.contact_residual = r.residual;
     const int64_t numbers = 6 * l.obstacles;
-    std::memcpy(l.rings.reactions + numbers * place, l.contact_reactions + numbers * from, sizeof(double) * numbers);
+    double* target = l.rings.reactions + 6 * l.rings.reaction_count * place;
+    std::memcpy(target, l.contact_reactions + numbers * from, sizeof(double) * numbers);
+}
+
+static void note_holders(GpuLoop& l, int64_t from, int64_t place) {
+    const int64_t numbers = 6 * l.holders;
+    double* end = l.rings.reactions + 6 * l.rings.reaction_count * (place + 1);
+    std::memcpy(end - numbers, l.held_reactions + numbers * from, sizeof(double) * numbers);
 }
 
 // Puts what bodies exerted on grabs in a step into the ring. from: place of the step in the results.
@@ -141,6 +148,7 @@ static void report(GpuLoop& l, const StepBatch& batch, int64_t k, double end, do
             if (record.form == FACTOR) record.residual = l.stage_results[slot + i].inconsistency;
         }
         if (l.contact_results) note_contact(l, slot + i, record, (head + i) % rings.record_capacity);
+        if (l.held_reactions) note_holders(l, slot + i, (head + i) % rings.record_capacity);
         if (l.energy_records) note_energy(record, l.energy_records[slot + i]);
     }
     rings.step.store(step);

@@ -75,7 +75,8 @@ struct GpuLoop {
     const StageResult* stage_results;      // (capacity, bodies) likewise; null: no scheme with stages
     const ContactResult* contact_results;  // (capacity, bodies) likewise; null: no contact
     const double* contact_reactions;       // (capacity, bodies, obstacles, 6) likewise
-    int64_t obstacles;
+    const double* held_reactions;          // (capacity, bodies, holders, 6) likewise
+    int64_t obstacles, holders;
     void* grabs;                           // graph that writes what bodies exert on grabs after a step; null: nothing can be touched
     const MailSlot* touch;                 // arguments of pushes and grabs
     const Reaction* grab_reactions;        // (capacity, most_grabs) pinned, written by `grabs`; number -1: no grab

@@ -68,6 +68,7 @@ class DeviceLoop(Reports):
     stage_results: likewise (CAPACITY, bodies) of STAGE_RESULT; None: no scheme with stages
     contact_results: likewise (CAPACITY, bodies) of CONTACT_RESULT; None: no contact
     contact_reactions: likewise (CAPACITY, bodies, obstacles, 6) of float64
+    held_reactions: likewise (CAPACITY, bodies, holders, 6); None: no holders
     clock: host array (1,), time of the simulation [s]
     records: capacity of the ring of records
     real: type of values, x and v on the device
@@ -79,7 +80,8 @@ class DeviceLoop(Reports):
         mailboxes: Sequence[tuple[int, int]], results: NDArray[Any], timestamps: NDArray[Any], clock: Float64,
         records: int = 8192, real: DTypeLike = np.float64, newton_results: NDArray[Any] | None = None,
         energy_records: NDArray[Any] | None = None, stage_results: NDArray[Any] | None = None,
-        contact_results: NDArray[Any] | None = None, contact_reactions: NDArray[Any] | None = None, **addresses: int,
+        contact_results: NDArray[Any] | None = None, contact_reactions: NDArray[Any] | None = None,
+        held_reactions: NDArray[Any] | None = None, **addresses: int,
     ):  # fmt: skip
         self._device, self._ranges, bodies, nodes = device, ranges, len(ranges), len(row_start) - 1
         self._native = library()
@@ -113,14 +115,17 @@ class DeviceLoop(Reports):
         loop.energy_records = None if energy_records is None else energy_records.ctypes.data
         loop.stage_results = None if stage_results is None else stage_results.ctypes.data
         self._written = (results, timestamps, clock, newton_results, energy_records, stage_results)
-        self._contact_written = (contact_results, contact_reactions)
+        self._contact_written = (contact_results, contact_reactions, held_reactions)
+        poses = None
         if contact_results is not None and contact_reactions is not None:
             loop.contact_results, loop.contact_reactions = contact_results.ctypes.data, contact_reactions.ctypes.data
             loop.obstacles = contact_reactions.shape[2]
-            poses = device.pinned(FRAMES * loop.obstacles * 56).view(np.float64).reshape(FRAMES, loop.obstacles, 7)
-            self.report_reactions(loop.obstacles, poses)
             loop.pose_bytes = 56 * loop.obstacles
             loop.pose_staging = device.memory(max(FRAME_COPIES * loop.pose_bytes, 16))
+            poses = device.pinned(FRAMES * loop.obstacles * 56).view(np.float64).reshape(FRAMES, loop.obstacles, 7)
+        if held_reactions is not None:
+            loop.held_reactions, loop.holders = held_reactions.ctypes.data, held_reactions.shape[2]
+        self.report_reactions(loop.obstacles + loop.holders, loop.obstacles, poses)
         self._pinned = self._events_and_memory(loop, sum(-(-size // 16) * 16 for _, size in mailboxes))
 
     def _events_and_memory(self, loop: structs.GpuLoop, upload: int) -> list[NDArray[np.uint8]]:

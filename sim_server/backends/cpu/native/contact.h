@@ -22,6 +22,7 @@
 #include "obstacle_sweep.h"
 #include "pairs.h"
 #include "passes.h"
+#include "ties.h"
 
 // The step of an island whose rows are detected; of a body alone as without contact where nothing is touched.
 static void solve_island(Loop& loop, int island, bool resumes) {
@@ -100,5 +101,6 @@ static bool solve_in_contact(Loop& loop) {
         p.take_up();
         ContactEnd(p, p.result, p.report).finish();
     }
+    if (c.ties.count) TieRows(loop).finish(loop.rings.step + 1);
     return false;
 }

@@ -29,6 +29,12 @@ static void add_contacts(const Loop& loop, const Body& body, double* target) {
         rows.add_blocks(k, s, block_of);
     };
     for (int k = c.body_start[index]; k < c.body_start[index + 1]; ++k) add(k);
+    for (int i = 0; i < c.ties.count; ++i) {
+        if (c.ties.broken[i] || (c.ties.body[2 * i] != index && c.ties.body[2 * i + 1] != index)) continue;
+        double s[6];
+        rows.stiffness(c.ties.first + i, {}, c.dx_dv * c.force_coefficient, s);
+        rows.add_blocks(c.ties.first + i, s, block_of);
+    }
     if (c.pair_first < 0 || !c.near[index]) return;
     for (int i = 0; i < loop.bodies; ++i)
         for (int k = c.pair_first + c.body_start[i]; c.near[i] && k < c.pair_first + c.body_start[i + 1]; ++k)

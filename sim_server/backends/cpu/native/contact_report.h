@@ -22,7 +22,9 @@ struct ContactEnd : IslandRows {
             std::fill(reaction, reaction + 6 * c.obstacle_count, 0.0);
         }
         each_range([&](int first, int last) {
-            for (int k = first; k < last; ++k) keep(k, well && !rows.empty(k) && c.state[k].force.normal > 0);
+            for (int k = first; k < last; ++k)
+                if (is_tie(c, k)) count_work(k, well && !rows.empty(k));
+                else keep(k, well && !rows.empty(k) && c.state[k].force.normal > 0);
         });
         for (int m = 0; m < count; ++m) {
             ContactReport& report = c.report[bodies[m]];
@@ -41,6 +43,17 @@ struct ContactEnd : IslandRows {
             f[m] = c.force[k] * c.normal[3 * k + m] + c.traction[3 * k + m];
         }
         if (!closed) return;
+        const int body = body_of_row(c, k, false);
+        ++c.report[body].contacts;
+        add_work(k, f);
+        if (is_pair(c, k)) ++c.report[c.obstacle[k]].contacts;
+        else react(k, f, c.reaction + 6 * ((int64_t)c.obstacle_count * body + c.obstacle[k]));
+    }
+    void count_work(int k, bool acts) const {
+        if (acts) add_work(k, c.state[k].force.traction);
+    }
+    // Adds the work of a row's force to the reports of its bodies.
+    void add_work(int k, const double* f) const {
         double displacement[2][3] = {};
         for (int a = 0; a < CORNERS; ++a) {
             const int node = c.corner[CORNERS * k + a];
@@ -48,17 +61,10 @@ struct ContactEnd : IslandRows {
             double u[3];
             rotated(c.rotation + 9 * (int64_t)node, y + 3 * (int64_t)node, u);
             for (int m = 0; m < 3; ++m)
-                displacement[a > 0][m] += c.weight[CORNERS * k + a] * c.dx_dv * (c.predictor[3 * (int64_t)node + m] + u[m]);
+                displacement[a > 0 && is_pair(c, k)][m] += c.weight[CORNERS * k + a] * c.dx_dv * (c.predictor[3 * (int64_t)node + m] + u[m]);
         }
-        const int body = body_of_row(c, k, false);
-        ++c.report[body].contacts;
-        c.report[body].work += dot3(f, displacement[0]);
-        if (is_pair(c, k)) {
-            ++c.report[c.obstacle[k]].contacts;
-            c.report[c.obstacle[k]].work += dot3(f, displacement[1]);
-        } else {
-            react(k, f, c.reaction + 6 * ((int64_t)c.obstacle_count * body + c.obstacle[k]));
-        }
+        c.report[body_of_row(c, k, false)].work += dot3(f, displacement[0]);
+        if (is_pair(c, k)) c.report[c.obstacle[k]].work += dot3(f, displacement[1]);
     }
 
     // Force and torque of row k on its obstacle.

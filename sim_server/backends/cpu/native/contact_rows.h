@@ -25,6 +25,23 @@ struct ContactReport {            // of a body in a step
     double work;                  // of contact on the body [J]
 };
 
+struct Ties {                     // attachments and springs (ties.h): rows after all others, by the body of their first corner
+    int32_t first, count, tables;     // row of the first one; of all; tables of the scene that they are from
+    const int32_t* start;             // (bodies + 1,)
+    const int32_t* body;              // (count, 2) of the first corner and of the others; -1: there are none
+    const int32_t* obstacle;          // (count,) -1: none
+    const int32_t *table, *order;     // (count,) table of each; ties by table
+    const double* point;              // (count, 3) in the obstacle's frame [m]
+    const double *kappa, *rest, *breaking;  // (count,) of attachments, 0: a spring; rest length [m]; force that breaks it [N]
+    double* stiffness;                // (count,) [N/m]; 0: set in the first step
+    double* force;                    // (count, 3) on the first corner, at the end of the last step [N]
+    double *start_force, *slope;      // (count, 3), (count, 6) f_0 and K of this step
+    int32_t* bound;                   // (nodes,) 1 + the other body that a node is attached to, 0: none; they do not touch there
+    int32_t* broken;                  // (count,) steps completed when it broke; 0: it has not
+    double* reaction;                 // (bodies, columns, 6) those of tables from column_first on
+    int32_t columns, column_first;
+};
+
 struct SolveResult;
 
 struct PassChoice {         // of a body, kept from step to step (pass_choice.h)
@@ -71,6 +88,7 @@ struct Contact {
     double *modes, *coarse, *lever;               // (nodes, 18), (most_modes + 4, most_modes), (rows, 8): island.h
     int32_t* mode;                                // (bodies,) first mode of a body; -1: it has none
     const int32_t* unheld;                        // (bodies,) 1: no node is fixed
+    Ties ties;
 };
 
 static void rotated(const double* R, const double* v, double* out) {
@@ -80,10 +98,20 @@ static void rotated_back(const double* R, const double* v, double* out) {
     for (int i = 0; i < 3; ++i) out[i] = R[i] * v[0] + R[3 + i] * v[1] + R[6 + i] * v[2];
 }
 
-inline bool is_pair(const Contact& c, int row) { return c.pair_first >= 0 && row >= c.pair_first; }
+inline bool is_tie(const Contact& c, int row) { return c.ties.count > 0 && row >= c.ties.first; }
+
+// Whether it is a row between two bodies.
+inline bool is_pair(const Contact& c, int row) {
+    if (is_tie(c, row)) {
+        const int32_t* body = c.ties.body + 2 * (row - c.ties.first);
+        return body[1] >= 0 && body[1] != body[0];
+    }
+    return c.pair_first >= 0 && row >= c.pair_first;
+}
 
 // Body of a row's vertex; other: that of its triangle, of a row between bodies.
 inline int body_of_row(const Contact& c, int row, bool other) {
+    if (is_tie(c, row)) return c.ties.body[2 * (row - c.ties.first) + (other && is_pair(c, row))];
     return other ? c.obstacle[row] : c.site_body[(is_pair(c, row) ? row - c.pair_first : row) / 2];
 }
 
@@ -114,6 +142,19 @@ struct Rows {
                 c.state[r].hardening * c.stiffness[r], c.friction[r]};
     }
     bool empty(int r) const { return c.obstacle[r] < 0; }
+    // set: the row counts as closed whatever its gap
+    ContactForce force(int r, const double* s, double limit, bool set) const {
+        if (!is_tie(c, r)) return contact_force(row(r), s, limit, set);
+        const int i = r - c.ties.first;
+        const double *f = c.ties.start_force + 3 * i, *K = c.ties.slope + 6 * i;
+        double back[3];
+        stiff(K, s, back);
+        return {0, {f[0] - back[0], f[1] - back[1], f[2] - back[2]}, 1, true};
+    }
+    void stiffness(int r, const ContactForce& f, double scale, double* k) const {
+        if (!is_tie(c, r)) return contact_stiffness(row(r), f, scale, k);
+        for (int m = 0; m < 6; ++m) k[m] = scale * c.ties.slope[6 * (r - c.ties.first) + m];
+    }
 
     // f(node, weight) of the corners that may move
     template <class F> void each_corner(int r, F f) const {

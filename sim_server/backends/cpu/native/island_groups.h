@@ -46,7 +46,7 @@ static void find_islands(Loop& loop) {
         const int64_t at = 3 * (int64_t)body.first;
         return std::isfinite(dot(3 * (body.last - body.first), loop.b + at, loop.b + at));
     };
-    for (int i = 0; c.pair_first >= 0 && i < loop.bodies; ++i) well[i] = !is_made(loop, i) && finite(i);
+    for (int i = 0; (c.pair_first >= 0 || c.ties.count) && i < loop.bodies; ++i) well[i] = !is_made(loop, i) && finite(i);
     for (int i = 0; c.pair_first >= 0 && i < loop.bodies; ++i) {
         if (!c.near[i] || is_made(loop, i)) continue;
         for (int k = c.pair_first + c.body_start[i]; k < c.pair_first + c.body_start[i + 1]; ++k) {
@@ -56,6 +56,14 @@ static void find_islands(Loop& loop) {
             const int a = root(i), b = root(other);
             parent[std::max(a, b)] = std::min(a, b);
         }
+    }
+    for (int i = 0; i < c.ties.count; ++i) {
+        const int32_t* body = c.ties.body + 2 * i;
+        const bool two = body[1] >= 0;
+        if (c.obstacle[c.ties.first + i] < 0) continue;
+        if (!well[body[0]] || (two && !well[body[1]])) { c.obstacle[c.ties.first + i] = -1; continue; }
+        const int a = root(body[0]), b = two ? root(body[1]) : a;
+        parent[std::max(a, b)] = std::min(a, b);
     }
     c.islands = 0;
     int bodies = 0, rows = 0;
@@ -67,6 +75,7 @@ static void find_islands(Loop& loop) {
             if (root(j) != i) continue;
             c.island[bodies++] = j;
             rows += (c.pair_first >= 0 ? 2 : 1) * (c.body_start[j + 1] - c.body_start[j]);
+            if (c.ties.count) rows += c.ties.start[j + 1] - c.ties.start[j];
         }
     }
     c.island_start[c.islands] = bodies;

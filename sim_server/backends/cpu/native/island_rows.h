@@ -32,6 +32,7 @@ struct IslandRows {
             const int first = c.body_start[bodies[m]], last = c.body_start[bodies[m] + 1];
             f(first, last);
             if (pairs) f(c.pair_first + first, c.pair_first + last);
+            if (c.ties.count) f(c.ties.first + c.ties.start[bodies[m]], c.ties.first + c.ties.start[bodies[m] + 1]);
         }
     }
     template <class F> void each_row(F f) const {

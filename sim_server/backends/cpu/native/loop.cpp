@@ -165,6 +165,7 @@ static void assemble(Loop* loop, bool whole) {
     if (loop->stages) assemble_stage(*loop, whole);
     else assemble_single(*loop, whole);
     if (loop->contact && !loop->euler && loop->contact->pair_first >= 0) PairDetection(*loop, *loop->contact).run();
+    if (loop->contact && loop->contact->ties.count) TieRows(*loop).prepare();
     for (int i = 0; i < loop->bodies && loop->contact; ++i) note_touches(*loop, loop->body[i]);
     for (int i = 0; i < loop->bodies; ++i) copy_for_worker(*loop, loop->body[i]);
     loop->assemble_begin = begin;
@@ -179,7 +180,14 @@ static void note_contact(Loop& loop, int index, int64_t slot) {
     record.clipped = report.clipped;
     record.contact_residual = report.residual;
     const int64_t size = 6 * (int64_t)loop.contact->obstacle_count;
-    std::memcpy(loop.rings.reactions + size * slot, loop.contact->reaction + size * index, sizeof(double) * size);
+    double* target = loop.rings.reactions + 6 * loop.rings.reaction_count * slot;
+    std::memcpy(target, loop.contact->reaction + size * index, sizeof(double) * size);
+}
+
+static void note_holders(const Loop& loop, int index, int64_t slot) {
+    const int64_t held = 6 * (int64_t)loop.holders;
+    double* end = loop.rings.reactions + 6 * loop.rings.reaction_count * (slot + 1);
+    std::memcpy(end - held, loop.held_reaction + held * index, sizeof(double) * held);
 }
 
 // Reports what bodies exert on grabs and on each other after a step.
@@ -257,6 +265,7 @@ static void finish_step(Loop* loop) {
             record.whole = end - loop->assemble_begin - waited;  // with a factorization that the step waited for
             record.cpu = cpu;
             if (loop->energies) note_energy(record, loop->energies->balance[i]);
+            if (loop->holders) note_holders(*loop, i, (first + i) % rings.record_capacity);
         }
         report_reactions(*loop, step);
         rings.record_head.store(first + loop->bodies, std::memory_order_release);

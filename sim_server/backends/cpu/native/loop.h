@@ -139,6 +139,8 @@ struct Loop {
     Stages* stages;                    // null: another scheme
     EulerForm* euler;                  // null: all bodies take the steps of the scheme
     Contact* contact;                  // null: nothing can be touched
+    int32_t holders;
+    const double* held_reaction;       // (bodies, holders, 6) force [N] and torque [N m] on each; launches that integrate set it
     double* clock;                     // (1,) s, read by kernels
     int32_t* moving;                   // (bodies,) 0: the body rests (kernels/nodes.cu)
     Energies* energies;                // or null

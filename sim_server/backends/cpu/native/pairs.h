@@ -66,7 +66,7 @@ struct PairDetection {
         const Box box = box_of(motion, node, thickness_of(tables, body));
         bool found = false;
         for (int other = 0; other < loop.bodies; ++other) {
-            if (other == body || !c.near[other] || !meet(box, c.body_box[other])) continue;
+            if (other == body || !c.near[other] || (c.ties.count && c.ties.bound[node] == other + 1) || !meet(box, c.body_box[other])) continue;
             const double thickness = 0.5 * (thickness_of(tables, body) + thickness_of(tables, other));
             Meeting t;
             if (passage_of(tables, motion, ended, node, other, thickness, t) == STAYS_OUT) continue;

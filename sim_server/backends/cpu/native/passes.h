@@ -31,7 +31,7 @@ struct Passes : IslandRows {
         each_row([&](int k, RowState& s) {
             s.limit = c.force[k];
             s.hardening = 1;
-            s.in_set = c.force[k] > 0 || (c.entry[k] <= 1 && c.entry[k] <= earliest + FIRST);
+            s.in_set = is_tie(c, k) || c.force[k] > 0 || (c.entry[k] <= 1 && c.entry[k] <= earliest + FIRST);
             closed += s.in_set;
         });
         return closed;
@@ -41,9 +41,8 @@ struct Passes : IslandRows {
     bool apply_law(bool set) {
         rows.actives = 0;
         each_row([&](int k, RowState& s) {
-            const ContactRow row = rows.row(k);
-            s.force = contact_force(row, s.s, s.limit, set && s.in_set);
-            contact_stiffness(row, s.force, scale2, s.stiffness);
+            s.force = rows.force(k, s.s, s.limit, set && s.in_set);
+            rows.stiffness(k, s.force, scale2, s.stiffness);
             if (rows.acts(k)) active[rows.actives++] = k;
         });
         return rows.actives > 0;
@@ -76,7 +75,7 @@ struct Passes : IslandRows {
         each_row([&](int k, RowState& s) {
             double at[3];
             for (int m = 0; m < 3; ++m) at[m] = s.s[m] + alpha * s.step[m];
-            const ContactForce f = contact_force(rows.row(k), at, s.limit, false);
+            const ContactForce f = rows.force(k, at, s.limit, false);
             sum -= factor * (f.normal * dot3(c.normal + 3 * k, s.step) + dot3(f.traction, s.step));
         });
         return sum;
@@ -174,20 +173,21 @@ struct Passes : IslandRows {
     void hold_limits() const {
         each_row([&](int k, RowState& s) {
             const bool was = s.force.closed;
-            s.limit = was ? contact_force(rows.row(k), s.s, 0, false).normal : 0;
+            s.limit = was ? rows.force(k, s.s, 0, false).normal : 0;
         });
     }
 
     // True if the rows that count as closed are those that the law closes.
     bool set_is_law() const {
         bool same = true;
-        each_row([&](int k, RowState& s) { same = same && s.in_set == contact_force(rows.row(k), s.s, 0, false).closed; });
+        each_row([&](int k, RowState& s) { same = same && s.in_set == rows.force(k, s.s, 0, false).closed; });
         return same;
     }
 
     // set: begin with the rows marked by choose_set.
     void solve(bool set) {
-        bool last = false, spent = false;
+        bool last = false, spent = false, linear = true;
+        each_row([&](int k, RowState&) { linear = linear && is_tie(c, k); });
         for (int k = 0;; ++k) {
             apply_law(set && k == 0);
             const double size = balance();
@@ -196,7 +196,7 @@ struct Passes : IslandRows {
             if (spent || (last && report.residual <= c.tolerance)) break;  // the last solve may have changed the law again
             const double goal = loop.body[bodies[0]].now.tolerance * given;
             const bool by_law = k > 0 || !set || set_is_law();
-            last = by_law && size <= c.tolerance * given;
+            last = by_law && (linear || size <= c.tolerance * given);
             if (last && size <= goal) {  // there is nothing left to solve
                 result.residual = report.residual;
                 return;

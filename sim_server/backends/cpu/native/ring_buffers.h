@@ -70,7 +70,8 @@ struct Rings {
     std::atomic<int64_t> step;             // completed
     Record* records;
     int64_t record_capacity;
-    double* reactions;                     // (record_capacity, obstacles, 6) of each record; null: no contact
+    double* reactions;                     // (record_capacity, reaction_count, 6) of each record
+    int64_t reaction_count;                // obstacles, and then holders
     std::atomic<int64_t> record_head, record_tail;
     Reaction* others;                      // (other_capacity,) on grabs and other bodies, in the order of steps; there before the step's records
     int64_t other_capacity;
