@@ -117,7 +117,7 @@ class Contact(Effect):
         self._input = ContactInput(
             self._table, start, corner, weight, np.full(rows, -1, np.int32), np.zeros((rows, 3)), np.zeros(rows),
             np.zeros((rows, 3)), np.full(rows, 2.0), np.zeros(rows), np.zeros(rows),
-            thickness, np.zeros(rows), np.zeros((rows, 3)),
+            thickness, np.ones(rows), np.zeros(rows), np.zeros((rows, 3)),
             world.predictor, world.free, world.dx_dv, world.force_coefficient, params.passes, params.tolerance,
             _surfaces(world, params, self.node, self.body) if touching else None,
         )  # fmt: skip
@@ -176,7 +176,8 @@ class Contact(Effect):
             free=w.free, mass=w.mass, block=system.block, gravity=gravity, force_coefficient=w.force_coefficient,
             dx_dv=w.dx_dv, kappa=self.params.stiffness, thickness=rows.thickness, obstacle=rows.obstacle,
             normal=rows.normal, gap=rows.gap, drift=rows.drift, entry=rows.entry, stiffness=rows.stiffness,
-            friction=rows.friction, force=rows.force, traction=rows.traction, dropped=self.dropped,
+            friction=rows.friction, hardening=rows.hardening, force=rows.force, traction=rows.traction,
+            dropped=self.dropped,
         )  # fmt: skip
         return [self._place(self._target), detect]
 

@@ -19,7 +19,6 @@ static void add_contacts(const Loop& loop, const Body& body, double* target) {
         if (rows.empty(k) || !(c.force[k] > 0)) return;
         const ContactForce f = lasting_contact(c.friction[k], c.force[k], c.traction + 3 * k);
         double s[6];
-        c.state[k].hardening = 1;
         contact_stiffness(rows.row(k), f, c.dx_dv * c.force_coefficient, s);
         rows.add_blocks(k, s, block_of);
     };
