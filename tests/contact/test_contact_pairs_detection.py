@@ -389,7 +389,7 @@ def test_bodies_of_different_thickness_keep_the_mean_of_both():
 
 
 def in_a_valley(x: float) -> tuple[Detected, int]:
-    """A block whose top is folded to a valley at x = 0.03, and a vertex half of D over its sides, x aside of the middle.
+    """A block whose top is folded to a valley at x = 0.03, and a vertex half of D over its sides, x off the middle.
 
     Returns the number of the vertex, too.
     """
