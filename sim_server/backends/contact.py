@@ -62,7 +62,8 @@ class Contact:
     entry: (rows,) when the point as predicted first comes nearer than the thickness, as a part of the step, 0 to 1;
         2: it does not
     stiffness: (rows,) [N/m], of rows between bodies set by the loop. friction: (rows,) coefficient
-    thickness: (rows,) [m]
+    thickness: (rows,) [m]. hardening: (rows,) what multiplies the stiffness: 1, or more in a contact whose force a
+        sweep found too large for it, as long as that is so
     force: (rows,) normal force lambda [N]; traction: (rows, 3) friction force [N]. In: of the last step, for the same
         obstacle (0 for another), traction turned with the normal. Out: of this step
     predictor: (nodes, 3), dx_dv, force_coefficient, free: (nodes,) of the world (mechanics/world.py)
@@ -83,6 +84,7 @@ class Contact:
     stiffness: Float64
     friction: Float64
     thickness: Float64
+    hardening: Float64
     force: Float64
     traction: Float64
     predictor: Float64

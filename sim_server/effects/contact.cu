@@ -35,6 +35,7 @@ struct Detect {
     double* entry;           // (2 n,) out
     double* stiffness;       // (2 n,) in, out: set in the first step [N/m]
     double* friction;        // (2 n,) out
+    double* hardening;       // (2 n,) in, out
     double* force;           // (2 n,) in, out [N]
     double* traction;        // (2 n, 3) in, out [N]
     int* dropped;            // (n,) in, out: obstacles that there was no row for, summed over the steps
@@ -80,13 +81,14 @@ INLINE Candidate candidate_of(const ObstacleTable& t, int o, const double* x, co
 // What a row remembers of the last step.
 struct Memory {
     int obstacle;
-    double force, normal[3], traction[3];
+    double force, hardening, normal[3], traction[3];
 };
 
 INLINE Memory memory_of(const Detect& p, int row) {
     Memory m;
     m.obstacle = p.obstacle[row];
     m.force = p.force[row];
+    m.hardening = p.hardening[row];
     for (int k = 0; k < 3; ++k) {
         m.normal[k] = p.normal[3 * row + k];
         m.traction[k] = p.traction[3 * row + k];
@@ -100,6 +102,7 @@ INLINE void put_row(const Detect& p, const ObstacleTable& t, int i, int row, con
     p.obstacle[row] = c.obstacle;
     p.force[row] = p.gap[row] = p.friction[row] = 0;
     p.entry[row] = NEVER;
+    p.hardening[row] = 1;
     for (int k = 0; k < 3; ++k) traction[k] = drift[k] = 0;
     if (c.obstacle < 0) return;
     world_vector(t.end + 7 * c.obstacle, c.normal, normal);
@@ -116,6 +119,7 @@ INLINE void put_row(const Detect& p, const ObstacleTable& t, int i, int row, con
     for (int r = 0; r < 2; ++r) {
         if (last[r].obstacle != c.obstacle) continue;
         p.force[row] = last[r].force;
+        p.hardening[row] = last[r].hardening;
         for (int k = 0; k < 3; ++k) traction[k] = last[r].traction[k];
         turn_with(last[r].normal, normal, traction);
     }

@@ -110,7 +110,7 @@ class Contact(Movable):
         self._input = ContactInput(
             self._table, start, corner, weight, np.full(rows, -1, np.int32), np.zeros((rows, 3)), np.zeros(rows),
             np.zeros((rows, 3)), np.full(rows, 2.0), np.zeros(rows), np.zeros(rows),
-            thickness, np.zeros(rows), np.zeros((rows, 3)),
+            thickness, np.ones(rows), np.zeros(rows), np.zeros((rows, 3)),
             world.v, world.free, world.dt, world.dt, params.passes, params.tolerance,
             _surfaces(world, params, self.node, self.body) if touching else None, ties,
         )  # fmt: skip
@@ -149,7 +149,8 @@ class Contact(Movable):
             mass=w.mass, block=system.block, block_scale=block_scale, gravity=gravity, force_coefficient=w.dt,
             dx_dv=w.dt, kappa=self.params.stiffness, thickness=rows.thickness, obstacle=rows.obstacle,
             normal=rows.normal, gap=rows.gap, drift=rows.drift, entry=rows.entry, stiffness=rows.stiffness,
-            friction=rows.friction, force=rows.force, traction=rows.traction, dropped=self.dropped,
+            friction=rows.friction, hardening=rows.hardening, force=rows.force, traction=rows.traction,
+            dropped=self.dropped,
         )  # fmt: skip
         return [self.place(system), detect]
 

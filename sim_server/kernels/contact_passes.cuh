@@ -9,6 +9,22 @@
 constexpr double FIRST = 0.02, EARLY = 0.01, SHORT_OF = 0.9, HARDER = 10;
 constexpr double SAME_PLANE = 0.995;  // cosine of the angle between normals
 constexpr int ROUNDS = 3;             // of passes after a sweep of the paths
+constexpr double HARDEST = 1000;      // times as stiff, at most
+constexpr double RESTING = 1e-4;      // contact residual of a step that began at rest
+constexpr int AT_REST = 4;            // passes of such a step, at most
+
+// The contact residual with which a step may end. rested: the law held where it began. What is left of the residual then moves the body
+// in the next step: within `tolerance` alone one near the limit of friction would go to and fro for ever.
+// passes: made; most: of any step.
+HOST_DEVICE double tolerance_of(double tolerance, bool rested, int passes, int most) {
+    return rested && passes < AT_REST && passes < most && RESTING < tolerance ? RESTING : tolerance;
+}
+
+// Hardening that a row takes into the next step: one that carried force before and whose force without it would press it through half of
+// its thickness keeps HARDER. before, force: normal forces at the start and the end of the step.
+HOST_DEVICE double lasting_hardening(double hardening, double before, double force, double stiffness, double thickness) {
+    return hardening > 1 && before > 0 && 2 * force > stiffness * thickness ? HARDER : 1;
+}
 
 // Zero of a slope that ascends: 1 where it is zero there but for rounding. slope(alpha) is the derivative along a solution.
 template <class Slope> HOST_DEVICE double minimum_along(Slope slope) {

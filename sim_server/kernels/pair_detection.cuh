@@ -11,6 +11,8 @@
 #include "vertex_triangle.cuh"
 
 constexpr double THROUGH = 1e-3;  // thicknesses: a vertex whose path comes so near passes the triangle
+constexpr double CREASE = 0.9;    // cosine of the angle between two triangles that a vertex lies on as in a crease, or less
+constexpr double OVER = 0.999;    // of a triangle's certainty: the vertex is over it, not beyond its edges
 constexpr double INSIDE = 3;      // thicknesses over DEEP: how deep a vertex may have come in one step to be sent back
 
 // How nodes move in a step. Real, Local: types of the state and of rotations.
@@ -30,7 +32,7 @@ struct SurfaceTables {        // of all bodies (backends/contact.py)
     int* corner;              // (rows, CORNERS)
     double* weight;           // (rows, CORNERS)
     int* obstacle;            // (rows,) of a row between bodies: the other body
-    double *normal, *gap, *entry, *stiffness, *friction, *thickness, *force, *traction;
+    double *normal, *gap, *entry, *stiffness, *friction, *thickness, *hardening, *force, *traction;
     int pair_first;           // row of the first one between bodies
     const int *site_body, *node_site;        // (sites,), (nodes,) or -1
     const int* triangle;                     // (triangles, 3) nodes
@@ -130,10 +132,11 @@ template <class Motion> struct TouchSearch {  // of a node against a body
     double x[3], s[3];   // the node's place and displacement
     Box box;
     Meeting nearest, first;
+    Meeting beside;      // of the triangles that the vertex is over and near, the nearest after `nearest`
 };
 
 template <class Motion> HOST_DEVICE TouchSearch<Motion> search_of(const Motion& m, int node, double thickness) {
-    TouchSearch<Motion> search = {&m, thickness, {}, {}, box_of(m, node, DEEP * thickness), {-1, -1, {}}, {-1, -1, {}}};
+    TouchSearch<Motion> search = {&m, thickness, {}, {}, box_of(m, node, DEEP * thickness), {-1, -1, {}}, {-1, -1, {}}, {-1, -1, {}}};
     place_of(m, node, search.x);  // only the nearest triangle of all tells inside from outside, hence DEEP
     displacement_of(m, node, search.s);
     return search;
@@ -153,7 +156,13 @@ template <class Motion> HOST_DEVICE void consider(const SurfaceTables& c, int bo
     if (!meet(search.x, path, x[0], x[1], x[2], thickness, here.touch)) return;
     const double farther = fabs(here.touch.distance) - fabs(nearest.touch.distance);
     const bool as_near = fabs(farther) <= 1e-9 * thickness;
-    if (nearest.other < 0 || (as_near ? here.touch.certainty > nearest.touch.certainty : farther < 0)) nearest = here;
+    Meeting later = here;
+    if (nearest.other < 0 || (as_near ? here.touch.certainty > nearest.touch.certainty : farther < 0)) {
+        later = nearest;
+        nearest = here;
+    }
+    const bool over = later.other >= 0 && later.touch.certainty > OVER && later.touch.distance > 0 && later.touch.distance <= thickness;
+    if (over && (search.beside.other < 0 || later.touch.distance < search.beside.touch.distance)) search.beside = later;
     if (here.touch.distance > 0 && here.touch.entry <= 1 && comes_before(here, search.first)) search.first = here;
 }
 
@@ -183,12 +192,6 @@ template <class Motion> HOST_DEVICE const Meeting& found_by(const TouchSearch<Mo
     return search.first.other >= 0 || distance > 2 * search.thickness ? search.first : search.nearest;
 }
 
-template <class Motion> HOST_DEVICE Meeting touch_of(const SurfaceTables& c, const Motion& m, int node, int body, double thickness) {
-    TouchSearch<Motion> search = search_of(m, node, thickness);
-    search_tree(c, body, &search, 1);
-    return found_by(search);
-}
-
 enum Passage { STAYS_OUT = 0, GOES_THROUGH = 1, COMES_INSIDE = 2 };
 
 // What a solution does to a vertex: whether it goes through a triangle of a body, or comes inside of it. found: where it touches then.
@@ -211,11 +214,11 @@ HOST_DEVICE Passage passage_of(const SurfaceTables& c, const Motion& m, const Mo
 
 struct RowMemory {       // what a row remembers of the last step
     int other;
-    double force, normal[3], traction[3];
+    double force, hardening, normal[3], traction[3];
 };
 
 HOST_DEVICE RowMemory memory_of(const SurfaceTables& c, int row) {
-    RowMemory m = {c.obstacle[row], c.force[row], {}, {}};
+    RowMemory m = {c.obstacle[row], c.force[row], c.hardening[row], {}, {}};
     for (int k = 0; k < 3; ++k) {
         m.normal[k] = c.normal[3 * row + k];
         m.traction[k] = c.traction[3 * row + k];
@@ -228,6 +231,7 @@ HOST_DEVICE void recall(const SurfaceTables& c, int row, const RowMemory* last, 
     for (int r = 0; r < count; ++r) {
         if (last[r].other != c.obstacle[row]) continue;
         c.force[row] = last[r].force;
+        c.hardening[row] = last[r].hardening;
         for (int k = 0; k < 3; ++k) c.traction[3 * row + k] = last[r].traction[k];
         turn_with(last[r].normal, c.normal + 3 * row, c.traction + 3 * row);
     }
@@ -238,6 +242,7 @@ template <class Motion> HOST_DEVICE void put_row(const SurfaceTables& c, const M
     c.obstacle[row] = t.other;
     c.force[row] = 0;
     c.entry[row] = NEVER;
+    c.hardening[row] = 1;
     for (int k = 0; k < 3; ++k) c.traction[3 * row + k] = 0;
     if (t.other < 0) return;
     const int body = c.site_body[site];
@@ -263,20 +268,42 @@ template <class Motion> HOST_DEVICE void put_row(const SurfaceTables& c, const M
     c.thickness[row] = 0.5 * (thickness_of(c, body) + thickness_of(c, t.other));
 }
 
-// Sets both rows of a site between bodies.
+// How well a memory fits a row: -2: it is of another body.
+HOST_DEVICE double fit_of(const SurfaceTables& c, int row, const RowMemory& last) {
+    return last.other < 0 || last.other != c.obstacle[row] ? -2 : dot3(last.normal, c.normal + 3 * row);
+}
+
+// Takes up the forces of two rows of a vertex, each of which is of the row that it fits best.
+HOST_DEVICE void recall_both(const SurfaceTables& c, int row, const RowMemory* last) {
+    const double straight[2] = {fit_of(c, row, last[0]), fit_of(c, row + 1, last[1])}, crossed[2] = {fit_of(c, row, last[1]), fit_of(c, row + 1, last[0])};
+    const bool cross = fmax(crossed[0], crossed[1]) > fmax(straight[0], straight[1]);
+    recall(c, row, last + cross, 1);
+    recall(c, row + 1, last + !cross, 1);
+}
+
+// True if a vertex lies in a crease of a body, where the normal of the nearest triangle alone would jump to and fro.
+template <class Motion> HOST_DEVICE bool in_crease(const TouchSearch<Motion>& search) {
+    const Touch &nearest = search.nearest.touch, &beside = search.beside.touch;
+    return search.beside.other >= 0 && nearest.distance > 0 && nearest.distance <= search.thickness && dot3(nearest.normal, beside.normal) < CREASE;
+}
+
+// Sets both rows of a site between bodies: of the bodies that it meets first, or is nearest to, or, with one, of both sides of a crease.
 template <class Motion> HOST_DEVICE void detect_site(const SurfaceTables& c, const Motion& m, int site) {
     const int node = node_of_site(c, site), body = c.site_body[site], row = c.pair_first + 2 * site;
-    Meeting first = {-1, -1, {}}, second = first;
+    Meeting first = {-1, -1, {}}, second = first, beside = first;
     const Box box = m.free[node] == 0 ? empty_box() : box_of(m, node, thickness_of(c, body));
     for (int other = 0; other < c.bodies; ++other) {
         if (other == body || !c.near[other] || !meet(box, c.body_box[other])) continue;
-        const Meeting t = touch_of(c, m, node, other, 0.5 * (thickness_of(c, body) + thickness_of(c, other)));
+        TouchSearch<Motion> search = search_of(m, node, 0.5 * (thickness_of(c, body) + thickness_of(c, other)));
+        search_tree(c, other, &search, 1);
+        const Meeting t = found_by(search);
         if (comes_before(t, first)) { second = first; first = t; }
         else if (comes_before(t, second)) second = t;
+        if (in_crease(search) && comes_before(search.beside, beside)) beside = search.beside;
     }
+    if (second.other < 0) second = beside;
     const RowMemory last[2] = {memory_of(c, row), memory_of(c, row + 1)};
     put_row(c, m, row, site, first);
-    recall(c, row, last, 2);
     put_row(c, m, row + 1, site, second);
-    recall(c, row + 1, last, 2);
+    recall_both(c, row, last);
 }

@@ -386,3 +386,49 @@ def test_bodies_of_different_thickness_keep_the_mean_of_both():
     found = Detected(Simulation(Scene.model_validate(table, context={"folder": "."})))
     rows = found.assemble()
     assert rows and found.input.thickness[list(rows.values())] == pytest.approx((0.001 + 0.003) / 2)
+
+
+def in_a_valley(x: float) -> tuple[Detected, int]:
+    """A block whose top is folded to a valley at x = 0.03, and a vertex half of D over its sides, x off the middle.
+
+    Returns the number of the vertex, too.
+    """
+    sim = scene(
+        block(cells=(1, 1, 1), size=(0.02, 0.02, 0.02), name="small", rotate=(0, 0, 45)),
+        block(cells=CELLS, size=SIZE, name="valley", at=(0, 0, 0)),
+    )
+    small, valley = sim.world.bodies
+    places = sim.world.x
+    folded = np.isclose(sim.world.rest[valley.nodes], [0.03, 0.06, 0])[:, :2].all(axis=1)
+    places[np.arange(valley.first, valley.last)[folded], 1] -= 0.03
+    lowest = small.first + int(places[small.nodes, 1].argmin())
+    places[small.nodes] += np.array([0.03 + x, 0.03 + 0.5 * D * np.sqrt(2), 0.04]) - places[lowest]
+    return Detected(sim), lowest
+
+
+def rows_of(found: Detected, node: int, other: int) -> list[int]:
+    rows = np.flatnonzero((found.input.corner[:, 0] == node) & (found.input.obstacle == other))
+    return [int(r) for r in rows if r >= found.first]
+
+
+def test_a_vertex_in_a_crease_has_both_its_sides():
+    found, node = in_a_valley(1e-4)
+    found.sim.engine.assemble()
+    rows = rows_of(found, node, 1)
+    assert len(rows) == 2
+    normal, gap = found.input.normal[rows], found.input.gap[rows]
+    assert np.allclose(np.sort(normal[:, 0]), [-np.sqrt(0.5), np.sqrt(0.5)], rtol=0, atol=1e-9)
+    assert np.allclose(np.sort(gap), 0.5 * D + np.array([-1, 1]) * 1e-4 * np.sqrt(0.5), rtol=0, atol=1e-9)
+
+
+def test_each_side_of_a_crease_keeps_its_forces():
+    """The vertex comes nearer to the other side, so that its rows change places."""
+    found, node = in_a_valley(1e-4)
+    found.sim.engine.assemble()
+    given, rows = found.input, rows_of(found, node, 1)
+    given.force[rows] = [3.0, 5.0]
+    before = {round(given.normal[r, 0], 3): given.force[r] for r in rows}
+    found.sim.world.x[found.sim.world.bodies[0].nodes, 0] -= 2e-4
+    found.sim.engine.assemble()
+    assert {round(given.normal[r, 0], 3): given.force[r] for r in rows_of(found, node, 1)} == before
+    assert given.normal[rows[0], 0] == pytest.approx(np.sqrt(0.5))  # the nearer side is first

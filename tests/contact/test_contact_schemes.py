@@ -53,7 +53,9 @@ def test_friction_holds_below_its_limit_and_lets_go_beyond(scheme):
         driver.advance(60)
         before, velocity = sim.world.x.mean(axis=0), mean_velocity(sim)
         records = driver.advance(60)
-        assert not records["status"].any() and records["iterations"].mean() <= 2  # factors know the contacts
+        assert (
+            not records["status"].any() and records["iterations"].mean() <= 10
+        )  # of a factor, or more of block Jacobi
         if degrees < 0:
             assert np.linalg.norm(sim.world.x.mean(axis=0) - before) <= 1e-6
         else:

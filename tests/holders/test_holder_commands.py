@@ -64,7 +64,8 @@ def test_messages_name_holders_and_the_forces_on_them():
     assert messages.scene(sim).obstacles == ["left", "right"]
     sim.engine.run(20)
     records, reactions = sim.engine.records_and_reactions()
-    last = messages.steps(sim, records, "", reactions)[-1]
+    told = messages.reactions(sim, reactions, sim.engine.other_reactions())
+    last = messages.steps(sim, records, "", told)[-1]
     forces = {r.obstacle: r.force.x for r in last.reactions}
     assert forces["left"] > 0 > forces["right"]
     assert pose_messages(sim, 20)[0].position.x == pytest.approx(2 + 0.1 * 0.2), "from where it begins at time 0"

@@ -216,7 +216,7 @@ class _NativeContact:
         for name in ("kind", "size", "grid", "place", "cells", "begin", "end"):
             setattr(self.native.obstacles, name, getattr(obstacles, name).ctypes.data)
         for name in ("body_start", "corner", "weight", "obstacle", "normal", "gap", "drift", "entry", "stiffness",
-                     "friction", "thickness", "force", "traction", "predictor", "free"):  # fmt: skip
+                     "friction", "thickness", "hardening", "force", "traction", "predictor", "free"):  # fmt: skip
             setattr(self.native, name, getattr(contact, name).ctypes.data)
         for name, array in self._own.items():
             setattr(self.native, name, array.ctypes.data)

@@ -19,7 +19,6 @@ struct DeviceRow {       // of a row in the step under way
     double s[3];         // displacement of its point by the velocities reached [m]
     double step[3];      // by the solution of the pass [m]
     double limit;        // normal force that limits friction, held in a pass [N]
-    double hardening;    // of the row's stiffness in this step
     ContactForce force;
     int in_set;          // 1: counts as closed in the first pass
 };
@@ -35,6 +34,7 @@ struct ContactArguments {
     const double* stiffness;    // (rows,)
     const double* friction;     // (rows,)
     const double* thickness;    // (rows,)
+    double* hardening;          // (rows,)
     double* force;              // (rows,)
     double* traction;           // (rows, 3)
     const int* pair;            // (nodes,) first row of the node, -1: none
@@ -69,7 +69,7 @@ struct ContactArguments {
     double dx_dv;               // [s]
     double force_coefficient;   // [s]
     double tolerance;
-    int obstacle_count, count, capacity, unused;
+    int obstacle_count, count, capacity, passes;
 };
 
 // --- sums ---------------------------------------------------------------------------------------------------------------------------
@@ -136,8 +136,8 @@ __device__ int list_rows(const ContactArguments& c, int body) {
     return before[CONTACT_THREADS - 1];
 }
 
-__device__ __forceinline__ ContactRow row_at(const ContactArguments& c, int r, double hardening) {
-    return {c.normal + 3 * r, c.drift + 3 * r, c.traction + 3 * r, c.gap[r], c.thickness[r], hardening * c.stiffness[r], c.friction[r]};
+__device__ __forceinline__ ContactRow row_at(const ContactArguments& c, int r) {
+    return {c.normal + 3 * r, c.drift + 3 * r, c.traction + 3 * r, c.gap[r], c.thickness[r], c.hardening[r] * c.stiffness[r], c.friction[r]};
 }
 
 struct SurfaceNode {         // a node and its frame
@@ -194,14 +194,14 @@ __device__ __forceinline__ void add_rows(const ContactArguments& c, const Surfac
         if (!used(c, r)) continue;
         const DeviceRow& row = c.row[r];
         n.add_force(c, r, row.force, f);
-        n.add_stiffness(c, row_at(c, r, row.hardening), row.force, S);
+        n.add_stiffness(c, row_at(c, r), row.force, S);
     }
 }
 
 // Evaluates the law at displacement s. hold: the normal force there limits friction from now on, where the row counted as closed.
 __device__ __forceinline__ void evaluate(const ContactArguments& c, int r, const double* s, bool hold, bool set) {
     DeviceRow& row = c.row[r];
-    const ContactRow given = row_at(c, r, row.hardening);
+    const ContactRow given = row_at(c, r);
     for (int k = 0; k < 3; ++k) row.s[k] = s[k];
     if (hold) row.limit = row.force.closed ? contact_force(given, s, 0, false).normal : 0;
     row.force = contact_force(given, s, row.limit, set && row.in_set);
@@ -228,7 +228,6 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) begin_contact(cons
         if (!used(c, r)) continue;
         DeviceRow& row = c.row[r];
         row.limit = c.force[r];
-        row.hardening = 1;
         row.in_set = c.force[r] > 0 || (c.entry[r] <= 1 && c.entry[r] <= earliest + FIRST);
         closed[0] += row.in_set;
     }
@@ -250,7 +249,7 @@ __device__ void keep_block(const ContactArguments& c, const SurfaceNode& n) {
     double S[9] = {};
     for (int r = n.pair; n.pair >= 0 && r < n.pair + 2; ++r)
         if (used(c, r) && c.force[r] > 0)
-            n.add_stiffness(c, row_at(c, r, 1), lasting_contact(c.friction[r], c.force[r], c.traction + 3 * r), S);
+            n.add_stiffness(c, row_at(c, r), lasting_contact(c.friction[r], c.force[r], c.traction + 3 * r), S);
     const real* own = c.values + 9ll * c.place[n.node];
     for (int k = 0; k < 9; ++k) {
         const long long to = 9ll * (pair / 2) + k;
@@ -299,7 +298,7 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) contact_forces(con
             evaluate(c, r, s, state.hold, state.set);
             n.add_force(c, r, c.row[r].force, f);
             if (starts) continue;
-            const ContactRow row = row_at(c, r, c.row[r].hardening);
+            const ContactRow row = row_at(c, r);
             n.add_stiffness(c, row, c.row[r].force, S);
             sum[2] += state.set && c.row[r].in_set != (int)contact_force(row, s, 0, false).closed;
         }
@@ -347,11 +346,11 @@ __device__ void take_row(const ContactArguments& c, int pair, int obstacle, cons
     c.entry[r] = time;
     DeviceRow& row = c.row[r];
     if (same && dot3(normal, n) > SAME_PLANE && fabs(gap - c.gap[r]) < 0.1 * c.thickness[r]) {
-        row.hardening *= HARDER;
+        c.hardening[r] = HARDER * c.hardening[r] < HARDEST ? HARDER * c.hardening[r] : HARDEST;
         return;
     }
     row.limit = 0;
-    row.hardening = 1;
+    c.hardening[r] = 1;
     row.in_set = 0;
     row.force = {0, {0, 0, 0}, 0, false};
     for (int k = 0; k < 3; ++k) c.traction[3 * r + k] = 0;
@@ -463,7 +462,7 @@ __device__ double search_along(const ContactArguments& c, int body, int rows, do
         for (int k = threadIdx.x; k < rows; k += CONTACT_THREADS) {
             const DeviceRow& row = c.row[list[k]];
             const double at[3] = {row.s[0] + alpha * row.step[0], row.s[1] + alpha * row.step[1], row.s[2] + alpha * row.step[2]};
-            const ContactForce f = contact_force(row_at(c, list[k], row.hardening), at, row.limit, false);
+            const ContactForce f = contact_force(row_at(c, list[k]), at, row.limit, false);
             work[0] += f.normal * dot3(c.normal + 3 * list[k], row.step) + dot3(f.traction, row.step);
         }
         sum_block(work);
@@ -496,6 +495,7 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) contact_search(con
     if (starts) {  // rows that would be hit without the law need not count as closed where it holds
         const double given2 = sum[2] > sum[1] ? sum[2] : sum[1];
         state.set = !(sum[0] <= c.tolerance * c.tolerance * given2);
+        state.rested = !state.set;
     } else if (phase == PASSED) {
         state.alpha = search_along(c, here.body, state.rows, sum[0], sum[1]);
     } else {
@@ -504,8 +504,12 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) contact_search(con
             const double given2 = sum[2] > sum[1] ? sum[2] : sum[1];
             state.residual = given2 > 0 ? sqrt(sum[0] / given2) : 0;
         }
-        const bool changed = phase == LAST_PASSED && state.residual > c.tolerance;  // the last solve may have changed the law again
-        if (phase != SOLVED && again && entered) ++state.rounds;
+        const double enough = tolerance_of(c.tolerance, state.rested, state.passes, c.passes);
+        const bool changed = phase == LAST_PASSED && state.residual > enough;  // the last solve may have changed the law again
+        if (phase != SOLVED && again && entered) {
+            ++state.rounds;
+            state.rested = 0;
+        }
         again = again && (entered || changed || (phase == SOLVED && sum[0] > 0));
         if (again && entered) state.rows = list_rows(c, here.body);
     }
@@ -549,7 +553,9 @@ __device__ void keep_forces(const ContactArguments& c, const SurfaceNode& n, boo
         const DeviceRow& row = c.row[r];
         const bool closed = well && used(c, r) && row.force.normal > 0;
         double f[3];
+        const double before = c.force[r];
         c.force[r] = closed ? row.force.normal : 0;
+        c.hardening[r] = lasting_hardening(c.hardening[r], before, c.force[r], c.stiffness[r], c.thickness[r]);
         for (int k = 0; k < 3; ++k) {
             c.traction[3 * r + k] = closed ? row.force.traction[k] : 0;
             f[k] = c.force[r] * c.normal[3 * r + k] + c.traction[3 * r + k];

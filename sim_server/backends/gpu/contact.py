@@ -25,8 +25,8 @@ CONTACT_ARGUMENTS, DEVICE_ROW = TEXT.dtype("ContactArguments"), TEXT.dtype("Devi
 KERNELS = ("begin_contact", "contact_forces", "contact_search", "finish_contact")
 TABLE = ("kind", "size", "grid", "place", "cells", "begin", "end")  # arrays of obstacles
 ROWS = (
-    "body_start", "obstacle", "normal", "gap", "drift", "entry", "stiffness", "friction", "thickness", "force",
-    "traction",
+    "body_start", "obstacle", "normal", "gap", "drift", "entry", "stiffness", "friction", "thickness",
+    "hardening", "force", "traction",
 )  # fmt: skip
 
 
@@ -121,7 +121,7 @@ class ContactPasses:
         params["contact_results"], params["reactions"] = results.ctypes.data, reactions.ctypes.data
         params["dx_dv"], params["force_coefficient"] = contact.dx_dv, contact.force_coefficient
         params["tolerance"], params["obstacle_count"] = contact.tolerance, len(contact.obstacles.kind)
-        params["count"], params["capacity"] = self._bodies, len(reactions)
+        params["count"], params["capacity"], params["passes"] = self._bodies, len(reactions), contact.passes
         return params  # type: ignore[no-any-return]
 
     def _solve(self, contact: Contact, first_of_step: int) -> NDArray[Any]:

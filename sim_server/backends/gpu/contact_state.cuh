@@ -37,7 +37,7 @@ struct ContactState {   // of a body
     int by_law;         // 1: the rows that count as closed are those that the law closes
     int hold;           // 1: there was a pass since limits were set
     int rows;           // number of rows that are not empty
-    int unused;
+    int rested;         // 1: the law held where the step began
 };
 
 struct ContactSolve {   // what a solve has beside PcgArguments

@@ -13,8 +13,9 @@
 // It ends when |r| <= Contact::tolerance max(|b|, |b + i H^T f|) with the law as it is then; a last solve to the tolerance of the step follows.
 //
 // The path of each point of the surface is then swept against all obstacles. Those that pass into one get a row where they enter, or a
-// stiffer one where they have it, for this step only, and the passes go on, at most ROUNDS times; what is still left is set to
-// SHORT_OF of the way and counted as clipped.
+// stiffer one where they have it, and the passes go on, at most ROUNDS times; what is still left is set to SHORT_OF of the way and counted
+// as clipped. A row stays stiffer as long as its force would press it through half of its thickness without that, so that a lasting load
+// that the given stiffness does not bear comes to rest.
 #pragma once
 #include "contact_copies.h"
 #include "contact_report.h"
@@ -32,12 +33,14 @@ static void solve_island(Loop& loop, int island, bool resumes) {
     if (p.count > 1) IslandSolver::make_modes(loop, p.c, p.bodies, p.count);
     if (resumes) {
         p.take_up();
+        p.report.clipped = 0;  // those of the last solve count
         p.leave();
         p.move_points();
         p.solve(false);
     } else if (set || p.count > 1) {
         p.start();
-        p.solve(!p.rests());
+        const bool rested = p.rests();
+        p.solve(!rested, rested);
     } else {
         Body& body = loop.body[first];
         const int64_t at = 3 * (int64_t)body.first;
@@ -91,7 +94,7 @@ static bool solve_in_contact(Loop& loop) {
     find_islands(loop);
     solve_islands(loop, false);
     for (int k = 0; k < ROUNDS && c.pair_first >= 0; ++k) {
-        if (!PairDetection(loop, c, loop.y).sweep(c.room)) break;
+        if (!PairDetection(loop, c, loop.y).sweep(c.room, k == 0)) break;
         if (unmake_touched(loop)) return true;
         find_islands(loop);
         solve_islands(loop, true);

@@ -6,7 +6,6 @@
 // Stiffness of a row that carried force in the last step. One that slid counts with its normal stiffness alone.
 static void lasting_stiffness(const Contact& c, const Rows& rows, int k, double* s) {
     const ContactForce f = lasting_contact(c.friction[k], c.force[k], c.traction + 3 * k);
-    c.state[k].hardening = 1;
     contact_stiffness(rows.row(k), f, c.dx_dv * c.force_coefficient, s);
 }
 

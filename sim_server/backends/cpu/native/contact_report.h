@@ -37,7 +37,9 @@ struct ContactEnd : IslandRows {
     void keep(int k, bool closed) const {
         const RowState& s = c.state[k];
         double f[3];
+        const double before = c.force[k];
         c.force[k] = closed ? s.force.normal : 0;
+        c.hardening[k] = lasting_hardening(c.hardening[k], before, c.force[k], c.stiffness[k], c.thickness[k]);
         for (int m = 0; m < 3; ++m) {
             c.traction[3 * k + m] = closed ? s.force.traction[m] : 0;
             f[m] = c.force[k] * c.normal[3 * k + m] + c.traction[3 * k + m];

@@ -11,7 +11,6 @@ struct RowState {                 // of a row in the step under way
     double s[3];                  // displacement of its point by the velocities reached, relative to the other surface [m]
     double step[3];               // by the solution of the pass [m]
     double limit;                 // normal force that limits friction, held in a pass [N]
-    double hardening;             // of the row's stiffness in this step
     int32_t in_set;               // 1: counts as closed in the first pass
     double stiffness[6];          // upper triangle of the force's slope times h^2, world frame [kg]
     ContactForce force;
@@ -63,7 +62,7 @@ struct Contact {
     double* weight;                               // (rows, 4)
     int32_t* obstacle;                            // (rows,) obstacle or other body
     double *normal, *gap, *drift, *entry;         // (rows, 3), (rows,), (rows, 3), (rows,)
-    double *stiffness, *friction, *thickness;     // (rows,)
+    double *stiffness, *friction, *thickness, *hardening;  // (rows,)
     double *force, *traction;                     // (rows,), (rows, 3)
     const double *rotation, *predictor, *free;    // (nodes, 3, 3), (nodes, 3), (nodes,)
     RowState* state;                              // (rows,)
@@ -116,7 +115,10 @@ inline int body_of_row(const Contact& c, int row, bool other) {
 }
 
 // Which of a point's two rows, `pair` and the next one, something that it enters gets: its own, an empty one, or the one that carries less.
-inline int row_for(const Contact& c, int pair, int other) {
+// normal: of two rows of the same other body the one that lies more along it.
+inline int row_for(const Contact& c, int pair, int other, const double* normal = nullptr) {
+    const bool both = normal && c.obstacle[pair] == other && c.obstacle[pair + 1] == other;
+    if (both) return pair + (dot3(c.normal + 3 * (pair + 1), normal) > dot3(c.normal + 3 * pair, normal));
     if (c.obstacle[pair] == other) return pair;
     const bool next = c.obstacle[pair + 1] == other || c.obstacle[pair + 1] < 0;
     return pair + (next || (c.obstacle[pair] >= 0 && c.state[pair + 1].force.normal < c.state[pair].force.normal));
@@ -125,7 +127,6 @@ inline int row_for(const Contact& c, int pair, int other) {
 // A row that a sweep has made has no force, and friction no limit, until a solve has found them.
 inline void take_anew(RowState& state) {
     state.limit = 0;
-    state.hardening = 1;
     state.in_set = 0;
     state.force = {0, {0, 0, 0}, 0, false};
 }
@@ -139,7 +140,7 @@ struct Rows {
 
     ContactRow row(int r) const {
         return {c.normal + 3 * r, c.drift + 3 * r, c.traction + 3 * r, c.gap[r], c.thickness[r],
-                c.state[r].hardening * c.stiffness[r], c.friction[r]};
+                c.hardening[r] * c.stiffness[r], c.friction[r]};
     }
     bool empty(int r) const { return c.obstacle[r] < 0; }
     // set: the row counts as closed whatever its gap

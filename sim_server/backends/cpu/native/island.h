@@ -67,25 +67,37 @@ struct IslandSolver {
     template <class F> void each_body(F f) const {
         for (int m = 0; m < count; ++m) f(loop.body[bodies[m]], m);
     }
+    // The same, bodies side by side: f writes what is its body's alone.
+    template <class F> void beside(F f) const {
+#pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) if (loop.threads > 1)
+        for (int m = 0; m < count; ++m) f(loop.body[bodies[m]], m);
+    }
+    // Sum of f(body, number), in the order of the bodies whatever the number of threads.
+    template <class F> double sum_of(F f) const {
+        std::vector<double>& parts = memory<double>();
+        parts.resize(count);
+        double* const part = parts.data();  // of this thread
+        beside([&](Body& body, int m) { part[m] = f(body, m); });
+        double sum = 0;
+        for (int m = 0; m < count; ++m) sum += part[m];
+        return sum;
+    }
     template <class F> void each_entry(F f) const {
         each_body([&](const Body& body, int) {
             for (int64_t k = 3 * (int64_t)body.first; k < 3 * (int64_t)body.last; ++k) f(k);
         });
     }
     double norm2(const double* a) const {
-        double s = 0;
-        each_body([&](const Body& body, int) {
+        return sum_of([&](const Body& body, int) {
             const int64_t at = 3 * (int64_t)body.first;
-            s += dot((int)(3 * (int64_t)(body.last - body.first)), a + at, a + at);
+            return dot((int)(3 * (int64_t)(body.last - body.first)), a + at, a + at);
         });
-        return s;
     }
     // y = (A + H^T S H) x; returns x . y
     double product(const double* x, double* y) const {
-        double sum = 0;
-        each_body([&](const Body& body, int) {
+        const double sum = sum_of([&](const Body& body, int) {
             const int64_t at = 3 * (int64_t)body.first;
-            sum += multiply(matrix_of(loop, body), x + at, y + at);
+            return multiply(matrix_of(loop, body), x + at, y + at);
         });
         return sum + rows.add_product(x, y);
     }
@@ -215,7 +227,7 @@ struct IslandSolver {
 
     // out = r - A Z m
     void subtract_motion(const double* m, const double* r, double* out) const {
-        each_body([&](const Body& body, int k) {
+        beside([&](const Body& body, int k) {
             const int first = c.mode[bodies[k]];
             for (int64_t i = 3 * (int64_t)body.first; i < 3 * (int64_t)body.last; ++i) {
                 double s = r[i];
@@ -235,7 +247,7 @@ struct IslandSolver {
     // m = (A Z)^T v
     void project_product(const double* v, double* m) const {
         std::fill(m, m + modes, 0.0);
-        each_body([&](const Body& body, int k) {
+        beside([&](const Body& body, int k) {
             const int first = c.mode[bodies[k]];
             if (first < 0) return;
             for (int64_t i = 3 * (int64_t)body.first; i < 3 * (int64_t)body.last; ++i)
@@ -295,27 +307,29 @@ struct IslandSolver {
 
     // to = P^-1 r by the bodies' own. A factor that is not positive definite is left for block Jacobi; false if that is not, either.
     bool apply_single(const double* r, double* to, int& fallbacks) {
-        bool well = true;
-        each_body([&](const Body& body, int m) {
+        int left = 0;
+        const double wrong = sum_of([&](const Body& body, int m) {
             const int64_t at = 3 * (int64_t)body.first;
             const int n = 3 * (body.last - body.first);
             const double norm = std::sqrt(dot(n, r + at, r + at));
-            if (norm == 0) { std::fill(to + at, to + at + n, 0.0); return; }
+            if (norm == 0) { std::fill(to + at, to + at + n, 0.0); return 0; }
             double zr = single[m].apply(r + at, norm, to + at);
             if (!(zr > 0 && zr < INFINITY) && single[m].kind == CHOLESKY) {
                 leave_factor(m);
-                ++fallbacks;
+#pragma omp atomic
+                ++left;
                 zr = single[m].apply(r + at, norm, to + at);
             }
-            well = well && zr > 0 && zr < INFINITY;
+            return zr > 0 && zr < INFINITY ? 0 : 1;
         });
-        return well;
+        fallbacks += left;
+        return wrong == 0;
     }
     // to = preconditioned r; returns to . r
     double apply(const double* r, double* to, double* scratch, int& fallbacks) {
         if (modes) {
             std::fill(c1, c1 + modes, 0.0);
-            each_body([&](const Body& body, int m) {
+            beside([&](const Body& body, int m) {
                 if (c.mode[bodies[m]] >= 0) project(body, r, c1 + c.mode[bodies[m]]);
             });
             solve_dense(E, modes, modes, c1);
@@ -326,7 +340,7 @@ struct IslandSolver {
             project_product(to, c2);
             solve_dense(E, modes, modes, c2);
             for (int k = 0; k < modes; ++k) c1[k] -= c2[k];
-            each_body([&](const Body& body, int m) {
+            beside([&](const Body& body, int m) {
                 if (c.mode[bodies[m]] < 0) return;
                 for (int i = body.first; i < body.last; ++i) {
                     double v[3];
@@ -335,9 +349,10 @@ struct IslandSolver {
                 }
             });
         }
-        double sum = 0;
-        each_entry([&](int64_t k) { sum += to[k] * r[k]; });
-        return sum;
+        return sum_of([&](const Body& body, int) {
+            const int64_t at = 3 * (int64_t)body.first;
+            return dot((int)(3 * (int64_t)(body.last - body.first)), to + at, r + at);
+        });
     }
 
     // Solves from zero; r: its residual at the end.
@@ -380,11 +395,9 @@ struct IslandSolver {
             ++out.iterations;
             if (!(pq > 0)) return finish(BREAKDOWN_MATRIX, true_residual());
             const double alpha = zr / pq;
-            r2 = 0;
-            each_entry([&](int64_t k) {
-                x[k] += alpha * p[k];
-                r[k] -= alpha * q[k];
-                r2 += r[k] * r[k];
+            r2 = sum_of([&](const Body& body, int) {
+                const int64_t at = 3 * (int64_t)body.first;
+                return descend((int)(3 * (int64_t)(body.last - body.first)), alpha, p + at, q + at, x + at, r + at);
             });
             if (r2 > goal) continue;
             r2 = true_residual();

@@ -96,10 +96,11 @@ struct ObstacleSweep : IslandRows {
         const double *n = c.normal + 3 * k, normal[3] = {n[0], n[1], n[2]}, gap = c.gap[k];
         set_plane(k, obstacle, from, begin, end, t);
         if (same && dot3(normal, c.normal + 3 * k) > SAME_PLANE && std::fabs(gap - c.gap[k]) < 0.1 * c.thickness[k]) {
-            c.state[k].hardening *= HARDER;
+            c.hardening[k] = std::min(HARDER * c.hardening[k], HARDEST);
             return;
         }
         take_anew(c.state[k]);
+        c.hardening[k] = 1;
         std::fill(c.traction + 3 * k, c.traction + 3 * k + 3, 0.0);
     }
 

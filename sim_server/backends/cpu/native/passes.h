@@ -30,7 +30,6 @@ struct Passes : IslandRows {
         each_row([&](int k, RowState&) { earliest = std::min(earliest, c.entry[k]); });
         each_row([&](int k, RowState& s) {
             s.limit = c.force[k];
-            s.hardening = 1;
             s.in_set = is_tie(c, k) || c.force[k] > 0 || (c.entry[k] <= 1 && c.entry[k] <= earliest + FIRST);
             closed += s.in_set;
         });
@@ -184,8 +183,8 @@ struct Passes : IslandRows {
         return same;
     }
 
-    // set: begin with the rows marked by choose_set.
-    void solve(bool set) {
+    // set: begin with the rows marked by choose_set. rested: the law held where it began.
+    void solve(bool set, bool rested = false) {
         bool last = false, spent = false, linear = true;
         each_row([&](int k, RowState&) { linear = linear && is_tie(c, k); });
         for (int k = 0;; ++k) {
@@ -193,12 +192,14 @@ struct Passes : IslandRows {
             const double size = balance();
             if (!std::isfinite(size)) { result.status = NOT_FINITE; return; }
             report.residual = given > 0 ? size / given : 0;
-            if (spent || (last && report.residual <= c.tolerance)) break;  // the last solve may have changed the law again
+            const bool holds = report.residual <= tolerance_of(c.tolerance, rested, report.passes, c.passes);
+            if (spent || (last && holds)) break;  // the last solve may have changed the law again
             const double goal = loop.body[bodies[0]].now.tolerance * given;
             const bool by_law = k > 0 || !set || set_is_law();
             last = by_law && (linear || size <= c.tolerance * given);
             if (last && size <= goal) {  // there is nothing left to solve
                 result.residual = report.residual;
+                if (!cut()) result.status = CONVERGED;  // whatever an earlier solve of the step came to
                 return;
             }
             if (!last && report.passes >= c.passes) break;
