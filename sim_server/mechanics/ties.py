@@ -61,8 +61,9 @@ def ties_alone(world: World, ties: Ties) -> Contact:
     zeros, vectors = (np.zeros(n) for _ in range(5)), (np.zeros((n, 3)) for _ in range(3))
     return Contact(
         shapes, np.zeros(m + 1, np.int32), ties.corner, ties.weight, np.full(n, -1, np.int32), next(vectors),
-        next(zeros), next(vectors), np.full(n, 2.0), next(zeros), next(zeros), next(zeros), np.ones(n), next(zeros), next(vectors),
-        world.predictor, world.free, world.dx_dv, world.force_coefficient, 16, 1e-3, None, ties,
+        next(zeros), next(vectors), np.full(n, 2.0), next(zeros), next(zeros), next(zeros), np.ones(n),
+        next(zeros), next(vectors), world.predictor, world.free, world.dx_dv, world.force_coefficient, 16, 1e-3,
+        None, ties,
     )  # fmt: skip
 
 
