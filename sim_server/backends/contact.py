@@ -25,6 +25,23 @@ class Obstacles:
 
 
 @dataclass(frozen=True)
+class Faces:
+    """Triangles of surfaces, each with a row against obstacles (kernels/triangle_shape.cuh).
+
+    start: (bodies + 1,) first row of each body. triangle: (triangles, 3) nodes of the scene, outward; in order of rows
+    owns: (triangles,) bit k is set where the edge from corner k to the next one belongs to the triangle, as each edge
+        does to one
+    friction: (bodies, obstacles) coefficients. gravity: (3,) [m/s2]
+    """
+
+    start: Int32
+    triangle: Int32
+    owns: Int32
+    friction: Float64
+    gravity: Float64
+
+
+@dataclass(frozen=True)
 class Surfaces:
     """What bodies need to touch each other (detection: kernels/pair_detection.cuh).
 
@@ -48,11 +65,14 @@ class Contact:
     """Rows of contacts, which launches among `assemble` fill in each step, and options.
 
     A row is a place where a surface may touch something: sum_a weight_a x_{corner_a}, against a plane that stands for
-    it in this step. The first rows are against obstacles, two for each surface node: the node, with weight 1. As many
-    rows between bodies follow if there are `surfaces`: a node with weight 1 and a triangle of another body with weights
-    below 0, which the loop sets.
+    it in this step. Those of a sort ascend by body; first come those against obstacles:
 
-    body_start: (bodies + 1,) rows of each body against obstacles; rows ascend by body
+        two for each surface node: the node, with weight 1
+        one for each triangle, if there are `faces`: its corners, which the loop sets
+        two for each surface node, if there are `surfaces`: the node with weight 1 and a triangle of another body with
+            weights below 0, which the loop sets
+
+    body_start: (bodies + 1,) rows of the nodes of each body against obstacles
     corner: (rows, 4) nodes of the scene; -1: fewer. weight: (rows, 4)
     obstacle: (rows,) number of the obstacle, or of the other body; -1: the row is empty
     normal: (rows, 3) unit, out of the obstacle, world frame
@@ -66,6 +86,8 @@ class Contact:
         obstacle (0 for another), traction turned with the normal. Out: of this step
     predictor: (nodes, 3), dx_dv, force_coefficient, free: (nodes,) of the world (mechanics/world.py)
     passes: most solves of a step. tolerance: of the contact residual
+    dropped: (surface nodes,) how often something that touches found no row; of a triangle at one of its nodes
+    faces: None where triangles have no rows of their own
     surfaces: None where bodies do not touch each other
     """
 
@@ -89,4 +111,6 @@ class Contact:
     force_coefficient: float
     passes: int
     tolerance: float
+    dropped: Int32
+    faces: Faces | None
     surfaces: Surfaces | None

@@ -35,7 +35,7 @@ from pydantic import BeforeValidator, Field
 from sim_server.arrays import Float64, Int32
 from sim_server.backends.base import Launch
 from sim_server.backends.contact import Contact as ContactInput
-from sim_server.backends.contact import Obstacles, Surfaces
+from sim_server.backends.contact import Faces, Obstacles, Surfaces
 from sim_server.backends.declarations import Declarations
 from sim_server.effects._base import Effect, EffectUpdates
 from sim_server.errors import InputError
@@ -43,7 +43,7 @@ from sim_server.mechanics.signed_distance import signed_distance_grid
 from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.world import Body, World
 from sim_server.mesh.box_tree import box_tree
-from sim_server.mesh.surface import surface_triangles
+from sim_server.mesh.surface import edge_owners, surface_triangles
 from sim_server.scene.obstacles import Obstacle
 from sim_server.scene.parameters import NotNegative, Parameters, Positive, as_tuple
 from sim_server.scene.pose import quaternion
@@ -107,22 +107,24 @@ class Contact(Effect):
         bounds = [_thickness(params, body) for body in world.bodies]
         self._shapes(max(bounds))
         self._poses()
+        self.dropped = np.zeros(len(self.node), np.int32)
+        self._pair_friction = _pair_friction(world, params)
         touching = len(world.bodies) > 1 and params.between
-        rows = (4 if touching else 2) * len(self.node)
-        corner, weight = np.full((rows, 4), -1, np.int32), np.zeros((rows, 4))
-        corner[: 2 * len(self.node), 0] = np.repeat(self.node, 2)
-        weight[:, 0] = 1
-        thickness = np.tile(np.repeat(np.array(bounds)[self.body], 2), 2 if touching else 1)
         start = np.concatenate([[0], np.cumsum([2 * len(s) for s in surfaces])]).astype(np.int32)
+        faces = _faces(world, self._pair_friction, int(start[-1]))
+        body = [np.repeat(self.body, 2), _body_of_rows(faces.start) if faces else (), np.repeat(self.body, 2 * touching)]
+        thickness = np.array(bounds)[np.concatenate(body).astype(np.int32)]
+        rows = len(thickness)
+        corner, weight = np.full((rows, 4), -1, np.int32), np.zeros((rows, 4))
+        corner[: start[-1], 0] = np.repeat(self.node, 2)
+        weight[:, 0] = 1
         self._input = ContactInput(
             self._table, start, corner, weight, np.full(rows, -1, np.int32), np.zeros((rows, 3)), np.zeros(rows),
             np.zeros((rows, 3)), np.full(rows, 2.0), np.zeros(rows), np.zeros(rows),
             thickness, np.zeros(rows), np.zeros((rows, 3)),
             world.predictor, world.free, world.dx_dv, world.force_coefficient, params.passes, params.tolerance,
-            _surfaces(world, params, self.node, self.body) if touching else None,
+            self.dropped, faces, _surfaces(world, params, self.node, self.body) if touching else None,
         )  # fmt: skip
-        self.dropped = np.zeros(len(self.node), np.int32)
-        self._pair_friction = _pair_friction(world, params)
         arrays = [*vars(self).values(), *vars(self._table).values(), *vars(self._input).values()]
         world.backend.keep(*(a for a in arrays if isinstance(a, np.ndarray)), exact=True)
 
@@ -268,6 +270,24 @@ def _surface(world: World, body: Body) -> Int32:
     """Returns the free nodes of a body's surface, in numbers of the scene, ascending."""
     nodes = np.unique(surface_triangles(body.mesh.tets)) + body.first
     return nodes[world.free[nodes] > 0].astype(np.int32)
+
+
+def _faces(world: World, friction: Float64, first: int) -> Faces | None:
+    """Returns the triangles that need rows against obstacles, the first of which is `first`.
+
+    None where there are none: corners are enough against planes, and a GPU has rows of nodes alone.
+    """
+    if world.backend.name != "cpu" or all(o.shape == "plane" for o in world.obstacles):
+        return None
+    triangles = [surface_triangles(b.mesh.tets) + np.int32(b.first) for b in world.bodies]
+    start = first + np.cumsum([0, *map(len, triangles)])
+    triangle = np.concatenate(triangles).astype(np.int32)
+    return Faces(start.astype(np.int32), triangle, edge_owners(triangle), friction, np.array(world.gravity))
+
+
+def _body_of_rows(start: Int32) -> Int32:
+    """Returns the body of each row from start[0] on."""
+    return np.repeat(np.arange(len(start) - 1, dtype=np.int32), np.diff(start))
 
 
 def _surfaces(world: World, params: Params, node: Int32, body: Int32) -> Surfaces:

@@ -214,7 +214,7 @@ struct RowMemory {       // what a row remembers of the last step
     double force, normal[3], traction[3];
 };
 
-HOST_DEVICE RowMemory memory_of(const SurfaceTables& c, int row) {
+template <class Tables> HOST_DEVICE RowMemory memory_of(const Tables& c, int row) {
     RowMemory m = {c.obstacle[row], c.force[row], {}, {}};
     for (int k = 0; k < 3; ++k) {
         m.normal[k] = c.normal[3 * row + k];
@@ -223,8 +223,8 @@ HOST_DEVICE RowMemory memory_of(const SurfaceTables& c, int row) {
     return m;
 }
 
-// Takes up the forces of the row of memory with the same other body, if there is one.
-HOST_DEVICE void recall(const SurfaceTables& c, int row, const RowMemory* last, int count) {
+// Takes up the forces of the row of memory that touched the same, if there is one.
+template <class Tables> HOST_DEVICE void recall(const Tables& c, int row, const RowMemory* last, int count) {
     for (int r = 0; r < count; ++r) {
         if (last[r].other != c.obstacle[row]) continue;
         c.force[row] = last[r].force;

@@ -25,3 +25,14 @@ def surface_triangles(tets: NDArray[np.integer]) -> Int32:
     starts = np.concatenate([[True], differs])  # where a new face begins in sorted order
     single = starts & np.concatenate([differs, [True]])
     return faces[np.sort(order[single])].astype(np.int32)
+
+
+def edge_owners(triangles: Int32) -> Int32:
+    """Returns which edges each triangle owns, (t,): bit k for the edge from its corner k to the next one.
+
+    Each edge belongs to the first of the triangles that have it.
+    """
+    edges = np.sort(np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2), axis=2).reshape(-1, 2)
+    first = np.zeros(len(edges), bool)
+    first[np.unique(edges, axis=0, return_index=True)[1]] = True
+    return (first.reshape(-1, 3) @ [1, 2, 4]).astype(np.int32)

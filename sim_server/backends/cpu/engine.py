@@ -165,19 +165,28 @@ class _NativeContact:
             "island": np.zeros(bodies, np.int32), "island_start": np.zeros(bodies + 1, np.int32),
             "island_rows": np.zeros(bodies, np.int32), "near": np.zeros(bodies, np.int32),
             "was_near": np.zeros(bodies, np.int32),
-            "touched": np.zeros(bodies, np.int32), "site_body": self._site_body(contact),
+            "touched": np.zeros(bodies, np.int32), "used": np.zeros(rows, np.int32),
+            "row_body": self._row_body(contact), "node_site": np.full(loop.nodes, -1, np.int32),
         }  # fmt: skip
+        sites = contact.body_start[-1] // 2
+        self._own["site_body"] = self._own["row_body"][: 2 * sites : 2].copy()
+        self._own["node_site"][contact.corner[: 2 * sites : 2, 0]] = np.arange(sites)
         self.native = structs.Contact(
             obstacle_count=count, passes=contact.passes, tolerance=contact.tolerance, dx_dv=contact.dx_dv,
             force_coefficient=contact.force_coefficient, state=c.addressof(self._state), pair_first=-1,
             report=c.addressof(self._report), result=c.addressof(self._result),
         )  # fmt: skip
+        if faces := contact.faces:
+            self._own |= {
+                "face_start": faces.start, "face": faces.triangle, "face_owns": faces.owns,
+                "face_friction": faces.friction, "gravity": faces.gravity,
+            }  # fmt: skip
         if contact.surfaces:
             self._touch(contact.surfaces, contact.free, rows, loop)
         for name in ("kind", "size", "grid", "place", "cells", "begin", "end"):
             setattr(self.native.obstacles, name, getattr(obstacles, name).ctypes.data)
         for name in ("body_start", "corner", "weight", "obstacle", "normal", "gap", "drift", "entry", "stiffness",
-                     "friction", "thickness", "force", "traction", "predictor", "free"):  # fmt: skip
+                     "friction", "thickness", "force", "traction", "predictor", "free", "dropped"):  # fmt: skip
             setattr(self.native, name, getattr(contact, name).ctypes.data)
         for name, array in self._own.items():
             setattr(self.native, name, array.ctypes.data)
@@ -185,9 +194,12 @@ class _NativeContact:
         loop.contact = c.addressof(self.native)
 
     @staticmethod
-    def _site_body(contact: Contact) -> NDArray[np.int32]:
-        counts = np.diff(contact.body_start) // 2
-        return np.repeat(np.arange(len(counts), dtype=np.int32), counts)
+    def _row_body(contact: Contact) -> NDArray[np.int32]:
+        """Returns the body of each row."""
+        starts = [contact.body_start]
+        starts += [contact.faces.start] if contact.faces else []
+        starts += [contact.body_start] if contact.surfaces else []
+        return np.concatenate([np.repeat(np.arange(len(s) - 1, dtype=np.int32), np.diff(s)) for s in starts])
 
     def _touch(self, surfaces: Surfaces, free: Reals, rows: int, loop: structs.Loop) -> None:
         """Adds what bodies need to touch each other."""
@@ -195,13 +207,13 @@ class _NativeContact:
         ranges = [(b.first, b.last) for b in c.cast(loop.body, c.POINTER(structs.Body))[: loop.bodies]]
         self._boxes = [(structs.Box * max(n, 1))() for n in (len(surfaces.tree_child), loop.bodies)]
         self._own |= {
-            "node_site": surfaces.node_site, "triangle": surfaces.triangle, "tree_start": surfaces.tree_start,
+            "triangle": surfaces.triangle, "tree_start": surfaces.tree_start,
             "tree_child": surfaces.tree_child, "pair_friction": surfaces.friction, "gravity": surfaces.gravity,
             "modes": np.zeros((loop.nodes, 18)), "coarse": np.zeros((most + 4, most)), "lever": np.zeros((rows, 8)),
             "unheld": np.array([bool((free[first:last] > 0).all()) for first, last in ranges], np.int32),
         }  # fmt: skip
         self.native.tree_box, self.native.body_box = map(c.addressof, self._boxes)
-        self.native.pair_first, self.native.most_modes = rows // 2, most
+        self.native.pair_first, self.native.most_modes = rows - self._input.body_start[-1], most
 
 
 def _binding(launch: CpuLaunch) -> structs.Binding:

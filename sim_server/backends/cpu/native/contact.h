@@ -18,10 +18,31 @@
 #pragma once
 #include "contact_copies.h"
 #include "contact_report.h"
+#include "faces.h"
 #include "island_groups.h"
 #include "obstacle_sweep.h"
 #include "pairs.h"
 #include "passes.h"
+
+// Gives points and triangles that y takes into an obstacle rows there. Returns whether there are such.
+static bool sweep_obstacles(Passes& p) {
+    const bool points = ObstacleSweep(p).sweep(), faces = FaceSweep(p).sweep();
+    if (!points && !faces) return false;
+    p.list_rows();
+    p.move_points();
+    return true;
+}
+
+// Sets those that y still takes into one back; returns the number of nodes.
+static int hold_back(const Passes& p) {
+    int clipped = ObstacleSweep(p).clip();
+    for (int k = 0; k < HOLDS; ++k) {
+        const int faces = FaceSweep(p).clip();
+        if (!faces) break;
+        clipped += faces + ObstacleSweep(p).clip();
+    }
+    return clipped;
+}
 
 // The step of an island whose rows are detected; of a body alone as without contact where nothing is touched.
 static void solve_island(Loop& loop, int island, bool resumes) {
@@ -45,7 +66,7 @@ static void solve_island(Loop& loop, int island, bool resumes) {
         if (p.result.status != NOT_FINITE) {
             p.move_points();
             const bool acts = p.apply_law(false);
-            outside = !ObstacleSweep(p).sweep() && !acts;
+            outside = !sweep_obstacles(p) && !acts;
             if (!outside) {
                 p.leave();
                 p.solve(false);
@@ -53,11 +74,11 @@ static void solve_island(Loop& loop, int island, bool resumes) {
         }
     }
     for (int k = 0; k < ROUNDS && !outside && p.result.status != NOT_FINITE; ++k) {
-        outside = !ObstacleSweep(p).sweep();
+        outside = !sweep_obstacles(p);
         if (!outside) p.solve(false);
     }
     if (p.result.status == NOT_FINITE) p.each_entry([&](int64_t k) { p.y[k] = NAN; });  // the kernel `advance` takes the bodies back
-    else if (!outside) p.report.clipped += ObstacleSweep(p).clip();
+    else if (!outside) p.report.clipped += hold_back(p);
     for (int m = 0; m < p.count; ++m) {
         p.c.result[p.bodies[m]] = p.result;
         p.c.report[p.bodies[m]] = p.report;

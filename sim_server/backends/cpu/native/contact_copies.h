@@ -24,6 +24,7 @@ static void add_contacts(const Loop& loop, const Body& body, double* target) {
         rows.add_blocks(k, s, block_of);
     };
     for (int k = c.body_start[index]; k < c.body_start[index + 1]; ++k) add(k);
+    for (int k = c.face_start ? c.face_start[index] : 0; c.face_start && k < c.face_start[index + 1]; ++k) add(k);
     if (c.pair_first < 0 || !c.near[index]) return;
     for (int i = 0; i < loop.bodies; ++i)
         for (int k = c.pair_first + c.body_start[i]; c.near[i] && k < c.pair_first + c.body_start[i + 1]; ++k)

@@ -48,7 +48,7 @@ struct ContactEnd : IslandRows {
             double u[3];
             rotated(c.rotation + 9 * (int64_t)node, y + 3 * (int64_t)node, u);
             for (int m = 0; m < 3; ++m)
-                displacement[a > 0][m] += c.weight[CORNERS * k + a] * c.dx_dv * (c.predictor[3 * (int64_t)node + m] + u[m]);
+                displacement[is_other_side(c, k, a)][m] += c.weight[CORNERS * k + a] * c.dx_dv * (c.predictor[3 * (int64_t)node + m] + u[m]);
         }
         const int body = body_of_row(c, k, false);
         ++c.report[body].contacts;

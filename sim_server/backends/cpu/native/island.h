@@ -122,9 +122,10 @@ struct IslandSolver {
             for (int a = 0; a < CORNERS; ++a) {
                 const int node = c.corner[CORNERS * r + a];
                 if (node < 0 || c.free[node] == 0) continue;
-                const Body& body = loop.body[body_of_row(c, r, a > 0)];
+                const bool other = is_other_side(c, r, a);
+                const Body& body = loop.body[body_of_row(c, r, other)];
                 const double w = c.weight[CORNERS * r + a], *x = loop.x + 3 * (int64_t)node, *o = loop.x + 3 * (int64_t)body.first;
-                double* side = lever + 4 * (a > 0);
+                double* side = lever + 4 * other;
                 side[0] += w;
                 for (int m = 0; m < 3; ++m) side[1 + m] += w * (x[m] - o[m]);
             }

@@ -40,7 +40,7 @@ static void find_islands(Loop& loop) {
         for (int j = i; j < loop.bodies; ++j) {
             if (root(j) != i) continue;
             c.island[bodies++] = j;
-            rows += (c.pair_first >= 0 ? 2 : 1) * (c.body_start[j + 1] - c.body_start[j]);
+            each_range_of(c, j, [&](int first, int last) { rows += last - first; });
         }
     }
     c.island_start[c.islands] = bodies;

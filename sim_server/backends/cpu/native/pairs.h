@@ -17,7 +17,7 @@ struct PairDetection {
         : loop(loop), c(c), tables{loop.bodies, c.body_start, c.corner, c.weight, c.obstacle, c.normal, c.gap, c.entry, c.stiffness, c.friction,
                                    c.thickness, c.force, c.traction, c.pair_first, c.site_body, c.node_site, c.triangle, c.tree_start,
                                    c.tree_child, c.tree_box, c.body_box, c.near, c.pair_friction},
-          motion{loop.x, c.predictor, y, c.rotation, c.free, c.dx_dv, c.force_coefficient, c.gravity} {}
+          motion(motion_of(c, loop.x, y)) {}
 
     void fit() const {
         for (int i = 0; i < loop.bodies; ++i) { fit_body(tables, motion, i); c.near[i] = c.touched[i] = 0; }
