@@ -39,11 +39,11 @@ from sim_server.backends.contact import Faces, Obstacles, Surfaces
 from sim_server.backends.declarations import Declarations
 from sim_server.effects._base import Effect, EffectUpdates
 from sim_server.errors import InputError
-from sim_server.mechanics.signed_distance import signed_distance_grid
+from sim_server.mechanics.signed_distance import closed_surface, signed_distance_grid, signed_distances
 from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.world import Body, World
 from sim_server.mesh.box_tree import box_tree
-from sim_server.mesh.surface import edge_owners, surface_triangles
+from sim_server.mesh.surface import edge_owners, surface_edges, surface_triangles
 from sim_server.scene.obstacles import Obstacle
 from sim_server.scene.parameters import NotNegative, Parameters, Positive, as_tuple
 from sim_server.scene.pose import quaternion
@@ -112,7 +112,10 @@ class Contact(Effect):
         touching = len(world.bodies) > 1 and params.between
         start = np.concatenate([[0], np.cumsum([2 * len(s) for s in surfaces])]).astype(np.int32)
         faces = _faces(world, self._pair_friction, int(start[-1]))
-        body = [np.repeat(self.body, 2), _body_of_rows(faces.start) if faces else (), np.repeat(self.body, 2 * touching)]
+        pairs = int(faces.start[-1] if faces else start[-1]) + int(start[-1])  # the row after those of nodes and bodies
+        surfaces_of = _surfaces(world, params, self.node, self.body, pairs, bounds) if touching else None
+        body = [np.repeat(self.body, 2), _body_of_rows(faces.start) if faces else ()]
+        body += [body[0], _body_of_rows(surfaces_of.edge_start)] if surfaces_of else []
         thickness = np.array(bounds)[np.concatenate(body).astype(np.int32)]
         rows = len(thickness)
         corner, weight = np.full((rows, 4), -1, np.int32), np.zeros((rows, 4))
@@ -122,8 +125,8 @@ class Contact(Effect):
             self._table, start, corner, weight, np.full(rows, -1, np.int32), np.zeros((rows, 3)), np.zeros(rows),
             np.zeros((rows, 3)), np.full(rows, 2.0), np.zeros(rows), np.zeros(rows),
             thickness, np.zeros(rows), np.zeros((rows, 3)),
-            world.predictor, world.free, world.dx_dv, world.force_coefficient, params.passes, params.tolerance,
-            self.dropped, faces, _surfaces(world, params, self.node, self.body) if touching else None,
+            world.predictor, world.free, world.mass, world.dx_dv, world.force_coefficient, params.passes,
+            params.tolerance, self.dropped, faces, surfaces_of,
         )  # fmt: skip
         arrays = [*vars(self).values(), *vars(self._table).values(), *vars(self._input).values()]
         world.backend.keep(*(a for a in arrays if isinstance(a, np.ndarray)), exact=True)
@@ -185,6 +188,8 @@ class Contact(Effect):
     def connect(self, simulation: EffectUpdates) -> None:
         self._simulation = simulation
         self._warn_of_nodes_inside()
+        if self._input.surfaces:
+            self._warn_of_bodies_inside()
 
     def _warn_of_nodes_inside(self) -> None:
         """Logs which objects begin deeper in an obstacle than their thickness: they are pushed out, fast."""
@@ -204,6 +209,29 @@ class Contact(Effect):
                     body.name, self.obstacles[nearest[worst]].name, self.node[worst] - body.first, -distance[worst],
                     found.size,
                 )  # fmt: skip
+
+    def _warn_of_bodies_inside(self) -> None:
+        """Logs which objects begin deeper in another one than their thickness: they are pushed out, or stay inside."""
+        w = self.world
+        for other in w.bodies:
+            corners, low, high = None, w.x[other.nodes].min(axis=0), w.x[other.nodes].max(axis=0)
+            for body in w.bodies:
+                nodes = self.node[self.body == body.index]
+                nodes = nodes[((w.x[nodes] > low) & (w.x[nodes] < high)).all(axis=1)]
+                if body is other or not len(nodes):
+                    continue
+                try:
+                    corners = corners or closed_surface(w.x, surface_triangles(other.mesh.tets) + np.int64(other.first))
+                except InputError:
+                    break  # its sides cannot be told
+                distance = signed_distances(corners, w.x[nodes])
+                worst = int(distance.argmin())
+                found = int(np.count_nonzero(distance < -_thickness(self.params, body)))
+                if found:
+                    log.warning(
+                        "object %r begins inside object %r: node %d is %.3g m deep (%d such nodes)",
+                        body.name, other.name, nodes[worst] - body.first, -distance[worst], found,
+                    )  # fmt: skip
 
     @property
     def targets(self) -> dict[str, Float64]:
@@ -290,17 +318,28 @@ def _body_of_rows(start: Int32) -> Int32:
     return np.repeat(np.arange(len(start) - 1, dtype=np.int32), np.diff(start))
 
 
-def _surfaces(world: World, params: Params, node: Int32, body: Int32) -> Surfaces:
-    """Returns what bodies need to touch each other. node, body: surface nodes and their bodies."""
+def _surfaces(
+    world: World, params: Params, node: Int32, body: Int32, first: int, thickness: Sequence[float]
+) -> Surfaces:  # fmt: skip
+    """Returns what bodies need to touch each other.
+
+    node, body: surface nodes and their bodies. first: row of the first edge. thickness: of each body [m]
+    """
     site = np.full(world.nodes, -1, np.int32)
     site[node] = np.arange(len(node), dtype=np.int32)
     triangles = [surface_triangles(b.mesh.tets) + np.int32(b.first) for b in world.bodies]
     trees = [box_tree(world.rest[t].mean(axis=1)) for t in triangles]
-    boxes, first = np.cumsum([0, *map(len, trees)]), np.cumsum([0, *map(len, triangles)])
-    shifted = [np.where(t < 0, t - k, t + box) for t, box, k in zip(trees, boxes, first, strict=False)]
+    boxes, first_triangle = np.cumsum([0, *map(len, trees)]), np.cumsum([0, *map(len, triangles)])
+    shifted = [np.where(t < 0, t - k, t + box) for t, box, k in zip(trees, boxes, first_triangle, strict=False)]
+    triangle = np.concatenate(triangles).astype(np.int32)
+    edge, opposite, of_triangle = surface_edges(triangle)
+    length = np.linalg.norm(world.rest[edge[:, 0]] - world.rest[edge[:, 1]], axis=1)
+    ends = np.concatenate([[0], np.cumsum((of_triangle >= 0).sum(axis=1))])[first_triangle]
+    mean = np.add.reduceat(length, ends[:-1]) / np.diff(ends)
     return Surfaces(
-        body, site, np.concatenate(triangles).astype(np.int32), boxes.astype(np.int32),
-        np.concatenate(shifted).astype(np.int32), _friction_of_bodies(world, params), np.array(world.gravity),
+        body, site, triangle, boxes.astype(np.int32), np.concatenate(shifted).astype(np.int32),
+        (first + 2 * ends).astype(np.int32), edge, opposite, of_triangle, mean, np.array(thickness),
+        _friction_of_bodies(world, params), np.array(world.gravity),
     )  # fmt: skip
 
 

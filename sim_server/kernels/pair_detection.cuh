@@ -38,13 +38,12 @@ struct SurfaceTables {        // of all bodies (backends/contact.py)
     Box *tree_box, *body_box;                // (tree,), (bodies,)
     const int* near;                         // (bodies,) 1: its box meets another's, and its tree is fitted
     const double* pair_friction;             // (bodies, bodies)
+    const double* body_thickness;            // (bodies,)
 };
 
 HOST_DEVICE int sites_before(const SurfaceTables& c, int body) { return c.body_start[body] / 2; }
 HOST_DEVICE int node_of_site(const SurfaceTables& c, int site) { return c.corner[CORNERS * 2 * site]; }
-HOST_DEVICE double thickness_of(const SurfaceTables& c, int body) {
-    return c.body_start[body] < c.body_start[body + 1] ? c.thickness[c.body_start[body]] : 0;
-}
+HOST_DEVICE double thickness_of(const SurfaceTables& c, int body) { return c.body_thickness[body]; }
 
 // --- motion and boxes ---------------------------------------------------------------------------------------------------------------
 

@@ -186,7 +186,7 @@ class _NativeContact:
         for name in ("kind", "size", "grid", "place", "cells", "begin", "end"):
             setattr(self.native.obstacles, name, getattr(obstacles, name).ctypes.data)
         for name in ("body_start", "corner", "weight", "obstacle", "normal", "gap", "drift", "entry", "stiffness",
-                     "friction", "thickness", "force", "traction", "predictor", "free", "dropped"):  # fmt: skip
+                     "friction", "thickness", "force", "traction", "predictor", "free", "dropped", "mass"):  # fmt: skip
             setattr(self.native, name, getattr(contact, name).ctypes.data)
         for name, array in self._own.items():
             setattr(self.native, name, array.ctypes.data)
@@ -198,7 +198,7 @@ class _NativeContact:
         """Returns the body of each row."""
         starts = [contact.body_start]
         starts += [contact.faces.start] if contact.faces else []
-        starts += [contact.body_start] if contact.surfaces else []
+        starts += [contact.body_start, contact.surfaces.edge_start] if contact.surfaces else []
         return np.concatenate([np.repeat(np.arange(len(s) - 1, dtype=np.int32), np.diff(s)) for s in starts])
 
     def _touch(self, surfaces: Surfaces, free: Reals, rows: int, loop: structs.Loop) -> None:
@@ -206,14 +206,20 @@ class _NativeContact:
         most = min(6 * loop.bodies, MOST_MODES)
         ranges = [(b.first, b.last) for b in c.cast(loop.body, c.POINTER(structs.Body))[: loop.bodies]]
         self._boxes = [(structs.Box * max(n, 1))() for n in (len(surfaces.tree_child), loop.bodies)]
+        self._wings = (structs.EdgeWings * max(len(surfaces.edge), 1))()
         self._own |= {
+            "edge_start": surfaces.edge_start, "edge": surfaces.edge, "edge_opposite": surfaces.opposite,
+            "triangle_edge": surfaces.triangle_edge, "edge_length": surfaces.edge_length,
+            "body_thickness": surfaces.thickness, "facing": np.full(2 * len(surfaces.edge), -1, np.int32),
             "triangle": surfaces.triangle, "tree_start": surfaces.tree_start,
             "tree_child": surfaces.tree_child, "pair_friction": surfaces.friction, "gravity": surfaces.gravity,
             "modes": np.zeros((loop.nodes, 18)), "coarse": np.zeros((most + 4, most)), "lever": np.zeros((rows, 8)),
             "unheld": np.array([bool((free[first:last] > 0).all()) for first, last in ranges], np.int32),
         }  # fmt: skip
         self.native.tree_box, self.native.body_box = map(c.addressof, self._boxes)
-        self.native.pair_first, self.native.most_modes = rows - self._input.body_start[-1], most
+        self.native.wings = c.addressof(self._wings)
+        self.native.pair_first = rows - self._input.body_start[-1] - 2 * len(surfaces.edge)
+        self.native.most_modes = most
 
 
 def _binding(launch: CpuLaunch) -> structs.Binding:

@@ -111,6 +111,7 @@ static void solve_in_contact(Loop& loop) {
         if (!PairDetection(loop, c, loop.y).sweep(c.room)) break;
         find_islands(loop);
         solve_islands(loop, true);
+        if (k == ROUNDS - 1) PairDetection(loop, c, loop.y).hold_back(c.room, loop.y);
     }
     for (int i = 0; i < c.islands; ++i) {
         Passes p(loop, i);

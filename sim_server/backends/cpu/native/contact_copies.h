@@ -23,10 +23,18 @@ static void add_contacts(const Loop& loop, const Body& body, double* target) {
         contact_stiffness(rows.row(k), f, c.dx_dv * c.force_coefficient, s);
         rows.add_blocks(k, s, block_of);
     };
-    for (int k = c.body_start[index]; k < c.body_start[index + 1]; ++k) add(k);
-    for (int k = c.face_start ? c.face_start[index] : 0; c.face_start && k < c.face_start[index + 1]; ++k) add(k);
+    auto add_all = [&](int first, int last) {
+        for (int k = first; k < last; ++k) add(k);
+    };
+    each_obstacle_range_of(c, index, add_all);
     if (c.pair_first < 0 || !c.near[index]) return;
-    for (int i = 0; i < loop.bodies; ++i)
-        for (int k = c.pair_first + c.body_start[i]; c.near[i] && k < c.pair_first + c.body_start[i + 1]; ++k)
-            if (i == index || c.obstacle[k] == index) add(k);
+    auto add_shared = [&](int first, int last) {
+        for (int k = first; k < last; ++k)
+            if (c.obstacle[k] == index) add(k);
+    };
+    for (int i = 0; i < loop.bodies; ++i) {
+        if (!c.near[i]) continue;
+        if (i == index) each_pair_range_of(c, i, add_all);
+        else each_pair_range_of(c, i, add_shared);
+    }
 }

@@ -18,18 +18,21 @@ static void find_islands(Loop& loop) {
     auto finite = [&](int i) {
         const Body& body = loop.body[i];
         const int64_t at = 3 * (int64_t)body.first;
-        return std::isfinite(dot(3 * (body.last - body.first), loop.b + at, loop.b + at));
+        const int size = 3 * (body.last - body.first);
+        return std::isfinite(dot(size, loop.b + at, loop.b + at)) && std::isfinite(dot(size, loop.x + at, loop.x + at));
     };
     for (int i = 0; c.pair_first >= 0 && i < loop.bodies; ++i) well[i] = finite(i);
     for (int i = 0; c.pair_first >= 0 && i < loop.bodies; ++i) {
         if (!c.near[i]) continue;
-        for (int k = c.pair_first + c.body_start[i]; k < c.pair_first + c.body_start[i + 1]; ++k) {
-            const int other = c.obstacle[k];
-            if (other < 0) continue;
-            if (!well[i] || !well[other]) { c.obstacle[k] = -1; continue; }
-            const int a = root(i), b = root(other);
-            parent[std::max(a, b)] = std::min(a, b);
-        }
+        each_pair_range_of(c, i, [&](int first, int last) {
+            for (int k = first; k < last; ++k) {
+                const int other = c.obstacle[k];
+                if (other < 0) continue;
+                if (!well[i] || !well[other]) { c.obstacle[k] = -1; continue; }
+                const int a = root(i), b = root(other);
+                parent[std::max(a, b)] = std::min(a, b);
+            }
+        });
     }
     c.islands = 0;
     int bodies = 0, rows = 0;
