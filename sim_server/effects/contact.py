@@ -17,7 +17,8 @@ poses that a client gives, no faster than `max_speed` and `max_turn`.
 With `between` a node is kept away from the triangles of other objects in the same way; what touches is solved as one
 system (kernels/pair_detection.cuh, backends/cpu/native/island.h).
 
-Only nodes are kept out: a corner or an edge that is smaller than the triangles of the surface may pass between them.
+On a CPU triangles and edges of the surfaces are kept out, too, where something small comes between their nodes
+(kernels/triangle_shape.cuh, edge_detection.cuh); on a GPU only nodes are.
 Friction of a pair is the geometric mean of both, unless `friction` names the pair.
 
 Usual values: a thickness of a tenth of the shortest edge of the surface (the default); friction 0.1 (wet tissue on

@@ -297,6 +297,26 @@ HOST_DEVICE bool stays_clear(const ObstacleTable& t, int obstacle, const NodeWay
     return false;
 }
 
+// True if no point of a triangle is ever nearer to a convex shape than its corners, by more than `slack`: if the distances of the corners
+// at the start and the end are those from one plane, within it. The distance function lies above that plane, and is convex.
+HOST_DEVICE bool corners_decide(const ObstacleTable& t, int obstacle, const NodeWay* const* ways, double slack) {
+    if (t.kind[obstacle] == GRID) return false;
+    for (int a = 0; a < 3; ++a) {
+        const NodeWay& by = *ways[a];
+        double most = 0;
+        for (int b = 0; b < 3; ++b) {
+            double begin = ways[b]->distance - by.distance, end = ways[b]->end_distance - by.distance;
+            for (int k = 0; k < 3; ++k) {
+                begin -= by.normal[k] * (ways[b]->begin[k] - by.begin[k]);
+                end -= by.normal[k] * (ways[b]->end[k] - by.begin[k]);
+            }
+            most = fmax(most, fmax(begin, end));
+        }
+        if (most <= slack) return true;
+    }
+    return false;
+}
+
 constexpr int MOST_ADVANCES = 200;
 
 // First time in [0, 1] at which a triangle that is farther away than `inflate` comes so near, to `slack`; NEVER. Each advance ends where
@@ -357,6 +377,7 @@ HOST_DEVICE bool comes_before(const FaceTouch& a, const FaceTouch& b) {
 HOST_DEVICE FaceTouch face_touch(const ObstacleTable& t, int obstacle, const NodeWay* const* ways, double thickness) {
     FaceTouch touch = {-1, NEVER, 0, 0, {}, {}};
     if (t.kind[obstacle] == PLANE || stays_clear(t, obstacle, ways, 2 * thickness)) return touch;
+    if (corners_decide(t, obstacle, ways, SHALLOW * thickness)) return touch;
     double begin[9], end[9], corners = 1e300, n[3];
     for (int a = 0; a < 3; ++a) {
         for (int k = 0; k < 3; ++k) {
@@ -423,6 +444,7 @@ HOST_DEVICE FaceTouch face_stays(const ObstacleTable& t, int obstacle, const Nod
 HOST_DEVICE FaceTouch face_passage(const ObstacleTable& t, int obstacle, const NodeWay* const* ways, double thickness, double through, double* time) {
     FaceTouch touch = {-1, NEVER, 0, 0, {}, {}};
     if (t.kind[obstacle] == PLANE || stays_clear(t, obstacle, ways, through)) return touch;
+    if (corners_decide(t, obstacle, ways, 1e-6 * thickness)) return touch;
     double begin[9], end[9], there[9], n[3];
     for (int a = 0; a < 3; ++a)
         for (int k = 0; k < 3; ++k) {
