@@ -72,3 +72,18 @@ def test_a_frozen_body_that_has_no_place_leaves_those_beside_it_alone():
     records = sim.engine.records().reshape(-1, 2)
     assert (records["status"][-1:, 1] != STATUS["NOT_FINITE"]).all()
     assert np.isfinite(sim.world.x[sim.world.bodies[1].nodes]).all()
+
+
+def test_what_is_held_apart_is_told_of_all_bodies_that_are_solved_together():
+    """Also of the first one, which only touches."""
+    under = block(name="under", cells=(2, 1, 2), size=(0.06, 0.02, 0.06), at=(0.1, -0.02 - 0.5 * D, 0.1))
+    plate = block(name="plate", cells=(4, 1, 4), size=(0.2, 0.02, 0.2), at=(-0.05, 0, -0.05), young=3e6)
+    ball = block(name="ball", cells=(2, 2, 2), size=(0.06, 0.06, 0.06), at=(0.021, 0.03, 0.017), young=3e6)
+    sim = over(
+        FAR, objects=[under, plate, ball], gravity=(0, 0, 0), solver=JACOBI,
+        contact={"thickness": D, "passes": 1, "stiffness": 0.001},
+    )  # fmt: skip
+    sim.world.v[sim.world.bodies[2].nodes] = (0, -3.0, 0)
+    sim.engine.run(1)
+    clipped = sim.engine.records()["clipped"]
+    assert clipped[0] == clipped[1] == clipped[2] > 0
