@@ -124,7 +124,9 @@ def test_a_thickness_is_a_tenth_of_the_shortest_edge_of_each_surface():
     starts = rows.body_start
     end = starts[2]
     assert rows.thickness[: starts[1]] == pytest.approx(0.05) and rows.thickness[starts[1] : end] == pytest.approx(0.01)
-    assert len(rows.thickness) == len(rows.corner) == end and rows.all == 2 * end, "as many rows between bodies"
+    edges = contact_of(sim).contact_input().surfaces.edge
+    assert len(rows.thickness) == len(rows.corner) == end
+    assert rows.all == 2 * end + 2 * len(edges), "as many rows between bodies, and two for each edge"
     bodies = np.searchsorted([b.last for b in sim.world.bodies], rows.corner[:end, 0], side="right")
     assert np.array_equal(np.repeat([0, 1], np.diff(starts)), bodies)
     sim.world.x[:, 1] = 0.001
