@@ -54,6 +54,7 @@ log = logging.getLogger(__name__)
 SCOPE = "scene"
 TEXT = "effects/contact.cu"
 REACH = 1e3  # sizes of the scene: how far from it a client's pose may be
+SAMPLES = 6  # of an edge, where triangles are looked at for obstacles at the start
 DEFAULT_THICKNESS, LARGEST_THICKNESS = 0.1, 0.5  # of the shortest edge of a surface
 
 ShapeKind = Declarations("kernels/shapes.cuh").enumeration("ShapeKind")
@@ -189,18 +190,15 @@ class Contact(Effect):
     def connect(self, simulation: EffectUpdates) -> None:
         self._simulation = simulation
         self._warn_of_nodes_inside()
+        if self._input.faces:
+            self._warn_of_triangles_inside(self._input.faces)
         if self._input.surfaces:
             self._warn_of_bodies_inside()
 
     def _warn_of_nodes_inside(self) -> None:
         """Logs which objects begin deeper in an obstacle than their thickness: they are pushed out, fast."""
         w, n = self.world, len(self.node)
-        launch = w.backend.module(TEXT).bind(
-            "distances", n, obstacles=len(self.obstacles), **vars(self._table), node=self.node, x=w.x,
-            distance=np.zeros(n), nearest=np.zeros(n, np.int32),
-        )  # fmt: skip
-        launch()
-        distance, nearest = launch.fetch("distance"), launch.fetch("nearest")
+        distance, nearest = self._distances(self.node, w.x)
         inside = distance < -self._input.thickness[: 2 * n : 2]
         for body in w.bodies:
             if (found := np.flatnonzero(inside & (self.body == body.index))).size:
@@ -209,6 +207,33 @@ class Contact(Effect):
                     "object %r begins inside obstacle %r: node %d is %.3g m deep (%d such nodes); it is thrown out",
                     body.name, self.obstacles[nearest[worst]].name, self.node[worst] - body.first, -distance[worst],
                     found.size,
+                )  # fmt: skip
+
+    def _distances(self, node: Int32, x: Float64) -> tuple[Float64, Int32]:
+        """Returns the distance of each point x[node] from the nearest obstacle, and which that is."""
+        n = len(node)
+        launch = self.world.backend.module(TEXT).bind(
+            "distances", n, obstacles=len(self.obstacles), **vars(self._table), node=node, x=x,
+            distance=np.zeros(n), nearest=np.zeros(n, np.int32),
+        )  # fmt: skip
+        launch()
+        return launch.fetch("distance"), launch.fetch("nearest")
+
+    def _warn_of_triangles_inside(self, faces: Faces) -> None:
+        """Logs which objects begin deeper in an obstacle between their nodes than their thickness, by samples."""
+        w, u, v = self.world, *np.indices((SAMPLES + 1, SAMPLES + 1)) / SAMPLES
+        weights = np.stack([1 - u - v, u, v], axis=-1)[u + v <= 1 + 1e-9]
+        for body in w.bodies:
+            triangle = faces.triangle[slice(*(faces.start[body.index : body.index + 2] - faces.start[0]))]
+            points = np.einsum("sa,tak->tsk", weights, w.x[triangle]).reshape(-1, 3)
+            distance, nearest = self._distances(np.arange(len(points), dtype=np.int32), points)
+            deep = distance.reshape(len(triangle), -1) < -_thickness(self.params, body)
+            between = deep.any(axis=1) & ~deep[:, (weights == 1).any(axis=1)].any(axis=1)  # nodes have been told
+            if found := int(np.count_nonzero(between)):
+                worst = int(np.where(np.repeat(between, len(weights)), distance, np.inf).argmin())
+                log.warning(
+                    "object %r begins inside obstacle %r between its nodes: %.3g m deep (%d such triangles); it is "
+                    "thrown out", body.name, self.obstacles[nearest[worst]].name, -distance[worst], found,
                 )  # fmt: skip
 
     def _warn_of_bodies_inside(self) -> None:

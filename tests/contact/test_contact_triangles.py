@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Obstacles that are smaller than the triangles of a surface do not pass between its nodes, at any speed."""
 
+import logging
+
 import numpy as np
 import pytest
 
@@ -114,6 +116,16 @@ def test_where_nothing_small_is_near_no_triangle_has_a_row():
         sim.engine.run(1)
         assert (given.obstacle[faces.start[0] : faces.start[-1]] == -1).all()
     assert (given.force > 0).any()
+
+
+def test_an_object_that_begins_on_a_spike_is_told(caplog):
+    with caplog.at_level(logging.WARNING):
+        over(obstacle("corner"), at=(0, -0.02, 0), **SMALL)
+    said = [r.getMessage() for r in caplog.records if "between its nodes" in r.getMessage()]
+    assert len(said) == 1 and "object 'bar' begins inside obstacle 'corner' between its nodes: 0.0" in said[0]
+    caplog.clear()
+    over(obstacle("corner"), at=(0, 0.001, 0), **SMALL)
+    assert not caplog.records
 
 
 def test_planes_need_no_rows_of_triangles_at_all():
