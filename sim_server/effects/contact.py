@@ -113,7 +113,7 @@ class Contact(Effect):
         self._pair_friction = _pair_friction(world, params)
         touching = len(world.bodies) > 1 and params.between
         start = np.concatenate([[0], np.cumsum([2 * len(s) for s in surfaces])]).astype(np.int32)
-        faces = _faces(world, self._pair_friction, int(start[-1]))
+        faces = faces_of(world, self._pair_friction, int(start[-1]))
         pairs = int(faces.start[-1] if faces else start[-1]) + int(start[-1])  # the row after those of nodes and bodies
         surfaces_of = _surfaces(world, params, self.node, self.body, pairs, bounds) if touching else None
         body = [np.repeat(self.body, 2), _body_of_rows(faces.start) if faces else ()]
@@ -326,7 +326,7 @@ def _surface(world: World, body: Body) -> Int32:
     return nodes[world.free[nodes] > 0].astype(np.int32)
 
 
-def _faces(world: World, friction: Float64, first: int) -> Faces | None:
+def faces_of(world: World, friction: Float64, first: int) -> Faces | None:
     """Returns the triangles that need rows against obstacles, the first of which is `first`.
 
     None where there are none: corners are enough against planes, and a GPU has rows of nodes alone.
