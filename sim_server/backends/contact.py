@@ -26,12 +26,33 @@ class Obstacles:
 
 
 @dataclass(frozen=True)
+class Faces:
+    """Triangles of surfaces, each with a row against obstacles (kernels/triangle_shape.cuh).
+
+    start: (bodies + 1,) first row of each body. triangle: (triangles, 3) nodes of the scene, outward; in order of rows
+    owns: (triangles,) bit k is set where the edge from corner k to the next one belongs to the triangle, as each edge
+        does to one
+    friction: (bodies, obstacles) coefficients. gravity: (3,) [m/s2]
+    """
+
+    start: Int32
+    triangle: Int32
+    owns: Int32
+    friction: Float64
+    gravity: Float64
+
+
+@dataclass(frozen=True)
 class Surfaces:
     """What bodies need to touch each other (detection: kernels/pair_detection.cuh).
 
     site_body: (surface nodes,). node_site: (nodes,) number of a node among the surface nodes, -1: it is none
     triangle: (triangles, 3) nodes of the scene, outward; those of a body are together
     tree_start: (bodies + 1,) and tree_child: (boxes, 2) of each body's tree: two later boxes, or ~ of a triangle, twice
+    edge_start: (bodies + 1,) first row of the edges of each body, two for each. edge: (edges, 2) nodes, as the triangle
+        that owns the edge has them; opposite: (edges, 2) third corners of its two triangles
+    triangle_edge: (triangles, 3) the edge from each corner to the next one that the triangle owns; -1
+    edge_length: (bodies,) of edges in the mean [m]. thickness: (bodies,) [m]
     friction: (bodies, bodies) coefficients. gravity: (3,) [m/s2]
     """
 
@@ -40,6 +61,12 @@ class Surfaces:
     triangle: Int32
     tree_start: Int32
     tree_child: Int32
+    edge_start: Int32
+    edge: Int32
+    opposite: Int32
+    triangle_edge: Int32
+    edge_length: Float64
+    thickness: Float64
     friction: Float64
     gravity: Float64
 
@@ -49,11 +76,15 @@ class Contact:
     """Rows of contacts, which launches among `assemble` fill in each step, and options.
 
     A row is a place where a surface may touch something: sum_a weight_a x_{corner_a}, against a plane that stands for
-    it in this step. The first rows are against obstacles, two for each surface node: the node, with weight 1. As many
-    rows between bodies follow if there are `surfaces`: a node with weight 1 and a triangle of another body with weights
-    below 0, which the loop sets.
+    it in this step. Those of a sort ascend by body; first come those against obstacles:
 
-    body_start: (bodies + 1,) rows of each body against obstacles; rows ascend by body
+        two for each surface node: the node, with weight 1
+        one for each triangle, if there are `faces`: its corners, which the loop sets
+        two for each surface node, if there are `surfaces`: the node with weight 1 and a triangle of another body with
+            weights below 0, which the loop sets
+        two for each edge then: its nodes with weights 1 - s, s and those of an edge of another body with -(1 - t), -t
+
+    body_start: (bodies + 1,) rows of the nodes of each body against obstacles
     corner: (rows, 4) nodes of the scene; -1: fewer. weight: (rows, 4)
     obstacle: (rows,) number of the obstacle, or of the other body; -1: the row is empty
     normal: (rows, 3) unit, out of the obstacle, world frame
@@ -66,8 +97,10 @@ class Contact:
         sweep found too large for it, as long as that is so
     force: (rows,) normal force lambda [N]; traction: (rows, 3) friction force [N]. In: of the last step, for the same
         obstacle (0 for another), traction turned with the normal. Out: of this step
-    predictor: (nodes, 3), dx_dv, force_coefficient, free: (nodes,) of the world (mechanics/world.py)
+    predictor: (nodes, 3), dx_dv, force_coefficient, free, mass: (nodes,) of the world (mechanics/world.py)
     passes: most solves of a step. tolerance: of the contact residual
+    dropped: (surface nodes,) how often something that touches found no row; of a triangle at one of its nodes
+    faces: None where triangles have no rows of their own
     surfaces: None where bodies do not touch each other
     ties: attachments and springs, which have the last rows; None: there are none
     """
@@ -89,9 +122,12 @@ class Contact:
     traction: Float64
     predictor: Float64
     free: Float64
+    mass: Float64
     dx_dv: float
     force_coefficient: float
     passes: int
     tolerance: float
+    dropped: Int32
+    faces: Faces | None
     surfaces: Surfaces | None
     ties: Ties | None = None

@@ -17,7 +17,8 @@ poses that a client gives, no faster than `max_speed` and `max_turn`.
 With `between` a node is kept away from the triangles of other objects in the same way; what touches is solved as one
 system (kernels/pair_detection.cuh, backends/cpu/native/island.h).
 
-Only nodes are kept out: a corner or an edge that is smaller than the triangles of the surface may pass between them.
+On a CPU triangles and edges of the surfaces are kept out, too, where something small comes between their nodes
+(kernels/triangle_shape.cuh, edge_detection.cuh); on a GPU only nodes are.
 Friction of a pair is the geometric mean of both, unless `friction` names the pair.
 
 Usual values: a thickness of a tenth of the shortest edge of the surface (the default); friction 0.1 (wet tissue on
@@ -35,17 +36,17 @@ from pydantic import BeforeValidator, Field
 from sim_server.arrays import Float64, Int32
 from sim_server.backends.base import Launch
 from sim_server.backends.contact import Contact as ContactInput
-from sim_server.backends.contact import Obstacles, Surfaces
+from sim_server.backends.contact import Faces, Obstacles, Surfaces
 from sim_server.backends.declarations import Declarations
 from sim_server.effects._base import EffectUpdates
 from sim_server.effects._movable import Movable, pose_of
 from sim_server.errors import InputError
-from sim_server.mechanics.signed_distance import signed_distance_grid
+from sim_server.mechanics.signed_distance import closed_surface, signed_distance_grid, signed_distances
 from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.ties import make_ties
 from sim_server.mechanics.world import Body, World
 from sim_server.mesh.box_tree import box_tree
-from sim_server.mesh.surface import surface_triangles
+from sim_server.mesh.surface import edge_owners, surface_edges, surface_triangles
 from sim_server.scene.obstacles import Obstacle
 from sim_server.scene.parameters import NotNegative, Parameters, Positive, as_tuple
 
@@ -53,6 +54,7 @@ log = logging.getLogger(__name__)
 
 SCOPE = "scene"
 TEXT = "effects/contact.cu"
+SAMPLES = 6  # of an edge, where triangles are looked at for obstacles at the start
 DEFAULT_THICKNESS, LARGEST_THICKNESS = 0.1, 0.5  # of the shortest edge of a surface
 
 ShapeKind = Declarations("kernels/shapes.cuh").enumeration("ShapeKind")
@@ -95,27 +97,32 @@ class Contact(Movable):
         self.body = np.repeat(np.arange(len(surfaces), dtype=np.int32), [len(s) for s in surfaces])
         bounds = [_thickness(params, body) for body in world.bodies]
         self._shapes(max(bounds))
+        self.dropped = np.zeros(len(self.node), np.int32)
+        self._pair_friction = _pair_friction(world, params)
         touching = len(world.bodies) > 1 and params.between
         ties = make_ties(world)
-        own = (4 if touching else 2) * len(self.node)
-        rows = own + (len(ties.corner) if ties else 0)
+        start = np.concatenate([[0], np.cumsum([2 * len(s) for s in surfaces])]).astype(np.int32)
+        faces = faces_of(world, self._pair_friction, int(start[-1]))
+        pairs = int(faces.start[-1] if faces else start[-1]) + int(start[-1])  # the row after those of nodes and bodies
+        surfaces_of = _surfaces(world, params, self.node, self.body, pairs, bounds) if touching else None
+        body = [np.repeat(self.body, 2), _body_of_rows(faces.start) if faces else ()]
+        body += [body[0], _body_of_rows(surfaces_of.edge_start)] if surfaces_of else []
+        thickness = np.array(bounds)[np.concatenate(body).astype(np.int32)]
+        own = len(thickness)  # rows of contact; those of attachments and springs follow
+        thickness = np.concatenate([thickness, np.zeros(len(ties.corner) if ties else 0)])
+        rows = len(thickness)
         corner, weight = np.full((rows, 4), -1, np.int32), np.zeros((rows, 4))
-        corner[: 2 * len(self.node), 0] = np.repeat(self.node, 2)
+        corner[: start[-1], 0] = np.repeat(self.node, 2)
         weight[:, 0] = 1
-        thickness = np.zeros(rows)
-        thickness[:own] = np.tile(np.repeat(np.array(bounds)[self.body], 2), 2 if touching else 1)
         if ties:
             corner[own:], weight[own:] = ties.corner, ties.weight
-        start = np.concatenate([[0], np.cumsum([2 * len(s) for s in surfaces])]).astype(np.int32)
         self._input = ContactInput(
             self._table, start, corner, weight, np.full(rows, -1, np.int32), np.zeros((rows, 3)), np.zeros(rows),
             np.zeros((rows, 3)), np.full(rows, 2.0), np.zeros(rows), np.zeros(rows),
             thickness, np.ones(rows), np.zeros(rows), np.zeros((rows, 3)),
-            world.v, world.free, world.dt, world.dt, params.passes, params.tolerance,
-            _surfaces(world, params, self.node, self.body) if touching else None, ties,
+            world.v, world.free, world.mass, world.dt, world.dt, params.passes, params.tolerance, self.dropped, faces,
+            surfaces_of, ties,
         )  # fmt: skip
-        self.dropped = np.zeros(len(self.node), np.int32)
-        self._pair_friction = _pair_friction(world, params)
         arrays = [*vars(self).values(), *vars(self._table).values(), *vars(self._input).values()]
         world.backend.keep(*(a for a in arrays if isinstance(a, np.ndarray)), exact=True)
 
@@ -160,16 +167,15 @@ class Contact(Movable):
     def connect(self, simulation: EffectUpdates) -> None:
         super().connect(simulation)
         self._warn_of_nodes_inside()
+        if self._input.faces:
+            self._warn_of_triangles_inside(self._input.faces)
+        if self._input.surfaces:
+            self._warn_of_bodies_inside()
 
     def _warn_of_nodes_inside(self) -> None:
         """Logs which objects begin deeper in an obstacle than their thickness: they are pushed out, fast."""
         w, n = self.world, len(self.node)
-        launch = w.backend.module(TEXT).bind(
-            "distances", n, obstacles=len(self.obstacles), **vars(self._table), node=self.node, x=w.x,
-            distance=np.zeros(n), nearest=np.zeros(n, np.int32),
-        )  # fmt: skip
-        launch()
-        distance, nearest = launch.fetch("distance"), launch.fetch("nearest")
+        distance, nearest = self._distances(self.node, w.x)
         inside = distance < -self._input.thickness[: 2 * n : 2]
         for body in w.bodies:
             if (found := np.flatnonzero(inside & (self.body == body.index))).size:
@@ -180,6 +186,56 @@ class Contact(Movable):
                     found.size,
                 )  # fmt: skip
 
+    def _distances(self, node: Int32, x: Float64) -> tuple[Float64, Int32]:
+        """Returns the distance of each point x[node] from the nearest obstacle, and which that is."""
+        n = len(node)
+        launch = self.world.backend.module(TEXT).bind(
+            "distances", n, obstacles=len(self.obstacles), **vars(self._table), node=node, x=x,
+            distance=np.zeros(n), nearest=np.zeros(n, np.int32),
+        )  # fmt: skip
+        launch()
+        return launch.fetch("distance"), launch.fetch("nearest")
+
+    def _warn_of_triangles_inside(self, faces: Faces) -> None:
+        """Logs which objects begin deeper in an obstacle between their nodes than their thickness, by samples."""
+        w, u, v = self.world, *np.indices((SAMPLES + 1, SAMPLES + 1)) / SAMPLES
+        weights = np.stack([1 - u - v, u, v], axis=-1)[u + v <= 1 + 1e-9]
+        for body in w.bodies:
+            triangle = faces.triangle[slice(*(faces.start[body.index : body.index + 2] - faces.start[0]))]
+            points = np.einsum("sa,tak->tsk", weights, w.x[triangle]).reshape(-1, 3)
+            distance, nearest = self._distances(np.arange(len(points), dtype=np.int32), points)
+            deep = distance.reshape(len(triangle), -1) < -_thickness(self.params, body)
+            between = deep.any(axis=1) & ~deep[:, (weights == 1).any(axis=1)].any(axis=1)  # nodes have been told
+            if found := int(np.count_nonzero(between)):
+                worst = int(np.where(np.repeat(between, len(weights)), distance, np.inf).argmin())
+                log.warning(
+                    "object %r begins inside obstacle %r between its nodes: %.3g m deep (%d such triangles); it is "
+                    "thrown out", body.name, self.obstacles[nearest[worst]].name, -distance[worst], found,
+                )  # fmt: skip
+
+    def _warn_of_bodies_inside(self) -> None:
+        """Logs which objects begin deeper in another one than their thickness: they are pushed out, or stay inside."""
+        w = self.world
+        for other in w.bodies:
+            corners, low, high = None, w.x[other.nodes].min(axis=0), w.x[other.nodes].max(axis=0)
+            for body in w.bodies:
+                nodes = self.node[self.body == body.index]
+                nodes = nodes[((w.x[nodes] > low) & (w.x[nodes] < high)).all(axis=1)]
+                if body is other or not len(nodes):
+                    continue
+                try:
+                    corners = corners or closed_surface(w.x, surface_triangles(other.mesh.tets) + np.int64(other.first))
+                except InputError:
+                    break  # its sides cannot be told
+                distance = signed_distances(corners, w.x[nodes])
+                worst = int(distance.argmin())
+                found = int(np.count_nonzero(distance < -_thickness(self.params, body)))
+                if found:
+                    log.warning(
+                        "object %r begins inside object %r: node %d is %.3g m deep (%d such nodes)",
+                        body.name, other.name, nodes[worst] - body.first, -distance[worst], found,
+                    )  # fmt: skip
+
 
 def _surface(world: World, body: Body) -> Int32:
     """Returns the free nodes of a body's surface, in numbers of the scene, ascending."""
@@ -187,17 +243,46 @@ def _surface(world: World, body: Body) -> Int32:
     return nodes[world.free[nodes] > 0].astype(np.int32)
 
 
-def _surfaces(world: World, params: Params, node: Int32, body: Int32) -> Surfaces:
-    """Returns what bodies need to touch each other. node, body: surface nodes and their bodies."""
+def faces_of(world: World, friction: Float64, first: int) -> Faces | None:
+    """Returns the triangles that need rows against obstacles, the first of which is `first`.
+
+    None where there are none: corners are enough against planes, and a GPU has rows of nodes alone.
+    """
+    if world.backend.name != "cpu" or all(o.shape == "plane" for o in world.obstacles):
+        return None
+    triangles = [surface_triangles(b.mesh.tets) + np.int32(b.first) for b in world.bodies]
+    start = first + np.cumsum([0, *map(len, triangles)])
+    triangle = np.concatenate(triangles).astype(np.int32)
+    return Faces(start.astype(np.int32), triangle, edge_owners(triangle), friction, np.array(world.gravity))
+
+
+def _body_of_rows(start: Int32) -> Int32:
+    """Returns the body of each row from start[0] on."""
+    return np.repeat(np.arange(len(start) - 1, dtype=np.int32), np.diff(start))
+
+
+def _surfaces(
+    world: World, params: Params, node: Int32, body: Int32, first: int, thickness: Sequence[float]
+) -> Surfaces:  # fmt: skip
+    """Returns what bodies need to touch each other.
+
+    node, body: surface nodes and their bodies. first: row of the first edge. thickness: of each body [m]
+    """
     site = np.full(world.nodes, -1, np.int32)
     site[node] = np.arange(len(node), dtype=np.int32)
     triangles = [surface_triangles(b.mesh.tets) + np.int32(b.first) for b in world.bodies]
     trees = [box_tree(world.rest[t].mean(axis=1)) for t in triangles]
-    boxes, first = np.cumsum([0, *map(len, trees)]), np.cumsum([0, *map(len, triangles)])
-    shifted = [np.where(t < 0, t - k, t + box) for t, box, k in zip(trees, boxes, first, strict=False)]
+    boxes, first_triangle = np.cumsum([0, *map(len, trees)]), np.cumsum([0, *map(len, triangles)])
+    shifted = [np.where(t < 0, t - k, t + box) for t, box, k in zip(trees, boxes, first_triangle, strict=False)]
+    triangle = np.concatenate(triangles).astype(np.int32)
+    edge, opposite, of_triangle = surface_edges(triangle)
+    length = np.linalg.norm(world.rest[edge[:, 0]] - world.rest[edge[:, 1]], axis=1)
+    ends = np.concatenate([[0], np.cumsum((of_triangle >= 0).sum(axis=1))])[first_triangle]
+    mean = np.add.reduceat(length, ends[:-1]) / np.diff(ends)
     return Surfaces(
-        body, site, np.concatenate(triangles).astype(np.int32), boxes.astype(np.int32),
-        np.concatenate(shifted).astype(np.int32), _friction_of_bodies(world, params), np.array(world.gravity),
+        body, site, triangle, boxes.astype(np.int32), np.concatenate(shifted).astype(np.int32),
+        (first + 2 * ends).astype(np.int32), edge, opposite, of_triangle, mean, np.array(thickness),
+        _friction_of_bodies(world, params), np.array(world.gravity),
     )  # fmt: skip
 
 

@@ -40,13 +40,12 @@ struct SurfaceTables {        // of all bodies (backends/contact.py)
     Box *tree_box, *body_box;                // (tree,), (bodies,)
     const int* near;                         // (bodies,) 1: its box meets another's, and its tree is fitted
     const double* pair_friction;             // (bodies, bodies)
+    const double* body_thickness;            // (bodies,)
 };
 
 HOST_DEVICE int sites_before(const SurfaceTables& c, int body) { return c.body_start[body] / 2; }
 HOST_DEVICE int node_of_site(const SurfaceTables& c, int site) { return c.corner[CORNERS * 2 * site]; }
-HOST_DEVICE double thickness_of(const SurfaceTables& c, int body) {
-    return c.body_start[body] < c.body_start[body + 1] ? c.thickness[c.body_start[body]] : 0;
-}
+HOST_DEVICE double thickness_of(const SurfaceTables& c, int body) { return c.body_thickness[body]; }
 
 // --- motion and boxes ---------------------------------------------------------------------------------------------------------------
 
@@ -217,7 +216,7 @@ struct RowMemory {       // what a row remembers of the last step
     double force, hardening, normal[3], traction[3];
 };
 
-HOST_DEVICE RowMemory memory_of(const SurfaceTables& c, int row) {
+template <class Tables> HOST_DEVICE RowMemory memory_of(const Tables& c, int row) {
     RowMemory m = {c.obstacle[row], c.force[row], c.hardening[row], {}, {}};
     for (int k = 0; k < 3; ++k) {
         m.normal[k] = c.normal[3 * row + k];
@@ -226,8 +225,8 @@ HOST_DEVICE RowMemory memory_of(const SurfaceTables& c, int row) {
     return m;
 }
 
-// Takes up the forces of the row of memory with the same other body, if there is one.
-HOST_DEVICE void recall(const SurfaceTables& c, int row, const RowMemory* last, int count) {
+// Takes up the forces of the row of memory that touched the same, if there is one.
+template <class Tables> HOST_DEVICE void recall(const Tables& c, int row, const RowMemory* last, int count) {
     for (int r = 0; r < count; ++r) {
         if (last[r].other != c.obstacle[row]) continue;
         c.force[row] = last[r].force;

@@ -62,8 +62,8 @@ def ties_alone(world: World, ties: Ties) -> Contact:
     return Contact(
         shapes, np.zeros(m + 1, np.int32), ties.corner, ties.weight, np.full(n, -1, np.int32), next(vectors),
         next(zeros), next(vectors), np.full(n, 2.0), next(zeros), next(zeros), next(zeros), np.ones(n),
-        next(zeros), next(vectors), world.predictor, world.free, world.dx_dv, world.force_coefficient, 16, 1e-3,
-        None, ties,
+        next(zeros), next(vectors), world.predictor, world.free, world.mass, world.dx_dv, world.force_coefficient, 16,
+        1e-3, none, None, None, ties,
     )  # fmt: skip
 
 

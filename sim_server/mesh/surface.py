@@ -25,3 +25,32 @@ def surface_triangles(tets: NDArray[np.integer]) -> Int32:
     starts = np.concatenate([[True], differs])  # where a new face begins in sorted order
     single = starts & np.concatenate([differs, [True]])
     return faces[np.sort(order[single])].astype(np.int32)
+
+
+def surface_edges(triangles: Int32) -> tuple[Int32, Int32, Int32]:
+    """Returns the edges of a closed surface (e, 2) as their owners have them, the third corners of both triangles of
+    each (e, 2), and the edge of each triangle from its corner k to the next one, -1 where it is another's, (t, 3).
+
+    Edges are in the order of their owners. Of an edge with more than two triangles the first two count.
+    """
+    owned = (edge_owners(triangles)[:, None] >> np.arange(3) & 1).astype(bool)
+    number = np.where(owned, np.cumsum(owned).reshape(-1, 3) - 1, -1).astype(np.int32)
+    pairs, third = np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2), np.roll(triangles, -2, axis=1)
+    found: dict[tuple[int, int], list[int]] = {}
+    for (p, q), r in zip(pairs.reshape(-1, 2).tolist(), third.ravel().tolist(), strict=True):
+        found.setdefault((min(p, q), max(p, q)), []).append(r)
+    edges = pairs[owned]
+    both = [found[min(p, q), max(p, q)] for p, q in edges.tolist()]
+    opposite = [(r[0], r[1] if len(r) > 1 else r[0]) for r in both]
+    return edges.astype(np.int32), np.array(opposite, np.int32).reshape(-1, 2), number
+
+
+def edge_owners(triangles: Int32) -> Int32:
+    """Returns which edges each triangle owns, (t,): bit k for the edge from its corner k to the next one.
+
+    Each edge belongs to the first of the triangles that have it.
+    """
+    edges = np.sort(np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2), axis=2).reshape(-1, 2)
+    first = np.zeros(len(edges), bool)
+    first[np.unique(edges, axis=0, return_index=True)[1]] = True
+    return (first.reshape(-1, 3) @ [1, 2, 4]).astype(np.int32)

@@ -60,10 +60,9 @@ def test_bodies_that_collide_keep_their_momentum_and_stay_out_of_each_other(spee
     size = sim.world.mass.sum() * speed
     for _ in range(int(0.3 / speed / sim.world.dt) + 4):
         sim.engine.run(1)
-        assert inside(sim, 0, 1) + inside(sim, 1, 0) <= (0 if speed < 1 else 2)  # for a step, where a surface is dented
-    assert inside(sim, 0, 1) == inside(sim, 1, 0) == 0
+        assert inside(sim, 0, 1) == inside(sim, 1, 0) == 0
     records = sim.engine.records()
-    assert records["contacts"].any() and not records["clipped"].any()
+    assert records["contacts"].any() and (not records["clipped"].any() or speed > 1)  # what is held back keeps momentum
     after, turned = momenta(sim)
     assert abs(after - linear).max() <= 1e-9 * size
     assert abs(turned - angular).max() <= 0.1 * size * 0.1  # as much as backward Euler keeps of it
@@ -82,9 +81,9 @@ def test_a_stack_stands_and_each_body_carries_those_above(count):
     assert abs(forces[:, 0, [0, 2]].sum(axis=0)).max() <= 1e-4 * weight
     rows = sim.contact.contact_input()
     site = np.repeat(rows.surfaces.site_body, 2)
-    force = rows.force[len(rows.force) // 2 :, None] * rows.normal[len(rows.force) // 2 :]
-    force = force + rows.traction[len(rows.force) // 2 :]
-    other = rows.obstacle[len(rows.obstacle) // 2 :]
+    of_pairs = slice(rows.surfaces.edge_start[0] - rows.body_start[-1], rows.surfaces.edge_start[0])
+    force = rows.force[of_pairs, None] * rows.normal[of_pairs] + rows.traction[of_pairs]
+    other = rows.obstacle[of_pairs]
     for level in range(1, count):  # what passes from body `level` down to the next one
         down = force[(site == level - 1) & (other == level)].sum(axis=0) - force[
             (site == level) & (other == level - 1)
@@ -198,7 +197,8 @@ def test_rows_that_a_sweep_has_found_end_when_the_bodies_part():
     blocks = [block(name=name, at=(x, 0, 0)) for name, x in (("one", -0.05), ("other", 0.09))]
     sim = over(ram, objects=blocks, gravity=(0, 0, 0), dt=0.02, solver=JACOBI)
     rows = sim.contact.contact_input()
-    of_pairs = rows.obstacle[len(rows.obstacle) // 2 :]
+    first = rows.faces.start[-1]
+    of_pairs = rows.obstacle[first:]
     sim.engine.run(1)
     assert (of_pairs >= 0).any()
     one, other = sim.world.bodies
@@ -207,7 +207,7 @@ def test_rows_that_a_sweep_has_found_end_when_the_bodies_part():
     sim.world.v[:] = 0
     sim.engine.run(1)
     assert (of_pairs < 0).all()
-    assert not rows.force[len(rows.obstacle) // 2 :].any()
+    assert not rows.force[first:].any()
 
 
 @pytest.mark.parametrize("speed", [0.5, 3.0])

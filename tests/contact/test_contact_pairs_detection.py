@@ -55,7 +55,7 @@ class Detected:
 
     @property
     def first(self) -> int:
-        return len(self.input.obstacle) // 2
+        return int(self.input.body_start[-1])
 
     def rows(self) -> dict[tuple[int, int], int]:
         """Row by (node, other body)."""

@@ -66,7 +66,7 @@ def test_the_block_tumbles_down_all_stairs():
     sim = loaded("stairs")
     driver, touched = Driver(sim), set()
     rows = sim.contact.contact_input()
-    for _ in range(180):
+    for _ in range(240):
         assert driver.advance(1)["status"][0] == STATUS["CONVERGED"]
         touched |= set(rows.obstacle[rows.force > 0].tolist())
     names = [o.name for o in sim.contact.obstacles]

@@ -11,7 +11,8 @@ SMALL = {"cells": (2, 2, 2), "size": (0.1, 0.1, 0.1), "young": 3e5}
 
 
 def surface(sim: Simulation) -> np.ndarray:
-    nodes: np.ndarray = sim.world.x[np.unique(sim.contact.contact_input().corner[:, 0])]
+    given = sim.contact.contact_input()
+    nodes: np.ndarray = sim.world.x[np.unique(given.corner[: given.body_start[-1], 0])]
     return nodes
 
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Obstacles in motion and the rows of surface nodes that may touch them in a step, against plain references."""
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -42,6 +43,15 @@ def contact_of(sim: Simulation) -> Contact:
     return found
 
 
+def rows_of(effect: Contact) -> Any:
+    """The rows of nodes against obstacles, without those of triangles and between bodies that follow: views."""
+    held = effect.contact_input()
+    count, rows = held.body_start[-1], len(held.obstacle)
+    names = ("corner", "weight", "obstacle", "normal", "gap", "drift", "entry", "stiffness", "friction", "thickness")
+    cut = {name: getattr(held, name)[:count] for name in (*names, "force", "traction")}
+    return SimpleNamespace(obstacles=held.obstacles, body_start=held.body_start, all=rows, **cut)
+
+
 SHAPES: dict[str, tuple[dict, contact_rows.Distance]] = {
     "plane": ({}, shapes.plane),
     "sphere": ({"radius": 0.3}, lambda p: shapes.sphere(p, 0.3)),
@@ -73,7 +83,7 @@ def test_rows_are_those_of_the_reference(seed, moving):
     world.x += random.normal(0, 0.03, world.x.shape)
     world.v[:] = random.normal(0, 10, world.v.shape)
     sim.engine.assemble()
-    rows, s = effect.contact_input(), H * (world.v + H * np.array(G))
+    rows, s = rows_of(effect), H * (world.v + H * np.array(G))
     table = rows.obstacles
     found = entering = 0
     for i, node in enumerate(effect.node):
@@ -96,7 +106,7 @@ def test_rows_are_those_of_the_reference(seed, moving):
 def test_stiffness_is_that_of_the_node_in_the_first_step_and_stays():
     sim = made(FLOOR, stiffness=3.0)
     effect = contact_of(sim)
-    rows, nodes = effect.contact_input(), np.repeat(effect.node, 2)
+    rows, nodes = rows_of(effect), np.repeat(effect.node, 2)
     assert not rows.stiffness.any()
     sim.engine.assemble()
     trace = sim.system.block[nodes][:, [0, 3, 5]].sum(axis=1)
@@ -111,11 +121,13 @@ def test_stiffness_is_that_of_the_node_in_the_first_step_and_stays():
 def test_a_thickness_is_a_tenth_of_the_shortest_edge_of_each_surface():
     bars = [bar((2, 1, 1), (1, 0.5, 0.5)), bar((3, 3, 3), (9, 0.3, 3), name="flat", friction=0.2)]
     sim = made(FLOOR, bars=bars)
-    rows = contact_of(sim).contact_input()
+    rows = rows_of(contact_of(sim))
     starts = rows.body_start
     end = starts[2]
     assert rows.thickness[: starts[1]] == pytest.approx(0.05) and rows.thickness[starts[1] : end] == pytest.approx(0.01)
-    assert len(rows.thickness) == len(rows.corner) == 2 * end, "as many rows between bodies"
+    edges = contact_of(sim).contact_input().surfaces.edge
+    assert len(rows.thickness) == len(rows.corner) == end
+    assert rows.all == 2 * end + 2 * len(edges), "as many rows between bodies, and two for each edge"
     bodies = np.searchsorted([b.last for b in sim.world.bodies], rows.corner[:end, 0], side="right")
     assert np.array_equal(np.repeat([0, 1], np.diff(starts)), bodies)
     sim.world.x[:, 1] = 0.001
@@ -132,10 +144,10 @@ def test_only_free_surface_nodes_have_rows():
     assert np.array_equal(effect.node, [i for i in surface if sim.world.rest[i, 0] > 0.01])
     sim.world.x[:, 1] = 0.0
     sim.engine.assemble()
-    assert (effect.contact_input().obstacle[::2] == 0).all()
+    assert (rows_of(effect).obstacle[::2] == 0).all()
     sim.world.free[effect.node[3]] = 0  # as of a body that is frozen
     sim.engine.assemble()
-    assert effect.contact_input().obstacle[6] == -1
+    assert rows_of(effect).obstacle[6] == -1
 
 
 def test_an_object_that_begins_inside_an_obstacle_is_told_with_its_deepest_node(caplog):
@@ -157,7 +169,7 @@ def test_a_plate_is_found_from_the_side_on_which_a_step_begins(speed, thick, mov
         ends = [{"time": t, "translate": [0, y, 0]} for t, y in ((0.0, 0.0), (H, speed * H))]
         plate["keyframes"] = ends
     sim = made(plate, thickness=0.0004, gravity=None)
-    rows, world, effect = contact_of(sim).contact_input(), sim.world, contact_of(sim)
+    rows, world, effect = rows_of(contact_of(sim)), sim.world, contact_of(sim)
     above = thick / 2 + 0.0005 + np.random.default_rng(1).uniform(0, 0.9, len(world.x)) * (speed * H - 0.0001)
     world.x[:, 1] = above
     world.v[:, 1] = 0 if moving else -speed
@@ -173,7 +185,7 @@ def test_a_plate_is_found_from_the_side_on_which_a_step_begins(speed, thick, mov
 def test_a_row_keeps_the_memory_of_its_obstacle_in_whatever_slot():
     wall = {"name": "wall", "shape": "plane", "pose": {"rotate": [0, 0, -90]}}  # x < 0
     sim = made(FLOOR, wall, thickness=0.02, gravity=None)
-    rows, world = contact_of(sim).contact_input(), sim.world
+    rows, world = rows_of(contact_of(sim)), sim.world
     world.v[:] = 0
 
     def at(x: float, y: float) -> None:
@@ -201,7 +213,7 @@ def test_traction_turns_with_the_normal(seed):
     """By the smallest rotation from one normal to the other: its length stays, and so does a part along the axis."""
     random = np.random.default_rng(seed)
     sim = made({"name": "ball", "shape": "sphere", "radius": 0.4}, thickness=0.02, gravity=None)
-    rows, world = contact_of(sim).contact_input(), sim.world
+    rows, world = rows_of(contact_of(sim)), sim.world
     before, after = random.normal(size=(2, 3))
     before, after = before / np.linalg.norm(before), after / np.linalg.norm(after)
     world.x[:] = 0.41 * before
@@ -219,7 +231,7 @@ def test_traction_turns_with_the_normal(seed):
 def test_a_traction_whose_normal_turns_over_stays_in_the_plane():
     plate = {"name": "plate", "shape": "box", "size": [9, 0.01, 9]}
     sim = made(plate, thickness=0.02, gravity=None)
-    rows = contact_of(sim).contact_input()
+    rows = rows_of(contact_of(sim))
     sim.world.x[:, 1] = 0.02
     sim.engine.assemble()
     rows.traction[::2] = [1, 0, 2]
@@ -235,7 +247,7 @@ def test_an_obstacle_too_many_is_counted():
     sim.world.x[:, 1] = 0.01
     sim.engine.assemble()
     assert (contact_of(sim).dropped == 2).all()
-    assert contact_of(sim).contact_input().obstacle[:2].tolist() == [0, 1]
+    assert rows_of(contact_of(sim)).obstacle[:2].tolist() == [0, 1]
 
 
 def test_states_that_are_no_numbers_have_no_rows():
@@ -244,7 +256,7 @@ def test_states_that_are_no_numbers_have_no_rows():
     sim.world.x[effect.node[0]] = np.nan
     sim.world.v[effect.node[1]] = np.inf
     sim.engine.assemble()
-    rows = effect.contact_input()
+    rows = rows_of(effect)
     assert rows.obstacle[:2].tolist() == [-1, -1]
     assert np.isfinite(rows.gap).all() and np.isfinite(rows.normal).all()
 
@@ -267,7 +279,7 @@ def test_keyframes_are_joined_by_lines_and_shortest_rotations():
         for t, a, p in zip(times, angles, places, strict=True)
     ]
     sim = made({**FLOOR, "keyframes": keys})
-    table = contact_of(sim).contact_input().obstacles
+    table = rows_of(contact_of(sim)).obstacles
     slerp = Slerp(times, Rotation.from_euler("xyz", angles, degrees=True))
     last = None
     for step in range(11):
@@ -290,7 +302,7 @@ TOOL = {"name": "tool", "shape": "sphere", "radius": 0.1, "moved": "client", "ma
 def test_a_fixed_obstacle_stays_where_its_pose_puts_it():
     sim = made({**FLOOR, "pose": {"rotate": [10, 20, 30], "translate": [1, 2, 3]}})
     sim.engine.run(3)
-    table = contact_of(sim).contact_input().obstacles
+    table = rows_of(contact_of(sim)).obstacles
     expected = [1, 2, 3, *quaternion((10, 20, 30))]
     assert table.begin[0].tolist() == table.end[0].tolist() == expected
 
@@ -298,7 +310,7 @@ def test_a_fixed_obstacle_stays_where_its_pose_puts_it():
 def test_a_client_moves_an_obstacle_at_most_so_fast():
     sim = made(FLOOR, TOOL)
     effect = contact_of(sim)
-    table, given = effect.contact_input().obstacles, []
+    table, given = rows_of(effect).obstacles, []
     sim.on_effect_update.append(lambda e, pending: given.append((e, pending)))
     sim.engine.run(2)
     goal, turn = np.array([3.05, 0.04, 0.0]), Rotation.from_rotvec([0, 0.3, 0])
@@ -326,7 +338,7 @@ def test_a_step_assembled_twice_moves_an_obstacle_once():
     effect.move("tool", (4.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
     for _ in range(3):
         sim.engine.assemble()
-    table = effect.contact_input().obstacles
+    table = rows_of(effect).obstacles
     assert table.begin[1, 0] == 3 and table.end[1, 0] == pytest.approx(3.02)
 
 
@@ -339,7 +351,7 @@ def test_targets_restored_at_the_same_steps_repeat_the_motion():
     for k in range(6):
         first.move("tool", (3 + 0.01 * k, 0.03 * k, 0.0), (1.0, 0.1 * k, 0.0, 0.0))
         sims[0].engine.run(3)
-        poses.append(first.contact_input().obstacles.end.copy())
+        poses.append(rows_of(first).obstacles.end.copy())
     again = contact_of(sims[1])
     targets = {pending.taken: target for pending, target in taken}
     for step in range(18):
@@ -347,7 +359,7 @@ def test_targets_restored_at_the_same_steps_repeat_the_motion():
             again.restore(targets[step])
         sims[1].engine.run(1)
         if step % 3 == 2:
-            assert np.array_equal(again.contact_input().obstacles.end, poses[step // 3])
+            assert np.array_equal(rows_of(again).obstacles.end, poses[step // 3])
 
 
 NAN = float("nan")
@@ -381,7 +393,7 @@ def test_poses_that_cannot_be_are_refused_and_change_nothing(given, message):
 def test_a_turn_never_passes_its_bound_and_arrives(angles, speed):
     sim = _turning(speed)
     effect = contact_of(sim)
-    table = effect.contact_input().obstacles
+    table = rows_of(effect).obstacles
     start, goal = quaternion(angles[:3]), quaternion(angles[3:])
     table.end[1, 3:] = start
     effect.move("tool", (3.0, 0.0, 0.0), goal)
@@ -412,7 +424,7 @@ def test_detection_turns_with_the_scene():
             x, v = sim.world.x + random.normal(0, 0.03, sim.world.x.shape), random.normal(0, 10, sim.world.v.shape)
         sim.world.x[:], sim.world.v[:] = x @ R.T, v @ R.T
         sim.engine.assemble()
-        rows = effect.contact_input()
+        rows = rows_of(effect)
         found.append((rows.obstacle, rows.entry, rows.gap, rows.normal @ R, rows.drift @ R))
     assert (found[0][0] >= 0).any()
     for a, b in zip(*found, strict=True):

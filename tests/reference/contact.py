@@ -14,6 +14,7 @@ class Rows:
     """Rows in use, as they were before the solve."""
 
     corner: np.ndarray
+    weight: np.ndarray
     normal: np.ndarray
     drift: np.ndarray
     gap: np.ndarray
@@ -58,15 +59,17 @@ def step(sim: Simulation) -> tuple[Solved, Any]:
     matrix, b, frames = sim.matrix(0), system.b_material.ravel().copy(), system.rotation.copy()
     sim.engine.solve()
     y = system.y
-    nodes = rows.corner[:, 0]
+    nodes = rows.corner  # -1: the weight is 0
     dv = np.einsum("nij,nj->ni", frames, y)
-    s = w.dx_dv * (predictor[nodes] + dv[nodes])
-    assert np.allclose(w.x[nodes], x[nodes] + s, rtol=0, atol=1e-12)
+    moved = w.dx_dv * (predictor + dv)
+    assert np.allclose(w.x, x + moved, rtol=0, atol=1e-12)
+    s = np.einsum("ra,rak->rk", rows.weight, moved[nodes])
     normal, _ = rows.forces(s, rows.force)
     normal, traction = rows.forces(s, normal)
     impulse = np.zeros_like(y)
     f = normal[:, None] * rows.normal + traction
-    np.add.at(impulse, nodes, w.force_coefficient * np.einsum("nji,nj->ni", frames[nodes], f))
+    each = w.force_coefficient * np.einsum("ra,raji,rj->rai", rows.weight, frames[nodes], f)
+    np.add.at(impulse, nodes, each)
     residual = b - matrix @ y.ravel() + impulse.ravel()
     scale = max(np.linalg.norm(b), np.linalg.norm(b + impulse.ravel()))
     return Solved(np.linalg.norm(residual) / scale, normal, traction), sim.engine.records()[0]

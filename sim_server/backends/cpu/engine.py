@@ -199,24 +199,36 @@ class _NativeContact:
             "island": np.zeros(bodies, np.int32), "island_start": np.zeros(bodies + 1, np.int32),
             "island_rows": np.zeros(bodies, np.int32), "near": np.zeros(bodies, np.int32),
             "was_near": np.zeros(bodies, np.int32),
-            "touched": np.zeros(bodies, np.int32), "site_body": self._site_body(contact),
+            "touched": np.zeros(bodies, np.int32), "used": np.zeros(rows, np.int32),
+            "row_body": self._row_body(contact), "node_site": np.full(loop.nodes, -1, np.int32),
         }  # fmt: skip
+        sites = contact.body_start[-1] // 2
+        self._own["site_body"] = self._own["row_body"][: 2 * sites : 2].copy()
+        self._own["node_site"][contact.corner[: 2 * sites : 2, 0]] = np.arange(sites)
         self.native = structs.Contact(
             obstacle_count=count, passes=contact.passes, tolerance=contact.tolerance, dx_dv=contact.dx_dv,
             force_coefficient=contact.force_coefficient, state=c.addressof(self._state), pair_first=-1,
             report=c.addressof(self._report), result=c.addressof(self._result),
             choice=c.addressof(self._choice),
         )  # fmt: skip
+        if faces := contact.faces:
+            self._own |= {
+                "face_start": faces.start, "face": faces.triangle, "face_owns": faces.owns,
+                "face_friction": faces.friction, "gravity": faces.gravity,
+            }  # fmt: skip
         if contact.surfaces or contact.ties:
             self._join(contact.free, rows, loop)
         if contact.surfaces:
-            self._touch(contact.surfaces, (rows - (len(contact.ties.corner) if contact.ties else 0)) // 2, loop)
+            tied = len(contact.ties.corner) if contact.ties else 0
+            first = rows - tied - 2 * len(contact.surfaces.edge) - int(contact.body_start[-1])
+            self._touch(contact.surfaces, first, loop)
         if contact.ties:
             self._tie(contact.ties, rows - len(contact.ties.corner), loop.nodes)
         for name in ("kind", "size", "grid", "place", "cells", "begin", "end"):
             setattr(self.native.obstacles, name, getattr(obstacles, name).ctypes.data)
         for name in ("body_start", "corner", "weight", "obstacle", "normal", "gap", "drift", "entry", "stiffness",
-                     "friction", "thickness", "hardening", "force", "traction", "predictor", "free"):  # fmt: skip
+                     "friction", "thickness", "hardening", "force", "traction", "predictor", "free", "dropped",
+                     "mass"):  # fmt: skip
             setattr(self.native, name, getattr(contact, name).ctypes.data)
         for name, array in self._own.items():
             setattr(self.native, name, array.ctypes.data)
@@ -229,9 +241,12 @@ class _NativeContact:
         return int(start[body + 1] - start[body]) // 2
 
     @staticmethod
-    def _site_body(contact: Contact) -> NDArray[np.int32]:
-        counts = np.diff(contact.body_start) // 2
-        return np.repeat(np.arange(len(counts), dtype=np.int32), counts)
+    def _row_body(contact: Contact) -> NDArray[np.int32]:
+        """Returns the body of each row."""
+        starts = [contact.body_start]
+        starts += [contact.faces.start] if contact.faces else []
+        starts += [contact.body_start, contact.surfaces.edge_start] if contact.surfaces else []
+        return np.concatenate([np.repeat(np.arange(len(s) - 1, dtype=np.int32), np.diff(s)) for s in starts])
 
     def _join(self, free: Reals, rows: int, loop: structs.Loop) -> None:
         """Adds what bodies need that are solved as one system."""
@@ -253,18 +268,9 @@ class _NativeContact:
             "start_force": np.zeros((n, 3)), "slope": np.zeros((n, 6)), "bound": np.zeros(nodes, np.int32),
         }  # fmt: skip
         named = (
-            "body",
-            "obstacle",
-            "table",
-            "point",
-            "kappa",
-            "rest",
-            "breaking",
-            "stiffness",
-            "force",
-            "broken",
+            "body", "obstacle", "table", "point", "kappa", "rest", "breaking", "stiffness", "force", "broken",
             "reaction",
-        )
+        )  # fmt: skip
         self._ties |= {name: getattr(ties, name) for name in named}
         native = self.native.ties
         native.first, native.count, native.tables = first, n, ties.tables
@@ -275,11 +281,16 @@ class _NativeContact:
     def _touch(self, surfaces: Surfaces, first: int, loop: structs.Loop) -> None:
         """Adds what bodies need to touch each other. first: row of the first one between bodies."""
         self._boxes = [(structs.Box * max(n, 1))() for n in (len(surfaces.tree_child), loop.bodies)]
+        self._wings = (structs.EdgeWings * max(len(surfaces.edge), 1))()
         self._own |= {
-            "node_site": surfaces.node_site, "triangle": surfaces.triangle, "tree_start": surfaces.tree_start,
+            "edge_start": surfaces.edge_start, "edge": surfaces.edge, "edge_opposite": surfaces.opposite,
+            "triangle_edge": surfaces.triangle_edge, "edge_length": surfaces.edge_length,
+            "body_thickness": surfaces.thickness, "facing": np.full(2 * len(surfaces.edge), -1, np.int32),
+            "triangle": surfaces.triangle, "tree_start": surfaces.tree_start,
             "tree_child": surfaces.tree_child, "pair_friction": surfaces.friction, "gravity": surfaces.gravity,
         }  # fmt: skip
         self.native.tree_box, self.native.body_box = map(c.addressof, self._boxes)
+        self.native.wings = c.addressof(self._wings)
         self.native.pair_first = first
 
 

@@ -116,6 +116,11 @@ class Box(c.Structure):
 
 
 @LOOP.struct
+class EdgeWings(c.Structure):
+    """Triangles at an edge of a surface: kernels/edge_edge.cuh."""
+
+
+@LOOP.struct
 class ContactReport(c.Structure):
     """What became of the contacts of a body."""
 

@@ -45,6 +45,8 @@ def pairs_of(contact: Contact, nodes: int) -> Int32:
     """
     if contact.surfaces:
         raise ValueError("bodies do not touch each other on a GPU")
+    if contact.faces:
+        raise ValueError("triangles of a surface have no rows of contact on a GPU")
     node = contact.corner[:, 0]
     alone = (contact.corner[:, 1:] < 0).all() and (contact.weight[:, 0] == 1).all()
     if len(node) % 2 or not alone or (node[::2] != node[1::2]).any():

@@ -221,7 +221,7 @@ def tunnelling(name: str, dt: float, speed: float) -> Row:
             table |= {"file": _closed_surface(Path(folder))}
         sim = over(table, velocity=(0.2 * speed, -speed, 0), dt=dt, at=(0, 0.05, 0), **SMALL)
     rows = sim.contact.contact_input()
-    nodes = np.unique(rows.corner[:, 0])
+    nodes = np.unique(rows.corner[: rows.body_start[-1], 0])
     pose, wrong, clipped = rows.obstacles.begin[0].copy(), 0, 0
     part = np.linspace(0, 1, SAMPLES)[:, None, None]
     for _ in range(int(0.05 / speed / dt) + 15):

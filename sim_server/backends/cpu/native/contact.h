@@ -19,11 +19,38 @@
 #pragma once
 #include "contact_copies.h"
 #include "contact_report.h"
+#include "faces.h"
 #include "island_groups.h"
 #include "obstacle_sweep.h"
 #include "pairs.h"
 #include "passes.h"
 #include "ties.h"
+
+// Sets the rows of a step but for those of nodes against obstacles, which are set.
+static void detect_other_rows(Loop& loop) {
+    if (loop.contact->face_start) FaceDetection{loop, *loop.contact}.run();
+    if (loop.contact->pair_first >= 0) PairDetection(loop, *loop.contact).run();
+}
+
+// Gives points and triangles that y takes into an obstacle rows there. Returns whether there are such.
+static bool sweep_obstacles(Passes& p) {
+    const bool points = ObstacleSweep(p).sweep(), faces = FaceSweep(p).sweep();
+    if (!points && !faces) return false;
+    p.list_rows();
+    p.move_points();
+    return true;
+}
+
+// Sets those that y still takes into one back; returns the number of nodes.
+static int hold_back(const Passes& p) {
+    int clipped = ObstacleSweep(p).clip();
+    for (int k = 0; k < HOLDS; ++k) {
+        const int faces = FaceSweep(p).clip();
+        if (!faces) break;
+        clipped += faces + ObstacleSweep(p).clip();
+    }
+    return clipped;
+}
 
 // The step of an island whose rows are detected; of a body alone as without contact where nothing is touched.
 static void solve_island(Loop& loop, int island, bool resumes) {
@@ -51,7 +78,7 @@ static void solve_island(Loop& loop, int island, bool resumes) {
         if (p.result.status != NOT_FINITE) {
             p.move_points();
             const bool acts = p.apply_law(false);
-            outside = !ObstacleSweep(p).sweep() && !acts;
+            outside = !sweep_obstacles(p) && !acts;
             if (!outside) {
                 p.leave();
                 p.solve(false);
@@ -59,11 +86,11 @@ static void solve_island(Loop& loop, int island, bool resumes) {
         }
     }
     for (int k = 0; k < ROUNDS && !outside && p.result.status != NOT_FINITE; ++k) {
-        outside = !ObstacleSweep(p).sweep();
+        outside = !sweep_obstacles(p);
         if (!outside) p.solve(false);
     }
     if (p.result.status == NOT_FINITE) p.each_entry([&](int64_t k) { p.y[k] = NAN; });  // the kernel `advance` takes the bodies back
-    else if (!outside) p.report.clipped += ObstacleSweep(p).clip();
+    else if (!outside) p.report.clipped += hold_back(p);
     for (int m = 0; m < p.count; ++m) {
         p.c.result[p.bodies[m]] = p.result;
         p.c.report[p.bodies[m]] = p.report;
@@ -98,6 +125,7 @@ static bool solve_in_contact(Loop& loop) {
         if (unmake_touched(loop)) return true;
         find_islands(loop);
         solve_islands(loop, true);
+        if (k == ROUNDS - 1) PairDetection(loop, c, loop.y).hold_back(c.room, loop.y);
     }
     for (int i = 0; i < c.islands; ++i) {
         Passes p(loop, i);

@@ -27,7 +27,10 @@ static void add_contacts(const Loop& loop, const Body& body, double* target) {
         lasting_stiffness(c, rows, k, s);
         rows.add_blocks(k, s, block_of);
     };
-    for (int k = c.body_start[index]; k < c.body_start[index + 1]; ++k) add(k);
+    auto add_all = [&](int first, int last) {
+        for (int k = first; k < last; ++k) add(k);
+    };
+    each_obstacle_range_of(c, index, add_all);
     for (int i = 0; i < c.ties.count; ++i) {
         if (c.ties.broken[i] || (c.ties.body[2 * i] != index && c.ties.body[2 * i + 1] != index)) continue;
         double s[6];
@@ -35,9 +38,15 @@ static void add_contacts(const Loop& loop, const Body& body, double* target) {
         rows.add_blocks(c.ties.first + i, s, block_of);
     }
     if (c.pair_first < 0 || !c.near[index]) return;
-    for (int i = 0; i < loop.bodies; ++i)
-        for (int k = c.pair_first + c.body_start[i]; c.near[i] && k < c.pair_first + c.body_start[i + 1]; ++k)
-            if (i == index || c.obstacle[k] == index) add(k);
+    auto add_shared = [&](int first, int last) {
+        for (int k = first; k < last; ++k)
+            if (c.obstacle[k] == index) add(k);
+    };
+    for (int i = 0; i < loop.bodies; ++i) {
+        if (!c.near[i]) continue;
+        if (i == index) each_pair_range_of(c, i, add_all);
+        else each_pair_range_of(c, i, add_shared);
+    }
 }
 
 // Upper triangle of w^2 R^T S R, the part of a row against an obstacle on its node's own block. Returns the node within the body.

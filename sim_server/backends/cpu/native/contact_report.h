@@ -63,7 +63,7 @@ struct ContactEnd : IslandRows {
             double u[3];
             rotated(c.rotation + 9 * (int64_t)node, y + 3 * (int64_t)node, u);
             for (int m = 0; m < 3; ++m)
-                displacement[a > 0 && is_pair(c, k)][m] += c.weight[CORNERS * k + a] * c.dx_dv * (c.predictor[3 * (int64_t)node + m] + u[m]);
+                displacement[is_other_side(c, k, a)][m] += c.weight[CORNERS * k + a] * c.dx_dv * (c.predictor[3 * (int64_t)node + m] + u[m]);
         }
         c.report[body_of_row(c, k, false)].work += dot3(f, displacement[0]);
         if (is_pair(c, k)) c.report[c.obstacle[k]].work += dot3(f, displacement[1]);

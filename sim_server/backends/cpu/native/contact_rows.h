@@ -5,7 +5,8 @@
 #include <cstdint>
 
 #include "contact_passes.cuh"
-#include "pair_detection.cuh"
+#include "edge_detection.cuh"
+#include "triangle_shape.cuh"
 
 struct RowState {                 // of a row in the step under way
     double s[3];                  // displacement of its point by the velocities reached, relative to the other surface [m]
@@ -66,11 +67,23 @@ struct Contact {
     double *force, *traction;                     // (rows,), (rows, 3)
     const double *rotation, *predictor, *free;    // (nodes, 3, 3), (nodes, 3), (nodes,)
     RowState* state;                              // (rows,)
-    int32_t* active;                              // (rows,) rows that act, those of an island one after another
+    int32_t *active, *used;                       // (rows,) rows that act, and that are not empty; those of an island one after another
     double* room;                                 // 24 doubles a node
     ContactReport* report;                        // (bodies,)
     double* reaction;                             // (bodies, obstacles, 6) force and torque on each obstacle
+    int32_t* dropped;                             // (sites,)
+    const double* mass;                           // (nodes,) [kg]
+    const double* body_thickness;                 // (bodies,) [m], where bodies touch each other
+    const int32_t* face_start;                    // (bodies + 1,) rows of triangles against obstacles; null: there are none (faces.h)
+    const int32_t *face, *face_owns;              // (faces, 3) nodes, (faces,) bits
+    const double* face_friction;                  // (bodies, obstacles)
     int32_t pair_first;                           // row of the first one between bodies; -1: bodies do not touch each other
+    const int32_t* edge_start;                    // (bodies + 1,) rows of edges against edges of other bodies; null: there are none
+    const int32_t *edge, *edge_opposite, *triangle_edge;  // (edges, 2), (edges, 2), (triangles, 3): edge_detection.cuh
+    const double* edge_length;                    // (bodies,)
+    EdgeWings* wings;                             // (edges,)
+    int32_t* facing;                              // (rows of edges,)
+    const int32_t* row_body;                      // (rows,)
     const int32_t *site_body, *node_site;         // (sites,), (nodes,) or -1
     const int32_t* triangle;                      // (triangles, 3) nodes
     const int32_t *tree_start, *tree_child;       // (bodies + 1,), (tree, 2): two children, or ~ of a triangle (pairs.h)
@@ -108,10 +121,33 @@ inline bool is_pair(const Contact& c, int row) {
     return c.pair_first >= 0 && row >= c.pair_first;
 }
 
-// Body of a row's vertex; other: that of its triangle, of a row between bodies.
+// True if corner a of a row is of the other one of its two bodies.
+inline bool is_other_side(const Contact& c, int row, int a) {
+    return is_pair(c, row) && a > (!is_tie(c, row) && c.edge_start && row >= c.edge_start[0]);
+}
+
+// Body of a row; other: the other one, of a row between bodies.
 inline int body_of_row(const Contact& c, int row, bool other) {
     if (is_tie(c, row)) return c.ties.body[2 * (row - c.ties.first) + (other && is_pair(c, row))];
-    return other ? c.obstacle[row] : c.site_body[(is_pair(c, row) ? row - c.pair_first : row) / 2];
+    return other ? c.obstacle[row] : c.row_body[row];
+}
+
+// f(first, last) of the rows of contact that a body has with others, each sort
+template <class F> void each_pair_range_of(const Contact& c, int body, F f) {
+    if (c.pair_first >= 0) f(c.pair_first + c.body_start[body], c.pair_first + c.body_start[body + 1]);
+    if (c.edge_start) f(c.edge_start[body], c.edge_start[body + 1]);
+}
+
+// f(first, last) of its rows against obstacles
+template <class F> void each_obstacle_range_of(const Contact& c, int body, F f) {
+    f(c.body_start[body], c.body_start[body + 1]);
+    if (c.face_start) f(c.face_start[body], c.face_start[body + 1]);
+}
+
+template <class F> void each_range_of(const Contact& c, int body, F f) {
+    each_obstacle_range_of(c, body, f);
+    each_pair_range_of(c, body, f);
+    if (c.ties.count) f(c.ties.first + c.ties.start[body], c.ties.first + c.ties.start[body + 1]);
 }
 
 // Which of a point's two rows, `pair` and the next one, something that it enters gets: its own, an empty one, or the one that carries less.
@@ -122,6 +158,11 @@ inline int row_for(const Contact& c, int pair, int other, const double* normal =
     if (c.obstacle[pair] == other) return pair;
     const bool next = c.obstacle[pair + 1] == other || c.obstacle[pair + 1] < 0;
     return pair + (next || (c.obstacle[pair] >= 0 && c.state[pair + 1].force.normal < c.state[pair].force.normal));
+}
+
+// How nodes move in the step, from positions x; y: solution found, material frame; null: before the solve.
+inline SurfaceMotion<double, double> motion_of(const Contact& c, const double* x, const double* y) {
+    return {x, c.predictor, y, c.rotation, c.free, c.dx_dv, c.force_coefficient, c.gravity};
 }
 
 // A row that a sweep has made has no force, and friction no limit, until a solve has found them.

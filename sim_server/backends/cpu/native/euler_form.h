@@ -34,12 +34,14 @@ static void join_touching(Loop& loop) {
     for (bool more = c.pair_first >= 0; more;) {
         more = false;
         for (int i = 0; i < loop.bodies; ++i)
-            for (int k = c.pair_first + c.body_start[i]; c.near[i] && k < c.pair_first + c.body_start[i + 1]; ++k) {
-                const int other = c.obstacle[k];
-                if (other < 0 || takes[i] == takes[other]) continue;
-                takes[i] = takes[other] = 1;
-                more = true;
-            }
+            each_pair_range_of(c, i, [&](int first, int last) {
+                for (int k = first; c.near[i] && k < last; ++k) {
+                    const int other = c.obstacle[k];
+                    if (other < 0 || takes[i] == takes[other]) continue;
+                    takes[i] = takes[other] = 1;
+                    more = true;
+                }
+            });
     }
 }
 
@@ -55,11 +57,12 @@ static void detect_contacts(Loop& loop) {
         take_mail(loop.launch[k], loop.rings.step);
         run(loop.launch[k], loop.threads);
     }
-    if (c.pair_first >= 0) PairDetection(loop, *loop.contact).run();
+    detect_other_rows(loop);
     for (int i = 0; i < loop.bodies; ++i) {
-        auto touches = [&](int k) { return c.obstacle[k] >= 0 && c.force[k] > 0; };
-        for (int k = c.body_start[i]; k < c.body_start[i + 1]; ++k)
-            if (touches(k) || (c.pair_first >= 0 && touches(c.pair_first + k))) e.takes[i] = 1;
+        each_range_of(c, i, [&](int first, int last) {
+            for (int k = first; k < last; ++k)
+                if (c.obstacle[k] >= 0 && c.force[k] > 0) e.takes[i] = 1;
+        });
     }
     join_touching(loop);
     for (int i = 0; i < loop.bodies; ++i) {
@@ -125,7 +128,7 @@ static void look_for_touch(Loop& loop) {
         p.choose_set();
         p.move_points();
         const bool acts = p.apply_law(false);
-        e.takes[i] = ObstacleSweep(p).sweep() || acts;
+        e.takes[i] = sweep_obstacles(p) || acts;
     }
 }
 

@@ -134,10 +134,10 @@ struct IslandSolver {
             for (int a = 0; a < CORNERS; ++a) {
                 const int node = c.corner[CORNERS * r + a];
                 if (node < 0 || c.free[node] == 0) continue;
-                const bool second = a > 0 && is_pair(c, r);
-                const Body& body = loop.body[body_of_row(c, r, second)];
+                const bool other = is_other_side(c, r, a);
+                const Body& body = loop.body[body_of_row(c, r, other)];
                 const double w = c.weight[CORNERS * r + a], *x = loop.x + 3 * (int64_t)node, *o = loop.x + 3 * (int64_t)body.first;
-                double* side = lever + 4 * second;
+                double* side = lever + 4 * other;
                 side[0] += w;
                 for (int m = 0; m < 3; ++m) side[1 + m] += w * (x[m] - o[m]);
             }

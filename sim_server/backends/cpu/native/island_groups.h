@@ -25,9 +25,10 @@ static void single_islands(Loop& loop) {
     Contact& c = *loop.contact;
     c.islands = loop.bodies;
     for (int i = 0; i <= loop.bodies; ++i) c.island_start[i] = i;
-    for (int i = 0; i < loop.bodies; ++i) {
+    for (int i = 0, rows = 0; i < loop.bodies; ++i) {
         c.island[i] = i;
-        c.island_rows[i] = (c.pair_first >= 0 ? 2 : 1) * c.body_start[i];
+        c.island_rows[i] = rows;
+        each_range_of(c, i, [&](int first, int last) { rows += last - first; });
     }
 }
 
@@ -44,18 +45,21 @@ static void find_islands(Loop& loop) {
     auto finite = [&](int i) {
         const Body& body = loop.body[i];
         const int64_t at = 3 * (int64_t)body.first;
-        return std::isfinite(dot(3 * (body.last - body.first), loop.b + at, loop.b + at));
+        const int size = 3 * (body.last - body.first);
+        return std::isfinite(dot(size, loop.b + at, loop.b + at)) && std::isfinite(dot(size, loop.x + at, loop.x + at));
     };
     for (int i = 0; (c.pair_first >= 0 || c.ties.count) && i < loop.bodies; ++i) well[i] = !is_made(loop, i) && finite(i);
     for (int i = 0; c.pair_first >= 0 && i < loop.bodies; ++i) {
         if (!c.near[i] || is_made(loop, i)) continue;
-        for (int k = c.pair_first + c.body_start[i]; k < c.pair_first + c.body_start[i + 1]; ++k) {
-            const int other = c.obstacle[k];
-            if (other < 0) continue;
-            if (!well[i] || !well[other]) { c.obstacle[k] = -1; continue; }
-            const int a = root(i), b = root(other);
-            parent[std::max(a, b)] = std::min(a, b);
-        }
+        each_pair_range_of(c, i, [&](int first, int last) {
+            for (int k = first; k < last; ++k) {
+                const int other = c.obstacle[k];
+                if (other < 0) continue;
+                if (!well[i] || !well[other]) { c.obstacle[k] = -1; continue; }
+                const int a = root(i), b = root(other);
+                parent[std::max(a, b)] = std::min(a, b);
+            }
+        });
     }
     for (int i = 0; i < c.ties.count; ++i) {
         const int32_t* body = c.ties.body + 2 * i;
@@ -74,8 +78,7 @@ static void find_islands(Loop& loop) {
         for (int j = i; j < loop.bodies; ++j) {
             if (root(j) != i) continue;
             c.island[bodies++] = j;
-            rows += (c.pair_first >= 0 ? 2 : 1) * (c.body_start[j + 1] - c.body_start[j]);
-            if (c.ties.count) rows += c.ties.start[j + 1] - c.ties.start[j];
+            each_range_of(c, j, [&](int first, int last) { rows += last - first; });
         }
     }
     c.island_start[c.islands] = bodies;

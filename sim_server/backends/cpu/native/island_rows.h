@@ -9,16 +9,18 @@ struct IslandRows {
     Contact& c;
     const int32_t* bodies;
     const int32_t count;
-    const bool pairs;                    // rows between bodies count
     Rows rows;
-    int32_t* const active;               // its rows that act
+    int32_t *const active, *const used;  // its rows that act, and that are not empty
+    int used_count = 0;
     const double* b;
     double* y;
 
     IslandRows(Loop& loop, int island)
         : loop(loop), c(*loop.contact), bodies(c.island + c.island_start[island]),
-          count(c.island_start[island + 1] - c.island_start[island]), pairs(c.pair_first >= 0),
-          rows{c, 0, c.active + c.island_rows[island], 0}, active(c.active + c.island_rows[island]), b(loop.b), y(loop.y) {}
+          count(c.island_start[island + 1] - c.island_start[island]), rows{c, 0, c.active + c.island_rows[island], 0},
+          active(c.active + c.island_rows[island]), used(c.used + c.island_rows[island]), b(loop.b), y(loop.y) {
+        list_rows();
+    }
 
     template <class F> void each_entry(F f) const {
         for (int m = 0; m < count; ++m) {
@@ -26,20 +28,20 @@ struct IslandRows {
             for (int64_t k = 3 * (int64_t)body.first; k < 3 * (int64_t)body.last; ++k) f(k);
         }
     }
-    // f(first, last) of the rows of each body, those with its own vertices
+    // f(first, last) of the rows of each body, each sort
     template <class F> void each_range(F f) const {
-        for (int m = 0; m < count; ++m) {
-            const int first = c.body_start[bodies[m]], last = c.body_start[bodies[m] + 1];
-            f(first, last);
-            if (pairs) f(c.pair_first + first, c.pair_first + last);
-            if (c.ties.count) f(c.ties.first + c.ties.start[bodies[m]], c.ties.first + c.ties.start[bodies[m] + 1]);
-        }
+        for (int m = 0; m < count; ++m) each_range_of(c, bodies[m], f);
     }
-    template <class F> void each_row(F f) const {
+    // Takes up which rows are not empty.
+    void list_rows() {
+        used_count = 0;
         each_range([&](int first, int last) {
             for (int k = first; k < last; ++k)
-                if (!rows.empty(k)) f(k, c.state[k]);
+                if (!rows.empty(k)) used[used_count++] = k;
         });
+    }
+    template <class F> void each_row(F f) const {
+        for (int m = 0; m < used_count; ++m) f(used[m], c.state[used[m]]);
     }
 
     // Displacements of the points by velocities y.

@@ -7,6 +7,7 @@
 
 #include "energy.h"
 #include "euler_form.h"
+#include "faces.h"
 #include "newton.h"
 #include "pair_reactions.h"
 #include "sizes.h"
@@ -164,7 +165,7 @@ static void assemble(Loop* loop, bool whole) {
     if (loop->euler && loop->contact) detect_contacts(*loop);
     if (loop->stages) assemble_stage(*loop, whole);
     else assemble_single(*loop, whole);
-    if (loop->contact && !loop->euler && loop->contact->pair_first >= 0) PairDetection(*loop, *loop->contact).run();
+    if (loop->contact && !loop->euler) detect_other_rows(*loop);
     if (loop->contact && loop->contact->ties.count) TieRows(*loop).prepare();
     for (int i = 0; i < loop->bodies && loop->contact; ++i) note_touches(*loop, loop->body[i]);
     for (int i = 0; i < loop->bodies; ++i) copy_for_worker(*loop, loop->body[i]);

@@ -72,7 +72,6 @@ struct ObstacleSweep : IslandRows {
             for (int o = 0; o < c.obstacle_count; ++o)
                 if (!far_away(o, w)) found = sweep(bodies[m], o) || found;
         }
-        if (found) move_points();
         return found;
     }
     bool sweep(int body, int obstacle) const {

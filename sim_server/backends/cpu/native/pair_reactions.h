@@ -65,8 +65,10 @@ static void add_pair_reactions(const Loop& loop, int64_t step, std::vector<React
     first.clear();
     for (int i = 0; i < loop.bodies; ++i) {
         first.push_back(sums.size());
-        for (int k = c.pair_first + c.body_start[i]; c.near[i] && k < c.pair_first + c.body_start[i + 1]; ++k)
-            if (c.obstacle[k] >= 0 && c.obstacle[k] != i && c.force[k] > 0) add_pair_row(c, loop.x, k, c.obstacle[k], sums, first[i]);
+        each_pair_range_of(c, i, [&](int begin, int end) {
+            for (int k = begin; c.near[i] && k < end; ++k)
+                if (c.obstacle[k] >= 0 && c.obstacle[k] != i && c.force[k] > 0) add_pair_row(c, loop.x, k, c.obstacle[k], sums, first[i]);
+        });
     }
     first.push_back(sums.size());
     for (int i = 0; i < loop.bodies; ++i) {

@@ -5,19 +5,24 @@
 
 #include "loop.h"
 
+constexpr int PAIR_HOLDS = 40;  // rounds in which bodies that pass through each other are held apart
+
 struct PairDetection {
     typedef SurfaceMotion<double, double> Motion;
     const Loop& loop;
     Contact& c;
     const SurfaceTables tables;
+    const EdgeTables edges;
     const Motion motion;
 
     // y: solution found, material frame; null: before the solve
     PairDetection(const Loop& loop, Contact& c, const double* y = nullptr)
         : loop(loop), c(c), tables{loop.bodies, c.body_start, c.corner, c.weight, c.obstacle, c.normal, c.gap, c.entry, c.stiffness, c.friction,
                                    c.thickness, c.hardening, c.force, c.traction, c.pair_first, c.site_body, c.node_site, c.triangle, c.tree_start,
-                                   c.tree_child, c.tree_box, c.body_box, c.near, c.pair_friction},
-          motion{loop.x, c.predictor, y, c.rotation, c.free, c.dx_dv, c.force_coefficient, c.gravity} {}
+                                   c.tree_child, c.tree_box, c.body_box, c.near, c.pair_friction, c.body_thickness},
+          edges{c.edge_start, c.edge, c.edge_opposite, c.triangle_edge, c.edge_length, c.wings, c.facing}, motion(motion_of(c, loop.x, y)) {}
+
+    int edges_before(int body) const { return c.edge_start ? (c.edge_start[body] - c.edge_start[0]) / 2 : 0; }
 
     void fit() const {
         for (int i = 0; i < loop.bodies; ++i) { fit_body(tables, motion, i); c.near[i] = c.touched[i] = 0; }
@@ -26,7 +31,10 @@ struct PairDetection {
                 if (meet(c.body_box[i], c.body_box[j])) c.near[i] = c.near[j] = 1;
 #pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) if (loop.threads > 1)
         for (int i = 0; i < loop.bodies; ++i)
-            if (c.near[i]) fit_tree(tables, motion, i);
+            if (c.near[i]) {
+                fit_tree(tables, motion, i);
+                for (int edge = edges_before(i); edge < edges_before(i + 1); ++edge) fit_wings(edges, motion, edge);
+            }
     }
 
     // Sets the rows of a step.
@@ -36,36 +44,161 @@ struct PairDetection {
         for (int i = 0; i < loop.bodies; ++i) {
             if (!c.near[i] && !c.was_near[i]) continue;
             for (int site = sites_before(tables, i); site < sites_before(tables, i + 1); ++site) detect_site(tables, motion, site);
+            for (int edge = edges_before(i); edge < edges_before(i + 1); ++edge) {
+                if (!c.near[i]) c.wings[edge].sharp = 0;
+                count_dropped(edge, detect_edge(tables, edges, motion, i, edge));
+            }
         }
         std::copy(c.near, c.near + loop.bodies, c.was_near);
     }
 
     // Gives vertices that the solution moves through a triangle, or into a body that they were outside of, a row there, or makes theirs
-    // stiffer. True if there are such. room: memory, 4 doubles a node, for where nodes come to and how far at most those of a body move.
-    // detected: the rows are those of `run`, so that a vertex that moves less than it was away need not be looked at.
+    // stiffer; edges that it moves through edges likewise. True if there are such. room: memory, 4 doubles a node, for where nodes come
+    // to and how far at most those of a body move. detected: the rows are those of `run`, so that a vertex that moves less than it was
+    // away need not be looked at.
     bool sweep(double* room, bool detected) const {
         fit();
-        double *ends = room, *farthest = room + 3 * (int64_t)loop.nodes;
-        for (int i = 0; i < loop.bodies; ++i) {
-            farthest[i] = 0;
-            for (int node = loop.body[i].first; c.near[i] && node < loop.body[i].last; ++node) {
-                double* end = ends + 3 * (int64_t)node;
-                displacement_of(motion, node, end);
-                farthest[i] = std::fmax(farthest[i], std::sqrt(dot3(end, end)));
-                for (int k = 0; k < 3; ++k) end[k] += loop.x[3 * (int64_t)node + k];
-            }
-        }
-        Motion ended = motion;
-        ended.x = ends;
-        ended.predictor = nullptr;
+        double* farthest = room + 3 * (int64_t)loop.nodes;
+        const Motion ended = arrived(room, farthest);
         bool found = false;
 #pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) reduction(|| : found) if (loop.threads > 1)
         for (int i = 0; i < loop.bodies; ++i)
             for (int site = sites_before(tables, i); c.near[i] && site < sites_before(tables, i + 1); ++site)
                 found = sweep_site(site, ended, detected ? farthest : nullptr) || found;
+        for (int i = 0; i < loop.bodies; ++i)
+            for (int edge = edges_before(i); c.near[i] && edge < edges_before(i + 1); ++edge) found = sweep_edge(i, edge) || found;
         // rows of this step, whether found before the solve or here, count in its islands and are looked at again in the next one
         for (int i = 0; i < loop.bodies; ++i) c.near[i] = c.was_near[i] = c.near[i] || c.was_near[i];
         return found;
+    }
+    // The motion of what has arrived. ends: (nodes, 3) memory. farthest: (bodies,) out, how far nodes move at most [m]; null: not wanted
+    Motion arrived(double* ends, double* farthest = nullptr) const {
+        for (int i = 0; i < loop.bodies; ++i) {
+            double most = 0;
+            for (int node = loop.body[i].first; c.near[i] && node < loop.body[i].last; ++node) {
+                double* end = ends + 3 * (int64_t)node;
+                displacement_of(motion, node, end);
+                most = std::fmax(most, std::sqrt(dot3(end, end)));
+                for (int k = 0; k < 3; ++k) end[k] += loop.x[3 * (int64_t)node + k];
+            }
+            if (farthest) farthest[i] = most;
+        }
+        Motion ended = motion;
+        ended.x = ends;
+        ended.predictor = nullptr;
+        return ended;
+    }
+
+    // Moves nodes so that what y still takes through another body stays in front of it: along the normal where they touch, both sides
+    // by their masses, which keeps their momentum. Counts the nodes in the reports of both bodies. True if there were such.
+    bool hold_back(double* ends, double* y) const {
+        bool any = false;
+        std::copy(c.near, c.near + loop.bodies, c.was_near);
+        for (int k = 0; k < PAIR_HOLDS; ++k) {
+            fit();
+            const Motion ended = arrived(ends);
+            bool found = false;
+            for (int i = 0; i < loop.bodies; ++i) {
+                if (!c.near[i] || c.result[i].status == NOT_FINITE) continue;
+                for (int site = sites_before(tables, i); site < sites_before(tables, i + 1); ++site) found = hold_site(i, site, ended, y) || found;
+                for (int edge = edges_before(i); edge < edges_before(i + 1); ++edge) found = hold_edge(i, edge, y) || found;
+            }
+            any = any || found;
+            if (!found) break;
+        }
+        for (int i = 0; i < loop.bodies; ++i) c.near[i] = c.was_near[i] = c.near[i] || c.was_near[i];
+        return any;
+    }
+    bool hold_site(int body, int site, const Motion& ended, double* y) const {
+        const int node = node_of_site(tables, site);
+        if (c.free[node] == 0) return false;
+        const Box box = box_of(motion, node, thickness_of(tables, body));
+        bool found = false;
+        for (int other = 0; other < loop.bodies; ++other) {
+            if (other == body || !c.near[other] || c.result[other].status == NOT_FINITE || !meet(box, c.body_box[other])) continue;
+            const double thickness = 0.5 * (thickness_of(tables, body) + thickness_of(tables, other));
+            Meeting t;
+            if (passage_of(tables, motion, ended, node, other, thickness, t) == STAYS_OUT) continue;
+            const int32_t* corner = c.triangle + 3 * t.triangle;
+            const int32_t nodes[CORNERS] = {node, corner[0], corner[1], corner[2]};
+            const double *w = t.touch.weight, weight[CORNERS] = {1, -w[0], -w[1], -w[2]};
+            hold_apart(nodes, weight, t.touch.normal, 0.1 * thickness, body, other, y);
+            found = true;
+        }
+        return found;
+    }
+    bool hold_edge(int body, int edge, double* y) const {
+        bool found = false;
+        each_facing_edge(tables, edges, motion, body, edge, [&](int other, int facing, double thickness) {
+            const EdgePath path = path_of(edges, motion, edge), way = path_of(edges, motion, facing);
+            EdgeTouch t;
+            if (c.result[other].status == NOT_FINITE || !edges_pass(path, c.wings[edge], way, c.wings[facing], THROUGH * thickness)) return;
+            if (!meet_edges(path, c.wings[edge], way, c.wings[facing], thickness, 1e-2 * thickness, t)) return;
+            const int32_t nodes[CORNERS] = {c.edge[2 * edge], c.edge[2 * edge + 1], c.edge[2 * facing], c.edge[2 * facing + 1]};
+            const double weight[CORNERS] = {1 - t.s, t.s, t.t - 1, -t.t};
+            hold_apart(nodes, weight, t.normal, 0.1 * thickness, body, other, y);
+            found = true;
+        });
+        return found;
+    }
+    // Moves nodes by their weights over their masses until sum_a weight_a x_a is `gap` along the normal.
+    void hold_apart(const int32_t* nodes, const double* weight, const double* normal, double gap, int body, int other, double* y) const {
+        double lacks = gap, share = 0;
+        for (int a = 0; a < CORNERS; ++a) {
+            double s[3];
+            displacement_of(motion, nodes[a], s);
+            for (int k = 0; k < 3; ++k) lacks -= weight[a] * normal[k] * (loop.x[3 * (int64_t)nodes[a] + k] + s[k]);
+            if (c.free[nodes[a]] != 0) share += weight[a] * weight[a] / c.mass[nodes[a]];
+        }
+        if (!(lacks > 0) || !(share > 0)) return;
+        for (int a = 0; a < CORNERS; ++a) {
+            if (c.free[nodes[a]] == 0 || weight[a] == 0) continue;
+            double dv[3], own[3];
+            for (int k = 0; k < 3; ++k) dv[k] = lacks / share * weight[a] / c.mass[nodes[a]] * normal[k] / c.dx_dv;
+            rotated_back(c.rotation + 9 * (int64_t)nodes[a], dv, own);
+            for (int k = 0; k < 3; ++k) y[3 * (int64_t)nodes[a] + k] += own[k];
+        }
+        ++c.report[body].clipped;
+        ++c.report[other].clipped;
+        c.touched[body] = c.touched[other] = 1;
+    }
+
+    void count_dropped(int edge, int rows) const {
+        for (int end = 0; end < 2 && rows; ++end)
+            if (const int site = c.node_site[c.edge[2 * edge + end]]; site >= 0) { c.dropped[site] += rows; return; }
+    }
+
+    // The same for an edge that the solution takes through another one.
+    bool sweep_edge(int body, int edge) const {
+        bool found = false;
+        const EdgePath path = path_of(edges, motion, edge);
+        each_facing_edge(tables, edges, motion, body, edge, [&](int other, int facing, double thickness) {
+            const EdgePath way = path_of(edges, motion, facing);
+            EdgeMeeting t = {other, facing, {}};
+            if (!edges_pass(path, c.wings[edge], way, c.wings[facing], THROUGH * thickness)) return;
+            if (!meet_edges(path, c.wings[edge], way, c.wings[facing], thickness, 1e-2 * thickness, t.touch)) return;
+            take_edge_row(body, edge, t);
+            c.touched[body] = c.touched[other] = 1;
+            found = true;
+        });
+        return found;
+    }
+    void take_edge_row(int body, int edge, const EdgeMeeting& t) const {
+        const int row = c.edge_start[0] + 2 * edge;
+        const int32_t* facing = c.facing + 2 * edge;
+        int k = row;
+        if (facing[0] != t.edge || c.obstacle[row] < 0) {
+            const bool next = c.obstacle[row + 1] < 0 || facing[1] == t.edge;
+            k += next || (c.obstacle[row] >= 0 && c.state[row + 1].force.normal < c.state[row].force.normal);
+        }
+        RowState& state = c.state[k];
+        const bool same = c.obstacle[k] >= 0 && facing[k - row] == t.edge;
+        if (same && dot3(c.normal + 3 * k, t.touch.normal) > SAME_PLANE) {
+            c.hardening[k] = std::min(HARDER * c.hardening[k], HARDEST);
+            return;
+        }
+        put_edge_row(tables, edges, motion, k, body, t);
+        take_anew(state);
     }
 
     // How far a vertex is at least from a body at the start of the step, as its rows tell, up to `thickness`.
@@ -92,7 +225,7 @@ struct PairDetection {
         const double own = std::sqrt(dot3(s, s));
         bool found = false;
         for (int other = 0; other < loop.bodies; ++other) {
-            if (other == body || !c.near[other] || (c.ties.count && c.ties.bound[node] == other + 1) || !meet(box, c.body_box[other])) continue;
+            if (other == body || !c.near[other] || !meet(box, c.body_box[other])) continue;
             const double thickness = 0.5 * (thickness_of(tables, body) + thickness_of(tables, other));
             if (farthest && own + farthest[other] < distance_at_start(site, other, thickness) - THROUGH * thickness) continue;
             Meeting t;

@@ -259,9 +259,11 @@ struct Passes : IslandRows {
         return size <= c.tolerance * given;
     }
 
-    // Goes on with what an earlier solve of the step has come to. An island that grew counts what its first body has.
+    // Goes on with what an earlier solve of the step has come to. An island that grew counts what its first body has, and what was held
+    // back in any of its bodies.
     void take_up() {
         result = c.result[bodies[0]];
         report = c.report[bodies[0]];
+        for (int m = 1; m < count; ++m) report.clipped = std::max(report.clipped, c.report[bodies[m]].clipped);
     }
 };

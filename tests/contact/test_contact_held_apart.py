@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: MIT
+"""Bodies that the passes would let through each other, begin inside each other, are held all over, or have no place."""
+
+import logging
+
+import numpy as np
+import pytest
+
+from sim_server.backends.kinds import KINDS
+from sim_server.simulation import Simulation
+from tests.contact.scenes import D, block, floor, over
+
+STATUS = KINDS.enumeration("Status")
+JACOBI = {"preconditioner": "block_jacobi"}
+FAR = floor(pose={"translate": [0, -100, 0]})
+
+
+def thrown(speed: float, **contact: float) -> Simulation:
+    """A block over a plate, both free."""
+    plate = block(name="plate", cells=(4, 1, 4), size=(0.2, 0.02, 0.2), at=(-0.05, 0, -0.05), young=3e6)
+    ball = block(name="ball", cells=(2, 2, 2), size=(0.06, 0.06, 0.06), at=(0.021, 0.03, 0.017), young=3e6)
+    sim = over(FAR, objects=[plate, ball], gravity=(0, 0, 0), solver=JACOBI, contact={"thickness": D} | contact)
+    sim.world.v[sim.world.bodies[1].nodes] = (0, -speed, 0)
+    return sim
+
+
+@pytest.mark.parametrize("speed", [3.0, 6.0])
+def test_what_passes_is_held_back_on_both_sides_and_counted_and_momentum_is_kept(speed):
+    """With passes that are too few to stop it, and hardly any stiffness."""
+    sim = thrown(speed, passes=1, stiffness=0.001)
+    plate, ball = (b.nodes for b in sim.world.bodies)
+    before = sim.world.mass @ sim.world.v
+    for _ in range(3):
+        sim.engine.run(1)
+        assert sim.world.x[ball, 1].mean() > sim.world.x[plate, 1].mean() + 0.02
+    records = sim.engine.records().reshape(-1, 2)
+    assert records["clipped"].any() and np.array_equal(*records["clipped"].T)
+    assert abs(sim.world.mass @ sim.world.v - before).max() <= 1e-9 * sim.world.mass.sum() * speed
+
+
+def test_objects_that_begin_inside_each_other_are_told_with_the_depth(caplog):
+    objects = [block(name="one", at=(0, 0, 0)), block(name="other", at=(0.01, 0.05, 0.01))]
+    with caplog.at_level(logging.WARNING):
+        over(FAR, objects=objects)
+    said = [r.getMessage() for r in caplog.records if "begins inside object" in r.getMessage()]
+    assert len(said) == 2 and "'other' begins inside object 'one': node 0 is 0.01 m deep (16 such nodes)" in said[0]
+    assert "'one' begins inside object 'other'" in said[1]
+    caplog.clear()
+    over(FAR, objects=[block(name="one", at=(0, 0, 0)), block(name="other", at=(0, 0.06 + D, 0))])
+    assert not [r for r in caplog.records if "begins inside object" in r.getMessage()]
+
+
+def test_a_body_all_of_whose_surface_is_fixed_carries_another():
+    """It has no rows of its own, but a thickness."""
+    sides = "X < 0.01 or X > 0.09 or Y < 0.01 or Y > 0.05 or Z < 0.01 or Z > 0.09"
+    held = block(name="held", fixed=sides, at=(0, 0, 0))
+    sim = over(FAR, objects=[held, block(name="free", at=(0.003, 0.06 + D, 0.002))], solver=JACOBI)
+    sim.engine.run(100)
+    low = sim.world.x[sim.world.bodies[1].nodes, 1].min()
+    assert low == pytest.approx(0.06 + D, abs=0.2 * D) and abs(sim.world.v).max() < 1e-4
+    given = sim.contact.contact_input()
+    assert (given.thickness[given.obstacle >= 0] == pytest.approx(D)) and (given.force > 0).any()
+
+
+def test_a_frozen_body_that_has_no_place_leaves_those_beside_it_alone():
+    objects = [block(name="lost", at=(0, 0, 0)), block(name="well", at=(0.003, 0.06 + D, 0.002))]
+    sim = over(FAR, objects=objects, solver=JACOBI)
+    sim.engine.run(2)
+    lost = sim.world.bodies[0].nodes
+    sim.world.free[lost], sim.world.v[lost], sim.world.x[lost] = 0, 0, np.nan
+    sim.engine.run(2)
+    records = sim.engine.records().reshape(-1, 2)
+    assert (records["status"][-1:, 1] != STATUS["NOT_FINITE"]).all()
+    assert np.isfinite(sim.world.x[sim.world.bodies[1].nodes]).all()
+
+
+def test_what_is_held_apart_is_told_of_all_bodies_that_are_solved_together():
+    """Also of the first one, which only touches."""
+    under = block(name="under", cells=(2, 1, 2), size=(0.06, 0.02, 0.06), at=(0.1, -0.02 - 0.5 * D, 0.1))
+    plate = block(name="plate", cells=(4, 1, 4), size=(0.2, 0.02, 0.2), at=(-0.05, 0, -0.05), young=3e6)
+    ball = block(name="ball", cells=(2, 2, 2), size=(0.06, 0.06, 0.06), at=(0.021, 0.03, 0.017), young=3e6)
+    sim = over(
+        FAR, objects=[under, plate, ball], gravity=(0, 0, 0), solver=JACOBI,
+        contact={"thickness": D, "passes": 1, "stiffness": 0.001},
+    )  # fmt: skip
+    sim.world.v[sim.world.bodies[2].nodes] = (0, -3.0, 0)
+    sim.engine.run(1)
+    clipped = sim.engine.records()["clipped"]
+    assert clipped[0] == clipped[1] == clipped[2] > 0
