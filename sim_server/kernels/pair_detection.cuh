@@ -1,7 +1,8 @@
 // SPDX-License-Identifier: MIT
 // Where the surfaces of bodies touch each other: each vertex against the triangles of the other bodies, along the paths that gravity
 // alone would make, or that a solution makes (vertex_triangle.cuh); shared by both devices. A vertex has two rows, for the two bodies that
-// it meets first, or is nearest to; a row remembers its forces as long as the vertex touches the same body, on whichever triangle.
+// it meets first, or is nearest to, or for both sides of a crease of one; a row remembers its forces as long as the vertex touches the same
+// body, on whichever triangle.
 //
 // A body has a tree of boxes over its triangles, made once, whose boxes are fitted anew in each step in which its own box meets
 // another's. Children come after their parents.
