@@ -26,7 +26,7 @@ class Obstacles:
 
 @dataclass(frozen=True)
 class Surfaces:
-    """What bodies need to touch each other (detection: backends/cpu/native/pairs.h).
+    """What bodies need to touch each other (detection: kernels/pair_detection.cuh).
 
     site_body: (surface nodes,). node_site: (nodes,) number of a node among the surface nodes, -1: it is none
     triangle: (triangles, 3) nodes of the scene, outward; those of a body are together

@@ -15,7 +15,7 @@ the nearest point, if that is nearer than 2 d. Obstacles (`[[obstacle]]`) are fi
 poses that a client gives, no faster than `max_speed` and `max_turn`.
 
 With `between` a node is kept away from the triangles of other objects in the same way; what touches is solved as one
-system (backends/cpu/native/pairs.h and island.h).
+system (kernels/pair_detection.cuh, backends/cpu/native/island.h).
 
 Only nodes are kept out: a corner or an edge that is smaller than the triangles of the surface may pass between them.
 Friction of a pair is the geometric mean of both, unless `friction` names the pair.

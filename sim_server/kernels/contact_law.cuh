@@ -16,6 +16,8 @@
 #pragma once
 #include "shapes.cuh"
 
+constexpr int CORNERS = 4;      // of a row, at most
+
 struct ContactRow {             // views of a row's entries
     const double *normal, *drift, *anchor;  // (3,) each
     double gap, thickness, stiffness, friction;

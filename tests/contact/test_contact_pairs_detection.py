@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Rows between bodies (backends/cpu/native/pairs.h) against all vertices x all triangles, and what rows remember."""
+"""Rows between bodies (kernels/pair_detection.cuh) against all vertices x all triangles, and what rows remember."""
 
 from dataclasses import dataclass
 from typing import Any

@@ -5,8 +5,7 @@
 #include <cstdint>
 
 #include "contact_passes.cuh"
-
-constexpr int CORNERS = 4;        // of a row, at most
+#include "pair_detection.cuh"
 
 struct RowState {                 // of a row in the step under way
     double s[3];                  // displacement of its point by the velocities reached, relative to the other surface [m]
@@ -27,10 +26,6 @@ struct ContactReport {            // of a body in a step
 };
 
 struct SolveResult;
-
-struct Box {
-    double low[3], high[3];
-};
 
 struct Contact {
     ObstacleTable obstacles;
@@ -88,6 +83,14 @@ inline int row_for(const Contact& c, int pair, int other) {
     if (c.obstacle[pair] == other) return pair;
     const bool next = c.obstacle[pair + 1] == other || c.obstacle[pair + 1] < 0;
     return pair + (next || (c.obstacle[pair] >= 0 && c.state[pair + 1].force.normal < c.state[pair].force.normal));
+}
+
+// A row that a sweep has made has no force, and friction no limit, until a solve has found them.
+inline void take_anew(RowState& state) {
+    state.limit = 0;
+    state.hardening = 1;
+    state.in_set = 0;
+    state.force = {0, {0, 0, 0}, 0, false};
 }
 
 // Rows of one system. Vectors are nodal, material frame, and begin at node `node_first`.

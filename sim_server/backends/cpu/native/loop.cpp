@@ -132,7 +132,7 @@ static void assemble(Loop* loop, bool whole) {
         for (int i = 0; i < loop->bodies; ++i)
             note_changes(loop->body[i].correction, rings.step, loop->body[i].steps == 0);
     }
-    if (loop->contact && loop->contact->pair_first >= 0) PairDetection{*loop, *loop->contact}.run();
+    if (loop->contact && loop->contact->pair_first >= 0) PairDetection(*loop, *loop->contact).run();
     for (int i = 0; i < loop->bodies; ++i) copy_for_worker(*loop, loop->body[i]);
     loop->assemble_begin = begin;
     loop->assemble_seconds = now() - begin;
