@@ -23,7 +23,7 @@ from sim_server.errors import InputError
 from sim_server.mesh import Mesh, bar, check, read
 from sim_server.scene.effect_tables import checked_effects
 from sim_server.scene.integrator_options import IntegratorOptions
-from sim_server.scene.obstacles import FRICTION, Obstacle, check_contact_on, contact_errors
+from sim_server.scene.obstacles import FRICTION, Obstacle, contact_errors
 from sim_server.scene.parameters import Count, Counts, File, Name, NotNegative, Parameters, Positive, Sizes, complaint
 from sim_server.scene.pose import Pose
 from sim_server.scene.solver_options import SolverOptions
@@ -207,8 +207,6 @@ class Scene(Parameters):
         """Raises InputError for what the device ("cpu" or "gpu") does not have."""
         self.solver.check_device(device)
         self.integrator.check_device(device)
-        if "contact" in self.effects:
-            check_contact_on(device, self.effects["contact"], self.objects)
 
     @property
     def projection(self) -> Literal["excess", "clamp", "absolute", "none"]:

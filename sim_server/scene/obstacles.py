@@ -8,7 +8,6 @@ from typing import Annotated, Any, Literal, Protocol
 from pydantic import Field, model_validator
 from pydantic_core import InitErrorDetails
 
-from sim_server.errors import InputError
 from sim_server.scene.integrator_options import IntegratorOptions
 from sim_server.scene.parameters import File, Name, NotNegative, Parameters, Positive, Sizes, complaint, nearest
 from sim_server.scene.pose import Pose
@@ -113,18 +112,6 @@ def contact_errors(
         if text := _wrong_pair(set(pair.between), names, shapes, pairs):
             yield _error(text, "effects", "contact", "friction", index, "between")
         pairs.append(set(pair.between))
-
-
-def check_contact_on(device: str, contact: Any, objects: Sequence[HasName]) -> None:
-    """Raises InputError for contact that the device ("cpu" or "gpu") does not have.
-
-    contact: parameters of the effect
-    """
-    if device == "gpu" and len(objects) > 1 and contact.between:
-        raise InputError(
-            f"effects.contact.between = true with {len(objects)} objects: on a GPU they touch obstacles, not each "
-            "other; allowed: contact = { between = false }, or --device cpu"
-        )
 
 
 def _wrong_pair(pair: set[str], objects: list[str], obstacles: list[str], earlier: list[set[str]]) -> str:

@@ -18,6 +18,8 @@
 #define __shared__ static
 #define __align__(n) alignas(n)
 
+using std::isfinite;
+
 struct uint4 { unsigned x, y, z, w; };
 struct Dimension { int x; };
 static thread_local Dimension threadIdx;
@@ -44,6 +46,10 @@ template <class T> static void __stcg(T* a, T value) { __atomic_store(a, &value,
 static void atomicMax(long long* a, long long b) {
     long long seen = __ldcg(a);
     while (seen < b && !__atomic_compare_exchange_n(a, &seen, b, false, __ATOMIC_SEQ_CST, __ATOMIC_SEQ_CST)) {}
+}
+static void atomicMin(int* a, int b) {
+    int seen = __ldcg(a);
+    while (seen > b && !__atomic_compare_exchange_n(a, &seen, b, false, __ATOMIC_SEQ_CST, __ATOMIC_SEQ_CST)) {}
 }
 static int min(int a, int b) { return a < b ? a : b; }
 static long long __double_as_longlong(double a) {

@@ -15,8 +15,11 @@ from sim_server.backends.compiler import INCLUDE, SOURCES, compiler
 from sim_server.backends.cpu.structs import BALANCE
 from sim_server.backends.declarations import Declarations
 from sim_server.backends.gpu import contact as gpu_contact
+from sim_server.backends.gpu import islands as gpu_islands
 from sim_server.backends.gpu.contact import ContactPasses
+from sim_server.backends.gpu.solver import PCG_BODY
 from sim_server.backends.gpu.structs import CONTACT_RESULT, CONTACT_STATE, PCG_RESULT
+from sim_server.backends.kinds import KINDS
 from sim_server.simulation import Simulation
 from tests.contact.scenes import D, block, edge, floor, over, ram
 
@@ -32,7 +35,7 @@ struct System { const int *row_start, *columns, *ranges; double tolerance; int m
 // Block Jacobi and conjugate gradients from y, as pcg.cu: to `goal` of the residual.
 static void solve(const ContactArguments& c, const ContactSolve& pass, const System& s, int body) {
     ContactState& state = pass.state[body];
-    if (!pass.first_of_step && state.phase != READY) return;
+    if (pass.first_of_step ? state.phase == OVER : state.phase != READY) return;
     const int first = s.ranges[2 * body], n = s.ranges[2 * body + 1] - first;
     const double* b = c.contact_b + 3 * first;
     double* y = c.y + 3 * first;
@@ -130,10 +133,11 @@ class System(c.Structure):
 @pytest.fixture(scope="module")
 def library(tmp_path_factory: pytest.TempPathFactory) -> c.CDLL:
     folder = tmp_path_factory.mktemp("passes")
-    text = (SOURCES / "backends/gpu/contact.cu").read_text()
+    text = (SOURCES / "backends/gpu/device_contact.cuh").read_text()
     shorter = text.replace("CONTACT_THREADS = 128", f"CONTACT_THREADS = {THREADS}")
     assert shorter != text
-    (folder / "contact.cu").write_text(shorter)
+    (folder / "device_contact.cuh").write_text(shorter)
+    (folder / "contact.cu").write_text((SOURCES / "backends/gpu/contact.cu").read_text())
     (folder / "passes.cpp").write_text(TEXT.replace("#include <cstdio>", '#include "invert3.cuh"'))
     paths = [f"-I{p}" for p in (folder, TESTS / "backends", SOURCES / "backends/gpu", INCLUDE)]
     command = [compiler(), "-std=c++17", "-O1", "-shared", "-fPIC", "-pthread", "-Dreal=double", *paths]
@@ -182,8 +186,9 @@ class Beside:
 
     def __init__(self, library: c.CDLL, sim: Simulation, monkeypatch: pytest.MonkeyPatch):
         monkeypatch.setattr(gpu_contact, "THREADS", THREADS)
-        monkeypatch.setattr(gpu_contact, "options", lambda types: ())
-        monkeypatch.setattr(gpu_contact, "compiled", lambda name, module, kernel: None)
+        for module in (gpu_contact, gpu_islands):
+            monkeypatch.setattr(module, "options", lambda types: ())
+            monkeypatch.setattr(module, "compiled", lambda name, module, kernel: None)
         self.sim, self.library, self.gpu = sim, library, Host()
         given = sim.engine_input()
         assert given.contact is not None
@@ -193,16 +198,21 @@ class Beside:
         self.work = np.zeros(bodies)
         self.reactions = np.zeros((4, bodies, len(self.contact.obstacles.kind), 6))
         self.balance = as_device(np.zeros(bodies, BALANCE))
+        self.bodies = np.zeros(bodies, PCG_BODY)
         solver: Any = SimpleNamespace(
             real=np.dtype(float), pool_counter=as_device(np.zeros(1, np.uint32)), results=self.results,
-            counter=self.counter,
+            counter=self.counter, bodies_device=self.bodies.ctypes.data,
         )  # fmt: skip
-        device: Any = SimpleNamespace(repeat=lambda flag: nullcontext())
+        device: Any = SimpleNamespace(repeat=lambda flag: nullcontext(), branch=lambda flag: nullcontext())
         gpu: Any = self.gpu
         self.passes = ContactPasses(
             gpu, device, self.contact, given.ranges, given.arrays, solver, self.balance, self.told, self.reactions
         )
         self.arrays, self.ranges = given.arrays, np.array(given.ranges, np.int32)
+        self.bodies["first"], self.bodies["nodes"] = self.ranges[:, 0], np.diff(self.ranges)[:, 0]
+        own = sim.scene.solver
+        self.bodies["tolerance"], self.bodies["max_iterations"] = own.tolerance, own.max_iterations
+        self.bodies["warm_start"], self.bodies["kind"] = own.warm_start, KINDS.enumeration("Kind")["BLOCK_JACOBI"]
 
     def step(self) -> tuple[np.ndarray, np.ndarray]:
         """Makes a step; returns the solutions of both."""
@@ -216,10 +226,14 @@ class Beside:
             sim.scene.solver.tolerance, sim.scene.solver.max_iterations, len(self.ranges), self.passes.grid,
         )  # fmt: skip
         given = [c.c_void_p(x.ctypes.data) for x in (self.passes.params, self.passes.first, self.passes.later)]
-        loops = self.library.step(*given, c.byref(system))
+        loops = self.library.step(*given, c.byref(system), *self.more())
         assert loops < 100 and not self.passes.active[0]
         sim.engine.solve()
         return self.gpu.twin(a["y"]), a["y"]
+
+    def more(self) -> tuple[Any, ...]:
+        """Arguments of a step beside those of contact with obstacles."""
+        return ()
 
     def compare(self, rel: float) -> np.void:
         """Makes a step on both; returns the record of the first body."""

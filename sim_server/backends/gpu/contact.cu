@@ -2,8 +2,8 @@
 // Contact with obstacles on a GPU, beside the solver: forces and stiffness of rows, line search, sweep, and the end of a step
 // (contact_state.cuh has the order; law: kernels/contact_law.cuh; input: backends/contact.py).
 //
-// Rows come in pairs, of one node each with weight 1. A thread has a node; the last thread block of a body to finish adds the sums in
-// a fixed order and makes the body's decision. Numbers of contact are double for every `real`.
+// A thread has a node; the last thread block of a body to finish adds the sums in a fixed order and makes the body's decision. Bodies that
+// touch each other are solved by island.cu, all but the end of a step.
 #include "device_contact.cuh"
 
 // --- the first kernel of a step -----------------------------------------------------------------------------------------------------
@@ -35,28 +35,12 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) begin_contact(cons
     const int rows = list_rows(c, body);
     if (threadIdx.x > 0) return;
     const double unknown = __longlong_as_double(0x7ff8000000000000ll);
-    c.state[body] = {0, 0, 1, unknown, closed[0] > 0 ? CHOOSE_START : WITHOUT, 0, 0, 1, 0, 0, rows};
-    if (body == 0) *c.active = c.count;
+    const bool grouped = c.island_of && c.island_of[body] >= 0;
+    c.state[body] = {0, 0, 1, unknown, grouped ? OVER : closed[0] > 0 ? CHOOSE_START : WITHOUT, 0, 0, 1, 0, 0, rows};
+    if (body == 0) *c.active = c.island_of ? *c.alone : c.count;
 }
 
 // --- forces -------------------------------------------------------------------------------------------------------------------------
-
-// Keeps a node's own block without contact, and with contacts that carried force in the last step: a factor that is made from a copy
-// of A is to know them.
-__device__ void keep_block(const ContactArguments& c, const SurfaceNode& n) {
-    const int pair = c.pair[n.node];
-    if (pair < 0) return;
-    double S[9] = {};
-    for (int r = n.pair; n.pair >= 0 && r < n.pair + 2; ++r)
-        if (used(c, r) && c.force[r] > 0)
-            n.add_stiffness(c, row_at(c, r, 1), lasting_contact(c.friction[r], c.force[r], c.traction + 3 * r), S);
-    const real* own = c.values + 9ll * c.place[n.node];
-    for (int k = 0; k < 9; ++k) {
-        const long long to = 9ll * (pair / 2) + k;
-        c.base[to] = own[k];
-        c.known[to] = (real)((double)own[k] + S[k]);
-    }
-}
 
 // Before the solver: in CHOOSE_START b' = b + i H^T f at y and the size of the same at 0, for READY what a pass needs.
 extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) contact_forces(const ContactArguments c) {
@@ -356,10 +340,12 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) finish_contact(con
             for (int r = c.pair[i]; r < c.pair[i] + 2; ++r) c.force[r] = c.traction[3 * r] = c.traction[3 * r + 1] = c.traction[3 * r + 2] = 0;
         }
     }
+    if (c.island_of && threadIdx.x == 0) sum[1] += c.pair_sums[blockIdx.x];
     if (!sum_body(c, here, sum)) return;
-    write_reactions(c, body, state.rows, slot);
+    const bool grouped = c.island_of && c.island_of[body] >= 0;  // its sweeps have not listed rows
+    write_reactions(c, body, grouped ? list_rows(c, body) : state.rows, slot);
     if (threadIdx.x > 0) return;
-    const int contacts = (int)sum[0];
+    const int contacts = (int)sum[0] + (c.island_of ? c.pair_contacts[body] : 0);
     const double unknown = __longlong_as_double(0x7ff8000000000000ll);
     c.contact_results[slot * c.count + body] = {contacts || state.passes ? state.residual : unknown, contacts, state.passes, (int)sum[2]};
     if (solve.status == CONVERGED && state.residual > c.tolerance) solve.status = CONTACT;

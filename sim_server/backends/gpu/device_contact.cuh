@@ -66,6 +66,10 @@ struct ContactArguments {
     Balance* balance;           // (bodies,)
     ContactResult* contact_results;  // (capacity, bodies) on the host
     double* reactions;          // (capacity, bodies, obstacles, 6) on the host
+    const int* island_of;       // (bodies,) -1: the body is alone (island_state.cuh); null: bodies do not touch each other
+    const int* alone;           // (1,) how many are
+    double* pair_sums;          // (grid,) work of rows between bodies
+    int* pair_contacts;         // (bodies,) those that carry force
     double dx_dv;               // [s]
     double force_coefficient;   // [s]
     double tolerance;
@@ -108,6 +112,13 @@ __device__ bool sum_body(const ContactArguments& c, const NodeChunk& here, doubl
     sum_block(sum);
     if (threadIdx.x == 0) c.finished_chunks[here.body] = 0;
     return true;
+}
+
+// An entry of sums, without an index that the compiler does not know.
+template <int N> __device__ __forceinline__ double pick(const double (&sum)[N], int k) {
+    double found = 0;
+    for (int n = 0; n < N; ++n) found = n == k ? sum[n] : found;
+    return found;
 }
 
 // --- rows ---------------------------------------------------------------------------------------------------------------------------
@@ -205,6 +216,23 @@ __device__ __forceinline__ void evaluate(const ContactArguments& c, int r, const
     for (int k = 0; k < 3; ++k) row.s[k] = s[k];
     if (hold) row.limit = row.force.closed ? contact_force(given, s, 0, false).normal : 0;
     row.force = contact_force(given, s, row.limit, set && row.in_set);
+}
+
+// Keeps a node's own block without contact, and with contacts that carried force in the last step: a factor that is made from a copy
+// of A is to know them.
+__device__ void keep_block(const ContactArguments& c, const SurfaceNode& n) {
+    const int pair = c.pair[n.node];
+    if (pair < 0) return;
+    double S[9] = {};
+    for (int r = n.pair; n.pair >= 0 && r < n.pair + 2; ++r)
+        if (used(c, r) && c.force[r] > 0)
+            n.add_stiffness(c, row_at(c, r, 1), lasting_contact(c.friction[r], c.force[r], c.traction + 3 * r), S);
+    const real* own = c.values + 9ll * c.place[n.node];
+    for (int k = 0; k < 9; ++k) {
+        const long long to = 9ll * (pair / 2) + k;
+        c.base[to] = own[k];
+        c.known[to] = (real)((double)own[k] + S[k]);
+    }
 }
 
 // --- points that enter obstacles ----------------------------------------------------------------------------------------------------

@@ -97,7 +97,7 @@ class GpuEngine(DeviceLoop):
         phases = NewtonPhases.initial(gpu, bodies) if newton else None
         self.solver = PcgSolver(
             gpu, ranges, arrays, self._counter, CAPACITY, planes, phases or (), ATTEMPTS if stages else 0,
-            given.contact is not None,
+            given.contact is not None, given.contact is not None and given.contact.surfaces is not None,
         )  # fmt: skip
         self._newton, newton_results = None, None
         if newton and phases:
@@ -113,6 +113,9 @@ class GpuEngine(DeviceLoop):
             self._contact = ContactPasses(
                 gpu, device, given.contact, ranges, arrays, self.solver, balance, contact_results, reactions
             )
+            if self._contact.islands:
+                self._whole_assembly = [*self._whole_assembly, self._contact.islands.detect]
+                self._first_launches = self._whole_assembly
         row, first = PCG_BODY.itemsize, self.solver.bodies_device
         mailboxes = [(first + row * k, SETTINGS_BYTES) for k in range(bodies)]
         mailboxes += [(first + row * k + SETTINGS_BYTES, row - SETTINGS_BYTES) for k in range(bodies)]
