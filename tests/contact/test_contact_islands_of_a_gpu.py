@@ -3,6 +3,7 @@
 the CPU."""
 
 import ctypes as c
+import re
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from tests.contact.scenes import D, block, floor, over
 TEXT = """
 #include "pairs.cu"
 #include "island.cu"
-struct Islands { int bodies, grid, sites, most, pivots; };
+struct Islands { int bodies, grid, sites, most, pivots, product_grid; };
 static void each(int blocks, auto kernel) { launch(blocks, CONTACT_THREADS, kernel); }
 static int island_pass(const IslandArguments& a, const Islands& s) {
     auto law = [&](int what) {
@@ -35,16 +36,15 @@ static int island_pass(const IslandArguments& a, const Islands& s) {
     int iterations = 0;
     for (; a.tally->iterating > 0 && iterations < 3000; ++iterations) {
         each(s.grid, [&] { island_update(a); });
-        each(s.bodies, [&] { island_gather(a, 0); });
+        each(s.bodies + s.product_grid, [&] { island_multiply(a, 0); });
         each(s.grid, [&] { island_product(a); });
         each(s.bodies, [&] { coarse_solve(a); });
         each(s.grid, [&] { island_finish(a); });
-        each(s.most, [&] { island_step(a); });
     }
     each(s.grid, [&] { island_update(a); });
-    each(s.bodies, [&] { island_gather(a, 1); });
+    each(s.bodies + s.product_grid, [&] { island_multiply(a, 1); });
     each(s.grid, [&] { island_residual(a); });
-    each(s.most, [&] { island_search(a); });
+    launch(s.most, SEARCH_THREADS, [&] { island_search(a); });
     each(s.grid, [&] { island_advance(a); });
     each(s.most, [&] { island_settle(a); });
     return iterations;
@@ -108,18 +108,22 @@ extern "C" int step(const ContactArguments* c, const ContactSolve* first, const 
 """
 
 
+SHORTER = {"device_contact.cuh": ["CONTACT_THREADS"], "island_state.cuh": ["LISTING_THREADS", "SEARCH_THREADS"]}
+
+
 class Islands(c.Structure):
-    _fields_ = [(name, c.c_int) for name in ("bodies", "grid", "sites", "most", "pivots")]
+    _fields_ = [(name, c.c_int) for name in ("bodies", "grid", "sites", "most", "pivots", "product_grid")]
 
 
 @pytest.fixture(scope="module")
 def library(tmp_path_factory: pytest.TempPathFactory) -> c.CDLL:
     folder = tmp_path_factory.mktemp("islands")
-    for name, number, value in (("device_contact.cuh", "CONTACT_THREADS", 128), ("island_state.cuh", "LISTING_THREADS", 256)):
+    for name, numbers in SHORTER.items():
         text = (SOURCES / "backends/gpu" / name).read_text()
-        shorter = text.replace(f"{number} = {value}", f"{number} = {passes.THREADS}")
-        assert shorter != text
-        (folder / name).write_text(shorter)
+        for number in numbers:
+            text, found = re.subn(rf"{number} = \d+", f"{number} = {passes.THREADS}", text)
+            assert found == 1
+        (folder / name).write_text(text)
     for name in ("contact.cu", "pairs.cu", "island.cu"):
         (folder / name).write_text((SOURCES / "backends/gpu" / name).read_text())
     base = passes.TEXT[: passes.TEXT.index('extern "C" int step')].replace("#include <cstdio>", '#include "invert3.cuh"')
@@ -137,7 +141,7 @@ class IslandsBeside(passes.Beside):
         islands = self.passes.islands
         assert islands is not None
         count, sites = len(self.ranges), len(self.contact.surfaces.site_body)  # type: ignore[union-attr]
-        numbers = (count, self.passes.grid, -(-sites // passes.THREADS), max(count // 2, 1), islands._pivots)
+        numbers = (count, self.passes.grid, -(-sites // passes.THREADS), max(count // 2, 1), islands._pivots, islands._product_grid)
         return c.c_void_p(islands.params.ctypes.data), c.byref(Islands(*numbers))
 
 

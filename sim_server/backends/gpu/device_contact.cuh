@@ -79,8 +79,8 @@ struct ContactArguments {
 // --- sums ---------------------------------------------------------------------------------------------------------------------------
 
 // Sums over the thread block, in all of its threads.
-template <int N> __device__ void sum_block(double (&sum)[N]) {
-    __shared__ double warps[CONTACT_THREADS / 32][N];
+template <int THREADS_OF_BLOCK = CONTACT_THREADS, int N> __device__ void sum_block(double (&sum)[N]) {
+    __shared__ double warps[THREADS_OF_BLOCK / 32][N];
     for (int k = 16; k; k >>= 1)
         for (int n = 0; n < N; ++n) sum[n] += __shfl_xor_sync(WARP, sum[n], k);
     __syncthreads();  // earlier contents have been read
@@ -89,7 +89,7 @@ template <int N> __device__ void sum_block(double (&sum)[N]) {
     __syncthreads();
     for (int n = 0; n < N; ++n) {
         sum[n] = 0;
-        for (int k = 0; k < CONTACT_THREADS / 32; ++k) sum[n] += warps[k][n];
+        for (int k = 0; k < THREADS_OF_BLOCK / 32; ++k) sum[n] += warps[k][n];
     }
 }
 

@@ -41,16 +41,6 @@ template <class Of> __device__ __forceinline__ void add_entries(const IslandArgu
     for (int k = 0; k < 3; ++k) f[k] += out[k];
 }
 
-// A v of a node, without contacts
-__device__ __forceinline__ void multiply_row(const IslandArguments& a, int node, const double* v, double* out) {
-    out[0] = out[1] = out[2] = 0;
-    for (int k = a.row_start[node]; k < a.row_start[node + 1]; ++k) {
-        const real* block = a.c.values + 9ll * k;
-        const double* w = v + 3ll * a.columns[k];
-        for (int m = 0; m < 3; ++m) out[m] += (double)block[3 * m] * w[0] + (double)block[3 * m + 1] * w[1] + (double)block[3 * m + 2] * w[2];
-    }
-}
-
 // Arm of a node about the first one of its body.
 __device__ __forceinline__ void arm_of(const IslandArguments& a, int body, int node, double* arm) {
     const long long origin = 3ll * a.bodies[body].first;
@@ -487,15 +477,31 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_update(cons
     for (int k = 0; k < 3; ++k) a.z[3ll * i + k] = s.stage == ITERATES ? v[3 * k] * r[0] + v[3 * k + 1] * r[1] + v[3 * k + 2] * r[2] : 0;
 }
 
-// A thread block has a body: H v of its rows and the forces against it. solution: v is that of the pass, else z.
-extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_gather(const IslandArguments a, int solution) {
-    const int body = blockIdx.x, island = island_of(a, body);
+// The first thread blocks have a body each: H v of its rows and the forces against it. In the others three threads have a node: A v
+// without contacts. solution: v is that of the pass, else z.
+extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_multiply(const IslandArguments a, int solution) {
+    const bool rows_of_body = (int)blockIdx.x < a.bodies_count;
+    const NodeChunk* here = rows_of_body ? nullptr : a.product_chunks + (blockIdx.x - a.bodies_count);
+    const int body = rows_of_body ? blockIdx.x : here->body, island = island_of(a, body);
     if (island < 0) return;
     const IslandState& s = a.state[island];
     if (solution ? !solves(s.phase) : s.stage == STANDS) return;
+    const double* v = solution ? a.x : a.z;
+    if (!rows_of_body) {
+        const int i = here->begin + threadIdx.x / 3, m = threadIdx.x % 3;
+        if (threadIdx.x >= 3 * (CONTACT_THREADS / 3) || i >= here->end) return;
+        double sum = 0;
+#pragma unroll 4
+        for (int k = a.row_start[i]; k < a.row_start[i + 1]; ++k) {
+            const real* block = a.c.values + 9ll * k + 3 * m;
+            const double* w = v + 3ll * a.columns[k];
+            sum += (double)block[0] * w[0] + (double)block[1] * w[1] + (double)block[2] * w[2];
+        }
+        (solution ? a.solution_product : a.az)[3ll * i + m] = sum;
+        return;
+    }
     const int rows = a.own_rows[body];
     const int* list = a.own_row + 2 * a.t.body_start[body];
-    const double* v = solution ? a.x : a.z;
     for (int k = threadIdx.x; k < rows; k += CONTACT_THREADS) {
         IslandRow& row = a.row[list[k]];
         double u[3] = {0, 0, 0}, f[3];
@@ -522,7 +528,7 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_product(con
     double sum[MODES] = {};
     if (i < here.end) {
         double az[3], r[3], arm[3];
-        multiply_row(a, i, a.z, az);
+        copy3(a.az, i, az);
         add_entries(a, i, az, [](const IslandRow& row) { return row.force; });
         copy3(a.r, i, r);
         for (int k = 0; k < 3; ++k) {
@@ -542,9 +548,10 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_product(con
 // A thread block has a free body: its part of E^-1 Z^T (r - A z).
 extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) coarse_solve(const IslandArguments a) {
     const int body = blockIdx.x, island = island_of(a, body);
-    if (island < 0 || a.mode[body] < 0) return;
+    if (island < 0) return;
     const IslandState& s = a.state[island];
-    if (s.stage == STANDS || !s.coarse || !a.coarse_well[island]) return;
+    if (s.stage == STANDS && s.pending && threadIdx.x == 0 && body == a.island[a.island_start[island]]) a.state[island].pending = 0;  // made
+    if (a.mode[body] < 0 || s.stage == STANDS || !s.coarse || !a.coarse_well[island]) return;
     const int first = a.island_start[island];
     const double* E = (s.modes / MODES % 2 ? a.coarse_b : a.coarse_a) + (long long)MODES * a.most_modes * body;
     double sum[MODES] = {};
@@ -558,7 +565,58 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) coarse_solve(const
     if (threadIdx.x < MODES) a.coefficient[MODES * body + threadIdx.x] = pick(sum, threadIdx.x);
 }
 
-// A thread has a node: z += Z c, A z += A Z c, and all sums of the iteration.
+// The step of an island's conjugate gradients, which island_update makes. Done by a whole thread block.
+__device__ void next_step(const IslandArguments& a, int island) {
+    IslandState s = a.state[island];
+    double sum[CG_SUMS];
+    sum_island(a, island, a.chunk_sums, sum);
+    if (threadIdx.x > 0) return;
+    const double gamma = sum[0], delta = sum[1], infinite = 1e300;
+    const bool begins = s.stage == BEGINS_COARSE;
+    const PcgBody& body = a.bodies[a.island[a.island_start[island]]];
+    int stop = -1;
+    s.pending = 0;
+    s.stage = ITERATES;
+    if (s.coarse && !a.coarse_well[island]) {
+        s.coarse = 0;  // E is not positive definite
+        s.restart = 1;
+    } else if (!(gamma > 0 && gamma < infinite && delta < infinite)) {
+        if (!begins) {  // the coarse space lost its precision, or a factor is of no use
+            if (!s.coarse && !s.factors) stop = BREAKDOWN_PRECONDITIONER;
+            if (!s.coarse && s.factors) ++s.fallbacks;
+            if (!s.coarse) s.factors = 0;
+            s.coarse = 0;
+        }
+        s.restart = 1;
+    } else {
+        s.beta = s.restart ? 0 : gamma / s.gamma;
+        const double pq = delta + s.beta * (sum[2] + sum[3]) + s.beta * s.beta * s.pq;
+        const double qq = sum[7] + 2 * s.beta * sum[8] + s.beta * s.beta * s.qq, rq = sum[5] + s.beta * sum[6];
+        if (!begins && s.own_iterations == body.max_iterations) {
+            stop = MAX_ITERATIONS;
+        } else if (!(pq > 0)) {
+            stop = BREAKDOWN_MATRIX;
+        } else {
+            s.own_iterations += !begins;
+            s.alpha = gamma / pq;
+            s.r2 = fmax(0.0, sum[4] - 2 * s.alpha * rq + s.alpha * s.alpha * qq);
+            s.gamma = gamma;
+            s.pq = pq;
+            s.qq = qq;
+            s.pending = 1;
+            s.restart = begins;
+            if (s.r2 <= s.goal2) stop = CONVERGED;
+        }
+    }
+    if (stop >= 0) {
+        s.own_status = stop;
+        s.stage = STANDS;
+        atomicSub(&a.tally->iterating, 1);
+    }
+    a.state[island] = s;
+}
+
+// A thread has a node: z += Z c, A z += A Z c, and all sums of the iteration. The last thread block of an island makes its step.
 extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_finish(const IslandArguments a) {
     const NodeChunk here = a.c.chunks[blockIdx.x];
     const int body = here.body, island = island_of(a, body), i = here.begin + threadIdx.x;
@@ -611,64 +669,16 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_finish(cons
         sum[8] = dot3(az, q);
     }
     sum_block(sum);
-    if (threadIdx.x < CG_SUMS) a.chunk_sums[(long long)CG_SUMS * blockIdx.x + threadIdx.x] = pick(sum, threadIdx.x);
-}
-
-// A thread block has an island: the step of its conjugate gradients, which island_update makes.
-extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_step(const IslandArguments a) {
-    const int island = blockIdx.x;
-    if (island >= a.tally->islands) return;
-    IslandState s = a.state[island];
-    if (s.stage == STANDS) {
-        if (threadIdx.x == 0 && s.pending) a.state[island].pending = 0;  // it is made
-        return;
-    }
-    double sum[CG_SUMS];
-    sum_island(a, island, a.chunk_sums, sum);
-    if (threadIdx.x > 0) return;
-    const double gamma = sum[0], delta = sum[1], infinite = 1e300;
-    const bool begins = s.stage == BEGINS_COARSE;
-    const PcgBody& body = a.bodies[a.island[a.island_start[island]]];
-    int stop = -1;
-    s.pending = 0;
-    s.stage = ITERATES;
-    if (s.coarse && !a.coarse_well[island]) {
-        s.coarse = 0;  // E is not positive definite
-        s.restart = 1;
-    } else if (!(gamma > 0 && gamma < infinite && delta < infinite)) {
-        if (!begins) {  // the coarse space lost its precision, or a factor is of no use
-            if (!s.coarse && !s.factors) stop = BREAKDOWN_PRECONDITIONER;
-            if (!s.coarse && s.factors) ++s.fallbacks;
-            if (!s.coarse) s.factors = 0;
-            s.coarse = 0;
-        }
-        s.restart = 1;
-    } else {
-        s.beta = s.restart ? 0 : gamma / s.gamma;
-        const double pq = delta + s.beta * (sum[2] + sum[3]) + s.beta * s.beta * s.pq;
-        const double qq = sum[7] + 2 * s.beta * sum[8] + s.beta * s.beta * s.qq, rq = sum[5] + s.beta * sum[6];
-        if (!begins && s.own_iterations == body.max_iterations) {
-            stop = MAX_ITERATIONS;
-        } else if (!(pq > 0)) {
-            stop = BREAKDOWN_MATRIX;
-        } else {
-            s.own_iterations += !begins;
-            s.alpha = gamma / pq;
-            s.r2 = fmax(0.0, sum[4] - 2 * s.alpha * rq + s.alpha * s.alpha * qq);
-            s.gamma = gamma;
-            s.pq = pq;
-            s.qq = qq;
-            s.pending = 1;
-            s.restart = begins;
-            if (s.r2 <= s.goal2) stop = CONVERGED;
-        }
-    }
-    if (stop >= 0) {
-        s.own_status = stop;
-        s.stage = STANDS;
-        atomicSub(&a.tally->iterating, 1);
-    }
-    a.state[island] = s;
+    if (threadIdx.x < CG_SUMS) __stcg(a.chunk_sums + (long long)CG_SUMS * blockIdx.x + threadIdx.x, pick(sum, threadIdx.x));
+    __shared__ bool last;
+    __threadfence();
+    __syncthreads();
+    if (threadIdx.x == 0) last = atomicAdd(a.finished_chunks + island, 1u) == a.state[island].chunks - 1u;
+    __syncthreads();
+    if (!last) return;
+    __threadfence();
+    if (threadIdx.x == 0) a.finished_chunks[island] = 0;
+    next_step(a, island);
 }
 
 // --- after a solve ------------------------------------------------------------------------------------------------------------------
@@ -681,13 +691,12 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_residual(co
     double sum[CG_SUMS] = {};
     if (i < here.end) {
         double product[3], contact[3] = {0, 0, 0}, x[3];
-        multiply_row(a, i, a.x, product);
+        copy3(a.solution_product, i, product);
         add_entries(a, i, contact, [](const IslandRow& row) { return row.force; });
         copy3(a.x, i, x);
         for (int k = 0; k < 3; ++k) {
             const long long at = 3ll * i + k;
             const double rest = a.r0[at] - product[k] - contact[k];
-            a.solution_product[at] = product[k];
             a.r[at] = rest;
             sum[0] += rest * rest;
             sum[1] += x[k] * a.left[at];
@@ -704,7 +713,7 @@ __device__ double search_along(const IslandArguments& a, int island, int bodies,
     const double factor = a.c.force_coefficient / a.c.dx_dv;
     return minimum_along([&](double part) {
         double work[1] = {0};
-        for (int m = warp; m < bodies; m += CONTACT_THREADS / 32) {
+        for (int m = warp; m < bodies; m += SEARCH_THREADS / 32) {
             const int rows = a.own_rows[members[m]], *list = a.own_row + 2 * a.t.body_start[members[m]];
             for (int k = lane; k < rows; k += 32) {
                 const int r = list[k];
@@ -718,19 +727,19 @@ __device__ double search_along(const IslandArguments& a, int island, int bodies,
                 work[0] += f.normal * dot3(a.c.normal + 3 * r, step) + dot3(f.traction, step);
             }
         }
-        sum_block(work);
+        sum_block<SEARCH_THREADS>(work);
         return part * curvature - dot_left - factor * work[0];
     });
 }
 
 // A thread block has an island: how well its system is solved, and which part of the solution is taken.
-extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_search(const IslandArguments a) {
+extern "C" __global__ void __launch_bounds__(SEARCH_THREADS) island_search(const IslandArguments a) {
     const int island = blockIdx.x;
     if (island >= a.tally->islands) return;
     IslandState s = a.state[island];
     if (!solves(s.phase)) return;
     double sum[CG_SUMS];
-    sum_island(a, island, a.chunk_sums, sum);
+    sum_island<SEARCH_THREADS>(a, island, a.chunk_sums, sum);
     s.pending = 0;
     s.phase = ISLAND_PASSED;
     if (s.own_status == CONVERGED && sum[0] > s.goal2) {

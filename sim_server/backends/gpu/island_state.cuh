@@ -11,8 +11,8 @@
 //             place_entries, fill_entries, island_start, and which start is the better one
 //             while one is not over:
 //                 island_law, island_balance, island_decide, island_prepare, coarse_matrix, invert_coarse for each body,
-//                 while one iterates: island_update, island_factor, island_gather, island_product, coarse_solve, island_finish, island_step
-//                 island_update, island_gather, island_residual, island_search, island_advance, island_settle
+//                 while one iterates: island_update, island_factor, island_multiply, island_product, coarse_solve, island_finish
+//                 island_update, island_multiply, island_residual, island_search, island_advance, island_settle
 //         the paths found: pair_boxes, pair_trees, pair_sweep; where they enter a body: look_at_bodies, list_island_rows, find_islands
 //
 // All islands go in step; a kernel does nothing for those that are in another phase. Sums have a fixed order: of thread blocks, which
@@ -25,6 +25,7 @@ constexpr int MODES = 6;          // rigid motions of a body: translations, then
 constexpr int CG_SUMS = 9;        // of an iteration
 constexpr int BASE_SUMS = 36;     // Z^T A Z of a body
 constexpr int LISTING_THREADS = 256;  // of find_islands, one thread block
+constexpr int SEARCH_THREADS = 512;   // of island_search
 
 enum IslandPhase {
     ISLAND_BEGINS = 0,    // the start is chosen next
@@ -48,7 +49,7 @@ struct IslandState {
     double goal2, r2, last_true2;   // of a solve: squares of residuals
     double alpha, beta, gamma, pq, qq;
     double began, seconds;
-    int phase, bodies, modes;       // numbers; modes: 0 if there are too many
+    int phase, bodies, chunks, modes;  // numbers; modes: 0 if there are too many
     int set;              // 1: rows with in_set count as closed
     int last;             // 1: the solve under way is the last one
     int hold;             // 1: there was a pass since limits were set
@@ -105,6 +106,8 @@ struct IslandArguments {
     int* entry;                  // 4 row + corner, of rows between bodies; those of a node together and sorted
     double *left, *r0, *r, *x, *p, *q, *z, *az;  // (nodes, 3) b - A y; right-hand side of the pass; conjugate gradients
     double* solution_product;    // (nodes, 3) A dy
+    unsigned* finished_chunks;   // (bodies,) of islands, zero between launches
+    const NodeChunk* product_chunks;  // (product_grid,) nodes of which each has three threads
     double* inverse;             // (nodes, 9) of diagonal blocks
     double* modes;               // (nodes, 3, MODES) A Z without contacts
     double* chunk_sums;          // (grid, CG_SUMS)
@@ -195,13 +198,13 @@ __device__ void list_own_rows(const IslandArguments& a, int body) {
 }
 
 // Sums of an island over what the chunks of its bodies have left; in all threads.
-template <int N> __device__ void sum_island(const IslandArguments& a, int island, const double* partial, double (&sum)[N]) {
+template <int THREADS_OF_BLOCK = CONTACT_THREADS, int N> __device__ void sum_island(const IslandArguments& a, int island, const double* partial, double (&sum)[N]) {
     const int first = a.island_start[island], bodies = a.island_start[island + 1] - first;
     for (int n = 0; n < N; ++n) sum[n] = 0;
-    for (int k = threadIdx.x; k < bodies * a.most_chunks; k += CONTACT_THREADS) {
+    for (int k = threadIdx.x; k < bodies * a.most_chunks; k += THREADS_OF_BLOCK) {
         const int body = a.island[first + k / a.most_chunks], chunk = a.chunk_first[body] + k % a.most_chunks;
         if (chunk >= a.chunk_first[body + 1]) continue;
         for (int n = 0; n < N; ++n) sum[n] += __ldcg(partial + (long long)N * chunk + n);
     }
-    sum_block(sum);
+    sum_block<THREADS_OF_BLOCK>(sum);
 }

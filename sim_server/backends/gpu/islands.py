@@ -13,6 +13,7 @@ from sim_server.backends.contact import Contact, Surfaces
 from sim_server.backends.declarations import Declarations
 from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction
 from sim_server.backends.gpu.device import Gpu, compiled, options, own_headers
+from sim_server.backends.gpu.energies import node_chunks
 from sim_server.backends.gpu.solver import PcgSolver
 
 PAIRS, ISLAND = Declarations("backends/gpu/pairs.cu"), Declarations("backends/gpu/island.cu")
@@ -20,7 +21,7 @@ ISLAND_ARGUMENTS = ISLAND.dtype("IslandArguments")
 SIZES = {name: ISLAND.dtype(name).itemsize for name in ("IslandState", "IslandRow", "Box")}
 TALLY = ISLAND.dtype("Tally")
 MODES, CG_SUMS, BASE_SUMS = (ISLAND.constant(name) for name in ("MODES", "CG_SUMS", "BASE_SUMS"))
-LISTING: int = PAIRS.constant("LISTING_THREADS")  # of find_islands
+LISTING, SEARCH = PAIRS.constant("LISTING_THREADS"), ISLAND.constant("SEARCH_THREADS")  # of a thread block
 WARM_START, ZERO_START, LAW_AT_START, LAW = ISLAND.enumeration("Evaluation").values()
 MOST_MODES = 600  # of the coarse space of an island of bodies
 DETECTION = (
@@ -29,8 +30,8 @@ DETECTION = (
 )  # fmt: skip
 SOLVE = (
     "island_start", "island_law", "island_balance", "island_decide", "island_prepare", "coarse_matrix",
-    "invert_coarse", "island_update", "island_gather", "island_product", "coarse_solve", "island_finish",
-    "island_step", "island_residual", "island_search", "island_advance", "island_settle", "know_pairs", "keep_pairs",
+    "invert_coarse", "island_update", "island_multiply", "island_product", "coarse_solve", "island_finish",
+    "island_residual", "island_search", "island_advance", "island_settle", "know_pairs", "keep_pairs",
     "pair_work",
 )  # fmt: skip
 ROWS = ("corner", "weight", "obstacle", "normal", "gap", "entry", "stiffness", "friction", "thickness", "force",
@@ -76,15 +77,16 @@ class IslandPasses:
         arrays: Mapping[str, NDArray[Any]], solver: PcgSolver, params: NDArray[Any], chunks: NDArray[Any], threads: int,
     ):  # fmt: skip
         assert contact.surfaces is not None
-        surfaces = contact.surfaces
+        surfaces, ints, doubles = contact.surfaces, np.int32, np.float64
         cp, bodies, rows, nodes = gpu.cp, len(ranges), len(contact.obstacle), len(arrays["x"])
         self._device, self._solver, self._threads, self._bodies = device, solver, threads, bodies
         self._grid, self._sites = len(chunks), len(surfaces.site_body)
         free = np.array([bool((contact.free[first:last] > 0).all()) for first, last in ranges], np.int32)
         most = min(MODES * bodies, MOST_MODES)
         self._pivots = min(int(free.sum()), most // MODES)
+        product_chunks = node_chunks(np.array([first for first, _ in ranges] + [nodes], ints), threads // 3)
+        self._product_grid = len(product_chunks)
         heights, first = tree_heights(surfaces), np.searchsorted(chunks["body"], np.arange(bodies + 1)).astype(np.int32)
-        ints, doubles = np.int32, np.float64
         real = solver.real
         self.tally = cp.zeros(TALLY.itemsize // 4, ints)
         sizes = {
@@ -105,7 +107,8 @@ class IslandPasses:
         self.memory |= {name: cp.zeros(SIZES[kind] * count, np.uint8) for name, (kind, count) in structs.items()}
         self.memory |= {
             "tally": self.tally, "unheld": cp.asarray(free), "tree_height": cp.asarray(heights),
-            "chunk_first": cp.asarray(first), "ends": cp.zeros((nodes, 3), real),
+            "chunk_first": cp.asarray(first), "finished_chunks": cp.zeros(bodies, np.uint32),
+            "product_chunks": cp.asarray(product_chunks.view(ints)), "ends": cp.zeros((nodes, 3), real),
             "gravity": gpu.twin(surfaces.gravity, dtype=surfaces.gravity.dtype),
             "row_start": gpu.twin(arrays["row_start"]), "columns": gpu.twin(arrays["columns"]),
         }  # fmt: skip
@@ -150,7 +153,7 @@ class IslandPasses:
     # --- launches -----------------------------------------------------------------------------------------------
 
     def _launch(self, kernel: str, blocks: int, *arguments: Any) -> None:
-        threads = {"find_islands": LISTING, "end_sweep": 1}.get(kernel, self._threads)
+        threads = {"find_islands": LISTING, "island_search": SEARCH, "end_sweep": 1}.get(kernel, self._threads)
         given = (np.int32(x) if isinstance(x, int) else x for x in arguments)
         self._kernels[kernel]((blocks,), (threads,), (self.params, *given))
 
@@ -212,7 +215,7 @@ class IslandPasses:
         with self._device.repeat(self.flag("iterating")):
             self._iterate()
         self._nodes("island_update")
-        self._each_body("island_gather", what=(1,))
+        self._launch("island_multiply", self._bodies + self._product_grid, 1)
         self._nodes("island_residual")
         self._launch("island_search", self._most_islands)
         self._nodes("island_advance")
@@ -221,11 +224,10 @@ class IslandPasses:
     def _iterate(self) -> None:
         self._nodes("island_update")
         self._solver.apply_island_factors(self.params)
-        self._each_body("island_gather", what=(0,))
+        self._launch("island_multiply", self._bodies + self._product_grid, 0)
         self._nodes("island_product")
         self._each_body("coarse_solve")
         self._nodes("island_finish")
-        self._launch("island_step", self._most_islands)
 
     def keep(self) -> None:
         """Appends what comes before the end of a step: forces of rows between bodies, and their work."""

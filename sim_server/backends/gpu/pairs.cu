@@ -166,11 +166,12 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) list_island_rows(c
 }
 
 // The state of an island before its solve; after a sweep it goes on with what its first body has.
-__device__ IslandState state_of(const IslandArguments& a, int first, int bodies, int modes, int phase) {
+__device__ IslandState state_of(const IslandArguments& a, int first, int bodies, int chunks, int modes, int phase) {
     IslandState s = {};
     s.residual = __longlong_as_double(0x7ff8000000000000ll);
     s.phase = phase;
     s.bodies = bodies;
+    s.chunks = chunks;
     s.modes = modes;
     s.factors = 1;
     if (phase == ISLAND_BEGINS) return s;
@@ -232,7 +233,7 @@ extern "C" __global__ void __launch_bounds__(LISTING_THREADS) find_islands(const
             atomicAdd(&alone, 1);
             continue;
         }
-        int number = 0, first = 0, rank = 0, free_rank = 0, frees = 0, again = 0;
+        int number = 0, first = 0, rank = 0, free_rank = 0, frees = 0, again = 0, chunks = 0;
         for (int j = 0; j < n; ++j) {
             if (label[j] == j && j < own && members[j] > 1) {
                 ++number;
@@ -242,6 +243,7 @@ extern "C" __global__ void __launch_bounds__(LISTING_THREADS) find_islands(const
             rank += j < i;
             free_rank += j < i && a.unheld[j];
             frees += a.unheld[j];
+            chunks += a.chunk_first[j + 1] - a.chunk_first[j];
             again |= a.touched[j];
         }
         const bool few = MODES * frees <= a.most_modes;
@@ -251,7 +253,7 @@ extern "C" __global__ void __launch_bounds__(LISTING_THREADS) find_islands(const
         if (a.mode[i] >= 0) a.free_body[first + free_rank] = i;
         if (i != own) continue;
         a.island_start[number] = first;
-        a.state[number] = state_of(a, i, size, few ? MODES * frees : 0, !swept ? ISLAND_BEGINS : again ? ISLAND_RESUMES : ISLAND_OVER);
+        a.state[number] = state_of(a, i, size, chunks, few ? MODES * frees : 0, !swept ? ISLAND_BEGINS : again ? ISLAND_RESUMES : ISLAND_OVER);
         atomicAdd(&islands, 1);
         if (a.state[number].phase != ISLAND_OVER) atomicAdd(&active, 1);
     }
