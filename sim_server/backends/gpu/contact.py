@@ -78,6 +78,7 @@ class ContactPasses:
         self.grid, names = len(chunks), ("values", "b", "y", "x", "rotation")
         own, pair = own_blocks(arrays["row_start"], arrays["columns"]), pairs_of(contact, nodes)
         self._surface = own[contact.corner[: contact.body_start[-1] : 2, 0]]  # places of the nodes that have rows
+        sites = len(self._surface)
         exact = {name: getattr(contact, name) for name in ROWS}
         self.memory: dict[str, DeviceArray] = {name: gpu.twin(arrays[name]) for name in names}
         self.memory |= {name: gpu.twin(host, dtype=host.dtype) for name, host in exact.items()}
@@ -86,7 +87,7 @@ class ContactPasses:
             "pair": cp.asarray(pair), "node": cp.asarray(contact.corner[:, 0].copy()), "place": cp.asarray(own),
             "contact_b": cp.zeros((nodes, 3), real), "start": cp.zeros((nodes, 3), real),
             "first": cp.zeros((nodes, 3), real), "last": cp.zeros((nodes, 3), real),
-            "base": cp.zeros((max(rows // 2, 1), 3, 3), real), "known": cp.zeros((max(rows // 2, 1), 3, 3), real),
+            "base": cp.zeros((max(sites, 1), 3, 3), real), "known": cp.zeros((max(sites, 1), 3, 3), real),
             "row": cp.zeros(max(rows, 1) * DEVICE_ROW.itemsize, np.uint8),
             "list": cp.zeros(max(rows, 1), np.int32), "active": self.active,
             "state": cp.zeros(self._bodies * CONTACT_STATE.itemsize, np.uint8),

@@ -182,7 +182,10 @@ class IslandPasses:
             with self._device.branch(self.flag("active")):
                 self.start()
                 with self._device.repeat(self.flag("active")):
-                    self._pass()
+                    self.begin_pass()
+                    with self._device.repeat(self.flag("iterating")):
+                        self.iterate()
+                    self.end_pass()
             self._each_body("pair_boxes", "pair_trees", what=(1,))
             self._launch("pair_sweep", -(-self._sites // self._threads))
             self._launch("end_sweep", 1)
@@ -206,28 +209,34 @@ class IslandPasses:
     def _most_islands(self) -> int:
         return max(self._bodies // 2, 1)
 
-    def _pass(self) -> None:
+    def begin_pass(self) -> None:
+        """Appends what comes before the iterations of a pass."""
         self._law(LAW)
         self._nodes("island_prepare")
         self._each_body("coarse_matrix")
         for pivot in range(self._pivots):
             self._each_body("invert_coarse", what=(pivot,))
-        with self._device.repeat(self.flag("iterating")):
-            self._iterate()
+
+    def iterate(self) -> None:
+        """Appends an iteration."""
         self._nodes("island_update")
-        self._launch("island_multiply", self._bodies + self._product_grid, 1)
+        self._solver.apply_island_factors(self.params)
+        self._multiply(0)
+        self._nodes("island_product")
+        self._each_body("coarse_solve")
+        self._nodes("island_finish")
+
+    def end_pass(self) -> None:
+        """Appends what comes after them."""
+        self._nodes("island_update")
+        self._multiply(1)
         self._nodes("island_residual")
         self._launch("island_search", self._most_islands)
         self._nodes("island_advance")
         self._launch("island_settle", self._most_islands)
 
-    def _iterate(self) -> None:
-        self._nodes("island_update")
-        self._solver.apply_island_factors(self.params)
-        self._launch("island_multiply", self._bodies + self._product_grid, 0)
-        self._nodes("island_product")
-        self._each_body("coarse_solve")
-        self._nodes("island_finish")
+    def _multiply(self, solution: int) -> None:
+        self._launch("island_multiply", self._bodies + self._product_grid, solution)
 
     def keep(self) -> None:
         """Appends what comes before the end of a step: forces of rows between bodies, and their work."""
