@@ -3,22 +3,17 @@
 the CPU."""
 
 import ctypes as c
-import re
-import subprocess
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from sim_server.backends.compiler import INCLUDE, SOURCES, compiler
-from sim_server.backends.gpu import islands as gpu_islands
 from sim_server.backends.gpu.islands import TALLY, tree_heights
 from sim_server.simulation import Simulation
-from tests.contact import test_contact_passes_of_a_gpu as passes
+from tests.contact.kernels_beside import TEXT, THREADS, Beside, compiled
 from tests.contact.scenes import D, block, floor, over
 
-TEXT = """
+ISLANDS = """
 #include "pairs.cu"
 #include "island.cu"
 struct Islands { int bodies, grid, sites, most, pivots, product_grid; };
@@ -108,42 +103,31 @@ extern "C" int step(const ContactArguments* c, const ContactSolve* first, const 
 """
 
 
-SHORTER = {"device_contact.cuh": ["CONTACT_THREADS"], "island_state.cuh": ["LISTING_THREADS", "SEARCH_THREADS"]}
-
-
 class Islands(c.Structure):
     _fields_ = [(name, c.c_int) for name in ("bodies", "grid", "sites", "most", "pivots", "product_grid")]
 
 
 @pytest.fixture(scope="module")
 def library(tmp_path_factory: pytest.TempPathFactory) -> c.CDLL:
-    folder = tmp_path_factory.mktemp("islands")
-    for name, numbers in SHORTER.items():
-        text = (SOURCES / "backends/gpu" / name).read_text()
-        for number in numbers:
-            text, found = re.subn(rf"{number} = \d+", f"{number} = {passes.THREADS}", text)
-            assert found == 1
-        (folder / name).write_text(text)
-    for name in ("contact.cu", "pairs.cu", "island.cu"):
-        (folder / name).write_text((SOURCES / "backends/gpu" / name).read_text())
-    base = passes.TEXT[: passes.TEXT.index('extern "C" int step')].replace("#include <cstdio>", '#include "invert3.cuh"')
-    (folder / "islands.cpp").write_text(base + TEXT + STEP)
-    paths = [f"-I{p}" for p in (folder, passes.TESTS / "backends", SOURCES / "backends/gpu", INCLUDE)]
-    command = [compiler(), "-std=c++20", "-O1", "-shared", "-fPIC", "-pthread", "-Dreal=double", *paths]
-    subprocess.run([*command, str(folder / "islands.cpp"), "-o", str(folder / "islands.so")], check=True)
-    return c.CDLL(str(folder / "islands.so"))
+    return compiled(tmp_path_factory.mktemp("islands"), TEXT + ISLANDS + STEP)
 
 
-class IslandsBeside(passes.Beside):
+class IslandsBeside(Beside):
     """Steps of bodies that touch each other."""
 
     def more(self) -> tuple[Any, ...]:
         islands = self.passes.islands
         assert islands is not None
         count, sites = len(self.ranges), len(self.contact.surfaces.site_body)  # type: ignore[union-attr]
-        numbers = (count, self.passes.grid, -(-sites // passes.THREADS), max(count // 2, 1), islands._pivots, islands._product_grid)
+        numbers = (
+            count,
+            self.passes.grid,
+            -(-sites // THREADS),
+            max(count // 2, 1),
+            islands.pivots,
+            islands.product_grid,
+        )
         return c.c_void_p(islands.params.ctypes.data), c.byref(Islands(*numbers))
-
 
     @property
     def tally(self) -> np.void:

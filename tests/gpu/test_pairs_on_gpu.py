@@ -31,9 +31,7 @@ def stack(count: int, **table: Any) -> Simulation:
 def heap(count: int = 6, **table: Any) -> Simulation:
     """Blocks that fall on each other, turned in various ways."""
     blocks = [
-        block(
-            name=f"b{i}", at=(0.06 * (i % 2), 0.05 + 0.15 * i, 0.05 * (i // 2 % 2)), rotate=(7 * i, 11 * i, 5 * i)
-        )
+        block(name=f"b{i}", at=(0.06 * (i % 2), 0.05 + 0.15 * i, 0.05 * (i // 2 % 2)), rotate=(7 * i, 11 * i, 5 * i))
         for i in range(count)
     ]
     return over(objects=blocks, **table)

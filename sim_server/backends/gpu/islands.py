@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_server.arrays import Float64, Int32
+from sim_server.arrays import Int32
 from sim_server.backends.contact import Contact, Surfaces
 from sim_server.backends.declarations import Declarations
 from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction
@@ -69,7 +69,8 @@ class IslandPasses:
     shared: arrays and arguments of contact.cu: memory by name, params, chunks
     threads: of a thread block
 
-    Tests run its kernels with what it keeps: params (arguments of all kernels), memory (arrays by name), tally.
+    Tests run its kernels with what it keeps: params (arguments of all kernels), memory (arrays by name), tally,
+    pivots (steps of an inversion), product_grid (thread blocks of the product with A).
     """
 
     def __init__(
@@ -83,9 +84,9 @@ class IslandPasses:
         self._grid, self._sites = len(chunks), len(surfaces.site_body)
         free = np.array([bool((contact.free[first:last] > 0).all()) for first, last in ranges], np.int32)
         most = min(MODES * bodies, MOST_MODES)
-        self._pivots = min(int(free.sum()), most // MODES)
+        self.pivots = min(int(free.sum()), most // MODES)
         product_chunks = node_chunks(np.array([first for first, _ in ranges] + [nodes], ints), threads // 3)
-        self._product_grid = len(product_chunks)
+        self.product_grid = len(product_chunks)
         heights, first = tree_heights(surfaces), np.searchsorted(chunks["body"], np.arange(bodies + 1)).astype(np.int32)
         real = solver.real
         self.tally = cp.zeros(TALLY.itemsize // 4, ints)
@@ -214,7 +215,7 @@ class IslandPasses:
         self._law(LAW)
         self._nodes("island_prepare")
         self._each_body("coarse_matrix")
-        for pivot in range(self._pivots):
+        for pivot in range(self.pivots):
             self._each_body("invert_coarse", what=(pivot,))
 
     def iterate(self) -> None:
@@ -236,7 +237,7 @@ class IslandPasses:
         self._launch("island_settle", self._most_islands)
 
     def _multiply(self, solution: int) -> None:
-        self._launch("island_multiply", self._bodies + self._product_grid, solution)
+        self._launch("island_multiply", self._bodies + self.product_grid, solution)
 
     def keep(self) -> None:
         """Appends what comes before the end of a step: forces of rows between bodies, and their work."""

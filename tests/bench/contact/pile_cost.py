@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a step of a pile of blocks costs, on a CPU or a GPU: blocks fall between four walls, onto each other, and come to
-rest.
+"""What a step of a pile of blocks costs, on a CPU or a GPU: they fall between walls and come to rest.
 
 python -m tests.bench.contact.pile_cost --device gpu --bodies 50
 """

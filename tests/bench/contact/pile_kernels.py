@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Where the time of a step of a pile goes on a GPU: its kernels one by one, launched from the host, with the times between
+"""Where the time of a step of a pile goes on a GPU: its kernels one by one, launched from the host, with times between
 events around each (some microseconds of each are the events').
 
 python -m tests.bench.contact.pile_kernels --bodies 50
@@ -79,7 +79,12 @@ def main() -> None:
     rows = []
     for name, events in spent.items():
         us = np.array([1e3 * cp.cuda.get_elapsed_time(*e) for e in events])
-        rows.append((us.sum(), f"{name:18} {len(us):6} x  median {np.median(us):8.2f} us  most {us.max():8.2f}  sum {us.sum():10.1f}"))
+        rows.append(
+            (
+                us.sum(),
+                f"{name:18} {len(us):6} x  median {np.median(us):8.2f} us  most {us.max():8.2f}  sum {us.sum():10.1f}",
+            )
+        )
     for _, line in sorted(rows, reverse=True):
         print(line)
 
