@@ -191,12 +191,14 @@ template <class Motion> HOST_DEVICE Meeting touch_of(const SurfaceTables& c, con
 
 enum Passage { STAYS_OUT = 0, GOES_THROUGH = 1, COMES_INSIDE = 2 };
 
-// What a solution does to a vertex: whether it goes through a triangle of a body, or comes inside of it. found: where it touches then.
-// ended: the motion of what has arrived: x where it is, nothing moves.
+// Searches that tell what a solution does to a vertex: along its way past triangles, and near them, and where it has arrived.
 template <class Motion>
-HOST_DEVICE Passage passage_of(const SurfaceTables& c, const Motion& m, const Motion& ended, int node, int body, double thickness, Meeting& found) {
-    TouchSearch<Motion> search[3] = {search_of(m, node, THROUGH * thickness), search_of(m, node, thickness), search_of(ended, node, INSIDE * thickness)};
-    search_tree(c, body, search, 3);
+HOST_DEVICE void searches_of_passage(const Motion& m, const Motion& ended, int node, double thickness, TouchSearch<Motion>* search) {
+    search[0] = search_of(m, node, THROUGH * thickness);
+    search[1] = search_of(m, node, thickness);
+    search[2] = search_of(ended, node, INSIDE * thickness);
+}
+template <class Motion> HOST_DEVICE Passage passage_found(const TouchSearch<Motion>* search, Meeting& found) {
     const Meeting &through = found_by(search[0]), &on_way = found_by(search[1]), &there = found_by(search[2]);
     if (through.other >= 0 && through.touch.entry <= 1 && on_way.other >= 0) {
         found = on_way;
@@ -205,6 +207,16 @@ HOST_DEVICE Passage passage_of(const SurfaceTables& c, const Motion& m, const Mo
     found = there;
     const bool enters = there.other >= 0 && there.touch.distance < 0 && (on_way.other < 0 || on_way.touch.distance >= 0);
     return enters ? COMES_INSIDE : STAYS_OUT;
+}
+
+// What a solution does to a vertex: whether it goes through a triangle of a body, or comes inside of it. found: where it touches then.
+// ended: the motion of what has arrived: x where it is, nothing moves.
+template <class Motion>
+HOST_DEVICE Passage passage_of(const SurfaceTables& c, const Motion& m, const Motion& ended, int node, int body, double thickness, Meeting& found) {
+    TouchSearch<Motion> search[3];
+    searches_of_passage(m, ended, node, thickness, search);
+    search_tree(c, body, search, 3);
+    return passage_found(search, found);
 }
 
 // --- rows ---------------------------------------------------------------------------------------------------------------------------

@@ -96,7 +96,21 @@ template <class T> static T exchange(T value, int from) {
     std::memcpy(&value, &bits, sizeof value);
     return value;
 }
+template <class T> static T __shfl_sync(unsigned, T a, int lane) { return exchange(a, lane); }
+static unsigned __ballot_sync(unsigned, bool holds) {
+    const int warp = threadIdx.x / 32;
+    exchanged[warp][threadIdx.x % 32] = holds;
+    warp_barrier[warp].wait(32);
+    unsigned all = 0;
+    for (int lane = 0; lane < 32; ++lane) all |= (unsigned)exchanged[warp][lane] << lane;
+    warp_barrier[warp].wait(32);
+    return all;
+}
+static int __popc(unsigned a) { return __builtin_popcount(a); }
+static int __ffs(unsigned a) { return __builtin_ffs((int)a); }
 template <class T> static T __shfl_xor_sync(unsigned, T a, int by) { return exchange(a, (threadIdx.x % 32) ^ by); }
+
+static void __syncwarp() { warp_barrier[threadIdx.x / 32].wait(32); }
 
 // Whether it holds in all threads of the thread block.
 static bool __syncthreads_and(bool holds) {

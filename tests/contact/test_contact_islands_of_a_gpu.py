@@ -10,7 +10,7 @@ import pytest
 
 from sim_server.backends.gpu.islands import TALLY, tree_heights
 from sim_server.simulation import Simulation
-from tests.contact.kernels_beside import TEXT, THREADS, Beside, compiled
+from tests.contact.kernels_beside import TEXT, Beside, compiled
 from tests.contact.scenes import D, block, floor, over
 
 ISLANDS = """
@@ -118,11 +118,11 @@ class IslandsBeside(Beside):
     def more(self) -> tuple[Any, ...]:
         islands = self.passes.islands
         assert islands is not None
-        count, sites = len(self.ranges), len(self.contact.surfaces.site_body)  # type: ignore[union-attr]
+        count = len(self.ranges)
         numbers = (
             count,
             self.passes.grid,
-            -(-sites // THREADS),
+            islands.vertex_grid,
             max(count // 2, 1),
             islands.pivots,
             islands.product_grid,

@@ -166,4 +166,5 @@ class ContactPasses:
             return out
         copy = self._gpu.cp.asarray(out.astype(self._solver.real))
         self.islands.know(copy)
-        return copy.get().astype(np.float64)
+        with_pairs: Float64 = copy.get().astype(np.float64)
+        return with_pairs

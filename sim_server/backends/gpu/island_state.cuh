@@ -86,8 +86,12 @@ struct IslandArguments {
     const int* columns;
     const double* gravity;       // (3,)
     const int* tree_height;      // (tree,) of a box over its triangles
+    const int* leaf;             // (triangles,) boxes of one triangle each
+    const int* leaf_start;       // (bodies + 1,) first one of each body
     int *near, *was_near, *touched;  // (bodies,) 1: its box meets another's; in the last step; it got rows by a sweep
     real* ends;                  // (nodes, 3) where nodes come to
+    real* ways;                  // (nodes, 3) how they come there, over dx_dv
+    const double* none;          // (3,) no gravity
     const int* unheld;           // (bodies,) 1: no node is fixed
     const int* chunk_first;      // (bodies + 1,) first chunk of each body
     Tally* tally;                // (1,)

@@ -60,6 +60,12 @@ def tree_heights(surfaces: Surfaces) -> Int32:
     return height
 
 
+def leaves_before(surfaces: Surfaces) -> Int32:
+    """Returns the number of boxes of one triangle before each body's, (bodies + 1,)."""
+    counted = np.concatenate([[0], np.cumsum(surfaces.tree_child[:, 0] < 0)])
+    return counted[surfaces.tree_start].astype(np.int32)
+
+
 class IslandPasses:
     """Launches detection between bodies, and the solves of bodies that touch each other.
 
@@ -70,7 +76,7 @@ class IslandPasses:
     threads: of a thread block
 
     Tests run its kernels with what it keeps: params (arguments of all kernels), memory (arrays by name), tally,
-    pivots (steps of an inversion), product_grid (thread blocks of the product with A).
+    pivots (steps of an inversion), product_grid (thread blocks of the product with A), vertex_grid (of detection).
     """
 
     def __init__(
@@ -81,7 +87,7 @@ class IslandPasses:
         surfaces, ints, doubles = contact.surfaces, np.int32, np.float64
         cp, bodies, rows, nodes = gpu.cp, len(ranges), len(contact.obstacle), len(arrays["x"])
         self._device, self._solver, self._threads, self._bodies = device, solver, threads, bodies
-        self._grid, self._sites = len(chunks), len(surfaces.site_body)
+        self._grid, self.vertex_grid = len(chunks), -(-len(surfaces.site_body) // (threads // 32))
         free = np.array([bool((contact.free[first:last] > 0).all()) for first, last in ranges], np.int32)
         most = min(MODES * bodies, MOST_MODES)
         self.pivots = min(int(free.sum()), most // MODES)
@@ -89,12 +95,13 @@ class IslandPasses:
         self.product_grid = len(product_chunks)
         heights, first = tree_heights(surfaces), np.searchsorted(chunks["body"], np.arange(bodies + 1)).astype(np.int32)
         real = solver.real
+        pairs = int(contact.body_start[-1])
         self.tally = cp.zeros(TALLY.itemsize // 4, ints)
         sizes = {
             "near": bodies, "was_near": bodies, "touched": 2 * bodies, "bad": bodies, "label": bodies,
             "island_of": bodies, "mode": bodies, "island_start": bodies + 1, "island": bodies, "free_body": bodies,
-            "own_row": rows, "own_rows": bodies, "pair_rows": bodies, "pair_list": 3 * rows // 2, "count": nodes,
-            "start": nodes, "cursor": nodes, "entry": 4 * rows // 2, "coarse_well": bodies,
+            "own_row": rows, "own_rows": bodies, "pair_rows": bodies, "pair_list": 3 * pairs, "count": nodes,
+            "start": nodes, "cursor": nodes, "entry": 4 * pairs, "coarse_well": bodies,
         }  # fmt: skip
         vectors = ("left", "r0", "r", "x", "p", "q", "z", "az", "solution_product")
         numbers = {name: 3 * nodes for name in vectors} | {
@@ -108,8 +115,11 @@ class IslandPasses:
         self.memory |= {name: cp.zeros(SIZES[kind] * count, np.uint8) for name, (kind, count) in structs.items()}
         self.memory |= {
             "tally": self.tally, "unheld": cp.asarray(free), "tree_height": cp.asarray(heights),
+            "leaf": cp.asarray(np.flatnonzero(surfaces.tree_child[:, 0] < 0).astype(ints)),
+            "leaf_start": cp.asarray(leaves_before(surfaces)),
             "chunk_first": cp.asarray(first), "finished_chunks": cp.zeros(bodies, np.uint32),
             "product_chunks": cp.asarray(product_chunks.view(ints)), "ends": cp.zeros((nodes, 3), real),
+            "ways": cp.zeros((nodes, 3), real), "none": cp.zeros(3),
             "gravity": gpu.twin(surfaces.gravity, dtype=surfaces.gravity.dtype),
             "row_start": gpu.twin(arrays["row_start"]), "columns": gpu.twin(arrays["columns"]),
         }  # fmt: skip
@@ -143,13 +153,17 @@ class IslandPasses:
         for name, array in self._box_memory.items():
             params["t"][name] = array.data.ptr
         params["t"]["near"] = self.memory["near"].data.ptr
-        params["t"]["bodies"], params["t"]["pair_first"] = self._bodies, len(contact.obstacle) // 2
+        params["t"]["bodies"], params["t"]["pair_first"] = (
+            self._bodies,
+            len(contact.obstacle) - int(contact.body_start[-1]),
+        )
         return params  # type: ignore[no-any-return]
 
     def flag(self, name: str) -> DeviceArray:
         """Returns a number of the tally, (1,)."""
         at = TALLY.fields[name][1] // 4  # type: ignore[index]
-        return self.tally[at : at + 1]
+        found: DeviceArray = self.tally[at : at + 1]
+        return found
 
     # --- launches -----------------------------------------------------------------------------------------------
 
@@ -169,7 +183,7 @@ class IslandPasses:
     def detect(self) -> None:
         """Appends detection, once a step: it turns what rows remember with their normals."""
         self._each_body("pair_boxes", "pair_trees", what=(0,))
-        self._launch("pair_sites", -(-self._sites // self._threads))
+        self._launch("pair_sites", self.vertex_grid)
 
     def group(self, swept: int = 0) -> None:
         """Appends the search of islands."""
@@ -188,7 +202,7 @@ class IslandPasses:
                         self.iterate()
                     self.end_pass()
             self._each_body("pair_boxes", "pair_trees", what=(1,))
-            self._launch("pair_sweep", -(-self._sites // self._threads))
+            self._launch("pair_sweep", self.vertex_grid)
             self._launch("end_sweep", 1)
             with self._device.branch(self.flag("go")):
                 self.group(1)

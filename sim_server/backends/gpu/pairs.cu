@@ -42,7 +42,10 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) pair_boxes(const I
     for (int i = nodes.first + threadIdx.x; solved && i < nodes.first + nodes.nodes; i += CONTACT_THREADS) {
         double s[3];
         displacement_of(m, i, s);
-        for (int k = 0; k < 3; ++k) a.ends[3ll * i + k] = (real)((double)a.c.x[3ll * i + k] + s[k]);
+        for (int k = 0; k < 3; ++k) {
+            a.ends[3ll * i + k] = (real)((double)a.c.x[3ll * i + k] + s[k]);
+            a.ways[3ll * i + k] = (real)(s[k] / a.c.dx_dv);
+        }
     }
 }
 
@@ -64,12 +67,103 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) pair_trees(const I
     }
 }
 
-// A thread has a vertex of a surface: sets its rows.
+// --- a vertex and a body ------------------------------------------------------------------------------------------------------------
+
+constexpr int QUEUE = 64;  // triangles of a warp that wait to be looked at
+
+// Copies what a lane has found to all lanes of the warp.
+__device__ __forceinline__ void share(Meeting& m, int lane) {
+    m.other = __shfl_sync(WARP, m.other, lane);
+    m.triangle = __shfl_sync(WARP, m.triangle, lane);
+    m.touch.entry = __shfl_sync(WARP, m.touch.entry, lane);
+    m.touch.distance = __shfl_sync(WARP, m.touch.distance, lane);
+    m.touch.certainty = __shfl_sync(WARP, m.touch.certainty, lane);
+    for (int k = 0; k < 3; ++k) {
+        m.touch.normal[k] = __shfl_sync(WARP, m.touch.normal[k], lane);
+        m.touch.weight[k] = __shfl_sync(WARP, m.touch.weight[k], lane);
+    }
+}
+__device__ __forceinline__ double least_of(double v) {
+    for (int by = 16; by; by >>= 1) v = fmin(v, __shfl_xor_sync(WARP, v, by));
+    return v;
+}
+__device__ __forceinline__ int lane_with(bool candidate, int number) {  // the lowest number among candidates; its lane
+    int best = candidate ? number : 0x7fffffff;
+    for (int by = 16; by; by >>= 1) best = min(best, __shfl_xor_sync(WARP, best, by));
+    const unsigned holders = __ballot_sync(WARP, candidate && number == best);
+    return holders ? __ffs(holders) - 1 : 0;
+}
+
+// Of what the lanes have found: the nearest, of those equally near the surest; the first; of equal ones the lowest triangle.
+__device__ void agree(TouchSearch<Motion>& search) {
+    Meeting &nearest = search.nearest, &first = search.first;
+    bool mine = nearest.other >= 0;
+    const double least = least_of(mine ? fabs(nearest.touch.distance) : 1e300);
+    mine = mine && fabs(nearest.touch.distance) - least <= 1e-9 * search.thickness;
+    const double surest = -least_of(mine ? -nearest.touch.certainty : 1e300);
+    mine = mine && nearest.touch.certainty == surest;
+    share(nearest, lane_with(mine, nearest.triangle));
+    mine = first.other >= 0;
+    const double entry = least_of(mine ? first.touch.entry : 1e300);
+    mine = mine && first.touch.entry == entry;
+    const double distance = least_of(mine ? first.touch.distance : 1e300);
+    mine = mine && first.touch.distance == distance;
+    share(first, lane_with(mine, first.triangle));
+}
+
+// Searches the triangles of a body, by a warp, once for all searches: all lanes have what was found. queue: (QUEUE,) of the warp.
+__device__ void search_body(const IslandArguments& a, int body, TouchSearch<Motion>* search, int count, int* queue) {
+    const int lane = threadIdx.x % 32, last = a.leaf_start[body + 1];
+    Box box = search[0].box;
+    for (int i = 1; i < count; ++i) box = joined(box, search[i].box);
+    int waiting = 0;
+    if (!meet(a.t.tree_box[a.t.tree_start[body]], box)) return;
+    for (int from = a.leaf_start[body]; from < last || waiting; from += 32) {
+        const int k = from + lane < last ? a.leaf[from + lane] : -1;
+        const bool met = k >= 0 && meet(a.t.tree_box[k], box);
+        const unsigned lanes = __ballot_sync(WARP, met);
+        if (met) queue[waiting + __popc(lanes & ((1u << lane) - 1))] = k;
+        waiting += __popc(lanes);
+        __syncwarp();
+        if (waiting < 32 && from + 32 < last) continue;
+        const int taken = waiting < 32 ? waiting : 32, mine = lane < taken ? queue[waiting - taken + lane] : -1;
+        __syncwarp();
+        waiting -= taken;
+        if (mine >= 0)
+            for (int i = 0; i < count; ++i)
+                if (count == 1 || meet(a.t.tree_box[mine], search[i].box)) consider(a.t, body, ~a.t.tree_child[2 * mine], search[i]);
+    }
+    for (int i = 0; i < count; ++i) agree(search[i]);
+}
+
+// A warp has a vertex of a surface: sets its rows, as detect_site.
 extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) pair_sites(const IslandArguments a) {
-    const int site = blockIdx.x * CONTACT_THREADS + threadIdx.x;
+    __shared__ int queues[CONTACT_THREADS / 32][QUEUE];
+    const int warp = threadIdx.x / 32, site = blockIdx.x * (CONTACT_THREADS / 32) + warp, lane = threadIdx.x % 32;
     if (site >= sites_before(a.t, a.bodies_count)) return;
-    const int body = a.t.site_body[site];
-    if (a.near[body] || a.was_near[body]) detect_site(a.t, motion_of(a, false), site);
+    const int body = a.t.site_body[site], node = node_of_site(a.t, site), row = a.t.pair_first + 2 * site;
+    if (!a.near[body] && !a.was_near[body]) return;
+    const Motion m = motion_of(a, false);
+    Meeting first = {-1, -1, {}}, second = first;
+    const Box box = a.c.free[node] == 0 ? empty_box() : box_of(m, node, thickness_of(a.t, body));
+    for (int from = 0; from < a.bodies_count; from += 32) {
+        const int there = from + lane;
+        const bool met = there < a.bodies_count && there != body && a.near[there] && meet(box, a.t.body_box[there]);
+        for (unsigned lanes = __ballot_sync(WARP, met); lanes; lanes &= lanes - 1) {
+            const int other = from + __ffs(lanes) - 1;
+            TouchSearch<Motion> search = search_of(m, node, 0.5 * (thickness_of(a.t, body) + thickness_of(a.t, other)));
+            search_body(a, other, &search, 1, queues[warp]);
+            const Meeting t = found_by(search);
+            if (comes_before(t, first)) { second = first; first = t; }
+            else if (comes_before(t, second)) second = t;
+        }
+    }
+    if (lane > 0) return;
+    const RowMemory last[2] = {memory_of(a.t, row), memory_of(a.t, row + 1)};
+    put_row(a.t, m, row, site, first);
+    recall(a.t, row, last, 2);
+    put_row(a.t, m, row + 1, site, second);
+    recall(a.t, row + 1, last, 2);
 }
 
 // Gives a body that a vertex touches one of its rows: that body's own, an empty one, or the one that carries less.
@@ -93,26 +187,34 @@ __device__ void take_pair_row(const IslandArguments& a, int site, const Meeting&
     for (int k = 0; k < 6; ++k) a.row[r].known[k] = 0;
 }
 
-// A thread has a vertex: gives it a row where the solution moves it through a triangle, or into a body that it was outside of, or makes
+// A warp has a vertex: gives it a row where the solution moves it through a triangle, or into a body that it was outside of, or makes
 // its row stiffer.
 extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) pair_sweep(const IslandArguments a) {
-    const int site = blockIdx.x * CONTACT_THREADS + threadIdx.x;
+    __shared__ int queues[CONTACT_THREADS / 32][QUEUE];
+    const int warp = threadIdx.x / 32, site = blockIdx.x * (CONTACT_THREADS / 32) + warp, lane = threadIdx.x % 32;
     if (swept_enough(a, 1) || site >= sites_before(a.t, a.bodies_count)) return;
     const int body = a.t.site_body[site], node = node_of_site(a.t, site);
     if (!a.near[body]) return;
-    if (site == sites_before(a.t, body)) a.was_near[body] = 1;  // its rows are looked at again in the next step
+    if (site == sites_before(a.t, body) && lane == 0) a.was_near[body] = 1;  // its rows are looked at again in the next step
     if (a.c.free[node] == 0) return;
-    const Motion m = motion_of(a, true);
+    const Motion m = {a.c.x, a.ways, nullptr, a.c.rotation, a.c.free, a.c.dx_dv, 0, a.none};  // ways as pair_boxes has made them
     Motion ended = m;
     ended.x = a.ends;
     ended.predictor = nullptr;
     const Box box = box_of(m, node, thickness_of(a.t, body));
-    for (int other = 0; other < a.bodies_count; ++other) {
-        if (other == body || !a.near[other] || !meet(box, a.t.body_box[other])) continue;
-        Meeting t;
-        if (passage_of(a.t, m, ended, node, other, 0.5 * (thickness_of(a.t, body) + thickness_of(a.t, other)), t) == STAYS_OUT) continue;
-        take_pair_row(a, site, t);
-        a.touched[body] = a.touched[other] = a.tally->found = 1;
+    for (int from = 0; from < a.bodies_count; from += 32) {
+        const int there = from + lane;
+        const bool met = there < a.bodies_count && there != body && a.near[there] && meet(box, a.t.body_box[there]);
+        for (unsigned lanes = __ballot_sync(WARP, met); lanes; lanes &= lanes - 1) {
+            const int other = from + __ffs(lanes) - 1;
+            TouchSearch<Motion> search[3];
+            searches_of_passage(m, ended, node, 0.5 * (thickness_of(a.t, body) + thickness_of(a.t, other)), search);
+            search_body(a, other, search, 3, queues[warp]);
+            Meeting t;
+            if (passage_found(search, t) == STAYS_OUT || lane > 0) continue;
+            take_pair_row(a, site, t);
+            a.touched[body] = a.touched[other] = a.tally->found = 1;
+        }
     }
 }
 
