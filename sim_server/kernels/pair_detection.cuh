@@ -13,7 +13,7 @@
 
 constexpr double THROUGH = 1e-3;  // thicknesses: a vertex whose path comes so near passes the triangle
 constexpr double CREASE = 0.9;    // cosine of the angle between two triangles that a vertex lies on as in a crease, or less
-constexpr double OVER = 0.999;    // of a triangle's certainty: the vertex is over it, not beyond its edges
+constexpr double OVER_FACE = 0.999;    // of a triangle's certainty: the vertex is over it, not beyond its edges
 constexpr double INSIDE = 3;      // thicknesses over DEEP: how deep a vertex may have come in one step to be sent back
 
 // How nodes move in a step. Real, Local: types of the state and of rotations.
@@ -142,6 +142,11 @@ template <class Motion> HOST_DEVICE TouchSearch<Motion> search_of(const Motion& 
     return search;
 }
 
+// True if a vertex lies over a triangle, within the thickness.
+HOST_DEVICE bool is_over(const Meeting& m, double thickness) {
+    return m.other >= 0 && m.touch.certainty > OVER_FACE && m.touch.distance > 0 && m.touch.distance <= thickness;
+}
+
 template <class Motion> HOST_DEVICE void consider(const SurfaceTables& c, int body, int triangle, TouchSearch<Motion>& search) {
     const int* t = c.triangle + 3 * triangle;
     const double thickness = search.thickness;
@@ -161,8 +166,7 @@ template <class Motion> HOST_DEVICE void consider(const SurfaceTables& c, int bo
         later = nearest;
         nearest = here;
     }
-    const bool over = later.other >= 0 && later.touch.certainty > OVER && later.touch.distance > 0 && later.touch.distance <= thickness;
-    if (over && (search.beside.other < 0 || later.touch.distance < search.beside.touch.distance)) search.beside = later;
+    if (is_over(later, thickness) && (search.beside.other < 0 || later.touch.distance < search.beside.touch.distance)) search.beside = later;
     if (here.touch.distance > 0 && here.touch.entry <= 1 && comes_before(here, search.first)) search.first = here;
 }
 
@@ -194,12 +198,14 @@ template <class Motion> HOST_DEVICE const Meeting& found_by(const TouchSearch<Mo
 
 enum Passage { STAYS_OUT = 0, GOES_THROUGH = 1, COMES_INSIDE = 2 };
 
-// What a solution does to a vertex: whether it goes through a triangle of a body, or comes inside of it. found: where it touches then.
-// ended: the motion of what has arrived: x where it is, nothing moves.
+// Searches that tell what a solution does to a vertex: along its way past triangles, and near them, and where it has arrived.
 template <class Motion>
-HOST_DEVICE Passage passage_of(const SurfaceTables& c, const Motion& m, const Motion& ended, int node, int body, double thickness, Meeting& found) {
-    TouchSearch<Motion> search[3] = {search_of(m, node, THROUGH * thickness), search_of(m, node, thickness), search_of(ended, node, INSIDE * thickness)};
-    search_tree(c, body, search, 3);
+HOST_DEVICE void searches_of_passage(const Motion& m, const Motion& ended, int node, double thickness, TouchSearch<Motion>* search) {
+    search[0] = search_of(m, node, THROUGH * thickness);
+    search[1] = search_of(m, node, thickness);
+    search[2] = search_of(ended, node, INSIDE * thickness);
+}
+template <class Motion> HOST_DEVICE Passage passage_found(const TouchSearch<Motion>* search, Meeting& found) {
     const Meeting &through = found_by(search[0]), &on_way = found_by(search[1]), &there = found_by(search[2]);
     if (through.other >= 0 && through.touch.entry <= 1 && on_way.other >= 0) {
         found = on_way;
@@ -208,6 +214,16 @@ HOST_DEVICE Passage passage_of(const SurfaceTables& c, const Motion& m, const Mo
     found = there;
     const bool enters = there.other >= 0 && there.touch.distance < 0 && (on_way.other < 0 || on_way.touch.distance >= 0);
     return enters ? COMES_INSIDE : STAYS_OUT;
+}
+
+// What a solution does to a vertex: whether it goes through a triangle of a body, or comes inside of it. found: where it touches then.
+// ended: the motion of what has arrived: x where it is, nothing moves.
+template <class Motion>
+HOST_DEVICE Passage passage_of(const SurfaceTables& c, const Motion& m, const Motion& ended, int node, int body, double thickness, Meeting& found) {
+    TouchSearch<Motion> search[3];
+    searches_of_passage(m, ended, node, thickness, search);
+    search_tree(c, body, search, 3);
+    return passage_found(search, found);
 }
 
 // --- rows ---------------------------------------------------------------------------------------------------------------------------

@@ -235,7 +235,7 @@ class Scene(Parameters):
         self.integrator.check_device(device)
         check_ties_on(device, self.attachments or [], self.springs or [])
         if "contact" in self.effects:
-            check_contact_on(device, self.effects["contact"], self.objects, self.integrator)
+            check_contact_on(device, self.integrator)
 
     @property
     def projection(self) -> Literal["excess", "clamp", "absolute", "none"]:

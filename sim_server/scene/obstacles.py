@@ -88,20 +88,12 @@ def contact_errors(
         pairs.append(set(pair.between))
 
 
-def check_contact_on(device: str, contact: Any, objects: Sequence[HasName], integrator: IntegratorOptions) -> None:
-    """Raises InputError for contact that the device ("cpu" or "gpu") does not have.
-
-    contact: parameters of the effect
-    """
+def check_contact_on(device: str, integrator: IntegratorOptions) -> None:
+    """Raises InputError for contact that the device ("cpu" or "gpu") does not have."""
     if device == "gpu" and integrator.scheme != "backward_euler":
         raise InputError(
             f"effects.contact with integrator.scheme = {integrator.scheme!r} on a GPU; allowed: 'backward_euler', or "
             "--device cpu"
-        )
-    if device == "gpu" and len(objects) > 1 and contact.between:
-        raise InputError(
-            f"effects.contact.between = true with {len(objects)} objects: on a GPU they touch obstacles, not each "
-            "other; allowed: contact = { between = false }, or --device cpu"
         )
 
 

@@ -1,13 +1,14 @@
 // SPDX-License-Identifier: MIT
-// Thread blocks of CUDA as threads of the processor, one block after another: enough for texts that sum over warps and blocks.
+// Thread blocks of CUDA, one after another, whose threads take turns on one thread of the processor, from barrier to barrier: enough
+// for texts that sum over warps and blocks.
 #pragma once
-#include <pthread.h>
+#include <ucontext.h>
 
-#include <atomic>
 #include <cmath>
 #include <cstdint>
+#include <cstdio>
+#include <cstdlib>
 #include <cstring>
-#include <thread>
 #include <vector>
 
 #define __device__
@@ -18,21 +19,48 @@
 #define __shared__ static
 #define __align__(n) alignas(n)
 
+using std::isfinite;
+
 struct uint4 { unsigned x, y, z, w; };
 struct Dimension { int x; };
-static thread_local Dimension threadIdx;
-static Dimension blockIdx, blockDim, gridDim;
-static pthread_barrier_t block_barrier, warp_barrier[32];
+static Dimension threadIdx, blockIdx, blockDim, gridDim;
 static uint64_t exchanged[32][32];
 
-static void __syncthreads() { pthread_barrier_wait(&block_barrier); }
+struct Turn {                // of a thread
+    ucontext_t context;
+    std::vector<char> stack;
+    bool ended;
+};
+static Turn turns[1024];
+static ucontext_t between_turns;
+
+static void give_turn() { swapcontext(&turns[threadIdx.x].context, &between_turns); }
+
+struct Barrier {
+    int waiting = 0;
+    unsigned passed = 0;
+    void wait(int all) {
+        const unsigned before = passed;
+        if (++waiting == all) {
+            waiting = 0;
+            ++passed;
+        }
+        for (int k = 0; passed == before; ++k) {
+            if (k > 100000) { std::fprintf(stderr, "a barrier waits for a thread that has ended\n"); std::abort(); }
+            give_turn();
+        }
+    }
+};
+static Barrier block_barrier, warp_barrier[32];
+
+static void __syncthreads() { block_barrier.wait(blockDim.x); }
 static double __longlong_as_double(long long bits) {
     double a;
     std::memcpy(&a, &bits, sizeof a);
     return a;
 }
 
-static void __threadfence() { std::atomic_thread_fence(std::memory_order_seq_cst); }
+static void __threadfence() { __atomic_thread_fence(__ATOMIC_SEQ_CST); }
 template <class T> static T atomicAdd(T* a, T by) { return __atomic_fetch_add(a, by, __ATOMIC_SEQ_CST); }
 template <class T> static T atomicSub(T* a, T by) { return __atomic_fetch_sub(a, by, __ATOMIC_SEQ_CST); }
 template <class T> static T __ldcg(const T* a) {
@@ -44,6 +72,10 @@ template <class T> static void __stcg(T* a, T value) { __atomic_store(a, &value,
 static void atomicMax(long long* a, long long b) {
     long long seen = __ldcg(a);
     while (seen < b && !__atomic_compare_exchange_n(a, &seen, b, false, __ATOMIC_SEQ_CST, __ATOMIC_SEQ_CST)) {}
+}
+static void atomicMin(int* a, int b) {
+    int seen = __ldcg(a);
+    while (seen > b && !__atomic_compare_exchange_n(a, &seen, b, false, __ATOMIC_SEQ_CST, __ATOMIC_SEQ_CST)) {}
 }
 static int min(int a, int b) { return a < b ? a : b; }
 static long long __double_as_longlong(double a) {
@@ -58,17 +90,31 @@ template <class T> static T exchange(T value, int from) {
     uint64_t bits = 0;
     std::memcpy(&bits, &value, sizeof value);
     exchanged[warp][lane] = bits;
-    pthread_barrier_wait(&warp_barrier[warp]);
+    warp_barrier[warp].wait(32);
     bits = exchanged[warp][from < 0 || from > 31 ? lane : from];
-    pthread_barrier_wait(&warp_barrier[warp]);
+    warp_barrier[warp].wait(32);
     std::memcpy(&value, &bits, sizeof value);
     return value;
 }
+template <class T> static T __shfl_sync(unsigned, T a, int lane) { return exchange(a, lane); }
+static unsigned __ballot_sync(unsigned, bool holds) {
+    const int warp = threadIdx.x / 32;
+    exchanged[warp][threadIdx.x % 32] = holds;
+    warp_barrier[warp].wait(32);
+    unsigned all = 0;
+    for (int lane = 0; lane < 32; ++lane) all |= (unsigned)exchanged[warp][lane] << lane;
+    warp_barrier[warp].wait(32);
+    return all;
+}
+static int __popc(unsigned a) { return __builtin_popcount(a); }
+static int __ffs(unsigned a) { return __builtin_ffs((int)a); }
 template <class T> static T __shfl_xor_sync(unsigned, T a, int by) { return exchange(a, (threadIdx.x % 32) ^ by); }
+
+static void __syncwarp() { warp_barrier[threadIdx.x / 32].wait(32); }
 
 // Whether it holds in all threads of the thread block.
 static bool __syncthreads_and(bool holds) {
-    static std::atomic<int> others{0};
+    static int others = 0;
     if (!holds) others = 1;
     __syncthreads();
     const bool all = others == 0;
@@ -78,18 +124,38 @@ static bool __syncthreads_and(bool holds) {
     return all;
 }
 
+static void (*run_kernel)(void*);
+static void* kernel_run;
+
+static void take_turns() {
+    run_kernel(kernel_run);
+    turns[threadIdx.x].ended = true;
+    give_turn();
+}
+
 template <class Kernel> static void launch(int blocks, int threads, Kernel kernel) {
     blockDim.x = threads;
     gridDim.x = blocks;
-    pthread_barrier_init(&block_barrier, nullptr, threads);
-    for (int w = 0; w < threads / 32; ++w) pthread_barrier_init(&warp_barrier[w], nullptr, 32);
+    run_kernel = [](void* k) { (*(Kernel*)k)(); };
+    kernel_run = &kernel;
     for (blockIdx.x = 0; blockIdx.x < blocks; ++blockIdx.x) {
-        std::vector<std::thread> all;
-        for (int t = 0; t < threads; ++t)
-            all.emplace_back([&, t] {
+        for (int t = 0; t < threads; ++t) {
+            Turn& turn = turns[t];
+            turn.stack.resize(1 << 18);
+            turn.ended = false;
+            getcontext(&turn.context);
+            turn.context.uc_stack.ss_sp = turn.stack.data();
+            turn.context.uc_stack.ss_size = turn.stack.size();
+            makecontext(&turn.context, take_turns, 0);
+        }
+        for (int left = threads; left > 0;) {
+            left = 0;
+            for (int t = 0; t < threads; ++t) {
+                if (turns[t].ended) continue;
                 threadIdx.x = t;
-                kernel();
-            });
-        for (std::thread& one : all) one.join();
+                swapcontext(&between_turns, &turns[t].context);
+                left += !turns[t].ended;
+            }
+        }
     }
 }

@@ -14,7 +14,7 @@ from sim_server.backends.gpu.inverse.plan import plan
 from sim_server.backends.gpu.inverse.workspace import workspace
 from sim_server.simulation import Simulation
 from tests.backends import fake_cupy
-from tests.contact.scenes import floor, over, ram
+from tests.contact.scenes import block, floor, over, ram
 from tests.holders.holder_scenes import held_bar, left, right
 from tests.scenes import bar, scene
 from tests.support import nvrtc
@@ -109,6 +109,34 @@ def test_a_scene_with_contact_is_built(cupy, precision):
     exact = vars(simulation.contact.contact_input())
     twins = {name: engine.gpu.twin(array) for name, array in exact.items() if name in ("gap", "force", "normal")}
     assert {twin.dtype for twin in twins.values()} == {np.dtype("f8")}
+
+
+@pytest.mark.parametrize("precision", ["float64", "mixed", "float32"])
+def test_a_scene_whose_bodies_touch_each_other_is_built(cupy, precision):
+    """Detection is a part of the assembly; what belongs to islands is launched in such scenes alone."""
+    solver = {"preconditioner": "cholesky", "precision": precision}
+    objects = [block(name="low"), block(name="high", at=(0, 0.07, 0))]
+    simulation = over(floor(), objects=objects, solver=solver, device="gpu")
+    names = [kernel for kernel, _ in cupy.calls]
+    first = names.index("place")
+    before = ["place", "detect", "pair_boxes", "pair_trees", "pair_sites", "look_at_bodies", "list_island_rows",
+              "find_islands", "begin_contact"]  # fmt: skip
+    assert names[first : first + len(before)] == before
+    iteration = ["island_update", "island_factor", "island_multiply", "island_product", "coarse_solve", "island_finish"]
+    at = names.index("island_factor") - 1
+    assert names[at : at + len(iteration)] == iteration
+    assert names.index("keep_pairs") < names.index("finish_contact") < names.index("know_pairs")
+    engine = simulation.engine
+    engine.run(3)
+    engine.assemble()
+    engine.solve()
+    assert engine.records()["step"].tolist() == [1, 1, 2, 2, 3, 3, 4, 4]
+
+
+def test_bodies_that_are_told_not_to_touch_each_other_have_nothing_of_it(cupy):
+    objects = [block(name="low"), block(name="high", at=(0, 0.07, 0))]
+    over(floor(), objects=objects, contact={"between": False}, device="gpu")
+    assert not any("pair" in kernel or "island" in kernel for kernel, _ in cupy.calls)
 
 
 def test_a_scene_without_contact_has_nothing_of_it(cupy):

@@ -11,7 +11,6 @@ import pytest
 from sim_server.errors import InputError
 from sim_server.scene import load
 from sim_server.scene.model import Scene
-from sim_server.simulation import Simulation
 
 GOOD = """\
 dt = 0.02
@@ -115,16 +114,8 @@ def test_one_value_of_an_obstacle_is_overridden_by_name(tmp_path):
     )
 
 
-def test_on_a_gpu_objects_must_not_touch_each_other(tmp_path):
-    both = read(tmp_path, GOOD)
-    both.check_device("cpu")
-    with pytest.raises(InputError, match=r"effects\.contact\.between = true with 2 objects: .* between = false"):
-        both.check_device("gpu")
-    with pytest.raises(InputError, match="between"):
-        Simulation(both, "gpu")
-    read(tmp_path, swap("contact = true", "contact = { between = false }")).check_device("gpu")
-    start, end = (GOOD.index(name) for name in ('[[object]]\nname = "other"', "[[obstacle]]"))
-    read(tmp_path, GOOD[:start] + GOOD[end:]).check_device("gpu")  # one object touches no other
+def test_a_gpu_takes_objects_that_touch_each_other(tmp_path):
+    read(tmp_path, GOOD).check_device("gpu")
 
 
 @pytest.mark.parametrize("scheme", ["newmark", "bdf2", "ros2"])

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Contact with obstacles on a GPU (contact_state.cuh): memory and launches of its kernels, between assembly and
-integration."""
+"""Contact on a GPU (contact_state.cuh): memory and launches of its kernels, between assembly and integration. Bodies
+that touch each other: islands.py."""
 
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +14,7 @@ from sim_server.backends.declarations import Declarations
 from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction
 from sim_server.backends.gpu.device import Gpu, compiled, options, own_headers
 from sim_server.backends.gpu.energies import node_chunks
+from sim_server.backends.gpu.islands import Graphs, IslandPasses
 from sim_server.backends.gpu.solver import PcgSolver
 from sim_server.backends.gpu.structs import CONTACT_SOLVE, CONTACT_STATE
 
@@ -30,25 +30,16 @@ ROWS = (
 )  # fmt: skip
 
 
-class Loops(Protocol):
-    """A device whose graphs have loops (cuda.CudaDevice)."""
-
-    def repeat(self, flag: DeviceArray) -> AbstractContextManager[None]:
-        """What is launched inside runs as long as `flag` (1,) is not 0."""
-        ...
-
-
 def pairs_of(contact: Contact, nodes: int) -> Int32:
-    """Returns the first of the two rows of each node, (nodes,); -1: it has none.
+    """Returns the first of the two rows against obstacles of each node, (nodes,); -1: it has none.
 
     Raises ValueError for rows that are not pairs of one node.
     """
-    if contact.surfaces:
-        raise ValueError("bodies do not touch each other on a GPU")
     if contact.faces:
         raise ValueError("triangles of a surface have no rows of contact on a GPU")
-    node = contact.corner[:, 0]
-    alone = (contact.corner[:, 1:] < 0).all() and (contact.weight[:, 0] == 1).all()
+    count = contact.body_start[-1]
+    node = contact.corner[:count, 0]
+    alone = (contact.corner[:count, 1:] < 0).all() and (contact.weight[:count, 0] == 1).all()
     if len(node) % 2 or not alone or (node[::2] != node[1::2]).any():
         raise ValueError("rows of contact on a GPU come in pairs, of one node each")
     pair = np.full(nodes, -1, np.int32)
@@ -78,17 +69,18 @@ class ContactPasses:
     """
 
     def __init__(
-        self, gpu: Gpu, device: Loops, contact: Contact, ranges: Sequence[tuple[int, int]],
+        self, gpu: Gpu, device: Graphs, contact: Contact, ranges: Sequence[tuple[int, int]],
         arrays: Mapping[str, NDArray[Any]], solver: PcgSolver, balance: DeviceArray, results: NDArray[Any],
         reactions: Float64,
     ):  # fmt: skip
         cp, nodes, self._bodies = gpu.cp, len(arrays["x"]), len(ranges)
-        self._device, self._solver, self.active = device, solver, cp.zeros(1, np.int32)
+        self._gpu, self._device, self._solver, self.active = gpu, device, solver, cp.zeros(1, np.int32)
         starts = np.array([first for first, _ in ranges] + [nodes], np.int32)
         chunks, rows, real = node_chunks(starts, THREADS), len(contact.obstacle), solver.real
         self.grid, names = len(chunks), ("values", "b", "y", "x", "rotation")
         own, pair = own_blocks(arrays["row_start"], arrays["columns"]), pairs_of(contact, nodes)
-        self._surface = own[contact.corner[::2, 0]]  # places of the nodes that have rows
+        self._surface = own[contact.corner[: contact.body_start[-1] : 2, 0]]  # places of the nodes that have rows
+        sites = len(self._surface)
         exact = {name: getattr(contact, name) for name in ROWS}
         self.memory: dict[str, DeviceArray] = {name: gpu.twin(arrays[name]) for name in names}
         self.memory |= {name: gpu.twin(host, dtype=host.dtype) for name, host in exact.items()}
@@ -97,7 +89,7 @@ class ContactPasses:
             "pair": cp.asarray(pair), "node": cp.asarray(contact.corner[:, 0].copy()), "place": cp.asarray(own),
             "contact_b": cp.zeros((nodes, 3), real), "start": cp.zeros((nodes, 3), real),
             "first": cp.zeros((nodes, 3), real), "last": cp.zeros((nodes, 3), real),
-            "base": cp.zeros((max(rows // 2, 1), 3, 3), real), "known": cp.zeros((max(rows // 2, 1), 3, 3), real),
+            "base": cp.zeros((max(sites, 1), 3, 3), real), "known": cp.zeros((max(sites, 1), 3, 3), real),
             "row": cp.zeros(max(rows, 1) * DEVICE_ROW.itemsize, np.uint8),
             "list": cp.zeros(max(rows, 1), np.int32), "active": self.active,
             "state": cp.zeros(self._bodies * CONTACT_STATE.itemsize, np.uint8),
@@ -107,6 +99,9 @@ class ContactPasses:
         }  # fmt: skip
         self._table = {n: gpu.twin(a, dtype=a.dtype) for n in TABLE for a in [getattr(contact.obstacles, n)]}
         self.params = self._arguments(contact, results, reactions)
+        self.islands: IslandPasses | None = None
+        if contact.surfaces:
+            self.islands = IslandPasses(gpu, device, contact, ranges, arrays, solver, self.params, chunks, THREADS)
         self.first, self.later = self._solve(contact, 1), self._solve(contact, 0)
         module = cp.RawModule(
             code=TEXT.checked(), options=(*options(gpu.types), *own_headers()), backend="nvrtc"
@@ -144,6 +139,8 @@ class ContactPasses:
 
     def begin(self) -> None:
         """Appends what comes before the first solve of a step whose rows are detected."""
+        if self.islands:
+            self.islands.group()
         self._launch("begin_contact", self._bodies)
         self._launch("contact_forces", self.grid)
 
@@ -154,7 +151,12 @@ class ContactPasses:
         with self._device.repeat(self.active):
             self._launch("contact_forces", self.grid)
             self._solve_and_search(self.later)
+        if self.islands:
+            self.islands.launch()
+            self.islands.keep()
         self._launch("finish_contact", self.grid)
+        if self.islands:
+            self.islands.know(self.memory["values"])
 
     def _solve_and_search(self, solve: NDArray[Any]) -> None:
         self._solver.solve_contact(self.memory["contact_b"], solve)
@@ -162,7 +164,14 @@ class ContactPasses:
 
     def known(self, values: Float64) -> Float64:
         """Returns a copy of the values of A of a step that has begun, with the contacts that a factor is to know."""
+        if self.islands:
+            self.islands.start()
         out = values.copy()
         if len(self._surface):
             out[self._surface] = self.memory["known"].get()
-        return out
+        if not self.islands:
+            return out
+        copy = self._gpu.cp.asarray(out.astype(self._solver.real))
+        self.islands.know(copy)
+        with_pairs: Float64 = copy.get().astype(np.float64)
+        return with_pairs

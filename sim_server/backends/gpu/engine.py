@@ -105,7 +105,7 @@ class GpuEngine(DeviceLoop):
         phases = NewtonPhases.initial(gpu, bodies) if newton else None
         self.solver = PcgSolver(
             gpu, ranges, arrays, self._counter, CAPACITY, planes, phases or (), ATTEMPTS if stages else 0,
-            given.contact is not None,
+            given.contact is not None, given.contact is not None and given.contact.surfaces is not None,
         )  # fmt: skip
         self._newton, newton_results = None, None
         if newton and phases:
@@ -123,6 +123,9 @@ class GpuEngine(DeviceLoop):
             self._contact = ContactPasses(
                 gpu, device, given.contact, ranges, arrays, self.solver, balance, contact_results, reactions
             )
+            if self._contact.islands:
+                self._whole_assembly = [*self._whole_assembly, self._contact.islands.detect]
+                self._first_launches = self._whole_assembly
         self._held, held = None, None
         if given.held is not None:
             held = device.pinned(CAPACITY * given.held.nbytes).view(np.float64).reshape(CAPACITY, *given.held.shape)

@@ -498,7 +498,8 @@ extern "C" __global__ void __launch_bounds__(THREADS, PER_PROCESSOR) pcg(const P
 #elif defined(STAGES)
         const bool solved = !takes_part(s, stage, s.row_ranges[next]);
 #elif defined(CONTACT_PASSES)
-        const bool solved = !pass.first_of_step && pass.state[s.row_ranges[next].body].phase != READY;
+        const int contact_phase = pass.state[s.row_ranges[next].body].phase;
+        const bool solved = pass.first_of_step ? contact_phase == OVER : contact_phase != READY;
 #else
         const bool solved = false;
 #endif

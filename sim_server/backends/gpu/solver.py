@@ -42,6 +42,7 @@ class PcgSolver:
     phases: newton.NewtonPhases; empty: one linearization a step
     attempts: number of solves that the graph of a Rosenbrock-W step holds (stages.cuh); 0: another scheme
     contact: True for a scene with contact (contact_state.cuh)
+    between: True if bodies touch each other there (island_state.cuh)
 
     bodies: host rows (PCG_BODY), one per body. The loop uploads the settings (the first SETTINGS_BYTES bytes of a row)
         and the factor (the others) separately.
@@ -53,12 +54,16 @@ class PcgSolver:
     def __init__(
         self, gpu: Gpu, ranges: Sequence[tuple[int, int]], arrays: Mapping[str, NDArray[Any]], counter: DeviceArray,
         capacity: int, planes: int = 1, phases: Sequence[DeviceArray] = (), attempts: int = 0, contact: bool = False,
+        between: bool = False,
     ):  # fmt: skip
         cp, processors = gpu.cp, gpu.properties["multiProcessorCount"]
         self.gpu, self.counter, self._capacity, self.planes, self._phases = gpu, counter, capacity, planes, phases
         self._attempts, self._contact = attempts, contact
         self._twins = {name: gpu.twin(arrays[name]) for name in ("row_start", "values", "b", "y", "moving")}
         self.real = np.dtype(self._twins["values"].dtype)
+        self._types = {"real": "float" if self.real == np.float32 else "double"}
+        if between:
+            self._types["local"] = gpu.types["local"]
         spans = np.array(ranges, np.int64)
         nodes = spans[:, 1] - spans[:, 0]
         self.threads, blocks = threads_and_blocks(nodes, processors)
@@ -89,7 +94,8 @@ class PcgSolver:
         self._shared = (gpu.properties["sharedMemPerMultiprocessor"] // blocks - fixed - 1024) // 16 * 16
         self._params = self._arguments(total, assigned.pooled)
         self._function = self._compiled("pcg", blocks)
-        self._application = self._compiled("apply_factor", blocks) if attempts else None
+        application = "apply_factor" if attempts else "island_factor" if between else None
+        self._application = self._compiled(application, blocks) if application else None
         self._plans: dict[tuple[int, int], DevicePlan] = {}  # by pattern and number of thread blocks
         self._builders: dict[tuple[int, int], InverseBuilder] = {}  # likewise
         self._vectors: dict[tuple[int, int], dict[str, DeviceArray]] = {}  # by body and plan
@@ -107,7 +113,7 @@ class PcgSolver:
         module = self.gpu.cp.RawModule(
             code=(SOURCES / f"backends/gpu/{name}.cu").read_text() + declared.assertions(),
             options=(
-                *options({"real": "float" if self.real == np.float32 else "double"}), *own_headers(),
+                *options(self._types), *own_headers(),
                 *(f"-D{name}={number}" for name, number in numbers.items()),
                 *(["-DNEWTON_PHASES"] if self._phases else []), *(["-DSTAGES"] if self._attempts else []),
                 *(["-DCONTACT_PASSES"] if self._contact else []),
@@ -132,6 +138,14 @@ class PcgSolver:
         params = self._params.copy()
         params["b"] = b.data.ptr
         self._function((self.grid,), (self.threads,), (params, contact), shared_mem=self._shared)
+
+    def apply_island_factors(self, islands: NDArray[Any]) -> None:
+        """Launches the application of factors in an iteration of bodies that touch each other (island_factor.cu).
+
+        islands: ISLAND_ARGUMENTS
+        """
+        assert self._application is not None
+        self._application((self.grid,), (self.threads,), (self._params, islands), shared_mem=self._shared)
 
     def iterate(self, number: int, stage: NDArray[Any]) -> None:
         """Launches solve `number` of a Rosenbrock-W step by iterations. stage: STAGE_SOLVE."""

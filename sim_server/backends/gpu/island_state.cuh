@@ -1,0 +1,215 @@
+// SPDX-License-Identifier: MIT
+// Bodies that touch each other on a GPU: islands, their state, and the arguments of all kernels (pairs.cu, island.cu, island_factor.cu).
+//
+// Bodies with rows between them are solved as one system (method: backends/cpu/native/passes.h, island.h); the others go on as
+// contact_state.cuh says. A step with such bodies is
+//
+//     detection: pair_boxes, pair_trees, pair_sites
+//     look_at_bodies, list_island_rows, find_islands, then the bodies that are alone
+//     while there is something to do (conditions.py):
+//         if there are islands to solve:
+//             place_entries, fill_entries, island_start, and which start is the better one
+//             while one is not over:
+//                 island_law, island_balance, island_decide, island_prepare, coarse_matrix, invert_coarse for each body,
+//                 while one iterates: island_update, island_factor, island_multiply, island_product, coarse_solve, island_finish
+//                 island_update, island_multiply, island_residual, island_search, island_advance, island_settle
+//         the paths found: pair_boxes, pair_trees, pair_sweep; where they enter a body: look_at_bodies, list_island_rows, find_islands
+//
+// All islands go in step; a kernel does nothing for those that are in another phase. Sums have a fixed order: of thread blocks, which
+// leave theirs in arrays, and of these in the kernel that reads them. What acts at a node is a list, sorted by row.
+#pragma once
+#include "device_contact.cuh"
+#include "pair_detection.cuh"
+
+constexpr int MODES = 6;          // rigid motions of a body: translations, then rotations about its first node
+constexpr int CG_SUMS = 9;        // of an iteration
+constexpr int BASE_SUMS = 36;     // Z^T A Z of a body
+constexpr int LISTING_THREADS = 256;  // of find_islands, one thread block
+constexpr int SEARCH_THREADS = 512;   // of island_search
+
+enum IslandPhase {
+    ISLAND_BEGINS = 0,    // the start is chosen next
+    ISLAND_RESUMES = 1,   // a sweep has given it rows after its solve
+    ISLAND_READY = 2,     // forces and stiffness are evaluated next
+    ISLAND_SOLVES = 3,    // a pass is solved
+    ISLAND_GOES_ON = 4,   // likewise, from where its residual was not as small as its iterations had it
+    ISLAND_PASSED = 5,    // it is solved
+    ISLAND_ENDED = 6,     // there is nothing left to solve, or no passes; its paths are looked at next
+    ISLAND_LOST = 7,      // forces are not finite
+    ISLAND_OVER = 8
+};
+enum Iterations { STANDS = 0, BEGINS_COARSE = 1, ITERATES = 2 };  // an island's conjugate gradients
+
+struct IslandState {
+    double given2;        // square of what residuals are relative to, the larger one of |b| and |b + i H^T f|
+    double warm2, zero2;  // squares of the residual at the last solution and at zero
+    double residual;      // with the law, relative; NaN: not known
+    double solved;        // relative residual of the last solve
+    double part;          // of the last solution that is taken
+    double goal2, r2, last_true2;   // of a solve: squares of residuals
+    double alpha, beta, gamma, pq, qq;
+    double began, seconds;
+    int phase, bodies, chunks, modes;  // numbers; modes: 0 if there are too many
+    int set;              // 1: rows with in_set count as closed
+    int last;             // 1: the solve under way is the last one
+    int hold;             // 1: there was a pass since limits were set
+    int rested;           // 1: the law held where the step began
+    int zero;             // 1: it starts from zero
+    int relist;           // 1: a sweep has filled rows against obstacles
+    int rounds, passes, iterations, status, fallbacks;
+    int stage;            // Iterations
+    int pending;          // 1: x and r are updated by alpha, beta next
+    int restart;          // 1: the next direction is the preconditioned residual
+    int coarse;           // 1: rigid motions precondition
+    int factors;          // 1: factors do, else block Jacobi
+    int own_iterations;   // of the solve
+    int own_status;
+};
+
+struct IslandRow {        // what a solve needs of a row
+    double stiffness[6];  // upper triangle of the force's slope times h^2, world frame [kg]
+    double known[6];      // likewise, as a factor is to know it
+    double impulse[3];    // i (lambda n + tau)
+    double seen[3];       // H v of the last gather
+    double force[3];      // stiffness times that
+    double lever[8];      // (W, lever) of the vertex's body, then of the other one: u = W t + w x lever
+};
+
+struct Tally {            // what kernels leave for the graph and each other
+    int islands, active, iterating, go, rounds, found, entries, alone, pairs, unused[7];
+};
+
+struct IslandArguments {
+    ContactArguments c;
+    SurfaceTables t;
+    const PcgBody* bodies;       // (bodies,)
+    const int* row_start;        // of A
+    const int* columns;
+    const double* gravity;       // (3,)
+    const int* tree_height;      // (tree,) of a box over its triangles
+    const int* leaf;             // (triangles,) boxes of one triangle each
+    const int* leaf_start;       // (bodies + 1,) first one of each body
+    int *near, *was_near, *touched;  // (bodies,) 1: its box meets another's; in the last step; it got rows by a sweep
+    real* ends;                  // (nodes, 3) where nodes come to
+    real* ways;                  // (nodes, 3) how they come there, over dx_dv
+    const double* none;          // (3,) no gravity
+    const int* unheld;           // (bodies,) 1: no node is fixed
+    const int* chunk_first;      // (bodies + 1,) first chunk of each body
+    Tally* tally;                // (1,)
+    IslandState* state;          // (bodies,) of islands
+    int* bad;                    // (bodies,) 1: its forces are not finite
+    int* label;                  // (bodies,) least body of its island
+    int* island_of;              // (bodies,) -1: it is alone
+    int* mode;                   // (bodies,) its first mode in the island; -1: it has none
+    int *island_start, *island;  // (bodies + 1,), (bodies,) bodies by island
+    int* free_body;              // (bodies,) likewise those with modes, from island_start on
+    int *own_row, *own_rows, *pair_rows;  // (rows,) rows of each body that are not empty, from twice body_start on; their number; of pairs
+    double* earliest;            // (bodies,) entry of its rows
+    IslandRow* row;              // (rows,)
+    int* pair_list;              // (rows between bodies, 3) row and its bodies, those in use
+    int *count, *start, *cursor; // (nodes,) entries of a node
+    int* entry;                  // 4 row + corner, of rows between bodies; those of a node together and sorted
+    double *left, *r0, *r, *x, *p, *q, *z, *az;  // (nodes, 3) b - A y; right-hand side of the pass; conjugate gradients
+    double* solution_product;    // (nodes, 3) A dy
+    unsigned* finished_chunks;   // (bodies,) of islands, zero between launches
+    const NodeChunk* product_chunks;  // (product_grid,) nodes of which each has three threads
+    double* inverse;             // (nodes, 9) of diagonal blocks
+    double* modes;               // (nodes, 3, MODES) A Z without contacts
+    double* chunk_sums;          // (grid, CG_SUMS)
+    double* coarse_sums;         // (grid, MODES) Z^T (r - A z)
+    double* base_sums;           // (grid, BASE_SUMS)
+    double* row_sums;            // (bodies,)
+    double *coarse_a, *coarse_b; // (bodies, MODES, most_modes) rows of E, while it is inverted from one to the other
+    int* coarse_well;            // (bodies,) of islands: 1: E is positive definite
+    double* coefficient;         // (bodies, MODES)
+    int bodies_count, most_modes, most_chunks, highest_tree, passes, unused;
+};
+
+typedef SurfaceMotion<real, local> Motion;
+
+__device__ __forceinline__ int island_of(const IslandArguments& a, int body) { return __ldcg(a.island_of + body); }
+
+// Body of a row's vertex; other: that of its triangle, of a row between bodies.
+__device__ __forceinline__ bool is_pair(const IslandArguments& a, int row) { return row >= a.t.pair_first; }
+__device__ __forceinline__ int body_of_row(const IslandArguments& a, int row, bool other) {
+    return other ? __ldcg(a.t.obstacle + row) : a.t.site_body[(is_pair(a, row) ? row - a.t.pair_first : row) / 2];
+}
+
+// f(first, last) of the rows of a body's own vertices.
+template <class F> __device__ __forceinline__ void each_range(const IslandArguments& a, int body, F f) {
+    const int first = a.t.body_start[body], last = a.t.body_start[body + 1];
+    f(first, last);
+    f(a.t.pair_first + first, a.t.pair_first + last);
+}
+
+// f(node, weight, corner) of the corners that may move.
+template <class F> __device__ __forceinline__ void each_corner(const IslandArguments& a, int row, F f) {
+    if (!is_pair(a, row)) {
+        const int node = a.c.node[row];
+        if (a.c.free[node] != 0) f(node, 1.0, 0);
+        return;
+    }
+    for (int k = 0; k < CORNERS; ++k) {
+        const int node = a.t.corner[CORNERS * row + k];
+        if (node >= 0 && a.c.free[node] != 0) f(node, a.t.weight[CORNERS * row + k], k);
+    }
+}
+
+__device__ __forceinline__ void rotated(const local* R, const double* v, double* out) {
+    for (int i = 0; i < 3; ++i) out[i] = (double)R[3 * i] * v[0] + (double)R[3 * i + 1] * v[1] + (double)R[3 * i + 2] * v[2];
+}
+__device__ __forceinline__ void rotated_back(const local* R, const double* v, double* out) {
+    for (int i = 0; i < 3; ++i) out[i] = (double)R[i] * v[0] + (double)R[3 + i] * v[1] + (double)R[6 + i] * v[2];
+}
+__device__ __forceinline__ const local* rotation_of(const IslandArguments& a, int node) { return a.c.rotation + 9ll * node; }
+__device__ __forceinline__ void copy3(const double* from, int node, double* to) {
+    for (int k = 0; k < 3; ++k) to[k] = from[3ll * node + k];
+}
+__device__ __forceinline__ void stiff(const double* k, const double* u, double* out) {
+    out[0] = k[0] * u[0] + k[1] * u[1] + k[2] * u[2];
+    out[1] = k[1] * u[0] + k[3] * u[1] + k[4] * u[2];
+    out[2] = k[2] * u[0] + k[4] * u[1] + k[5] * u[2];
+}
+
+// Lists the rows of a body that are not empty, in order, and counts them, and those between bodies, which come last. Done by a whole
+// thread block.
+__device__ void list_own_rows(const IslandArguments& a, int body) {
+    __shared__ int before[CONTACT_THREADS];
+    int listed = 0, against = 0;
+    each_range(a, body, [&](int first, int last) {
+        const int each = (last - first + CONTACT_THREADS - 1) / CONTACT_THREADS;
+        const int begin = min(first + (int)threadIdx.x * each, last), end = min(begin + each, last);
+        int own = 0;
+        for (int r = begin; r < end; ++r) own += __ldcg(a.t.obstacle + r) >= 0;
+        __syncthreads();
+        before[threadIdx.x] = own;
+        __syncthreads();
+        for (int by = 1; by < CONTACT_THREADS; by *= 2) {
+            const int other = (int)threadIdx.x >= by ? before[threadIdx.x - by] : 0;
+            __syncthreads();
+            before[threadIdx.x] += other;
+            __syncthreads();
+        }
+        int* to = a.own_row + 2 * a.t.body_start[body] + listed + before[threadIdx.x] - own;
+        for (int r = begin; r < end; ++r)
+            if (__ldcg(a.t.obstacle + r) >= 0) *to++ = r;
+        against = listed;
+        listed += before[CONTACT_THREADS - 1];
+        __syncthreads();
+    });
+    if (threadIdx.x > 0) return;
+    a.own_rows[body] = listed;
+    a.pair_rows[body] = listed - against;
+}
+
+// Sums of an island over what the chunks of its bodies have left; in all threads.
+template <int THREADS_OF_BLOCK = CONTACT_THREADS, int N> __device__ void sum_island(const IslandArguments& a, int island, const double* partial, double (&sum)[N]) {
+    const int first = a.island_start[island], bodies = a.island_start[island + 1] - first;
+    for (int n = 0; n < N; ++n) sum[n] = 0;
+    for (int k = threadIdx.x; k < bodies * a.most_chunks; k += THREADS_OF_BLOCK) {
+        const int body = a.island[first + k / a.most_chunks], chunk = a.chunk_first[body] + k % a.most_chunks;
+        if (chunk >= a.chunk_first[body + 1]) continue;
+        for (int n = 0; n < N; ++n) sum[n] += __ldcg(partial + (long long)N * chunk + n);
+    }
+    sum_block<THREADS_OF_BLOCK>(sum);
+}

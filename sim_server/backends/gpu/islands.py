@@ -1,0 +1,264 @@
+# SPDX-License-Identifier: MIT
+"""Bodies that touch each other on a GPU (island_state.cuh): memory and launches of detection and of the solves."""
+
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_server.arrays import Int32
+from sim_server.backends.contact import Contact, Surfaces
+from sim_server.backends.declarations import Declarations
+from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction
+from sim_server.backends.gpu.device import Gpu, compiled, options, own_headers
+from sim_server.backends.gpu.energies import node_chunks
+from sim_server.backends.gpu.solver import PcgSolver
+
+PAIRS, ISLAND = Declarations("backends/gpu/pairs.cu"), Declarations("backends/gpu/island.cu")
+ISLAND_ARGUMENTS = ISLAND.dtype("IslandArguments")
+SIZES = {name: ISLAND.dtype(name).itemsize for name in ("IslandState", "IslandRow", "Box")}
+TALLY = ISLAND.dtype("Tally")
+MODES, CG_SUMS, BASE_SUMS = (ISLAND.constant(name) for name in ("MODES", "CG_SUMS", "BASE_SUMS"))
+LISTING, SEARCH = PAIRS.constant("LISTING_THREADS"), ISLAND.constant("SEARCH_THREADS")  # of a thread block
+WARM_START, ZERO_START, LAW_AT_START, LAW = ISLAND.enumeration("Evaluation").values()
+MOST_MODES = 600  # of the coarse space of an island of bodies
+DETECTION = (
+    "pair_boxes", "pair_trees", "pair_sites", "pair_sweep", "end_sweep", "look_at_bodies", "list_island_rows",
+    "find_islands", "place_entries", "fill_entries",
+)  # fmt: skip
+SOLVE = (
+    "island_start", "island_law", "island_balance", "island_decide", "island_prepare", "coarse_matrix",
+    "invert_coarse", "island_update", "island_multiply", "island_product", "coarse_solve", "island_finish",
+    "island_residual", "island_search", "island_advance", "island_settle", "know_pairs", "keep_pairs",
+    "pair_work",
+)  # fmt: skip
+ROWS = ("corner", "weight", "obstacle", "normal", "gap", "entry", "stiffness", "friction", "thickness",
+        "hardening", "force",
+        "traction", "body_start")  # fmt: skip
+
+
+class Graphs(Protocol):
+    """A device whose graphs have branches and loops (cuda.CudaDevice)."""
+
+    def branch(self, flag: DeviceArray) -> AbstractContextManager[None]:
+        """What is launched inside runs only if `flag` (1,) is not 0."""
+        ...
+
+    def repeat(self, flag: DeviceArray) -> AbstractContextManager[None]:
+        """What is launched inside runs as long as `flag` (1,) is not 0."""
+        ...
+
+
+def tree_heights(surfaces: Surfaces) -> Int32:
+    """Returns how high each box is over its triangles, (tree,)."""
+    child = surfaces.tree_child
+    height = np.zeros(len(child), np.int32)
+    for k in range(len(child) - 1, -1, -1):  # children come after their parents
+        if child[k, 0] >= 0:
+            height[k] = 1 + max(height[child[k, 0]], height[child[k, 1]])
+    return height
+
+
+def leaves_before(surfaces: Surfaces) -> Int32:
+    """Returns the number of boxes of one triangle before each body's, (bodies + 1,)."""
+    counted = np.concatenate([[0], np.cumsum(surfaces.tree_child[:, 0] < 0)])
+    return counted[surfaces.tree_start].astype(np.int32)
+
+
+class IslandPasses:
+    """Launches detection between bodies, and the solves of bodies that touch each other.
+
+    contact: rows, and options; its `surfaces` are there
+    ranges: nodes [first, last) of each body
+    arrays: host arrays by name
+    shared: arrays and arguments of contact.cu: memory by name, params, chunks
+    threads: of a thread block
+
+    Tests run its kernels with what it keeps: params (arguments of all kernels), memory (arrays by name), tally,
+    pivots (steps of an inversion), product_grid (thread blocks of the product with A), vertex_grid (of detection).
+    """
+
+    def __init__(
+        self, gpu: Gpu, device: Graphs, contact: Contact, ranges: Sequence[tuple[int, int]],
+        arrays: Mapping[str, NDArray[Any]], solver: PcgSolver, params: NDArray[Any], chunks: NDArray[Any], threads: int,
+    ):  # fmt: skip
+        assert contact.surfaces is not None
+        surfaces, ints, doubles = contact.surfaces, np.int32, np.float64
+        cp, bodies, rows, nodes = gpu.cp, len(ranges), len(contact.obstacle), len(arrays["x"])
+        self._device, self._solver, self._threads, self._bodies = device, solver, threads, bodies
+        self._grid, self.vertex_grid = len(chunks), -(-len(surfaces.site_body) // (threads // 32))
+        free = np.array([bool((contact.free[first:last] > 0).all()) for first, last in ranges], np.int32)
+        most = min(MODES * bodies, MOST_MODES)
+        self.pivots = min(int(free.sum()), most // MODES)
+        product_chunks = node_chunks(np.array([first for first, _ in ranges] + [nodes], ints), threads // 3)
+        self.product_grid = len(product_chunks)
+        heights, first = tree_heights(surfaces), np.searchsorted(chunks["body"], np.arange(bodies + 1)).astype(np.int32)
+        real = solver.real
+        pairs = int(contact.body_start[-1])
+        self.tally = cp.zeros(TALLY.itemsize // 4, ints)
+        sizes = {
+            "near": bodies, "was_near": bodies, "touched": 2 * bodies, "bad": bodies, "label": bodies,
+            "island_of": bodies, "mode": bodies, "island_start": bodies + 1, "island": bodies, "free_body": bodies,
+            "own_row": rows, "own_rows": bodies, "pair_rows": bodies, "pair_list": 3 * pairs, "count": nodes,
+            "start": nodes, "cursor": nodes, "entry": 4 * pairs, "coarse_well": bodies,
+        }  # fmt: skip
+        vectors = ("left", "r0", "r", "x", "p", "q", "z", "az", "solution_product")
+        numbers = {name: 3 * nodes for name in vectors} | {
+            "earliest": bodies, "inverse": 9 * nodes, "modes": 3 * MODES * nodes, "chunk_sums": CG_SUMS * len(chunks),
+            "coarse_sums": MODES * len(chunks), "base_sums": BASE_SUMS * len(chunks), "row_sums": bodies,
+            "coarse_a": bodies * MODES * most, "coarse_b": bodies * MODES * most, "coefficient": MODES * bodies,
+        }  # fmt: skip
+        structs = {"state": ("IslandState", bodies), "row": ("IslandRow", rows)}
+        self.memory: dict[str, DeviceArray] = {name: cp.zeros(size, ints) for name, size in sizes.items()}
+        self.memory |= {name: cp.zeros(size, doubles) for name, size in numbers.items()}
+        self.memory |= {name: cp.zeros(SIZES[kind] * count, np.uint8) for name, (kind, count) in structs.items()}
+        self.memory |= {
+            "tally": self.tally, "unheld": cp.asarray(free), "tree_height": cp.asarray(heights),
+            "leaf": cp.asarray(np.flatnonzero(surfaces.tree_child[:, 0] < 0).astype(ints)),
+            "leaf_start": cp.asarray(leaves_before(surfaces)),
+            "chunk_first": cp.asarray(first), "finished_chunks": cp.zeros(bodies, np.uint32),
+            "product_chunks": cp.asarray(product_chunks.view(ints)), "ends": cp.zeros((nodes, 3), real),
+            "ways": cp.zeros((nodes, 3), real), "none": cp.zeros(3),
+            "gravity": gpu.twin(surfaces.gravity, dtype=surfaces.gravity.dtype),
+            "row_start": gpu.twin(arrays["row_start"]), "columns": gpu.twin(arrays["columns"]),
+        }  # fmt: skip
+        self._pair_sums, self._pair_contacts = cp.zeros(len(chunks)), cp.zeros(bodies, ints)
+        params["island_of"], params["alone"] = self.memory["island_of"].data.ptr, self.flag("alone").data.ptr
+        params["pair_sums"], params["pair_contacts"] = self._pair_sums.data.ptr, self._pair_contacts.data.ptr
+        self.params = self._arguments(gpu, contact, surfaces, params)
+        self.params["bodies"], self.params["bodies_count"] = solver.bodies_device, bodies
+        self.params["most_modes"], self.params["passes"] = most, contact.passes
+        self.params["most_chunks"], self.params["highest_tree"] = np.diff(first).max(), heights.max()
+        self._kernels: dict[str, KernelFunction] = {}
+        for text, name, kernels in ((PAIRS, "pairs.cu", DETECTION), (ISLAND, "island.cu", SOLVE)):
+            module = cp.RawModule(code=text.checked(), options=(*options(gpu.types), *own_headers()), backend="nvrtc")
+            self._kernels |= {kernel: compiled(name, module, kernel) for kernel in kernels}
+
+    def _arguments(self, gpu: Gpu, contact: Contact, surfaces: Surfaces, contact_params: NDArray[Any]) -> NDArray[Any]:
+        """Returns the arguments of all kernels."""
+        params: Any = np.zeros((), ISLAND_ARGUMENTS)
+        params["c"] = contact_params
+        for name, array in self.memory.items():
+            params[name] = array.data.ptr
+        tables = {name: getattr(contact, name) for name in ROWS}
+        tables |= {name: getattr(surfaces, name) for name in ("site_body", "node_site", "triangle", "tree_start",
+                                                              "tree_child")}  # fmt: skip
+        tables["pair_friction"], tables["body_thickness"] = surfaces.friction, surfaces.thickness
+        for name, host in tables.items():
+            params["t"][name] = gpu.twin(host, dtype=host.dtype).data.ptr
+        zeros = gpu.cp.zeros
+        self._boxes = {"tree_box": len(surfaces.tree_child), "body_box": self._bodies}
+        self._box_memory = {name: zeros(SIZES["Box"] * count, np.uint8) for name, count in self._boxes.items()}
+        for name, array in self._box_memory.items():
+            params["t"][name] = array.data.ptr
+        params["t"]["near"] = self.memory["near"].data.ptr
+        params["t"]["bodies"], params["t"]["pair_first"] = (
+            self._bodies,
+            len(contact.obstacle) - int(contact.body_start[-1]),
+        )
+        return params  # type: ignore[no-any-return]
+
+    def flag(self, name: str) -> DeviceArray:
+        """Returns a number of the tally, (1,)."""
+        at = TALLY.fields[name][1] // 4  # type: ignore[index]
+        found: DeviceArray = self.tally[at : at + 1]
+        return found
+
+    # --- launches -----------------------------------------------------------------------------------------------
+
+    def _launch(self, kernel: str, blocks: int, *arguments: Any) -> None:
+        threads = {"find_islands": LISTING, "island_search": SEARCH, "end_sweep": 1}.get(kernel, self._threads)
+        given = (np.int32(x) if isinstance(x, int) else x for x in arguments)
+        self._kernels[kernel]((blocks,), (threads,), (self.params, *given))
+
+    def _nodes(self, *kernels: str, what: tuple[int, ...] = ()) -> None:
+        for kernel in kernels:
+            self._launch(kernel, self._grid, *what)
+
+    def _each_body(self, *kernels: str, what: tuple[int, ...] = ()) -> None:
+        for kernel in kernels:
+            self._launch(kernel, self._bodies, *what)
+
+    def detect(self) -> None:
+        """Appends detection, once a step: it turns what rows remember with their normals."""
+        self._each_body("pair_boxes", "pair_trees", what=(0,))
+        self._launch("pair_sites", self.vertex_grid)
+
+    def group(self, swept: int = 0) -> None:
+        """Appends the search of islands."""
+        self._nodes("look_at_bodies")
+        self._each_body("list_island_rows", what=(swept,))
+        self._launch("find_islands", 1, swept)
+
+    def launch(self) -> None:
+        """Appends all solves of islands, while a graph is captured."""
+        with self._device.repeat(self.flag("go")):
+            with self._device.branch(self.flag("active")):
+                self.start()
+                with self._device.repeat(self.flag("active")):
+                    self.begin_pass()
+                    with self._device.repeat(self.flag("iterating")):
+                        self.iterate()
+                    self.end_pass()
+            self._each_body("pair_boxes", "pair_trees", what=(1,))
+            self._launch("pair_sweep", self.vertex_grid)
+            self._launch("end_sweep", 1)
+            with self._device.branch(self.flag("go")):
+                self.group(1)
+
+    def start(self) -> None:
+        """Appends what comes before the first pass of islands."""
+        self._nodes("place_entries")
+        self._each_body("fill_entries")
+        self._nodes("island_start")
+        for what in (WARM_START, ZERO_START, LAW_AT_START):
+            self._law(what)
+
+    def _law(self, what: int) -> None:
+        self._each_body("island_law", what=(what,))
+        self._nodes("island_balance", what=(what,))
+        self._launch("island_decide", self._most_islands, what)
+
+    @property
+    def _most_islands(self) -> int:
+        return max(self._bodies // 2, 1)
+
+    def begin_pass(self) -> None:
+        """Appends what comes before the iterations of a pass."""
+        self._law(LAW)
+        self._nodes("island_prepare")
+        self._each_body("coarse_matrix")
+        for pivot in range(self.pivots):
+            self._each_body("invert_coarse", what=(pivot,))
+
+    def iterate(self) -> None:
+        """Appends an iteration."""
+        self._nodes("island_update")
+        self._solver.apply_island_factors(self.params)
+        self._multiply(0)
+        self._nodes("island_product")
+        self._each_body("coarse_solve")
+        self._nodes("island_finish")
+
+    def end_pass(self) -> None:
+        """Appends what comes after them."""
+        self._nodes("island_update")
+        self._multiply(1)
+        self._nodes("island_residual")
+        self._launch("island_search", self._most_islands)
+        self._nodes("island_advance")
+        self._launch("island_settle", self._most_islands)
+
+    def _multiply(self, solution: int) -> None:
+        self._launch("island_multiply", self._bodies + self.product_grid, solution)
+
+    def keep(self) -> None:
+        """Appends what comes before the end of a step: forces of rows between bodies, and their work."""
+        self._each_body("keep_pairs")
+        self._nodes("pair_work")
+
+    def know(self, values: DeviceArray) -> None:
+        """Appends the addition of contacts between bodies, as a factor is to know them, to values of A."""
+        self._launch("know_pairs", self._grid, np.uint64(values.data.ptr))

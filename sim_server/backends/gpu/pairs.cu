@@ -1,0 +1,407 @@
+// SPDX-License-Identifier: MIT
+// Where bodies touch each other on a GPU: detection (kernels/pair_detection.cuh), the sweep of the paths found, which bodies are solved
+// together, and what acts at each node (order: island_state.cuh).
+#include "island_state.cuh"
+
+__device__ __forceinline__ Motion motion_of(const IslandArguments& a, bool solved) {
+    return {a.c.x, a.c.predictor, solved ? a.c.y : nullptr, a.c.rotation, a.c.free, a.c.dx_dv, a.c.force_coefficient, a.gravity};
+}
+__device__ __forceinline__ bool swept_enough(const IslandArguments& a, int solved) { return solved && __ldcg(&a.tally->rounds) >= ROUNDS; }
+
+// --- detection ----------------------------------------------------------------------------------------------------------------------
+
+// A thread block has a body: its box, along paths under gravity alone, or as solved.
+extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) pair_boxes(const IslandArguments a, int solved) {
+    if (swept_enough(a, solved)) return;
+    __shared__ Box warps[CONTACT_THREADS / 32];
+    const int body = blockIdx.x;
+    const Motion m = motion_of(a, solved);
+    const double margin = thickness_of(a.t, body);
+    Box box = empty_box();
+    for (int site = sites_before(a.t, body) + threadIdx.x; site < sites_before(a.t, body + 1); site += CONTACT_THREADS)
+        box = joined(box, box_of(m, node_of_site(a.t, site), margin));
+    for (int k = a.t.tree_start[body] + threadIdx.x; k < a.t.tree_start[body + 1]; k += CONTACT_THREADS)
+        for (int v = 0; v < 3 && a.t.tree_child[2 * k] < 0; ++v) {
+            const int node = a.t.triangle[3 * ~a.t.tree_child[2 * k] + v];
+            if (a.t.node_site[node] < 0) box = joined(box, box_of(m, node, margin));  // a fixed node
+        }
+    for (int by = 16; by; by >>= 1)
+        for (int k = 0; k < 3; ++k) {
+            box.low[k] = fmin(box.low[k], __shfl_xor_sync(WARP, box.low[k], by));
+            box.high[k] = fmax(box.high[k], __shfl_xor_sync(WARP, box.high[k], by));
+        }
+    if (threadIdx.x % 32 == 0) warps[threadIdx.x / 32] = box;
+    __syncthreads();
+    for (int w = 0; w < CONTACT_THREADS / 32; ++w) box = joined(box, warps[w]);
+    if (threadIdx.x == 0) {
+        a.t.body_box[body] = box;
+        a.touched[body] = 0;
+        if (body == 0) a.tally->found = 0;
+    }
+    const PcgBody& nodes = a.bodies[body];
+    for (int i = nodes.first + threadIdx.x; solved && i < nodes.first + nodes.nodes; i += CONTACT_THREADS) {
+        double s[3];
+        displacement_of(m, i, s);
+        for (int k = 0; k < 3; ++k) {
+            a.ends[3ll * i + k] = (real)((double)a.c.x[3ll * i + k] + s[k]);
+            a.ways[3ll * i + k] = (real)(s[k] / a.c.dx_dv);
+        }
+    }
+}
+
+// A thread block has a body: whether its box meets another's, and then the boxes of its tree.
+extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) pair_trees(const IslandArguments a, int solved) {
+    if (swept_enough(a, solved)) return;
+    const int body = blockIdx.x;
+    bool apart = true;
+    for (int other = threadIdx.x; other < a.bodies_count; other += CONTACT_THREADS)
+        if (other != body && meet(a.t.body_box[body], a.t.body_box[other])) apart = false;
+    apart = __syncthreads_and(apart);
+    if (threadIdx.x == 0) a.near[body] = !apart;
+    if (apart) return;
+    const Motion m = motion_of(a, solved);
+    for (int height = 0; height <= a.highest_tree; ++height) {
+        for (int k = a.t.tree_start[body] + threadIdx.x; k < a.t.tree_start[body + 1]; k += CONTACT_THREADS)
+            if (a.tree_height[k] == height) fit_box(a.t, m, body, k);
+        __syncthreads();
+    }
+}
+
+// --- a vertex and a body ------------------------------------------------------------------------------------------------------------
+
+constexpr int QUEUE = 64;  // triangles of a warp that wait to be looked at
+
+// Copies what a lane has found to all lanes of the warp.
+__device__ __forceinline__ void share(Meeting& m, int lane) {
+    m.other = __shfl_sync(WARP, m.other, lane);
+    m.triangle = __shfl_sync(WARP, m.triangle, lane);
+    m.touch.entry = __shfl_sync(WARP, m.touch.entry, lane);
+    m.touch.distance = __shfl_sync(WARP, m.touch.distance, lane);
+    m.touch.certainty = __shfl_sync(WARP, m.touch.certainty, lane);
+    for (int k = 0; k < 3; ++k) {
+        m.touch.normal[k] = __shfl_sync(WARP, m.touch.normal[k], lane);
+        m.touch.weight[k] = __shfl_sync(WARP, m.touch.weight[k], lane);
+    }
+}
+__device__ __forceinline__ double least_of(double v) {
+    for (int by = 16; by; by >>= 1) v = fmin(v, __shfl_xor_sync(WARP, v, by));
+    return v;
+}
+__device__ __forceinline__ int lane_with(bool candidate, int number) {  // the lowest number among candidates; its lane
+    int best = candidate ? number : 0x7fffffff;
+    for (int by = 16; by; by >>= 1) best = min(best, __shfl_xor_sync(WARP, best, by));
+    const unsigned holders = __ballot_sync(WARP, candidate && number == best);
+    return holders ? __ffs(holders) - 1 : 0;
+}
+
+// Of what the lanes have found: the nearest, of those equally near the surest; of the others that the vertex is over, the nearest; the
+// first; of equal ones the lowest triangle.
+__device__ void agree(TouchSearch<Motion>& search) {
+    Meeting &nearest = search.nearest, &first = search.first, &beside = search.beside;
+    const Meeting own = nearest;
+    bool mine = nearest.other >= 0;
+    const double least = least_of(mine ? fabs(nearest.touch.distance) : 1e300);
+    mine = mine && fabs(nearest.touch.distance) - least <= 1e-9 * search.thickness;
+    const double surest = -least_of(mine ? -nearest.touch.certainty : 1e300);
+    mine = mine && nearest.touch.certainty == surest;
+    share(nearest, lane_with(mine, nearest.triangle));
+    const bool nearer = beside.other < 0 || own.touch.distance < beside.touch.distance;
+    if (own.triangle != nearest.triangle && is_over(own, search.thickness) && nearer) beside = own;
+    mine = beside.other >= 0;
+    const double next = least_of(mine ? beside.touch.distance : 1e300);
+    mine = mine && beside.touch.distance == next;
+    share(beside, lane_with(mine, beside.triangle));
+    mine = first.other >= 0;
+    const double entry = least_of(mine ? first.touch.entry : 1e300);
+    mine = mine && first.touch.entry == entry;
+    const double distance = least_of(mine ? first.touch.distance : 1e300);
+    mine = mine && first.touch.distance == distance;
+    share(first, lane_with(mine, first.triangle));
+}
+
+// Searches the triangles of a body, by a warp, once for all searches: all lanes have what was found. queue: (QUEUE,) of the warp.
+__device__ void search_body(const IslandArguments& a, int body, TouchSearch<Motion>* search, int count, int* queue) {
+    const int lane = threadIdx.x % 32, last = a.leaf_start[body + 1];
+    Box box = search[0].box;
+    for (int i = 1; i < count; ++i) box = joined(box, search[i].box);
+    int waiting = 0;
+    if (!meet(a.t.tree_box[a.t.tree_start[body]], box)) return;
+    for (int from = a.leaf_start[body]; from < last || waiting; from += 32) {
+        const int k = from + lane < last ? a.leaf[from + lane] : -1;
+        const bool met = k >= 0 && meet(a.t.tree_box[k], box);
+        const unsigned lanes = __ballot_sync(WARP, met);
+        if (met) queue[waiting + __popc(lanes & ((1u << lane) - 1))] = k;
+        waiting += __popc(lanes);
+        __syncwarp();
+        if (waiting < 32 && from + 32 < last) continue;
+        const int taken = waiting < 32 ? waiting : 32, mine = lane < taken ? queue[waiting - taken + lane] : -1;
+        __syncwarp();
+        waiting -= taken;
+        if (mine >= 0)
+            for (int i = 0; i < count; ++i)
+                if (count == 1 || meet(a.t.tree_box[mine], search[i].box)) consider(a.t, body, ~a.t.tree_child[2 * mine], search[i]);
+    }
+    for (int i = 0; i < count; ++i) agree(search[i]);
+}
+
+// A warp has a vertex of a surface: sets its rows, as detect_site.
+extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) pair_sites(const IslandArguments a) {
+    __shared__ int queues[CONTACT_THREADS / 32][QUEUE];
+    const int warp = threadIdx.x / 32, site = blockIdx.x * (CONTACT_THREADS / 32) + warp, lane = threadIdx.x % 32;
+    if (site >= sites_before(a.t, a.bodies_count)) return;
+    const int body = a.t.site_body[site], node = node_of_site(a.t, site), row = a.t.pair_first + 2 * site;
+    if (!a.near[body] && !a.was_near[body]) return;
+    const Motion m = motion_of(a, false);
+    Meeting first = {-1, -1, {}}, second = first, beside = first;
+    const Box box = a.c.free[node] == 0 ? empty_box() : box_of(m, node, thickness_of(a.t, body));
+    for (int from = 0; from < a.bodies_count; from += 32) {
+        const int there = from + lane;
+        const bool met = there < a.bodies_count && there != body && a.near[there] && meet(box, a.t.body_box[there]);
+        for (unsigned lanes = __ballot_sync(WARP, met); lanes; lanes &= lanes - 1) {
+            const int other = from + __ffs(lanes) - 1;
+            TouchSearch<Motion> search = search_of(m, node, 0.5 * (thickness_of(a.t, body) + thickness_of(a.t, other)));
+            search_body(a, other, &search, 1, queues[warp]);
+            const Meeting t = found_by(search);
+            if (comes_before(t, first)) { second = first; first = t; }
+            else if (comes_before(t, second)) second = t;
+            if (in_crease(search) && comes_before(search.beside, beside)) beside = search.beside;
+        }
+    }
+    if (lane > 0) return;
+    if (second.other < 0) second = beside;
+    const RowMemory last[2] = {memory_of(a.t, row), memory_of(a.t, row + 1)};
+    put_row(a.t, m, row, site, first);
+    put_row(a.t, m, row + 1, site, second);
+    recall_both(a.t, row, last);
+}
+
+// Gives a body that a vertex touches one of its rows: that body's own, an empty one, or the one that carries less.
+__device__ void take_pair_row(const IslandArguments& a, int site, const Meeting& t) {
+    const int pair = a.t.pair_first + 2 * site;
+    int r = pair;
+    if (a.t.obstacle[pair] == t.other && a.t.obstacle[pair + 1] == t.other) {  // both sides of a crease
+        r += dot3(a.t.normal + 3 * (pair + 1), t.touch.normal) > dot3(a.t.normal + 3 * pair, t.touch.normal);
+    } else if (a.t.obstacle[pair] != t.other) {
+        const bool next = a.t.obstacle[pair + 1] == t.other || a.t.obstacle[pair + 1] < 0;
+        r += next || (a.t.obstacle[pair] >= 0 && a.c.row[pair + 1].force.normal < a.c.row[pair].force.normal);
+    }
+    DeviceRow& row = a.c.row[r];
+    if (a.t.obstacle[r] == t.other && dot3(a.t.normal + 3 * r, t.touch.normal) > SAME_PLANE) {
+        a.t.hardening[r] = fmin(HARDER * a.t.hardening[r], HARDEST);
+        return;
+    }
+    put_row(a.t, motion_of(a, false), r, site, t);
+    row.limit = 0;
+    row.in_set = 0;
+    row.force = {0, {0, 0, 0}, 0, false};
+    for (int k = 0; k < 6; ++k) a.row[r].known[k] = 0;
+}
+
+// A warp has a vertex: gives it a row where the solution moves it through a triangle, or into a body that it was outside of, or makes
+// its row stiffer.
+extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) pair_sweep(const IslandArguments a) {
+    __shared__ int queues[CONTACT_THREADS / 32][QUEUE];
+    const int warp = threadIdx.x / 32, site = blockIdx.x * (CONTACT_THREADS / 32) + warp, lane = threadIdx.x % 32;
+    if (swept_enough(a, 1) || site >= sites_before(a.t, a.bodies_count)) return;
+    const int body = a.t.site_body[site], node = node_of_site(a.t, site);
+    if (!a.near[body]) return;
+    if (site == sites_before(a.t, body) && lane == 0) a.was_near[body] = 1;  // its rows are looked at again in the next step
+    if (a.c.free[node] == 0) return;
+    const Motion m = {a.c.x, a.ways, nullptr, a.c.rotation, a.c.free, a.c.dx_dv, 0, a.none};  // ways as pair_boxes has made them
+    Motion ended = m;
+    ended.x = a.ends;
+    ended.predictor = nullptr;
+    const Box box = box_of(m, node, thickness_of(a.t, body));
+    for (int from = 0; from < a.bodies_count; from += 32) {
+        const int there = from + lane;
+        const bool met = there < a.bodies_count && there != body && a.near[there] && meet(box, a.t.body_box[there]);
+        for (unsigned lanes = __ballot_sync(WARP, met); lanes; lanes &= lanes - 1) {
+            const int other = from + __ffs(lanes) - 1;
+            TouchSearch<Motion> search[3];
+            searches_of_passage(m, ended, node, 0.5 * (thickness_of(a.t, body) + thickness_of(a.t, other)), search);
+            search_body(a, other, search, 3, queues[warp]);
+            Meeting t;
+            if (passage_found(search, t) == STAYS_OUT || lane > 0) continue;
+            take_pair_row(a, site, t);
+            a.touched[body] = a.touched[other] = a.tally->found = 1;
+        }
+    }
+}
+
+// After a sweep, one thread: whether there is more to solve.
+extern "C" __global__ void end_sweep(const IslandArguments a) {
+    Tally& tally = *a.tally;
+    tally.go = tally.rounds < ROUNDS && tally.found;
+    tally.rounds += tally.go;
+}
+
+// --- islands ------------------------------------------------------------------------------------------------------------------------
+
+// A thread has a node: forgets what acts there, and looks at its forces. `bad` is 0 before.
+extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) look_at_bodies(const IslandArguments a) {
+    const NodeChunk here = a.c.chunks[blockIdx.x];
+    const int i = here.begin + threadIdx.x;
+    if (i >= here.end) return;
+    a.count[i] = a.cursor[i] = 0;
+    if (i == here.begin && (int)blockIdx.x == here.first) a.c.pair_contacts[here.body] = 0;
+    for (int k = 0; k < 3; ++k)
+        if (!(fabs((double)a.c.b[3ll * i + k]) < 1e150)) a.bad[here.body] = 1;
+}
+
+// A thread block has a body: lists its rows, and counts those that act at each node. Rows with a body whose forces are not finite go.
+extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) list_island_rows(const IslandArguments a, int swept) {
+    __shared__ double least[CONTACT_THREADS];
+    const int body = blockIdx.x, first = a.t.body_start[body], last = a.t.body_start[body + 1];
+    double earliest = NEVER;
+    for (int r = first + threadIdx.x; r < last; r += CONTACT_THREADS) {
+        const int p = a.t.pair_first + r, other = a.t.obstacle[p];
+        if (used(a.c, r)) earliest = fmin(earliest, a.t.entry[r]);
+        if (other < 0) continue;
+        if (a.bad[body] || a.bad[other]) {
+            a.t.obstacle[p] = -1;
+            continue;
+        }
+        earliest = fmin(earliest, a.t.entry[p]);
+        each_corner(a, p, [&](int node, double, int) { atomicAdd(a.count + node, 1); });
+    }
+    least[threadIdx.x] = earliest;
+    __syncthreads();
+    for (int k = CONTACT_THREADS / 2; k; k /= 2) {
+        if ((int)threadIdx.x < k) least[threadIdx.x] = fmin(least[threadIdx.x], least[threadIdx.x + k]);
+        __syncthreads();
+    }
+    if (threadIdx.x == 0) {
+        a.earliest[body] = least[0];
+        if (!swept) a.was_near[body] = a.near[body];
+    }
+    list_own_rows(a, body);
+}
+
+// The state of an island before its solve; after a sweep it goes on with what its first body has.
+__device__ IslandState state_of(const IslandArguments& a, int first, int bodies, int chunks, int modes, int phase) {
+    IslandState s = {};
+    s.residual = __longlong_as_double(0x7ff8000000000000ll);
+    s.phase = phase;
+    s.bodies = bodies;
+    s.chunks = chunks;
+    s.modes = modes;
+    s.factors = 1;
+    if (phase == ISLAND_BEGINS) return s;
+    const PcgResult& result = a.c.results[(a.c.step[0] % a.c.capacity) * a.bodies_count + first];
+    s.residual = a.c.state[first].residual;
+    s.passes = a.c.state[first].passes;
+    s.iterations = result.iterations;
+    s.status = result.status;
+    s.fallbacks = result.fallbacks;
+    s.solved = result.residual;
+    s.seconds = result.seconds;
+    return s;
+}
+
+// One thread block: groups the bodies that have rows with each other, each group's by number. swept: only those that a sweep has
+// touched are solved again.
+extern "C" __global__ void __launch_bounds__(LISTING_THREADS) find_islands(const IslandArguments a, int swept) {
+    const int n = a.bodies_count, me = threadIdx.x, warp = me / 32, lane = me % 32;
+    for (int i = me; i < n; i += LISTING_THREADS) {
+        __stcg(a.label + i, i);
+        a.bad[i] = 0;
+    }
+    __syncthreads();
+    for (bool changed = true; changed;) {
+        changed = false;
+        for (int i = warp; i < n; i += LISTING_THREADS / 32) {
+            const int rows = a.own_rows[i], pairs = a.pair_rows[i];
+            for (int k = rows - pairs + lane; k < rows; k += 32) {
+                const int one = __ldcg(a.label + i), two = __ldcg(a.label + a.t.obstacle[a.own_row[2 * a.t.body_start[i] + k]]);
+                if (one == two) continue;
+                atomicMin(a.label + (one > two ? one : two), min(one, two));
+                changed = true;
+            }
+        }
+        __syncthreads();
+        for (int i = me; i < n; i += LISTING_THREADS) {
+            int root = __ldcg(a.label + i);
+            while (__ldcg(a.label + root) != root) root = __ldcg(a.label + root);
+            __stcg(a.label + i, root);
+        }
+        changed = !__syncthreads_and(!changed);
+    }
+    // the place of a body is that among those of earlier islands and its own; O(bodies^2) / threads
+    const int* label = a.label;
+    int* members = a.touched + n;
+    for (int i = me; i < n; i += LISTING_THREADS) {
+        int size = 0;
+        for (int j = 0; j < n; ++j) size += label[j] == label[i];
+        members[i] = size;
+    }
+    __syncthreads();
+    __shared__ int islands, active, alone;
+    if (me == 0) islands = active = alone = 0;
+    __syncthreads();
+    for (int i = me; i < n; i += LISTING_THREADS) {
+        const int own = label[i], size = members[i];
+        if (size == 1) {
+            a.island_of[i] = a.mode[i] = -1;
+            atomicAdd(&alone, 1);
+            continue;
+        }
+        int number = 0, first = 0, rank = 0, free_rank = 0, frees = 0, again = 0, chunks = 0;
+        for (int j = 0; j < n; ++j) {
+            if (label[j] == j && j < own && members[j] > 1) {
+                ++number;
+                first += members[j];
+            }
+            if (label[j] != own) continue;
+            rank += j < i;
+            free_rank += j < i && a.unheld[j];
+            frees += a.unheld[j];
+            chunks += a.chunk_first[j + 1] - a.chunk_first[j];
+            again |= a.touched[j];
+        }
+        const bool few = MODES * frees <= a.most_modes;
+        a.island_of[i] = number;
+        a.island[first + rank] = i;
+        a.mode[i] = a.unheld[i] && few ? MODES * free_rank : -1;
+        if (a.mode[i] >= 0) a.free_body[first + free_rank] = i;
+        if (i != own) continue;
+        a.island_start[number] = first;
+        a.state[number] = state_of(a, i, size, chunks, few ? MODES * frees : 0, !swept ? ISLAND_BEGINS : again ? ISLAND_RESUMES : ISLAND_OVER);
+        atomicAdd(&islands, 1);
+        if (a.state[number].phase != ISLAND_OVER) atomicAdd(&active, 1);
+    }
+    __syncthreads();
+    if (me > 0) return;
+    Tally& tally = *a.tally;
+    a.island_start[islands] = n - alone;
+    tally.islands = islands;
+    tally.active = active;
+    tally.alone = alone;
+    tally.iterating = tally.entries = 0;
+    if (swept) return;
+    tally.go = 1;
+    tally.rounds = 0;
+}
+
+// A thread has a node: makes room for what acts there.
+extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) place_entries(const IslandArguments a) {
+    const NodeChunk here = a.c.chunks[blockIdx.x];
+    const int i = here.begin + threadIdx.x;
+    if (i < here.end && a.count[i]) a.start[i] = atomicAdd(&a.tally->entries, a.count[i]);
+}
+
+// A thread block has a body: lists its rows with others, and what they do at nodes, those of a node in any order.
+extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) fill_entries(const IslandArguments a) {
+    const int body = blockIdx.x, rows = a.own_rows[body], pairs = a.pair_rows[body];
+    double before[1] = {0};
+    for (int j = threadIdx.x; j < body; j += CONTACT_THREADS) before[0] += a.pair_rows[j];
+    sum_block(before);
+    if (body == a.bodies_count - 1 && threadIdx.x == 0) a.tally->pairs = (int)before[0] + pairs;
+    for (int k = threadIdx.x; k < pairs; k += CONTACT_THREADS) {
+        const int r = a.own_row[2 * a.t.body_start[body] + rows - pairs + k];
+        int* to = a.pair_list + 3 * ((int)before[0] + k);
+        to[0] = r;
+        to[1] = body;
+        to[2] = a.t.obstacle[r];
+        each_corner(a, r, [&](int node, double, int corner) { a.entry[a.start[node] + atomicAdd(a.cursor + node, 1)] = CORNERS * r + corner; });
+    }
+}
