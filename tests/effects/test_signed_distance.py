@@ -186,7 +186,7 @@ def test_a_grid_of_a_box_finds_what_the_box_finds(tmp_path, volume):
     assert np.count_nonzero(alike) > 0.8 * np.count_nonzero(there & nodes)
     np.testing.assert_allclose(grid.gap[alike], exact.gap[alike], atol=0.02)
     np.testing.assert_allclose(grid.entry[alike], exact.entry[alike], atol=0.02)
-    # triangles between such nodes lie right through the box, deepest in its middle, where each side is as near as the next
+    # triangles between such nodes lie through the box, deepest in its middle, where its normal is not unique
     triangles = there & same & ~nodes
     assert np.count_nonzero(triangles) > 0.97 * np.count_nonzero(there & ~nodes) > 50
     assert np.quantile(np.abs(grid.gap - exact.gap)[triangles], 0.9) < 0.01  # the spacing
