@@ -10,7 +10,7 @@ constexpr double FIRST = 0.02, EARLY = 0.01, SHORT_OF = 0.9, HARDER = 10;
 constexpr double SAME_PLANE = 0.995;  // cosine of the angle between normals
 constexpr int ROUNDS = 3;             // of passes after a sweep of the paths
 constexpr double HARDEST = 1000;      // times as stiff, at most
-constexpr double RESTING = 1e-4;      // contact residual of a step that began at rest
+constexpr double RESTING = 1e-5;      // contact residual of a step that began at rest
 constexpr int AT_REST = 4;            // passes of such a step, at most
 
 // The contact residual with which a step may end. rested: the law held where it began. What is left of the residual then moves the body

@@ -116,6 +116,13 @@ HOST_DEVICE void put_edge_row(const SurfaceTables& c, const EdgeTables& e, const
     c.thickness[row] = 0.5 * (thickness_of(c, body) + thickness_of(c, t.other));
 }
 
+// Normal of the row of an edge that another one bore on in the last step; null: there is none.
+HOST_DEVICE const double* held_by(const SurfaceTables& c, const EdgeTables& e, int edge, int other, int facing) {
+    for (int row = e.start[0] + 2 * edge, r = row; r < row + 2; ++r)
+        if (c.obstacle[r] == other && e.facing[r - e.start[0]] == facing && c.force[r] > 0) return c.normal + 3 * r;
+    return nullptr;
+}
+
 // Sets both rows of an edge; returns how many more edges it comes near to.
 template <class Motion> HOST_DEVICE int detect_edge(const SurfaceTables& c, const EdgeTables& e, const Motion& m, int body, int edge) {
     const int row = e.start[0] + 2 * edge;
@@ -124,7 +131,8 @@ template <class Motion> HOST_DEVICE int detect_edge(const SurfaceTables& c, cons
     const EdgePath path = path_of(e, m, edge);
     each_facing_edge(c, e, m, body, edge, [&](int other, int facing, double thickness) {
         EdgeMeeting here = {other, facing, {}};
-        if (!meet_edges(path, e.wings[edge], path_of(e, m, facing), e.wings[facing], thickness, 1e-2 * thickness, here.touch)) return;
+        const double* held = held_by(c, e, edge, other, facing);
+        if (!meet_edges(path, e.wings[edge], path_of(e, m, facing), e.wings[facing], thickness, 1e-2 * thickness, held, here.touch)) return;
         if (comes_before(here, first)) {
             const EdgeMeeting last = first;
             first = here;

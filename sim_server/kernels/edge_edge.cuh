@@ -57,9 +57,9 @@ HOST_DEVICE EdgeWings wings_of(const double* p, const double* q, const double* r
     return w;
 }
 
-// True if both triangles lean away from what is on the other side of a plane with normal n through the edge.
-HOST_DEVICE bool leans(const EdgeWings& w, const double* n, double sign) {
-    return sign * dot3(w.into[0], n) > FLAT_EDGE && sign * dot3(w.into[1], n) > FLAT_EDGE;
+// True if both triangles lean away by `least` from what is on the other side of a plane with normal n through the edge.
+HOST_DEVICE bool leans(const EdgeWings& w, const double* n, double sign, double least) {
+    return sign * dot3(w.into[0], n) > least && sign * dot3(w.into[1], n) > least;
 }
 
 struct EdgeTouch {       // where two edges may touch in a step
@@ -114,8 +114,10 @@ HOST_DEVICE double entry_of_edges(const EdgePath& a, const EdgePath& b, double i
 }
 
 // Where two sharp edges touch between their ends, so that neither has a nearer point on its triangles. False: nowhere.
+// held: normal with which they bore each other in the last step, null: they did not. Their triangles may then lean a little the other way:
+// edges that bear each other turn to and fro about FLAT_EDGE, and would else spring in and out for ever.
 HOST_DEVICE bool meet_edges(const EdgePath& a, const EdgeWings& wa, const EdgePath& b, const EdgeWings& wb, double thickness, double slack,
-                            EdgeTouch& touch) {
+                            const double* held, EdgeTouch& touch) {
     double u[3], v[3], n[3], off[3];
     for (int k = 0; k < 3; ++k) {
         u[k] = a.x[1][k] - a.x[0][k];
@@ -125,9 +127,10 @@ HOST_DEVICE bool meet_edges(const EdgePath& a, const EdgeWings& wa, const EdgePa
     for (int k = 0; k < 3; ++k) n[k] = u[(k + 1) % 3] * v[(k + 2) % 3] - u[(k + 2) % 3] * v[(k + 1) % 3];
     const double sine = make_unit(n);
     if (!(sine > PARALLEL * sqrt(dot3(u, u) * dot3(v, v)))) return false;
-    if (dot3(wa.into[0], n) < 0)
+    if (dot3(held ? held : wa.into[0], n) < 0)
         for (int k = 0; k < 3; ++k) n[k] = -n[k];
-    if (!leans(wa, n, 1) || !leans(wb, n, -1)) return false;
+    const double least = held ? -FLAT_EDGE : FLAT_EDGE;
+    if (!leans(wa, n, 1, least) || !leans(wb, n, -1, least)) return false;
     const double gap = dot3(n, off), apart = edges_apart(a, b, 0, touch);
     const bool between = within_edge(touch.s) && within_edge(touch.t);
     touch.entry = NEVER;
@@ -144,7 +147,7 @@ HOST_DEVICE bool meet_edges(const EdgePath& a, const EdgeWings& wa, const EdgePa
     }
     EdgeTouch then;
     const double time = entry_of_edges(a, b, thickness, slack, then);
-    if (time <= 1 && within_edge(then.s) && within_edge(then.t) && leans(wa, then.normal, 1) && leans(wb, then.normal, -1)) {
+    if (time <= 1 && within_edge(then.s) && within_edge(then.t) && leans(wa, then.normal, 1, FLAT_EDGE) && leans(wb, then.normal, -1, FLAT_EDGE)) {
         then.entry = time;
         then.distance = apart;
         touch = then;
@@ -157,6 +160,6 @@ HOST_DEVICE bool meet_edges(const EdgePath& a, const EdgeWings& wa, const EdgePa
 // Whether the paths of two sharp edges that had not crossed pass through each other.
 HOST_DEVICE bool edges_pass(const EdgePath& a, const EdgeWings& wa, const EdgePath& b, const EdgeWings& wb, double through) {
     EdgeTouch touch;
-    if (!meet_edges(a, wa, b, wb, through, through, touch) || !(touch.distance > 0)) return false;
+    if (!meet_edges(a, wa, b, wb, through, through, nullptr, touch) || !(touch.distance > 0)) return false;
     return touch.entry <= 1;
 }

@@ -133,7 +133,7 @@ struct PairDetection {
             const EdgePath path = path_of(edges, motion, edge), way = path_of(edges, motion, facing);
             EdgeTouch t;
             if (c.result[other].status == NOT_FINITE || !edges_pass(path, c.wings[edge], way, c.wings[facing], THROUGH * thickness)) return;
-            if (!meet_edges(path, c.wings[edge], way, c.wings[facing], thickness, 1e-2 * thickness, t)) return;
+            if (!meet_edges(path, c.wings[edge], way, c.wings[facing], thickness, 1e-2 * thickness, nullptr, t)) return;
             const int32_t nodes[CORNERS] = {c.edge[2 * edge], c.edge[2 * edge + 1], c.edge[2 * facing], c.edge[2 * facing + 1]};
             const double weight[CORNERS] = {1 - t.s, t.s, t.t - 1, -t.t};
             hold_apart(nodes, weight, t.normal, 0.1 * thickness, body, other, y);
@@ -176,7 +176,7 @@ struct PairDetection {
             const EdgePath way = path_of(edges, motion, facing);
             EdgeMeeting t = {other, facing, {}};
             if (!edges_pass(path, c.wings[edge], way, c.wings[facing], THROUGH * thickness)) return;
-            if (!meet_edges(path, c.wings[edge], way, c.wings[facing], thickness, 1e-2 * thickness, t.touch)) return;
+            if (!meet_edges(path, c.wings[edge], way, c.wings[facing], thickness, 1e-2 * thickness, nullptr, t.touch)) return;
             take_edge_row(body, edge, t);
             c.touched[body] = c.touched[other] = 1;
             found = true;
