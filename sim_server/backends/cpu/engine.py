@@ -414,7 +414,7 @@ class CpuEngine(Reports):
             "last": np.full(count, 0.0), "then": np.full(count, 0.0),
             "change": np.zeros(HISTORY, structs.CHANGE),
             "node": np.full(nodes, 0, np.int32), "supernode": np.full(3 * count, 0, np.int32),
-            "marked": np.full(3 * count, 0, np.uint8), "delta": np.full((nodes, 6), 0.0),
+            "marked": np.full(3 * count, 0, np.uint8), "delta": np.full((3 * nodes, 3 * nodes), 0.0),
             "small": np.full(4 * width**2 + 2 * width, 0.0),
             "columns": np.zeros((3 * count, width), np.float64 if double else np.float32),  # touched by the first grab
             "diagonal": diagonal[entry.first : entry.last],
@@ -429,8 +429,9 @@ class CpuEngine(Reports):
             touches = min(each * self._contact.surface_nodes(body), most)
             correction.touches, correction.touch_lost = touches, -1
             room |= {
-                "touch": np.zeros(touches, structs.KNOWN_CONTACT), "touch_now": np.zeros((count, 6)),
-                "touch_then": np.zeros((count, 6)),
+                "touch": np.zeros(touches, structs.KNOWN_CONTACT), "touch_now": np.zeros((count, 9)),
+                "touch_then": np.zeros((count, 9)), "link_now": np.zeros(touches, structs.KNOWN_CONTACT),
+                "link_then": np.zeros(touches, structs.KNOWN_CONTACT),
             }  # fmt: skip
         for name, array in room.items():
             setattr(correction, name, array.ctypes.data)

@@ -72,7 +72,7 @@ static void solve_island(Loop& loop, int island, bool resumes) {
         Body& body = loop.body[first];
         const int64_t at = 3 * (int64_t)body.first;
         p.rows.actives = 0;
-        p.tell_correction(body);
+        tell_correction(p.rows, body);
         p.result = pcg(matrix_of(loop, body), loop.b + at, body.factor, body.now, loop.y + at, loop.work + 27 * (int64_t)body.first,
                        !loop.moving[first], &body.correction);
         if (p.result.status != NOT_FINITE) {

@@ -94,19 +94,6 @@ struct Passes : IslandRows {
         return s;
     }
 
-    // Tells the factor's correction which contacts A has.
-    void tell_correction(Body& body) const {
-        Correction& t = body.correction;
-        if (!t.touches) return;
-        t.in_contact = 1;
-        std::fill(t.touch_now, t.touch_now + 6 * (int64_t)t.nodes, 0.0);
-        for (int k = 0; k < rows.actives; ++k) {
-            double block[6];
-            const int node = own_block(c, body, active[k], c.state[active[k]].stiffness, block);
-            for (int m = 0; m < 6; ++m) t.touch_now[6 * (int64_t)node + m] += block[m];
-        }
-    }
-
     // dy of (A + H^T S H) dy = r, and its residual.
     SolveResult solve_linear(double tolerance) {
         SolveSettings settings = settings_for(tolerance);
@@ -117,7 +104,7 @@ struct Passes : IslandRows {
         own.node_first = body.first;
         const BlockCsr A{body.first, body.last, loop.row_start, loop.columns, loop.values, &own};
         double* work = loop.work + 27 * (int64_t)body.first;
-        tell_correction(body);
+        tell_correction(rows, body);
         auto solve_by = [&] { return pcg(A, r + at, body.factor, settings, dy + at, work, false, &body.correction); };
         SolveResult solved;
         if (settings.kind == CHOLESKY && body.factor) {

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: MIT
-// Low-rank correction of a factor for changes of the nodes' own blocks of A since its matrix. Grabs of clients (effects/touch.py) and
-// contacts with obstacles begin and end from one step to the next; a factor lacks them, or has them too long, until one arrives that was
-// made of a later matrix. With U the columns of the identity at the nodes concerned and C the difference of their blocks,
+// Low-rank correction of a factor for changes of blocks of A since its matrix. Grabs of clients (effects/touch.py) and contacts with
+// obstacles begin and end from one step to the next; a factor lacks them, or has them too long, until one arrives that was made of a
+// later matrix. With U the columns of the identity at the nodes concerned and C the difference of the blocks on and between them,
 //     (P + U C U')^-1 = L^-T (I - V W V') L^-1,    V = L^-1 U,  W = (C^-1 + V'V)^-1,
 // the Sherman-Morrison-Woodbury formula between the two triangular solves. V has entries only in the supernodes on the paths
 // from these nodes to the root, so that it costs a few applications of the factor. With V'V = K K' and
@@ -33,10 +33,10 @@ struct Change {        // of the diagonal of a node
     int32_t node;
 };
 
-struct KnownContact {  // what a copy of A for a worker would know of the contacts of a node
-    int64_t step;
-    double block[6];   // upper triangle, material frame [kg]
-    int32_t node;      // -1: of the body; it has contacts that no node's own block has
+struct KnownContact {  // a contact's part of a block of A
+    int64_t step;      // whose copy for a worker would have it
+    double block[9];   // material frame [kg]
+    int32_t node, other;  // row and column, node <= other; node -1: the body has contacts that are not noted
 };
 
 struct Correction {
@@ -59,17 +59,19 @@ struct Correction {
     int32_t* node;          // (capacity,) of V
     int32_t* supernode;     // (3 nodes,) of V, ascending
     uint8_t* marked;        // (3 nodes,)
-    double* delta;          // (capacity, 6) as W was made with, upper triangles [kg]
+    double* delta;          // C as W was made with, (3 count, 3 count) in room for (3 capacity, 3 capacity) [kg]
     double* small;          // 4 width^2 + 2 width
     void* columns;          // (3 nodes, width) V, in the values' type, only rows of its supernodes
     double spent;           // on V and W, not yet charged to a solve, as much as reading so many bytes of A
-    int32_t touches;        // most entries of `touch`; 0: there is no contact
-    int32_t in_contact;     // 1: touch_now is what A has beside its values
-    int32_t touch_known;    // 1: touch_then is what the matrix of the factor in use had there
+    int32_t touches;        // most entries of `touch` and of each of `link_*`; 0: there is no contact
+    int32_t in_contact;     // 1: touch_now and link_now are what A has beside its values
+    int32_t touch_known;    // 1: touch_then and link_then are what the matrix of the factor in use had there
+    int32_t links_now, links_then;
     int64_t touched;        // entries of `touch` so far
     int64_t touch_lost;     // step of the newest one that has left the ring
     KnownContact* touch;    // (touches,) the ring
-    double *touch_now, *touch_then;  // (nodes, 6)
+    double *touch_now, *touch_then;  // (nodes, 9) own blocks
+    KnownContact *link_now, *link_then;  // blocks between two nodes
 };
 
 constexpr int MAX_CORRECTED = 64;              // nodes
@@ -136,16 +138,11 @@ struct Corrected {
         c.used = 0;
         c.missed = c.count < 0;
         if (!choose()) return false;
-        bool same = true;
-        for (int k = 0; k < c.count; ++k) {
-            double delta[6];
-            difference(c.node[k], bounded(c.node[k]), delta);
-            for (int m = 0; m < 6; ++m) {
-                same = same && delta[m] == c.delta[6 * k + m];
-                c.delta[6 * k + m] = delta[m];
-            }
-        }
-        if (!same) c.usable = make_inner();
+        const int64_t size = 9 * (int64_t)c.count * c.count;
+        double* present = inner() + (int64_t)width() * width();
+        differences(present);
+        const bool same = std::equal(present, present + size, c.delta);
+        if (!same) std::copy(present, present + size, c.delta), c.usable = make_inner();
         if (!same) c.spent += INNER_BYTES * (27.0 * c.count * c.count * c.count);
         if (c.usable) c.used = c.count;
         c.missed = !c.usable;
@@ -208,28 +205,56 @@ private:
     // What the factor knows of contacts.
     void take_touches() {
         c.touch_known = c.touch_lost < factor.step;
-        std::fill(c.touch_then, c.touch_then + 6 * (int64_t)c.nodes, 0.0);
+        std::fill(c.touch_then, c.touch_then + 9 * (int64_t)c.nodes, 0.0);
+        c.links_then = 0;
         for (int64_t k = c.touched; k > std::max<int64_t>(0, c.touched - c.touches); --k) {
             const KnownContact& touch = c.touch[(k - 1) % c.touches];
             if (touch.step < factor.step) break;
             if (touch.step > factor.step) continue;
             if (touch.node < 0) c.touch_known = 0;
-            else for (int m = 0; m < 6; ++m) c.touch_then[6 * (int64_t)touch.node + m] += touch.block[m];
+            else if (touch.node < touch.other) c.link_then[c.links_then++] = touch;
+            else for (int m = 0; m < 9; ++m) c.touch_then[9 * (int64_t)touch.node + m] += touch.block[m];
         }
     }
 
     bool contacts() const { return c.in_contact && c.touch_known; }
 
-    // Difference of a node's block from that of the factor's matrix; diagonal: its part from springs. Returns its size.
+    // Difference of a node's block from that of the factor's matrix, symmetric; diagonal: its part from springs. Returns its size.
     double difference(int node, double diagonal, double* out) const {
-        const double *now = c.touch_now + 6 * (int64_t)node, *then = c.touch_then + 6 * (int64_t)node;
+        const double *now = c.touch_now + 9 * (int64_t)node, *then = c.touch_then + 9 * (int64_t)node;
         double size = 0;
-        for (int m = 0; m < 6; ++m) {
-            out[m] = contacts() ? now[m] - then[m] : 0;
-            if (m == 0 || m == 3 || m == 5) out[m] += diagonal;
-            size = std::fmax(size, std::fabs(out[m]));
-        }
+        for (int i = 0; i < 3; ++i)
+            for (int j = i; j < 3; ++j) {
+                const double d = (contacts() ? now[3 * i + j] - then[3 * i + j] : 0) + (i == j ? diagonal : 0);
+                out[3 * i + j] = out[3 * j + i] = d;
+                size = std::fmax(size, std::fabs(d));
+            }
         return size;
+    }
+
+    // C
+    void differences(double* out) const {
+        const int d = 3 * c.count;
+        std::fill(out, out + (int64_t)d * d, 0.0);
+        for (int k = 0; k < c.count; ++k) {
+            double own[9];
+            difference(c.node[k], bounded(c.node[k]), own);
+            for (int m = 0; m < 9; ++m) out[(3 * k + m / 3) * d + 3 * k + m % 3] = own[m];
+        }
+        auto place = [&](int node) { return (int)(std::find(c.node, c.node + c.count, node) - c.node); };
+        auto add = [&](const KnownContact* link, int links, double sign) {
+            for (int k = 0; k < links; ++k) {
+                const int i = place(link[k].node), j = i < c.count ? place(link[k].other) : i;
+                if (i == c.count || j == c.count) continue;
+                for (int m = 0; m < 9; ++m) {
+                    const int row = 3 * i + m / 3, column = 3 * j + m % 3;
+                    out[row * d + column] = out[column * d + row] += sign * link[k].block[m];
+                }
+            }
+        };
+        if (!contacts()) return;
+        add(c.link_now, c.links_now, 1);
+        add(c.link_then, c.links_then, -1);
     }
 
     const double* block(int node) const {
@@ -257,7 +282,7 @@ private:
         double together = 0;
         for (int i = 0; i < c.nodes; ++i) {
             const double spring = c.diagonal[i] - c.then[i];
-            double delta = spring, block[6];
+            double delta = spring, block[9];
             if (contacts()) delta = difference(i, spring, block);
             if (delta == 0) continue;
             const double share = std::fabs(delta) / (own(i) - std::fmax(spring, 0));
@@ -273,7 +298,7 @@ private:
             if (contacts() && others + c.count <= c.capacity) changed = with_present(chosen, changed);
             std::copy(chosen, chosen + changed, c.node);
             c.count = changed;
-            std::fill(c.delta, c.delta + 6 * changed, NAN);
+            std::fill(c.delta, c.delta + 9 * (int64_t)changed * changed, NAN);
             if (factor.bytes == 4) make_columns<float>();
             else make_columns<double>();
             c.spent += column_bytes();
@@ -350,12 +375,35 @@ private:
         });
     }
 
+    // Blocks of C that are not zero, or on its diagonal.
+    struct Blocks {
+        int start[MAX_CORRECTED + 1];
+        uint8_t column[MAX_CORRECTED * MAX_CORRECTED];
+    };
+    void find_blocks(Blocks& found) const {
+        const int d = 3 * c.count;
+        int count = 0;
+        for (int i = 0; i < c.count; ++i) {
+            found.start[i] = count;
+            for (int j = 0; j < c.count; ++j) {
+                bool any = i == j;
+                for (int m = 0; m < 9 && !any; ++m) any = c.delta[(3 * i + m / 3) * d + 3 * j + m % 3] != 0;
+                if (any) found.column[count++] = (uint8_t)j;
+            }
+        }
+        found.start[c.count] = count;
+    }
+
     // W from V'V and C.
     bool make_inner() {
         const int w = width(), d = 3 * c.count;
-        double *W = inner(), *K = W + (int64_t)w * w, *G = K + (int64_t)w * w;
-        static constexpr int place[3][3] = {{0, 1, 2}, {1, 3, 4}, {2, 4, 5}};
-        auto C = [&](int i, int j) { return c.delta[6 * (i / 3) + place[i % 3][j % 3]]; };  // within a block
+        double *W = inner(), *K = W + (int64_t)w * w, *G = K + (int64_t)w * w, product[3 * MAX_CORRECTED];
+        const double* C = c.delta;
+        Blocks blocks;
+        find_blocks(blocks);
+        auto each_block = [&](int i, auto f) {
+            for (int k = blocks.start[i]; k < blocks.start[i + 1]; ++k) f(3 * blocks.column[k]);
+        };
         std::copy(gram(), gram() + (int64_t)w * w, K);
         if (!cholesky(K, d, w, 0)) return false;
         for (int i = 0; i < d; ++i)
@@ -363,21 +411,29 @@ private:
         std::fill(G, G + (int64_t)w * w, 0.0);
         for (int i = 0; i < d; ++i) {
             G[i * w + i] += 1;
-            const int block = i - i % 3;
-            for (int a = 0; a < block + 3; ++a) {
-                const double f = C(i, block) * K[block * w + a] + C(i, block + 1) * K[(block + 1) * w + a] + C(i, block + 2) * K[(block + 2) * w + a];
-                for (int b = 0; b <= i; ++b) G[a * w + b] += f * K[i * w + b];
-            }
+            std::fill(product, product + d, 0.0);  // row i of C K
+            int end = 0;
+            each_block(i / 3, [&](int j) {
+                const double *f = C + i * d + j, *k = K + j * w;
+                end = j + 3;
+                for (int a = 0; a < end; ++a) product[a] += f[0] * k[a] + f[1] * k[w + a] + f[2] * k[2 * w + a];
+            });
+            for (int a = 0; a < end; ++a)
+                for (int b = 0; b <= i; ++b) G[a * w + b] += product[a] * K[i * w + b];
         }
         if (!cholesky(G, d, w, LEAST)) return false;
         // K <- B = M^-1 K' C with G = M M', row after row; then W = C - B' B
         for (int i = 0; i < d; ++i)
             for (int j = 0; j < i; ++j) std::swap(K[i * w + j], K[j * w + i]);
         for (int i = 0; i < d; ++i) {
-            for (int j = 0; j < d; j += 3) {
-                const double k[3] = {K[i * w + j], K[i * w + j + 1], K[i * w + j + 2]};
-                for (int m = 0; m < 3; ++m) K[i * w + j + m] = k[0] * C(j, j + m) + k[1] * C(j + 1, j + m) + k[2] * C(j + 2, j + m);
+            std::fill(product, product + d, 0.0);
+            for (int k = 0; k < c.count; ++k) {
+                const double *x = K + i * w + 3 * k, *f = C + 3 * k * d;
+                each_block(k, [&](int j) {
+                    for (int m = j; m < j + 3; ++m) product[m] += x[0] * f[m] + x[1] * f[d + m] + x[2] * f[2 * d + m];
+                });
             }
+            std::copy(product, product + d, K + i * w);
             for (int k = 0; k < i; ++k) {
                 const double f = G[i * w + k];
                 for (int j = 0; j < d; ++j) K[i * w + j] -= f * K[k * w + j];
@@ -386,7 +442,7 @@ private:
         }
         std::fill(W, W + (int64_t)w * w, 0.0);
         for (int i = 0; i < d; ++i)
-            for (int j = i - i % 3; j < i - i % 3 + 3; ++j) W[i * w + j] = C(i, j);
+            for (int j = 0; j < d; ++j) W[i * w + j] = C[i * d + j];
         for (int k = 0; k < d; ++k)
             for (int i = 0; i < d; ++i) {
                 const double f = K[k * w + i];
