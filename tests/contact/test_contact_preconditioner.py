@@ -121,6 +121,19 @@ def test_a_factor_that_is_not_of_its_step_costs_iterations_not_the_answer(known)
     np.testing.assert_allclose(sim.world.x, known[1], rtol=0, atol=1e-7)
 
 
+def test_triangles_that_a_tool_touches_are_corrected_with_what_couples_their_nodes():
+    """Between nodes the rod touches triangles alone."""
+    sim = pressed()
+    run(sim, 18)
+    records = Driver(sim).advance(4)
+    given = sim.contact.contact_input()
+    assert given.faces is not None
+    first, last = given.faces.start[[0, -1]]
+    assert (given.force[first:last] > 0).any() and not given.force[:first].any()
+    assert sim.engine.corrected(0) >= 6
+    assert each(records) <= 3
+
+
 def test_more_contacts_than_are_corrected_are_left_to_the_iteration():
     solver = EXACT | {"woodbury": 4}
     sim = over(cells=(5, 2, 5), solver=solver)
