@@ -94,13 +94,14 @@ struct Passes : IslandRows {
         return s;
     }
 
-    // Tells the factor's correction which contacts A has.
+    // Tells the factor's correction which contacts of nodes with obstacles A has; it does not know other rows (note_touches).
     void tell_correction(Body& body) const {
         Correction& t = body.correction;
         if (!t.touches) return;
         t.in_contact = 1;
         std::fill(t.touch_now, t.touch_now + 6 * (int64_t)t.nodes, 0.0);
         for (int k = 0; k < rows.actives; ++k) {
+            if (active[k] >= c.body_start[loop.bodies]) continue;
             double block[6];
             const int node = own_block(c, body, active[k], c.state[active[k]].stiffness, block);
             for (int m = 0; m < 6; ++m) t.touch_now[6 * (int64_t)node + m] += block[m];
