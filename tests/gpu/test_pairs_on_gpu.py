@@ -97,7 +97,7 @@ def test_a_heap_stays_near_that_of_the_cpu():
     g, c, apart = both(heap, 40, solver=LOCKSTEP)
     assert max(apart[:8]) < 1e-4, apart
     assert np.isfinite(apart).all() and g["contacts"][-1].sum() > 20
-    assert abs(g["contacts"][-1].sum() - c["contacts"][-1].sum()) <= 0.5 * c["contacts"][-1].sum()
+    assert 0.5 <= g["contacts"][-10:].sum() / c["contacts"][-10:].sum() <= 2
 
 
 @pytest.mark.parametrize("speed", [0.5, 5.0])
