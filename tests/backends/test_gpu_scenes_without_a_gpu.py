@@ -159,13 +159,12 @@ def test_what_a_build_of_an_inverse_reads_is_there_before_its_own_stream_runs(cu
         assert not cupy.pending
 
 
-@pytest.mark.parametrize("integrator", [{}, {"linearizations": 3}])
 @pytest.mark.parametrize("precision", ["float64", "mixed", "float32"])
-def test_a_scene_with_holders_is_built(cupy, precision, integrator):
+def test_a_scene_with_holders_is_built(cupy, precision):
     """Their launches come after the energy balance, which reads velocities, and around the solve; once a step."""
     keys = [{"time": 1.0, "translate": [0.1, 0, 0]}]
     solver = {"preconditioner": "cholesky", "precision": precision}
-    engine = held_bar(left(), right(keyframes=keys), integrator=integrator, solver=solver, device="gpu").engine
+    engine = held_bar(left(), right(keyframes=keys), solver=solver, device="gpu").engine
     names = [kernel for kernel, _ in cupy.calls]
     first = names.index("place")
     assert names[first - 1] == "energy_balance" and names[first : first + 2] == ["place", "hold"]
