@@ -62,7 +62,8 @@ class ContactTelemetry:
             if body.index not in self.clipped:
                 lines.append(
                     f"object {body.name!r}, step {int(r['step'])}: {int(r['clipped'])} nodes would have passed into an "
-                    "obstacle and were held back, so momentum is not exact; further ones are counted. A smaller dt or "
+                    "obstacle or another object and were held back; at an obstacle momentum is then not exact; further "
+                    "ones are counted. A smaller dt or "
                     "more passes (effects.contact) may help"
                 )
             self.clipped[body.index] += int(r["clipped"])
@@ -98,7 +99,7 @@ class ContactTelemetry:
         found = set(self.crowded) - self._crowded
         self._crowded |= found
         return [
-            f"object {self._simulation.world.bodies[body].name!r}: some nodes had more than two obstacles near at a "
-            "time; they touch the nearest two only; further ones are counted"
+            f"object {self._simulation.world.bodies[body].name!r}: some places had more obstacles or objects near than "
+            "rows at a time; they touch the nearest only; further ones are counted"
             for body in sorted(found)
         ]

@@ -157,7 +157,7 @@ def test_what_contact_leaves_undone_is_said_once_for_each_object(monkeypatch: py
     assert "not converged (contact, residual 2.5e-01)" in telemetry.count_unconverged(records)[0]
     assert sim.contact is not None
     sim.contact.dropped[7:9] = 1, 4
-    assert "more than two obstacles near" in telemetry.contact.crowded_nodes()[0]
+    assert "more obstacles or objects near" in telemetry.contact.crowded_nodes()[0]
     assert telemetry.contact.crowded_nodes() == [] and telemetry.contact.crowded == {0: 5}
     statuses: list[pb.Status] = []
     link.publish_status = statuses.append

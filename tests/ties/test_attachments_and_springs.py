@@ -201,3 +201,11 @@ def test_a_factor_that_knows_attachments_is_not_corrected_for_them():
         found.append(driver.advance(10)["iterations"].tolist())
         assert sim.engine.corrected(0) == 0
     assert found[0] == found[1]
+
+
+def test_glued_bars_that_fall_far_in_a_step_do_not_touch_each_other():
+    """With contact listed: they move by half an element in a step, together."""
+    sim = made(half("a", 0), half("b", 1), attachment=[glue()], obstacle=[FLOOR | {"pose": {"translate": [0, -90, 0]}}])
+    sim.world.v[:] = (0, -12, 0)
+    records = Driver(sim).advance(20)
+    assert not records["clipped"].any() and not records["contacts"].any() and records["passes"].max() <= 1

@@ -167,7 +167,8 @@ static void assemble(Loop* loop, bool whole) {
     else assemble_single(*loop, whole);
     if (loop->contact && !loop->euler) detect_other_rows(*loop);
     if (loop->contact && loop->contact->ties.count) TieRows(*loop).prepare();
-    for (int i = 0; i < loop->bodies && loop->contact; ++i) note_touches(*loop, loop->body[i]);
+    for (int i = 0; i < loop->bodies && loop->contact; ++i)  // what copies have
+        if (!loop->stages || copied_as_of_euler(*loop, i)) note_touches(*loop, loop->body[i]);
     for (int i = 0; i < loop->bodies; ++i) copy_for_worker(*loop, loop->body[i]);
     loop->assemble_begin = begin;
     loop->assemble_seconds = now() - begin;

@@ -3,6 +3,7 @@
 #pragma once
 #include <algorithm>
 
+#include "island_groups.h"
 #include "loop.h"
 
 constexpr int PAIR_HOLDS = 40;  // rounds in which bodies that pass through each other are held apart
@@ -89,6 +90,14 @@ struct PairDetection {
         return ended;
     }
 
+    // True if a node is attached to a body: the two do not touch.
+    bool is_bound(int node, int body) const { return c.ties.count && c.ties.bound[node] == body + 1; }
+    // The same of two edges.
+    bool are_bound(int edge, int body, int facing, int other) const {
+        return is_bound(c.edge[2 * edge], other) || is_bound(c.edge[2 * edge + 1], other) || is_bound(c.edge[2 * facing], body) ||
+               is_bound(c.edge[2 * facing + 1], body);
+    }
+
     // Moves nodes so that what y still takes through another body stays in front of it: along the normal where they touch, both sides
     // by their masses, which keeps their momentum. Counts the nodes in the reports of both bodies. True if there were such.
     bool hold_back(double* ends, double* y) const {
@@ -115,15 +124,15 @@ struct PairDetection {
         const Box box = box_of(motion, node, thickness_of(tables, body));
         bool found = false;
         for (int other = 0; other < loop.bodies; ++other) {
-            if (other == body || !c.near[other] || c.result[other].status == NOT_FINITE || !meet(box, c.body_box[other])) continue;
+            if (other == body || !c.near[other] || is_bound(node, other) || c.result[other].status == NOT_FINITE) continue;
+            if (!meet(box, c.body_box[other])) continue;
             const double thickness = 0.5 * (thickness_of(tables, body) + thickness_of(tables, other));
             Meeting t;
             if (passage_of(tables, motion, ended, node, other, thickness, t) == STAYS_OUT) continue;
             const int32_t* corner = c.triangle + 3 * t.triangle;
             const int32_t nodes[CORNERS] = {node, corner[0], corner[1], corner[2]};
             const double *w = t.touch.weight, weight[CORNERS] = {1, -w[0], -w[1], -w[2]};
-            hold_apart(nodes, weight, t.touch.normal, 0.1 * thickness, body, other, y);
-            found = true;
+            found = hold_apart(nodes, weight, t.touch.normal, 0.1 * thickness, body, other, y) || found;
         }
         return found;
     }
@@ -132,27 +141,29 @@ struct PairDetection {
         each_facing_edge(tables, edges, motion, body, edge, [&](int other, int facing, double thickness) {
             const EdgePath path = path_of(edges, motion, edge), way = path_of(edges, motion, facing);
             EdgeTouch t;
-            if (c.result[other].status == NOT_FINITE || !edges_pass(path, c.wings[edge], way, c.wings[facing], THROUGH * thickness)) return;
+            if (c.result[other].status == NOT_FINITE || are_bound(edge, body, facing, other)) return;
+            if (!edges_pass(path, c.wings[edge], way, c.wings[facing], THROUGH * thickness)) return;
             if (!meet_edges(path, c.wings[edge], way, c.wings[facing], thickness, 1e-2 * thickness, nullptr, t)) return;
             const int32_t nodes[CORNERS] = {c.edge[2 * edge], c.edge[2 * edge + 1], c.edge[2 * facing], c.edge[2 * facing + 1]};
             const double weight[CORNERS] = {1 - t.s, t.s, t.t - 1, -t.t};
-            hold_apart(nodes, weight, t.normal, 0.1 * thickness, body, other, y);
-            found = true;
+            found = hold_apart(nodes, weight, t.normal, 0.1 * thickness, body, other, y) || found;
         });
         return found;
     }
-    // Moves nodes by their weights over their masses until sum_a weight_a x_a is `gap` along the normal.
-    void hold_apart(const int32_t* nodes, const double* weight, const double* normal, double gap, int body, int other, double* y) const {
+    // Moves nodes by their weights over their masses until sum_a weight_a x_a is `gap` along the normal; weights above 0 are of `body`.
+    // Those of a body whose step is made stay. False if there is nothing to move.
+    bool hold_apart(const int32_t* nodes, const double* weight, const double* normal, double gap, int body, int other, double* y) const {
         double lacks = gap, share = 0;
+        auto moves = [&](int a) { return c.free[nodes[a]] != 0 && !is_made(loop, weight[a] > 0 ? body : other); };
         for (int a = 0; a < CORNERS; ++a) {
             double s[3];
             displacement_of(motion, nodes[a], s);
             for (int k = 0; k < 3; ++k) lacks -= weight[a] * normal[k] * (loop.x[3 * (int64_t)nodes[a] + k] + s[k]);
-            if (c.free[nodes[a]] != 0) share += weight[a] * weight[a] / c.mass[nodes[a]];
+            if (moves(a)) share += weight[a] * weight[a] / c.mass[nodes[a]];
         }
-        if (!(lacks > 0) || !(share > 0)) return;
+        if (!(lacks > 0) || !(share > 0)) return false;
         for (int a = 0; a < CORNERS; ++a) {
-            if (c.free[nodes[a]] == 0 || weight[a] == 0) continue;
+            if (!moves(a) || weight[a] == 0) continue;
             double dv[3], own[3];
             for (int k = 0; k < 3; ++k) dv[k] = lacks / share * weight[a] / c.mass[nodes[a]] * normal[k] / c.dx_dv;
             rotated_back(c.rotation + 9 * (int64_t)nodes[a], dv, own);
@@ -161,6 +172,7 @@ struct PairDetection {
         ++c.report[body].clipped;
         ++c.report[other].clipped;
         c.touched[body] = c.touched[other] = 1;
+        return true;
     }
 
     void count_dropped(int edge, int rows) const {
@@ -175,6 +187,7 @@ struct PairDetection {
         each_facing_edge(tables, edges, motion, body, edge, [&](int other, int facing, double thickness) {
             const EdgePath way = path_of(edges, motion, facing);
             EdgeMeeting t = {other, facing, {}};
+            if (are_bound(edge, body, facing, other)) return;
             if (!edges_pass(path, c.wings[edge], way, c.wings[facing], THROUGH * thickness)) return;
             if (!meet_edges(path, c.wings[edge], way, c.wings[facing], thickness, 1e-2 * thickness, nullptr, t.touch)) return;
             take_edge_row(body, edge, t);
@@ -225,7 +238,7 @@ struct PairDetection {
         const double own = std::sqrt(dot3(s, s));
         bool found = false;
         for (int other = 0; other < loop.bodies; ++other) {
-            if (other == body || !c.near[other] || !meet(box, c.body_box[other])) continue;
+            if (other == body || !c.near[other] || is_bound(node, other) || !meet(box, c.body_box[other])) continue;
             const double thickness = 0.5 * (thickness_of(tables, body) + thickness_of(tables, other));
             if (farthest && own + farthest[other] < distance_at_start(site, other, thickness) - THROUGH * thickness) continue;
             Meeting t;

@@ -55,6 +55,12 @@ struct TieRows {
                     for (int row = c.pair_first + 2 * site; site >= 0 && row < c.pair_first + 2 * site + 2; ++row)
                         if (c.obstacle[row] == other) c.obstacle[row] = -1;
                 });
+        auto bound = [&](int node, int other) { return t.bound[node] == other + 1; };
+        for (int row = c.edge_start ? c.edge_start[0] : 0; c.edge_start && row < c.edge_start[loop.bodies]; ++row) {
+            const int32_t *node = c.corner + CORNERS * row, other = c.obstacle[row], body = c.row_body[row];
+            if (other < 0) continue;
+            if (bound(node[0], other) || bound(node[1], other) || bound(node[2], body) || bound(node[3], body)) c.obstacle[row] = -1;
+        }
     }
     // h^2 times the sum of w_a^2 / A_aa of the corners that may move [1 / (N/m)]
     double compliance(int row) const {
