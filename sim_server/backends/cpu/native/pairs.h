@@ -99,9 +99,8 @@ struct PairDetection {
     }
 
     // Moves nodes so that what y still takes through another body stays in front of it: along the normal where they touch, both sides
-    // by their masses, which keeps their momentum. Counts the nodes in the reports of both bodies. True if there were such.
-    bool hold_back(double* ends, double* y) const {
-        bool any = false;
+    // by their masses, which keeps their momentum. Counts the nodes in the reports of both bodies.
+    void hold_back(double* ends, double* y) const {
         std::copy(c.near, c.near + loop.bodies, c.was_near);
         for (int k = 0; k < PAIR_HOLDS; ++k) {
             fit();
@@ -112,11 +111,9 @@ struct PairDetection {
                 for (int site = sites_before(tables, i); site < sites_before(tables, i + 1); ++site) found = hold_site(i, site, ended, y) || found;
                 for (int edge = edges_before(i); edge < edges_before(i + 1); ++edge) found = hold_edge(i, edge, y) || found;
             }
-            any = any || found;
             if (!found) break;
         }
         for (int i = 0; i < loop.bodies; ++i) c.near[i] = c.was_near[i] = c.near[i] || c.was_near[i];
-        return any;
     }
     bool hold_site(int body, int site, const Motion& ended, double* y) const {
         const int node = node_of_site(tables, site);
@@ -136,14 +133,20 @@ struct PairDetection {
         }
         return found;
     }
-    bool hold_edge(int body, int edge, double* y) const {
-        bool found = false;
+    // f(other, facing, thickness, touch) of the edges that the solution takes an edge through, but for attached ones.
+    template <class F> void each_edge_passed(int body, int edge, F f) const {
         each_facing_edge(tables, edges, motion, body, edge, [&](int other, int facing, double thickness) {
+            if (are_bound(edge, body, facing, other)) return;
             const EdgePath path = path_of(edges, motion, edge), way = path_of(edges, motion, facing);
             EdgeTouch t;
-            if (c.result[other].status == NOT_FINITE || are_bound(edge, body, facing, other)) return;
             if (!edges_pass(path, c.wings[edge], way, c.wings[facing], THROUGH * thickness)) return;
-            if (!meet_edges(path, c.wings[edge], way, c.wings[facing], thickness, 1e-2 * thickness, nullptr, t)) return;
+            if (meet_edges(path, c.wings[edge], way, c.wings[facing], thickness, 1e-2 * thickness, nullptr, t)) f(other, facing, thickness, t);
+        });
+    }
+    bool hold_edge(int body, int edge, double* y) const {
+        bool found = false;
+        each_edge_passed(body, edge, [&](int other, int facing, double thickness, const EdgeTouch& t) {
+            if (c.result[other].status == NOT_FINITE) return;
             const int32_t nodes[CORNERS] = {c.edge[2 * edge], c.edge[2 * edge + 1], c.edge[2 * facing], c.edge[2 * facing + 1]};
             const double weight[CORNERS] = {1 - t.s, t.s, t.t - 1, -t.t};
             found = hold_apart(nodes, weight, t.normal, 0.1 * thickness, body, other, y) || found;
@@ -171,7 +174,6 @@ struct PairDetection {
         }
         ++c.report[body].clipped;
         ++c.report[other].clipped;
-        c.touched[body] = c.touched[other] = 1;
         return true;
     }
 
@@ -183,14 +185,8 @@ struct PairDetection {
     // The same for an edge that the solution takes through another one.
     bool sweep_edge(int body, int edge) const {
         bool found = false;
-        const EdgePath path = path_of(edges, motion, edge);
-        each_facing_edge(tables, edges, motion, body, edge, [&](int other, int facing, double thickness) {
-            const EdgePath way = path_of(edges, motion, facing);
-            EdgeMeeting t = {other, facing, {}};
-            if (are_bound(edge, body, facing, other)) return;
-            if (!edges_pass(path, c.wings[edge], way, c.wings[facing], THROUGH * thickness)) return;
-            if (!meet_edges(path, c.wings[edge], way, c.wings[facing], thickness, 1e-2 * thickness, nullptr, t.touch)) return;
-            take_edge_row(body, edge, t);
+        each_edge_passed(body, edge, [&](int other, int facing, double, const EdgeTouch& t) {
+            take_edge_row(body, edge, {other, facing, t});
             c.touched[body] = c.touched[other] = 1;
             found = true;
         });
