@@ -43,8 +43,23 @@ class Faces:
 
 
 @dataclass(frozen=True)
+class OwnSurfaces:
+    """What bodies need to touch themselves (detection: kernels/own_surface.cuh).
+
+    near_start: (nodes + 1,) and near_node: of each node of a surface those that it does not touch, ascending, with
+        itself
+    start: (bodies + 1,) and node: all nodes of each body's surface
+    """
+
+    near_start: Int32
+    near_node: Int32
+    start: Int32
+    node: Int32
+
+
+@dataclass(frozen=True)
 class Surfaces:
-    """What bodies need to touch each other (detection: kernels/pair_detection.cuh).
+    """What bodies need to touch each other, or themselves (detection: kernels/pair_detection.cuh).
 
     site_body: (surface nodes,). node_site: (nodes,) number of a node among the surface nodes, -1: it is none
     triangle: (triangles, 3) nodes of the scene, outward; those of a body are together
@@ -54,6 +69,7 @@ class Surfaces:
     triangle_edge: (triangles, 3) the edge from each corner to the next one that the triangle owns; -1
     edge_length: (bodies,) of edges in the mean [m]. thickness: (bodies,) [m]
     friction: (bodies, bodies) coefficients. gravity: (3,) [m/s2]
+    between: whether bodies touch each other. own: None where they do not touch themselves
     """
 
     site_body: Int32
@@ -69,6 +85,8 @@ class Surfaces:
     thickness: Float64
     friction: Float64
     gravity: Float64
+    between: bool
+    own: OwnSurfaces | None
 
 
 @dataclass(frozen=True)
@@ -80,13 +98,13 @@ class Contact:
 
         two for each surface node: the node, with weight 1
         one for each triangle, if there are `faces`: its corners, which the loop sets
-        two for each surface node, if there are `surfaces`: the node with weight 1 and a triangle of another body with
-            weights below 0, which the loop sets
-        two for each edge then: its nodes with weights 1 - s, s and those of an edge of another body with -(1 - t), -t
+        two for each surface node, if there are `surfaces`: the node with weight 1 and a triangle of another body, or
+            of its own, with weights below 0, which the loop sets
+        two for each edge then: its nodes with weights 1 - s, s and those of another edge with -(1 - t), -t
 
     body_start: (bodies + 1,) rows of the nodes of each body against obstacles
     corner: (rows, 4) nodes of the scene; -1: fewer. weight: (rows, 4)
-    obstacle: (rows,) number of the obstacle, or of the other body; -1: the row is empty
+    obstacle: (rows,) number of the obstacle, or of the other body, which may be its own; -1: the row is empty
     normal: (rows, 3) unit, out of the obstacle, world frame
     gap: (rows,) signed distance of the point at the start of the step from where the plane is at the end of it [m]
     drift: (rows, 3) displacement in the step of the obstacle's point that is touched [m]
@@ -101,7 +119,7 @@ class Contact:
     passes: most solves of a step. tolerance: of the contact residual
     dropped: (surface nodes,) how often something that touches found no row; of a triangle at one of its nodes
     faces: None where triangles have no rows of their own
-    surfaces: None where bodies do not touch each other
+    surfaces: None where bodies touch neither each other nor themselves
     ties: attachments and springs, which have the last rows; None: there are none
     """
 

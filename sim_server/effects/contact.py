@@ -36,7 +36,7 @@ from pydantic import BeforeValidator, Field
 from sim_server.arrays import Float64, Int32
 from sim_server.backends.base import Launch
 from sim_server.backends.contact import Contact as ContactInput
-from sim_server.backends.contact import Faces, Obstacles, Surfaces
+from sim_server.backends.contact import Faces, Obstacles, OwnSurfaces, Surfaces
 from sim_server.backends.declarations import Declarations
 from sim_server.effects._base import EffectUpdates
 from sim_server.effects._movable import Movable, pose_of
@@ -46,6 +46,7 @@ from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.ties import make_ties
 from sim_server.mechanics.world import Body, World
 from sim_server.mesh.box_tree import box_tree
+from sim_server.mesh.own_surface import edges_through_triangles, nearby_nodes
 from sim_server.mesh.surface import edge_owners, surface_edges, surface_triangles
 from sim_server.scene.obstacles import Obstacle
 from sim_server.scene.parameters import NotNegative, Parameters, Positive, as_tuple
@@ -55,6 +56,7 @@ log = logging.getLogger(__name__)
 SCOPE = "scene"
 TEXT = "effects/contact.cu"
 SAMPLES = 6  # of an edge, where triangles are looked at for obstacles at the start
+FREE_AT_REST = 2.0  # thicknesses: parts of a body nearer than that at rest do not touch each other
 DEFAULT_THICKNESS, LARGEST_THICKNESS = 0.1, 0.5  # of the shortest edge of a surface
 
 ShapeKind = Declarations("kernels/shapes.cuh").enumeration("ShapeKind")
@@ -78,6 +80,7 @@ class Params(Parameters):
     tolerance: float = Field(default=1e-3, gt=0, lt=1, description="of the contact residual over the right-hand side")
     friction: list[PairFriction] | None = Field(default=None, description="of pairs, instead of the geometric mean")
     between: bool = Field(default=True, description="objects touch each other, too")
+    self: bool = Field(default=False, description="objects touch themselves, too")
 
 
 class Contact(Movable):
@@ -99,7 +102,7 @@ class Contact(Movable):
         self._shapes(max(bounds))
         self.dropped = np.zeros(len(self.node), np.int32)
         self._pair_friction = _pair_friction(world, params)
-        touching = len(world.bodies) > 1 and params.between
+        touching = params.self or (len(world.bodies) > 1 and params.between)
         ties = make_ties(world)
         start = np.concatenate([[0], np.cumsum([2 * len(s) for s in surfaces])]).astype(np.int32)
         faces = faces_of(world, self._pair_friction, int(start[-1]))
@@ -169,8 +172,10 @@ class Contact(Movable):
         self._warn_of_nodes_inside()
         if self._input.faces:
             self._warn_of_triangles_inside(self._input.faces)
-        if self._input.surfaces:
+        if self._input.surfaces and self.params.between:
             self._warn_of_bodies_inside()
+        if self._input.surfaces and self.params.self:
+            self._warn_of_bodies_through_themselves(self._input.surfaces)
 
     def _warn_of_nodes_inside(self) -> None:
         """Logs which objects begin deeper in an obstacle than their thickness: they are pushed out, fast."""
@@ -237,6 +242,20 @@ class Contact(Movable):
                     )  # fmt: skip
 
 
+    def _warn_of_bodies_through_themselves(self, surfaces: Surfaces) -> None:
+        """Logs which objects begin with edges through their own surface: what is through stays so."""
+        first = (surfaces.edge_start - surfaces.edge_start[0]) // 2
+        for body in self.world.bodies:
+            own = (surfaces.triangle[:, 0] >= body.first) & (surfaces.triangle[:, 0] < body.last)
+            edges = surfaces.edge[first[body.index] : first[body.index + 1]]
+            if (found := edges_through_triangles(self.world.x, edges, surfaces.triangle[own])).size:
+                one, other = edges[found[0]] - body.first
+                log.warning(
+                    "object %r begins passing through itself: the edge from node %d to %d goes through its surface (%d "
+                    "such edges)", body.name, one, other, found.size,
+                )  # fmt: skip
+
+
 def _surface(world: World, body: Body) -> Int32:
     """Returns the free nodes of a body's surface, in numbers of the scene, ascending."""
     nodes = np.unique(surface_triangles(body.mesh.tets)) + body.first
@@ -289,7 +308,22 @@ def _surfaces(
     return Surfaces(
         body, site, triangle, boxes.astype(np.int32), np.concatenate(shifted).astype(np.int32),
         (first + 2 * ends).astype(np.int32), edge, opposite, of_triangle, mean, np.array(thickness),
-        _friction_of_bodies(world, params), np.array(world.gravity),
+        _friction_of_bodies(world, params), np.array(world.gravity), params.between,
+        _own_surfaces(world, triangles, thickness) if params.self else None,
+    )  # fmt: skip
+
+
+def _own_surfaces(world: World, triangles: Sequence[Int32], thickness: Sequence[float]) -> OwnSurfaces:
+    """Returns what bodies need to touch themselves. triangles, thickness: of each body, in nodes of the scene; [m]"""
+    ends, near = [np.zeros(1, np.int64)], [np.zeros(0, np.int32)]
+    for body, own, d in zip(world.bodies, triangles, thickness, strict=True):
+        start, node = nearby_nodes(body.mesh.tets, body.mesh.rest, own - np.int32(body.first), FREE_AT_REST * d)
+        ends.append(start[1:] + ends[-1][-1])
+        near.append(node + np.int32(body.first))
+    nodes = [np.unique(t).astype(np.int32) for t in triangles]
+    return OwnSurfaces(
+        np.concatenate(ends).astype(np.int32), np.concatenate(near),
+        np.cumsum([0, *map(len, nodes)]).astype(np.int32), np.concatenate(nodes),
     )  # fmt: skip
 
 

@@ -39,7 +39,7 @@ struct SurfaceTables {        // of all bodies (backends/contact.py)
     const int* triangle;                     // (triangles, 3) nodes
     const int *tree_start, *tree_child;      // (bodies + 1,), (tree, 2): two children, or ~ of a triangle, twice
     Box *tree_box, *body_box;                // (tree,), (bodies,)
-    const int* near;                         // (bodies,) 1: its box meets another's, and its tree is fitted
+    const int* near;                         // (bodies,) 1: its box meets another's; 2: it may touch itself; then its tree is fitted
     const double* pair_friction;             // (bodies, bodies)
     const double* body_thickness;            // (bodies,)
 };
@@ -303,20 +303,29 @@ template <class Motion> HOST_DEVICE bool in_crease(const TouchSearch<Motion>& se
     return search.beside.other >= 0 && nearest.distance > 0 && nearest.distance <= search.thickness && dot3(nearest.normal, beside.normal) < CREASE;
 }
 
+struct NothingElse {  // of a body itself, which is not touched
+    template <class F> void operator()(F) const {}
+};
+
 // Sets both rows of a site between bodies: of the bodies that it meets first, or is nearest to, or, with one, of both sides of a crease.
-template <class Motion> HOST_DEVICE void detect_site(const SurfaceTables& c, const Motion& m, int site) {
+// own(f): f(search) of the body itself, if the site may touch it
+template <class Motion, class Own = NothingElse> HOST_DEVICE void detect_site(const SurfaceTables& c, const Motion& m, int site, Own own = {}) {
     const int node = node_of_site(c, site), body = c.site_body[site], row = c.pair_first + 2 * site;
     Meeting first = {-1, -1, {}}, second = first, beside = first;
     const Box box = m.free[node] == 0 ? empty_box() : box_of(m, node, thickness_of(c, body));
-    for (int other = 0; other < c.bodies; ++other) {
-        if (other == body || !c.near[other] || !meet(box, c.body_box[other])) continue;
-        TouchSearch<Motion> search = search_of(m, node, 0.5 * (thickness_of(c, body) + thickness_of(c, other)));
-        search_tree(c, other, &search, 1);
+    auto take = [&](const TouchSearch<Motion>& search) {
         const Meeting t = found_by(search);
         if (comes_before(t, first)) { second = first; first = t; }
         else if (comes_before(t, second)) second = t;
         if (in_crease(search) && comes_before(search.beside, beside)) beside = search.beside;
+    };
+    for (int other = 0; other < c.bodies; ++other) {
+        if (other == body || !(c.near[other] & 1) || !meet(box, c.body_box[other])) continue;
+        TouchSearch<Motion> search = search_of(m, node, 0.5 * (thickness_of(c, body) + thickness_of(c, other)));
+        search_tree(c, other, &search, 1);
+        take(search);
     }
+    if (m.free[node] != 0) own(take);
     if (second.other < 0) second = beside;
     const RowMemory last[2] = {memory_of(c, row), memory_of(c, row + 1)};
     put_row(c, m, row, site, first);

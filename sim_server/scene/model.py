@@ -236,7 +236,7 @@ class Scene(Parameters):
         check_holders_on(device, self.holders or [], self.integrator)
         check_ties_on(device, self.attachments or [], self.springs or [])
         if "contact" in self.effects:
-            check_contact_on(device, self.integrator)
+            check_contact_on(device, self.effects["contact"], self.integrator)
 
     @property
     def projection(self) -> Literal["excess", "clamp", "absolute", "none"]:

@@ -74,8 +74,9 @@ def contact_errors(
         if obstacles:
             yield _error("objects touch it by the effect contact: list contact = true under [effects]", "obstacle", 0)
         return
-    if not obstacles and (len(objects) < 2 or not contact.between):
-        yield _error("there is nothing to touch; needed: an [[obstacle]], or another object", "effects", "contact")
+    if not obstacles and not contact.self and (len(objects) < 2 or not contact.between):
+        text = "there is nothing to touch; needed: an [[obstacle]], another object, or self = true"
+        yield _error(text, "effects", "contact")
     linearized = integrator.scheme == "backward_euler" and integrator.linearizations > 1
     if integrator.scheme == "quasi_static" or linearized:
         found = f"{integrator.scheme!r} with linearizations = {integrator.linearizations}"
@@ -83,25 +84,29 @@ def contact_errors(
         yield _error(f"contact with integrator.scheme = {found}; allowed: {allowed}", "effects", "contact")
     pairs: list[set[str]] = []
     for index, pair in enumerate(contact.friction or ()):
-        if text := _wrong_pair(set(pair.between), names, shapes, pairs):
+        if text := _wrong_pair(set(pair.between), names, shapes, pairs, contact.self):
             yield _error(text, "effects", "contact", "friction", index, "between")
         pairs.append(set(pair.between))
 
 
-def check_contact_on(device: str, integrator: IntegratorOptions) -> None:
+def check_contact_on(device: str, contact: Any, integrator: IntegratorOptions) -> None:
     """Raises InputError for contact that the device ("cpu" or "gpu") does not have."""
     if device == "gpu" and integrator.scheme != "backward_euler":
         raise InputError(
             f"effects.contact with integrator.scheme = {integrator.scheme!r} on a GPU; allowed: 'backward_euler', or "
             "--device cpu"
         )
+    if device == "gpu" and contact.self:
+        raise InputError("effects.contact.self = true: objects touch themselves on CPUs alone; allowed: --device cpu")
 
 
-def _wrong_pair(pair: set[str], objects: list[str], obstacles: list[str], earlier: list[set[str]]) -> str:
+def _wrong_pair(
+    pair: set[str], objects: list[str], obstacles: list[str], earlier: list[set[str]], itself: bool
+) -> str:
     for name in sorted(pair):
         if name not in objects and name not in obstacles:
             return f"no object or obstacle {name!r}" + nearest(name, [*objects, *obstacles], "names")
-    if len(pair) != 2 or not pair & set(objects):
+    if (len(pair) != 2 and not itself) or not pair & set(objects):
         return f"{' and '.join(sorted(pair))}: must be an object, and an obstacle or another object"
     return f"{' and '.join(sorted(pair))} stand in the list already" if pair in earlier else ""
 

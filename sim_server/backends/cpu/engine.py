@@ -18,7 +18,7 @@ from protocol.factor import FactorPattern
 from sim_server.arrays import Int32
 from sim_server.backends.base import Capability, EngineInput, Launch
 from sim_server.backends.compiler import native
-from sim_server.backends.contact import Contact, Surfaces
+from sim_server.backends.contact import Contact, OwnSurfaces, Surfaces
 from sim_server.backends.cpu import structs
 from sim_server.backends.cpu.device import CpuLaunch
 from sim_server.backends.cpu.energies import NativeEnergies
@@ -291,7 +291,23 @@ class _NativeContact:
         }  # fmt: skip
         self.native.tree_box, self.native.body_box = map(c.addressof, self._boxes)
         self.native.wings = c.addressof(self._wings)
-        self.native.pair_first = first
+        self.native.pair_first, self.native.between = first, surfaces.between
+        if surfaces.own:
+            self._touch_itself(surfaces.own, len(surfaces.site_body), len(surfaces.edge), loop)
+
+    def _touch_itself(self, own: OwnSurfaces, sites: int, edges: int, loop: structs.Loop) -> None:
+        """Adds what bodies need to touch themselves."""
+        self._references = (structs.OwnReference * loop.bodies)()
+        self._own_surfaces: dict[str, NDArray[Any]] = {
+            "start": own.start, "node": own.node, "reference": np.zeros((len(own.node), 3)),
+            "strain": np.zeros(loop.nodes), "moved": np.zeros(loop.nodes), "clear": np.zeros(sites),
+            "edge_clear": np.zeros(edges),
+        }  # fmt: skip
+        native = self.native.own
+        for name, array in self._own_surfaces.items():
+            setattr(native, name, array.ctypes.data)
+        native.near.start, native.near.node = own.near_start.ctypes.data, own.near_node.ctypes.data
+        native.body = c.addressof(self._references)
 
 
 def _binding(launch: CpuLaunch) -> structs.Binding:

@@ -131,6 +131,21 @@ class Ties(c.Structure):
 
 
 @LOOP.struct
+class OwnTables(c.Structure):
+    """What does not touch each other of a body."""
+
+
+@LOOP.struct
+class OwnReference(c.Structure):
+    """Since when, and how far, a body has moved against itself."""
+
+
+@LOOP.struct
+class OwnContact(c.Structure):
+    """Input and memory of the contact of bodies with themselves."""
+
+
+@LOOP.struct
 class Contact(c.Structure):
     """Input and memory of contact."""
 

@@ -108,10 +108,10 @@ static void solve_islands(Loop& loop, bool resumes) {
     };
     for (int i = 0; i < c.islands; ++i)
         if (size(i) > 1 && wanted(i)) solve_island(loop, i, resumes);
-    if (resumes) return;
+    if (resumes && !c.own.near.start) return;
 #pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) if (loop.threads > 1)
     for (int i = 0; i < c.islands; ++i)
-        if (size(i) == 1) solve_island(loop, i, false);
+        if (size(i) == 1 && wanted(i)) solve_island(loop, i, resumes);
 }
 
 // Solves all bodies whose step is not made. Those that pass through each other then get rows where they do, and are solved again. True

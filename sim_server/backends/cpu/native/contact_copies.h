@@ -83,11 +83,20 @@ static void note_touches(const Loop& loop, Body& body) {
     auto block_of = [&](int i, int j) -> double* {
         return i > j || block_between(loop, body, i, j) < 0 ? nullptr : put(i - body.first, j - body.first);
     };
-    bool others = c.pair_first >= 0 && c.near[index];
+    bool others = c.pair_first >= 0 && (c.near[index] & 1);
     each_lasting_row(c, rows, index, [&](int k, const double* s) {
         if (is_pair(c, k)) others = true;
         else rows.add_blocks(k, s, block_of);
     });
+    if (c.own.near.start)
+        each_pair_range_of(c, index, [&](int first, int last) {
+            for (int k = first; k < last; ++k) {
+                if (c.obstacle[k] != index || !(c.force[k] > 0)) continue;
+                double s[6];
+                lasting_stiffness(c, rows, k, s);
+                rows.add_blocks(k, s, block_of);
+            }
+        });
     if (others) put(-1, -1);
 }
 

@@ -48,7 +48,7 @@ struct ContactEnd : IslandRows {
         const int body = body_of_row(c, k, false);
         ++c.report[body].contacts;
         add_work(k, f);
-        if (is_pair(c, k)) ++c.report[c.obstacle[k]].contacts;
+        if (is_pair(c, k)) c.report[c.obstacle[k]].contacts += c.obstacle[k] != body;
         else react(k, f, c.reaction + 6 * ((int64_t)c.obstacle_count * body + c.obstacle[k]));
     }
     void count_work(int k, bool acts) const {

@@ -5,7 +5,7 @@
 #include <cstdint>
 
 #include "contact_passes.cuh"
-#include "edge_detection.cuh"
+#include "own_surface.cuh"
 #include "triangle_shape.cuh"
 
 struct RowState {                 // of a row in the step under way
@@ -52,6 +52,21 @@ struct PassChoice {         // of a body, kept from step to step (pass_choice.h)
     int32_t wait, waited;   // passes between trials; since the last one
 };
 
+struct OwnReference {       // of a body (own_contact.h)
+    double range;           // up to which distances are measured; 0: there is no reference [m]
+    double rotation[9];     // since then
+    double most, most_in_step;  // of what nodes have moved since, and in this step alone, but for rigid motions [m]
+};
+
+struct OwnContact {         // of bodies with themselves (own_contact.h)
+    OwnTables near;
+    const int32_t *start, *node;        // (bodies + 1,), nodes of surfaces, by body
+    double* reference;                  // (nodes of surfaces, 3) [m]
+    double *strain, *moved;             // (nodes,) moved since the reference, but for rigid motions: up to the start of the step, in all [m]
+    double *clear, *edge_clear;         // (sites,), (edges,) distances measured [m]
+    OwnReference* body;                 // (bodies,)
+};
+
 struct Contact {
     ObstacleTable obstacles;
     int32_t obstacle_count;
@@ -77,7 +92,8 @@ struct Contact {
     const int32_t* face_start;                    // (bodies + 1,) rows of triangles against obstacles; null: there are none (faces.h)
     const int32_t *face, *face_owns;              // (faces, 3) nodes, (faces,) bits
     const double* face_friction;                  // (bodies, obstacles)
-    int32_t pair_first;                           // row of the first one between bodies; -1: bodies do not touch each other
+    int32_t between;                              // 1: bodies touch each other; else at most themselves
+    int32_t pair_first;                           // row of the first one between bodies; -1: there are none
     const int32_t* edge_start;                    // (bodies + 1,) rows of edges against edges of other bodies; null: there are none
     const int32_t *edge, *edge_opposite, *triangle_edge;  // (edges, 2), (edges, 2), (triangles, 3): edge_detection.cuh
     const double* edge_length;                    // (bodies,)
@@ -88,7 +104,7 @@ struct Contact {
     const int32_t* triangle;                      // (triangles, 3) nodes
     const int32_t *tree_start, *tree_child;       // (bodies + 1,), (tree, 2): two children, or ~ of a triangle (pairs.h)
     Box *tree_box, *body_box;                     // (tree,), (bodies,)
-    int32_t *near, *was_near, *touched;           // (bodies,) 1: its box meets another's; in the last step; it got rows by a sweep
+    int32_t *near, *was_near, *touched;           // (bodies,) bits: its box meets another's, it may touch itself; in the last step; it got rows by a sweep
     const double* pair_friction;                  // (bodies, bodies)
     const double* gravity;                        // (3,)
     int32_t *island, *island_start;               // (bodies,) bodies by island; (bodies + 1,)
@@ -101,6 +117,7 @@ struct Contact {
     int32_t* mode;                                // (bodies,) first mode of a body; -1: it has none
     const int32_t* unheld;                        // (bodies,) 1: no node is fixed
     Ties ties;
+    OwnContact own;
 };
 
 static void rotated(const double* R, const double* v, double* out) {

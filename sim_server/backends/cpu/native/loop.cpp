@@ -332,7 +332,7 @@ void wf_precondition(Loop* loop, int32_t index, const double* r, double* z, doub
 const StructSize* wf_sizes() {
     static const StructSize sizes[] = {SIZE(Launch), SIZE(Body), SIZE(Loop), SIZE(Factor), SIZE(KnownContact), SIZE(Pattern), SIZE(Record),
                                        SIZE(Newton), SIZE(Search), SIZE(Stages), SIZE(StageState), SIZE(EulerForm), SIZE(Elastic), SIZE(Energies), SIZE(Balance),
-                                       SIZE(Contact), SIZE(RowState), SIZE(PassChoice), SIZE(ContactReport), SIZE(Box), SIZE(Reaction), {}};
+                                       SIZE(Contact), SIZE(RowState), SIZE(PassChoice), SIZE(OwnReference), SIZE(ContactReport), SIZE(Box), SIZE(Reaction), {}};
     return sizes;
 }
 }

@@ -5,7 +5,9 @@
 
 #include "island_groups.h"
 #include "loop.h"
+#include "own_contact.h"
 
+constexpr int MAY_TOUCH_ITSELF = 2;  // bit of Contact::near
 constexpr int PAIR_HOLDS = 40;  // rounds in which bodies that pass through each other are held apart
 
 struct PairDetection {
@@ -15,21 +17,24 @@ struct PairDetection {
     const SurfaceTables tables;
     const EdgeTables edges;
     const Motion motion;
+    const OwnSearch own;
 
     // y: solution found, material frame; null: before the solve
     PairDetection(const Loop& loop, Contact& c, const double* y = nullptr)
         : loop(loop), c(c), tables{loop.bodies, c.body_start, c.corner, c.weight, c.obstacle, c.normal, c.gap, c.entry, c.stiffness, c.friction,
                                    c.thickness, c.hardening, c.force, c.traction, c.pair_first, c.site_body, c.node_site, c.triangle, c.tree_start,
                                    c.tree_child, c.tree_box, c.body_box, c.near, c.pair_friction, c.body_thickness},
-          edges{c.edge_start, c.edge, c.edge_opposite, c.triangle_edge, c.edge_length, c.wings, c.facing}, motion(motion_of(c, loop.x, y)) {}
+          edges{c.edge_start, c.edge, c.edge_opposite, c.triangle_edge, c.edge_length, c.wings, c.facing}, motion(motion_of(c, loop.x, y)), own{c, tables, edges, motion, c.own} {}
 
     int edges_before(int body) const { return c.edge_start ? (c.edge_start[body] - c.edge_start[0]) / 2 : 0; }
 
-    void fit() const {
+    // before: the solve
+    void fit(bool before = false) const {
         for (int i = 0; i < loop.bodies; ++i) { fit_body(tables, motion, i); c.near[i] = c.touched[i] = 0; }
         for (int i = 0; i < loop.bodies; ++i)
             for (int j = 0; j < i; ++j)
-                if (meet(c.body_box[i], c.body_box[j])) c.near[i] = c.near[j] = 1;
+                if (c.between && meet(c.body_box[i], c.body_box[j])) c.near[i] = c.near[j] = 1;
+        find_own(before);
 #pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) if (loop.threads > 1)
         for (int i = 0; i < loop.bodies; ++i)
             if (c.near[i]) {
@@ -38,16 +43,48 @@ struct PairDetection {
             }
     }
 
+    // Finds the bodies that may touch themselves.
+    void find_own(bool before) const {
+        if (!own.exists()) return;
+#pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) if (loop.threads > 1)
+        for (int i = 0; i < loop.bodies; ++i) {
+            if (!before) own.add_ways(i);
+            bool may = before ? own.begin(i) : own.any_may_touch(i, 1);
+            if (before && may && own.wants_reference(i)) {
+                fit_tree(tables, motion, i);
+                own.measure(i);
+                may = own.any_may_touch(i, 2);
+            }
+            if (may) c.near[i] |= MAY_TOUCH_ITSELF;
+        }
+    }
+    // Sets the rows that a site may have with its own body, too.
+    void detect_site_and_own(int body, int site) const {
+        const int node = node_of_site(tables, site);
+        detect_site(tables, motion, site, [&](auto take) {
+            if (!(c.near[body] & MAY_TOUCH_ITSELF) || is_bound(node, body) || !own.site_may_touch(site, body, 2)) return;
+            take(search_own(tables, c.own.near, motion, body, node, thickness_of(tables, body)));
+        });
+    }
+    int detect_edge_and_own(int body, int edge) const {
+        return detect_edge(tables, edges, motion, body, edge, [&](auto consider) {
+            if (!(c.near[body] & MAY_TOUCH_ITSELF) || !own.edge_may_touch(edge, body, 2)) return;
+            each_own_edge(tables, edges, c.own.near, motion, body, edge, consider);
+        });
+    }
+
     // Sets the rows of a step.
     void run() const {
-        fit();
+        fit(true);
 #pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) if (loop.threads > 1)
         for (int i = 0; i < loop.bodies; ++i) {
             if (!c.near[i] && !c.was_near[i]) continue;
-            for (int site = sites_before(tables, i); site < sites_before(tables, i + 1); ++site) detect_site(tables, motion, site);
+            for (int site = sites_before(tables, i); site < sites_before(tables, i + 1); ++site)
+                if (own.exists()) detect_site_and_own(i, site);
+                else detect_site(tables, motion, site);
             for (int edge = edges_before(i); edge < edges_before(i + 1); ++edge) {
                 if (!c.near[i]) c.wings[edge].sharp = 0;
-                count_dropped(edge, detect_edge(tables, edges, motion, i, edge));
+                count_dropped(edge, own.exists() ? detect_edge_and_own(i, edge) : detect_edge(tables, edges, motion, i, edge));
             }
         }
         std::copy(c.near, c.near + loop.bodies, c.was_near);
@@ -69,7 +106,7 @@ struct PairDetection {
         for (int i = 0; i < loop.bodies; ++i)
             for (int edge = edges_before(i); c.near[i] && edge < edges_before(i + 1); ++edge) found = sweep_edge(i, edge) || found;
         // rows of this step, whether found before the solve or here, count in its islands and are looked at again in the next one
-        for (int i = 0; i < loop.bodies; ++i) c.near[i] = c.was_near[i] = c.near[i] || c.was_near[i];
+        for (int i = 0; i < loop.bodies; ++i) c.near[i] = c.was_near[i] = c.near[i] | c.was_near[i];
         return found;
     }
     // The motion of what has arrived. ends: (nodes, 3) memory. farthest: (bodies,) out, how far nodes move at most [m]; null: not wanted
@@ -113,7 +150,7 @@ struct PairDetection {
             }
             if (!found) break;
         }
-        for (int i = 0; i < loop.bodies; ++i) c.near[i] = c.was_near[i] = c.near[i] || c.was_near[i];
+        for (int i = 0; i < loop.bodies; ++i) c.near[i] = c.was_near[i] = c.near[i] | c.was_near[i];
     }
     bool hold_site(int body, int site, const Motion& ended, double* y) const {
         const int node = node_of_site(tables, site);
@@ -121,27 +158,41 @@ struct PairDetection {
         const Box box = box_of(motion, node, thickness_of(tables, body));
         bool found = false;
         for (int other = 0; other < loop.bodies; ++other) {
-            if (other == body || !c.near[other] || is_bound(node, other) || c.result[other].status == NOT_FINITE) continue;
+            if (other == body || !(c.near[other] & 1) || is_bound(node, other) || c.result[other].status == NOT_FINITE) continue;
             if (!meet(box, c.body_box[other])) continue;
             const double thickness = 0.5 * (thickness_of(tables, body) + thickness_of(tables, other));
             Meeting t;
             if (passage_of(tables, motion, ended, node, other, thickness, t) == STAYS_OUT) continue;
-            const int32_t* corner = c.triangle + 3 * t.triangle;
-            const int32_t nodes[CORNERS] = {node, corner[0], corner[1], corner[2]};
-            const double *w = t.touch.weight, weight[CORNERS] = {1, -w[0], -w[1], -w[2]};
-            found = hold_apart(nodes, weight, t.touch.normal, 0.1 * thickness, body, other, y) || found;
+            found = hold_vertex(body, node, t, y) || found;
         }
-        return found;
+        Meeting t;
+        return (site_passes_own(body, site, t) && hold_vertex(body, node, t, y)) || found;
+    }
+    bool hold_vertex(int body, int node, const Meeting& t, double* y) const {
+        const int32_t* corner = c.triangle + 3 * t.triangle;
+        const int32_t nodes[CORNERS] = {node, corner[0], corner[1], corner[2]};
+        const double *w = t.touch.weight, weight[CORNERS] = {1, -w[0], -w[1], -w[2]};
+        const double thickness = 0.5 * (thickness_of(tables, body) + thickness_of(tables, t.other));
+        return hold_apart(nodes, weight, t.touch.normal, 0.1 * thickness, body, t.other, y);
+    }
+    // True if the solution takes a vertex through its own body. t: where it touches then.
+    bool site_passes_own(int body, int site, Meeting& t) const {
+        const int node = node_of_site(tables, site);
+        if (!own.exists() || !(c.near[body] & MAY_TOUCH_ITSELF) || is_bound(node, body) || !own.site_may_touch(site, body, 1)) return false;
+        return passes_own(tables, c.own.near, motion, body, node, thickness_of(tables, body), t);
     }
     // f(other, facing, thickness, touch) of the edges that the solution takes an edge through, but for attached ones.
     template <class F> void each_edge_passed(int body, int edge, F f) const {
-        each_facing_edge(tables, edges, motion, body, edge, [&](int other, int facing, double thickness) {
+        auto look = [&](int other, int facing, double thickness) {
             if (are_bound(edge, body, facing, other)) return;
             const EdgePath path = path_of(edges, motion, edge), way = path_of(edges, motion, facing);
             EdgeTouch t;
             if (!edges_pass(path, c.wings[edge], way, c.wings[facing], THROUGH * thickness)) return;
             if (meet_edges(path, c.wings[edge], way, c.wings[facing], thickness, 1e-2 * thickness, nullptr, t)) f(other, facing, thickness, t);
-        });
+        };
+        each_facing_edge(tables, edges, motion, body, edge, look);
+        if (own.exists() && (c.near[body] & MAY_TOUCH_ITSELF) && own.edge_may_touch(edge, body, 1))
+            each_own_edge(tables, edges, c.own.near, motion, body, edge, look);
     }
     bool hold_edge(int body, int edge, double* y) const {
         bool found = false;
@@ -173,7 +224,7 @@ struct PairDetection {
             for (int k = 0; k < 3; ++k) y[3 * (int64_t)nodes[a] + k] += own[k];
         }
         ++c.report[body].clipped;
-        ++c.report[other].clipped;
+        if (other != body) ++c.report[other].clipped;
         return true;
     }
 
@@ -234,7 +285,7 @@ struct PairDetection {
         const double own = std::sqrt(dot3(s, s));
         bool found = false;
         for (int other = 0; other < loop.bodies; ++other) {
-            if (other == body || !c.near[other] || is_bound(node, other) || !meet(box, c.body_box[other])) continue;
+            if (other == body || !(c.near[other] & 1) || is_bound(node, other) || !meet(box, c.body_box[other])) continue;
             const double thickness = 0.5 * (thickness_of(tables, body) + thickness_of(tables, other));
             if (farthest && own + farthest[other] < distance_at_start(site, other, thickness) - THROUGH * thickness) continue;
             Meeting t;
@@ -244,6 +295,11 @@ struct PairDetection {
             c.touched[body] = 1;
 #pragma omp atomic write
             c.touched[other] = 1;
+            found = true;
+        }
+        if (Meeting t; site_passes_own(body, site, t)) {
+            take_row(c.pair_first + 2 * site, site, t);
+            c.touched[body] = 1;
             found = true;
         }
         return found;
