@@ -16,8 +16,6 @@ struct EdgeTables {           // of all bodies (backends/contact.py), beside Sur
     int* facing;              // (rows from start[0] on,) the other edge
 };
 
-constexpr double OWN_EDGE_DEEP = 0.5;  // thicknesses: edges of one body that have crossed deeper have its material between them
-
 HOST_DEVICE int edge_of_row(const EdgeTables& e, int row) { return (row - e.start[0]) / 2; }
 // True if rows between the bodies are those of `body`.
 HOST_DEVICE bool has_rows(const EdgeTables& e, int body, int other) {
@@ -125,19 +123,14 @@ HOST_DEVICE const double* held_by(const SurfaceTables& c, const EdgeTables& e, i
     return nullptr;
 }
 
-// Sets both rows of an edge; returns how many more edges it comes near to. own(f): f(body, edge, thickness) of the edges of the same body
-// that it may touch
+// Sets both rows of an edge; returns how many more edges it comes near to. own(f): f(meeting) of the edges of the same body that it may touch
 template <class Motion, class Own = NothingElse>
 HOST_DEVICE int detect_edge(const SurfaceTables& c, const EdgeTables& e, const Motion& m, int body, int edge, Own own = {}) {
     const int row = e.start[0] + 2 * edge;
     EdgeMeeting first = {-1, -1, {}}, second = first;
     int left = 0;
     const EdgePath path = path_of(e, m, edge);
-    auto consider_edge = [&](int other, int facing, double thickness) {
-        EdgeMeeting here = {other, facing, {}};
-        const double* held = held_by(c, e, edge, other, facing);
-        if (!meet_edges(path, e.wings[edge], path_of(e, m, facing), e.wings[facing], thickness, 1e-2 * thickness, held, here.touch)) return;
-        if (other == body && here.touch.distance < -OWN_EDGE_DEEP * thickness) return;
+    auto take = [&](EdgeMeeting here) {
         if (comes_before(here, first)) {
             const EdgeMeeting last = first;
             first = here;
@@ -150,8 +143,12 @@ HOST_DEVICE int detect_edge(const SurfaceTables& c, const EdgeTables& e, const M
         }
         left += here.other >= 0 && here.touch.entry <= 1;
     };
-    each_facing_edge(c, e, m, body, edge, consider_edge);
-    own(consider_edge);
+    each_facing_edge(c, e, m, body, edge, [&](int other, int facing, double thickness) {
+        EdgeMeeting here = {other, facing, {}};
+        const double* held = held_by(c, e, edge, other, facing);
+        if (meet_edges(path, e.wings[edge], path_of(e, m, facing), e.wings[facing], thickness, 1e-2 * thickness, held, here.touch)) take(here);
+    });
+    own(take);
     if (first.other < 0 && c.obstacle[row] < 0 && c.obstacle[row + 1] < 0) return 0;  // the rows are empty already
     const RowMemory last[2] = {memory_of(c, row), memory_of(c, row + 1)};
     const int facing[2] = {e.facing[row - e.start[0]], e.facing[row + 1 - e.start[0]]};

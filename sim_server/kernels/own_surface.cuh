@@ -157,17 +157,78 @@ HOST_DEVICE bool passes_own(const SurfaceTables& c, const OwnTables& o, const Mo
 
 // --- edges ------------------------------------------------------------------------------------------------------------------------------
 
-// f(body, edge, thickness) of the sharp edges of the same body that come before this one, are not nearby, and may meet its way.
+// As `meet_edges` of edge_edge.cuh, but the side is that on which the edges are. Rims of a strip that lies on itself count, whose triangles
+// lean neither way. held: normal with which the edges bore each other in the last step, null: they did not.
+HOST_DEVICE bool meet_own_edges(const EdgePath& a, const EdgeWings& wa, const EdgePath& b, const EdgeWings& wb, double thickness,
+                                const double* held, EdgeTouch& touch) {
+    double u[3], v[3], n[3];
+    for (int k = 0; k < 3; ++k) {
+        u[k] = a.x[1][k] - a.x[0][k];
+        v[k] = b.x[1][k] - b.x[0][k];
+    }
+    for (int k = 0; k < 3; ++k) n[k] = u[(k + 1) % 3] * v[(k + 2) % 3] - u[(k + 2) % 3] * v[(k + 1) % 3];
+    if (!(make_unit(n) > PARALLEL * sqrt(dot3(u, u) * dot3(v, v)))) return false;
+    touch.distance = edges_apart(a, b, 0, touch);
+    touch.entry = NEVER;
+    const bool between = within_edge(touch.s) && within_edge(touch.t);
+    auto leans_away = [&](const double* normal) { return leans(wa, normal, 1, -FLAT_EDGE) && leans(wb, normal, -1, -FLAT_EDGE); };
+    if (between) {  // the nearest points lie along the common normal
+        if (dot3(n, held ? held : touch.normal) < 0)
+            for (int k = 0; k < 3; ++k) n[k] = -n[k];
+        if (dot3(n, touch.normal) < 0) touch.distance = -touch.distance;
+        for (int k = 0; k < 3; ++k) touch.normal[k] = n[k];
+    }
+    if (touch.distance <= thickness) {
+        if (!between || touch.distance < -thickness || (!held && !leans_away(n))) return false;
+        double rate = 0;
+        for (int k = 0; k < 3; ++k)
+            rate += n[k] * (a.way[0][k] + touch.s * (a.way[1][k] - a.way[0][k]) - b.way[0][k] - touch.t * (b.way[1][k] - b.way[0][k]));
+        if (rate < 0) touch.entry = 0;
+        return true;
+    }
+    EdgeTouch then;
+    const double time = entry_of_edges(a, b, thickness, 1e-2 * thickness, then);
+    if (time <= 1 && within_edge(then.s) && within_edge(then.t) && leans_away(then.normal)) {
+        then.entry = time;
+        then.distance = touch.distance;
+        touch = then;
+        return true;
+    }
+    return time > 1 && between && touch.distance < 2 * thickness && leans_away(touch.normal);
+}
+
+// True if the paths of two edges, whatever their triangles, take them through each other. touch: where they touch then.
+HOST_DEVICE bool own_edges_pass(const EdgePath& a, const EdgePath& b, double thickness, EdgeTouch& touch) {
+    EdgeTouch then;
+    const double through = THROUGH * thickness;
+    if (!(edges_apart(a, b, 0, touch) > through) || !(entry_of_edges(a, b, through, through, then) <= 1)) return false;
+    if (!within_edge(then.s) || !within_edge(then.t)) return false;  // vertices pass triangles there
+    touch.distance = edges_apart(a, b, 0, touch);
+    touch.entry = touch.distance > thickness ? entry_of_edges(a, b, thickness, 1e-2 * thickness, touch) : 0;
+    return touch.entry <= 1;
+}
+
+// f(other edge) of those of the same body that come before this one, are not nearby, and may meet its way.
 template <class Motion, class F>
 HOST_DEVICE void each_own_edge(const SurfaceTables& c, const EdgeTables& e, const OwnTables& o, const Motion& m, int body, int edge, F f) {
-    if (!e.wings[edge].sharp) return;
     const int* node = e.edge + 2 * edge;
     const double thickness = thickness_of(c, body);
     each_own_triangle(c, body, joined(box_of(m, node[0], thickness), box_of(m, node[1], thickness)), [&](int triangle) {
         for (int a = 0; a < 3; ++a) {
             const int facing = e.of_triangle[3 * triangle + a];
-            if (facing < 0 || facing >= edge || !e.wings[facing].sharp || are_nearby_edges(o, node, e.edge + 2 * facing)) continue;
-            f(body, facing, thickness);
+            if (facing >= 0 && facing < edge && !are_nearby_edges(o, node, e.edge + 2 * facing)) f(facing);
         }
+    });
+}
+
+// f(meeting) of the edges of the same body that an edge may touch in the step: of sharp ones, and of those that it bore on in the last step.
+template <class Motion, class F>
+HOST_DEVICE void meet_each_own_edge(const SurfaceTables& c, const EdgeTables& e, const OwnTables& o, const Motion& m, int body, int edge, F f) {
+    const EdgePath path = path_of(e, m, edge);
+    each_own_edge(c, e, o, m, body, edge, [&](int facing) {
+        const double* held = held_by(c, e, edge, body, facing);
+        if (!held && !(e.wings[edge].sharp && e.wings[facing].sharp)) return;
+        EdgeMeeting here = {body, facing, {}};
+        if (meet_own_edges(path, e.wings[edge], path_of(e, m, facing), e.wings[facing], thickness_of(c, body), held, here.touch)) f(here);
     });
 }

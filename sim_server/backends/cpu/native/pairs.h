@@ -67,9 +67,11 @@ struct PairDetection {
         });
     }
     int detect_edge_and_own(int body, int edge) const {
-        return detect_edge(tables, edges, motion, body, edge, [&](auto consider) {
+        return detect_edge(tables, edges, motion, body, edge, [&](auto take) {
             if (!(c.near[body] & MAY_TOUCH_ITSELF) || !own.edge_may_touch(edge, body, 2)) return;
-            each_own_edge(tables, edges, c.own.near, motion, body, edge, consider);
+            meet_each_own_edge(tables, edges, c.own.near, motion, body, edge, [&](const EdgeMeeting& here) {
+                if (!are_bound(edge, body, here.edge, body)) take(here);
+            });
         });
     }
 
@@ -183,16 +185,20 @@ struct PairDetection {
     }
     // f(other, facing, thickness, touch) of the edges that the solution takes an edge through, but for attached ones.
     template <class F> void each_edge_passed(int body, int edge, F f) const {
-        auto look = [&](int other, int facing, double thickness) {
+        each_facing_edge(tables, edges, motion, body, edge, [&](int other, int facing, double thickness) {
             if (are_bound(edge, body, facing, other)) return;
             const EdgePath path = path_of(edges, motion, edge), way = path_of(edges, motion, facing);
             EdgeTouch t;
             if (!edges_pass(path, c.wings[edge], way, c.wings[facing], THROUGH * thickness)) return;
             if (meet_edges(path, c.wings[edge], way, c.wings[facing], thickness, 1e-2 * thickness, nullptr, t)) f(other, facing, thickness, t);
-        };
-        each_facing_edge(tables, edges, motion, body, edge, look);
-        if (own.exists() && (c.near[body] & MAY_TOUCH_ITSELF) && own.edge_may_touch(edge, body, 1))
-            each_own_edge(tables, edges, c.own.near, motion, body, edge, look);
+        });
+        if (!own.exists() || !(c.near[body] & MAY_TOUCH_ITSELF) || !own.edge_may_touch(edge, body, 1)) return;
+        const EdgePath path = path_of(edges, motion, edge);
+        each_own_edge(tables, edges, c.own.near, motion, body, edge, [&](int facing) {
+            EdgeTouch t;
+            if (are_bound(edge, body, facing, body) || !own_edges_pass(path, path_of(edges, motion, facing), thickness_of(tables, body), t)) return;
+            f(body, facing, thickness_of(tables, body), t);
+        });
     }
     bool hold_edge(int body, int edge, double* y) const {
         bool found = false;
