@@ -28,7 +28,7 @@ from sim_server.scene.obstacles import FRICTION, Obstacle, check_contact_on, con
 from sim_server.scene.parameters import Count, Counts, File, Name, NotNegative, Parameters, Positive, Sizes, complaint
 from sim_server.scene.pose import Pose
 from sim_server.scene.solver_options import SolverOptions
-from sim_server.scene.ties import Attachment, Spring, check_ties_on, tie_errors
+from sim_server.scene.ties import Attachment, Spring, tie_errors
 
 
 class MeshSource(Parameters):
@@ -234,7 +234,6 @@ class Scene(Parameters):
         self.solver.check_device(device)
         self.integrator.check_device(device)
         check_holders_on(device, self.holders or [], self.integrator)
-        check_ties_on(device, self.attachments or [], self.springs or [])
         if "contact" in self.effects:
             check_contact_on(device, self.effects["contact"], self.integrator)
 

@@ -7,7 +7,6 @@ from typing import Annotated, Any
 from pydantic import Field
 from pydantic_core import InitErrorDetails
 
-from sim_server.errors import InputError
 from sim_server.scene.integrator_options import IntegratorOptions
 from sim_server.scene.parameters import Name, NotNegative, Parameters, Positive, Vector, Where, complaint, nearest
 
@@ -71,13 +70,6 @@ def tie_errors(
         found = f"{integrator.scheme!r} with linearizations = {integrator.linearizations}"
         text = f"integrator.scheme = {found}; allowed: 'backward_euler' with linearizations = 1"
         yield _error(text, *kinds[0][:2])
-
-
-def check_ties_on(device: str, attachments: Sequence[Attachment], springs: Sequence[Spring]) -> None:
-    """Raises InputError for attachments and springs on a device ("cpu" or "gpu") that does not have them."""
-    if device == "gpu" and (attachments or springs):
-        names = [a.name for a in attachments] + [s.name for s in springs]
-        raise InputError(f"{names[0]!r}: attachments and springs are for CPUs; allowed: --device cpu")
 
 
 def _error(message: str, *place: Any) -> InitErrorDetails:

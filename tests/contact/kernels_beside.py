@@ -123,7 +123,7 @@ class System(c.Structure):
 SHORTER = {"device_contact.cuh": ["CONTACT_THREADS"], "island_state.cuh": ["LISTING_THREADS", "SEARCH_THREADS"]}
 
 
-def compiled(folder: Path, text: str) -> c.CDLL:
+def compiled(folder: Path, text: str, *options: str) -> c.CDLL:
     """Compiles a text that includes kernels of contact, whose thread blocks have THREADS here."""
     for name, numbers in SHORTER.items():
         header = (SOURCES / "backends/gpu" / name).read_text()
@@ -131,12 +131,12 @@ def compiled(folder: Path, text: str) -> c.CDLL:
             header, found = re.subn(rf"{number} = \d+", f"{number} = {THREADS}", header)
             assert found == 1
         (folder / name).write_text(header)
-    for name in ("contact.cu", "pairs.cu", "island.cu"):
+    for name in ("contact.cu", "pairs.cu", "island.cu", "ties.cu"):
         (folder / name).write_text((SOURCES / "backends/gpu" / name).read_text())
     (folder / "kernels.cpp").write_text(text)
     paths = [f"-I{p}" for p in (folder, TESTS / "backends", SOURCES / "backends/gpu", INCLUDE)]
     command = [compiler(), "-std=c++20", "-O1", "-shared", "-fPIC", "-Dreal=double", *paths]
-    subprocess.run([*command, str(folder / "kernels.cpp"), "-o", str(folder / "kernels.so")], check=True)
+    subprocess.run([*command, *options, str(folder / "kernels.cpp"), "-o", str(folder / "kernels.so")], check=True)
     return c.CDLL(str(folder / "kernels.so"))
 
 
@@ -198,11 +198,13 @@ class Beside:
             real=np.dtype(float), pool_counter=as_device(np.zeros(1, np.uint32)), results=self.results,
             counter=self.counter, bodies_device=self.bodies.ctypes.data,
         )  # fmt: skip
+        self.broken = np.zeros(len(self.contact.ties.broken) if self.contact.ties else 0, np.int32)
         device: Any = SimpleNamespace(repeat=lambda flag: nullcontext(), branch=lambda flag: nullcontext())
         gpu: Any = self.gpu
         self.passes = ContactPasses(
-            gpu, device, self.contact, given.ranges, given.arrays, solver, self.balance, self.told, self.reactions
-        )
+            gpu, device, self.contact, given.ranges, given.arrays, solver, self.balance, self.told, self.reactions,
+            self.broken,
+        )  # fmt: skip
         self.arrays, self.ranges = given.arrays, np.array(given.ranges, np.int32)
         self.bodies["first"], self.bodies["nodes"] = self.ranges[:, 0], np.diff(self.ranges)[:, 0]
         own = sim.scene.solver

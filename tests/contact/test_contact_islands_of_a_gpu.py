@@ -57,12 +57,10 @@ static void group(const IslandArguments& a, const Islands& s, int swept) {
     each(s.bodies, [&] { list_island_rows(a, swept); });
     launch(1, LISTING_THREADS, [&] { find_islands(a, swept); });
 }
-extern "C" void detect_pairs(const IslandArguments* p, const Islands* s) {
-    const IslandArguments& a = *p;
-    each(s->bodies, [&] { pair_boxes(a, 0); });
-    each(s->bodies, [&] { pair_trees(a, 0); });
-    each(s->sites, [&] { pair_sites(a); });
-    group(a, *s, 0);
+static void detect_pairs(const IslandArguments& a, const Islands& s) {
+    each(s.bodies, [&] { pair_boxes(a, 0); });
+    each(s.bodies, [&] { pair_trees(a, 0); });
+    each(s.sites, [&] { pair_sites(a); });
 }
 extern "C" int solve_islands(const IslandArguments* p, const Islands* s) {
     const IslandArguments& a = *p;
@@ -79,16 +77,18 @@ extern "C" int solve_islands(const IslandArguments* p, const Islands* s) {
             }
             for (; a.tally->active && loops < 500; ++loops) island_pass(a, *s);
         }
-        each(s->bodies, [&] { pair_boxes(a, 1); });
-        each(s->bodies, [&] { pair_trees(a, 1); });
-        each(s->sites, [&] { pair_sweep(a); });
+        if (s->sites) {
+            each(s->bodies, [&] { pair_boxes(a, 1); });
+            each(s->bodies, [&] { pair_trees(a, 1); });
+            each(s->sites, [&] { pair_sweep(a); });
+        }
         launch(1, 1, [&] { end_sweep(a); });
         if (a.tally->go) group(a, *s, 1);
     }
     return loops;
 }
 extern "C" void keep_pairs_of_step(const IslandArguments* p, const Islands* s) {
-    each(s->bodies, [&] { keep_pairs(*p); });
+    if (s->sites) each(s->bodies, [&] { keep_pairs(*p); });
     each(s->grid, [&] { pair_work(*p); });
 }
 extern "C" void know_pairs_of_step(const IslandArguments* p, const Islands* s) {
@@ -99,7 +99,8 @@ STEP = """
 extern "C" int step(const ContactArguments* c, const ContactSolve* first, const ContactSolve* pass, const System* s,
                     const IslandArguments* a, const Islands* islands) {
     int loops = 0;
-    detect_pairs(a, islands);
+    detect_pairs(*a, *islands);
+    group(*a, *islands, 0);
     launch(s->bodies, CONTACT_THREADS, [&] { begin_contact(*c); });
     for (one_pass(*c, *first, *s); *c->active > 0 && loops < 200; ++loops) one_pass(*c, *pass, *s);
     solve_islands(a, islands);

@@ -181,7 +181,6 @@ def test_nearest_points_of_triangles_are_those_of_many_samples():
         ({"attachment": [glue(where="X > 0.9")]}, "since what is attached is drawn together"),
         ({"attachment": [glue(), glue()]}, "more than once: glue"),
         ({"attachment": [glue()], "integrator": {"scheme": "newmark"}}, "allowed: 'backward_euler'"),
-        ({"attachment": [glue()], "device": "gpu"}, "attachments and springs are for CPUs"),
         ({"spring": [{"name": "s", "between": [{"object": "a", "at": [0, 0, 0]}] * 2, "stiffness": 1.0}]}, "needs two"),
     ],
 )

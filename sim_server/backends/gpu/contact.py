@@ -62,6 +62,7 @@ class ContactPasses:
     balance: energy balances of the bodies on the device, which get the work of contact
     results, reactions: host memory (capacity, bodies) of CONTACT_RESULT and (capacity, bodies, obstacles, 6) that the
         steps write to
+    broken: likewise (ties,) of int32, steps completed when one broke
 
     Tests run its kernels with what it keeps: grid (thread blocks), params (arguments of the kernels), first and later
     (of the solver, in the first solve of a step and in passes), active (bodies that are not over), memory (arrays by
@@ -71,7 +72,7 @@ class ContactPasses:
     def __init__(
         self, gpu: Gpu, device: Graphs, contact: Contact, ranges: Sequence[tuple[int, int]],
         arrays: Mapping[str, NDArray[Any]], solver: PcgSolver, balance: DeviceArray, results: NDArray[Any],
-        reactions: Float64,
+        reactions: Float64, broken: Int32,
     ):  # fmt: skip
         cp, nodes, self._bodies = gpu.cp, len(arrays["x"]), len(ranges)
         self._gpu, self._device, self._solver, self.active = gpu, device, solver, cp.zeros(1, np.int32)
@@ -100,8 +101,9 @@ class ContactPasses:
         self._table = {n: gpu.twin(a, dtype=a.dtype) for n in TABLE for a in [getattr(contact.obstacles, n)]}
         self.params = self._arguments(contact, results, reactions)
         self.islands: IslandPasses | None = None
-        if contact.surfaces:
-            self.islands = IslandPasses(gpu, device, contact, ranges, arrays, solver, self.params, chunks, THREADS)
+        if contact.surfaces or contact.ties:
+            given = gpu, device, contact, ranges, arrays, solver, self.params, chunks, THREADS, broken
+            self.islands = IslandPasses(*given)
         self.first, self.later = self._solve(contact, 1), self._solve(contact, 0)
         module = cp.RawModule(
             code=TEXT.checked(), options=(*options(gpu.types), *own_headers()), backend="nvrtc"
@@ -140,6 +142,7 @@ class ContactPasses:
     def begin(self) -> None:
         """Appends what comes before the first solve of a step whose rows are detected."""
         if self.islands:
+            self.islands.begin_ties()
             self.islands.group()
         self._launch("begin_contact", self._bodies)
         self._launch("contact_forces", self.grid)
@@ -157,6 +160,7 @@ class ContactPasses:
         self._launch("finish_contact", self.grid)
         if self.islands:
             self.islands.know(self.memory["values"])
+            self.islands.keep_ties()
 
     def _solve_and_search(self, solve: NDArray[Any]) -> None:
         self._solver.solve_contact(self.memory["contact_b"], solve)

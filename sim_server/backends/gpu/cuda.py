@@ -47,7 +47,7 @@ class CudaDevice:
 
     def pinned(self, size: int) -> NDArray[np.uint8]:
         """Allocates page-locked host memory, set to zero."""
-        memory = self.cp.cuda.alloc_pinned_memory(size)
+        memory = self.cp.cuda.alloc_pinned_memory(max(size, 1))
         self._kept.append(memory)
         array = np.frombuffer(memory, np.uint8, size)
         array[:] = 0

@@ -105,7 +105,7 @@ class GpuEngine(DeviceLoop):
         phases = NewtonPhases.initial(gpu, bodies) if newton else None
         self.solver = PcgSolver(
             gpu, ranges, arrays, self._counter, CAPACITY, planes, phases or (), ATTEMPTS if stages else 0,
-            given.contact is not None, given.contact is not None and given.contact.surfaces is not None,
+            given.contact is not None, given.contact is not None and bool(given.contact.surfaces or given.contact.ties),
         )  # fmt: skip
         self._newton, newton_results = None, None
         if newton and phases:
@@ -114,15 +114,18 @@ class GpuEngine(DeviceLoop):
             newton = Newton(newton.options, newton.dx_dv, parts, **newton.arrays)
             self._newton = NewtonIteration(gpu, newton, assemble, ranges, arrays, phases, self.solver, newton_results)
         self._contact, contact_results, reactions = None, None, None
+        self._ties = given.contact.ties if given.contact else None
         if given.contact:
+            self._broken = device.pinned(4 * len(self._ties.broken) if self._ties else 0).view(np.int32)
             contact_results = device.pinned(CAPACITY * CONTACT_RESULT.itemsize * bodies)
             obstacles = len(given.contact.obstacles.kind)
             reactions = device.pinned(CAPACITY * bodies * obstacles * 48).view(np.float64)
             reactions = reactions.reshape(CAPACITY, bodies, obstacles, 6)
             balance = self._energies.balance
             self._contact = ContactPasses(
-                gpu, device, given.contact, ranges, arrays, self.solver, balance, contact_results, reactions
-            )
+                gpu, device, given.contact, ranges, arrays, self.solver, balance, contact_results, reactions,
+                self._broken,
+            )  # fmt: skip
             if self._contact.islands:
                 self._whole_assembly = [*self._whole_assembly, self._contact.islands.detect]
                 self._first_launches = self._whole_assembly
@@ -380,4 +383,6 @@ class GpuEngine(DeviceLoop):
         """Returns the records since the last call, oldest first, and reactions of obstacles (Reports); also begins to
         build inverses that were queued."""
         self._factor_upload.advance()
+        if self._ties:
+            self._ties.broken[:] = self._broken
         return super().records_and_reactions()

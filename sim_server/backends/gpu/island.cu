@@ -9,6 +9,8 @@
 #include "island_state.cuh"
 #include "invert3.cuh"
 
+constexpr int ROW_SUMS = HAS_TIES ? 2 : 1;  // rows whose state is not that of the set, and those that are no ties
+
 enum Evaluation { WARM_START = 0, ZERO_START = 1, LAW_AT_START = 2, LAW = 3 };  // what rows are evaluated for
 
 __device__ __forceinline__ bool takes_part(int phase, int what) { return phase == (what == LAW ? ISLAND_READY : ISLAND_BEGINS); }
@@ -138,7 +140,7 @@ __device__ __forceinline__ void point_displacement(const IslandArguments& a, int
         }
         for (int k = 0; k < 3; ++k) s[k] += weight * a.c.dx_dv * ((double)a.c.predictor[3ll * node + k] + u[k]);
     };
-    if (!is_pair(a, r)) return add(a.c.node[r], 1);
+    if (r < a.t.pair_first) return add(a.c.node[r], 1);
     for (int k = 0; k < CORNERS; ++k)
         if (a.t.corner[CORNERS * r + k] >= 0) add(a.t.corner[CORNERS * r + k], a.t.weight[CORNERS * r + k]);
 }
@@ -146,12 +148,28 @@ __device__ __forceinline__ void point_displacement(const IslandArguments& a, int
 __device__ __forceinline__ void set_lever(const IslandArguments& a, int r, double* lever) {
     for (int k = 0; k < 8; ++k) lever[k] = 0;
     each_corner(a, r, [&](int node, double weight, int corner) {
-        double* side = lever + 4 * (corner > 0);
+        const bool other = is_other_side(a, r, corner);
+        double* side = lever + 4 * other;
         double arm[3];
-        arm_of(a, body_of_row(a, r, corner > 0), node, arm);
+        arm_of(a, body_of_row(a, r, other), node, arm);
         side[0] += weight;
         for (int k = 0; k < 3; ++k) side[1 + k] += weight * arm[k];
     });
+}
+
+// The law of a row: its force at displacement s, as evaluate, its slope times h^2, and the force alone.
+__device__ __forceinline__ void evaluate_row(const IslandArguments& a, int r, const double* s, bool hold, bool set) {
+    if (!is_tie(a, r)) return evaluate(a.c, r, s, hold, set);
+    for (int k = 0; k < 3; ++k) a.c.row[r].s[k] = s[k];
+    a.c.row[r].force = force_of_tie(a.ties, r - a.ties.first, s);
+}
+__device__ __forceinline__ void set_stiffness(const IslandArguments& a, int r, const ContactRow& row, const ContactForce& force, double* k) {
+    const double scale = a.c.dx_dv * a.c.force_coefficient;
+    if (is_tie(a, r)) stiffness_of_tie(a.ties, r - a.ties.first, scale, k);
+    else contact_stiffness(row, force, scale, k);
+}
+__device__ __forceinline__ ContactForce force_of_row(const IslandArguments& a, int r, const double* s, double limit) {
+    return is_tie(a, r) ? force_of_tie(a.ties, r - a.ties.first, s) : contact_force(row_at(a.c, r), s, limit, false);
 }
 
 // A thread block has a body: forces and stiffness of its rows.
@@ -163,8 +181,8 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_law(const I
     if (state.relist) list_own_rows(a, body);
     __syncthreads();
     const int rows = __ldcg(a.own_rows + body);
-    const int* list = a.own_row + 2 * a.t.body_start[body];
-    double earliest = NEVER, changed[1] = {0};
+    const int* list = a.own_row + own_start(a, body);
+    double earliest = NEVER, changed[ROW_SUMS] = {};
     if (what == WARM_START)
         for (int k = 0; k < state.bodies; ++k) earliest = fmin(earliest, a.earliest[a.island[a.island_start[island] + k]]);
     for (int k = threadIdx.x; k < rows; k += CONTACT_THREADS) {
@@ -173,26 +191,27 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_law(const I
         IslandRow& own = a.row[r];
         if (what == WARM_START) {  // rows that count as closed in the first pass
             row.limit = a.c.force[r];
-            row.in_set = a.c.force[r] > 0 || (a.c.entry[r] <= 1 && a.c.entry[r] <= earliest + FIRST);
+            row.in_set = is_tie(a, r) || a.c.force[r] > 0 || (a.c.entry[r] <= 1 && a.c.entry[r] <= earliest + FIRST);
             for (int m = 0; m < 6; ++m) own.known[m] = 0;
-            if (a.c.force[r] > 0)
-                contact_stiffness(row_at(a.c, r), lasting_contact(a.c.friction[r], a.c.force[r], a.c.traction + 3 * r),
-                                  a.c.dx_dv * a.c.force_coefficient, own.known);
+            if (is_tie(a, r) || a.c.force[r] > 0)
+                set_stiffness(a, r, row_at(a.c, r), lasting_contact(a.c.friction[r], a.c.force[r], a.c.traction + 3 * r), own.known);
         }
         double s[3];
         point_displacement(a, r, what == ZERO_START || (what == LAW_AT_START && state.zero), s);
         const ContactRow given = row_at(a.c, r);
-        evaluate(a.c, r, s, what == LAW && state.hold, what == LAW ? state.set : what != LAW_AT_START);
+        evaluate_row(a, r, s, what == LAW && state.hold, what == LAW ? state.set : what != LAW_AT_START);
         for (int m = 0; m < 3; ++m)
             own.impulse[m] = a.c.force_coefficient * (row.force.normal * a.c.normal[3 * r + m] + row.force.traction[m]);
         if (what != LAW) continue;
-        contact_stiffness(given, row.force, a.c.dx_dv * a.c.force_coefficient, own.stiffness);
+        set_stiffness(a, r, given, row.force, own.stiffness);
         set_lever(a, r, own.lever);
+        if (is_tie(a, r)) continue;
         changed[0] += state.set && row.in_set != (int)contact_force(given, s, 0, false).closed;
+        if (HAS_TIES) changed[ROW_SUMS - 1] += 1;
     }
     if (what != LAW) return;
     sum_block(changed);
-    if (threadIdx.x == 0) a.row_sums[body] = changed[0];
+    for (int k = 0; threadIdx.x == 0 && k < ROW_SUMS; ++k) a.row_sums[k * a.bodies_count + body] = changed[k];
 }
 
 // A thread has a node: r0 = left + i H^T f; squares of it, of b + i H^T f and of b.
@@ -238,10 +257,11 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_decide(cons
         return;
     }
     if (!takes_part(s.phase, what)) return;
-    double sum[CG_SUMS], changed[1] = {0};
+    double sum[CG_SUMS], changed[ROW_SUMS] = {};
     sum_island(a, island, a.chunk_sums, sum);
     if (what == LAW) {
-        for (int k = threadIdx.x; k < s.bodies; k += CONTACT_THREADS) changed[0] += a.row_sums[a.island[a.island_start[island] + k]];
+        for (int k = threadIdx.x; k < s.bodies; k += CONTACT_THREADS)
+            for (int n = 0; n < ROW_SUMS; ++n) changed[n] += a.row_sums[n * a.bodies_count + a.island[a.island_start[island] + k]];
         sum_block(changed);
     }
     if (threadIdx.x > 0) return;
@@ -260,7 +280,8 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_decide(cons
         s.relist = s.hold = 0;
         const bool by_law = !s.set || changed[0] == 0, well = s.residual <= tolerance_of(a.c.tolerance, s.rested, s.passes, a.passes), was_last = s.last;
         const double goal2 = body.tolerance * body.tolerance * given2;
-        s.last = by_law && size2 <= tolerance2 * given2;
+        const bool linear = HAS_TIES && changed[ROW_SUMS - 1] == 0;  // the law is linear where there are ties alone
+        s.last = by_law && (linear || size2 <= tolerance2 * given2);
         if (!isfinite(size2)) {
             s.phase = ISLAND_LOST;
             s.status = NOT_FINITE;
@@ -340,7 +361,7 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) coarse_matrix(cons
         E[k / MODES * a.most_modes + mode + k % MODES] = sum;
     }
     const int pairs = a.tally->pairs, own = __ldcg(a.own_rows + body) - __ldcg(a.pair_rows + body);  // first those against obstacles
-    const int* list = a.own_row + 2 * a.t.body_start[body];
+    const int* list = a.own_row + own_start(a, body);
     for (int from = 0; from < own + pairs; from += CONTACT_THREADS) {
         // the rows among the next ones that touch the body
         const int k = from + me;
@@ -351,7 +372,8 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) coarse_matrix(cons
             row = pair[0];
             which = pair[2] == body;
             mine = pair[1] == body || which;
-            if (mine) mode_there = a.mode[pair[which ? 1 : 2]];
+            const int there = pair[which ? 1 : 2];
+            if (mine && (!HAS_TIES || there >= 0)) mode_there = a.mode[there];
         }
         __syncthreads();
         before[me] = mine;
@@ -501,7 +523,7 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_multiply(co
         return;
     }
     const int rows = a.own_rows[body];
-    const int* list = a.own_row + 2 * a.t.body_start[body];
+    const int* list = a.own_row + own_start(a, body);
     for (int k = threadIdx.x; k < rows; k += CONTACT_THREADS) {
         IslandRow& row = a.row[list[k]];
         double u[3] = {0, 0, 0}, f[3];
@@ -714,7 +736,7 @@ __device__ double search_along(const IslandArguments& a, int island, int bodies,
     return minimum_along([&](double part) {
         double work[1] = {0};
         for (int m = warp; m < bodies; m += SEARCH_THREADS / 32) {
-            const int rows = a.own_rows[members[m]], *list = a.own_row + 2 * a.t.body_start[members[m]];
+            const int rows = a.own_rows[members[m]], *list = a.own_row + own_start(a, members[m]);
             for (int k = lane; k < rows; k += 32) {
                 const int r = list[k];
                 const DeviceRow& row = a.c.row[r];
@@ -723,7 +745,7 @@ __device__ double search_along(const IslandArguments& a, int island, int bodies,
                     step[n] = a.c.dx_dv * a.row[r].seen[n];
                     at[n] = row.s[n] + part * step[n];
                 }
-                const ContactForce f = contact_force(row_at(a.c, r), at, row.limit, false);
+                const ContactForce f = force_of_row(a, r, at, row.limit);
                 work[0] += f.normal * dot3(a.c.normal + 3 * r, step) + dot3(f.traction, step);
             }
         }
@@ -846,7 +868,7 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) know_pairs(const I
         if (s[0] == 0 && s[3] == 0 && s[5] == 0) continue;
         const double S[9] = {s[0], s[1], s[2], s[1], s[3], s[4], s[2], s[4], s[5]};
         each_corner(a, r, [&](int node, double weight, int c) {
-            if ((c > 0) != (corner > 0)) return;  // of another body
+            if (is_other_side(a, r, c) != is_other_side(a, r, corner)) return;
             int k = a.row_start[i];
             while (k < a.row_start[i + 1] && a.columns[k] != node) ++k;
             if (k == a.row_start[i + 1]) return;
@@ -885,7 +907,8 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) pair_work(const Is
     const NodeChunk here = a.c.chunks[blockIdx.x];
     const int island = island_of(a, here.body), i = here.begin + threadIdx.x;
     double sum[2] = {0, 0};
-    if (island >= 0 && i < here.end && a.c.free[i] != 0) {
+    const bool well = !HAS_TIES || a.c.results[(a.c.step[0] % a.c.capacity) * a.bodies_count + here.body].status != NOT_FINITE;
+    if (island >= 0 && well && i < here.end && a.c.free[i] != 0) {
         double s[3], y[3], u[3];
         load3(a.c.y, i, y);
         rotated(rotation_of(a, i), y, u);
@@ -893,9 +916,10 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) pair_work(const Is
         const int first = a.start[i], last = first + a.count[i];
         for (int e = first; a.count[i] && e < last; ++e) {
             const int entry = a.entry[e], r = entry / CORNERS;
-            if (!(a.t.force[r] > 0)) continue;
+            if (!is_tie(a, r) && !(a.t.force[r] > 0)) continue;
             double f[3];
-            for (int k = 0; k < 3; ++k) f[k] = a.t.force[r] * a.t.normal[3 * r + k] + a.t.traction[3 * r + k];
+            for (int k = 0; k < 3; ++k)
+                f[k] = is_tie(a, r) ? a.c.row[r].force.traction[k] : a.t.force[r] * a.t.normal[3 * r + k] + a.t.traction[3 * r + k];
             sum[1] += a.t.weight[entry] * dot3(f, s);
         }
     }

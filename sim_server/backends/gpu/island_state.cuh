@@ -4,7 +4,7 @@
 // Bodies with rows between them are solved as one system (method: backends/cpu/native/passes.h, island.h); the others go on as
 // contact_state.cuh says. A step with such bodies is
 //
-//     detection: pair_boxes, pair_trees, pair_sites
+//     detection: pair_boxes, pair_trees, pair_sites; begin_ties where there are attachments or springs (ties.cu)
 //     look_at_bodies, list_island_rows, find_islands, then the bodies that are alone
 //     while there is something to do (conditions.py):
 //         if there are islands to solve:
@@ -17,9 +17,18 @@
 //
 // All islands go in step; a kernel does nothing for those that are in another phase. Sums have a fixed order: of thread blocks, which
 // leave theirs in arrays, and of these in the kernel that reads them. What acts at a node is a list, sorted by row.
+//
+// With TIES, attachments and springs have rows after all others; a body that has one is solved here even if it is alone.
 #pragma once
 #include "device_contact.cuh"
 #include "pair_detection.cuh"
+#include "ties.cuh"
+
+#ifdef TIES
+constexpr bool HAS_TIES = true;
+#else
+constexpr bool HAS_TIES = false;
+#endif
 
 constexpr int MODES = 6;          // rigid motions of a body: translations, then rotations about its first node
 constexpr int CG_SUMS = 9;        // of an iteration
@@ -103,12 +112,12 @@ struct IslandArguments {
     int* mode;                   // (bodies,) its first mode in the island; -1: it has none
     int *island_start, *island;  // (bodies + 1,), (bodies,) bodies by island
     int* free_body;              // (bodies,) likewise those with modes, from island_start on
-    int *own_row, *own_rows, *pair_rows;  // (rows,) rows of each body that are not empty, from twice body_start on; their number; of pairs
+    int *own_row, *own_rows, *pair_rows;  // (rows,) rows of each body that are not empty, from own_start on; their number; of pairs and ties
     double* earliest;            // (bodies,) entry of its rows
     IslandRow* row;              // (rows,)
-    int* pair_list;              // (rows between bodies, 3) row and its bodies, those in use
+    int* pair_list;              // (rows between bodies, 3) row and its bodies, those in use; -1: a tie of one body
     int *count, *start, *cursor; // (nodes,) entries of a node
-    int* entry;                  // 4 row + corner, of rows between bodies; those of a node together and sorted
+    int* entry;                  // 4 row + corner, of rows between bodies and ties; those of a node together and sorted
     double *left, *r0, *r, *x, *p, *q, *z, *az;  // (nodes, 3) b - A y; right-hand side of the pass; conjugate gradients
     double* solution_product;    // (nodes, 3) A dy
     unsigned* finished_chunks;   // (bodies,) of islands, zero between launches
@@ -118,33 +127,58 @@ struct IslandArguments {
     double* chunk_sums;          // (grid, CG_SUMS)
     double* coarse_sums;         // (grid, MODES) Z^T (r - A z)
     double* base_sums;           // (grid, BASE_SUMS)
-    double* row_sums;            // (bodies,)
+    double* row_sums;            // (bodies,) rows that change; with ties (2, bodies), and those that are none
     double *coarse_a, *coarse_b; // (bodies, MODES, most_modes) rows of E, while it is inverted from one to the other
     int* coarse_well;            // (bodies,) of islands: 1: E is positive definite
     double* coefficient;         // (bodies, MODES)
-    int bodies_count, most_modes, most_chunks, highest_tree, passes, unused;
+    int bodies_count, most_modes, most_chunks, highest_tree, passes, bound_nodes;
+    Ties ties;                   // ties.first is the number of rows where there are none
+    const int *bound_node, *bound_start;    // (bound_nodes,), (bound_nodes + 1,) nodes that may be bound, and first ties of each
+    const int *bound_tie, *bound_other;     // those ties in order, and the bodies that they bind the node to
+    const int* table_start;      // (tables + 1,) first ones in ties.order
+    int* broken_on_host;         // (ties,)
 };
 
 typedef SurfaceMotion<real, local> Motion;
 
 __device__ __forceinline__ int island_of(const IslandArguments& a, int body) { return __ldcg(a.island_of + body); }
 
+__device__ __forceinline__ bool is_tie(const IslandArguments& a, int row) { return HAS_TIES && row >= a.ties.first; }
+
+// Whether it is a row between two bodies.
+__device__ __forceinline__ bool is_pair(const IslandArguments& a, int row) {
+    return is_tie(a, row) ? joins_bodies(a.ties, row - a.ties.first) : row >= a.t.pair_first;
+}
+// True if a corner of a row is of the other one of its two bodies.
+__device__ __forceinline__ bool is_other_side(const IslandArguments& a, int row, int corner) {
+    return corner > 0 && (!HAS_TIES || is_pair(a, row));
+}
 // Body of a row's vertex; other: that of its triangle, of a row between bodies.
-__device__ __forceinline__ bool is_pair(const IslandArguments& a, int row) { return row >= a.t.pair_first; }
 __device__ __forceinline__ int body_of_row(const IslandArguments& a, int row, bool other) {
+    if (is_tie(a, row)) return a.ties.body[2 * (row - a.ties.first) + other];
     return other ? __ldcg(a.t.obstacle + row) : a.t.site_body[(is_pair(a, row) ? row - a.t.pair_first : row) / 2];
+}
+// True if there are rows of contact between bodies.
+__device__ __forceinline__ bool bodies_touch(const IslandArguments& a) { return !HAS_TIES || a.t.pair_first < a.ties.first; }
+// True if a node is attached to a body: the two do not touch.
+__device__ __forceinline__ bool is_bound(const IslandArguments& a, int node, int body) {
+    return HAS_TIES && a.ties.bound[node] == body + 1;
+}
+__device__ __forceinline__ int own_start(const IslandArguments& a, int body) {
+    return 2 * a.t.body_start[body] + (HAS_TIES ? a.ties.start[body] : 0);
 }
 
 // f(first, last) of the rows of a body's own vertices.
 template <class F> __device__ __forceinline__ void each_range(const IslandArguments& a, int body, F f) {
     const int first = a.t.body_start[body], last = a.t.body_start[body + 1];
     f(first, last);
-    f(a.t.pair_first + first, a.t.pair_first + last);
+    if (bodies_touch(a)) f(a.t.pair_first + first, a.t.pair_first + last);
+    if (HAS_TIES) f(a.ties.first + a.ties.start[body], a.ties.first + a.ties.start[body + 1]);
 }
 
 // f(node, weight, corner) of the corners that may move.
 template <class F> __device__ __forceinline__ void each_corner(const IslandArguments& a, int row, F f) {
-    if (!is_pair(a, row)) {
+    if (row < a.t.pair_first) {
         const int node = a.c.node[row];
         if (a.c.free[node] != 0) f(node, 1.0, 0);
         return;
@@ -171,11 +205,11 @@ __device__ __forceinline__ void stiff(const double* k, const double* u, double* 
     out[2] = k[2] * u[0] + k[4] * u[1] + k[5] * u[2];
 }
 
-// Lists the rows of a body that are not empty, in order, and counts them, and those between bodies, which come last. Done by a whole
-// thread block.
+// Lists the rows of a body that are not empty, in order, and counts them, and those that are not against obstacles, which come last. Done
+// by a whole thread block.
 __device__ void list_own_rows(const IslandArguments& a, int body) {
     __shared__ int before[CONTACT_THREADS];
-    int listed = 0, against = 0;
+    int listed = 0, against = -1;
     each_range(a, body, [&](int first, int last) {
         const int each = (last - first + CONTACT_THREADS - 1) / CONTACT_THREADS;
         const int begin = min(first + (int)threadIdx.x * each, last), end = min(begin + each, last);
@@ -190,11 +224,11 @@ __device__ void list_own_rows(const IslandArguments& a, int body) {
             before[threadIdx.x] += other;
             __syncthreads();
         }
-        int* to = a.own_row + 2 * a.t.body_start[body] + listed + before[threadIdx.x] - own;
+        int* to = a.own_row + own_start(a, body) + listed + before[threadIdx.x] - own;
         for (int r = begin; r < end; ++r)
             if (__ldcg(a.t.obstacle + r) >= 0) *to++ = r;
-        against = listed;
         listed += before[CONTACT_THREADS - 1];
+        if (against < 0) against = listed;
         __syncthreads();
     });
     if (threadIdx.x > 0) return;

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: MIT
-"""Bodies that touch each other on a GPU (island_state.cuh): memory and launches of detection and of the solves."""
+"""Bodies that touch each other, or are tied, on a GPU (island_state.cuh): memory and launches of detection and of the
+solves."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -15,14 +16,17 @@ from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction
 from sim_server.backends.gpu.device import Gpu, compiled, options, own_headers
 from sim_server.backends.gpu.energies import node_chunks
 from sim_server.backends.gpu.solver import PcgSolver
+from sim_server.backends.gpu.tie_arguments import tie_arguments
 
 PAIRS, ISLAND = Declarations("backends/gpu/pairs.cu"), Declarations("backends/gpu/island.cu")
+TIES = Declarations("backends/gpu/ties.cu")
 ISLAND_ARGUMENTS = ISLAND.dtype("IslandArguments")
 SIZES = {name: ISLAND.dtype(name).itemsize for name in ("IslandState", "IslandRow", "Box")}
 TALLY = ISLAND.dtype("Tally")
 MODES, CG_SUMS, BASE_SUMS = (ISLAND.constant(name) for name in ("MODES", "CG_SUMS", "BASE_SUMS"))
 LISTING, SEARCH = PAIRS.constant("LISTING_THREADS"), ISLAND.constant("SEARCH_THREADS")  # of a thread block
 WARM_START, ZERO_START, LAW_AT_START, LAW = ISLAND.enumeration("Evaluation").values()
+KERNELS_OF_TIES = ("begin_ties", "keep_ties")
 MOST_MODES = 600  # of the coarse space of an island of bodies
 DETECTION = (
     "pair_boxes", "pair_trees", "pair_sites", "pair_sweep", "end_sweep", "look_at_bodies", "list_island_rows",
@@ -68,13 +72,14 @@ def leaves_before(surfaces: Surfaces) -> Int32:
 
 
 class IslandPasses:
-    """Launches detection between bodies, and the solves of bodies that touch each other.
+    """Launches detection between bodies, and the solves of bodies that touch each other or have attachments or springs.
 
-    contact: rows, and options; its `surfaces` are there
+    contact: rows, and options; its `surfaces`, its `ties` or both are there
     ranges: nodes [first, last) of each body
     arrays: host arrays by name
     shared: arrays and arguments of contact.cu: memory by name, params, chunks
     threads: of a thread block
+    broken: host memory (ties,) of int32 that the steps write to: steps completed when a tie broke
 
     Tests run its kernels with what it keeps: params (arguments of all kernels), memory (arrays by name), tally,
     pivots (steps of an inversion), product_grid (thread blocks of the product with A), vertex_grid (of detection).
@@ -83,31 +88,34 @@ class IslandPasses:
     def __init__(
         self, gpu: Gpu, device: Graphs, contact: Contact, ranges: Sequence[tuple[int, int]],
         arrays: Mapping[str, NDArray[Any]], solver: PcgSolver, params: NDArray[Any], chunks: NDArray[Any], threads: int,
+        broken: Int32,
     ):  # fmt: skip
-        assert contact.surfaces is not None
-        surfaces, ints, doubles = contact.surfaces, np.int32, np.float64
+        surfaces, ties, ints, doubles = contact.surfaces, contact.ties, np.int32, np.float64
+        self._touching, self._ties = surfaces is not None, ties
         cp, bodies, rows, nodes = gpu.cp, len(ranges), len(contact.obstacle), len(arrays["x"])
         self._device, self._solver, self._threads, self._bodies = device, solver, threads, bodies
-        self._grid, self.vertex_grid = len(chunks), -(-len(surfaces.site_body) // (threads // 32))
+        sites = int(contact.body_start[-1]) // 2
+        self._grid, self.vertex_grid = len(chunks), -(-sites // (threads // 32))
         free = np.array([bool((contact.free[first:last] > 0).all()) for first, last in ranges], np.int32)
         most = min(MODES * bodies, MOST_MODES)
         self.pivots = min(int(free.sum()), most // MODES)
         product_chunks = node_chunks(np.array([first for first, _ in ranges] + [nodes], ints), threads // 3)
         self.product_grid = len(product_chunks)
-        heights, first = tree_heights(surfaces), np.searchsorted(chunks["body"], np.arange(bodies + 1)).astype(np.int32)
+        heights, first = np.zeros(1, ints), np.searchsorted(chunks["body"], np.arange(bodies + 1)).astype(np.int32)
         real = solver.real
-        pairs = int(contact.body_start[-1])
+        tied = len(ties.corner) if ties else 0
+        pairs = int(contact.body_start[-1]) + tied  # and ties
         self.tally = cp.zeros(TALLY.itemsize // 4, ints)
         sizes = {
             "near": bodies, "was_near": bodies, "touched": 2 * bodies, "bad": bodies, "label": bodies,
             "island_of": bodies, "mode": bodies, "island_start": bodies + 1, "island": bodies, "free_body": bodies,
-            "own_row": rows, "own_rows": bodies, "pair_rows": bodies, "pair_list": 3 * pairs, "count": nodes,
-            "start": nodes, "cursor": nodes, "entry": 4 * pairs, "coarse_well": bodies,
+            "own_row": max(rows, 2 * pairs), "own_rows": bodies, "pair_rows": bodies, "pair_list": 3 * pairs,
+            "count": nodes, "start": nodes, "cursor": nodes, "entry": 4 * pairs, "coarse_well": bodies,
         }  # fmt: skip
         vectors = ("left", "r0", "r", "x", "p", "q", "z", "az", "solution_product")
         numbers = {name: 3 * nodes for name in vectors} | {
             "earliest": bodies, "inverse": 9 * nodes, "modes": 3 * MODES * nodes, "chunk_sums": CG_SUMS * len(chunks),
-            "coarse_sums": MODES * len(chunks), "base_sums": BASE_SUMS * len(chunks), "row_sums": bodies,
+            "coarse_sums": MODES * len(chunks), "base_sums": BASE_SUMS * len(chunks), "row_sums": 2 * bodies,
             "coarse_a": bodies * MODES * most, "coarse_b": bodies * MODES * most, "coefficient": MODES * bodies,
         }  # fmt: skip
         structs = {"state": ("IslandState", bodies), "row": ("IslandRow", rows)}
@@ -115,15 +123,19 @@ class IslandPasses:
         self.memory |= {name: cp.zeros(size, doubles) for name, size in numbers.items()}
         self.memory |= {name: cp.zeros(SIZES[kind] * count, np.uint8) for name, (kind, count) in structs.items()}
         self.memory |= {
-            "tally": self.tally, "unheld": cp.asarray(free), "tree_height": cp.asarray(heights),
-            "leaf": cp.asarray(np.flatnonzero(surfaces.tree_child[:, 0] < 0).astype(ints)),
-            "leaf_start": cp.asarray(leaves_before(surfaces)),
-            "chunk_first": cp.asarray(first), "finished_chunks": cp.zeros(bodies, np.uint32),
+            "tally": self.tally, "unheld": cp.asarray(free), "chunk_first": cp.asarray(first),
+            "finished_chunks": cp.zeros(bodies, np.uint32),
             "product_chunks": cp.asarray(product_chunks.view(ints)), "ends": cp.zeros((nodes, 3), real),
             "ways": cp.zeros((nodes, 3), real), "none": cp.zeros(3),
-            "gravity": gpu.twin(surfaces.gravity, dtype=surfaces.gravity.dtype),
             "row_start": gpu.twin(arrays["row_start"]), "columns": gpu.twin(arrays["columns"]),
         }  # fmt: skip
+        if surfaces:
+            heights = tree_heights(surfaces)
+            self.memory |= {
+                "leaf": cp.asarray(np.flatnonzero(surfaces.tree_child[:, 0] < 0).astype(ints)),
+                "leaf_start": cp.asarray(leaves_before(surfaces)), "tree_height": cp.asarray(heights),
+                "gravity": gpu.twin(surfaces.gravity, dtype=surfaces.gravity.dtype),
+            }  # fmt: skip
         self._pair_sums, self._pair_contacts = cp.zeros(len(chunks)), cp.zeros(bodies, ints)
         params["island_of"], params["alone"] = self.memory["island_of"].data.ptr, self.flag("alone").data.ptr
         params["pair_sums"], params["pair_contacts"] = self._pair_sums.data.ptr, self._pair_contacts.data.ptr
@@ -131,33 +143,43 @@ class IslandPasses:
         self.params["bodies"], self.params["bodies_count"] = solver.bodies_device, bodies
         self.params["most_modes"], self.params["passes"] = most, contact.passes
         self.params["most_chunks"], self.params["highest_tree"] = np.diff(first).max(), heights.max()
+        self.params["ties"]["first"] = rows - tied
+        if ties:
+            self._tie_memory = tie_arguments(gpu, ties, nodes, broken, self.params)
         self._kernels: dict[str, KernelFunction] = {}
-        for text, name, kernels in ((PAIRS, "pairs.cu", DETECTION), (ISLAND, "island.cu", SOLVE)):
-            module = cp.RawModule(code=text.checked(), options=(*options(gpu.types), *own_headers()), backend="nvrtc")
+        texts = [(PAIRS, "pairs.cu", DETECTION), (ISLAND, "island.cu", SOLVE)]
+        texts += [(TIES, "ties.cu", KERNELS_OF_TIES)] if ties else []
+        for text, name, kernels in texts:
+            given = (*options(gpu.types), *own_headers(), *(["-DTIES"] if ties else []))
+            module = cp.RawModule(code=text.checked(), options=given, backend="nvrtc")
             self._kernels |= {kernel: compiled(name, module, kernel) for kernel in kernels}
 
-    def _arguments(self, gpu: Gpu, contact: Contact, surfaces: Surfaces, contact_params: NDArray[Any]) -> NDArray[Any]:
+    def _arguments(
+        self, gpu: Gpu, contact: Contact, surfaces: Surfaces | None, contact_params: NDArray[Any]
+    ) -> NDArray[Any]:
         """Returns the arguments of all kernels."""
         params: Any = np.zeros((), ISLAND_ARGUMENTS)
         params["c"] = contact_params
         for name, array in self.memory.items():
             params[name] = array.data.ptr
-        tables = {name: getattr(contact, name) for name in ROWS}
-        tables |= {name: getattr(surfaces, name) for name in ("site_body", "node_site", "triangle", "tree_start",
-                                                              "tree_child")}  # fmt: skip
-        tables["pair_friction"], tables["body_thickness"] = surfaces.friction, surfaces.thickness
+        tables, start = {name: getattr(contact, name) for name in ROWS}, contact.body_start
+        of_node, tied = int(start[-1]), len(contact.ties.corner) if contact.ties else 0
+        params["t"]["bodies"], params["t"]["pair_first"] = self._bodies, len(contact.obstacle) - tied
+        if surfaces:
+            params["t"]["pair_first"] -= of_node
+            tables |= {name: getattr(surfaces, name) for name in ("site_body", "node_site", "triangle", "tree_start",
+                                                                  "tree_child")}  # fmt: skip
+            tables["pair_friction"], tables["body_thickness"] = surfaces.friction, surfaces.thickness
+        else:
+            tables["site_body"] = np.repeat(np.arange(self._bodies, dtype=np.int32), np.diff(start) // 2)
         for name, host in tables.items():
             params["t"][name] = gpu.twin(host, dtype=host.dtype).data.ptr
         zeros = gpu.cp.zeros
-        self._boxes = {"tree_box": len(surfaces.tree_child), "body_box": self._bodies}
+        self._boxes = {"tree_box": len(surfaces.tree_child), "body_box": self._bodies} if surfaces else {}
         self._box_memory = {name: zeros(SIZES["Box"] * count, np.uint8) for name, count in self._boxes.items()}
         for name, array in self._box_memory.items():
             params["t"][name] = array.data.ptr
         params["t"]["near"] = self.memory["near"].data.ptr
-        params["t"]["bodies"], params["t"]["pair_first"] = (
-            self._bodies,
-            len(contact.obstacle) - int(contact.body_start[-1]),
-        )
         return params  # type: ignore[no-any-return]
 
     def flag(self, name: str) -> DeviceArray:
@@ -183,6 +205,8 @@ class IslandPasses:
 
     def detect(self) -> None:
         """Appends detection, once a step: it turns what rows remember with their normals."""
+        if not self._touching:
+            return
         self._each_body("pair_boxes", "pair_trees", what=(0,))
         self._launch("pair_sites", self.vertex_grid)
 
@@ -191,6 +215,17 @@ class IslandPasses:
         self._nodes("look_at_bodies")
         self._each_body("list_island_rows", what=(swept,))
         self._launch("find_islands", 1, swept)
+
+    def begin_ties(self) -> None:
+        """Appends what attachments and springs do before islands are searched."""
+        if self._ties:
+            items = max(int(self.params["ties"]["count"]), int(self.params["bound_nodes"]))
+            self._launch("begin_ties", -(-items // self._threads))
+
+    def keep_ties(self) -> None:
+        """Appends what they do at the end of a step, after all that moves nodes."""
+        if self._ties:
+            self._launch("keep_ties", self._ties.tables)
 
     def launch(self) -> None:
         """Appends all solves of islands, while a graph is captured."""
@@ -202,8 +237,9 @@ class IslandPasses:
                     with self._device.repeat(self.flag("iterating")):
                         self.iterate()
                     self.end_pass()
-            self._each_body("pair_boxes", "pair_trees", what=(1,))
-            self._launch("pair_sweep", self.vertex_grid)
+            if self._touching:
+                self._each_body("pair_boxes", "pair_trees", what=(1,))
+                self._launch("pair_sweep", self.vertex_grid)
             self._launch("end_sweep", 1)
             with self._device.branch(self.flag("go")):
                 self.group(1)
@@ -223,7 +259,7 @@ class IslandPasses:
 
     @property
     def _most_islands(self) -> int:
-        return max(self._bodies // 2, 1)
+        return self._bodies if self._ties else max(self._bodies // 2, 1)
 
     def begin_pass(self) -> None:
         """Appends what comes before the iterations of a pass."""
@@ -256,7 +292,8 @@ class IslandPasses:
 
     def keep(self) -> None:
         """Appends what comes before the end of a step: forces of rows between bodies, and their work."""
-        self._each_body("keep_pairs")
+        if self._touching:
+            self._each_body("keep_pairs")
         self._nodes("pair_work")
 
     def know(self, values: DeviceArray) -> None:

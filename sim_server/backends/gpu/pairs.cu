@@ -214,7 +214,7 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) pair_sweep(const I
     const Box box = box_of(m, node, thickness_of(a.t, body));
     for (int from = 0; from < a.bodies_count; from += 32) {
         const int there = from + lane;
-        const bool met = there < a.bodies_count && there != body && a.near[there] && meet(box, a.t.body_box[there]);
+        const bool met = there < a.bodies_count && there != body && a.near[there] && !is_bound(a, node, there) && meet(box, a.t.body_box[there]);
         for (unsigned lanes = __ballot_sync(WARP, met); lanes; lanes &= lanes - 1) {
             const int other = from + __ffs(lanes) - 1;
             TouchSearch<Motion> search[3];
@@ -254,7 +254,7 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) list_island_rows(c
     const int body = blockIdx.x, first = a.t.body_start[body], last = a.t.body_start[body + 1];
     double earliest = NEVER;
     for (int r = first + threadIdx.x; r < last; r += CONTACT_THREADS) {
-        const int p = a.t.pair_first + r, other = a.t.obstacle[p];
+        const int p = a.t.pair_first + r, other = bodies_touch(a) ? a.t.obstacle[p] : -1;
         if (used(a.c, r)) earliest = fmin(earliest, a.t.entry[r]);
         if (other < 0) continue;
         if (a.bad[body] || a.bad[other]) {
@@ -263,6 +263,12 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) list_island_rows(c
         }
         earliest = fmin(earliest, a.t.entry[p]);
         each_corner(a, p, [&](int node, double, int) { atomicAdd(a.count + node, 1); });
+    }
+    for (int i = HAS_TIES ? a.ties.start[body] + threadIdx.x : 0; HAS_TIES && i < a.ties.start[body + 1]; i += CONTACT_THREADS) {
+        const int r = a.ties.first + i, other = a.t.obstacle[r];
+        if (other < 0) continue;
+        if (a.bad[body] || a.bad[other]) a.t.obstacle[r] = -1;
+        else each_corner(a, r, [&](int node, double, int) { atomicAdd(a.count + node, 1); });
     }
     least[threadIdx.x] = earliest;
     __syncthreads();
@@ -298,7 +304,14 @@ __device__ IslandState state_of(const IslandArguments& a, int first, int bodies,
     return s;
 }
 
-// One thread block: groups the bodies that have rows with each other, each group's by number. swept: only those that a sweep has
+// True if the last one of a body's rows, whose ties come last, is a tie.
+__device__ bool is_tied(const IslandArguments& a, int body) {
+    const int rows = a.own_rows[body];
+    return HAS_TIES && rows > 0 && is_tie(a, a.own_row[own_start(a, body) + rows - 1]);
+}
+
+// One thread block: groups the bodies that have rows with each other, each group's by number; one that is tied and touches no other is a
+// group. swept: only those that a sweep has
 // touched are solved again.
 extern "C" __global__ void __launch_bounds__(LISTING_THREADS) find_islands(const IslandArguments a, int swept) {
     const int n = a.bodies_count, me = threadIdx.x, warp = me / 32, lane = me % 32;
@@ -312,7 +325,7 @@ extern "C" __global__ void __launch_bounds__(LISTING_THREADS) find_islands(const
         for (int i = warp; i < n; i += LISTING_THREADS / 32) {
             const int rows = a.own_rows[i], pairs = a.pair_rows[i];
             for (int k = rows - pairs + lane; k < rows; k += 32) {
-                const int one = __ldcg(a.label + i), two = __ldcg(a.label + a.t.obstacle[a.own_row[2 * a.t.body_start[i] + k]]);
+                const int one = __ldcg(a.label + i), two = __ldcg(a.label + a.t.obstacle[a.own_row[own_start(a, i) + k]]);
                 if (one == two) continue;
                 atomicMin(a.label + (one > two ? one : two), min(one, two));
                 changed = true;
@@ -332,7 +345,7 @@ extern "C" __global__ void __launch_bounds__(LISTING_THREADS) find_islands(const
     for (int i = me; i < n; i += LISTING_THREADS) {
         int size = 0;
         for (int j = 0; j < n; ++j) size += label[j] == label[i];
-        members[i] = size;
+        members[i] = size > 1 || is_tied(a, i) ? size : 0;
     }
     __syncthreads();
     __shared__ int islands, active, alone;
@@ -340,14 +353,14 @@ extern "C" __global__ void __launch_bounds__(LISTING_THREADS) find_islands(const
     __syncthreads();
     for (int i = me; i < n; i += LISTING_THREADS) {
         const int own = label[i], size = members[i];
-        if (size == 1) {
+        if (size == 0) {
             a.island_of[i] = a.mode[i] = -1;
             atomicAdd(&alone, 1);
             continue;
         }
         int number = 0, first = 0, rank = 0, free_rank = 0, frees = 0, again = 0, chunks = 0;
         for (int j = 0; j < n; ++j) {
-            if (label[j] == j && j < own && members[j] > 1) {
+            if (label[j] == j && j < own && members[j] > 0) {
                 ++number;
                 first += members[j];
             }
@@ -397,11 +410,11 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) fill_entries(const
     sum_block(before);
     if (body == a.bodies_count - 1 && threadIdx.x == 0) a.tally->pairs = (int)before[0] + pairs;
     for (int k = threadIdx.x; k < pairs; k += CONTACT_THREADS) {
-        const int r = a.own_row[2 * a.t.body_start[body] + rows - pairs + k];
+        const int r = a.own_row[own_start(a, body) + rows - pairs + k];
         int* to = a.pair_list + 3 * ((int)before[0] + k);
         to[0] = r;
         to[1] = body;
-        to[2] = a.t.obstacle[r];
+        to[2] = HAS_TIES && !is_pair(a, r) ? -1 : a.t.obstacle[r];
         each_corner(a, r, [&](int node, double, int corner) { a.entry[a.start[node] + atomicAdd(a.cursor + node, 1)] = CORNERS * r + corner; });
     }
 }

@@ -6,6 +6,8 @@
 
 #include "contact_passes.cuh"
 #include "own_surface.cuh"
+#include "edge_detection.cuh"
+#include "ties.cuh"
 #include "triangle_shape.cuh"
 
 struct RowState {                 // of a row in the step under way
@@ -23,23 +25,6 @@ struct ContactReport {            // of a body in a step
     int32_t clipped;              // nodes held back at an obstacle, beside the law
     double residual;              // of the system with the law as it is at the end, relative; NaN: nothing was touched
     double work;                  // of contact on the body [J]
-};
-
-struct Ties {                     // attachments and springs (ties.h): rows after all others, by the body of their first corner
-    int32_t first, count, tables;     // row of the first one; of all; tables of the scene that they are from
-    const int32_t* start;             // (bodies + 1,)
-    const int32_t* body;              // (count, 2) of the first corner and of the others; -1: there are none
-    const int32_t* obstacle;          // (count,) -1: none
-    const int32_t *table, *order;     // (count,) table of each; ties by table
-    const double* point;              // (count, 3) in the obstacle's frame [m]
-    const double *kappa, *rest, *breaking;  // (count,) of attachments, 0: a spring; rest length [m]; force that breaks it [N]
-    double* stiffness;                // (count,) [N/m]; 0: set in the first step
-    double* force;                    // (count, 3) on the first corner, at the end of the last step [N]
-    double *start_force, *slope;      // (count, 3), (count, 6) f_0 and K of this step
-    int32_t* bound;                   // (nodes,) 1 + the other body that a node is attached to, 0: none; they do not touch there
-    int32_t* broken;                  // (count,) steps completed when it broke; 0: it has not
-    double* reaction;                 // (bodies, columns, 6) those of tables from column_first on
-    int32_t columns, column_first;
 };
 
 struct SolveResult;
@@ -131,10 +116,7 @@ inline bool is_tie(const Contact& c, int row) { return c.ties.count > 0 && row >
 
 // Whether it is a row between two bodies.
 inline bool is_pair(const Contact& c, int row) {
-    if (is_tie(c, row)) {
-        const int32_t* body = c.ties.body + 2 * (row - c.ties.first);
-        return body[1] >= 0 && body[1] != body[0];
-    }
+    if (is_tie(c, row)) return joins_bodies(c.ties, row - c.ties.first);
     return c.pair_first >= 0 && row >= c.pair_first;
 }
 
@@ -203,16 +185,11 @@ struct Rows {
     bool empty(int r) const { return c.obstacle[r] < 0; }
     // set: the row counts as closed whatever its gap
     ContactForce force(int r, const double* s, double limit, bool set) const {
-        if (!is_tie(c, r)) return contact_force(row(r), s, limit, set);
-        const int i = r - c.ties.first;
-        const double *f = c.ties.start_force + 3 * i, *K = c.ties.slope + 6 * i;
-        double back[3];
-        stiff(K, s, back);
-        return {0, {f[0] - back[0], f[1] - back[1], f[2] - back[2]}, 1, true};
+        return is_tie(c, r) ? force_of_tie(c.ties, r - c.ties.first, s) : contact_force(row(r), s, limit, set);
     }
     void stiffness(int r, const ContactForce& f, double scale, double* k) const {
-        if (!is_tie(c, r)) return contact_stiffness(row(r), f, scale, k);
-        for (int m = 0; m < 6; ++m) k[m] = scale * c.ties.slope[6 * (r - c.ties.first) + m];
+        if (is_tie(c, r)) stiffness_of_tie(c.ties, r - c.ties.first, scale, k);
+        else contact_stiffness(row(r), f, scale, k);
     }
 
     // f(node, weight) of the corners that may move
