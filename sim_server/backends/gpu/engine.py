@@ -123,8 +123,8 @@ class GpuEngine(DeviceLoop):
             self._contact = ContactPasses(
                 gpu, device, given.contact, ranges, arrays, self.solver, balance, contact_results, reactions
             )
-            if self._contact.islands:
-                self._whole_assembly = [*self._whole_assembly, self._contact.islands.detect]
+            if self._contact.detects:
+                self._whole_assembly = [*self._whole_assembly, self._contact.detect]
                 self._first_launches = self._whole_assembly
         self._held, held = None, None
         if given.held is not None:
