@@ -157,7 +157,8 @@ def compiled(folder: Path, text: str, *options: str) -> c.CDLL:
     return c.CDLL(str(folder / "kernels.so"))
 
 
-REMEMBERED = ("obstacle", "weight", "normal", "force", "traction", "hardening", "gap", "entry")  # of rows, from step to step
+# of rows, from step to step
+REMEMBERED = ("obstacle", "corner", "weight", "normal", "force", "traction", "hardening", "gap", "entry")
 
 
 class Array(np.ndarray):
@@ -237,10 +238,9 @@ class Beside:
         sim.engine.assemble()
         self.matrix = sim.engine.factor_matrix(0)
         self.gpu.renew()
-        if self.contact.faces:  # which the kernels detect
-            first, last = self.contact.faces.start[[0, -1]]
-            for name, before in rows.items():
-                self.gpu.twin(getattr(self.contact, name))[first:last] = before[first:last]
+        first = self.contact.body_start[-1]  # of those that the kernels detect
+        for name, before in rows.items():
+            self.gpu.twin(getattr(self.contact, name))[first:] = before[first:]
         self.balance["work"] = 0
         system = System(
             a["row_start"].ctypes.data, a["columns"].ctypes.data, self.ranges.ctypes.data,

@@ -355,8 +355,14 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) finish_contact(con
         sum[2] += c.faces.clipped[body];
     }
     const bool grouped = c.island_of && c.island_of[body] >= 0;  // its sweeps have not listed rows
-    write_reactions(c, body, grouped ? list_rows(c, body) : state.rows, slot);
+    int rows = state.rows;
+    if (grouped) {
+        rows = list_rows(c, body);
+        __syncthreads();  // threads read what others have listed
+    }
+    write_reactions(c, body, rows, slot);
     if (threadIdx.x > 0) return;
+    if (c.island_of) sum[2] += c.pair_clipped[body];
     const int contacts = (int)sum[0] + (c.island_of ? c.pair_contacts[body] : 0);
     const double unknown = __longlong_as_double(0x7ff8000000000000ll);
     c.contact_results[slot * c.count + body] = {contacts || state.passes ? state.residual : unknown, contacts, state.passes, (int)sum[2]};

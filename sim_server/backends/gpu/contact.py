@@ -101,7 +101,9 @@ class ContactPasses:
         self.params = self._arguments(contact, results, reactions)
         self.islands: IslandPasses | None = None
         if contact.surfaces:
-            self.islands = IslandPasses(gpu, device, contact, ranges, arrays, solver, self.params, chunks, THREADS)
+            self.islands = IslandPasses(
+                gpu, device, contact, ranges, arrays, solver, self.params, chunks, THREADS, self.faces
+            )
         self.first, self.later = self._solve(contact, 1), self._solve(contact, 0)
         module = cp.RawModule(
             code=TEXT.checked(), options=(*options(gpu.types), *own_headers(), *([DEFINED] if self.faces else [])),

@@ -14,19 +14,21 @@ from sim_server.backends.declarations import Declarations
 from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction
 from sim_server.backends.gpu.device import Gpu, compiled, options, own_headers
 from sim_server.backends.gpu.energies import node_chunks
+from sim_server.backends.gpu.faces import DEFINED, FaceRows
 from sim_server.backends.gpu.solver import PcgSolver
 
 PAIRS, ISLAND = Declarations("backends/gpu/pairs.cu"), Declarations("backends/gpu/island.cu")
 ISLAND_ARGUMENTS = ISLAND.dtype("IslandArguments")
-SIZES = {name: ISLAND.dtype(name).itemsize for name in ("IslandState", "IslandRow", "Box")}
+SIZES = {name: ISLAND.dtype(name).itemsize for name in ("IslandState", "IslandRow", "Box", "EdgeWings")}
 TALLY = ISLAND.dtype("Tally")
+MOST_HELD: int = ISLAND.constant("MOST_HELD")
 MODES, CG_SUMS, BASE_SUMS = (ISLAND.constant(name) for name in ("MODES", "CG_SUMS", "BASE_SUMS"))
 LISTING, SEARCH = PAIRS.constant("LISTING_THREADS"), ISLAND.constant("SEARCH_THREADS")  # of a thread block
 WARM_START, ZERO_START, LAW_AT_START, LAW = ISLAND.enumeration("Evaluation").values()
 MOST_MODES = 600  # of the coarse space of an island of bodies
 DETECTION = (
-    "pair_boxes", "pair_trees", "pair_sites", "pair_sweep", "end_sweep", "look_at_bodies", "list_island_rows",
-    "find_islands", "place_entries", "fill_entries",
+    "pair_boxes", "pair_trees", "pair_sites", "pair_edges", "pair_sweep", "edge_sweep", "end_sweep", "look_at_bodies",
+    "list_island_rows", "find_islands", "place_entries", "fill_entries",
 )  # fmt: skip
 SOLVE = (
     "island_start", "island_law", "island_balance", "island_decide", "island_prepare", "coarse_matrix",
@@ -67,6 +69,17 @@ def leaves_before(surfaces: Surfaces) -> Int32:
     return counted[surfaces.tree_start].astype(np.int32)
 
 
+def bodies_of_rows(contact: Contact, surfaces: Surfaces) -> Int32:
+    """Returns the body of each row, (rows,)."""
+
+    def of(start: Int32) -> Int32:
+        return np.repeat(np.arange(len(start) - 1, dtype=np.int32), np.diff(start))
+
+    faces = of(contact.faces.start) if contact.faces else np.zeros(0, np.int32)
+    nodes = of(contact.body_start)
+    return np.concatenate([nodes, faces, nodes, of(surfaces.edge_start)])
+
+
 class IslandPasses:
     """Launches detection between bodies, and the solves of bodies that touch each other.
 
@@ -76,19 +89,25 @@ class IslandPasses:
     shared: arrays and arguments of contact.cu: memory by name, params, chunks
     threads: of a thread block
 
+    faces: its rows of triangles; None: there are none
+
     Tests run its kernels with what it keeps: params (arguments of all kernels), memory (arrays by name), tally,
-    pivots (steps of an inversion), product_grid (thread blocks of the product with A), vertex_grid (of detection).
+    pivots (steps of an inversion), product_grid (thread blocks of the product with A), vertex_grid, edge_grid (of
+    detection).
     """
 
     def __init__(
         self, gpu: Gpu, device: Graphs, contact: Contact, ranges: Sequence[tuple[int, int]],
         arrays: Mapping[str, NDArray[Any]], solver: PcgSolver, params: NDArray[Any], chunks: NDArray[Any], threads: int,
+        faces: FaceRows | None,
     ):  # fmt: skip
         assert contact.surfaces is not None
         surfaces, ints, doubles = contact.surfaces, np.int32, np.float64
         cp, bodies, rows, nodes = gpu.cp, len(ranges), len(contact.obstacle), len(arrays["x"])
         self._device, self._solver, self._threads, self._bodies = device, solver, threads, bodies
         self._grid, self.vertex_grid = len(chunks), -(-len(surfaces.site_body) // (threads // 32))
+        edges, edge_rows = len(surfaces.edge), int(np.ptp(surfaces.edge_start[[0, -1]]))
+        self.edge_grid, self._faces = -(-edges // threads), faces
         free = np.array([bool((contact.free[first:last] > 0).all()) for first, last in ranges], np.int32)
         most = min(MODES * bodies, MOST_MODES)
         self.pivots = min(int(free.sum()), most // MODES)
@@ -96,13 +115,15 @@ class IslandPasses:
         self.product_grid = len(product_chunks)
         heights, first = tree_heights(surfaces), np.searchsorted(chunks["body"], np.arange(bodies + 1)).astype(np.int32)
         real = solver.real
-        pairs = int(contact.body_start[-1])
+        pairs = int(contact.body_start[-1]) + edge_rows
+        row_body = bodies_of_rows(contact, surfaces)
         self.tally = cp.zeros(TALLY.itemsize // 4, ints)
+        places = MOST_HELD * (len(surfaces.site_body) + edges)
         sizes = {
             "near": bodies, "was_near": bodies, "touched": 2 * bodies, "bad": bodies, "label": bodies,
             "island_of": bodies, "mode": bodies, "island_start": bodies + 1, "island": bodies, "free_body": bodies,
             "own_row": rows, "own_rows": bodies, "pair_rows": bodies, "pair_list": 3 * pairs, "count": nodes,
-            "start": nodes, "cursor": nodes, "entry": 4 * pairs, "coarse_well": bodies,
+            "start": nodes, "cursor": nodes, "entry": 4 * pairs, "coarse_well": bodies, "held_list": places, "held_count": bodies,
         }  # fmt: skip
         vectors = ("left", "r0", "r", "x", "p", "q", "z", "az", "solution_product")
         numbers = {name: 3 * nodes for name in vectors} | {
@@ -121,19 +142,29 @@ class IslandPasses:
             "chunk_first": cp.asarray(first), "finished_chunks": cp.zeros(bodies, np.uint32),
             "product_chunks": cp.asarray(product_chunks.view(ints)), "ends": cp.zeros((nodes, 3), real),
             "ways": cp.zeros((nodes, 3), real), "none": cp.zeros(3),
+            "edge_body": cp.asarray(row_body[surfaces.edge_start[0] :: 2].copy()), "row_body": cp.asarray(row_body),
+            "dropped": gpu.twin(contact.dropped, dtype=contact.dropped.dtype),
             "gravity": gpu.twin(surfaces.gravity, dtype=surfaces.gravity.dtype),
             "row_start": gpu.twin(arrays["row_start"]), "columns": gpu.twin(arrays["columns"]),
         }  # fmt: skip
+        held = np.zeros(places, ISLAND.dtype("HeldPlace"))
+        held["other"] = -1
+        self.memory |= {"held": cp.asarray(held.view(np.uint8)), "mass": gpu.twin(contact.mass)}
         self._pair_sums, self._pair_contacts = cp.zeros(len(chunks)), cp.zeros(bodies, ints)
+        self._pair_clipped = cp.zeros(bodies, ints)
+        params["pair_clipped"] = self._pair_clipped.data.ptr
         params["island_of"], params["alone"] = self.memory["island_of"].data.ptr, self.flag("alone").data.ptr
         params["pair_sums"], params["pair_contacts"] = self._pair_sums.data.ptr, self._pair_contacts.data.ptr
         self.params = self._arguments(gpu, contact, surfaces, params)
         self.params["bodies"], self.params["bodies_count"] = solver.bodies_device, bodies
         self.params["most_modes"], self.params["passes"] = most, contact.passes
+        self.params["edges"] = edges
         self.params["most_chunks"], self.params["highest_tree"] = np.diff(first).max(), heights.max()
         self._kernels: dict[str, KernelFunction] = {}
-        for text, name, kernels in ((PAIRS, "pairs.cu", DETECTION), (ISLAND, "island.cu", SOLVE)):
-            module = cp.RawModule(code=text.checked(), options=(*options(gpu.types), *own_headers()), backend="nvrtc")
+        given = (*options(gpu.types), *own_headers(), *([DEFINED] if faces else []))
+        solve = (*SOLVE, *(["sweep_island_faces"] if faces else []))
+        for text, name, kernels in ((PAIRS, "pairs.cu", DETECTION), (ISLAND, "island.cu", solve)):
+            module = cp.RawModule(code=text.checked(), options=given, backend="nvrtc")
             self._kernels |= {kernel: compiled(name, module, kernel) for kernel in kernels}
 
     def _arguments(self, gpu: Gpu, contact: Contact, surfaces: Surfaces, contact_params: NDArray[Any]) -> NDArray[Any]:
@@ -154,10 +185,16 @@ class IslandPasses:
         for name, array in self._box_memory.items():
             params["t"][name] = array.data.ptr
         params["t"]["near"] = self.memory["near"].data.ptr
-        params["t"]["bodies"], params["t"]["pair_first"] = (
-            self._bodies,
-            len(contact.obstacle) - int(contact.body_start[-1]),
-        )
+        params["t"]["bodies"] = self._bodies
+        params["t"]["pair_first"] = surfaces.edge_start[0] - contact.body_start[-1]
+        edges = {
+            "start": surfaces.edge_start, "edge": surfaces.edge, "opposite": surfaces.opposite,
+            "of_triangle": surfaces.triangle_edge, "length": surfaces.edge_length,
+        }  # fmt: skip
+        for name, host in edges.items():
+            params["e"][name] = gpu.twin(host, dtype=host.dtype).data.ptr
+        self._edge_memory = zeros(max(len(surfaces.edge), 1) * SIZES["EdgeWings"], np.uint8), zeros(max(2 * len(surfaces.edge), 1), np.int32)
+        params["e"]["wings"], params["e"]["facing"] = (array.data.ptr for array in self._edge_memory)
         return params  # type: ignore[no-any-return]
 
     def flag(self, name: str) -> DeviceArray:
@@ -169,13 +206,17 @@ class IslandPasses:
     # --- launches -----------------------------------------------------------------------------------------------
 
     def _launch(self, kernel: str, blocks: int, *arguments: Any) -> None:
-        threads = {"find_islands": LISTING, "island_search": SEARCH, "end_sweep": 1}.get(kernel, self._threads)
+        threads = {"find_islands": LISTING, "island_search": SEARCH, "end_sweep": LISTING}.get(kernel, self._threads)
         given = (np.int32(x) if isinstance(x, int) else x for x in arguments)
         self._kernels[kernel]((blocks,), (threads,), (self.params, *given))
 
     def _nodes(self, *kernels: str, what: tuple[int, ...] = ()) -> None:
         for kernel in kernels:
             self._launch(kernel, self._grid, *what)
+
+    def _edges(self, kernel: str) -> None:
+        if self.edge_grid:
+            self._launch(kernel, self.edge_grid)
 
     def _each_body(self, *kernels: str, what: tuple[int, ...] = ()) -> None:
         for kernel in kernels:
@@ -185,6 +226,7 @@ class IslandPasses:
         """Appends detection, once a step: it turns what rows remember with their normals."""
         self._each_body("pair_boxes", "pair_trees", what=(0,))
         self._launch("pair_sites", self.vertex_grid)
+        self._edges("pair_edges")
 
     def group(self, swept: int = 0) -> None:
         """Appends the search of islands."""
@@ -204,8 +246,9 @@ class IslandPasses:
                     self.end_pass()
             self._each_body("pair_boxes", "pair_trees", what=(1,))
             self._launch("pair_sweep", self.vertex_grid)
+            self._edges("edge_sweep")
             self._launch("end_sweep", 1)
-            with self._device.branch(self.flag("go")):
+            with self._device.branch(self.flag("again")):
                 self.group(1)
 
     def start(self) -> None:
@@ -249,6 +292,8 @@ class IslandPasses:
         self._nodes("island_residual")
         self._launch("island_search", self._most_islands)
         self._nodes("island_advance")
+        if self._faces:
+            self._launch("sweep_island_faces", self._faces.grid)
         self._launch("island_settle", self._most_islands)
 
     def _multiply(self, solution: int) -> None:
