@@ -17,8 +17,8 @@ poses that a client gives, no faster than `max_speed` and `max_turn`.
 With `between` a node is kept away from the triangles of other objects in the same way; what touches is solved as one
 system (kernels/pair_detection.cuh, backends/cpu/native/island.h).
 
-On a CPU triangles and edges of the surfaces are kept out, too, where something small comes between their nodes
-(kernels/triangle_shape.cuh, edge_detection.cuh); on a GPU only nodes are.
+Triangles and edges of the surfaces are kept out, too, where something small comes between their nodes
+(kernels/face_detection.cuh, edge_detection.cuh).
 Friction of a pair is the geometric mean of both, unless `friction` names the pair.
 
 Usual values: a thickness of a tenth of the shortest edge of the surface (the default); friction 0.1 (wet tissue on
@@ -262,17 +262,12 @@ def _surface(world: World, body: Body) -> Int32:
     return nodes[world.free[nodes] > 0].astype(np.int32)
 
 
-def nodes_alone(world: World) -> bool:
-    """Returns True on devices where nodes alone have rows of contact."""
-    return world.backend.name != "cpu"
-
-
 def faces_of(world: World, friction: Float64, first: int) -> Faces | None:
     """Returns the triangles that need rows against obstacles, the first of which is `first`.
 
-    None where there are none: corners are enough against planes, and a GPU has rows of nodes alone.
+    None where there are none: corners are enough against planes.
     """
-    if nodes_alone(world) or all(o.shape == "plane" for o in world.obstacles):
+    if all(o.shape == "plane" for o in world.obstacles):
         return None
     triangles = [surface_triangles(b.mesh.tets) + np.int32(b.first) for b in world.bodies]
     start = first + np.cumsum([0, *map(len, triangles)])
@@ -303,8 +298,6 @@ def _surfaces(
     length = np.linalg.norm(world.rest[edge[:, 0]] - world.rest[edge[:, 1]], axis=1)
     ends = np.concatenate([[0], np.cumsum((of_triangle >= 0).sum(axis=1))])[first_triangle]
     mean = np.add.reduceat(length, ends[:-1]) / np.diff(ends)
-    if nodes_alone(world):
-        edge, opposite, of_triangle, ends = edge[:0], opposite[:0], np.full_like(of_triangle, -1), np.zeros_like(ends)
     return Surfaces(
         body, site, triangle, boxes.astype(np.int32), np.concatenate(shifted).astype(np.int32),
         (first + 2 * ends).astype(np.int32), edge, opposite, of_triangle, mean, np.array(thickness),

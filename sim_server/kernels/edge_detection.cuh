@@ -3,6 +3,7 @@
 // only sharp edges count. The edges of the body with the finer surface have the rows, two each: for the edges that they meet first, or are
 // nearest to. A row remembers its forces as long as the edges are the same.
 #pragma once
+#include "contact_passes.cuh"
 #include "edge_edge.cuh"
 #include "pair_detection.cuh"
 
@@ -159,4 +160,43 @@ HOST_DEVICE int detect_edge(const SurfaceTables& c, const EdgeTables& e, const M
             if (t.other >= 0 && facing[r] == t.edge) recall(c, row + slot, last + r, 1);
     }
     return left;
+}
+
+// The site for which edges without a row are counted; -1: both ends are fixed.
+HOST_DEVICE int site_of_edge(const SurfaceTables& c, const EdgeTables& e, int edge) {
+    for (int end = 0; end < 2; ++end)
+        if (const int site = c.node_site[e.edge[2 * edge + end]]; site >= 0) return site;
+    return -1;
+}
+
+// --- what a solution does -----------------------------------------------------------------------------------------------------------
+
+// f(other, facing, thickness, touch) of the edges that a solution takes an edge through.
+template <class Motion, class F>
+HOST_DEVICE void each_edge_passed(const SurfaceTables& c, const EdgeTables& e, const Motion& m, int body, int edge, F f) {
+    each_facing_edge(c, e, m, body, edge, [&](int other, int facing, double thickness) {
+        const EdgePath path = path_of(e, m, edge), way = path_of(e, m, facing);
+        EdgeTouch t;
+        if (!edges_pass(path, e.wings[edge], way, e.wings[facing], THROUGH * thickness)) return;
+        if (meet_edges(path, e.wings[edge], way, e.wings[facing], thickness, 1e-2 * thickness, nullptr, t)) f(other, facing, thickness, t);
+    });
+}
+
+// Gives an edge that another one passes one of its rows: the other's own, an empty one, or the one that carries less; -1: it is made
+// stiffer. force_of(row): normal force
+template <class Motion, class F>
+HOST_DEVICE int take_edge_row(const SurfaceTables& c, const EdgeTables& e, const Motion& m, int body, int edge, const EdgeMeeting& t, F force_of) {
+    const int row = e.start[0] + 2 * edge, *facing = e.facing + 2 * edge;
+    int k = row;
+    if (facing[0] != t.edge || c.obstacle[row] < 0) {
+        const bool next = c.obstacle[row + 1] < 0 || facing[1] == t.edge;
+        k += next || (c.obstacle[row] >= 0 && force_of(row + 1) < force_of(row));
+    }
+    const bool same = c.obstacle[k] >= 0 && facing[k - row] == t.edge;
+    if (same && dot3(c.normal + 3 * k, t.touch.normal) > SAME_PLANE) {
+        c.hardening[k] = fmin(HARDER * c.hardening[k], HARDEST);
+        return -1;
+    }
+    put_edge_row(c, e, m, k, body, t);
+    return k;
 }

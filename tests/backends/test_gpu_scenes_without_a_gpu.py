@@ -98,12 +98,13 @@ def test_momenta_are_set_where_a_body_may_be_free(cupy, fixed, solve, precision)
 @pytest.mark.parametrize("precision", ["float64", "mixed", "float32"])
 def test_a_scene_with_contact_is_built(cupy, precision):
     solver = {"preconditioner": "cholesky", "precision": precision}
-    simulation = over(ram(), floor(), solver=solver, device="gpu")
+    simulation = over(floor(), floor(name="wall"), solver=solver, device="gpu")
     names = [kernel for kernel, _ in cupy.calls]
     one_pass = ["contact_forces", "pcg", "contact_search"]
     step = ["place", "detect", "begin_contact", *one_pass, *one_pass, "finish_contact", "fused"]
     first = names.index("place")
     assert names[first : first + len(step)] == step
+    assert not any("face" in kernel for kernel in names) and not any("FACE_ROWS" in str(o) for _, o in cupy.compiled)
     engine = simulation.engine
     engine.run(3)
     records, reactions = engine.records_and_reactions()
@@ -114,6 +115,26 @@ def test_a_scene_with_contact_is_built(cupy, precision):
 
 
 @pytest.mark.parametrize("precision", ["float64", "mixed", "float32"])
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_scene_whose_triangles_have_rows_is_built(cupy, precision, count):
+    """Beside something that is no plane; of bodies that touch each other, too."""
+    objects = [block(name=f"b{k}", at=(0, 0.07 * k, 0)) for k in range(count)]
+    solver = {"preconditioner": "cholesky", "precision": precision}
+    engine = over(ram(), floor(), objects=objects, solver=solver, device="gpu").engine
+    names = [kernel for kernel, _ in cupy.calls]
+    one_pass = ["face_forces", "contact_forces", "pcg", "face_search", "sweep_faces", "contact_search"]
+    first = names.index("begin_contact")
+    assert names[first + 1 : first + 13] == one_pass * 2 and names.count("detect_faces") == names.count("detect")
+    assert names.index("detect") < names.index("detect_faces") < first
+    assert names[names.index("finish_contact") - 1] == "finish_faces"
+    assert ("sweep_island_faces" in names) == (count == 2)
+    engine.run(2)
+    engine.assemble()
+    engine.solve()
+    assert engine.records()["step"].tolist() == [step for step in (1, 2, 3) for _ in range(count)]
+
+
+@pytest.mark.parametrize("precision", ["float64", "mixed", "float32"])
 def test_a_scene_whose_bodies_touch_each_other_is_built(cupy, precision):
     """Detection is a part of the assembly; what belongs to islands is launched in such scenes alone."""
     solver = {"preconditioner": "cholesky", "precision": precision}
@@ -121,8 +142,8 @@ def test_a_scene_whose_bodies_touch_each_other_is_built(cupy, precision):
     simulation = over(floor(), objects=objects, solver=solver, device="gpu")
     names = [kernel for kernel, _ in cupy.calls]
     first = names.index("place")
-    before = ["place", "detect", "pair_boxes", "pair_trees", "pair_sites", "look_at_bodies", "list_island_rows",
-              "find_islands", "begin_contact"]  # fmt: skip
+    before = ["place", "detect", "pair_boxes", "pair_trees", "pair_sites", "pair_edges", "look_at_bodies",
+              "list_island_rows", "find_islands", "begin_contact"]  # fmt: skip
     assert names[first : first + len(before)] == before
     iteration = ["island_update", "island_factor", "island_multiply", "island_product", "coarse_solve", "island_finish"]
     at = names.index("island_factor") - 1
@@ -152,7 +173,7 @@ def test_attachments_and_springs_begin_before_islands_are_searched_and_end_after
     cupy.calls.clear()
     made(half("a", 0), half("b", 1), attachment=[glue()], obstacle=[FLOOR], device="gpu")
     names = [kernel for kernel, _ in cupy.calls]
-    assert names[names.index("pair_sites") + 1] == "begin_ties" and "pair_sweep" in names
+    assert names[names.index("pair_edges") + 1] == "begin_ties" and "pair_sweep" in names
 
 
 def test_a_scene_without_contact_has_nothing_of_it(cupy):

@@ -15,6 +15,7 @@ import pytest
 from sim_server.backends.compiler import INCLUDE, SOURCES, compiler
 from sim_server.backends.cpu.structs import BALANCE
 from sim_server.backends.gpu import contact as gpu_contact
+from sim_server.backends.gpu import faces as gpu_faces
 from sim_server.backends.gpu import islands as gpu_islands
 from sim_server.backends.gpu.contact import ContactPasses
 from sim_server.backends.gpu.solver import PCG_BODY
@@ -28,6 +29,9 @@ TEXT = """
 #include "cuda_threads.h"
 #include "invert3.cuh"
 #include "contact.cu"
+#ifdef FACE_ROWS
+#include "faces.cu"
+#endif
 struct System { const int *row_start, *columns, *ranges; double tolerance; int most, bodies, grid; };
 // Block Jacobi and conjugate gradients from y, as pcg.cu: to `goal` of the residual.
 static void solve(const ContactArguments& c, const ContactSolve& pass, const System& s, int body) {
@@ -105,9 +109,22 @@ static void solve(const ContactArguments& c, const ContactSolve& pass, const Sys
     }
     note_pass(state, pass, outcome, sum, out);
 }
+#ifdef FACE_ROWS
+static void each_triangle(const ContactArguments& c, auto kernel) {
+    const int count = c.faces.start[c.count] - c.faces.start[0];
+    launch((count + CONTACT_THREADS - 1) / CONTACT_THREADS, CONTACT_THREADS, kernel);
+}
+#endif
 static void one_pass(const ContactArguments& c, const ContactSolve& pass, const System& s) {
+#ifdef FACE_ROWS
+    launch(s.bodies, CONTACT_THREADS, [&] { face_forces(c); });
+#endif
     launch(s.grid, CONTACT_THREADS, [&] { contact_forces(c); });
     for (int body = 0; body < s.bodies; ++body) solve(c, pass, s, body);
+#ifdef FACE_ROWS
+    launch(s.bodies, CONTACT_THREADS, [&] { face_search(c); });
+    each_triangle(c, [&] { sweep_faces(c); });
+#endif
     launch(s.grid, CONTACT_THREADS, [&] { contact_search(c); });
 }
 """
@@ -131,13 +148,17 @@ def compiled(folder: Path, text: str, *options: str) -> c.CDLL:
             header, found = re.subn(rf"{number} = \d+", f"{number} = {THREADS}", header)
             assert found == 1
         (folder / name).write_text(header)
-    for name in ("contact.cu", "pairs.cu", "island.cu", "ties.cu"):
+    for name in ("contact.cu", "faces.cu", "face_sweep.cuh", "pairs.cu", "island.cu", "ties.cu"):
         (folder / name).write_text((SOURCES / "backends/gpu" / name).read_text())
     (folder / "kernels.cpp").write_text(text)
     paths = [f"-I{p}" for p in (folder, TESTS / "backends", SOURCES / "backends/gpu", INCLUDE)]
-    command = [compiler(), "-std=c++20", "-O1", "-shared", "-fPIC", "-Dreal=double", *paths]
-    subprocess.run([*command, *options, str(folder / "kernels.cpp"), "-o", str(folder / "kernels.so")], check=True)
+    command = [compiler(), "-std=c++20", "-O1", "-shared", "-fPIC", "-Dreal=double", *options, *paths]
+    subprocess.run([*command, str(folder / "kernels.cpp"), "-o", str(folder / "kernels.so")], check=True)
     return c.CDLL(str(folder / "kernels.so"))
+
+
+# of rows, from step to step
+REMEMBERED = ("obstacle", "corner", "weight", "normal", "force", "traction", "hardening", "gap", "entry")
 
 
 class Array(np.ndarray):
@@ -181,7 +202,8 @@ class Beside:
 
     def __init__(self, library: c.CDLL, sim: Simulation, monkeypatch: pytest.MonkeyPatch):
         monkeypatch.setattr(gpu_contact, "THREADS", THREADS)
-        for module in (gpu_contact, gpu_islands):
+        monkeypatch.setattr(gpu_faces, "THREADS", THREADS)
+        for module in (gpu_contact, gpu_faces, gpu_islands):
             monkeypatch.setattr(module, "options", lambda types: ())
             monkeypatch.setattr(module, "compiled", lambda name, module, kernel: None)
         self.sim, self.library, self.gpu = sim, library, Host()
@@ -214,9 +236,13 @@ class Beside:
     def step(self) -> tuple[np.ndarray, np.ndarray]:
         """Makes a step; returns the solutions of both."""
         sim, a = self.sim, self.arrays
+        rows = {name: getattr(self.contact, name).copy() for name in REMEMBERED}
         sim.engine.assemble()
         self.matrix = sim.engine.factor_matrix(0)
         self.gpu.renew()
+        first = self.contact.body_start[-1]  # of those that the kernels detect
+        for name, before in rows.items():
+            self.gpu.twin(getattr(self.contact, name))[first:] = before[first:]
         self.balance["work"] = 0
         system = System(
             a["row_start"].ctypes.data, a["columns"].ctypes.data, self.ranges.ctypes.data,

@@ -3,28 +3,26 @@
 the CPU."""
 
 import ctypes as c
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pytest
 
+from sim_server.backends.gpu.faces import DEFINED
 from sim_server.backends.gpu.islands import TALLY, tree_heights
-from sim_server.effects import contact
 from sim_server.simulation import Simulation
 from tests.contact.kernels_beside import TEXT, Beside, compiled
 from tests.contact.scenes import D, block, floor, over
-
-
-@pytest.fixture(autouse=True)
-def nodes_alone(monkeypatch):
-    """On a GPU triangles and edges have no rows: here they have none on the CPU beside it, either."""
-    monkeypatch.setattr(contact, "nodes_alone", lambda world: True)
+from tests.contact.test_contact_edges import crossed
+from tests.contact.test_contact_held_apart import thrown
+from tests.contact.test_contact_triangles import SMALL, obstacle
 
 
 ISLANDS = """
 #include "pairs.cu"
 #include "island.cu"
-struct Islands { int bodies, grid, sites, most, pivots, product_grid; };
+struct Islands { int bodies, grid, sites, most, pivots, product_grid, edges; };
 static void each(int blocks, auto kernel) { launch(blocks, CONTACT_THREADS, kernel); }
 static int island_pass(const IslandArguments& a, const Islands& s) {
     auto law = [&](int what) {
@@ -49,6 +47,9 @@ static int island_pass(const IslandArguments& a, const Islands& s) {
     each(s.grid, [&] { island_residual(a); });
     launch(s.most, SEARCH_THREADS, [&] { island_search(a); });
     each(s.grid, [&] { island_advance(a); });
+#ifdef FACE_ROWS
+    each_triangle(a.c, [&] { sweep_island_faces(a); });
+#endif
     each(s.most, [&] { island_settle(a); });
     return iterations;
 }
@@ -61,6 +62,7 @@ static void detect_pairs(const IslandArguments& a, const Islands& s) {
     each(s.bodies, [&] { pair_boxes(a, 0); });
     each(s.bodies, [&] { pair_trees(a, 0); });
     each(s.sites, [&] { pair_sites(a); });
+    each(s.edges, [&] { pair_edges(a); });
 }
 extern "C" int solve_islands(const IslandArguments* p, const Islands* s) {
     const IslandArguments& a = *p;
@@ -81,9 +83,10 @@ extern "C" int solve_islands(const IslandArguments* p, const Islands* s) {
             each(s->bodies, [&] { pair_boxes(a, 1); });
             each(s->bodies, [&] { pair_trees(a, 1); });
             each(s->sites, [&] { pair_sweep(a); });
+            each(s->edges, [&] { edge_sweep(a); });
         }
-        launch(1, 1, [&] { end_sweep(a); });
-        if (a.tally->go) group(a, *s, 1);
+        launch(1, LISTING_THREADS, [&] { end_sweep(a); });
+        if (a.tally->again) group(a, *s, 1);
     }
     return loops;
 }
@@ -99,12 +102,18 @@ STEP = """
 extern "C" int step(const ContactArguments* c, const ContactSolve* first, const ContactSolve* pass, const System* s,
                     const IslandArguments* a, const Islands* islands) {
     int loops = 0;
+#ifdef FACE_ROWS
+    each_triangle(*c, [&] { detect_faces(*c); });
+#endif
     detect_pairs(*a, *islands);
     group(*a, *islands, 0);
     launch(s->bodies, CONTACT_THREADS, [&] { begin_contact(*c); });
     for (one_pass(*c, *first, *s); *c->active > 0 && loops < 200; ++loops) one_pass(*c, *pass, *s);
     solve_islands(a, islands);
     keep_pairs_of_step(a, islands);
+#ifdef FACE_ROWS
+    launch(s->bodies, CONTACT_THREADS, [&] { finish_faces(*c); });
+#endif
     launch(s->grid, CONTACT_THREADS, [&] { finish_contact(*c); });
     know_pairs_of_step(a, islands);
     return loops;
@@ -113,12 +122,17 @@ extern "C" int step(const ContactArguments* c, const ContactSolve* first, const 
 
 
 class Islands(c.Structure):
-    _fields_ = [(name, c.c_int) for name in ("bodies", "grid", "sites", "most", "pivots", "product_grid")]
+    _fields_ = [(name, c.c_int) for name in ("bodies", "grid", "sites", "most", "pivots", "product_grid", "edges")]
 
 
 @pytest.fixture(scope="module")
 def library(tmp_path_factory: pytest.TempPathFactory) -> c.CDLL:
     return compiled(tmp_path_factory.mktemp("islands"), TEXT + ISLANDS + STEP)
+
+
+@pytest.fixture(scope="module")
+def with_triangles(tmp_path_factory: pytest.TempPathFactory) -> c.CDLL:
+    return compiled(tmp_path_factory.mktemp("triangles"), TEXT + ISLANDS + STEP, DEFINED)
 
 
 class IslandsBeside(Beside):
@@ -135,6 +149,7 @@ class IslandsBeside(Beside):
             max(count // 2, 1),
             islands.pivots,
             islands.product_grid,
+            islands.edge_grid,
         )
         return c.c_void_p(islands.params.ctypes.data), c.byref(Islands(*numbers))
 
@@ -274,6 +289,68 @@ def test_rows_of_a_body_whose_forces_are_not_finite_go(library, monkeypatch):
     first = beside.sim.world.bodies[2].first
     y, ours = beside.arrays["y"], beside.gpu.twin(beside.arrays["y"])
     assert np.isfinite(y[:first]).all() and abs(ours[:first] - y[:first]).max() <= 1e-6 * abs(y[:first]).max()
+
+
+def edge_rows(beside: IslandsBeside) -> int:
+    surfaces = beside.contact.surfaces
+    assert surfaces is not None
+    return int((beside.contact.force[surfaces.edge_start[0] :] > 0).sum())
+
+
+@pytest.mark.parametrize("stiffness", [1.0, 0.01])
+def test_edges_that_cross_between_their_nodes(library, monkeypatch, stiffness):
+    """Also so soft ones that a sweep finds them passing."""
+    sim = crossed(3.0, contact=CONTACT | {"stiffness": stiffness}, solver=TIGHT)
+    beside, used, sweeps = IslandsBeside(library, sim, monkeypatch), 0, 0
+    for _ in range(2):
+        beside.near(1e-6)
+        used, sweeps = max(used, edge_rows(beside)), sweeps + beside.tally["rounds"]
+    assert used > 0 and (sweeps > 0) == (stiffness < 1)
+
+
+@pytest.mark.parametrize("what", ["vertices", "edges"])
+def test_what_still_passes_is_held_apart(library, monkeypatch, what):
+    """Contacts with hardly any stiffness; on both sides by their masses, as on the CPU, which keeps momentum."""
+    soft = {"thickness": D, "tolerance": 1e-8, "passes": 30, "stiffness": 1e-6}
+    sim = thrown(6.0, **soft) if what == "vertices" else crossed(3.0, contact=soft, solver=TIGHT)
+    beside, world, clipped = IslandsBeside(library, sim, monkeypatch), sim.world, 0
+    for _ in range(2):
+        before = world.mass @ world.v
+        slot, rotation = int(beside.counter[0]) % 4, beside.arrays["rotation"]
+        ours, theirs = beside.step()
+        beside.counter += 1
+        assert np.abs(ours - theirs).max() <= 1e-4 * np.abs(theirs).max()
+        records = beside.sim.engine.records()
+        told = beside.told[slot]["clipped"]
+        assert told.tolist() == records["clipped"].tolist()
+        clipped += told.sum()
+        change = np.einsum("n,nij,nj->i", world.mass, rotation, ours)
+        assert abs(world.mass @ world.predictor + change - before).max() <= 1e-9 * world.mass.sum()
+    assert clipped > 0
+
+
+@pytest.mark.parametrize("speed", [0.0, 8.0])
+def test_triangles_of_bodies_that_touch_each_other(with_triangles, monkeypatch, speed):
+    """A block on a spike, which carries another one, or is thrown onto it with that; a third one is alone on a ball."""
+    small = SMALL | {"cells": (2, 1, 2), "size": (0.1, 0.05, 0.1)}
+    low = 0.5 * D if speed == 0 else 0.05
+    blocks = [
+        block(name="low", **small | {"at": (0, low, 0)}), block(name="high", **small | {"at": (0.01, low + 0.05 + 0.5 * D, 0.004)}),
+        block(name="alone", **small | {"at": (2, low, 0)}),
+    ]  # fmt: skip
+    ball = obstacle("ball") | {"pose": {"translate": [2.062, -0.005, 0.029]}}
+    sim = over(obstacle("corner"), ball, objects=blocks, contact=CONTACT, solver=TIGHT, velocity=(0.1 * speed, -speed, 0))
+    beside, used, rounds = IslandsBeside(with_triangles, sim, monkeypatch), 0, 0
+    faces = beside.contact.faces
+    assert faces is not None
+    for _ in range(3):
+        beside.near(1e-6)
+        force = [(beside.contact.force[first:last] > 0).any() for first, last in pairwise(faces.start)]
+        used += force[0] + 2 * force[2]
+        matrix, values = beside.matrix, beside.gpu.twin(beside.arrays["values"])[: len(beside.matrix)]
+        assert np.abs(values - matrix).max() <= 1e-9 * np.abs(matrix).max()
+        rounds = max(rounds, beside.tally["islands"])
+    assert used >= 3 and rounds == 1
 
 
 def test_heights_of_boxes_over_triangles():

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from sim_server.backends.declarations import Declarations
-from sim_server.effects import contact
 from tests.contact.kernels_beside import TEXT, Beside, compiled
 from tests.contact.scenes import D, block, edge, floor, over, ram
 
@@ -23,12 +22,6 @@ extern "C" int step(const ContactArguments* c, const ContactSolve* first, const 
     return loops;
 }
 """
-
-
-@pytest.fixture(autouse=True)
-def nodes_alone(monkeypatch):
-    """On a GPU triangles and edges have no rows: here they have none on the CPU beside it, either."""
-    monkeypatch.setattr(contact, "nodes_alone", lambda world: True)
 
 
 @pytest.fixture(scope="module")

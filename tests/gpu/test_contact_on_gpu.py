@@ -10,7 +10,6 @@ import pytest
 from numpy.typing import NDArray
 
 from sim_server.backends.declarations import Declarations
-from sim_server.effects import contact
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
 from tests.contact.scenes import LOCKSTEP, D, block, edge, floor, over, ram
@@ -34,11 +33,6 @@ CASES: dict[str, Callable[..., Simulation]] = {
     "is hit from below": lambda **table: over(ram(), floor(), at=(0, 0.02, 0), **table),
 }
 
-
-@pytest.fixture(autouse=True)
-def nodes_alone(monkeypatch):
-    """On a GPU triangles have no rows: here they have none on the CPU beside it, either."""
-    monkeypatch.setattr(contact, "nodes_alone", lambda world: True)
 
 
 def both(make: Callable[..., Simulation], steps: int, **table: Any) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sim_server.effects import contact
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
 from tests.contact.scenes import LOCKSTEP, D, block, floor, over
@@ -22,11 +21,6 @@ TIGHT: dict[str, Any] = JACOBI | {"tolerance": 1e-10, "max_iterations": 3000}
 EXACT: dict[str, Any] = {"thickness": D, "tolerance": 1e-8, "passes": 200}
 FAR = floor(pose={"translate": [0, -100, 0]})
 
-
-@pytest.fixture(autouse=True)
-def nodes_alone(monkeypatch):
-    """On a GPU triangles and edges have no rows: here they have none on the CPU beside it, either."""
-    monkeypatch.setattr(contact, "nodes_alone", lambda world: True)
 
 
 def stack(count: int, **table: Any) -> Simulation:

@@ -24,6 +24,7 @@ extern "C" int step(const ContactArguments* c, const ContactSolve* first, const 
     int loops = 0;
     if (islands->sites) detect_pairs(*a, *islands);
     each((items + CONTACT_THREADS - 1) / CONTACT_THREADS, [&] { begin_ties(*a); });
+    each(islands->edges, [&] { bind_edges(*a); });
     group(*a, *islands, 0);
     each(s->bodies, [&] { begin_contact(*c); });
     for (one_pass(*c, *first, *s); *c->active > 0 && loops < 200; ++loops) one_pass(*c, *pass, *s);
@@ -49,7 +50,7 @@ class TiesBeside(IslandsBeside):
         islands, count = self.passes.islands, len(self.ranges)
         assert islands is not None
         sites = islands.vertex_grid if self.contact.surfaces else 0
-        numbers = (count, self.passes.grid, sites, count, islands.pivots, islands.product_grid)
+        numbers = (count, self.passes.grid, sites, count, islands.pivots, islands.product_grid, islands.edge_grid)
         return c.c_void_p(islands.params.ctypes.data), c.byref(Islands(*numbers))
 
     def same(self, rel: float) -> np.void:

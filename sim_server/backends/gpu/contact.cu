@@ -11,10 +11,11 @@
 // A thread block has a body: chooses the rows that count as closed in the first pass.
 extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) begin_contact(const ContactArguments c) {
     __shared__ double least[CONTACT_THREADS];
-    const int body = blockIdx.x, first = c.body_start[body], last = c.body_start[body + 1];
+    const int body = blockIdx.x;
     double earliest = NEVER;
-    for (int r = first + threadIdx.x; r < last; r += CONTACT_THREADS)
-        if (used(c, r) && c.entry[r] < earliest) earliest = c.entry[r];
+    each_own_row(c, body, [&](int r) {
+        if (c.entry[r] < earliest) earliest = c.entry[r];
+    });
     least[threadIdx.x] = earliest;
     __syncthreads();
     for (int k = CONTACT_THREADS / 2; k; k /= 2) {
@@ -23,16 +24,16 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) begin_contact(cons
     }
     earliest = least[0];
     double closed[1] = {0};
-    for (int r = first + threadIdx.x; r < last; r += CONTACT_THREADS) {
-        if (!used(c, r)) continue;
+    each_own_row(c, body, [&](int r) {
         DeviceRow& row = c.row[r];
         row.limit = c.force[r];
         row.in_set = c.force[r] > 0 || (c.entry[r] <= 1 && c.entry[r] <= earliest + FIRST);
         closed[0] += row.in_set;
-    }
+    });
     sum_block(closed);
     const int rows = list_rows(c, body);
     if (threadIdx.x > 0) return;
+    if (FACES) c.faces.entered[body] = 0;
     const double unknown = __longlong_as_double(0x7ff8000000000000ll);
     const bool grouped = c.island_of && c.island_of[body] >= 0;
     c.state[body] = {0, 0, 1, unknown, grouped ? OVER : closed[0] > 0 ? CHOOSE_START : WITHOUT, 0, 0, 1, 0, 0, rows};
@@ -48,7 +49,7 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) contact_forces(con
     const ContactState state = c.state[here.body];
     if (blockIdx.x == 0 && threadIdx.x == 0) *c.pool_counter = 0;
     if (state.phase == WITHOUT && i < here.end) {
-        keep_block(c, SurfaceNode::at(c, i));
+        keep_block(c, SurfaceNode::at(c, i), here.body);
         for (long long k = 3ll * i; k < 3ll * i + 3; ++k) c.contact_b[k] = c.b[k];
     }
     if (state.phase != CHOOSE_START && state.phase != READY) return;
@@ -56,7 +57,7 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) contact_forces(con
     if (i < here.end) {
         const bool starts = state.phase == CHOOSE_START;
         const SurfaceNode n = SurfaceNode::at(c, i);
-        if (starts) keep_block(c, n);
+        if (starts) keep_block(c, n, here.body);
         double b[3], y[3], f[3] = {0, 0, 0}, other[3] = {0, 0, 0}, S[9] = {};
         load3(c.b, i, b);
         load3(c.y, i, y);
@@ -85,18 +86,25 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) contact_forces(con
             n.add_stiffness(c, row, c.row[r].force, S);
             sum[2] += state.set && c.row[r].in_set != (int)contact_force(row, s, 0, false).closed;
         }
+        double pull[3] = {0, 0, 0};  // of triangles, H^T S H y; at the start i H^T f at 0
+        if (has_faces(c, n, here.body)) {
+            add_face_impulses(c, n, f);
+            add_face_pulls(c, n, starts ? other : pull);
+        }
         for (int k = 0; k < 3; ++k) {
-            const double Sy = S[3 * k] * y[0] + S[3 * k + 1] * y[1] + S[3 * k + 2] * y[2], all = b[k] + (starts ? other[k] : f[k]);
+            const double Sy = S[3 * k] * y[0] + S[3 * k + 1] * y[1] + S[3 * k + 2] * y[2] + pull[k], all = b[k] + (starts ? other[k] : f[k]);
             c.contact_b[3ll * i + k] = (real)(b[k] + f[k] + Sy);
             sum[0] += all * all;
             sum[1] += b[k] * b[k];
         }
+        if (has_faces(c, n, here.body) && !starts) add_face_blocks(c, n, S);
         if (n.pair >= 0 && !starts) {
             real *own = c.values + 9ll * c.place[i], *base = c.base + 9ll * (n.pair / 2);
             for (int k = 0; k < 9; ++k) own[k] = (real)((double)base[k] + S[k]);
         }
     }
     if (!sum_body(c, here, sum) || threadIdx.x > 0) return;
+    if (FACES) sum[2] += c.faces.counted[here.body];
     ContactState& to = c.state[here.body];
     if (state.phase == CHOOSE_START) {
         to.zero2 = sum[0];
@@ -122,7 +130,7 @@ __device__ void look_for_touch(const ContactArguments& c, const SurfaceNode& n, 
 
 // Evaluates the law at the start that the solver chose. sum[0]: square of the residual with it, b - A y + i H^T f; sum[1], sum[2]: of
 // b + i H^T f and b.
-__device__ void evaluate_start(const ContactArguments& c, const SurfaceNode& n, const double* y, bool zero, double* sum) {
+__device__ void evaluate_start(const ContactArguments& c, const SurfaceNode& n, int body, const double* y, bool zero, double* sum) {
     double product[3], b[3], s[3], f[3] = {0, 0, 0};
     load3(c.last, n.node, product);
     load3(c.b, n.node, b);
@@ -132,6 +140,7 @@ __device__ void evaluate_start(const ContactArguments& c, const SurfaceNode& n, 
         evaluate(c, r, s, false, false);
         n.add_force(c, r, c.row[r].force, f);
     }
+    if (has_faces(c, n, body)) add_face_impulses(c, n, f);
     for (int k = 0; k < 3; ++k) {
         const double all = b[k] + f[k], left = zero ? all : all + product[k];
         sum[0] += left * left;
@@ -142,22 +151,26 @@ __device__ void evaluate_start(const ContactArguments& c, const SurfaceNode& n, 
 
 // Sums of the line search, with r and r' the residuals of the pass: sum[0] dy . (b - A y) = dy . (r - i H^T f),
 // sum[1] dy . A dy = dy . (r - r' - H^T S H dy).
-__device__ void project(const ContactArguments& c, const SurfaceNode& n, const double* y, double* sum) {
-    double from[3], before[3], after[3], f[3] = {0, 0, 0}, S[9] = {};
+__device__ void project(const ContactArguments& c, const SurfaceNode& n, int body, const double* y, double* sum) {
+    double from[3], before[3], after[3], f[3] = {0, 0, 0}, S[9] = {}, pull[3] = {0, 0, 0};
     load3(c.start, n.node, from);
     load3(c.first, n.node, before);
     load3(c.last, n.node, after);
     const double dy[3] = {y[0] - from[0], y[1] - from[1], y[2] - from[2]};
     if (n.pair >= 0) add_rows(c, n, f, S);
+    if (has_faces(c, n, body)) {
+        add_face_impulses(c, n, f);
+        add_face_pulls(c, n, pull);
+    }
     for (int k = 0; k < 3; ++k) {
         sum[0] += dy[k] * (before[k] - f[k]);
-        sum[1] += dy[k] * (before[k] - after[k] - (S[3 * k] * dy[0] + S[3 * k + 1] * dy[1] + S[3 * k + 2] * dy[2]));
+        sum[1] += dy[k] * (before[k] - after[k] - (S[3 * k] * dy[0] + S[3 * k + 1] * dy[1] + S[3 * k + 2] * dy[2] + pull[k]));
     }
 }
 
 // Evaluates the law after the last pass. sum[0]: square of the residual with it, r' + i H^T (f' - f) + H^T S H dy;
 // sum[1], sum[2]: of b + i H^T f' and b.
-__device__ void evaluate_end(const ContactArguments& c, const SurfaceNode& n, const double* y, double* sum) {
+__device__ void evaluate_end(const ContactArguments& c, const SurfaceNode& n, int body, const double* y, double* sum) {
     double from[3], left[3], b[3], s[3], f[3] = {0, 0, 0}, now[3] = {0, 0, 0}, S[9] = {};
     load3(c.start, n.node, from);
     load3(c.last, n.node, left);
@@ -172,6 +185,10 @@ __device__ void evaluate_end(const ContactArguments& c, const SurfaceNode& n, co
         evaluate(c, r, s, true, false);
         n.add_force(c, r, c.row[r].force, now);
     }
+    if (has_faces(c, n, body)) {
+        add_face_impulses(c, n, now);
+        add_face_pulls(c, n, left);
+    }
     for (int k = 0; k < 3; ++k) {
         const double r = left[k] + now[k] - f[k] + S[3 * k] * dy[0] + S[3 * k + 1] * dy[1] + S[3 * k + 2] * dy[2];
         sum[0] += r * r;
@@ -182,8 +199,8 @@ __device__ void evaluate_end(const ContactArguments& c, const SurfaceNode& n, co
 
 // Part of the solution at which the function that the pass minimizes is least along it. Done by a whole thread block.
 __device__ double search_along(const ContactArguments& c, int body, int rows, double dot_left, double curvature) {
-    const int* list = c.list + c.body_start[body];
-    for (int k = threadIdx.x; k < rows; k += CONTACT_THREADS) {
+    const int *list = list_of(c, body), nodes = rows - (FACES ? c.faces.rows[body] : 0);  // triangles have their steps
+    for (int k = threadIdx.x; k < nodes; k += CONTACT_THREADS) {
         const SurfaceNode n = SurfaceNode::at(c, c.node[list[k]]);
         double from[3], y[3], u[3];
         load3(c.start, n.node, from);
@@ -218,14 +235,15 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) contact_search(con
         const SurfaceNode n = SurfaceNode::at(c, i);
         double y[3];
         load3(c.y, i, y);
-        if (starts) evaluate_start(c, n, y, phase == FROM_ZERO, sum);
+        if (starts) evaluate_start(c, n, here.body, y, phase == FROM_ZERO, sum);
         if (phase == SOLVED && n.pair >= 0) look_for_touch(c, n, y, sum);
-        if (phase == PASSED) project(c, n, y, sum);
-        if (phase == LAST_PASSED) evaluate_end(c, n, y, sum);
+        if (phase == PASSED) project(c, n, here.body, y, sum);
+        if (phase == LAST_PASSED) evaluate_end(c, n, here.body, y, sum);
         if (phase >= LAST_PASSED && n.pair >= 0 && state.rounds < ROUNDS) sum[3] += sweep(c, n, y);
     }
     if (!sum_body(c, here, sum)) return;
-    const bool entered = sum[phase == SOLVED ? 1 : 3] > 0;
+    if (FACES && phase == SOLVED) sum[0] += c.faces.counted[here.body];
+    const bool entered = sum[phase == SOLVED ? 1 : 3] > 0 || (FACES && c.faces.entered[here.body]);
     bool again = phase != LOST;
     state.set = 0;
     if (starts) {  // rows that would be hit without the law need not count as closed where it holds
@@ -251,34 +269,14 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) contact_search(con
     }
     state.hold = phase == PASSED;
     state.phase = again ? READY : OVER;
+    if (FACES) __syncthreads();
     if (threadIdx.x > 0) return;
+    if (FACES) c.faces.entered[here.body] = 0;
     c.state[here.body] = state;
     if (!again) atomicSub(c.active, 1);
 }
 
 // --- the end of a step --------------------------------------------------------------------------------------------------------------
-
-// Sets a point that y moves into an obstacle back, to a part of the way. Returns whether it does.
-__device__ bool clip(const ContactArguments& c, const SurfaceNode& n) {
-    double y[3], from[3], to[3], begin[3], end[3], back[3], earliest = NEVER;
-    load3(c.y, n.node, y);
-    load3(c.x, n.node, from);
-    n.displacement(c, y, to);
-    for (int k = 0; k < 3; ++k) to[k] += from[k];
-    for (int o = 0; o < c.obstacle_count; ++o) {
-        const double t = entry(c.obstacles, o, 0, from, to, begin, end);
-        if (t > 1 || t >= earliest) continue;
-        earliest = t;
-        for (int k = 0; k < 3; ++k) back[k] = begin[k] + SHORT_OF * t * (end[k] - begin[k]);
-        world_point(c.obstacles.end + 7 * o, back, back);
-    }
-    if (earliest > 1) return false;
-    double dv[3];
-    for (int k = 0; k < 3; ++k) dv[k] = (back[k] - from[k]) / c.dx_dv - (double)c.predictor[3ll * n.node + k];
-    n.to_material(dv, y);
-    for (int k = 0; k < 3; ++k) c.y[3ll * n.node + k] = (real)y[k];
-    return true;
-}
 
 // Keeps the forces of a node's rows for the next step: sum[0] rows that carry force, sum[1] their work.
 __device__ void keep_forces(const ContactArguments& c, const SurfaceNode& n, bool well, double* sum) {
@@ -303,7 +301,7 @@ __device__ void keep_forces(const ContactArguments& c, const SurfaceNode& n, boo
 
 // Force and torque of a body on each obstacle, to the host. Done by a whole thread block.
 __device__ void write_reactions(const ContactArguments& c, int body, int rows, long long slot) {
-    const int* list = c.list + c.body_start[body];
+    const int* list = list_of(c, body);
     for (int o = 0; o < c.obstacle_count; ++o) {
         double sum[6] = {};
         for (int k = threadIdx.x; k < rows; k += CONTACT_THREADS) {
@@ -311,9 +309,11 @@ __device__ void write_reactions(const ContactArguments& c, int body, int rows, l
             const double normal = __ldcg(c.force + r);
             if (c.obstacle[r] != o || !(normal > 0)) continue;
             double f[3], arm[3];
+            const bool face = is_face(c, r);
+            if (face) place_on_face(c, r, arm);
             for (int m = 0; m < 3; ++m) {
                 f[m] = normal * c.normal[3 * r + m] + __ldcg(c.traction + 3 * r + m);
-                arm[m] = (double)c.x[3ll * c.node[r] + m] + c.row[r].s[m] - c.obstacles.end[7 * o + m];
+                arm[m] = (face ? arm[m] : (double)c.x[3ll * c.node[r] + m]) + c.row[r].s[m] - c.obstacles.end[7 * o + m];
                 sum[m] -= f[m];
             }
             sum[3] -= arm[1] * f[2] - arm[2] * f[1];
@@ -342,15 +342,27 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) finish_contact(con
             if (well) sum[2] += clip(c, n);
             keep_forces(c, n, well, sum);
             for (int k = 0; k < 9; ++k) c.values[9ll * c.place[i] + k] = c.known[9ll * (n.pair / 2) + k];  // copies are made after the step
+            if (has_faces(c, n, body)) give_links(c, n, c.faces.known);
         } else if (c.pair[i] >= 0) {  // of a fixed node
             for (int r = c.pair[i]; r < c.pair[i] + 2; ++r) c.force[r] = c.traction[3 * r] = c.traction[3 * r + 1] = c.traction[3 * r + 2] = 0;
         }
     }
     if (c.island_of && threadIdx.x == 0) sum[1] += c.pair_sums[blockIdx.x];
     if (!sum_body(c, here, sum)) return;
+    if (FACES) {
+        sum[0] += c.faces.sums[2 * body];
+        sum[1] += c.faces.sums[2 * body + 1];
+        sum[2] += c.faces.clipped[body];
+    }
     const bool grouped = c.island_of && c.island_of[body] >= 0;  // its sweeps have not listed rows
-    write_reactions(c, body, grouped ? list_rows(c, body) : state.rows, slot);
+    int rows = state.rows;
+    if (grouped) {
+        rows = list_rows(c, body);
+        __syncthreads();  // threads read what others have listed
+    }
+    write_reactions(c, body, rows, slot);
     if (threadIdx.x > 0) return;
+    if (c.island_of) sum[2] += c.pair_clipped[body];
     const int contacts = (int)sum[0] + (c.island_of ? c.pair_contacts[body] : 0);
     const double unknown = __longlong_as_double(0x7ff8000000000000ll);
     c.contact_results[slot * c.count + body] = {contacts || state.passes ? state.residual : unknown, contacts, state.passes, (int)sum[2]};

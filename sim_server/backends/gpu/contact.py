@@ -14,6 +14,7 @@ from sim_server.backends.declarations import Declarations
 from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction
 from sim_server.backends.gpu.device import Gpu, compiled, options, own_headers
 from sim_server.backends.gpu.energies import node_chunks
+from sim_server.backends.gpu.faces import DEFINED, FaceRows
 from sim_server.backends.gpu.islands import Graphs, IslandPasses
 from sim_server.backends.gpu.solver import PcgSolver
 from sim_server.backends.gpu.structs import CONTACT_SOLVE, CONTACT_STATE
@@ -35,8 +36,6 @@ def pairs_of(contact: Contact, nodes: int) -> Int32:
 
     Raises ValueError for rows that are not pairs of one node.
     """
-    if contact.faces:
-        raise ValueError("triangles of a surface have no rows of contact on a GPU")
     count = contact.body_start[-1]
     node = contact.corner[:count, 0]
     alone = (contact.corner[:count, 1:] < 0).all() and (contact.weight[:count, 0] == 1).all()
@@ -99,14 +98,16 @@ class ContactPasses:
             "results": solver.results, "step": solver.counter, "balance": balance,
         }  # fmt: skip
         self._table = {n: gpu.twin(a, dtype=a.dtype) for n in TABLE for a in [getattr(contact.obstacles, n)]}
+        self.faces = FaceRows(gpu, contact, contact.faces, starts, arrays, real) if contact.faces else None
         self.params = self._arguments(contact, results, reactions)
         self.islands: IslandPasses | None = None
         if contact.surfaces or contact.ties:
-            given = gpu, device, contact, ranges, arrays, solver, self.params, chunks, THREADS, broken
+            given = gpu, device, contact, ranges, arrays, solver, self.params, chunks, THREADS, broken, self.faces
             self.islands = IslandPasses(*given)
         self.first, self.later = self._solve(contact, 1), self._solve(contact, 0)
         module = cp.RawModule(
-            code=TEXT.checked(), options=(*options(gpu.types), *own_headers()), backend="nvrtc"
+            code=TEXT.checked(), options=(*options(gpu.types), *own_headers(), *([DEFINED] if self.faces else [])),
+            backend="nvrtc",
         )  # fmt: skip
         self._kernels: dict[str, KernelFunction] = {name: compiled("contact.cu", module, name) for name in KERNELS}
 
@@ -117,6 +118,8 @@ class ContactPasses:
             params[name] = array.data.ptr
         for name, array in self._table.items():
             params["obstacles"][name] = array.data.ptr
+        if self.faces:
+            self.faces.fill(params["faces"])
         params["contact_results"], params["reactions"] = results.ctypes.data, reactions.ctypes.data
         params["dx_dv"], params["force_coefficient"] = contact.dx_dv, contact.force_coefficient
         params["tolerance"], params["obstacle_count"] = contact.tolerance, len(contact.obstacles.kind)
@@ -139,12 +142,33 @@ class ContactPasses:
     def _launch(self, kernel: str, blocks: int) -> None:
         self._kernels[kernel]((blocks,), (THREADS,), (self.params,))
 
+    def _launch_faces(self, *kernels: str) -> None:
+        for kernel in kernels if self.faces else ():
+            assert self.faces is not None
+            self.faces.launch(kernel, self.params)
+
+    def detect(self) -> None:
+        """Appends the detection that is no launch of an effect, once a step: it turns what rows remember with their
+        normals."""
+        self._launch_faces("detect_faces")
+        if self.islands:
+            self.islands.detect()
+
+    @property
+    def detects(self) -> bool:
+        """Whether there is such detection."""
+        return bool(self.islands or self.faces)
+
     def begin(self) -> None:
         """Appends what comes before the first solve of a step whose rows are detected."""
         if self.islands:
             self.islands.begin_ties()
             self.islands.group()
         self._launch("begin_contact", self._bodies)
+        self._forces()
+
+    def _forces(self) -> None:
+        self._launch_faces("face_forces")
         self._launch("contact_forces", self.grid)
 
     def launch(self) -> None:
@@ -152,11 +176,12 @@ class ContactPasses:
         self.begin()
         self._solve_and_search(self.first)
         with self._device.repeat(self.active):
-            self._launch("contact_forces", self.grid)
+            self._forces()
             self._solve_and_search(self.later)
         if self.islands:
             self.islands.launch()
             self.islands.keep()
+        self._launch_faces("finish_faces")
         self._launch("finish_contact", self.grid)
         if self.islands:
             self.islands.know(self.memory["values"])
@@ -164,6 +189,7 @@ class ContactPasses:
 
     def _solve_and_search(self, solve: NDArray[Any]) -> None:
         self._solver.solve_contact(self.memory["contact_b"], solve)
+        self._launch_faces("face_search", "sweep_faces")
         self._launch("contact_search", self.grid)
 
     def known(self, values: Float64) -> Float64:
@@ -173,6 +199,8 @@ class ContactPasses:
         out = values.copy()
         if len(self._surface):
             out[self._surface] = self.memory["known"].get()
+        if self.faces:
+            self.faces.known(out)
         if not self.islands:
             return out
         copy = self._gpu.cp.asarray(out.astype(self._solver.real))

@@ -2,7 +2,8 @@
 // Rows of contact on a GPU: arguments of the kernels, sums, what acts at a node, and points that enter obstacles; shared by contact.cu
 // and island.cu.
 //
-// Rows against obstacles come in pairs, of one node each with weight 1. Numbers of contact are double for every `real`.
+// Rows against obstacles come in pairs, of one node each with weight 1, and, with FACE_ROWS, one for each triangle of a surface
+// (device_faces.cuh). Numbers of contact are double for every `real`.
 #pragma once
 #include "contact_state.cuh"
 #include "energy_balance.cuh"
@@ -14,6 +15,11 @@
 
 constexpr int CONTACT_THREADS = 128, CONTACT_SUMS = 6;
 #define WARP 0xffffffffu
+#ifdef FACE_ROWS
+constexpr bool FACES = true;
+#else
+constexpr bool FACES = false;
+#endif
 
 struct DeviceRow {       // of a row in the step under way
     double s[3];         // displacement of its point by the velocities reached [m]
@@ -21,6 +27,41 @@ struct DeviceRow {       // of a row in the step under way
     double limit;        // normal force that limits friction, held in a pass [N]
     ContactForce force;
     int in_set;          // 1: counts as closed in the first pass
+};
+
+struct FaceRow {         // of a triangle in the step under way
+    double stiffness[6];  // upper triangle of the force's slope times h^2, world frame [kg]
+    double impulse[3];    // i (lambda n + tau)
+    double pull[3];       // what nodes sum next, by what contact_search or contact_forces does
+    double time;          // of the passage through `held_at`
+    int held_at;          // obstacle that it is set back in front of; -1: none
+};
+
+struct DeviceFaces {     // triangles with rows against obstacles; null where there are none
+    const int* start;           // (bodies + 1,) rows
+    const int* node;            // (faces, 3)
+    const int* owns;            // (faces,) bits
+    const int* body;            // (faces,)
+    const double* friction;     // (bodies, obstacles)
+    const int* node_site;       // (nodes,) or -1
+    const int* node_start;      // (bodies + 1,) nodes
+    const double* gravity;      // (3,) [m/s2]
+    const int* entry_start;     // (nodes + 1,)
+    const int* entry;           // CORNERS * triangle + corner, those of a node ascending
+    const int* entry_link;      // (entries, 2) links from the corner to the next one, and to the one after; -1: there is none
+    const int* link_start;      // (nodes + 1,)
+    const int* link_place;      // (links,) of the block between a node and another one on the surface, in values
+    int* corner;                // (rows, CORNERS)
+    double* weight;             // (rows, CORNERS)
+    int* dropped;               // (sites,)
+    real* base;                 // (links, 3, 3) blocks without contact
+    real* known;                // (links, 3, 3) and as a factor is to know them
+    FaceRow* row;               // (faces,)
+    int* rows;                  // (bodies,) in use, the last of those that are listed
+    int* counted;               // (bodies,) rows that act, or that do not count as closed as the law has it
+    int* entered;               // (bodies,) 1: the solution takes a triangle into an obstacle
+    int* clipped;               // (bodies,) nodes held back before the others are
+    double* sums;               // (bodies, 2) rows that carry force, and their work
 };
 
 struct ContactArguments {
@@ -70,10 +111,12 @@ struct ContactArguments {
     const int* alone;           // (1,) how many are
     double* pair_sums;          // (grid,) work of rows between bodies
     int* pair_contacts;         // (bodies,) those that carry force
+    int* pair_clipped;          // (bodies,) places where it is held apart from others
     double dx_dv;               // [s]
     double force_coefficient;   // [s]
     double tolerance;
     int obstacle_count, count, capacity, passes;
+    DeviceFaces faces;
 };
 
 // --- sums ---------------------------------------------------------------------------------------------------------------------------
@@ -125,10 +168,15 @@ template <int N> __device__ __forceinline__ double pick(const double (&sum)[N], 
 
 __device__ __forceinline__ bool used(const ContactArguments& c, int row) { return __ldcg(c.obstacle + row) >= 0; }
 
-// Lists the rows of a body that are not empty, in order; returns their number. Done by a whole thread block.
-__device__ int list_rows(const ContactArguments& c, int body) {
+// Where the list of a body's rows begins.
+__device__ __forceinline__ int* list_of(const ContactArguments& c, int body) {
+    return c.list + c.body_start[body] + (FACES ? c.faces.start[body] - c.faces.start[0] : 0);
+}
+
+// Lists the rows from first to last that are not empty, in order; returns their number. Done by a whole thread block.
+__device__ __forceinline__ int list_range(const ContactArguments& c, int first, int last, int* list) {
     __shared__ int before[CONTACT_THREADS];
-    const int first = c.body_start[body], last = c.body_start[body + 1], each = (last - first + CONTACT_THREADS - 1) / CONTACT_THREADS;
+    const int each = (last - first + CONTACT_THREADS - 1) / CONTACT_THREADS;
     const int begin = min(first + (int)threadIdx.x * each, last), end = min(begin + each, last);
     int own = 0;
     for (int r = begin; r < end; ++r) own += used(c, r);
@@ -141,10 +189,20 @@ __device__ int list_rows(const ContactArguments& c, int body) {
         before[threadIdx.x] += other;
         __syncthreads();
     }
-    int* to = c.list + first + before[threadIdx.x] - own;
+    int* to = list + before[threadIdx.x] - own;
     for (int r = begin; r < end; ++r)
         if (used(c, r)) *to++ = r;
     return before[CONTACT_THREADS - 1];
+}
+
+// Lists the rows of a body that are not empty, those of triangles last; returns their number. Done by a whole thread block.
+__device__ int list_rows(const ContactArguments& c, int body) {
+    const int nodes = list_range(c, c.body_start[body], c.body_start[body + 1], list_of(c, body));
+    if (!FACES) return nodes;
+    __syncthreads();
+    const int faces = list_range(c, c.faces.start[body], c.faces.start[body + 1], list_of(c, body) + nodes);
+    if (threadIdx.x == 0) c.faces.rows[body] = faces;
+    return nodes + faces;
 }
 
 __device__ __forceinline__ ContactRow row_at(const ContactArguments& c, int r) {
@@ -195,6 +253,8 @@ struct SurfaceNode {         // a node and its frame
     }
 };
 
+#include "device_faces.cuh"
+
 __device__ __forceinline__ void load3(const real* from, int i, double* to) {
     for (int k = 0; k < 3; ++k) to[k] = from[3ll * i + k];
 }
@@ -220,13 +280,17 @@ __device__ __forceinline__ void evaluate(const ContactArguments& c, int r, const
 
 // Keeps a node's own block without contact, and with contacts that carried force in the last step: a factor that is made from a copy
 // of A is to know them.
-__device__ void keep_block(const ContactArguments& c, const SurfaceNode& n) {
+__device__ void keep_block(const ContactArguments& c, const SurfaceNode& n, int body) {
     const int pair = c.pair[n.node];
     if (pair < 0) return;
     double S[9] = {};
     for (int r = n.pair; n.pair >= 0 && r < n.pair + 2; ++r)
         if (used(c, r) && c.force[r] > 0)
             n.add_stiffness(c, row_at(c, r), lasting_contact(c.friction[r], c.force[r], c.traction + 3 * r), S);
+    if (FACES) {
+        keep_links(c, n);
+        if (has_faces(c, n, body)) add_known_faces(c, n, S);
+    }
     const real* own = c.values + 9ll * c.place[n.node];
     for (int k = 0; k < 9; ++k) {
         const long long to = 9ll * (pair / 2) + k;
@@ -282,4 +346,26 @@ __device__ bool sweep(const ContactArguments& c, const SurfaceNode& n, const dou
         found = true;
     }
     return found;
+}
+
+// Sets a point that y moves into an obstacle back, to a part of the way. Returns whether it does.
+__device__ bool clip(const ContactArguments& c, const SurfaceNode& n) {
+    double y[3], from[3], to[3], begin[3], end[3], back[3], earliest = NEVER;
+    load3(c.y, n.node, y);
+    load3(c.x, n.node, from);
+    n.displacement(c, y, to);
+    for (int k = 0; k < 3; ++k) to[k] += from[k];
+    for (int o = 0; o < c.obstacle_count; ++o) {
+        const double t = entry(c.obstacles, o, 0, from, to, begin, end);
+        if (t > 1 || t >= earliest) continue;
+        earliest = t;
+        for (int k = 0; k < 3; ++k) back[k] = begin[k] + SHORT_OF * t * (end[k] - begin[k]);
+        world_point(c.obstacles.end + 7 * o, back, back);
+    }
+    if (earliest > 1) return false;
+    double dv[3];
+    for (int k = 0; k < 3; ++k) dv[k] = (back[k] - from[k]) / c.dx_dv - (double)c.predictor[3ll * n.node + k];
+    n.to_material(dv, y);
+    for (int k = 0; k < 3; ++k) c.y[3ll * n.node + k] = (real)y[k];
+    return true;
 }

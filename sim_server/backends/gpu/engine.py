@@ -126,8 +126,8 @@ class GpuEngine(DeviceLoop):
                 gpu, device, given.contact, ranges, arrays, self.solver, balance, contact_results, reactions,
                 self._broken,
             )  # fmt: skip
-            if self._contact.islands:
-                self._whole_assembly = [*self._whole_assembly, self._contact.islands.detect]
+            if self._contact.detects:
+                self._whole_assembly = [*self._whole_assembly, self._contact.detect]
                 self._first_launches = self._whole_assembly
         self._held, held = None, None
         if given.held is not None:

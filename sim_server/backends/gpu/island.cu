@@ -7,6 +7,9 @@
 // with Z^T r = 0 at the start, where this is the balanced form of island.h (A-DEF2 of Tang, Nabben, Vuik and Erlangga 2009). A z follows
 // from A z' and A Z, A p from A z: one product and one solve with E an iteration, whose sums are made at its end, all at once.
 #include "island_state.cuh"
+#ifdef FACE_ROWS
+#include "face_sweep.cuh"
+#endif
 #include "invert3.cuh"
 
 constexpr int ROW_SUMS = HAS_TIES ? 2 : 1;  // rows whose state is not that of the set, and those that are no ties
@@ -20,11 +23,13 @@ __device__ __forceinline__ bool has_factor(const PcgBody& body) { return body.ki
 // --- rows and nodes -----------------------------------------------------------------------------------------------------------------
 
 // f(row, weight) of what acts at a node.
-template <class F> __device__ __forceinline__ void each_entry(const IslandArguments& a, int node, F f) {
+template <class F> __device__ __forceinline__ void each_entry(const IslandArguments& a, int body, int node, F f) {
     const int pair = a.c.pair[node];
     if (a.c.free[node] == 0) return;
     for (int r = pair; pair >= 0 && r < pair + 2; ++r)
         if (used(a.c, r)) f(r, 1.0, 0);
+    if (FACES && pair >= 0 && a.c.faces.rows[body] > 0)
+        each_face_row(a.c, node, [&](int r, int corner, int) { f(r, a.t.weight[CORNERS * r + corner], corner); });
     const int first = a.start[node], last = first + a.count[node];
     for (int k = first; k < last; ++k) {
         const int entry = a.entry[k], r = entry / CORNERS, corner = entry % CORNERS;
@@ -33,9 +38,9 @@ template <class F> __device__ __forceinline__ void each_entry(const IslandArgume
 }
 
 // f += R^T sum of what rows have in a vector of theirs
-template <class Of> __device__ __forceinline__ void add_entries(const IslandArguments& a, int node, double* f, Of of) {
+template <class Of> __device__ __forceinline__ void add_entries(const IslandArguments& a, int body, int node, double* f, Of of) {
     double sum[3] = {0, 0, 0}, out[3];
-    each_entry(a, node, [&](int r, double weight, int) {
+    each_entry(a, body, node, [&](int r, double weight, int) {
         const double* v = of(a.row[r]);
         for (int k = 0; k < 3; ++k) sum[k] += weight * v[k];
     });
@@ -88,9 +93,13 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_start(const
             a.entry[at] = entry;
         }
         const int pair = a.c.pair[i];
-        if (phase == ISLAND_BEGINS) keep_block(a.c, SurfaceNode::at(a.c, i));
-        else if (pair >= 0)  // it may have been alone
+        if (phase == ISLAND_BEGINS) {
+            keep_block(a.c, SurfaceNode::at(a.c, i), body);
+        } else if (pair >= 0) {  // it may have been alone
             for (int k = 0; k < 9; ++k) a.c.values[9ll * a.c.place[i] + k] = a.c.base[9ll * (pair / 2) + k];
+            const SurfaceNode n = SurfaceNode::at(a.c, i);
+            if (has_faces(a.c, n, body)) give_links(a.c, n, a.c.faces.base);
+        }
         double Ay[3] = {0, 0, 0}, AZ[3][MODES] = {};
         for (int k = a.row_start[i]; k < a.row_start[i + 1]; ++k) {
             const real* block = a.c.values + 9ll * k;
@@ -140,7 +149,7 @@ __device__ __forceinline__ void point_displacement(const IslandArguments& a, int
         }
         for (int k = 0; k < 3; ++k) s[k] += weight * a.c.dx_dv * ((double)a.c.predictor[3ll * node + k] + u[k]);
     };
-    if (r < a.t.pair_first) return add(a.c.node[r], 1);
+    if (!is_pair(a, r) && !is_face(a.c, r) && !is_tie(a, r)) return add(a.c.node[r], 1);
     for (int k = 0; k < CORNERS; ++k)
         if (a.t.corner[CORNERS * r + k] >= 0) add(a.t.corner[CORNERS * r + k], a.t.weight[CORNERS * r + k]);
 }
@@ -149,8 +158,7 @@ __device__ __forceinline__ void set_lever(const IslandArguments& a, int r, doubl
     for (int k = 0; k < 8; ++k) lever[k] = 0;
     each_corner(a, r, [&](int node, double weight, int corner) {
         const bool other = is_other_side(a, r, corner);
-        double* side = lever + 4 * other;
-        double arm[3];
+        double *side = lever + 4 * other, arm[3];
         arm_of(a, body_of_row(a, r, other), node, arm);
         side[0] += weight;
         for (int k = 0; k < 3; ++k) side[1 + k] += weight * arm[k];
@@ -181,7 +189,7 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_law(const I
     if (state.relist) list_own_rows(a, body);
     __syncthreads();
     const int rows = __ldcg(a.own_rows + body);
-    const int* list = a.own_row + own_start(a, body);
+    const int* list = own_list(a, body);
     double earliest = NEVER, changed[ROW_SUMS] = {};
     if (what == WARM_START)
         for (int k = 0; k < state.bodies; ++k) earliest = fmin(earliest, a.earliest[a.island[a.island_start[island] + k]]);
@@ -223,7 +231,7 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_balance(con
     double sum[CG_SUMS] = {};
     if (i < here.end) {
         double f[3] = {0, 0, 0};
-        add_entries(a, i, f, [](const IslandRow& row) { return row.impulse; });
+        add_entries(a, here.body, i, f, [](const IslandRow& row) { return row.impulse; });
         for (int k = 0; k < 3; ++k) {
             const long long at = 3ll * i + k;
             const double b = a.c.b[at];
@@ -327,7 +335,7 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_prepare(con
     }
     if (phase != ISLAND_SOLVES) return;
     double block[9], S[9] = {}, sum[6] = {};
-    each_entry(a, i, [&](int r, double weight, int) {
+    each_entry(a, here.body, i, [&](int r, double weight, int) {
         for (int k = 0; k < 6; ++k) sum[k] += weight * weight * a.row[r].stiffness[k];
     });
     const local* R = rotation_of(a, i);
@@ -361,7 +369,7 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) coarse_matrix(cons
         E[k / MODES * a.most_modes + mode + k % MODES] = sum;
     }
     const int pairs = a.tally->pairs, own = __ldcg(a.own_rows + body) - __ldcg(a.pair_rows + body);  // first those against obstacles
-    const int* list = a.own_row + own_start(a, body);
+    const int* list = own_list(a, body);
     for (int from = 0; from < own + pairs; from += CONTACT_THREADS) {
         // the rows among the next ones that touch the body
         const int k = from + me;
@@ -523,7 +531,7 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_multiply(co
         return;
     }
     const int rows = a.own_rows[body];
-    const int* list = a.own_row + own_start(a, body);
+    const int* list = own_list(a, body);
     for (int k = threadIdx.x; k < rows; k += CONTACT_THREADS) {
         IslandRow& row = a.row[list[k]];
         double u[3] = {0, 0, 0}, f[3];
@@ -551,7 +559,7 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_product(con
     if (i < here.end) {
         double az[3], r[3], arm[3];
         copy3(a.az, i, az);
-        add_entries(a, i, az, [](const IslandRow& row) { return row.force; });
+        add_entries(a, here.body, i, az, [](const IslandRow& row) { return row.force; });
         copy3(a.r, i, r);
         for (int k = 0; k < 3; ++k) {
             a.az[3ll * i + k] = az[k];
@@ -664,7 +672,7 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_finish(cons
                 }
             }
             double f[3] = {0, 0, 0}, out[3];
-            each_entry(a, i, [&](int r, double weight, int) {
+            each_entry(a, here.body, i, [&](int r, double weight, int) {
                 double u[3] = {0, 0, 0}, w[3];
                 for (int side = 0; side < (is_pair(a, r) ? 2 : 1); ++side) {
                     const int there = body_of_row(a, r, side);
@@ -714,7 +722,7 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_residual(co
     if (i < here.end) {
         double product[3], contact[3] = {0, 0, 0}, x[3];
         copy3(a.solution_product, i, product);
-        add_entries(a, i, contact, [](const IslandRow& row) { return row.force; });
+        add_entries(a, here.body, i, contact, [](const IslandRow& row) { return row.force; });
         copy3(a.x, i, x);
         for (int k = 0; k < 3; ++k) {
             const long long at = 3ll * i + k;
@@ -736,7 +744,7 @@ __device__ double search_along(const IslandArguments& a, int island, int bodies,
     return minimum_along([&](double part) {
         double work[1] = {0};
         for (int m = warp; m < bodies; m += SEARCH_THREADS / 32) {
-            const int rows = a.own_rows[members[m]], *list = a.own_row + own_start(a, members[m]);
+            const int rows = a.own_rows[members[m]], *list = own_list(a, members[m]);
             for (int k = lane; k < rows; k += 32) {
                 const int r = list[k];
                 const DeviceRow& row = a.c.row[r];
@@ -816,6 +824,17 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_advance(con
     if (threadIdx.x < CG_SUMS) a.chunk_sums[(long long)CG_SUMS * blockIdx.x + threadIdx.x] = pick(sum, threadIdx.x);
 }
 
+#ifdef FACE_ROWS
+// A thread has a triangle: rows where the path of an island that has ended takes it into obstacles.
+extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) sweep_island_faces(const IslandArguments a) {
+    const int i = blockIdx.x * CONTACT_THREADS + threadIdx.x;
+    if (i >= a.c.faces.start[a.bodies_count] - a.c.faces.start[0]) return;
+    const int body = a.c.faces.body[i], island = island_of(a, body);
+    if (island < 0 || a.state[island].phase != ISLAND_ENDED || a.state[island].rounds >= ROUNDS) return;
+    if (sweep_face(a.c, body, a.c.faces.start[0] + i)) a.c.faces.entered[body] = 1;
+}
+#endif
+
 // A thread block has an island: whether there is another pass. One that is over leaves its results with its bodies.
 extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_settle(const IslandArguments a) {
     const int island = blockIdx.x;
@@ -828,6 +847,16 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_settle(cons
     if (s.phase != ISLAND_ENDED && s.phase != ISLAND_LOST) return;
     double sum[CG_SUMS] = {};
     if (s.phase == ISLAND_ENDED) sum_island(a, island, a.chunk_sums, sum);
+    if (FACES) {
+        double entered[1] = {0};
+        for (int m = threadIdx.x; m < s.bodies; m += CONTACT_THREADS) {
+            int& of_body = a.c.faces.entered[a.island[a.island_start[island] + m]];
+            entered[0] += of_body;
+            of_body = 0;
+        }
+        sum_block(entered);
+        sum[0] += entered[0];
+    }
     if (sum[0] > 0) {
         ++s.rounds;
         s.phase = ISLAND_READY;
@@ -844,6 +873,7 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_settle(cons
                       s.fallbacks, -1, body.probe};
             a.c.state[k].residual = s.residual;
             a.c.state[k].passes = s.passes;
+            a.c.state[k].rounds = s.rounds;
         }
     }
     __syncthreads();
@@ -888,7 +918,7 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) know_pairs(const I
 extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) keep_pairs(const IslandArguments a) {
     const int body = blockIdx.x;
     const bool well = a.c.results[(a.c.step[0] % a.c.capacity) * a.bodies_count + body].status != NOT_FINITE;
-    for (int r = a.t.pair_first + a.t.body_start[body] + threadIdx.x; r < a.t.pair_first + a.t.body_start[body + 1]; r += CONTACT_THREADS) {
+    auto keep = [&](int r) {
         const DeviceRow& row = a.c.row[r];
         const bool closed = well && a.t.obstacle[r] >= 0 && row.force.normal > 0;
         if (closed) {
@@ -899,7 +929,10 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) keep_pairs(const I
         a.t.force[r] = closed ? row.force.normal : 0;
         a.t.hardening[r] = lasting_hardening(a.t.hardening[r], before, a.t.force[r], a.t.stiffness[r], a.t.thickness[r]);
         for (int k = 0; k < 3; ++k) a.t.traction[3 * r + k] = closed ? row.force.traction[k] : 0;
-    }
+    };
+    each_pair_range(a, body, [&](int first, int last) {
+        for (int r = first + threadIdx.x; r < last; r += CONTACT_THREADS) keep(r);
+    });
 }
 
 // A thread has a node: rows between bodies that carry force, and their work, added to what its body has from obstacles.

@@ -4,7 +4,7 @@
 // Bodies with rows between them are solved as one system (method: backends/cpu/native/passes.h, island.h); the others go on as
 // contact_state.cuh says. A step with such bodies is
 //
-//     detection: pair_boxes, pair_trees, pair_sites; begin_ties where there are attachments or springs (ties.cu)
+//     detection: pair_boxes, pair_trees, pair_sites, pair_edges; begin_ties, bind_edges where there are attachments or springs (ties.cu)
 //     look_at_bodies, list_island_rows, find_islands, then the bodies that are alone
 //     while there is something to do (conditions.py):
 //         if there are islands to solve:
@@ -13,7 +13,8 @@
 //                 island_law, island_balance, island_decide, island_prepare, coarse_matrix, invert_coarse for each body,
 //                 while one iterates: island_update, island_factor, island_multiply, island_product, coarse_solve, island_finish
 //                 island_update, island_multiply, island_residual, island_search, island_advance, island_settle
-//         the paths found: pair_boxes, pair_trees, pair_sweep; where they enter a body: look_at_bodies, list_island_rows, find_islands
+//         the paths found: pair_boxes, pair_trees, pair_sweep, edge_sweep, end_sweep, which after ROUNDS sweeps holds bodies apart
+//         if they enter a body: look_at_bodies, list_island_rows, find_islands
 //
 // All islands go in step; a kernel does nothing for those that are in another phase. Sums have a fixed order: of thread blocks, which
 // leave theirs in arrays, and of these in the kernel that reads them. What acts at a node is a list, sorted by row.
@@ -21,7 +22,8 @@
 // With TIES, attachments and springs have rows after all others; a body that has one is solved here even if it is alone.
 #pragma once
 #include "device_contact.cuh"
-#include "pair_detection.cuh"
+#include "edge_detection.cuh"
+#include "hold_apart.cuh"
 #include "ties.cuh"
 
 #ifdef TIES
@@ -85,12 +87,15 @@ struct IslandRow {        // what a solve needs of a row
 };
 
 struct Tally {            // what kernels leave for the graph and each other
-    int islands, active, iterating, go, rounds, found, entries, alone, pairs, unused[7];
+    int islands, active, iterating, go, rounds, found, entries, alone, pairs, again, holds, unused[5];
 };
 
 struct IslandArguments {
     ContactArguments c;
     SurfaceTables t;
+    EdgeTables e;
+    const int* edge_body;        // (edges,)
+    const int* row_body;         // (rows,)
     const PcgBody* bodies;       // (bodies,)
     const int* row_start;        // of A
     const int* columns;
@@ -102,6 +107,10 @@ struct IslandArguments {
     real* ends;                  // (nodes, 3) where nodes come to
     real* ways;                  // (nodes, 3) how they come there, over dx_dv
     const double* none;          // (3,) no gravity
+    int* dropped;                // (sites,)
+    const real* mass;            // (nodes,) [kg]
+    HeldPlace* held;             // (MOST_HELD (sites + edges),) where bodies are held apart, those of a body together
+    int *held_list, *held_count; // likewise, those in use; (bodies,) places in a step
     const int* unheld;           // (bodies,) 1: no node is fixed
     const int* chunk_first;      // (bodies + 1,) first chunk of each body
     Tally* tally;                // (1,)
@@ -112,7 +121,7 @@ struct IslandArguments {
     int* mode;                   // (bodies,) its first mode in the island; -1: it has none
     int *island_start, *island;  // (bodies + 1,), (bodies,) bodies by island
     int* free_body;              // (bodies,) likewise those with modes, from island_start on
-    int *own_row, *own_rows, *pair_rows;  // (rows,) rows of each body that are not empty, from own_start on; their number; of pairs and ties
+    int *own_row, *own_rows, *pair_rows;  // (rows,) rows of each body that are not empty (own_list); (bodies,) their number; of pairs and ties
     double* earliest;            // (bodies,) entry of its rows
     IslandRow* row;              // (rows,)
     int* pair_list;              // (rows between bodies, 3) row and its bodies, those in use; -1: a tie of one body
@@ -131,7 +140,7 @@ struct IslandArguments {
     double *coarse_a, *coarse_b; // (bodies, MODES, most_modes) rows of E, while it is inverted from one to the other
     int* coarse_well;            // (bodies,) of islands: 1: E is positive definite
     double* coefficient;         // (bodies, MODES)
-    int bodies_count, most_modes, most_chunks, highest_tree, passes, bound_nodes;
+    int bodies_count, most_modes, most_chunks, highest_tree, passes, bound_nodes, edges;
     Ties ties;                   // ties.first is the number of rows where there are none
     const int *bound_node, *bound_start;    // (bound_nodes,), (bound_nodes + 1,) nodes that may be bound, and first ties of each
     const int *bound_tie, *bound_other;     // those ties in order, and the bodies that they bind the node to
@@ -149,14 +158,14 @@ __device__ __forceinline__ bool is_tie(const IslandArguments& a, int row) { retu
 __device__ __forceinline__ bool is_pair(const IslandArguments& a, int row) {
     return is_tie(a, row) ? joins_bodies(a.ties, row - a.ties.first) : row >= a.t.pair_first;
 }
-// True if a corner of a row is of the other one of its two bodies.
-__device__ __forceinline__ bool is_other_side(const IslandArguments& a, int row, int corner) {
-    return corner > 0 && (!HAS_TIES || is_pair(a, row));
-}
-// Body of a row's vertex; other: that of its triangle, of a row between bodies.
+// Body of a row; other: the other one, of a row between bodies.
 __device__ __forceinline__ int body_of_row(const IslandArguments& a, int row, bool other) {
     if (is_tie(a, row)) return a.ties.body[2 * (row - a.ties.first) + other];
-    return other ? __ldcg(a.t.obstacle + row) : a.t.site_body[(is_pair(a, row) ? row - a.t.pair_first : row) / 2];
+    return other ? __ldcg(a.t.obstacle + row) : a.row_body[row];
+}
+// True if a corner of a row is of the other one of its two bodies: of edges the last two.
+__device__ __forceinline__ bool is_other_side(const IslandArguments& a, int row, int corner) {
+    return is_pair(a, row) && corner > (!is_tie(a, row) && row >= a.e.start[0]);
 }
 // True if there are rows of contact between bodies.
 __device__ __forceinline__ bool bodies_touch(const IslandArguments& a) { return !HAS_TIES || a.t.pair_first < a.ties.first; }
@@ -164,21 +173,32 @@ __device__ __forceinline__ bool bodies_touch(const IslandArguments& a) { return 
 __device__ __forceinline__ bool is_bound(const IslandArguments& a, int node, int body) {
     return HAS_TIES && a.ties.bound[node] == body + 1;
 }
-__device__ __forceinline__ int own_start(const IslandArguments& a, int body) {
-    return 2 * a.t.body_start[body] + (HAS_TIES ? a.ties.start[body] : 0);
+// The same of two edges. edge, facing: their nodes
+__device__ __forceinline__ bool are_bound(const IslandArguments& a, const int* edge, int body, const int* facing, int other) {
+    return is_bound(a, edge[0], other) || is_bound(a, edge[1], other) || is_bound(a, facing[0], body) || is_bound(a, facing[1], body);
+}
+// f(first, last) of the rows of a body, each sort
+template <class F> __device__ __forceinline__ void each_obstacle_range(const IslandArguments& a, int body, F f) {
+    f(a.t.body_start[body], a.t.body_start[body + 1]);
+    if (FACES) f(a.c.faces.start[body], a.c.faces.start[body + 1]);
+}
+template <class F> __device__ __forceinline__ void each_pair_range(const IslandArguments& a, int body, F f) {
+    if (bodies_touch(a)) {
+        f(a.t.pair_first + a.t.body_start[body], a.t.pair_first + a.t.body_start[body + 1]);
+        f(a.e.start[body], a.e.start[body + 1]);
+    }
+    if (HAS_TIES) f(a.ties.first + a.ties.start[body], a.ties.first + a.ties.start[body + 1]);
 }
 
-// f(first, last) of the rows of a body's own vertices.
-template <class F> __device__ __forceinline__ void each_range(const IslandArguments& a, int body, F f) {
-    const int first = a.t.body_start[body], last = a.t.body_start[body + 1];
-    f(first, last);
-    if (bodies_touch(a)) f(a.t.pair_first + first, a.t.pair_first + last);
-    if (HAS_TIES) f(a.ties.first + a.ties.start[body], a.ties.first + a.ties.start[body + 1]);
+// Where the list of a body's rows that are not empty begins.
+__device__ __forceinline__ int* own_list(const IslandArguments& a, int body) {
+    return a.own_row + 2 * a.t.body_start[body] + (bodies_touch(a) ? a.e.start[body] - a.e.start[0] : 0) +
+           (FACES ? a.c.faces.start[body] - a.c.faces.start[0] : 0) + (HAS_TIES ? a.ties.start[body] : 0);
 }
 
 // f(node, weight, corner) of the corners that may move.
 template <class F> __device__ __forceinline__ void each_corner(const IslandArguments& a, int row, F f) {
-    if (row < a.t.pair_first) {
+    if (!is_pair(a, row) && !is_face(a.c, row) && !is_tie(a, row)) {
         const int node = a.c.node[row];
         if (a.c.free[node] != 0) f(node, 1.0, 0);
         return;
@@ -208,29 +228,23 @@ __device__ __forceinline__ void stiff(const double* k, const double* u, double* 
 // Lists the rows of a body that are not empty, in order, and counts them, and those that are not against obstacles, which come last. Done
 // by a whole thread block.
 __device__ void list_own_rows(const IslandArguments& a, int body) {
-    __shared__ int before[CONTACT_THREADS];
-    int listed = 0, against = -1;
-    each_range(a, body, [&](int first, int last) {
-        const int each = (last - first + CONTACT_THREADS - 1) / CONTACT_THREADS;
-        const int begin = min(first + (int)threadIdx.x * each, last), end = min(begin + each, last);
-        int own = 0;
-        for (int r = begin; r < end; ++r) own += __ldcg(a.t.obstacle + r) >= 0;
-        __syncthreads();
-        before[threadIdx.x] = own;
-        __syncthreads();
-        for (int by = 1; by < CONTACT_THREADS; by *= 2) {
-            const int other = (int)threadIdx.x >= by ? before[threadIdx.x - by] : 0;
-            __syncthreads();
-            before[threadIdx.x] += other;
-            __syncthreads();
-        }
-        int* to = a.own_row + own_start(a, body) + listed + before[threadIdx.x] - own;
-        for (int r = begin; r < end; ++r)
-            if (__ldcg(a.t.obstacle + r) >= 0) *to++ = r;
-        listed += before[CONTACT_THREADS - 1];
-        if (against < 0) against = listed;
-        __syncthreads();
-    });
+// f(first, last) of the rows of a body, each sort
+template <class F> __device__ __forceinline__ void each_obstacle_range(const IslandArguments& a, int body, F f) {
+    f(a.t.body_start[body], a.t.body_start[body + 1]);
+    if (FACES) f(a.c.faces.start[body], a.c.faces.start[body + 1]);
+}
+template <class F> __device__ __forceinline__ void each_pair_range(const IslandArguments& a, int body, F f) {
+    if (bodies_touch(a)) {
+        f(a.t.pair_first + a.t.body_start[body], a.t.pair_first + a.t.body_start[body + 1]);
+        f(a.e.start[body], a.e.start[body + 1]);
+    }
+    if (HAS_TIES) f(a.ties.first + a.ties.start[body], a.ties.first + a.ties.start[body + 1]);
+}
+
+// Where the list of a body's rows that are not empty begins.
+__device__ __forceinline__ int* own_list(const IslandArguments& a, int body) {
+    return a.own_row + 2 * a.t.body_start[body] + (bodies_touch(a) ? a.e.start[body] - a.e.start[0] : 0) +
+           (FACES ? a.c.faces.start[body] - a.c.faces.start[0] : 0) + (HAS_TIES ? a.ties.start[body] : 0);
     if (threadIdx.x > 0) return;
     a.own_rows[body] = listed;
     a.pair_rows[body] = listed - against;

@@ -15,22 +15,25 @@ from sim_server.backends.declarations import Declarations
 from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction
 from sim_server.backends.gpu.device import Gpu, compiled, options, own_headers
 from sim_server.backends.gpu.energies import node_chunks
+from sim_server.backends.gpu.faces import DEFINED, FaceRows
 from sim_server.backends.gpu.solver import PcgSolver
 from sim_server.backends.gpu.tie_arguments import tie_arguments
 
 PAIRS, ISLAND = Declarations("backends/gpu/pairs.cu"), Declarations("backends/gpu/island.cu")
 TIES = Declarations("backends/gpu/ties.cu")
 ISLAND_ARGUMENTS = ISLAND.dtype("IslandArguments")
-SIZES = {name: ISLAND.dtype(name).itemsize for name in ("IslandState", "IslandRow", "Box")}
+SIZES = {name: ISLAND.dtype(name).itemsize for name in ("IslandState", "IslandRow", "Box", "EdgeWings")}
 TALLY = ISLAND.dtype("Tally")
+MOST_HELD: int = ISLAND.constant("MOST_HELD")
 MODES, CG_SUMS, BASE_SUMS = (ISLAND.constant(name) for name in ("MODES", "CG_SUMS", "BASE_SUMS"))
 LISTING, SEARCH = PAIRS.constant("LISTING_THREADS"), ISLAND.constant("SEARCH_THREADS")  # of a thread block
 WARM_START, ZERO_START, LAW_AT_START, LAW = ISLAND.enumeration("Evaluation").values()
-KERNELS_OF_TIES = ("begin_ties", "keep_ties")
+KERNELS_OF_TIES = ("begin_ties", "bind_edges", "keep_ties")
+SWEEP_OF_FACES = ("sweep_island_faces",)
 MOST_MODES = 600  # of the coarse space of an island of bodies
 DETECTION = (
-    "pair_boxes", "pair_trees", "pair_sites", "pair_sweep", "end_sweep", "look_at_bodies", "list_island_rows",
-    "find_islands", "place_entries", "fill_entries",
+    "pair_boxes", "pair_trees", "pair_sites", "pair_edges", "pair_sweep", "edge_sweep", "end_sweep", "look_at_bodies",
+    "list_island_rows", "find_islands", "place_entries", "fill_entries",
 )  # fmt: skip
 SOLVE = (
     "island_start", "island_law", "island_balance", "island_decide", "island_prepare", "coarse_matrix",
@@ -71,6 +74,17 @@ def leaves_before(surfaces: Surfaces) -> Int32:
     return counted[surfaces.tree_start].astype(np.int32)
 
 
+def bodies_of_rows(contact: Contact) -> Int32:
+    """Returns the body of each row but those of ties, (rows,)."""
+
+    def of(start: Int32) -> Int32:
+        return np.repeat(np.arange(len(start) - 1, dtype=np.int32), np.diff(start))
+
+    faces = of(contact.faces.start) if contact.faces else np.zeros(0, np.int32)
+    nodes = of(contact.body_start)
+    return np.concatenate([nodes, faces, *([nodes, of(contact.surfaces.edge_start)] if contact.surfaces else [])])
+
+
 class IslandPasses:
     """Launches detection between bodies, and the solves of bodies that touch each other or have attachments or springs.
 
@@ -81,21 +95,25 @@ class IslandPasses:
     threads: of a thread block
     broken: host memory (ties,) of int32 that the steps write to: steps completed when a tie broke
 
+    faces: its rows of triangles; None: there are none
+
     Tests run its kernels with what it keeps: params (arguments of all kernels), memory (arrays by name), tally,
-    pivots (steps of an inversion), product_grid (thread blocks of the product with A), vertex_grid (of detection).
+    pivots (steps of an inversion), product_grid (thread blocks of the product with A), vertex_grid, edge_grid (of
+    detection).
     """
 
     def __init__(
         self, gpu: Gpu, device: Graphs, contact: Contact, ranges: Sequence[tuple[int, int]],
         arrays: Mapping[str, NDArray[Any]], solver: PcgSolver, params: NDArray[Any], chunks: NDArray[Any], threads: int,
-        broken: Int32,
+        broken: Int32, faces: FaceRows | None,
     ):  # fmt: skip
         surfaces, ties, ints, doubles = contact.surfaces, contact.ties, np.int32, np.float64
         self._touching, self._ties = surfaces is not None, ties
         cp, bodies, rows, nodes = gpu.cp, len(ranges), len(contact.obstacle), len(arrays["x"])
         self._device, self._solver, self._threads, self._bodies = device, solver, threads, bodies
-        sites = int(contact.body_start[-1]) // 2
-        self._grid, self.vertex_grid = len(chunks), -(-sites // (threads // 32))
+        sites, edges = int(contact.body_start[-1]) // 2, len(surfaces.edge) if surfaces else 0
+        self._grid, self.vertex_grid, self.edge_grid = len(chunks), -(-sites // (threads // 32)), -(-edges // threads)
+        self._faces = faces
         free = np.array([bool((contact.free[first:last] > 0).all()) for first, last in ranges], np.int32)
         most = min(MODES * bodies, MOST_MODES)
         self.pivots = min(int(free.sum()), most // MODES)
@@ -104,13 +122,16 @@ class IslandPasses:
         heights, first = np.zeros(1, ints), np.searchsorted(chunks["body"], np.arange(bodies + 1)).astype(np.int32)
         real = solver.real
         tied = len(ties.corner) if ties else 0
-        pairs = int(contact.body_start[-1]) + tied  # and ties
+        pairs = int(contact.body_start[-1]) + 2 * edges + tied  # and ties
+        row_body = bodies_of_rows(contact)
         self.tally = cp.zeros(TALLY.itemsize // 4, ints)
+        places = MOST_HELD * (sites + edges)
         sizes = {
             "near": bodies, "was_near": bodies, "touched": 2 * bodies, "bad": bodies, "label": bodies,
             "island_of": bodies, "mode": bodies, "island_start": bodies + 1, "island": bodies, "free_body": bodies,
-            "own_row": max(rows, 2 * pairs), "own_rows": bodies, "pair_rows": bodies, "pair_list": 3 * pairs,
-            "count": nodes, "start": nodes, "cursor": nodes, "entry": 4 * pairs, "coarse_well": bodies,
+            "own_row": rows + (0 if surfaces else 2 * sites), "own_rows": bodies, "pair_rows": bodies,
+            "pair_list": 3 * pairs, "count": nodes, "start": nodes, "cursor": nodes, "entry": 4 * pairs,
+            "coarse_well": bodies, "held_list": places, "held_count": bodies,
         }  # fmt: skip
         vectors = ("left", "r0", "r", "x", "p", "q", "z", "az", "solution_product")
         numbers = {name: 3 * nodes for name in vectors} | {
@@ -128,29 +149,38 @@ class IslandPasses:
             "product_chunks": cp.asarray(product_chunks.view(ints)), "ends": cp.zeros((nodes, 3), real),
             "ways": cp.zeros((nodes, 3), real), "none": cp.zeros(3),
             "row_start": gpu.twin(arrays["row_start"]), "columns": gpu.twin(arrays["columns"]),
+            "row_body": cp.asarray(row_body), "dropped": gpu.twin(contact.dropped, dtype=contact.dropped.dtype),
         }  # fmt: skip
         if surfaces:
             heights = tree_heights(surfaces)
+            held = np.zeros(places, ISLAND.dtype("HeldPlace"))
+            held["other"] = -1
             self.memory |= {
                 "leaf": cp.asarray(np.flatnonzero(surfaces.tree_child[:, 0] < 0).astype(ints)),
                 "leaf_start": cp.asarray(leaves_before(surfaces)), "tree_height": cp.asarray(heights),
+                "edge_body": cp.asarray(row_body[surfaces.edge_start[0] : surfaces.edge_start[-1] : 2].copy()),
                 "gravity": gpu.twin(surfaces.gravity, dtype=surfaces.gravity.dtype),
+                "held": cp.asarray(held.view(np.uint8)), "mass": gpu.twin(contact.mass),
             }  # fmt: skip
         self._pair_sums, self._pair_contacts = cp.zeros(len(chunks)), cp.zeros(bodies, ints)
+        self._pair_clipped = cp.zeros(bodies, ints)
+        params["pair_clipped"] = self._pair_clipped.data.ptr
         params["island_of"], params["alone"] = self.memory["island_of"].data.ptr, self.flag("alone").data.ptr
         params["pair_sums"], params["pair_contacts"] = self._pair_sums.data.ptr, self._pair_contacts.data.ptr
         self.params = self._arguments(gpu, contact, surfaces, params)
         self.params["bodies"], self.params["bodies_count"] = solver.bodies_device, bodies
         self.params["most_modes"], self.params["passes"] = most, contact.passes
+        self.params["edges"] = edges
         self.params["most_chunks"], self.params["highest_tree"] = np.diff(first).max(), heights.max()
         self.params["ties"]["first"] = rows - tied
         if ties:
             self._tie_memory = tie_arguments(gpu, ties, nodes, broken, self.params)
         self._kernels: dict[str, KernelFunction] = {}
-        texts = [(PAIRS, "pairs.cu", DETECTION), (ISLAND, "island.cu", SOLVE)]
+        texts = [(PAIRS, "pairs.cu", DETECTION), (ISLAND, "island.cu", (*SOLVE, *(SWEEP_OF_FACES if faces else ())))]
         texts += [(TIES, "ties.cu", KERNELS_OF_TIES)] if ties else []
         for text, name, kernels in texts:
-            given = (*options(gpu.types), *own_headers(), *(["-DTIES"] if ties else []))
+            defined = (*([DEFINED] if faces else []), *(["-DTIES"] if ties else []))
+            given = (*options(gpu.types), *own_headers(), *defined)
             module = cp.RawModule(code=text.checked(), options=given, backend="nvrtc")
             self._kernels |= {kernel: compiled(name, module, kernel) for kernel in kernels}
 
@@ -180,7 +210,24 @@ class IslandPasses:
         for name, array in self._box_memory.items():
             params["t"][name] = array.data.ptr
         params["t"]["near"] = self.memory["near"].data.ptr
+        self._edge_memory: list[DeviceArray] = []
+        if surfaces:
+            self._edge_memory = self._edge_arguments(gpu, surfaces, params)
         return params  # type: ignore[no-any-return]
+
+    @staticmethod
+    def _edge_arguments(gpu: Gpu, surfaces: Surfaces, params: Any) -> list[DeviceArray]:
+        """Sets the tables of edges; returns memory that has to stay."""
+        edges = {
+            "start": surfaces.edge_start, "edge": surfaces.edge, "opposite": surfaces.opposite,
+            "of_triangle": surfaces.triangle_edge, "length": surfaces.edge_length,
+        }  # fmt: skip
+        for name, host in edges.items():
+            params["e"][name] = gpu.twin(host, dtype=host.dtype).data.ptr
+        count = max(len(surfaces.edge), 1)
+        memory = [gpu.cp.zeros(count * SIZES["EdgeWings"], np.uint8), gpu.cp.zeros(2 * count, np.int32)]
+        params["e"]["wings"], params["e"]["facing"] = (array.data.ptr for array in memory)
+        return memory
 
     def flag(self, name: str) -> DeviceArray:
         """Returns a number of the tally, (1,)."""
@@ -191,13 +238,17 @@ class IslandPasses:
     # --- launches -----------------------------------------------------------------------------------------------
 
     def _launch(self, kernel: str, blocks: int, *arguments: Any) -> None:
-        threads = {"find_islands": LISTING, "island_search": SEARCH, "end_sweep": 1}.get(kernel, self._threads)
+        threads = {"find_islands": LISTING, "island_search": SEARCH, "end_sweep": LISTING}.get(kernel, self._threads)
         given = (np.int32(x) if isinstance(x, int) else x for x in arguments)
         self._kernels[kernel]((blocks,), (threads,), (self.params, *given))
 
     def _nodes(self, *kernels: str, what: tuple[int, ...] = ()) -> None:
         for kernel in kernels:
             self._launch(kernel, self._grid, *what)
+
+    def _edges(self, kernel: str) -> None:
+        if self.edge_grid:
+            self._launch(kernel, self.edge_grid)
 
     def _each_body(self, *kernels: str, what: tuple[int, ...] = ()) -> None:
         for kernel in kernels:
@@ -209,6 +260,7 @@ class IslandPasses:
             return
         self._each_body("pair_boxes", "pair_trees", what=(0,))
         self._launch("pair_sites", self.vertex_grid)
+        self._edges("pair_edges")
 
     def group(self, swept: int = 0) -> None:
         """Appends the search of islands."""
@@ -221,6 +273,7 @@ class IslandPasses:
         if self._ties:
             items = max(int(self.params["ties"]["count"]), int(self.params["bound_nodes"]))
             self._launch("begin_ties", -(-items // self._threads))
+            self._edges("bind_edges")
 
     def keep_ties(self) -> None:
         """Appends what they do at the end of a step, after all that moves nodes."""
@@ -240,8 +293,9 @@ class IslandPasses:
             if self._touching:
                 self._each_body("pair_boxes", "pair_trees", what=(1,))
                 self._launch("pair_sweep", self.vertex_grid)
+                self._edges("edge_sweep")
             self._launch("end_sweep", 1)
-            with self._device.branch(self.flag("go")):
+            with self._device.branch(self.flag("again")):
                 self.group(1)
 
     def start(self) -> None:
@@ -285,6 +339,8 @@ class IslandPasses:
         self._nodes("island_residual")
         self._launch("island_search", self._most_islands)
         self._nodes("island_advance")
+        if self._faces:
+            self._launch("sweep_island_faces", self._faces.grid)
         self._launch("island_settle", self._most_islands)
 
     def _multiply(self, solution: int) -> None:

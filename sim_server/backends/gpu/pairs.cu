@@ -6,13 +6,21 @@
 __device__ __forceinline__ Motion motion_of(const IslandArguments& a, bool solved) {
     return {a.c.x, a.c.predictor, solved ? a.c.y : nullptr, a.c.rotation, a.c.free, a.c.dx_dv, a.c.force_coefficient, a.gravity};
 }
-__device__ __forceinline__ bool swept_enough(const IslandArguments& a, int solved) { return solved && __ldcg(&a.tally->rounds) >= ROUNDS; }
+// That of the solution, as pair_boxes has left it.
+__device__ __forceinline__ Motion way_of_step(const IslandArguments& a) {
+    return {a.c.x, a.ways, nullptr, a.c.rotation, a.c.free, a.c.dx_dv, 0, a.none};
+}
+__device__ __forceinline__ int edges_before(const IslandArguments& a, int body) { return (a.e.start[body] - a.e.start[0]) / 2; }
+// Whether the sweeps are over: what still passes through a body is held apart.
+__device__ __forceinline__ bool holds_apart(const IslandArguments& a) { return __ldcg(&a.tally->rounds) >= ROUNDS; }
+__device__ __forceinline__ bool is_lost(const IslandArguments& a, int body) {
+    return a.c.results[(a.c.step[0] % a.c.capacity) * a.bodies_count + body].status == NOT_FINITE;
+}
 
 // --- detection ----------------------------------------------------------------------------------------------------------------------
 
 // A thread block has a body: its box, along paths under gravity alone, or as solved.
 extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) pair_boxes(const IslandArguments a, int solved) {
-    if (swept_enough(a, solved)) return;
     __shared__ Box warps[CONTACT_THREADS / 32];
     const int body = blockIdx.x;
     const Motion m = motion_of(a, solved);
@@ -49,9 +57,8 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) pair_boxes(const I
     }
 }
 
-// A thread block has a body: whether its box meets another's, and then the boxes of its tree.
+// A thread block has a body: whether its box meets another's, and then the boxes of its tree, and its edges.
 extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) pair_trees(const IslandArguments a, int solved) {
-    if (swept_enough(a, solved)) return;
     const int body = blockIdx.x;
     bool apart = true;
     for (int other = threadIdx.x; other < a.bodies_count; other += CONTACT_THREADS)
@@ -65,6 +72,7 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) pair_trees(const I
             if (a.tree_height[k] == height) fit_box(a.t, m, body, k);
         __syncthreads();
     }
+    for (int edge = edges_before(a, body) + threadIdx.x; edge < edges_before(a, body + 1); edge += CONTACT_THREADS) fit_wings(a.e, m, edge);
 }
 
 // --- a vertex and a body ------------------------------------------------------------------------------------------------------------
@@ -175,6 +183,14 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) pair_sites(const I
     recall_both(a.t, row, last);
 }
 
+__device__ void take_anew(const IslandArguments& a, int r) {
+    DeviceRow& row = a.c.row[r];
+    row.limit = 0;
+    row.in_set = 0;
+    row.force = {0, {0, 0, 0}, 0, false};
+    for (int k = 0; k < 6; ++k) a.row[r].known[k] = 0;
+}
+
 // Gives a body that a vertex touches one of its rows: that body's own, an empty one, or the one that carries less.
 __device__ void take_pair_row(const IslandArguments& a, int site, const Meeting& t) {
     const int pair = a.t.pair_first + 2 * site;
@@ -185,16 +201,12 @@ __device__ void take_pair_row(const IslandArguments& a, int site, const Meeting&
         const bool next = a.t.obstacle[pair + 1] == t.other || a.t.obstacle[pair + 1] < 0;
         r += next || (a.t.obstacle[pair] >= 0 && a.c.row[pair + 1].force.normal < a.c.row[pair].force.normal);
     }
-    DeviceRow& row = a.c.row[r];
     if (a.t.obstacle[r] == t.other && dot3(a.t.normal + 3 * r, t.touch.normal) > SAME_PLANE) {
         a.t.hardening[r] = fmin(HARDER * a.t.hardening[r], HARDEST);
         return;
     }
     put_row(a.t, motion_of(a, false), r, site, t);
-    row.limit = 0;
-    row.in_set = 0;
-    row.force = {0, {0, 0, 0}, 0, false};
-    for (int k = 0; k < 6; ++k) a.row[r].known[k] = 0;
+    take_anew(a, r);
 }
 
 // A warp has a vertex: gives it a row where the solution moves it through a triangle, or into a body that it was outside of, or makes
@@ -202,12 +214,14 @@ __device__ void take_pair_row(const IslandArguments& a, int site, const Meeting&
 extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) pair_sweep(const IslandArguments a) {
     __shared__ int queues[CONTACT_THREADS / 32][QUEUE];
     const int warp = threadIdx.x / 32, site = blockIdx.x * (CONTACT_THREADS / 32) + warp, lane = threadIdx.x % 32;
-    if (swept_enough(a, 1) || site >= sites_before(a.t, a.bodies_count)) return;
+    if (site >= sites_before(a.t, a.bodies_count)) return;
+    const bool holds = holds_apart(a);
+    int held = 0;
     const int body = a.t.site_body[site], node = node_of_site(a.t, site);
     if (!a.near[body]) return;
     if (site == sites_before(a.t, body) && lane == 0) a.was_near[body] = 1;  // its rows are looked at again in the next step
-    if (a.c.free[node] == 0) return;
-    const Motion m = {a.c.x, a.ways, nullptr, a.c.rotation, a.c.free, a.c.dx_dv, 0, a.none};  // ways as pair_boxes has made them
+    if (a.c.free[node] == 0 || (holds && is_lost(a, body))) return;
+    const Motion m = way_of_step(a);
     Motion ended = m;
     ended.x = a.ends;
     ended.predictor = nullptr;
@@ -218,21 +232,119 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) pair_sweep(const I
         for (unsigned lanes = __ballot_sync(WARP, met); lanes; lanes &= lanes - 1) {
             const int other = from + __ffs(lanes) - 1;
             TouchSearch<Motion> search[3];
-            searches_of_passage(m, ended, node, 0.5 * (thickness_of(a.t, body) + thickness_of(a.t, other)), search);
+            const double thickness = 0.5 * (thickness_of(a.t, body) + thickness_of(a.t, other));
+            searches_of_passage(m, ended, node, thickness, search);
             search_body(a, other, search, 3, queues[warp]);
             Meeting t;
             if (passage_found(search, t) == STAYS_OUT || lane > 0) continue;
+            if (holds) {
+                if (held < MOST_HELD && !is_lost(a, other)) {
+                    a.held[MOST_HELD * (site + edges_before(a, body)) + held++] = held_vertex(a.t, node, body, t, thickness);
+                    a.tally->found = 1;
+                }
+                continue;
+            }
             take_pair_row(a, site, t);
             a.touched[body] = a.touched[other] = a.tally->found = 1;
         }
     }
 }
 
-// After a sweep, one thread: whether there is more to solve.
-extern "C" __global__ void end_sweep(const IslandArguments a) {
+// --- edges --------------------------------------------------------------------------------------------------------------------------
+
+// A thread has an edge: sets its rows, as detect_edge.
+extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) pair_edges(const IslandArguments a) {
+    const int edge = blockIdx.x * CONTACT_THREADS + threadIdx.x;
+    if (edge >= a.edges) return;
+    const int body = a.edge_body[edge];
+    if (!a.near[body] && !a.was_near[body]) return;
+    if (!a.near[body]) a.e.wings[edge].sharp = 0;
+    const int dropped = detect_edge(a.t, a.e, motion_of(a, false), body, edge);
+    if (dropped)
+        if (const int site = site_of_edge(a.t, a.e, edge); site >= 0) atomicAdd(a.dropped + site, dropped);
+}
+
+// A thread has an edge: gives it a row where the solution moves it through another one, or makes its row stiffer.
+extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) edge_sweep(const IslandArguments a) {
+    const int edge = blockIdx.x * CONTACT_THREADS + threadIdx.x;
+    if (edge >= a.edges || !a.near[a.edge_body[edge]]) return;
+    const int body = a.edge_body[edge];
+    const bool holds = holds_apart(a);
+    if (holds && is_lost(a, body)) return;
+    const Motion m = way_of_step(a);
+    int held = 0;
+    each_edge_passed(a.t, a.e, m, body, edge, [&](int other, int facing, double thickness, const EdgeTouch& t) {
+        if (are_bound(a, a.e.edge + 2 * edge, body, a.e.edge + 2 * facing, other)) return;
+        if (holds) {
+            if (held >= MOST_HELD || is_lost(a, other)) return;
+            a.held[MOST_HELD * (sites_before(a.t, body + 1) + edge) + held++] =
+                held_edges(a.e.edge + 2 * edge, a.e.edge + 2 * facing, body, other, t.s, t.t, t.normal, thickness);
+            a.tally->found = 1;
+            return;
+        }
+        const int r = take_edge_row(a.t, a.e, m, body, edge, {other, facing, t}, [&](int row) { return a.c.row[row].force.normal; });
+        if (r >= 0) take_anew(a, r);
+        a.touched[body] = a.touched[other] = a.tally->found = 1;
+    });
+}
+
+// --- after a sweep ------------------------------------------------------------------------------------------------------------------
+
+// Holds the places found apart, by their order: vertices of a body, then its edges. Returns whether anything moved, in all threads. Done by
+// one thread block.
+__device__ bool hold_places(const IslandArguments& a) {
+    __shared__ int before[LISTING_THREADS];
+    __shared__ bool moved;
+    const int n = a.bodies_count, me = threadIdx.x, slots = MOST_HELD * (sites_before(a.t, n) + a.edges);
+    const int each = (slots + LISTING_THREADS - 1) / LISTING_THREADS, begin = min(me * each, slots), end = min(begin + each, slots);
+    int own = 0;
+    for (int k = begin; k < end; ++k) own += a.held[k].other >= 0;
+    before[me] = own;
+    __syncthreads();
+    for (int by = 1; by < LISTING_THREADS; by *= 2) {
+        const int other = me >= by ? before[me - by] : 0;
+        __syncthreads();
+        before[me] += other;
+        __syncthreads();
+    }
+    int* to = a.held_list + before[me] - own;
+    for (int k = begin; k < end; ++k)
+        if (a.held[k].other >= 0) *to++ = k;
+    __syncthreads();
+    if (me == 0) {
+        const Motion m = motion_of(a, true);
+        moved = false;
+        for (int k = 0; k < before[LISTING_THREADS - 1]; ++k) {
+            HeldPlace& p = a.held[a.held_list[k]];
+            if (hold_apart(m, a.mass, p, a.c.y, [&](int corner) { return a.c.free[p.node[corner]] != 0; })) {
+                ++a.held_count[p.body];
+                ++a.held_count[p.other];
+                moved = true;
+            }
+            p.other = -1;
+        }
+    }
+    __syncthreads();
+    for (int i = me; i < n; i += LISTING_THREADS) {  // bodies that are solved together tell the same
+        int most = a.held_count[i];
+        for (int j = 0; j < n && a.island_of[i] >= 0; ++j)
+            if (a.island_of[j] == a.island_of[i] && a.held_count[j] > most) most = a.held_count[j];
+        a.c.pair_clipped[i] = most;
+    }
+    return moved;
+}
+
+// One thread block: whether there is more to solve, or to hold apart.
+extern "C" __global__ void __launch_bounds__(LISTING_THREADS) end_sweep(const IslandArguments a) {
     Tally& tally = *a.tally;
-    tally.go = tally.rounds < ROUNDS && tally.found;
-    tally.rounds += tally.go;
+    const bool holds = holds_apart(a), found = __ldcg(&tally.found);
+    __syncthreads();  // all threads have read them
+    const bool moved = holds && found && hold_places(a);
+    if (threadIdx.x > 0) return;
+    tally.again = !holds && found;
+    tally.rounds += tally.again;
+    tally.holds += moved;
+    tally.go = tally.again || (moved && tally.holds < PAIR_HOLDS);
 }
 
 // --- islands ------------------------------------------------------------------------------------------------------------------------
@@ -251,25 +363,21 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) look_at_bodies(con
 // A thread block has a body: lists its rows, and counts those that act at each node. Rows with a body whose forces are not finite go.
 extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) list_island_rows(const IslandArguments a, int swept) {
     __shared__ double least[CONTACT_THREADS];
-    const int body = blockIdx.x, first = a.t.body_start[body], last = a.t.body_start[body + 1];
+    const int body = blockIdx.x;
     double earliest = NEVER;
-    for (int r = first + threadIdx.x; r < last; r += CONTACT_THREADS) {
-        const int p = a.t.pair_first + r, other = bodies_touch(a) ? a.t.obstacle[p] : -1;
-        if (used(a.c, r)) earliest = fmin(earliest, a.t.entry[r]);
-        if (other < 0) continue;
-        if (a.bad[body] || a.bad[other]) {
-            a.t.obstacle[p] = -1;
-            continue;
+    each_own_row(a.c, body, [&](int r) { earliest = fmin(earliest, a.t.entry[r]); });
+    each_pair_range(a, body, [&](int first, int last) {
+        for (int p = first + threadIdx.x; p < last; p += CONTACT_THREADS) {
+            const int other = a.t.obstacle[p];
+            if (other < 0) continue;
+            if (a.bad[body] || a.bad[other]) {
+                a.t.obstacle[p] = -1;
+                continue;
+            }
+            if (!is_tie(a, p)) earliest = fmin(earliest, a.t.entry[p]);
+            each_corner(a, p, [&](int node, double, int) { atomicAdd(a.count + node, 1); });
         }
-        earliest = fmin(earliest, a.t.entry[p]);
-        each_corner(a, p, [&](int node, double, int) { atomicAdd(a.count + node, 1); });
-    }
-    for (int i = HAS_TIES ? a.ties.start[body] + threadIdx.x : 0; HAS_TIES && i < a.ties.start[body + 1]; i += CONTACT_THREADS) {
-        const int r = a.ties.first + i, other = a.t.obstacle[r];
-        if (other < 0) continue;
-        if (a.bad[body] || a.bad[other]) a.t.obstacle[r] = -1;
-        else each_corner(a, r, [&](int node, double, int) { atomicAdd(a.count + node, 1); });
-    }
+    });
     least[threadIdx.x] = earliest;
     __syncthreads();
     for (int k = CONTACT_THREADS / 2; k; k /= 2) {
@@ -307,7 +415,7 @@ __device__ IslandState state_of(const IslandArguments& a, int first, int bodies,
 // True if the last one of a body's rows, whose ties come last, is a tie.
 __device__ bool is_tied(const IslandArguments& a, int body) {
     const int rows = a.own_rows[body];
-    return HAS_TIES && rows > 0 && is_tie(a, a.own_row[own_start(a, body) + rows - 1]);
+    return HAS_TIES && rows > 0 && is_tie(a, own_list(a, body)[rows - 1]);
 }
 
 // One thread block: groups the bodies that have rows with each other, each group's by number; one that is tied and touches no other is a
@@ -318,6 +426,7 @@ extern "C" __global__ void __launch_bounds__(LISTING_THREADS) find_islands(const
     for (int i = me; i < n; i += LISTING_THREADS) {
         __stcg(a.label + i, i);
         a.bad[i] = 0;
+        if (!swept) a.held_count[i] = a.c.pair_clipped[i] = 0;
     }
     __syncthreads();
     for (bool changed = true; changed;) {
@@ -325,7 +434,7 @@ extern "C" __global__ void __launch_bounds__(LISTING_THREADS) find_islands(const
         for (int i = warp; i < n; i += LISTING_THREADS / 32) {
             const int rows = a.own_rows[i], pairs = a.pair_rows[i];
             for (int k = rows - pairs + lane; k < rows; k += 32) {
-                const int one = __ldcg(a.label + i), two = __ldcg(a.label + a.t.obstacle[a.own_row[own_start(a, i) + k]]);
+                const int one = __ldcg(a.label + i), two = __ldcg(a.label + a.t.obstacle[own_list(a, i)[k]]);
                 if (one == two) continue;
                 atomicMin(a.label + (one > two ? one : two), min(one, two));
                 changed = true;
@@ -392,7 +501,7 @@ extern "C" __global__ void __launch_bounds__(LISTING_THREADS) find_islands(const
     tally.iterating = tally.entries = 0;
     if (swept) return;
     tally.go = 1;
-    tally.rounds = 0;
+    tally.rounds = tally.holds = 0;
 }
 
 // A thread has a node: makes room for what acts there.
@@ -410,7 +519,7 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) fill_entries(const
     sum_block(before);
     if (body == a.bodies_count - 1 && threadIdx.x == 0) a.tally->pairs = (int)before[0] + pairs;
     for (int k = threadIdx.x; k < pairs; k += CONTACT_THREADS) {
-        const int r = a.own_row[own_start(a, body) + rows - pairs + k];
+        const int r = own_list(a, body)[rows - pairs + k];
         int* to = a.pair_list + 3 * ((int)before[0] + k);
         to[0] = r;
         to[1] = body;

@@ -35,6 +35,16 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) begin_ties(const I
     set_tie(a.ties, i, e);
 }
 
+// A thread has an edge: takes its rows with what its nodes, or those of the other edge, are attached to away.
+extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) bind_edges(const IslandArguments a) {
+    const int edge = blockIdx.x * CONTACT_THREADS + threadIdx.x;
+    if (edge >= a.edges) return;
+    for (int row = a.e.start[0] + 2 * edge; row < a.e.start[0] + 2 * edge + 2; ++row) {
+        const int other = a.t.obstacle[row], *node = a.t.corner + CORNERS * row;
+        if (other >= 0 && are_bound(a, node, a.edge_body[edge], node + 2, other)) a.t.obstacle[row] = -1;
+    }
+}
+
 // First corner at the end of the step.
 __device__ void first_point(const IslandArguments& a, int i, double* p) {
     const int node = a.t.corner[CORNERS * (a.ties.first + i)];

@@ -2,13 +2,14 @@
 // Detection of contacts between bodies on a CPU (kernels/pair_detection.cuh): before a solve, and the sweep of the paths that it found.
 #pragma once
 #include <algorithm>
+#include <vector>
 
+#include "hold_apart.cuh"
 #include "island_groups.h"
 #include "loop.h"
 #include "own_contact.h"
 
 constexpr int MAY_TOUCH_ITSELF = 2;  // bit of Contact::near
-constexpr int PAIR_HOLDS = 40;  // rounds in which bodies that pass through each other are held apart
 
 struct PairDetection {
     typedef SurfaceMotion<double, double> Motion;
@@ -137,45 +138,47 @@ struct PairDetection {
                is_bound(c.edge[2 * facing + 1], body);
     }
 
-    // Moves nodes so that what y still takes through another body stays in front of it: along the normal where they touch, both sides
-    // by their masses, which keeps their momentum. Counts the nodes in the reports of both bodies.
+    // Moves nodes so that what y still takes through another body stays in front of it (hold_apart.cuh). Counts the places in the reports
+    // of both bodies. Bodies whose step is made stay.
     void hold_back(double* ends, double* y) const {
+        static thread_local std::vector<HeldPlace> places;
         std::copy(c.near, c.near + loop.bodies, c.was_near);
         for (int k = 0; k < PAIR_HOLDS; ++k) {
             fit();
             const Motion ended = arrived(ends);
-            bool found = false;
+            places.clear();
             for (int i = 0; i < loop.bodies; ++i) {
                 if (!c.near[i] || c.result[i].status == NOT_FINITE) continue;
-                for (int site = sites_before(tables, i); site < sites_before(tables, i + 1); ++site) found = hold_site(i, site, ended, y) || found;
-                for (int edge = edges_before(i); edge < edges_before(i + 1); ++edge) found = hold_edge(i, edge, y) || found;
+                for (int site = sites_before(tables, i); site < sites_before(tables, i + 1); ++site) find_held_site(i, site, ended, places);
+                for (int edge = edges_before(i); edge < edges_before(i + 1); ++edge) find_held_edge(i, edge, places);
             }
-            if (!found) break;
+            bool moved = false;
+            for (const HeldPlace& p : places) {
+                auto moves = [&](int a) { return c.free[p.node[a]] != 0 && !is_made(loop, p.weight[a] > 0 ? p.body : p.other); };
+                if (!hold_apart(motion, c.mass, p, y, moves)) continue;
+                ++c.report[p.body].clipped;
+                if (p.other != p.body) ++c.report[p.other].clipped;
+                moved = true;
+            }
+            if (!moved) break;
         }
         for (int i = 0; i < loop.bodies; ++i) c.near[i] = c.was_near[i] = c.near[i] | c.was_near[i];
     }
-    bool hold_site(int body, int site, const Motion& ended, double* y) const {
+    void find_held_site(int body, int site, const Motion& ended, std::vector<HeldPlace>& places) const {
         const int node = node_of_site(tables, site);
-        if (c.free[node] == 0) return false;
+        if (c.free[node] == 0) return;
         const Box box = box_of(motion, node, thickness_of(tables, body));
-        bool found = false;
-        for (int other = 0; other < loop.bodies; ++other) {
+        for (int other = 0, found = 0; other < loop.bodies && found < MOST_HELD; ++other) {
             if (other == body || !(c.near[other] & 1) || is_bound(node, other) || c.result[other].status == NOT_FINITE) continue;
             if (!meet(box, c.body_box[other])) continue;
             const double thickness = 0.5 * (thickness_of(tables, body) + thickness_of(tables, other));
             Meeting t;
             if (passage_of(tables, motion, ended, node, other, thickness, t) == STAYS_OUT) continue;
-            found = hold_vertex(body, node, t, y) || found;
+            places.push_back(held_vertex(tables, node, body, t, thickness));
+            ++found;
         }
         Meeting t;
-        return (site_passes_own(body, site, t) && hold_vertex(body, node, t, y)) || found;
-    }
-    bool hold_vertex(int body, int node, const Meeting& t, double* y) const {
-        const int32_t* corner = c.triangle + 3 * t.triangle;
-        const int32_t nodes[CORNERS] = {node, corner[0], corner[1], corner[2]};
-        const double *w = t.touch.weight, weight[CORNERS] = {1, -w[0], -w[1], -w[2]};
-        const double thickness = 0.5 * (thickness_of(tables, body) + thickness_of(tables, t.other));
-        return hold_apart(nodes, weight, t.touch.normal, 0.1 * thickness, body, t.other, y);
+        if (site_passes_own(body, site, t)) places.push_back(held_vertex(tables, node, body, t, thickness_of(tables, body)));
     }
     // True if the solution takes a vertex through its own body. t: where it touches then.
     bool site_passes_own(int body, int site, Meeting& t) const {
@@ -185,12 +188,8 @@ struct PairDetection {
     }
     // f(other, facing, thickness, touch) of the edges that the solution takes an edge through, but for attached ones.
     template <class F> void each_edge_passed(int body, int edge, F f) const {
-        each_facing_edge(tables, edges, motion, body, edge, [&](int other, int facing, double thickness) {
-            if (are_bound(edge, body, facing, other)) return;
-            const EdgePath path = path_of(edges, motion, edge), way = path_of(edges, motion, facing);
-            EdgeTouch t;
-            if (!edges_pass(path, c.wings[edge], way, c.wings[facing], THROUGH * thickness)) return;
-            if (meet_edges(path, c.wings[edge], way, c.wings[facing], thickness, 1e-2 * thickness, nullptr, t)) f(other, facing, thickness, t);
+        ::each_edge_passed(tables, edges, motion, body, edge, [&](int other, int facing, double thickness, const EdgeTouch& t) {
+            if (!are_bound(edge, body, facing, other)) f(other, facing, thickness, t);
         });
         if (!own.exists() || !(c.near[body] & MAY_TOUCH_ITSELF) || !own.edge_may_touch(edge, body, 1)) return;
         const EdgePath path = path_of(edges, motion, edge);
@@ -200,73 +199,30 @@ struct PairDetection {
             f(body, facing, thickness_of(tables, body), t);
         });
     }
-    bool hold_edge(int body, int edge, double* y) const {
-        bool found = false;
+    void find_held_edge(int body, int edge, std::vector<HeldPlace>& places) const {
+        int found = 0;
         each_edge_passed(body, edge, [&](int other, int facing, double thickness, const EdgeTouch& t) {
-            if (c.result[other].status == NOT_FINITE) return;
-            const int32_t nodes[CORNERS] = {c.edge[2 * edge], c.edge[2 * edge + 1], c.edge[2 * facing], c.edge[2 * facing + 1]};
-            const double weight[CORNERS] = {1 - t.s, t.s, t.t - 1, -t.t};
-            found = hold_apart(nodes, weight, t.normal, 0.1 * thickness, body, other, y) || found;
+            if (c.result[other].status == NOT_FINITE || found++ >= MOST_HELD) return;
+            places.push_back(held_edges(c.edge + 2 * edge, c.edge + 2 * facing, body, other, t.s, t.t, t.normal, thickness));
         });
-        return found;
-    }
-    // Moves nodes by their weights over their masses until sum_a weight_a x_a is `gap` along the normal; weights above 0 are of `body`.
-    // Those of a body whose step is made stay. False if there is nothing to move.
-    bool hold_apart(const int32_t* nodes, const double* weight, const double* normal, double gap, int body, int other, double* y) const {
-        double lacks = gap, share = 0;
-        auto moves = [&](int a) { return c.free[nodes[a]] != 0 && !is_made(loop, weight[a] > 0 ? body : other); };
-        for (int a = 0; a < CORNERS; ++a) {
-            double s[3];
-            displacement_of(motion, nodes[a], s);
-            for (int k = 0; k < 3; ++k) lacks -= weight[a] * normal[k] * (loop.x[3 * (int64_t)nodes[a] + k] + s[k]);
-            if (moves(a)) share += weight[a] * weight[a] / c.mass[nodes[a]];
-        }
-        if (!(lacks > 0) || !(share > 0)) return false;
-        for (int a = 0; a < CORNERS; ++a) {
-            if (!moves(a) || weight[a] == 0) continue;
-            double dv[3], own[3];
-            for (int k = 0; k < 3; ++k) dv[k] = lacks / share * weight[a] / c.mass[nodes[a]] * normal[k] / c.dx_dv;
-            rotated_back(c.rotation + 9 * (int64_t)nodes[a], dv, own);
-            for (int k = 0; k < 3; ++k) y[3 * (int64_t)nodes[a] + k] += own[k];
-        }
-        ++c.report[body].clipped;
-        if (other != body) ++c.report[other].clipped;
-        return true;
     }
 
     void count_dropped(int edge, int rows) const {
-        for (int end = 0; end < 2 && rows; ++end)
-            if (const int site = c.node_site[c.edge[2 * edge + end]]; site >= 0) { c.dropped[site] += rows; return; }
+        if (!rows) return;
+        if (const int site = site_of_edge(tables, edges, edge); site >= 0) c.dropped[site] += rows;
     }
 
     // The same for an edge that the solution takes through another one.
     bool sweep_edge(int body, int edge) const {
         bool found = false;
         each_edge_passed(body, edge, [&](int other, int facing, double, const EdgeTouch& t) {
-            take_edge_row(body, edge, {other, facing, t});
+            const int k = take_edge_row(tables, edges, motion, body, edge, {other, facing, t}, [&](int row) { return c.state[row].force.normal; });
+            if (k >= 0) take_anew(c.state[k]);
             c.touched[body] = c.touched[other] = 1;
             found = true;
         });
         return found;
     }
-    void take_edge_row(int body, int edge, const EdgeMeeting& t) const {
-        const int row = c.edge_start[0] + 2 * edge;
-        const int32_t* facing = c.facing + 2 * edge;
-        int k = row;
-        if (facing[0] != t.edge || c.obstacle[row] < 0) {
-            const bool next = c.obstacle[row + 1] < 0 || facing[1] == t.edge;
-            k += next || (c.obstacle[row] >= 0 && c.state[row + 1].force.normal < c.state[row].force.normal);
-        }
-        RowState& state = c.state[k];
-        const bool same = c.obstacle[k] >= 0 && facing[k - row] == t.edge;
-        if (same && dot3(c.normal + 3 * k, t.touch.normal) > SAME_PLANE) {
-            c.hardening[k] = std::min(HARDER * c.hardening[k], HARDEST);
-            return;
-        }
-        put_edge_row(tables, edges, motion, k, body, t);
-        take_anew(state);
-    }
-
     // How far a vertex is at least from a body at the start of the step, as its rows tell, up to `thickness`.
     double distance_at_start(int site, int other, double thickness) const {
         const int row = c.pair_first + 2 * site;
