@@ -228,23 +228,17 @@ __device__ __forceinline__ void stiff(const double* k, const double* u, double* 
 // Lists the rows of a body that are not empty, in order, and counts them, and those that are not against obstacles, which come last. Done
 // by a whole thread block.
 __device__ void list_own_rows(const IslandArguments& a, int body) {
-// f(first, last) of the rows of a body, each sort
-template <class F> __device__ __forceinline__ void each_obstacle_range(const IslandArguments& a, int body, F f) {
-    f(a.t.body_start[body], a.t.body_start[body + 1]);
-    if (FACES) f(a.c.faces.start[body], a.c.faces.start[body + 1]);
-}
-template <class F> __device__ __forceinline__ void each_pair_range(const IslandArguments& a, int body, F f) {
-    if (bodies_touch(a)) {
-        f(a.t.pair_first + a.t.body_start[body], a.t.pair_first + a.t.body_start[body + 1]);
-        f(a.e.start[body], a.e.start[body + 1]);
-    }
-    if (HAS_TIES) f(a.ties.first + a.ties.start[body], a.ties.first + a.ties.start[body + 1]);
-}
-
-// Where the list of a body's rows that are not empty begins.
-__device__ __forceinline__ int* own_list(const IslandArguments& a, int body) {
-    return a.own_row + 2 * a.t.body_start[body] + (bodies_touch(a) ? a.e.start[body] - a.e.start[0] : 0) +
-           (FACES ? a.c.faces.start[body] - a.c.faces.start[0] : 0) + (HAS_TIES ? a.ties.start[body] : 0);
+    int* list = own_list(a, body);
+    int listed = 0, found = 0;
+    auto add = [&](int first, int last) {
+        found = list_range(a.c, first, last, list + listed);
+        listed += found;
+        __syncthreads();
+    };
+    each_obstacle_range(a, body, add);
+    if (FACES && threadIdx.x == 0) a.c.faces.rows[body] = found;
+    const int against = listed;
+    each_pair_range(a, body, add);
     if (threadIdx.x > 0) return;
     a.own_rows[body] = listed;
     a.pair_rows[body] = listed - against;
