@@ -209,7 +209,7 @@ __device__ __forceinline__ void stiff(const double* k, const double* u, double* 
 // by a whole thread block.
 __device__ void list_own_rows(const IslandArguments& a, int body) {
     __shared__ int before[CONTACT_THREADS];
-    int listed = 0, against = -1;
+    int listed = 0, against = 0, ranges = 0;
     each_range(a, body, [&](int first, int last) {
         const int each = (last - first + CONTACT_THREADS - 1) / CONTACT_THREADS;
         const int begin = min(first + (int)threadIdx.x * each, last), end = min(begin + each, last);
@@ -227,8 +227,8 @@ __device__ void list_own_rows(const IslandArguments& a, int body) {
         int* to = a.own_row + own_start(a, body) + listed + before[threadIdx.x] - own;
         for (int r = begin; r < end; ++r)
             if (__ldcg(a.t.obstacle + r) >= 0) *to++ = r;
+        if (!HAS_TIES || ranges++ < 2) against = listed;
         listed += before[CONTACT_THREADS - 1];
-        if (against < 0) against = listed;
         __syncthreads();
     });
     if (threadIdx.x > 0) return;
