@@ -18,7 +18,6 @@ from tests.contact.scenes import block, floor, over, ram
 from tests.holders.holder_scenes import held_bar, left, right
 from tests.scenes import bar, scene
 from tests.support import nvrtc
-from tests.ties.test_attachments_and_springs import FLOOR, glue, half, made
 from tests.worker.block_matrices import bar_edges, pattern
 
 pytestmark = pytest.mark.slow
@@ -37,7 +36,6 @@ SCENES = {
     "springs.toml": (),
     "fibres.toml": ("integrator.scheme=bdf2",),
     "equilibrium.toml": (),
-    "graft.toml, float32": ("solver.precision=float32",),
 }
 
 
@@ -162,18 +160,20 @@ def test_bodies_that_are_told_not_to_touch_each_other_have_nothing_of_it(cupy):
     assert not any("pair" in kernel or "island" in kernel for kernel, _ in cupy.calls)
 
 
-def test_attachments_and_springs_begin_before_islands_are_searched_and_end_after_all_that_moves_nodes(cupy):
-    """Also where there is no contact: nothing is detected then. Texts of other scenes do not know of them."""
-    Simulation.load("deploy/scenes/graft.toml", [], "gpu")
+def test_a_scene_with_attachments_and_springs_alone_is_built(cupy):
+    """They begin before islands are searched and end after all that moves nodes; nothing is detected."""
+    engine = Simulation.load("deploy/scenes/graft.toml", ["solver.precision=float32"], "gpu").engine
     names = [kernel for kernel, _ in cupy.calls]
     first, last = names.index("begin_ties"), names.index("finish_contact")
     assert names[first : first + 4] == ["begin_ties", "look_at_bodies", "list_island_rows", "find_islands"]
     assert names[last : last + 3] == ["finish_contact", "know_pairs", "keep_ties"]
     assert not {"pair_boxes", "pair_trees", "pair_sites", "pair_sweep", "keep_pairs"} & set(names)
-    cupy.calls.clear()
-    made(half("a", 0), half("b", 1), attachment=[glue()], obstacle=[FLOOR], device="gpu")
-    names = [kernel for kernel, _ in cupy.calls]
-    assert names[names.index("pair_edges") + 1] == "begin_ties" and "pair_sweep" in names
+    assert names.index("keep_ties") < names.index("report_held")
+    engine.run(3)
+    engine.assemble()
+    engine.solve()
+    records, reactions = engine.records_and_reactions()
+    assert records["step"].tolist() == [1, 1, 2, 2, 3, 3, 4, 4] and reactions.shape == (8, 3, 6)
 
 
 def test_a_scene_without_contact_has_nothing_of_it(cupy):

@@ -70,12 +70,12 @@ def test_in_motion_two_bars_are_the_nearer_to_one_the_stiffer_the_attachment():
     assert away[2] < 0.2 * away[1] < 0.04 * away[0] and away[2] < 1e-4
 
 
-def masses(**spring: Any) -> Simulation:
+def masses(device: str = "cpu", **spring: Any) -> Simulation:
     """Two stiff free bars, a spring between the middles of the ends that face each other, 0.5 m apart."""
     ends = [{"object": "a", "at": [1, 0.25, 0.25]}, {"object": "b", "at": [0, 0.25, 0.25]}]
     bars = half("a", 0, young=1e9), half("b", 1.5, young=1e9, density=3000.0)
     given = {"name": "band", "between": ends, "stiffness": 5e4, "rest_length": 0.4, **spring}
-    return made(*bars, gravity=False, spring=[given])
+    return made(*bars, gravity=False, spring=[given], device=device)
 
 
 def test_a_spring_between_free_bodies_keeps_momentum():

@@ -165,19 +165,14 @@ __device__ __forceinline__ void set_lever(const IslandArguments& a, int r, doubl
     });
 }
 
-// The law of a row: its force at displacement s, as evaluate, its slope times h^2, and the force alone.
-__device__ __forceinline__ void evaluate_row(const IslandArguments& a, int r, const double* s, bool hold, bool set) {
-    if (!is_tie(a, r)) return evaluate(a.c, r, s, hold, set);
-    for (int k = 0; k < 3; ++k) a.c.row[r].s[k] = s[k];
-    a.c.row[r].force = force_of_tie(a.ties, r - a.ties.first, s);
+// The law of a tie, as evaluate and contact_stiffness.
+__device__ __forceinline__ void evaluate_tie(const IslandArguments& a, int r, const double* s) {
+    DeviceRow& row = a.c.row[r];
+    for (int k = 0; k < 3; ++k) row.s[k] = s[k];
+    row.force = force_of_tie(a.ties, r - a.ties.first, s);
 }
-__device__ __forceinline__ void set_stiffness(const IslandArguments& a, int r, const ContactRow& row, const ContactForce& force, double* k) {
-    const double scale = a.c.dx_dv * a.c.force_coefficient;
-    if (is_tie(a, r)) stiffness_of_tie(a.ties, r - a.ties.first, scale, k);
-    else contact_stiffness(row, force, scale, k);
-}
-__device__ __forceinline__ ContactForce force_of_row(const IslandArguments& a, int r, const double* s, double limit) {
-    return is_tie(a, r) ? force_of_tie(a.ties, r - a.ties.first, s) : contact_force(row_at(a.c, r), s, limit, false);
+__device__ __forceinline__ void set_tie_stiffness(const IslandArguments& a, int r, double* k) {
+    stiffness_of_tie(a.ties, r - a.ties.first, a.c.dx_dv * a.c.force_coefficient, k);
 }
 
 // A thread block has a body: forces and stiffness of its rows.
@@ -201,17 +196,21 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_law(const I
             row.limit = a.c.force[r];
             row.in_set = is_tie(a, r) || a.c.force[r] > 0 || (a.c.entry[r] <= 1 && a.c.entry[r] <= earliest + FIRST);
             for (int m = 0; m < 6; ++m) own.known[m] = 0;
-            if (is_tie(a, r) || a.c.force[r] > 0)
-                set_stiffness(a, r, row_at(a.c, r), lasting_contact(a.c.friction[r], a.c.force[r], a.c.traction + 3 * r), own.known);
+            if (is_tie(a, r)) set_tie_stiffness(a, r, own.known);
+            else if (a.c.force[r] > 0)
+                contact_stiffness(row_at(a.c, r), lasting_contact(a.c.friction[r], a.c.force[r], a.c.traction + 3 * r),
+                                  a.c.dx_dv * a.c.force_coefficient, own.known);
         }
         double s[3];
         point_displacement(a, r, what == ZERO_START || (what == LAW_AT_START && state.zero), s);
         const ContactRow given = row_at(a.c, r);
-        evaluate_row(a, r, s, what == LAW && state.hold, what == LAW ? state.set : what != LAW_AT_START);
+        if (is_tie(a, r)) evaluate_tie(a, r, s);
+        else evaluate(a.c, r, s, what == LAW && state.hold, what == LAW ? state.set : what != LAW_AT_START);
         for (int m = 0; m < 3; ++m)
             own.impulse[m] = a.c.force_coefficient * (row.force.normal * a.c.normal[3 * r + m] + row.force.traction[m]);
         if (what != LAW) continue;
-        set_stiffness(a, r, given, row.force, own.stiffness);
+        if (is_tie(a, r)) set_tie_stiffness(a, r, own.stiffness);
+        else contact_stiffness(given, row.force, a.c.dx_dv * a.c.force_coefficient, own.stiffness);
         set_lever(a, r, own.lever);
         if (is_tie(a, r)) continue;
         changed[0] += state.set && row.in_set != (int)contact_force(given, s, 0, false).closed;
@@ -219,7 +218,9 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_law(const I
     }
     if (what != LAW) return;
     sum_block(changed);
-    for (int k = 0; threadIdx.x == 0 && k < ROW_SUMS; ++k) a.row_sums[k * a.bodies_count + body] = changed[k];
+    if (threadIdx.x > 0) return;
+    a.row_sums[body] = changed[0];
+    if (HAS_TIES) a.row_sums[a.bodies_count + body] = changed[ROW_SUMS - 1];
 }
 
 // A thread has a node: r0 = left + i H^T f; squares of it, of b + i H^T f and of b.
@@ -380,8 +381,7 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) coarse_matrix(cons
             row = pair[0];
             which = pair[2] == body;
             mine = pair[1] == body || which;
-            const int there = pair[which ? 1 : 2];
-            if (mine && (!HAS_TIES || there >= 0)) mode_there = a.mode[there];
+            if (mine && (!HAS_TIES || pair[which ? 1 : 2] >= 0)) mode_there = a.mode[pair[which ? 1 : 2]];
         }
         __syncthreads();
         before[me] = mine;
@@ -753,7 +753,8 @@ __device__ double search_along(const IslandArguments& a, int island, int bodies,
                     step[n] = a.c.dx_dv * a.row[r].seen[n];
                     at[n] = row.s[n] + part * step[n];
                 }
-                const ContactForce f = force_of_row(a, r, at, row.limit);
+                const ContactForce f =
+                    is_tie(a, r) ? force_of_tie(a.ties, r - a.ties.first, at) : contact_force(row_at(a.c, r), at, row.limit, false);
                 work[0] += f.normal * dot3(a.c.normal + 3 * r, step) + dot3(f.traction, step);
             }
         }

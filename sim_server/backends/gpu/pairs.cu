@@ -412,6 +412,8 @@ __device__ IslandState state_of(const IslandArguments& a, int first, int bodies,
     return s;
 }
 
+constexpr int LONE = HAS_TIES ? 0 : 1;  // what counts as the size of the island of a body that is none
+
 // True if the last one of a body's rows, whose ties come last, is a tie.
 __device__ bool is_tied(const IslandArguments& a, int body) {
     const int rows = a.own_rows[body];
@@ -454,7 +456,7 @@ extern "C" __global__ void __launch_bounds__(LISTING_THREADS) find_islands(const
     for (int i = me; i < n; i += LISTING_THREADS) {
         int size = 0;
         for (int j = 0; j < n; ++j) size += label[j] == label[i];
-        members[i] = size > 1 || is_tied(a, i) ? size : 0;
+        members[i] = HAS_TIES && size == 1 && !is_tied(a, i) ? LONE : size;
     }
     __syncthreads();
     __shared__ int islands, active, alone;
@@ -462,14 +464,14 @@ extern "C" __global__ void __launch_bounds__(LISTING_THREADS) find_islands(const
     __syncthreads();
     for (int i = me; i < n; i += LISTING_THREADS) {
         const int own = label[i], size = members[i];
-        if (size == 0) {
+        if (size == LONE) {
             a.island_of[i] = a.mode[i] = -1;
             atomicAdd(&alone, 1);
             continue;
         }
         int number = 0, first = 0, rank = 0, free_rank = 0, frees = 0, again = 0, chunks = 0;
         for (int j = 0; j < n; ++j) {
-            if (label[j] == j && j < own && members[j] > 0) {
+            if (label[j] == j && j < own && members[j] > LONE) {
                 ++number;
                 first += members[j];
             }
