@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sim_server.backends.gpu.faces import DEFINED
 from sim_server.backends.gpu.tie_arguments import bindings
-from sim_server.effects import contact
 from tests.contact.kernels_beside import TEXT, compiled
 from tests.contact.test_contact_islands_of_a_gpu import ISLANDS, Islands, IslandsBeside
 from tests.scenes import bar
@@ -21,6 +21,9 @@ extern "C" int step(const ContactArguments* c, const ContactSolve* first, const 
                     const IslandArguments* a, const Islands* islands) {
     const int items = a->bound_nodes > a->ties.count ? a->bound_nodes : a->ties.count;
     int loops = 0;
+#ifdef FACE_ROWS
+    each_triangle(*c, [&] { detect_faces(*c); });
+#endif
     if (islands->sites) detect_pairs(*a, *islands);
     each((items + CONTACT_THREADS - 1) / CONTACT_THREADS, [&] { begin_ties(*a); });
     each(islands->edges, [&] { bind_edges(*a); });
@@ -29,6 +32,9 @@ extern "C" int step(const ContactArguments* c, const ContactSolve* first, const 
     for (one_pass(*c, *first, *s); *c->active > 0 && loops < 200; ++loops) one_pass(*c, *pass, *s);
     solve_islands(a, islands);
     keep_pairs_of_step(a, islands);
+#ifdef FACE_ROWS
+    each(s->bodies, [&] { finish_faces(*c); });
+#endif
     each(s->grid, [&] { finish_contact(*c); });
     know_pairs_of_step(a, islands);
     each(a->ties.tables, [&] { keep_ties(*a); });
@@ -40,6 +46,11 @@ extern "C" int step(const ContactArguments* c, const ContactSolve* first, const 
 @pytest.fixture(scope="module")
 def library(tmp_path_factory: pytest.TempPathFactory) -> c.CDLL:
     return compiled(tmp_path_factory.mktemp("ties"), TEXT + ISLANDS + STEP, "-DTIES")
+
+
+@pytest.fixture(scope="module")
+def library_with_triangles(tmp_path_factory: pytest.TempPathFactory) -> c.CDLL:
+    return compiled(tmp_path_factory.mktemp("ties"), TEXT + ISLANDS + STEP, "-DTIES", DEFINED)
 
 
 class TiesBeside(IslandsBeside):
@@ -123,9 +134,8 @@ def test_glued_bars_tear(library, monkeypatch):
     assert 0 < broken[0] < len(beside.contact.ties.broken)
 
 
-def test_attachments_to_an_obstacle_and_between_bodies_in_contact(library, monkeypatch):
+def test_attachments_to_an_obstacle_and_between_bodies_in_contact(library_with_triangles, monkeypatch):
     """With contact: a moving tool holds one bar, which a floor and another bar touch; glued nodes have no contact."""
-    monkeypatch.setattr(contact, "nodes_alone", lambda world: True)  # as on a GPU
     keys = [{"time": 0, "translate": [0, 2, 0]}, {"time": 0.5, "translate": [0.1, 2.1, 0], "rotate": [0, 0, 30]}]
     tool = {"name": "tool", "shape": "sphere", "radius": 0.1, "keyframes": keys}
     floor = FLOOR | {"pose": {"translate": [0, -0.01, 0]}}
@@ -134,7 +144,7 @@ def test_attachments_to_an_obstacle_and_between_bodies_in_contact(library, monke
     objects = piece("a", 0), piece("b", 1), piece("c", 2.015)
     sim = made(*objects, obstacle=[floor, tool], attachment=[stuck, glue()], contact=effect)
     sim.world.v[sim.world.bodies[2].nodes] = [-1.0, 0, 0]
-    beside = TiesBeside(library, sim, monkeypatch)
+    beside = TiesBeside(library_with_triangles, sim, monkeypatch)
     records = np.array([beside.same(1e-4) for _ in range(2)])
     assert records["contacts"].max() > 0 and beside.tally["islands"] == 1 and not records["clipped"].any()
     assert (beside.gpu.twin(beside.contact.obstacle) == beside.contact.obstacle).all()
@@ -142,7 +152,6 @@ def test_attachments_to_an_obstacle_and_between_bodies_in_contact(library, monke
 
 def test_glued_bars_that_fall_far_in_a_step_do_not_touch_each_other(library, monkeypatch):
     """Neither before the solve nor in the sweep after it: by half an element in a step, together."""
-    monkeypatch.setattr(contact, "nodes_alone", lambda world: True)
     far = FLOOR | {"pose": {"translate": [0, -90, 0]}}
     sim = made(piece("a", 0), piece("b", 1), attachment=[glue()], obstacle=[far])
     sim.world.v[:] = (0, -12, 0)
