@@ -76,11 +76,9 @@ def contact_errors(
         return
     if not obstacles and (len(objects) < 2 or not contact.between):
         yield _error("there is nothing to touch; needed: an [[obstacle]], or another object", "effects", "contact")
-    linearized = integrator.scheme == "backward_euler" and integrator.linearizations > 1
-    if integrator.scheme == "quasi_static" or linearized:
-        found = f"{integrator.scheme!r} with linearizations = {integrator.linearizations}"
-        allowed = "'backward_euler' with linearizations = 1, 'newmark', 'bdf2', 'ros2'"
-        yield _error(f"contact with integrator.scheme = {found}; allowed: {allowed}", "effects", "contact")
+    if integrator.scheme == "quasi_static":
+        allowed = "'backward_euler', 'newmark', 'bdf2', 'ros2'"
+        yield _error(f"contact with integrator.scheme = 'quasi_static'; allowed: {allowed}", "effects", "contact")
     pairs: list[set[str]] = []
     for index, pair in enumerate(contact.friction or ()):
         if text := _wrong_pair(set(pair.between), names, shapes, pairs):
@@ -93,6 +91,11 @@ def check_contact_on(device: str, integrator: IntegratorOptions) -> None:
     if device == "gpu" and integrator.scheme != "backward_euler":
         raise InputError(
             f"effects.contact with integrator.scheme = {integrator.scheme!r} on a GPU; allowed: 'backward_euler', or "
+            "--device cpu"
+        )
+    if device == "gpu" and integrator.linearizations > 1:
+        raise InputError(
+            f"effects.contact with integrator.linearizations = {integrator.linearizations} on a GPU; allowed: 1, or "
             "--device cpu"
         )
 

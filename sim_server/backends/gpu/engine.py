@@ -111,7 +111,7 @@ class GpuEngine(DeviceLoop):
         if newton and phases:
             newton_results = device.pinned(CAPACITY * NEWTON_RESULT.itemsize * bodies)
             parts = newton.parts[len(self._first) :]
-            newton = Newton(newton.options, newton.dx_dv, parts, **newton.arrays)
+            newton = Newton(newton.options, newton.dx_dv, parts, newton.detect, **newton.arrays)
             self._newton = NewtonIteration(gpu, newton, assemble, ranges, arrays, phases, self.solver, newton_results)
         self._contact, contact_results, reactions = None, None, None
         if given.contact:
