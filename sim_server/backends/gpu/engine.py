@@ -112,7 +112,9 @@ class GpuEngine(DeviceLoop):
             newton_results = device.pinned(CAPACITY * NEWTON_RESULT.itemsize * bodies)
             parts = newton.parts[len(self._first) :]
             newton = Newton(newton.options, newton.dx_dv, parts, newton.detect, **newton.arrays)
-            self._newton = NewtonIteration(gpu, newton, assemble, ranges, arrays, phases, self.solver, newton_results)
+            self._newton = NewtonIteration(
+                gpu, newton, assemble, ranges, arrays, phases, self.solver, newton_results, settled
+            )  # fmt: skip
         self._contact, contact_results, reactions = None, None, None
         if given.contact:
             contact_results = device.pinned(CAPACITY * CONTACT_RESULT.itemsize * bodies)
