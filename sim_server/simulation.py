@@ -62,7 +62,7 @@ class Simulation:
             ahead("backends/cpu/native/factor_check.cpp")
         self.on_effect_update: list[Callable[[Effect, PendingUpdate], None]] = []
         self._mailed: dict[Effect, int] = {}  # numbers of their launches whose arguments may change
-        self._detection = slice(0)  # numbers of those that detect contacts
+        self._detection = slice(0, 0)  # numbers of those that detect contacts
         with backend.building():
             self._build(backend, watched)
 
@@ -105,7 +105,7 @@ class Simulation:
         mailed = {x.name: x for x in assemble if x.mailed}  # whose arguments come to one launch, which all lists share
         *lists, euler_launches = [[mailed.get(x.name, x) for x in other] for other in others]
         effects, numbers = list(self.effects.values()), self._detection
-        newton = self.integrator.newton(assemble, effects)
+        newton = self.integrator.newton(assemble, numbers, effects)
         stages = self.integrator.stages(assemble, lists, effects)
         euler = self.integrator.euler_form([*assemble, *integrate], assemble[numbers], euler_launches, effects)
         contact = ties_alone(w, self.ties) if self.ties else None

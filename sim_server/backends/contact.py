@@ -116,7 +116,7 @@ class Contact:
     force: (rows,) normal force lambda [N]; traction: (rows, 3) friction force [N]. In: of the last step, for the same
         obstacle (0 for another), traction turned with the normal. Out: of this step
     predictor: (nodes, 3), dx_dv, force_coefficient, free, mass: (nodes,) of the world (mechanics/world.py)
-    passes: most solves of a step. tolerance: of the contact residual
+    passes: most solves of a linearization. tolerance: of the contact residual
     dropped: (surface nodes,) how often something that touches found no row; of a triangle at one of its nodes
     faces: None where triangles have no rows of their own
     surfaces: None where bodies touch neither each other nor themselves

@@ -76,7 +76,7 @@ class Params(Parameters):
         default=None, description="distance kept from obstacles [m]; a tenth of the shortest edge of each surface"
     )
     stiffness: float = Field(default=1.0, gt=0, le=1e4, description="of a contact over that of its node [-]")
-    passes: int = Field(default=16, ge=1, le=1000, description="most solves of a step")
+    passes: int = Field(default=16, ge=1, le=1000, description="most solves of a linearization")
     tolerance: float = Field(default=1e-3, gt=0, lt=1, description="of the contact residual over the right-hand side")
     friction: list[PairFriction] | None = Field(default=None, description="of pairs, instead of the geometric mean")
     between: bool = Field(default=True, description="objects touch each other, too")

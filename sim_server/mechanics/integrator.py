@@ -97,7 +97,7 @@ class Integrator:
 
     inertial_increment (n, 3) [m/s]: r, above; none in backward Euler. beta (n,): damping of the stiffness at nodes [s].
     before (n, 3) [m]: x at the start of the last step, to which a body goes back whose forces are NaN.
-    touches: whether the scene has contact, and another scheme than backward Euler with one linearization.
+    touches: whether the scene has contact, and another scheme than backward Euler.
     takes_euler: whether single bodies may take steps of backward Euler in place of those of the scheme. For these
     start_x [m], start_v [m/s] (n, 3): state at the start of the step; earlier (n, 3): `before` there.
     """
@@ -109,7 +109,7 @@ class Integrator:
         self.beta = np.repeat(w.beta, [b.last - b.first for b in w.bodies]) if not w.plain else np.zeros(0)
         self.before = w.x.copy()
         w.backend.keep(self.inertial_increment, self.beta, self.before)
-        self.touches = "contact" in scene.effects and not w.plain
+        self.touches = "contact" in scene.effects and self.options.scheme != "backward_euler"
         self.takes_euler = self.touches or self.has_stages
         n = w.nodes if self.takes_euler else 0
         self.start_x, self.start_v, self.earlier = w.x[:n].copy(), np.zeros((n, 3)), w.x[:n].copy()
@@ -160,8 +160,13 @@ class Integrator:
         )  # fmt: skip
         return [self._bind("prepare", from_velocity=0.0, **state), *assemble, begin]
 
-    def newton(self, assemble: Sequence[Launch], effects: Sequence[CouplesNodes]) -> Newton | None:
-        """Input of Newton-Raphson; None with one linearization a step. assemble: the launches of each linearization."""
+    def newton(
+        self, assemble: Sequence[Launch], detect: slice, effects: Sequence[CouplesNodes]
+    ) -> Newton | None:  # fmt: skip
+        """Input of Newton-Raphson; None with one linearization a step.
+
+        assemble: the launches of each linearization; detect: numbers of those among them that detect contacts
+        """
         w, s = self.world, self.system
         if self.options.linearizations == 1:
             return None
@@ -169,7 +174,7 @@ class Integrator:
         w.backend.keep(mass)
         parts = list(self.parts_of(assemble, effects).values())
         return Newton(
-            self.options, w.dx_dv, parts, rotation=s.rotation, mass=mass, beta=self.beta, predictor=w.predictor,
+            self.options, w.dx_dv, parts, detect, rotation=s.rotation, mass=mass, beta=self.beta, predictor=w.predictor,
             damping_velocity=w.damping_velocity, inertial_increment=self.inertial_increment,
         )  # fmt: skip
 

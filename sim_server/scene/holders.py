@@ -6,7 +6,6 @@ from collections.abc import Iterator, Sequence
 from pydantic import Field, model_validator
 from pydantic_core import InitErrorDetails
 
-from sim_server.errors import InputError
 from sim_server.scene.integrator_options import IntegratorOptions
 from sim_server.scene.motion import Moved
 from sim_server.scene.obstacles import HasName
@@ -29,15 +28,6 @@ class Holder(Moved):
         if first is not None and first.time == 0 and Pose(rotate=first.rotate, translate=first.translate) != Pose():
             raise complaint("keyframes: that of time 0 must be without rotate and translate, since the object is there")
         return self
-
-
-def check_holders_on(device: str, holders: Sequence[Holder], integrator: IntegratorOptions) -> None:
-    """Raises InputError for holders that the device ("cpu" or "gpu") does not have."""
-    if device == "gpu" and holders and integrator.linearizations > 1:
-        raise InputError(
-            f"holder {holders[0].name!r} with integrator.linearizations = {integrator.linearizations} on a GPU; "
-            "allowed: 1, or --device cpu"
-        )
 
 
 def holder_errors(

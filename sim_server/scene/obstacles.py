@@ -77,11 +77,9 @@ def contact_errors(
     if not obstacles and not contact.self and (len(objects) < 2 or not contact.between):
         text = "there is nothing to touch; needed: an [[obstacle]], another object, or self = true"
         yield _error(text, "effects", "contact")
-    linearized = integrator.scheme == "backward_euler" and integrator.linearizations > 1
-    if integrator.scheme == "quasi_static" or linearized:
-        found = f"{integrator.scheme!r} with linearizations = {integrator.linearizations}"
-        allowed = "'backward_euler' with linearizations = 1, 'newmark', 'bdf2', 'ros2'"
-        yield _error(f"contact with integrator.scheme = {found}; allowed: {allowed}", "effects", "contact")
+    if integrator.scheme == "quasi_static":
+        allowed = "'backward_euler', 'newmark', 'bdf2', 'ros2'"
+        yield _error(f"contact with integrator.scheme = 'quasi_static'; allowed: {allowed}", "effects", "contact")
     pairs: list[set[str]] = []
     for index, pair in enumerate(contact.friction or ()):
         if text := _wrong_pair(set(pair.between), names, shapes, pairs, contact.self):
@@ -98,6 +96,11 @@ def check_contact_on(device: str, contact: Any, integrator: IntegratorOptions) -
         )
     if device == "gpu" and contact.self:
         raise InputError("effects.contact.self = true: objects touch themselves on CPUs alone; allowed: --device cpu")
+    if device == "gpu" and integrator.linearizations > 1:
+        raise InputError(
+            f"effects.contact with integrator.linearizations = {integrator.linearizations} on a GPU; allowed: 1, or "
+            "--device cpu"
+        )
 
 
 def _wrong_pair(

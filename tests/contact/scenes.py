@@ -44,7 +44,7 @@ def block(friction: float = 0.5, cells: Sequence[int] = CELLS, size: Sequence[fl
 def over(
     *obstacles: dict, objects: Sequence[dict] = (), velocity: ArrayLike = (0, 0, 0), dt: float = 1 / 60,
     gravity: Sequence[float] = (0, -9.81, 0), contact: Any = True, solver: dict | None = None, device: str = "cpu",
-    integrator: dict | None = None, **table: Any,
+    integrator: dict | None = None, holders: Sequence[dict] = (), **table: Any,
 ) -> Simulation:  # fmt: skip
     """A block, or other objects, over obstacles. velocity: at the start [m/s]; other arguments are the block's.
 
@@ -57,6 +57,8 @@ def over(
         "name": "test", "dt": dt, "effects": effects, "solver": LOCKSTEP if solver is None else solver,
         "object": list(objects) or [block(**table)], "integrator": integrator or {},
     }  # fmt: skip
+    if holders:
+        scene["holder"] = list(holders)
     if contact is not None:
         scene["obstacle"] = list(obstacles) or [floor()]
     sim = Simulation(Scene.model_validate(scene, context={"folder": "."}), device)

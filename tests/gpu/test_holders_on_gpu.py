@@ -41,6 +41,18 @@ def test_steps_and_forces_are_those_of_the_cpu(scheme, touch):
     np.testing.assert_allclose(g["work"], c["work"], atol=1e-6 * np.abs(c["work"]).max())
 
 
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_with_newton_raphson_too(scheme):
+    newton = SCHEMES[scheme] | {"linearizations": 8, "tolerance": 1e-9}
+    keys: dict[str, Any] = {"gravity": (0, -9.81, 0), "integrator": newton, "damping": (0.2, 0.01)}
+    sims = [held_bar(left(), right(keyframes=MOTION), device=device, **keys) for device in ("gpu", "cpu")]
+    (g, on_gpu), (c, on_cpu) = (run(sim, 20) for sim in sims)
+    assert np.abs(sims[0].world.x - sims[1].world.x).max() < 1e-7
+    np.testing.assert_allclose(on_gpu, on_cpu, atol=1e-5 * np.abs(on_cpu).max())
+    assert (g["linearizations"] == c["linearizations"]).all() and g["linearizations"].max() > 1
+    np.testing.assert_allclose(g["work"], c["work"], atol=1e-6 * np.abs(c["work"]).max())
+
+
 @pytest.mark.parametrize("precision", ["float64", "mixed", "float32"])
 def test_a_holder_at_rest_is_fixed_nodes(precision):
     solver = {"precision": precision, "tolerance": 1e-5}

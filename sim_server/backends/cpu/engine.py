@@ -113,10 +113,20 @@ class _NativeNewton:
         for name, array in {**newton.arrays, "room": self._room}.items():
             setattr(self.native, name, array.ctypes.data)
         self.native.search = c.addressof(self._search)
+        self.native.detect, self.native.detects = newton.detect.start, newton.detect.stop - newton.detect.start
         loop.newton = c.addressof(self.native)
         self._parts = newton.parts
         for launch, part in zip(launches, newton.parts, strict=False):
             launch.parts = None if part is None else part.ctypes.data
+
+    def search_in_contact(self, bodies: int) -> Reals:
+        """Adds what searches with contact need; returns the predictor of contact."""
+        moved = np.zeros((self._room.shape[1], 3))
+        most, entered = np.zeros(bodies, np.int32), np.zeros(bodies, np.int32)
+        self._touch: dict[str, NDArray[Any]] = {"moved": moved, "most_touching": most, "entered": entered}
+        for name, array in self._touch.items():
+            setattr(self.native, name, array.ctypes.data)
+        return moved
 
 
 LISTS = ("first", "again")  # of launches
@@ -356,6 +366,8 @@ class CpuEngine(Reports):
         self._contact = given.contact and _NativeContact(given.contact, loop, arrays)
         if self._contact and given.euler:  # bodies whose step is made have the velocities of its end
             self._contact.native.predictor = given.euler.start_v.ctypes.data
+        elif self._contact and self._newton:
+            self._contact.native.predictor = self._newton.search_in_contact(bodies).ctypes.data
         obstacles = len(given.contact.obstacles.kind) if given.contact else 0
         if given.held is not None:
             loop.holders, loop.held_reaction = given.held.shape[1], given.held.ctypes.data

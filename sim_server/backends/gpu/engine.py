@@ -111,8 +111,10 @@ class GpuEngine(DeviceLoop):
         if newton and phases:
             newton_results = device.pinned(CAPACITY * NEWTON_RESULT.itemsize * bodies)
             parts = newton.parts[len(self._first) :]
-            newton = Newton(newton.options, newton.dx_dv, parts, **newton.arrays)
-            self._newton = NewtonIteration(gpu, newton, assemble, ranges, arrays, phases, self.solver, newton_results)
+            newton = Newton(newton.options, newton.dx_dv, parts, newton.detect, **newton.arrays)
+            self._newton = NewtonIteration(
+                gpu, newton, assemble, ranges, arrays, phases, self.solver, newton_results, settled
+            )  # fmt: skip
         self._contact, contact_results, reactions = None, None, None
         self._ties = given.contact.ties if given.contact else None
         if given.contact:

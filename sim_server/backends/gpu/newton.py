@@ -82,6 +82,7 @@ class NewtonIteration:
     ranges: nodes [first, last) of each body
     arrays: host arrays by name (row_start, columns, values, b, y, x, v)
     results: host memory (capacity, bodies) of NEWTON_RESULT that the steps write to
+    readers: launches after the step's end that read what the last assembly made
 
     rounds: trials in a step
     first_values: A of the first linearization of the step, from which factors are made
@@ -90,11 +91,12 @@ class NewtonIteration:
     def __init__(
         self, gpu: Gpu, newton: Newton, again: Sequence[DeviceLaunch], ranges: Sequence[tuple[int, int]],
         arrays: Mapping[str, NDArray[Any]], phases: NewtonPhases, solver: PcgSolver, results: NDArray[Any],
+        readers: Sequence[DeviceLaunch] = (),
     ):  # fmt: skip
         cp, nodes, bodies = gpu.cp, len(arrays["x"]), len(ranges)
         self._gpu, self._solver, self.rounds = gpu, solver, newton.options.rounds
         self._bodies: list[DeviceArray | None] = []  # of the items of each kernel
-        self._again = self._guarded(newton, again, phases)
+        self._again = self._guarded(newton, again, phases, readers)
         names = ("row_start", "columns", "values", "b", "y", "x", "v")
         host = {name: arrays[name] for name in names} | newton.arrays
         twins = {name: gpu.twin(array) for name, array in host.items()}
@@ -126,7 +128,7 @@ class NewtonIteration:
         )
 
     def _guarded(
-        self, newton: Newton, again: Sequence[DeviceLaunch], phases: NewtonPhases
+        self, newton: Newton, again: Sequence[DeviceLaunch], phases: NewtonPhases, readers: Sequence[DeviceLaunch]
     ) -> list[FusedKernel | DeviceLaunch]:
         """Fuses the launches, each kernel with its guard."""
         parts = {id(launch): part for launch, part in zip(again, newton.parts, strict=True)}
@@ -137,7 +139,7 @@ class NewtonIteration:
             self._bodies.append(None if body is None else self._gpu.cp.asarray(body))
             return phases.guard(self._bodies[-1])
 
-        return fuse(again, guard)
+        return fuse(again, guard, readers=readers)
 
     def launch(self) -> None:
         """Launches the whole iteration of a step whose first linearization has been assembled."""

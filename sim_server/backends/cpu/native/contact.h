@@ -2,7 +2,8 @@
 // A step of a body that touches obstacles, on a CPU (law: kernels/contact_law.cuh; numbers, line search and planes:
 // kernels/contact_passes.cuh; what it is for: docs/contact.md).
 //
-// Elasticity is linearized once, as without contact; the law of contact is solved with it, by a semi-smooth Newton method. A pass is
+// Elasticity is linearized once, as without contact (several times: newton_contact.h); the law of contact is solved with it, by a
+// semi-smooth Newton method. A pass is
 //   - the rows in the state reached: force f, stiffness S. In the first pass the rows that carried force in the last step and those
 //     that are hit first (FIRST) count as closed, with the force of a spring that may pull, unless the law holds already; afterwards
 //     the law decides;

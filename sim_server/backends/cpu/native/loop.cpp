@@ -9,6 +9,7 @@
 #include "euler_form.h"
 #include "faces.h"
 #include "newton.h"
+#include "newton_contact.h"
 #include "pair_reactions.h"
 #include "sizes.h"
 
@@ -165,6 +166,8 @@ static void assemble(Loop* loop, bool whole) {
     if (loop->euler && loop->contact) detect_contacts(*loop);
     if (loop->stages) assemble_stage(*loop, whole);
     else assemble_single(*loop, whole);
+    if (loop->newton && loop->newton->moved)
+        std::memcpy(loop->newton->moved, loop->newton->predictor, 3 * sizeof(double) * (int64_t)loop->nodes);
     if (loop->contact && !loop->euler) detect_other_rows(*loop);
     if (loop->contact && loop->contact->ties.count) TieRows(*loop).prepare();
     for (int i = 0; i < loop->bodies && loop->contact; ++i)  // what copies have
@@ -211,8 +214,9 @@ static void finish_step(Loop* loop) {
     double entered = now();
     bool keep = room_for_records(rings, loop->bodies, [] { return true; });
     double waited = now() - entered;  // no part of the step
-    if (loop->newton && !loop->euler) search_all(*loop);
     if (loop->euler) make_step(*loop);
+    else if (loop->newton && loop->contact) search_in_contact(*loop);
+    else if (loop->newton) search_all(*loop);
     else if (loop->contact) solve_in_contact(*loop);
 #pragma omp parallel for num_threads(loop->threads) schedule(dynamic, 1) if (loop->threads > 1 && loop->bodies > 1)
     for (int i = 0; i < loop->bodies; ++i) {

@@ -45,6 +45,10 @@ struct Newton {                        // several linearizations a step (newton.
     double *predictor, *damping_velocity, *inertial_increment;  // (nodes, 3) [m/s]
     double* room;                      // 18 doubles a node
     Search* search;                    // (bodies,)
+    int32_t detect, detects;           // first and number of the launches that detect contacts, once a step (newton_contact.h)
+    double* moved;                     // (nodes, 3) predictor of contact: from the start of the step to the state reached; null: none
+    int32_t* most_touching;            // (bodies,) most linearizations of a body whose search has contact in it, else 0
+    int32_t* entered;                  // (bodies,) 1: a sweep of the step's paths has given it rows
 };
 
 struct StageState {                    // of a body in the step under way (rosenbrock.h)

@@ -59,6 +59,7 @@ static void set_state(Loop& loop, const Body& body, double scale) {
         newton.predictor[at + k] = 0;
         newton.inertial_increment[at + k] = p.inertial_increment;
         newton.damping_velocity[at + k] = p.damping_velocity;
+        if (newton.moved) newton.moved[at + k] = room.predictor[k] + increment;
     }
 }
 
@@ -123,6 +124,7 @@ static void end_search(Loop& loop, int index) {
         loop.v[at + k] = room.v[k];
         newton.predictor[at + k] = room.predictor[k];
         newton.inertial_increment[at + k] = room.inertial_increment[k];
+        if (newton.moved) newton.moved[at + k] = room.predictor[k];
     }
     rotate(newton, body, true, room.increment, loop.y + at);
 }

@@ -15,9 +15,11 @@ struct Passes : IslandRows {
     ContactReport report = {0, 0, 0, NAN, 0};
     SolveResult result;
     double given;                        // what |r| is relative to
+    const double contact_tolerance;      // of the residual with the law
 
     Passes(Loop& loop, int island)
-        : IslandRows(loop, island), scale2(c.dx_dv * c.force_coefficient), result{0, 0, 0, CONVERGED, loop.body[bodies[0]].now.kind, 0} {
+        : IslandRows(loop, island), scale2(c.dx_dv * c.force_coefficient), result{0, 0, 0, CONVERGED, loop.body[bodies[0]].now.kind, 0},
+          contact_tolerance(loop.newton && !loop.euler ? std::min(c.tolerance, loop.newton->most.tolerance) : c.tolerance) {
         const int64_t n = 3 * (int64_t)loop.nodes;
         left = c.room;
         r = left + n; dy = r + n; before = dy + n; rest = before + n;
@@ -179,11 +181,11 @@ struct Passes : IslandRows {
             const double size = balance();
             if (!std::isfinite(size)) { result.status = NOT_FINITE; return; }
             report.residual = given > 0 ? size / given : 0;
-            const bool holds = report.residual <= tolerance_of(c.tolerance, rested, report.passes, c.passes);
+            const bool holds = report.residual <= tolerance_of(contact_tolerance, rested, report.passes, c.passes);
             if (spent || (last && holds)) break;  // the last solve may have changed the law again
             const double goal = loop.body[bodies[0]].now.tolerance * given;
             const bool by_law = k > 0 || !set || set_is_law();
-            last = by_law && (linear || size <= c.tolerance * given);
+            last = by_law && (linear || size <= contact_tolerance * given);
             if (last && size <= goal) {  // there is nothing left to solve
                 result.residual = report.residual;
                 if (!cut()) result.status = CONVERGED;  // whatever an earlier solve of the step came to
@@ -243,7 +245,7 @@ struct Passes : IslandRows {
     bool rests() {
         apply_law(false);
         const double size = balance();
-        return size <= c.tolerance * given;
+        return size <= contact_tolerance * given;
     }
 
     // Goes on with what an earlier solve of the step has come to. An island that grew counts what its first body has, and what was held
