@@ -6,7 +6,7 @@
 
 // Rows that are hit within FIRST of the step after the first one count as closed in the first pass; a pass is solved to EARLY of its
 // residual; a point that is held back stops at SHORT_OF of its way; a row that does not hold becomes HARDER times as stiff.
-constexpr double FIRST = 0.02, EARLY = 0.01, SHORT_OF = 0.9, HARDER = 10;
+constexpr double FIRST = 0.02, EARLY = 0.1, SHORT_OF = 0.9, HARDER = 10;
 constexpr double SAME_PLANE = 0.995;  // cosine of the angle between normals
 constexpr int ROUNDS = 3;             // of passes after a sweep of the paths
 constexpr double HARDEST = 1000;      // times as stiff, at most

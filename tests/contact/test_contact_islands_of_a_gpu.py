@@ -219,10 +219,9 @@ def test_islands_side_by_side_and_one_alone(library, monkeypatch):
         for k in range(5)
     ]
     beside = IslandsBeside(library, over(objects=blocks, contact=CONTACT, solver=TIGHT), monkeypatch)
-    for _ in range(4):
-        records = beside.near(1e-6)
+    passes = np.array([beside.near(1e-6)["passes"] for _ in range(4)])
     assert beside.tally["islands"] == 2 and beside.tally["alone"] == 1
-    assert len(set(records["passes"])) > 1
+    assert (passes.max(axis=1) > passes.min(axis=1)).any()
 
 
 @pytest.mark.parametrize("speed", [0.5, 4.0])

@@ -26,7 +26,7 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) begin_contact(cons
     for (int r = first + threadIdx.x; r < last; r += CONTACT_THREADS) {
         if (!used(c, r)) continue;
         DeviceRow& row = c.row[r];
-        row.limit = c.force[r];
+        begin_friction(c, r);
         row.in_set = c.force[r] > 0 || (c.entry[r] <= 1 && c.entry[r] <= earliest + FIRST);
         closed[0] += row.in_set;
     }
@@ -78,11 +78,11 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) contact_forces(con
                 n.add_force(c, r, c.row[r].force, other);
             }
             n.displacement(c, y, s);
-            evaluate(c, r, s, state.hold, state.set);
+            evaluate(c, r, s, state.hold, state.set, state.rested && state.passes == 0 && !starts);
             n.add_force(c, r, c.row[r].force, f);
             if (starts) continue;
             const ContactRow row = row_at(c, r);
-            n.add_stiffness(c, row, c.row[r].force, S);
+            n.add_stiffness(c, row, c.row[r].force, c.row[r].dual, S);
             sum[2] += state.set && c.row[r].in_set != (int)contact_force(row, s, 0, false).closed;
         }
         for (int k = 0; k < 3; ++k) {

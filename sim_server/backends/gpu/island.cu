@@ -172,21 +172,23 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_law(const I
         DeviceRow& row = a.c.row[r];
         IslandRow& own = a.row[r];
         if (what == WARM_START) {  // rows that count as closed in the first pass
-            row.limit = a.c.force[r];
+            begin_friction(a.c, r);
             row.in_set = a.c.force[r] > 0 || (a.c.entry[r] <= 1 && a.c.entry[r] <= earliest + FIRST);
             for (int m = 0; m < 6; ++m) own.known[m] = 0;
-            if (a.c.force[r] > 0)
-                contact_stiffness(row_at(a.c, r), lasting_contact(a.c.friction[r], a.c.force[r], a.c.traction + 3 * r),
-                                  a.c.dx_dv * a.c.force_coefficient, own.known);
+            if (a.c.force[r] > 0) {
+                const ContactForce f = lasting_contact(a.c.friction[r], a.c.force[r], a.c.traction + 3 * r);
+                contact_stiffness(row_at(a.c, r), f, f.traction, a.c.dx_dv * a.c.force_coefficient, own.known);
+            }
         }
         double s[3];
         point_displacement(a, r, what == ZERO_START || (what == LAW_AT_START && state.zero), s);
         const ContactRow given = row_at(a.c, r);
-        evaluate(a.c, r, s, what == LAW && state.hold, what == LAW ? state.set : what != LAW_AT_START);
+        evaluate(a.c, r, s, what == LAW && state.hold, what == LAW ? state.set : what != LAW_AT_START,
+                 what == LAW && state.rested && state.passes == 0);
         for (int m = 0; m < 3; ++m)
             own.impulse[m] = a.c.force_coefficient * (row.force.normal * a.c.normal[3 * r + m] + row.force.traction[m]);
         if (what != LAW) continue;
-        contact_stiffness(given, row.force, a.c.dx_dv * a.c.force_coefficient, own.stiffness);
+        contact_stiffness(given, row.force, row.dual, a.c.dx_dv * a.c.force_coefficient, own.stiffness);
         set_lever(a, r, own.lever);
         changed[0] += state.set && row.in_set != (int)contact_force(given, s, 0, false).closed;
     }

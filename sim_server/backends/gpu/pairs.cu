@@ -191,7 +191,7 @@ __device__ void take_pair_row(const IslandArguments& a, int site, const Meeting&
         return;
     }
     put_row(a.t, motion_of(a, false), r, site, t);
-    row.limit = 0;
+    row.limit = row.dual[0] = row.dual[1] = row.dual[2] = 0;
     row.in_set = 0;
     row.force = {0, {0, 0, 0}, 0, false};
     for (int k = 0; k < 6; ++k) a.row[r].known[k] = 0;

@@ -13,6 +13,7 @@ struct RowState {                 // of a row in the step under way
     double step[3];               // by the solution of the pass [m]
     double limit;                 // normal force that limits friction, held in a pass [N]
     int32_t in_set;               // 1: counts as closed in the first pass
+    double dual[3];               // friction force with which the pass linearizes friction [N]
     double stiffness[6];          // upper triangle of the force's slope times h^2, world frame [kg]
     ContactForce force;
 };
@@ -168,6 +169,7 @@ inline SurfaceMotion<double, double> motion_of(const Contact& c, const double* x
 // A row that a sweep has made has no force, and friction no limit, until a solve has found them.
 inline void take_anew(RowState& state) {
     state.limit = 0;
+    for (double& f : state.dual) f = 0;
     state.in_set = 0;
     state.force = {0, {0, 0, 0}, 0, false};
 }
@@ -193,8 +195,8 @@ struct Rows {
         stiff(K, s, back);
         return {0, {f[0] - back[0], f[1] - back[1], f[2] - back[2]}, 1, true};
     }
-    void stiffness(int r, const ContactForce& f, double scale, double* k) const {
-        if (!is_tie(c, r)) return contact_stiffness(row(r), f, scale, k);
+    void stiffness(int r, const ContactForce& f, const double* dual, double scale, double* k) const {
+        if (!is_tie(c, r)) return contact_stiffness(row(r), f, dual, scale, k);
         for (int m = 0; m < 6; ++m) k[m] = scale * c.ties.slope[6 * (r - c.ties.first) + m];
     }
 

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: MIT
-// Which preconditioner a pass of contact begins with, for a body with a factor: the factor or block Jacobi. A factor that does not know the
+// Which preconditioner a pass of contact begins with, for a body with a factor, or an island with some: factors or block Jacobi. A factor that does not know the
 // contacts, or knows some that are gone, needs many iterations, each of which costs several of block Jacobi; a slender or stiff body
 // needs hundreds of those. So both are measured, in passes: what a decade of the residual takes. The one in use goes over to the
 // other within a pass that takes GIVE_UP times as much as is expected of the other one. The other one is tried now and then by a pass
@@ -24,18 +24,25 @@ constexpr double LEAST_TRIED[2] = {2, 8};  // iterations that the cost of a pass
 
 struct ChoiceOfPass {
     PassChoice& choice;
-    const Factor& factor;
-    double cost[2];         // of an iteration, of the factor and of block Jacobi [bytes]
-    double decades = 0;     // that the pass is to reach
-    bool trial = false;     // the pass tries the other one
+    double cost[2] = {0, 0};  // of an iteration, of the factor and of block Jacobi [bytes]
+    int64_t factor_step = -1; // of the newest factor
+    double decades = 0;       // that the pass is to reach
+    bool trial = false;       // the pass tries the other one
 
-    ChoiceOfPass(PassChoice& choice, const BlockCsr& A, const Factor& factor) : choice(choice), factor(factor) {
-        const Pattern& p = *factor.pattern;
+    explicit ChoiceOfPass(PassChoice& choice) : choice(choice) {}
+
+    // Counts a body in. factor: null: it has block Jacobi whatever is chosen.
+    void add(const BlockCsr& A, const Factor* factor) {
+        const double own = 76.0 * (A.row_start[A.last] - A.row_start[A.first]);
+        cost[0] += own;
+        cost[1] += own;
+        if (!factor) return;
+        const Pattern& p = *factor->pattern;
         const int last = p.supernodes - 1;
         const int64_t n = p.super_start[last + 1] - p.super_start[last], h = p.row_start[last + 1] - p.row_start[last];
         const int64_t values = p.value_start[last] + h * n - n * (n - 1) / 2;
-        cost[1] = 76.0 * (A.row_start[A.last] - A.row_start[A.first]);
-        cost[0] = cost[1] + 2 * FACTOR_BYTES * ((double)values * factor.bytes + 4.0 * p.row_start[last + 1]);
+        cost[0] += 2 * FACTOR_BYTES * ((double)values * factor->bytes + 4.0 * p.row_start[last + 1]);
+        factor_step = std::max(factor_step, factor->step);
     }
 
     double expected(int which) const { return choice.rate[which] * decades * cost[which]; }
@@ -58,7 +65,7 @@ struct ChoiceOfPass {
         ++choice.waited;
         const double own = expected(used);
         if (own < LEAST_TRIED[other] * cost[other]) return false;
-        const bool renewed = other == 0 && choice.factor_step != factor.step;
+        const bool renewed = other == 0 && choice.factor_step != factor_step;
         if (choice.rate[other] == 0 || choice.waited >= (renewed ? std::min(choice.wait, MOST_WAIT_OF_NEW) : choice.wait)) return true;
         return own > HARDER_PASS * choice.reference * decades && choice.reference > 0;
     }
@@ -79,7 +86,7 @@ struct ChoiceOfPass {
         if (trial) {
             choice.wait = better ? MIN_WAIT : std::min(2 * std::max(choice.wait, MIN_WAIT / 2), MAX_WAIT);
             choice.waited = 0;
-            choice.factor_step = factor.step;
+            choice.factor_step = factor_step;
             choice.reference = choice.rate[used] * cost[used];
         }
         if (better || r.fallbacks) {

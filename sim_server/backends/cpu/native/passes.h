@@ -30,18 +30,22 @@ struct Passes : IslandRows {
         each_row([&](int k, RowState&) { earliest = std::min(earliest, c.entry[k]); });
         each_row([&](int k, RowState& s) {
             s.limit = c.force[k];
+            std::copy(c.traction + 3 * k, c.traction + 3 * k + 3, s.dual);
+            bound_dual(rows.row(k), s.limit, s.dual);
             s.in_set = is_tie(c, k) || c.force[k] > 0 || (c.entry[k] <= 1 && c.entry[k] <= earliest + FIRST);
             closed += s.in_set;
         });
         return closed;
     }
 
-    // Forces and stiffness of the rows as they are. set: those marked count as closed. Returns whether a row has either.
-    bool apply_law(bool set) {
+    // Forces and stiffness of the rows as they are. set: those marked count as closed. exactly: friction is linearized by its derivative.
+    // Returns whether a row has either.
+    bool apply_law(bool set, bool exactly = false) {
         rows.actives = 0;
         each_row([&](int k, RowState& s) {
             s.force = rows.force(k, s.s, s.limit, set && s.in_set);
-            rows.stiffness(k, s.force, scale2, s.stiffness);
+            if (exactly) std::copy(s.force.traction, s.force.traction + 3, s.dual);
+            rows.stiffness(k, s.force, s.dual, scale2, s.stiffness);
             if (rows.acts(k)) active[rows.actives++] = k;
         });
         return rows.actives > 0;
@@ -97,7 +101,7 @@ struct Passes : IslandRows {
     // dy of (A + H^T S H) dy = r, and its residual.
     SolveResult solve_linear(double tolerance) {
         SolveSettings settings = settings_for(tolerance);
-        if (count > 1) return IslandSolver{loop, c, bodies, count, rows}.solve(r, settings, dy, rest);
+        if (count > 1) return solve_together(settings);
         Body& body = loop.body[bodies[0]];
         const int64_t at = 3 * (int64_t)body.first;
         Rows own = rows;
@@ -108,7 +112,8 @@ struct Passes : IslandRows {
         auto solve_by = [&] { return pcg(A, r + at, body.factor, settings, dy + at, work, false, &body.correction); };
         SolveResult solved;
         if (settings.kind == CHOLESKY && body.factor) {
-            ChoiceOfPass choice(c.choice[bodies[0]], A, *body.factor);
+            ChoiceOfPass choice(c.choice[bodies[0]]);
+            choice.add(A, body.factor);
             choice.begin(settings);
             solved = solve_by();
             choice.end(settings, solved, body.correction.spent);
@@ -116,6 +121,23 @@ struct Passes : IslandRows {
             solved = solve_by();
         }
         std::copy(work, work + A.size(), rest + at);  // where pcg leaves its residual
+        return solved;
+    }
+
+    // The same of an island of several bodies. What is known of its choice is kept with its first body.
+    SolveResult solve_together(SolveSettings& settings) {
+        IslandSolver solver{loop, c, bodies, count, rows};
+        ChoiceOfPass choice(c.choice[bodies[0]]);
+        for (int m = 0; m < count; ++m) {
+            const Body& body = loop.body[bodies[m]];
+            choice.add(matrix_of(loop, body), IslandSolver::factor_of(body));
+        }
+        settings.kind = BLOCK_JACOBI;
+        const bool chooses = choice.factor_step >= 0;
+        if (chooses) choice.begin(settings);
+        const SolveResult solved = solver.solve(r, settings, dy, rest);
+        double spent = 0;
+        if (chooses) choice.end(settings, solved, spent);
         return solved;
     }
 
@@ -150,8 +172,12 @@ struct Passes : IslandRows {
             y[k] += alpha * dy[k];
             left[k] -= alpha * r[k];
         });
-        each_row([&](int, RowState& s) {
-            for (int m = 0; m < 3; ++m) s.s[m] += alpha * s.step[m];
+        each_row([&](int k, RowState& s) {
+            for (int m = 0; m < 3; ++m) {
+                s.step[m] *= alpha;
+                s.s[m] += s.step[m];
+            }
+            move_dual(rows.row(k), s.force, s.step, s.dual);
         });
     }
 
@@ -160,6 +186,7 @@ struct Passes : IslandRows {
         each_row([&](int k, RowState& s) {
             const bool was = s.force.closed;
             s.limit = was ? rows.force(k, s.s, 0, false).normal : 0;
+            bound_dual(rows.row(k), s.limit, s.dual);
         });
     }
 
@@ -175,7 +202,7 @@ struct Passes : IslandRows {
         bool last = false, spent = false, linear = true;
         each_row([&](int k, RowState&) { linear = linear && is_tie(c, k); });
         for (int k = 0;; ++k) {
-            apply_law(set && k == 0);
+            apply_law(set && k == 0, rested && k == 0);
             const double size = balance();
             if (!std::isfinite(size)) { result.status = NOT_FINITE; return; }
             report.residual = given > 0 ? size / given : 0;
