@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sim_server.backends.gpu.islands import TALLY, tree_heights
+from sim_server.backends.gpu.islands import ISLAND, TALLY, tree_heights
+from sim_server.backends.kinds import KINDS
 from sim_server.effects import contact
 from sim_server.simulation import Simulation
 from tests.contact.kernels_beside import TEXT, Beside, compiled
@@ -25,6 +26,14 @@ ISLANDS = """
 #include "pairs.cu"
 #include "island.cu"
 struct Islands { int bodies, grid, sites, most, pivots, product_grid; };
+// In place of island_factor: what stands for a factor does nothing.
+static void apply_factors(const IslandArguments& a) {
+    for (int body = 0; body < a.bodies_count; ++body) {
+        const int island = island_of(a, body);
+        if (island < 0 || a.state[island].stage != ITERATES || !a.state[island].factors || !has_factor(a.bodies[body])) continue;
+        for (int k = 3 * a.bodies[body].first; k < 3 * (a.bodies[body].first + a.bodies[body].nodes); ++k) a.z[k] = a.r[k];
+    }
+}
 static void each(int blocks, auto kernel) { launch(blocks, CONTACT_THREADS, kernel); }
 static int island_pass(const IslandArguments& a, const Islands& s) {
     auto law = [&](int what) {
@@ -39,6 +48,7 @@ static int island_pass(const IslandArguments& a, const Islands& s) {
     int iterations = 0;
     for (; a.tally->iterating > 0 && iterations < 3000; ++iterations) {
         each(s.grid, [&] { island_update(a); });
+        apply_factors(a);
         each(s.bodies + s.product_grid, [&] { island_multiply(a, 0); });
         each(s.grid, [&] { island_product(a); });
         each(s.bodies, [&] { coarse_solve(a); });
@@ -272,6 +282,18 @@ def test_rows_of_a_body_whose_forces_are_not_finite_go(library, monkeypatch):
     first = beside.sim.world.bodies[2].first
     y, ours = beside.arrays["y"], beside.gpu.twin(beside.arrays["y"])
     assert np.isfinite(y[:first]).all() and abs(ours[:first] - y[:first]).max() <= 1e-6 * abs(y[:first]).max()
+
+
+def test_an_island_goes_over_to_block_jacobi(library, monkeypatch):
+    """Factors that are of little use are left within a pass, and passes then begin without them."""
+    beside = IslandsBeside(library, pile(2), monkeypatch)
+    beside.bodies["kind"], beside.bodies["plan"], beside.bodies["factor_step"] = KINDS.enumeration("Kind")["CHOLESKY"], 1, 0
+    beside.near(1e-6)
+    islands = beside.passes.islands
+    assert islands is not None
+    choice = islands.memory["choice"].view(ISLAND.dtype("PassChoice"))[0]
+    assert choice["jacobi"] == 1 and choice["rate"][0] > choice["rate"][1] > 0
+    assert (beside.results[0]["kind"] == KINDS.enumeration("Kind")["BLOCK_JACOBI"]).all()
 
 
 def test_heights_of_boxes_over_triangles():

@@ -225,6 +225,15 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_balance(con
     if (threadIdx.x < CG_SUMS) a.chunk_sums[(long long)CG_SUMS * blockIdx.x + threadIdx.x] = pick(sum, threadIdx.x);
 }
 
+// Sets what a solve begins with. factors: 0: there is none.
+__device__ void choose_factors(const IslandArguments& a, int island, IslandState& s, long long factors) {
+    s.choice = {{FACTOR_COST, 1}, 0, factors, 1, 0, 0};
+    s.start2 = s.r2;
+    s.switched_after = s.fell = 0;
+    if (factors > 0) begin_pass(a.choice[a.island[a.island_start[island]]], s.choice, sqrt(s.goal2 / s.r2));
+    s.factors = !s.choice.first;
+}
+
 // A thread block has an island: what follows from its residual.
 extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_decide(const IslandArguments a, int what) {
     const int island = blockIdx.x;
@@ -240,10 +249,14 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_decide(cons
         return;
     }
     if (!takes_part(s.phase, what)) return;
-    double sum[CG_SUMS], changed[1] = {0};
+    double sum[CG_SUMS], changed[2] = {0, 0};  // rows that the law does not close; numbers of factors
     sum_island(a, island, a.chunk_sums, sum);
     if (what == LAW) {
-        for (int k = threadIdx.x; k < s.bodies; k += CONTACT_THREADS) changed[0] += a.row_sums[a.island[a.island_start[island] + k]];
+        for (int k = threadIdx.x; k < s.bodies; k += CONTACT_THREADS) {
+            const int member = a.island[a.island_start[island] + k];
+            changed[0] += a.row_sums[member];
+            if (has_factor(a.bodies[member])) changed[1] += 1.0 + a.bodies[member].factor_step;
+        }
         sum_block(changed);
     }
     if (threadIdx.x > 0) return;
@@ -282,6 +295,7 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_decide(cons
             s.stage = s.coarse ? BEGINS_COARSE : ITERATES;
             s.restart = 1;
             s.own_iterations = s.own_status = s.pending = 0;
+            choose_factors(a, island, s, (long long)changed[1]);
             a.coarse_well[island] = 1;
             atomicAdd(&a.tally->iterating, 1);
         }
@@ -585,7 +599,7 @@ __device__ void next_step(const IslandArguments& a, int island) {
     } else if (!(gamma > 0 && gamma < infinite && delta < infinite)) {
         if (!begins) {  // the coarse space lost its precision, or a factor is of no use
             if (!s.coarse && !s.factors) stop = BREAKDOWN_PRECONDITIONER;
-            if (!s.coarse && s.factors) ++s.fallbacks;
+            if (!s.coarse && s.factors) ++s.fallbacks, s.fell = 1;
             if (!s.coarse) s.factors = 0;
             s.coarse = 0;
         }
@@ -608,6 +622,12 @@ __device__ void next_step(const IslandArguments& a, int island) {
             s.pending = 1;
             s.restart = begins;
             if (s.r2 <= s.goal2) stop = CONVERGED;
+            if (s.choice.probe > 0 && s.own_iterations == s.choice.probe && !s.switched_after && !s.fell) {
+                s.switched_after = s.own_iterations;
+                s.residual_then = sqrt(s.r2 / s.start2);
+                s.factors = !s.factors;
+                s.restart = 1;
+            }
         }
     }
     if (stop >= 0) {
@@ -768,7 +788,11 @@ extern "C" __global__ void __launch_bounds__(SEARCH_THREADS) island_search(const
         }
     }
     __syncthreads();
-    if (threadIdx.x == 0) a.state[island] = s;
+    if (threadIdx.x > 0) return;
+    a.state[island] = s;
+    if (s.phase != ISLAND_PASSED || s.choice.factor_step == 0 || s.own_iterations == 0) return;
+    const PassEnd end = {s.own_iterations, s.switched_after, s.fell, sqrt(sum[0] / s.start2), s.residual_then};
+    end_pass(a.choice[a.island[a.island_start[island]]], s.choice, end, 0);
 }
 
 // A thread has a node: y += part dy, left accordingly. Of an island that has ended: where its path enters obstacles.

@@ -20,12 +20,14 @@
 #pragma once
 #include "device_contact.cuh"
 #include "pair_detection.cuh"
+#include "pass_choice.cuh"
 
 constexpr int MODES = 6;          // rigid motions of a body: translations, then rotations about its first node
 constexpr int CG_SUMS = 9;        // of an iteration
 constexpr int BASE_SUMS = 36;     // Z^T A Z of a body
 constexpr int LISTING_THREADS = 256;  // of find_islands, one thread block
 constexpr int SEARCH_THREADS = 512;   // of island_search
+constexpr double FACTOR_COST = 2;     // of an iteration with factors, over that of one with block Jacobi
 
 enum IslandPhase {
     ISLAND_BEGINS = 0,    // the start is chosen next
@@ -62,6 +64,9 @@ struct IslandState {
     int restart;          // 1: the next direction is the preconditioned residual
     int coarse;           // 1: rigid motions precondition
     int factors;          // 1: factors do, else block Jacobi
+    PassBegin choice;     // of the two, for the solve; its factor_step is a sum over the bodies, 0: there is no factor
+    double start2, residual_then;    // square of the residual at the start of the solve; relative, where it went over to the other one
+    int switched_after, fell;        // iterations before that, 0: it did not; 1: a factor was of no use
     int own_iterations;   // of the solve
     int own_status;
 };
@@ -122,6 +127,7 @@ struct IslandArguments {
     double *coarse_a, *coarse_b; // (bodies, MODES, most_modes) rows of E, while it is inverted from one to the other
     int* coarse_well;            // (bodies,) of islands: 1: E is positive definite
     double* coefficient;         // (bodies, MODES)
+    PassChoice* choice;          // (bodies,) of islands, kept by their first body
     int bodies_count, most_modes, most_chunks, highest_tree, passes, unused;
 };
 

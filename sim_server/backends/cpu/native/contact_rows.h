@@ -6,6 +6,7 @@
 
 #include "contact_passes.cuh"
 #include "edge_detection.cuh"
+#include "pass_choice.cuh"
 #include "triangle_shape.cuh"
 
 struct RowState {                 // of a row in the step under way
@@ -44,14 +45,6 @@ struct Ties {                     // attachments and springs (ties.h): rows afte
 };
 
 struct SolveResult;
-
-struct PassChoice {         // of a body, kept from step to step (pass_choice.h)
-    double rate[2];         // iterations a decade of the residual, of the factor and of block Jacobi; 0: not known
-    double reference;       // what the one in use cost when the other one was tried last, a decade
-    int64_t factor_step;    // of the factor in use when the other one was tried last
-    int32_t jacobi;         // 1: block Jacobi is in use, 0: the factor
-    int32_t wait, waited;   // passes between trials; since the last one
-};
 
 struct Contact {
     ObstacleTable obstacles;

@@ -116,7 +116,7 @@ struct Passes : IslandRows {
             choice.add(A, body.factor);
             choice.begin(settings);
             solved = solve_by();
-            choice.end(settings, solved, body.correction.spent);
+            choice.end(solved, body.correction.spent);
         } else {
             solved = solve_by();
         }
@@ -133,11 +133,11 @@ struct Passes : IslandRows {
             choice.add(matrix_of(loop, body), IslandSolver::factor_of(body));
         }
         settings.kind = BLOCK_JACOBI;
-        const bool chooses = choice.factor_step >= 0;
+        const bool chooses = choice.pass.factor_step >= 0;
         if (chooses) choice.begin(settings);
         const SolveResult solved = solver.solve(r, settings, dy, rest);
         double spent = 0;
-        if (chooses) choice.end(settings, solved, spent);
+        if (chooses) choice.end(solved, spent);
         return solved;
     }
 
