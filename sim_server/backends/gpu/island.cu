@@ -288,7 +288,8 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_decide(cons
             s.phase = ISLAND_ENDED;
         } else {
             s.phase = ISLAND_SOLVES;
-            s.goal2 = s.last ? goal2 : fmax(goal2, EARLY * EARLY * size2);
+            const double early = early_tolerance(s.residual, a.c.tolerance, s.passes, a.passes);
+            s.goal2 = s.last ? goal2 : fmax(goal2, early * early * size2);
             s.r2 = size2;
             s.last_true2 = 1e300;
             s.coarse = s.modes > 0;

@@ -217,7 +217,8 @@ struct Passes : IslandRows {
                 return;
             }
             if (!last && report.passes >= c.passes) break;
-            pass(last ? goal / size : std::max(goal / size, EARLY), last);
+            const double early = early_tolerance(report.residual, c.tolerance, report.passes, c.passes);
+            pass(last ? goal / size : std::max(goal / size, early), last);
             result.residual *= given > 0 ? size / given : 0;
             if (result.status == NOT_FINITE) return;
             spent = cut();
