@@ -10,7 +10,11 @@
 //
 // With l held, -(lambda n + tau) is the gradient by s of a convex, continuously differentiable function. -d(force)/ds is
 //     k n n^T where lambda > 0,   and   k T where it sticks,   k (mu l / |t|) (T - t t^T / |t|^2)   where it slips;
-// dtau/dlambda is left out, since it is not symmetric: a pass holds l. t_0 is an anchor, so that a contact that sticks does not creep;
+// dtau/dlambda is left out, since it is not symmetric: a pass holds l. Newton's method with that goes to and fro between sticking and
+// slipping, so a pass has k (mu l / |t|) (T - (e w^T + w e^T) / 2) in its place, e = t / |t|: w mu l is the dual variable, a friction
+// force that each pass linearizes along with s and keeps within mu l. It starts between the secant (w = 0), which never overshoots, and
+// ends at the derivative (w = e), which converges fast (Chan, Golub and Mulet, A nonlinear primal-dual method for total
+// variation-based image restoration, 1999, whose function is the same). t_0 is an anchor, so that a contact that sticks does not creep;
 // it slips by mu l / k, elastically, before it slides. (Elastic-plastic friction: Wriggers, Computational Contact Mechanics, 2006,
 // section 5.2; Huber's function as its potential.)
 #pragma once
@@ -46,14 +50,33 @@ HOST_DEVICE ContactForce contact_force(const ContactRow& row, const double* s, d
     return f;
 }
 
-// -d(force)/ds times `scale`, upper triangle 00, 01, 02, 11, 12, 22; both parts as the force was evaluated.
-HOST_DEVICE void contact_stiffness(const ContactRow& row, const ContactForce& f, double scale, double* k) {
+// What a pass takes for -d(force)/ds times `scale`, upper triangle 00, 01, 02, 11, 12, 22; both parts as the force was evaluated.
+// dual: dual variable of friction [N]; with that of f.traction it is the derivative.
+HOST_DEVICE void contact_stiffness(const ContactRow& row, const ContactForce& f, const double* dual, double scale, double* k) {
     const double *n = row.normal, normal = f.closed ? scale * row.stiffness : 0, tangential = f.slip * scale * row.stiffness;
-    const double size2 = dot3(f.traction, f.traction), along = f.slip < 1 && size2 > 0 ? tangential / size2 : 0;
+    const double size2 = dot3(f.traction, f.traction), along = f.slip < 1 && size2 > 0 ? 0.5 * tangential / size2 : 0;
     int m = 0;
     for (int i = 0; i < 3; ++i)
         for (int j = i; j < 3; ++j)
-            k[m++] = (normal - tangential) * n[i] * n[j] + (i == j ? tangential : 0) - along * f.traction[i] * f.traction[j];
+            k[m++] = (normal - tangential) * n[i] * n[j] + (i == j ? tangential : 0) -
+                     along * (f.traction[i] * dual[j] + dual[i] * f.traction[j]);
+}
+
+// Takes the dual variable back into the disc of friction.
+HOST_DEVICE void bound_dual(const ContactRow& row, double limit, double* dual) {
+    const double most = row.friction * limit, size = sqrt(dot3(dual, dual));
+    for (int c = 0; c < 3 && size > most; ++c) dual[c] *= most / size;
+}
+
+// Moves the dual variable by the linearization that a pass was made with. f: at its start. step: displacement that the pass made [m].
+HOST_DEVICE void move_dual(const ContactRow& row, const ContactForce& f, const double* step, double* dual) {
+    const double* n = row.normal;
+    const double along = dot3(n, step), size2 = dot3(f.traction, f.traction);
+    if (!(f.slip > 0) || !(size2 > 0 || f.slip == 1)) return;
+    double change[3];  // of the trial
+    for (int c = 0; c < 3; ++c) change[c] = -row.stiffness * (step[c] - along * n[c]);
+    const double part = f.slip < 1 ? dot3(f.traction, change) / size2 : 0;
+    for (int c = 0; c < 3; ++c) dual[c] = f.traction[c] + f.slip * (change[c] - part * dual[c]);
 }
 
 // Turns v by the smallest rotation from the normal `before` to `now`, and takes what is left of it along `now` away.

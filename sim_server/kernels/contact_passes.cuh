@@ -4,9 +4,9 @@
 #pragma once
 #include "contact_law.cuh"
 
-// Rows that are hit within FIRST of the step after the first one count as closed in the first pass; a pass is solved to EARLY of its
-// residual; a point that is held back stops at SHORT_OF of its way; a row that does not hold becomes HARDER times as stiff.
-constexpr double FIRST = 0.02, EARLY = 0.01, SHORT_OF = 0.9, HARDER = 10;
+// Rows that are hit within FIRST of the step after the first one count as closed in the first pass; a pass is solved to a part between
+// EARLIEST and EARLY of its residual; a point that is held back stops at SHORT_OF of its way; a row that does not hold becomes HARDER times as stiff.
+constexpr double FIRST = 0.02, EARLY = 0.03, EARLIEST = 0.1, SHORT_OF = 0.9, HARDER = 10;
 constexpr double SAME_PLANE = 0.995;  // cosine of the angle between normals
 constexpr int ROUNDS = 3;             // of passes after a sweep of the paths
 constexpr double HARDEST = 1000;      // times as stiff, at most
@@ -18,6 +18,14 @@ constexpr int AT_REST = 4;            // passes of such a step, at most
 // passes: made; most: of any step.
 HOST_DEVICE double tolerance_of(double tolerance, bool rested, int passes, int most) {
     return rested && passes < AT_REST && passes < most && RESTING < tolerance ? RESTING : tolerance;
+}
+
+// Part of its residual to which a pass is solved that need not be the last one: the nearer to the solution the more exactly, since the next
+// one then profits; but no more exactly than the law asks for (forcing terms: Eisenstat and Walker, Choosing the forcing terms in an
+// inexact Newton method, 1996). residual: contact residual before the pass. passes: made; most: of any step.
+HOST_DEVICE double early_tolerance(double residual, double tolerance, int passes, int most) {
+    const double wanted = fmax(3 * residual, 0.5 * tolerance / residual);
+    return passes + 1 >= most || wanted < EARLY ? EARLY : wanted < EARLIEST ? wanted : EARLIEST;
 }
 
 // Hardening that a row takes into the next step: one that carried force before and whose force without it would press it through half of

@@ -77,7 +77,7 @@ static void solve(const ContactArguments& c, const ContactSolve& pass, const Sys
     }
     if (state.phase == READY) {
         outcome = outcome_of(state, pass, r2, goal);
-        if (outcome == PASSED) goal = fmax(goal, EARLY * EARLY * r2);
+        if (outcome == PASSED) goal = early_goal(state, pass, r2, goal);
         for (int k = 0; k < 3 * n; ++k) pass.first[3 * first + k] = pass.last[3 * first + k] = r[k];
         if (outcome == ENDED) {
             out.residual = state.given2 > 0 ? sqrt(r2 / state.given2) : 0;

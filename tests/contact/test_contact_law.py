@@ -34,7 +34,7 @@ KERNEL(probe, Probe) {
     const ContactForce f = contact_force(row, p.s + 3 * i, p.limit, p.closed != 0);
     for (int k = 0; k < 3; ++k) p.force[3 * i + k] = f.normal * row.normal[k] + f.traction[k];
     p.normal_force[i] = f.normal;
-    contact_stiffness(row, f, 1, p.matrix + 6 * i);
+    contact_stiffness(row, f, f.traction, 1, p.matrix + 6 * i);
 }
 """
 D, K, MU = 1e-3, 2e3, 0.5

@@ -74,7 +74,7 @@ def test_an_obstacle_hits_a_block_at_10_m_per_s(library, monkeypatch):
     assert max(r["contacts"] for r in records) == 16 and max(r["passes"] for r in records) > 8
 
 
-@pytest.mark.parametrize("short", [{"passes": 2}, {"passes": 1, "stiffness": 0.05}], ids=str)
+@pytest.mark.parametrize("short", [{"passes": 1}, {"passes": 1, "stiffness": 0.05}], ids=str)
 def test_points_are_held_back_where_passes_run_out(library, monkeypatch, short):
     beside = Beside(library, over(ram(), floor(), at=(0, 0.02, 0), contact=short, **SMALL), monkeypatch)
     records = [beside.compare(1e-6) for _ in range(3)]

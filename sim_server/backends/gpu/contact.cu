@@ -26,7 +26,7 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) begin_contact(cons
     double closed[1] = {0};
     each_own_row(c, body, [&](int r) {
         DeviceRow& row = c.row[r];
-        row.limit = c.force[r];
+        begin_friction(c, r);
         row.in_set = c.force[r] > 0 || (c.entry[r] <= 1 && c.entry[r] <= earliest + FIRST);
         closed[0] += row.in_set;
     });
@@ -79,11 +79,11 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) contact_forces(con
                 n.add_force(c, r, c.row[r].force, other);
             }
             n.displacement(c, y, s);
-            evaluate(c, r, s, state.hold, state.set);
+            evaluate(c, r, s, state.hold, state.set, state.rested && state.passes == 0 && !starts);
             n.add_force(c, r, c.row[r].force, f);
             if (starts) continue;
             const ContactRow row = row_at(c, r);
-            n.add_stiffness(c, row, c.row[r].force, S);
+            n.add_stiffness(c, row, c.row[r].force, c.row[r].dual, S);
             sum[2] += state.set && c.row[r].in_set != (int)contact_force(row, s, 0, false).closed;
         }
         double pull[3] = {0, 0, 0};  // of triangles, H^T S H y; at the start i H^T f at 0

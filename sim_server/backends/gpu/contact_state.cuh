@@ -55,6 +55,12 @@ HOST_DEVICE int outcome_of(const ContactState& c, const ContactSolve& pass, doub
     return c.passes >= pass.passes ? ENDED : PASSED;
 }
 
+// Square of the residual to which a pass is solved that need not be the last one.
+HOST_DEVICE double early_goal(const ContactState& c, const ContactSolve& pass, double r2, double goal2) {
+    const double early = early_tolerance(sqrt(r2 / c.given2), pass.tolerance, c.passes, pass.passes);
+    return early * early * r2 > goal2 ? early * early * r2 : goal2;
+}
+
 // Adds a solve to a body's state and to the result of its step.
 HOST_DEVICE void note_pass(ContactState& c, const ContactSolve& pass, int outcome, PcgResult& sum, const PcgResult& out) {
     c.phase = out.status == NOT_FINITE ? LOST : outcome;

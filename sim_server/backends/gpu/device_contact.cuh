@@ -25,6 +25,7 @@ struct DeviceRow {       // of a row in the step under way
     double s[3];         // displacement of its point by the velocities reached [m]
     double step[3];      // by the solution of the pass [m]
     double limit;        // normal force that limits friction, held in a pass [N]
+    double dual[3];      // friction force with which the pass linearizes friction [N]
     ContactForce force;
     int in_set;          // 1: counts as closed in the first pass
 };
@@ -241,9 +242,10 @@ struct SurfaceNode {         // a node and its frame
         for (int k = 0; k < 3; ++k) f[k] += m[k];
     }
     // S += i c R^T (-d force / ds) R
-    __device__ __forceinline__ void add_stiffness(const ContactArguments& c, const ContactRow& row, const ContactForce& force, double* S) const {
+    __device__ __forceinline__ void add_stiffness(const ContactArguments& c, const ContactRow& row, const ContactForce& force, const double* dual,
+                                                  double* S) const {
         double k[6];
-        contact_stiffness(row, force, c.dx_dv * c.force_coefficient, k);
+        contact_stiffness(row, force, dual, c.dx_dv * c.force_coefficient, k);
         const double full[9] = {k[0], k[1], k[2], k[1], k[3], k[4], k[2], k[4], k[5]};
         for (int j = 0; j < 3; ++j) {
             double column[3];
@@ -265,17 +267,32 @@ __device__ __forceinline__ void add_rows(const ContactArguments& c, const Surfac
         if (!used(c, r)) continue;
         const DeviceRow& row = c.row[r];
         n.add_force(c, r, row.force, f);
-        n.add_stiffness(c, row_at(c, r), row.force, S);
+        n.add_stiffness(c, row_at(c, r), row.force, row.dual, S);
     }
 }
 
-// Evaluates the law at displacement s. hold: the normal force there limits friction from now on, where the row counted as closed.
-__device__ __forceinline__ void evaluate(const ContactArguments& c, int r, const double* s, bool hold, bool set) {
+// Takes up what limits friction at the start of a step.
+__device__ __forceinline__ void begin_friction(const ContactArguments& c, int r) {
+    DeviceRow& row = c.row[r];
+    row.limit = c.force[r];
+    for (int k = 0; k < 3; ++k) row.dual[k] = c.traction[3 * r + k];
+    bound_dual(row_at(c, r), row.limit, row.dual);
+}
+
+// Evaluates the law at displacement s. hold: there was a pass; the normal force there limits friction from now on, where the row
+// counted as closed. exactly: friction is linearized by its derivative.
+__device__ __forceinline__ void evaluate(const ContactArguments& c, int r, const double* s, bool hold, bool set, bool exactly = false) {
     DeviceRow& row = c.row[r];
     const ContactRow given = row_at(c, r);
+    if (hold) {
+        const double step[3] = {s[0] - row.s[0], s[1] - row.s[1], s[2] - row.s[2]};
+        move_dual(given, row.force, step, row.dual);
+        row.limit = row.force.closed ? contact_force(given, s, 0, false).normal : 0;
+        bound_dual(given, row.limit, row.dual);
+    }
     for (int k = 0; k < 3; ++k) row.s[k] = s[k];
-    if (hold) row.limit = row.force.closed ? contact_force(given, s, 0, false).normal : 0;
     row.force = contact_force(given, s, row.limit, set && row.in_set);
+    for (int k = 0; k < 3 && exactly; ++k) row.dual[k] = row.force.traction[k];
 }
 
 // Keeps a node's own block without contact, and with contacts that carried force in the last step: a factor that is made from a copy
@@ -284,9 +301,11 @@ __device__ void keep_block(const ContactArguments& c, const SurfaceNode& n, int 
     const int pair = c.pair[n.node];
     if (pair < 0) return;
     double S[9] = {};
-    for (int r = n.pair; n.pair >= 0 && r < n.pair + 2; ++r)
-        if (used(c, r) && c.force[r] > 0)
-            n.add_stiffness(c, row_at(c, r), lasting_contact(c.friction[r], c.force[r], c.traction + 3 * r), S);
+    for (int r = n.pair; n.pair >= 0 && r < n.pair + 2; ++r) {
+        if (!used(c, r) || !(c.force[r] > 0)) continue;
+        const ContactForce f = lasting_contact(c.friction[r], c.force[r], c.traction + 3 * r);
+        n.add_stiffness(c, row_at(c, r), f, f.traction, S);
+    }
     if (FACES) {
         keep_links(c, n);
         if (has_faces(c, n, body)) add_known_faces(c, n, S);
@@ -325,7 +344,7 @@ __device__ void take_row(const ContactArguments& c, int pair, int obstacle, cons
         c.hardening[r] = HARDER * c.hardening[r] < HARDEST ? HARDER * c.hardening[r] : HARDEST;
         return;
     }
-    row.limit = 0;
+    row.limit = row.dual[0] = row.dual[1] = row.dual[2] = 0;
     c.hardening[r] = 1;
     row.in_set = 0;
     row.force = {0, {0, 0, 0}, 0, false};

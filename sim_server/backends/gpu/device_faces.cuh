@@ -106,7 +106,8 @@ __device__ void add_known_faces(const ContactArguments& c, const SurfaceNode& n,
     each_face_row(c, n.node, [&](int r, int corner, int e) {
         if (!(c.force[r] > 0)) return;
         double s[6];
-        contact_stiffness(row_at(c, r), lasting_contact(c.friction[r], c.force[r], c.traction + 3 * r), c.dx_dv * c.force_coefficient, s);
+        const ContactForce f = lasting_contact(c.friction[r], c.force[r], c.traction + 3 * r);
+        contact_stiffness(row_at(c, r), f, f.traction, c.dx_dv * c.force_coefficient, s);
         add_face_stiffness(c, n, r, corner, e, s, S, c.faces.known, nullptr);
     });
 }

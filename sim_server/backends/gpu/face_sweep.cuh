@@ -88,7 +88,7 @@ __device__ bool sweep_face(const ContactArguments& c, int body, int r) {
             count_dropped_face(c, t, r);
             continue;
         }
-        row.limit = 0;
+        row.limit = row.dual[0] = row.dual[1] = row.dual[2] = 0;
         row.in_set = 0;
         row.force = {0, {0, 0, 0}, 0, false};
         found = true;

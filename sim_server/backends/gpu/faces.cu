@@ -79,11 +79,11 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) face_forces(const 
             }
         });
         displace_face(c, r, u, s);
-        evaluate(c, r, s, state.hold, state.set);
+        evaluate(c, r, s, state.hold, state.set, state.rested && state.passes == 0 && !starts);
         impulse_of(c, r, own.impulse);
         if (starts) return;
         const ContactRow row = row_at(c, r);
-        contact_stiffness(row, c.row[r].force, c.dx_dv * c.force_coefficient, own.stiffness);
+        contact_stiffness(row, c.row[r].force, c.row[r].dual, c.dx_dv * c.force_coefficient, own.stiffness);
         stiff_face(own.stiffness, u, own.pull);
         changed[0] += state.set && c.row[r].in_set != (int)contact_force(row, s, 0, false).closed;
     });

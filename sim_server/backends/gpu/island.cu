@@ -193,24 +193,27 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_law(const I
         DeviceRow& row = a.c.row[r];
         IslandRow& own = a.row[r];
         if (what == WARM_START) {  // rows that count as closed in the first pass
-            row.limit = a.c.force[r];
+            begin_friction(a.c, r);
             row.in_set = is_tie(a, r) || a.c.force[r] > 0 || (a.c.entry[r] <= 1 && a.c.entry[r] <= earliest + FIRST);
             for (int m = 0; m < 6; ++m) own.known[m] = 0;
             if (is_tie(a, r)) set_tie_stiffness(a, r, own.known);
-            else if (a.c.force[r] > 0)
-                contact_stiffness(row_at(a.c, r), lasting_contact(a.c.friction[r], a.c.force[r], a.c.traction + 3 * r),
-                                  a.c.dx_dv * a.c.force_coefficient, own.known);
+            else if (a.c.force[r] > 0) {
+                const ContactForce f = lasting_contact(a.c.friction[r], a.c.force[r], a.c.traction + 3 * r);
+                contact_stiffness(row_at(a.c, r), f, f.traction, a.c.dx_dv * a.c.force_coefficient, own.known);
+            }
         }
         double s[3];
         point_displacement(a, r, what == ZERO_START || (what == LAW_AT_START && state.zero), s);
         const ContactRow given = row_at(a.c, r);
         if (is_tie(a, r)) evaluate_tie(a, r, s);
-        else evaluate(a.c, r, s, what == LAW && state.hold, what == LAW ? state.set : what != LAW_AT_START);
+        else
+            evaluate(a.c, r, s, what == LAW && state.hold, what == LAW ? state.set : what != LAW_AT_START,
+                     what == LAW && state.rested && state.passes == 0);
         for (int m = 0; m < 3; ++m)
             own.impulse[m] = a.c.force_coefficient * (row.force.normal * a.c.normal[3 * r + m] + row.force.traction[m]);
         if (what != LAW) continue;
         if (is_tie(a, r)) set_tie_stiffness(a, r, own.stiffness);
-        else contact_stiffness(given, row.force, a.c.dx_dv * a.c.force_coefficient, own.stiffness);
+        else contact_stiffness(given, row.force, row.dual, a.c.dx_dv * a.c.force_coefficient, own.stiffness);
         set_lever(a, r, own.lever);
         if (is_tie(a, r)) continue;
         changed[0] += state.set && row.in_set != (int)contact_force(given, s, 0, false).closed;
@@ -251,6 +254,15 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_balance(con
     if (threadIdx.x < CG_SUMS) a.chunk_sums[(long long)CG_SUMS * blockIdx.x + threadIdx.x] = pick(sum, threadIdx.x);
 }
 
+// Sets what a solve begins with. factors: 0: there is none.
+__device__ void choose_factors(const IslandArguments& a, int island, IslandState& s, long long factors) {
+    s.choice = {{FACTOR_COST, 1}, 0, factors, 1, 0, 0};
+    s.start2 = s.r2;
+    s.switched_after = s.fell = 0;
+    if (factors > 0) begin_pass(a.choice[a.island[a.island_start[island]]], s.choice, sqrt(s.goal2 / s.r2));
+    s.factors = !s.choice.first;
+}
+
 // A thread block has an island: what follows from its residual.
 extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_decide(const IslandArguments a, int what) {
     const int island = blockIdx.x;
@@ -266,11 +278,14 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_decide(cons
         return;
     }
     if (!takes_part(s.phase, what)) return;
-    double sum[CG_SUMS], changed[ROW_SUMS] = {};
+    double sum[CG_SUMS], changed[ROW_SUMS + 1] = {};  // rows that the law does not close, those that are no ties; numbers of factors
     sum_island(a, island, a.chunk_sums, sum);
     if (what == LAW) {
-        for (int k = threadIdx.x; k < s.bodies; k += CONTACT_THREADS)
-            for (int n = 0; n < ROW_SUMS; ++n) changed[n] += a.row_sums[n * a.bodies_count + a.island[a.island_start[island] + k]];
+        for (int k = threadIdx.x; k < s.bodies; k += CONTACT_THREADS) {
+            const int member = a.island[a.island_start[island] + k];
+            for (int n = 0; n < ROW_SUMS; ++n) changed[n] += a.row_sums[n * a.bodies_count + member];
+            if (has_factor(a.bodies[member])) changed[ROW_SUMS] += 1.0 + a.bodies[member].factor_step;
+        }
         sum_block(changed);
     }
     if (threadIdx.x > 0) return;
@@ -303,13 +318,15 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_decide(cons
             s.phase = ISLAND_ENDED;
         } else {
             s.phase = ISLAND_SOLVES;
-            s.goal2 = s.last ? goal2 : fmax(goal2, EARLY * EARLY * size2);
+            const double early = early_tolerance(s.residual, a.c.tolerance, s.passes, a.passes);
+            s.goal2 = s.last ? goal2 : fmax(goal2, early * early * size2);
             s.r2 = size2;
             s.last_true2 = 1e300;
             s.coarse = s.modes > 0;
             s.stage = s.coarse ? BEGINS_COARSE : ITERATES;
             s.restart = 1;
             s.own_iterations = s.own_status = s.pending = 0;
+            choose_factors(a, island, s, (long long)changed[ROW_SUMS]);
             a.coarse_well[island] = 1;
             atomicAdd(&a.tally->iterating, 1);
         }
@@ -613,7 +630,7 @@ __device__ void next_step(const IslandArguments& a, int island) {
     } else if (!(gamma > 0 && gamma < infinite && delta < infinite)) {
         if (!begins) {  // the coarse space lost its precision, or a factor is of no use
             if (!s.coarse && !s.factors) stop = BREAKDOWN_PRECONDITIONER;
-            if (!s.coarse && s.factors) ++s.fallbacks;
+            if (!s.coarse && s.factors) ++s.fallbacks, s.fell = 1;
             if (!s.coarse) s.factors = 0;
             s.coarse = 0;
         }
@@ -636,6 +653,12 @@ __device__ void next_step(const IslandArguments& a, int island) {
             s.pending = 1;
             s.restart = begins;
             if (s.r2 <= s.goal2) stop = CONVERGED;
+            if (s.choice.probe > 0 && s.own_iterations == s.choice.probe && !s.switched_after && !s.fell) {
+                s.switched_after = s.own_iterations;
+                s.residual_then = sqrt(s.r2 / s.start2);
+                s.factors = !s.factors;
+                s.restart = 1;
+            }
         }
     }
     if (stop >= 0) {
@@ -797,7 +820,11 @@ extern "C" __global__ void __launch_bounds__(SEARCH_THREADS) island_search(const
         }
     }
     __syncthreads();
-    if (threadIdx.x == 0) a.state[island] = s;
+    if (threadIdx.x > 0) return;
+    a.state[island] = s;
+    if (s.phase != ISLAND_PASSED || s.choice.factor_step == 0 || s.own_iterations == 0) return;
+    const PassEnd end = {s.own_iterations, s.switched_after, s.fell, sqrt(sum[0] / s.start2), s.residual_then};
+    end_pass(a.choice[a.island[a.island_start[island]]], s.choice, end, 0);
 }
 
 // A thread has a node: y += part dy, left accordingly. Of an island that has ended: where its path enters obstacles.

@@ -24,6 +24,7 @@
 #include "device_contact.cuh"
 #include "edge_detection.cuh"
 #include "hold_apart.cuh"
+#include "pass_choice.cuh"
 #include "ties.cuh"
 
 #ifdef TIES
@@ -37,6 +38,7 @@ constexpr int CG_SUMS = 9;        // of an iteration
 constexpr int BASE_SUMS = 36;     // Z^T A Z of a body
 constexpr int LISTING_THREADS = 256;  // of find_islands, one thread block
 constexpr int SEARCH_THREADS = 512;   // of island_search
+constexpr double FACTOR_COST = 2;     // of an iteration with factors, over that of one with block Jacobi
 
 enum IslandPhase {
     ISLAND_BEGINS = 0,    // the start is chosen next
@@ -73,6 +75,9 @@ struct IslandState {
     int restart;          // 1: the next direction is the preconditioned residual
     int coarse;           // 1: rigid motions precondition
     int factors;          // 1: factors do, else block Jacobi
+    PassBegin choice;     // of the two, for the solve; its factor_step is a sum over the bodies, 0: there is no factor
+    double start2, residual_then;    // square of the residual at the start of the solve; relative, where it went over to the other one
+    int switched_after, fell;        // iterations before that, 0: it did not; 1: a factor was of no use
     int own_iterations;   // of the solve
     int own_status;
 };
@@ -140,7 +145,8 @@ struct IslandArguments {
     double *coarse_a, *coarse_b; // (bodies, MODES, most_modes) rows of E, while it is inverted from one to the other
     int* coarse_well;            // (bodies,) of islands: 1: E is positive definite
     double* coefficient;         // (bodies, MODES)
-    int bodies_count, most_modes, most_chunks, highest_tree, passes, bound_nodes, edges;
+    PassChoice* choice;          // (bodies,) of islands, kept by their first body
+    int bodies_count, most_modes, most_chunks, highest_tree, passes, bound_nodes, edges, unused;
     Ties ties;                   // ties.first is the number of rows where there are none
     const int *bound_node, *bound_start;    // (bound_nodes,), (bound_nodes + 1,) nodes that may be bound, and first ties of each
     const int *bound_tie, *bound_other;     // those ties in order, and the bodies that they bind the node to

@@ -22,7 +22,7 @@ from sim_server.backends.gpu.tie_arguments import tie_arguments
 PAIRS, ISLAND = Declarations("backends/gpu/pairs.cu"), Declarations("backends/gpu/island.cu")
 TIES = Declarations("backends/gpu/ties.cu")
 ISLAND_ARGUMENTS = ISLAND.dtype("IslandArguments")
-SIZES = {name: ISLAND.dtype(name).itemsize for name in ("IslandState", "IslandRow", "Box", "EdgeWings")}
+SIZES = {name: ISLAND.dtype(name).itemsize for name in ("IslandState", "IslandRow", "Box", "EdgeWings", "PassChoice")}
 TALLY = ISLAND.dtype("Tally")
 MOST_HELD: int = ISLAND.constant("MOST_HELD")
 MODES, CG_SUMS, BASE_SUMS = (ISLAND.constant(name) for name in ("MODES", "CG_SUMS", "BASE_SUMS"))
@@ -139,7 +139,7 @@ class IslandPasses:
             "coarse_sums": MODES * len(chunks), "base_sums": BASE_SUMS * len(chunks), "row_sums": 2 * bodies,
             "coarse_a": bodies * MODES * most, "coarse_b": bodies * MODES * most, "coefficient": MODES * bodies,
         }  # fmt: skip
-        structs = {"state": ("IslandState", bodies), "row": ("IslandRow", rows)}
+        structs = {"state": ("IslandState", bodies), "row": ("IslandRow", rows), "choice": ("PassChoice", bodies)}
         self.memory: dict[str, DeviceArray] = {name: cp.zeros(size, ints) for name, size in sizes.items()}
         self.memory |= {name: cp.zeros(size, doubles) for name, size in numbers.items()}
         self.memory |= {name: cp.zeros(SIZES[kind] * count, np.uint8) for name, (kind, count) in structs.items()}

@@ -185,7 +185,7 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) pair_sites(const I
 
 __device__ void take_anew(const IslandArguments& a, int r) {
     DeviceRow& row = a.c.row[r];
-    row.limit = 0;
+    row.limit = row.dual[0] = row.dual[1] = row.dual[2] = 0;
     row.in_set = 0;
     row.force = {0, {0, 0, 0}, 0, false};
     for (int k = 0; k < 6; ++k) a.row[r].known[k] = 0;

@@ -290,7 +290,7 @@ struct PcgSolver {
         const int outcome = outcome_of(c, pass, r2, memory.goal);
         memory.outcome = outcome;
         if (outcome == ENDED) memory.out.residual = c.given2 > 0 ? sqrt(r2 / c.given2) : 0;
-        if (outcome == PASSED) memory.goal = fmax(memory.goal, EARLY * EARLY * r2);
+        if (outcome == PASSED) memory.goal = early_goal(c, pass, r2, memory.goal);
         return outcome == ENDED;
     }
 #endif

@@ -7,7 +7,7 @@
 //   - the rows in the state reached: force f, stiffness S. In the first pass the rows that carried force in the last step and those
 //     that are hit first (FIRST) count as closed, with the force of a spring that may pull, unless the law holds already; afterwards
 //     the law decides;
-//   - (A + H^T S H) dy = r, r = b - A y + i H^T f, solved to EARLY of |r|;
+//   - (A + H^T S H) dy = r, r = b - A y + i H^T f, solved to a part of |r| (early_tolerance);
 //   - y += alpha dy, alpha the exact minimum along dy of the convex function of which -r is the gradient;
 //   - the normal force found is what limits friction in the next pass; 0 in a row that the solve did not take as closed: a force
 //     that no solve has balanced would glue.

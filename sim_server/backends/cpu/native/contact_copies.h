@@ -6,7 +6,7 @@
 // Stiffness of a row that carried force in the last step. One that slid counts with its normal stiffness alone.
 static void lasting_stiffness(const Contact& c, const Rows& rows, int k, double* s) {
     const ContactForce f = lasting_contact(c.friction[k], c.force[k], c.traction + 3 * k);
-    contact_stiffness(rows.row(k), f, c.dx_dv * c.force_coefficient, s);
+    contact_stiffness(rows.row(k), f, f.traction, c.dx_dv * c.force_coefficient, s);
 }
 
 // Block (i, j) of a body's A, counted from its first one; -1: A has none, or j is of another body.
@@ -29,7 +29,7 @@ template <class F> static void each_lasting_row(const Contact& c, const Rows& ro
     });
     for (int i = 0; i < c.ties.count; ++i) {
         if (c.ties.broken[i] || (c.ties.body[2 * i] != index && c.ties.body[2 * i + 1] != index)) continue;
-        rows.stiffness(c.ties.first + i, {}, c.dx_dv * c.force_coefficient, s);
+        rows.stiffness(c.ties.first + i, {}, nullptr, c.dx_dv * c.force_coefficient, s);
         f(c.ties.first + i, s);
     }
 }

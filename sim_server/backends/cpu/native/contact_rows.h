@@ -7,6 +7,7 @@
 #include "contact_passes.cuh"
 #include "own_surface.cuh"
 #include "edge_detection.cuh"
+#include "pass_choice.cuh"
 #include "ties.cuh"
 #include "triangle_shape.cuh"
 
@@ -15,6 +16,7 @@ struct RowState {                 // of a row in the step under way
     double step[3];               // by the solution of the pass [m]
     double limit;                 // normal force that limits friction, held in a pass [N]
     int32_t in_set;               // 1: counts as closed in the first pass
+    double dual[3];               // friction force with which the pass linearizes friction [N]
     double stiffness[6];          // upper triangle of the force's slope times h^2, world frame [kg]
     ContactForce force;
 };
@@ -28,14 +30,6 @@ struct ContactReport {            // of a body in a step
 };
 
 struct SolveResult;
-
-struct PassChoice {         // of a body, kept from step to step (pass_choice.h)
-    double rate[2];         // iterations a decade of the residual, of the factor and of block Jacobi; 0: not known
-    double reference;       // what the one in use cost when the other one was tried last, a decade
-    int64_t factor_step;    // of the factor in use when the other one was tried last
-    int32_t jacobi;         // 1: block Jacobi is in use, 0: the factor
-    int32_t wait, waited;   // passes between trials; since the last one
-};
 
 struct OwnReference {       // of a body (own_contact.h)
     double range;           // up to which distances are measured; 0: there is no reference [m]
@@ -167,6 +161,7 @@ inline SurfaceMotion<double, double> motion_of(const Contact& c, const double* x
 // A row that a sweep has made has no force, and friction no limit, until a solve has found them.
 inline void take_anew(RowState& state) {
     state.limit = 0;
+    for (double& f : state.dual) f = 0;
     state.in_set = 0;
     state.force = {0, {0, 0, 0}, 0, false};
 }
@@ -187,9 +182,9 @@ struct Rows {
     ContactForce force(int r, const double* s, double limit, bool set) const {
         return is_tie(c, r) ? force_of_tie(c.ties, r - c.ties.first, s) : contact_force(row(r), s, limit, set);
     }
-    void stiffness(int r, const ContactForce& f, double scale, double* k) const {
+    void stiffness(int r, const ContactForce& f, const double* dual, double scale, double* k) const {
         if (is_tie(c, r)) stiffness_of_tie(c.ties, r - c.ties.first, scale, k);
-        else contact_stiffness(row(r), f, scale, k);
+        else contact_stiffness(row(r), f, dual, scale, k);
     }
 
     // f(node, weight) of the corners that may move

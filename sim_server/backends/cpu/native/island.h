@@ -264,32 +264,45 @@ struct IslandSolver {
 
     // --- preconditioner -----------------------------------------------------------------------------------------------------------
 
-    // Bodies without a factor have block Jacobi, with the diagonal parts of contacts.
-    void prepare() {
+    // The factor that a body wants and has, or null.
+    static const Factor* factor_of(const Body& body) { return body.now.kind == CHOLESKY ? body.factor : nullptr; }
+
+    // kind: CHOLESKY or BLOCK_JACOBI, which bodies without a factor have anyway.
+    void prepare(int kind) {
         single.clear();
         matrices.clear();
         each_body([&](Body& body, int) { matrices.push_back(matrix_of(loop, body)); });
         each_body([&](Body& body, int m) {
             double* work = loop.work + 27 * (int64_t)body.first;
             const int n = 3 * (body.last - body.first);
-            const int kind = body.now.kind == CHOLESKY && body.factor ? CHOLESKY : BLOCK_JACOBI;
             body.correction.in_contact = 0;
-            single.push_back({matrices[m], body.factor, kind, work, work + 3 * n, 1, &body.correction});
-            single.back().prepare();
+            single.push_back({matrices[m], body.factor, BLOCK_JACOBI, work, work + 3 * n, 1, &body.correction});
         });
-        // block Jacobi knows contacts: the inverses are made anew where rows act
-        for (int m = 0; m < count; ++m) {
-            if (single[m].kind != BLOCK_JACOBI) continue;
-            Rows own = rows;
-            own.node_first = loop.body[bodies[m]].first;
-            BlockCsr A = single[m].A;
-            std::vector<int32_t>& list = touching(bodies[m]);
-            own.active = list.data();
-            own.actives = (int)list.size();
-            A.rows = &own;
-            invert_diagonal(A, true, single[m].inverse);
-        }
+        set_kinds(kind);
         prepare_modes();
+    }
+    void set_kinds(int kind) {
+        each_body([&](const Body& body, int m) {
+            if (kind == CHOLESKY && factor_of(body)) use_factor(m);
+            else leave_factor(m);
+        });
+    }
+    void use_factor(int m) {
+        single[m].kind = CHOLESKY;
+        single[m].prepare();
+    }
+    // Block Jacobi knows the diagonal parts of contacts.
+    void leave_factor(int m) {
+        single[m].kind = BLOCK_JACOBI;
+        single[m].corrects = false;
+        Rows own = rows;
+        own.node_first = loop.body[bodies[m]].first;
+        BlockCsr A = single[m].A;
+        std::vector<int32_t>& list = touching(bodies[m]);
+        own.active = list.data();
+        own.actives = (int)list.size();
+        A.rows = &own;
+        invert_diagonal(A, true, single[m].inverse);
     }
     std::vector<int32_t>& touching(int body) const {
         static thread_local std::vector<int32_t> list;
@@ -299,10 +312,6 @@ struct IslandSolver {
             if (body_of_row(c, r, false) == body || (is_pair(c, r) && body_of_row(c, r, true) == body)) list.push_back(r);
         }
         return list;
-    }
-    void leave_factor(int m) {
-        single[m].kind = BLOCK_JACOBI;
-        single[m].prepare();
     }
 
     // to = P^-1 r by the bodies' own. A factor that is not positive definite is left for block Jacobi; false if that is not, either.
@@ -359,7 +368,7 @@ struct IslandSolver {
     SolveResult solve(const double* b, const SolveSettings& settings, double* x, double* r) {
         const double begin = now();
         const double b2 = norm2(b), goal = settings.tolerance * settings.tolerance * b2;
-        SolveResult out{0, 0, 0, CONVERGED, settings.kind, 0};
+        SolveResult out{0, 0, 0, CONVERGED, settings.kind, 0, 0, 0};
         each_entry([&](int64_t k) { x[k] = 0; r[k] = b[k]; });
         auto finish = [&](int status, double r2) {
             out.status = status;
@@ -374,9 +383,16 @@ struct IslandSolver {
         };
         if (!std::isfinite(b2)) return finish(NOT_FINITE, b2);
         if (b2 == 0) return finish(CONVERGED, 0);
-        prepare();
+        prepare(settings.kind);
         double r2 = b2, rz = 0, last_true = INFINITY;
         for (bool restart = true;;) {
+            if (settings.probe > 0 && out.iterations == settings.probe && !out.switched_after) {
+                out.kind = out.kind == CHOLESKY ? BLOCK_JACOBI : CHOLESKY;
+                out.switched_after = out.iterations;
+                out.residual_then = std::sqrt(r2 / b2);
+                set_kinds(out.kind);
+                restart = true;
+            }
             const double zr = apply(r, z, q, out.fallbacks);
             if (!(zr > 0 && zr < INFINITY)) {
                 if (!modes) return finish(BREAKDOWN_PRECONDITIONER, true_residual());

@@ -157,6 +157,7 @@ struct ContactSearch : Passes {
         begin_here();
         each_row([&](int k, RowState& s) {
             if (s.limit > 0) s.limit = rows.force(k, s.s, 0, false).normal;
+            bound_dual(rows.row(k), s.limit, s.dual);
         });
         apply_law(false);
         const double size = balance();

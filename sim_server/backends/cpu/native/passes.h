@@ -32,18 +32,22 @@ struct Passes : IslandRows {
         each_row([&](int k, RowState&) { earliest = std::min(earliest, c.entry[k]); });
         each_row([&](int k, RowState& s) {
             s.limit = c.force[k];
+            std::copy(c.traction + 3 * k, c.traction + 3 * k + 3, s.dual);
+            bound_dual(rows.row(k), s.limit, s.dual);
             s.in_set = is_tie(c, k) || c.force[k] > 0 || (c.entry[k] <= 1 && c.entry[k] <= earliest + FIRST);
             closed += s.in_set;
         });
         return closed;
     }
 
-    // Forces and stiffness of the rows as they are. set: those marked count as closed. Returns whether a row has either.
-    bool apply_law(bool set) {
+    // Forces and stiffness of the rows as they are. set: those marked count as closed. exactly: friction is linearized by its derivative.
+    // Returns whether a row has either.
+    bool apply_law(bool set, bool exactly = false) {
         rows.actives = 0;
         each_row([&](int k, RowState& s) {
             s.force = rows.force(k, s.s, s.limit, set && s.in_set);
-            rows.stiffness(k, s.force, scale2, s.stiffness);
+            if (exactly) std::copy(s.force.traction, s.force.traction + 3, s.dual);
+            rows.stiffness(k, s.force, s.dual, scale2, s.stiffness);
             if (rows.acts(k)) active[rows.actives++] = k;
         });
         return rows.actives > 0;
@@ -99,7 +103,7 @@ struct Passes : IslandRows {
     // dy of (A + H^T S H) dy = r, and its residual.
     SolveResult solve_linear(double tolerance) {
         SolveSettings settings = settings_for(tolerance);
-        if (count > 1) return IslandSolver{loop, c, bodies, count, rows}.solve(r, settings, dy, rest);
+        if (count > 1) return solve_together(settings);
         Body& body = loop.body[bodies[0]];
         const int64_t at = 3 * (int64_t)body.first;
         Rows own = rows;
@@ -110,14 +114,32 @@ struct Passes : IslandRows {
         auto solve_by = [&] { return pcg(A, r + at, body.factor, settings, dy + at, work, false, &body.correction); };
         SolveResult solved;
         if (settings.kind == CHOLESKY && body.factor) {
-            ChoiceOfPass choice(c.choice[bodies[0]], A, *body.factor);
+            ChoiceOfPass choice(c.choice[bodies[0]]);
+            choice.add(A, body.factor);
             choice.begin(settings);
             solved = solve_by();
-            choice.end(settings, solved, body.correction.spent);
+            choice.end(solved, body.correction.spent);
         } else {
             solved = solve_by();
         }
         std::copy(work, work + A.size(), rest + at);  // where pcg leaves its residual
+        return solved;
+    }
+
+    // The same of an island of several bodies. What is known of its choice is kept with its first body.
+    SolveResult solve_together(SolveSettings& settings) {
+        IslandSolver solver{loop, c, bodies, count, rows};
+        ChoiceOfPass choice(c.choice[bodies[0]]);
+        for (int m = 0; m < count; ++m) {
+            const Body& body = loop.body[bodies[m]];
+            choice.add(matrix_of(loop, body), IslandSolver::factor_of(body));
+        }
+        settings.kind = BLOCK_JACOBI;
+        const bool chooses = choice.pass.factor_step >= 0;
+        if (chooses) choice.begin(settings);
+        const SolveResult solved = solver.solve(r, settings, dy, rest);
+        double spent = 0;
+        if (chooses) choice.end(solved, spent);
         return solved;
     }
 
@@ -152,8 +174,12 @@ struct Passes : IslandRows {
             y[k] += alpha * dy[k];
             left[k] -= alpha * r[k];
         });
-        each_row([&](int, RowState& s) {
-            for (int m = 0; m < 3; ++m) s.s[m] += alpha * s.step[m];
+        each_row([&](int k, RowState& s) {
+            for (int m = 0; m < 3; ++m) {
+                s.step[m] *= alpha;
+                s.s[m] += s.step[m];
+            }
+            move_dual(rows.row(k), s.force, s.step, s.dual);
         });
     }
 
@@ -162,6 +188,7 @@ struct Passes : IslandRows {
         each_row([&](int k, RowState& s) {
             const bool was = s.force.closed;
             s.limit = was ? rows.force(k, s.s, 0, false).normal : 0;
+            bound_dual(rows.row(k), s.limit, s.dual);
         });
     }
 
@@ -177,7 +204,7 @@ struct Passes : IslandRows {
         bool last = false, spent = false, linear = true;
         each_row([&](int k, RowState&) { linear = linear && is_tie(c, k); });
         for (int k = 0;; ++k) {
-            apply_law(set && k == 0);
+            apply_law(set && k == 0, rested && k == 0);
             const double size = balance();
             if (!std::isfinite(size)) { result.status = NOT_FINITE; return; }
             report.residual = given > 0 ? size / given : 0;
@@ -192,7 +219,8 @@ struct Passes : IslandRows {
                 return;
             }
             if (!last && report.passes >= c.passes) break;
-            pass(last ? goal / size : std::max(goal / size, EARLY), last);
+            const double early = early_tolerance(report.residual, c.tolerance, report.passes, c.passes);
+            pass(last ? goal / size : std::max(goal / size, early), last);
             result.residual *= given > 0 ? size / given : 0;
             if (result.status == NOT_FINITE) return;
             spent = cut();
