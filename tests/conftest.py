@@ -1,10 +1,15 @@
 # SPDX-License-Identifier: MIT
 """What holds for all tests."""
 
+import os
 import signal
 from typing import Any
 
 import pytest
+
+# Threads of a loop that wait for one another sleep, before the library of OpenMP is loaded: where cores are shared with
+# other processes they would spin for longer than they work.
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 # Folders and files of tests that one process runs, when there are several: servers and workers in real time have the
 # rest of the machine to themselves and one other process of tests; there is one GPU.
@@ -24,6 +29,17 @@ def pytest_configure() -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Of several processes one begins with what takes longest because it waits, so that no other has to wait for it."""
+    if hasattr(config, "workerinput"):
+        items.sort(key=lambda item: _group(item.nodeid) != "real time")
+
+
+def _group(nodeid: str) -> str | None:
+    """What a test is run together with, other than its file."""
+    return next((group for start, group in TOGETHER.items() if nodeid.startswith(start)), None)
+
+
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     """--dist loadfile deals out files of tests whole, what is TOGETHER as if it were one file."""
@@ -33,7 +49,6 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 
     class Together(LoadFileScheduling):
         def _split_scope(self, nodeid: str) -> str:
-            found = (group for start, group in TOGETHER.items() if nodeid.startswith(start))
-            return next(found, None) or super()._split_scope(nodeid)
+            return _group(nodeid) or super()._split_scope(nodeid)
 
     return Together(config, log)

@@ -3,8 +3,6 @@
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from sim_server.mechanics.world import Body
 from sim_server.simulation import Simulation
@@ -48,11 +46,25 @@ def _parts(simulation: Simulation) -> tuple[NDArray[np.int32], NDArray[np.bool_]
     elements = [e.elements for e in simulation.effects.values() if e.elements is not None]
     ends = [e[:, [0, k]] for e in elements for k in range(1, e.shape[1])]
     pairs = np.concatenate([np.zeros((0, 2), np.int32), *ends])
-    graph = coo_array((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
-    _, part = connected_components(graph, directed=False)
     elastic = np.zeros(n, dtype=bool)
     elastic[pairs] = True
-    return part, elastic
+    return connected_parts(n, pairs), elastic
+
+
+def connected_parts(nodes: int, pairs: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Returns the lowest node that each node is connected with. pairs: neighbours, (k, 2).
+
+    SciPy has a function for it, whose import takes a fifth of a server's start.
+    """
+    part = np.arange(nodes, dtype=np.int32)
+    while (part[pairs[:, 0]] != part[pairs[:, 1]]).any():
+        ends = part[pairs]
+        lowest = ends.min(axis=1)
+        for k in range(2):
+            np.minimum.at(part, ends[:, k], lowest)
+        while (part != part[part]).any():
+            part = part[part]
+    return part
 
 
 def _incompressible(simulation: Simulation) -> str:

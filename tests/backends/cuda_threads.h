@@ -2,6 +2,8 @@
 // Thread blocks of CUDA, one after another, whose threads take turns on one thread of the processor, from barrier to barrier: enough
 // for texts that sum over warps and blocks.
 #pragma once
+#undef _FORTIFY_SOURCE  // its longjmp refuses to go to another stack
+#include <setjmp.h>
 #include <ucontext.h>
 
 #include <cmath>
@@ -27,14 +29,23 @@ static Dimension threadIdx, blockIdx, blockDim, gridDim;
 static uint64_t exchanged[32][32];
 
 struct Turn {                // of a thread
-    ucontext_t context;
+    ucontext_t start;
+    jmp_buf here;  // where it goes on; a jump asks nothing of the system, as a swap of contexts does
     std::vector<char> stack;
-    bool ended;
+    bool begun, ended;
 };
 static Turn turns[1024];
-static ucontext_t between_turns;
+static jmp_buf between_turns;
 
-static void give_turn() { swapcontext(&turns[threadIdx.x].context, &between_turns); }
+__attribute__((noinline)) static void give_turn() {
+    if (!_setjmp(turns[threadIdx.x].here)) _longjmp(between_turns, 1);
+}
+__attribute__((noinline)) static void take_turn(Turn& turn) {
+    if (_setjmp(between_turns)) return;
+    if (turn.begun) _longjmp(turn.here, 1);
+    turn.begun = true;
+    setcontext(&turn.start);
+}
 
 struct Barrier {
     int waiting = 0;
@@ -142,18 +153,18 @@ template <class Kernel> static void launch(int blocks, int threads, Kernel kerne
         for (int t = 0; t < threads; ++t) {
             Turn& turn = turns[t];
             turn.stack.resize(1 << 18);
-            turn.ended = false;
-            getcontext(&turn.context);
-            turn.context.uc_stack.ss_sp = turn.stack.data();
-            turn.context.uc_stack.ss_size = turn.stack.size();
-            makecontext(&turn.context, take_turns, 0);
+            turn.begun = turn.ended = false;
+            getcontext(&turn.start);
+            turn.start.uc_stack.ss_sp = turn.stack.data();
+            turn.start.uc_stack.ss_size = turn.stack.size();
+            makecontext(&turn.start, take_turns, 0);
         }
         for (int left = threads; left > 0;) {
             left = 0;
             for (int t = 0; t < threads; ++t) {
                 if (turns[t].ended) continue;
                 threadIdx.x = t;
-                swapcontext(&between_turns, &turns[t].context);
+                take_turn(turns[t]);
                 left += !turns[t].ended;
             }
         }

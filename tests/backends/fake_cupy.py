@@ -105,7 +105,7 @@ def made(folder: Path, library: Any) -> ModuleType:
             if (self.code, self.options) not in compiled:
                 text = folder / f"text{len(compiled)}.cu"
                 text.write_text(self.code)
-                code, said = nvrtc.compiled(library, text, ["-arch=sm_90", "--Ofast-compile=mid", *self.options])
+                code, said = nvrtc.compiled(library, text, ["-arch=sm_90", "--Ofast-compile=max", *self.options])
                 if not code:
                     raise CompileException(said)
                 compiled.add((self.code, self.options))

@@ -183,6 +183,7 @@ FRAME = "kernels/hyperelastic.cu"  # of the laws: no text by itself
 GPU_TEXTS = sorted(p.relative_to(SOURCES).as_posix() for p in SOURCES.rglob("*.cu"))
 GPU_TEXTS = [path for path in GPU_TEXTS if path != FRAME] + [f"{FRAME}+{law}" for law in LAWS]
 TEXTS = [path for path in GPU_TEXTS if not path.startswith("backends/gpu/")]
+WHOLE = {f"backends/gpu/{name}.cu" for name in ("apply_factor", "newton", "pcg")}
 
 
 @pytest.mark.slow
@@ -200,14 +201,17 @@ def test_every_text_of_the_package_compiles_without_warnings(path, tmp_path):
 @pytest.mark.parametrize("arch", ["sm_80", "sm_90"])
 @pytest.mark.parametrize("path", GPU_TEXTS)
 def test_every_text_of_the_package_compiles_for_gpus(path, arch, tmp_path):
-    """By NVRTC, which needs no GPU and no driver; what it says counts as a failure too."""
+    """By NVRTC, which needs no GPU and no driver; what it says counts as a failure too.
+
+    In double precision for sm_90 with all optimization; those named in WHOLE are compiled so in test_gpu_structs.py.
+    """
     if (library := nvrtc.library()) is None:
         pytest.skip("needs the package nvidia-cuda-nvrtc")
     own = path.startswith("backends/gpu/")
     for name, types in PRECISIONS.items():
         if name == "mixed" and own and "local*" not in backend.read_text(path)[1]:
             continue  # the same: they know no elements
-        options = nvrtc.arch(arch, "max" if own else "mid")
+        options = nvrtc.arch(arch, "max" if own else "mid", whole=name == "float64" and path not in WHOLE)
         options += [*device_options(types), *own_headers()]  # as they are compiled there
         text = tmp_path / "text.cu"
         text.write_text(backend.read_text(path)[1])

@@ -17,6 +17,7 @@ import pytest
 
 from tests.clients.fake_server import FakeServer
 from tests.sample_run import record
+from tests.support.commands import Ended, in_turn
 
 pytestmark = pytest.mark.system
 ROOT = Path(__file__).parents[2]
@@ -173,36 +174,45 @@ def test_refused_command_is_bad_input(server: FakeServer) -> None:
     assert code == 2 and err == "sim-client: push: no object 'spleen'; there is beam, liver\n"
 
 
-@pytest.mark.parametrize(
-    ("arguments", "code", "said"),
-    [
-        ((), 2, "Usage"),
-        (("fly",), 2, "No such command 'fly'"),
-        (("push",), 2, "Missing option '--object'"),
-        (("push", "--object", "b", "--at", "1", "2", "x", "--force", "0", "0", "0"), 2, "--at"),
-        (("status", "--connect", "nowhere"), 2, "endpoint 'nowhere' cannot be used"),
-        (("push", "--object", "b", "--at", "1", "2", "--force", "0", "0", "0"), 2, "--at 1 2: allowed are three"),
-        (("status", "--connect", "tcp/no-such-host.invalid:1"), 1, "the name 'no-such-host.invalid' does not resolve"),
-        (("status", "--connect", "tcp/127.0.0.1:9"), 1, "no server 'sim' at tcp/127.0.0.1:9; is it running?"),
-        (("view",), 2, "give either a log or --live"),
-        (("view", "x.mcap", "--live"), 2, "give either a log or --live"),
-        (("view", "--live", "--save", "x.rrd"), 2, "need a log"),
-        (("view", "gone.mcap"), 2, "gone.mcap: cannot be read: No such file or directory"),
-        (("export", "gone.mcap", "--object", "beam", "--to", "x.npz"), 2, "gone.mcap: cannot be read"),
-        (("export", "pyproject.toml", "--object", "beam", "--to", "x.npz"), 2, "not an MCAP file"),
-    ],
-)
-def test_errors(arguments: tuple[str, ...], code: int, said: str) -> None:
-    found, out, err = run(*arguments)
-    assert found == code and said in out + err
+ERRORS: list[tuple[tuple[str, ...], int, str]] = [
+    ((), 2, "Usage"),
+    (("fly",), 2, "No such command 'fly'"),
+    (("push",), 2, "Missing option '--object'"),
+    (("push", "--object", "b", "--at", "1", "2", "x", "--force", "0", "0", "0"), 2, "--at"),
+    (("status", "--connect", "nowhere"), 2, "endpoint 'nowhere' cannot be used"),
+    (("push", "--object", "b", "--at", "1", "2", "--force", "0", "0", "0"), 2, "--at 1 2: allowed are three"),
+    (("status", "--connect", "tcp/no-such-host.invalid:1"), 1, "the name 'no-such-host.invalid' does not resolve"),
+    (("status", "--connect", "tcp/127.0.0.1:9"), 1, "no server 'sim' at tcp/127.0.0.1:9; is it running?"),
+    (("view",), 2, "give either a log or --live"),
+    (("view", "x.mcap", "--live"), 2, "give either a log or --live"),
+    (("view", "--live", "--save", "x.rrd"), 2, "need a log"),
+    (("view", "gone.mcap"), 2, "gone.mcap: cannot be read: No such file or directory"),
+    (("export", "gone.mcap", "--object", "beam", "--to", "x.npz"), 2, "gone.mcap: cannot be read"),
+    (("export", "pyproject.toml", "--object", "beam", "--to", "x.npz"), 2, "not an MCAP file"),
+]
+COMMANDS = ("status", "watch", "push", "grab", "haptics", "move-obstacle", "pause", "resume", "stop", "view", "export")
 
 
-@pytest.mark.parametrize(
-    "command",
-    ["status", "watch", "push", "grab", "haptics", "move-obstacle", "pause", "resume", "stop", "view", "export"],
-)
-def test_help_has_examples(command: str) -> None:
-    code, out, _ = run(command, "--help")
+@pytest.fixture(scope="module")
+def ended() -> dict[tuple[str, ...], Ended]:
+    """What comes of commands that need no server, one after another in one process."""
+    return in_turn("clients", [*(arguments for arguments, _, _ in ERRORS), *((name, "--help") for name in COMMANDS)])
+
+
+@pytest.mark.parametrize(("arguments", "code", "said"), ERRORS)
+def test_errors(ended: dict[tuple[str, ...], Ended], arguments: tuple[str, ...], code: int, said: str) -> None:
+    found, out, err = ended[arguments]
+    assert found == code and said in out + err and "Traceback" not in err
+
+
+def test_an_error_ends_the_process(tmp_path: Path) -> None:
+    assert run("view", tmp_path / "gone.mcap")[0] == 2
+    assert run("push")[0] == 2
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_has_examples(ended: dict[tuple[str, ...], Ended], command: str) -> None:
+    code, out, _ = ended[command, "--help"]
     assert code == 0 and f"Examples:\n    sim-client {command}" in out
 
 

@@ -302,7 +302,8 @@ def test_it_repeats_to_the_bit(scheme, threads):
     ends = []
     for _ in range(2):
         sim = collision(3.0, solver=LOCKSTEP | {"threads": threads}, integrator={"scheme": scheme})
-        records = Driver(sim).advance(30)
+        records = Driver(sim).advance(10)
+        assert (records["contacts"] > 0).any()
         ends.append(np.concatenate([sim.world.x.ravel(), records["iterations"], records["form"]]))
     assert np.array_equal(*ends)
 

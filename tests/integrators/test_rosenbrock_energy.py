@@ -61,11 +61,17 @@ def test_a_kicked_bar_under_tension(young, dt, solve):
     assert forms[FORMS["FACTOR" if solve == "auto" else "ITERATE"]] > 0.9 * forms.sum() and not forms[FORMS["EULER"]]
 
 
+# Small steps, which take longest, of the stiff bar alone, the smallest by factors alone.
+MINUTES = [
+    (young, dt, solve)
+    for young in (1e6, 1e7) for dt in (0.005, 0.01, 0.02, 0.04) for solve in SOLVES
+    if dt > 0.01 or (young > 1e6 and (dt == 0.01 or solve == "auto"))
+]  # fmt: skip
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("solve", SOLVES)
-@pytest.mark.parametrize("dt", [0.005, 0.01, 0.02, 0.04])
+@pytest.mark.parametrize(("young", "dt", "solve"), MINUTES)
 @pytest.mark.parametrize("split", ["mirrored", "kuhn"])
-@pytest.mark.parametrize("young", [1e6, 1e7])
 def test_a_minute_of_it(young, split, dt, solve):
     """The kick is 5 m/s at the end, or 1 cm/s; a small one loses little with small steps."""
     for kick in (5.0, 0.01):

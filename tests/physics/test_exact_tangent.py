@@ -12,6 +12,7 @@ from tests.physics.test_forces import REGIONS, SIZE, elastic_forces, stir, stirr
 from tests.physics.test_system_matrix import LARGE, error, frame, tangent
 from tests.reference.corotational import deformation, exact_tangent
 from tests.scenes import bar, elastic, interior, jittered_bar, mesh_file, random_rotations, simulation, solid
+from tests.texts import module_in
 
 
 def exact_bar(folder: Path, tangent: str = "exact", **table) -> Simulation:
@@ -137,8 +138,6 @@ def test_newton_is_faster_with_it_where_some_is_clamped(tmp_path):
 
 
 def test_single_precision_agrees(tmp_path):
-    from sim_server.backends.cpu.device import module
-
     sim = exact_bar(tmp_path)
     stir(sim, 0.1)
     e, w, found = elastic(sim), sim.world, []
@@ -151,7 +150,7 @@ def test_single_precision_agrees(tmp_path):
             "twist": np.zeros((m, 6), dtype),
             "nodal_impulse": np.zeros((m, 4, 3), dtype),
         }
-        module("effects/corotational_exact.cu", real).bind(
+        module_in("effects/corotational_exact.cu", real).bind(
             "elements", m, tets=e.elements, x=x, v=v, gradients=gradients, lame=lame,
             stiffness_coefficient=np.full(m, w.dt**2, dtype), h=w.dt, **out,
         )()  # fmt: skip

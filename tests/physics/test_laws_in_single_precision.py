@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sim_server.backends.cpu.device import module
 from sim_server.effects._hyperelastic import PROJECTIONS
 from tests.physics.laws import LAWS, Law, deform, odd_bar
+from tests.texts import module_in
 
 
 def in_precision(sim, law: Law, real: str) -> dict[str, np.ndarray]:
@@ -27,7 +27,7 @@ def in_precision(sim, law: Law, real: str) -> dict[str, np.ndarray]:
         only = {"projection": PROJECTIONS["clamp"], "clock": np.zeros(1), "refused": effect.refused.copy()}
     given = {name: array.astype(dtype) for name, array in inputs.items()}
     step = {"v": sim.world.v.astype(dtype), "h": 0.02, "stiffness_coefficient": np.full(m, 0.02**2, dtype)}
-    text = module(path, real)
+    text = module_in(path, real)
     text.bind("elements", m, tets=effect.elements, **given, **step, **only, **out)()
     text.bind("energy", m, tets=effect.elements, **given, **energy)()
     return {name: array.astype(float) for name, array in (out | energy).items()}

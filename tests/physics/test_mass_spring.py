@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sim_server.backends.cpu.device import module
 from sim_server.effects.mass_spring import CALIBRATION, MassSpring
 from sim_server.errors import InputError
 from sim_server.simulation import Simulation
@@ -14,6 +13,7 @@ from tests.physics.test_forces import elastic_forces, stir, stirred
 from tests.physics.test_system_matrix import frame
 from tests.reference.mass_spring import Net
 from tests.scenes import bar, jittered_bar, mesh_file, random_rotations, simulation
+from tests.texts import module_in
 
 SIZE = (1.5, 1.0, 0.8)
 REGIONS = [{"where": "X < 0.6", "young": 4e5}, {"young": 3e4}]
@@ -255,7 +255,7 @@ def test_single_precision_agrees(tmp_path, size):
         m = len(e.elements)
         x, v, k, l0 = (a.astype(dtype) for a in (w.x, w.v, e.stiffness, e.length))
         tangent, impulse, energy = np.zeros((m, 4), dtype), np.zeros((m, 3), dtype), np.zeros(m, dtype)
-        text = module("effects/mass_spring.cu", real)
+        text = module_in("effects/mass_spring.cu", real)
         c = np.full(m, w.dt**2, dtype)
         text.bind(
             "springs", m, ends=e.elements, x=x, v=v, stiffness=k, length=l0, stiffness_coefficient=c, h=w.dt,

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sim_server.backends.cpu.device import module
 from sim_server.effects.corotational import rotation_matrices
 from tests.reference.corotational import nearest_rotation
 from tests.scenes import random_rotations
+from tests.texts import module_in
 
 COUNT = 2000
 
@@ -23,7 +23,7 @@ def kernel(F: NDArray, real: str = "double") -> NDArray:
     corners = np.zeros((m, 4, 3), dtype)
     corners[:, 1:] = np.swapaxes(F, 1, 2)
     quaternion = np.full((m, 4), np.nan, dtype)
-    module("effects/corotational.cu", real).bind(
+    module_in("effects/corotational.cu", real).bind(
         "elements", m, tets=np.arange(4 * m, dtype=np.int32).reshape(m, 4), x=corners.reshape(-1, 3),
         v=np.zeros((4 * m, 3), dtype), gradients=np.repeat(np.eye(3, dtype=dtype).reshape(9, 1), m, axis=1),
         lame=np.ones((2, m), dtype), stiffness_coefficient=np.ones(m, dtype), h=0.01, quaternion=quaternion,

@@ -4,9 +4,9 @@
 import numpy as np
 import pytest
 
-from sim_server.backends.cpu.device import module
 from tests.physics.test_forces import solid_bar, stir
 from tests.scenes import elastic, solid
+from tests.texts import module_in
 
 
 def in_precision(real: str, sim) -> dict[str, np.ndarray]:
@@ -20,18 +20,18 @@ def in_precision(real: str, sim) -> dict[str, np.ndarray]:
         "energy": np.zeros(m, dtype), "sums": np.zeros(s.sums.shape, dtype), "b": np.zeros((w.nodes, 3), dtype),
         "block": np.zeros((w.nodes, 6), dtype), "mean": np.zeros((w.nodes, 10), dtype),
     }  # fmt: skip
-    corotational = module("effects/corotational.cu", real)
+    corotational = module_in("effects/corotational.cu", real)
     corotational.bind(
         "elements", m, tets=e.elements, x=x, v=v, gradients=gradients, lame=lame,
         stiffness_coefficient=np.full(m, w.dt**2, dtype), h=w.dt, quaternion=out["quaternion"],
         scaled_gradients=out["scaled_gradients"], nodal_impulse=out["nodal_impulse"],
     )()  # fmt: skip
     corotational.bind("energy", m, tets=e.elements, x=x, gradients=gradients, lame=lame, energy=out["energy"])()
-    module("effects/corotational_blocks.cu", real).bind(
+    module_in("effects/corotational_blocks.cu", real).bind(
         "blocks", len(s.row), accumulate=0, start=stencil.pair_start, pairs=stencil.pairs,
         scaled_gradients=out["scaled_gradients"], sums=out["sums"],
     )()  # fmt: skip
-    module("effects/corotational_nodes.cu", real).bind(
+    module_in("effects/corotational_nodes.cu", real).bind(
         "gather", w.nodes, start=stencil.corner_start, corners=stencil.corners, nodal_impulse=out["nodal_impulse"],
         scaled_gradients=out["scaled_gradients"], quaternion=out["quaternion"], b=out["b"], block=out["block"],
         mean=out["mean"],

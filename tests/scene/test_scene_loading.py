@@ -203,6 +203,13 @@ def test_loading_a_bar_imports_no_heavy_library(sample):
     imported_by(program + "assert not {'meshio', 'scipy', 'zenoh', 'cupy', 'matplotlib'} & set(sys.modules)")
 
 
+def test_a_server_begins_without_scipy(sample):
+    """Its import would be a fifth of the start of a server."""
+    program = "from sim_server.service import scene_notes, service; from sim_server.simulation import Simulation; "
+    program += f"scene_notes.scene_notes(Simulation.load({str(sample)!r})); import sys\n"
+    imported_by(program + "assert not {'meshio', 'scipy', 'cupy', 'matplotlib'} & set(sys.modules)")
+
+
 def test_the_folder_is_the_registry():
     assert {"corotational", "fixed", "gravity", "rayleigh", "touch"} <= set(known_effects())
     assert "__init__" not in known_effects()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sim_server.scene.model import Scene
-from sim_server.service.scene_notes import scene_notes
+from sim_server.service.scene_notes import connected_parts, scene_notes
 from sim_server.simulation import Simulation
 from tests.scenes import bar, jittered_bar, mesh_file, simulation
 
@@ -63,3 +63,18 @@ def test_nearly_incompressible_materials_are_said():
     assert scene_notes(simulation(small("a", poisson=0.4999))) == []
     lines = scene_notes(simulation(small("a", poisson=0.3), small("b", poisson=0.49999999)))
     assert len(lines) == 1 and lines[0].startswith("object 'b' with a Poisson's ratio of 0.49999999: above 0.4999")
+
+
+@pytest.mark.parametrize("pairs", [0, 50, 150, 400])
+def test_parts_are_those_of_scipy(pairs):
+    """By the names of their lowest nodes."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    nodes = 200
+    ends = np.random.default_rng(pairs).integers(0, nodes, (pairs, 2), dtype=np.int32)
+    chain = np.stack([np.arange(149, 100, -1), np.arange(148, 99, -1)], axis=1, dtype=np.int32)
+    ends = np.concatenate([ends, chain])
+    count, part = connected_components(coo_array((np.ones(len(ends)), ends.T), shape=(nodes, nodes)), directed=False)
+    lowest = np.array([np.flatnonzero(part == k)[0] for k in range(count)])
+    assert np.array_equal(connected_parts(nodes, ends), lowest[part])

@@ -19,8 +19,7 @@ def forms(log: Path) -> Counter[str]:
     return Counter(pb.StepForm.Name(step.form) for step in messages(log, "step"))
 
 
-@pytest.mark.parametrize("build", ["server", "worker"])
-@pytest.mark.parametrize("preconditioner", ["cholesky", "auto"])
+@pytest.mark.parametrize(("build", "preconditioner"), [("server", "cholesky"), ("worker", "auto")])
 def test_the_same_bit_for_bit(build: str, preconditioner: str, tmp_path: Path) -> None:
     """Nearly all steps are made by the factor alone: only the first ones have none, and a few of those with a new grab
     are not corrected for it."""

@@ -12,6 +12,7 @@ import pytest
 from link_helpers import ROOT, free_endpoint, process
 
 from sim_server.network.link import ServerLink
+from tests.support.commands import Ended, in_turn
 
 pytestmark = pytest.mark.system
 
@@ -34,28 +35,37 @@ def test_help_shows_examples() -> None:
         assert text in done.stdout
 
 
-@pytest.mark.parametrize(
-    ("arguments", "text"),
-    [
-        (["--connect", "nonsense"], "endpoint 'nonsense' cannot be used; allowed: PROTOCOL/HOST:PORT"),
-        (["--connect", "tcp/127.0.0.1:99999"], "PORT 1 to 65535"),
-        (["--name", "a/b"], "--name is 'a/b'; allowed: 1 to 64 characters"),
-        (["--server", ""], "--server is ''; allowed"),
-        (["--server", "a@nonsense"], "endpoint 'nonsense' cannot be used"),
-        (["--server", "a", "--server", "a"], "--server a is given twice"),
-        (["--threads", "0"], "--threads"),
-        (["--threads", "many"], "--threads"),
-        (["--nonsense"], "--nonsense"),
-        (["--device", "tpu"], "--device tpu: allowed are auto, cpu, gpu"),
-        (["--device", "gpu", "--precision", "float16"], "--precision float16: allowed are auto, float32, float64"),
-        (["--device", "gpu", "--arithmetic", "float16"], "--arithmetic is called --precision now"),
-        (["--device", "gpu", "--arithmetic", "float16"], "--precision float16: allowed are auto, float32"),
-    ],
-)
-def test_bad_input_is_one_clear_message(arguments: list[str], text: str) -> None:
-    done = run(*arguments)
-    assert done.returncode == 2
-    assert text in done.stderr and "Traceback" not in done.stderr
+BAD: list[tuple[list[str], str]] = [
+    (["--connect", "nonsense"], "endpoint 'nonsense' cannot be used; allowed: PROTOCOL/HOST:PORT"),
+    (["--connect", "tcp/127.0.0.1:99999"], "PORT 1 to 65535"),
+    (["--name", "a/b"], "--name is 'a/b'; allowed: 1 to 64 characters"),
+    (["--server", ""], "--server is ''; allowed"),
+    (["--server", "a@nonsense"], "endpoint 'nonsense' cannot be used"),
+    (["--server", "a", "--server", "a"], "--server a is given twice"),
+    (["--threads", "0"], "--threads"),
+    (["--threads", "many"], "--threads"),
+    (["--nonsense"], "--nonsense"),
+    (["--device", "tpu"], "--device tpu: allowed are auto, cpu, gpu"),
+    (["--device", "gpu", "--precision", "float16"], "--precision float16: allowed are auto, float32, float64"),
+    (["--device", "gpu", "--arithmetic", "float16"], "--arithmetic is called --precision now"),
+    (["--device", "gpu", "--arithmetic", "float16"], "--precision float16: allowed are auto, float32"),
+]
+
+
+@pytest.fixture(scope="module")
+def ended() -> dict[tuple[str, ...], Ended]:
+    return in_turn("precond_worker", [arguments for arguments, _ in BAD])
+
+
+@pytest.mark.parametrize(("arguments", "text"), BAD)
+def test_bad_input_is_one_clear_message(ended: dict[tuple[str, ...], Ended], arguments: list[str], text: str) -> None:
+    code, _, said = ended[tuple(arguments)]
+    assert code == 2
+    assert text in said and "Traceback" not in said
+
+
+def test_bad_input_ends_the_process() -> None:
+    assert run("--threads", "0").returncode == 2
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])

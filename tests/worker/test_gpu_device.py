@@ -125,6 +125,6 @@ def test_the_kernels_compile_for_gpus(arch, real, value):
     """By NVRTC, which needs no GPU and no driver; what it says counts as a failure too."""
     if (library := nvrtc.library()) is None:
         pytest.skip("needs the package nvidia-cuda-nvrtc")
-    options = [*nvrtc.arch(arch, "max"), "-std=c++17", f"-Dreal={real}", f"-DValue={value}"]
+    options = [*nvrtc.arch(arch, "max", whole=real == "double"), "-std=c++17", f"-Dreal={real}", f"-DValue={value}"]
     code, said = nvrtc.compiled(library, device.SOURCE, options)
     assert len(code) > 1000 and not said, said
