@@ -77,7 +77,7 @@ def contact_errors(
     if not obstacles and (len(objects) < 2 or not contact.between):
         yield _error("there is nothing to touch; needed: an [[obstacle]], or another object", "effects", "contact")
     linearized = integrator.scheme == "backward_euler" and integrator.linearizations > 1
-    if integrator.scheme == "quasi_static" or linearized:
+    if integrator.scheme == "quasi_static" or integrator.explicit or linearized:
         found = f"{integrator.scheme!r} with linearizations = {integrator.linearizations}"
         allowed = "'backward_euler' with linearizations = 1, 'newmark', 'bdf2', 'ros2'"
         yield _error(f"contact with integrator.scheme = {found}; allowed: {allowed}", "effects", "contact")
