@@ -33,6 +33,7 @@ struct SubstepState {
     int left;       // of these, in the step under way
     int since;      // substeps since the last estimate
     int tries;      // of the step under way
+    int round;      // substeps come in multiples of it
 };
 
 struct ModeSums {  // over the free nodes of a body, with w = M^-1 K u
@@ -105,14 +106,15 @@ HOST_DEVICE double stable_step_of(const StableStep& body) {
     return body.omega > 0 ? 2 / body.omega * (sqrt(1 + ratio * ratio) - ratio) : 1e300;
 }
 
-HOST_DEVICE int substeps_within(double time, double stable, int most) {
+HOST_DEVICE int substeps_within(double time, double stable, int most, int round) {
     const double wanted = time / (SAFETY * stable);
-    return wanted < 1 ? 1 : wanted < most ? (int)ceil(wanted) : most;
+    const int found = wanted < 1 ? 1 : wanted < most ? (int)ceil(wanted) : most;
+    return (found + round - 1) / round * round;
 }
 
 // Sets the substeps of a step of dt [s] in which the stable step of all bodies is `stable` [s].
 HOST_DEVICE void begin_step(SubstepState& s, double dt, double stable) {
-    const int last = s.substeps, needed = substeps_within(dt, stable, last ? s.most : MOST_SUBSTEPS), least = (int)(DECLINE * last);
+    const int last = s.substeps, needed = substeps_within(dt, stable, last ? s.most : MOST_SUBSTEPS, s.round), least = (int)(DECLINE * last) / s.round * s.round;
     if (!last) s.most = MOST_MORE * needed;
     s.substeps = needed >= last ? needed : needed > FEWER * last ? last : needed > least ? needed : least;
     s.tries = 0;
@@ -123,7 +125,7 @@ HOST_DEVICE void begin_step(SubstepState& s, double dt, double stable) {
 HOST_DEVICE bool shorten(SubstepState& s, double stable, double* substep, double* shift) {
     const double time = s.left * substep[0];
     const int most = s.most - s.substeps + s.left;
-    const int left = substep[0] > LIMIT * stable ? substeps_within(time, stable, most) : s.left;
+    const int left = substep[0] > LIMIT * stable ? substeps_within(time, stable, most, s.round) : s.left;
     if (left <= s.left) return false;
     *shift = (time / left - substep[0]) / 2;
     substep[0] = time / left;

@@ -196,6 +196,7 @@ class _NativeSubsteps:
         )  # fmt: skip
         for name in ("substep", "shift_time", "mass", "free", "force", "kept_x", "kept_force", "mode", "failed"):
             setattr(self.native, name, getattr(given, name).ctypes.data)
+        self.native.state.round = 1
         loop.substeps = c.addressof(self.native)
 
 

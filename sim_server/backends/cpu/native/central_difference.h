@@ -76,17 +76,13 @@ static void run_substeps(const Loop& loop) {
     }
 }
 
-// Whether a body runs away in the step as it is now (kernels/energy_balance.cuh), or has no state.
+// Whether a body runs away in the step as it is now (kernels/energy_balance.cuh). Notes whether it has no state at all.
 static bool runs_away(const Loop& loop, int index) {
     Balance balance = loop.energies->balance[index];
-    update_balance(balance, sums_of(loop, loop.body[index], true), GO_ON, true);
+    const Sums s = sums_of(loop, loop.body[index], true);
+    update_balance(balance, s, GO_ON, true);
+    loop.substeps->failed[index] = !is_finite(s.kinetic) || !is_finite(s.gravity);
     return balance.found;
-}
-
-static bool has_state(const Loop& loop, const Body& body) {
-    for (int64_t k = 3 * (int64_t)body.first; k < 3 * (int64_t)body.last; ++k)
-        if (!std::isfinite(loop.x[k]) || !std::isfinite(loop.v[k])) return false;
-    return true;
 }
 
 static void make_substeps(Loop& loop) {
@@ -101,15 +97,13 @@ static void make_substeps(Loop& loop) {
     for (bool again = true; again;) {
         run_substeps(loop);
         again = false;
-        for (int i = 0; i < loop.bodies; ++i) again = again || runs_away(loop, i);
+        for (int i = 0; i < loop.bodies; ++i) again = runs_away(loop, i) || again;
         again = again && try_again(c.state);
     }
     for (int i = 0; i < loop.bodies; ++i) {
         const Body& body = loop.body[i];
-        const bool failed = !has_state(loop, body);
-        if (failed || c.failed[i]) std::fill(loop.y + 3 * (int64_t)body.first, loop.y + 3 * (int64_t)body.last, failed ? NAN : 0);  // for holders
-        c.failed[i] = failed;
         c.result[i] = {0, now() - begin, 0, c.failed[i] ? NOT_FINITE : CONVERGED, NONE, 0, 0, 0};
+        std::fill(loop.y + 3 * (int64_t)body.first, loop.y + 3 * (int64_t)body.last, c.failed[i] ? NAN : 0);  // tells holders
     }
     run_nodal(loop, c.close);
 }
