@@ -13,11 +13,14 @@
 //   - the steps of two of its nodes differ along an axis by more than LONG times its size plus twice their difference at the
 //     start. In the same cases it is at most 1.7 times, except where a body was thrown or spun. Without inertia this is the only
 //     criterion.
+// Explicit substeps have slack SLACK_OF_SUBSTEPS: the kinetic energy of a mode of angular frequency w is up to 1 / (1 - (h w / 2)^2)
+// of its energy there, h the substep.
 // Its size is the longer of the diagonals of its boxes at rest and at the start.
 #pragma once
 #include "host_device.cuh"
 
 constexpr double SLACK_OF_ENERGY = 2, LONG = 4, SLOW = 1e-3;
+constexpr double SLACK_OF_SUBSTEPS = 10;
 
 enum OnRunaway { FREEZE = 0, GO_ON = 1, UNWATCHED = 2 };
 enum BalancePhase { WELL = 0, AWAY = 1, FROZEN = 2 };  // AWAY: ran away in the last step, and goes on
@@ -35,6 +38,7 @@ struct Balance {      // of a body, after its last step [J]
     double diagonal;  // at rest [m]
     double floor;     // of kinetic
     double limit;     // of stride [m]
+    double slack;     // of kinetic, in place of SLACK_OF_ENERGY; 0: that
     double kinetic, elastic, gravity, work, budget;
     double fallen;    // work of gravity
     double stride;    // largest difference of two nodes' steps along an axis [m]
@@ -95,7 +99,7 @@ HOST_DEVICE bool update_balance(Balance& b, const Sums& s, int on_runaway, bool 
     b.budget = b.start + b.work + b.fallen;
     if (b.phase == FROZEN) return false;
     b.budget = b.start + work + fallen;
-    const double most = SLACK_OF_ENERGY * (b.budget > 0 ? b.budget : 0) + b.floor;
+    const double most = (b.slack > 0 ? b.slack : SLACK_OF_ENERGY) * (b.budget > 0 ? b.budget : 0) + b.floor;
     const bool known = b.budget == b.budget;  // NaN: the law defines no energy of the state at the start
     const bool away = !is_finite(s.kinetic) || !is_finite(s.gravity) || (known && b.kinetic > most) || b.stride > b.limit;
     b.found = away && on_runaway != UNWATCHED;

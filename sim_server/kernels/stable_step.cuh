@@ -15,7 +15,7 @@ constexpr int FIRST_ITERATIONS = 68;  // with those that find the ratio of w^2 a
 constexpr int ESTIMATE_EVERY = 8;     // substeps between two estimates of one iteration
 constexpr int RETRIES = 4;            // of a step that ran away: each halves the substeps
 constexpr int MOST_SUBSTEPS = 1 << 20;  // of the first step
-constexpr int MOST_MORE = 16;         // times as many of the first step a step may have, so that none takes forever
+constexpr int MOST_MORE = 16, MOST_AT_LEAST = 1024;  // a step has at most so many times those of the first step, or so many
 constexpr double SAFETY = 0.9;        // part of the stable step that a step begins with
 constexpr double LIMIT = 0.95;        // where the substep exceeds this part of it within a step the rest is made with SAFETY again
 constexpr double FEWER = 0.8;         // fewer substeps are taken only where this part of them would do
@@ -115,7 +115,7 @@ HOST_DEVICE int substeps_within(double time, double stable, int most, int round)
 // Sets the substeps of a step of dt [s] in which the stable step of all bodies is `stable` [s].
 HOST_DEVICE void begin_step(SubstepState& s, double dt, double stable) {
     const int last = s.substeps, needed = substeps_within(dt, stable, last ? s.most : MOST_SUBSTEPS, s.round), least = (int)(DECLINE * last) / s.round * s.round;
-    if (!last) s.most = MOST_MORE * needed;
+    if (!last) s.most = MOST_MORE * needed > MOST_AT_LEAST ? MOST_MORE * needed : MOST_AT_LEAST;
     s.substeps = needed >= last ? needed : needed > FEWER * last ? last : needed > least ? needed : least;
     s.tries = 0;
 }

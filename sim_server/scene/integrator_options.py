@@ -43,6 +43,10 @@ class IntegratorOptions(Parameters):
                 f"ros2 with linearizations = {self.linearizations}: its order does not depend on the matrix, so it has "
                 "no use for more; allowed: 1"
             )
+        if self.explicit and self.linearizations > 1:
+            raise complaint(
+                f"{self.scheme} with linearizations = {self.linearizations}: it solves no equations; allowed: 1"
+            )
         return self
 
     @model_validator(mode="after")

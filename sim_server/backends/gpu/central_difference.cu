@@ -89,7 +89,7 @@ __device__ double least_stable_step(const Substeps& p) {
 __device__ void begin_rounds(const Substeps& p, SubstepState& s) {
     s.left = s.substeps;
     p.substep[0] = (real)(p.dt / s.substeps);
-    *p.due = s.since >= ESTIMATE_EVERY;
+    *p.due = p.energy.force || s.since >= ESTIMATE_EVERY;  // there may be new grabs
     *p.runs = *p.opens = 1;
 }
 

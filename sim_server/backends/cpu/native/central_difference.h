@@ -10,9 +10,13 @@ static void take_mail(Launch& l, int64_t step);
 
 static void run_nodal(const Loop& loop, int number) { run(loop.launch[number], loop.threads); }
 
-// Runs what a step runs once before its substeps.
+// Runs what a step runs once before its substeps. New pushes, grabs or moves: the stable step is estimated at once.
 static void begin_substeps(Loop& loop) {
-    for (int i = 0; i < loop.before; ++i) take_mail(loop.launch[i], loop.rings.step);
+    for (int i = 0; i < loop.before; ++i) {
+        const Binding* last = loop.launch[i].binding;
+        take_mail(loop.launch[i], loop.rings.step);
+        if (loop.launch[i].binding != last) loop.substeps->state.since = ESTIMATE_EVERY;
+    }
     for (int i = 0; i < loop.substeps->held; ++i) run(loop.launch[i], loop.threads);
 }
 
