@@ -30,7 +30,7 @@ from sim_server.mechanics.energy import collected_energies
 from sim_server.mechanics.rosenbrock import make_integrator
 from sim_server.mechanics.shape_matching import ShapeMatching
 from sim_server.mechanics.static_check import check_held
-from sim_server.mechanics.system import System
+from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.ties import make_ties, ties_alone
 from sim_server.mechanics.world import Body, World
 from sim_server.scene import Scene, load
@@ -107,6 +107,7 @@ class Simulation:
         effects, numbers = list(self.effects.values()), self._detection
         newton = self.integrator.newton(assemble, numbers, effects)
         stages = self.integrator.stages(assemble, lists, effects)
+        substeps = self.integrator.substeps(len(self._held_launches))
         euler = self.integrator.euler_form([*assemble, *integrate], assemble[numbers], euler_launches, effects)
         contact = ties_alone(w, self.ties) if self.ties else None
         if self.contact:
@@ -114,8 +115,8 @@ class Simulation:
         touch = assemble[self._mailed[self.touch]] if self.touch else None
         held = w.reaction if w.reaction.size else None
         return EngineInput(
-            assemble, integrate, names, ranges, w.dt, self.scene.solver, self.energies, newton, stages, euler, contact,
-            touch, held, arrays,
+            assemble, integrate, names, ranges, w.dt, self.scene.solver, self.energies, newton, stages, euler, substeps,
+            contact, touch, held, arrays,
         )  # fmt: skip
 
     @classmethod
@@ -150,7 +151,10 @@ class Simulation:
             stencil = next(stencils) if e.elements is not None else None
             if e is self.contact and not detect:
                 continue
-            added = e.launches(system, stencil, accumulate)  # f and K, M, B of each effect
+            if self.world.explicit:
+                added = self._forces_of(e, stencil)
+            else:
+                added = e.launches(system, stencil, accumulate)  # f and K, M, B of each effect
             if e is self.contact:
                 self._detection = slice(len(assemble), len(assemble) + len(added))
             for number, launch in enumerate(added, len(assemble)):
@@ -160,9 +164,17 @@ class Simulation:
             accumulate = accumulate or stencil is not None
         if self.shape is not None:
             assemble.append(self.shape.launch(system.mean))
-        assemble += system.finish(matrix)  # into the material frame (eq. 12 and 13)
+        if not self.world.explicit:
+            assemble += system.finish(matrix)  # into the material frame (eq. 12 and 13)
         settled = self.holders.last_launches(system) if self.holders else []
         return assemble, [*settled, *self.integrator.advance()]
+
+    def _forces_of(self, effect: Effect, stencil: Stencil | None) -> list[Launch]:
+        """Returns the launches that add the forces of an effect: those without A, or all but the blocks of A."""
+        forces = effect.force_launches(self.system, stencil, False)
+        if forces is not None:
+            return forces
+        return [x for x in effect.launches(self.system, stencil, False) if x.domain != "blocks"]
 
     @cached_property
     def _held_launches(self) -> list[Launch]:

@@ -20,6 +20,7 @@ from protocol.factor import FactorPattern
 from sim_server.arrays import Float64
 
 if TYPE_CHECKING:
+    from sim_server.backends.central_difference import CentralDifference
     from sim_server.backends.contact import Contact
     from sim_server.backends.energies import Energies
     from sim_server.backends.euler_form import EulerForm
@@ -256,6 +257,7 @@ class EngineInput:
     newton: for several linearizations a step; None for one
     stages: of a Rosenbrock-W step; None for other schemes
     euler: steps of backward Euler that single bodies take; None: all bodies take those of the scheme
+    substeps: explicit substeps that make a step; None: an implicit scheme
     contact: rows that launches among `assemble` fill in; None: nothing can be touched
     touch: the one of `assemble` that pushes and grabs (effects/touch.cu); None: no object lists the effect
     held: (bodies, k, 6) force [N] and torque [N m] on each holder, attachment and spring; None: there are none
@@ -272,6 +274,7 @@ class EngineInput:
     newton: Newton | None
     stages: Rosenbrock | None
     euler: EulerForm | None
+    substeps: CentralDifference | None
     contact: Contact | None
     touch: Launch | None
     held: Float64 | None

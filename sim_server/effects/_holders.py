@@ -84,12 +84,15 @@ class Holders(Movable):
         w = self.world
         if not any(h.keyframes or h.moved for h in w.holders):
             return []
+        # An explicit scheme moves held nodes by the predictor, and has one velocity for all forces.
+        dx_dv, unused = (w.dt, np.zeros_like(w.v)) if w.explicit else (w.dx_dv, w.damping_velocity)
+        w.backend.keep(unused)
         hold = w.backend.module(TEXT).bind(
             "hold", len(self.node), node=self.node, holder=self.holder, witness=self._witnesses(), free=w.free,
             start=self.start, arm=self.arm, center=self.center, begin=self.begin, end=self.end, velocity=self.velocity,
-            beta=beta, h=w.dt, dx_dv=w.dx_dv, force_coefficient=w.force_coefficient, plain=int(w.plain),
+            beta=beta, h=w.dt, dx_dv=dx_dv, force_coefficient=w.force_coefficient, plain=int(w.plain),
             search=int(w.searches), next=self.next, later=self.later, x=w.x, v=w.v, predictor=w.predictor,
-            damping_velocity=w.damping_velocity, inertial_increment=inertial_increment,
+            damping_velocity=unused, inertial_increment=inertial_increment,
         )  # fmt: skip
         return [self.place(system), hold]
 
@@ -98,6 +101,8 @@ class Holders(Movable):
         w = self.world
         mass = w.mass if w.inertia else np.zeros(w.nodes)
         first, last = system.held_couplings(self.node)
+        if w.explicit:  # b holds the whole force
+            last = first
         w.backend.keep(mass, first, last)
         text = w.backend.module(TEXT)
         settle = text.bind(

@@ -45,7 +45,7 @@ class Drag(Effect):
 
     def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
         w = self.world
-        if not self.alpha.any():
+        if not self.alpha.any() or w.explicit:  # an explicit scheme damps by world.alpha
             return []
         drag = self.world.backend.module("effects/rayleigh.cu").bind(
             "drag", w.nodes, mass=w.mass, alpha=self.alpha, v=w.v, h=w.force_coefficient, diagonal=system.diagonal,

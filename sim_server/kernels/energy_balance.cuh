@@ -13,11 +13,14 @@
 //   - the steps of two of its nodes differ along an axis by more than LONG times its size plus twice their difference at the
 //     start. In the same cases it is at most 1.7 times, except where a body was thrown or spun. Without inertia this is the only
 //     criterion.
+// Explicit substeps: kinetic > SLACK_OF_SUBSTEPS (largest budget so far) + floor, since the kinetic energy of a mode of angular
+// frequency w oscillates, up to 1 / (1 - (h w / 2)^2) of its energy, h the substep. What is not stable grows beyond any factor.
 // Its size is the longer of the diagonals of its boxes at rest and at the start.
 #pragma once
 #include "host_device.cuh"
 
 constexpr double SLACK_OF_ENERGY = 2, LONG = 4, SLOW = 1e-3;
+constexpr double SLACK_OF_SUBSTEPS = 10;
 
 enum OnRunaway { FREEZE = 0, GO_ON = 1, UNWATCHED = 2 };
 enum BalancePhase { WELL = 0, AWAY = 1, FROZEN = 2 };  // AWAY: ran away in the last step, and goes on
@@ -35,6 +38,8 @@ struct Balance {      // of a body, after its last step [J]
     double diagonal;  // at rest [m]
     double floor;     // of kinetic
     double limit;     // of stride [m]
+    double slack;     // of explicit substeps: kinetic may be this times `largest`; 0: an implicit scheme
+    double largest;   // budget so far, with slack
     double kinetic, elastic, gravity, work, budget;
     double fallen;    // work of gravity
     double stride;    // largest difference of two nodes' steps along an axis [m]
@@ -78,7 +83,7 @@ HOST_DEVICE void start_balance(Balance& b, const Sums& s, double size, double dt
     const double longest = size > b.diagonal ? size : b.diagonal;
     b.kinetic = inertia ? s.kinetic : 0;
     b.gravity = s.gravity;
-    b.work = b.fallen = 0;
+    b.work = b.fallen = b.largest = 0;
     b.start = b.budget = b.kinetic + b.elastic;
     b.floor = 0.5 * b.mass * square(SLOW * longest / dt);
     b.limit = LONG * longest + 2 * stride_of(s);
@@ -95,7 +100,12 @@ HOST_DEVICE bool update_balance(Balance& b, const Sums& s, int on_runaway, bool 
     b.budget = b.start + b.work + b.fallen;
     if (b.phase == FROZEN) return false;
     b.budget = b.start + work + fallen;
-    const double most = SLACK_OF_ENERGY * (b.budget > 0 ? b.budget : 0) + b.floor;
+    double allowed = SLACK_OF_ENERGY * (b.budget > 0 ? b.budget : 0);
+    if (b.slack > 0) {
+        b.largest = b.budget > b.largest ? b.budget : b.largest;
+        allowed = b.slack * b.largest;
+    }
+    const double most = allowed + b.floor;
     const bool known = b.budget == b.budget;  // NaN: the law defines no energy of the state at the start
     const bool away = !is_finite(s.kinetic) || !is_finite(s.gravity) || (known && b.kinetic > most) || b.stride > b.limit;
     b.found = away && on_runaway != UNWATCHED;

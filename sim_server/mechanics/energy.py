@@ -12,6 +12,8 @@ from sim_server.backends.energies import ElementEnergies, Energies
 from sim_server.mechanics.world import World
 from sim_server.scene.solver_options import OnRunaway
 
+SLACK_OF_SUBSTEPS: float = structs.LOOP.constant("SLACK_OF_SUBSTEPS")
+
 
 class EnergyContributor(Protocol):
     """An effect, as far as it takes part in the energy balance."""
@@ -34,6 +36,7 @@ def collected_energies(
     balance = np.zeros(len(world.bodies), structs.BALANCE)
     for body, b in zip(world.bodies, balance, strict=True):
         b["mass"] = world.mass[body.nodes].sum()
+        b["slack"] = SLACK_OF_SUBSTEPS if world.explicit else 0
         b["diagonal"] = np.linalg.norm(np.ptp(world.rest[body.nodes], axis=0))
     return Energies(
         starts=np.array([*(b.first for b in world.bodies), world.nodes], np.int32),

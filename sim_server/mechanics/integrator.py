@@ -49,6 +49,7 @@ import numpy as np
 
 from sim_server.arrays import Int32
 from sim_server.backends.base import Launch
+from sim_server.backends.central_difference import CentralDifference
 from sim_server.backends.euler_form import EulerForm
 from sim_server.backends.newton import Newton
 from sim_server.backends.rosenbrock import Rosenbrock
@@ -220,6 +221,10 @@ class Integrator:
         return {id(x): items_of_bodies(x, starts, self.system.row, rows) for x in launches}
 
     has_stages = False
+
+    def substeps(self, held: int) -> CentralDifference | None:
+        """Input of explicit substeps; None for an implicit scheme. held: number of launches that move holders."""
+        return None
 
     def start_forces(self) -> Launch:
         """Begins the forces of a stage."""

@@ -50,6 +50,7 @@ import numpy as np
 from sim_server.arrays import Float64
 from sim_server.backends.base import Launch
 from sim_server.backends.rosenbrock import Rosenbrock
+from sim_server.mechanics.central_difference import CentralDifferenceIntegrator
 from sim_server.mechanics.integrator import CouplesNodes, Integrator
 from sim_server.mechanics.system import System
 from sim_server.mechanics.world import Body
@@ -164,4 +165,5 @@ class RosenbrockIntegrator(Integrator):
 
 def make_integrator(scene: Scene, system: System) -> Integrator:
     """Returns the launches of the scheme that the scene names."""
-    return (RosenbrockIntegrator if scene.integrator.scheme == "ros2" else Integrator)(scene, system)
+    others = {"ros2": RosenbrockIntegrator, "central_difference": CentralDifferenceIntegrator}
+    return others.get(scene.integrator.scheme, Integrator)(scene, system)

@@ -71,6 +71,7 @@ class World:
     predictor (n, 3) [m/s]: the step moves x by dx_dv (predictor + dv), dv the solution
     damping_velocity (n, 3) [m/s]: (dx_dv predictor + beta v) / (dx_dv + beta). Elements take it for their velocity: the
         impulse stiffness_coefficient (K damping_velocity) then holds displacement and damping
+    explicit: True for explicit substeps (central_difference.py); b is then a force, and all velocities but predictor are v
     inertia: False in a quasi-static scene. searches: True with several linearizations a step. plain: True for backward
         Euler with one
     """
@@ -107,8 +108,9 @@ class World:
         self.inertia = integrator.scheme != "quasi_static"
         self.searches = integrator.linearizations > 1
         self.plain = integrator.scheme == "backward_euler" and not self.searches
+        self.explicit = integrator.explicit
         self.predictor = self.v if self.plain else np.zeros_like(self.v)
-        self.damping_velocity = self.v if self.plain else np.zeros_like(self.v)
+        self.damping_velocity = self.v if self.plain or self.explicit else np.zeros_like(self.v)
 
     @contextmanager
     def made_with(self, force_coefficient: float, dx_dv: float, usual_tangent: bool) -> Iterator[None]:

@@ -9,7 +9,7 @@ from sim_server.errors import InputError
 from sim_server.scene.parameters import Parameters, complaint
 
 MAX_STATES = 1024  # tried in a step on a GPU, whose graph of launches holds them all
-SchemeName = Literal["backward_euler", "newmark", "bdf2", "quasi_static", "ros2"]
+SchemeName = Literal["backward_euler", "newmark", "bdf2", "quasi_static", "ros2", "central_difference"]
 GAMMA = 0.29289321881345247559915563789515  # 1 - 1 / sqrt 2, of ros2 (mechanics/rosenbrock.py)
 
 
@@ -43,6 +43,10 @@ class IntegratorOptions(Parameters):
                 f"ros2 with linearizations = {self.linearizations}: its order does not depend on the matrix, so it has "
                 "no use for more; allowed: 1"
             )
+        if self.explicit and self.linearizations > 1:
+            raise complaint(
+                f"{self.scheme} with linearizations = {self.linearizations}: it solves no equations; allowed: 1"
+            )
         return self
 
     @model_validator(mode="after")
@@ -60,6 +64,11 @@ class IntegratorOptions(Parameters):
         return self
 
     @property
+    def explicit(self) -> bool:
+        """True if a step consists of explicit substeps (mechanics/central_difference.py)."""
+        return self.scheme == "central_difference"
+
+    @property
     def needs_stiff_matrix(self) -> bool:
         """True if the energy grows unless the stiffness in A is at least the slope of the forces (integrator.py)."""
         return self.scheme in ("newmark", "bdf2") and self.linearizations == 1
@@ -70,15 +79,22 @@ class IntegratorOptions(Parameters):
         return (0.25 if self.beta is None else self.beta, 0.5 if self.gamma is None else self.gamma)
 
     def force_coefficient(self, dt: float) -> float:
-        """Coefficient i [s] of the forces in M (v' - V) = i f (integrator.py)."""
+        """Coefficient i [s] of the forces in M (v' - V) = i f (integrator.py); 1 of an explicit scheme."""
         if self.scheme == "newmark":
             return self.newmark[1] * dt
         if self.scheme == "ros2":
             return GAMMA * dt
+        if self.explicit:
+            return 1.0
         return 2 * dt / 3 if self.scheme == "bdf2" else dt
 
     def dx_dv(self, dt: float) -> float:
-        """Derivative c = dx / dv [s] of positions by velocities at the end of the step (integrator.py)."""
+        """Derivative c = dx / dv [s] of positions by velocities at the end of the step (integrator.py).
+
+        0 of an explicit scheme.
+        """
+        if self.explicit:
+            return 0.0
         if self.scheme == "newmark":
             beta, gamma = self.newmark
             return beta * dt / gamma

@@ -181,6 +181,25 @@ class Scene(Parameters):
             raise complaint(f'solver.budget = {solver.budget:g} with integrator.scheme = "ros2", which solves twice')
         return self
 
+    @model_validator(mode="after")
+    def _explicit_has_no_matrix(self) -> "Scene":
+        """With an explicit scheme there is nothing to solve, to factorize or to warp."""
+        if not self.integrator.explicit:
+            return self
+        scheme, solver = self.integrator.scheme, self.solver
+        if solver.preconditioner not in ("auto", "none"):
+            raise complaint(
+                f'solver.preconditioner = "{solver.preconditioner}" with integrator.scheme = "{scheme}", which solves '
+                'no equations; allowed: "auto", "none"'
+            )
+        if solver.budget:
+            raise complaint(
+                f'solver.budget = {solver.budget:g} with integrator.scheme = "{scheme}", which solves no equations; '
+                "allowed: 0"
+            )
+        self.__dict__["solver"] = solver.model_copy(update={"preconditioner": "none", "warp": False})  # it is frozen
+        return self
+
     @property
     def uses_factor_alone(self) -> bool:
         """True if steps may be solved by the factor alone."""

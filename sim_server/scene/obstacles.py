@@ -77,9 +77,9 @@ def contact_errors(
     if not obstacles and not contact.self and (len(objects) < 2 or not contact.between):
         text = "there is nothing to touch; needed: an [[obstacle]], another object, or self = true"
         yield _error(text, "effects", "contact")
-    if integrator.scheme == "quasi_static":
+    if integrator.scheme == "quasi_static" or integrator.explicit:
         allowed = "'backward_euler', 'newmark', 'bdf2', 'ros2'"
-        yield _error(f"contact with integrator.scheme = 'quasi_static'; allowed: {allowed}", "effects", "contact")
+        yield _error(f"contact with integrator.scheme = {integrator.scheme!r}; allowed: {allowed}", "effects", "contact")
     pairs: list[set[str]] = []
     for index, pair in enumerate(contact.friction or ()):
         if text := _wrong_pair(set(pair.between), names, shapes, pairs, contact.self):

@@ -33,7 +33,9 @@ SCENES = {
         "solver.precision=float32",
     ),
     "four_beams.toml, ros2": ("integrator.scheme=ros2", "solver.precision=mixed"),
+    "beam.toml, central_difference": ("integrator.scheme=central_difference", "solver.preconditioner=auto"),
     "springs.toml": (),
+    "springs.toml, central_difference": ("integrator.scheme=central_difference", "solver.precision=float32"),
     "fibres.toml": ("integrator.scheme=bdf2",),
     "equilibrium.toml": (),
 }

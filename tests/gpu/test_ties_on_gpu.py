@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sim_server.effects import contact
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
 from tests.scenes import bar
@@ -20,12 +19,6 @@ pytestmark = pytest.mark.gpu
 
 GRAFT = "deploy/scenes/graft.toml"
 EXACT = ["solver.tolerance=1e-11", "solver.preconditioner=block_jacobi", "solver.max_iterations=3000"]
-
-
-@pytest.fixture(autouse=True)
-def nodes_alone(monkeypatch):
-    """On a GPU triangles and edges have no rows: here they have none on the CPU beside it, either."""
-    monkeypatch.setattr(contact, "nodes_alone", lambda world: True)
 
 
 def compare(sims: list[Simulation], steps: int, within: float = 1e-8) -> tuple[np.ndarray, np.ndarray]:

@@ -20,7 +20,7 @@ mesh = {{ bar = [2, 1, 1], size = [2, 1, 1] }}
 
 BAD = {
     'scheme = "euler"': "integrator.scheme = 'euler': must be 'backward_euler', 'newmark', 'bdf2', "
-    "'quasi_static' or 'ros2'",
+    "'quasi_static', 'ros2' or 'central_difference'",
     "beta = 0.25": "beta belong to scheme newmark, not to backward_euler",
     'scheme = "newmark"\nbeta = 0.1': "newmark with beta = 0.1, gamma = 0.5 is stable for small steps only; "
     "allowed: 1/2 <= gamma <= 2 beta",

@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from protocol.factor import FactorPattern
 from sim_server.arrays import Int32
 from sim_server.backends.base import Capability, EngineInput, Launch
+from sim_server.backends.central_difference import NODAL as NODAL_OF_SUBSTEPS
+from sim_server.backends.central_difference import CentralDifference
 from sim_server.backends.compiler import native
 from sim_server.backends.contact import Contact, OwnSurfaces, Surfaces
 from sim_server.backends.cpu import structs
@@ -190,6 +192,24 @@ class _NativeEuler:
         _tell_bodies_apart(euler.parts, launches, number)
 
 
+class _NativeSubsteps:
+    """The input of explicit substeps and its memory, attached to a loop. number: of each launch by id."""
+
+    def __init__(self, given: CentralDifference, loop: structs.Loop, number: dict[int, int]):
+        self._input = given
+        self._stable = np.zeros(loop.bodies, structs.STABLE_STEP)
+        given.set_bodies(self._stable)
+        self._result = (structs.SolveResult * loop.bodies)()
+        self.native = structs.CentralDifference(
+            held=given.held, stable=self._stable.ctypes.data, result=c.addressof(self._result),
+            **{name: number[id(getattr(given, name))] for name in NODAL_OF_SUBSTEPS},
+        )  # fmt: skip
+        for name in ("substep", "shift_time", "mass", "free", "force", "kept_x", "kept_force", "mode", "failed"):
+            setattr(self.native, name, getattr(given, name).ctypes.data)
+        self.native.state.round = 1
+        loop.substeps = c.addressof(self.native)
+
+
 MOST_MODES = 600  # of the coarse space of an island of bodies
 
 
@@ -332,8 +352,8 @@ class CpuEngine(Reports):
 
     def __init__(self, given: EngineInput, records: int = 8192, frames: int = 8):
         self._native = _library()
-        stages, euler = (part.launches if part else () for part in (given.stages, given.euler))
-        listed = cast(list[CpuLaunch], [*given.assemble, *given.integrate, *stages, *euler])
+        others = [part.launches for part in (given.stages, given.euler, given.substeps) if part]
+        listed = cast(list[CpuLaunch], [*given.assemble, *given.integrate, *(x for part in others for x in part)])
         launches = list({id(launch): launch for launch in listed}.values())  # some take part in several stages
         arrays, ranges = given.arrays, given.ranges
         nodes, bodies = len(arrays["x"]), len(ranges)
@@ -363,6 +383,7 @@ class CpuEngine(Reports):
         number = {id(launch): k for k, launch in enumerate(launches)}
         self._stages = given.stages and _NativeStages(given.stages, loop, self._launch, number)
         self._euler = given.euler and _NativeEuler(given.euler, loop, self._launch, number)
+        self._substeps = given.substeps and _NativeSubsteps(given.substeps, loop, number)
         self._contact = given.contact and _NativeContact(given.contact, loop, arrays)
         if self._contact and given.euler:  # bodies whose step is made have the velocities of its end
             self._contact.native.predictor = given.euler.start_v.ctypes.data

@@ -55,8 +55,8 @@ class Conditions:
         missing = [name for name in FUNCTIONS if not hasattr(driver, name)]
         if missing:
             raise DeviceError(
-                f"the NVIDIA driver is too old for scheme ros2 and for contact: it has no {missing[0]}; CUDA 12.4 or "
-                "above has it"
+                "the NVIDIA driver is too old for the schemes ros2 and central_difference and for contact: it has no "
+                f"{missing[0]}; CUDA 12.4 or above has it"
             )
         self._module, self._set_condition = self._compiled()
 

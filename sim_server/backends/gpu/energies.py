@@ -91,6 +91,11 @@ class DeviceEnergies:
         return made
 
     @property
+    def params(self) -> NDArray[Any]:
+        """Arguments of the energy balance (EnergyBalance)."""
+        return self._params
+
+    @property
     def balance(self) -> DeviceArray:
         """Balances of the bodies (BALANCE) on the device."""
         balance: DeviceArray = self._balance

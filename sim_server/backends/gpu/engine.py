@@ -17,6 +17,7 @@ from sim_server.arrays import Float64
 from sim_server.backends.base import Capability, EngineInput, Launch
 from sim_server.backends.cpu.structs import REACTION
 from sim_server.backends.declarations import Declarations
+from sim_server.backends.gpu.central_difference import SubstepLoop
 from sim_server.backends.gpu.contact import ContactPasses
 from sim_server.backends.gpu.cuda import CudaDevice
 from sim_server.backends.gpu.cupy_types import DeviceArray, Graph
@@ -36,6 +37,7 @@ from sim_server.backends.gpu.structs import (
     NEWTON_RESULT,
     STAGE_RESULT,
     STEP_TIMESTAMP,
+    SUBSTEP_RESULT,
     Mail,
 )
 from sim_server.backends.newton import Newton
@@ -80,6 +82,9 @@ class GpuEngine(DeviceLoop):
         self.launches, self._first = [*assemble, *integrate], assemble[: leading(assemble)]
         assemble, settled = assemble[len(self._first) :], integrate[: leading(integrate)]
         integrate = integrate[len(settled) :]
+        substep_forces: Sequence[DeviceLaunch] = ()  # which a step evaluates many times
+        if given.substeps:
+            substep_forces, assemble = assemble, []
         ranges, arrays, dt, newton = given.ranges, given.arrays, given.dt, given.newton
         stages, precision = given.stages, given.solver.factor_precision
         fine = precision == "float32" or (precision == "auto" and stages is not None and stages.factor_alone)
@@ -131,6 +136,14 @@ class GpuEngine(DeviceLoop):
             if self._contact.detects:
                 self._whole_assembly = [*self._whole_assembly, self._contact.detect]
                 self._first_launches = self._whole_assembly
+        self._substeps, substep_results = None, None
+        if given.substeps:
+            substep_results = device.pinned(CAPACITY * SUBSTEP_RESULT.itemsize * bodies)
+            self._substeps = SubstepLoop(
+                gpu, device, given.substeps, substep_forces, settled, self.solver, self._energies.params, dt,
+                substep_results,
+            )  # fmt: skip
+            integrate = [self._substeps.close]
         self._held, held = None, None
         if given.held is not None:
             held = device.pinned(CAPACITY * given.held.nbytes).view(np.float64).reshape(CAPACITY, *given.held.shape)
@@ -150,7 +163,7 @@ class GpuEngine(DeviceLoop):
         super().__init__(
             device, ranges, arrays["row_start"], dt, mailboxes, self._results, self._timestamps, arrays["clock"],
             records, twins["values"].dtype, newton_results, energy_records, stage_results,
-            contact_results, reactions, held, **addresses,
+            contact_results, reactions, held, substep_results, **addresses,
         )  # fmt: skip
         self._factor_upload = FactorUpload(gpu, self.solver, self, given.names, self.mailboxes[bodies : 2 * bodies])
         for k in range(bodies):
@@ -203,10 +216,12 @@ class GpuEngine(DeviceLoop):
 
     def _make_ready(self) -> None:
         """Runs the launches before the first step, and takes the initial state of the energy balance."""
-        begins = bool(self.begin) and self.step == 0
+        begins = bool(self.begin or self._substeps) and self.step == 0
         if begins:
             for launch in self.begin:
                 launch()
+            if self._substeps:
+                self._substeps.start()
         if not self._energies.started:
             self._energies.start()
             begins = True
@@ -238,7 +253,9 @@ class GpuEngine(DeviceLoop):
         handles = [int(graph.graphExec) if graph else 0 for graph in self._graphs]
         self.use_graphs(handles, *(int(graph.graphExec) for graph in others))
         self._graphs += others  # kept as long as the engine
-        self._second_half = self._captured(self._finish_step) if self._stages or self._contact else None
+        self._second_half = None
+        if self._stages or self._contact or self._substeps:
+            self._second_half = self._captured(self._finish_step)
 
     def _report_grabs(self, device: CudaDevice, touch: DeviceLaunch) -> None:
         """Captures the kernel that writes the forces on grabs, which follows a step only while there are some."""
@@ -307,7 +324,7 @@ class GpuEngine(DeviceLoop):
         if self._stages:
             self._stages.launch()
             return
-        (self._newton or self._contact or self.solver).launch()
+        (self._newton or self._contact or self._substeps or self.solver).launch()
         if self._held:
             self._held.launch()
         assert self._integrate is not None

@@ -147,6 +147,10 @@ static void report(GpuLoop& l, const StepBatch& batch, int64_t k, double end, do
             record.estimate = l.stage_results[slot + i].estimate;
             if (record.form == FACTOR) record.residual = l.stage_results[slot + i].inconsistency;
         }
+        if (l.substep_results) {
+            record.substeps = l.substep_results[slot + i].substeps;
+            record.stable_step = l.substep_results[slot + i].stable_step;
+        }
         if (l.contact_results) note_contact(l, slot + i, record, (head + i) % rings.record_capacity);
         if (l.held_reactions) note_holders(l, slot + i, (head + i) % rings.record_capacity);
         if (l.energy_records) note_energy(record, l.energy_records[slot + i]);
@@ -235,7 +239,7 @@ void wf_gpu_start_balance(Balance* balance, const double* sums, double dt, int32
 
 const StructSize* wf_sizes() {
     static const StructSize sizes[] = {SIZE(CudaDriver), SIZE(Mail), SIZE(MailSlot), SIZE(PcgResult), SIZE(StepTimestamp),
-                                       SIZE(NewtonResult), SIZE(StageResult), SIZE(ContactResult), SIZE(BodyReadback), SIZE(GpuLoop), SIZE(Record), SIZE(EnergyRecord),
+                                       SIZE(NewtonResult), SIZE(StageResult), SIZE(ContactResult), SIZE(SubstepResult), SIZE(BodyReadback), SIZE(GpuLoop), SIZE(Record), SIZE(EnergyRecord),
                                        SIZE(Balance), SIZE(Reaction), {}};
     return sizes;
 }

@@ -74,6 +74,7 @@ struct GpuLoop {
     const EnergyRecord* energy_records;    // (capacity, bodies) likewise
     const StageResult* stage_results;      // (capacity, bodies) likewise; null: no scheme with stages
     const ContactResult* contact_results;  // (capacity, bodies) likewise; null: no contact
+    const SubstepResult* substep_results;  // (capacity, bodies) likewise; null: an implicit scheme
     const double* contact_reactions;       // (capacity, bodies, obstacles, 6) likewise
     const double* held_reactions;          // (capacity, bodies, holders, 6) likewise
     int64_t obstacles, holders;

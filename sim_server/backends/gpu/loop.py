@@ -66,6 +66,7 @@ class DeviceLoop(Reports):
     newton_results: likewise (CAPACITY, bodies) of NEWTON_RESULT; None: one linearization a step
     energy_records: likewise (CAPACITY, bodies) of ENERGY_RECORD
     stage_results: likewise (CAPACITY, bodies) of STAGE_RESULT; None: no scheme with stages
+    substep_results: likewise (CAPACITY, bodies) of SUBSTEP_RESULT; None: an implicit scheme
     contact_results: likewise (CAPACITY, bodies) of CONTACT_RESULT; None: no contact
     contact_reactions: likewise (CAPACITY, bodies, obstacles, 6) of float64
     held_reactions: likewise (CAPACITY, bodies, holders, 6); None: no holders
@@ -81,7 +82,7 @@ class DeviceLoop(Reports):
         records: int = 8192, real: DTypeLike = np.float64, newton_results: NDArray[Any] | None = None,
         energy_records: NDArray[Any] | None = None, stage_results: NDArray[Any] | None = None,
         contact_results: NDArray[Any] | None = None, contact_reactions: NDArray[Any] | None = None,
-        held_reactions: NDArray[Any] | None = None, **addresses: int,
+        held_reactions: NDArray[Any] | None = None, substep_results: NDArray[Any] | None = None, **addresses: int,
     ):  # fmt: skip
         self._device, self._ranges, bodies, nodes = device, ranges, len(ranges), len(row_start) - 1
         self._native = library()
@@ -115,6 +116,8 @@ class DeviceLoop(Reports):
         loop.energy_records = None if energy_records is None else energy_records.ctypes.data
         loop.stage_results = None if stage_results is None else stage_results.ctypes.data
         self._written = (results, timestamps, clock, newton_results, energy_records, stage_results)
+        loop.substep_results = None if substep_results is None else substep_results.ctypes.data
+        self._substeps_written = substep_results
         self._contact_written = (contact_results, contact_reactions, held_reactions)
         poses = None
         if contact_results is not None and contact_reactions is not None:

@@ -27,4 +27,9 @@ struct ContactResult {     // of a step with contact
     int clipped;           // nodes held back at an obstacle beside the law
 };
 
+struct SubstepResult {    // of a step by explicit substeps
+    double stable_step;   // of the body, as estimated last [s]
+    int substeps;
+};
+
 struct StepTimestamp { long long begin, end; };  // ns of the device's clock

@@ -15,6 +15,7 @@ FIRST = ("cpu", "gpu", "models", "paper", "figure4", "warp", "preconditioners", 
 PAGES = (
     *FIRST,
     "rosenbrock",
+    "explicit",
     "contact",
     "verification",
     "accuracy",

@@ -8,8 +8,8 @@
 
 static void run(const Launch& l, int threads);
 
-// Sums over a body's nodes.
-static Sums sums_of(const Loop& loop, const Body& body) {
+// Sums over a body's nodes. keeps: what pushes and grabs exert stays, for another call.
+static Sums sums_of(const Loop& loop, const Body& body, bool keeps = false) {
     Energies& e = *loop.energies;
     Sums s = no_sums();
     for (int i = body.first; i < body.last; ++i) {
@@ -20,6 +20,7 @@ static Sums sums_of(const Loop& loop, const Body& body) {
         double *force = e.force + 3 * i, *anchor = e.anchor + 3 * i, &spring = e.spring[i];
         if (spring == 0 && force[0] == 0 && force[1] == 0 && force[2] == 0) continue;
         s.work += work_on(force, spring, anchor, from, step);
+        if (keeps) continue;
         force[0] = force[1] = force[2] = spring = 0;  // until something touches the node again
     }
     if (loop.contact) s.work += loop.contact->report[&body - loop.body].work;

@@ -5,6 +5,7 @@
 #include <cstring>
 #include <vector>
 
+#include "central_difference.h"
 #include "energy.h"
 #include "euler_form.h"
 #include "faces.h"
@@ -111,10 +112,10 @@ static void write_frame(Loop& loop) {
     rings.frame_head.fetch_add(1, std::memory_order_release);
 }
 
-static int first_bad_node(const Loop& loop, const Body& body) {
+static int first_bad_node(const double* b, const Body& body) {
     for (int i = body.first; i < body.last; ++i)
         for (int k = 0; k < 3; ++k)
-            if (!std::isfinite(loop.b[3 * i + k])) return i - body.first;
+            if (!std::isfinite(b[3 * i + k])) return i - body.first;
     return -1;
 }
 
@@ -164,7 +165,8 @@ static void assemble(Loop* loop, bool whole) {
         if (loop->euler) loop->euler->takes[i] = 0;
     }
     if (loop->euler && loop->contact) detect_contacts(*loop);
-    if (loop->stages) assemble_stage(*loop, whole);
+    if (loop->substeps) begin_substeps(*loop);
+    else if (loop->stages) assemble_stage(*loop, whole);
     else assemble_single(*loop, whole);
     if (loop->newton && loop->newton->moved)
         std::memcpy(loop->newton->moved, loop->newton->predictor, 3 * sizeof(double) * (int64_t)loop->nodes);
@@ -214,6 +216,7 @@ static void finish_step(Loop* loop) {
     double entered = now();
     bool keep = room_for_records(rings, loop->bodies, [] { return true; });
     double waited = now() - entered;  // no part of the step
+    if (loop->substeps) make_substeps(*loop);
     if (loop->euler) make_step(*loop);
     else if (loop->newton && loop->contact) search_in_contact(*loop);
     else if (loop->newton) search_all(*loop);
@@ -229,6 +232,8 @@ static void finish_step(Loop* loop) {
             r = as_solve_result(loop->newton->search[i]);
             linearizations = std::max(1, loop->newton->search[i].linearizations);
             nonlinear = residual_ratio(loop->newton->search[i]);
+        } else if (loop->substeps) {
+            r = loop->substeps->result[i];
         } else if (loop->euler) {
             r = step_result(*loop, i);
         } else if (loop->contact) {
@@ -249,10 +254,11 @@ static void finish_step(Loop* loop) {
         record.begin = loop->assemble_begin;
         record.nonlinear = nonlinear;
         record.asked = settings.kind;
-        record.bad_node = r.status == NOT_FINITE ? first_bad_node(*loop, body) : -1;
+        record.bad_node = r.status != NOT_FINITE ? -1 : first_bad_node(loop->substeps ? loop->substeps->force : loop->b, body);
         record.probe = settings.probe;
         record.linearizations = linearizations;
         if (loop->contact) note_contact(*loop, i, (first + i) % rings.record_capacity);
+        if (loop->substeps) note_substeps(*loop->substeps, i, record);
         if (loop->euler && loop->euler->takes[i]) record.form = EULER;
         if (!loop->stages) continue;
         record.form = loop->stages->state[i].form;
@@ -336,7 +342,7 @@ void wf_precondition(Loop* loop, int32_t index, const double* r, double* z, doub
 const StructSize* wf_sizes() {
     static const StructSize sizes[] = {SIZE(Launch), SIZE(Body), SIZE(Loop), SIZE(Factor), SIZE(KnownContact), SIZE(Pattern), SIZE(Record),
                                        SIZE(Newton), SIZE(Search), SIZE(Stages), SIZE(StageState), SIZE(EulerForm), SIZE(Elastic), SIZE(Energies), SIZE(Balance),
-                                       SIZE(Contact), SIZE(RowState), SIZE(PassChoice), SIZE(OwnReference), SIZE(ContactReport), SIZE(Box), SIZE(Reaction), {}};
+                                       SIZE(Contact), SIZE(RowState), SIZE(PassChoice), SIZE(OwnReference), SIZE(ContactReport), SIZE(Box), SIZE(Reaction), SIZE(CentralDifference), SIZE(StableStep), {}};
     return sizes;
 }
 }

@@ -5,6 +5,7 @@
 #include "pcg.h"
 #include "newton_line_search.cuh"
 #include "rigid_motion.h"
+#include "stable_step.cuh"
 #include "step_form.h"
 
 typedef void (*Kernel)(const void* params, int begin, int end);
@@ -104,6 +105,20 @@ struct EulerForm {                     // steps of backward Euler in scenes of o
     SolveResult* result;               // (bodies,) of the step, without stages
 };
 
+struct CentralDifference {             // steps by explicit substeps (central_difference.h)
+    int32_t held;                      // launches that assemble and run once a step, before the others: motion of holders
+    int32_t remember, keep, displace, open, shift, kick, close;  // numbers of launches
+    double *substep, *shift_time;      // (1,) [s]
+    const double *mass, *free;         // (nodes,)
+    double* force;                     // (nodes, 3) of the last evaluation [N]
+    const double *kept_x, *kept_force; // (nodes, 3) [m], [N]
+    double* mode;                      // (nodes, 3) displacement that forces are differentiated along [m]
+    int32_t* failed;                   // (bodies,) 1: the step gave no state
+    StableStep* stable;                // (bodies,)
+    SolveResult* result;               // (bodies,)
+    SubstepState state;
+};
+
 struct Elastic {                       // potential energies of the elements of an effect
     Launch launch;
     const double* energy;              // (items,) out [J]
@@ -143,6 +158,7 @@ struct Loop {
     Stages* stages;                    // null: another scheme
     EulerForm* euler;                  // null: all bodies take the steps of the scheme
     Contact* contact;                  // null: nothing can be touched
+    CentralDifference* substeps;       // null: an implicit scheme
     int32_t holders;
     const double* held_reaction;       // (bodies, holders, 6) force [N] and torque [N m] on each; launches that integrate set it
     double* clock;                     // (1,) s, read by kernels
