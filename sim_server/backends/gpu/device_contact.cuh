@@ -5,6 +5,7 @@
 // Rows against obstacles come in pairs, of one node each with weight 1. Numbers of contact are double for every `real`.
 #pragma once
 #include "contact_state.cuh"
+#include "correction_state.cuh"
 #include "energy_balance.cuh"
 #include "node_chunk.cuh"
 
@@ -70,6 +71,10 @@ struct ContactArguments {
     const int* alone;           // (1,) how many are
     double* pair_sums;          // (grid,) work of rows between bodies
     int* pair_contacts;         // (bodies,) those that carry force
+    const real* spring;         // (nodes,) as Correction has it
+    real* springs_then;         // (HISTORY, nodes) likewise
+    real* blocks_then;          // (HISTORY, rows / 2, 6) likewise; null: factors are not corrected
+    double spring_scale;        // likewise
     double dx_dv;               // [s]
     double force_coefficient;   // [s]
     double tolerance;

@@ -18,6 +18,7 @@ from sim_server.backends.base import Capability, EngineInput, Launch
 from sim_server.backends.cpu.structs import REACTION
 from sim_server.backends.declarations import Declarations
 from sim_server.backends.gpu.contact import ContactPasses
+from sim_server.backends.gpu.correction import FactorCorrection
 from sim_server.backends.gpu.cuda import CudaDevice
 from sim_server.backends.gpu.cupy_types import DeviceArray, Graph
 from sim_server.backends.gpu.device import DeviceLaunch, Gpu
@@ -103,9 +104,10 @@ class GpuEngine(DeviceLoop):
         self._first_launches = self._beginning(forces) if alone else self._whole_assembly
         self._forces = fuse(forces) if alone else ()  # after a whole assembly, whose energy balance is made already
         phases = NewtonPhases.initial(gpu, bodies) if newton else None
+        correction = FactorCorrection.wanted(gpu, given)
         self.solver = PcgSolver(
             gpu, ranges, arrays, self._counter, CAPACITY, planes, phases or (), ATTEMPTS if stages else 0,
-            given.contact is not None, given.contact is not None and given.contact.surfaces is not None,
+            given.contact is not None, given.contact is not None and given.contact.surfaces is not None, correction,
         )  # fmt: skip
         self._newton, newton_results = None, None
         if newton and phases:
@@ -121,7 +123,7 @@ class GpuEngine(DeviceLoop):
             reactions = reactions.reshape(CAPACITY, bodies, obstacles, 6)
             balance = self._energies.balance
             self._contact = ContactPasses(
-                gpu, device, given.contact, ranges, arrays, self.solver, balance, contact_results, reactions
+                gpu, device, given.contact, ranges, arrays, self.solver, balance, contact_results, reactions, correction
             )
             if self._contact.islands:
                 self._whole_assembly = [*self._whole_assembly, self._contact.islands.detect]
