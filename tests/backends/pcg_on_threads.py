@@ -5,6 +5,7 @@ dense inverse in float16 in place of the partitioned one."""
 import ctypes as c
 import re
 import subprocess
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,16 +15,43 @@ import pytest
 
 from precond_worker.factorization.factorize import Analysis
 from sim_server.backends.compiler import INCLUDE, SOURCES, compiler
+from sim_server.backends.cpu.structs import BALANCE
+from sim_server.backends.gpu import contact as gpu_contact
 from sim_server.backends.gpu import solver as gpu_solver
+from sim_server.backends.gpu.contact import ContactPasses
 from sim_server.backends.gpu.correction import CORRECTED_BODY, FactorCorrection
 from sim_server.backends.gpu.row_partition import assign_blocks
 from sim_server.backends.gpu.solver import PCG_RESULT, PcgSolver
-from sim_server.backends.gpu.structs import PCG
+from sim_server.backends.gpu.structs import CONTACT_RESULT, PCG
 from sim_server.backends.kinds import KINDS
 from sim_server.simulation import Simulation
 from tests.contact.kernels_beside import TESTS, Host, as_device
 
 THREADS = 64  # of a thread block here
+SOLVE = """
+#include "pcg.cu"
+extern "C" void solve(const PcgArguments* s, const Correction* k) {
+    *s->pool_counter = 0;
+    launch(s->grid, THREADS, [&] { pcg(*s, *k); });
+}
+"""
+STEP = """
+#include "contact.cu"
+#include "pcg.cu"
+extern "C" int step(const ContactArguments* c, const ContactSolve* first, const ContactSolve* later, const PcgArguments* s,
+                    const Correction* k, int chunks) {
+    auto one_pass = [&](const ContactSolve& pass) {
+        launch(chunks, CONTACT_THREADS, [&] { contact_forces(*c); });
+        launch(s->grid, THREADS, [&] { pcg(*s, pass, *k); });
+        launch(chunks, CONTACT_THREADS, [&] { contact_search(*c); });
+    };
+    int loops = 0;
+    launch(c->count, CONTACT_THREADS, [&] { begin_contact(*c); });
+    for (one_pass(*first); *c->active > 0 && loops < 200; ++loops) one_pass(*later);
+    launch(chunks, CONTACT_THREADS, [&] { finish_contact(*c); });
+    return loops;
+}
+"""
 PLAN = PCG.dtype("DevicePlan")
 LAST = 32  # unused entries behind vectors of an inverse
 INVERSE = """
@@ -108,8 +136,12 @@ def compiled(folder: Path, text: str, *defined: str) -> c.CDLL:
     headers = {"block_group.cuh": group, "pcg.cu": solver, "partitioned_inverse.cuh": INVERSE, "clock.cuh": clock}
     for name, written in headers.items():
         (folder / name).write_text(written)
-    for name in ("spmv.cuh", "correction.cuh"):  # beside the other block_group.cuh
+    for name in ("spmv.cuh", "correction.cuh", "contact.cu"):  # beside the other headers
         (folder / name).write_text((gpu / name).read_text())
+    header, found = re.subn(r"CONTACT_THREADS = \d+", f"CONTACT_THREADS = {THREADS}",
+                            (gpu / "device_contact.cuh").read_text())  # fmt: skip
+    assert found == 1
+    (folder / "device_contact.cuh").write_text(header)
     (folder / "solver.cpp").write_text(f'#include "cuda_threads.h"\n{MORE}{text}')
     paths = [f"-I{p}" for p in (folder, TESTS / "backends", gpu, INCLUDE)]
     words = [f"-D{d}" for d in ("real=double", f"THREADS={THREADS}", "PER_PROCESSOR=1", "CORRECTED", *defined)]
@@ -191,15 +223,42 @@ class Solver:
         self.gpu.renew()
         self.solver._rows[...] = self.solver.bodies.view(np.uint8)
 
+    def _run(self, library: c.CDLL) -> None:
+        library.solve(*(c.c_void_p(x.ctypes.data) for x in (self.solver._params, self.correction.params)))
+
     def solve(self, library: c.CDLL) -> tuple[np.void, np.void]:
         """Makes a step; returns the results of both."""
         self.sim.engine.assemble()
         self.matrix = self.sim.engine.factor_matrix(0).copy()
         self.renew()
-        library.solve(c.c_void_p(self.solver._params.ctypes.data), c.c_void_p(self.correction.params.ctypes.data))
+        self._run(library)
         self.sim.engine.solve()
         ours, theirs = self.gpu.twin(self.arrays["y"]), self.arrays["y"]
         self.error = float(np.abs(ours - theirs).max() / np.abs(theirs).max())
         result = self.solver.results.view(PCG_RESULT)[int(self.counter[0]) % 4].copy()
         self.counter += 1
         return result, self.sim.engine.records()[-1]
+
+
+class ContactSolver(Solver):
+    """The same with contact."""
+
+    def __init__(self, sim: Simulation, monkeypatch: pytest.MonkeyPatch, near: int = 0):
+        super().__init__(sim, monkeypatch, near)
+        monkeypatch.setattr(gpu_contact, "THREADS", THREADS)
+        monkeypatch.setattr(gpu_contact, "options", lambda types: ())
+        monkeypatch.setattr(gpu_contact, "compiled", lambda name, module, kernel: None)
+        given, device = sim.engine_input(), SimpleNamespace(repeat=lambda flag: nullcontext())
+        assert given.contact is not None
+        obstacles = len(given.contact.obstacles.kind)
+        self.told, self.reactions = np.zeros((4, 1), CONTACT_RESULT), np.zeros((4, 1, obstacles, 6))
+        self.passes = ContactPasses(
+            self.gpu, device, given.contact, given.ranges, given.arrays, self.solver, as_device(np.zeros(1, BALANCE)),  # type: ignore[arg-type]
+            self.told, self.reactions, self.correction,
+        )  # fmt: skip
+        self.solver._params["b"] = self.passes.memory["contact_b"].data.ptr
+
+    def _run(self, library: c.CDLL) -> None:
+        passes = self.passes
+        given = (passes.params, passes.first, passes.later, self.solver._params, self.correction.params)
+        assert library.step(*(c.c_void_p(x.ctypes.data) for x in given), passes.grid) < 200

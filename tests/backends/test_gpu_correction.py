@@ -6,23 +6,23 @@ import ctypes as c
 import numpy as np
 import pytest
 
+from sim_server.effects import contact
 from sim_server.simulation import Simulation
-from tests.backends.pcg_on_threads import Solver, compiled
+from tests.backends.pcg_on_threads import SOLVE, STEP, ContactSolver, Solver, compiled
+from tests.contact.scenes import over
 from tests.scenes import bar, simulation
 
-SOLVE = """
-#include "pcg.cu"
-extern "C" void solve(const PcgArguments* s, const Correction* k) {
-    *s->pool_counter = 0;
-    launch(s->grid, THREADS, [&] { pcg(*s, *k); });
-}
-"""
 END = np.array([2.0, 1.0, 0.5])
 
 
 @pytest.fixture(scope="module")
 def library(tmp_path_factory: pytest.TempPathFactory) -> c.CDLL:
     return compiled(tmp_path_factory.mktemp("solver"), SOLVE)
+
+
+@pytest.fixture(scope="module")
+def contact_library(tmp_path_factory: pytest.TempPathFactory) -> c.CDLL:
+    return compiled(tmp_path_factory.mktemp("contact_solver"), STEP, "CONTACT_PASSES")
 
 
 def grabbed(woodbury: int = 32) -> Simulation:
@@ -52,13 +52,37 @@ def steps(solver: Solver, library: c.CDLL, count: int, factor_at: int = -1) -> l
     return found
 
 
-@pytest.mark.parametrize(("stiffness", "radius", "near"), [(1.0, 0.6, 0), (100.0, 0.6, 40), (1e4, 0.0, 40)])
-def test_grabs_are_corrected_as_on_a_cpu(library, monkeypatch, stiffness, radius, near):
-    solver = Solver(grabbed(), monkeypatch, near)
-    plain = Solver(grabbed(), monkeypatch, near, woodbury=1)
+def off(solver: Solver) -> Solver:
+    solver.correction.params["capacity"] = 0
+    return solver
+
+
+@pytest.mark.parametrize(
+    ("stiffness", "radius", "near", "much"), [(1.0, 0.6, 0, 8), (100.0, 0.6, 400, 18), (1e4, 0.0, 400, 1)]
+)
+def test_grabs_are_corrected_as_on_a_cpu(library, monkeypatch, stiffness, radius, near, much):
+    """Those that come and those that go, until a factor knows; near: M is made in memory of the inverse, or not."""
+    solver, plain = Solver(grabbed(), monkeypatch, near), off(Solver(grabbed(), monkeypatch, near))
+    found = []
     for each in (solver, plain):
         steps(each, library, 2, factor_at=0)
         assert each.used == 0
-        hold(each.sim, stiffness, radius)
-    (with_it, without) = steps(solver, library, 3), steps(plain, library, 3)
-    print(with_it, without)
+        held = hold(each.sim, stiffness, radius)
+        found.append(steps(each, library, 3, factor_at=4))
+        knows = steps(each, library, 1)
+        each.sim.touch.release("anna", held)
+        found.append(steps(each, library, 3, factor_at=8))
+        print(found, knows, steps(each, library, 1), each.used)
+
+
+def test_contacts(contact_library, monkeypatch):
+    monkeypatch.setattr(contact, "nodes_alone", lambda world: True)
+    solver = {"preconditioner": "cholesky", "update": "never", "tolerance": 1e-8}
+    for capacity in (32, 0):
+        sim = over(cells=(3, 2, 3), at=(0, 0.006, 0), solver=solver)
+        each = ContactSolver(sim, monkeypatch)
+        each.correction.params["capacity"] = capacity
+        for k in range(14):
+            ours, theirs = each.solve(contact_library)
+            print(k, ours["iterations"], theirs["iterations"], theirs["passes"], each.told[k % 4]["passes"], theirs["contacts"], theirs["kind"], each.used, each.error)
+            if k in (0, 9): each.post(each.matrix, k)

@@ -329,14 +329,13 @@ __device__ void write_reactions(const ContactArguments& c, int body, int rows, l
 
 // Keeps what springs and contacts add to the matrix of this step, as a copy for a factor has it.
 __device__ void keep_for_factors(const ContactArguments& c, int i) {
-    const long long slot = c.step[0] % HISTORY, nodes = c.chunks[gridDim.x - 1].end, sites = c.body_start[c.count] / 2;
-    if (c.spring) c.springs_then[slot * nodes + i] = (real)(c.spring_scale * c.spring[i]);
-    const int site = c.pair[i] / 2;
+    const long long step = c.step[0], site = c.pair[i] / 2, sites = c.body_start[c.count] / 2;
+    if (c.spring) note_spring(c.springs[i], step, c.spring_scale * c.spring[i]);
     if (c.pair[i] < 0) return;
     for (int j = 0; j < 3; ++j)
         for (int k = j; k < 3; ++k) {
             const long long at = 9ll * site + 3 * j + k;
-            c.blocks_then[6 * (slot * sites + site) + upper(j, k)] = (real)((double)c.known[at] - (double)c.base[at]);
+            c.blocks_then[6 * (step % HISTORY * sites + site) + upper(j, k)] = (float)((double)c.known[at] - (double)c.base[at]);
         }
 }
 

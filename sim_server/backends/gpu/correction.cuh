@@ -69,10 +69,16 @@ __device__ __noinline__ void choose_slots(CorrectionMemory& m, const float* shar
     __syncthreads();
 }
 
-// Sets `changed` if C is not what M was made with. difference: of the body's nodes; block: CorrectedBody.
-__device__ __noinline__ void compare_blocks(CorrectionMemory& m, const double* difference, const double (*block)[6]) {
+// Entry `k % 6` of C of slot k / 6. share, difference: of the body's nodes.
+__device__ __forceinline__ double entry_of(const CorrectionMemory& m, const float* share, const double* difference, int k) {
+    const long long node = m.node[k / 6];
+    return __ldcg(share + node) > 0 ? __ldcg(difference + 6 * node + k % 6) : 0;
+}
+
+// Sets `changed` if C is not what M was made with. block: CorrectedBody.
+__device__ __noinline__ void compare_blocks(CorrectionMemory& m, const float* share, const double* difference, const double (*block)[6]) {
     for (int k = threadIdx.x; k < 6 * m.used; k += THREADS)
-        if (__ldcg(difference + 6ll * m.node[k / 6] + k % 6) != __ldcg(block[k / 6] + k % 6)) m.changed = 1;  // all write the same
+        if (entry_of(m, share, difference, k) != __ldcg(block[k / 6] + k % 6)) m.changed = 1;  // all write the same
     if (threadIdx.x == 0 && m.fresh_count) m.changed = 1;
     __syncthreads();
 }
@@ -83,12 +89,12 @@ HOST_DEVICE long long scratch_size(int nodes) { return 9ll * nodes * nodes + 18l
 // M = C (I + S C)^-1 with S = U'V, by Gauss-Jordan elimination with pivots of 3x3: without exchanges of rows, as I + S C has
 // eigenvalues from 1 on where something is added, and positive ones as long as the corrected inverse is positive definite. Sets
 // `ordered` if the pivots are. Done by one thread block. columns: V of the body; a: `scratch`.
-__device__ __noinline__ void make_inner(CorrectionMemory& m, const double* difference, const float* columns, int width, double (*block)[6],
-                                        float* inner, double* a) {
+__device__ __noinline__ void make_inner(CorrectionMemory& m, const float* share, const double* difference, const float* columns, int width,
+                                        double (*block)[6], float* inner, double* a) {
     const int n = 3 * m.used, me = threadIdx.x;
     double *row = a + (long long)n * n, *column = row + 3 * n;  // of a pivot: (3, n) and (n, 3)
     auto of_V = [&](int i, int j) { return (double)__ldcg(columns + (3ll * m.node[i / 3] + i % 3) * width + j); };
-    for (int k = me; k < 6 * m.used; k += THREADS) block[k / 6][k % 6] = __ldcg(difference + 6ll * m.node[k / 6] + k % 6);
+    for (int k = me; k < 6 * m.used; k += THREADS) block[k / 6][k % 6] = entry_of(m, share, difference, k);
     if (me == 0) m.ordered = 1;
     __syncthreads();
     for (int e = me; e < n * n; e += THREADS) {

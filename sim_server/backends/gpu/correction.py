@@ -13,6 +13,7 @@ from sim_server.backends.gpu.structs import CORRECTION
 
 HISTORY, MOST_CORRECTED = CORRECTION.constant("HISTORY"), CORRECTION.constant("MOST_CORRECTED")
 CORRECTION_ARGUMENTS, CORRECTED_BODY = CORRECTION.dtype("Correction"), CORRECTION.dtype("CorrectedBody")
+SPRING_HISTORY = CORRECTION.dtype("SpringHistory")
 MOST_BYTES = 1 << 30  # of all columns
 
 
@@ -32,7 +33,6 @@ class FactorCorrection:
         cp, nodes, bodies = gpu.cp, max(last for _, last in ranges), len(ranges)
         capacity = max(1, min(most, MOST_CORRECTED, MOST_BYTES // (36 * nodes)))
         width = -(-3 * capacity // 4) * 4
-        real = np.dtype("f4" if gpu.types["real"] == "float" else "f8")
         state = np.zeros(bodies, CORRECTED_BODY)
         state["step"] = -1
         self.bodies: DeviceArray = cp.asarray(state.view(np.uint8))
@@ -43,9 +43,9 @@ class FactorCorrection:
             "scratch": cp.zeros((bodies, 9 * capacity**2 + 18 * capacity)),
         }  # fmt: skip
         if touch:
-            self._memory |= {"spring": touch.arrays["spring"], "springs_then": cp.zeros((HISTORY, nodes), real)}
+            self._memory |= {"spring": touch.arrays["spring"], "springs": cp.zeros(nodes * SPRING_HISTORY.itemsize, np.uint8)}
         if sites:
-            self._memory["blocks_then"] = cp.zeros((HISTORY, sites, 6), real)
+            self._memory["blocks_then"] = cp.zeros((HISTORY, sites, 6), np.float32)
         self.params: NDArray[Any] = np.zeros((), CORRECTION_ARGUMENTS)
         for name, array in self._memory.items():
             self.params[name] = array.data.ptr
@@ -67,5 +67,5 @@ class FactorCorrection:
         pair: (nodes,), base: (sites, 3, 3), contact: CONTACT_ARGUMENTS
         """
         self.params["pair"], self.params["base"] = pair.data.ptr, base.data.ptr
-        for name in ("spring", "springs_then", "blocks_then", "spring_scale"):
+        for name in ("spring", "springs", "blocks_then", "spring_scale"):
             contact[name] = self.params[name]

@@ -8,7 +8,8 @@
 // iteration has no more exchanges than without.
 //
 // V is made of unit vectors, which pcg.cu passes through the preconditioner before the first iteration; its columns remain until the next
-// factor, as nodes come and go. What a factor knows is read from a history of what grabs and contacts added to the last matrices.
+// factor, as nodes come and go. What a factor knows of grabs follows from the changes of each node's spring, read backwards; of contacts
+// from a history of what they added to the last matrices.
 #pragma once
 #include "host_device.cuh"
 
@@ -16,14 +17,22 @@
 #define real double
 #endif
 
-constexpr int HISTORY = 64;         // matrices of which what grabs and contacts added is kept: an older factor is not corrected
+constexpr int HISTORY = 128;        // matrices of which what contacts added is kept: an older factor is not corrected for contacts
+constexpr int SPRING_CHANGES = 4;   // of a node that are kept: a factor is not corrected there for more
 constexpr int MOST_CORRECTED = 64;  // nodes of a body
 // Relative to the node's own block: a node with a smaller difference gets no columns, which would cost more than they save (each as much
 // as half an iteration, for every factor), and differences below NOTHING are none.
 constexpr double LEAST_SHARE = 0.3, NOTHING = 0.004;
 // Larger springs, in blocks, are corrected as this much, and of a spring that has gone a part remains: the inverse has float16 numbers,
 // or pairs of them (PcgBody.planes).
-constexpr double STIFF[2] = {1e3, 1e5}, REMAINS[2] = {4e-3, 1e-4};
+constexpr double STIFF[2] = {1e4, 1e5}, REMAINS[2] = {1e-3, 1e-4};
+
+struct SpringHistory {              // of a node: what springs add to the diagonal of A [kg]
+    double last;
+    int count, unused;              // changes so far
+    long long step[SPRING_CHANGES];  // whose matrix is the first with the new value; a ring
+    double before[SPRING_CHANGES];  // the old one
+};
 
 struct CorrectedBody {              // kept from solve to solve
     long long step;                 // of the factor that V is for
@@ -37,12 +46,12 @@ struct Correction {                 // arguments
     int sites;                      // nodes with rows of contact
     CorrectedBody* bodies;          // (bodies,)
     const real* spring;             // (nodes,) of grabs [N/m]; null: nothing can be touched
-    real* springs_then;             // (HISTORY, nodes) what springs added, by step [kg]
+    SpringHistory* springs;         // (nodes,)
     const int* pair;                // (nodes,) as ContactArguments has it; null: no contact
     const real* base;               // likewise
-    const real* blocks_then;        // (HISTORY, sites, 6) what contacts added for a factor, upper triangles [kg]
-    double* difference;             // (nodes, 6) C of each node, upper triangles [kg]
-    float* share;                   // (nodes,) its size relative to the node's own block
+    const float* blocks_then;       // (HISTORY, sites, 6) what contacts added for a factor, upper triangles [kg]
+    float* share;                   // (nodes,) size of a node's difference relative to its own block; 0: there is none
+    double* difference;             // (nodes, 6) C of nodes with a share, upper triangles [kg]
     float* columns;                 // (nodes, 3, width) V
     float* inner;                   // (bodies, width, width) M
     double* scratch;                // (bodies, scratch_size(capacity)) for make_inner
@@ -55,6 +64,26 @@ HOST_DEVICE int upper(int i, int j) {
     return 3 * low - low * (low + 1) / 2 + high;
 }
 
+// Takes note of what springs add to the matrix of a step.
+HOST_DEVICE void note_spring(SpringHistory& h, long long step, double now) {
+    if (now == h.last) return;
+    h.step[h.count % SPRING_CHANGES] = step;
+    h.before[h.count % SPRING_CHANGES] = h.last;
+    h.last = now;
+    ++h.count;
+}
+
+// What springs add now, less what they added to the matrix of step `then`; 0 if there were too many changes.
+HOST_DEVICE double spring_difference(const SpringHistory& h, long long then, double now) {
+    double before = h.last;
+    for (int k = h.count; k > 0; --k) {
+        if (k <= h.count - SPRING_CHANGES) return 0;
+        if (h.step[(k - 1) % SPRING_CHANGES] <= then) break;
+        before = h.before[(k - 1) % SPRING_CHANGES];
+    }
+    return now - before;
+}
+
 // Difference of what a spring adds now from what it added then, within what an inverse of so many planes resolves. rest: the node's own
 // entry without the spring.
 HOST_DEVICE double bounded_difference(double delta, double rest, int planes) {
@@ -64,14 +93,12 @@ HOST_DEVICE double bounded_difference(double delta, double rest, int planes) {
 }
 
 // Difference of a node's own block from that of the factor's matrix; returns its size relative to the block, 0 if there is none.
-// own: its block of A now (9); then: step of the factor; node: of the scene; nodes: of the scene.
-HOST_DEVICE double difference_of(const Correction& c, int node, int nodes, const real* own, long long then, int planes, double out[6]) {
+// pair: of the node, -1 without contacts; spring: spring_difference; own: its block of A now (9); then: step of the factor.
+HOST_DEVICE double difference_of(const Correction& c, int pair, double spring, const real* own, long long then, int planes, double out[6]) {
     const double trace = ((double)own[0] + own[4] + own[8]) / 3;
-    double spring = 0, size = 0;
-    const long long slot = then % HISTORY;
-    if (c.spring) spring = c.spring_scale * c.spring[node] - (double)c.springs_then[slot * nodes + node];
+    double size = 0;
     for (int k = 0; k < 6; ++k) out[k] = 0;
-    const int pair = c.pair ? c.pair[node] : -1;
+    const long long slot = then % HISTORY;
     for (int i = 0; i < 3 && pair >= 0; ++i)
         for (int j = i; j < 3; ++j) {
             const int k = upper(i, j);
@@ -83,7 +110,5 @@ HOST_DEVICE double difference_of(const Correction& c, int node, int nodes, const
     for (int i = 0; i < 3; ++i) out[upper(i, i)] += spring;
     for (int k = 0; k < 6; ++k) size = fabs(out[k]) > size ? fabs(out[k]) : size;
     const double share = rest > 0 ? size / rest : 0;
-    if (share > NOTHING) return share;
-    for (int k = 0; k < 6; ++k) out[k] = 0;
-    return 0;
+    return share > NOTHING ? share : 0;
 }

@@ -72,8 +72,8 @@ struct ContactArguments {
     double* pair_sums;          // (grid,) work of rows between bodies
     int* pair_contacts;         // (bodies,) those that carry force
     const real* spring;         // (nodes,) as Correction has it
-    real* springs_then;         // (HISTORY, nodes) likewise
-    real* blocks_then;          // (HISTORY, rows / 2, 6) likewise; null: factors are not corrected
+    SpringHistory* springs;     // (nodes,) likewise
+    float* blocks_then;         // (HISTORY, rows / 2, 6) likewise; null: factors are not corrected
     double spring_scale;        // likewise
     double dx_dv;               // [s]
     double force_coefficient;   // [s]

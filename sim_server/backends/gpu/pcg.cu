@@ -304,19 +304,31 @@ struct PcgSolver {
         const Correction& c = given_correction;
         const BlockRows& rows = memory.rows;
         const long long step = s.step[0], then = memory.body.factor_step;
-        const bool known = packed && then >= 0 && then < step && step - then < HISTORY;
+        bool known = packed && then >= 0 && then < step;
+#ifdef CONTACT_PASSES
+        known &= memory.contact.phase != CHOOSE_START;
+#endif
         double large = 0;
         for (int k = threadIdx.x; k < rows.own; k += THREADS) {
             const int node = memory.body.first + rows.begin + k;
+            double spring = 0, share = 0;
+            if (c.spring) {
+                const double now = c.spring_scale * c.spring[node];
 #ifndef CONTACT_PASSES
-            c.springs_then[step % HISTORY * s.nodes + node] = (real)(c.spring_scale * c.spring[node]);
+                note_spring(c.springs[node], step, now);
 #endif
+                if (known) spring = spring_difference(c.springs[node], then, now);
+            }
             if (!known) continue;
-            int at = rows.row_start[k] - rows.base;
-            while (rows.columns[at] != k) ++at;
-            double difference[6];
-            const double share = difference_of(c, node, s.nodes, rows.blocks + 9ll * at, then, memory.body.planes, difference);
-            for (int i = 0; i < 6; ++i) __stcg(c.difference + 6ll * node + i, difference[i]);
+            const int pair = c.pair && step - then < HISTORY ? c.pair[node] : -1;
+            if (spring != 0 || pair >= 0) {
+                int at = rows.row_start[k] - rows.base;
+                while (rows.columns[at] != k) ++at;
+                double difference[6];
+                share = difference_of(c, pair, spring, rows.blocks + 9ll * at, then, memory.body.planes, difference);
+                if (share > 0)
+                    for (int i = 0; i < 6; ++i) __stcg(c.difference + 6ll * node + i, difference[i]);
+            }
             __stcg(c.share + node, (float)share);
             large += (float)share >= (float)LEAST_SHARE;
         }
@@ -337,7 +349,7 @@ struct PcgSolver {
         }
         __syncthreads();
         choose_slots(m, c.share + first, memory.body.nodes, c.capacity);
-        compare_blocks(m, c.difference + 6ll * first, c.bodies[body].block);
+        compare_blocks(m, c.share + first, c.difference + 6ll * first, c.bodies[body].block);
         for (int k = threadIdx.x; k < m.used; k += THREADS) m.place[k] = memory.plan.place[m.node[k]];
         __syncthreads();
         column = m.fresh_count ? 3 * m.fresh[0] : -1;
@@ -373,7 +385,7 @@ struct PcgSolver {
                 __syncthreads();
                 double* scratch = (double*)memory.inverse.kept;
                 if (8 * numbers > inverse_bytes) scratch = c.scratch + body * scratch_size(c.capacity);
-                make_inner(m, c.difference + 6ll * memory.body.first, correction_row(0), c.width, c.bodies[body].block,
+                make_inner(m, c.share + memory.body.first, c.difference + 6ll * memory.body.first, correction_row(0), c.width, c.bodies[body].block,
                            c.inner + (long long)body * c.width * c.width, scratch);
                 if (threadIdx.x == 0) __stcg(&c.bodies[body].usable, m.ordered);
                 fetched = arrived = false;
