@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: MIT
-"""The solver of a GPU (pcg.cu), run by threads of the processor beside steps of the CPU: one thread block a body, and a
-dense inverse in float16 in place of the partitioned one."""
+"""The solver of a GPU (pcg.cu), run by threads of the processor beside steps of the CPU, with a dense inverse in float16 in
+place of the partitioned one."""
 
 import ctypes as c
 import re
@@ -32,7 +32,8 @@ SOLVE = """
 #include "pcg.cu"
 extern "C" void solve(const PcgArguments* s, const Correction* k) {
     *s->pool_counter = 0;
-    launch(s->grid, THREADS, [&] { pcg(*s, *k); });
+    launch_together(s->grid, THREADS, [&] { pcg(*s, *k); }, {{&memory, sizeof memory}, {shared_memory, sizeof shared_memory},
+                                                             {shared_vector, sizeof shared_vector}});
 }
 """
 STEP = """
@@ -60,15 +61,15 @@ INVERSE = """
 static float unit_for(double) { return 1; }
 static int first_bad_node(const PcgBody&, const real*, int&) { return -1; }
 struct ResidualSource { const FlagWord<float>* r; unsigned r_number, q_number; float alpha; };
-static float shared_vector[8192];
+static float shared_vector[2048];
 struct PartitionedInverse {
     const float *scale, *matrix;
     FlagWord<float> *residual, *product, *z;
     uint4* kept;
-    int size, phases, near;
+    int size, phases, near, first, last;  // own rows
     void reserve(const DevicePlan*, Arena&) {}
-    void set_up(const PcgBody& body, const DevicePlan* plan, int, Arena& arena) {
-        size = plan->size; phases = 1; scale = body.scale; matrix = (const float*)body.matrix;
+    void set_up(const PcgBody& body, const DevicePlan* plan, int index, Arena& arena) {
+        size = plan->size; first = index * size / body.blocks; last = (index + 1) * size / body.blocks; phases = 1; scale = body.scale; matrix = (const float*)body.matrix;
         residual = body.residual; product = body.product; z = body.z;
         near = plan->entries;
         kept = arena.take<uint4>(32 * near);
@@ -88,7 +89,7 @@ struct PartitionedInverse {
     }
     double multiply(int, const ResidualSource&, unsigned number, float) const {
         double zr = 0;
-        for (int k = threadIdx.x; k < size; k += THREADS) {
+        for (int k = first + threadIdx.x; k < last; k += THREADS) {
             float sum = 0;
             for (int j = 0; j < size; ++j) sum += matrix[(long long)k * size + j] * shared_vector[j];
             z[k].put(scale[k] * sum, number);
@@ -116,7 +117,7 @@ WORDS = {
     r'asm volatile\("ld\.relaxed\.gpu\.global\.v2[^;]*;[^;]*;': "w = *this;",
     r"    unsigned to = \(unsigned\)__cvta_generic_to_shared\(shared\);.*?\n\}": "    std::memcpy(shared, global, bytes);\n}",
     r'asm volatile\("cp\.async\.(commit|wait)_group[^;]*;[^;]*;': "",
-    r"extern __shared__ __align__\(16\) char shared_memory\[\];": "alignas(16) static char shared_memory[1 << 20];",
+    r"extern __shared__ __align__\(16\) char shared_memory\[\];": "alignas(16) static char shared_memory[1 << 17];",
     r"if \(missing && \+\+spins > 1u << 27\) __trap\(\);": "if (missing && ++spins > 100000u) __trap();\n    if (missing) give_turn();",
 }  # fmt: skip
 
@@ -156,17 +157,20 @@ class SolverHost(Host):
     def __init__(self) -> None:
         super().__init__()
         self.cp.ones = lambda shape, dtype=float: as_device(np.ones(shape, dtype))
-        self.properties = {"multiProcessorCount": 132, "sharedMemPerMultiprocessor": 1 << 20}
+        self.properties = {"multiProcessorCount": 132, "sharedMemPerMultiprocessor": 1 << 17}
 
 
 class Solver:
-    """Solves the systems of a simulation on a CPU by pcg.cu, too. near: pieces of 512 bytes of an inverse that are in
-    shared memory."""
+    """Solves the system of a body of a simulation on a CPU by pcg.cu, too.
 
-    def __init__(self, sim: Simulation, monkeypatch: pytest.MonkeyPatch, near: int = 0, woodbury: int | None = None):
+    near: pieces of 512 bytes of an inverse that are in shared memory
+    blocks: thread blocks of the body
+    """
+
+    def __init__(self, sim: Simulation, monkeypatch: pytest.MonkeyPatch, near: int = 0, blocks: int = 1):
         monkeypatch.setattr(gpu_solver, "compiled", lambda name, module, kernel: SimpleNamespace())
-        one_each = lambda nodes, processors, blocks: (assign_blocks(nodes, len(nodes)), len(nodes))  # noqa: E731
-        monkeypatch.setattr(gpu_solver, "best_assignment", one_each)
+        assigned = lambda nodes, processors, most: (assign_blocks(nodes, blocks), blocks)  # noqa: E731
+        monkeypatch.setattr(gpu_solver, "best_assignment", assigned)
         self.sim, self.gpu, self.near = sim, SolverHost(), near
         given = sim.engine_input()
         self.arrays, gpu = given.arrays, self.gpu
@@ -175,15 +179,14 @@ class Solver:
             own = {"spring": gpu.twin(sim.touch.spring), "coefficients": as_device(sim.world.coefficients)}
             touch = SimpleNamespace(arrays=own)
         sites = int(given.contact.body_start[-1]) // 2 if given.contact else 0
-        most = sim.scene.solver.woodbury if woodbury is None else woodbury
-        self.correction = FactorCorrection(gpu, most, list(given.ranges), touch, sites)  # type: ignore[arg-type]
+        self.correction = FactorCorrection(gpu, sim.scene.solver.woodbury, list(given.ranges), touch, sites)  # type: ignore[arg-type]
         self.counter, contact = as_device(np.zeros(1, np.int64)), given.contact is not None
         self.solver = PcgSolver(
             gpu, given.ranges, given.arrays, self.counter, 4, contact=contact, correction=self.correction  # type: ignore[arg-type]
         )  # fmt: skip
         own = sim.scene.solver
         rows = self.solver.bodies
-        assert (rows["blocks"] == 1).all()
+        assert rows["blocks"].tolist() == [blocks]
         rows["tolerance"], rows["max_iterations"], rows["warm_start"] = own.tolerance, own.max_iterations, own.warm_start
         rows["kind"], rows["factor_step"] = KINDS.enumeration("Kind")["CHOLESKY"], -1
         self.kept: list[Any] = []

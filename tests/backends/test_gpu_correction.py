@@ -59,8 +59,8 @@ def uncorrected(solver: Solver) -> Solver:
 
 
 def test_nodes_that_are_held_fast_are_corrected_as_on_a_cpu(library, monkeypatch):
-    """A hand takes hold, and lets go again, both after the matrix of the factor."""
-    solver, plain = Solver(grabbed(), monkeypatch), uncorrected(Solver(grabbed(), monkeypatch))
+    """A hand takes hold, and lets go again, both after the matrix of the factor; by thread blocks that exchange values."""
+    solver, plain = Solver(grabbed(), monkeypatch, blocks=3), uncorrected(Solver(grabbed(), monkeypatch))
     found: list[list[tuple[int, int]]] = []
     for each in (solver, plain):
         steps(each, library, 2, factor_at=0)
@@ -77,7 +77,7 @@ def test_nodes_that_are_held_fast_are_corrected_as_on_a_cpu(library, monkeypatch
 
 def test_a_factor_that_knows_the_grab_is_not_corrected(library, monkeypatch):
     """near: M is made in memory of the inverse, which is fetched again."""
-    solver = Solver(grabbed(), monkeypatch, near=400)
+    solver = Solver(grabbed(), monkeypatch, near=40)
     steps(solver, library, 1, factor_at=0)
     hold(solver.sim, 1e4, 0.0)
     ((ours, theirs),) = steps(solver, library, 1, factor_at=1)
