@@ -17,7 +17,7 @@
 #define __global__
 #define __forceinline__ inline
 #define __noinline__
-#define __launch_bounds__(n)
+#define __launch_bounds__(...)
 #define __shared__ static
 #define __align__(n) alignas(n)
 
@@ -35,10 +35,11 @@ struct Turn {                // of a thread
     bool begun, ended;
 };
 static Turn turns[1024];
+static int first_turn;       // of the thread block
 static jmp_buf between_turns;
 
 __attribute__((noinline)) static void give_turn() {
-    if (!_setjmp(turns[threadIdx.x].here)) _longjmp(between_turns, 1);
+    if (!_setjmp(turns[first_turn + threadIdx.x].here)) _longjmp(between_turns, 1);
 }
 __attribute__((noinline)) static void take_turn(Turn& turn) {
     if (_setjmp(between_turns)) return;
@@ -140,8 +141,50 @@ static void* kernel_run;
 
 static void take_turns() {
     run_kernel(kernel_run);
-    turns[threadIdx.x].ended = true;
+    turns[first_turn + threadIdx.x].ended = true;
     give_turn();
+}
+
+static void begin_turn(int t) {
+    Turn& turn = turns[t];
+    turn.stack.resize(1 << 18);
+    turn.begun = turn.ended = false;
+    getcontext(&turn.start);
+    turn.start.uc_stack.ss_sp = turn.stack.data();
+    turn.start.uc_stack.ss_size = turn.stack.size();
+    makecontext(&turn.start, take_turns, 0);
+}
+
+// Thread blocks that wait for each other: all of them take turns. shared: what `__shared__` stands before, which each block has by itself.
+struct Region { void* begin; size_t bytes; };
+template <class Kernel> static void launch_together(int blocks, int threads, Kernel kernel, std::vector<Region> shared) {
+    shared.insert(shared.end(), {{&block_barrier, sizeof block_barrier}, {warp_barrier, sizeof warp_barrier}, {exchanged, sizeof exchanged}});
+    std::vector<std::vector<char>> kept(blocks * shared.size());
+    auto each = [&](int block, auto f) {
+        for (size_t k = 0; k < shared.size(); ++k) f((char*)shared[k].begin, shared[k].bytes, kept[block * shared.size() + k]);
+    };
+    blockDim.x = threads;
+    gridDim.x = blocks;
+    run_kernel = [](void* k) { (*(Kernel*)k)(); };
+    kernel_run = &kernel;
+    for (int b = 0; b < blocks; ++b) each(b, [](char* from, size_t bytes, auto& to) { to.assign(from, from + bytes); });
+    for (int t = 0; t < blocks * threads; ++t) begin_turn(t);
+    for (int left = 1, first = 0; left > 0; first = (first + 1) % blocks) {
+        left = 0;
+        for (int k = 0; k < blocks; ++k) {
+            blockIdx.x = (first + k) % blocks;
+            first_turn = blockIdx.x * threads;
+            each(blockIdx.x, [](char* to, size_t bytes, auto& from) { std::memcpy(to, from.data(), bytes); });
+            for (int t = 0; t < threads; ++t) {
+                if (turns[first_turn + t].ended) continue;
+                threadIdx.x = t;
+                take_turn(turns[first_turn + t]);
+                left += !turns[first_turn + t].ended;
+            }
+            each(blockIdx.x, [](char* from, size_t bytes, auto& to) { std::memcpy(to.data(), from, bytes); });
+        }
+    }
+    first_turn = 0;
 }
 
 template <class Kernel> static void launch(int blocks, int threads, Kernel kernel) {
@@ -150,15 +193,7 @@ template <class Kernel> static void launch(int blocks, int threads, Kernel kerne
     run_kernel = [](void* k) { (*(Kernel*)k)(); };
     kernel_run = &kernel;
     for (blockIdx.x = 0; blockIdx.x < blocks; ++blockIdx.x) {
-        for (int t = 0; t < threads; ++t) {
-            Turn& turn = turns[t];
-            turn.stack.resize(1 << 18);
-            turn.begun = turn.ended = false;
-            getcontext(&turn.start);
-            turn.start.uc_stack.ss_sp = turn.stack.data();
-            turn.start.uc_stack.ss_size = turn.stack.size();
-            makecontext(&turn.start, take_turns, 0);
-        }
+        for (int t = 0; t < threads; ++t) begin_turn(t);
         for (int left = threads; left > 0;) {
             left = 0;
             for (int t = 0; t < threads; ++t) {

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sim_server.arrays import Float64, Int32
 from sim_server.backends.contact import Contact
 from sim_server.backends.declarations import Declarations
+from sim_server.backends.gpu.correction import FactorCorrection
 from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction
 from sim_server.backends.gpu.device import Gpu, compiled, options, own_headers
 from sim_server.backends.gpu.energies import node_chunks
@@ -59,6 +60,7 @@ class ContactPasses:
     ranges: nodes [first, last) of each body
     arrays: host arrays by name (row_start, columns, values, b, y, x, rotation)
     balance: energy balances of the bodies on the device, which get the work of contact
+    correction: of factors; None: they are not corrected
     results, reactions: host memory (capacity, bodies) of CONTACT_RESULT and (capacity, bodies, obstacles, 6) that the
         steps write to
     broken: likewise (ties,) of int32, steps completed when one broke
@@ -71,7 +73,7 @@ class ContactPasses:
     def __init__(
         self, gpu: Gpu, device: Graphs, contact: Contact, ranges: Sequence[tuple[int, int]],
         arrays: Mapping[str, NDArray[Any]], solver: PcgSolver, balance: DeviceArray, results: NDArray[Any],
-        reactions: Float64, broken: Int32,
+        reactions: Float64, broken: Int32, correction: FactorCorrection | None = None,
     ):  # fmt: skip
         cp, nodes, self._bodies = gpu.cp, len(arrays["x"]), len(ranges)
         self._gpu, self._device, self._solver, self.active = gpu, device, solver, cp.zeros(1, np.int32)
@@ -100,6 +102,8 @@ class ContactPasses:
         self._table = {n: gpu.twin(a, dtype=a.dtype) for n in TABLE for a in [getattr(contact.obstacles, n)]}
         self.faces = FaceRows(gpu, contact, contact.faces, starts, arrays, real) if contact.faces else None
         self.params = self._arguments(contact, results, reactions)
+        if correction:
+            correction.connect(self.memory["pair"], self.memory["base"], self.params)
         self.islands: IslandPasses | None = None
         if contact.surfaces or contact.ties:
             given = gpu, device, contact, ranges, arrays, solver, self.params, chunks, THREADS, broken, self.faces

@@ -6,6 +6,7 @@
 // (device_faces.cuh). Numbers of contact are double for every `real`.
 #pragma once
 #include "contact_state.cuh"
+#include "correction_state.cuh"
 #include "energy_balance.cuh"
 #include "node_chunk.cuh"
 
@@ -113,6 +114,10 @@ struct ContactArguments {
     double* pair_sums;          // (grid,) work of rows between bodies
     int* pair_contacts;         // (bodies,) those that carry force
     int* pair_clipped;          // (bodies,) places where it is held apart from others
+    const real* spring;         // (nodes,) as Correction has it
+    SpringHistory* springs;     // (nodes,) likewise
+    float* blocks_then;         // (HISTORY, rows / 2, 6) likewise; null: factors are not corrected
+    double spring_scale;        // likewise
     double dx_dv;               // [s]
     double force_coefficient;   // [s]
     double tolerance;

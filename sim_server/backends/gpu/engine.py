@@ -19,6 +19,7 @@ from sim_server.backends.cpu.structs import REACTION
 from sim_server.backends.declarations import Declarations
 from sim_server.backends.gpu.central_difference import SubstepLoop
 from sim_server.backends.gpu.contact import ContactPasses
+from sim_server.backends.gpu.correction import FactorCorrection
 from sim_server.backends.gpu.cuda import CudaDevice
 from sim_server.backends.gpu.cupy_types import DeviceArray, Graph
 from sim_server.backends.gpu.device import DeviceLaunch, Gpu
@@ -108,9 +109,10 @@ class GpuEngine(DeviceLoop):
         self._first_launches = self._beginning(forces) if alone else self._whole_assembly
         self._forces = fuse(forces) if alone else ()  # after a whole assembly, whose energy balance is made already
         phases = NewtonPhases.initial(gpu, bodies) if newton else None
+        correction = FactorCorrection.wanted(gpu, given)
         self.solver = PcgSolver(
             gpu, ranges, arrays, self._counter, CAPACITY, planes, phases or (), ATTEMPTS if stages else 0,
-            given.contact is not None, given.contact is not None and bool(given.contact.surfaces or given.contact.ties),
+            given.contact is not None, given.contact is not None and bool(given.contact.surfaces or given.contact.ties), correction,
         )  # fmt: skip
         self._newton, newton_results = None, None
         if newton and phases:
@@ -131,7 +133,7 @@ class GpuEngine(DeviceLoop):
             balance = self._energies.balance
             self._contact = ContactPasses(
                 gpu, device, given.contact, ranges, arrays, self.solver, balance, contact_results, reactions,
-                self._broken,
+                self._broken, correction,
             )  # fmt: skip
             if self._contact.detects:
                 self._whole_assembly = [*self._whole_assembly, self._contact.detect]

@@ -16,6 +16,9 @@
 #ifdef CONTACT_PASSES
 #include "contact_state.cuh"
 #endif
+#ifdef CORRECTED
+#include "correction.cuh"
+#endif
 
 struct BlockMemory {  // static shared memory of a thread block: data that is the same in all threads needs no registers
     double scratch[3 * WARPS][4], totals[4];
@@ -32,6 +35,9 @@ struct BlockMemory {  // static shared memory of a thread block: data that is th
 #ifdef CONTACT_PASSES
     ContactState contact;          // before the solve
     int outcome;                   // ContactPhase after it
+#endif
+#ifdef CORRECTED
+    CorrectionMemory correction;
 #endif
 };
 __shared__ BlockMemory memory;
@@ -57,6 +63,12 @@ struct PcgSolver {
     bool given = false;    // the start is given, and the tolerance is relative to its residual (GIVEN_START of pcg.h)
 #ifdef CONTACT_PASSES
     const ContactSolve& pass;
+#endif
+#ifdef CORRECTED
+    const Correction& given_correction;
+    bool corrects = false;  // applications are corrected
+    int column = -1;        // of V, that the next application makes
+    int body = 0;
 #endif
 
     __device__ __forceinline__ void set_up(const RowRange& range) {
@@ -126,7 +138,12 @@ struct PcgSolver {
         for (int k = threadIdx.x; k < 3 * rows.halo; k += THREADS)
             rows.values[k] = __ldcg(s.y + 3 * (first + rows.nodes[k / 3]) + k % 3);
         __syncthreads();
+#ifdef CORRECTED
+        double mine[3] = {0, 0, 0}, out[3];
+        const double large = first_of_solve ? look_for_differences() : 0;
+#else
         double mine[2] = {0, 0}, out[2];
+#endif
         rows.multiply([&](int node, int c, real qk) {
             const int k = 3 * node + c;
             const real bk = s.b[begin + k];
@@ -146,7 +163,13 @@ struct PcgSolver {
         });
         r_number = group.number;
         into_three<2>(mine);
+#ifdef CORRECTED
+        if (threadIdx.x % 32 == 0) mine[2] = large;
+        group.sums<3, 3>(mine, out);
+        if (first_of_solve) memory.correction.count = (int)out[2];  // the same in all threads
+#else
         group.sums<2, 3>(mine, out);
+#endif
         b2 = out[1];
         return out[0];
     }
@@ -164,8 +187,13 @@ struct PcgSolver {
     // 7. 8. 2. p = z + beta p, q = A p; sums p.q, r.q, q.q, r.r
     __device__ __forceinline__ void direction(real beta, double out[4]) {
         const BlockRows rows = memory.rows;
+#ifdef CORRECTED
+        if (packed) rows.form(memory.inverse.z, z_number, beta, [&](int k) { return corrects ? correction_at(rows, k) : 0.0f; });
+        else rows.form(s.z, z_number, beta, [](int) { return 0.0f; });
+#else
         if (packed) rows.form(memory.inverse.z, z_number, beta);
         else rows.form(s.z, z_number, beta);
+#endif
         double mine[4] = {0, 0, 0, 0};
         rows.multiply([&](int node, int c, real q) {
             const int k = 3 * node + c;
@@ -186,6 +214,13 @@ struct PcgSolver {
     __device__ __forceinline__ double precondition(int kind, real alpha, double r2) {
         const BlockRows rows = memory.rows;
         for (int k = threadIdx.x; k < 3 * rows.own; k += THREADS) {
+#ifdef CORRECTED
+            if (column >= 0) {
+                const CorrectionMemory& m = memory.correction;
+                publish(1 - turn, k, 3 * (m.node[column / 3] - rows.begin) + column % 3 == k);
+                continue;
+            }
+#endif
             real r = rows.r[k];
             if (alpha != 0) {
                 const real x = rows.x[k] + alpha * rows.values[k];
@@ -199,6 +234,9 @@ struct PcgSolver {
         z_number = group.number;
         if (kind == CHOLESKY) {
             mine[0] = by_inverse(alpha, r2);
+#ifdef CORRECTED
+            if (column >= 0) keep_column();
+#endif
         } else {
             __syncthreads();
             mine[0] = by_diagonal(kind);
@@ -226,7 +264,12 @@ struct PcgSolver {
         const float unit = unit_for(r2 * memory.peak * memory.peak);
         ResidualSource from = {residuals(turn), r_number, q_number, fresh ? 0 : (float)alpha};  // the update is being applied
         double mine = 0;
+#ifdef CORRECTED
+        if (column >= 0) from = {residuals(1 - turn), group.number, 0, 0};  // the update is left as it is
+        else fresh = false;
+#else
         fresh = false;
+#endif
         if (!fetched) fetch();
         if (!arrived) copies_end<0>();
         arrived = true;
@@ -237,10 +280,145 @@ struct PcgSolver {
             from = {residuals(1 - turn), group.number, 0, 0};
             if (phase + 1 < inverse.phases) __syncthreads();  // the vector has been read
         }
+#ifdef CORRECTED
+        if (column >= 0) return mine;
+#endif
         turn = 1 - turn;
         r_number = group.number;
         return mine;
     }
+
+#ifdef CORRECTED
+    __device__ __forceinline__ const float* correction_row(int node) const {
+        return given_correction.columns + 3ll * (memory.body.first + node) * given_correction.width;
+    }
+
+    // What the correction takes off z, by entry of the halo.
+    __device__ __forceinline__ float correction_at(const BlockRows& rows, int k) const {
+        return taken_off(memory.correction, correction_row(rows.nodes[k / 3]) + k % 3 * given_correction.width);
+    }
+
+    // Compares the own nodes' blocks with those that the factor knows, and without contact keeps what springs add to this matrix. Returns
+    // the number of large differences of this warp's nodes.
+    __device__ __forceinline__ double look_for_differences() const {
+        const Correction& c = given_correction;
+        const BlockRows& rows = memory.rows;
+        const long long step = s.step[0], then = memory.body.factor_step;
+        bool known = packed && then >= 0 && then < step;
+#ifdef CONTACT_PASSES
+        known &= memory.contact.phase != CHOOSE_START;
+#endif
+        double large = 0;
+        for (int k = threadIdx.x; k < rows.own; k += THREADS) {
+            const int node = memory.body.first + rows.begin + k;
+            double spring = 0, share = 0;
+            if (c.spring) {
+                const double now = c.spring_scale * c.spring[node];
+#ifndef CONTACT_PASSES
+                note_spring(c.springs[node], step, now);
+#endif
+                if (known) spring = spring_difference(c.springs[node], then, now);
+            }
+            if (!known) continue;
+            const int pair = c.pair && step - then < HISTORY ? c.pair[node] : -1;
+            if (spring != 0 || pair >= 0) {
+                int at = rows.row_start[k] - rows.base;
+                while (rows.columns[at] != k) ++at;
+                double difference[6];
+                share = difference_of(c, pair, spring, rows.blocks + 9ll * at, then, memory.body.planes, difference);
+                if (share > 0)
+                    for (int i = 0; i < 6; ++i) __stcg(c.difference + 6ll * node + i, difference[i]);
+            }
+            __stcg(c.share + node, (float)share);
+            large += (float)share >= (float)LEAST_SHARE;
+        }
+        for (int k = 16; k; k >>= 1) large += __shfl_xor_sync(ALL, large, k);
+        return large;
+    }
+
+    // Chooses the nodes to correct; column: of V, to be made first. Returns whether there is anything to correct.
+    __device__ __forceinline__ bool begin_correction() {
+        CorrectionMemory& m = memory.correction;
+        const Correction& c = given_correction;
+        const int first = memory.body.first;
+        if (m.count == 0 || m.count > c.capacity) return false;
+        group.barrier();  // the differences are written
+        if (m.step != memory.body.factor_step && threadIdx.x == 0) {
+            m.step = memory.body.factor_step;
+            m.used = m.usable = 0;
+        }
+        __syncthreads();
+        choose_slots(m, c.share + first, memory.body.nodes, c.capacity);
+        compare_blocks(m, c.share + first, c.difference + 6ll * first, c.bodies[body].block);
+        for (int k = threadIdx.x; k < m.used; k += THREADS) m.place[k] = memory.plan.place[m.node[k]];
+        __syncthreads();
+        column = m.fresh_count ? 3 * m.fresh[0] : -1;
+        return true;
+    }
+
+    // Keeps the own rows of a column of V.
+    __device__ __forceinline__ void keep_column() const {
+        const BlockRows& rows = memory.rows;
+        for (int k = threadIdx.x; k < 3 * rows.own; k += THREADS) {
+            const FlagWord<float>* z = memory.inverse.z + rows.place[k / 3] + k % 3;
+            float value;
+            for (unsigned spins = 0; keep_polling(!z->get(value, group.number), spins);) {}
+            __stcg(const_cast<float*>(correction_row(rows.begin + k / 3)) + k % 3 * given_correction.width + column, value);
+        }
+    }
+
+    // Goes on to the column after the `made`-th.
+    __device__ __forceinline__ void next_column(int made) {
+        const CorrectionMemory& m = memory.correction;
+        column = made < 3 * m.fresh_count ? 3 * m.fresh[made / 3] + made % 3 : -1;
+    }
+
+    // Makes M where V or C has changed. The first thread block takes the memory of its part of the inverse, if that is large enough.
+    __device__ __forceinline__ void finish_correction() {
+        CorrectionMemory& m = memory.correction;
+        const Correction& c = given_correction;
+        if (m.changed) {
+            group.barrier();  // V is complete, and no block compares with the old C
+            if (group.index == 0) {
+                const long long numbers = scratch_size(m.used), inverse_bytes = 512ll * memory.inverse.near;
+                copies_end<0>();
+                __syncthreads();
+                double* scratch = (double*)memory.inverse.kept;
+                if (8 * numbers > inverse_bytes) scratch = c.scratch + body * scratch_size(c.capacity);
+                make_inner(m, c.share + memory.body.first, c.difference + 6ll * memory.body.first, correction_row(0), c.width, c.bodies[body].block,
+                           c.inner + (long long)body * c.width * c.width, scratch);
+                if (threadIdx.x == 0) __stcg(&c.bodies[body].usable, m.ordered);
+                fetched = arrived = false;
+            }
+            group.barrier();
+            if (threadIdx.x == 0) m.usable = __ldcg(&c.bodies[body].usable);
+            __syncthreads();
+        }
+        corrects = m.usable;
+    }
+
+    // s = M t, for t = z at the corrected nodes; returns what the correction takes off z . r.
+    __device__ __forceinline__ double correct() {
+        CorrectionMemory& m = memory.correction;
+        for (int k = threadIdx.x; k < 3 * m.used; k += THREADS) {
+            const FlagWord<float>* z = memory.inverse.z + m.place[k / 3] + k % 3;
+            float value;
+            for (unsigned spins = 0; keep_polling(!z->get(value, z_number), spins);) {}
+            m.t[k] = value;
+        }
+        __syncthreads();
+        return small_product(m, given_correction.inner + (long long)body * given_correction.width * given_correction.width,
+                             given_correction.width);
+    }
+
+    // Keeps nodes and state for later solves.
+    __device__ __forceinline__ void keep_correction() const {
+        const CorrectionMemory& m = memory.correction;
+        CorrectedBody& to = given_correction.bodies[body];
+        for (int k = threadIdx.x; k < m.used; k += THREADS) to.node[k] = m.node[k];
+        if (threadIdx.x == 0) { to.step = m.step; to.used = m.used; to.usable = m.usable; }
+    }
+#endif
 
     __device__ __forceinline__ void invert_diagonal(bool whole) const {
         const BlockRows& rows = memory.rows;
@@ -307,6 +485,10 @@ __device__ __forceinline__ void PcgSolver::solve() {
     double r2 = 0, alpha = 0, last = 1e300;
     int stop = CONVERGED, iterations = 0;
     bool begun = false, measure = true, restart = true, switched = false;
+#ifdef CORRECTED
+    bool prepares = false;
+    int made = 0;  // columns of V
+#endif
     if (kind == JACOBI || kind == BLOCK_JACOBI) invert_diagonal(kind == BLOCK_JACOBI);
     for (;;) {
         if (measure) {  // the true residual
@@ -346,6 +528,9 @@ __device__ __forceinline__ void PcgSolver::solve() {
                     out.residual = refused ? bb : bb > 0 ? sqrt(r2 / bb) : 0;
                     return;
                 }
+#ifdef CORRECTED
+                prepares = kind == CHOLESKY && begin_correction();
+#endif
             } else {
                 if (stop == CONVERGED && r2 > memory.goal && !(r2 < 0.25 * last)) stop = MAX_ITERATIONS;  // rounding errors dominate
                 if (stop != CONVERGED || r2 <= memory.goal) {
@@ -360,7 +545,26 @@ __device__ __forceinline__ void PcgSolver::solve() {
         }
         stop = r2 <= memory.goal ? CONVERGED : -1;
         if (stop < 0) {
+#ifdef CORRECTED
+            if (prepares && column < 0) {
+                prepares = false;
+                finish_correction();
+            }
+            double zr = precondition(kind, (real)alpha, column < 0 ? r2 : 1.0);
+            if (column >= 0) {
+                next_column(++made);
+                continue;
+            }
+            if (corrects && kind == CHOLESKY) {
+                const double corrected = zr - correct();
+                corrects = usable(corrected);
+                if (corrects) zr = corrected;
+                else restart = true;  // without the correction
+                if (!corrects && threadIdx.x == 0) memory.correction.usable = 0;
+            }
+#else
             const double zr = precondition(kind, (real)alpha, r2);
+#endif
             alpha = 0;
             int other = -1;
             if (!usable(zr)) stop = BREAKDOWN_PRECONDITIONER;
@@ -413,6 +617,15 @@ __device__ __forceinline__ void PcgSolver::solve() {
 #define KIND_OF_STEP
 #define STAGE
 #endif
+#ifdef CORRECTED  // factors are corrected (correction_state.cuh)
+#define CORRECTION , const Correction correction
+#define CORRECTION_PARAMETER , const Correction& correction
+#define CORRECTED_BY , correction
+#else
+#define CORRECTION
+#define CORRECTION_PARAMETER
+#define CORRECTED_BY
+#endif
 #ifdef STAGES
 #define STAGE_PARAMETER , const StageSolve& stage
 #elif defined(CONTACT_PASSES)
@@ -421,7 +634,7 @@ __device__ __forceinline__ void PcgSolver::solve() {
 #define STAGE_PARAMETER
 #endif
 
-__device__ __forceinline__ void solve_body(const PcgArguments& s, const RowRange& range STAGE_PARAMETER) {
+__device__ __forceinline__ void solve_body(const PcgArguments& s, const RowRange& range STAGE_PARAMETER CORRECTION_PARAMETER) {
     const int k = range.body;
     for (int i = threadIdx.x; i < (int)(sizeof(PcgBody) / 4); i += THREADS) ((int*)&memory.body)[i] = ((const int*)(s.bodies + k))[i];
     if (threadIdx.x == THREADS - 1) memory.rests = s.moving[k] == 0;
@@ -438,6 +651,14 @@ __device__ __forceinline__ void solve_body(const PcgArguments& s, const RowRange
 #endif
     if (memory.body.plan)
         for (int i = threadIdx.x; i < (int)(sizeof(DevicePlan) / 4); i += THREADS) ((int*)&memory.plan)[i] = ((const int*)memory.body.plan)[i];
+#ifdef CORRECTED
+    for (int i = threadIdx.x; i < MOST_CORRECTED; i += THREADS) memory.correction.node[i] = correction.bodies[k].node[i];
+    if (threadIdx.x == 0) {
+        memory.correction.step = correction.bodies[k].step;
+        memory.correction.used = correction.bodies[k].used;
+        memory.correction.usable = correction.bodies[k].usable;
+    }
+#endif
     __syncthreads();
     const long long begin = nanoseconds();
     PcgSolver solver = {s, {range.index, memory.body.blocks, s.exchange_number[k], s.block_sums + 8ll * s.grid * k, s.grid, memory.scratch, memory.totals,
@@ -445,12 +666,23 @@ __device__ __forceinline__ void solve_body(const PcgArguments& s, const RowRange
 #ifdef CONTACT_PASSES
                         , 0, 0, 0, 0, false, false, false, false, memory.contact.phase == READY, pass
 #endif
+#if defined(CORRECTED) && defined(CONTACT_PASSES)
+                        , correction
+#elif defined(CORRECTED)
+                        , 0, 0, 0, 0, false, false, false, false, false, correction
+#endif
     };
 #ifdef STAGES
     solver.given = stage.form == ITERATE;
 #endif
+#ifdef CORRECTED
+    solver.body = k;
+#endif
     solver.set_up(range);
     solver.solve();
+#ifdef CORRECTED
+    if (range.index == 0) solver.keep_correction();
+#endif
     if (range.index == 0 && threadIdx.x == 0) {
         PcgResult out = memory.out;
         out.seconds = 1e-9 * (nanoseconds() - begin);
@@ -482,7 +714,7 @@ __device__ __forceinline__ bool takes_part(const PcgArguments& s, const StageSol
 }
 #endif
 
-extern "C" __global__ void __launch_bounds__(THREADS, PER_PROCESSOR) pcg(const PcgArguments s KIND_OF_STEP) {
+extern "C" __global__ void __launch_bounds__(THREADS, PER_PROCESSOR) pcg(const PcgArguments s KIND_OF_STEP CORRECTION) {
 #ifdef NEWTON_PHASES
     if (*active == 0) return;
 #endif
@@ -507,6 +739,6 @@ extern "C" __global__ void __launch_bounds__(THREADS, PER_PROCESSOR) pcg(const P
             __syncthreads();  // all threads have read memory.next
             continue;
         }
-        solve_body(s, s.row_ranges[next] STAGE);
+        solve_body(s, s.row_ranges[next] STAGE CORRECTED_BY);
     }
 }

@@ -10,13 +10,14 @@ from numpy.typing import NDArray
 from protocol.factor import FactorPattern
 from sim_server.arrays import Int64
 from sim_server.backends.compiler import SOURCES
+from sim_server.backends.gpu.correction import FactorCorrection
 from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction
 from sim_server.backends.gpu.device import Gpu, compiled, options, own_headers
 from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder, PartitionedInverse
 from sim_server.backends.gpu.inverse.device_plan import DevicePlan, shared_bytes
 from sim_server.backends.gpu.inverse.plan import plan
 from sim_server.backends.gpu.row_partition import SPARED, best_assignment, halo, initial_ranges
-from sim_server.backends.gpu.structs import CONTACT, PCG, PCG_RESULT, STAGES
+from sim_server.backends.gpu.structs import CONTACT, CORRECTION, PCG, PCG_RESULT, STAGES
 
 PCG_BODY = PCG.dtype("PcgBody")
 SETTINGS_BYTES = PCG_BODY.fields["factor_step"][1]  # type: ignore[index]
@@ -43,6 +44,7 @@ class PcgSolver:
     attempts: number of solves that the graph of a Rosenbrock-W step holds (stages.cuh); 0: another scheme
     contact: True for a scene with contact (contact_state.cuh)
     between: True if bodies touch each other there (island_state.cuh)
+    correction: of factors for grabs and contacts; None: they are not corrected
 
     bodies: host rows (PCG_BODY), one per body. The loop uploads the settings (the first SETTINGS_BYTES bytes of a row)
         and the factor (the others) separately.
@@ -54,11 +56,11 @@ class PcgSolver:
     def __init__(
         self, gpu: Gpu, ranges: Sequence[tuple[int, int]], arrays: Mapping[str, NDArray[Any]], counter: DeviceArray,
         capacity: int, planes: int = 1, phases: Sequence[DeviceArray] = (), attempts: int = 0, contact: bool = False,
-        between: bool = False,
+        between: bool = False, correction: FactorCorrection | None = None,
     ):  # fmt: skip
         cp, processors = gpu.cp, gpu.properties["multiProcessorCount"]
         self.gpu, self.counter, self._capacity, self.planes, self._phases = gpu, counter, capacity, planes, phases
-        self._attempts, self._contact = attempts, contact
+        self._attempts, self._contact, self._correction = attempts, contact, correction
         self._twins = {name: gpu.twin(arrays[name]) for name in ("row_start", "values", "b", "y", "moving")}
         self.real = np.dtype(self._twins["values"].dtype)
         self._types = {"real": "float" if self.real == np.float32 else "double"}
@@ -90,7 +92,7 @@ class PcgSolver:
             "exchange_number": cp.ones(len(ranges), np.uint32),  # unwritten words have the number 0
             "pool_counter": self.pool_counter, "results": self.results, "step": counter,
         }  # fmt: skip
-        fixed = 2048  # bytes: shared memory that pcg.cu declares, and the driver's
+        fixed = 5120 if correction else 2048  # bytes: shared memory that pcg.cu declares, and the driver's
         self._shared = (gpu.properties["sharedMemPerMultiprocessor"] // blocks - fixed - 1024) // 16 * 16
         self._params = self._arguments(total, assigned.pooled)
         self._function = self._compiled("pcg", blocks)
@@ -110,13 +112,14 @@ class PcgSolver:
         """Compiles the kernel of the text <name>.cu for `blocks` thread blocks a multiprocessor."""
         declared = STAGES if self._attempts else CONTACT if self._contact else PCG
         numbers = {"THREADS": self.threads, "PER_PROCESSOR": blocks}
+        text, corrected = (SOURCES / f"backends/gpu/{name}.cu").read_text(), name == "pcg" and self._correction
         module = self.gpu.cp.RawModule(
-            code=(SOURCES / f"backends/gpu/{name}.cu").read_text() + declared.assertions(),
+            code=text + declared.assertions() + (CORRECTION.assertions() if corrected else ""),
             options=(
                 *options(self._types), *own_headers(),
                 *(f"-D{name}={number}" for name, number in numbers.items()),
                 *(["-DNEWTON_PHASES"] if self._phases else []), *(["-DSTAGES"] if self._attempts else []),
-                *(["-DCONTACT_PASSES"] if self._contact else []),
+                *(["-DCONTACT_PASSES"] if self._contact else []), *(["-DCORRECTED"] if corrected else []),
             ),
             backend="nvrtc",
             enable_cooperative_groups=True,
@@ -128,7 +131,13 @@ class PcgSolver:
     def launch(self) -> None:
         """Launches a solve of all bodies."""
         phases = (np.uint64(array.data.ptr) for array in self._phases)
-        self._function((self.grid,), (self.threads,), (self._params, *phases), shared_mem=self._shared)
+        arguments = (self._params, *phases, *self._corrected)
+        self._function((self.grid,), (self.threads,), arguments, shared_mem=self._shared)
+
+    @property
+    def _corrected(self) -> tuple[NDArray[Any], ...]:
+        """The last argument of pcg.cu, if there is one."""
+        return (self._correction.params,) if self._correction else ()
 
     def solve_contact(self, b: DeviceArray, contact: NDArray[Any]) -> None:
         """Launches a solve of a step with contact (contact_state.cuh).
@@ -137,7 +146,7 @@ class PcgSolver:
         """
         params = self._params.copy()
         params["b"] = b.data.ptr
-        self._function((self.grid,), (self.threads,), (params, contact), shared_mem=self._shared)
+        self._function((self.grid,), (self.threads,), (params, contact, *self._corrected), shared_mem=self._shared)
 
     def apply_island_factors(self, islands: NDArray[Any]) -> None:
         """Launches the application of factors in an iteration of bodies that touch each other (island_factor.cu).

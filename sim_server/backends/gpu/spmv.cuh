@@ -229,8 +229,14 @@ struct BlockRows {
     }
 
     // values = (values of exchange `number`) + beta values, for all nodes of the halo.
+    // less: what is taken off the values of the exchange, by entry of the halo.
+#ifdef CORRECTED
+    template <class T, class Less>
+    __device__ __forceinline__ void form(const FlagWord<T>* from, unsigned number, real beta, Less less) const {
+#else
     template <class T>
     __device__ __forceinline__ void form(const FlagWord<T>* from, unsigned number, real beta) const {
+#endif
         for (int first = threadIdx.x; first < 3 * halo; first += 3 * THREADS) {
             FlagWord<T> seen[3];
             T got[3];
@@ -252,6 +258,9 @@ struct BlockRows {
 #pragma unroll
             for (int n = 0; n < 3; ++n) {
                 const int k = first + n * THREADS;
+#ifdef CORRECTED
+                if (k < 3 * halo) got[n] -= less(k);
+#endif
                 if (k < 3 * halo) values[k] = beta != 0 ? got[n] + beta * values[k] : got[n];
             }
         }
