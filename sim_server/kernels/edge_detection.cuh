@@ -124,32 +124,38 @@ HOST_DEVICE const double* held_by(const SurfaceTables& c, const EdgeTables& e, i
     return nullptr;
 }
 
-// Sets both rows of an edge; returns how many more edges it comes near to. own(f): f(meeting) of the edges of the same body that it may touch
-template <class Motion, class Own = NothingElse>
-HOST_DEVICE int detect_edge(const SurfaceTables& c, const EdgeTables& e, const Motion& m, int body, int edge, Own own = {}) {
+struct EdgeMeetings {    // of an edge: the two that come first, and how many more it comes near to
+    EdgeMeeting first, second;
+    int left;
+};
+HOST_DEVICE EdgeMeetings no_edges() { return {{-1, -1, {}}, {-1, -1, {}}, 0}; }
+
+HOST_DEVICE void take(EdgeMeetings& found, EdgeMeeting here) {
+    if (comes_before(here, found.first)) {
+        const EdgeMeeting last = found.first;
+        found.first = here;
+        here = last;
+    }
+    if (comes_before(here, found.second)) {
+        const EdgeMeeting last = found.second;
+        found.second = here;
+        here = last;
+    }
+    found.left += here.other >= 0 && here.touch.entry <= 1;
+}
+
+// Sets both rows of an edge; returns how many more edges it comes near to. found: those of its own body
+template <class Motion>
+HOST_DEVICE int detect_edge(const SurfaceTables& c, const EdgeTables& e, const Motion& m, int body, int edge, EdgeMeetings found) {
     const int row = e.start[0] + 2 * edge;
-    EdgeMeeting first = {-1, -1, {}}, second = first;
-    int left = 0;
     const EdgePath path = path_of(e, m, edge);
-    auto take = [&](EdgeMeeting here) {
-        if (comes_before(here, first)) {
-            const EdgeMeeting last = first;
-            first = here;
-            here = last;
-        }
-        if (comes_before(here, second)) {
-            const EdgeMeeting last = second;
-            second = here;
-            here = last;
-        }
-        left += here.other >= 0 && here.touch.entry <= 1;
-    };
     each_facing_edge(c, e, m, body, edge, [&](int other, int facing, double thickness) {
         EdgeMeeting here = {other, facing, {}};
         const double* held = held_by(c, e, edge, other, facing);
-        if (meet_edges(path, e.wings[edge], path_of(e, m, facing), e.wings[facing], thickness, 1e-2 * thickness, held, here.touch)) take(here);
+        if (!meet_edges(path, e.wings[edge], path_of(e, m, facing), e.wings[facing], thickness, 1e-2 * thickness, held, here.touch)) return;
+        take(found, here);
     });
-    own(take);
+    const EdgeMeeting &first = found.first, &second = found.second;
     if (first.other < 0 && c.obstacle[row] < 0 && c.obstacle[row + 1] < 0) return 0;  // the rows are empty already
     const RowMemory last[2] = {memory_of(c, row), memory_of(c, row + 1)};
     const int facing[2] = {e.facing[row - e.start[0]], e.facing[row + 1 - e.start[0]]};
@@ -159,7 +165,7 @@ HOST_DEVICE int detect_edge(const SurfaceTables& c, const EdgeTables& e, const M
         for (int r = 0; r < 2; ++r)
             if (t.other >= 0 && facing[r] == t.edge) recall(c, row + slot, last + r, 1);
     }
-    return left;
+    return found.left;
 }
 
 // The site for which edges without a row are counted; -1: both ends are fixed.

@@ -157,9 +157,14 @@ HOST_DEVICE bool passes_own(const SurfaceTables& c, const OwnTables& o, const Mo
 
 // --- edges ------------------------------------------------------------------------------------------------------------------------------
 
+__attribute__((noinline)) static double own_edges_apart(const EdgePath& a, const EdgePath& b, EdgeTouch& touch) { return edges_apart(a, b, 0, touch); }
+__attribute__((noinline)) static double own_entry(const EdgePath& a, const EdgePath& b, double inflate, double slack, EdgeTouch& touch) {
+    return entry_of_edges(a, b, inflate, slack, touch);
+}
+
 // As `meet_edges` of edge_edge.cuh, but the side is that on which the edges are. Rims of a strip that lies on itself count, whose triangles
 // lean neither way. held: normal with which the edges bore each other in the last step, null: they did not.
-HOST_DEVICE bool meet_own_edges(const EdgePath& a, const EdgeWings& wa, const EdgePath& b, const EdgeWings& wb, double thickness,
+__attribute__((noinline)) static bool meet_own_edges(const EdgePath& a, const EdgeWings& wa, const EdgePath& b, const EdgeWings& wb, double thickness,
                                 const double* held, EdgeTouch& touch) {
     double u[3], v[3], n[3];
     for (int k = 0; k < 3; ++k) {
@@ -168,7 +173,7 @@ HOST_DEVICE bool meet_own_edges(const EdgePath& a, const EdgeWings& wa, const Ed
     }
     for (int k = 0; k < 3; ++k) n[k] = u[(k + 1) % 3] * v[(k + 2) % 3] - u[(k + 2) % 3] * v[(k + 1) % 3];
     if (!(make_unit(n) > PARALLEL * sqrt(dot3(u, u) * dot3(v, v)))) return false;
-    touch.distance = edges_apart(a, b, 0, touch);
+    touch.distance = own_edges_apart(a, b, touch);
     touch.entry = NEVER;
     const bool between = within_edge(touch.s) && within_edge(touch.t);
     auto leans_away = [&](const double* normal) { return leans(wa, normal, 1, -FLAT_EDGE) && leans(wb, normal, -1, -FLAT_EDGE); };
@@ -187,7 +192,7 @@ HOST_DEVICE bool meet_own_edges(const EdgePath& a, const EdgeWings& wa, const Ed
         return true;
     }
     EdgeTouch then;
-    const double time = entry_of_edges(a, b, thickness, 1e-2 * thickness, then);
+    const double time = own_entry(a, b, thickness, 1e-2 * thickness, then);
     if (time <= 1 && within_edge(then.s) && within_edge(then.t) && leans_away(then.normal)) {
         then.entry = time;
         then.distance = touch.distance;
@@ -201,10 +206,10 @@ HOST_DEVICE bool meet_own_edges(const EdgePath& a, const EdgeWings& wa, const Ed
 HOST_DEVICE bool own_edges_pass(const EdgePath& a, const EdgePath& b, double thickness, EdgeTouch& touch) {
     EdgeTouch then;
     const double through = THROUGH * thickness;
-    if (!(edges_apart(a, b, 0, touch) > through) || !(entry_of_edges(a, b, through, through, then) <= 1)) return false;
+    if (!(own_edges_apart(a, b, touch) > through) || !(own_entry(a, b, through, through, then) <= 1)) return false;
     if (!within_edge(then.s) || !within_edge(then.t)) return false;  // vertices pass triangles there
-    touch.distance = edges_apart(a, b, 0, touch);
-    touch.entry = touch.distance > thickness ? entry_of_edges(a, b, thickness, 1e-2 * thickness, touch) : 0;
+    touch.distance = own_edges_apart(a, b, touch);
+    touch.entry = touch.distance > thickness ? own_entry(a, b, thickness, 1e-2 * thickness, touch) : 0;
     return touch.entry <= 1;
 }
 

@@ -12,6 +12,8 @@
 #include "loop.h"
 #include "own_surface.cuh"
 
+constexpr double SMALL_TURN = 1e-4;  // rad: a rotation that is left
+
 struct OwnSearch {
     typedef SurfaceMotion<double, double> Motion;
     const Contact& c;
@@ -85,10 +87,10 @@ struct OwnSearch {
             return Vector3{v[0], v[1], v[2]};
         };
         auto off_reference = [&](int node, int k) { return place(node) - turned(node, k); };
+        Fit rest = fit_rigid(body, turned, off_reference);
         for (int k = 0; k < 2; ++k) {
-            const Fit rest = fit_rigid(body, turned, off_reference);
             const double angle = std::sqrt(dot3(rest.w, rest.w));
-            if (!(angle > 1e-12)) break;
+            if (!(angle > SMALL_TURN)) break;
             const Vector3 axis = (1 / angle) * rest.w;
             for (int column = 0; column < 3; ++column) {
                 const Vector3 a = {Q[column], Q[3 + column], Q[6 + column]}, across = cross3(axis, a);
@@ -96,8 +98,8 @@ struct OwnSearch {
                 Q[column] = b.x; Q[3 + column] = b.y; Q[6 + column] = b.z;
             }
             make_orthonormal(Q);
+            rest = fit_rigid(body, turned, off_reference);
         }
-        const Fit rest = fit_rigid(body, turned, off_reference);
         each_node(body, [&](int node, int k) {
             const Vector3 off = off_reference(node, k) - rest.t;
             own.strain[node] = std::sqrt(dot3(off, off));

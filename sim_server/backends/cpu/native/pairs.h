@@ -45,7 +45,7 @@ struct PairDetection {
     }
 
     // Finds the bodies that may touch themselves.
-    void find_own(bool before) const {
+    __attribute__((noinline)) void find_own(bool before) const {
         if (!own.exists()) return;
 #pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) if (loop.threads > 1)
         for (int i = 0; i < loop.bodies; ++i) {
@@ -67,13 +67,13 @@ struct PairDetection {
             take(search_own(tables, c.own.near, motion, body, node, thickness_of(tables, body)));
         });
     }
-    int detect_edge_and_own(int body, int edge) const {
-        return detect_edge(tables, edges, motion, body, edge, [&](auto take) {
-            if (!(c.near[body] & MAY_TOUCH_ITSELF) || !own.edge_may_touch(edge, body, 2)) return;
-            meet_each_own_edge(tables, edges, c.own.near, motion, body, edge, [&](const EdgeMeeting& here) {
-                if (!are_bound(edge, body, here.edge, body)) take(here);
-            });
+    __attribute__((noinline)) EdgeMeetings own_edges(int body, int edge) const {
+        EdgeMeetings found = no_edges();
+        if (!own.exists() || !(c.near[body] & MAY_TOUCH_ITSELF) || !own.edge_may_touch(edge, body, 2)) return found;
+        meet_each_own_edge(tables, edges, c.own.near, motion, body, edge, [&](const EdgeMeeting& here) {
+            if (!are_bound(edge, body, here.edge, body)) take(found, here);
         });
+        return found;
     }
 
     // Sets the rows of a step.
@@ -82,12 +82,10 @@ struct PairDetection {
 #pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) if (loop.threads > 1)
         for (int i = 0; i < loop.bodies; ++i) {
             if (!c.near[i] && !c.was_near[i]) continue;
-            for (int site = sites_before(tables, i); site < sites_before(tables, i + 1); ++site)
-                if (own.exists()) detect_site_and_own(i, site);
-                else detect_site(tables, motion, site);
+            for (int site = sites_before(tables, i); site < sites_before(tables, i + 1); ++site) detect_site_and_own(i, site);
             for (int edge = edges_before(i); edge < edges_before(i + 1); ++edge) {
                 if (!c.near[i]) c.wings[edge].sharp = 0;
-                count_dropped(edge, own.exists() ? detect_edge_and_own(i, edge) : detect_edge(tables, edges, motion, i, edge));
+                count_dropped(edge, detect_edge(tables, edges, motion, i, edge, own_edges(i, edge)));
             }
         }
         std::copy(c.near, c.near + loop.bodies, c.was_near);
@@ -181,7 +179,7 @@ struct PairDetection {
         if (site_passes_own(body, site, t)) places.push_back(held_vertex(tables, node, body, t, thickness_of(tables, body)));
     }
     // True if the solution takes a vertex through its own body. t: where it touches then.
-    bool site_passes_own(int body, int site, Meeting& t) const {
+    __attribute__((noinline)) bool site_passes_own(int body, int site, Meeting& t) const {
         const int node = node_of_site(tables, site);
         if (!own.exists() || !(c.near[body] & MAY_TOUCH_ITSELF) || is_bound(node, body) || !own.site_may_touch(site, body, 1)) return false;
         return passes_own(tables, c.own.near, motion, body, node, thickness_of(tables, body), t);
