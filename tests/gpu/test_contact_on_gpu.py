@@ -34,7 +34,6 @@ CASES: dict[str, Callable[..., Simulation]] = {
 }
 
 
-
 def both(make: Callable[..., Simulation], steps: int, **table: Any) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
     """Returns records (2, steps), of a GPU first, largest difference of x in each step [m], and x of the GPU."""
     sims = [make(device=device, **table) for device in ("gpu", "cpu")]

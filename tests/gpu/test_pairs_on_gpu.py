@@ -22,7 +22,6 @@ EXACT: dict[str, Any] = {"thickness": D, "tolerance": 1e-8, "passes": 200}
 FAR = floor(pose={"translate": [0, -100, 0]})
 
 
-
 def stack(count: int, **table: Any) -> Simulation:
     """Blocks one over another, each a little aside."""
     blocks = [block(name=f"b{i}", at=(0.003 * (i % 2), D + i * (HEIGHT + D), 0.002 * (i % 2))) for i in range(count)]

@@ -15,7 +15,7 @@ from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction
 from sim_server.backends.gpu.device import Gpu, compiled, options, own_headers
 from sim_server.backends.gpu.energies import node_chunks
 from sim_server.backends.gpu.faces import DEFINED, FaceRows
-from sim_server.backends.gpu.islands import Graphs, IslandPasses
+from sim_server.backends.gpu.islands import Graphs, IslandPasses, PairsTold
 from sim_server.backends.gpu.solver import PcgSolver
 from sim_server.backends.gpu.structs import CONTACT_SOLVE, CONTACT_STATE
 
@@ -61,6 +61,7 @@ class ContactPasses:
     balance: energy balances of the bodies on the device, which get the work of contact
     results, reactions: host memory (capacity, bodies) of CONTACT_RESULT and (capacity, bodies, obstacles, 6) that the
         steps write to
+    told: of bodies that touch each other, likewise; None: they do not
 
     Tests run its kernels with what it keeps: grid (thread blocks), params (arguments of the kernels), first and later
     (of the solver, in the first solve of a step and in passes), active (bodies that are not over), memory (arrays by
@@ -70,7 +71,7 @@ class ContactPasses:
     def __init__(
         self, gpu: Gpu, device: Graphs, contact: Contact, ranges: Sequence[tuple[int, int]],
         arrays: Mapping[str, NDArray[Any]], solver: PcgSolver, balance: DeviceArray, results: NDArray[Any],
-        reactions: Float64,
+        reactions: Float64, told: PairsTold | None = None,
     ):  # fmt: skip
         cp, nodes, self._bodies = gpu.cp, len(arrays["x"]), len(ranges)
         self._gpu, self._device, self._solver, self.active = gpu, device, solver, cp.zeros(1, np.int32)
@@ -100,9 +101,9 @@ class ContactPasses:
         self.faces = FaceRows(gpu, contact, contact.faces, starts, arrays, real) if contact.faces else None
         self.params = self._arguments(contact, results, reactions)
         self.islands: IslandPasses | None = None
-        if contact.surfaces:
+        if contact.surfaces and told:
             self.islands = IslandPasses(
-                gpu, device, contact, ranges, arrays, solver, self.params, chunks, THREADS, self.faces
+                gpu, device, contact, ranges, arrays, solver, self.params, chunks, THREADS, self.faces, told
             )
         self.first, self.later = self._solve(contact, 1), self._solve(contact, 0)
         module = cp.RawModule(

@@ -57,7 +57,9 @@ class FaceRows:
     What it keeps: link_place, places of blocks that rows share; memory (arrays by name).
     """
 
-    def __init__(self, gpu: Gpu, contact: Contact, faces: Faces, starts: Int32, arrays: Mapping[str, NDArray[Any]], real: Any):
+    def __init__(
+        self, gpu: Gpu, contact: Contact, faces: Faces, starts: Int32, arrays: Mapping[str, NDArray[Any]], real: Any
+    ):
         cp, bodies, nodes = gpu.cp, len(starts) - 1, len(arrays["x"])
         count, start = len(faces.triangle), contact.body_start[-1]
         entry, entry_start = corners_of_nodes(faces.triangle, nodes)

@@ -22,6 +22,7 @@
 #include "device_contact.cuh"
 #include "edge_detection.cuh"
 #include "hold_apart.cuh"
+#include "reaction.h"
 
 constexpr int MODES = 6;          // rigid motions of a body: translations, then rotations about its first node
 constexpr int CG_SUMS = 9;        // of an iteration
@@ -131,6 +132,9 @@ struct IslandArguments {
     double *coarse_a, *coarse_b; // (bodies, MODES, most_modes) rows of E, while it is inverted from one to the other
     int* coarse_well;            // (bodies,) of islands: 1: E is positive definite
     double* coefficient;         // (bodies, MODES)
+    PairSum* told;               // (capacity, bodies, most_told) on the host: what bodies exert on each other
+    int* told_count;             // (capacity, bodies) on the host: other bodies of each; more than most_told have no place
+    int most_told, unused;
     int bodies_count, most_modes, most_chunks, highest_tree, passes, edges;
 };
 

@@ -41,6 +41,10 @@ ROWS = ("corner", "weight", "obstacle", "normal", "gap", "entry", "stiffness", "
         "traction", "body_start")  # fmt: skip
 
 
+PairsTold = tuple[NDArray[Any], NDArray[Any]]
+"""What bodies exert on each other: (capacity, bodies, most) of PAIR_SUM; (capacity, bodies) how many each has."""
+
+
 class Graphs(Protocol):
     """A device whose graphs have branches and loops (cuda.CudaDevice)."""
 
@@ -88,8 +92,8 @@ class IslandPasses:
     arrays: host arrays by name
     shared: arrays and arguments of contact.cu: memory by name, params, chunks
     threads: of a thread block
-
-    faces: its rows of triangles; None: there are none
+    faces: rows of triangles; None: there are none
+    told: host memory that the steps write to
 
     Tests run its kernels with what it keeps: params (arguments of all kernels), memory (arrays by name), tally,
     pivots (steps of an inversion), product_grid (thread blocks of the product with A), vertex_grid, edge_grid (of
@@ -99,7 +103,7 @@ class IslandPasses:
     def __init__(
         self, gpu: Gpu, device: Graphs, contact: Contact, ranges: Sequence[tuple[int, int]],
         arrays: Mapping[str, NDArray[Any]], solver: PcgSolver, params: NDArray[Any], chunks: NDArray[Any], threads: int,
-        faces: FaceRows | None,
+        faces: FaceRows | None, told: PairsTold,
     ):  # fmt: skip
         assert contact.surfaces is not None
         surfaces, ints, doubles = contact.surfaces, np.int32, np.float64
@@ -160,6 +164,8 @@ class IslandPasses:
         self.params["most_modes"], self.params["passes"] = most, contact.passes
         self.params["edges"] = edges
         self.params["most_chunks"], self.params["highest_tree"] = np.diff(first).max(), heights.max()
+        self.params["told"], self.params["told_count"] = (array.ctypes.data for array in told)
+        self.params["most_told"] = told[0].shape[2]
         self._kernels: dict[str, KernelFunction] = {}
         given = (*options(gpu.types), *own_headers(), *([DEFINED] if faces else []))
         solve = (*SOLVE, *(["sweep_island_faces"] if faces else []))
@@ -193,7 +199,10 @@ class IslandPasses:
         }  # fmt: skip
         for name, host in edges.items():
             params["e"][name] = gpu.twin(host, dtype=host.dtype).data.ptr
-        self._edge_memory = zeros(max(len(surfaces.edge), 1) * SIZES["EdgeWings"], np.uint8), zeros(max(2 * len(surfaces.edge), 1), np.int32)
+        self._edge_memory = (
+            zeros(max(len(surfaces.edge), 1) * SIZES["EdgeWings"], np.uint8),
+            zeros(max(2 * len(surfaces.edge), 1), np.int32),
+        )
         params["e"]["wings"], params["e"]["facing"] = (array.data.ptr for array in self._edge_memory)
         return params  # type: ignore[no-any-return]
 
