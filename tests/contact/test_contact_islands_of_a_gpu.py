@@ -19,7 +19,6 @@ from tests.contact.test_contact_edges import crossed
 from tests.contact.test_contact_held_apart import thrown
 from tests.contact.test_contact_triangles import SMALL, obstacle
 
-
 ISLANDS = """
 #include "pairs.cu"
 #include "island.cu"
@@ -353,10 +352,8 @@ def test_triangles_of_bodies_that_touch_each_other(with_triangles, monkeypatch, 
     """A block on a spike, which carries another one, or is thrown onto it with that; a third one is alone on a ball."""
     small = SMALL | {"cells": (2, 1, 2), "size": (0.1, 0.05, 0.1)}
     low = 0.5 * D if speed == 0 else 0.05
-    blocks = [
-        block(name="low", **small | {"at": (0, low, 0)}), block(name="high", **small | {"at": (0.01, low + 0.05 + 0.5 * D, 0.004)}),
-        block(name="alone", **small | {"at": (2, low, 0)}),
-    ]  # fmt: skip
+    places = {"low": (0, low, 0), "high": (0.01, low + 0.05 + 0.5 * D, 0.004), "alone": (2, low, 0)}
+    blocks = [block(name=name, **small | {"at": at}) for name, at in places.items()]
     ball = obstacle("ball") | {"pose": {"translate": [2.062, -0.005, 0.029]}}
     sim = over(
         obstacle("corner"), ball, objects=blocks, contact=CONTACT, solver=TIGHT, velocity=(0.1 * speed, -speed, 0)

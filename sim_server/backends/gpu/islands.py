@@ -127,7 +127,8 @@ class IslandPasses:
             "near": bodies, "was_near": bodies, "touched": 2 * bodies, "bad": bodies, "label": bodies,
             "island_of": bodies, "mode": bodies, "island_start": bodies + 1, "island": bodies, "free_body": bodies,
             "own_row": rows, "own_rows": bodies, "pair_rows": bodies, "pair_list": 3 * pairs, "count": nodes,
-            "start": nodes, "cursor": nodes, "entry": 4 * pairs, "coarse_well": bodies, "held_list": places, "held_count": bodies,
+            "start": nodes, "cursor": nodes, "entry": 4 * pairs, "coarse_well": bodies,
+            "held_list": places, "held_count": bodies,
         }  # fmt: skip
         vectors = ("left", "r0", "r", "x", "p", "q", "z", "az", "solution_product")
         numbers = {name: 3 * nodes for name in vectors} | {
