@@ -16,3 +16,11 @@ struct Reaction {
     double torque[3];  // N m, about `point`
     double point[3];   // m, at the end of the step
 };
+
+struct PairSum {       // of the rows of a body against another one
+    int other;
+    double normal;     // sum of the normal forces [N]
+    double force[3];   // on the body [N]
+    double torque[3];  // about the origin [N m]
+    double point[3];   // sum of the points, times normal force [N m]
+};

@@ -11,7 +11,7 @@ import pytest
 
 from sim_server.backends.cpu.structs import REACTION, REACTION_KINDS
 from sim_server.backends.gpu.loop import BATCH, CAPACITY, FRAMES
-from sim_server.backends.gpu.structs import NEWTON_RESULT, STAGE_RESULT
+from sim_server.backends.gpu.structs import NEWTON_RESULT, PAIR_SUM, STAGE_RESULT
 from sim_server.backends.rosenbrock import FORMS
 from sim_server.errors import DeviceLost
 from tests.backends.fake_cuda import BALANCE_GRAPH, ELASTIC_GRAPH, NOT_READY, STEPS, TIMED, FakeScene, number
@@ -483,6 +483,29 @@ def test_forces_on_more_grabs_than_there_is_room_for_are_counted():
     scene.loop.run(10)
     scene.loop.records()
     assert len(scene.loop.other_reactions()) == 10 * 3 and scene.loop.loop.others_dropped == 10 * 2
+
+
+def test_what_bodies_exert_on_each_other_is_told_of_both():
+    """The first one has rows against the others, the second one against the first; a body more has no place."""
+    scene = FakeScene(bodies=3)
+    sums, counts = np.zeros((CAPACITY, 3, 2), PAIR_SUM), np.zeros((CAPACITY, 3), np.int32)
+    sums["normal"], sums["force"] = 2.0, (0, 2.0, 0)
+    sums["point"], sums["torque"] = (2.0, 0, 0), (0, 0, 2.0)  # at (1, 0, 0)
+    counts[0::2] = 2, 1, 0
+    sums[:, 0, :]["other"], sums[:, 1, 0]["other"] = (1, 2), 0
+    sums[:, 1, 0]["force"], sums[:, 1, 0]["torque"] = (0, -3.0, 0), (0, 0, -3.0)
+    counts[2, 2] = 3
+    sums[2, 2]["other"] = 1, 0
+    scene.loop.report_pairs(sums, counts)
+    scene.loop.run(3)
+    scene.loop.records()
+    told = scene.loop.other_reactions()
+    assert (told["kind"] == REACTION_KINDS["ON_OBJECT"]).all() and scene.loop.loop.others_dropped == 1
+    first = told[told["step"] == 1]
+    assert first["body"].tolist() == [0, 1, 0, 2] and first["number"].tolist() == [1, 0, 2, 0]
+    assert first["force"][:, 1].tolist() == [-5.0, 5.0, -2.0, 2.0]
+    assert (first["point"] == (1, 0, 0)).all() and not first["torque"].any()
+    assert not (told["step"] == 2).any() and (told["step"] == 3).sum() == 6
 
 
 def test_forces_wait_for_the_record_of_their_step():

@@ -19,7 +19,7 @@ from sim_server.backends.gpu import faces as gpu_faces
 from sim_server.backends.gpu import islands as gpu_islands
 from sim_server.backends.gpu.contact import ContactPasses
 from sim_server.backends.gpu.solver import PCG_BODY
-from sim_server.backends.gpu.structs import CONTACT_RESULT, CONTACT_STATE, PCG_RESULT
+from sim_server.backends.gpu.structs import CONTACT_RESULT, CONTACT_STATE, PAIR_SUM, PCG_RESULT
 from sim_server.backends.kinds import KINDS
 from sim_server.simulation import Simulation
 
@@ -223,9 +223,10 @@ class Beside:
         self.broken = np.zeros(len(self.contact.ties.broken) if self.contact.ties else 0, np.int32)
         device: Any = SimpleNamespace(repeat=lambda flag: nullcontext(), branch=lambda flag: nullcontext())
         gpu: Any = self.gpu
+        self.pairs = np.zeros((4, bodies, bodies), PAIR_SUM), np.zeros((4, bodies), np.int32)
         self.passes = ContactPasses(
             gpu, device, self.contact, given.ranges, given.arrays, solver, self.balance, self.told, self.reactions,
-            self.broken,
+            self.broken, told=self.pairs,
         )  # fmt: skip
         self.arrays, self.ranges = given.arrays, np.array(given.ranges, np.int32)
         self.bodies["first"], self.bodies["nodes"] = self.ranges[:, 0], np.diff(self.ranges)[:, 0]

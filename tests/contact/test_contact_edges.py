@@ -7,6 +7,7 @@ import pytest
 from sim_server.backends.kinds import KINDS
 from sim_server.simulation import Simulation
 from tests.contact.scenes import D, block, floor, over
+from tests.state import put
 
 STATUS = KINDS.enumeration("Status")
 JACOBI = {"preconditioner": "block_jacobi"}
@@ -23,9 +24,12 @@ def crossed(speed: float, dt: float = 1 / 60, apart: float = 0.02, cells: tuple 
     sim = over(FAR, objects=[upper, lower], gravity=(0, 0, 0), dt=dt, **({"solver": JACOBI} | table))
     world = sim.world
     top, bottom = (world.bodies[k].nodes for k in (0, 1))
-    world.x[bottom] -= [world.x[bottom, 0].mean(), world.x[bottom, 1].max(), world.x[bottom, 2].mean()]
-    world.x[top] -= [world.x[top, 0].mean() + 0.002, world.x[top, 1].min() - apart, world.x[top, 2].mean() - 0.001]
-    world.v[top], world.v[bottom] = (0, -speed, 0), (0, 0.2 * speed, 0)
+    x, v = world.x.copy(), np.zeros(world.v.shape)
+    x[bottom] -= [x[bottom, 0].mean(), x[bottom, 1].max(), x[bottom, 2].mean()]
+    x[top] -= [x[top, 0].mean() + 0.002, x[top, 1].min() - apart, x[top, 2].mean() - 0.001]
+    v[top], v[bottom] = (0, -speed, 0), (0, 0.2 * speed, 0)
+    put(sim, world.x, x)
+    put(sim, world.v, v)
     return sim
 
 

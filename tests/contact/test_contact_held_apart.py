@@ -9,18 +9,22 @@ import pytest
 from sim_server.backends.kinds import KINDS
 from sim_server.simulation import Simulation
 from tests.contact.scenes import D, block, floor, over
+from tests.state import put
 
 STATUS = KINDS.enumeration("Status")
 JACOBI = {"preconditioner": "block_jacobi"}
 FAR = floor(pose={"translate": [0, -100, 0]})
 
 
-def thrown(speed: float, **contact: float) -> Simulation:
+def thrown(speed: float, device: str = "cpu", **contact: float) -> Simulation:
     """A block over a plate, both free."""
     plate = block(name="plate", cells=(4, 1, 4), size=(0.2, 0.02, 0.2), at=(-0.05, 0, -0.05), young=3e6)
     ball = block(name="ball", cells=(2, 2, 2), size=(0.06, 0.06, 0.06), at=(0.021, 0.03, 0.017), young=3e6)
-    sim = over(FAR, objects=[plate, ball], gravity=(0, 0, 0), solver=JACOBI, contact={"thickness": D} | contact)
-    sim.world.v[sim.world.bodies[1].nodes] = (0, -speed, 0)
+    given = {"thickness": D} | contact
+    sim = over(FAR, objects=[plate, ball], gravity=(0, 0, 0), solver=JACOBI, contact=given, device=device)
+    v = np.zeros(sim.world.v.shape)
+    v[sim.world.bodies[1].nodes] = (0, -speed, 0)
+    put(sim, sim.world.v, v)
     return sim
 
 

@@ -12,13 +12,13 @@ import pytest
 from sim_server.backends.gpu.faces import DEFINED
 from sim_server.backends.gpu.islands import ISLAND, TALLY, tree_heights
 from sim_server.backends.kinds import KINDS
+from sim_server.backends.gpu.structs import PAIR_SUM
 from sim_server.simulation import Simulation
 from tests.contact.kernels_beside import TEXT, Beside, compiled
 from tests.contact.scenes import D, block, floor, over
 from tests.contact.test_contact_edges import crossed
 from tests.contact.test_contact_held_apart import thrown
 from tests.contact.test_contact_triangles import SMALL, obstacle
-
 
 ISLANDS = """
 #include "pairs.cu"
@@ -146,7 +146,9 @@ def with_triangles(tmp_path_factory: pytest.TempPathFactory) -> c.CDLL:
 
 
 class IslandsBeside(Beside):
-    """Steps of bodies that touch each other."""
+    """Steps of bodies that touch each other. seen: reactions that were compared"""
+
+    seen = 0
 
     def more(self) -> tuple[Any, ...]:
         islands = self.passes.islands
@@ -186,11 +188,28 @@ class IslandsBeside(Beside):
             host = getattr(self.contact, name)
             assert np.abs(self.gpu.twin(host) - host).max() <= 100 * rel * size, name
         assert np.abs(self.reactions[slot] - reactions).max() <= 100 * rel * max(np.abs(reactions).max(), 1e-9)
+        self.pairs_are_told(slot, 100 * rel * size)
         work = records["work"] - self.work
         assert np.abs(self.balance["work"] - work).max() <= 1e-3 * max(np.abs(work).max(), 1e-9)
         self.work = records["work"].copy()
         self.counter += 1
         return records
+
+    def pairs_are_told(self, slot: int, near: float) -> None:
+        """Sums over rows are those of which the CPU has made what bodies exert on each other."""
+        sums, counts = self.pairs
+        ours = {(i, s["other"]): s for i, count in enumerate(counts[slot]) for s in sums[slot, i, :count]}
+        told = self.sim.engine.other_reactions()
+        assert {frozenset(pair) for pair in ours} == {frozenset((r["body"], r["number"])) for r in told}
+        none = np.zeros((), PAIR_SUM)
+        for r in told:
+            own, back = (ours.get(pair, none) for pair in ((r["body"], r["number"]), (r["number"], r["body"])))
+            assert np.abs(back["force"] - own["force"] - r["force"]).max() <= near
+            point = (own["point"] + back["point"]) / (own["normal"] + back["normal"])
+            assert np.abs(point - r["point"]).max() <= 1e-6
+            torque = back["torque"] - own["torque"] - np.cross(point, back["force"] - own["force"])
+            assert np.abs(torque - r["torque"]).max() <= near
+        self.seen += len(told)
 
 
 TIGHT: dict[str, Any] = {"preconditioner": "block_jacobi", "tolerance": 1e-11, "max_iterations": 3000}
@@ -228,7 +247,7 @@ def collision(speed: float) -> Simulation:
 def test_two_blocks_are_set_down(library, monkeypatch):
     beside = IslandsBeside(library, pile(2), monkeypatch)
     records = np.array([beside.near(1e-6) for _ in range(6)])
-    assert (records["contacts"][-1] > 0).all() and records["passes"].max() > 3
+    assert (records["contacts"][-1] > 0).all() and records["passes"].max() > 3 and beside.seen > 0
 
 
 def test_a_stack_of_four(library, monkeypatch):
@@ -343,12 +362,12 @@ def test_triangles_of_bodies_that_touch_each_other(with_triangles, monkeypatch, 
     """A block on a spike, which carries another one, or is thrown onto it with that; a third one is alone on a ball."""
     small = SMALL | {"cells": (2, 1, 2), "size": (0.1, 0.05, 0.1)}
     low = 0.5 * D if speed == 0 else 0.05
-    blocks = [
-        block(name="low", **small | {"at": (0, low, 0)}), block(name="high", **small | {"at": (0.01, low + 0.05 + 0.5 * D, 0.004)}),
-        block(name="alone", **small | {"at": (2, low, 0)}),
-    ]  # fmt: skip
+    places = {"low": (0, low, 0), "high": (0.01, low + 0.05 + 0.5 * D, 0.004), "alone": (2, low, 0)}
+    blocks = [block(name=name, **small | {"at": at}) for name, at in places.items()]
     ball = obstacle("ball") | {"pose": {"translate": [2.062, -0.005, 0.029]}}
-    sim = over(obstacle("corner"), ball, objects=blocks, contact=CONTACT, solver=TIGHT, velocity=(0.1 * speed, -speed, 0))
+    sim = over(
+        obstacle("corner"), ball, objects=blocks, contact=CONTACT, solver=TIGHT, velocity=(0.1 * speed, -speed, 0)
+    )
     beside, used, rounds = IslandsBeside(with_triangles, sim, monkeypatch), 0, 0
     faces = beside.contact.faces
     assert faces is not None

@@ -61,7 +61,9 @@ def test_steps_are_those_of_the_cpu(library, monkeypatch, name):
 
 def test_a_fast_block_gets_rows_by_the_sweep(library, monkeypatch):
     """Over a ball and a floor, where nodes touch, too; from farther away than a step without them goes."""
-    sim = over(obstacle("ball"), floor(), **SMALL | {"at": (0, 0.06, 0), "velocity": (0, -8, 0)}, contact=EXACT, solver=TIGHT)
+    sim = over(
+        obstacle("ball"), floor(), **SMALL | {"at": (0, 0.06, 0), "velocity": (0, -8, 0)}, contact=EXACT, solver=TIGHT
+    )
     beside, used = Beside(library, sim, monkeypatch), 0
     for _ in range(3):
         beside.compare(1e-6)
@@ -113,7 +115,10 @@ def test_bodies_go_their_own_ways(library, monkeypatch):
 
 def test_blocks_between_nodes_of_triangles_are_found():
     triangle = np.array([[0, 1, 2], [2, 1, 3]], np.int32)
-    row_start, columns = np.array([0, 3, 7, 11, 14], np.int32), np.array([0, 1, 2, 0, 1, 2, 3, 0, 1, 2, 3, 1, 2, 3], np.int32)
+    row_start, columns = (
+        np.array([0, 3, 7, 11, 14], np.int32),
+        np.array([0, 1, 2, 0, 1, 2, 3, 0, 1, 2, 3, 1, 2, 3], np.int32),
+    )
     entry, first = corners_of_nodes(triangle, 4)
     assert entry.tolist() == [0, 1, 5, 2, 4, 6] and first.tolist() == [0, 1, 3, 5, 6]
     place, link_first, of_entry = links_of_corners(triangle, entry, row_start, columns)

@@ -13,6 +13,7 @@ from sim_server.backends.declarations import Declarations
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
 from tests.contact.scenes import LOCKSTEP, D, block, edge, floor, over, ram
+from tests.contact.test_contact_triangles import SMALL, check, obstacle
 from tests.system.server_process import Stage
 from tests.system.test_replay_of_a_server import replayed
 
@@ -23,7 +24,18 @@ TIGHT: dict[str, Any] = {
     "contact": {"thickness": 0.002, "tolerance": 1e-8, "passes": 200},
     "solver": {"preconditioner": "block_jacobi", "tolerance": 1e-10, "max_iterations": 2000},
 }
+
+
+def on(name: str, speed: float = 1.0, **table: Any) -> Simulation:
+    """A block that comes down on an obstacle between its nodes."""
+    given = SMALL | {"at": (0, 0.5 * D, 0), "velocity": (0.3 * speed, -speed, 0.1 * speed)}
+    return over(obstacle(name), **{**given, **table})
+
+
 CASES: dict[str, Callable[..., Simulation]] = {
+    "lands on a corner of a box": lambda **table: on("corner", **table),
+    "lands on a rod": lambda **table: on("rod", **table),
+    "is thrown onto a ball": lambda **table: on("ball", 8.0, at=(0, 0.06, 0), **table),
     "falls": lambda **table: over(at=(0, 0.02, 0), **table),
     "slides": lambda **table: over(velocity=(2, 0, 0), friction=0.1, **table),
     "tumbles": lambda **table: over(at=(0, 0.05, 0), rotate=(20, 0, 35), velocity=(1, -2, 0), **table),
@@ -33,6 +45,8 @@ CASES: dict[str, Callable[..., Simulation]] = {
     "is hit from below": lambda **table: over(ram(), floor(), at=(0, 0.02, 0), **table),
 }
 
+
+ON_TRIANGLES = ["lands on a corner of a box", "lands on a rod", "is thrown onto a ball"]
 
 
 def both(make: Callable[..., Simulation], steps: int, **table: Any) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
@@ -58,7 +72,7 @@ def test_steps_are_those_of_the_cpu(case):
     assert g["work"] == pytest.approx(c["work"], rel=1e-2, abs=1e-4)
 
 
-@pytest.mark.parametrize("case", ["falls", "slides", "is thrown down", "is hit from below"])
+@pytest.mark.parametrize("case", ["falls", "slides", "is thrown down", "is hit from below", *ON_TRIANGLES])
 def test_tight_tolerances_leave_no_difference(case):
     (g, c), apart, _ = both(CASES[case], 15, **TIGHT)
     assert apart.max() < 1e-8, apart
@@ -79,7 +93,7 @@ def test_a_block_at_rest_weighs_what_it_weighs():
     assert force.sum() == pytest.approx(weight, rel=1e-5)
 
 
-@pytest.mark.parametrize("case", ["slides", "is hit from below"])
+@pytest.mark.parametrize("case", ["slides", "is hit from below", "lands on a rod"])
 def test_runs_repeat_to_the_bit(case):
     """Also in batches, whose steps are one graph, and by halves of a step."""
 
@@ -123,6 +137,38 @@ def test_points_are_held_back_where_passes_run_out():
     (g, c), apart, _ = both(CASES["is hit from below"], 4, contact=short)
     assert g["clipped"].max() > 0 and (g["clipped"] == c["clipped"]).all() and OUT_OF_PASSES in g["status"]
     assert apart[:3].max() < 1e-9 and apart.max() < 1e-3  # such steps are not solved, so that they differ more and more
+
+
+@pytest.mark.parametrize("name", ["corner", "ball", "rod"])
+@pytest.mark.parametrize("speed", [1.0, 30.0])
+def test_nothing_passes_between_nodes(name, speed):
+    hard = SMALL | {"young": 3e5 * max(1, speed / 10) ** 2, "at": (0, 0.05, 0)}
+    sim = over(obstacle(name), velocity=(0.1 * speed, -speed, 0.05 * speed), device="gpu", **hard)
+    touched = False
+    for _ in range(12):
+        sim.engine.run(1)
+        sim.fetch()
+        check(sim, name)
+        touched = touched or sim.engine.records()["contacts"].any()
+    assert touched and np.isfinite(sim.world.v).all()
+
+
+def test_triangles_are_held_back_where_passes_run_out():
+    """Counted as on the CPU."""
+    short = {"thickness": D, "passes": 1, "stiffness": 0.001}
+    (g, c), apart, _ = both(lambda **table: on("rod", 10.0, at=(0, 0.05, 0), **table), 2, contact=short)
+    assert g["clipped"].max() > 0 and (g["clipped"] == c["clipped"]).all() and apart.max() < 1e-3
+
+
+def test_a_factor_learns_of_triangles():
+    copies = []
+    for device in ("gpu", "cpu"):
+        sim = on("ball", device=device, **TIGHT)
+        sim.engine.run(4)
+        sim.engine.assemble()
+        copies.append(sim.engine.factor_matrix(0).copy())
+        sim.engine.solve()
+    assert np.abs(copies[0] - copies[1]).max() <= 1e-6 * np.abs(copies[1]).max()
 
 
 @pytest.mark.parametrize("count", [3, 400])

@@ -16,7 +16,7 @@ from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction
 from sim_server.backends.gpu.device import Gpu, compiled, options, own_headers
 from sim_server.backends.gpu.energies import node_chunks
 from sim_server.backends.gpu.faces import DEFINED, FaceRows
-from sim_server.backends.gpu.islands import Graphs, IslandPasses
+from sim_server.backends.gpu.islands import Graphs, IslandPasses, PairsTold
 from sim_server.backends.gpu.solver import PcgSolver
 from sim_server.backends.gpu.structs import CONTACT_SOLVE, CONTACT_STATE
 
@@ -64,6 +64,7 @@ class ContactPasses:
     results, reactions: host memory (capacity, bodies) of CONTACT_RESULT and (capacity, bodies, obstacles, 6) that the
         steps write to
     broken: likewise (ties,) of int32, steps completed when one broke
+    told: of bodies that touch each other, likewise; None: they do not
 
     Tests run its kernels with what it keeps: grid (thread blocks), params (arguments of the kernels), first and later
     (of the solver, in the first solve of a step and in passes), active (bodies that are not over), memory (arrays by
@@ -74,6 +75,7 @@ class ContactPasses:
         self, gpu: Gpu, device: Graphs, contact: Contact, ranges: Sequence[tuple[int, int]],
         arrays: Mapping[str, NDArray[Any]], solver: PcgSolver, balance: DeviceArray, results: NDArray[Any],
         reactions: Float64, broken: Int32, correction: FactorCorrection | None = None,
+        told: PairsTold | None = None,
     ):  # fmt: skip
         cp, nodes, self._bodies = gpu.cp, len(arrays["x"]), len(ranges)
         self._gpu, self._device, self._solver, self.active = gpu, device, solver, cp.zeros(1, np.int32)
@@ -106,7 +108,7 @@ class ContactPasses:
             correction.connect(self.memory["pair"], self.memory["base"], self.params)
         self.islands: IslandPasses | None = None
         if contact.surfaces or contact.ties:
-            given = gpu, device, contact, ranges, arrays, solver, self.params, chunks, THREADS, broken, self.faces
+            given = gpu, device, contact, ranges, arrays, solver, self.params, chunks, THREADS, broken, self.faces, told
             self.islands = IslandPasses(*given)
         self.first, self.later = self._solve(contact, 1), self._solve(contact, 0)
         module = cp.RawModule(

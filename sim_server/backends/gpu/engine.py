@@ -36,6 +36,7 @@ from sim_server.backends.gpu.structs import (
     CONTACT_RESULT,
     ENERGY_RECORD,
     NEWTON_RESULT,
+    PAIR_SUM,
     STAGE_RESULT,
     STEP_TIMESTAMP,
     SUBSTEP_RESULT,
@@ -44,6 +45,7 @@ from sim_server.backends.gpu.structs import (
 from sim_server.backends.newton import Newton
 
 MOST_GRABS = 1024  # pushes and grabs at a time, of which forces are told
+MOST_TOLD = 16  # other bodies whose forces on a body are told, at most
 GRAB_BLOCKS, GRAB_THREADS = 32, 128  # of the kernel react (effects/touch.cu)
 FEW = 16  # largest number of trials in a step for which MANY steps are captured in one graph
 EPILOGUE = Declarations("backends/gpu/step_epilogue.cu")
@@ -122,7 +124,7 @@ class GpuEngine(DeviceLoop):
             self._newton = NewtonIteration(
                 gpu, newton, assemble, ranges, arrays, phases, self.solver, newton_results, settled
             )  # fmt: skip
-        self._contact, contact_results, reactions = None, None, None
+        self._contact, contact_results, reactions, told = None, None, None, None
         self._ties = given.contact.ties if given.contact else None
         if given.contact:
             self._broken = device.pinned(4 * len(self._ties.broken) if self._ties else 0).view(np.int32)
@@ -131,9 +133,14 @@ class GpuEngine(DeviceLoop):
             reactions = device.pinned(CAPACITY * bodies * obstacles * 48).view(np.float64)
             reactions = reactions.reshape(CAPACITY, bodies, obstacles, 6)
             balance = self._energies.balance
+            if given.contact.surfaces:
+                most = min(bodies - 1, MOST_TOLD)
+                sums = device.pinned(CAPACITY * bodies * most * PAIR_SUM.itemsize).view(PAIR_SUM)
+                counts = device.pinned(CAPACITY * bodies * 4).view(np.int32)
+                told = sums.reshape(CAPACITY, bodies, most), counts.reshape(CAPACITY, bodies)
             self._contact = ContactPasses(
                 gpu, device, given.contact, ranges, arrays, self.solver, balance, contact_results, reactions,
-                self._broken, correction,
+                self._broken, correction, told,
             )  # fmt: skip
             if self._contact.detects:
                 self._whole_assembly = [*self._whole_assembly, self._contact.detect]
@@ -167,6 +174,8 @@ class GpuEngine(DeviceLoop):
             records, twins["values"].dtype, newton_results, energy_records, stage_results,
             contact_results, reactions, held, substep_results, **addresses,
         )  # fmt: skip
+        if told:
+            self.report_pairs(*told)
         self._factor_upload = FactorUpload(gpu, self.solver, self, given.names, self.mailboxes[bodies : 2 * bodies])
         for k in range(bodies):
             whole = self.solver.bodies[k : k + 1].tobytes()

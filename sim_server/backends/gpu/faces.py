@@ -22,7 +22,7 @@ DEFINED = "-DFACE_ROWS"  # in texts of scenes with such rows
 
 
 def corners_of_nodes(triangle: Int32, nodes: int) -> tuple[Int32, Int32]:
-    """Returns CORNERS * triangle + corner of the corners at each node, ascending, and the first of each node, (nodes + 1,)."""
+    """Returns CORNERS * triangle + corner of all corners, by node, ascending; the first of each node, (nodes + 1,)."""
     entry = (CORNERS * np.arange(len(triangle))[:, None] + np.arange(3)).ravel()
     order = np.argsort(triangle.ravel(), kind="stable")
     first = np.searchsorted(triangle.ravel()[order], np.arange(nodes + 1))
@@ -57,7 +57,9 @@ class FaceRows:
     What it keeps: link_place, places of blocks that rows share; memory (arrays by name).
     """
 
-    def __init__(self, gpu: Gpu, contact: Contact, faces: Faces, starts: Int32, arrays: Mapping[str, NDArray[Any]], real: Any):
+    def __init__(
+        self, gpu: Gpu, contact: Contact, faces: Faces, starts: Int32, arrays: Mapping[str, NDArray[Any]], real: Any
+    ):
         cp, bodies, nodes = gpu.cp, len(starts) - 1, len(arrays["x"])
         count, start = len(faces.triangle), contact.body_start[-1]
         entry, entry_start = corners_of_nodes(faces.triangle, nodes)

@@ -942,7 +942,63 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) know_pairs(const I
     }
 }
 
-// A thread block has a body: keeps the forces of its rows with others for the next step. After the last kernel that reads the old ones.
+// Sums what a body's rows with others exert, for each of these, ascending. Done by a whole thread block.
+__device__ void tell_pairs(const IslandArguments& a, int body) {
+    __shared__ int next;
+    const long long slot = (a.c.step[0] % a.c.capacity) * a.bodies_count + body;
+    const int pairs = a.pair_rows[body], *list = own_list(a, body) + a.own_rows[body] - pairs;
+    int told = 0;
+    for (int last = -1; pairs > 0; ++told) {
+        __syncthreads();
+        if (threadIdx.x == 0) next = a.bodies_count;
+        __syncthreads();
+        for (int k = threadIdx.x; k < pairs; k += CONTACT_THREADS) {
+            const int r = list[k], other = a.t.obstacle[r];
+            if (other > last && __ldcg(a.t.force + r) > 0) atomicMin(&next, other);
+        }
+        __syncthreads();
+        last = next;
+        if (last == a.bodies_count) break;
+        double sum[10] = {};  // normal force, force, torque, point
+        for (int k = threadIdx.x; k < pairs; k += CONTACT_THREADS) {
+            const int r = list[k];
+            const double normal = __ldcg(a.t.force + r);
+            if (a.t.obstacle[r] != last || !(normal > 0)) continue;
+            double p[3] = {0, 0, 0}, f[3];  // of the body's own side, at the end of the step
+            for (int corner = 0; corner < CORNERS && !is_other_side(a, r, corner); ++corner) {
+                const int node = a.t.corner[CORNERS * r + corner];
+                double y[3], u[3];
+                load3(a.c.y, node, y);
+                rotated(rotation_of(a, node), y, u);
+                for (int m = 0; m < 3; ++m)
+                    p[m] += a.t.weight[CORNERS * r + corner] *
+                            ((double)a.c.x[3ll * node + m] + a.c.dx_dv * ((double)a.c.predictor[3ll * node + m] + u[m]));
+            }
+            sum[0] += normal;
+            for (int m = 0; m < 3; ++m) {
+                f[m] = normal * a.t.normal[3 * r + m] + __ldcg(a.t.traction + 3 * r + m);
+                sum[1 + m] += f[m];
+                sum[7 + m] += normal * p[m];
+            }
+            sum[4] += p[1] * f[2] - p[2] * f[1];
+            sum[5] += p[2] * f[0] - p[0] * f[2];
+            sum[6] += p[0] * f[1] - p[1] * f[0];
+        }
+        sum_block(sum);
+        if (threadIdx.x > 0 || told >= a.most_told) continue;
+        PairSum& to = a.told[slot * a.most_told + told];
+        to.other = last;
+        to.normal = sum[0];
+        for (int m = 0; m < 3; ++m) {
+            to.force[m] = sum[1 + m];
+            to.torque[m] = sum[4 + m];
+            to.point[m] = sum[7 + m];
+        }
+    }
+    if (threadIdx.x == 0) a.told_count[slot] = told;
+}
+
+// A thread block has a body: keeps the forces of its rows with others for the next step, and tells them. After the last kernel that reads the old ones.
 extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) keep_pairs(const IslandArguments a) {
     const int body = blockIdx.x;
     const bool well = a.c.results[(a.c.step[0] % a.c.capacity) * a.bodies_count + body].status != NOT_FINITE;
@@ -958,9 +1014,11 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) keep_pairs(const I
         a.t.hardening[r] = lasting_hardening(a.t.hardening[r], before, a.t.force[r], a.t.stiffness[r], a.t.thickness[r]);
         for (int k = 0; k < 3; ++k) a.t.traction[3 * r + k] = closed ? row.force.traction[k] : 0;
     };
-    each_pair_range(a, body, [&](int first, int last) {
+    each_touching_range(a, body, [&](int first, int last) {
         for (int r = first + threadIdx.x; r < last; r += CONTACT_THREADS) keep(r);
     });
+    __syncthreads();
+    tell_pairs(a, body);
 }
 
 // A thread has a node: rows between bodies that carry force, and their work, added to what its body has from obstacles.

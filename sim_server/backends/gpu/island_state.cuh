@@ -25,6 +25,7 @@
 #include "edge_detection.cuh"
 #include "hold_apart.cuh"
 #include "pass_choice.cuh"
+#include "reaction.h"
 #include "ties.cuh"
 
 #ifdef TIES
@@ -146,7 +147,9 @@ struct IslandArguments {
     int* coarse_well;            // (bodies,) of islands: 1: E is positive definite
     double* coefficient;         // (bodies, MODES)
     PassChoice* choice;          // (bodies,) of islands, kept by their first body
-    int bodies_count, most_modes, most_chunks, highest_tree, passes, bound_nodes, edges, unused;
+    PairSum* told;               // (capacity, bodies, most_told) on the host: what bodies exert on each other
+    int* told_count;             // (capacity, bodies) on the host: other bodies of each; more than most_told have no place
+    int bodies_count, most_modes, most_chunks, highest_tree, passes, bound_nodes, edges, most_told;
     Ties ties;                   // ties.first is the number of rows where there are none
     const int *bound_node, *bound_start;    // (bound_nodes,), (bound_nodes + 1,) nodes that may be bound, and first ties of each
     const int *bound_tie, *bound_other;     // those ties in order, and the bodies that they bind the node to
@@ -188,11 +191,12 @@ template <class F> __device__ __forceinline__ void each_obstacle_range(const Isl
     f(a.t.body_start[body], a.t.body_start[body + 1]);
     if (FACES) f(a.c.faces.start[body], a.c.faces.start[body + 1]);
 }
+template <class F> __device__ __forceinline__ void each_touching_range(const IslandArguments& a, int body, F f) {
+    f(a.t.pair_first + a.t.body_start[body], a.t.pair_first + a.t.body_start[body + 1]);
+    f(a.e.start[body], a.e.start[body + 1]);
+}
 template <class F> __device__ __forceinline__ void each_pair_range(const IslandArguments& a, int body, F f) {
-    if (bodies_touch(a)) {
-        f(a.t.pair_first + a.t.body_start[body], a.t.pair_first + a.t.body_start[body + 1]);
-        f(a.e.start[body], a.e.start[body + 1]);
-    }
+    if (bodies_touch(a)) each_touching_range(a, body, f);
     if (HAS_TIES) f(a.ties.first + a.ties.start[body], a.ties.first + a.ties.start[body + 1]);
 }
 

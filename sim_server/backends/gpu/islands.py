@@ -46,6 +46,10 @@ ROWS = ("corner", "weight", "obstacle", "normal", "gap", "entry", "stiffness", "
         "traction", "body_start")  # fmt: skip
 
 
+PairsTold = tuple[NDArray[Any], NDArray[Any]]
+"""What bodies exert on each other: (capacity, bodies, most) of PAIR_SUM; (capacity, bodies) how many each has."""
+
+
 class Graphs(Protocol):
     """A device whose graphs have branches and loops (cuda.CudaDevice)."""
 
@@ -94,8 +98,8 @@ class IslandPasses:
     shared: arrays and arguments of contact.cu: memory by name, params, chunks
     threads: of a thread block
     broken: host memory (ties,) of int32 that the steps write to: steps completed when a tie broke
-
-    faces: its rows of triangles; None: there are none
+    faces: rows of triangles; None: there are none
+    told: host memory that the steps write to, of bodies that touch each other
 
     Tests run its kernels with what it keeps: params (arguments of all kernels), memory (arrays by name), tally,
     pivots (steps of an inversion), product_grid (thread blocks of the product with A), vertex_grid, edge_grid (of
@@ -105,7 +109,7 @@ class IslandPasses:
     def __init__(
         self, gpu: Gpu, device: Graphs, contact: Contact, ranges: Sequence[tuple[int, int]],
         arrays: Mapping[str, NDArray[Any]], solver: PcgSolver, params: NDArray[Any], chunks: NDArray[Any], threads: int,
-        broken: Int32, faces: FaceRows | None,
+        broken: Int32, faces: FaceRows | None, told: PairsTold | None,
     ):  # fmt: skip
         surfaces, ties, ints, doubles = contact.surfaces, contact.ties, np.int32, np.float64
         self._touching, self._ties = surfaces is not None, ties
@@ -175,6 +179,9 @@ class IslandPasses:
         self.params["ties"]["first"] = rows - tied
         if ties:
             self._tie_memory = tie_arguments(gpu, ties, nodes, broken, self.params)
+        if told:
+            self.params["told"], self.params["told_count"] = (array.ctypes.data for array in told)
+            self.params["most_told"] = told[0].shape[2]
         self._kernels: dict[str, KernelFunction] = {}
         texts = [(PAIRS, "pairs.cu", DETECTION), (ISLAND, "island.cu", (*SOLVE, *(SWEEP_OF_FACES if faces else ())))]
         texts += [(TIES, "ties.cu", KERNELS_OF_TIES)] if ties else []

@@ -8,6 +8,7 @@
 #include <algorithm>
 #include <vector>
 
+#include "../cpu/native/pair_wrenches.h"
 #include "../cpu/native/sizes.h"
 #include "readback.h"
 #include "step_form.h"
@@ -118,6 +119,18 @@ static void report_grabs(GpuLoop& l, int64_t from) {
     put_reactions(l.rings, found.data(), (int64_t)found.size(), [&] { publish(l); return true; });
 }
 
+// Puts what bodies exerted on each other in a step into the ring. from: place of the step in the results.
+static void report_pairs(GpuLoop& l, int64_t from, int64_t step) {
+    static thread_local std::vector<Reaction> found;
+    found.clear();
+    const int32_t* counts = l.pair_counts + from * l.bodies;
+    for (int i = 0; i < l.bodies; ++i) l.rings.others_dropped += std::max<int64_t>(0, counts[i] - l.most_pairs);
+    add_pairs(l.bodies, step, found, [&](int i) {
+        return Span{l.pair_sums + (from * l.bodies + i) * l.most_pairs, (int)std::min<int64_t>(counts[i], l.most_pairs)};
+    });
+    put_reactions(l.rings, found.data(), (int64_t)found.size(), [&] { publish(l); return true; });
+}
+
 static void report(GpuLoop& l, const StepBatch& batch, int64_t k, double end, double cpu) {
     Rings& rings = l.rings;
     const StepTimestamp &stamp = l.timestamps[(batch.first + k) % l.capacity];
@@ -158,6 +171,7 @@ static void report(GpuLoop& l, const StepBatch& batch, int64_t k, double end, do
     rings.step.store(step);
     *l.clock = rings.start_time + step * rings.dt;
     if (keep && batch.touched) report_grabs(l, (batch.first + k) % l.capacity);
+    if (keep && l.pair_sums) report_pairs(l, (batch.first + k) % l.capacity, step);
     if (keep) rings.record_head.store(head + l.bodies, std::memory_order_release);
     else rings.records_dropped += l.bodies;
 }
@@ -240,7 +254,7 @@ void wf_gpu_start_balance(Balance* balance, const double* sums, double dt, int32
 const StructSize* wf_sizes() {
     static const StructSize sizes[] = {SIZE(CudaDriver), SIZE(Mail), SIZE(MailSlot), SIZE(PcgResult), SIZE(StepTimestamp),
                                        SIZE(NewtonResult), SIZE(StageResult), SIZE(ContactResult), SIZE(SubstepResult), SIZE(BodyReadback), SIZE(GpuLoop), SIZE(Record), SIZE(EnergyRecord),
-                                       SIZE(Balance), SIZE(Reaction), {}};
+                                       SIZE(Balance), SIZE(Reaction), SIZE(PairSum), {}};
     return sizes;
 }
 }

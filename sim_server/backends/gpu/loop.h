@@ -77,6 +77,9 @@ struct GpuLoop {
     const SubstepResult* substep_results;  // (capacity, bodies) likewise; null: an implicit scheme
     const double* contact_reactions;       // (capacity, bodies, obstacles, 6) likewise
     const double* held_reactions;          // (capacity, bodies, holders, 6) likewise
+    const PairSum* pair_sums;              // (capacity, bodies, most_pairs) likewise; null: bodies do not touch each other
+    const int32_t* pair_counts;            // (capacity, bodies) likewise, sums of each body; more than most_pairs have no place
+    int64_t most_pairs;
     int64_t obstacles, holders;
     void* grabs;                           // graph that writes what bodies exert on grabs after a step; null: nothing can be touched
     const MailSlot* touch;                 // arguments of pushes and grabs

@@ -151,6 +151,16 @@ class DeviceLoop(Reports):
         loop.grab_reactions, loop.grab_counts = reactions.ctypes.data, counts.ctypes.data
         loop.most_grabs = reactions.shape[1]
 
+    def report_pairs(self, sums: NDArray[Any], counts: NDArray[Any]) -> None:
+        """Has records come with what bodies exert on each other.
+
+        sums: host memory (CAPACITY, bodies, most) of structs.PAIR_SUM that the steps write to, by other body. counts:
+        likewise (CAPACITY, bodies), how many each body has
+        """
+        self._pairs_written = sums, counts
+        self.loop.pair_sums, self.loop.pair_counts = sums.ctypes.data, counts.ctypes.data
+        self.loop.most_pairs = sums.shape[2]
+
     # --- running ------------------------------------------------------------------------------------------------
 
     def use_graphs(self, graphs: Sequence[int], energy_balance: int, elastic_energy: int, matrix: int = 0) -> None:

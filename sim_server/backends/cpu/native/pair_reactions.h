@@ -4,14 +4,7 @@
 #include <vector>
 
 #include "loop.h"
-
-struct PairSum {      // of the rows of a body against another one
-    int other;
-    double normal;    // sum of the normal forces [N]
-    double force[3];  // on the body [N]
-    double torque[3]; // about the origin [N m]
-    double point[3];  // sum of the points, times normal force [N m]
-};
+#include "pair_wrenches.h"
 
 // Adds the force of row k, of a body against `other`, to the sums from `first` on.
 static void add_pair_row(const Contact& c, const double* x, int k, int other, std::vector<PairSum>& sums, size_t first) {
@@ -35,27 +28,6 @@ static void add_pair_row(const Contact& c, const double* x, int k, int other, st
     sum.torque[2] += p[0] * f[1] - p[1] * f[0];
 }
 
-// Appends what body `i` exerts on sum.other, and the contrary. back: of the rows of that body against i, or null.
-static void add_pair(std::vector<Reaction>& found, int64_t step, int i, const PairSum& sum, const PairSum* back) {
-    Reaction r{step, sum.other, i, ON_OBJECT, {}, {}, {}};
-    for (int m = 0; m < 3; ++m) {
-        r.force[m] = (back ? back->force[m] : 0) - sum.force[m];
-        r.point[m] = (sum.point[m] + (back ? back->point[m] : 0)) / (sum.normal + (back ? back->normal : 0));
-    }
-    for (int m = 0; m < 3; ++m) {
-        const int a = (m + 1) % 3, b = (m + 2) % 3;
-        r.torque[m] = (back ? back->torque[m] : 0) - sum.torque[m] - (r.point[a] * r.force[b] - r.point[b] * r.force[a]);
-    }
-    found.push_back(r);
-    r.body = sum.other;
-    r.number = i;
-    for (int m = 0; m < 3; ++m) {
-        r.force[m] = -r.force[m];
-        r.torque[m] = -r.torque[m];
-    }
-    found.push_back(r);
-}
-
 // Appends the reactions of all bodies that touch each other, after a step. A body's contact with itself is none.
 static void add_pair_reactions(const Loop& loop, int64_t step, std::vector<Reaction>& found) {
     const Contact& c = *loop.contact;
@@ -71,13 +43,5 @@ static void add_pair_reactions(const Loop& loop, int64_t step, std::vector<React
         });
     }
     first.push_back(sums.size());
-    for (int i = 0; i < loop.bodies; ++i) {
-        for (size_t at = first[i]; at < first[i + 1]; ++at) {
-            const int other = sums[at].other;
-            const PairSum* back = nullptr;
-            for (size_t b = first[other]; b < first[other + 1]; ++b)
-                if (sums[b].other == i) back = &sums[b];
-            if (!back || i < other) add_pair(found, step, i, sums[at], back);
-        }
-    }
+    add_pairs(loop.bodies, step, found, [&](int i) { return Span{sums.data() + first[i], (int)(first[i + 1] - first[i])}; });
 }
