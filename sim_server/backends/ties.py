@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Attachments and springs as input of an engine (forces: backends/cpu/native/ties.h)."""
+"""Attachments and springs as input of an engine (forces: kernels/ties.cuh)."""
 
 from dataclasses import dataclass
 

@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: MIT
 """Attachments and springs on a GPU beside the CPU's. Runs where there is a GPU: pytest -m gpu."""
 
+import tomllib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from sim_server.scene.model import Scene
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
 from tests.scenes import bar
@@ -18,7 +20,7 @@ from tests.ties.test_attachments_and_springs import FLOOR, glue, half, made, mas
 pytestmark = pytest.mark.gpu
 
 GRAFT = "deploy/scenes/graft.toml"
-EXACT = ["solver.tolerance=1e-11", "solver.preconditioner=block_jacobi", "solver.max_iterations=3000"]
+EXACT = {"tolerance": 1e-11, "preconditioner": "block_jacobi", "max_iterations": 3000}
 
 
 def compare(sims: list[Simulation], steps: int, within: float = 1e-8) -> tuple[np.ndarray, np.ndarray]:
@@ -47,7 +49,10 @@ def both(**keys: Any) -> list[Simulation]:
 
 def test_the_graft_tears_as_on_a_cpu() -> None:
     """A holder, an attachment to a body, a spring, without contact."""
-    sims = [Simulation.load(GRAFT, EXACT, device) for device in ("gpu", "cpu")]
+    sims = [
+        Simulation.load(GRAFT, [f"solver.{key}={value}" for key, value in EXACT.items()], device)
+        for device in ("gpu", "cpu")
+    ]
     compare(sims, 90)
     assert 0 < (sims[0].ties.broken > 0).sum() < len(sims[0].ties.broken)
 
@@ -87,6 +92,20 @@ def test_a_tool_that_holds_one_of_two_glued_bars_over_a_floor() -> None:
     given = {"objects": [half("a", 0), half("b", 1)], "obstacle": [floor, tool], "attachment": [stuck, glue()]}
     records, _ = compare(both(contact=effect, **given), 30)
     assert records["contacts"].max() > 0
+
+
+def test_a_needle_holder_pulls_at_tissue_that_is_sutured_to_a_plate() -> None:
+    """With contact: held nodes, attached ones and ones that touch, of one body; the suture tears."""
+    table = tomllib.loads(Path("deploy/scenes/needle_holder.toml").read_text()) | {"name": "suture", "solver": EXACT}
+    table["effects"] |= {"contact": {"thickness": 2e-4, "tolerance": 1e-8, "passes": 100}}
+    plate = {"name": "plate", "shape": "box", "size": [0.03, 0.004, 0.06], "pose": {"translate": [0.03, -0.0021, 0.02]}}
+    nodes = "abs(X - 0.03) < 0.001 and Y < 0.001 and abs(Z - 0.02) < 0.011"
+    suture = {"name": "suture", "object": "tissue", "where": nodes, "to": "plate", "breaking": 0.02}
+    table |= {"obstacle": [plate], "attachment": [suture]}
+    scene = Scene.model_validate(table, context={"folder": "."})
+    sims = [Simulation(scene, device) for device in ("gpu", "cpu")]
+    records, _ = compare(sims, 70)
+    assert records["contacts"].max() > 0 and sims[0].ties.broken.any()
 
 
 def test_a_factor_that_knows_attachments_needs_few_iterations() -> None:

@@ -109,7 +109,7 @@ struct ContactArguments {
     Balance* balance;           // (bodies,)
     ContactResult* contact_results;  // (capacity, bodies) on the host
     double* reactions;          // (capacity, bodies, obstacles, 6) on the host
-    const int* island_of;       // (bodies,) -1: the body is alone (island_state.cuh); null: bodies do not touch each other
+    const int* island_of;       // (bodies,) -1: the body is alone (island_state.cuh); null: there are no islands
     const int* alone;           // (1,) how many are
     double* pair_sums;          // (grid,) work of rows between bodies
     int* pair_contacts;         // (bodies,) those that carry force

@@ -43,7 +43,7 @@ class PcgSolver:
     phases: newton.NewtonPhases; empty: one linearization a step
     attempts: number of solves that the graph of a Rosenbrock-W step holds (stages.cuh); 0: another scheme
     contact: True for a scene with contact (contact_state.cuh)
-    between: True if bodies touch each other there (island_state.cuh)
+    between: True if bodies touch each other, or are tied, there (island_state.cuh)
     correction: of factors for grabs and contacts; None: they are not corrected
 
     bodies: host rows (PCG_BODY), one per body. The loop uploads the settings (the first SETTINGS_BYTES bytes of a row)
