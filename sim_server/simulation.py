@@ -12,7 +12,6 @@ record  service/telemetry.py fetches those of the engine (`records`) for recordi
 """
 
 from collections.abc import Callable, Sequence
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -82,6 +81,7 @@ class Simulation:
         self.integrator = make_integrator(scene, self.system)
         if not self.world.inertia:
             check_held(self.world, elements)
+        self._held_launches = self._hold()
         still = [self.world.v, self.system.dv, *self.integrator.still]
         on_runaway = solver.on_runaway if watched else None
         self.energies = collected_energies(self.world, self.effects, self.integrator.before, still, on_runaway)
@@ -103,12 +103,15 @@ class Simulation:
         others = self._other_launches()
         assemble, integrate = self.launches()
         mailed = {x.name: x for x in assemble if x.mailed}  # whose arguments come to one launch, which all lists share
-        *lists, euler_launches = [[mailed.get(x.name, x) for x in other] for other in others]
+        own = {id(x): x for x in assemble}
+        *lists, euler_launches, settled = [[own.get(id(x)) or mailed.get(x.name, x) for x in o] for o in others]
         effects, numbers = list(self.effects.values()), self._detection
         newton = self.integrator.newton(assemble, numbers, effects)
         stages = self.integrator.stages(assemble, lists, effects)
         substeps = self.integrator.substeps(len(self._held_launches))
-        euler = self.integrator.euler_form([*assemble, *integrate], assemble[numbers], euler_launches, effects)
+        euler = self.integrator.euler_form(
+            [*assemble, *integrate], assemble[numbers], euler_launches, settled, effects
+        )  # fmt: skip
         contact = ties_alone(w, self.ties) if self.ties else None
         if self.contact:
             contact = self.contact.contact_input()
@@ -136,14 +139,17 @@ class Simulation:
             self.world.backend.fetch(array)
         return self.world
 
-    def launches(self, matrix: bool = True, detect: bool = True) -> tuple[list[Launch], list[Launch]]:
+    def launches(
+        self, matrix: bool = True, detect: bool = True, euler: bool = False
+    ) -> tuple[list[Launch], list[Launch]]:
         """What a step runs: before and after the solve.
 
-        matrix: takes A into the material frame; detect: detects contacts
+        matrix: takes A into the material frame; detect: detects contacts; euler: a step of backward Euler that bodies
+        take in place of that of the scheme
         """
         system = self.system
-        assemble = [*self._held_launches, self.integrator.start()]
-        if self.holders and self._held_launches:
+        assemble = [*(self._hold(euler=True) if euler else self._held_launches), self.integrator.start()]
+        if self.holders and self._held_launches and not euler:
             self._mailed[self.holders] = 0
         stencils = iter(system.stencils)
         accumulate = False
@@ -176,23 +182,28 @@ class Simulation:
             return forces
         return [x for x in effect.launches(self.system, stencil, False) if x.domain != "blocks"]
 
-    @cached_property
-    def _held_launches(self) -> list[Launch]:
-        """The launches that move holders and their nodes; the first is the one that is mailed."""
+    def _hold(self, euler: bool = False) -> list[Launch]:
+        """Returns the launches that move holders and their nodes, of a step of the scheme or of backward Euler. The
+        first is the same in both, and mailed."""
         if self.holders is None:
             return []
-        return self.holders.first_launches(self.system, self.integrator.beta, self.integrator.inertial_increment)
+        i = self.integrator
+        made = self.holders.first_launches(self.system, i.beta, i.inertial_increment, euler)
+        return [*self._held_launches[:1], *made] if euler else made
 
     def _other_launches(self) -> list[list[Launch]]:
-        """Returns what steps run beside `launches`: the forces of the stages of ros2, and backward Euler.
+        """Returns what steps run beside `launches`: the forces of the stages of ros2, the assembly of backward Euler,
+        and what settles the forces of holders there.
 
         Where bodies touch, with the tangent that backward Euler has by default: the exact one would take their spin.
         """
         stages = [self.force_launches(frames) for frames in (True, False)] if self.integrator.has_stages else []
         if not self.integrator.takes_euler:
-            return [*stages, []]
+            return [*stages, [], []]
         with self.world.made_with(self.world.dt, self.world.dt, usual_tangent=self.integrator.touches):
-            return [*stages, self.launches(detect=False)[0]]
+            assemble = self.launches(detect=False, euler=True)[0]
+            settled = self.holders.last_launches(self.system, euler=True) if self.holders else []
+        return [*stages, assemble, settled]
 
     def force_launches(self, frames: bool) -> list[Launch]:
         """Returns the launches of a stage that needs no A. frames: those of the nodes are made, too."""

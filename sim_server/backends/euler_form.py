@@ -18,6 +18,7 @@ class EulerForm:
 
     assemble: launches that assemble such a step
     detect: launches that detect contacts, which all schemes list among those that assemble; empty without contact
+    settle: launches after the solve that make the forces on holders; empty without holders
     restore: nodal kernel that goes back to the start of the step, with what backward Euler is assembled from
     advance: nodal kernel of the end of the step, with what the next step of the scheme itself is assembled from
     parts: (bodies + 1,) first item of each body, by id of a launch; None if a launch does not tell bodies apart
@@ -32,6 +33,7 @@ class EulerForm:
 
     assemble: Sequence[Launch]
     detect: Sequence[Launch]
+    settle: Sequence[Launch]
     restore: Launch
     advance: Launch
     parts: Mapping[int, Int32 | None]
@@ -47,4 +49,4 @@ class EulerForm:
     @property
     def launches(self) -> list[Launch]:
         """All launches beside those of the scheme itself."""
-        return [*self.assemble, self.restore, self.advance]
+        return [*self.assemble, *self.settle, self.restore, self.advance]

@@ -33,7 +33,8 @@ TEXT = "kernels/holders.cu"
 class Holders(Movable):
     """All holders of a scene. It is made before the effects of objects, which ask which nodes are free.
 
-    node (n,): held nodes, holder by holder, ascending. holder (n,): of each
+    node (n,): held nodes, holder by holder, ascending; holders in the order of their bodies. holder (n,): of each
+    first, last (holders,): where those of each begin and end
     force (n, 3): on each node in the last step [N]. They are summed to world.reaction, torques about centres
     load (nodes, 3): the array `force` of the energy balance, of the effect touch where the scene has it
     """
@@ -44,9 +45,13 @@ class Holders(Movable):
         for h in holders:
             masks.append(_mask(world, h))
             world.held[masks[-1]] = 1
-        self.node = np.concatenate([np.flatnonzero(m) for m in masks]).astype(np.int32)
-        self.holder = np.repeat(np.arange(len(holders), dtype=np.int32), [int(m.sum()) for m in masks])
-        self.first = np.searchsorted(self.holder, np.arange(len(holders) + 1)).astype(np.int32)
+        self._bodies = [world.body(h.object) for h in holders]
+        order = sorted(range(len(holders)), key=lambda k: self._bodies[k].index)
+        self.node = np.concatenate([np.flatnonzero(masks[k]) for k in order]).astype(np.int32)
+        self.holder = np.repeat(np.array(order, np.int32), [int(masks[k].sum()) for k in order])
+        self.first = np.array([np.flatnonzero(self.holder == k)[0] for k in range(len(holders))], np.int32)
+        self.last = self.first + np.array([int(m.sum()) for m in masks], np.int32)
+        world.held_nodes = self.node
         self.start = world.x[self.node]
         means = [self.start[self.holder == k].mean(axis=0) for k in range(len(holders))]
         self.center = np.array([mean if h.center is None else h.center for h, mean in zip(holders, means, strict=True)])
@@ -54,12 +59,12 @@ class Holders(Movable):
         self.arm = self.start - self.center[self.holder]
         self.ball[:, 3] = -1
         world.free[self.node] = 0
-        self._bodies = [world.body(h.object) for h in holders]
         n = len(self.node)
         self.next, self.later, self.velocity, self.force = self.start.copy(), *(np.zeros((n, 3)) for _ in range(3))
         columns = world.reaction.shape[1]
         self._place = np.array([b.index * columns + k for k, b in enumerate(self._bodies)], np.int32)
         self.load, self._own_load = np.zeros((world.nodes, 3)), True
+        self._settled = np.full(n, -1.0)
         exact = [a for a in vars(self).values() if isinstance(a, np.ndarray) and a is not self.load]
         world.backend.keep(*exact, exact=True)
         world.backend.keep(self.load)
@@ -76,10 +81,13 @@ class Holders(Movable):
         w.backend.keep(spring, anchor)
         return {"force": self.load, "spring": spring, "anchor": anchor}
 
-    def first_launches(self, system: System, beta: Float64, inertial_increment: Float64) -> list[Launch]:
+    def first_launches(
+        self, system: System, beta: Float64, inertial_increment: Float64, euler: bool = False
+    ) -> list[Launch]:  # fmt: skip
         """Returns the launches before all others of a step; none where no holder moves.
 
-        beta, inertial_increment: of the integrator
+        beta, inertial_increment: of the integrator. euler: of a step of backward Euler in a scene of another scheme,
+        whose first launches have been those of the scheme
         """
         w = self.world
         if not any(h.keyframes or h.moved for h in w.holders):
@@ -87,17 +95,17 @@ class Holders(Movable):
         # An explicit scheme moves held nodes by the predictor, and has one velocity for all forces.
         dx_dv, unused = (w.dt, np.zeros_like(w.v)) if w.explicit else (w.dx_dv, w.damping_velocity)
         w.backend.keep(unused)
-        hold = w.backend.module(TEXT).bind(
+        hold: Launch = w.backend.module(TEXT).bind(
             "hold", len(self.node), node=self.node, holder=self.holder, witness=self._witnesses(), free=w.free,
             start=self.start, arm=self.arm, center=self.center, begin=self.begin, end=self.end, velocity=self.velocity,
             beta=beta, h=w.dt, dx_dv=dx_dv, force_coefficient=w.force_coefficient, plain=int(w.plain),
-            search=int(w.searches), next=self.next, later=self.later, x=w.x, v=w.v, predictor=w.predictor,
-            damping_velocity=unused, inertial_increment=inertial_increment,
+            search=int(w.searches and not euler), euler=int(euler), next=self.next, later=self.later, x=w.x, v=w.v,
+            predictor=w.predictor, damping_velocity=unused, inertial_increment=inertial_increment,
         )  # fmt: skip
-        return [self.place(system), hold]
+        return [hold] if euler else [self.place(system), hold]
 
-    def last_launches(self, system: System) -> list[Launch]:
-        """Returns the launches after the solve, before the state advances."""
+    def last_launches(self, system: System, euler: bool = False) -> list[Launch]:
+        """Returns the launches after the solve, before the state advances. euler: as of `first_launches`."""
         w = self.world
         mass = w.mass if w.inertia else np.zeros(w.nodes)
         first, last = system.held_couplings(self.node)
@@ -110,14 +118,19 @@ class Holders(Movable):
             start=self.start, arm=self.arm, center=self.center, begin=self.begin, next=self.next, later=self.later,
             first=first, last=last, columns=system.held_columns, blocks=system.sums, rotation=system.rotation,
             y=system.y, b=system.b, mass=mass, dx_dv=w.dx_dv, force_coefficient=w.force_coefficient,
-            plain=int(w.plain), search=int(w.searches), inertia=int(w.inertia), x=w.x, predictor=w.predictor,
-            velocity=self.velocity, force=self.force, load=self.load,
+            plain=int(w.plain), search=int(w.searches and not euler), inertia=int(w.inertia), clock=system.clock,
+            settled=self._settled, x=w.x, predictor=w.predictor, velocity=self.velocity, force=self.force,
+            load=self.load,
         )  # fmt: skip
-        total = text.bind(
-            "total", len(self.first) - 1, first=self.first, place=self._place, end=self.end, next=self.next,
-            force=self.force, reaction=w.reaction,
+        return [settle, self._total()]
+
+    def _total(self) -> Launch:
+        """Returns the launch that adds up the forces on each holder."""
+        total: Launch = self.world.backend.module(TEXT).bind(
+            "total", len(self.first), first=self.first, last=self.last, place=self._place, end=self.end,
+            next=self.next, force=self.force, reaction=self.world.reaction,
         )  # fmt: skip
-        return [settle, total]
+        return total
 
     def _witnesses(self) -> Int32:
         """Returns for each held node one of its body that nothing holds, (n,): it is fixed where the body is frozen."""

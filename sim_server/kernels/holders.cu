@@ -39,10 +39,11 @@ struct Hold {
     double force_coefficient;  // [s]
     int plain;                 // 1: backward Euler with one linearization
     int search;                // 1: several linearizations
+    int euler;                 // 1: a step of backward Euler in a scene of another scheme
     double* next;              // (n, 3) out: where the node is at the end of the step [m]
     double* later;             // (n, 3) out: its velocity then [m/s]
     real* x;                   // (nodes, 3) in; with a search out
-    real* v;                   // (nodes, 3) out
+    real* v;                   // (nodes, 3) out; in a step of backward Euler in: at the start of the step
     real* predictor;           // (nodes, 3) out
     real* damping_velocity;    // (nodes, 3) out
     real* inertial_increment;  // (nodes, 3) out, but in a plain scheme
@@ -62,14 +63,14 @@ KERNEL(hold, Hold) {
         const int at = 3 * node + k, a = (k + 1) % 3, b = (k + 2) % 3;
         const double step = next[k] - p.x[at], beta = p.plain ? 0 : p.beta[node];
         const double rigid = ((end[k] - begin[k]) + turn[a] * turned[b] - turn[b] * turned[a]) / p.h;
-        const double v = p.plain ? step / p.h : rigid;
+        const double v = p.plain || p.euler ? step / p.h : rigid, before = p.euler ? p.v[at] : p.velocity[3 * i + k];
         p.next[3 * i + k] = next[k];
         p.later[3 * i + k] = v;
         p.v[at] = v;
         if (p.plain) continue;  // all velocities are v
         p.predictor[at] = p.search ? 0 : step / p.dx_dv;
         p.damping_velocity[at] = ((p.search ? 0 : step) + beta * v) / (p.dx_dv + beta);
-        p.inertial_increment[at] = -p.force_coefficient / p.h * (v - p.velocity[3 * i + k]);
+        p.inertial_increment[at] = -p.force_coefficient / p.h * (v - before);
         if (p.search) p.x[at] = next[k];
     }
 }
@@ -98,13 +99,21 @@ struct Settle {
     int plain;
     int search;
     int inertia;               // 0: the solution is the velocity
+    const double* clock;       // (1,) t at the start of the step [s]
+    double* settled;           // (n,) in, out: t of the step whose force `load` has; negative at first [s]
     real* x;                   // (nodes, 3) with a search out: where the node was at the start of the step
     real* y;                   // (nodes, 3) in: solution, material frame; without inertia out at held nodes [m/s]
     real* predictor;           // (nodes, 3) with a search or without inertia out
     double* velocity;          // (n, 3) in, out: at the end of the step [m/s]
-    double* force;             // (n, 3) out: on the node [N]
+    double* force;             // (n, 3) in, out: on the node [N]
     real* load;                // (nodes, 3) in, out: forces that the energy balance counts [N]
 };
+
+// Has the energy balance count the force at held node i, in place of that of an earlier attempt at the same step.
+template <class P> INLINE void tell_force(const P& p, int i, int k, bool again, double force) {
+    p.load[3 * p.node[i] + k] += force - (again ? p.force[3 * i + k] : 0);
+    p.force[3 * i + k] = force;
+}
 
 // After the solve, before the state advances: the force at a held node is what its equation lacks.
 KERNEL(settle, Settle) {
@@ -119,6 +128,8 @@ KERNEL(settle, Settle) {
         for (int k = 0; k < 3; ++k) dv[k] = (double)R[3 * k] * y[0] + (double)R[3 * k + 1] * y[1] + (double)R[3 * k + 2] * y[2];
         for (int k = 0; k < 3; ++k) sum[k] += A[3 * k] * dv[0] + A[3 * k + 1] * dv[1] + A[3 * k + 2] * dv[2];
     }
+    const bool told = p.settled[i] == p.clock[0];
+    p.settled[i] = p.clock[0];
     if (moves && p.search) held_point(p.begin + 7 * p.holder[i], p.center + 3 * p.holder[i], p.arm + 3 * i, p.start + 3 * i, x);
     for (int k = 0; k < 3; ++k) {
         const int at = 3 * node + k;
@@ -126,8 +137,7 @@ KERNEL(settle, Settle) {
         if (p.plain) impulse += p.mass[node] * (p.later[3 * i + k] - velocity);
         const double force = moves ? impulse / p.force_coefficient : 0;
         velocity = moves ? p.later[3 * i + k] : 0;
-        p.force[3 * i + k] = force;
-        p.load[at] += force;
+        tell_force(p, i, k, told, force);
         if (!moves || (p.inertia && !p.search)) continue;
         if (p.search) p.x[at] = x[k];
         step[k] = (p.next[3 * i + k] - p.x[at]) / p.dx_dv;
@@ -139,17 +149,18 @@ KERNEL(settle, Settle) {
 
 struct Total {
     int n;                // holders
-    const int* first;     // (n + 1,) into held nodes
+    const int* first;     // (n,) into held nodes
+    const int* last;      // (n,) where they end
     const int* place;     // (n,) row of `reaction`
     const double* end;    // (n, 7)
-    const double* next;   // (first[n], 3) [m]
-    const double* force;  // (first[n], 3) on nodes [N]
+    const double* next;   // (held nodes, 3) [m]
+    const double* force;  // (held nodes, 3) on nodes [N]
     double* reaction;     // (rows, 6) out: force [N] and torque about the centre [N m] on the holder
 };
 
 KERNEL(total, Total) {
     double sum[6] = {0, 0, 0, 0, 0, 0};
-    for (int t = p.first[i]; t < p.first[i + 1]; ++t) {
+    for (int t = p.first[i]; t < p.last[i]; ++t) {
         const double* f = p.force + 3 * t;
         double arm[3];
         for (int k = 0; k < 3; ++k) arm[k] = p.next[3 * t + k] - p.end[7 * i + k];

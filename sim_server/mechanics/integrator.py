@@ -180,13 +180,13 @@ class Integrator:
         )  # fmt: skip
 
     def euler_form(
-        self, step: Sequence[Launch], detect: Sequence[Launch], euler: Sequence[Launch],
+        self, step: Sequence[Launch], detect: Sequence[Launch], euler: Sequence[Launch], settle: Sequence[Launch],
         effects: Sequence[CouplesNodes],
     ) -> EulerForm | None:  # fmt: skip
         """Input of steps of backward Euler that single bodies take; None if none do.
 
         step: launches of a step of the scheme; detect: those among them that detect contacts; euler: launches that
-        assemble backward Euler
+        assemble backward Euler; settle: launches after its solve that make the forces on holders
         """
         if not self.takes_euler:
             return None
@@ -198,8 +198,8 @@ class Integrator:
         )  # fmt: skip
         advance = self.advance_euler()
         return EulerForm(
-            assemble=euler, detect=detect, restore=restore, advance=advance, before=self.before, **start,
-            parts=self.parts_of((*step, *euler, restore, advance), effects),
+            assemble=euler, detect=detect, settle=settle, restore=restore, advance=advance, before=self.before, **start,
+            parts=self.parts_of((*step, *euler, *settle, restore, advance), effects),
             diagonal=self.system.diagonal, block_scale=w.euler_block_scale,
             coefficients=w.coefficients, euler_coefficients=(w.dt, w.dt),
         )  # fmt: skip
@@ -218,7 +218,7 @@ class Integrator:
         """Returns the first item of each body, (bodies + 1,), by the id of a launch; None if it tells none apart."""
         w, rows = self.world, rows_of(effects)
         starts = np.array([*(b.first for b in w.bodies), w.nodes], dtype=np.int32)
-        return {id(x): items_of_bodies(x, starts, self.system.row, rows) for x in launches}
+        return {id(x): items_of_bodies(x, starts, self.system.row, rows, w.held_nodes) for x in launches}
 
     has_stages = False
 
@@ -258,14 +258,15 @@ def rows_of(effects: Sequence[CouplesNodes]) -> list[Int32]:
     return [e.elements[:, 0] for e in effects if e.elements is not None]
 
 
-def items_of_bodies(launch: Launch, starts: Int32, row: Int32, firsts: list[Int32]) -> Int32 | None:
+def items_of_bodies(launch: Launch, starts: Int32, row: Int32, firsts: list[Int32], held: Int32) -> Int32 | None:
     """First item of each body, (bodies + 1,); None for a launch whose items are not ordered by body.
 
-    starts: first node of each body; row: of each block; firsts: one corner of each element, per effect.
+    starts: first node of each body; row: of each block; firsts: one corner of each element, per effect; held: nodes of
+    holders
     """
     if launch.domain == "nodes" and launch.items == starts[-1]:
         return starts
-    candidates = {"elements": firsts, "blocks": [row]}.get(launch.domain, [])
+    candidates = {"elements": firsts, "blocks": [row], "held": [held]}.get(launch.domain, [])
     found = [c for c in candidates if len(c) == launch.items]
     parts = [np.searchsorted(np.searchsorted(starts, c, "right"), np.arange(1, len(starts) + 1)) for c in found]
     same = bool(parts) and all(np.array_equal(p, parts[0]) for p in parts)

@@ -172,14 +172,15 @@ class _NativeEuler:
     def __init__(self, euler: EulerForm, loop: structs.Loop, launches: Any, number: dict[int, int]):
         self._input, detect = euler, [number[id(x)] for x in euler.detect]
         self._launch = np.array([number[id(x)] for x in euler.assemble], np.int32)
+        self._settle = np.array([number[id(x)] for x in euler.settle], np.int32)
         self._result = (structs.SolveResult * loop.bodies)()
         self._own = {
             "end_x": np.zeros_like(euler.start_x), "takes": np.zeros(loop.bodies, np.int32),
-            "assembled": np.zeros(loop.bodies, np.int32), "launch": self._launch,
+            "assembled": np.zeros(loop.bodies, np.int32), "launch": self._launch, "settle": self._settle,
             "touching": np.zeros(loop.bodies, np.int32), "solution": np.zeros_like(euler.start_x),
         }  # fmt: skip
         self.native = structs.EulerForm(
-            launches=len(self._launch), detect=min(detect, default=0), detects=len(detect),
+            launches=len(self._launch), settles=len(self._settle), detect=min(detect, default=0), detects=len(detect),
             restore=number[id(euler.restore)], advance=number[id(euler.advance)],
             own_coefficients=tuple(euler.coefficients.tolist()), euler_coefficients=euler.euler_coefficients,
             result=c.addressof(self._result),

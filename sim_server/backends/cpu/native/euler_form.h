@@ -211,5 +211,6 @@ static void make_step(Loop& loop) {
         forget(step_result(loop, i));
         note(step_result(loop, i), loop.contact->result[i]);
     }
+    for (int k = 0; k < e.settles; ++k) run_for(loop, loop.launch[e.settle[k]], takes);
     run_for(loop, loop.launch[e.advance], takes);
 }

@@ -89,6 +89,8 @@ struct EulerForm {                     // steps of backward Euler in scenes of o
     const int32_t* launch;             // numbers of launches that assemble them
     int32_t launches;
     int32_t detect, detects;           // first and number of the launches that detect contacts
+    const int32_t* settle;             // numbers of launches after the solve, that make the forces on holders
+    int32_t settles;
     int32_t restore, advance;          // numbers of launches: back to the start of the step; the end of it
     double* coefficients;              // (2,) of launches whose arguments change while steps run
     double own_coefficients[2], euler_coefficients[2];
