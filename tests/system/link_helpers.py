@@ -22,7 +22,7 @@ from sim_server.updates.factor_source import Job
 from tests.ports import free_port
 
 ROOT = Path(__file__).parents[2]
-PATIENCE = 30.0  # s until a test gives up
+PATIENCE = 60.0  # s until a test gives up: half of what pytest gives it
 
 
 def free_endpoint() -> str:

@@ -16,6 +16,7 @@ from clients.errors import BadInput
 from clients.log.export import export
 from clients.log.reader import Log
 from protocol import messages_pb2 as pb
+from tests.support.commands import in_turn
 from tests.system.link_helpers import ROOT, free_endpoint
 from tests.system.server_process import Stage, alive, beam, fresh, run, until
 
@@ -241,10 +242,11 @@ def test_bad_input_gives_one_line_and_code_2(tmp_path: Path) -> None:
         ([str(beam(tmp_path)), "--set", "solver.tolerence=1"], "did you mean 'tolerance'"),
         ([str(beam(tmp_path)), "--record", "/no/such/folder/a.mcap"], "/no/such/folder"),
     ]
-    for arguments, words in cases:
-        result = run("sim_server", *arguments, "--steps", "1")
-        assert result.returncode == 2, (arguments, result.stdout, result.stderr)
-        assert words in result.stderr and "Traceback" not in result.stderr, result.stderr
+    ended = in_turn("sim_server", [[*arguments, "--steps", "1"] for arguments, _ in cases])
+    for (code, out, err), (arguments, words) in zip(ended.values(), cases, strict=True):
+        assert code == 2, (arguments, out, err)
+        assert words in err and "Traceback" not in err, err
+    assert run("sim_server", str(bad), "--steps", "1").returncode == 2
 
 
 def test_a_taken_port_is_told(stage: Stage, tmp_path: Path) -> None:
