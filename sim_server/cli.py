@@ -175,7 +175,7 @@ def _set_up(closing: ExitStack, o: Options) -> "tuple[Service, Supervisor | None
             "docs/protocol.md (Security) tells how to restrict that", endpoint
         )  # fmt: skip
     supervisor = None
-    if o.workers:
+    if o.workers and not simulation.scene.integrator.explicit:  # which needs none
         endpoint = on_this_machine((o.listen or [DEFAULT_ENDPOINT])[0])
         supervisor = Supervisor(o.workers, o.name, [endpoint], ["--device", o.worker_device])
         closing.callback(supervisor.close)

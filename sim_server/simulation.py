@@ -157,10 +157,8 @@ class Simulation:
             stencil = next(stencils) if e.elements is not None else None
             if e is self.contact and not detect:
                 continue
-            if self.world.explicit:
-                added = self._forces_of(e, stencil)
-            else:
-                added = e.launches(system, stencil, accumulate)  # f and K, M, B of each effect
+            explicit = self.world.explicit  # f alone, else f and K, M, B of each effect
+            added = self._forces_of(e, stencil) if explicit else e.launches(system, stencil, accumulate)
             if e is self.contact:
                 self._detection = slice(len(assemble), len(assemble) + len(added))
             for number, launch in enumerate(added, len(assemble)):

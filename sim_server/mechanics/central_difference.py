@@ -7,10 +7,11 @@ With x, v, the lumped masses M, the forces f without damping of the mass, and a 
     v'    = ((1 - c) v + h M^-1 f(x_1/2, v)) / (1 + c),   c = h alpha / 2
     x'    = x_1/2 + h v' / 2
 
-The drifts of neighbouring substeps are one, so this is the leapfrog, x and v half a substep apart, which starts and ends
-a step with both at one time: the position form of the Verlet scheme, equal to central differences of x. There is one
-evaluation of the forces a substep, and no matrix, no solve and no factor. Order 2, symplectic without damping; linear
-and angular momentum of a free body are exact, since the forces of every element have neither sum nor torque.
+The drifts of neighbouring substeps are one, so this is the leapfrog, x and v half a substep apart, with both at one
+time where a step starts and ends: the position form of the Verlet scheme, equal to central differences of x. There is
+one evaluation of the forces a substep, and no matrix, no solve and no factor. Order 2, symplectic without damping; a
+free body keeps its linear and angular momentum, since the forces of an element have neither sum nor torque. The energy
+of a mode of angular frequency w is kept up to a part of (h w)^2 / 4, with which its kinetic energy oscillates.
 
 Damping of the mass (Rayleigh's alpha) is the trapezoidal rule in v: it has no limit of stability, and a body falls with
 g / alpha in the end, exactly. That of the stiffness (beta) takes v of half a substep before: it is of order 1 in h, and
@@ -21,12 +22,13 @@ z = beta w / 2 for ::
 
     h < (2 / w) (sqrt(1 + z^2) - z)
 
-w comes from power iterations with differences of the forces (kernels/stable_step.cuh): at length before the first step,
-and shortly after so many substeps again, since what is deformed becomes stiffer or softer. So it knows grabs, fibres,
-slivers and fixed nodes as the substeps do, where a bound by single elements is too high, or has to know every law. A
-step has the fewest substeps that are shorter than SAFETY times the stable step of all bodies. What an estimate did not
-foresee shows as energy out of nothing: a step that runs away by the criterion of the energy balance
-(kernels/energy_balance.cuh) is made again with half the substep, a few times, before the body counts as run away.
+w comes from differences of the forces (kernels/stable_step.cuh): a power iteration at length before the first step,
+and one evaluation each ESTIMATE_EVERY substeps and after new grabs, since what is deformed becomes stiffer or softer.
+So it knows grabs, fibres, slivers and fixed nodes as the substeps do, where a bound by single elements is too high, or
+has to know every law. All bodies of a scene have the same substeps: a step has the fewest that are shorter than SAFETY
+times the least stable step, and the rest of a step has shorter ones where an estimate within it says so. What no
+estimate foresaw shows as energy out of nothing: a step in which a body runs away by the criterion of the energy balance
+(kernels/energy_balance.cuh) is made again with half the substep, RETRIES times, before it counts as run away.
 
 Fixed nodes keep their place; those of holders move evenly through a step.
 

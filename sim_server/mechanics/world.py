@@ -72,7 +72,7 @@ class World:
     predictor (n, 3) [m/s]: the step moves x by dx_dv (predictor + dv), dv the solution
     damping_velocity (n, 3) [m/s]: (dx_dv predictor + beta v) / (dx_dv + beta). Elements take it for their velocity: the
         impulse stiffness_coefficient (K damping_velocity) then holds displacement and damping
-    explicit: True for explicit substeps (central_difference.py); b is then a force, and all velocities but predictor are v
+    explicit: True for explicit substeps (central_difference.py); b is then a force, and damping_velocity is v
     inertia: False in a quasi-static scene. searches: True with several linearizations a step. plain: True for backward
         Euler with one
     """

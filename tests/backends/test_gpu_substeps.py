@@ -21,7 +21,9 @@ TEXT = """
 #include "cuda_threads.h"
 #include "central_difference.cu"
 extern "C" {
-void measure(int blocks, int threads, const Substeps* p, int k) { launch(blocks, threads, [&] { measure_frequency(*p, k); }); }
+void measure(int blocks, int threads, const Substeps* p, int k) {
+    launch(blocks, threads, [&] { measure_frequency(*p, k); });
+}
 void begin(int threads, const Substeps* p) { launch(1, threads, [&] { begin_substeps(*p); }); }
 void shorten_all(int threads, const Substeps* p) { launch(1, threads, [&] { shorten_substeps(*p); }); }
 void end(int blocks, int threads, const Substeps* p) { launch(blocks, threads, [&] { end_round(*p); }); }

@@ -64,7 +64,9 @@ class Row:
         }  # fmt: skip
 
 
-def motion(cells: list[int], young: float, dt: float, more: tuple[str, ...], end: float, device: str) -> tuple[Any, Frames, int]:
+def motion(
+    cells: list[int], young: float, dt: float, more: tuple[str, ...], end: float, device: str
+) -> tuple[Any, Frames, int]:
     """Returns the records, the positions each 20 ms, and the number of elements."""
     keys = [f"object.beam.mesh.bar={cells}", f"object.beam.effects.corotational.young={young:g}", f"dt={dt!r}", *more]
     sim = Simulation.load(SCENES / "beam.toml", keys, device)
