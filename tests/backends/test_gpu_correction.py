@@ -28,7 +28,9 @@ def contact_library(tmp_path_factory: pytest.TempPathFactory) -> c.CDLL:
 
 def grabbed(woodbury: int = 32) -> Simulation:
     beam = bar((4, 2, 2), young=1e6, fixed="X < 0.01", touch={"max_force": 1e30})
-    return simulation(beam, gravity=(0, -9.81, 0), preconditioner="cholesky", update="never", tolerance=1e-8, woodbury=woodbury)
+    return simulation(
+        beam, gravity=(0, -9.81, 0), preconditioner="cholesky", update="never", tolerance=1e-8, woodbury=woodbury
+    )
 
 
 def hold(sim: Simulation, stiffness: float, radius: float) -> int:
@@ -59,20 +61,20 @@ def uncorrected(solver: Solver) -> Solver:
 
 
 def test_nodes_that_are_held_fast_are_corrected_as_on_a_cpu(library, monkeypatch):
-    """A hand takes hold, and lets go again, both after the matrix of the factor; by thread blocks that exchange values."""
+    """A hand takes hold, and lets go again, both after the matrix of the factor. Thread blocks exchange values."""
     solver, plain = Solver(grabbed(), monkeypatch, blocks=3), uncorrected(Solver(grabbed(), monkeypatch))
     found: list[list[tuple[int, int]]] = []
     for each in (solver, plain):
         steps(each, library, 2, factor_at=0)
         assert each.used == 0
         held = hold(each.sim, 100.0, 0.6)
-        found.append(steps(each, library, 2, factor_at=3))
+        found.append(steps(each, library, 1, factor_at=2))
         each.sim.touch.release("anna", held)
         found.append(steps(each, library, 1))
-    came, gone, stale, stale_gone = found
+    ((came, on_cpu),), ((gone, gone_on_cpu),), ((stale, _),), ((stale_gone, _),) = found
     assert solver.used == 5 and plain.used == 0
-    assert max(ours - theirs for ours, theirs in came) <= 2 and gone[0][0] <= gone[0][1] + 4  # of float16 a part remains
-    assert min(ours for ours, _ in stale) > 20 and stale_gone[0][0] > 4 * gone[0][0]
+    assert came <= on_cpu + 2 and gone <= gone_on_cpu + 4, "a part of what has gone remains"
+    assert stale > 20 and stale_gone > 4 * gone
 
 
 def test_a_factor_that_knows_the_grab_is_not_corrected(library, monkeypatch):
@@ -97,7 +99,7 @@ def test_more_nodes_than_allowed_and_weak_springs_are_left_to_the_iteration(libr
 
 
 def test_contacts_that_came_are_corrected(contact_library, monkeypatch):
-    """A block with a factor without contacts falls onto a floor. On a GPU its pairs of nodes and triangles have no rows."""
+    """A block with a factor without contacts falls onto a floor."""
     monkeypatch.setattr(contact, "nodes_alone", lambda world: True)
     options = {"preconditioner": "cholesky", "update": "never", "tolerance": 1e-8, "max_iterations": 5000}
     iterations = {}

@@ -43,7 +43,10 @@ class FactorCorrection:
             "scratch": cp.zeros((bodies, 9 * capacity**2 + 18 * capacity)),
         }  # fmt: skip
         if touch:
-            self._memory |= {"spring": touch.arrays["spring"], "springs": cp.zeros(nodes * SPRING_HISTORY.itemsize, np.uint8)}
+            self._memory |= {
+                "spring": touch.arrays["spring"],
+                "springs": cp.zeros(nodes * SPRING_HISTORY.itemsize, np.uint8),
+            }
         if sites:
             self._memory["blocks_then"] = cp.zeros((HISTORY, sites, 6), np.float32)
         self.params: NDArray[Any] = np.zeros((), CORRECTION_ARGUMENTS)

@@ -113,7 +113,8 @@ def _cost(report: Report, rows: list[Row]) -> None:
 def _few(report: Report, rows: list[Row]) -> None:
     report.say("## A few contacts", words.FEW)
     report.table(rows)
-    report.remember(rows, ("body", "nodes", "kappa", "lockstep", "preconditioner"), ("iterations", "mean ms"))
+    key = ("device", "body", "nodes", "contacts", "kappa", "lockstep", "preconditioner")
+    report.remember(rows, key, ("iterations", "mean ms"))
 
 
 def _where(device: str) -> str:
@@ -197,7 +198,7 @@ ORDER: dict[str, Callable[[Row], Any]] = {
     "passes": lambda row: row["passes, at most"],
     "cost": lambda row: (row["device"], row["tets"], row["kappa"], _phase(row)[0], list(COLOURS).index(row[SOLVER]),
                          _phase(row)[1]),
-    "few": lambda row: (row["nodes"], row["body"], row["kappa"], row["lockstep"]),
+    "few": lambda row: (row["device"], row["nodes"], row["body"], row["kappa"], row["contacts"], row["lockstep"]),
     "impact": lambda row: (row["device"], row["tets"], impact.WAYS.index(row[SOLVER])),
     "goals": lambda row: (row["device"], row["bodies"], row["contacts"] > 50, row["goal"]),
     "own": lambda row: row["device"],

@@ -18,7 +18,7 @@ KEYS = {  # what tells the rows of a table apart
     "paths": ("obstacle", "dt ms", "speed"),
     "passes": ("passes, at most",),
     "cost": ("device", "tets", "kappa", "situation", "preconditioner"),
-    "few": ("body", "nodes", "kappa", "lockstep", "preconditioner"),
+    "few": ("device", "body", "nodes", "contacts", "kappa", "lockstep", "preconditioner"),
     "impact": ("device", "tets", "preconditioner"),
     "goals": ("device", "situation", "bodies", "contacts"),
     "own": ("device", "case"),
@@ -38,14 +38,15 @@ CASES: dict[str, tuple[float, Callable[[], list[Row]]]] = {
 
 def units(device: str, sizes: tuple[int, ...], quick: bool, python: Path | None) -> list[Unit]:
     """All of a device. python: one that has the peers."""
-    there = [*_cost(device, sizes, quick), *_others(device, quick), *_peers(device, quick, python)]
+    there = [*_few(device, quick), *_cost(device, sizes, quick), *_others(device, quick),
+             *_peers(device, quick, python)]  # fmt: skip
     if device == "gpu":
         replays = partial(agreement.replays, "gpu")
         return [
             Unit("answers", "gpu", 10, agreement.devices), Unit("answers", "stacks, gpu", 5, agreement.stacks),
             Unit("answers", "replays, gpu", 20, replays), *there,
         ]  # fmt: skip
-    return [*_answers(quick), *_paths(quick), *_passes(quick), *_few(quick), *there]
+    return [*_answers(quick), *_paths(quick), *_passes(quick), *there]
 
 
 def _answers(quick: bool) -> Iterator[Unit]:
@@ -72,11 +73,17 @@ def _passes(quick: bool) -> Iterator[Unit]:
         yield Unit("passes", f"{most}", 7, partial(_one, passes.row, most, 0.2 if quick else 1.0))
 
 
-def _few(quick: bool) -> Iterator[Unit]:
+def _few(device: str, quick: bool) -> Iterator[Unit]:
+    for hand in few.HANDS[1:2] if quick else few.HANDS:
+        for age in (2,) if quick else (3, 20):
+            measure = partial(few.hand_rows, hand, age, few.SMALL.cells if quick else few.HELD, device)
+            name = f"hand, {hand.nodes} nodes, {hand.stiffness:g} blocks, lockstep-{age}, {device}"
+            yield Unit("few", name, 2, measure)
     for name, tooled in [("beam", few.SMALL)] if quick else few.BODIES.items():
         for kappa, age in ((1.0, 3),) if quick else ((1.0, 3), (1.0, 20), (10.0, 3), (10.0, 20)):
-            measure = partial(few.rows, tooled, kappa, age, 12 if quick else few.STEPS)
-            yield Unit("few", f"{name}, kappa {kappa:g}, lockstep-{age}", 60 if name == "large slab" else 5, measure)
+            measure = partial(few.rows, tooled, kappa, age, 12 if quick else few.STEPS, device)
+            weight = 60 if name == "large slab" else 5
+            yield Unit("few", f"{name}, kappa {kappa:g}, lockstep-{age}, {device}", weight, measure)
 
 
 def _cost(device: str, sizes: tuple[int, ...], quick: bool) -> Iterator[Unit]:

@@ -58,8 +58,10 @@ kappa 100."""
 
 FEW = """\
 A round tool presses into a body, strokes it and leaves: steps in which it touches, of 100. *lockstep*: steps from a
-matrix to its factor. *corrected*: for contacts that came or went since its matrix (`woodbury`, on by default); both
-kinds of factors go over to block Jacobi in passes that it is expected to solve for less."""
+matrix to its factor. *corrected*: for contacts that came or went since its matrix (`woodbury`, on by default); on a CPU
+both kinds of factors go over to block Jacobi in passes that it is expected to solve for less. *a hand*: so many nodes
+of a beam of 3,000 tetrahedra, in the column contacts, each held by a spring of so many of its own blocks of A: the
+steps until a factor knows it."""
 
 IMPACT = """\
 A block falls flat on a floor at 3 m/s, without friction, kappa 1. *at*: the first six steps with passes; *after*:

@@ -40,7 +40,7 @@ class Hand:
 def grab_row(scene: str, cells: tuple[int, int, int], latency: int, hand: Hand, rounds: int) -> dict[str, Any]:
     """Iterations and processor time of every way."""
     found = {
-        name: [_run(scene, cells, latency, hand, way) for _ in range(rounds if name in TIMED else 1)]
+        name: [held_records(scene, cells, latency, hand, way) for _ in range(rounds if name in TIMED else 1)]
         for name, way in WAYS.items()
     }
     out: dict[str, Any] = {
@@ -71,8 +71,8 @@ def short(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return out
 
 
-def _run(
-    scene: str, cells: tuple[int, int, int], latency: int, hand: Hand, way: dict[str, Any]
+def held_records(
+    scene: str, cells: tuple[int, int, int], latency: int, hand: Hand, way: dict[str, Any], device: str = "cpu"
 ) -> tuple[NDArray[Any], NDArray[Any]]:
     """Records of the solves after the grab, and after its end, that have factors without the change."""
     solver = {
@@ -84,12 +84,13 @@ def _run(
     }
     overrides = [f"solver.{key}={_toml(value)}" for key, value in solver.items()]
     overrides += [f"object.beam.mesh.bar={list(cells)}", "object.beam.effects.touch={max_force=1e15}"]
-    sim = Simulation.load(SCENES / f"{scene}.toml", overrides)
+    sim = Simulation.load(SCENES / f"{scene}.toml", overrides, device)
+    at_rest = Simulation.load(SCENES / f"{scene}.toml", overrides)
     touch, driver, unaware = sim.touch, Driver(sim), 2 * latency - 1
     assert touch is not None
     driver.step_with_fresh_factors()
     driver.advance(max(1, SETTLED // latency) * latency + 1)  # a matrix has gone out with the last one
-    held = _grab(sim, touch, hand)
+    held = _grab(sim, touch, hand, at_rest)
     grabbed = []
     for _ in range(4 * latency):
         grabbed.append(driver.advance(1))
@@ -103,9 +104,11 @@ def _toml(value: Any) -> str:
     return f"'{value}'" if isinstance(value, str) else str(value).lower()
 
 
-def _grab(sim: Simulation, touch: Touch, hand: Hand) -> Interaction:
-    """So many nodes nearest to the middle of the free end's upper edge."""
-    w, s = sim.world, sim.system
+def _grab(sim: Simulation, touch: Touch, hand: Hand, at_rest: Simulation) -> Interaction:
+    """So many nodes nearest to the middle of the free end's upper edge. at_rest: the same on a CPU, for its blocks."""
+    sim.fetch()
+    at_rest.engine.assemble()
+    w, s = sim.world, at_rest.system
     corner = w.rest.max(axis=0) * [0.5, 1.0, 1.0]
     point = w.x[np.linalg.norm(w.rest - corner, axis=1).argmin()] + [1e-3, 2e-3, 3e-3]  # no two at one distance
     distance = np.where(w.free > 0, np.linalg.norm(w.x - point, axis=1), np.inf)
