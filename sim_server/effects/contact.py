@@ -248,7 +248,7 @@ class Contact(Movable):
         for body in self.world.bodies:
             own = (surfaces.triangle[:, 0] >= body.first) & (surfaces.triangle[:, 0] < body.last)
             edges = surfaces.edge[first[body.index] : first[body.index + 1]]
-            if (found := edges_through_triangles(self.world.x, edges, surfaces.triangle[own])).size:
+            if (found := np.unique(edges_through_triangles(self.world.x, edges, surfaces.triangle[own])[0])).size:
                 one, other = edges[found[0]] - body.first
                 log.warning(
                     "object %r begins passing through itself: the edge from node %d to %d goes through its surface (%d "

@@ -86,11 +86,12 @@ def _distances(p: Float64, corners: Float64) -> Float64:
     return np.where(over, height, from_edges)
 
 
-def edges_through_triangles(x: Float64, edges: Int32, triangles: Int32) -> Int64:
-    """Returns the numbers of the edges (e, 2) that go through a triangle with which they share no node."""
+def edges_through_triangles(x: Float64, edges: Int32, triangles: Int32) -> tuple[Int64, Int64]:
+    """Returns which edges (e, 2) go through triangles with which they share no node: the edge and triangle of each pair."""
     corners, ends = x[triangles], x[edges]
     middle = corners.mean(axis=1)
-    reach = np.linalg.norm(corners - middle[:, None], axis=2).max() + 0.5 * np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).max()
+    reach = np.linalg.norm(corners - middle[:, None], axis=2).max()
+    reach += 0.5 * np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).max()
     edge, triangle = _within(ends.mean(axis=1), middle, reach)
     apart = (edges[edge][:, :, None] != triangles[triangle][:, None, :]).all(axis=(1, 2))
     edge, triangle = edge[apart], triangle[apart]
@@ -98,7 +99,7 @@ def edges_through_triangles(x: Float64, edges: Int32, triangles: Int32) -> Int64
     for k in range(0, len(edge), PART):
         part = slice(k, k + PART)
         through[part] = _goes_through(ends[edge[part]], corners[triangle[part]])
-    return np.unique(edge[through])
+    return edge[through], triangle[through]
 
 
 def _goes_through(ends: Float64, corners: Float64) -> NDArray[np.bool_]:
