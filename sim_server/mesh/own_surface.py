@@ -65,7 +65,7 @@ def _within(points: Float64, others: Float64, reach: float) -> tuple[Int64, Int6
     """Returns the pairs of a point and another one that are no farther apart than `reach`."""
     from scipy.spatial import cKDTree
 
-    found = cKDTree(others).query_ball_point(points, reach)
+    found: list[list[int]] = list(cKDTree(others).query_ball_point(points, reach))
     count = np.array([len(f) for f in found], np.int64)
     return np.repeat(np.arange(len(points)), count), np.concatenate([*found, []]).astype(np.int64)
 

@@ -225,7 +225,7 @@ class IslandPasses:
     @staticmethod
     def _edge_arguments(gpu: Gpu, surfaces: Surfaces, params: Any) -> list[DeviceArray]:
         """Sets the tables of edges; returns memory that has to stay."""
-        edges = {
+        edges: dict[str, NDArray[Any]] = {
             "start": surfaces.edge_start, "edge": surfaces.edge, "opposite": surfaces.opposite,
             "of_triangle": surfaces.triangle_edge, "length": surfaces.edge_length,
         }  # fmt: skip
