@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
 """A surface and itself: which nodes of it are nearby, and where it passes through itself."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -65,7 +67,7 @@ def _within(points: Float64, others: Float64, reach: float) -> tuple[Int64, Int6
     """Returns the pairs of a point and another one that are no farther apart than `reach`."""
     from scipy.spatial import cKDTree
 
-    found: list[list[int]] = list(cKDTree(others).query_ball_point(points, reach))
+    found: Any = cKDTree(others).query_ball_point(points, reach)
     count = np.array([len(f) for f in found], np.int64)
     return np.repeat(np.arange(len(points)), count), np.concatenate([*found, []]).astype(np.int64)
 

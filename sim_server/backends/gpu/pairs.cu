@@ -259,7 +259,7 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) pair_edges(const I
     const int body = a.edge_body[edge];
     if (!a.near[body] && !a.was_near[body]) return;
     if (!a.near[body]) a.e.wings[edge].sharp = 0;
-    const int dropped = detect_edge(a.t, a.e, motion_of(a, false), body, edge);
+    const int dropped = detect_edge(a.t, a.e, motion_of(a, false), body, edge, no_edges());
     if (dropped)
         if (const int site = site_of_edge(a.t, a.e, edge); site >= 0) atomicAdd(a.dropped + site, dropped);
 }
