@@ -73,6 +73,7 @@ HOST_DEVICE double entry_of_vertex(const OwnPaths& p, double inflate, OwnPlace& 
 // As `meet` of vertex_triangle.cuh. A vertex behind the triangle counts if it is over it, and no deeper than the thickness.
 HOST_DEVICE bool meet_own(const OwnPaths& p, double thickness, Touch& t) {
     double face[3];
+    t.distance = 0;
     if (!normal_of(p.x[1], p.x[2], p.x[3], face)) return false;
     const OwnPlace start = place_at(p, 0);
     const double away = start.distance;
@@ -125,14 +126,18 @@ template <class F> HOST_DEVICE void each_own_triangle(const SurfaceTables& c, in
     }
 }
 
-// Searches the body of a vertex, which it touches at one thickness; `meet_own` tells how.
+// Searches the body of a vertex, which it touches at one thickness; `meet_own` tells how. least: of the distances at the start of the step
+// from what is found, if that is less; null: not wanted
 template <class Motion>
-HOST_DEVICE TouchSearch<Motion> search_own(const SurfaceTables& c, const OwnTables& o, const Motion& m, int body, int node, double thickness) {
+HOST_DEVICE TouchSearch<Motion> search_own(const SurfaceTables& c, const OwnTables& o, const Motion& m, int body, int node, double thickness,
+                                           double* least = nullptr) {
     TouchSearch<Motion> search = {&m, thickness, {}, {}, box_of(m, node, thickness), {-1, -1, {}}, {-1, -1, {}}, {-1, -1, {}}};
     each_own_triangle(c, body, search.box, [&](int triangle) {
         if (is_nearby_triangle(o, node, c.triangle + 3 * triangle)) return;
         Meeting here = {body, triangle, {}}, &nearest = search.nearest;
-        if (!meet_own(own_paths(c, m, node, triangle), thickness, here.touch)) return;
+        const bool met = meet_own(own_paths(c, m, node, triangle), thickness, here.touch);
+        if (least) *least = fmin(*least, fabs(here.touch.distance));
+        if (!met) return;
         const double farther = fabs(here.touch.distance) - fabs(nearest.touch.distance);
         const bool as_near = fabs(farther) <= 1e-9 * thickness;
         Meeting later = here;
@@ -219,21 +224,29 @@ HOST_DEVICE void each_own_edge(const SurfaceTables& c, const EdgeTables& e, cons
     const int* node = e.edge + 2 * edge;
     const double thickness = thickness_of(c, body);
     each_own_triangle(c, body, joined(box_of(m, node[0], thickness), box_of(m, node[1], thickness)), [&](int triangle) {
-        for (int a = 0; a < 3; ++a) {
-            const int facing = e.of_triangle[3 * triangle + a];
-            if (facing >= 0 && facing < edge && !are_nearby_edges(o, node, e.edge + 2 * facing)) f(facing);
-        }
+        const int *number = e.of_triangle + 3 * triangle, *corner = c.triangle + 3 * triangle;
+        auto counts = [&](int a) { return number[a] >= 0 && number[a] < edge; };
+        if (!counts(0) && !counts(1) && !counts(2)) return;
+        bool nearby[3];
+        for (int a = 0; a < 3; ++a) nearby[a] = is_nearby(o, node[0], corner[a]) || is_nearby(o, node[1], corner[a]);
+        for (int a = 0; a < 3; ++a)
+            if (counts(a) && !nearby[a] && !nearby[(a + 1) % 3]) f(number[a]);
     });
 }
 
 // f(meeting) of the edges of the same body that an edge may touch in the step: of sharp ones, and of those that it bore on in the last step.
+// least: of the distances at the start of the step, if that is less
 template <class Motion, class F>
-HOST_DEVICE void meet_each_own_edge(const SurfaceTables& c, const EdgeTables& e, const OwnTables& o, const Motion& m, int body, int edge, F f) {
+HOST_DEVICE void meet_each_own_edge(const SurfaceTables& c, const EdgeTables& e, const OwnTables& o, const Motion& m, int body, int edge,
+                                    double* least, F f) {
     const EdgePath path = path_of(e, m, edge);
     each_own_edge(c, e, o, m, body, edge, [&](int facing) {
+        EdgeTouch start;
+        const EdgePath way = path_of(e, m, facing);
+        *least = fmin(*least, own_edges_apart(path, way, start));
         const double* held = held_by(c, e, edge, body, facing);
         if (!held && !(e.wings[edge].sharp && e.wings[facing].sharp)) return;
         EdgeMeeting here = {body, facing, {}};
-        if (meet_own_edges(path, e.wings[edge], path_of(e, m, facing), e.wings[facing], thickness_of(c, body), held, here.touch)) f(here);
+        if (meet_own_edges(path, e.wings[edge], way, e.wings[facing], thickness_of(c, body), held, here.touch)) f(here);
     });
 }

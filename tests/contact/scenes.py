@@ -2,13 +2,16 @@
 """Scenes of contact made in a test: a block over obstacles."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numpy.typing import ArrayLike
 
+from sim_server.mesh import bar as bar_mesh
 from sim_server.scene.model import Scene
 from sim_server.simulation import Simulation
-from tests.scenes import bar
+from tests.scenes import bar, mesh_file
 from tests.state import put
 
 CELLS, SIZE = (4, 3, 4), (0.1, 0.06, 0.1)  # of the block [m]
@@ -33,6 +36,15 @@ def edge() -> list[dict]:
     """[[obstacle]] tables: a plate under two thirds of a block, and a floor 50 micrometres lower under the rest."""
     low = floor(pose={"translate": (0, -5e-5, 0)})
     return [low, {"name": "plate", "shape": "box", "size": (0.13, 0.02, 0.3), "pose": {"translate": (0.015, -0.01, 0)}}]
+
+
+def fork(folder: Path, cells: tuple[int, int, int] = (8, 5, 2), edge: float = 0.01) -> dict[str, str]:
+    """The mesh of two arms along x, two cells thick, that a back at x = 0 joins."""
+    mesh = bar_mesh(cells, [edge * c for c in cells])
+    middle = mesh.rest[mesh.tets].mean(axis=1) / edge
+    kept = mesh.tets[~((middle[:, 0] > 2) & (abs(middle[:, 1] - cells[1] / 2) < cells[1] / 2 - 2))]
+    used, tets = np.unique(kept, return_inverse=True)
+    return mesh_file(folder, mesh.rest[used], tets.reshape(-1, 4), f"fork {cells}")
 
 
 def block(friction: float = 0.5, cells: Sequence[int] = CELLS, size: Sequence[float] = SIZE, **table: Any) -> dict:

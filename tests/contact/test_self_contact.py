@@ -2,7 +2,6 @@
 """Bodies that touch themselves (kernels/own_surface.cuh, backends/cpu/native/own_contact.h)."""
 
 import logging
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,7 @@ from sim_server.mesh.own_surface import edges_through_triangles, nearby_nodes
 from sim_server.mesh.surface import surface_triangles
 from sim_server.scene.model import Scene
 from sim_server.simulation import Simulation
-from tests.contact.scenes import floor
+from tests.contact.scenes import floor, fork
 from tests.reference.triangles import distances, normals
 from tests.scenes import mesh_file
 from tests.state import put
@@ -25,15 +24,6 @@ EULER = 3  # StepForm in protocol/messages.proto
 STATUS = KINDS.enumeration("Status")
 EDGE, D = 0.01, 0.001  # of cells; thickness [m]
 EXACT = {"preconditioner": "block_jacobi", "tolerance": 1e-11}
-
-
-def fork(folder: Path, cells: tuple[int, int, int] = (8, 5, 2)) -> dict[str, str]:
-    """The mesh of two arms along x, two cells thick, that a back at x = 0 joins."""
-    mesh = bar_mesh(cells, [EDGE * c for c in cells])
-    middle = mesh.rest[mesh.tets].mean(axis=1) / EDGE
-    kept = mesh.tets[~((middle[:, 0] > 2) & (abs(middle[:, 1] - cells[1] / 2) < cells[1] / 2 - 2))]
-    used, tets = np.unique(kept, return_inverse=True)
-    return mesh_file(folder, mesh.rest[used], tets.reshape(-1, 4))
 
 
 def body(mesh: dict, name: str = "body", young: float = 3e5, fixed: str | None = None, **table: Any) -> dict:

@@ -332,7 +332,7 @@ class _NativeContact:
         self._own_surfaces: dict[str, NDArray[Any]] = {
             "start": own.start, "node": own.node, "reference": np.zeros((len(own.node), 3)),
             "strain": np.zeros(loop.nodes), "moved": np.zeros(loop.nodes), "clear": np.zeros(sites),
-            "edge_clear": np.zeros(edges),
+            "edge_clear": np.zeros(edges), "apart": np.zeros(sites), "edges_apart": np.zeros(edges),
         }  # fmt: skip
         native = self.native.own
         for name, array in self._own_surfaces.items():

@@ -23,7 +23,7 @@ def write(report: Report, tables: Tables) -> None:
         report.table(found)
     report.say(words.SETUP)
     shown = {
-        "stairs": _stairs, "answers": _answers, "paths": _paths, "goals": _goals, "impact": _impact, "own": _own,
+        "stairs": _stairs, "answers": _answers, "paths": _paths, "goals": _goals, "impact": _impact, "own": _own, "itself": _itself,
         "pile": _pile, "peers": _peers, "wall": _wall, "hertz": _hertz, "belt": _belt, "passes": _passes, "cost": _cost,
         "few": _few,
     }  # fmt: skip
@@ -153,6 +153,11 @@ def _own(report: Report, rows: list[Row]) -> None:
     report.say("## The effect itself", words.OWN)
     report.table(rows)
     report.remember(rows, ("device", "case"), ("p50 ms",))
+
+
+def _itself(report: Report, rows: list[Row]) -> None:
+    report.say("## Bodies that touch themselves", words.ITSELF)
+    report.table(rows)
 
 
 def _pile(report: Report, rows: list[Row]) -> None:

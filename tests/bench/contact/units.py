@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
-from tests.bench.contact import agreement, cost, few, impact, known, ladder, pairs, passes, peers, picture, pile
+from tests.bench.contact import agreement, cost, few, impact, itself, known, ladder, pairs, passes, peers, picture, pile
 from tests.bench.contact.bodies import SITUATIONS, TUMBLING, Row
 from tests.bench.harness.pieces import say
 from tests.bench.harness.units import Unit
@@ -22,6 +22,7 @@ KEYS = {  # what tells the rows of a table apart
     "impact": ("device", "tets", "preconditioner"),
     "goals": ("device", "situation", "bodies", "contacts"),
     "own": ("device", "case"),
+    "itself": ("case",),
     "pile": ("device", "bodies"),
     "peers": ("device", "case", "who", "settings"),
     "stairs": ("scene",),
@@ -33,6 +34,7 @@ SECONDS = {"MuJoCo": 10, "Newton VBD": 40}  # weight of a case of others, by bod
 CASES: dict[str, tuple[float, Callable[[], list[Row]]]] = {
     **{name: (ENERGY if name == "energies" else 2, case) for name, case in ladder.CASES.items()},
     "collisions": (2, pairs.collisions), "stacks": (10, pairs.stacks), "replays": (20, agreement.replays),
+    "itself": (5, itself.answers),
 }  # fmt: skip
 
 
@@ -107,6 +109,7 @@ def _others(device: str, quick: bool) -> Iterator[Unit]:
     for bodies in (2,) if quick else pile.COUNTS:
         yield Unit("pile", f"{bodies}, {device}", 1.5 * bodies, partial(_one, pile.row, bodies, device, quick))
     if device == "cpu":
+        yield Unit("itself", "cost", 10, partial(itself.cost, 2 if quick else 30))
         yield Unit("stairs", "picture", 5, partial(picture.rows, 20 if quick else 180))
 
 

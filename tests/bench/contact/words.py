@@ -113,3 +113,7 @@ ours by the clock of the device. *the loop alone*: ours without what makes facto
 STAIRS = """\
 deploy/scenes/stairs.toml: the block on its way down, iterations and passes of each step and contacts that carry
 force."""
+
+ITSELF = """With `contact.self`, beside the same without it, in turns. What is nowhere near itself is not searched: how far it has
+moved since distances were measured says so ([how](../contact.md#how-it-works)). Without the key the arms pass through each
+other, and their steps are those of a body that touches nothing."""

@@ -34,6 +34,7 @@ struct SolveResult;
 struct OwnReference {       // of a body (own_contact.h)
     double range;           // up to which distances are measured; 0: there is no reference [m]
     double rotation[9];     // since then
+    double least;           // of the distances measured [m]
     double most, most_in_step;  // of what nodes have moved since, and in this step alone, but for rigid motions [m]
 };
 
@@ -42,7 +43,8 @@ struct OwnContact {         // of bodies with themselves (own_contact.h)
     const int32_t *start, *node;        // (bodies + 1,), nodes of surfaces, by body
     double* reference;                  // (nodes of surfaces, 3) [m]
     double *strain, *moved;             // (nodes,) moved since the reference, but for rigid motions: up to the start of the step, in all [m]
-    double *clear, *edge_clear;         // (sites,), (edges,) distances measured [m]
+    double *clear, *edge_clear;         // (sites,), (edges,) distances measured at the reference [m]
+    double *apart, *edges_apart;        // (sites,), (edges,) distances at the start of the step, or less [m]
     OwnReference* body;                 // (bodies,)
 };
 

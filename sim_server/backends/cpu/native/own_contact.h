@@ -117,7 +117,7 @@ struct OwnSearch {
 
     // --- what may touch ---------------------------------------------------------------------------------------------------------------
 
-    // margin: thicknesses within which a vertex is looked at; 2 before a solve, 1 after it
+    // margin: thicknesses within which a vertex is looked at: 2 before a solve, 1 after it
     bool may_touch(double clear, double moved, int body, double margin) const {
         return !(own.body[body].range > 0 && clear - moved - own.body[body].most > margin * c.body_thickness[body]);
     }
@@ -129,9 +129,32 @@ struct OwnSearch {
         return may_touch(own.edge_clear[edge], std::fmax(own.moved[node[0]], own.moved[node[1]]), body, margin);
     }
     bool any_may_touch(int body, double margin) const {
+        const OwnReference& ref = own.body[body];
+        if (ref.range > 0 && ref.least - 2 * ref.most > margin * c.body_thickness[body]) return false;
         bool any = false;
         each_site(body, [&](int site) { any = any || site_may_touch(site, body, margin); });
         each_edge(body, [&](int edge) { any = any || edge_may_touch(edge, body, margin); });
+        return any;
+    }
+
+    // After it, of what the step may take through the surface.
+    bool may_pass(double apart, double moved_in_step, int body) const {
+        return !(apart - moved_in_step - own.body[body].most_in_step > THROUGH * c.body_thickness[body]);
+    }
+    bool site_may_pass(int site, int body) const {
+        const int node = node_of_site(tables, site);
+        return may_pass(own.apart[site], own.moved[node] - own.strain[node], body) && site_may_touch(site, body, 1);
+    }
+    bool edge_may_pass(int edge, int body) const {
+        const int32_t* node = c.edge + 2 * edge;
+        const double moved = std::fmax(own.moved[node[0]] - own.strain[node[0]], own.moved[node[1]] - own.strain[node[1]]);
+        return may_pass(own.edges_apart[edge], moved, body) && edge_may_touch(edge, body, 1);
+    }
+    bool any_may_pass(int body) const {
+        if (!any_may_touch(body, 1)) return false;
+        bool any = false;
+        each_site(body, [&](int site) { any = any || site_may_pass(site, body); });
+        each_edge(body, [&](int edge) { any = any || edge_may_pass(edge, body); });
         return any;
     }
 
@@ -141,6 +164,8 @@ struct OwnSearch {
         if (ref.range > 0) follow(body);
         else each_node(body, [&](int node, int) { own.strain[node] = 0; });
         add_ways(body);
+        each_site(body, [&](int site) { own.apart[site] = 2 * c.body_thickness[body]; });
+        each_edge(body, [&](int edge) { own.edges_apart[edge] = 2 * c.body_thickness[body]; });
         return wants_reference(body) || any_may_touch(body, 2);
     }
     // True if what is nowhere near cannot be told by the reference, but could be by a new one.
@@ -158,8 +183,15 @@ struct OwnSearch {
             put3(own.reference, k, place(node));
             own.strain[node] = 0;
         });
-        each_site(body, [&](int site) { own.clear[site] = room_of_vertex(body, node_of_site(tables, site), ref.range); });
-        each_edge(body, [&](int edge) { own.edge_clear[edge] = room_of_edge(body, edge, ref.range); });
+        ref.least = ref.range;
+        each_site(body, [&](int site) {
+            own.clear[site] = room_of_vertex(body, node_of_site(tables, site), ref.range);
+            ref.least = std::fmin(ref.least, own.clear[site]);
+        });
+        each_edge(body, [&](int edge) {
+            own.edge_clear[edge] = room_of_edge(body, edge, ref.range);
+            ref.least = std::fmin(ref.least, own.edge_clear[edge]);
+        });
         add_ways(body);
     }
     Box box_around(int node, double margin) const {

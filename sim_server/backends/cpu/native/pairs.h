@@ -31,7 +31,10 @@ struct PairDetection {
 
     // before: the solve
     void fit(bool before = false) const {
-        for (int i = 0; i < loop.bodies; ++i) { fit_body(tables, motion, i); c.near[i] = c.touched[i] = 0; }
+        for (int i = 0; i < loop.bodies; ++i) {
+            if (loop.bodies > 1) fit_body(tables, motion, i);
+            c.near[i] = c.touched[i] = 0;
+        }
         for (int i = 0; i < loop.bodies; ++i)
             for (int j = 0; j < i; ++j)
                 if (c.between && meet(c.body_box[i], c.body_box[j])) c.near[i] = c.near[j] = 1;
@@ -50,7 +53,7 @@ struct PairDetection {
 #pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) if (loop.threads > 1)
         for (int i = 0; i < loop.bodies; ++i) {
             if (!before) own.add_ways(i);
-            bool may = before ? own.begin(i) : own.any_may_touch(i, 1);
+            bool may = before ? own.begin(i) : own.any_may_pass(i);
             if (before && may && own.wants_reference(i)) {
                 fit_tree(tables, motion, i);
                 own.measure(i);
@@ -64,13 +67,13 @@ struct PairDetection {
         const int node = node_of_site(tables, site);
         detect_site(tables, motion, site, [&](auto take) {
             if (!(c.near[body] & MAY_TOUCH_ITSELF) || is_bound(node, body) || !own.site_may_touch(site, body, 2)) return;
-            take(search_own(tables, c.own.near, motion, body, node, thickness_of(tables, body)));
+            take(search_own(tables, c.own.near, motion, body, node, thickness_of(tables, body), c.own.apart + site));
         });
     }
     __attribute__((noinline)) EdgeMeetings own_edges(int body, int edge) const {
         EdgeMeetings found = no_edges();
         if (!own.exists() || !(c.near[body] & MAY_TOUCH_ITSELF) || !own.edge_may_touch(edge, body, 2)) return found;
-        meet_each_own_edge(tables, edges, c.own.near, motion, body, edge, [&](const EdgeMeeting& here) {
+        meet_each_own_edge(tables, edges, c.own.near, motion, body, edge, c.own.edges_apart + edge, [&](const EdgeMeeting& here) {
             if (!are_bound(edge, body, here.edge, body)) take(found, here);
         });
         return found;
@@ -181,7 +184,7 @@ struct PairDetection {
     // True if the solution takes a vertex through its own body. t: where it touches then.
     __attribute__((noinline)) bool site_passes_own(int body, int site, Meeting& t) const {
         const int node = node_of_site(tables, site);
-        if (!own.exists() || !(c.near[body] & MAY_TOUCH_ITSELF) || is_bound(node, body) || !own.site_may_touch(site, body, 1)) return false;
+        if (!own.exists() || !(c.near[body] & MAY_TOUCH_ITSELF) || is_bound(node, body) || !own.site_may_pass(site, body)) return false;
         return passes_own(tables, c.own.near, motion, body, node, thickness_of(tables, body), t);
     }
     // f(other, facing, thickness, touch) of the edges that the solution takes an edge through, but for attached ones.
@@ -189,7 +192,7 @@ struct PairDetection {
         ::each_edge_passed(tables, edges, motion, body, edge, [&](int other, int facing, double thickness, const EdgeTouch& t) {
             if (!are_bound(edge, body, facing, other)) f(other, facing, thickness, t);
         });
-        if (!own.exists() || !(c.near[body] & MAY_TOUCH_ITSELF) || !own.edge_may_touch(edge, body, 1)) return;
+        if (!own.exists() || !(c.near[body] & MAY_TOUCH_ITSELF) || !own.edge_may_pass(edge, body)) return;
         const EdgePath path = path_of(edges, motion, edge);
         each_own_edge(tables, edges, c.own.near, motion, body, edge, [&](int facing) {
             EdgeTouch t;
