@@ -79,7 +79,7 @@ class Capability(Enum):
     """Positions requested are those that the next matrix is assembled from, extrapolated if wanted; without it those at
     the end of that step."""
     LOW_RANK_UPDATE = auto()
-    """A factor is corrected for springs that came after its matrix (`correct`)."""
+    """`correct` has a factor corrected for springs that came after its matrix; a GPU does so by itself."""
 
 
 class SolveSettings(Protocol):

@@ -105,7 +105,7 @@ class SolverOptions(Parameters):
     warm_start: bool = Field(default=True, description="start from the last step's dv")
     woodbury: int = Field(
         default=32, ge=0, le=64,
-        description="on a CPU: correct factors for grabs and contacts since, of at most this many nodes; 0: off",
+        description="correct factors for grabs and contacts since, of at most this many nodes of an object; 0: off",
     )  # fmt: skip
     build: Literal["server", "worker"] = Field(
         default="server", description="where the matrices to factorize are assembled; worker: positions are sent"

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: MIT
-"""The solver of a GPU (pcg.cu), run by threads of the processor beside steps of the CPU, with a dense inverse in float16
-in place of the partitioned one."""
+"""The solver of a GPU (pcg.cu), run by threads of the processor beside steps of the CPU, with a dense inverse in
+float16 in place of the partitioned one."""
 
 import ctypes as c
 import re
@@ -132,11 +132,11 @@ def compiled(folder: Path, text: str, *defined: str) -> c.CDLL:
     gpu = SOURCES / "backends/gpu"
     group, solver = (gpu / "block_group.cuh").read_text(), (gpu / "pcg.cu").read_text()
     for pattern, plain in WORDS:
-        group, found = re.subn(pattern, lambda _, p=plain: p, group, flags=re.DOTALL)  # type: ignore[misc]
+        group, found = re.subn(pattern, lambda _, p=plain: p, group, flags=re.DOTALL)
         assert found, pattern
     assert "asm" not in group
-    solver, found = re.subn(r"    double y;\n    asm\(.*?\n    return y \* \(2 - a \* y\);", "    return 1 / a;", solver,
-                            flags=re.DOTALL)  # fmt: skip
+    approximate = r"    double y;\n    asm\(.*?\n    return y \* \(2 - a \* y\);"
+    solver, found = re.subn(approximate, "    return 1 / a;", solver, flags=re.DOTALL)
     assert found == 1
     clock = "#pragma once\nstatic long long nanoseconds() { return 0; }\n"
     headers = {"block_group.cuh": group, "pcg.cu": solver, "partitioned_inverse.cuh": INVERSE, "clock.cuh": clock}
@@ -176,7 +176,8 @@ class Solver:
         monkeypatch.setattr(gpu_solver, "compiled", lambda name, module, kernel: SimpleNamespace())
         assigned = lambda nodes, processors, most: (assign_blocks(nodes, blocks), blocks)  # noqa: E731
         monkeypatch.setattr(gpu_solver, "best_assignment", assigned)
-        self.sim, self.gpu, self.near = sim, SolverHost(), near
+        self.sim, self.near = sim, near
+        self.gpu: Any = SolverHost()
         given = sim.engine_input()
         self.arrays, gpu = given.arrays, self.gpu
         touch: Any = None
@@ -184,10 +185,10 @@ class Solver:
             own = {"spring": gpu.twin(sim.touch.spring), "coefficients": as_device(sim.world.coefficients)}
             touch = SimpleNamespace(arrays=own)
         sites = int(given.contact.body_start[-1]) // 2 if given.contact else 0
-        self.correction = FactorCorrection(gpu, sim.scene.solver.woodbury, list(given.ranges), touch, sites)  # type: ignore[arg-type]
+        self.correction = FactorCorrection(gpu, sim.scene.solver.woodbury, list(given.ranges), touch, sites)
         self.counter, contact = as_device(np.zeros(1, np.int64)), given.contact is not None
         self.solver = PcgSolver(
-            gpu, given.ranges, given.arrays, self.counter, 4, contact=contact, correction=self.correction  # type: ignore[arg-type]
+            gpu, given.ranges, given.arrays, self.counter, 4, contact=contact, correction=self.correction
         )  # fmt: skip
         own = sim.scene.solver
         rows = self.solver.bodies
@@ -233,10 +234,10 @@ class Solver:
     def renew(self) -> None:
         """Takes what the CPU has before a solve."""
         self.gpu.renew()
-        self.solver._rows[...] = self.solver.bodies.view(np.uint8)
+        c.memmove(self.solver.bodies_device, self.solver.bodies.ctypes.data, self.solver.bodies.nbytes)
 
     def _run(self, library: c.CDLL) -> None:
-        library.solve(*(c.c_void_p(x.ctypes.data) for x in (self.solver._params, self.correction.params)))
+        library.solve(*(c.c_void_p(x.ctypes.data) for x in (self.solver.params, self.correction.params)))
 
     def solve(self, library: c.CDLL) -> tuple[np.void, np.void]:
         """Makes a step; returns the results of both."""
@@ -260,17 +261,18 @@ class ContactSolver(Solver):
         monkeypatch.setattr(gpu_contact, "THREADS", THREADS)
         monkeypatch.setattr(gpu_contact, "options", lambda types: ())
         monkeypatch.setattr(gpu_contact, "compiled", lambda name, module, kernel: None)
-        given, device = sim.engine_input(), SimpleNamespace(repeat=lambda flag: nullcontext())
+        given = sim.engine_input()
+        device: Any = SimpleNamespace(repeat=lambda flag: nullcontext())
         assert given.contact is not None
         obstacles = len(given.contact.obstacles.kind)
         self.told, self.reactions = np.zeros((4, 1), CONTACT_RESULT), np.zeros((4, 1, obstacles, 6))
         self.passes = ContactPasses(
-            self.gpu, device, given.contact, given.ranges, given.arrays, self.solver, as_device(np.zeros(1, BALANCE)),  # type: ignore[arg-type]
+            self.gpu, device, given.contact, given.ranges, given.arrays, self.solver, as_device(np.zeros(1, BALANCE)),
             self.told, self.reactions, self.correction,
         )  # fmt: skip
-        self.solver._params["b"] = self.passes.memory["contact_b"].data.ptr
+        self.solver.params["b"] = self.passes.memory["contact_b"].data.ptr
 
     def _run(self, library: c.CDLL) -> None:
         passes = self.passes
-        given = (passes.params, passes.first, passes.later, self.solver._params, self.correction.params)
+        given = (passes.params, passes.first, passes.later, self.solver.params, self.correction.params)
         assert library.step(*(c.c_void_p(x.ctypes.data) for x in given), passes.grid) < 200

@@ -22,13 +22,13 @@ EXACT = {"preconditioner": "cholesky", "factor_precision": "float64", "tolerance
 PRESSED, LIFTED = 28, 30  # steps: until the rod presses, and until it begins to leave
 
 
-def pressed(**solver: Any) -> Simulation:
+def pressed(device: str = "cpu", **solver: Any) -> Simulation:
     """A slender beam that a rod bends upwards, slides along, and leaves."""
     times = ((0.0, 0.3, -0.014), (0.15, 0.3, 0.01), (0.45, 0.36, 0.01), (0.6, 0.36, -0.05), (9.0, 0.36, -0.05))
     frames = [{"time": t, "rotate": [90, 0, 0], "translate": [x, y, 0.01]} for t, x, y in times]
     rod = {"name": "rod", "shape": "capsule", "radius": 0.01, "length": 0.06, "friction": 0.3, "keyframes": frames}
     contact = {"tolerance": 1e-6, "passes": 50}
-    return over(rod, objects=[block(**BEAM)], dt=0.015, contact=contact, solver=EXACT | solver)
+    return over(rod, objects=[block(**BEAM)], dt=0.015, contact=contact, solver=EXACT | solver, device=device)
 
 
 def run(sim: Simulation, steps: int = LIFTED) -> NDArray[Any]:

@@ -398,7 +398,7 @@ class GpuEngine(DeviceLoop):
     def correct(
         self, body: int, nodes: int, diagonal: Float64, double: bool = False, block: Float64 | None = None
     ) -> None:
-        """Not on a GPU (Capability.LOW_RANK_UPDATE)."""
+        """Not on a GPU (Capability.LOW_RANK_UPDATE), whose solver corrects factors by itself (correction.py)."""
         raise NotImplementedError
 
     def replace(self, launch: int, new: Launch) -> Mail:

@@ -46,6 +46,7 @@ class PcgSolver:
     between: True if bodies touch each other, or are tied, there (island_state.cuh)
     correction: of factors for grabs and contacts; None: they are not corrected
 
+    params: arguments of the kernel (PCG_ARGUMENTS)
     bodies: host rows (PCG_BODY), one per body. The loop uploads the settings (the first SETTINGS_BYTES bytes of a row)
         and the factor (the others) separately.
     results: device ring (capacity, bodies) of PCG_RESULT
@@ -94,7 +95,7 @@ class PcgSolver:
         }  # fmt: skip
         fixed = 5120 if correction else 2048  # bytes: shared memory that pcg.cu declares, and the driver's
         self._shared = (gpu.properties["sharedMemPerMultiprocessor"] // blocks - fixed - 1024) // 16 * 16
-        self._params = self._arguments(total, assigned.pooled)
+        self.params = self._arguments(total, assigned.pooled)
         self._function = self._compiled("pcg", blocks)
         application = "apply_factor" if attempts else "island_factor" if between else None
         self._application = self._compiled(application, blocks) if application else None
@@ -131,7 +132,7 @@ class PcgSolver:
     def launch(self) -> None:
         """Launches a solve of all bodies."""
         phases = (np.uint64(array.data.ptr) for array in self._phases)
-        arguments = (self._params, *phases, *self._corrected)
+        arguments = (self.params, *phases, *self._corrected)
         self._function((self.grid,), (self.threads,), arguments, shared_mem=self._shared)
 
     @property
@@ -144,7 +145,7 @@ class PcgSolver:
 
         b: (nodes, 3), right-hand side. contact: CONTACT_SOLVE
         """
-        params = self._params.copy()
+        params = self.params.copy()
         params["b"] = b.data.ptr
         self._function((self.grid,), (self.threads,), (params, contact, *self._corrected), shared_mem=self._shared)
 
@@ -154,7 +155,7 @@ class PcgSolver:
         islands: ISLAND_ARGUMENTS
         """
         assert self._application is not None
-        self._application((self.grid,), (self.threads,), (self._params, islands), shared_mem=self._shared)
+        self._application((self.grid,), (self.threads,), (self.params, islands), shared_mem=self._shared)
 
     def iterate(self, number: int, stage: NDArray[Any]) -> None:
         """Launches solve `number` of a Rosenbrock-W step by iterations. stage: STAGE_SOLVE."""
@@ -166,7 +167,7 @@ class PcgSolver:
         self._launch_stage(self._application, number, stage)
 
     def _launch_stage(self, function: KernelFunction, number: int, stage: NDArray[Any]) -> None:
-        params = self._params.copy()
+        params = self.params.copy()
         params["pool_counter"] += np.uint64(self.pool_counter.dtype.itemsize * number)
         function((self.grid,), (self.threads,), (params, stage), shared_mem=self._shared)
 

@@ -69,7 +69,8 @@ def rows(tooled: Tooled, kappa: float, age: int, steps: int = STEPS, device: str
         records = begun(tooled.simulation(solver, kappa, device)).advance(5 + steps)[5:]
         touching = records[records["passes"] > 0]
         found.append({
-            "device": device, "body": tooled.name, "nodes": (tooled.cells[0] + 1) * (tooled.cells[1] + 1) * (tooled.cells[2] + 1),
+            "device": device, "body": tooled.name,
+            "nodes": (tooled.cells[0] + 1) * (tooled.cells[1] + 1) * (tooled.cells[2] + 1),
             "kappa": kappa, "lockstep": age, "preconditioner": name, "contacts": int(touching["contacts"].max()),
             "passes": float(touching["passes"].mean()), "iterations": float(touching["iterations"].mean()),
             "most": int(touching["iterations"].max()), "mean ms": float(times(touching, device).mean()),

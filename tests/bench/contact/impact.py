@@ -28,8 +28,6 @@ def curves(tets: int, device: str = "cpu", steps: int = STEPS) -> list[Row]:
     """Iterations and time of each step; the impact has `AT` steps from `first` on."""
     found = []
     for way in WAYS:
-        if device == "gpu" and way == UNCORRECTED:
-            continue  # it corrects none
         sim = replace(IMPACT, steps=steps).simulation(tets, _solver(way, tets), device=device)
         driver = begun(sim)
         records = _by_turns(driver, steps) if way == NONE_IN_CONTACT else driver.advance(steps)

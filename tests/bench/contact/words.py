@@ -65,7 +65,7 @@ steps until a factor knows it."""
 
 IMPACT = """\
 A block falls flat on a floor at 3 m/s, without friction, kappa 1. *at*: the first six steps with passes; *after*:
-the rest. Each way makes the same motion. *factor*: as it is by default, on a CPU corrected for contacts that came or
+the rest. Each way makes the same motion. *factor*: as it is by default, corrected for contacts that came or
 went since its matrix where that pays (`woodbury`); *not corrected*: `woodbury = 0`. *no factor while in contact*:
 block Jacobi in steps after one that touched something, as Courtecuisse et al. 2010 put a factor aside after cuts,
 until one comes that knows them. *first factor*: that of the first matrix for ever."""
