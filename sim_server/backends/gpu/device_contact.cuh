@@ -113,7 +113,6 @@ struct ContactArguments {
     const int* alone;           // (1,) how many are
     double* pair_sums;          // (grid,) work of rows between bodies
     int* pair_contacts;         // (bodies,) those that carry force
-    int* pair_clipped;          // (bodies,) places where it is held apart from others
     const real* spring;         // (nodes,) as Correction has it
     SpringHistory* springs;     // (nodes,) likewise
     float* blocks_then;         // (HISTORY, rows / 2, 6) likewise; null: factors are not corrected
@@ -122,6 +121,7 @@ struct ContactArguments {
     double force_coefficient;   // [s]
     double tolerance;
     int obstacle_count, count, capacity, passes;
+    int* pair_clipped;          // (bodies,) places where it is held apart from others
     DeviceFaces faces;
 };
 
