@@ -122,6 +122,20 @@ def test_a_spring_breaks_at_its_force_within_a_step():
     np.testing.assert_allclose(after, before, atol=1e-9 * np.abs(before).max())
 
 
+def test_a_spring_at_a_held_node_does_no_work_on_the_body():
+    """It pulls at the holder, whose work is that on the body."""
+    keys = [{"time": 0.0}, {"time": 0.3, "translate": [0.0, 0.3, 0]}]
+    holder = {"name": "holder", "object": "a", "where": "X > 0.99", "keyframes": keys}
+    ends, work = [{"object": "a", "at": [1, 0.25, 0.25]}, {"object": "b", "at": [0, 0.25, 0.25]}], []
+    for stiffness in (1e-3, 1e5):
+        spring = {"name": "band", "between": ends, "stiffness": stiffness}
+        bodies = half("a", 0, "X < 0.01"), half("b", 1.5, "X < 0.9")
+        sim = made(*bodies, holder=[holder], spring=[spring], gravity=False)
+        sim.engine.run(30)
+        work.append(sim.engine.records()["work"][-2])
+    assert work[1] == pytest.approx(work[0], rel=1e-9) and work[0] > 1
+
+
 def test_an_attachment_tears_where_it_carries_most():
     """A bar that is glued to a wall by its end: the rows above carry its weight; they break one after another."""
     strong = made(half("a", 0, "X < 0.01"), half("b", 1), attachment=[glue()])

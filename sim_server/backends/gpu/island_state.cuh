@@ -19,7 +19,7 @@
 // All islands go in step; a kernel does nothing for those that are in another phase. Sums have a fixed order: of thread blocks, which
 // leave theirs in arrays, and of these in the kernel that reads them. What acts at a node is a list, sorted by row.
 //
-// With TIES, attachments and springs have rows after all others; a body that has one is solved here even if it is alone.
+// With TIES, attachments and springs have rows after all others; a body that has one is solved here even if it is alone. keep_ties comes last.
 #pragma once
 #include "device_contact.cuh"
 #include "edge_detection.cuh"

@@ -421,8 +421,7 @@ __device__ bool is_tied(const IslandArguments& a, int body) {
 }
 
 // One thread block: groups the bodies that have rows with each other, each group's by number; one that is tied and touches no other is a
-// group. swept: only those that a sweep has
-// touched are solved again.
+// group. swept: only those that a sweep has touched are solved again.
 extern "C" __global__ void __launch_bounds__(LISTING_THREADS) find_islands(const IslandArguments a, int swept) {
     const int n = a.bodies_count, me = threadIdx.x, warp = me / 32, lane = me % 32;
     for (int i = me; i < n; i += LISTING_THREADS) {

@@ -54,12 +54,12 @@ struct ContactEnd : IslandRows {
     void count_work(int k, bool acts) const {
         if (acts) add_work(k, c.state[k].force.traction);
     }
-    // Adds the work of a row's force to the reports of its bodies.
+    // Adds the work of a row's force to the reports of its bodies; at a held node it acts on what holds the node.
     void add_work(int k, const double* f) const {
         double displacement[2][3] = {};
         for (int a = 0; a < CORNERS; ++a) {
             const int node = c.corner[CORNERS * k + a];
-            if (node < 0) continue;
+            if (node < 0 || c.free[node] == 0) continue;
             double u[3];
             rotated(c.rotation + 9 * (int64_t)node, y + 3 * (int64_t)node, u);
             for (int m = 0; m < 3; ++m)
