@@ -12,7 +12,8 @@ columns of A times theta (V + beta a), and times the opposite, go to the right-h
 these terms, which stand for dF/dt in the Jacobian, stiff bodies would overshoot.
 
 The force on a held node is what its own equation lacks, i F_c = A_cf dv_f + A_cc dv_c - b_c, so that momentum is kept
-to rounding; in a step by stages what the mean of the forces of both lacks, to second order. The energy balance counts its work.
+to rounding; in a step by stages what the mean of the forces of both lacks, to second order. The energy balance counts
+its work.
 
 Sources: Hughes, The Finite Element Method, section 1.10 (prescribed boundary values).
 """
