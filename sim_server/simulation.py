@@ -26,7 +26,7 @@ from sim_server.effects import effect
 from sim_server.effects._base import Effect, Refusal
 from sim_server.errors import DeviceError, InputError
 from sim_server.mechanics.energy import collected_energies
-from sim_server.mechanics.rosenbrock import make_integrator
+from sim_server.mechanics.rosenbrock import RosenbrockIntegrator, make_integrator
 from sim_server.mechanics.shape_matching import ShapeMatching
 from sim_server.mechanics.static_check import check_held
 from sim_server.mechanics.system import Stencil, System
@@ -61,6 +61,7 @@ class Simulation:
             ahead("backends/cpu/native/factor_check.cpp")
         self.on_effect_update: list[Callable[[Effect, PendingUpdate], None]] = []
         self._mailed: dict[Effect, int] = {}  # numbers of their launches whose arguments may change
+        self._stages_of_holders: list[list[Launch]] = [[], []]  # their launches in the second stage, and after it
         self._detection = slice(0, 0)  # numbers of those that detect contacts
         with backend.building():
             self._build(backend, watched)
@@ -170,7 +171,7 @@ class Simulation:
             assemble.append(self.shape.launch(system.mean))
         if not self.world.explicit:
             assemble += system.finish(matrix)  # into the material frame (eq. 12 and 13)
-        settled = self.holders.last_launches(system) if self.holders else []
+        settled = self.holders.last_launches(system) if self.holders and not self.integrator.has_stages else []
         return assemble, [*settled, *self.integrator.advance()]
 
     def _forces_of(self, effect: Effect, stencil: Stencil | None) -> list[Launch]:
@@ -186,16 +187,22 @@ class Simulation:
         if self.holders is None:
             return []
         i = self.integrator
+        if isinstance(i, RosenbrockIntegrator) and not euler:
+            first, *self._stages_of_holders = self.holders.stage_launches(self.system, i)
+            return first
         made = self.holders.first_launches(self.system, i.beta, i.inertial_increment, euler)
         return [*self._held_launches[:1], *made] if euler else made
 
     def _other_launches(self) -> list[list[Launch]]:
-        """Returns what steps run beside `launches`: the forces of the stages of ros2, the assembly of backward Euler,
-        and what settles the forces of holders there.
+        """Returns what steps run beside `launches`: the forces of the stages of ros2 and what follows them, the
+        assembly of backward Euler, and what settles the forces of holders there.
 
         Where bodies touch, with the tangent that backward Euler has by default: the exact one would take their spin.
         """
-        stages = [self.force_launches(frames) for frames in (True, False)] if self.integrator.has_stages else []
+        stages: list[list[Launch]] = []
+        if self.integrator.has_stages:
+            second, end = self._stages_of_holders
+            stages = [[*self._held_launches, *self.force_launches(True)], [*second, *self.force_launches(False)], end]
         if not self.integrator.takes_euler:
             return [*stages, [], []]
         with self.world.made_with(self.world.dt, self.world.dt, usual_tangent=self.integrator.touches):
@@ -211,7 +218,8 @@ class Simulation:
             e.force_launches(self.system, next(stencils) if e.elements is not None else None, frames) for e in ordered
         ]
         if any(part is None for part in parts):  # then all that `launches` has but for the blocks
-            full = [x for x in self.launches(matrix=False, detect=False)[0] if x.domain != "blocks"]
+            full = self.launches(matrix=False, detect=False)[0][len(self._held_launches) :]
+            full = [x for x in full if x.domain != "blocks"]
             return full if frames else full[:-1] + self.integrator.rotate_force()
         shape = [self.shape.launch(self.system.mean)] if frames and self.shape is not None else []
         finish = self.system.finish(matrix=False) if frames else self.integrator.rotate_force()

@@ -21,6 +21,8 @@ class Rosenbrock:
 
     first: launches that evaluate the forces of the first stage and the frames of the nodes, without A
     again: launches that evaluate the forces of the second stage
+    end: launches after `finish`, of the forces on holders
+    held_moves: (bodies,) 1 where a holder moves in the step, which the first launches set: such a body iterates
     second, finish: nodal kernels after the first and after the second solve
     prepare: nodal kernel that makes what the next step is assembled from, from v
     remember: nodal kernel that keeps the nodes' own blocks of A of a step that iterates, for steps without A
@@ -36,6 +38,8 @@ class Rosenbrock:
 
     first: Sequence[Launch]
     again: Sequence[Launch]
+    end: Sequence[Launch]
+    held_moves: Int32
     second: Launch
     finish: Launch
     prepare: Launch
@@ -59,4 +63,4 @@ class Rosenbrock:
     def launches(self) -> list[Launch]:
         """All launches beside those of `assemble`."""
         nodal = [getattr(self, name) for name in NODAL]
-        return [*self.first, *self.again, *nodal]
+        return [*self.first, *self.again, *self.end, *nodal]

@@ -7,13 +7,19 @@ go to the right-hand side, b_f -= A_fc dv_c. That costs no iterations, and A sta
 product is made by the elements: they get, for the velocity of a held node, the one that has dv_c in it (`hold` in
 kernels/holders.cu). With several linearizations a held node is where the step ends before the first of them.
 
+In a step by stages (mechanics/rosenbrock.py) a held node goes straight, at its mean velocity V and acceleration a; the
+columns of A times theta (V + beta a), and times the opposite, go to the right-hand sides of the two stages. Without
+these terms, which stand for dF/dt in the Jacobian, stiff bodies would overshoot.
+
 The force on a held node is what its own equation lacks, i F_c = A_cf dv_f + A_cc dv_c - b_c, so that momentum is kept
-to rounding. The energy balance counts its work.
+to rounding; in a step by stages what the mean of the forces of both lacks, to second order. The energy balance counts
+its work.
 
 Sources: Hughes, The Finite Element Method, section 1.10 (prescribed boundary values).
 """
 
 from collections.abc import Sequence
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,12 +28,22 @@ from sim_server.arrays import Float64, Int32
 from sim_server.backends.base import Launch
 from sim_server.effects._movable import Movable, pose_of
 from sim_server.errors import InputError
-from sim_server.mechanics.system import System
+from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.world import World
 from sim_server.scene import where
 from sim_server.scene.holders import Holder
 
 TEXT = "kernels/holders.cu"
+
+
+class Stages(Protocol):
+    """What holders need of a scheme with stages (mechanics/rosenbrock.py): arrays of its nodes."""
+
+    inertial_increment: Float64
+    beta: Float64
+    share: Float64
+    weight: Float64
+    estimate: Float64
 
 
 class Holders(Movable):
@@ -65,6 +81,7 @@ class Holders(Movable):
         self._place = np.array([b.index * columns + k for k, b in enumerate(self._bodies)], np.int32)
         self.load, self._own_load = np.zeros((world.nodes, 3)), True
         self._settled = np.full(n, -1.0)
+        self._shift, self._sum, self.moves = np.zeros((n, 3)), np.zeros((n, 3)), world.held_moves
         exact = [a for a in vars(self).values() if isinstance(a, np.ndarray) and a is not self.load]
         world.backend.keep(*exact, exact=True)
         world.backend.keep(self.load)
@@ -72,6 +89,9 @@ class Holders(Movable):
     def use_load(self, load: Float64) -> None:
         """Has forces added to `load` (nodes, 3), the array `force` of another effect, for the energy balance."""
         self.load, self._own_load = load, False
+
+    def force_launches(self, system: System, stencil: Stencil | None, frames: bool) -> list[Launch]:
+        return []  # those of `stage_launches`
 
     def balance_arrays(self) -> dict[str, Float64]:
         if not self._own_load:
@@ -123,6 +143,31 @@ class Holders(Movable):
             load=self.load,
         )  # fmt: skip
         return [settle, self._total()]
+
+    def stage_launches(self, system: System, stages: "Stages") -> tuple[list[Launch], list[Launch], list[Launch]]:
+        """Returns the launches of a step by stages: before the forces of the first, of the second, and at the end.
+
+        Without a holder that moves there are none of the first.
+        """
+        w, text = self.world, self.world.backend.module(TEXT)
+        n, both = len(self.node), {"node": self.node, "witness": self._witnesses(), "free": w.free}
+        state: dict[str, Any] = {"x": w.x, "v": w.v, "next": self.next, "later": self.later}
+        state |= {"damping_velocity": w.damping_velocity, "inertial_increment": stages.inertial_increment}
+        state |= both | {"share": stages.share}
+        first = text.bind(
+            "hold_first", n, holder=self.holder, body=system.body, start=self.start, arm=self.arm, center=self.center,
+            begin=self.begin, end=self.end, beta=stages.beta, h=w.dt, velocity=self.velocity, shift=self._shift,
+            moves=self.moves, **state,
+        )  # fmt: skip
+        second = text.bind("hold_second", n, shift=self._shift, b=system.b, sum=self._sum, **state)
+        settle = text.bind(
+            "settle_stages", n, body=system.body, moving=system.moving, mass=w.mass, weight=stages.weight, h=w.dt,
+            force_coefficient=w.force_coefficient, clock=system.clock, settled=self._settled, velocity=self.velocity,
+            sum=self._sum, b=system.b, predictor=w.predictor, dv=system.dv, estimate=stages.estimate,
+            force=self.force, load=self.load, **state,
+        )  # fmt: skip
+        moved = any(h.keyframes or h.moved for h in w.holders)
+        return [self.place(system), first] if moved else [], [second], [settle, self._total()]
 
     def _total(self) -> Launch:
         """Returns the launch that adds up the forces on each holder."""

@@ -147,6 +147,141 @@ KERNEL(settle, Settle) {
     for (int k = 0; k < 3 && moves && !p.inertia; ++k) p.y[3 * node + k] = R[k] * step[0] + R[3 + k] * step[1] + R[6 + k] * step[2];
 }
 
+// --- steps by two stages (mechanics/rosenbrock.py) ------------------------------------------------------------------------------------
+
+struct HoldFirst {
+    int n;                     // held nodes
+    const int* node;           // (n,) of the scene
+    const int* holder;         // (n,)
+    const int* witness;        // (n,)
+    const real* free;          // (nodes,)
+    const int* body;           // (nodes,)
+    const double* start;       // (n, 3) [m]
+    const double* arm;         // (n, 3) [m]
+    const double* center;      // (holders, 3) [m]
+    const double* begin;       // (holders, 7)
+    const double* end;         // (holders, 7)
+    const real* beta;          // (nodes,) [s]
+    const real* share;         // (nodes,) theta [-]
+    double h;                  // [s]
+    const real* x;             // (nodes, 3) at the start of the step [m]
+    const real* v;             // (nodes, 3) likewise [m/s]
+    double* next;              // (n, 3) out: at the end of the step [m]
+    double* later;             // (n, 3) out: likewise [m/s]
+    double* velocity;          // (n, 3) out: at the start of the step [m/s]
+    double* shift;             // (n, 3) out: y_c of the first stage; that of the second is less than 0 by as much [m/s]
+    real* damping_velocity;    // (nodes, 3) out
+    real* inertial_increment;  // (nodes, 3) out: 0
+    int* moves;                // (bodies,) out: 1 where a holder moves in the step
+};
+
+// Before the forces of the first stage. In the stages a held node has the straight motion from x to `next`, with the mean velocity
+// V and acceleration a of the step: its parts of k_1 are V and a, of k_2 -V and -a. So y_c = theta (V + beta a), times the columns
+// of A, goes to the right-hand side, as part of the velocity that the elements take.
+KERNEL(hold_first, HoldFirst) {
+    const int node = p.node[i], holder = p.holder[i];
+    if (p.free[p.witness[i]] == 0) return;
+    const double *begin = p.begin + 7 * holder, *end = p.end + 7 * holder, *arm = p.arm + 3 * i, share = p.share[node];
+    double next[3], turn[3], turned[3];
+    held_point(end, p.center + 3 * holder, arm, p.start + 3 * i, next);
+    rotation_between(begin, end, turn);
+    world_vector(end, arm, turned);
+    for (int k = 0; k < 3; ++k) {
+        const int at = 3 * node + k, a = (k + 1) % 3, b = (k + 2) % 3;
+        const double later = ((end[k] - begin[k]) + turn[a] * turned[b] - turn[b] * turned[a]) / p.h, before = p.v[at];
+        const double V = (next[k] - p.x[at]) / p.h, shift = share * (V + p.beta[node] * (later - before) / p.h);
+        p.next[3 * i + k] = next[k];
+        p.later[3 * i + k] = later;
+        p.velocity[3 * i + k] = before;
+        p.shift[3 * i + k] = shift;
+        p.damping_velocity[at] = (1 - share) * before + shift;
+        p.inertial_increment[at] = 0;
+        if (V != 0 || later != 0 || before != 0) p.moves[p.body[node]] = 1;
+    }
+}
+
+struct HoldSecond {
+    int n;                     // held nodes
+    const int* node;           // (n,) of the scene
+    const int* witness;        // (n,)
+    const real* free;          // (nodes,)
+    const real* share;         // (nodes,)
+    const double* next;        // (n, 3) [m]
+    const double* later;       // (n, 3) [m/s]
+    const double* shift;       // (n, 3) [m/s]
+    const real* b;             // (nodes, 3) of the first stage [N s]
+    double* sum;               // (n, 3) out: b at held nodes [N s]
+    real* x;                   // (nodes, 3) out
+    real* v;                   // (nodes, 3) out
+    real* damping_velocity;    // (nodes, 3) out
+    real* inertial_increment;  // (nodes, 3) out: 0
+};
+
+// Before the forces of the second stage, which is at the end of the step.
+KERNEL(hold_second, HoldSecond) {
+    const int node = p.node[i];
+    if (p.free[p.witness[i]] == 0) return;
+    for (int k = 0; k < 3; ++k) {
+        const int at = 3 * node + k;
+        p.sum[3 * i + k] = p.b[at];
+        p.x[at] = p.next[3 * i + k];
+        p.v[at] = p.later[3 * i + k];
+        p.damping_velocity[at] = (1 - p.share[node]) * p.later[3 * i + k] - p.shift[3 * i + k];
+        p.inertial_increment[at] = 0;
+    }
+}
+
+struct SettleStages {
+    int n;                     // held nodes
+    const int* node;           // (n,) of the scene
+    const int* witness;        // (n,)
+    const real* free;          // (nodes,)
+    const int* body;           // (nodes,)
+    const int* moving;         // (bodies,) 0: the body rests, and has no second stage
+    const real* mass;          // (nodes,) [kg]
+    const real* share;         // (nodes,)
+    const real* weight;        // (nodes,) w [-]
+    double h;                  // [s]
+    double force_coefficient;  // [s]
+    const double* clock;       // (1,) [s]
+    double* settled;           // (n,) in, out [s]
+    const double* next;        // (n, 3) [m]
+    const double* later;       // (n, 3) [m/s]
+    const double* velocity;    // (n, 3) at the start of the step [m/s]
+    const double* sum;         // (n, 3) b of the first stage [N s]
+    const real* b;             // (nodes, 3) of the last stage [N s]
+    real* x;                   // (nodes, 3) out
+    real* v;                   // (nodes, 3) out
+    real* predictor;           // (nodes, 3) out: of the next step, as the next three [m/s]
+    real* damping_velocity;
+    real* inertial_increment;
+    real* dv;
+    real* estimate;            // (nodes,) out: 0
+    double* force;             // (n, 3) in, out [N]
+    real* load;                // (nodes, 3) in, out [N]
+};
+
+// After an attempt. The force is what the mean of those of both stages lacks.
+KERNEL(settle_stages, SettleStages) {
+    const int node = p.node[i];
+    const bool moves = p.free[p.witness[i]] != 0, told = p.settled[i] == p.clock[0], still = p.moving[p.body[node]] == 0;
+    const double share = p.share[node];
+    p.settled[i] = p.clock[0];
+    for (int k = 0; k < 3; ++k) {
+        const int at = 3 * node + k;
+        const double later = p.later[3 * i + k], impulse = still ? (double)p.b[at] : (p.sum[3 * i + k] + p.b[at]) / 2;
+        const double force = p.mass[node] * (later - p.velocity[3 * i + k]) / p.h - impulse / p.force_coefficient;
+        tell_force(p, i, k, told, moves ? force : 0);
+        if (!moves) continue;
+        p.x[at] = p.next[3 * i + k];
+        p.v[at] = later;
+        p.predictor[at] = p.damping_velocity[at] = (1 - share) * later;
+        p.inertial_increment[at] = p.weight[node] * later;
+        p.dv[at] = share * later;
+        p.estimate[node] = 0;
+    }
+}
+
 struct Total {
     int n;                // holders
     const int* first;     // (n,) into held nodes

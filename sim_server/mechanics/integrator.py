@@ -244,7 +244,7 @@ class Integrator:
     ) -> Rosenbrock | None:
         """Input of a Rosenbrock-W step; None for other schemes.
 
-        lists: launches of the forces of the first and of the second stage
+        lists: launches of the forces of the first and of the second stage, and after it
         """
         return None
 

@@ -35,6 +35,9 @@ PATIENCE steps after it, too.
 After a step by stages a body without fixed nodes or springs of grabs gets the momenta that its forces make
 (kernels/rigid_motion.h): the stages alone lose angular momentum of stiff bodies that turn.
 
+A node of a holder (effects/_holders.py) has a known motion; in k_1 it has its mean velocity and acceleration of the
+step, in k_2 both with the other sign, so that it ends where the holder is, and J counts how the forces change with it.
+
 Stability: A-stable with J the slope of F, L-stable (R(infinity) = 0). With an older, warped J in place of it see
 docs/bench/rosenbrock.md; without the warp it flies apart.
 
@@ -121,15 +124,15 @@ class RosenbrockIntegrator(Integrator):
     def stages(
         self, assemble: Sequence[Launch], lists: Sequence[Sequence[Launch]], effects: Sequence[CouplesNodes]
     ) -> Rosenbrock:
-        """Input of the step. lists: launches of the forces of both stages."""
+        """Input of the step. lists: launches of the forces of both stages, and after the second."""
         w, s = self.world, self.system
         state: dict[str, Any] = {"x": w.x, "v": w.v}
         started: dict[str, Any] = {"start_x": self.start_x, "start_v": self.start_v}
         solved: dict[str, Any] = {"rotation": s.rotation, "y": s.y, "h": w.dt}
         history: dict[str, Any] = {"before": self.before, "earlier": self.earlier}
-        first, again = lists
+        first, again, end = lists
         found = Rosenbrock(
-            first=first, again=again,
+            first=first, again=again, end=end, held_moves=w.held_moves,
             second=self._stage("second", first=self.first, **solved, **state, **started, **self._prepared()),
             finish=self._stage(
                 "finish", body=s.body, moving=s.moving, first=self.first, estimate=self.estimate,

@@ -53,7 +53,8 @@ class World:
 
     rest (n, 3): before the pose [m]; x (n, 3): positions [m]; v (n, 3): velocities [m/s]; mass (n,): lumped [kg];
     free (n,): 1, or 0 at fixed nodes; held (n,): 1 at nodes of holders, which are fixed, too; held_nodes (held,): these
-    nodes in the order of the launches over them; alpha, beta (bodies,):
+    nodes in the order of the launches over them; held_moves (bodies,): 1 where a holder moves in a step by stages;
+    alpha, beta (bodies,):
     Rayleigh damping of the mass [1/s] and of the stiffness [s]; dt: time step [s];
     projection: of the elements' stiffness, the scene's choice;
     obstacles, holders, attachments, springs: of the scene; reaction (bodies, k, 6): force [N] and torque [N m] of each
@@ -101,7 +102,7 @@ class World:
         self.v = np.zeros_like(self.x)
         self.mass = np.concatenate([_lumped(o, mesh) for o, mesh in meshes])
         self.free, self.held = np.ones(first), np.zeros(first, np.int32)
-        self.held_nodes = np.zeros(0, np.int32)
+        self.held_nodes, self.held_moves = np.zeros(0, np.int32), np.zeros(len(self.bodies), np.int32)
         self.alpha, self.beta = np.zeros(len(self.bodies)), np.zeros(len(self.bodies))
         integrator = scene.integrator
         self.force_coefficient, self.dx_dv = integrator.force_coefficient(self.dt), integrator.dx_dv(self.dt)

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from pydantic import Field, model_validator
 from pydantic_core import InitErrorDetails
 
+from sim_server.errors import InputError
 from sim_server.scene.integrator_options import IntegratorOptions
 from sim_server.scene.motion import Moved
 from sim_server.scene.obstacles import HasName
@@ -30,8 +31,15 @@ class Holder(Moved):
         return self
 
 
+def check_holders_on(device: str, holders: Sequence[Holder], integrator: IntegratorOptions) -> None:
+    """Raises InputError for holders that the device ("cpu" or "gpu") does not have."""
+    if device == "gpu" and holders and integrator.scheme == "ros2":
+        allowed = "'backward_euler', 'newmark', 'bdf2', 'quasi_static', or --device cpu"
+        raise InputError(f"holder {holders[0].name!r} with integrator.scheme = 'ros2' on a GPU; allowed: {allowed}")
+
+
 def holder_errors(
-    holders: Sequence[Holder], objects: Sequence[HasName], others: Sequence[str], integrator: IntegratorOptions
+    holders: Sequence[Holder], objects: Sequence[HasName], others: Sequence[str]
 ) -> Iterator[InitErrorDetails]:
     """Yields what is wrong with holders as a whole. others: names that are taken."""
     names = [o.name for o in objects]
@@ -42,9 +50,6 @@ def holder_errors(
             yield _error(text, index)
         if holder.object not in names:
             yield _error(f"no object {holder.object!r}" + nearest(holder.object, names, "objects"), index, "object")
-        if integrator.scheme == "ros2":
-            allowed = "'backward_euler', 'newmark', 'bdf2', 'quasi_static', or the effect fixed in place of the holder"
-            yield _error(f"a holder with integrator.scheme = 'ros2'; allowed: {allowed}", index)
 
 
 def _error(message: str, index: int, *place: str) -> InitErrorDetails:

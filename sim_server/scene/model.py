@@ -22,7 +22,7 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 from sim_server.errors import InputError
 from sim_server.mesh import Mesh, bar, check, read
 from sim_server.scene.effect_tables import checked_effects
-from sim_server.scene.holders import Holder, holder_errors
+from sim_server.scene.holders import Holder, check_holders_on, holder_errors
 from sim_server.scene.integrator_options import IntegratorOptions
 from sim_server.scene.obstacles import FRICTION, Obstacle, check_contact_on, contact_errors
 from sim_server.scene.parameters import Count, Counts, File, Name, NotNegative, Parameters, Positive, Sizes, complaint
@@ -235,7 +235,7 @@ class Scene(Parameters):
     @model_validator(mode="after")
     def _as_holders_need(self) -> "Scene":
         shapes = [o.name for o in self.obstacles or []]
-        if errors := list(holder_errors(self.holders or [], self.objects, shapes, self.integrator)):
+        if errors := list(holder_errors(self.holders or [], self.objects, shapes)):
             raise ValidationError.from_exception_data("Scene", errors)
         return self
 
@@ -252,6 +252,7 @@ class Scene(Parameters):
         """Raises InputError for what the device ("cpu" or "gpu") does not have."""
         self.solver.check_device(device)
         self.integrator.check_device(device)
+        check_holders_on(device, self.holders or [], self.integrator)
         if "contact" in self.effects:
             check_contact_on(device, self.effects["contact"], self.integrator)
 

@@ -11,6 +11,7 @@ SCHEMES = {
     "backward_euler": {}, "newmark": {"scheme": "newmark"}, "bdf2": {"scheme": "bdf2"},
     "newton": {"linearizations": 20, "tolerance": 1e-10},
     "newmark_newton": {"scheme": "newmark", "linearizations": 20, "tolerance": 1e-10},
+    "ros2": {"scheme": "ros2"},
 }  # fmt: skip
 SPIN = [{"time": t / 4, "rotate": [0, 0, 90.0 * t]} for t in range(9)]  # a quarter of a turn in 0.25 s
 
@@ -114,7 +115,7 @@ def test_a_bar_that_turns_with_its_holder_has_the_momentum_of_a_rigid_one():
     assert spin == pytest.approx(rigid, rel=0.02)
 
 
-@pytest.mark.parametrize("scheme", ["newmark", "bdf2"])
+@pytest.mark.parametrize("scheme", ["newmark", "bdf2", "ros2"])
 def test_velocities_of_held_nodes_are_those_of_the_motion(scheme):
     sim = held_bar(left(keyframes=SPIN, center=[0, 0.5, 0.5]), integrator={"scheme": scheme}, young=1e6)
     sim.engine.run(13)

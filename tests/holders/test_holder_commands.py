@@ -98,7 +98,6 @@ def test_a_worker_assembles_the_matrix_of_held_bodies():
         ([left(keyframes=[{"time": 0.0, "translate": [1, 0, 0]}])], {}, "that of time 0 must be without"),
         ([left(moved="client", keyframes=[{"time": 1.0}])], {}, "allowed is one of the two"),
         ([left(max_speed=1.0)], {}, 'without moved = "client"'),
-        ([left()], {"integrator": {"scheme": "ros2"}}, "a holder with integrator.scheme = 'ros2'"),
     ],
 )
 def test_tables_that_cannot_be_are_refused(holders, keys, said):

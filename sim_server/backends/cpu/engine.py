@@ -131,7 +131,7 @@ class _NativeNewton:
         return moved
 
 
-LISTS = ("first", "again")  # of launches
+LISTS = ("first", "again", "end")  # of launches
 
 
 class _NativeStages:
@@ -144,7 +144,7 @@ class _NativeStages:
         for state in self._state:
             state.factor_step = state.euler_step = -1
         self.native = structs.Stages(
-            firsts=len(stages.first), agains=len(stages.again), factor_alone=stages.factor_alone,
+            firsts=len(stages.first), agains=len(stages.again), ends=len(stages.end), factor_alone=stages.factor_alone,
             state=c.addressof(self._state),
         )  # fmt: skip
         for name in NODAL:
@@ -154,7 +154,7 @@ class _NativeStages:
         self._first_stage = np.zeros((len(stages.mass), 9))
         self.native.first_stage = self._first_stage.ctypes.data
         for name in ("estimate", "bound", "mass", "share", "weight", "diagonal",
-                     "start_x", "start_v", "b", "inertial_increment", "unheld"):  # fmt: skip
+                     "start_x", "start_v", "b", "inertial_increment", "unheld", "held_moves"):  # fmt: skip
             setattr(self.native, name, getattr(stages, name).ctypes.data)
         loop.stages = c.addressof(self.native)
         _tell_bodies_apart(stages.parts, launches, number)

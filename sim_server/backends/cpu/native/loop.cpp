@@ -135,6 +135,7 @@ static void assemble_stage(Loop& loop, bool whole) {
     const Stages& stages = *loop.stages;
     auto needs_matrix = [&](int i) { return stages.state[i].assembled != 0; };
     auto alone = [&](int i) { return stages.state[i].form == FACTOR; };
+    std::fill_n(stages.held_moves, loop.bodies, 0);
     for (int i = 0; i < loop.bodies; ++i) choose_form(loop, i, whole);
     run_assembly(loop, needs_matrix);
     for (int i = 0; i < stages.firsts; ++i) run_for(loop, loop.launch[stages.first[i]], alone);

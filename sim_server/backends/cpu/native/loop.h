@@ -72,8 +72,8 @@ struct StageState {                    // of a body in the step under way (rosen
 constexpr int FAILED = -1;             // form of an attempt that gave no state
 
 struct Stages {                        // input of the Rosenbrock-W step
-    const int32_t *first, *again;      // numbers of launches: the forces of both stages
-    int32_t firsts, agains;
+    const int32_t *first, *again, *end;  // numbers of launches: the forces of both stages; after the second
+    int32_t firsts, agains, ends;
     int32_t second, finish, prepare, remember, restore;  // likewise
     int32_t factor_alone;              // 1: wanted
     const double* estimate;            // (nodes,) of the last attempt [m]
@@ -81,6 +81,7 @@ struct Stages {                        // input of the Rosenbrock-W step
     const double *mass, *share, *weight, *diagonal;  // (nodes,) of the first stage's check (step_form.h): M, theta, w, of A
     const double *start_x, *start_v, *b, *inertial_increment;  // (nodes, 3) of the momenta; b: world frame (momentum.h)
     const int32_t* unheld;             // (bodies,) 1: no node is fixed
+    int32_t* held_moves;               // (bodies,) 1: a holder moves in the step; set before the forces of the first stage
     double* first_stage;               // (nodes, 9) start of the solve, b and y of the first stage
     StageState* state;                 // (bodies,)
 };

@@ -48,16 +48,19 @@ static void choose_form(Loop& loop, int index, bool whole) {
 }
 
 // After the forces of the first stage are evaluated: whether factors know the springs of grabs, or are corrected for them. Where one
-// does not, the body iterates in this step.
+// does not, the body iterates in this step, and so does one whose holder moves: the check of its factor knows nothing of that.
 static void check_corrections(Loop& loop) {
     const Stages& stages = *loop.stages;
     for (int i = 0; i < loop.bodies; ++i) {
         StageState& s = stages.state[i];
         Body& body = loop.body[i];
         s.corrects = s.misses = false;
-        if (s.form != FACTOR || body.correction.capacity == 0) continue;
-        s.corrects = Corrected{body.correction, matrix_of(loop, body), *body.factor}.prepare();
-        s.misses = body.correction.missed;
+        if (s.form != FACTOR) continue;
+        s.misses = loop.stages->held_moves[i];
+        if (!s.misses && body.correction.capacity > 0) {
+            s.corrects = Corrected{body.correction, matrix_of(loop, body), *body.factor}.prepare();
+            s.misses = body.correction.missed;
+        }
         if (s.misses) s.form = ITERATE;
     }
     for (int k = 0; k < loop.before; ++k) run_for(loop, loop.launch[k], [&](int i) { return stages.state[i].misses != 0; });
@@ -182,6 +185,7 @@ template <class F> static bool make_attempt(Loop& loop, F take_part) {
     }
     solve_stage(loop, false, take_part);
     run_for(loop, loop.launch[stages.finish], take_part);
+    for (int k = 0; k < stages.ends; ++k) run_for(loop, loop.launch[stages.end[k]], take_part);
     bool again = false;
     for (int i = 0; i < loop.bodies; ++i) {
         if (!take_part(i)) continue;
