@@ -28,8 +28,9 @@ struct Islands { int bodies, grid, sites, most, pivots, product_grid, edges; };
 static void apply_factors(const IslandArguments& a) {
     for (int body = 0; body < a.bodies_count; ++body) {
         const int island = island_of(a, body);
-        if (island < 0 || a.state[island].stage != ITERATES || !a.state[island].factors || !has_factor(a.bodies[body])) continue;
-        for (int k = 3 * a.bodies[body].first; k < 3 * (a.bodies[body].first + a.bodies[body].nodes); ++k) a.z[k] = a.r[k];
+        if (island < 0 || a.state[island].stage != ITERATES || !a.state[island].factors) continue;
+        const int first = a.bodies[body].first, last = first + a.bodies[body].nodes;
+        for (int k = 3 * first; k < 3 * last && has_factor(a.bodies[body]); ++k) a.z[k] = a.r[k];
     }
 }
 static void each(int blocks, auto kernel) { launch(blocks, CONTACT_THREADS, kernel); }
@@ -382,13 +383,14 @@ def test_triangles_of_bodies_that_touch_each_other(with_triangles, monkeypatch, 
 def test_an_island_goes_over_to_block_jacobi(library, monkeypatch):
     """Factors that are of little use are left within a pass, and passes then begin without them."""
     beside = IslandsBeside(library, pile(2), monkeypatch)
-    beside.bodies["kind"], beside.bodies["plan"], beside.bodies["factor_step"] = KINDS.enumeration("Kind")["CHOLESKY"], 1, 0
+    kinds = KINDS.enumeration("Kind")
+    beside.bodies["kind"], beside.bodies["plan"] = kinds["CHOLESKY"], 1
     beside.near(1e-6)
     islands = beside.passes.islands
     assert islands is not None
     choice = islands.memory["choice"].view(ISLAND.dtype("PassChoice"))[0]
     assert choice["jacobi"] == 1 and choice["rate"][0] > choice["rate"][1] > 0
-    assert (beside.results[0]["kind"] == KINDS.enumeration("Kind")["BLOCK_JACOBI"]).all()
+    assert (beside.results[0]["kind"] == kinds["BLOCK_JACOBI"]).all()
 
 
 def test_heights_of_boxes_over_triangles():

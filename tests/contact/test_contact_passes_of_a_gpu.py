@@ -71,7 +71,7 @@ def test_a_block_at_rest_whose_edge_is_lifted_needs_one_solve_a_step(library, mo
 def test_an_obstacle_hits_a_block_at_10_m_per_s(library, monkeypatch):
     beside = Beside(library, over(ram(), floor(), at=(0, 0.02, 0), **SMALL), monkeypatch)
     records = [beside.compare(1e-6) for _ in range(5)]
-    assert max(r["contacts"] for r in records) == 16 and max(r["passes"] for r in records) > 8
+    assert max(r["contacts"] for r in records) == 16 and max(r["passes"] for r in records) > 6
 
 
 @pytest.mark.parametrize("short", [{"passes": 1}, {"passes": 1, "stiffness": 0.05}], ids=str)

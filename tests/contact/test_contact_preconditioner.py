@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Contacts that a factor does not know: its correction (native/woodbury.h), and block Jacobi (native/pass_choice.h)."""
+"""Contacts that a factor does not know: its correction (woodbury.h), and block Jacobi (pass_choice.cuh)."""
 
 from typing import Any
 
