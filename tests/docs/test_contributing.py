@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Examples of CONTRIBUTING.md work as they stand there, in a copy of the repository's packages."""
 
+import os
 import re
 import shutil
 import subprocess
@@ -78,14 +79,20 @@ def insert(folder: Path, diff: str) -> set[str]:
 
 @pytest.mark.slow
 def test_the_record_column_is_in_records_messages_and_exports(tmp_path: Path) -> None:
+    """With a compiler that does not optimize, for time: all texts are compiled again."""
     pytest.importorskip("grpc_tools")
     (diff,) = re.findall(r"^```diff\n(.*?)^```", TEXT, re.MULTILINE | re.DOTALL)
     (command,) = re.findall(r"^python -m grpc_tools.*$", TEXT, re.MULTILINE)
     copy_packages(tmp_path, "sim_server", "protocol", "clients")
     assert len(insert(tmp_path, diff)) == 2
     (tmp_path / "scene.toml").write_text(SCENE)
+    (tmp_path / "c++").write_text('#!/bin/sh\nexec g++ "$@" -O0\n')
+    (tmp_path / "c++").chmod(0o755)
+    variables = os.environ | {"WARPFACTOR_CACHE": str(tmp_path / "cache"), "CXX": str(tmp_path / "c++")}
     for arguments, folder in ((command.split()[1:], "protocol"), (["-c", RUN], "")):
-        run = subprocess.run([sys.executable, *arguments], cwd=tmp_path / folder, capture_output=True, text=True)
+        run = subprocess.run(
+            [sys.executable, *arguments], cwd=tmp_path / folder, env=variables, capture_output=True, text=True
+        )
         assert run.returncode == 0, run.stdout + run.stderr
     assert (tmp_path / "run.csv").read_text().splitlines()[0].endswith(",contact_residual,iteration_rate")
 
