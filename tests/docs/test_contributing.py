@@ -87,7 +87,7 @@ def test_the_record_column_is_in_records_messages_and_exports(tmp_path: Path) ->
     for arguments, folder in ((command.split()[1:], "protocol"), (["-c", RUN], "")):
         run = subprocess.run([sys.executable, *arguments], cwd=tmp_path / folder, capture_output=True, text=True)
         assert run.returncode == 0, run.stdout + run.stderr
-    assert (tmp_path / "run.csv").read_text().splitlines()[0].endswith(",contact_residual,iteration_rate")
+    assert (tmp_path / "run.csv").read_text().splitlines()[0].endswith(",stable_step,iteration_rate")
 
 
 @pytest.mark.slow
