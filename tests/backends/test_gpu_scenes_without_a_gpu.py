@@ -33,9 +33,7 @@ SCENES = {
         "solver.precision=float32",
     ),
     "four_beams.toml, ros2": ("integrator.scheme=ros2", "solver.precision=mixed"),
-    "beam.toml, central_difference": ("integrator.scheme=central_difference", "solver.preconditioner=auto"),
     "springs.toml": (),
-    "springs.toml, central_difference": ("integrator.scheme=central_difference", "solver.precision=float32"),
     "fibres.toml": ("integrator.scheme=bdf2",),
     "equilibrium.toml": (),
 }
@@ -74,6 +72,19 @@ def test_a_scene_is_built_and_its_kernels_compile(cupy, name):
     engine.settle_factors()
     engine.run(1)
     assert engine.factor_bytes(body.index) > 9 * nodes
+
+
+@pytest.mark.parametrize(("name", "precision"), [("beam.toml", "float64"), ("springs.toml", "float32")])
+def test_a_scene_with_explicit_substeps_is_built(cupy, name, precision):
+    """A step has no solve, and four substeps between two decisions."""
+    keys = ["integrator.scheme=central_difference", f"solver.precision={precision}"]
+    engine = Simulation.load(f"deploy/scenes/{name}", keys, "gpu").engine
+    names = [kernel for kernel, _ in cupy.calls]
+    first = names.index("begin_substeps")
+    last = names.index("end_round")
+    assert "pcg" not in names and names[first:last].count("fused") >= 8 and "measure_frequency" in names[first:last]
+    engine.run(3)
+    assert engine.step == 3
 
 
 @pytest.mark.parametrize(

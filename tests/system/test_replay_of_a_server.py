@@ -297,3 +297,11 @@ def test_several_linearizations_of_another_scheme(tmp_path: Path) -> None:
     log = recorded(tmp_path, integrator)
     assert any(s.linearizations > 1 and 0 < s.nonlinear_residual < 1e-6 for s in messages(log, "step"))
     assert replayed(log, 0)["same"]
+
+
+def test_explicit_substeps_start_no_worker_and_are_repeated(tmp_path: Path) -> None:
+    explicit = recorded(tmp_path, '[integrator]\nscheme = "central_difference"', "none")
+    steps = messages(explicit, "step")
+    assert all(s.substeps > 0 and s.iterations == 0 and not s.factor_age > 0 for s in steps)
+    assert not messages(explicit, "factor") and len(messages(explicit, "touch")) > 5
+    assert replayed(explicit, 0)["same"]
