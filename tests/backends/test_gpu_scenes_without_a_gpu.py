@@ -102,6 +102,7 @@ def test_a_scene_with_contact_is_built(cupy, precision):
     step = ["place", "detect", "begin_contact", *one_pass, *one_pass, "finish_contact", "fused"]
     first = names.index("place")
     assert names[first : first + len(step)] == step
+    assert ("pcg", 3) in cupy.calls, "with what a pass and the correction of the factor need"
     engine = simulation.engine
     engine.run(3)
     records, reactions = engine.records_and_reactions()
