@@ -116,6 +116,7 @@ def test_a_scene_with_contact_is_built(cupy, precision):
     first = names.index("place")
     assert names[first : first + len(step)] == step
     assert not any("face" in kernel for kernel in names) and not any("FACE_ROWS" in str(o) for _, o in cupy.compiled)
+    assert ("pcg", 3) in cupy.calls, "with what a pass and the correction of the factor need"
     engine = simulation.engine
     engine.run(3)
     records, reactions = engine.records_and_reactions()

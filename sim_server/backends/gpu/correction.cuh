@@ -6,7 +6,7 @@
 #include "correction_state.cuh"
 
 constexpr int MOST_COLUMNS = 3 * MOST_CORRECTED;
-constexpr double LEAST_PIVOT = 1e-9;  // of the determinant of a pivot of I + U'V C
+constexpr double LEAST_PIVOT = 1e-14;  // of the determinant of a pivot of I + U'V C
 
 struct CorrectionMemory {        // shared memory of a thread block
     long long step;              // of the factor that V is for
