@@ -92,7 +92,9 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) contact_forces(con
             add_face_pulls(c, n, starts ? other : pull);
         }
         for (int k = 0; k < 3; ++k) {
-            const double Sy = S[3 * k] * y[0] + S[3 * k + 1] * y[1] + S[3 * k + 2] * y[2] + pull[k], all = b[k] + (starts ? other[k] : f[k]);
+            double Sy = S[3 * k] * y[0] + S[3 * k + 1] * y[1] + S[3 * k + 2] * y[2];
+            const double all = b[k] + (starts ? other[k] : f[k]);
+            if (FACES) Sy += pull[k];
             c.contact_b[3ll * i + k] = (real)(b[k] + f[k] + Sy);
             sum[0] += all * all;
             sum[1] += b[k] * b[k];
@@ -164,7 +166,9 @@ __device__ void project(const ContactArguments& c, const SurfaceNode& n, int bod
     }
     for (int k = 0; k < 3; ++k) {
         sum[0] += dy[k] * (before[k] - f[k]);
-        sum[1] += dy[k] * (before[k] - after[k] - (S[3 * k] * dy[0] + S[3 * k + 1] * dy[1] + S[3 * k + 2] * dy[2] + pull[k]));
+        double Sdy = S[3 * k] * dy[0] + S[3 * k + 1] * dy[1] + S[3 * k + 2] * dy[2];
+        if (FACES) Sdy += pull[k];
+        sum[1] += dy[k] * (before[k] - after[k] - Sdy);
     }
 }
 

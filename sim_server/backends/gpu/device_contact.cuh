@@ -111,11 +111,11 @@ struct ContactArguments {
     const int* alone;           // (1,) how many are
     double* pair_sums;          // (grid,) work of rows between bodies
     int* pair_contacts;         // (bodies,) those that carry force
-    int* pair_clipped;          // (bodies,) places where it is held apart from others
     double dx_dv;               // [s]
     double force_coefficient;   // [s]
     double tolerance;
     int obstacle_count, count, capacity, passes;
+    int* pair_clipped;          // (bodies,) places where it is held apart from others
     DeviceFaces faces;
 };
 

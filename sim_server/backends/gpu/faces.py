@@ -70,7 +70,7 @@ class FaceRows:
         node = contact.corner[:start:2, 0]
         site[node] = np.arange(len(node), dtype=np.int32)
         body = np.repeat(np.arange(bodies, dtype=np.int32), np.diff(faces.start))
-        tables = {
+        tables: dict[str, NDArray[Any]] = {
             "start": faces.start, "node": faces.triangle, "owns": faces.owns, "friction": faces.friction,
             "gravity": faces.gravity, "corner": contact.corner, "weight": contact.weight, "dropped": contact.dropped,
         }  # fmt: skip

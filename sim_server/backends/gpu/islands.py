@@ -194,7 +194,7 @@ class IslandPasses:
         params["t"]["near"] = self.memory["near"].data.ptr
         params["t"]["bodies"] = self._bodies
         params["t"]["pair_first"] = surfaces.edge_start[0] - contact.body_start[-1]
-        edges = {
+        edges: dict[str, NDArray[Any]] = {
             "start": surfaces.edge_start, "edge": surfaces.edge, "opposite": surfaces.opposite,
             "of_triangle": surfaces.triangle_edge, "length": surfaces.edge_length,
         }  # fmt: skip
