@@ -313,7 +313,7 @@ template <class Motion, class Own = NothingElse> HOST_DEVICE void detect_site(co
     const int node = node_of_site(c, site), body = c.site_body[site], row = c.pair_first + 2 * site;
     Meeting first = {-1, -1, {}}, second = first, beside = first;
     const Box box = m.free[node] == 0 ? empty_box() : box_of(m, node, thickness_of(c, body));
-    auto take = [&](const auto& search) {
+    auto take = [&](const TouchSearch<Motion>& search) {
         const Meeting t = found_by(search);
         if (comes_before(t, first)) { second = first; first = t; }
         else if (comes_before(t, second)) second = t;

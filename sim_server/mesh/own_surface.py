@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
 """A surface and itself: which nodes of it are nearby, and where it passes through itself."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -65,7 +67,7 @@ def _within(points: Float64, others: Float64, reach: float) -> tuple[Int64, Int6
     """Returns the pairs of a point and another one that are no farther apart than `reach`."""
     from scipy.spatial import cKDTree
 
-    found = cKDTree(others).query_ball_point(points, reach)
+    found: Any = cKDTree(others).query_ball_point(points, reach)
     count = np.array([len(f) for f in found], np.int64)
     return np.repeat(np.arange(len(points)), count), np.concatenate([*found, []]).astype(np.int64)
 
@@ -87,7 +89,7 @@ def _distances(p: Float64, corners: Float64) -> Float64:
 
 
 def edges_through_triangles(x: Float64, edges: Int32, triangles: Int32) -> tuple[Int64, Int64]:
-    """Returns which edges (e, 2) go through triangles with which they share no node: the edge and triangle of each pair."""
+    """Returns which edges (e, 2) go through triangles with which they share no node: edge and triangle of each pair."""
     corners, ends = x[triangles], x[edges]
     middle = corners.mean(axis=1)
     reach = np.linalg.norm(corners - middle[:, None], axis=2).max()

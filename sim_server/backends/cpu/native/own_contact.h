@@ -15,11 +15,11 @@
 constexpr double SMALL_TURN = 1e-4;  // rad: a rotation that is left
 
 struct OwnSearch {
-    typedef SurfaceMotion<double, const double> Motion;  // a type of its own, so that what is compiled for other bodies stays as it was
+    typedef SurfaceMotion<double, double> Motion;
     const Contact& c;
     const SurfaceTables& tables;
     const EdgeTables& edges;
-    const Motion motion;
+    const Motion& motion;
     const OwnContact& own;
 
     bool exists() const { return own.near.start; }

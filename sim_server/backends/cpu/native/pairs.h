@@ -24,11 +24,8 @@ struct PairDetection {
         : loop(loop), c(c), tables{loop.bodies, c.body_start, c.corner, c.weight, c.obstacle, c.normal, c.gap, c.entry, c.stiffness, c.friction,
                                    c.thickness, c.hardening, c.force, c.traction, c.pair_first, c.site_body, c.node_site, c.triangle, c.tree_start,
                                    c.tree_child, c.tree_box, c.body_box, c.near, c.pair_friction, c.body_thickness},
-          edges{c.edge_start, c.edge, c.edge_opposite, c.triangle_edge, c.edge_length, c.wings, c.facing}, motion(motion_of(c, loop.x, y)), own{c, tables, edges, as_own(motion), c.own} {}
+          edges{c.edge_start, c.edge, c.edge_opposite, c.triangle_edge, c.edge_length, c.wings, c.facing}, motion(motion_of(c, loop.x, y)), own{c, tables, edges, motion, c.own} {}
 
-    static OwnSearch::Motion as_own(const Motion& m) {
-        return {m.x, m.predictor, m.y, m.rotation, m.free, m.dx_dv, m.force_coefficient, m.gravity};
-    }
     int edges_before(int body) const { return c.edge_start ? (c.edge_start[body] - c.edge_start[0]) / 2 : 0; }
 
     // before: the solve
@@ -50,14 +47,14 @@ struct PairDetection {
     }
 
     // Finds the bodies that may touch themselves.
-    __attribute__((noinline)) void find_own(bool before) const {
+    void find_own(bool before) const {
         if (!own.exists()) return;
 #pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) if (loop.threads > 1)
         for (int i = 0; i < loop.bodies; ++i) {
             if (!before) own.add_ways(i);
             bool may = before ? own.begin(i) : own.any_may_pass(i);
             if (before && may && own.wants_reference(i)) {
-                fit_tree(tables, own.motion, i);
+                fit_tree(tables, motion, i);
                 own.measure(i);
                 may = own.any_may_touch(i, 2);
             }
@@ -69,13 +66,14 @@ struct PairDetection {
         const int node = node_of_site(tables, site);
         detect_site(tables, motion, site, [&](auto take) {
             if (!(c.near[body] & MAY_TOUCH_ITSELF) || is_bound(node, body) || !own.site_may_touch(site, body, 2)) return;
-            take(search_own(tables, c.own.near, own.motion, body, node, thickness_of(tables, body), c.own.apart + site));
+            take(search_own(tables, c.own.near, motion, body, node, thickness_of(tables, body), c.own.apart + site));
         });
     }
-    __attribute__((noinline)) EdgeMeetings own_edges(int body, int edge) const {
+    // What an edge may touch of its own body.
+    EdgeMeetings own_edges(int body, int edge) const {
         EdgeMeetings found = no_edges();
         if (!own.exists() || !(c.near[body] & MAY_TOUCH_ITSELF) || !own.edge_may_touch(edge, body, 2)) return found;
-        meet_each_own_edge(tables, edges, c.own.near, own.motion, body, edge, c.own.edges_apart + edge, [&](const EdgeMeeting& here) {
+        meet_each_own_edge(tables, edges, c.own.near, motion, body, edge, c.own.edges_apart + edge, [&](const EdgeMeeting& here) {
             if (!are_bound(edge, body, here.edge, body)) take(found, here);
         });
         return found;
@@ -182,10 +180,10 @@ struct PairDetection {
         return hold_apart(nodes, weight, t.touch.normal, 0.1 * thickness, body, t.other, y);
     }
     // True if the solution takes a vertex through its own body. t: where it touches then.
-    __attribute__((noinline)) bool site_passes_own(int body, int site, Meeting& t) const {
+    bool site_passes_own(int body, int site, Meeting& t) const {
         const int node = node_of_site(tables, site);
         if (!own.exists() || !(c.near[body] & MAY_TOUCH_ITSELF) || is_bound(node, body) || !own.site_may_pass(site, body)) return false;
-        return passes_own(tables, c.own.near, own.motion, body, node, thickness_of(tables, body), t);
+        return passes_own(tables, c.own.near, motion, body, node, thickness_of(tables, body), t);
     }
     // f(other, facing, thickness, touch) of the edges that the solution takes an edge through, but for attached ones.
     template <class F> void each_edge_passed(int body, int edge, F f) const {
@@ -197,10 +195,10 @@ struct PairDetection {
             if (meet_edges(path, c.wings[edge], way, c.wings[facing], thickness, 1e-2 * thickness, nullptr, t)) f(other, facing, thickness, t);
         });
         if (!own.exists() || !(c.near[body] & MAY_TOUCH_ITSELF) || !own.edge_may_pass(edge, body)) return;
-        const EdgePath path = path_of(edges, own.motion, edge);
-        each_own_edge(tables, edges, c.own.near, own.motion, body, edge, [&](int facing) {
+        const EdgePath path = path_of(edges, motion, edge);
+        each_own_edge(tables, edges, c.own.near, motion, body, edge, [&](int facing) {
             EdgeTouch t;
-            if (are_bound(edge, body, facing, body) || !own_edges_pass(path, path_of(edges, own.motion, facing), thickness_of(tables, body), t)) return;
+            if (are_bound(edge, body, facing, body) || !own_edges_pass(path, path_of(edges, motion, facing), thickness_of(tables, body), t)) return;
             f(body, facing, thickness_of(tables, body), t);
         });
     }
