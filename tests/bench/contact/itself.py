@@ -35,7 +35,7 @@ def made(
 
 
 def answers() -> list[Row]:
-    """Arms of a free fork driven into each other: momentum, edges through triangles. An arm at rest on the other one."""
+    """Arms of a free fork driven into each other: momentum, edges through triangles. An arm that rests on the other."""
     found = []
     with tempfile.TemporaryDirectory() as folder:
         for speed in (1.0, 10.0, 50.0):
@@ -70,7 +70,7 @@ def _carried(folder: str) -> Row:
 
 
 def cost(steps: int = 30) -> list[Row]:
-    """Steps with the key and without it, in turns: nothing near; arms at rest on each other by few and many contacts."""
+    """Steps with the key and without it, in turns: nothing near, and an arm at rest by few and by many contacts."""
     found: list[Row] = []
     with tempfile.TemporaryDirectory() as folder:
         held = {"fixed": f"Y > {0.05 - 1e-4}"}
@@ -92,7 +92,7 @@ def cost(steps: int = 30) -> list[Row]:
             records = np.concatenate([r[1] for r in rounds])
             found.append({
                 "case": name, "self contacts": int(records["contacts"].max()),
-                "iterations": float(records["iterations"].mean()), "passes": float(records["passes"].mean()), "p50 ms": ms[1], "without the key, ms": ms[0],
-                "over without": ms[1] / ms[0],
+                "iterations": float(records["iterations"].mean()), "passes": float(records["passes"].mean()),
+                "p50 ms": ms[1], "without the key, ms": ms[0], "over without": ms[1] / ms[0],
             })  # fmt: skip
     return found
