@@ -241,7 +241,6 @@ class Contact(Movable):
                         body.name, other.name, nodes[worst] - body.first, -distance[worst], found,
                     )  # fmt: skip
 
-
     def _warn_of_bodies_through_themselves(self, surfaces: Surfaces) -> None:
         """Logs which objects begin with edges through their own surface: what is through stays so."""
         first = (surfaces.edge_start - surfaces.edge_start[0]) // 2

@@ -162,14 +162,9 @@ HOST_DEVICE bool passes_own(const SurfaceTables& c, const OwnTables& o, const Mo
 
 // --- edges ------------------------------------------------------------------------------------------------------------------------------
 
-__attribute__((noinline)) static double own_edges_apart(const EdgePath& a, const EdgePath& b, EdgeTouch& touch) { return edges_apart(a, b, 0, touch); }
-__attribute__((noinline)) static double own_entry(const EdgePath& a, const EdgePath& b, double inflate, double slack, EdgeTouch& touch) {
-    return entry_of_edges(a, b, inflate, slack, touch);
-}
-
 // As `meet_edges` of edge_edge.cuh, but the side is that on which the edges are. Rims of a strip that lies on itself count, whose triangles
 // lean neither way. held: normal with which the edges bore each other in the last step, null: they did not.
-__attribute__((noinline)) static bool meet_own_edges(const EdgePath& a, const EdgeWings& wa, const EdgePath& b, const EdgeWings& wb, double thickness,
+HOST_DEVICE bool meet_own_edges(const EdgePath& a, const EdgeWings& wa, const EdgePath& b, const EdgeWings& wb, double thickness,
                                 const double* held, EdgeTouch& touch) {
     double u[3], v[3], n[3];
     for (int k = 0; k < 3; ++k) {
@@ -178,7 +173,7 @@ __attribute__((noinline)) static bool meet_own_edges(const EdgePath& a, const Ed
     }
     for (int k = 0; k < 3; ++k) n[k] = u[(k + 1) % 3] * v[(k + 2) % 3] - u[(k + 2) % 3] * v[(k + 1) % 3];
     if (!(make_unit(n) > PARALLEL * sqrt(dot3(u, u) * dot3(v, v)))) return false;
-    touch.distance = own_edges_apart(a, b, touch);
+    touch.distance = edges_apart(a, b, 0, touch);
     touch.entry = NEVER;
     const bool between = within_edge(touch.s) && within_edge(touch.t);
     auto leans_away = [&](const double* normal) { return leans(wa, normal, 1, -FLAT_EDGE) && leans(wb, normal, -1, -FLAT_EDGE); };
@@ -197,7 +192,7 @@ __attribute__((noinline)) static bool meet_own_edges(const EdgePath& a, const Ed
         return true;
     }
     EdgeTouch then;
-    const double time = own_entry(a, b, thickness, 1e-2 * thickness, then);
+    const double time = entry_of_edges(a, b, thickness, 1e-2 * thickness, then);
     if (time <= 1 && within_edge(then.s) && within_edge(then.t) && leans_away(then.normal)) {
         then.entry = time;
         then.distance = touch.distance;
@@ -211,10 +206,10 @@ __attribute__((noinline)) static bool meet_own_edges(const EdgePath& a, const Ed
 HOST_DEVICE bool own_edges_pass(const EdgePath& a, const EdgePath& b, double thickness, EdgeTouch& touch) {
     EdgeTouch then;
     const double through = THROUGH * thickness;
-    if (!(own_edges_apart(a, b, touch) > through) || !(own_entry(a, b, through, through, then) <= 1)) return false;
+    if (!(edges_apart(a, b, 0, touch) > through) || !(entry_of_edges(a, b, through, through, then) <= 1)) return false;
     if (!within_edge(then.s) || !within_edge(then.t)) return false;  // vertices pass triangles there
-    touch.distance = own_edges_apart(a, b, touch);
-    touch.entry = touch.distance > thickness ? own_entry(a, b, thickness, 1e-2 * thickness, touch) : 0;
+    touch.distance = edges_apart(a, b, 0, touch);
+    touch.entry = touch.distance > thickness ? entry_of_edges(a, b, thickness, 1e-2 * thickness, touch) : 0;
     return touch.entry <= 1;
 }
 
@@ -243,7 +238,7 @@ HOST_DEVICE void meet_each_own_edge(const SurfaceTables& c, const EdgeTables& e,
     each_own_edge(c, e, o, m, body, edge, [&](int facing) {
         EdgeTouch start;
         const EdgePath way = path_of(e, m, facing);
-        *least = fmin(*least, own_edges_apart(path, way, start));
+        *least = fmin(*least, edges_apart(path, way, 0, start));
         const double* held = held_by(c, e, edge, body, facing);
         if (!held && !(e.wings[edge].sharp && e.wings[facing].sharp)) return;
         EdgeMeeting here = {body, facing, {}};

@@ -89,7 +89,7 @@ def _distances(p: Float64, corners: Float64) -> Float64:
 
 
 def edges_through_triangles(x: Float64, edges: Int32, triangles: Int32) -> tuple[Int64, Int64]:
-    """Returns which edges (e, 2) go through triangles with which they share no node: the edge and triangle of each pair."""
+    """Returns which edges (e, 2) go through triangles with which they share no node: edge and triangle of each pair."""
     corners, ends = x[triangles], x[edges]
     middle = corners.mean(axis=1)
     reach = np.linalg.norm(corners - middle[:, None], axis=2).max()

@@ -103,9 +103,7 @@ def check_contact_on(device: str, contact: Any, integrator: IntegratorOptions) -
         )
 
 
-def _wrong_pair(
-    pair: set[str], objects: list[str], obstacles: list[str], earlier: list[set[str]], itself: bool
-) -> str:
+def _wrong_pair(pair: set[str], objects: list[str], obstacles: list[str], earlier: list[set[str]], itself: bool) -> str:
     for name in sorted(pair):
         if name not in objects and name not in obstacles:
             return f"no object or obstacle {name!r}" + nearest(name, [*objects, *obstacles], "names")

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from sim_server.mesh import bar as bar_mesh
 from sim_server.scene.model import Scene
 from sim_server.simulation import Simulation
+from tests.reference.corotational import Solid
 from tests.scenes import bar, mesh_file
 from tests.state import put
 
@@ -45,6 +46,22 @@ def fork(folder: Path, cells: tuple[int, int, int] = (8, 5, 2), edge: float = 0.
     kept = mesh.tets[~((middle[:, 0] > 2) & (abs(middle[:, 1] - cells[1] / 2) < cells[1] / 2 - 2))]
     used, tets = np.unique(kept, return_inverse=True)
     return mesh_file(folder, mesh.rest[used], tets.reshape(-1, 4), f"fork {cells}")
+
+
+def contact_forces(sim: Simulation) -> np.ndarray:
+    """Forces of bodies on each other, or on themselves, at their nodes (n, 3) [N]."""
+    rows, force = sim.contact.contact_input(), np.zeros_like(sim.world.x)
+    for r in np.flatnonzero((rows.obstacle >= 0) & (rows.corner[:, 1] >= 0) & (rows.force > 0)):
+        f = rows.force[r] * rows.normal[r] + rows.traction[r]
+        np.add.at(force, rows.corner[r], rows.weight[r][:, None] * f)
+    return force
+
+
+def elastic_forces(sim: Simulation, young: float, poisson: float) -> np.ndarray:
+    """Those of the reference at the nodes (n, 3) [N], of a scene of one body."""
+    w, tets = sim.world, sim.world.bodies[0].mesh.tets
+    each = np.ones(len(tets))
+    return Solid(w.rest, tets, young * each, poisson * each, w.mass, w.free, w.x, w.v, w.dt).forces()
 
 
 def block(friction: float = 0.5, cells: Sequence[int] = CELLS, size: Sequence[float] = SIZE, **table: Any) -> dict:

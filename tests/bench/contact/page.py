@@ -23,9 +23,9 @@ def write(report: Report, tables: Tables) -> None:
         report.table(found)
     report.say(words.SETUP)
     shown = {
-        "stairs": _stairs, "answers": _answers, "paths": _paths, "goals": _goals, "impact": _impact, "own": _own, "itself": _itself,
-        "pile": _pile, "peers": _peers, "wall": _wall, "hertz": _hertz, "belt": _belt, "passes": _passes, "cost": _cost,
-        "few": _few,
+        "stairs": _stairs, "answers": _answers, "paths": _paths, "goals": _goals, "impact": _impact, "own": _own,
+        "itself": _itself, "pile": _pile, "peers": _peers, "wall": _wall, "hertz": _hertz, "belt": _belt,
+        "passes": _passes, "cost": _cost, "few": _few,
     }  # fmt: skip
     for name, show in shown.items():
         if rows := tables.get(name, []):

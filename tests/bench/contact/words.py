@@ -114,6 +114,7 @@ STAIRS = """\
 deploy/scenes/stairs.toml: the block on its way down, iterations and passes of each step and contacts that carry
 force."""
 
-ITSELF = """With `contact.self`, beside the same without it, in turns. What is nowhere near itself is not searched: how far it has
-moved since distances were measured says so ([how](../contact.md#how-it-works)). Without the key the arms pass through each
-other, and their steps are those of a body that touches nothing."""
+ITSELF = """\
+With `contact.self`, beside the same without it, in turns. What is nowhere near itself is not searched: how far it has
+moved since distances were measured tells that ([how](../contact.md#how-it-works)). Without the key the arms pass
+through each other, and their steps are those of a body that touches nothing."""

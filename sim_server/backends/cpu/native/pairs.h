@@ -48,7 +48,7 @@ struct PairDetection {
     }
 
     // Finds the bodies that may touch themselves.
-    __attribute__((noinline)) void find_own(bool before) const {
+    void find_own(bool before) const {
         if (!own.exists()) return;
 #pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) if (loop.threads > 1)
         for (int i = 0; i < loop.bodies; ++i) {
@@ -70,7 +70,8 @@ struct PairDetection {
             take(search_own(tables, c.own.near, motion, body, node, thickness_of(tables, body), c.own.apart + site));
         });
     }
-    __attribute__((noinline)) EdgeMeetings own_edges(int body, int edge) const {
+    // What an edge may touch of its own body.
+    EdgeMeetings own_edges(int body, int edge) const {
         EdgeMeetings found = no_edges();
         if (!own.exists() || !(c.near[body] & MAY_TOUCH_ITSELF) || !own.edge_may_touch(edge, body, 2)) return found;
         meet_each_own_edge(tables, edges, c.own.near, motion, body, edge, c.own.edges_apart + edge, [&](const EdgeMeeting& here) {
@@ -182,7 +183,7 @@ struct PairDetection {
         if (site_passes_own(body, site, t)) places.push_back(held_vertex(tables, node, body, t, thickness_of(tables, body)));
     }
     // True if the solution takes a vertex through its own body. t: where it touches then.
-    __attribute__((noinline)) bool site_passes_own(int body, int site, Meeting& t) const {
+    bool site_passes_own(int body, int site, Meeting& t) const {
         const int node = node_of_site(tables, site);
         if (!own.exists() || !(c.near[body] & MAY_TOUCH_ITSELF) || is_bound(node, body) || !own.site_may_pass(site, body)) return false;
         return passes_own(tables, c.own.near, motion, body, node, thickness_of(tables, body), t);
