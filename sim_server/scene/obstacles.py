@@ -79,7 +79,9 @@ def contact_errors(
         yield _error(text, "effects", "contact")
     if integrator.scheme == "quasi_static" or integrator.explicit:
         allowed = "'backward_euler', 'newmark', 'bdf2', 'ros2'"
-        yield _error(f"contact with integrator.scheme = {integrator.scheme!r}; allowed: {allowed}", "effects", "contact")
+        yield _error(
+            f"contact with integrator.scheme = {integrator.scheme!r}; allowed: {allowed}", "effects", "contact"
+        )
     pairs: list[set[str]] = []
     for index, pair in enumerate(contact.friction or ()):
         if text := _wrong_pair(set(pair.between), names, shapes, pairs, contact.self):

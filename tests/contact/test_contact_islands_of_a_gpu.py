@@ -11,8 +11,8 @@ import pytest
 
 from sim_server.backends.gpu.faces import DEFINED
 from sim_server.backends.gpu.islands import ISLAND, TALLY, tree_heights
-from sim_server.backends.kinds import KINDS
 from sim_server.backends.gpu.structs import PAIR_SUM
+from sim_server.backends.kinds import KINDS
 from sim_server.simulation import Simulation
 from tests.contact.kernels_beside import TEXT, Beside, compiled
 from tests.contact.scenes import D, block, floor, over

@@ -203,7 +203,7 @@ class IslandPasses:
         of_node, tied = int(start[-1]), len(contact.ties.corner) if contact.ties else 0
         params["t"]["bodies"], params["t"]["pair_first"] = self._bodies, len(contact.obstacle) - tied
         if surfaces:
-            params["t"]["pair_first"] -= of_node
+            params["t"]["pair_first"] = surfaces.edge_start[0] - of_node
             tables |= {name: getattr(surfaces, name) for name in ("site_body", "node_site", "triangle", "tree_start",
                                                                   "tree_child")}  # fmt: skip
             tables["pair_friction"], tables["body_thickness"] = surfaces.friction, surfaces.thickness
