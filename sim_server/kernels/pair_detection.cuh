@@ -304,7 +304,11 @@ template <class Motion> HOST_DEVICE bool in_crease(const TouchSearch<Motion>& se
 }
 
 struct NothingElse {  // of a body itself, which is not touched
+#ifdef __CUDACC_RTC__
+    template <class F> __device__ void operator()(F) const {}
+#else
     template <class F> void operator()(F) const {}
+#endif
 };
 
 // Sets both rows of a site between bodies: of the bodies that it meets first, or is nearest to, or, with one, of both sides of a crease.
