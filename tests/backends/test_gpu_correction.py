@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from sim_server.backends.gpu.correction import CORRECTED_BODY
-from sim_server.effects import contact
 from sim_server.simulation import Simulation
 from tests.backends.pcg_on_threads import SOLVE, STEP, ContactSolver, Solver, compiled
 from tests.contact.scenes import over
@@ -100,7 +99,6 @@ def test_more_nodes_than_allowed_and_weak_springs_are_left_to_the_iteration(libr
 
 def test_contacts_that_came_are_corrected(contact_library, monkeypatch):
     """A block with a factor without contacts falls onto a floor."""
-    monkeypatch.setattr(contact, "nodes_alone", lambda world: True)
     options = {"preconditioner": "cholesky", "update": "never", "tolerance": 1e-8, "max_iterations": 5000}
     iterations = {}
     for capacity in (32, 0):
@@ -118,7 +116,6 @@ def test_contacts_that_came_are_corrected(contact_library, monkeypatch):
 
 
 def test_what_a_factor_knows_of_contacts_is_not_corrected(contact_library, monkeypatch):
-    monkeypatch.setattr(contact, "nodes_alone", lambda world: True)
     options = {"preconditioner": "cholesky", "update": "never", "tolerance": 1e-8}
     solver = ContactSolver(over(cells=(2, 1, 2), solver=options), monkeypatch)
     for step in range(5):

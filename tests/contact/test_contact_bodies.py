@@ -250,7 +250,7 @@ def test_blocks_that_fall_on_each_other_take_few_iterations():
 
 
 def test_islands_choose_between_factors_and_block_jacobi():
-    """Compact blocks that land go over to block Jacobi; slender beams, one on the other, keep their factors."""
+    """Compact blocks that land go over to block Jacobi; slender beams that lie on each other keep their factors."""
     kinds = KINDS.enumeration("Kind")
     records = Driver(falling()).advance(30)
     assert not records["status"].any() and (records["kind"][-4:] == kinds["BLOCK_JACOBI"]).all()

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sim_server.effects import contact
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
 from tests.contact.test_contact_preconditioner import each, pressed, run
@@ -84,9 +83,8 @@ def test_several_linearizations(linearizations):
 
 
 @pytest.mark.parametrize("precision", ["float16", "float32"])
-def test_contacts_of_a_tool_that_a_factor_does_not_know(monkeypatch, precision):
+def test_contacts_of_a_tool_that_a_factor_does_not_know(precision):
     """A rod bends a slender beam and slides along it: with the factor of the first step."""
-    monkeypatch.setattr(contact, "nodes_alone", lambda world: True)
     made = {}
     for woodbury in (32, 0):
         sim = pressed("gpu", woodbury=woodbury, factor_precision=precision)
