@@ -268,7 +268,7 @@ class ContactSolver(Solver):
         self.told, self.reactions = np.zeros((4, 1), CONTACT_RESULT), np.zeros((4, 1, obstacles, 6))
         self.passes = ContactPasses(
             self.gpu, device, given.contact, given.ranges, given.arrays, self.solver, as_device(np.zeros(1, BALANCE)),
-            self.told, self.reactions, self.correction,
+            self.told, self.reactions, np.zeros(0, np.int32), self.correction,
         )  # fmt: skip
         self.solver.params["b"] = self.passes.memory["contact_b"].data.ptr
 
