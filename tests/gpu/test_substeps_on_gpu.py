@@ -38,7 +38,7 @@ def test_steps_are_those_of_the_cpu(law, damping):
     (x, y), (g, c) = [s.world.x for s in sims], [s.engine.records() for s in sims]
     assert np.abs(x - y).max() < 5e-3 and not g["status"].any() and not g["iterations"].any()
     assert (g["substeps"] % 4 == 0).all() and (g["substeps"] >= c["substeps"]).all()
-    np.testing.assert_allclose(g["stable_step"], c["stable_step"], rtol=0.05)
+    np.testing.assert_allclose(g["stable_step"], c["stable_step"], rtol=0.1)
 
 
 def test_same_bits_whatever_the_batches():

@@ -897,7 +897,7 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_settle(cons
             const PcgBody& body = a.bodies[k];
             const bool factor = s.factors && has_factor(body);
             PcgResult& result = a.c.results[(a.c.step[0] % a.c.capacity) * a.bodies_count + k];
-            result = {s.solved, s.seconds, factor ? body.factor_step : -1, s.iterations, s.status, factor ? CHOLESKY : BLOCK_JACOBI, body.kind,
+            result = {s.solved, s.seconds, has_factor(body) ? body.factor_step : -1, s.iterations, s.status, factor ? CHOLESKY : BLOCK_JACOBI, body.kind,
                       s.fallbacks, -1, body.probe};
             a.c.state[k].residual = s.residual;
             a.c.state[k].passes = s.passes;
