@@ -74,7 +74,7 @@ def test_a_unit_has_a_name_of_its_own_and_a_gpu_has_others() -> None:
     names = [u.name for device in ("cpu", "gpu") for u in units(device, (540, 3000), False, None)]
     assert len(set(names)) == len(names)
     tables = {u.table for u in units("gpu", (540,), False, None)}
-    assert {"answers", "cost", "goals", "impact", "own", "peers", "pile"} == tables <= set(KEYS)
+    assert {"answers", "cost", "few", "goals", "impact", "own", "peers", "pile"} == tables <= set(KEYS)
 
 
 def test_ours_keeps_still_below_the_limit_of_friction() -> None:

@@ -177,7 +177,7 @@ REFUSED = [
     (swap("contact = true", "contact = false"), ["obstacle 'floor'", "list contact = true under [effects]"]),
     (
         GOOD[: GOOD.index("[[obstacle]]")].replace("contact = true", "contact = { between = false }"),
-        ["effects.contact", "needed: an [[obstacle]], or another object"],
+        ["effects.contact", "needed: an [[obstacle]], another object, or self = true"],
     ),
     (
         swap('[[object]]\nname = "beam"', '[integrator]\nscheme = "quasi_static"\n[[object]]\nname = "beam"'),
