@@ -333,9 +333,10 @@ __device__ void write_reactions(const ContactArguments& c, int body, int rows, l
 
 // Keeps what springs and contacts add to the matrix of this step, as a copy for a factor has it.
 __device__ void keep_for_factors(const ContactArguments& c, int i) {
-    const long long step = c.step[0], site = c.pair[i] / 2, sites = c.body_start[c.count] / 2;
+    const long long step = c.step[0];
     if (c.spring) note_spring(c.springs[i], step, c.spring_scale * c.spring[i]);
-    if (c.pair[i] < 0) return;
+    if (!c.blocks_then || c.pair[i] < 0) return;
+    const long long site = c.pair[i] / 2, sites = c.body_start[c.count] / 2;
     for (int j = 0; j < 3; ++j)
         for (int k = j; k < 3; ++k) {
             const long long at = 9ll * site + 3 * j + k;
@@ -354,7 +355,7 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) finish_contact(con
     double sum[CONTACT_SUMS] = {};
     if (i < here.end) {
         const SurfaceNode n = SurfaceNode::at(c, i);
-        if (c.blocks_then) keep_for_factors(c, i);
+        if (c.spring || c.blocks_then) keep_for_factors(c, i);
         if (n.pair >= 0) {
             if (well) sum[2] += clip(c, n);
             keep_forces(c, n, well, sum);

@@ -106,7 +106,7 @@ class ContactPasses:
         self.params = self._arguments(contact, results, reactions)
         if correction:
             correction.connect(self.memory["pair"], self.memory["base"], self.params)
-            if self.faces:  # couple nodes, so that own blocks are not all that they change: grabs alone are corrected
+            if self.faces:  # grabs alone are corrected
                 correction.params["pair"] = 0
         self.islands: IslandPasses | None = None
         if contact.surfaces or contact.ties:

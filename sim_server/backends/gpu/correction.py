@@ -59,7 +59,9 @@ class FactorCorrection:
     def wanted(cls, gpu: Gpu, given: EngineInput) -> "FactorCorrection | None":
         """Returns the correction of a scene that can have one: with factors, grabs or obstacles, and no Rosenbrock-W
         steps."""
-        sites = int(given.contact.body_start[-1]) // 2 if given.contact else 0
+        contact = given.contact
+        # rows of triangles couple nodes, so that own blocks are not all that they change
+        sites = int(contact.body_start[-1]) // 2 if contact and not contact.faces else 0
         if not (given.solver.woodbury and given.solver.wants_factors and (given.touch or sites)) or given.stages:
             return None
         return cls(gpu, given.solver.woodbury, list(given.ranges), cast(DeviceLaunch | None, given.touch), sites)

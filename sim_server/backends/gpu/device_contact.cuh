@@ -115,7 +115,7 @@ struct ContactArguments {
     int* pair_contacts;         // (bodies,) those that carry force
     const real* spring;         // (nodes,) as Correction has it
     SpringHistory* springs;     // (nodes,) likewise
-    float* blocks_then;         // (HISTORY, rows / 2, 6) likewise; null: factors are not corrected
+    float* blocks_then;         // (HISTORY, rows / 2, 6) likewise; null: factors are not corrected for contacts
     double spring_scale;        // likewise
     double dx_dv;               // [s]
     double force_coefficient;   // [s]

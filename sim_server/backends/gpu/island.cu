@@ -76,22 +76,27 @@ __device__ __forceinline__ void see(const double* lever, const double* m, double
 
 // --- the start of a step ------------------------------------------------------------------------------------------------------------
 
+// Sorts what acts at a node.
+__device__ void sort_entries(const IslandArguments& a, int i) {
+    const int first = a.start[i], last = first + a.count[i];
+    for (int k = first + 1; a.count[i] && k < last; ++k) {
+        const int entry = a.entry[k];
+        int at = k;
+        for (; at > first && a.entry[at - 1] > entry; --at) a.entry[at] = a.entry[at - 1];
+        a.entry[at] = entry;
+    }
+}
+
 // A thread has a node. Sorts what acts at it, keeps its block as a factor is to know it, left = b - A y; A Z and Z^T A Z of its body.
 extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_start(const IslandArguments a) {
     const NodeChunk here = a.c.chunks[blockIdx.x];
     const int body = here.body, island = island_of(a, body);
     if (island < 0) return;
     const int phase = a.state[island].phase, i = here.begin + threadIdx.x;
+    if (i < here.end) sort_entries(a, i);  // also of islands that are over: they are listed anew, and read once more
     if (phase != ISLAND_BEGINS && phase != ISLAND_RESUMES) return;
     double sum[BASE_SUMS] = {};
     if (i < here.end) {
-        const int first = a.start[i], last = first + a.count[i];
-        for (int k = first + 1; a.count[i] && k < last; ++k) {
-            const int entry = a.entry[k];
-            int at = k;
-            for (; at > first && a.entry[at - 1] > entry; --at) a.entry[at] = a.entry[at - 1];
-            a.entry[at] = entry;
-        }
         const int pair = a.c.pair[i];
         if (phase == ISLAND_BEGINS) {
             keep_block(a.c, SurfaceNode::at(a.c, i), body);

@@ -76,9 +76,14 @@ struct ContactSearch : Passes {
         tell_correction(rows, loop.body[bodies[0]]);
     }
 
-    // Goes on with rows that a sweep has made.
+    // Goes on with rows that a sweep has made. Bodies that were one island have copies of its search.
     void resume() const {
-        join();
+        for (int m = 0; m < count; ++m) {
+            const Search& s = newton.search[bodies[m]];
+            search.first = std::max(search.first, s.first);
+            search.floor = std::max(search.floor, s.floor);
+            search.linearizations = std::max(search.linearizations, s.linearizations);
+        }
         if (search.status == MAX_LINEARIZATIONS) search.status = CONVERGED;
         search.phase = SOLVE;
         const int most = std::max(newton.most.linearizations, search.linearizations + 1);

@@ -228,6 +228,7 @@ struct PairDetection {
     // How far a vertex is at least from a body at the start of the step, as its rows tell, up to `thickness`.
     double distance_at_start(int site, int other, double thickness) const {
         const int row = c.pair_first + 2 * site;
+        if (c.ties.count && c.ties.bound[node_of_site(tables, site)]) return -1;  // attachments have taken rows away
         const bool full = c.obstacle[row] >= 0 && c.obstacle[row + 1] >= 0 && c.obstacle[row] != c.obstacle[row + 1];
         double least = thickness;
         bool known = !full;  // a body without a row is farther away than that, unless there was no place for one

@@ -219,7 +219,7 @@ struct Passes : IslandRows {
                 return;
             }
             if (!last && report.passes >= c.passes) break;
-            const double early = early_tolerance(report.residual, c.tolerance, report.passes, c.passes);
+            const double early = early_tolerance(report.residual, contact_tolerance, report.passes, c.passes);
             pass(last ? goal / size : std::max(goal / size, early), last);
             result.residual *= given > 0 ? size / given : 0;
             if (result.status == NOT_FINITE) return;
