@@ -106,8 +106,6 @@ class ContactPasses:
         self.params = self._arguments(contact, results, reactions)
         if correction:
             correction.connect(self.memory["pair"], self.memory["base"], self.params)
-            if self.faces:  # grabs alone are corrected
-                correction.params["pair"] = 0
         self.islands: IslandPasses | None = None
         if contact.surfaces or contact.ties:
             given = gpu, device, contact, ranges, arrays, solver, self.params, chunks, THREADS, broken, self.faces, told

@@ -71,6 +71,7 @@ class FactorCorrection:
 
         pair: (nodes,), base: (sites, 3, 3), contact: CONTACT_ARGUMENTS
         """
-        self.params["pair"], self.params["base"] = pair.data.ptr, base.data.ptr
+        if "blocks_then" in self._memory:
+            self.params["pair"], self.params["base"] = pair.data.ptr, base.data.ptr
         for name in ("spring", "springs", "blocks_then", "spring_scale"):
             contact[name] = self.params[name]

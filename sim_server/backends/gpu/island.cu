@@ -154,7 +154,7 @@ __device__ __forceinline__ void point_displacement(const IslandArguments& a, int
         }
         for (int k = 0; k < 3; ++k) s[k] += weight * a.c.dx_dv * ((double)a.c.predictor[3ll * node + k] + u[k]);
     };
-    if (!is_pair(a, r) && !is_face(a.c, r) && !is_tie(a, r)) return add(a.c.node[r], 1);
+    if (is_of_node(a, r)) return add(a.c.node[r], 1);
     for (int k = 0; k < CORNERS; ++k)
         if (a.t.corner[CORNERS * r + k] >= 0) add(a.t.corner[CORNERS * r + k], a.t.weight[CORNERS * r + k]);
 }

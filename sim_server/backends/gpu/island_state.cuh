@@ -206,9 +206,12 @@ __device__ __forceinline__ int* own_list(const IslandArguments& a, int body) {
            (FACES ? a.c.faces.start[body] - a.c.faces.start[0] : 0) + (HAS_TIES ? a.ties.start[body] : 0);
 }
 
+// True if a row acts on one node, with weight 1: of a node against an obstacle.
+__device__ __forceinline__ bool is_of_node(const IslandArguments& a, int row) { return !is_pair(a, row) && !is_face(a.c, row) && !is_tie(a, row); }
+
 // f(node, weight, corner) of the corners that may move.
 template <class F> __device__ __forceinline__ void each_corner(const IslandArguments& a, int row, F f) {
-    if (!is_pair(a, row) && !is_face(a.c, row) && !is_tie(a, row)) {
+    if (is_of_node(a, row)) {
         const int node = a.c.node[row];
         if (a.c.free[node] != 0) f(node, 1.0, 0);
         return;
