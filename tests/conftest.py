@@ -30,9 +30,25 @@ def pytest_configure() -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Of several processes one begins with what takes longest because it waits, so that no other has to wait for it."""
+    """Of several processes one begins with what takes longest because it waits, so that no other has to wait for it.
+
+    A test of real processes that fails is made once more: it shares cores and network with the rest of the machine.
+    What failed first is printed at the end (`pytest_terminal_summary`), so that it is not lost.
+    """
     if hasattr(config, "workerinput"):
         items.sort(key=lambda item: _group(item.nodeid) != "real time")
+    for item in items:
+        if item.get_closest_marker("system"):
+            item.add_marker(pytest.mark.flaky(reruns=1))
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Prints why tests were made a second time."""
+    for report in terminalreporter.stats.get("rerun", []):
+        terminalreporter.write_sep("=", f"failed at first: {report.nodeid}")
+        terminalreporter.write_line(report.longreprtext)
+        for title, text in report.sections:
+            terminalreporter.write_line(f"--- {title}\n{text}")
 
 
 def _group(nodeid: str) -> str | None:

@@ -34,7 +34,7 @@ def every_step(data: dict[str, np.ndarray], seen: int) -> None:
 def test_steps_go_on_without_the_worker_that_was_killed(stage: Stage) -> None:
     worker = stage.worker("w1")
     with stage.client() as client:
-        progress = Progress(client)
+        progress = Progress(stage, client)
         progress.until(lambda: progress.factor_step > 0)
         progress.until(lambda: client.status().objects[0].in_flight)  # it factorizes nearly all the time
         worker.kill()
@@ -56,7 +56,7 @@ def test_steps_go_on_without_the_worker_that_was_killed(stage: Stage) -> None:
 def test_steps_go_on_while_the_worker_is_stopped_and_it_is_used_again(stage: Stage) -> None:
     worker = stage.worker("w1")
     with stage.client() as client:
-        progress = Progress(client)
+        progress = Progress(stage, client)
         progress.until(lambda: progress.factor_step > 0)
         worker.send_signal(signal.SIGSTOP)
         stopped = client.status(fresh=True).step
@@ -71,7 +71,7 @@ def test_steps_go_on_while_the_worker_is_stopped_and_it_is_used_again(stage: Sta
 
 def test_with_no_worker_at_all_every_step_is_made(stage: Stage) -> None:
     with stage.client() as client:
-        progress = Progress(client)
+        progress = Progress(stage, client)
         progress.past(100)
         data = stage.finish(client)
     every_step(data, progress.step)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """A real server with a log, real workers on a port of their own, and what the log says afterwards."""
 
+import os
 import signal
 import subprocess
 import sys
@@ -61,7 +62,8 @@ class Stage:
     def start(self, command: Sequence[str]) -> "subprocess.Popen[bytes]":
         """A process that ends with the stage."""
         out = (Path(self._folder.name) / "output").open("ab")
-        process = subprocess.Popen(command, stdout=out, stderr=out)
+        stacks = {**os.environ, "PYTHONFAULTHANDLER": "1"}  # for `stacks`
+        process = subprocess.Popen(command, stdout=out, stderr=out, env=stacks)
         out.close()
         self._processes.append(process)
         return process
@@ -99,6 +101,17 @@ class Stage:
         """Of all processes."""
         return (Path(self._folder.name) / "output").read_text()
 
+    def stacks(self) -> str:
+        """Ends all processes; what they did, for a test that waited in vain."""
+        ends = []
+        for process in reversed(self._processes):  # the server's last, since the end of the output is shown
+            ended = process.poll()
+            process.send_signal(signal.SIGCONT)
+            process.send_signal(signal.SIGABRT)  # prints what its threads do
+            process.wait()
+            ends.append(f"{' '.join(process.args[:3])}: {'running' if ended is None else f'had ended with {ended}'}")
+        return "\n".join([*ends, self.output()[-8000:]])
+
     def __enter__(self) -> Self:
         return self
 
@@ -119,7 +132,8 @@ def tool(package: str, *arguments: str) -> list[str]:
 class Progress:
     """What the server reports while it runs."""
 
-    def __init__(self, client: Client):
+    def __init__(self, stage: Stage, client: Client):
+        self._stage, self._client = stage, client
         self._steps = client.steps()
         self.step, self.factor_step = 0, -1
 
@@ -128,14 +142,22 @@ class Progress:
         for record in self._steps.new():
             self.step, self.factor_step = record.step, max(self.factor_step, record.factor_step)
 
-    def until(self, holds: Any, seconds: float = PATIENCE) -> None:
-        """Look until a condition holds; raises TimeoutError."""
-        end = time.monotonic() + seconds
+    def until(self, holds: Any, seconds: float | None = None) -> None:
+        """Look until a condition holds; raises TimeoutError. Without `seconds` that ends the stage with its stacks."""
+        end = time.monotonic() + (seconds or PATIENCE)
         while not holds():
             if time.monotonic() > end:
-                raise TimeoutError(f"waited {seconds:g} s at step {self.step}")
+                more = self._server() if seconds is None else ""
+                raise TimeoutError(f"waited {seconds or PATIENCE:g} s at step {self.step}{more}")
             time.sleep(0.01)
             self.look()
+
+    def _server(self) -> str:
+        try:
+            at = f"the server says that it is at step {self._client.status().step}"
+        except ClientError as error:
+            at = str(error)
+        return f"; {at}\n{self._stage.stacks()}"
 
     def past(self, step: int) -> None:
         """Look until the run is past a step."""

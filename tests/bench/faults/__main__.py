@@ -144,7 +144,7 @@ def run(name: str, fault: Fault, stage: Stage, o: argparse.Namespace, *options: 
     with stage:
         o.worker = stage.worker("w1", *of_worker(o), *options)
         with stage.client() as client:
-            progress = Progress(client)
+            progress = Progress(stage, client)
             progress.until(lambda: progress.factor_step > 0)
             begun = progress.step
             progress.past(begun + SETTLE)
@@ -161,7 +161,7 @@ def lives(o: argparse.Namespace, limit: Limit) -> list[Row]:
     """Workers killed one after another, each after its first factor: what stays of them in the server's memory."""
     rows: list[Row] = []
     with Stage(device=o.device) as stage, stage.client() as client:
-        progress = Progress(client)
+        progress = Progress(stage, client)
         for life in range(1, o.lives + 1):
             if limit.reached(f"lives from {life} on"):
                 break
