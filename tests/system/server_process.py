@@ -59,7 +59,10 @@ class Process:
     def __init__(self, package: str, *arguments: str, log: Path):
         self.log = log
         with log.open("ab") as out:
-            self.process = subprocess.Popen(tool(package, *arguments), cwd=ROOT, stdout=out, stderr=subprocess.STDOUT)
+            self.process = subprocess.Popen(
+                tool(package, *arguments), cwd=ROOT, stdout=out, stderr=subprocess.STDOUT,
+                env={**os.environ, "PYTHONFAULTHANDLER": "1"},  # for `wait`
+            )  # fmt: skip
 
     def output(self) -> str:
         return self.log.read_text()
@@ -71,10 +74,16 @@ class Process:
     def end(self, how: signal.Signals = signal.SIGTERM) -> int:
         if self.process.poll() is None:
             self.process.send_signal(how)
-        return self.process.wait(PATIENCE)
+        return self.wait()
 
     def wait(self, timeout: float = PATIENCE) -> int:
-        return self.process.wait(timeout)
+        """Its exit code. One that does not end is ended with SIGABRT, and fails with what its threads did."""
+        try:
+            return self.process.wait(timeout)
+        except subprocess.TimeoutExpired:
+            self.process.send_signal(signal.SIGABRT)
+            self.process.wait(PATIENCE)
+            raise AssertionError(f"did not end within {timeout} s\n{self.output()[-8000:]}") from None
 
 
 class Stage:
