@@ -50,10 +50,10 @@ SERVED = (
     "100 steps so that it keeps swinging. Residual: as the solver reports it."
 )
 SEARCHED = (
-    "The same beam of stable Neo-Hookean material, dt 20 ms, E 1 MPa, with as many linearizations as a scene allows and "
-    "as its steps need: to need all, the goal of Newton-Raphson is one that is never reached; to need one, any that is "
-    "smaller than before. Tolerance: of each linear solve. Made: mean of a step. Of one: p50 over that of one "
-    "linearization solved to 1e-6. Factors as above; the projection is clamp in all."
+    "The same beam of stable Neo-Hookean material, dt 20 ms, E 1 MPa, with as many linearizations as the scene "
+    "allows and as its steps need: to need all, the goal of Newton-Raphson is one that is never reached; to need "
+    "one, any that is smaller than before. Tolerance: of each linear solve. Made: mean of a step. Of one: p50 over "
+    "that of one linearization solved to 1e-6. Factors as above; the projection is clamp in all."
 )
 PUBLISHED = "In turns; the factor stays the same, what the worker (on the CPU) sends back is thrown away."
 
