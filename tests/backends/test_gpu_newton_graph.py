@@ -5,7 +5,7 @@ import ctypes as c
 import re
 import sys
 from collections.abc import Iterator
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,9 +13,10 @@ import pytest
 
 from sim_server.backends.gpu import device
 from sim_server.backends.gpu import engine as gpu_engine
+from sim_server.backends.gpu.cuda import CudaDevice
 from sim_server.backends.gpu.engine import FEW
 from sim_server.backends.gpu.inverse.workspace import workspace
-from sim_server.errors import InputError
+from sim_server.errors import DeviceError, InputError
 from sim_server.scene.integrator_options import MAX_STATES
 from sim_server.simulation import Simulation
 from tests.backends import fake_cupy
@@ -146,3 +147,14 @@ def test_how_many_trials_there_may_be(cupy, monkeypatch, loops):
     words = rf"linearizations = 256 with trials = 4: .* 1280, .* CUDA 12.4; allowed: .* up to {MAX_STATES}"
     with pytest.raises(InputError, match=words):
         simulation(monkeypatch, loops, **most)
+
+
+def test_a_driver_without_conditional_nodes_has_no_loops():
+    class OldDevice(CudaDevice):
+        def __init__(self) -> None:
+            self.cp, self.context, self._driver = None, 0, SimpleNamespace(cuGraphAddNode=None)
+
+    old = OldDevice()
+    assert old.has_conditions is False
+    with pytest.raises(DeviceError, match=r"too old .* cuStreamGetCaptureInfo_v2; CUDA 12.4 or above has it"):
+        old.repeat(np.ones(1, np.int32))
