@@ -74,7 +74,8 @@ class Launch:
         return Launch(self._run, bound)
 
     def __call__(self) -> None:
-        self._run.put(self.name, self._launch, guarded=True)
+        solves = self.domain == "blocks"  # only bodies that are solved next need these
+        self._run.put(self.name, self._launch, guarded=True, solves=solves)
 
 
 class OnThreads:
@@ -120,11 +121,11 @@ class OnThreads:
         for launch in sim.integrator.begin(self._assemble):
             launch()
 
-    def put(self, name: str, work: Any, guarded: bool) -> None:
-        """Appends a launch. guarded: it returns at once where no body needs it."""
+    def put(self, name: str, work: Any, guarded: bool, solves: bool = False) -> None:
+        """Appends a launch. guarded: it returns at once where no body needs it; solves: needs to be solved."""
 
         def run() -> None:
-            if guarded and not self.phases.active[0]:
+            if (guarded and not self.phases.active[0]) or (solves and (self.phases.phase != SOLVE).all()):
                 return
             self.ran.append(name)
             work()

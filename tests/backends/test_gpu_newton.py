@@ -89,7 +89,10 @@ def test_a_loop_makes_the_steps_of_the_unrolled_form_to_the_bit(library, monkeyp
         assert np.abs(looped.sim.world.x - cpu.world.x).max() < 1e-8
         most, status = max(most, int(told["linearizations"].max())), status | set(records["status"].tolist())
         trials = looped.ran.count("accept_trial")
-        assert looped.ran.count("rotate_blocks") == trials - 1  # none after the last
+        solved = [k for k, name in enumerate(looped.ran) if name == "rotate_blocks"]
+        if len(told) == 1:
+            assert len(solved) == told["linearizations"][0] - 1  # none after the last
+        assert trials > len(solved) and all(looped.ran[k + 1] == "pcg" for k in solved)
     assert most > 2
     assert (SolveStatus.NOT_FINITE in status) == (made is crushed)
     assert (trials > most) == (made is overshooting)

@@ -124,6 +124,8 @@ def test_later_linearizations_have_a_matrix_of_their_own(cupy, monkeypatch):
         if name(launch) in ("nodes", "blocks"):
             addresses = [int(x) for x in launch[4] if x.dtype == np.uint64]
             assert later in addresses and first not in addresses
+            needed = "== 0))" if name(launch) == "blocks" else "!= 2))"  # solved next; not done
+            assert f"phase[body[block * BLOCK_ITEMS + threadIdx.x]] {needed} return;" in launch[1]
 
 
 def test_one_linearization_has_the_launches_of_a_solve_alone(cupy, monkeypatch):

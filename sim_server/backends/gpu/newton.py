@@ -19,7 +19,7 @@ from sim_server.arrays import Int32, Int64
 from sim_server.backends.declarations import Declarations
 from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction
 from sim_server.backends.gpu.device import DeviceLaunch, Gpu, compiled, options, own_headers
-from sim_server.backends.gpu.kernel_fusion import FusedKernel, PhaseGuard, fuse
+from sim_server.backends.gpu.kernel_fusion import FusedKernel, PhaseGuard, SolveGuard, fuse
 from sim_server.backends.gpu.solver import PcgSolver
 from sim_server.backends.gpu.structs import NEWTON_RESULT
 from sim_server.backends.newton import Newton
@@ -47,9 +47,11 @@ class NewtonPhases(NamedTuple):
         """Returns the state before the first step."""
         return cls(gpu.cp.full(1, bodies, np.int32), gpu.cp.zeros(bodies, np.int32))
 
-    def guard(self, body: DeviceArray | None) -> PhaseGuard:
-        """Returns the guard of a kernel. body: (items,), body of each item; None: not known."""
-        return PhaseGuard(self.active.data.ptr, self.phase.data.ptr, 0 if body is None else body.data.ptr)
+    def guard(self, body: DeviceArray | None, blocks: bool = False) -> PhaseGuard:
+        """Returns the guard of a kernel. body: (items,), body of each item; None: not known. blocks: it makes those
+        of A."""
+        kind = SolveGuard if blocks else PhaseGuard
+        return kind(self.active.data.ptr, self.phase.data.ptr, 0 if body is None else body.data.ptr)
 
 
 class Loops(Protocol):
@@ -167,7 +169,7 @@ class NewtonIteration:
             known = [parts[id(launch)] for launch in group if not launch.mailed]
             body = bodies_of(known)
             self._bodies.append(None if body is None else self._gpu.cp.asarray(body))
-            return phases.guard(self._bodies[-1])
+            return phases.guard(self._bodies[-1], blocks=group[0].domain == "blocks")
 
         blocks = [launch for launch in again if launch.domain == "blocks"]
         forces = [launch for launch in again if launch.domain != "blocks"]
