@@ -158,8 +158,8 @@ class Holders(Movable):
             first=first, last=last, columns=system.held_columns, blocks=system.sums, rotation=system.rotation,
             y=system.y, b=system.b, mass=mass, dx_dv=w.dx_dv / w.balance_point,
             force_coefficient=w.force_coefficient, plain=int(w.plain), search=int(w.searches and not euler),
-            inertia=int(w.inertia), clock=system.clock, settled=self._settled, x=w.x, predictor=w.predictor, velocity=self.velocity,
-            force=self.force, load=self.load,
+            inertia=int(w.inertia), clock=system.clock, settled=self._settled, x=w.x,
+            predictor=w.predictor, velocity=self.velocity, force=self.force, load=self.load,
         )  # fmt: skip
         return [settle, self._total()]
 

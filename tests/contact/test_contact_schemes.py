@@ -15,7 +15,7 @@ from tests.contact.test_contact_answers import G, mean_velocity, reactions, weig
 from tests.contact.test_contact_bodies import collision, inside, momenta
 from tests.contact.test_contact_sweep import SMALL, plate, surface
 
-SCHEMES = ("newmark", "bdf2", "ros2")
+SCHEMES = ("newmark", "bdf2", "generalized_alpha", "ros2")
 EULER, ONE_SOLVE, ITERATE, FACTOR = (FORMS[name] for name in ("EULER", "ONE_SOLVE", "ITERATE", "FACTOR"))
 STATUS = KINDS.enumeration("Status")
 FAR = {"at": (0, 5, 0), "rotate": (10, 20, 30)}
