@@ -107,7 +107,7 @@ class OnThreads:
         return self.memory["newton_results"][0].copy()
 
 
-@pytest.mark.parametrize("scheme", ["backward_euler", "newmark", "bdf2", "quasi_static"])
+@pytest.mark.parametrize("scheme", ["backward_euler", "newmark", "bdf2", "generalized_alpha", "quasi_static"])
 def test_steps_and_forces_are_those_of_the_cpu(library, scheme):
     keys: dict[str, Any] = {
         "integrator": {"scheme": scheme, "linearizations": 12, "tolerance": 1e-10},
