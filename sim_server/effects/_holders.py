@@ -5,7 +5,8 @@ A held node i is at x_i(t) = start_i + u(t) + (R(t) - 1) arm_i, with arm_i = sta
 is no unknown of the solve: its rows and columns leave A as those of fixed nodes do (fixed.py), and the columns times dv
 go to the right-hand side, b_f -= A_fc dv_c. That costs no iterations, and A stays symmetric positive definite. The
 product is made by the elements: they get, for the velocity of a held node, the one that has dv_c in it (`hold` in
-kernels/holders.cu). With several linearizations a held node is where the step ends before the first of them.
+kernels/holders.cu). With several linearizations a held node is where the step ends before the first of them, in the
+generalized-alpha method where its forces balance.
 
 In a step by stages (mechanics/rosenbrock.py) a held node goes straight, at its mean velocity V and acceleration a; the
 columns of A times theta (V + beta a), and times the opposite, go to the right-hand sides of the two stages. Without
@@ -25,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_server.arrays import Float64, Int32
-from sim_server.backends.base import Launch
+from sim_server.backends.base import Launch, Module
 from sim_server.effects._movable import Movable, pose_of
 from sim_server.errors import InputError
 from sim_server.mechanics.system import Stencil, System
@@ -114,15 +115,33 @@ class Holders(Movable):
             return []
         # An explicit scheme moves held nodes by the predictor, and has one velocity for all forces.
         dx_dv, unused = (w.dt, np.zeros_like(w.v)) if w.explicit else (w.dx_dv, w.damping_velocity)
+        whole, search = 1 / w.balance_point, w.searches and not euler  # of the step, over what is solved for
         w.backend.keep(unused)
-        hold: Launch = w.backend.module(TEXT).bind(
+        if whole != 1:
+            beta = whole * beta
+            w.backend.keep(beta)
+        text = w.backend.module(TEXT)
+        hold: Launch = text.bind(
             "hold", len(self.node), node=self.node, holder=self.holder, witness=self._witnesses(), free=w.free,
             start=self.start, arm=self.arm, center=self.center, begin=self.begin, end=self.end, velocity=self.velocity,
-            beta=beta, h=w.dt, dx_dv=dx_dv, force_coefficient=w.force_coefficient, plain=int(w.plain),
-            search=int(w.searches and not euler), euler=int(euler), next=self.next, later=self.later, x=w.x, v=w.v,
+            beta=beta, h=w.dt, dx_dv=whole * dx_dv, force_coefficient=w.force_coefficient, plain=int(w.plain),
+            search=int(search), euler=int(euler), next=self.next, later=self.later, x=w.x, v=w.v,
             predictor=w.predictor, damping_velocity=unused, inertial_increment=inertial_increment,
         )  # fmt: skip
-        return [hold] if euler else [self.place(system), hold]
+        launches = [hold] if euler else [self.place(system), hold]
+        if search and whole != 1:
+            launches.append(self._hold_within(text))
+        return launches
+
+    def _hold_within(self, text: Module) -> Launch:
+        """Returns the launch that has held nodes where the forces of the generalized-alpha method balance."""
+        w = self.world
+        launch: Launch = text.bind(
+            "hold_within", len(self.node), node=self.node, holder=self.holder, witness=self._witnesses(), free=w.free,
+            start=self.start, arm=self.arm, center=self.center, begin=self.begin, next=self.next,
+            share=w.balance_point, x=w.x,
+        )  # fmt: skip
+        return launch
 
     def last_launches(self, system: System, euler: bool = False) -> list[Launch]:
         """Returns the launches after the solve, before the state advances. euler: as of `first_launches`."""
@@ -137,10 +156,10 @@ class Holders(Movable):
             "settle", len(self.node), node=self.node, holder=self.holder, witness=self._witnesses(), free=w.free,
             start=self.start, arm=self.arm, center=self.center, begin=self.begin, next=self.next, later=self.later,
             first=first, last=last, columns=system.held_columns, blocks=system.sums, rotation=system.rotation,
-            y=system.y, b=system.b, mass=mass, dx_dv=w.dx_dv, force_coefficient=w.force_coefficient,
-            plain=int(w.plain), search=int(w.searches and not euler), inertia=int(w.inertia), clock=system.clock,
-            settled=self._settled, x=w.x, predictor=w.predictor, velocity=self.velocity, force=self.force,
-            load=self.load,
+            y=system.y, b=system.b, mass=mass, dx_dv=w.dx_dv / w.balance_point,
+            force_coefficient=w.force_coefficient, plain=int(w.plain), search=int(w.searches and not euler),
+            inertia=int(w.inertia), clock=system.clock, settled=self._settled, x=w.x,
+            predictor=w.predictor, velocity=self.velocity, force=self.force, load=self.load,
         )  # fmt: skip
         return [settle, self._total()]
 

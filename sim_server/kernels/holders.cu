@@ -75,6 +75,30 @@ KERNEL(hold, Hold) {
     }
 }
 
+struct HoldWithin {
+    int n;                 // held nodes
+    const int* node;       // (n,) of the scene
+    const int* holder;     // (n,)
+    const int* witness;    // (n,)
+    const real* free;      // (nodes,)
+    const double* start;   // (n, 3) [m]
+    const double* arm;     // (n, 3) [m]
+    const double* center;  // (holders, 3) [m]
+    const double* begin;   // (holders, 7)
+    const double* next;    // (n, 3) [m]
+    double share;          // part of the step after which the forces balance [-]
+    real* x;               // (nodes, 3) out
+};
+
+// After `hold` with a search, where the forces balance within the step (mechanics/generalized_alpha.py).
+KERNEL(hold_within, HoldWithin) {
+    const int node = p.node[i];
+    if (p.free[p.witness[i]] == 0) return;
+    double x[3];
+    held_point(p.begin + 7 * p.holder[i], p.center + 3 * p.holder[i], p.arm + 3 * i, p.start + 3 * i, x);
+    for (int k = 0; k < 3; ++k) p.x[3 * node + k] = x[k] + p.share * (p.next[3 * i + k] - x[k]);
+}
+
 struct Settle {
     int n;                     // held nodes
     const int* node;           // (n,) of the scene

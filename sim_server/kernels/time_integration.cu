@@ -109,6 +109,42 @@ KERNEL(advance, Advance) {
     store3(p.inertial_increment, i, select(refused, zero, p.inertia_from_force * force_increment + p.inertia_from_dv * dv));
 }
 
+struct AdvanceGeneralizedAlpha {
+    int n;                     // nodes
+    const local* rotation;     // (n, 3, 3)
+    const real* y;             // (n, 3) solution in the material frame [m/s]
+    const real* beta;          // (n,) [s]
+    real dx_dv;                // [s]
+    real whole;                // 1 / (1 - alpha_f): the step over its part up to the generalized mid point
+    real from_velocity;        // weight in the next predictor of v
+    real from_inertia;         // weight in the next predictor of the next inertial increment
+    real inertia_from_force;   // weight of dv - inertial_increment in the next inertial increment
+    real inertia_from_inertia; // weight of the inertial increment in the next one
+    real* inertial_increment;  // (n, 3) in, out [m/s]
+    real* predictor;           // (n, 3) in, out [m/s]
+    real* damping_velocity;    // (n, 3) out [m/s]
+    real* dv;                  // (n, 3) out: R y, up to the generalized mid point [m/s]
+    real* v;                   // (n, 3) in, out [m/s]
+    real* x;                   // (n, 3) in, out [m]
+    real* before;              // (n, 3) in, out: x when the step before began [m]
+};
+
+// As `advance`, on from the generalized mid point to the end of the step (formulas: mechanics/generalized_alpha.py).
+KERNEL(advance_generalized_alpha, AdvanceGeneralizedAlpha) {
+    vec3 y = load3(p.y, i), dv = mul(as<number>(load9(p.rotation, i)), y), x = load3(p.x, i), before = load3(p.before, i), zero = {};
+    vec3 step_velocity = load3(p.predictor, i) + dv, inertial = load3(p.inertial_increment, i), v = load3(p.v, i) + p.whole * dv;
+    inertial = p.inertia_from_force * (dv - inertial) + p.inertia_from_inertia * inertial;
+    vec3 predictor = p.from_velocity * v + p.from_inertia * inertial;
+    auto refused = y.x != y.x;
+    store3(p.dv, i, select(refused, zero, dv));
+    store3(p.v, i, select(refused, zero, v));
+    store3(p.x, i, select(refused, before, x + (p.whole * p.dx_dv) * step_velocity));
+    store3(p.before, i, select(refused, before, x));
+    store3(p.predictor, i, select(refused, zero, predictor));
+    store3(p.damping_velocity, i, select(refused, zero, damping_velocity_of(predictor, v, p.dx_dv, at(p.beta, i))));
+    store3(p.inertial_increment, i, select(refused, zero, inertial));
+}
+
 struct RestoreForEuler {
     int n;                     // nodes
     const real* start_v;       // (n, 3) [m/s]

@@ -9,6 +9,7 @@ Symbols and names: docs/notation.md. All schemes are, with f the forces, M the l
     backward_euler  h            h                       v                        x
     newmark         beta h / g   g h                     v + h (1 - g) a          x + h v + h^2 (1/2 - beta) a - c V
     bdf2            2 h / 3      2 h / 3                 v + (v - v_before) / 3   x + (x - x_before) / 3
+    generalized_alpha            the same within the step, and on from there to its end (generalized_alpha.py)
     quasi_static    h            h                       0 = f(x'), v' = (x' - x) / h
 
 with g Newmark's gamma and a = (v' - V) / (g h) of the step before. Linearized at (x, v), with K = -df/dx, C = alpha M +
@@ -25,15 +26,15 @@ weights with which it makes p and r of the next step (PredictorWeights, kernels/
 p = d = v, r = 0, and the launches are those of kernels/nodes.cu. Newton-Raphson (kernels/newton_line_search.cuh)
 linearizes again at the state reached; there p = 0.
 
-Order: 1, 2 (gamma = 1/2), 2. One linearization keeps it only where K is the exact slope of the forces; the usual
+Order: 1, 2 (gamma = 1/2), 2, 2. One linearization keeps it only where K is the exact slope of the forces; the usual
 tangent of corotational elements is not, by as much as they are strained. The scheme ros2 keeps it with any tangent: it
 has two stages of its own (rosenbrock.py).
 
 Where a body touches something its step is one of backward Euler, whatever the scheme (docs/contact.md); the history of
 the next step is then that of this one, (x' - x) / c = h v' / c and V = v' + (1 - g) dv, as if dv / h had been a.
 
-Stability with one linearization: a mode of stiffness k with k' in its place in the matrix is stable in Newmark's scheme
-and BDF2 at every h if k' >= k, and grows if k' < k (backward Euler: if k' < k / 2). The usual tangent has k' < k under
+Stability with one linearization: a mode of stiffness k with k' in its place in the matrix is stable in the schemes of
+order 2 at every h if k' >= k, and grows if k' < k (backward Euler: if k' < k / 2). The usual tangent has k' < k under
 tension; the exact one leaves out what compression takes from k, as springs do, and projections add to it, so k' >= k.
 
 Sources: Newmark 1959; Hughes, The Finite Element Method, section 9.1; Hairer and Wanner, Solving Ordinary Differential

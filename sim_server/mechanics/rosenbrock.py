@@ -54,6 +54,7 @@ from sim_server.arrays import Float64
 from sim_server.backends.base import Launch
 from sim_server.backends.rosenbrock import Rosenbrock
 from sim_server.mechanics.central_difference import CentralDifferenceIntegrator
+from sim_server.mechanics.generalized_alpha import GeneralizedAlphaIntegrator
 from sim_server.mechanics.integrator import CouplesNodes, Integrator
 from sim_server.mechanics.system import System
 from sim_server.mechanics.world import Body
@@ -168,5 +169,8 @@ class RosenbrockIntegrator(Integrator):
 
 def make_integrator(scene: Scene, system: System) -> Integrator:
     """Returns the launches of the scheme that the scene names."""
-    others = {"ros2": RosenbrockIntegrator, "central_difference": CentralDifferenceIntegrator}
+    others: dict[str, type[Integrator]] = {
+        "ros2": RosenbrockIntegrator, "central_difference": CentralDifferenceIntegrator,
+        "generalized_alpha": GeneralizedAlphaIntegrator,
+    }  # fmt: skip
     return others.get(scene.integrator.scheme, Integrator)(scene, system)

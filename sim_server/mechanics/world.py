@@ -67,6 +67,8 @@ class World:
 
     force_coefficient [s]: factor of forces in b
     dx_dv [s]: derivative of the positions by the velocities at the end of the step
+    balance_point: part of the step after which the forces balance, and for which the step solves; 1 but in
+        generalized_alpha, where positions, velocities and dv of a solve are those of that point [-]
     coefficients (2,): force_coefficient and dx_dv as kernels read them whose arguments change while steps run
     stiffness_coefficient (bodies,) [s2]: factor of K in A
     usual_tangent: an exact tangent of corotational elements is not wanted in the launches that are made
@@ -106,6 +108,7 @@ class World:
         self.alpha, self.beta = np.zeros(len(self.bodies)), np.zeros(len(self.bodies))
         integrator = scene.integrator
         self.force_coefficient, self.dx_dv = integrator.force_coefficient(self.dt), integrator.dx_dv(self.dt)
+        self.balance_point = integrator.balance_point
         self.usual_tangent = False
         self.coefficients = np.array([self.force_coefficient, self.dx_dv])
         self.inertia = integrator.scheme != "quasi_static"
@@ -117,13 +120,14 @@ class World:
 
     @contextmanager
     def made_with(self, force_coefficient: float, dx_dv: float, usual_tangent: bool) -> Iterator[None]:
-        """Launches made inside have these coefficients [s], and usual_tangent."""
-        given = self.force_coefficient, self.dx_dv, self.usual_tangent
+        """Launches made inside have these coefficients [s], and usual_tangent; their forces balance at the end."""
+        given = self.force_coefficient, self.dx_dv, self.usual_tangent, self.balance_point
         self.force_coefficient, self.dx_dv, self.usual_tangent = force_coefficient, dx_dv, usual_tangent
+        self.balance_point = 1.0
         try:
             yield
         finally:
-            self.force_coefficient, self.dx_dv, self.usual_tangent = given
+            self.force_coefficient, self.dx_dv, self.usual_tangent, self.balance_point = given
 
     @property
     def stiffness_coefficient(self) -> Float64:

@@ -34,7 +34,7 @@ class Holder(Moved):
 def check_holders_on(device: str, holders: Sequence[Holder], integrator: IntegratorOptions) -> None:
     """Raises InputError for holders that the device ("cpu" or "gpu") does not have."""
     if device == "gpu" and holders and integrator.scheme == "ros2":
-        allowed = "'backward_euler', 'newmark', 'bdf2', 'quasi_static', or --device cpu"
+        allowed = "'backward_euler', 'newmark', 'bdf2', 'generalized_alpha', 'quasi_static', or --device cpu"
         raise InputError(f"holder {holders[0].name!r} with integrator.scheme = 'ros2' on a GPU; allowed: {allowed}")
 
 

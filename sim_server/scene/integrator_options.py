@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The [integrator] table of a scene."""
 
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from pydantic import Field, model_validator
 
@@ -9,8 +9,20 @@ from sim_server.errors import InputError
 from sim_server.scene.parameters import Parameters, complaint
 
 MAX_STATES = 1024  # tried in a step on a GPU whose graphs have no loops, so that they hold them all
-SchemeName = Literal["backward_euler", "newmark", "bdf2", "quasi_static", "ros2", "central_difference"]
+SchemeName = Literal[
+    "backward_euler", "newmark", "bdf2", "generalized_alpha", "quasi_static", "ros2", "central_difference"
+]
 GAMMA = 0.29289321881345247559915563789515  # 1 - 1 / sqrt 2, of ros2 (mechanics/rosenbrock.py)
+SPECTRAL_RADIUS = 0.5  # of generalized_alpha: with more, undamped bodies may run away from violent starts
+
+
+class AlphaParameters(NamedTuple):
+    """Parameters of the generalized-alpha method [-] (mechanics/generalized_alpha.py)."""
+
+    alpha_m: float
+    alpha_f: float
+    beta: float
+    gamma: float
 
 
 class IntegratorOptions(Parameters):
@@ -19,6 +31,10 @@ class IntegratorOptions(Parameters):
     scheme: SchemeName = "backward_euler"
     beta: float | None = Field(default=None, gt=0, le=1, description="of Newmark's scheme [-]; default 1/4")
     gamma: float | None = Field(default=None, ge=0.5, le=1, description="of Newmark's scheme [-]; default 1/2")
+    spectral_radius: float | None = Field(
+        default=None, ge=0, le=1,
+        description=f"of generalized_alpha, at infinite frequency [-]; default {SPECTRAL_RADIUS}",
+    )  # fmt: skip
     linearizations: int = Field(default=1, ge=1, le=1000, description="most of them in a step; above 1: Newton-Raphson")
     tolerance: float = Field(
         default=1e-4, gt=0, lt=1, description="of Newton-Raphson: nonlinear residual over the first |b| of the step"
@@ -63,6 +79,12 @@ class IntegratorOptions(Parameters):
             )
         return self
 
+    @model_validator(mode="after")
+    def _of_generalized_alpha(self) -> "IntegratorOptions":
+        if self.scheme != "generalized_alpha" and self.spectral_radius is not None:
+            raise complaint(f"spectral_radius belongs to scheme generalized_alpha, not to {self.scheme}")
+        return self
+
     @property
     def explicit(self) -> bool:
         """True if a step consists of explicit substeps (mechanics/central_difference.py)."""
@@ -71,17 +93,27 @@ class IntegratorOptions(Parameters):
     @property
     def needs_stiff_matrix(self) -> bool:
         """True if the energy grows unless the stiffness in A is at least the slope of the forces (integrator.py)."""
-        return self.scheme in ("newmark", "bdf2") and self.linearizations == 1
+        return self.scheme in ("newmark", "bdf2", "generalized_alpha") and self.linearizations == 1
 
     @property
     def newmark(self) -> tuple[float, float]:
         """Newmark's beta and gamma [-]."""
         return (0.25 if self.beta is None else self.beta, 0.5 if self.gamma is None else self.gamma)
 
+    @property
+    def alpha(self) -> AlphaParameters:
+        """Parameters of generalized_alpha (Chung and Hulbert 1993, eq. 17, 18, 25)."""
+        rho = SPECTRAL_RADIUS if self.spectral_radius is None else self.spectral_radius
+        alpha_m, alpha_f = (2 * rho - 1) / (1 + rho), rho / (1 + rho)
+        return AlphaParameters(alpha_m, alpha_f, (1 - alpha_m + alpha_f) ** 2 / 4, 0.5 - alpha_m + alpha_f)
+
     def force_coefficient(self, dt: float) -> float:
         """Coefficient i [s] of the forces in M (v' - V) = i f (integrator.py); 1 of an explicit scheme."""
         if self.scheme == "newmark":
             return self.newmark[1] * dt
+        if self.scheme == "generalized_alpha":
+            a = self.alpha
+            return a.gamma * (1 - a.alpha_f) / (1 - a.alpha_m) * dt
         if self.scheme == "ros2":
             return GAMMA * dt
         if self.explicit:
@@ -98,7 +130,14 @@ class IntegratorOptions(Parameters):
         if self.scheme == "newmark":
             beta, gamma = self.newmark
             return beta * dt / gamma
+        if self.scheme == "generalized_alpha":
+            return self.alpha.beta * dt / self.alpha.gamma
         return self.force_coefficient(dt)
+
+    @property
+    def balance_point(self) -> float:
+        """Part of a step after which the forces balance [-] (mechanics/generalized_alpha.py); 1 in other schemes."""
+        return 1 - self.alpha.alpha_f if self.scheme == "generalized_alpha" else 1.0
 
     @property
     def rounds(self) -> int:

@@ -78,7 +78,7 @@ def contact_errors(
         text = "there is nothing to touch; needed: an [[obstacle]], another object, or self = true"
         yield _error(text, "effects", "contact")
     if integrator.scheme == "quasi_static" or integrator.explicit:
-        allowed = "'backward_euler', 'newmark', 'bdf2', 'ros2'"
+        allowed = "'backward_euler', 'newmark', 'bdf2', 'generalized_alpha', 'ros2'"
         yield _error(
             f"contact with integrator.scheme = {integrator.scheme!r}; allowed: {allowed}", "effects", "contact"
         )

@@ -33,6 +33,11 @@ SCENES = {
         "solver.precision=float32",
     ),
     "four_beams.toml, ros2": ("integrator.scheme=ros2", "solver.precision=mixed"),
+    "needle_holder.toml, generalized alpha": (
+        "integrator.scheme=generalized_alpha",
+        "integrator.linearizations=2",
+        "solver.precision=mixed",
+    ),
     "springs.toml": (),
     "fibres.toml": ("integrator.scheme=bdf2",),
     "equilibrium.toml": (),

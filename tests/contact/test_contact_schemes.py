@@ -15,7 +15,7 @@ from tests.contact.test_contact_answers import G, mean_velocity, reactions, weig
 from tests.contact.test_contact_bodies import collision, inside, momenta
 from tests.contact.test_contact_sweep import SMALL, plate, surface
 
-SCHEMES = ("newmark", "bdf2", "ros2")
+SCHEMES = ("newmark", "bdf2", "generalized_alpha", "ros2")
 EULER, ONE_SOLVE, ITERATE, FACTOR = (FORMS[name] for name in ("EULER", "ONE_SOLVE", "ITERATE", "FACTOR"))
 STATUS = KINDS.enumeration("Status")
 FAR = {"at": (0, 5, 0), "rotate": (10, 20, 30)}
@@ -242,7 +242,7 @@ def test_bodies_that_collide_in_free_flight_keep_their_momentum(scheme, speed):
     assert np.linalg.norm(relative) < 1.9 * speed  # it was a collision
 
 
-@pytest.mark.parametrize("scheme", ["newmark", "bdf2"])
+@pytest.mark.parametrize("scheme", ["newmark", "bdf2", "generalized_alpha"])
 def test_with_newton_raphson_in_flight_colliding_bodies_keep_their_spin_too(scheme):
     solver = {"preconditioner": "block_jacobi", "tolerance": 1e-12, "max_iterations": 3000}
     newton = {"scheme": scheme, "linearizations": 20, "tolerance": 1e-10}

@@ -206,7 +206,7 @@ def test_friction_holds_what_lies_on_itself_and_is_bounded(tmp_path):
     assert slides
 
 
-@pytest.mark.parametrize("scheme", ["newmark", "bdf2", "ros2"])
+@pytest.mark.parametrize("scheme", ["newmark", "bdf2", "generalized_alpha", "ros2"])
 def test_bodies_of_other_schemes_take_backward_euler_while_they_touch_themselves(tmp_path, scheme):
     sim = made(body(fork(tmp_path)), integrator={"scheme": scheme}, contact={"passes": 60}, dt=0.002)
     close(sim, 2.0)

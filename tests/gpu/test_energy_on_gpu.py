@@ -49,6 +49,7 @@ def run(sim: Simulation, steps: int) -> NDArray[Any]:
 INTEGRATORS = [
     {}, {"linearizations": 4, "tolerance": 1e-8}, {"scheme": "newmark", "linearizations": 4, "tolerance": 1e-8},
     {"scheme": "bdf2", "linearizations": 4, "tolerance": 1e-8},
+    {"scheme": "generalized_alpha", "linearizations": 4, "tolerance": 1e-8},
 ]  # fmt: skip
 
 

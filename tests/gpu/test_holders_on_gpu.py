@@ -17,7 +17,7 @@ pytestmark = pytest.mark.gpu
 MOTION = [{"time": 0.0}, {"time": 0.2, "translate": [0.1, 0.2, 0], "rotate": [0, 40, 90]}, {"time": 0.3}]
 SCHEMES: dict[str, dict[str, Any]] = {
     "backward_euler": {}, "newmark": {"scheme": "newmark"}, "bdf2": {"scheme": "bdf2"},
-    "quasi_static": {"scheme": "quasi_static"},
+    "generalized_alpha": {"scheme": "generalized_alpha"}, "quasi_static": {"scheme": "quasi_static"},
 }  # fmt: skip
 
 

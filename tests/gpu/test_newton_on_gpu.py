@@ -146,7 +146,7 @@ def test_each_model_takes_the_decisions_of_the_cpu(model):
     assert np.abs(once.x - gpu.x).max() > 1e-4, "one linearization is something else"
 
 
-@pytest.mark.parametrize("scheme", ["newmark", "bdf2"])
+@pytest.mark.parametrize("scheme", ["newmark", "bdf2", "generalized_alpha"])
 def test_schemes_that_look_back(scheme):
     made = lambda: scene(  # noqa: E731
         of_law("stable_neo_hookean", damping=(0.1, 0.01)), dt=0.05, gravity=GRAVITY,

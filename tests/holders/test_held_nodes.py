@@ -10,6 +10,8 @@ VELOCITY = np.array([1.0, 2.0, 0.5])
 SCHEMES = {
     "backward_euler": {}, "newmark": {"scheme": "newmark"}, "bdf2": {"scheme": "bdf2"},
     "newton": {"linearizations": 20, "tolerance": 1e-10},
+    "alpha": {"scheme": "generalized_alpha"},
+    "alpha_newton": {"scheme": "generalized_alpha", "linearizations": 20, "tolerance": 1e-10},
     "newmark_newton": {"scheme": "newmark", "linearizations": 20, "tolerance": 1e-10},
     "ros2": {"scheme": "ros2"},
 }  # fmt: skip
@@ -115,7 +117,7 @@ def test_a_bar_that_turns_with_its_holder_has_the_momentum_of_a_rigid_one():
     assert spin == pytest.approx(rigid, rel=0.02)
 
 
-@pytest.mark.parametrize("scheme", ["newmark", "bdf2", "ros2"])
+@pytest.mark.parametrize("scheme", ["newmark", "bdf2", "generalized_alpha", "ros2"])
 def test_velocities_of_held_nodes_are_those_of_the_motion(scheme):
     sim = held_bar(left(keyframes=SPIN, center=[0, 0.5, 0.5]), integrator={"scheme": scheme}, young=1e6)
     sim.engine.run(13)

@@ -24,7 +24,7 @@ def library(tmp_path_factory: pytest.TempPathFactory) -> c.CDLL:
     return compiled(tmp_path_factory.mktemp("newton"))
 
 
-@pytest.mark.parametrize("scheme", ["backward_euler", "newmark", "bdf2", "quasi_static"])
+@pytest.mark.parametrize("scheme", ["backward_euler", "newmark", "bdf2", "generalized_alpha", "quasi_static"])
 def test_steps_and_forces_are_those_of_the_cpu(library, monkeypatch, scheme):
     keys: dict[str, Any] = {
         "integrator": {"scheme": scheme, "linearizations": 12, "tolerance": 1e-10},

@@ -9,7 +9,7 @@ from sim_server.simulation import Simulation
 from tests.physics.test_cantilever import lowest_mode
 from tests.scenes import bar, simulation
 
-SCHEMES = ["backward_euler", "newmark", "bdf2"]
+SCHEMES = ["backward_euler", "newmark", "bdf2", "generalized_alpha"]
 TIGHT = {"tolerance": 1e-13, "preconditioner": "block_jacobi", "max_iterations": 3000}
 
 

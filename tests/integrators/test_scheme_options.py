@@ -20,16 +20,20 @@ mesh = {{ bar = [2, 1, 1], size = [2, 1, 1] }}
 
 BAD = {
     'scheme = "euler"': "integrator.scheme = 'euler': must be 'backward_euler', 'newmark', 'bdf2', "
-    "'quasi_static', 'ros2' or 'central_difference'",
+    "'generalized_alpha', 'quasi_static', 'ros2' or 'central_difference'",
     "beta = 0.25": "beta belong to scheme newmark, not to backward_euler",
     'scheme = "newmark"\nbeta = 0.1': "newmark with beta = 0.1, gamma = 0.5 is stable for small steps only; "
     "allowed: 1/2 <= gamma <= 2 beta",
     'scheme = "newmark"\ngamma = 0.4': "integrator.gamma = 0.4: must be greater than or equal to 0.5",
+    'scheme = "newmark"\nspectral_radius = 0.5': "spectral_radius belongs to scheme generalized_alpha, not to newmark",
+    'scheme = "generalized_alpha"\nspectral_radius = 1.1': "integrator.spectral_radius = 1.1: must be less than or "
+    "equal to 1",
+    'scheme = "generalized_alpha"\ngamma = 0.6': "gamma belong to scheme newmark, not to generalized_alpha",
     "linearizations = 0": "integrator.linearizations = 0: must be greater than or equal to 1",
     "linearizations = 2.5": "integrator.linearizations = 2.5: must be a whole number",
     "tolerance = 0.0": "integrator.tolerance = 0.0: must be greater than 0",
-    "newton = true": "unknown key .known keys: beta, error_bound, gamma, linearizations, scheme, solve, tolerance, "
-    "trials",
+    "newton = true": "unknown key .known keys: beta, error_bound, gamma, linearizations, scheme, solve, "
+    "spectral_radius, tolerance, trials",
     "linearizations = 4\n[solver]\nbudget = 0.01": "a budget is for one solve a step; allowed: one of the two",
 }
 
@@ -45,7 +49,7 @@ def test_mistakes_are_told(tmp_path, table):
 UNSTABLE = {"tangent": "usual"}, {"rotation": "qr"}
 
 
-@pytest.mark.parametrize("scheme", ["newmark", "bdf2"])
+@pytest.mark.parametrize("scheme", ["newmark", "bdf2", "generalized_alpha"])
 @pytest.mark.parametrize("given", UNSTABLE, ids=str)
 def test_a_tangent_with_which_the_energy_grows_is_refused(tmp_path, scheme, given):
     """The message names the object. More linearizations, or another scheme, allow it."""
@@ -62,7 +66,7 @@ def test_a_tangent_with_which_the_energy_grows_is_refused(tmp_path, scheme, give
         assert [o.effects["corotational"].tangent for o in made.objects] == ["usual", "usual"]
 
 
-@pytest.mark.parametrize("scheme", ["newmark", "bdf2"])
+@pytest.mark.parametrize("scheme", ["newmark", "bdf2", "generalized_alpha"])
 def test_the_tangent_is_exact_where_it_must_be(scheme):
     bodies = bar(name="a"), bar(name="b", tangent="exact"), bar(name="c", young=None)
     made = scene(*bodies, integrator={"scheme": scheme})

@@ -14,6 +14,7 @@ import pytest
 from sim_server.simulation import Simulation
 from tests.scenes import bar, simulation
 
+SCHEMES = ["newmark", "bdf2", "generalized_alpha"]
 SOLVER = {"preconditioner": "block_jacobi", "max_iterations": 2000}
 ELASTIC = {"young": 2e5, "poisson": 0.45}
 LAWS: dict[str, dict[str, Any]] = {
@@ -48,7 +49,7 @@ def kicked(law: str, scheme: str, dt: float) -> list[float]:
 
 
 @pytest.mark.parametrize("dt", [0.04, 0.02, 0.01, 0.002])
-@pytest.mark.parametrize("scheme", ["newmark", "bdf2"])
+@pytest.mark.parametrize("scheme", SCHEMES)
 def test_a_kicked_bar_under_tension_calms_down(scheme, dt):
     """20 s; with the usual tangent the energy is 1e43 times the kick's (newmark, 20 ms)."""
     found = kicked("corotational", scheme, dt)
@@ -56,14 +57,14 @@ def test_a_kicked_bar_under_tension_calms_down(scheme, dt):
 
 
 @pytest.mark.parametrize("law", [law for law in LAWS if law != "corotational"])
-@pytest.mark.parametrize("scheme", ["newmark", "bdf2"])
+@pytest.mark.parametrize("scheme", SCHEMES)
 def test_so_it_does_of_every_law(scheme, law):
     found = kicked(law, scheme, 0.02)
     assert np.diff(found).max() < 1e-6, found
 
 
 @pytest.mark.parametrize("dt", [0.04, 0.01])
-@pytest.mark.parametrize("scheme", ["newmark", "bdf2"])
+@pytest.mark.parametrize("scheme", SCHEMES)
 def test_a_swing_without_damping_never_rises_above_its_start(scheme, dt):
     sim = held("corotational", (0, -9.81, 0), dt=dt, integrator={"scheme": scheme})
     start, highest = sim.potential_energy(), -np.inf
@@ -74,7 +75,7 @@ def test_a_swing_without_damping_never_rises_above_its_start(scheme, dt):
     assert highest < start * (1 + 1e-4)  # the first steps, of 40 ms, are off by 3e-5
 
 
-@pytest.mark.parametrize("scheme", ["newmark", "bdf2"])
+@pytest.mark.parametrize("scheme", SCHEMES)
 def test_with_damping_it_comes_to_rest_and_stays_there(scheme):
     """The usual tangent leaves the rest again."""
     sim = held("corotational", (9.81, -1, 0), damping=1.0, dt=0.02, integrator={"scheme": scheme})

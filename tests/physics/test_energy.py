@@ -35,7 +35,7 @@ def gravity(sim: Simulation, body: int) -> float:
     return -float((sim.world.mass[nodes, None] * sim.world.x[nodes] * np.array(G)).sum())
 
 
-@pytest.mark.parametrize("scheme", ["backward_euler", "newmark", "bdf2"])
+@pytest.mark.parametrize("scheme", ["backward_euler", "newmark", "bdf2", "generalized_alpha"])
 def test_each_body_is_told_its_energy_in_each_step(scheme):
     objects = [
         bar((3, 1, 1), name="a", young=2e4, fixed="X < 0.01", damping=(0.2, 0.01)),

@@ -52,7 +52,7 @@ def thrown_together(law: Law, speed: float = 60.0, **scene):
 
 
 @pytest.mark.parametrize("fixed", [None, "X < 0.01"], ids=["free", "held"])
-@pytest.mark.parametrize("scheme", ["backward_euler", "newmark", "bdf2", "ros2"])
+@pytest.mark.parametrize("scheme", ["backward_euler", "newmark", "bdf2", "generalized_alpha", "ros2"])
 def test_a_body_pressed_through_itself_is_back_where_the_step_before_began(scheme, fixed):
     sim, driver = thrown_together(LAWS["neo_hookean"], integrator={"scheme": scheme}, fixed=fixed)
     x = [sim.world.x.copy()]

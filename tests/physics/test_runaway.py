@@ -91,6 +91,7 @@ SCHEMES = {
     "Newton": {"linearizations": 4},
     "newmark": {"scheme": "newmark", "linearizations": 3},
     "bdf2": {"scheme": "bdf2", "linearizations": 3},
+    "generalized_alpha": {"scheme": "generalized_alpha", "linearizations": 3},
     "ros2": {"scheme": "ros2", "error_bound": 1e9},  # what drives the body is no part of its backward Euler step
 }
 

@@ -118,7 +118,7 @@ def test_a_gpu_takes_objects_that_touch_each_other(tmp_path):
     read(tmp_path, GOOD).check_device("gpu")
 
 
-@pytest.mark.parametrize("scheme", ["newmark", "bdf2", "ros2"])
+@pytest.mark.parametrize("scheme", ["newmark", "bdf2", "generalized_alpha", "ros2"])
 def test_on_a_gpu_bodies_in_contact_take_backward_euler_alone(tmp_path, scheme):
     one = swap("contact = true", f'contact = {{ between = false }}\n[integrator]\nscheme = "{scheme}"')
     scene = read(tmp_path, one)
@@ -181,7 +181,7 @@ REFUSED = [
     ),
     (
         swap('[[object]]\nname = "beam"', '[integrator]\nscheme = "quasi_static"\n[[object]]\nname = "beam"'),
-        ["effects.contact", "'quasi_static'", "'backward_euler', 'newmark', 'bdf2', 'ros2'"],
+        ["effects.contact", "'quasi_static'", "'backward_euler', 'newmark', 'bdf2', 'generalized_alpha', 'ros2'"],
     ),
     (
         swap(

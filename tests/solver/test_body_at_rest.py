@@ -12,6 +12,7 @@ SCHEMES = {
     "backward Euler": {},
     "bdf2": {"scheme": "bdf2", "linearizations": 3},
     "newmark": {"scheme": "newmark", "linearizations": 2},
+    "generalized_alpha": {"scheme": "generalized_alpha", "linearizations": 2},
     "quasi-static": {"scheme": "quasi_static", "linearizations": 10},
 }
 DAMPED = (20.0, 0.02)

@@ -52,7 +52,7 @@ def test_the_same_matrix_bit_for_bit(solid, warp):
         assert built.matrix(sim.world.x.copy()).tobytes() == sim.system.values.tobytes()
 
 
-@pytest.mark.parametrize("scheme", ["newmark", "bdf2", "quasi_static", "ros2"])
+@pytest.mark.parametrize("scheme", ["newmark", "bdf2", "generalized_alpha", "quasi_static", "ros2"])
 def test_the_same_matrix_under_any_integrator(scheme):
     sim = simulation(
         bar((4, 2, 2), fixed="X < 0.01", damping=(0.1, 0.02)), gravity=(0, -1, 0), integrator={"scheme": scheme}

@@ -108,7 +108,8 @@ ROS2_FACTOR = Method("ros2, factor", {"scheme": "ros2", "solve": "factor"})
 NEWTON = {"scheme": "newmark", "linearizations": 30, "tolerance": 1e-10}
 OTHERS = (
     EULER, _other("backward_euler", 1, 3), NEWMARK, _other("newmark", 1, 3), _other("newmark", 2, 2),
-    _other("newmark", 3, 2), _other("bdf2", 1, 3), _other("bdf2", 2, 2), ROS2_ITERATE,
+    _other("newmark", 3, 2), _other("bdf2", 1, 3), _other("bdf2", 2, 2), _other("generalized_alpha", 1, 3),
+    _other("generalized_alpha", 2, 2), ROS2_ITERATE,
     Method("ros2, iterate, 1e-3", ITERATE, {"tolerance": 1e-3}),
 )  # fmt: skip
 REFERENCE = Method("newmark, Newton to 1e-10", NEWTON, {"tolerance": 1e-8})

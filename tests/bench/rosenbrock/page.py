@@ -11,7 +11,10 @@ from tests.bench.rosenbrock.stability import groups
 
 Tables = dict[str, list[Row]]
 MAIN = 3000  # tetrahedra of the first picture, if there are such rows
-COLOURS = {"backward Euler": "C0", "newmark": "C2", "bdf2": "C4", "ros2, iterate": "C1", "ros2, factor": "k"}
+COLOURS = {
+    "backward Euler": "C0", "newmark": "C2", "bdf2": "C4", "generalized_alpha": "C3", "ros2, iterate": "C1",
+    "ros2, factor": "k",
+}  # fmt: skip
 VARIED = ("start", "model", "E MPa", "Poisson", "dt ms", "latency", "tangent", "bound / edge")  # of stability
 REMEMBERED = ("3e-03", "1e-03")  # errors of the key figures
 
