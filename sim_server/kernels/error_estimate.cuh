@@ -1,0 +1,61 @@
+// SPDX-License-Identifier: MIT
+// Estimates of the error e = A^-1 r of an iterate x of conjugate gradients, shared by both devices. |.| is the largest Euclidean norm of
+// a node's part; the frame of the nodes does not matter. In a step, dx_dv |e| is the error of the positions [m].
+//
+//   - By P^-1: z = P^-1 r is e itself where P is A, and near it where P is an older factor. alpha of an iteration is the mean of the
+//     eigenvalues of A^-1 P as its direction sees them: single ones scatter, but several beyond SCALE_RANGE say that P has a wrong
+//     scale, and then alpha z is meant.
+//   - By the iterates: x_k - x_(k-d) is what d iterations took off the error, and sqrt(z.r) falls as the error in the norm of A does.
+//     Right with any preconditioner once d is FEWEST or more.
+// Where both are known the larger one counts. `trust` times an estimate is at least the error, as tests/accuracy measures.
+#pragma once
+#ifndef __CUDACC__
+#include <cmath>
+#endif
+#include "host_device.cuh"
+#include "kinds.h"
+
+constexpr double WARPED_TRUST = 1.5;  // with factors in the material frame
+constexpr double FACTOR_TRUST = 3;    // with factors in the world frame
+constexpr double OTHER_TRUST = 3;   // with other preconditioners
+constexpr double AHEAD = 2;           // and so many times more where z is of the iteration before
+constexpr double FEW = 5;             // of z with other preconditioners, where fewer than FEWEST iterations are done
+constexpr int LAG = 10;               // iterations d from one look at x to the next, at least
+constexpr int FEWEST = 4, FEWEST_WITH_FACTOR = 1;  // from which on the iterates tell
+constexpr double MOST_LEFT = 0.1;     // of |b|: a solve with more of a residual does not end by an estimate
+constexpr double SCALE_RANGE = 10;
+constexpr double SLOWEST = 0.95;      // fall of the error in d iterations; what falls less is taken for it
+
+// In place of an estimate that there is not.
+HOST_DEVICE double not_known() { return nan(""); }
+
+HOST_DEVICE double trust_of(int kind, double trust_in_factor) { return kind == CHOLESKY ? trust_in_factor : OTHER_TRUST; }
+
+HOST_DEVICE int fewest_of(int kind) { return kind == CHOLESKY ? FEWEST_WITH_FACTOR : FEWEST; }
+
+// Whether an estimate may end a solve, with squares of |r| and |b|.
+HOST_DEVICE bool may_end(double r2, double b2) { return r2 <= MOST_LEFT * MOST_LEFT * b2; }
+
+// Iterations from one look at x to the next: more where convergence is slow.
+HOST_DEVICE int lag_of(int looked) { return looked / 2 > LAG ? looked / 2 : LAG; }
+
+// Scale of P^-1 by alpha of the last two iterations; 1 where nothing is wrong.
+HOST_DEVICE double factor_scale_of(double alpha, double alpha_before) {
+    const double larger = alpha > alpha_before ? alpha : alpha_before;
+    return larger > SCALE_RANGE || larger < 1 / SCALE_RANGE ? larger : 1;
+}
+
+// |e| by z = |P^-1 r_k|. fall: |r| now over |r_k|, 1 where z is of now.
+HOST_DEVICE double error_by_factor(int kind, double z, double scale, double fall) { return (kind == CHOLESKY ? scale : FEW * scale) * z * fall; }
+
+// |e_k| by change = |x_k - x_(k-d)|. rz, rz_before: z.r at k and at k - d. With q the fall of the error, change is about (1 - q) of the
+// error at k - d, and q / (1 - q) of it is left.
+HOST_DEVICE double error_by_iterates(double change, double rz, double rz_before) {
+    const double q = rz < SLOWEST * SLOWEST * rz_before ? sqrt(rz / rz_before) : SLOWEST;
+    return change * q / (1 - q);
+}
+
+// Whether a solve may end. estimate: dx_dv |e|; ahead: z in it is of the iteration before.
+HOST_DEVICE bool is_exact_enough(double estimate, double trust, double position, bool ahead) {
+    return (ahead ? AHEAD * trust : trust) * estimate <= position;
+}
