@@ -284,7 +284,7 @@ class Simulation:
         settings.tolerance, settings.max_iterations = solver.tolerance, solver.max_iterations
         settings.budget, settings.warm_start = solver.budget, int(solver.warm_start)
         settings.kind, settings.omega = KINDS.get(solver.preconditioner, Kind.CHOLESKY), solver.omega
-        accuracy, settings.dx_dv = self.scene.accuracy, self.world.dx_dv
+        accuracy, settings.dx_dv = self.scene.accuracy, self.world.dx_dv / self.world.balance_point
         settings.position = accuracy.position_of(body.mesh.rest) if accuracy else 0.0
         settings.trust = WARPED_TRUST if body.index in self.warped else FACTOR_TRUST
         settings.step_budget = solver.step_budget
