@@ -44,7 +44,9 @@ def convergence(
     residual = np.where(records["residual"] > 0, records["residual"], 1.0)  # NaN counts as 1
     gained = np.clip(-np.log10(residual), MIN_DECADES, wanted)
     with np.errstate(divide="ignore", invalid="ignore"):
-        left = np.log10(records["solve_error"] / np.asarray(position))  # decades of the error; NaN or infinite: not known
+        left = np.log10(
+            records["solve_error"] / np.asarray(position)
+        )  # decades of the error; NaN or infinite: not known
     wanted = np.where(np.isfinite(left), gained + np.maximum(left, 0.0), wanted)
     used = records["iterations"] / (solves * solver.max_iterations)
     if solver.budget:
