@@ -56,8 +56,8 @@ class Study:
         """Measures for so many minutes, or until all is measured; 0: only what is there is looked at."""
         self._deadline, self._minutes = self._began + 60 * minutes, minutes
         found = self.found
-        found.left_out = [left for left in found.left_out if left["reason"] != NO_TIME]
         if minutes > 0:
+            found.left_out = []  # what the server refused is asked again: it may be another version
             self._keep()
             self._run_scene()
             self._reference()

@@ -219,7 +219,7 @@ def test_a_study_that_is_cut_off_goes_on(scene: Path, monkeypatch: pytest.Monkey
     )
     assert all(runs[12:].count(s) == 2 for s in first[-3:-1]), "only for further rounds"
     runs.clear()
-    assert to_dict(study_of(scene)) == to_dict(whole) and len(runs) == 1, "all is measured: the scene is looked at"
+    assert to_dict(study_of(scene)) == to_dict(whole) and len(runs) == 2, "the scene is read, a refusal asked again"
 
 
 def test_a_short_time_leaves_the_rest_for_the_next_call(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
