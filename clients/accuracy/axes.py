@@ -120,7 +120,8 @@ class SceneValues:
             return {}
         found = self.exact_solves()
         if self.bounds_position:
-            found = {"accuracy.position": EXACT_POSITION, "solver.max_iterations": ITERATIONS} | self._without_budget()
+            found = {"accuracy.position": EXACT_POSITION, "solver.tolerance": EXACT}
+            found |= {"solver.max_iterations": ITERATIONS} | self._without_budget()
         return found | {"integrator.linearizations": str(MANY), "integrator.tolerance": EXACT}
 
     def references(self, parts: int) -> list[Settings]:
@@ -153,7 +154,7 @@ class SceneValues:
 
 def candidates(scene: SceneValues, size: float) -> list[Candidate]:
     """Returns the points to measure beside the scene itself, the most telling ones first. size: of an object [m]."""
-    given = [*_first(scene), *_single(scene, size), *_pairs(scene), *_factors(scene)]
+    given = [*_first(scene), *_single(scene, size), *_pairs(scene, size), *_factors(scene)]
     found: list[Candidate] = []
     for each in given:
         if each.settings and all(each.settings != other.settings for other in found):
@@ -235,7 +236,7 @@ def _scheme(scene: SceneValues, scheme: str) -> Settings:
     return found
 
 
-def _pairs(scene: SceneValues) -> Iterator[Candidate]:
+def _pairs(scene: SceneValues, size: float) -> Iterator[Candidate]:
     if not scene.explicit and not scene.bounds_position:
         if scene.scheme != "ros2":
             for number, tolerance in ((2, "1e-2"), (2, "1e-1"), (4, "1e-1")):
@@ -243,6 +244,9 @@ def _pairs(scene: SceneValues) -> Iterator[Candidate]:
                 yield Candidate("linearizations and tolerance", both, number)
         for factor in (0.5, 0.25):
             yield Candidate("time step and tolerance", scene.step(factor) | {"solver.tolerance": "1e-2"}, 1 / factor)
+    for factor in (0.5, 0.25) if not scene.explicit else ():
+        both = scene.step(factor) | {"accuracy.position": f"{size * POSITIONS[0]:.1g}"}
+        yield Candidate("time step and position", both, 1 / factor)
     if scene.scheme == "quasi_static":
         return
     for scheme, factor in SCHEMES_AND_STEPS:

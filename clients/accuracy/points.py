@@ -38,6 +38,7 @@ class Point:
     step_ms: dict[str, float] | None = None  # p50, p99, max
     iterations: float | None = None  # mean a step, of all objects together
     unconverged: int = 0  # solves that did not reach their tolerance
+    limit: float | None = None  # of one that timed out: wall time that its process had [s]
     against: str = "reference"  # what `error` is measured from; on the axis mesh its extrapolation
 
 

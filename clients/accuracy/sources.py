@@ -31,7 +31,7 @@ CHANGES = {  # what to change first, and the axes whose points show it
     ),
     TIME: (
         "take a smaller time step or a scheme of second order (dt, integrator.scheme)",
-        ("time step", "scheme", "scheme and time step", "time step and tolerance"),
+        ("time step", "scheme", "scheme and time step", "time step and tolerance", "time step and position"),
     ),
     MESH: ("refine the mesh (mesh.bar)", ("mesh",)),
 }
@@ -102,6 +102,8 @@ def sentence(found: Points) -> str:
         text += (
             f"; another law of the material moves it by {_length(model)}, more than any of these: be sure of the law"
         )
+    if (uncertainty := found.reference.get("uncertainty") or 0.0) > HALF * errors[first]:
+        text += f"; the reference itself is uncertain by {_length(uncertainty)}, so all this is rough"
     return f"{text}."
 
 

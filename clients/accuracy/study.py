@@ -28,6 +28,7 @@ PARTS = (4, 8, 16, 32, 64)  # of dt: time steps of references; two of them at le
 REFERENCE_SHARE = 0.35  # of the time given, that references may take
 LONGEST_SHARE = 0.25  # of the time given, that one point may take before it counts as timed out
 FINE_ENOUGH = 1e-6  # uncertainty of the reference over the size of the objects, below which no finer one is made
+SHORTEST_LIMIT = 30.0  # s; a point counts as timed out no sooner, and is tried again when there is more time
 START_TIMEOUT = 120.0  # s for the first start, which compiles
 NO_TIME = "no time"
 TIMED = ("scheme", "model", "preconditioner")  # axes whose settings are refused one by one; others as a whole
@@ -57,6 +58,8 @@ class Study:
         self._deadline, self._minutes = self._began + 60 * minutes, minutes
         found = self.found
         if minutes > 0:
+            longest = self._longest()
+            found.points = [p for p in found.points if p.limit is None or p.limit >= longest]
             found.left_out = []  # what the server refused is asked again: it may be another version
             self._keep()
             self._run_scene()
@@ -86,6 +89,10 @@ class Study:
 
     def _left(self) -> float:
         return self._deadline - time.monotonic()
+
+    def _longest(self) -> float:
+        """Returns the wall time that one point may take before it counts as timed out [s]."""
+        return max(SHORTEST_LIMIT, 60 * self._minutes * LONGEST_SHARE)
 
     def _keep(self) -> None:
         save(self.found, self.folder / "points.json")
@@ -159,8 +166,8 @@ class Study:
         if not settings and self._scene_run is not None:
             run = self._scene_run
         else:
-            longest = 60 * self._minutes * LONGEST_SHARE
-            run = self._run(f"{candidate.axis}: {short_words(settings)}", settings, min(longest, self._left()))
+            limit = min(self._longest(), self._left())
+            run = self._run(f"{candidate.axis}: {short_words(settings)}", settings, limit)
             if run.status == "timed out" and self._left() <= 0:
                 return False
         if run.status == "refused":
@@ -180,6 +187,8 @@ class Study:
 
     def _add(self, point: Point, run: Run) -> None:
         self.found.points.append(point)
+        if point.status == "timed out":
+            point.limit = self._longest()
         role = self._role(point)
         if not role or point.status != "done" or run.trajectory is None:
             return

@@ -192,7 +192,7 @@ def test_failures_are_points_and_refusals_are_not(scene: Path) -> None:
     assert found.point({"integrator.scheme": "ros2"}) is not None
     refused = [left for left in found.left_out if left["axis"] == "position"]
     assert len(refused) == 1 and refused[0]["reason"] == "accuracy: unknown key", "the axis is asked for once"
-    assert {left["axis"] for left in found.left_out} == {"position", "precision"}
+    assert {left["axis"] for left in found.left_out} == {"position", "time step and position", "precision"}
 
 
 def test_a_study_that_is_cut_off_goes_on(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -219,7 +219,15 @@ def test_a_study_that_is_cut_off_goes_on(scene: Path, monkeypatch: pytest.Monkey
     )
     assert all(runs[12:].count(s) == 2 for s in first[-3:-1]), "only for further rounds"
     runs.clear()
-    assert to_dict(study_of(scene)) == to_dict(whole) and len(runs) == 2, "the scene is read, a refusal asked again"
+    assert to_dict(study_of(scene)) == to_dict(whole) and len(runs) == 3, "the scene is read, refusals asked again"
+
+
+def test_what_took_too_long_is_tried_again_when_there_is_more_time(scene: Path) -> None:
+    late = next(p for p in study_of(scene, 20).points if p.status == "timed out")
+    assert late.settings == {"dt": "0.08"} and late.limit == 60 * 20 * study.LONGEST_SHARE
+    assert study_of(scene, 10).point(late.settings) == late
+    again = study_of(scene, 40).point(late.settings)
+    assert again is not None and again.limit == 2 * late.limit
 
 
 def test_a_short_time_leaves_the_rest_for_the_next_call(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -405,6 +413,9 @@ def test_the_sentence_names_the_first_change_and_what_is_cheaper() -> None:
         "takes 2 times the time; --set solver.tolerance=1e-2 is as exact as the scene and takes 0.25 times the time; "
         "another law of the material moves it by 0.3 m, more than any of these: be sure of the law."
     )
+    rough = sample()
+    rough.reference["uncertainty"] = 0.09
+    assert sentence(rough).endswith("; the reference itself is uncertain by 0.09 m, so all this is rough.")
     failed = sample()
     failed.points[0].status, failed.points[0].reason = "diverged", "bar: runaway"
     assert sentence(failed) == "The scene's own settings do not work (bar: runaway): change them first."
