@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -37,6 +38,8 @@ def accuracy(scene: Path, out: Path | None, minutes: float, duration: float, dev
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise BadInput(f"--out {folder}: cannot be made: {error.strerror}") from None
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise BadInput(f"--out {folder}: cannot be written to")
     try:
         with titled_progress_bar(60 * minutes) as progress:
             found = Study(scene, folder, duration, device, progress).run(minutes)

@@ -23,6 +23,7 @@ from clients.errors import BadInput, ClientError
 from clients.load_test.processes import end, free_endpoint
 from clients.log.reader import Log
 
+LOG_FOLDER = "warpfactor-accuracy-"  # and more letters: folder of the log of a run
 POLL = 0.05  # s between looks at a process
 ATTEMPTS = 3  # of a start whose port was taken meanwhile
 SOLVED = ("converged", "max_linearizations")  # every linear system was solved
@@ -75,7 +76,7 @@ def run_point(
     timeout: wall time of the whole process [s]. folder: for the log, which is removed; by default a temporary one.
     """
     began = time.monotonic()
-    with tempfile.TemporaryDirectory(prefix="warpfactor-accuracy-", dir=folder) as place:
+    with tempfile.TemporaryDirectory(prefix=LOG_FOLDER, dir=folder) as place:
         log, said = Path(place) / "run.mcap", Path(place) / "said.txt"
         code = _serve(task, settings, workers, began + timeout, tick, log, said)
         run = _outcome(code, log, said, task.interval)

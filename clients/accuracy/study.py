@@ -7,6 +7,7 @@ import hashlib
 import json
 import os
 import platform
+import shutil
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -17,7 +18,7 @@ import numpy as np
 from clients.accuracy.axes import COARSEST, Candidate, SceneValues, candidates, left_out, mesh_settings
 from clients.accuracy.errors import add_round, measure, point_of
 from clients.accuracy.points import SCENE, Point, Points, Settings, load, save, short_words
-from clients.accuracy.runs import Run, Task, run_point
+from clients.accuracy.runs import LOG_FOLDER, Run, Task, run_point
 from clients.accuracy.sources import MESH, MODEL, errors_by_source, mesh_error, sentence
 from clients.accuracy.trajectories import Trajectory, distance, extrapolate, load_trajectory, save_trajectory
 from clients.errors import BadInput, ClientError
@@ -31,7 +32,7 @@ FINE_ENOUGH = 1e-6  # uncertainty of the reference over the size of the objects,
 SHORTEST_LIMIT = 30.0  # s; a point counts as timed out no sooner, and is tried again when there is more time
 START_TIMEOUT = 120.0  # s for the first start, which compiles
 NO_TIME = "no time"
-TIMED = ("scheme", "model", "preconditioner")  # axes whose settings are refused one by one; others as a whole
+ONE_BY_ONE = ("scheme", "model", "preconditioner")  # axes whose settings are refused one by one; others as a whole
 
 Progress = Callable[[float, str], None]  # seconds gone, and what runs
 
@@ -44,6 +45,8 @@ class Study:
 
     def __init__(self, scene: Path, folder: Path, duration: float, device: str, progress: Progress):
         self.folder, self._progress, self._began = folder, progress, time.monotonic()
+        for log in folder.glob(f"{LOG_FOLDER}*"):  # of a run that was killed
+            shutil.rmtree(log, ignore_errors=True)
         self._what = "the scene is read"
         self._scene_run: Run | None = None
         probed = self._probe(scene, device)
@@ -100,7 +103,7 @@ class Study:
     def _run(self, what: str, settings: Settings, timeout: float) -> Run:
         self._what = what
         workers = int(self.values.wants_workers(settings))
-        return run_point(self.task, settings, workers, max(timeout, 0.1), self._tick)
+        return run_point(self.task, settings, workers, max(timeout, 0.1), self._tick, self.folder)
 
     def _run_scene(self) -> None:
         """Runs the scene's own settings, first of all: what they take tells what other runs will."""
@@ -183,7 +186,7 @@ class Study:
         if any(left["settings"] == candidate.settings for left in refused):
             return True
         taken = any(p.axis == candidate.axis for p in self.found.points)
-        return bool(refused) and not taken and candidate.axis not in TIMED
+        return bool(refused) and not taken and candidate.axis not in ONE_BY_ONE
 
     def _add(self, point: Point, run: Run) -> None:
         self.found.points.append(point)

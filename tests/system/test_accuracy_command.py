@@ -54,6 +54,7 @@ def test_points_are_kept_through_a_kill_and_an_interrupt(tmp_path: Path) -> None
         interrupted.send_signal(signal.SIGINT)
         _, said = interrupted.communicate(timeout=PATIENCE)
     assert interrupted.returncode == 130 and "the same command goes on" in said and "Traceback" not in said, said
+    assert {path.name for path in folder.iterdir()} == {"points.json", "runs"}, "no log is left"
     kept = points(folder)
     assert kept[: len(before)] == before
 
