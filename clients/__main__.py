@@ -446,6 +446,33 @@ def load(
 
 
 @app.command()
+def accuracy(
+    scene: Annotated[Path, typer.Argument(metavar="SCENE.toml", help="What to measure.")],
+    minutes: Annotated[float, typer.Option(metavar="M", help="Time to spend; 0: only draw what is there.")] = 5.0,
+    duration: Annotated[float, typer.Option(metavar="S", help="Simulated in each run.")] = 1.0,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="For the results; by default accuracy-SCENE.")
+    ] = None,
+    device: Annotated[str, typer.Option(metavar="auto|cpu|gpu", help="Of the servers.")] = "auto",
+    as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
+) -> None:
+    """Measure what accuracy costs in a scene: runs it at many settings and compares them with a reference.
+
+    Starts a server for each run. Points are kept as they come: after the time given or Ctrl-C the same command goes
+    on. Writes points.json, points.csv, accuracy.png and accuracy.html.
+
+    \b
+    Examples:
+      sim-client accuracy deploy/scenes/beam.toml
+      sim-client accuracy beam.toml --minutes 20 --duration 2 --out out/beam
+      sim-client accuracy beam.toml --json | jq .sentence
+    """
+    from clients.accuracy import command
+
+    command.accuracy(scene, out, minutes, duration, device, as_json)
+
+
+@app.command()
 def replay(
     log: Annotated[Path, typer.Argument(metavar="LOG.mcap", help="A recorded run.")],
     simulate: Annotated[bool, typer.Option("--simulate", help="Run it again and compare bit by bit.")] = False,
