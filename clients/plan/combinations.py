@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: MIT
+"""Names combinations of settings that were measured apart only, and may be worth a measurement together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import combinations
+
+from clients.plan.front import Choice, Wish
+from clients.plan.points import Point
+
+
+def untried(points: Sequence[Point], wish: Wish, choice: Choice, uncertainty: float) -> list[dict[str, str]]:
+    """Returns combinations of two points that may be better than `choice`, the most promising first.
+
+    Factors by which each alone changes time and error of the scene's own settings are multiplied. That is good for an
+    order of measurements alone: nothing of it is told.
+    """
+    own = next((p for p in points if not p.settings), None)
+    if own is None or not own.error:
+        return []
+    measured = [p.settings for p in points]
+    found = []
+    for a, b in combinations((p for p in points if p.settings), 2):
+        settings = {**a.settings, **b.settings}
+        if a.settings.keys() & b.settings.keys() or settings in measured:
+            continue
+        guess = _product(own, a, b, settings)
+        better = wish.cost(guess) < wish.cost(choice.point) if wish.cheapest else guess.error < choice.point.error
+        if wish.fits(guess, uncertainty) and (better or not choice.reached):
+            found.append(guess)
+    found.sort(key=wish.cost if wish.cheapest else lambda p: p.error)
+    return [guess.settings for guess in found]
+
+
+def _product(own: Point, a: Point, b: Point, settings: dict[str, str]) -> Point:
+    error, seconds, p99 = (
+        getattr(a, name) * getattr(b, name) / max(getattr(own, name), 1e-30) for name in ("error", "seconds", "p99")
+    )
+    return replace(own, settings=settings, error=error, seconds=seconds, p99=p99)
