@@ -475,9 +475,7 @@ def plan(
     if as_json:
         print(json.dumps(found.as_json()))
     else:
-        from rich.console import Console
-
-        Console().print(found.shown())
+        found.show()
     raise typer.Exit(0 if found.to else 1)
 
 

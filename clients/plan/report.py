@@ -135,11 +135,14 @@ def table(points: Points, choice: Choice) -> Table:
 
     from clients.watch import COMPACT
 
-    found = Table("", "settings", "error [m]", "p99 [ms]", "s a simulated s", "iterations", **COMPACT)
+    found = Table("", "settings", "error, m", "p99, ms", "s per s", "iter.", **COMPACT)
+    found.columns[1].overflow = "fold"
     chosen = "chosen" if choice.reached else "nearest"
     for word, p in (("cheaper", choice.cheaper), (chosen, choice.point), ("more exact", choice.more_exact)):
         if p is not None:
             iterations = "-" if math.isnan(p.iterations) else f"{p.iterations:.3g}"
-            error = _error(p, points).replace(" m", "")
-            found.add_row(word, settings(p), error, f"{p.p99:.3g}", f"{p.seconds:.3g}", iterations)
+            found.add_row(
+                word, settings(p).replace(" ", "\n") if p.settings else settings(p), f"{p.error:.2g}", f"{p.p99:.3g}",
+                f"{p.seconds:.3g}", iterations,
+            )  # fmt: skip
     return found

@@ -6,7 +6,7 @@ from __future__ import annotations
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from clients.errors import BadInput
 from clients.plan import overlay, report
@@ -14,9 +14,6 @@ from clients.plan.combinations import untried
 from clients.plan.front import Choice, Wish, choose
 from clients.plan.points import Points, read
 from clients.plan.scene import digest
-
-if TYPE_CHECKING:
-    from rich.console import Group
 
 
 @dataclass(frozen=True)
@@ -38,15 +35,16 @@ class Plan:
         found = report.as_json(self.points, self.wish, self.choice, self.untried)
         return {**found, "overlay": str(self.to) if self.to else None, "use": self.use if self.to else None}
 
-    def shown(self) -> Group:
-        """Returns the answer for a terminal."""
-        from rich.console import Group
-        from rich.text import Text
+    def show(self) -> None:
+        """Prints the answer for people."""
+        from rich.console import Console
 
-        lines = [f"- {note}" for note in report.notes(self.points, self.wish, self.choice, self.untried)]
-        lines += [f"wrote {self.to}; {self.use}"] if self.to else []
-        head = Text(report.answer(self.points, self.wish, self.choice))
-        return Group(head, report.table(self.points, self.choice), Text("\n".join(lines)))
+        print(report.answer(self.points, self.wish, self.choice))
+        Console().print(report.table(self.points, self.choice))
+        for note in report.notes(self.points, self.wish, self.choice, self.untried):
+            print(f"- {note}")
+        if self.to:
+            print(f"wrote {self.to}:\n  {self.use}")
 
 
 def plan(scene: Path, wish: Wish, where: Path | None, to: Path | None) -> Plan:
