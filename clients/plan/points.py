@@ -15,6 +15,8 @@ from clients.errors import BadInput
 from protocol.printable import printable
 
 VERSION = 1  # of points.json
+REFERENCE = "reference"  # what errors are measured from
+OTHER_BODIES = ("mesh", "model")  # axes that change what is simulated, beside how exactly that is done
 KEY = re.compile(r"[A-Za-z0-9_-]+(\.[A-Za-z0-9_-]+)*")  # of an override
 
 
@@ -48,7 +50,7 @@ class Points:
     """All measurements of a scene.
 
     digest: of the scene as resolved; duration: simulated [s]; uncertainty: of the reference [m], None if not known;
-    lost: number of measurements without a result, by status
+    lost: number of measurements left out, by reason
     """
 
     scene: str
@@ -83,10 +85,10 @@ def read(path: Path) -> Points:
 def _points(found: dict[str, Any]) -> Points:
     done, lost = [], Counter[str]()
     for point in found["points"]:
-        if point["status"] == "done":
-            done.append(_point(point))
+        if reason := _reason_to_leave_out(point):
+            lost[reason] += 1
         else:
-            lost[printable(str(point["status"]))] += 1
+            done.append(_point(point))
     reference = found["reference"] or {}
     machine = {printable(str(k)): printable(str(v)) for k, v in found["machine"].items()}
     given = reference.get("uncertainty")
@@ -95,6 +97,17 @@ def _points(found: dict[str, Any]) -> Points:
         printable(str(found["scene"])), printable(str(found["digest"])), _number(found["duration"]),
         printable(str(found["device"])), machine, uncertainty, done, lost,
     )  # fmt: skip
+
+
+def _reason_to_leave_out(point: dict[str, Any]) -> str:
+    """Returns why a point is no choice; empty if it is one."""
+    if point["status"] != "done":
+        return printable(str(point["status"]))
+    if any(point[name] is None for name in ("error", "seconds", "step_ms")):
+        return "without an error or a time"
+    if point["axis"] in OTHER_BODIES or point.get("against", REFERENCE) != REFERENCE:
+        return "of another body or reference"
+    return ""
 
 
 def _point(point: dict[str, Any]) -> Point:

@@ -49,7 +49,7 @@ def notes(points: Points, wish: Wish, choice: Choice, untried: Sequence[dict[str
         told.append(f"{point.unconverged} steps did not reach their tolerance")
     if points.lost:
         lost = ", ".join(f"{count} {status}" for status, count in points.lost.most_common())
-        told.append(f"measurements without a result, left out: {lost}")
+        told.append(f"measurements left out: {lost}")
     if untried:
         together = " ".join(f"{key}={value}" for key, value in untried[0].items())
         told.append(f"measured apart but not together, may be better: {together} (--measure MINUTES tries it)")
