@@ -7,6 +7,7 @@ import json
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from clients.errors import BadInput, ClientError
 from clients.log.atomic_file import atomic_file
@@ -15,21 +16,31 @@ MARK = "Settings by sim-client plan"  # begins the first comment; a file that be
 
 
 def overlay_text(settings: Mapping[str, str], comments: Sequence[str]) -> str:
-    """Returns the text of an overlay: comments, then a line for each of the settings (KEY: VALUE as of `--set`)."""
+    """Returns the text of an overlay: comments, then settings (KEY: VALUE as of `--set`).
+
+    These are keys where that means the same, else overrides as on the command line.
+    """
     head = "".join(f"# {line}\n" if line else "#\n" for line in comments)
-    values = {key: _value(text) for key, text in settings.items()}
-    dotted = "".join(f"{key} = {value}\n" for key, value in values.items())
-    quoted = "".join(f"{json.dumps(key)} = {value}\n" for key, value in values.items())
-    return head + (dotted if _is_plain(dotted, values) else quoted)
+    keys = "".join(f"{key} = {_value(text)}\n" for key, text in settings.items())
+    if _is_plain(keys, settings):
+        return head + keys
+    words = "".join(f"  {_string(f'{key}={text}')},\n" for key, text in settings.items())
+    return f"{head}set = [\n{words}]\n"
 
 
-def _is_plain(text: str, values: Mapping[str, str]) -> bool:
-    """True if dotted keys do: no value is a table, which would be merged, and none is in another one's."""
+def _is_plain(text: str, settings: Mapping[str, str]) -> bool:
+    """True if the text is TOML and none of its values is a table, which would be merged with that of the scene."""
     try:
-        tomllib.loads(text)
+        table = tomllib.loads(text)
     except tomllib.TOMLDecodeError:
         return False
-    return not any(isinstance(tomllib.loads(f"value = {value}")["value"], dict) for value in values.values())
+    return not any(isinstance(_at(table, key), dict) for key in settings)
+
+
+def _at(table: Mapping[str, Any], key: str) -> Any:
+    for part in key.split("."):
+        table = table[part]
+    return table
 
 
 def _value(text: str) -> str:
@@ -39,6 +50,10 @@ def _value(text: str) -> str:
             return text
     except (tomllib.TOMLDecodeError, RecursionError):
         pass
+    return _string(text)
+
+
+def _string(text: str) -> str:
     return json.dumps(text, ensure_ascii=False)
 
 

@@ -32,9 +32,9 @@ def scene(tmp_path, monkeypatch):
 
 def test_an_overlay_is_the_overrides_that_it_lists(scene):
     overlay = """
-        dt = 0.01                       # nested tables, dotted keys and paths in quotation marks
+        dt = 0.01                       # nested tables, dotted keys, and overrides as they are
         solver.tolerance = 1e-4
-        "object.beam.mesh" = { bar = [2, 1, 1], size = [2, 1, 1] }
+        set = ["object.beam.mesh={ bar = [2, 1, 1], size = [2, 1, 1] }", "solver.update=every-3"]
         [integrator]
         scheme = "newmark"
         [object.beam.effects]
@@ -49,7 +49,7 @@ def test_an_overlay_is_the_overrides_that_it_lists(scene):
     overrides = [
         "dt=0.01", "solver.tolerance=1e-4", "object.beam.mesh={ bar = [2, 1, 1], size = [2, 1, 1] }",
         "integrator.scheme=newmark", "object.beam.effects.corotational.young=2e5", "object.beam.effects.touch=true",
-        "object.beam.effects.fixed.where=X < 1", "object.beam.tip.density=900",
+        "solver.update=every-3", "object.beam.effects.fixed.where=X < 1", "object.beam.tip.density=900",
     ]  # fmt: skip
     assert load(scene, ["@fast.toml"]).resolved() == load(scene, overrides).resolved() != load(scene).resolved()
 
@@ -61,10 +61,10 @@ def test_later_values_take_the_place_of_earlier_ones(scene):
     assert (found.dt, found.solver.tolerance, found.solver.max_iterations) == (0.01, 1e-5, 9)
 
 
-def test_tables_are_merged_and_a_path_replaces_them(scene):
+def test_tables_are_merged_and_an_override_replaces_them(scene):
     (scene.parent / "merged.toml").write_text("object.beam.mesh = { bar = [8, 2, 2] }")
     assert load(scene, ["@merged.toml"]).objects[0].mesh.size == (4.0, 1.0, 1.0)
-    (scene.parent / "replaced.toml").write_text('"object.beam.mesh" = { bar = [8, 2, 2] }')
+    (scene.parent / "replaced.toml").write_text("set = ['object.beam.mesh={ bar = [8, 2, 2] }']")
     with pytest.raises(InputError, match=r"scene scene\.toml with overlay replaced\.toml, object 'beam', mesh"):
         load(scene, ["@replaced.toml"])
 
@@ -81,6 +81,9 @@ def test_tables_are_merged_and_a_path_replaces_them(scene):
         ("dt.x = 3", ["overlay wrong.toml, dt.x = 3: dt = 0.02 is no table"]),
         ('"" = 3', ["overlay wrong.toml,  = 3: must be KEY=VALUE"]),
         ("dt = {}", ["with overlay wrong.toml, dt", "must be a number"]),
+        ("set = 3", ["overlay wrong.toml, set = 3: must be an array of overrides"]),
+        ("set = ['dt']", ["overlay wrong.toml, set = ['dt']: override 'dt': must be KEY=VALUE"]),
+        ("set = ['@wrong.toml']", ["override '@wrong.toml': must be KEY=VALUE"]),
         ("dt =", ["overlay wrong.toml: not valid TOML"]),
         (b"\xff", ["overlay wrong.toml: not a text file"]),
     ],
