@@ -8,10 +8,10 @@ from dataclasses import replace
 from itertools import combinations
 
 from clients.plan.front import Choice, Wish
-from clients.plan.points import Point
+from clients.plan.measurements import Measurement
 
 
-def untried(points: Sequence[Point], wish: Wish, choice: Choice, uncertainty: float) -> list[dict[str, str]]:
+def untried(points: Sequence[Measurement], wish: Wish, choice: Choice, uncertainty: float) -> list[dict[str, str]]:
     """Returns combinations of two points that may be better than `choice`, the most promising first.
 
     Factors by which each alone changes time and error of the scene's own settings are multiplied. That is good for an
@@ -34,7 +34,7 @@ def untried(points: Sequence[Point], wish: Wish, choice: Choice, uncertainty: fl
     return [guess.settings for guess in found]
 
 
-def _product(own: Point, a: Point, b: Point, settings: dict[str, str]) -> Point:
+def _product(own: Measurement, a: Measurement, b: Measurement, settings: dict[str, str]) -> Measurement:
     error, seconds, p99 = (
         getattr(a, name) * getattr(b, name) / max(getattr(own, name), 1e-30) for name in ("error", "seconds", "p99")
     )

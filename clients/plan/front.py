@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from clients.errors import BadInput
-from clients.plan.points import Point
+from clients.plan.measurements import Measurement
 
 
 @dataclass(frozen=True)
@@ -22,11 +22,11 @@ class Budget:
     step: float
     cheapest: ClassVar[bool] = False
 
-    def cost(self, point: Point) -> float:
+    def cost(self, point: Measurement) -> float:
         """Returns the part of the time that is used: of that of a step, or of a second that is simulated."""
         return max(point.p99 / self.step, point.seconds)
 
-    def fits(self, point: Point, uncertainty: float) -> bool:
+    def fits(self, point: Measurement, uncertainty: float) -> bool:
         """Returns True if the point is as wished."""
         return self.cost(point) <= 1
 
@@ -44,11 +44,11 @@ class Exactness:
     position: float
     cheapest: ClassVar[bool] = True
 
-    def cost(self, point: Point) -> float:
+    def cost(self, point: Measurement) -> float:
         """Returns the wall time a simulated second."""
         return point.seconds
 
-    def fits(self, point: Point, uncertainty: float) -> bool:
+    def fits(self, point: Measurement, uncertainty: float) -> bool:
         """Returns True if the point is as wished, also where the reference is off as far as it may be [m]."""
         return bound(point, uncertainty) <= self.position
 
@@ -78,30 +78,30 @@ class Choice:
     point: the best one as wished; if none is as wished, the nearest to it
     """
 
-    point: Point
+    point: Measurement
     reached: bool
-    cheaper: Point | None
-    more_exact: Point | None
+    cheaper: Measurement | None
+    more_exact: Measurement | None
 
 
-def bound(point: Point, uncertainty: float) -> float:
+def bound(point: Measurement, uncertainty: float) -> float:
     """Returns what the error is at most: errors below the uncertainty of the reference [m] say no more than that."""
     return max(point.error, uncertainty) + uncertainty
 
 
-def front(points: Sequence[Point], cost: Callable[[Point], float], uncertainty: float) -> list[Point]:
+def front(points: Sequence[Measurement], cost: Callable[[Measurement], float], uncertainty: float) -> list[Measurement]:
     """Returns the points that no other one improves in cost and in error; the cheapest, least exact one first.
 
     Errors below the uncertainty of the reference count as equal.
     """
-    found: list[Point] = []
+    found: list[Measurement] = []
     for point in sorted(points, key=lambda p: (cost(p), max(p.error, uncertainty), len(p.settings), p.error)):
         if not found or max(point.error, uncertainty) < max(found[-1].error, uncertainty):
             found.append(point)
     return found
 
 
-def choose(points: Sequence[Point], wish: Wish, uncertainty: float) -> Choice:
+def choose(points: Sequence[Measurement], wish: Wish, uncertainty: float) -> Choice:
     """Chooses from at least one point. uncertainty: of the reference [m]"""
     along = front(points, wish.cost, uncertainty)
     fitting = [k for k, point in enumerate(along) if wish.fits(point, uncertainty)]

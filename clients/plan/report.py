@@ -9,18 +9,18 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from clients.plan.front import Budget, Choice, Wish, bound
-from clients.plan.points import Point, Points
+from clients.plan.measurements import Measurement, Measurements
 
 if TYPE_CHECKING:
     from rich.table import Table
 
 
-def settings(point: Point) -> str:
+def settings(point: Measurement) -> str:
     """Returns settings as they are written on a command line."""
     return " ".join(f"{key}={value}" for key, value in point.settings.items()) or "the scene as it is"
 
 
-def figures(point: Point, points: Points) -> str:
+def figures(point: Measurement, points: Measurements) -> str:
     """Returns what was measured, in words."""
     iterations = "" if math.isnan(point.iterations) else f", {point.iterations:.3g} iterations a step"
     return (
@@ -29,17 +29,17 @@ def figures(point: Point, points: Points) -> str:
     )
 
 
-def answer(points: Points, wish: Wish, choice: Choice) -> str:
+def answer(points: Measurements, wish: Wish, choice: Choice) -> str:
     """Returns the first sentence."""
     point = choice.point
     if choice.reached:
         best = "the cheapest" if wish.cheapest else "the most exact"
-        return f"{wish}: {best} of {len(points.points)} measured settings: {settings(point)}"
+        return f"{wish}: {best} of {len(points.usable)} measured settings: {settings(point)}"
     what = "the most exact ones" if wish.cheapest else "the nearest ones"
-    return f"{wish}: none of {len(points.points)} measured settings; {what}: {settings(point)}"
+    return f"{wish}: none of {len(points.usable)} measured settings; {what}: {settings(point)}"
 
 
-def notes(points: Points, wish: Wish, choice: Choice, untried: Sequence[dict[str, str]]) -> list[str]:
+def notes(points: Measurements, wish: Wish, choice: Choice, untried: Sequence[dict[str, str]]) -> list[str]:
     """Returns what else there is to say of a choice, a sentence each."""
     point = choice.point
     told = [_margin(points, wish, choice), *_reference(points, wish, choice)]
@@ -56,7 +56,7 @@ def notes(points: Points, wish: Wish, choice: Choice, untried: Sequence[dict[str
     return told
 
 
-def _margin(points: Points, wish: Wish, choice: Choice) -> str:
+def _margin(points: Measurements, wish: Wish, choice: Choice) -> str:
     point = choice.point
     if isinstance(wish, Budget):
         step = f"p99 {point.p99:.3g} of {wish.step:g} ms ({_share(point.p99 / wish.step)})"
@@ -73,7 +73,7 @@ def _share(used: float) -> str:
     return f"{100 * (1 - used):.0f} % left" if used <= 1 else f"{used:.3g} times too much"
 
 
-def _reference(points: Points, wish: Wish, choice: Choice) -> list[str]:
+def _reference(points: Measurements, wish: Wish, choice: Choice) -> list[str]:
     """Returns what the uncertainty of the reference leaves open."""
     if points.uncertainty is None:
         return ["how exact the reference is was not measured; the errors are distances from it"]
@@ -88,7 +88,7 @@ def _reference(points: Points, wish: Wish, choice: Choice) -> list[str]:
     return []
 
 
-def _error(point: Point, points: Points) -> str:
+def _error(point: Measurement, points: Measurements) -> str:
     if points.uncertainty is None:
         return f"{point.error:.2g} m"
     if point.error <= points.uncertainty:
@@ -96,32 +96,33 @@ def _error(point: Point, points: Points) -> str:
     return f"{point.error:.2g} m (+- {points.uncertainty:.2g} m)"
 
 
-def comments(points: Points, wish: Wish, choice: Choice, use: str, mark: str) -> list[str]:
+def comments(points: Measurements, wish: Wish, choice: Choice, use: str, mark: str) -> list[str]:
     """Returns the comments of an overlay. use: the command that takes it; mark: begins the first one"""
-    machine = ", ".join(f"{key} {value}" for key, value in points.machine.items())
+    machine = ", ".join(f"{key} {value}" for key, value in points.found.machine.items())
     near = (("cheaper", choice.cheaper), ("more exact", choice.more_exact))
     return [
-        f"{mark} for {points.scene}: {wish}.",
+        f"{mark} for {points.found.scene}: {wish}.",
         f"Use: {use}",
         "",
         f"Measured: {figures(choice.point, points)};",
-        f"  axis {choice.point.axis!r}, {points.duration:g} s simulated on {points.device} ({machine}).",
+        f"  axis {choice.point.axis!r}, {points.found.duration:g} s simulated on {points.found.device} ({machine}).",
         *(f"Next, {word}: {settings(p)}: {figures(p, points)}." for word, p in near if p is not None),
-        f"Digest of the scene: {points.digest}",
+        f"Digest of the scene: {points.found.digest}",
     ]  # fmt: skip
 
 
-def as_json(points: Points, wish: Wish, choice: Choice, untried: Sequence[dict[str, str]]) -> dict[str, Any]:
+def as_json(points: Measurements, wish: Wish, choice: Choice, untried: Sequence[dict[str, str]]) -> dict[str, Any]:
     """Returns the answer for programs."""
 
-    def shown(point: Point | None) -> dict[str, Any] | None:
+    def shown(point: Measurement | None) -> dict[str, Any] | None:
         if point is None:
             return None
         found = {**asdict(point), "bound": bound(point, points.floor), "fits": wish.fits(point, points.floor)}
         return {key: None if isinstance(v, float) and math.isnan(v) else v for key, v in found.items()}
 
+    found = points.found
     return {
-        "scene": points.scene, "digest": points.digest, "device": points.device, "machine": points.machine,
+        "scene": found.scene, "digest": found.digest, "device": found.device, "machine": found.machine,
         "wish": {"budget_ms": wish.step} if isinstance(wish, Budget) else {"position": wish.position},
         "reached": choice.reached, "chosen": shown(choice.point), "cheaper": shown(choice.cheaper),
         "more_exact": shown(choice.more_exact), "uncertainty": points.uncertainty,
@@ -129,7 +130,7 @@ def as_json(points: Points, wish: Wish, choice: Choice, untried: Sequence[dict[s
     }  # fmt: skip
 
 
-def table(points: Points, choice: Choice) -> Table:
+def table(points: Measurements, choice: Choice) -> Table:
     """Returns a table of the choice and its neighbours on the front."""
     from rich.table import Table
 

@@ -12,7 +12,7 @@ from clients.errors import BadInput
 from clients.plan import overlay, report
 from clients.plan.combinations import untried
 from clients.plan.front import Choice, Wish, choose
-from clients.plan.points import Points, read
+from clients.plan.measurements import Measurements, read
 from clients.plan.scene import digest
 
 
@@ -23,7 +23,7 @@ class Plan:
     untried: settings that were measured apart only; to: the overlay written, None if nothing is as wished
     """
 
-    points: Points
+    points: Measurements
     wish: Wish
     choice: Choice
     untried: list[dict[str, str]]
@@ -57,18 +57,18 @@ def plan(scene: Path, wish: Wish, where: Path | None, to: Path | None) -> Plan:
     to = to or scene.with_suffix(".plan.toml")
     overlay.check_path(to)
     points = checked(scene, where or scene.with_suffix(".accuracy"))
-    choice = choose(points.points, wish, points.floor)
-    device = ["--device", points.device] if points.device in ("cpu", "gpu") else []
+    choice = choose(points.usable, wish, points.floor)
+    device = ["--device", points.found.device] if points.found.device in ("cpu", "gpu") else []
     use = shlex.join(["sim-server", str(scene), *device, "--set", f"@{to}"])
     found = Plan(
-        points, wish, choice, untried(points.points, wish, choice, points.floor), to if choice.reached else None, use
+        points, wish, choice, untried(points.usable, wish, choice, points.floor), to if choice.reached else None, use
     )
     if choice.reached:
         overlay.write(to, choice.point.settings, report.comments(points, wish, choice, use, overlay.MARK))
     return found
 
 
-def checked(scene: Path, where: Path) -> Points:
+def checked(scene: Path, where: Path) -> Measurements:
     """Reads the points of a scene. Raises BadInput if there are none, or only those of another scene."""
     known = digest(scene)
     first = f"first: sim-client accuracy {shlex.quote(str(scene))}"
@@ -76,11 +76,11 @@ def checked(scene: Path, where: Path) -> Points:
     if not path.exists():
         raise BadInput(f"{path}: no such file; settings are chosen from what was measured, {first}")
     points = read(path)
-    if points.digest != known:
+    if points.found.digest != known:
         raise BadInput(
-            f"{path}: measured of another scene, or of this one with other values (digest {points.digest[:12]}, "
+            f"{path}: measured of another scene, or of this one with other values (digest {points.found.digest[:12]}, "
             f"{scene} has {known[:12]}); {first}"
         )
-    if not points.points:
+    if not points.usable:
         raise BadInput(f"{path}: no measurement has come to its end; {first}")
     return points
