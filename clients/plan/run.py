@@ -3,79 +3,105 @@
 
 from __future__ import annotations
 
+import json
 import shlex
-from dataclasses import dataclass
+import time
 from pathlib import Path
-from typing import Any
 
+from clients.accuracy.runs import Run
+from clients.accuracy.study import Study
 from clients.errors import BadInput
-from clients.plan import overlay, report
+from clients.plan import overlay
+from clients.plan.answer import Answer, words
 from clients.plan.combinations import untried
-from clients.plan.front import Choice, Wish, choose
+from clients.plan.front import Wish, choose
+from clients.plan.measure import measure, probe
 from clients.plan.measurements import Measurements, read
-from clients.plan.scene import digest
+from clients.progress import titled_progress_bar
+
+SHARE = 0.8  # of the time for measurements that those of sim-client accuracy take, where there are none yet
+DURATION = 1.0  # s that is simulated in them
 
 
-@dataclass(frozen=True)
-class Plan:
-    """An answer.
+def plan(scene: Path, wish: Wish, where: Path | None, to: Path | None, minutes: float, as_json: bool) -> bool:
+    """Proposes settings of a scene, writes and prints them; returns False if none are as wished.
 
-    untried: settings that were measured apart only; to: the overlay written, None if nothing is as wished
-    """
-
-    points: Measurements
-    wish: Wish
-    choice: Choice
-    untried: list[dict[str, str]]
-    to: Path | None
-    use: str
-
-    def as_json(self) -> dict[str, Any]:
-        """Returns the answer for programs."""
-        found = report.as_json(self.points, self.wish, self.choice, self.untried)
-        return {**found, "overlay": str(self.to) if self.to else None, "use": self.use if self.to else None}
-
-    def show(self) -> None:
-        """Prints the answer for people."""
-        from rich.console import Console
-
-        print(report.answer(self.points, self.wish, self.choice))
-        Console().print(report.table(self.points, self.choice))
-        for note in report.notes(self.points, self.wish, self.choice, self.untried):
-            print(f"- {note}")
-        if self.to:
-            print(f"wrote {self.to}:\n  {self.use}")
-
-
-def plan(scene: Path, wish: Wish, where: Path | None, to: Path | None) -> Plan:
-    """Proposes settings of a scene and writes them.
-
-    where: of the points, a file or its folder; to: overlay to write; None: beside the scene
+    where: of the points, a file or its folder, None: where sim-client accuracy leaves them; to: overlay to write,
+    None: beside the scene; minutes: for measurements, 0: none
 
     Raises BadInput if there are no points of this scene, or `to` is another file.
     """
     to = to or scene.with_suffix(".plan.toml")
     overlay.check_path(to)
-    points = checked(scene, where or scene.with_suffix(".accuracy"))
-    choice = choose(points.usable, wish, points.floor)
-    device = ["--device", points.found.device] if points.found.device in ("cpu", "gpu") else []
+    where = where or Path(f"accuracy-{scene.stem}")
+    path = where if where.suffix == ".json" else where / "points.json"
+    found = measured(scene, wish, path, minutes) if minutes else answer(scene, wish, path)
+    device = ["--device", found.points.found.device] if found.points.found.device in ("cpu", "gpu") else []
     use = shlex.join(["sim-server", str(scene), *device, "--set", f"@{to}"])
-    found = Plan(
-        points, wish, choice, untried(points.usable, wish, choice, points.floor), to if choice.reached else None, use
-    )
-    if choice.reached:
-        overlay.write(to, choice.point.settings, report.comments(points, wish, choice, use, overlay.MARK))
-    return found
+    if found.choice.reached:
+        overlay.write(to, found.choice.point.settings, found.comments(overlay.MARK, use))
+    if as_json:
+        written = {"overlay": str(to), "use": use} if found.choice.reached else {"overlay": None, "use": None}
+        print(json.dumps(found.as_json() | written, allow_nan=False))
+    else:
+        show(found)
+        print(f"wrote {to}:\n  {use}" if found.choice.reached else "nothing is written")
+    return found.choice.reached
 
 
-def checked(scene: Path, where: Path) -> Measurements:
-    """Reads the points of a scene. Raises BadInput if there are none, or only those of another scene."""
-    known = digest(scene)
+def show(found: Answer) -> None:
+    """Prints an answer for people."""
+    from rich.console import Console
+
+    print(found.first())
+    Console().print(found.table())
+    for note in found.notes():
+        print(f"- {note}")
+
+
+def answer(scene: Path, wish: Wish, path: Path) -> Answer:
+    """Chooses from the points in a file."""
+    return chosen(wish, checked(scene, path)[0])
+
+
+def chosen(wish: Wish, points: Measurements) -> Answer:
+    """Chooses from points."""
+    choice = choose(points.usable, wish, points.floor)
+    return Answer(points, wish, choice, untried(points, wish, choice))
+
+
+def measured(scene: Path, wish: Wish, path: Path, minutes: float) -> Answer:
+    """Chooses after measurements: all points if there are none, then combinations while time is left."""
+    began = time.monotonic()
+    with titled_progress_bar(60 * minutes) as progress:
+        if not path.exists():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            Study(scene, path.parent, DURATION, "auto", progress).run(SHARE * minutes)
+        points, probed = checked(scene, path)
+        while found := chosen(wish, points).untried:
+            left = began + 60 * minutes - time.monotonic()
+
+            def tick(settings: dict[str, str] = found[0]) -> None:
+                progress(time.monotonic() - began, words(settings))
+
+            if left <= 0 or not measure(scene, path.parent, points.found, probed, found[0], left, tick):
+                break
+            points = read(path)
+    return chosen(wish, points)
+
+
+def checked(scene: Path, path: Path) -> tuple[Measurements, Run]:
+    """Reads the points of a scene; returns them and a run of one step.
+
+    Raises BadInput if there are none, or only those of another scene.
+    """
     first = f"first: sim-client accuracy {shlex.quote(str(scene))}"
-    path = where / "points.json" if where.is_dir() or where.suffix != ".json" else where
     if not path.exists():
-        raise BadInput(f"{path}: no such file; settings are chosen from what was measured, {first}")
+        if not scene.is_file():
+            raise BadInput(f"{scene}: no such file")
+        raise BadInput(f"{path}: no such file; settings are chosen from what was measured, {first} (or --measure 5)")
     points = read(path)
+    run, known = probe(scene, points.found.device)
     if points.found.digest != known:
         raise BadInput(
             f"{path}: measured of another scene, or of this one with other values (digest {points.found.digest[:12]}, "
@@ -83,4 +109,4 @@ def checked(scene: Path, where: Path) -> Measurements:
         )
     if not points.usable:
         raise BadInput(f"{path}: no measurement has come to its end; {first}")
-    return points
+    return points, run
