@@ -446,6 +446,33 @@ def load(
 
 
 @app.command()
+def accuracy(
+    scene: Annotated[Path, typer.Argument(metavar="SCENE.toml", help="What to measure.")],
+    minutes: Annotated[float, typer.Option(metavar="M", help="Time to spend; 0: only draw what is there.")] = 5.0,
+    duration: Annotated[float, typer.Option(metavar="S", help="Simulated in each run.")] = 1.0,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="For the results; by default accuracy-SCENE.")
+    ] = None,
+    device: Annotated[str, typer.Option(metavar="auto|cpu|gpu", help="Of the servers.")] = "auto",
+    as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
+) -> None:
+    """Measure what accuracy costs in a scene: runs it at many settings and compares them with a reference.
+
+    Starts a server for each run. Points are kept as they come: after the time given or Ctrl-C the same command goes
+    on. Writes points.json, points.csv, accuracy.png and accuracy.html.
+
+    \b
+    Examples:
+      sim-client accuracy deploy/scenes/beam.toml
+      sim-client accuracy beam.toml --minutes 20 --duration 2 --out out/beam
+      sim-client accuracy beam.toml --json | jq .sentence
+    """
+    from clients.accuracy import command
+
+    command.accuracy(scene, out, minutes, duration, device, as_json)
+
+
+@app.command()
 def plan(
     scene: Annotated[Path, typer.Argument(metavar="SCENE.toml", help="What is to be simulated.")],
     budget_ms: Annotated[
@@ -453,9 +480,12 @@ def plan(
     ] = None,
     position: Annotated[float | None, typer.Option(metavar="M", help="Error that a node may have, m.")] = None,
     points: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="points.json, or its folder; else SCENE.accuracy.")
+        Path | None, typer.Option(metavar="FILE", help="points.json or its folder; by default accuracy-SCENE.")
     ] = None,
-    to: Annotated[Path | None, typer.Option(metavar="FILE.toml", help="Overlay; else SCENE.plan.toml.")] = None,
+    measure: Annotated[
+        float, typer.Option(metavar="MINUTES", help="Time for measurements first: what may be better.")
+    ] = 0.0,
+    to: Annotated[Path | None, typer.Option(metavar="FILE.toml", help="Overlay; SCENE.plan.toml.")] = None,
     as_json: Json = False,
 ) -> None:
     """Propose settings of a scene from what was measured, and write them for sim-server --set @FILE.
@@ -463,20 +493,18 @@ def plan(
     With --budget-ms the most exact settings that are fast enough in real time, with --position the cheapest ones that
     are exact enough; measured ones alone (sim-client accuracy), nothing between them. Exit code 1: there are none.
 
+    --measure makes those measurements if there are none, and tries settings together that were measured apart.
+
     \b
     Examples:
       sim-client plan beam.toml --budget-ms 2        and then: sim-server beam.toml --set @beam.plan.toml
       sim-client plan beam.toml --position 1e-3 --to exact.toml
     """
     from clients.plan.front import wish_for
-    from clients.plan.run import plan as choose
+    from clients.plan.run import plan as run
 
-    found = choose(scene, wish_for(budget_ms, position), points, to)
-    if as_json:
-        print(json.dumps(found.as_json()))
-    else:
-        found.show()
-    raise typer.Exit(0 if found.to else 1)
+    reached = run(scene, wish_for(budget_ms, position), points, to, measure, as_json)
+    raise typer.Exit(0 if reached else 1)
 
 
 @app.command()

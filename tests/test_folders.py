@@ -18,7 +18,7 @@ ALLOWED = {  # what each folder imports of its package
     "precond_worker.gpu": {"arrays", "errors", "symbolic"},
     "precond_worker.factorization": {"arrays", "errors", "gpu", "symbolic"},
     "precond_worker.network": {"errors", "remote_assembly"},
-    "clients.accuracy": {"errors", "load_test", "log"},
+    "clients.accuracy": {"errors", "load_test", "log", "progress", "watch"},
     "clients.haptics": {"client", "errors", "obstacle"},
     "clients.log": {"errors"},
     "clients.viewer": {"client", "errors", "log", "progress"},

@@ -25,6 +25,7 @@ from clients.log.reader import Log
 
 POLL = 0.05  # s between looks at a process
 ATTEMPTS = 3  # of a start whose port was taken meanwhile
+SOLVED = ("converged", "max_linearizations")  # every linear system was solved
 RUN_AWAY = ("runaway", "not_finite")
 
 
@@ -140,22 +141,25 @@ def _outcome(code: int | None, log: Path, said: Path, interval: float) -> Run:
 
 def read_run(log: Log, interval: float) -> Run:
     """Reads a run from its log; it has diverged where a body has run away or is not finite."""
+    run = Run("failed", "; ".join(log.notes) or "its log holds no frames to compare")
     steps = {name: log.scalars(name) for name in log.objects}
     steps = {name: found for name, found in steps.items() if len(found["step"])}
-    trajectory = read_trajectory(log, interval)
-    if not log.complete or log.scene is None or not steps or not len(trajectory.times):
-        return Run("failed", "; ".join(log.notes) or "its log holds no frames to compare")
+    if not log.complete or log.scene is None or not steps:
+        return run
+    run.scene, run.device, run.software = json.loads(log.scene.resolved), log.scene.device, log.scene.software
+    run.trajectory = read_trajectory(log, interval)
+    run.elements = {name: len(log.mesh(name, min(found.meshes)).tets) for name, found in log.objects.items()}
+    if not len(run.trajectory.times):
+        return run
     whole = next(iter(steps.values()))
     times = 1e3 * whole["step_seconds"]
-    simulated = float(whole["time"][-1])
     states = np.concatenate([found["status"] for found in steps.values()])
-    run = Run("done", "", trajectory, 1e-3 * float(times.sum()) / simulated, step_times(times))
+    run.status, run.reason, run.step_ms = "done", "", step_times(times)
+    run.seconds = 1e-3 * float(times.sum()) / float(whole["time"][-1])
     run.iterations = float(sum(found["iterations"].sum() for found in steps.values()) / len(times))
-    run.unconverged = int((states != "converged").sum())
-    run.scene, run.device, run.software = json.loads(log.scene.resolved), log.scene.device, log.scene.software
-    run.elements = {name: len(log.mesh(name, min(found.meshes)).tets) for name, found in log.objects.items()}
+    run.unconverged = int((~np.isin(states, SOLVED)).sum())
     bad = {name: set(found["status"].tolist()) & set(RUN_AWAY) for name, found in steps.items()}
-    if not trajectory.finite or any(bad.values()):
+    if not run.trajectory.finite or any(bad.values()):
         run.status = "diverged"
         words = [f"{name}: {', '.join(sorted(found))}".replace("_", " ") for name, found in bad.items() if found]
         run.reason = "; ".join(words[:5]) or "positions are not finite"

@@ -77,10 +77,10 @@ def sentence(found: Points) -> str:
     """Says which source dominates and what to change first, with the measured point that does it at least cost."""
     known = {name: value for name, value in found.sources.items() if value is not None}
     scene = next((p for p in found.points if p.axis == SCENE), None)
+    if scene is not None and scene.status != "done":
+        return f"The scene's own settings do not work ({scene.reason or scene.status}): change them first."
     if not set(known) - {MODEL} or scene is None or scene.error is None:
         return "No error could be told by its source."
-    if scene.status != "done":
-        return f"The scene's own settings do not work ({scene.reason}): change them first."
     errors = {name: value for name, value in known.items() if name != MODEL}
     first = max(errors, key=lambda name: errors[name])
     others = ", ".join(f"{name} {_length(errors[name])}" for name in SOURCES if name in errors and name != first)

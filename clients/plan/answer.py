@@ -72,7 +72,7 @@ class Answer:
             return ["how exact the reference is was not measured; the errors are distances from it"]
         if isinstance(self.wish, Exactness) and not self.choice.reached and error <= self.wish.position:
             return [
-                f"the distance from the reference is {error:.2g} m, but the reference itself is uncertain by {u:.2g} m: "
+                f"the distance from the reference is {error:.2g} m, but the reference is uncertain by {u:.2g} m: "
                 "a finer one could confirm it"
             ]
         if error <= u:

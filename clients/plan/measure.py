@@ -30,12 +30,15 @@ def probe(scene: Path, device: str) -> tuple[Run, str]:
 
 
 def measure(
-    scene: Path, folder: Path, found: Points, probed: Run, settings: Settings, left: float, tick: Callable[[], None]
+    scene: Path, path: Path, found: Points, probed: Run, settings: Settings, left: float, tick: Callable[[], None]
 ) -> bool:
-    """Adds a point with these settings to `found` and its file; returns False if it was not over in `left` seconds."""
-    reference = load_trajectory(folder / "runs" / "reference.npz")
+    """Adds a point with these settings to `found` and its file; returns False if it was not over in `left` seconds.
+
+    path: of points.json; probed: a run of the scene as it is. Raises BadInput if the run of the reference is gone.
+    """
+    reference = load_trajectory(path.parent / "runs" / "reference.npz")
     if reference is None:
-        raise BadInput(f"{folder}: the run of the reference is gone; --measure needs it to compare with")
+        raise BadInput(f"{path.parent}: the run of the reference is gone; --measure needs it to compare with")
     task = Task(scene, found.dt, found.duration, found.interval, found.device)
     workers = int(SceneValues(probed.scene, found.device).wants_workers(settings))
     run = run_point(task, settings, workers, left, tick)
@@ -46,5 +49,5 @@ def measure(
     else:
         sizes = {name: values["size"] for name, values in found.objects.items()}
         found.points.append(point_of(AXIS, settings, run, reference, sizes))
-    save(found, folder / "points.json")
+    save(found, path)
     return True

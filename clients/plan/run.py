@@ -8,6 +8,7 @@ import shlex
 import time
 from pathlib import Path
 
+from clients.accuracy.command import MOST_MINUTES, write
 from clients.accuracy.runs import Run
 from clients.accuracy.study import Study
 from clients.errors import BadInput
@@ -31,6 +32,8 @@ def plan(scene: Path, wish: Wish, where: Path | None, to: Path | None, minutes: 
 
     Raises BadInput if there are no points of this scene, or `to` is another file.
     """
+    if not 0 <= minutes <= MOST_MINUTES:
+        raise BadInput(f"--measure {minutes:g}: allowed is 0 (nothing is measured) to {MOST_MINUTES:g} minutes")
     to = to or scene.with_suffix(".plan.toml")
     overlay.check_path(to)
     where = where or Path(f"accuracy-{scene.stem}")
@@ -76,7 +79,7 @@ def measured(scene: Path, wish: Wish, path: Path, minutes: float) -> Answer:
     with titled_progress_bar(60 * minutes) as progress:
         if not path.exists():
             path.parent.mkdir(parents=True, exist_ok=True)
-            Study(scene, path.parent, DURATION, "auto", progress).run(SHARE * minutes)
+            write(Study(scene, path.parent, DURATION, "auto", progress).run(SHARE * minutes), path.parent)
         points, probed = checked(scene, path)
         while found := chosen(wish, points).untried:
             left = began + 60 * minutes - time.monotonic()
@@ -84,7 +87,7 @@ def measured(scene: Path, wish: Wish, path: Path, minutes: float) -> Answer:
             def tick(settings: dict[str, str] = found[0]) -> None:
                 progress(time.monotonic() - began, words(settings))
 
-            if left <= 0 or not measure(scene, path.parent, points.found, probed, found[0], left, tick):
+            if left <= 0 or not measure(scene, path, points.found, probed, found[0], left, tick):
                 break
             points = read(path)
     return chosen(wish, points)

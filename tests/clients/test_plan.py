@@ -6,19 +6,26 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from clients.__main__ import app
+from clients.accuracy.points import Points
+from clients.accuracy.runs import Run
+from clients.accuracy.trajectories import Trajectory, save_trajectory
 from clients.errors import BadInput
 from clients.load_test.processes import free_endpoint
 from clients.plan import overlay
 from clients.plan.combinations import untried
-from clients.plan.front import Budget, Exactness, bound, choose, front, wish_for
-from clients.plan.measurements import Measurement, read
-from clients.plan.run import plan
-from clients.plan.scene import digest
+from clients.plan.front import Budget, Exactness, Wish, bound, choose, front, wish_for
+from clients.plan.measure import probe
+from clients.plan.measurements import Measurement, Measurements, read
+from clients.plan.run import answer, measured, plan
 from sim_server.scene import load
 from tests.support.commands import in_turn
 
@@ -34,6 +41,7 @@ mesh = { bar = [3, 1, 1], size = [3, 1, 1] }
 corotational = { young = 1e5, poisson = 0.3 }
 fixed = { where = "X < 0.01" }
 """
+RESOLVED = {"integrator": {"scheme": "backward_euler"}, "solver": {"preconditioner": "auto"}}
 
 
 def row(settings: dict[str, str], error: float | None, seconds: float, p99: float, **more: Any) -> dict[str, Any]:
@@ -64,22 +72,23 @@ ROWS = [
 
 @pytest.fixture
 def resolved(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leaves the process aside that resolves a scene."""
-    monkeypatch.setattr("clients.plan.run.digest", lambda scene: "made-up")
+    """Leaves the server aside that tells the digest of a scene."""
+    monkeypatch.setattr("clients.plan.run.probe", lambda scene, device: (Run("done", scene=RESOLVED), "made-up"))
 
 
 def points_file(folder: Path, rows: list[dict[str, Any]] = ROWS, **more: Any) -> Path:
     """A folder with a scene and its points; returns the scene."""
     scene = folder / "beam.toml"
     scene.write_text(SCENE)
-    (folder / "beam.accuracy").mkdir(exist_ok=True)
+    (folder / "accuracy-beam").mkdir(exist_ok=True)
     found = {
-        "version": 1, "scene": "beam.toml", "digest": "made-up", "duration": 1.0, "device": "cpu",
-        "machine": {"cpu": "made-up", "cores": "2"}, "reference": {"settings": {"dt": "1e-4"}, "uncertainty": 1e-5},
+        "version": 1, "scene": "beam.toml", "digest": "made-up", "device": "cpu", "duration": 1.0,
+        "dt": 0.02, "interval": 0.04, "machine": {"cpu": "made-up", "cores": "2"},
+        "reference": {"settings": {"dt": "1e-4"}, "uncertainty": 1e-5},
         "objects": {"beam": {"size": 3.0, "nodes": 16, "elements": 18}}, "points": rows,
-        "sources": {"time step": 3e-2}, "sentence": "",
+        "sources": {"time step": 3e-2, "mesh": 4e-2}, "sentence": "",
     }  # fmt: skip
-    (folder / "beam.accuracy" / "points.json").write_text(json.dumps(found | more))
+    (folder / "accuracy-beam" / "points.json").write_text(json.dumps(found | more))
     return scene
 
 
@@ -129,41 +138,80 @@ def test_wishes_are_checked(budget: float | None, position: float | None, words:
         wish_for(budget, position)
 
 
+def chosen(folder: Path, wish: Wish) -> Any:
+    """The answer for the points in a folder."""
+    return answer(folder / "beam.toml", wish, folder / "accuracy-beam" / "points.json")
+
+
 @pytest.mark.usefixtures("resolved")
-def test_a_plan_tells_what_was_measured(tmp_path: Path) -> None:
-    found = plan(points_file(tmp_path), Budget(2), None, None)
-    told = found.as_json()
+def test_an_answer_tells_what_was_measured(tmp_path: Path) -> None:
+    points_file(tmp_path)
+    told = chosen(tmp_path, Budget(2)).as_json()
     assert told["chosen"]["settings"] == {"integrator.scheme": "newmark", "dt": "0.005"} and told["reached"]
     assert told["cheaper"]["settings"] == {"dt": "0.005"} and told["more_exact"]["p99"] == 18.0
     assert not told["more_exact"]["fits"] and told["uncertainty"] == 1e-5
-    assert any("p99 1.2 of 2 ms (40 % left), 0.24 of 1 s a simulated second (76 % left)" in n for n in told["notes"])
+    assert "p99 1.2 of 2 ms (40 % left), 0.24 of 1 s a simulated second (76 % left)" in told["notes"]
     assert any(note.startswith("measurements left out: 1 diverged, 1 of another body") for note in told["notes"])
+    assert "the mesh is off by about 0.04 m, which these settings do not change" in told["notes"]
     json.dumps(told, allow_nan=False)
-    found = plan(tmp_path / "beam.toml", Exactness(7e-3), None, tmp_path / "other.toml")
-    assert found.choice.point.settings == {"dt": "0.005"} and (tmp_path / "other.toml").is_file()
 
 
 @pytest.mark.usefixtures("resolved")
 def test_an_unreachable_wish_names_the_nearest_point_and_writes_nothing(tmp_path: Path) -> None:
     scene = points_file(tmp_path)
-    found = plan(scene, Exactness(1e-5), None, None)
-    assert found.choice.point.settings == {"integrator.scheme": "ros2"} and not found.choice.reached
-    assert found.as_json()["overlay"] is None and not (tmp_path / "beam.plan.toml").exists()
-    found = plan(scene, Exactness(1.05e-4), None, None)  # measured 1e-4, but the reference is not that certain
-    assert any("a finer one could confirm it" in note for note in found.as_json()["notes"])
+    words = ["plan", str(scene), "--position", "1e-5", "--points", str(tmp_path / "accuracy-beam")]
+    done = CliRunner().invoke(app, words)
+    assert "none of 8 measured settings; the most exact ones: integrator.scheme=ros2" in done.stdout
+    assert done.exit_code == 1 and done.stdout.endswith("nothing is written\n")
+    assert json.loads(CliRunner().invoke(app, [*words, "--json"]).stdout)["reached"] is False
+    assert not (tmp_path / "beam.plan.toml").exists()
+    found = chosen(tmp_path, Exactness(1.05e-4))  # measured 1e-4, but the reference is not that certain
+    assert not found.choice.reached and any("a finer one could confirm it" in note for note in found.notes())
 
 
 @pytest.mark.usefixtures("resolved")
 def test_settings_measured_apart_are_named_but_not_proposed(tmp_path: Path) -> None:
-    found = plan(points_file(tmp_path), Exactness(7e-3), None, None)
+    points_file(tmp_path)
+    found = chosen(tmp_path, Exactness(7e-3))
     assert found.choice.point.settings == {"dt": "0.005"}
     assert found.untried[0] == {"solver.tolerance": "1e-2", "dt": "0.005"}
-    assert "measured apart but not together" in found.as_json()["notes"][-1]
-    together = made("own", 6.1e-3, 0.1, 0.4)
-    object.__setattr__(together, "settings", found.untried[0])
-    points = [*found.points.usable, together]
-    choice = choose(points, Exactness(7e-3), 0.0)
-    assert choice.point is together and together.settings not in untried(points, Exactness(7e-3), choice, 0.0)
+    assert any(note.startswith("measured apart but not together") for note in found.notes())
+    points_file(tmp_path, [*ROWS, row(found.untried[0], 6.1e-3, 0.1, 0.4)])
+    again = chosen(tmp_path, Exactness(7e-3))
+    assert again.choice.point.settings == found.untried[0] not in again.untried
+
+
+def test_a_table_and_what_is_in_it_are_not_combined() -> None:
+    table, key = made("integrator", 1e-2, 1, 1), made("integrator.linearizations", 2e-2, 1, 1)
+    other = made("dt", 1e-2, 1, 1)
+    points = Measurements(Points("x"), [made("own", 1e-1, 1, 1), table, key, other], Counter(), None)
+    wish = Exactness(1e-2)
+    found = untried(points, wish, choose(points.usable, Exactness(1e-9), 0.0))
+    assert found == [{"integrator": "1", "dt": "1"}, {"integrator.linearizations": "1", "dt": "1"}]
+
+
+@pytest.mark.usefixtures("resolved")
+def test_combinations_are_measured_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, asked = points_file(tmp_path), []
+    rest, times = {"beam": np.zeros((2, 3))}, np.arange(1, 3)
+    still = Trajectory(times, rest, {"beam": np.zeros((2, 2, 3))})
+    save_trajectory(still, tmp_path / "accuracy-beam" / "runs" / "reference.npz")
+
+    def run_point(task: Any, settings: dict[str, str], workers: int, timeout: float, tick: Any) -> Run:
+        asked.append(settings)
+        tick()
+        if len(asked) == 2:
+            return Run("refused", "these do not go together")
+        off = Trajectory(times, rest, {"beam": still.x["beam"] + [5e-3, 0, 0]})
+        return Run("done", "", off, 0.01, {"p50": 0.1, "p99": 0.2, "max": 0.3}, 2.0)
+
+    monkeypatch.setattr("clients.plan.measure.run_point", run_point)
+    path = tmp_path / "accuracy-beam" / "points.json"
+    found = measured(scene, Exactness(7e-3), path, minutes=1)
+    assert found.choice.point.settings == asked[0] == {"solver.tolerance": "1e-2", "dt": "0.005"}
+    assert found.choice.point.error == pytest.approx(5e-3) and found.choice.point.axis == "combination"
+    assert found.untried == [] and len(asked) == len({str(settings) for settings in asked})
+    assert [left["settings"] for left in read(path).found.left_out] == asked[1:2]
 
 
 @pytest.mark.usefixtures("resolved")
@@ -184,7 +232,7 @@ def test_settings_measured_apart_are_named_but_not_proposed(tmp_path: Path) -> N
 def test_what_is_no_measurement_of_this_scene_is_refused(tmp_path: Path, more: dict[str, Any], words: str) -> None:
     scene = points_file(tmp_path, **more)
     with pytest.raises(BadInput, match=words) as error:
-        plan(scene, Budget(2), None, None)
+        chosen(tmp_path, Budget(2))
     if {"digest", "points"} & more.keys() and "cannot" not in words and "finite" not in words:
         assert str(error.value).endswith(f"first: sim-client accuracy {scene}")
 
@@ -225,31 +273,31 @@ def loaded(scene: Path, overrides: list[str]) -> Any:
 
 @pytest.mark.usefixtures("resolved")
 def test_another_file_is_left_as_it_is(tmp_path: Path) -> None:
-    scene = points_file(tmp_path)
-    plan(scene, Budget(2), None, None)
-    plan(scene, Budget(2), None, None)  # its own one is replaced
+    scene, where = points_file(tmp_path), tmp_path / "accuracy-beam"
+    assert plan(scene, Budget(2), where, None, 0, as_json=False)
+    assert plan(scene, Budget(2), where, None, 0, as_json=True)  # its own one is replaced
     with pytest.raises(BadInput, match="was not written by this command"):
-        plan(scene, Budget(2), None, scene)
+        plan(scene, Budget(2), where, scene, 0, as_json=False)
     assert scene.read_text() == SCENE
 
 
 @pytest.mark.system
 def test_the_command_and_a_server_that_takes_the_overlay(tmp_path: Path) -> None:
     scene = points_file(tmp_path)
-    points_file(tmp_path, digest=digest(scene))
-    where = str(scene)
+    points_file(tmp_path, digest=probe(scene, "cpu")[1])
+    where, points = str(scene), ("--points", str(tmp_path / "accuracy-beam"))
     ended = in_turn("clients", [
-        ("plan", where, "--budget-ms", "2"),
-        ("plan", where, "--position", "1e-9", "--json"),
+        ("plan", where, "--budget-ms", "2", *points),
         ("plan", where),
         ("plan", str(tmp_path / "gone.toml"), "--budget-ms", "2"),
         ("plan", where, "--budget-ms", "2", "--points", str(tmp_path / "no")),
+        ("plan", where, "--budget-ms", "2", "--measure", "nan"),
     ])  # fmt: skip
-    good, unreachable, unclear, gone, unmeasured = ended.values()
+    good, *wrong = ended.values()
     assert good[0] == 0 and "integrator.scheme=newmark dt=0.005" in good[1] and "more exact" in good[1], good
-    assert unreachable[0] == 1 and json.loads(unreachable[1])["reached"] is False
-    assert unclear[0] == gone[0] == unmeasured[0] == 2, (unclear, gone, unmeasured)
-    assert "gone.toml" in gone[2] and f"first: sim-client accuracy {where}" in unmeasured[2]
+    unclear, gone, unmeasured, no_time = (err for code, _, err in wrong if code == 2)
+    assert "give one of" in unclear and "gone.toml: no such file" in gone and "--measure nan" in no_time
+    assert f"first: sim-client accuracy {where}" in unmeasured
     text = (tmp_path / "beam.plan.toml").read_text()
     assert text.startswith(f"# {overlay.MARK}") and "error 0.0002 m (+- 1e-05 m)" in text and "made-up" in text
     use = next(line.split(": ", 1)[1] for line in text.splitlines() if line.startswith("# Use: "))

@@ -1,0 +1,326 @@
+# SPDX-License-Identifier: MIT
+"""Measures the points of a scene within a given time, keeps each in points.json as soon as it is there, and goes on."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import platform
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from clients.accuracy.axes import COARSEST, Candidate, SceneValues, candidates, left_out, mesh_settings
+from clients.accuracy.errors import add_round, measure, point_of
+from clients.accuracy.points import SCENE, Point, Points, Settings, load, save
+from clients.accuracy.runs import Run, Task, run_point
+from clients.accuracy.sources import MESH, MODEL, errors_by_source, mesh_error, sentence
+from clients.accuracy.trajectories import Trajectory, distance, extrapolate, load_trajectory, save_trajectory
+from clients.errors import BadInput, ClientError
+
+ROUNDS = 3  # of each point, as far as the time goes
+FRAMES = 24  # compared times, at least half as many where the duration allows
+PARTS = (4, 8, 16, 32, 64)  # of dt: time steps of references; two of them at least
+REFERENCE_SHARE = 0.35  # of the time given, that references may take
+LONGEST_SHARE = 0.25  # of the time given, that one point may take before it counts as timed out
+FINE_ENOUGH = 1e-6  # uncertainty of the reference over the size of the objects, below which no finer one is made
+START_TIMEOUT = 120.0  # s for the first start, which compiles
+NO_TIME = "no time"
+TIMED = ("scheme", "model", "preconditioner")  # axes whose settings are refused one by one; others as a whole
+
+Progress = Callable[[float, str], None]  # seconds gone, and what runs
+
+
+class Study:
+    """Measures a scene and keeps what it finds in a folder: points.json, and runs/*.npz to compare with.
+
+    Raises BadInput for a scene that the server refuses, or a folder with points of another scene.
+    """
+
+    def __init__(self, scene: Path, folder: Path, duration: float, device: str, progress: Progress):
+        self.folder, self._progress, self._began = folder, progress, time.monotonic()
+        self._what = "the scene is read"
+        self._scene_run: Run | None = None
+        probed = self._probe(scene, device)
+        self.values = SceneValues(probed.scene, probed.device)
+        self.task = task_of(scene, self.values.dt, duration, device)
+        fresh = _fresh(scene, self.task, probed)
+        self.found = resumed(folder / "points.json", fresh)
+        self._start = probed.wall  # s that a process takes beside its steps
+
+    def run(self, minutes: float) -> Points:
+        """Measures for so many minutes, or until all is measured; 0: only what is there is looked at."""
+        self._deadline, self._minutes = self._began + 60 * minutes, minutes
+        found = self.found
+        found.left_out = [left for left in found.left_out if left["reason"] != NO_TIME]
+        if minutes > 0:
+            self._keep()
+            self._run_scene()
+            self._reference()
+            self._measure(Candidate(SCENE, {}))
+            wanted = candidates(self.values, found.size)
+            missing = [each for each in wanted if not self._measure(each)]
+            self._more_rounds()
+            found.left_out += [{"axis": c.axis, "settings": c.settings, "reason": NO_TIME} for c in missing]
+        self._sources()
+        if minutes > 0 or found.points:
+            self._keep()
+        return found
+
+    def _probe(self, scene: Path, device: str) -> Run:
+        if not scene.is_file():
+            raise BadInput(f"{scene}: no such file")
+        run = run_point(Task(scene, 1.0, 1.0, 1.0, device), {}, timeout=START_TIMEOUT, tick=self._tick)  # one step
+        if run.status == "refused":
+            raise BadInput(run.reason)
+        if not run.scene or run.trajectory is None:
+            raise ClientError(f"the scene could not be run: {run.reason}")
+        return run
+
+    def _tick(self) -> None:
+        self._progress(time.monotonic() - self._began, self._what)
+
+    def _left(self) -> float:
+        return self._deadline - time.monotonic()
+
+    def _keep(self) -> None:
+        save(self.found, self.folder / "points.json")
+
+    def _run(self, what: str, settings: Settings, timeout: float) -> Run:
+        self._what = what
+        workers = int(self.values.wants_workers(settings))
+        return run_point(self.task, settings, workers, max(timeout, 0.1), self._tick)
+
+    def _run_scene(self) -> None:
+        """Runs the scene's own settings, first of all: what they take tells what other runs will."""
+        if self._kept("scene") is not None and self.found.point({}) is not None:
+            return
+        run = self._run("the scene as it is", {}, self._left())
+        if run.trajectory is None or run.seconds is None:
+            raise ClientError(f"the scene could not be run for {self.task.duration:g} s: {run.reason or run.status}")
+        self._start = max(0.1, run.wall - run.seconds * self.task.duration)
+        self._scene_run = run
+        save_trajectory(run.trajectory, self._file("scene"))
+
+    # -- the reference --
+
+    def _reference(self) -> None:
+        """Makes references with ever smaller time steps; the finest is kept, and its distance from the one before."""
+        if (kept := self._kept("reference")) is not None and self.found.reference["uncertainty"] is not None:
+            self.reference = kept
+            return
+        until = time.monotonic() + REFERENCE_SHARE * 60 * self._minutes
+        said: list[str] = []
+        for choice in range(len(self.values.references(1))):
+            made = self._references(choice, until, said)
+            if len(made) > 1:
+                break
+        else:
+            why = "; ".join(dict.fromkeys(said)) or "there was no time"
+            raise ClientError(f"no two references could be made ({why}); more --minutes or less --duration may help")
+        (previous, before, _), (settings, finest, _) = made[-2:]
+        self.reference = finest
+        uncertainty = distance(finest, before).error
+        self.found.reference = {"settings": settings, "uncertainty": uncertainty, "compared_with": previous}
+        save_trajectory(finest, self._file("reference"))
+        self._keep()
+
+    def _references(self, choice: int, until: float, said: list[str]) -> list[tuple[Settings, Trajectory, float]]:
+        made: list[tuple[Settings, Trajectory, float]] = []
+        for parts in PARTS:
+            settings = self.values.references(parts)[choice]
+            if made and len(made) > 1:
+                apart = distance(made[-1][1], made[-2][1]).error
+                if time.monotonic() + 2.2 * made[-1][2] > until or apart < FINE_ENOUGH * self.found.size:
+                    break
+            run = self._run(f"reference with dt / {parts}", settings, self._left())
+            if run.status != "done" or run.trajectory is None:
+                said.append(f"dt / {parts}: {run.reason or run.status}")
+                break
+            made.append((settings, run.trajectory, run.wall))
+        return made
+
+    # -- points --
+
+    def _measure(self, candidate: Candidate) -> bool:
+        """Measures a point unless it is there or refused; returns False if there is no time for it."""
+        settings, found = candidate.settings, self.found
+        if found.point(settings) is not None or self._is_refused(candidate):
+            return True
+        scene = found.point({})
+        if scene is not None:
+            took = (scene.seconds or 0.0) * self.task.duration * candidate.cost
+            if self._start + took > self._left():
+                return False
+        if not settings and self._scene_run is not None:
+            run = self._scene_run
+        else:
+            longest = 60 * self._minutes * LONGEST_SHARE
+            run = self._run(f"{candidate.axis}: {_short(settings)}", settings, min(longest, self._left()))
+            if run.status == "timed out" and self._left() <= 0:
+                return False
+        if run.status == "refused":
+            found.left_out.append({"axis": candidate.axis, "settings": settings, "reason": run.reason})
+        else:
+            self._add(point_of(candidate.axis, settings, run, self.reference, self._sizes()), run)
+        self._keep()
+        return True
+
+    def _is_refused(self, candidate: Candidate) -> bool:
+        """True if the server refused these settings, or the axis as a whole: its first point, and none was taken."""
+        refused = [left for left in self.found.left_out if left["axis"] == candidate.axis]
+        if any(left["settings"] == candidate.settings for left in refused):
+            return True
+        taken = any(p.axis == candidate.axis for p in self.found.points)
+        return bool(refused) and not taken and candidate.axis not in TIMED
+
+    def _add(self, point: Point, run: Run) -> None:
+        self.found.points.append(point)
+        role = self._role(point)
+        if not role or point.status != "done" or run.trajectory is None:
+            return
+        save_trajectory(run.trajectory, self._file(role))
+        if role in ("coarse", "fine"):
+            self._measure_meshes()
+
+    def _role(self, point: Point) -> str:
+        """Names the trajectory of a point that others are compared with; "" for the rest."""
+        roles = {"scene": {}, "exact_solves": self.values.exact_solves(), "exact_steps": self.values.exact_steps()}
+        roles |= {name: mesh_settings(self.values, name == "fine") for name in ("coarse", "fine")}
+        found = next((role for role, settings in roles.items() if settings == point.settings), "")
+        first = point.axis == "model" and not self._file("model").exists()
+        return found or ("model" if first else "")
+
+    def _measure_meshes(self) -> None:
+        """Measures all points of the axis mesh from the reference extrapolated to a mesh of size zero."""
+        scene, coarse, fine = (self._kept(name) for name in ("scene", "coarse", "fine"))
+        if scene is None or (found := mesh_error(coarse, scene, fine)) is None:
+            return
+        power = 2 ** found[1]
+        if fine is not None:
+            goal = extrapolate(self.reference, scene, fine, power / (power - 1))
+        else:
+            assert coarse is not None
+            goal = extrapolate(self.reference, coarse, scene, 1 / (power - 1))
+        for name, trajectory in (("coarse", coarse), ("fine", fine)):
+            point = self.found.point(mesh_settings(self.values, name == "fine"))
+            if point is not None and trajectory is not None:
+                measure(point, trajectory, goal, self._sizes())
+                point.against = "reference extrapolated to a mesh of size zero"
+
+    def _more_rounds(self) -> None:
+        """Repeats points for the median of their times, those with the fewest rounds first, while there is time."""
+        for rounds in range(1, ROUNDS):
+            for point in self.found.points:
+                if point.status != "done" or len(point.rounds) != rounds or point.seconds is None:
+                    continue
+                if self._start + point.seconds * self.task.duration > self._left():
+                    continue
+                what = f"round {rounds + 1} of {point.axis}: {_short(point.settings)}"
+                run = self._run(what, point.settings, self._left())
+                if run.status == "done":
+                    add_round(point, run)
+                    self._keep()
+
+    # -- what follows from them --
+
+    def _sources(self) -> None:
+        names = ("scene", "exact_solves", "exact_steps", "reference")
+        kept = {name: self._kept(name) for name in (*names, "coarse", "fine", "model")}
+        own = self.found.point({})
+        scene = kept["scene"] = kept["scene"] if own is not None and own.status == "done" else None
+        sources = errors_by_source(*(kept[name] for name in names))
+        if scene is not None and (mesh := mesh_error(kept["coarse"], scene, kept["fine"])) is not None:
+            sources[MESH] = mesh[0]
+        if scene is not None and kept["model"] is not None:
+            sources[MODEL] = distance(scene, kept["model"]).error
+        self.found.sources = sources
+        self.found.sentence = sentence(self.found)
+        asked = [left for left in self.found.left_out if left["settings"]]
+        without = [{"axis": axis, "settings": {}, "reason": reason} for axis, reason in left_out(self.values)]
+        self.found.left_out = asked + without
+
+    def _sizes(self) -> dict[str, float]:
+        return {name: o["size"] for name, o in self.found.objects.items()}
+
+    def _file(self, role: str) -> Path:
+        return self.folder / "runs" / f"{role}.npz"
+
+    def _kept(self, role: str) -> Trajectory | None:
+        return load_trajectory(self._file(role))
+
+
+def task_of(scene: Path, dt: float, duration: float, device: str) -> Task:
+    """Returns the task whose duration and interval are whole numbers of every time step. Raises BadInput."""
+    grid = COARSEST * dt
+    if duration < grid * (1 - 1e-9):
+        raise BadInput(
+            f"--duration {duration:g}: allowed is {grid:g} s at least, {COARSEST} time steps of the scene ({dt:g} s)"
+        )
+    interval = grid * max(1, int(duration / grid / FRAMES))
+    return Task(scene, dt, interval * int(duration / interval * (1 + 1e-9)), interval, device)
+
+
+def resumed(path: Path, fresh: Points) -> Points:
+    """Returns the points of a file, to go on with, or `fresh` if there is none. Raises BadInput for other points."""
+    if not path.exists():
+        return fresh
+    old = load(path)
+    for what in ("digest", "duration", "device"):
+        if getattr(old, what) != getattr(fresh, what):
+            words = {"digest": "the scene has changed since", "duration": f"they are of {old.duration:g} s simulated"}
+            raise BadInput(
+                f"{path.parent} holds points that this run cannot go on with: "
+                f"{words.get(what, f'they were measured on another device ({old.device})')}; "
+                "give another --out, or remove the folder to begin anew"
+            )
+    if old.machine.get("processor") != fresh.machine.get("processor"):
+        raise BadInput(
+            f"{path.parent} holds points of another machine ({old.machine.get('processor')}); give another --out, or "
+            "remove the folder to begin anew"
+        )
+    old.scene, old.objects = fresh.scene, fresh.objects
+    return old
+
+
+def _fresh(scene: Path, task: Task, probed: Run) -> Points:
+    assert probed.trajectory is not None
+    rest = probed.trajectory.rest
+    objects: dict[str, dict[str, float]] = {
+        name: {"size": float(np.ptp(x, axis=0).max()), "nodes": len(x), "elements": probed.elements[name]}
+        for name, x in rest.items()
+    }
+    return Points(
+        str(scene), digest(probed.scene, probed.trajectory), task.duration, task.interval, task.dt, probed.device,
+        machine(probed.software), objects=objects,
+    )  # fmt: skip
+
+
+def digest(resolved: dict[str, Any], trajectory: Trajectory) -> str:
+    """Returns a digest of a resolved scene, but for its name and what its log holds, and of the nodes at rest."""
+    kept = {key: value for key, value in resolved.items() if key not in ("name", "record")}
+    found = hashlib.sha256(json.dumps(kept, sort_keys=True).encode())
+    for name, rest in sorted(trajectory.rest.items()):
+        found.update(name.encode() + rest.tobytes())
+    return found.hexdigest()
+
+
+def machine(software: str) -> dict[str, str]:
+    """Describes this machine."""
+    processor = platform.processor() or platform.machine()
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        processor = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), processor)
+    except OSError:
+        pass
+    return {
+        "processor": processor, "cores": str(os.cpu_count() or 1), "system": platform.platform(), "software": software,
+    }  # fmt: skip
+
+
+def _short(settings: Settings) -> str:
+    return " ".join(f"{key.split('.')[-1]}={value}" for key, value in settings.items())
