@@ -7,8 +7,10 @@ import math
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
+from clients.accuracy.study import NO_TIME
 from clients.plan.front import Budget, Choice, Exactness, Wish, bound
 from clients.plan.measurements import Measurement, Measurements
+from protocol.printable import printable
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -49,6 +51,10 @@ class Answer:
         if points.lost:
             lost = ", ".join(f"{count} {reason}" for reason, count in points.lost.most_common())
             told.append(f"measurements left out: {lost}")
+        if late := sum(left["reason"] == NO_TIME for left in points.found.left_out):
+            told.append(f"settings that had no time to be measured: {late}; sim-client accuracy goes on with them")
+        if not self.choice.reached and points.found.sentence:
+            told.append(printable(points.found.sentence))
         if self.untried:
             told.append(f"measured apart but not together, may be better: {words(self.untried[0])} (--measure MINUTES)")
         return told
