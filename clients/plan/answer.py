@@ -7,7 +7,7 @@ import math
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
-from clients.accuracy.study import NO_TIME
+from clients.accuracy.study import NO_TIME, machine
 from clients.plan.front import Budget, Choice, Exactness, Wish, bound
 from clients.plan.measurements import Measurement, Measurements
 from protocol.printable import printable
@@ -28,6 +28,11 @@ class Answer:
     choice: Choice
     untried: list[dict[str, str]]
 
+    @property
+    def own(self) -> Measurement | None:
+        """The scene with its own settings."""
+        return next((p for p in self.points.usable if not p.settings), None)
+
     def first(self) -> str:
         """Returns the first sentence."""
         count, shown = len(self.points.usable), settings(self.choice.point)
@@ -41,6 +46,8 @@ class Answer:
         """Returns what else there is to say, a sentence each."""
         point, points = self.choice.point, self.points
         told = [self._margin(), *self._reference()]
+        if points.found.machine.get("processor", here := machine("")["processor"]) != here:
+            told.append(f"measured on another machine ({points.found.machine['processor']}): times differ on this one")
         mesh = points.found.sources.get("mesh")
         if mesh is not None and mesh > point.error:
             told.append(f"the mesh is off by about {mesh:.2g} m, which these settings do not change")
@@ -120,8 +127,8 @@ class Answer:
             "scene": found.scene, "digest": found.digest, "device": found.device, "machine": found.machine,
             "wish": {"budget_ms": wish.step} if isinstance(wish, Budget) else {"position": wish.position},
             "reached": choice.reached, "chosen": self._values(choice.point), "cheaper": self._values(choice.cheaper),
-            "more_exact": self._values(choice.more_exact), "uncertainty": self.points.uncertainty,
-            "notes": self.notes(), "untried": self.untried,
+            "more_exact": self._values(choice.more_exact), "as_it_is": self._values(self.own),
+            "uncertainty": self.points.uncertainty, "notes": self.notes(), "untried": self.untried,
         }  # fmt: skip
 
     def _values(self, point: Measurement | None) -> dict[str, Any] | None:
@@ -140,6 +147,8 @@ class Answer:
         found = Table("", "settings", "error, m", "p99, ms", "s per s", "iter.", **COMPACT)
         found.columns[1].overflow = "fold"
         rows = [("chosen" if self.choice.reached else "nearest", self.choice.point), *self._neighbours()]
+        if (own := self.own) is not None and all(own is not p for _, p in rows):
+            rows.append(("", own))
         for word, p in sorted(rows, key=lambda row: -row[1].error):
             iterations = "-" if math.isnan(p.iterations) else f"{p.iterations:.3g}"
             times = f"{p.p99:.3g}", f"{p.seconds:.3g}", iterations

@@ -8,6 +8,7 @@ import shlex
 import time
 from pathlib import Path
 
+from clients.accuracy.axes import SceneValues
 from clients.accuracy.command import MOST_MINUTES, write
 from clients.accuracy.runs import Run
 from clients.accuracy.study import Study
@@ -38,9 +39,8 @@ def plan(scene: Path, wish: Wish, where: Path | None, to: Path | None, minutes: 
     overlay.check_path(to)
     where = where or Path(f"accuracy-{scene.stem}")
     path = where if where.suffix == ".json" else where / "points.json"
-    found = measured(scene, wish, path, minutes) if minutes else answer(scene, wish, path)
-    device = ["--device", found.points.found.device] if found.points.found.device in ("cpu", "gpu") else []
-    use = shlex.join(["sim-server", str(scene), *device, "--set", f"@{to}"])
+    found, probed = measured(scene, wish, path, minutes) if minutes else answer(scene, wish, path)
+    use = shlex.join([*server(scene, found, probed), "--set", f"@{to}"])
     if found.choice.reached:
         overlay.write(to, found.choice.point.settings, found.comments(overlay.MARK, use))
     if as_json:
@@ -62,9 +62,17 @@ def show(found: Answer) -> None:
         print(f"- {note}")
 
 
-def answer(scene: Path, wish: Wish, path: Path) -> Answer:
-    """Chooses from the points in a file."""
-    return chosen(wish, checked(scene, path)[0])
+def server(scene: Path, found: Answer, probed: Run) -> list[str]:
+    """Returns the words that start a server as the chosen settings were measured."""
+    device = found.points.found.device
+    workers = SceneValues(probed.scene, device).wants_workers(found.choice.point.settings)
+    return ["sim-server", str(scene), "--device", device, *(["--workers", "1"] if workers else [])]
+
+
+def answer(scene: Path, wish: Wish, path: Path) -> tuple[Answer, Run]:
+    """Chooses from the points in a file; returns a run of the scene as it is, too."""
+    points, probed = checked(scene, path)
+    return chosen(wish, points), probed
 
 
 def chosen(wish: Wish, points: Measurements) -> Answer:
@@ -73,8 +81,8 @@ def chosen(wish: Wish, points: Measurements) -> Answer:
     return Answer(points, wish, choice, untried(points, wish, choice))
 
 
-def measured(scene: Path, wish: Wish, path: Path, minutes: float) -> Answer:
-    """Chooses after measurements: all points if there are none, then combinations while time is left."""
+def measured(scene: Path, wish: Wish, path: Path, minutes: float) -> tuple[Answer, Run]:
+    """Chooses as `answer`, after measurements: all if there are none, then combinations while time is left."""
     began = time.monotonic()
     with titled_progress_bar(60 * minutes) as progress:
         if not path.exists():
@@ -90,7 +98,7 @@ def measured(scene: Path, wish: Wish, path: Path, minutes: float) -> Answer:
             if left <= 0 or not measure(scene, path, points.found, probed, found[0], left, tick):
                 break
             points = read(path)
-    return chosen(wish, points)
+    return chosen(wish, points), probed
 
 
 def checked(scene: Path, path: Path) -> tuple[Measurements, Run]:

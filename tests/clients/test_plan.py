@@ -83,7 +83,7 @@ def points_file(folder: Path, rows: list[dict[str, Any]] = ROWS, **more: Any) ->
     (folder / "accuracy-beam").mkdir(exist_ok=True)
     found = {
         "version": 1, "scene": "beam.toml", "digest": "made-up", "device": "cpu", "duration": 1.0,
-        "dt": 0.02, "interval": 0.04, "machine": {"cpu": "made-up", "cores": "2"},
+        "dt": 0.02, "interval": 0.04, "machine": {"processor": "made-up", "cores": "2"},
         "reference": {"settings": {"dt": "1e-4"}, "uncertainty": 1e-5},
         "objects": {"beam": {"size": 3.0, "nodes": 16, "elements": 18}}, "points": rows,
         "sources": {"time step": 3e-2, "mesh": 4e-2}, "sentence": "The error of the time step dominates.",
@@ -141,7 +141,7 @@ def test_wishes_are_checked(budget: float | None, position: float | None, words:
 
 def chosen(folder: Path, wish: Wish) -> Any:
     """The answer for the points in a folder."""
-    return answer(folder / "beam.toml", wish, folder / "accuracy-beam" / "points.json")
+    return answer(folder / "beam.toml", wish, folder / "accuracy-beam" / "points.json")[0]
 
 
 @pytest.mark.usefixtures("resolved")
@@ -150,6 +150,8 @@ def test_an_answer_tells_what_was_measured(tmp_path: Path) -> None:
     told = chosen(tmp_path, Budget(2)).as_json()
     assert told["chosen"]["settings"] == {"integrator.scheme": "newmark", "dt": "0.005"} and told["reached"]
     assert told["cheaper"]["settings"] == {"dt": "0.005"} and told["more_exact"]["p99"] == 18.0
+    assert told["as_it_is"]["settings"] == {} and told["as_it_is"]["error"] == 3e-2
+    assert "measured on another machine (made-up): times differ on this one" in told["notes"]
     assert not told["more_exact"]["fits"] and told["uncertainty"] == 1e-5
     assert "p99 1.2 of 2 ms (40 % left), 0.24 of 1 s a simulated second (76 % left)" in told["notes"]
     assert any(note.startswith("measurements left out: 1 diverged, 1 of another body") for note in told["notes"])
@@ -210,7 +212,7 @@ def test_combinations_are_measured_and_kept(tmp_path: Path, monkeypatch: pytest.
 
     monkeypatch.setattr("clients.plan.measure.run_point", run_point)
     path = tmp_path / "accuracy-beam" / "points.json"
-    found = measured(scene, Exactness(7e-3), path, minutes=1)
+    found, _ = measured(scene, Exactness(7e-3), path, minutes=1)
     assert found.choice.point.settings == asked[0] == {"solver.tolerance": "1e-2", "dt": "0.005"}
     assert found.choice.point.error == pytest.approx(5e-3) and found.choice.point.axis == "combination"
     assert found.untried == [] and len(asked) == len({str(settings) for settings in asked})
@@ -306,4 +308,6 @@ def test_the_command_and_a_server_that_takes_the_overlay(tmp_path: Path) -> None
     use = next(line.split(": ", 1)[1] for line in text.splitlines() if line.startswith("# Use: "))
     command = [sys.executable, "-m", "sim_server", *use.split()[1:], "--steps", "2", "--listen", free_endpoint()]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=100)
-    assert done.returncode == 0 and "dt 0.005 s" in done.stdout and "2 steps" in done.stdout, done
+    assert done.returncode == 0, done
+    assert "--device cpu --workers 1 --set" in use
+    assert "dt 0.005 s" in done.stdout and "2 steps" in done.stdout, done
