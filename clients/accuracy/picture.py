@@ -57,7 +57,8 @@ def _points(plot: Any, found: Points, number: int) -> None:
         plot.axvline(uncertainty, color="0.5", linestyle=":", label="uncertainty of the reference")
     plot.set(title=TITLES[number], xlabel=ERROR, ylabel=TIME, xscale="log", yscale="log")
     plot.grid(alpha=0.3)
-    plot.legend(fontsize="small")
+    if plot.get_legend_handles_labels()[1]:
+        plot.legend(fontsize="small")
 
 
 def _sources(plot: Any, found: Points) -> None:

@@ -146,7 +146,7 @@ def read_run(log: Log, interval: float) -> Run:
     steps = {name: found for name, found in steps.items() if len(found["step"])}
     if not log.complete or log.scene is None or not steps:
         return run
-    run.scene, run.device, run.software = json.loads(log.scene.resolved), log.scene.device, log.scene.software
+    run.scene, run.device, run.software = json.loads(log.scene.resolved or "{}"), log.scene.device, log.scene.software
     run.trajectory = read_trajectory(log, interval)
     run.elements = {name: len(log.mesh(name, min(found.meshes)).tets) for name, found in log.objects.items()}
     if not len(run.trajectory.times):
