@@ -58,7 +58,9 @@ def _string(text: str) -> str:
 
 
 def check_path(path: Path) -> None:
-    """Raises BadInput for a path at which there is something other than an overlay of this program."""
+    """Raises BadInput for a path at which there is something other than an overlay of this program, or no folder."""
+    if not path.parent.is_dir():
+        raise BadInput(f"--to {path}: no such folder")
     try:
         with path.open(encoding="utf-8", errors="replace") as file:
             if not file.readline().startswith(f"# {MARK}"):

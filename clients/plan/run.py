@@ -35,10 +35,12 @@ def plan(scene: Path, wish: Wish, where: Path | None, to: Path | None, minutes: 
     """
     if not 0 <= minutes <= MOST_MINUTES:
         raise BadInput(f"--measure {minutes:g}: allowed is 0 (nothing is measured) to {MOST_MINUTES:g} minutes")
+    if not scene.is_file():
+        raise BadInput(f"{scene}: no such file")
     to = to or scene.with_suffix(".plan.toml")
     overlay.check_path(to)
     where = where or Path(f"accuracy-{scene.stem}")
-    path = where if where.suffix == ".json" else where / "points.json"
+    path = where if where.is_file() else where / "points.json"
     found, probed = measured(scene, wish, path, minutes) if minutes else answer(scene, wish, path)
     use = shlex.join([*server(scene, found, probed), "--set", f"@{to}"])
     if found.choice.reached:
@@ -86,7 +88,10 @@ def measured(scene: Path, wish: Wish, path: Path, minutes: float) -> tuple[Answe
     began = time.monotonic()
     with titled_progress_bar(60 * minutes) as progress:
         if not path.exists():
-            path.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                path.parent.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise BadInput(f"--points {path.parent}: cannot be made: {error.strerror}") from None
             write(Study(scene, path.parent, DURATION, "auto", progress).run(SHARE * minutes), path.parent)
         points, probed = checked(scene, path)
         while found := chosen(wish, points).untried:
@@ -108,8 +113,6 @@ def checked(scene: Path, path: Path) -> tuple[Measurements, Run]:
     """
     first = f"first: sim-client accuracy {shlex.quote(str(scene))}"
     if not path.exists():
-        if not scene.is_file():
-            raise BadInput(f"{scene}: no such file")
         raise BadInput(f"{path}: no such file; settings are chosen from what was measured, {first} (or --measure 5)")
     points = read(path)
     run, known = probe(scene, points.found.device)

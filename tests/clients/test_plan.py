@@ -32,6 +32,7 @@ from tests.support.commands import in_turn
 ROOT = Path(__file__).parents[2]
 SCENE = """
 dt = 0.02
+solver = { preconditioner = "block_jacobi" }
 [effects]
 gravity = { g = [0, 0, -9.81] }
 [[object]]
@@ -277,12 +278,18 @@ def loaded(scene: Path, overrides: list[str]) -> Any:
 
 
 @pytest.mark.usefixtures("resolved")
-def test_another_file_is_left_as_it_is(tmp_path: Path) -> None:
+def test_another_file_is_left_as_it_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene, where = points_file(tmp_path), tmp_path / "accuracy-beam"
     assert plan(scene, Budget(2), where, None, 0, as_json=False)
     assert plan(scene, Budget(2), where, None, 0, as_json=True)  # its own one is replaced
+    told = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert told["overlay"] == str(tmp_path / "beam.plan.toml")  # auto was measured with a worker
+    assert told["use"] == f"sim-server {scene} --device cpu --workers 1 --set @{told['overlay']}"
     with pytest.raises(BadInput, match="was not written by this command"):
         plan(scene, Budget(2), where, scene, 0, as_json=False)
+    for to, words in ((tmp_path / "no" / "x.toml", "no such folder"), (tmp_path, "Is a directory")):
+        with pytest.raises(BadInput, match=words):
+            plan(scene, Budget(2), where, to, 0, as_json=False)
     assert scene.read_text() == SCENE
 
 
@@ -309,5 +316,4 @@ def test_the_command_and_a_server_that_takes_the_overlay(tmp_path: Path) -> None
     command = [sys.executable, "-m", "sim_server", *use.split()[1:], "--steps", "2", "--listen", free_endpoint()]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=100)
     assert done.returncode == 0, done
-    assert "--device cpu --workers 1 --set" in use
     assert "dt 0.005 s" in done.stdout and "2 steps" in done.stdout, done
