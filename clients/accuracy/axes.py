@@ -22,7 +22,7 @@ SCHEMES = ("bdf2", "newmark", "generalized_alpha", "ros2", "central_difference",
 SCHEMES_AND_STEPS = (
     ("bdf2", 0.5), ("newmark", 0.5), ("generalized_alpha", 0.5), ("ros2", 0.5), ("bdf2", 2.0), ("newmark", 0.25),
 )  # fmt: skip
-AGES = (1, 10, 30)  # steps
+AGES = (1, 10, 30)  # steps; by every-N, whose times hold those of its factorizations, as those of lockstep-N do not
 DROPS = ("1e-3", "1e-2", "1e-1")
 POSITIONS = (1e-3, 1e-4, 1e-2, 1e-5)  # over the size of the largest object
 LAWS = ("stable_neo_hookean", "corotational", "neo_hookean", "st_venant_kirchhoff")  # with young and poisson
@@ -75,7 +75,18 @@ class SceneValues:
         """True if a run at `settings` is helped by workers."""
         scheme = settings.get("integrator.scheme", settings.get("integrator", self.scheme))
         kind = settings.get("solver.preconditioner", self.solver.get("preconditioner"))
-        return kind in FACTORS and "central_difference" not in scheme
+        update = settings.get("solver.update", self.solver.get("update", "async"))
+        return kind in FACTORS and "central_difference" not in scheme and not update.startswith("every-")
+
+    def own(self) -> Settings:
+        """Returns what the scene itself has for the keys that the joined points of an axis differ in."""
+        keys = ("solver.tolerance", "integrator.linearizations", "integrator.scheme", "solver.preconditioner")
+        found = {"dt": f"{self.dt:.12g}"}
+        for key in keys:
+            table, name = key.split(".")
+            if name in self.table.get(table, {}):
+                found[key] = _bare(self.table[table][name])
+        return found
 
     def step(self, factor: float) -> Settings:
         """Returns the setting of a time step, over the scene's."""
@@ -248,9 +259,9 @@ def _factors(scene: SceneValues) -> Iterator[Candidate]:
         if kind != scene.solver.get("preconditioner"):
             yield Candidate("preconditioner", {"solver.preconditioner": kind})
     for age in AGES:
-        yield Candidate("factor age", cholesky | {"solver.update": f"lockstep-{age}"}, 3)
+        yield Candidate("factor age", cholesky | {"solver.update": f"every-{age}"}, 3)
     if scene.device == "cpu":
-        double = {"solver.update": "lockstep-10", "solver.factor_precision": "float64"}
+        double = {"solver.update": "every-10", "solver.factor_precision": "float64"}
         yield Candidate("factor precision", cholesky | double, 3)
         for drop in DROPS:
             incomplete = {"solver.preconditioner": "incomplete_cholesky", "solver.drop_tolerance": drop}

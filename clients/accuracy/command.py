@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from clients.accuracy.page import render
 from clients.accuracy.picture import draw
-from clients.accuracy.points import Points, set_words, to_csv, to_dict
+from clients.accuracy.points import Points, short_words, to_csv, to_dict
 from clients.accuracy.study import NO_TIME, Study
 from clients.errors import BadInput, ClientError
 from clients.log.atomic_file import atomic_file
@@ -81,19 +81,16 @@ def report(found: Points, folder: Path) -> Group:
 
     from clients.watch import COMPACT
 
-    table = Table("axis", **COMPACT)
-    table.add_column("settings", overflow="fold")
-    for head in ("error [m]", "s a simulated s", "p99 [ms]", "iterations", "status"):
-        table.add_column(head)
+    table = Table("axis", "settings", "error [m]", "s / s", "p99 [ms]", "iter.", "status", **COMPACT)
     for p in found.points:
-        words = set_words(p.settings).replace("--set ", "") or "as the scene is"
         numbers = (p.error, p.seconds, (p.step_ms or {}).get("p99"), p.iterations)
         status = p.status if p.status == "done" else f"{p.status}: {p.reason}"
-        table.add_row(Text(p.axis), Text(words), *(_cell(value) for value in numbers), Text(status))
+        table.add_row(Text(p.axis), Text(short_words(p.settings)), *(_cell(value) for value in numbers), Text(status))
     known = ", ".join(f"{name} {value:.2g} m" for name, value in found.sources.items() if value is not None)
     uncertainty = found.reference.get("uncertainty")
     lines = [
-        f"{found.duration:g} s simulated on {found.device}; the reference is uncertain by {_cell(uncertainty)} m",
+        f"{found.duration:g} s simulated on {found.device}; s / s: wall time of the steps of a simulated second; "
+        f"the reference is uncertain by {_cell(uncertainty)} m",
         f"errors by source: {known or 'none known'}",
         found.sentence,
         *_left_out(found),
@@ -111,7 +108,7 @@ def _left_out(found: Points) -> list[str]:
         lines.append(f"no time for {len(late)} points ({axes}): the same command goes on")
     for left in found.left_out:
         if left["reason"] != NO_TIME:
-            words = set_words(left["settings"]).replace("--set ", "")
+            words = short_words(left["settings"]) if left["settings"] else ""
             lines.append(f"left out: {left['axis']}{f' ({words})' if words else ''}: {left['reason']}")
     return lines
 

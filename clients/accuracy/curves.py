@@ -9,7 +9,14 @@ from clients.accuracy.points import SCENE, Point, Points, set_words
 
 TITLES = ("one setting at a time", "pairs, and how equations are solved")
 SINGLE = (SCENE, "tolerance", "linearizations", "time step", "scheme", "position", "mesh", "model")
-JOINED = ("tolerance", "linearizations", "time step", "position", "factor age", "drop tolerance")  # points in order
+JOINED = {  # axes whose points are drawn as a line, in the order of this key
+    "tolerance": "solver.tolerance",
+    "linearizations": "integrator.linearizations",
+    "time step": "dt",
+    "position": "accuracy.position",
+    "factor age": "solver.update",
+    "drop tolerance": "solver.drop_tolerance",
+}
 ERROR = "largest distance of a node from the reference [m]"
 TIME = "wall time a simulated second [s]"
 EDGE = 2.0  # times the largest error (and time) of a point: where those without are drawn
@@ -26,17 +33,25 @@ class Curve:
 
 
 def curves(found: Points) -> list[Curve]:
-    """Returns the points by axis that are done, in the order of their times; the scene's point joins each line."""
+    """Returns the points by axis that are done; the scene's point is part of each line that it has a place in."""
     scene = [p for p in found.points if p.axis == SCENE and p.status == "done"]
     result = []
     for axis in dict.fromkeys(p.axis for p in found.points):
         points = [p for p in found.points if p.axis == axis and is_drawn(p)]
-        if axis in JOINED and axis in SINGLE:
-            points += scene
-        points.sort(key=lambda p: p.seconds or 0.0)
+        if key := JOINED.get(axis):
+            points += scene if key in found.own else []
+            points.sort(key=lambda p: _number({**found.own, **p.settings}.get(key, "")))
         if points:
             result.append(Curve(axis, int(axis not in SINGLE), points, axis in JOINED))
     return result
+
+
+def _number(value: str) -> float:
+    """Returns the number in a setting: 0.01 of "0.01", 10 of "every-10"."""
+    try:
+        return float(value.rpartition("every-")[2])
+    except ValueError:
+        return 0.0
 
 
 def is_drawn(point: Point) -> bool:

@@ -28,13 +28,15 @@ async function copyWords(text, button) {
 }
 for (const button of document.querySelectorAll("button[data-words]"))
   button.addEventListener("click", () => copyWords(button.dataset.words, button));
-for (const plot of document.querySelectorAll(".plotly-graph-div"))
-  plot.on("plotly_click", event => {
-    const found = event.points[0].customdata;
-    if (found === undefined) return;
-    copyWords(found, null);
-    document.getElementById("clicked").textContent = "copied: " + (found || "(nothing: the scene as it is)");
-  });
+window.addEventListener("load", () => {
+  for (const plot of document.querySelectorAll(".plotly-graph-div"))
+    plot.on("plotly_click", event => {
+      const found = event.points[0].customdata;
+      if (found === undefined) return;
+      copyWords(found, null);
+      document.getElementById("clicked").textContent = "copied: " + (found || "(nothing: the scene as it is)");
+    });
+});
 """
 
 

@@ -26,11 +26,9 @@ def draw(found: Points) -> bytes:
     figure = Figure(figsize=(14, 9), dpi=100, layout="constrained")
     FigureCanvasAgg(figure)
     grid = figure.add_gridspec(2, 2, height_ratios=[3, 1])
-    plots = [figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[0, 1])]
-    for number, plot in enumerate(plots):
+    first = figure.add_subplot(grid[0, 0])
+    for number, plot in enumerate((first, figure.add_subplot(grid[0, 1], sharex=first, sharey=first))):
         _points(plot, found, number)
-    plots[1].sharey(plots[0])
-    plots[1].sharex(plots[0])
     _sources(figure.add_subplot(grid[1, :]), found)
     head = f"{found.scene} on {found.device}, {found.duration:g} s simulated\n"
     figure.suptitle(head + "\n".join(textwrap.wrap(found.sentence, WIDTH)), fontsize="medium")

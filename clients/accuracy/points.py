@@ -49,7 +49,7 @@ class Points:
     digest: str = ""  # of the resolved scene and its meshes
     duration: float = 0.0  # simulated [s]
     interval: float = 0.0  # between compared times [s]
-    dt: float = 0.0  # of the scene [s]
+    own: Settings = field(default_factory=dict)  # what the scene itself has for keys of the points
     device: str = ""
     machine: dict[str, str] = field(default_factory=dict)
     reference: dict[str, Any] = field(default_factory=lambda: {"settings": {}, "uncertainty": None})
@@ -77,6 +77,11 @@ class Points:
 def set_words(settings: Settings) -> str:
     """Returns the words for the command line of sim-server that repeat a point."""
     return shlex.join(word for key, value in settings.items() for word in ("--set", f"{key}={value}"))
+
+
+def short_words(settings: Settings) -> str:
+    """Returns the settings with the last part of each key, to read only."""
+    return " ".join(f"{key.split('.')[-1]}={value}" for key, value in settings.items()) or "as the scene is"
 
 
 def to_dict(found: Points) -> dict[str, Any]:

@@ -16,7 +16,7 @@ import numpy as np
 
 from clients.accuracy.axes import COARSEST, Candidate, SceneValues, candidates, left_out, mesh_settings
 from clients.accuracy.errors import add_round, measure, point_of
-from clients.accuracy.points import SCENE, Point, Points, Settings, load, save
+from clients.accuracy.points import SCENE, Point, Points, Settings, load, save, short_words
 from clients.accuracy.runs import Run, Task, run_point
 from clients.accuracy.sources import MESH, MODEL, errors_by_source, mesh_error, sentence
 from clients.accuracy.trajectories import Trajectory, distance, extrapolate, load_trajectory, save_trajectory
@@ -56,8 +56,8 @@ class Study:
         """Measures for so many minutes, or until all is measured; 0: only what is there is looked at."""
         self._deadline, self._minutes = self._began + 60 * minutes, minutes
         found = self.found
-        found.left_out = [left for left in found.left_out if left["reason"] != NO_TIME]
         if minutes > 0:
+            found.left_out = []  # what the server refused is asked again: it may be another version
             self._keep()
             self._run_scene()
             self._reference()
@@ -160,7 +160,7 @@ class Study:
             run = self._scene_run
         else:
             longest = 60 * self._minutes * LONGEST_SHARE
-            run = self._run(f"{candidate.axis}: {_short(settings)}", settings, min(longest, self._left()))
+            run = self._run(f"{candidate.axis}: {short_words(settings)}", settings, min(longest, self._left()))
             if run.status == "timed out" and self._left() <= 0:
                 return False
         if run.status == "refused":
@@ -220,7 +220,7 @@ class Study:
                     continue
                 if self._start + point.seconds * self.task.duration > self._left():
                     continue
-                what = f"round {rounds + 1} of {point.axis}: {_short(point.settings)}"
+                what = f"round {rounds + 1} of {point.axis}: {short_words(point.settings)}"
                 run = self._run(what, point.settings, self._left())
                 if run.status == "done":
                     add_round(point, run)
@@ -289,13 +289,14 @@ def resumed(path: Path, fresh: Points) -> Points:
 
 def _fresh(scene: Path, task: Task, probed: Run) -> Points:
     assert probed.trajectory is not None
+    own = SceneValues(probed.scene, probed.device).own()
     rest = probed.trajectory.rest
     objects: dict[str, dict[str, float]] = {
         name: {"size": float(np.ptp(x, axis=0).max()), "nodes": len(x), "elements": probed.elements[name]}
         for name, x in rest.items()
     }
     return Points(
-        str(scene), digest(probed.scene, probed.trajectory), task.duration, task.interval, task.dt, probed.device,
+        str(scene), digest(probed.scene, probed.trajectory), task.duration, task.interval, own, probed.device,
         machine(probed.software), objects=objects,
     )  # fmt: skip
 
@@ -320,7 +321,3 @@ def machine(software: str) -> dict[str, str]:
     return {
         "processor": processor, "cores": str(os.cpu_count() or 1), "system": platform.platform(), "software": software,
     }  # fmt: skip
-
-
-def _short(settings: Settings) -> str:
-    return " ".join(f"{key.split('.')[-1]}={value}" for key, value in settings.items())

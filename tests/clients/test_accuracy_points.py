@@ -17,6 +17,7 @@ import pytest
 from clients.accuracy import study
 from clients.accuracy.axes import SceneValues, candidates, mesh_settings, toml
 from clients.accuracy.command import accuracy, report, write
+from clients.accuracy.curves import at_the_edge, curves
 from clients.accuracy.errors import add_round, order_of_convergence, point_of
 from clients.accuracy.points import Point, Points, Settings, load, save, set_words, to_csv, to_dict
 from clients.accuracy.runs import Run, Task, command, read_run
@@ -218,7 +219,7 @@ def test_a_study_that_is_cut_off_goes_on(scene: Path, monkeypatch: pytest.Monkey
     )
     assert all(runs[12:].count(s) == 2 for s in first[-3:-1]), "only for further rounds"
     runs.clear()
-    assert to_dict(study_of(scene)) == to_dict(whole) and len(runs) == 1, "all is measured: the scene is looked at"
+    assert to_dict(study_of(scene)) == to_dict(whole) and len(runs) == 2, "the scene is read, a refusal asked again"
 
 
 def test_a_short_time_leaves_the_rest_for_the_next_call(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -344,6 +345,7 @@ def test_axes_follow_the_scene() -> None:
     assert not static & {"scheme", "scheme and time step"}
     first = [c.axis for c in candidates(values(), SIZE)][:6]
     assert first == ["tolerance", "linearizations", "tolerance", "linearizations", "time step", "time step"]
+    assert not values().wants_workers({"solver.preconditioner": "cholesky", "solver.update": "every-3"})
     assert values().wants_workers({"solver.preconditioner": "cholesky"}) and not values().wants_workers({})
     assert not values().wants_workers({"solver.preconditioner": "auto", "integrator.scheme": "central_difference"})
 
@@ -385,7 +387,9 @@ def sample() -> Points:
         Point("pairs", {"dt": "1"}, "timed out", "not over after 3 s"),
         Point("age", {"dt": "2"}, "failed", "killed", float("nan")),
     ]
-    found = Points("<i>.toml", "ab", 1.0, 0.1, 0.02, "cpu", {"processor": "p"}, {"settings": {}, "uncertainty": 1e-4})
+    found = Points(
+        "<i>.toml", "ab", 1.0, 0.1, {"dt": "0.02"}, "cpu", {"processor": "p"}, {"settings": {}, "uncertainty": 1e-4}
+    )
     found.objects = {"<b>": {"size": 1.0, "nodes": 3, "elements": 1}, "c": {"size": 1.0, "nodes": 3, "elements": 1}}
     found.points = points
     found.left_out = [{"axis": "position", "settings": {"accuracy.position": "1"}, "reason": "unknown <key>"}]
@@ -438,6 +442,14 @@ def test_words_and_table_repeat_a_point() -> None:
     assert rows[0]["error/<b>"] == "0.1" and rows[0]["p99_ms"] == "2" and rows[4]["error_m"] == ""
 
 
+def test_lines_follow_the_value_that_differs() -> None:
+    found = sample()
+    found.points.append(Point("time step", {"dt": "0.04"}, "done", "", 0.3, 0.1, {}, 3.0, [3.0]))
+    drawn = {curve.axis: [p.settings.get("dt") for p in curve.points] for curve in curves(found)}
+    assert drawn["time step"] == ["0.01", None, "0.04"], "the scene has 0.02"
+    assert next((p.status, error) for p, error, _ in at_the_edge(found)) == ("diverged", pytest.approx(0.6))
+
+
 def test_the_page_opens_alone_and_escapes_what_it_shows(tmp_path: Path) -> None:
     pytest.importorskip("plotly")
     from clients.accuracy.page import render
@@ -463,7 +475,5 @@ def test_the_report_fits_a_terminal(capsys: pytest.CaptureFixture[str], tmp_path
 
     Console(width=80).print(report(sample(), tmp_path))
     said = capsys.readouterr().out
-    assert (
-        "diverged" in said and "dt=0.01" in said and "left out: position (accuracy.position=1): unknown <key>" in said
-    )
+    assert "diverged" in said and "dt=0.01" in said and "left out: position (position=1): unknown <key>" in said
     assert max(map(len, said.splitlines())) <= 80
