@@ -37,9 +37,9 @@ def measure(
     reference = load_trajectory(path.parent / "runs" / "reference.npz")
     if reference is None:
         raise BadInput(f"{path.parent}: the run of the reference is gone; --measure needs it to compare with")
-    task = Task(scene, found.dt, found.duration, found.interval, found.device)
-    workers = int(SceneValues(probed.scene, found.device).wants_workers(settings))
-    run = run_point(task, settings, workers, left, tick)
+    values = SceneValues(probed.scene, found.device)
+    task = Task(scene, values.dt, found.duration, found.interval, found.device)
+    run = run_point(task, settings, int(values.wants_workers(settings)), left, tick)
     if run.status == "timed out":
         return False
     if run.status == "refused":
