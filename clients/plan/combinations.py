@@ -9,6 +9,8 @@ from itertools import combinations
 from clients.plan.front import Choice, Wish
 from clients.plan.measurements import Measurement, Measurements
 
+WORTH = 0.9  # of the error or cost of the scene's own settings: below, others alone are of use
+
 
 def untried(points: Measurements, wish: Wish, choice: Choice) -> list[dict[str, str]]:
     """Returns combinations of two measured settings that may be better than `choice`, the most promising first.
@@ -21,7 +23,8 @@ def untried(points: Measurements, wish: Wish, choice: Choice) -> list[dict[str, 
         return []
     tried = [p.settings for p in points.found.points] + [left["settings"] for left in points.found.left_out]
     found = []
-    for a, b in combinations((p for p in points.usable if p.settings), 2):
+    useful = [p for p in points.usable if p.error < WORTH * own.error or wish.cost(p) < WORTH * wish.cost(own)]
+    for a, b in combinations(useful, 2):
         settings = {**a.settings, **b.settings}
         if _overlap(a.settings, b.settings) or settings in tried:
             continue
