@@ -473,6 +473,41 @@ def accuracy(
 
 
 @app.command()
+def plan(
+    scene: Annotated[Path, typer.Argument(metavar="SCENE.toml", help="What is to be simulated.")],
+    budget_ms: Annotated[
+        float | None, typer.Option("--budget-ms", metavar="MS", help="Wall time that a step (p99) may take.")
+    ] = None,
+    position: Annotated[float | None, typer.Option(metavar="M", help="Error that a node may have, m.")] = None,
+    points: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="points.json or its folder; by default accuracy-SCENE.")
+    ] = None,
+    measure: Annotated[
+        float, typer.Option(metavar="MINUTES", help="Time for measurements first: what may be better.")
+    ] = 0.0,
+    to: Annotated[Path | None, typer.Option(metavar="FILE.toml", help="Overlay; SCENE.plan.toml.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Propose settings of a scene from what was measured, and write them for sim-server --set @FILE.
+
+    With --budget-ms the most exact settings that are fast enough in real time, with --position the cheapest ones that
+    are exact enough; measured ones alone (sim-client accuracy), nothing between them. Exit code 1: there are none.
+
+    --measure makes those measurements if there are none, and tries settings together that were measured apart.
+
+    \b
+    Examples:
+      sim-client plan beam.toml --budget-ms 2        and then: sim-server beam.toml --set @beam.plan.toml
+      sim-client plan beam.toml --position 1e-3 --to exact.toml
+    """
+    from clients.plan.front import wish_for
+    from clients.plan.run import plan as run
+
+    reached = run(scene, wish_for(budget_ms, position), points, to, measure, as_json)
+    raise typer.Exit(0 if reached else 1)
+
+
+@app.command()
 def replay(
     log: Annotated[Path, typer.Argument(metavar="LOG.mcap", help="A recorded run.")],
     simulate: Annotated[bool, typer.Option("--simulate", help="Run it again and compare bit by bit.")] = False,

@@ -231,7 +231,8 @@ def launch(
     realtime: Annotated[bool, typer.Option("--realtime/--free-run", help="Keep pace with the clock or not")] = True,
     record: Annotated[Path | None, typer.Option(metavar="FOLDER", help="Write a log of each server there")] = None,
     set_: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Another value than the scene's")
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE|@FILE", help="Another value than the scene's, or a file of them"),
     ] = None,
     json_: Annotated[bool, typer.Option("--json", help="Print what was started as JSON on one line")] = False,
 ) -> None:

@@ -35,6 +35,8 @@ Examples:
         open to workers and clients on other machines
   sim-server beam.toml --set solver.tolerance=1e-8 --set dt=0.01
         with other values than the scene's
+  sim-server beam.toml --set @beam.plan.toml
+        with those that the file lists
 """
 
 WORKER_TIMEOUT = 15.0  # s that the start waits for the first local worker, at most
@@ -56,7 +58,8 @@ def serve(
         list[str] | None, typer.Option(metavar="EP", help="Where to be reached [default: tcp/127.0.0.1:7447]")
     ] = None,
     set_: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Another value than the scene's")
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE|@FILE", help="Another value than the scene's, or a file of them"),
     ] = None,
     workers: Annotated[int, typer.Option(metavar="N", min=0, max=64, help="Local workers to start and supervise")] = 0,
     worker_device: Annotated[

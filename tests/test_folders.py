@@ -24,6 +24,7 @@ ALLOWED = {  # what each folder imports of its package
     "clients.viewer": {"client", "errors", "log", "progress"},
     "clients.replay": {"errors", "log", "progress"},
     "clients.load_test": {"client", "errors", "log", "progress", "watch"},
+    "clients.plan": {"accuracy", "errors", "log", "progress", "watch"},
 }
 ORDER = (  # of sim_server: each imports of those before it
     "errors", "arrays", "kernels", "mesh", "scene", "backends", "mechanics", "effects", "simulation", "updates",

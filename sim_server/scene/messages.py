@@ -2,6 +2,8 @@
 """Turns validation errors into messages, one line each: file, object, key = value, allowed values."""
 
 import re
+from collections.abc import Mapping
+from operator import eq
 from typing import Any
 
 from pydantic import ValidationError
@@ -25,13 +27,30 @@ NAMED = ("object", "obstacle", "holder", "attachment", "spring")  # lists of tab
 MAX_VALUE = 80  # characters of a value in a message
 
 
-def readable(error: ValidationError, file: str, table: dict[str, Any]) -> InputError:
-    """Returns one InputError for all errors of `error`, found in `table` as read from `file`."""
-    return InputError("\n".join(f"scene {file}, {_line(e, table)}" for e in error.errors(include_url=False)))
+def readable(
+    error: ValidationError,
+    file: str,
+    table: dict[str, Any],
+    overlays: Mapping[tuple[str | int, ...], str] | None = None,
+) -> InputError:
+    """Returns one InputError for all errors of `error`, found in `table` as read from `file`.
+
+    overlays: files that values are from, by their places
+    """
+    lines = []
+    for e in error.errors(include_url=False):
+        path = [part for part in e["loc"] if not str(part).startswith("<")]
+        lines.append(f"scene {file}{_with_overlays(path, overlays or {})}, {_line(e, path, table)}")
+    return InputError("\n".join(lines))
 
 
-def _line(error: Any, table: dict[str, Any]) -> str:
-    path = [part for part in error["loc"] if not str(part).startswith("<")]
+def _with_overlays(path: list[str | int], overlays: Mapping[tuple[str | int, ...], str]) -> str:
+    """Returns words on the overlays that set the value at `path`, a value in it, or a table around it."""
+    found = {name for place, name in overlays.items() if name and all(map(eq, place, path))}
+    return f" with overlay {', '.join(sorted(found))}" if found else ""
+
+
+def _line(error: Any, path: list[str | int], table: dict[str, Any]) -> str:
     key = ".".join(part for part in path if isinstance(part, str))
     message = deleted.advice(key, error["input"]) or _message(error)
     if path == ["object"] and error["type"] == "missing":
@@ -41,7 +60,7 @@ def _line(error: Any, table: dict[str, Any]) -> str:
     place = _place(path, table)
     whole = len(path) == 1 and path[0] in NAMED
     if error["type"] != "missing" and not isinstance(error["input"], dict) and path[:1] and not whole:
-        place += f" = {_toml(error['input'])}"
+        place += f" = {as_toml(error['input'])}"
     return f"{place}: {message}"
 
 
@@ -74,6 +93,7 @@ def _dotted(path: list[str | int]) -> str:
     return text.lstrip(".")
 
 
-def _toml(value: Any) -> str:
+def as_toml(value: Any) -> str:
+    """Returns a value about as TOML has it, shortened, for a message."""
     text = str(value).lower() if isinstance(value, bool) else repr(value)
     return text if len(text) <= MAX_VALUE else text[:MAX_VALUE] + "..."

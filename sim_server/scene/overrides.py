@@ -9,24 +9,42 @@ from sim_server.errors import InputError
 from sim_server.scene.messages import NAMED
 from sim_server.scene.parameters import nearest
 
+KEY_VALUE = "must be KEY=VALUE, as solver.tolerance=1e-8 or object.beam.density=900, or @FILE"
+Place = tuple[str | int, ...]
+"""Where a value stands in a parsed scene: keys, and indices of lists as that of objects."""
 
-def apply(override: str, table: dict[str, Any]) -> None:
+
+def apply(override: str, table: dict[str, Any]) -> Place:
     """Sets one value of a parsed scene: ``solver.tolerance=1e-8``, ``object.NAME.effects.corotational.young=1e6``,
-    ``obstacle.NAME.friction=0.2``.
+    ``obstacle.NAME.friction=0.2``; returns its place. Raises InputError as `assign` does.
+    """
+    key, equals, text = override.partition("=")
+    text = text.strip()
+    try:
+        if not equals:
+            raise InputError(KEY_VALUE)
+        return assign(key.strip(), value(text), text, table)
+    except InputError as error:
+        raise InputError(f"override {override!r}: {error}") from None
+
+
+def assign(key: str, given: Any, text: str, table: dict[str, Any], replace: bool = True) -> Place:
+    """Sets the value of a dotted key in a parsed scene; returns its place.
+
+    text: the value as it was written; replace: an empty table takes the place of one that is there, too
 
     Missing tables on the way are created, so that an override may list an effect. The validation of the scene finds
     unknown keys. Raises InputError for an unknown object or a key below a value that is no table.
     """
-    key, equals, text = override.partition("=")
-    key = key.strip()
-    if not equals or not key or not all(key.split(".")):
-        raise InputError("must be KEY=VALUE, as solver.tolerance=1e-8 or object.beam.density=900")
-    place = table
+    if not all(key.split(".")):
+        raise InputError(KEY_VALUE)
+    place, rest = table, key
+    at: Place = ()
     for kind in NAMED:
         if key == kind or key.startswith(f"{kind}."):
-            place, key = _named(kind, key.removeprefix(kind).lstrip("."), table)
+            place, at, rest = _named(kind, key.removeprefix(kind).lstrip("."), table)
             break
-    *parents, last = key.split(".")
+    *parents, last = rest.split(".")
     for depth, part in enumerate(parents):
         below = place.get(part)
         if below is None or below is True:  # an effect listed as true: its defaults
@@ -34,34 +52,35 @@ def apply(override: str, table: dict[str, Any]) -> None:
         if not isinstance(below, dict):
             raise InputError(f"{'.'.join(parents[: depth + 1])} = {below!r} is no table, so it has no keys")
         place = below
-    given = value(text.strip())
     there: Any = place.get(last)
     if _tables(there) and not _tables(given):
         raise InputError(
             f"{last} is a list of {len(there)} regions in the scene, which one value would take the place of; allowed: "
-            f"a list of regions, for all elements {override.partition('=')[0].strip()}=[{{ {last} = {text.strip()} }}]"
+            f"a list of regions, for all elements {key}=[{{ {last} = {text} }}]"
         )
-    place[last] = given
+    if replace or given != {} or not (isinstance(there, dict) or there is True):
+        place[last] = given
+    return (*at, *parents, last)
 
 
 def _tables(value: Any) -> bool:
     return isinstance(value, list) and bool(value) and all(isinstance(v, dict) for v in value)
 
 
-def _named(kind: str, key: str, table: dict[str, Any]) -> tuple[dict[str, Any], str]:
-    """Returns the table of an object (or obstacle, or holder) and the key inside it.
+def _named(kind: str, key: str, table: dict[str, Any]) -> tuple[dict[str, Any], Place, str]:
+    """Returns the table of an object (or obstacle, or holder), its place, and the key inside it.
 
     Names may hold dots, so the longest matching name wins.
     """
     entries = table.get(kind)
-    entries = [e for e in entries if isinstance(e, dict)] if isinstance(entries, list) else []
-    named = {e["name"]: e for e in entries if isinstance(e.get("name"), str)}
-    fitting = [name for name in named if key.startswith(name + ".")]
+    listed = [e if isinstance(e, dict) else {} for e in entries] if isinstance(entries, list) else []
+    index = {e["name"]: number for number, e in enumerate(listed) if isinstance(e.get("name"), str)}
+    fitting = [name for name in index if key.startswith(name + ".")]
     if not fitting:
         wanted = key.split(".")[0]
-        raise InputError(f"no {kind} {wanted!r} with a key after it" + nearest(wanted, list(named), f"{kind}s"))
+        raise InputError(f"no {kind} {wanted!r} with a key after it" + nearest(wanted, list(index), f"{kind}s"))
     name = max(fitting, key=len)
-    return named[name], key[len(name) + 1 :]
+    return listed[index[name]], (kind, index[name]), key[len(name) + 1 :]
 
 
 def value(text: str) -> Any:

@@ -10,6 +10,7 @@ Threads:
 import contextlib
 import logging
 import os
+import shlex
 import threading
 import time
 from collections import deque
@@ -187,6 +188,8 @@ class Service:
             ways.append("more workers" if workers else "a worker (--workers 1)")
         if not self._on_gpu and nvidia_device():
             ways.append("--device gpu")
+        scene, dt = shlex.quote(str(self.simulation.scene.path)), 1e3 * self.simulation.world.dt
+        ways.append(f"other settings (sim-client plan {scene} --budget-ms {dt:g})")
         return f"What helps: {', '.join(ways)}; --free-run does without the clock"
 
     def _drain(self) -> None:

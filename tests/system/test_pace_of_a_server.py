@@ -29,6 +29,7 @@ def test_a_server_that_cannot_keep_pace_says_so(stage: Stage, tmp_path: Path) ->
     line = next(line for line in server.output().splitlines() if line.startswith(told))
     assert "ms (p50), dt is 0.01 ms; " in line
     assert "a larger dt" in line and "a coarser mesh" in line and "(--workers 1)" in line and "--free-run" in line
+    assert f"(sim-client plan {tmp_path / 'beam.toml'} --budget-ms 0.01)" in line
     with stage.client() as client:
         until(lambda: fresh(client).pace.startswith("cannot keep pace: a step takes "), "the status says so")
 

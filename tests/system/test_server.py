@@ -240,6 +240,7 @@ def test_bad_input_gives_one_line_and_code_2(tmp_path: Path) -> None:
         ([str(beam(tmp_path)), "--device", "tpu"], "allowed are auto, cpu, gpu"),
         ([str(beam(tmp_path)), "--listen", "nonsense"], "nonsense"),
         ([str(beam(tmp_path)), "--set", "solver.tolerence=1"], "did you mean 'tolerance'"),
+        ([str(beam(tmp_path)), "--set", "@gone.toml"], "overlay 'gone.toml': cannot be read"),
         ([str(beam(tmp_path)), "--record", "/no/such/folder/a.mcap"], "/no/such/folder"),
     ]
     ended = in_turn("sim_server", [[*arguments, "--steps", "1"] for arguments, _ in cases])
