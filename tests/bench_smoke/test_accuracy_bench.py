@@ -16,6 +16,7 @@ from tests.bench.accuracy.motion import Motion, common, distances, error, extrap
 from tests.bench.accuracy.peers import MODULES, US, missing, ways
 from tests.bench.accuracy.units import KEYS, units
 from tests.bench.harness.pieces import Merged, Piece, Row
+from tests.bench.harness.report import Report
 
 UNITS = {device: units(device, 1, False, None) for device in ("cpu", "gpu")}
 
@@ -74,7 +75,8 @@ def test_order_of_a_scheme_is_read_off_its_points() -> None:
     line = page.order_line(scheme("Newmark, 3 linearizations", 2))
     assert line is not None and line["p at the smallest"] == pytest.approx(2) and line["should be"] == 2
     assert page.order_line([point("Newmark", "20 ms", None, 1.0)]) is None
-    assert {axes.order_of(name) for name in axes.SCHEMES} == {1, 2}
+    assert page.order_line(scheme("explicit substeps", 2)) is None
+    assert axes.order_of("backward Euler, 4 linearizations") == 1 and axes.order_of("ros2, factor") == 2
 
 
 def test_the_largest_source_dominates_and_the_model_is_told_apart() -> None:
@@ -116,6 +118,10 @@ def test_the_cheapest_exact_enough_is_told_here_and_of_others() -> None:
     peers += [point("RK4", "2 ms", 1e-3, 2.0, **{"who": "MuJoCo", "E MPa": 1.0})]
     assert "0.8 s here (Newmark, 5 ms) and 2 s by the cheapest of others (MuJoCo RK4, 2 ms)" in short.beside_others(
         peers
+    )
+    said = short.what_it_costs([*points, point("explicit substeps", "20 ms", 1e-3, 0.1)])
+    assert (
+        "of 0.1 % of the length 0.1 s (explicit substeps, 20 ms) or, with implicit steps, 0.8 s (Newmark, 5 ms)" in said
     )
     assert short.what_it_costs([]) == short.beside_others(peers[-1:]) == ""
 
@@ -169,7 +175,9 @@ def test_a_peer_that_is_not_there_is_left_out(capsys: pytest.CaptureFixture[str]
     assert {way.who for way in ways(1e6)} == {way.who for way in ways(1e7)} == set(MODULES)
 
 
-def test_pieces_become_a_page_with_its_table_of_settings(tmp_path: Path) -> None:
+def test_pieces_become_a_page_with_its_table_of_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[str] = []
+    monkeypatch.setattr(Report, "figure", lambda self, figure, file, caption: drawn.append(file))  # it is slow to save
     found = {"linear solve": 1e-8, "linearization": 2e-2, "time step": 5e-2, "mesh": None, "model": 9e-2}
     of_sources = [
         {"scene": RUBBER.name, "source": name, "compared": "", "error": value, "length": 4.0, "all together": 4e-2,
@@ -193,6 +201,7 @@ def test_pieces_become_a_page_with_its_table_of_settings(tmp_path: Path) -> None
     merged = Merged("accuracy", "Accuracy", files, tmp_path)
     page.write(merged, {name: merged.rows(name, keys) for name, keys in KEYS.items()})
     text = (tmp_path / "accuracy.md").read_text()
+    assert drawn == ["accuracy.png", "accuracy_sources.png", "accuracy_neo-Hookean_beam.png"]
     order = ("## In short", "## Errors by source", "## Tolerance and linearizations", "## Orders in time",
              "## Work and precision", "### Not done", "## Order in the mesh", "## How good the estimates")  # fmt: skip
     places = [text.index(title) for title in order]
