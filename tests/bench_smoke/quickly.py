@@ -11,8 +11,9 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 UNKNOWN = ("age", "next factor")  # may be unknown in any bench
-UNKNOWN_IN = {  # without a goal; of a step that is not ours; without potential energy to compare with, or an estimate
-    "contact": ("goal ms", "loop ms"), "cpu": ("iterations", "residual", "wall"), "rosenbrock": ("energy", "estimate"),
+UNKNOWN_IN = {  # of other steps; without a goal; of a step not ours; without potential energy, or an estimate
+    "accuracy": ("step error",), "contact": ("goal ms", "loop ms"), "cpu": ("iterations", "residual", "wall"),
+    "rosenbrock": ("energy", "estimate"),
 }  # fmt: skip
 
 

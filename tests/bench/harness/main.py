@@ -21,12 +21,14 @@ class Bench:
     write: Callable[[Report, dict[str, list[Row]]], None]
 
     def options(
-        self, description: str | None, example: str, sizes: Sequence[int], usual: Sequence[int], sizes_of: str
-    ) -> argparse.ArgumentParser:
-        """The options that all have. example: of --only; sizes_of: the tables that --sizes is for."""
+        self, description: str | None, example: str, sizes: Sequence[int] = (), usual: Sequence[int] = (),
+        sizes_of: str = "",
+    ) -> argparse.ArgumentParser:  # fmt: skip
+        """The options that all have. example: of --only; sizes_of: the tables that --sizes is for, if there are any."""
         parser = argparse.ArgumentParser(description=(description or "").split("\n\n")[0])
         parser.add_argument("--device", choices=("cpu", "gpu"), default="cpu")
-        parser.add_argument("--sizes", type=int, nargs="+", choices=list(sizes), default=list(usual), help=sizes_of)
+        if sizes:
+            parser.add_argument("--sizes", type=int, nargs="+", choices=list(sizes), default=list(usual), help=sizes_of)
         arguments_of_units(parser, f"{', '.join(self.keys)}, {example}")
         parser.add_argument("--quick", action="store_true", help="a small smoke run")
         arguments_of_pieces(parser)

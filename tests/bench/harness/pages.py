@@ -28,12 +28,12 @@ PAGES = (
 
 
 def copied(name: str, out: Path, docs: Path) -> bool:
-    """Copies one benchmark's page and pictures; False if it has not been run."""
+    """Copies one benchmark's page, pictures and tables; False if it has not been run."""
     page = out / name / f"{name}.md"
     if not page.exists():
         return False
     docs.mkdir(parents=True, exist_ok=True)
-    for file in [page, *sorted((out / name).glob("*.png"))]:
+    for file in [page, *sorted((out / name).glob("*.png")), *sorted((out / name).glob("*.csv"))]:
         shutil.copyfile(file, docs / file.name)
     return True
 
