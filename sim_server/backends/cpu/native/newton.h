@@ -78,7 +78,7 @@ static double seconds_of_trial(const Newton& newton, const Search& search) {
 // Scale of P^-1 for the estimate at a trial, 0: not known. That of a factor is told by the end of a solve. With other
 // preconditioners it depends on how smooth the error is, and that of a trial is as smooth as the one at the start of a solve.
 static double scale_of(const Search& search, const SolveResult& r) {
-    const double scale = r.kind == CHOLESKY ? r.factor_scale : r.start_scale;
+    const double scale = std::max(r.factor_scale, r.start_scale);
     return scale > 0 ? scale : search.factor_scale;
 }
 
@@ -128,7 +128,7 @@ static double remaining_error(Loop& loop, int index) {
                               &body.correction);
     search.applied = search.kind == CHOLESKY && body.now.kind == CHOLESKY && z > 0;
     const double e = search.factor_scale > 0 ? body.now.dx_dv * search.factor_scale * z : not_known();
-    return search.kind != CHOLESKY && e < search.solve_error ? search.solve_error : e;
+    return e < search.solve_error ? search.solve_error : e;
 }
 
 // Ends the step where its budget does not allow another linearization, or ended a solve.
@@ -167,6 +167,11 @@ static int judge(Loop& loop, int index) {
     }
     for (int k = 0; k < room.n; ++k) room.increment[k] = increment_after(search, room.increment[k], room.direction[k]);
     if (verdict == TAKEN && body.now.position > 0) bound_error(search, before, remaining_error(loop, index), trust_of(search.kind, body.now.trust), body.now.position);
+    if (search.phase == DONE && search.applied && body.now.trust <= WARPED_TRUST) {
+        double* z = loop.work + WORK * (int64_t)body.first + room.n;
+        rotate(newton, body, false, z, room.direction);
+        for (int k = 0; k < room.n; ++k) room.increment[k] += room.direction[k];
+    }
     if (body.now.step_budget > 0 || body.now.most_linearizations > 0) end_by_budget(loop, index);
     return search.phase;
 }
