@@ -17,16 +17,27 @@
 
 constexpr double WARPED_TRUST = 1.5;  // with factors in the material frame
 constexpr double FACTOR_TRUST = 3;    // with factors in the world frame
-constexpr double OTHER_TRUST = 2.5;   // with other preconditioners
+constexpr double OTHER_TRUST = 3;   // with other preconditioners
 constexpr double AHEAD = 2;           // and so many times more where z is of the iteration before
 constexpr double FEW = 5;             // of z with other preconditioners, where fewer than FEWEST iterations are done
-constexpr int LAG = 10, FEWEST = 4;   // iterations d: between two looks at x; from which on the iterates tell
+constexpr int LAG = 10;               // iterations d from one look at x to the next, at least
+constexpr int FEWEST = 4, FEWEST_WITH_FACTOR = 1;  // from which on the iterates tell
+constexpr double MOST_LEFT = 0.1;     // of |b|: a solve with more of a residual does not end by an estimate
 constexpr double SCALE_RANGE = 10;
+constexpr double SLOWEST = 0.95;      // fall of the error in d iterations; what falls less is taken for it
 
 // In place of an estimate that there is not.
 HOST_DEVICE double not_known() { return nan(""); }
 
 HOST_DEVICE double trust_of(int kind, double trust_in_factor) { return kind == CHOLESKY ? trust_in_factor : OTHER_TRUST; }
+
+HOST_DEVICE int fewest_of(int kind) { return kind == CHOLESKY ? FEWEST_WITH_FACTOR : FEWEST; }
+
+// Whether an estimate may end a solve, with squares of |r| and |b|.
+HOST_DEVICE bool may_end(double r2, double b2) { return r2 <= MOST_LEFT * MOST_LEFT * b2; }
+
+// Iterations from one look at x to the next: more where convergence is slow.
+HOST_DEVICE int lag_of(int looked) { return looked / 2 > LAG ? looked / 2 : LAG; }
 
 // Scale of P^-1 by alpha of the last two iterations; 1 where nothing is wrong.
 HOST_DEVICE double factor_scale_of(double alpha, double alpha_before) {
@@ -37,9 +48,11 @@ HOST_DEVICE double factor_scale_of(double alpha, double alpha_before) {
 // |e| by z = |P^-1 r_k|. fall: |r| now over |r_k|, 1 where z is of now.
 HOST_DEVICE double error_by_factor(int kind, double z, double scale, double fall) { return (kind == CHOLESKY ? scale : FEW * scale) * z * fall; }
 
-// |e_k| by change = |x_k - x_(k-d)|. rz, rz_before: z.r at k and at k - d.
+// |e_k| by change = |x_k - x_(k-d)|. rz, rz_before: z.r at k and at k - d. With q the fall of the error, change is about (1 - q) of the
+// error at k - d, and q / (1 - q) of it is left.
 HOST_DEVICE double error_by_iterates(double change, double rz, double rz_before) {
-    return change * (rz < rz_before ? sqrt(rz / rz_before) : 1);
+    const double q = rz < SLOWEST * SLOWEST * rz_before ? sqrt(rz / rz_before) : SLOWEST;
+    return change * q / (1 - q);
 }
 
 // Whether a solve may end. estimate: dx_dv |e|; ahead: z in it is of the iteration before.

@@ -424,7 +424,7 @@ struct IslandSolver {
         double r2 = b2, rz = 0, last_true = INFINITY;
         bool restart = true;
         auto is_enough = [&](bool ahead) {
-            return settings.position > 0 && r2 <= limit && error.is_enough(settings.dx_dv, bound.trust, bound.position, r2, ahead);
+            return settings.position > 0 && r2 <= limit && may_end(r2, b2) && error.is_enough(settings.dx_dv, bound.trust, bound.position, r2, ahead);
         };
         auto ended = [&](bool enough) {  // as in pcg.h
             const double found = r2;

@@ -61,7 +61,7 @@ template <class Nodes> struct IterateError {
     }
     // An iteration follows: looks at x where it is time.
     void look() {
-        if (looked >= 0 && iterations - looked < LAG) return;
+        if (looked >= 0 && iterations - looked < lag_of(looked)) return;
         if (looked >= 0) {
             const double change = nodes.change(x, before);
             lagged = error_by_iterates(change, rz, rz_looked);
@@ -85,8 +85,9 @@ template <class Nodes> struct IterateError {
     }
     double by_iterates(double rz_now) const {
         const int d = iterations - looked;
-        if (looked >= 0 && d >= FEWEST) return error_by_iterates(nodes.change(x, before), rz_now, rz_looked);
-        return lagged < 0 ? -1 : error_by_iterates(lagged, rz_now, rz_looked);
+        const double by_last = lagged < 0 ? -1 : lagged * std::sqrt(std::min(1.0, rz_now / rz_looked));
+        if (looked < 0 || d < fewest_of(kind)) return by_last;
+        return std::max(by_last, error_by_iterates(nodes.change(x, before), rz_now, rz_looked));
     }
     // |e| of x, whose residual has the square r_now2; NaN: not known.
     double estimate(double r_now2) {
