@@ -12,12 +12,20 @@
 //     longer: in a slender body the minimum along a straight direction is a short step.
 //   - The first direction starts at the state before the step, u = -p0: its first trial is the result of one linearization.
 //   - The iteration ends when |b| <= tolerance |b of the step's first linearization|, or when b is rounding.
+// With a bound of the error of positions [m]
+//   - it ends, too, where P^-1 of the nonlinear residual, which is about the displacement that is left, is within the bound. That needs
+//     the forces at the trial and no blocks of A; these are made where another linearization follows;
+//   - linear solves end at a forcing term, choice 2 of Eisenstat and Walker 1996 (SIAM J. Sci. Comput. 17): not more exact than Newton's
+//     iteration converges. Where that says that the linearization is the last one, and in any case at LINEAR_SHARE of the bound, the
+//     estimated error of the solve ends it.
 #pragma once
 #include "error_estimate.cuh"
 #include "host_device.cuh"
 #include "kinds.h"
 
 constexpr double SLOPE_REDUCTION = 0.9;
+constexpr double LINEAR_SHARE = 0.3;                            // of the bound of the error: of the last linear solve
+constexpr double MOST_FORCING = 0.1, FORCING_FACTOR = 0.9;      // largest forcing term, also the first one; of the fall of |b|, squared
 template <class T> constexpr double EPSILON = sizeof(T) == 8 ? 2.2e-16 : 1.2e-7;  // T: type in which forces are computed
 
 enum Phase { SOLVE = 0, TRY = 1, DONE = 2 };
@@ -34,7 +42,8 @@ struct Search {                        // Newton iteration of a step, of one bod
     int iterations, status, kind, fallbacks, verdict;
     double solve_error, step_error;    // estimated, largest of a node [m], of the last linear solve and of the state reached; NaN: not known
     double forcing;                    // relative tolerance of the next linear solve; 0: that of the settings
-    double factor_scale;               // of P^-1 in the last solve (error_estimate.cuh); 0: not known
+    double factor_scale;               // estimated error over that of P^-1, as the last solve has told; 0: not known
+    int applied;                       // 1: P^-1 b is made for the next solve
 };
 
 struct Limits {
@@ -121,6 +130,22 @@ HOST_DEVICE int evaluate_trial(Search& s, const Limits& most, double norm, doubl
     if (!small && s.linearizations < most.linearizations) s.phase = SOLVE;
     else if (!small && s.status == CONVERGED) s.status = MAX_LINEARIZATIONS;
     return s.verdict = TAKEN;
+}
+
+// Relative tolerance of a linear solve. tolerance: of the settings.
+HOST_DEVICE double solve_tolerance(const Search& s, double tolerance) { return s.forcing > tolerance ? s.forcing : tolerance; }
+
+// After a trial that was taken. estimate: of its error [m]; NaN: not known. Ends the iteration where trust * estimate is within
+// position; else sets the forcing term. before: |b| at the start of the linearization.
+HOST_DEVICE void bound_error(Search& s, double before, double estimate, double trust, double position) {
+    s.step_error = estimate;
+    if (is_exact_enough(estimate, trust, position, false)) {
+        s.phase = DONE;
+        if (s.status == MAX_LINEARIZATIONS) s.status = CONVERGED;
+        return;
+    }
+    const double fall = s.norm / before, forcing = FORCING_FACTOR * fall * fall;
+    s.forcing = is_exact_enough(forcing * estimate, trust, position, false) ? 0 : forcing < MOST_FORCING ? forcing : MOST_FORCING;
 }
 
 // A component of the increment after a verdict. NaN if no trial of the first linearization had a finite residual: then y is NaN,

@@ -103,16 +103,19 @@ class Mailbox:
 
 
 class _NativeNewton:
-    """The input of Newton-Raphson and its memory, attached to a loop and its launches."""
+    """The input of Newton-Raphson and its memory, attached to a loop and its launches.
 
-    def __init__(self, newton: Newton, loop: structs.Loop, launches: Any):
+    late: of each assembling launch, whether a trial can do without it
+    """
+
+    def __init__(self, newton: Newton, late: Sequence[bool], loop: structs.Loop, launches: Any):
         self._room = np.zeros((18, len(newton.arrays["mass"])))
         self._search = (structs.Search * loop.bodies)()
-        self._arrays = newton.arrays
+        self._arrays, self._late = newton.arrays, np.array(late, np.int32)
         options = newton.options
         limits = structs.Limits(options.linearizations, options.trials, options.tolerance)
         self.native = structs.Newton(most=limits, dx_dv=newton.dx_dv)
-        for name, array in {**newton.arrays, "room": self._room}.items():
+        for name, array in {**newton.arrays, "room": self._room, "late": self._late}.items():
             setattr(self.native, name, array.ctypes.data)
         self.native.search = c.addressof(self._search)
         self.native.detect, self.native.detects = newton.detect.start, newton.detect.stop - newton.detect.start
@@ -380,7 +383,10 @@ class CpuEngine(Reports):
         for name in ("row_start", "columns", "values", "b", "y", "x", "v", "clock", "moving"):
             setattr(loop, name, arrays[name].ctypes.data)
         loop.work, loop.threads = self._work.ctypes.data, given.solver.threads
-        self._newton = given.newton and _NativeNewton(given.newton, loop, self._launch)
+        self._newton = None
+        if given.newton:
+            late = [x.domain == "blocks" and given.held is None for x in given.assemble]  # holders take forces from A
+            self._newton = _NativeNewton(given.newton, late, loop, self._launch)
         number = {id(launch): k for k, launch in enumerate(launches)}
         self._stages = given.stages and _NativeStages(given.stages, loop, self._launch, number)
         self._euler = given.euler and _NativeEuler(given.euler, loop, self._launch, number)

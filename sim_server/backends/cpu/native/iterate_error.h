@@ -42,6 +42,8 @@ template <class Nodes> struct IterateError {
     int looked = -1;          // iterations at the last look, -1: none yet
     double rz_looked = 0;
     double lagged = -1;       // |e| by the iterates then, -1: not known
+    double first_size = 0;    // |z| at the start, 0: not known
+    double travelled = 0;     // sum of the changes of x between looks
 
     // What P^-1 and the iterates have told is of another kind.
     void forget() {
@@ -60,7 +62,11 @@ template <class Nodes> struct IterateError {
     // An iteration follows: looks at x where it is time.
     void look() {
         if (looked >= 0 && iterations - looked < lag_of(looked)) return;
-        if (looked >= 0) lagged = error_by_iterates(nodes.change(x, before), rz, rz_looked);
+        if (looked >= 0) {
+            const double change = nodes.change(x, before);
+            lagged = error_by_iterates(change, rz, rz_looked);
+            travelled += change;
+        }
         nodes.copy(x, before);
         looked = iterations;
         rz_looked = rz;
@@ -95,7 +101,8 @@ template <class Nodes> struct IterateError {
     // Puts the estimate into the result of a solve; of P^-1 its scale, 0 where that is not known.
     template <class Result> void tell(double dx_dv, double r_now2, Result& out) {
         if (!(alpha > 0 || given_scale > 0)) return;
-        const double e = estimate(r_now2);
+        const double e = estimate(r_now2), start = travelled + (looked >= 0 ? nodes.change(x, before) : 0) + e;
+        out.start_scale = first_size > 0 && start > 0 ? start / first_size : 0;
         out.solve_error = dx_dv * e;
         out.factor_scale = size > 0 && e > 0 ? e / (size * std::sqrt(r_now2 / r2)) : 0;
     }

@@ -36,7 +36,15 @@ static void run(const Launch& l, int threads) {
 // Euler have none.
 static void search_all(Loop& loop) {
     double begin = now(), solving = 0;
+    Newton& newton = *loop.newton;
     auto own = [&](int i) { return !loop.euler || is_made(loop, i); };
+    auto launch = [&](int late, auto takes_part) {
+        const double start = now();
+        for (int i = 0; i < loop.before; ++i)
+            if (!detects(loop, i) && newton.late[i] == late) run_for(loop, loop.launch[i], takes_part);
+        return now() - start;
+    };
+    if (!newton.forces_seconds) newton.forces_seconds = newton.blocks_seconds = loop.assemble_seconds;
     for (int i = 0; i < loop.bodies; ++i) {
         loop.newton->search[i].phase = DONE;
         if (own(i)) begin_search(loop, i);
@@ -47,11 +55,14 @@ static void search_all(Loop& loop) {
 #pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) if (loop.threads > 1 && loop.bodies > 1)
         for (int i = 0; i < loop.bodies; ++i) solve(loop, i);
         solving += now() - t;
-        for (int i = 0; i < loop.before; ++i)
-            if (!detects(loop, i)) run_for(loop, loop.launch[i], searching);
+        newton.forces_seconds = launch(0, searching);
         left = false;
 #pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) reduction(|| : left) if (loop.threads > 1 && loop.bodies > 1)
         for (int i = 0; i < loop.bodies; ++i) left = judge(loop, i) != DONE || left;
+        auto linearizes = [&](int i) { return newton.search[i].phase == SOLVE; };
+        bool more = false;
+        for (int i = 0; i < loop.bodies; ++i) more = more || linearizes(i);
+        if (more) newton.blocks_seconds = launch(1, linearizes);
     }
     for (int i = 0; i < loop.bodies; ++i)
         if (own(i)) end_search(loop, i);
@@ -217,6 +228,10 @@ static void finish_step(Loop* loop) {
     double entered = now();
     bool keep = room_for_records(rings, loop->bodies, [] { return true; });
     double waited = now() - entered;  // no part of the step
+    for (int i = 0; i < loop->bodies; ++i) {
+        SolveSettings& now = loop->body[i].now;
+        now.deadline = now.step_budget > 0 ? loop->assemble_begin + now.step_budget : 0;
+    }
     if (loop->substeps) make_substeps(*loop);
     if (loop->euler) make_step(*loop);
     else if (loop->newton && loop->contact) search_in_contact(*loop);

@@ -47,6 +47,8 @@ struct Newton {                        // several linearizations a step (newton.
     double* room;                      // 18 doubles a node
     Search* search;                    // (bodies,)
     int32_t detect, detects;           // first and number of the launches that detect contacts, once a step (newton_contact.h)
+    const int32_t* late;               // (launches,) 1: makes blocks of A that no trial needs, only the next linearization
+    double forces_seconds, blocks_seconds;  // of the launches that are not late, and of those that are, as they ran last; 0: not yet
     double* moved;                     // (nodes, 3) predictor of contact: from the start of the step to the state reached; null: none
     int32_t* most_touching;            // (bodies,) most linearizations of a body whose search has contact in it, else 0
     int32_t* entered;                  // (bodies,) 1: a sweep of the step's paths has given it rows

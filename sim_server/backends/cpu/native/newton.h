@@ -43,6 +43,7 @@ static void begin_search(Loop& loop, int index) {
         room.increment[k] = -room.predictor[k];
     }
     start_search(newton.search[index], norm(room.n, loop.b + at), rounding(loop, body), body.now.kind);
+    if (body.now.position > 0) newton.search[index].forcing = MOST_FORCING;
 }
 
 // Sets the state to that after increment + scale * direction.
@@ -69,6 +70,18 @@ static void rotate(const Newton& newton, const Body& body, bool back, const doub
         rotate_node(newton.rotation + 9 * (int64_t)(body.first + i), back, from + 3 * i, to + 3 * i);
 }
 
+// Wall time of the forces at a trial and of P^-1 of the residual there, as measured.
+static double seconds_of_trial(const Newton& newton, const Search& search) {
+    return newton.forces_seconds + search.seconds / std::max(1, search.iterations);
+}
+
+// Scale of P^-1 for the estimate at a trial, 0: not known. That of a factor is told by the end of a solve. With other
+// preconditioners it depends on how smooth the error is, and that of a trial is as smooth as the one at the start of a solve.
+static double scale_of(const Search& search, const SolveResult& r) {
+    const double scale = std::max(r.factor_scale, r.start_scale);
+    return scale > 0 ? scale : search.factor_scale;
+}
+
 // One linearization, if it is the body's turn.
 static void solve(Loop& loop, int index) {
     const Newton& newton = *loop.newton;
@@ -81,8 +94,17 @@ static void solve(Loop& loop, int index) {
     BlockCsr A{body.first, body.last, loop.row_start, loop.columns, loop.values};
     SolveSettings settings = body.now;
     settings.warm_start = settings.warm_start && search.linearizations == 0;  // the last step's is no guess for a correction
-    SolveResult r = pcg(A, loop.b + at, body.factor, settings, y, work, !loop.moving[index], &body.correction);
+    settings.tolerance = solve_tolerance(search, settings.tolerance);
+    settings.position *= LINEAR_SHARE;
+    settings.factor_scale = search.factor_scale;
+    if (settings.budget < 0) settings.budget = std::min(-1.0, settings.budget + search.iterations);
+    if (settings.deadline > 0) settings.deadline -= seconds_of_trial(newton, search);
+    SolveResult r = pcg(A, loop.b + at, body.factor, settings, y, work, !loop.moving[index], &body.correction,
+                        search.applied ? APPLIED_START : WARM_START);
     record_solve(search, r.residual, r.seconds, r.iterations, r.fallbacks, r.kind, r.status);
+    search.applied = 0;
+    search.solve_error = r.solve_error;
+    search.factor_scale = scale_of(search, r);
     if (search.phase == DONE) {
         for (int k = 0; k < room.n; ++k) room.increment[k] = increment_after(search, room.increment[k], room.direction[k]);
         return;
@@ -96,6 +118,34 @@ static void solve(Loop& loop, int index) {
     set_state(loop, body, 1);
 }
 
+// Estimated error of the state reached [m], by P^-1 of the nonlinear residual; NaN: not known. The next solve may go on from it.
+static double remaining_error(Loop& loop, int index) {
+    Body& body = loop.body[index];
+    Search& search = loop.newton->search[index];
+    if (!loop.moving[index]) return 0;
+    const double* b = loop.b + 3 * (int64_t)body.first;
+    const double z = apply_to(matrix_of(loop, body), b, body.factor, search.kind, body.now.omega, loop.work + WORK * (int64_t)body.first,
+                              &body.correction);
+    search.applied = search.kind == CHOLESKY && body.now.kind == CHOLESKY && z > 0;
+    const double e = search.factor_scale > 0 ? body.now.dx_dv * search.factor_scale * z : not_known();
+    return e < search.solve_error ? search.solve_error : e;
+}
+
+// Ends the step where its budget does not allow another linearization, or ended a solve.
+static void end_by_budget(Loop& loop, int index) {
+    const Newton& newton = *loop.newton;
+    const Body& body = loop.body[index];
+    Search& search = newton.search[index];
+    const double next = newton.blocks_seconds + seconds_of_trial(newton, search) + 2 * search.seconds / std::max(1, search.iterations);
+    const bool spent = body.now.deadline > 0 && search.phase == SOLVE && now() + next > body.now.deadline;
+    const bool was_spent = body.now.most_linearizations > 0 && search.status == MAX_LINEARIZATIONS;
+    if (spent || was_spent) {
+        search.phase = DONE;
+        search.status = BUDGET;
+    }
+    if (search.status == BUDGET && search.verdict == TAKEN && !(body.now.position > 0)) search.step_error = remaining_error(loop, index);
+}
+
 // Evaluates a trial: accept, reduce the scale, or end. Returns the phase.
 static int judge(Loop& loop, int index) {
     const Newton& newton = *loop.newton;
@@ -106,10 +156,23 @@ static int judge(Loop& loop, int index) {
     const double* b = loop.b + 3 * (int64_t)body.first;
     double* material = loop.work + WORK * (int64_t)body.first;
     rotate(newton, body, true, room.direction, material);
-    const int verdict = evaluate_trial(search, newton.most, norm(room.n, b), dot(room.n, material, b));
-    if (verdict == SHORTER) set_state(loop, body, search.scale);
-    else
-        for (int k = 0; k < room.n; ++k) room.increment[k] = increment_after(search, room.increment[k], room.direction[k]);
+    Limits most = newton.most;
+    if (body.now.most_linearizations > 0) most.linearizations = body.now.most_linearizations;
+    if (search.status == BUDGET) most.linearizations = search.linearizations;
+    const double before = search.linearizations == 1 ? search.first : search.last;
+    const int verdict = evaluate_trial(search, most, norm(room.n, b), dot(room.n, material, b));
+    if (verdict == SHORTER) {
+        set_state(loop, body, search.scale);
+        return search.phase;
+    }
+    for (int k = 0; k < room.n; ++k) room.increment[k] = increment_after(search, room.increment[k], room.direction[k]);
+    if (verdict == TAKEN && body.now.position > 0) bound_error(search, before, remaining_error(loop, index), trust_of(search.kind, body.now.trust), body.now.position);
+    if (search.phase == DONE && search.applied && body.now.trust <= WARPED_TRUST) {
+        double* z = loop.work + WORK * (int64_t)body.first + room.n;
+        rotate(newton, body, false, z, room.direction);
+        for (int k = 0; k < room.n; ++k) room.increment[k] += room.direction[k];
+    }
+    if (body.now.step_budget > 0 || body.now.most_linearizations > 0) end_by_budget(loop, index);
     return search.phase;
 }
 

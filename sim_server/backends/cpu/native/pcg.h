@@ -53,11 +53,12 @@ struct SolveResult {
     double residual_then;   // recursive, relative
     double solve_error = NAN;  // estimated, of the solution, largest of a node [m]; NaN: not known
     double factor_scale = 0;   // of P^-1 at the end: the estimate over dx_dv |P^-1 r|; 0: not known
+    double start_scale = 0;    // the same of the start, by the change of x and the estimate; 0: not known
 };
 
 // Where a solve starts: from zero or from x if that is better, as the settings say; or from x, whose residual is what the tolerance
-// is relative to.
-enum Start { WARM_START = 0, GIVEN_START = 1 };
+// is relative to; or from zero, with z = P^-1 b in `work` (apply_to).
+enum Start { WARM_START = 0, GIVEN_START = 1, APPLIED_START = 2 };
 
 struct Preconditioner {
     const BlockCsr& A;
@@ -128,7 +129,7 @@ static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor,
     double goal = settings.tolerance * settings.tolerance * b2;
     if (rests) return finish(CONVERGED, residual(A, b, x, r), b2);
     double r2 = from == GIVEN_START ? b2 : settings.warm_start ? residual(A, b, x, r) : b2;  // 1. r = b - A x
-    if (from == WARM_START && (!settings.warm_start || !(r2 < b2))) {
+    if (from != GIVEN_START && (!settings.warm_start || !(r2 < b2))) {
         zero();
         for (int i = 0; i < n; ++i) r[i] = b[i];
         r2 = b2;
@@ -140,7 +141,7 @@ static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor,
     const double useful = bounded ? std::max(goal, USEFUL * USEFUL * b2) : goal;
     const double limit = settings.residual_limit > 0 ? settings.residual_limit * settings.residual_limit * b2 : INFINITY;
     double rz = 0, last_true = INFINITY, quarter = r2 * std::pow(useful / r2, 0.25);
-    bool restart = true, switched = false;
+    bool restart = true, switched = false, applied = from == APPLIED_START;
     auto leave_factor = [&] {
         P.kind = out.kind = BLOCK_JACOBI;
         out.fallbacks = 1;
@@ -163,13 +164,15 @@ static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor,
         return -1;
     };
     for (;;) {
-        double zr = P.apply(r, std::sqrt(r2), z);                                // 1. 6. z = P^-1 r
+        double zr = applied ? dot(n, z, r) : P.apply(r, std::sqrt(r2), z);       // 1. 6. z = P^-1 r
+        applied = false;
         if (!(zr > 0 && zr < INFINITY)) {                                        // also NaN
             if (P.kind != CHOLESKY) return finish(BREAKDOWN_PRECONDITIONER, residual(A, b, x, r), b2);
             leave_factor();
             continue;
         }
         error.apply(out.kind, zr, r2);
+        if (out.iterations == 0) error.first_size = error.nodes.peak(z);
         if (is_enough(false)) {
             const int status = ended(true);
             if (status >= 0) return finish(status, r2, b2);
@@ -192,6 +195,7 @@ static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor,
             continue;
         }
         bool spent = settings.budget > 0 ? out.iterations > 0 && now() - start > settings.budget : out.iterations + 1 == -settings.budget;
+        if (settings.deadline > 0 && out.iterations > 0) spent = spent || now() > settings.deadline;
         if (spent) return finish(BUDGET, residual(A, b, x, r), b2);
 
         error.look();
@@ -205,4 +209,18 @@ static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor,
         const int status = ended(enough);
         if (status >= 0) return finish(status, r2, b2);
     }
+}
+
+// z = P^-1 b, with b and z in `work` where a solve of APPLIED_START looks for them; returns |z|, NaN where P is not positive.
+static double apply_to(const BlockCsr& A, const double* b, const Factor* factor, int kind, double omega, double* work,
+                       Correction* correction) {
+    const int n = A.size();
+    double *r = work, *z = r + n, *inverse = z + 3 * n, *scratch = inverse + 3 * n;
+    const double norm = std::sqrt(dot(n, b, b));
+    std::copy(b, b + n, r);
+    if (norm == 0) return 0;
+    Preconditioner P{A, factor, kind, inverse, scratch, omega, correction};
+    P.prepare();
+    const double zr = P.apply(r, norm, z);
+    return zr > 0 && zr < INFINITY ? BodyNodes{n / 3}.peak(z) : not_known();
 }
