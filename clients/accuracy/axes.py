@@ -13,7 +13,7 @@ from clients.accuracy.points import Settings
 TOLERANCES = ("1e-2", "1e-1", "1e-4", "1e-3", "1e-6")
 LINEARIZATIONS = (2, 4)
 EXACT = "1e-9"  # relative residual that counts as exact, of linear systems and of steps
-MANY = 20  # linearizations that a step solved exactly may take
+MANY = 20  # linearizations that a step solved exactly may take, or the scene's own if these are more
 EXACT_POSITION = "1e-12"  # m; a bound that counts as exact
 ITERATIONS = "100000"  # that a solve which counts as exact may take
 STEPS = (0.5, 2.0, 0.25, 4.0, 0.125)  # over the scene's dt
@@ -122,7 +122,7 @@ class SceneValues:
         if self.bounds_position:
             found = {"accuracy.position": EXACT_POSITION, "solver.tolerance": EXACT}
             found |= {"solver.max_iterations": ITERATIONS} | self._without_budget()
-        return found | {"integrator.linearizations": str(MANY), "integrator.tolerance": EXACT}
+        return found | {"integrator.linearizations": str(self._many), "integrator.tolerance": EXACT}
 
     def references(self, parts: int) -> list[Settings]:
         """Returns settings of a reference with time steps of dt / parts; the first ones that work are to be taken.
@@ -136,7 +136,7 @@ class SceneValues:
         if self.bounds_position:
             solver["accuracy.position"] = EXACT_POSITION
         common = self.step(1 / parts) | solver
-        many = {"linearizations": MANY, "tolerance": float(EXACT)}
+        many = {"linearizations": self._many, "tolerance": float(EXACT)}
         if self.scheme == "quasi_static":
             return [common | self.with_scheme("quasi_static", **many)]
         own = "backward_euler" if self.scheme in ("ros2", "central_difference") else self.scheme
@@ -144,6 +144,10 @@ class SceneValues:
         found = [self.with_scheme("bdf2", **many), self.with_scheme("bdf2", **last)]
         found += [self.with_scheme(own, **many), self.with_scheme(own, **last)]
         return [common | settings for settings in found]
+
+    @property
+    def _many(self) -> int:
+        return max(MANY, int(self.integrator["linearizations"]))
 
     def _without_budget(self) -> Settings:
         found = {}
