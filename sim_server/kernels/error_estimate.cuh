@@ -30,8 +30,10 @@ constexpr double SLOWEST = 0.95;      // fall of the error in d iterations; what
 // In place of an estimate that there is not.
 HOST_DEVICE double not_known() { return nan(""); }
 
+// Times an estimate of this kind is at least the error. trust_in_factor: WARPED_TRUST or FACTOR_TRUST.
 HOST_DEVICE double trust_of(int kind, double trust_in_factor) { return kind == CHOLESKY ? trust_in_factor : OTHER_TRUST; }
 
+// Iterations from which on the iterates tell.
 HOST_DEVICE int fewest_of(int kind) { return kind == CHOLESKY ? FEWEST_WITH_FACTOR : FEWEST; }
 
 // Whether an estimate may end a solve, with squares of |r| and |b|.
