@@ -26,6 +26,7 @@
 
 constexpr double SLOPE_REDUCTION = 0.9;
 constexpr double LINEAR_SHARE = 0.3;                            // of the bound of the error: of the last linear solve
+constexpr double NEAR = 2;                                       // scale of P^-1 within which it may be A^-1
 constexpr double MOST_FORCING = 0.1, FORCING_FACTOR = 0.9;      // largest forcing term, also the first one; of the fall of |b|, squared
 template <class T> constexpr double EPSILON = sizeof(T) == 8 ? 2.2e-16 : 1.2e-7;  // T: type in which forces are computed
 
@@ -148,6 +149,11 @@ HOST_DEVICE bool bound_error(Search& s, double before, double estimate, double t
     const double fall = s.norm / before, forcing = FORCING_FACTOR * fall * fall;
     s.forcing = is_exact_enough(forcing * estimate, trust, position, false) ? 0 : forcing < MOST_FORCING ? forcing : MOST_FORCING;
     return false;
+}
+
+// Whether P^-1 b, which is made, takes off most of the error of a state that is exact enough. trust: in the factor.
+HOST_DEVICE bool adds_remaining(const Search& s, double trust) {
+    return s.applied && trust <= WARPED_TRUST && s.factor_scale < NEAR && s.factor_scale > 1 / NEAR;
 }
 
 // A component of the increment after a verdict. NaN if no trial of the first linearization had a finite residual: then y is NaN,

@@ -184,7 +184,7 @@ static int judge(Loop& loop, int index) {
         return search.phase;
     }
     for (int k = 0; k < room.n; ++k) room.increment[k] = increment_after(search, room.increment[k], room.direction[k]);
-    if (verdict == TAKEN && body.now.position > 0 && bound_error(loop, index, before) && search.applied && body.now.trust <= WARPED_TRUST)
+    if (verdict == TAKEN && body.now.position > 0 && bound_error(loop, index, before) && adds_remaining(search, body.now.trust))
         add_remaining(loop, index);
     if (body.now.step_budget > 0 || body.now.most_linearizations > 0) end_by_budget(loop, index);
     return search.phase;
