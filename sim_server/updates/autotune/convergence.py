@@ -40,12 +40,14 @@ def convergence(
     """
     solves = np.maximum(records["linearizations"], 1)
     converged = np.isin(records["status"], (pb.CONVERGED, pb.MAX_LINEARIZATIONS, pb.CONTACT))
-    wanted = max(-math.log10(solver.tolerance), MIN_DECADES)
+    decades = max(-math.log10(solver.tolerance), MIN_DECADES)
     residual = np.where(records["residual"] > 0, records["residual"], 1.0)  # NaN counts as 1
-    gained = np.clip(-np.log10(residual), MIN_DECADES, wanted)
+    gained = np.clip(-np.log10(residual), MIN_DECADES, decades)
     with np.errstate(divide="ignore", invalid="ignore"):
-        left = np.log10(records["solve_error"] / np.asarray(position))  # decades of the error; NaN or infinite: not known
-    wanted = np.where(np.isfinite(left), gained + np.maximum(left, 0.0), wanted)
+        left = np.log10(
+            records["solve_error"] / np.asarray(position)
+        )  # decades of the error; NaN or infinite: not known
+    wanted = np.where(np.isfinite(left), gained + np.maximum(left, 0.0), decades)
     used = records["iterations"] / (solves * solver.max_iterations)
     if solver.budget:
         used = np.maximum(used, records["solve"] / (solves * solver.budget))

@@ -38,7 +38,7 @@ template <class Nodes> struct IterateError {
     int kind = NONE, iterations = 0;
     double rz = 0, r2 = 0;    // of z
     double size = -1;         // |z|, -1: not looked at
-    double alpha = 0, alpha_before = 0;
+    double alpha = 0, alpha_before = 0;  // of the last iteration, and the largest one before
     int looked = -1;          // iterations at the last look, -1: none yet
     double rz_looked = 0;
     double lagged = -1;       // |e| by the iterates then, -1: not known
@@ -72,7 +72,7 @@ template <class Nodes> struct IterateError {
         rz_looked = rz;
     }
     void move(double by) {
-        alpha_before = alpha > 0 ? alpha : by;
+        alpha_before = alpha > 0 ? std::max(alpha, alpha_before) : by;
         alpha = by;
         ++iterations;
     }
@@ -108,6 +108,7 @@ template <class Nodes> struct IterateError {
     }
     // Whether the estimate is within `position`. ahead: z is of the iteration before.
     bool is_enough(double dx_dv, double trust, double position, double r_now2, bool ahead) {
+        if (ahead) r_now2 = std::max(r_now2, LEAST_FALL * LEAST_FALL * r2);
         const double cheap = dx_dv * by_factor(std::sqrt(r_now2 / r2)) / (kind == CHOLESKY ? 1 : FEW);
         return cheap >= 0 && is_exact_enough(cheap, trust, position, ahead) &&
                is_exact_enough(dx_dv * estimate(r_now2), trust, position, ahead);
