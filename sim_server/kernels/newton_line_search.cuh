@@ -14,7 +14,8 @@
 //   - The iteration ends when |b| <= tolerance |b of the step's first linearization|, or when b is rounding.
 // With a bound of the error of positions [m]
 //   - it ends, too, where P^-1 of the nonlinear residual, which is about the displacement that is left, is within the bound. That needs
-//     the forces at the trial and no blocks of A; these are made where another linearization follows;
+//     the forces at the trial and no blocks of A; these are made where another linearization follows. Where P is a factor in the
+//     material frame that displacement is added at the end: the error is then below the estimate, by a factor of a few;
 //   - linear solves end at a forcing term, choice 2 of Eisenstat and Walker 1996 (SIAM J. Sci. Comput. 17): not more exact than Newton's
 //     iteration converges. Where that says that the linearization is the last one, and in any case at LINEAR_SHARE of the bound, the
 //     estimated error of the solve ends it.
@@ -25,6 +26,7 @@
 
 constexpr double SLOPE_REDUCTION = 0.9;
 constexpr double LINEAR_SHARE = 0.3;                            // of the bound of the error: of the last linear solve
+constexpr double NEAR = 2;                                       // scale of P^-1 within which it may be A^-1
 constexpr double MOST_FORCING = 0.1, FORCING_FACTOR = 0.9;      // largest forcing term, also the first one; of the fall of |b|, squared
 template <class T> constexpr double EPSILON = sizeof(T) == 8 ? 2.2e-16 : 1.2e-7;  // T: type in which forces are computed
 
@@ -136,16 +138,22 @@ HOST_DEVICE int evaluate_trial(Search& s, const Limits& most, double norm, doubl
 HOST_DEVICE double solve_tolerance(const Search& s, double tolerance) { return s.forcing > tolerance ? s.forcing : tolerance; }
 
 // After a trial that was taken. estimate: of its error [m]; NaN: not known. Ends the iteration where trust * estimate is within
-// position; else sets the forcing term. before: |b| at the start of the linearization.
-HOST_DEVICE void bound_error(Search& s, double before, double estimate, double trust, double position) {
+// position, and returns whether it is; else sets the forcing term. before: |b| at the start of the linearization.
+HOST_DEVICE bool bound_error(Search& s, double before, double estimate, double trust, double position) {
     s.step_error = estimate;
     if (is_exact_enough(estimate, trust, position, false)) {
         s.phase = DONE;
         if (s.status == MAX_LINEARIZATIONS) s.status = CONVERGED;
-        return;
+        return true;
     }
     const double fall = s.norm / before, forcing = FORCING_FACTOR * fall * fall;
     s.forcing = is_exact_enough(forcing * estimate, trust, position, false) ? 0 : forcing < MOST_FORCING ? forcing : MOST_FORCING;
+    return false;
+}
+
+// Whether P^-1 b, which is made, takes off most of the error of a state that is exact enough. trust: in the factor.
+HOST_DEVICE bool adds_remaining(const Search& s, double trust) {
+    return s.applied && trust <= WARPED_TRUST && s.factor_scale < NEAR && s.factor_scale > 1 / NEAR;
 }
 
 // A component of the increment after a verdict. NaN if no trial of the first linearization had a finite residual: then y is NaN,

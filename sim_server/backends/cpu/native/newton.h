@@ -75,8 +75,8 @@ static double seconds_of_trial(const Newton& newton, const Search& search) {
     return newton.forces_seconds + search.seconds / std::max(1, search.iterations);
 }
 
-// Scale of P^-1 for the estimate at a trial, 0: not known. That of a factor is told by the end of a solve. With other
-// preconditioners it depends on how smooth the error is, and that of a trial is as smooth as the one at the start of a solve.
+// Scale of P^-1 for the estimate at a trial, 0: not known. It depends on how smooth the error is: that of a trial is about as smooth as
+// the one at the start of the solve before.
 static double scale_of(const Search& search, const SolveResult& r) {
     const double scale = std::max(r.factor_scale, r.start_scale);
     return scale > 0 ? scale : search.factor_scale;
@@ -123,12 +123,30 @@ static double remaining_error(Loop& loop, int index) {
     Body& body = loop.body[index];
     Search& search = loop.newton->search[index];
     if (!loop.moving[index]) return 0;
+    const double start = now();
     const double* b = loop.b + 3 * (int64_t)body.first;
     const double z = apply_to(matrix_of(loop, body), b, body.factor, search.kind, body.now.omega, loop.work + WORK * (int64_t)body.first,
                               &body.correction);
     search.applied = search.kind == CHOLESKY && body.now.kind == CHOLESKY && z > 0;
+    search.seconds += now() - start;
     const double e = search.factor_scale > 0 ? body.now.dx_dv * search.factor_scale * z : not_known();
     return e < search.solve_error ? search.solve_error : e;
+}
+
+// Ends the search where the estimated error is within the bound; returns whether it is. before: as of the other one.
+static bool bound_error(Loop& loop, int index, double before) {
+    Search& search = loop.newton->search[index];
+    const SolveSettings& settings = loop.body[index].now;
+    return bound_error(search, before, remaining_error(loop, index), trust_of(search.kind, settings.trust), settings.position);
+}
+
+// Adds P^-1 of the nonlinear residual, which is made, to the increment: with a factor near A it takes off most of what is left.
+static void add_remaining(Loop& loop, int index) {
+    const Newton& newton = *loop.newton;
+    const Body& body = loop.body[index];
+    BodyRoom room(newton, body);
+    rotate(newton, body, false, loop.work + WORK * (int64_t)body.first + room.n, room.direction);
+    for (int k = 0; k < room.n; ++k) room.increment[k] += room.direction[k];
 }
 
 // Ends the step where its budget does not allow another linearization, or ended a solve.
@@ -166,12 +184,8 @@ static int judge(Loop& loop, int index) {
         return search.phase;
     }
     for (int k = 0; k < room.n; ++k) room.increment[k] = increment_after(search, room.increment[k], room.direction[k]);
-    if (verdict == TAKEN && body.now.position > 0) bound_error(search, before, remaining_error(loop, index), trust_of(search.kind, body.now.trust), body.now.position);
-    if (search.phase == DONE && search.applied && body.now.trust <= WARPED_TRUST) {
-        double* z = loop.work + WORK * (int64_t)body.first + room.n;
-        rotate(newton, body, false, z, room.direction);
-        for (int k = 0; k < room.n; ++k) room.increment[k] += room.direction[k];
-    }
+    if (verdict == TAKEN && body.now.position > 0 && bound_error(loop, index, before) && adds_remaining(search, body.now.trust))
+        add_remaining(loop, index);
     if (body.now.step_budget > 0 || body.now.most_linearizations > 0) end_by_budget(loop, index);
     return search.phase;
 }
