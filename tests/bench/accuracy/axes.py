@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from tests.bench.accuracy.cases import EXPLICIT, Case, Settings, accepts, usual
 
 STEPS, SCHEME, MESH = "tolerance, linearizations", "time step, scheme", "mesh"  # axes
+SOLVES, DROP = "tolerance, preconditioner", "drop tolerance"
+ERROR_OF = {STEPS: "step error", SOLVES: "solve error", DROP: "solve error"}  # what tells points apart; else "error"
 TIME_STEPS = (2.0, 1.0, 0.5, 0.25, 0.125)  # over that of the scene
 FINE = 0.0625  # where order 2 is seen
 TOLERANCES = ("1e-1", "1e-2", "1e-3", "1e-6")
@@ -101,7 +103,7 @@ def drop_tolerances(case: Case) -> Iterator[Point]:
     """Of the incomplete factor."""
     for drop in ("0.1", "0.03", "0.01", "0.003", "0.001", "0.0001"):
         settings = {"solver.preconditioner": "incomplete_cholesky", "solver.drop_tolerance": drop}
-        yield Point("drop tolerance", "incomplete Cholesky", drop, usual(settings))
+        yield Point(DROP, "incomplete Cholesky", drop, usual(settings))
 
 
 PRECONDITIONERS = {
@@ -118,7 +120,7 @@ def preconditioners(case: Case, device: str) -> Iterator[Point]:
             continue
         for tolerance in FINE_TOLERANCES:
             settings = usual({"solver.preconditioner": key, "solver.tolerance": tolerance})
-            yield Point("tolerance, preconditioner", name, tolerance, settings)
+            yield Point(SOLVES, name, tolerance, settings)
 
 
 def laws(case: Case) -> Iterator[Point]:
@@ -135,12 +137,12 @@ def points(case: Case, device: str, quick: bool) -> dict[str, list[Point]]:
     """By axis."""
     found = {
         STEPS: list(steps(case)), SCHEME: list(time_steps(case, device)),
-        "tolerance, preconditioner": list(preconditioners(case, device)), "model": list(laws(case)),
+        SOLVES: list(preconditioners(case, device)), "model": list(laws(case)),
     }  # fmt: skip
     if not case.contact:
         found |= {"age of the factor": list(ages(case)), "factor precision": list(precisions(case, device))}
         if device == "cpu":
-            found["drop tolerance"] = list(drop_tolerances(case))
+            found[DROP] = list(drop_tolerances(case))
     if device == "gpu" and case.contact:  # one linearization there
         found[STEPS] = [p for p in found[STEPS] if p.series in ("1", "position")]
     return {axis: found[axis][:3] for axis in (STEPS, SCHEME)} if quick else found

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from tests.bench.accuracy import peers, picture, words
-from tests.bench.accuracy.axes import SCHEME, STEPS, order_of
+from tests.bench.accuracy.axes import ERROR_OF, SCHEME, STEPS, order_of
 from tests.bench.accuracy.cases import CASES
 from tests.bench.accuracy.short import EXPLICIT, Tables, position_sentence, sentences
 from tests.bench.accuracy.sources import length, orders, sentence
@@ -162,9 +162,10 @@ def _lines(rows: list[Row]) -> list[Row]:
 def _cell(row: Row | None) -> str | None:
     if row is None:
         return None
-    if row["error"] is None or row["seconds"] is None:
+    metres = row[ERROR_OF.get(row["axis"], "error")]
+    if metres is None or row["seconds"] is None:
         return str(row["status"])
-    return f"{1e3 * row['error']:.2g}, {row['seconds']:.3g}"
+    return f"{1e3 * metres:.2g}, {row['seconds']:.3g}"
 
 
 # --- the other parts --------------------------------------------------------------------------------------------------
@@ -216,7 +217,7 @@ def _peers(report: Report, rows: list[Row]) -> None:
 def _write_csv(path: Path, tables: Tables) -> None:
     """All points, one a line, with the settings that repeat it."""
     names = ("device", "scene", "who", "axis", "series", "value", "status", "reason", "error", "rms", "step error",
-             "seconds", "iterations", "unconverged")  # fmt: skip
+             "solve error", "seconds", "iterations", "unconverged")  # fmt: skip
     with path.open("w", newline="") as out:
         writer = csv.writer(out, lineterminator="\n")
         writer.writerow([*names, "p50 ms", "p99 ms", "max ms", "settings"])

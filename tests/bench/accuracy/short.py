@@ -50,14 +50,14 @@ def what_it_costs(points: Sequence[Row]) -> str:
     for bound in BOUNDS:
         if (best := cheapest(points, bound)) is None:
             continue
-        part = f"of {100 * bound:g} % of the length {best['seconds']:.2g} s ({called(best)})"
+        part = f"{best['seconds']:.2g} s ({called(best)}) with an error of {100 * bound:g} % of the length"
         if best not in implicit and (other := cheapest(implicit, bound)) is not None:
-            part += f" or, with implicit steps, {other['seconds']:.2g} s ({called(other)})"
+            part += f", by implicit steps {other['seconds']:.2g} s ({called(other)})"
         parts.append(part)
     euler = [r for r in points if r["series"].startswith("backward Euler") and r["error"] is not None]
     if not parts:
         return ""
-    said = f"A simulated second with an error {', '.join(parts)}"
+    said = f"A simulated second takes {'; '.join(parts)}"
     if euler:
         best = min(euler, key=lambda r: r["error"])
         said += f"; backward Euler gets to {length(best['error'])} with {best['seconds']:.2g} s ({best['value']})"

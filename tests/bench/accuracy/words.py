@@ -52,9 +52,10 @@ too stiff: both may make it smaller."""
 AXES = """\
 One axis at a time, or the two that matter together. Horizontal: error; vertical: seconds of a simulated second.
 Crosses at the right edge: ran away, failed or took too long. *tolerance, linearizations* is against the error of
-the steps, which the time step hides in the others. Preconditioners, age and precision of the factor and the drop
-tolerance change the time alone, but for ros2 with the factor as its matrix. *mesh*: beside 16 cells across, at the
-nodes that both have. *model*: each law beside its own small steps."""
+the steps, *tolerance, preconditioner* and *drop tolerance* (at 1e-6) against the error of the linear solves alone
+(from a run of the same steps, one linearization each, with linear solves to 1e-12): the time step would hide both.
+Age and precision of the factor change the time alone, but for ros2, which has the factor as its matrix. *mesh*:
+beside 16 cells across, at the nodes that both have. *model*: each law beside its own small steps."""
 
 CELLS = "In the cells: error [mm], seconds of a simulated second."
 
