@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tests.bench.accuracy import axes, page, short, sources
-from tests.bench.accuracy.cases import BANDS, BEAM, CASES, EXPLICIT, FLOOR, RUBBER, SMALL, accepts, usual
+from tests.bench.accuracy.cases import BANDS, BEAM, CASES, EXPLICIT, FLOOR, RUBBER, SMALL, accepts, damped_by, usual
 from tests.bench.accuracy.effectivity import judged
 from tests.bench.accuracy.motion import Motion, common, distances, error, extrapolated, move, rms
 from tests.bench.accuracy.peers import MODULES, US, missing, ways
@@ -158,6 +158,13 @@ def test_explicit_substeps_have_no_solver_and_other_laws_take_the_place_of_the_s
     assert usual(EXPLICIT) == EXPLICIT
     assert BEAM.with_law(BEAM.law) == {} and "false" in BANDS.with_law("stable_neo_hookean").values()
     assert FLOOR.stepped(FLOOR.dt) == {} and FLOOR.stepped(0.005) == {"dt": "0.005"}
+
+
+def test_the_reference_damps_as_the_scheme_does() -> None:
+    exact = {"object.beam.effects.corotational.tangent": "exact"}
+    ros2, several = axes.SCHEMES["ros2, factor"], axes.SCHEMES["Newmark, 3 linearizations"]
+    assert damped_by(BANDS, usual(ros2)) == damped_by(BANDS, usual(axes.SCHEMES["Newmark"])) == exact
+    assert damped_by(BANDS, usual(several)) is damped_by(BANDS, usual()) is damped_by(BEAM, usual(ros2)) is None
 
 
 def test_what_a_scene_refuses_is_a_failed_point() -> None:

@@ -4,7 +4,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from tests.bench.accuracy.cases import EXPLICIT, Case, Settings, accepts, usual
+from tests.bench.accuracy.cases import EXPLICIT, Case, Settings, accepts, damped_by, usual
 
 STEPS, SCHEME, MESH = "tolerance, linearizations", "time step, scheme", "mesh"  # axes
 SOLVES, DROP = "tolerance, preconditioner", "drop tolerance"
@@ -79,24 +79,26 @@ def time_steps(case: Case, device: str) -> Iterator[Point]:
         for share in (*TIME_STEPS, FINE) if case.explicit and name.endswith("3 linearizations") else TIME_STEPS:
             settings = usual(scheme, case.stepped(share * case.dt))
             if accepts(case, settings):
-                yield Point(SCHEME, name, f"{1e3 * share * case.dt:g} ms", settings)
+                yield Point(SCHEME, name, f"{1e3 * share * case.dt:g} ms", settings, damped_by(case, settings))
 
 
 def ages(case: Case) -> Iterator[Point]:
     """Age of the factor: D to 2 D - 1 steps."""
     for name, scheme in TWO.items():
         for update in ("every-1", "lockstep-1", "lockstep-4", "lockstep-10", "lockstep-30", "never"):
-            yield Point("age of the factor", name, update, usual(scheme, {"solver.update": update}))
+            settings = usual(scheme, {"solver.update": update})
+            yield Point("age of the factor", name, update, settings, damped_by(case, settings))
 
 
 def precisions(case: Case, device: str) -> Iterator[Point]:
     """Of the values of the factor as it is applied; on a GPU of the kernels, too."""
     for name, scheme in TWO.items():
         for kind in ("float64", "float32") if device == "cpu" else ("float32", "float16"):
-            yield Point("factor precision", name, kind, usual(scheme, {"solver.factor_precision": kind}))
+            settings = usual(scheme, {"solver.factor_precision": kind})
+            yield Point("factor precision", name, kind, settings, damped_by(case, settings))
         for kind in ("mixed", "float32") if device == "gpu" else ():
             settings = usual(scheme, {"solver.precision": kind})
-            yield Point("arithmetic", name, kind, settings)
+            yield Point("arithmetic", name, kind, settings, damped_by(case, settings))
 
 
 def drop_tolerances(case: Case) -> Iterator[Point]:

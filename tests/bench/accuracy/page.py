@@ -27,7 +27,7 @@ def write(report: Report, tables: Tables) -> None:
         report.say("## In short")
         report.table([{"to read from it": line} for _, line in said])
     if devices:
-        report.figure(picture.short(tables, devices), "accuracy.png", words.SHORT)
+        report.figure(picture.short(tables, devices), "accuracy.png", " ".join(words.SHORT.split()))
     report.say("## How", words.SETUP)
     shown: dict[str, Callable[[Report, list[Row]], None]] = {
         "sources": _sources, "points": _points, "meshes": _meshes, "effectivity": _effectivity, "peers": _peers,
