@@ -10,6 +10,8 @@ STEPS, SCHEME, MESH = "tolerance, linearizations", "time step, scheme", "mesh"  
 SOLVES, DROP = "tolerance, preconditioner", "drop tolerance"
 ERROR_OF = {STEPS: "step error", SOLVES: "solve error", DROP: "solve error"}  # what tells points apart; else "error"
 TIME_STEPS = (2.0, 1.0, 0.5, 0.25, 0.125)  # over that of the scene
+EXPLICIT_STEPS = (1.0, 0.125)
+EXPLICIT_NAME = "explicit substeps"
 FINE = 0.0625  # where order 2 is seen
 TOLERANCES = ("1e-1", "1e-2", "1e-3", "1e-6")
 LINEARIZATIONS = (1, 2, 4)
@@ -33,7 +35,7 @@ SCHEMES: dict[str, Settings] = {
     "generalized alpha, 3 linearizations": {"integrator.scheme": "generalized_alpha", **_several(3)},
     "ros2, iterations": {"integrator.scheme": "ros2", "integrator.solve": "iterate"},
     "ros2, factor": {"integrator.scheme": "ros2"},
-    "explicit substeps": EXPLICIT,
+    EXPLICIT_NAME: EXPLICIT,
 }
 ORDERS = {"backward Euler": 1, "Newmark": 2, "BDF2": 2, "generalized alpha": 2, "ros2": 2}
 TWO: dict[str, Settings] = {name: SCHEMES[name] for name in ("backward Euler", "ros2, factor")}
@@ -76,10 +78,17 @@ def time_steps(case: Case, device: str) -> Iterator[Point]:
     for name, scheme in SCHEMES.items():
         if case.contact and (not name.startswith("backward Euler") or (device == "gpu" and name != "backward Euler")):
             continue  # other schemes take backward Euler in contact; a GPU has one linearization there
-        for share in (*TIME_STEPS, FINE) if case.explicit and name.endswith("3 linearizations") else TIME_STEPS:
+        for share in _shares(case, name):
             settings = usual(scheme, case.stepped(share * case.dt))
             if accepts(case, settings):
                 yield Point(SCHEME, name, f"{1e3 * share * case.dt:g} ms", settings, damped_by(case, settings))
+
+
+def _shares(case: Case, scheme: str) -> tuple[float, ...]:
+    """Time steps over that of the scene. Explicit substeps are as long as is stable in all of them."""
+    if scheme == EXPLICIT_NAME:
+        return EXPLICIT_STEPS
+    return (*TIME_STEPS, FINE) if case.explicit and scheme.endswith("3 linearizations") else TIME_STEPS
 
 
 def ages(case: Case) -> Iterator[Point]:

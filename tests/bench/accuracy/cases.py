@@ -117,4 +117,5 @@ def usual(*more: Settings) -> dict[str, str]:
         together |= one
     if together.get("integrator.scheme") == EXPLICIT["integrator.scheme"]:
         together = {key: value for key, value in together.items() if not key.startswith("solver.")}
+        together["solver.preconditioner"] = "none"
     return together

@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from tests.bench.accuracy import peers, picture, words
-from tests.bench.accuracy.axes import ERROR_OF, SCHEME, STEPS, order_of
+from tests.bench.accuracy.axes import ERROR_OF, EXPLICIT_NAME, SCHEME, STEPS, order_of
 from tests.bench.accuracy.cases import CASES
-from tests.bench.accuracy.short import EXPLICIT, Tables, position_sentence, sentences
+from tests.bench.accuracy.short import Tables, position_sentence, sentences
 from tests.bench.accuracy.sources import length, orders, sentence
 from tests.bench.harness.pieces import Row
 from tests.bench.harness.report import Report
@@ -137,7 +137,7 @@ def order_line(rows: list[Row]) -> Row | None:
 
     An explicit scheme has none: its substeps are as long as is stable, whatever the time step is.
     """
-    if rows[0]["series"].startswith(EXPLICIT):
+    if rows[0]["series"].startswith(EXPLICIT_NAME):
         return None
     sizes = [float(row["value"].split()[0]) for row in rows]
     errors = [row["rms"] if row["status"] == "done" else None for row in rows]

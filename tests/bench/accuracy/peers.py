@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from sim_server.simulation import Simulation
-from tests.bench.accuracy.axes import SCHEMES
+from tests.bench.accuracy.axes import EXPLICIT_NAME, SCHEMES
 from tests.bench.accuracy.cases import BEAM, RUBBER, Settings, usual
 from tests.bench.accuracy.motion import LIMIT, Motion, error, exact_step, reference, rms
 from tests.bench.accuracy.points import measured
@@ -108,7 +108,7 @@ OURS: dict[str, tuple[tuple[float, ...], Settings]] = {  # time steps [ms] and s
     ),
     "Newmark": ((10.0, 5.0, 2.0), SCHEMES["Newmark"] | {"solver.tolerance": "1e-4"}),
     "ros2, factor": ((20.0, 10.0, 5.0), SCHEMES["ros2, factor"]),
-    "explicit substeps": ((20.0, 1.0, 0.5), SCHEMES["explicit substeps"]),
+    EXPLICIT_NAME: ((20.0, 1.0, 0.5), SCHEMES[EXPLICIT_NAME]),
 }
 STIFFNESSES = (1e6, 1e7)  # Pa
 SCIPY_STEPS = (0.02, 0.01, 0.005)  # s

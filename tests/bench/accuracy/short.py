@@ -3,13 +3,12 @@
 
 from collections.abc import Iterable, Sequence
 
-from tests.bench.accuracy.axes import SCHEME, STEPS
+from tests.bench.accuracy.axes import EXPLICIT_NAME, SCHEME, STEPS
 from tests.bench.accuracy.cases import RUBBER
 from tests.bench.accuracy.peers import US
 from tests.bench.accuracy.sources import length, sentence
 from tests.bench.harness.pieces import Row
 
-EXPLICIT = "explicit substeps"  # begins the name of a series
 BOUNDS = (1e-2, 1e-3)  # errors over L
 Tables = dict[str, list[Row]]
 
@@ -45,7 +44,7 @@ def sentences(tables: Tables, device: str) -> list[str]:
 
 def what_it_costs(points: Sequence[Row]) -> str:
     """The cheapest point for each bound, that of implicit steps if it is none, and the best of backward Euler."""
-    implicit = [row for row in points if not row["series"].startswith(EXPLICIT)]
+    implicit = [row for row in points if not row["series"].startswith(EXPLICIT_NAME)]
     parts = []
     for bound in BOUNDS:
         if (best := cheapest(points, bound)) is None:
