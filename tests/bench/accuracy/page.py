@@ -155,7 +155,8 @@ def _lines(rows: list[Row]) -> list[Row]:
     found = []
     for (series,), several in _by(rows, "series").items():
         by_value = {row["value"]: row for row in several}
-        found.append({"": series} | {value: _cell(by_value.get(value)) for value in values})
+        cells: Row = {value: _cell(by_value.get(value)) for value in values}
+        found.append({"": series} | cells)
     return found
 
 

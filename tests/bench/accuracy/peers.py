@@ -63,7 +63,7 @@ class Way:
 
 
 def _mujoco(series: str, young: float, milliseconds: Sequence[float], **settings: str) -> list[Way]:
-    limit = {"limit": 2.5e-4 if young < 5e6 else 1.25e-4, "limit_by": {"integrator": "RK4"}}
+    limit: dict[str, Any] = {"limit": 2.5e-4 if young < 5e6 else 1.25e-4, "limit_by": {"integrator": "RK4"}}
     return [
         Way("MuJoCo", series, f"{ms:g} ms", young, 1e-3 * ms, "peers_mujoco.py", "mujoco", settings, **limit)
         for ms in milliseconds
@@ -72,7 +72,7 @@ def _mujoco(series: str, young: float, milliseconds: Sequence[float], **settings
 
 def _semi_implicit(young: float, milliseconds: Sequence[float]) -> list[Way]:
     settings = {"solver": "semi-implicit"}
-    limit = {"limit": 2.5e-4 if young < 5e6 else 1.25e-4, "limit_by": settings, "on_gpu": True}
+    limit: dict[str, Any] = {"limit": 2.5e-4 if young < 5e6 else 1.25e-4, "limit_by": settings, "on_gpu": True}
     return [
         Way("Newton", "semi-implicit", f"{ms:g} ms", young, 1e-3 * ms, "peers_newton.py", "newton", settings, **limit)
         for ms in milliseconds

@@ -25,7 +25,7 @@ def short(tables: dict[str, list[Row]], devices: Sequence[str]) -> Any:
     )
     for panel, device in zip(panels[0], devices, strict=True):
         ours = [r for r in tables.get("points", []) if r["device"] == device and r["axis"] == SCHEME]
-        ours = [r for r in ours if r["scene"] == RUBBER.name] or ours
+        ours = [r for r in ours if r["scene"] == RUBBER.name] or [r for r in ours if r["scene"] == ours[0]["scene"]]
         others = [r for r in tables.get("peers", []) if r["device"] == device and r["E MPa"] == 1 and r["who"] != US]
         named = [row | {"series": _who(row)} for row in others]
         curves(panel, ours, "error", style="-")
