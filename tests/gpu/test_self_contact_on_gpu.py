@@ -25,7 +25,6 @@ def arms(folder: Path, speed: float, uneven: float = 0.0, **table: Any) -> Simul
     """A fork whose arms are driven into each other, without momentum. uneven: by which nodes are moved [m]"""
     sim = made(body(fork(folder)), contact={"passes": 200, "tolerance": table.pop("tolerance", 1e-3)}, **table)
     close(sim, speed)
-    put(sim, sim.world.v, sim.world.v)
     put(sim, sim.world.x, sim.world.x + np.random.default_rng(1).normal(0, 1, sim.world.x.shape) * uneven)
     return sim
 
@@ -61,7 +60,6 @@ def test_arms_with_hardly_any_stiffness_are_held_apart(tmp_path):
     contact = {"passes": 30, "tolerance": 1e-8, "stiffness": 1e-6}
     sim = made(body(fork(tmp_path)), contact=contact, device="gpu")
     close(sim, 3.0)
-    put(sim, sim.world.v, sim.world.v)
     size = (sim.world.mass * np.linalg.norm(sim.world.v, axis=1)).sum()
     sim.engine.run(2)
     sim.fetch()
