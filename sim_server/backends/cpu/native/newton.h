@@ -99,9 +99,16 @@ static void solve(Loop& loop, int index) {
     settings.factor_scale = search.factor_scale;
     if (settings.budget < 0) settings.budget = std::min(-1.0, settings.budget + search.iterations);
     if (settings.deadline > 0) settings.deadline -= seconds_of_trial(newton, search);
+    const double* z = work + room.n;
+    if (search.applied) std::copy(z, z + room.n, room.direction);  // the direction is made below
     SolveResult r = pcg(A, loop.b + at, body.factor, settings, y, work, !loop.moving[index], &body.correction,
                         search.applied ? APPLIED_START : WARM_START);
     record_solve(search, r.residual, r.seconds, r.iterations, r.fallbacks, r.kind, r.status);
+    if (search.applied) {
+        const BodyNodes nodes{body.last - body.first};
+        search.moved = settings.dx_dv * nodes.peak(y);
+        search.left = (nodes.change(y, room.direction) + r.solve_error / settings.dx_dv) / nodes.peak(room.direction);
+    }
     search.applied = 0;
     search.solve_error = r.solve_error;
     search.factor_scale = scale_of(search, r);
@@ -137,7 +144,7 @@ static double remaining_error(Loop& loop, int index) {
 static bool bound_error(Loop& loop, int index, double before) {
     Search& search = loop.newton->search[index];
     const SolveSettings& settings = loop.body[index].now;
-    return bound_error(search, before, remaining_error(loop, index), trust_of(search.kind, settings.trust), settings.position);
+    return bound_error(search, before, remaining_error(loop, index), settings.trust, settings.position);
 }
 
 // Adds P^-1 of the nonlinear residual, which is made, to the increment: with a factor near A it takes off most of what is left.
