@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from sim_server import backends
 from sim_server.backends.base import Backend, Capability, EngineInput, Launch, PendingUpdate
 from sim_server.backends.compiler import ahead
-from sim_server.backends.kinds import Kind
+from sim_server.backends.kinds import FACTOR_TRUST, WARPED_TRUST, Kind
 from sim_server.effects import effect
 from sim_server.effects._base import Effect, Refusal
 from sim_server.errors import DeviceError, InputError
@@ -284,6 +284,10 @@ class Simulation:
         settings.tolerance, settings.max_iterations = solver.tolerance, solver.max_iterations
         settings.budget, settings.warm_start = solver.budget, int(solver.warm_start)
         settings.kind, settings.omega = KINDS.get(solver.preconditioner, Kind.CHOLESKY), solver.omega
+        accuracy, settings.dx_dv = self.scene.accuracy, self.world.dx_dv
+        settings.position = accuracy.position_of(body.mesh.rest) if accuracy else 0.0
+        settings.trust = WARPED_TRUST if body.index in self.warped else FACTOR_TRUST
+        settings.step_budget = solver.step_budget
         alone = self.scene.uses_factor_alone  # then the loop has to know what a factor lacks
         corrects = (solver.woodbury or alone) and solver.wants_factors and ("touch" in body.effects or self.contact)
         if corrects and Capability.LOW_RANK_UPDATE in self.engine.capabilities:

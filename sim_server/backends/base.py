@@ -86,6 +86,8 @@ class SolveSettings(Protocol):
     """Settings of the solves of a body; what is set holds from the next solve, or batch of steps, on.
 
     kind: a Kind. budget: of wall time [s]; negative: of iterations. probe: a solve that `auto` measures. omega: of SSOR
+    position: largest error of a node [m], 0: any. trust: times the estimate with a factor is at least the error
+    dx_dv: of the step [s]. step_budget: of wall time of a step [s], 0: any
     """
 
     tolerance: float
@@ -95,6 +97,10 @@ class SolveSettings(Protocol):
     warm_start: int
     probe: int
     omega: float
+    position: float
+    trust: float
+    dx_dv: float
+    step_budget: float
 
 
 class LoopState(Protocol):

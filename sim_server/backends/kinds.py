@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""Numbers of kernels/kinds.h and kernels/energy_balance.cuh by name."""
+"""Numbers of kernels/kinds.h, kernels/error_estimate.cuh and kernels/energy_balance.cuh by name."""
 
 from enum import IntEnum, auto
 
 from sim_server.backends.declarations import Declarations
 
 KINDS = Declarations("kernels/kinds.h")
+_estimate = Declarations("kernels/error_estimate.cuh")
+WARPED_TRUST: float = _estimate.constant("WARPED_TRUST")
+FACTOR_TRUST: float = _estimate.constant("FACTOR_TRUST")
 _balance = Declarations("kernels/energy_balance.cuh")
 ON_RUNAWAY = _balance.enumeration("OnRunaway")
 SLACK_OF_ENERGY: float = _balance.constant("SLACK_OF_ENERGY")

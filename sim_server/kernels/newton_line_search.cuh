@@ -13,6 +13,7 @@
 //   - The first direction starts at the state before the step, u = -p0: its first trial is the result of one linearization.
 //   - The iteration ends when |b| <= tolerance |b of the step's first linearization|, or when b is rounding.
 #pragma once
+#include "error_estimate.cuh"
 #include "host_device.cuh"
 #include "kinds.h"
 
@@ -31,6 +32,9 @@ struct Search {                        // Newton iteration of a step, of one bod
     double residual, seconds;          // largest of the solves; sum of all
     int phase, linearizations, tried;
     int iterations, status, kind, fallbacks, verdict;
+    double solve_error, step_error;    // estimated, largest of a node [m], of the last linear solve and of the state reached; NaN: not known
+    double forcing;                    // relative tolerance of the next linear solve; 0: that of the settings
+    double factor_scale;               // of P^-1 in the last solve (error_estimate.cuh); 0: not known
 };
 
 struct Limits {
@@ -67,6 +71,7 @@ HOST_DEVICE double elastic_impulse_square(const A* a, const X* x, double mass, d
 // At the first linearization. norm: |b|; floor: rounding error of b; kind: preconditioner asked for.
 HOST_DEVICE void start_search(Search& s, double norm, double floor, int kind) {
     s = Search{};
+    s.solve_error = s.step_error = not_known();
     s.first = s.norm = norm;
     s.floor = floor;
     s.kind = kind;

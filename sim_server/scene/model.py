@@ -21,6 +21,7 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from sim_server.errors import InputError
 from sim_server.mesh import Mesh, bar, check, read
+from sim_server.scene.accuracy_options import MOST_LINEARIZATIONS, ROUNDING, AccuracyOptions
 from sim_server.scene.effect_tables import checked_effects
 from sim_server.scene.holders import Holder, check_holders_on, holder_errors
 from sim_server.scene.integrator_options import IntegratorOptions
@@ -145,6 +146,7 @@ class Scene(Parameters):
     effects: Annotated[dict[str, BaseModel], *_effects("scene")] = Field(default_factory=dict)
     integrator: IntegratorOptions = IntegratorOptions()
     solver: SolverOptions = SolverOptions()
+    accuracy: AccuracyOptions | None = None
     record: RecordOptions = RecordOptions()
     objects: Annotated[list[SceneObject], AfterValidator(_some_objects)] = Field(alias="object")
     obstacles: list[Obstacle] | None = Field(default=None, alias="obstacle", min_length=1)
@@ -154,6 +156,52 @@ class Scene(Parameters):
 
     _path: Path = PrivateAttr(Path())
     _text: str = PrivateAttr("")
+
+    @model_validator(mode="after")
+    def _as_accuracy_needs(self) -> "Scene":
+        """With a bound of the error in metres, tolerances that the scene does not give are rounding, and there are
+        more linearizations where the scene may have them."""
+        if self.accuracy is None:
+            return self
+        scheme, solve = self.integrator.scheme, self.integrator.solve
+        if self.integrator.explicit:
+            raise complaint(f'[accuracy] with integrator.scheme = "{scheme}", which solves no equations')
+        if solve == "factor":
+            raise complaint(
+                '[accuracy] with integrator.solve = "factor", which makes steps without iterations; allowed: '
+                '"auto", "iterate"'
+            )
+        one_solve = scheme == "ros2" or self.solver.budget or self.attachments or self.springs
+        given = self.integrator.model_fields_set
+        if "contact" not in self.effects and not one_solve:
+            more = {"linearizations": MOST_LINEARIZATIONS, "tolerance": ROUNDING}
+            self._set("integrator", {key: value for key, value in more.items() if key not in given})
+        if "tolerance" not in self.solver.model_fields_set:
+            self._set("solver", {"tolerance": ROUNDING})
+        return self
+
+    def _set(self, table: str, values: dict[str, Any]) -> None:
+        """Replaces values of a table; tables are frozen."""
+        self.__dict__[table] = getattr(self, table).model_copy(update=values)
+
+    @model_validator(mode="after")
+    def _budget_of_a_step(self) -> "Scene":
+        if self.solver.budget_ms is None:
+            return self
+        scheme, given, other = self.integrator.scheme, f"{self.solver.budget_ms:g}", self.solver.budget
+        if scheme == "ros2" or self.integrator.explicit:
+            raise complaint(
+                f'solver.budget_ms = {given} with integrator.scheme = "{scheme}", which cannot end a '
+                "step early; allowed: none"
+            )
+        if "contact" in self.effects and scheme != "backward_euler":
+            raise complaint(
+                f"solver.budget_ms = {given} with contact and integrator.scheme = "
+                f'"{scheme}", which may make a step twice; allowed: "backward_euler"'
+            )
+        if other:
+            raise complaint(f"solver.budget_ms = {given} with budget = {other:g}; allowed: one of both")
+        return self
 
     @model_validator(mode="after")
     def _budget_of_one_solve(self) -> "Scene":
@@ -197,7 +245,7 @@ class Scene(Parameters):
                 f'solver.budget = {solver.budget:g} with integrator.scheme = "{scheme}", which solves no equations; '
                 "allowed: 0"
             )
-        self.__dict__["solver"] = solver.model_copy(update={"preconditioner": "none", "warp": False})  # it is frozen
+        self._set("solver", {"preconditioner": "none", "warp": False})
         return self
 
     @property

@@ -98,6 +98,7 @@ class SolverOptions(Parameters):
         description="of the factor as applied; auto: float32 on a CPU and where it is used alone (ros2), else float16",
     )
     budget: float = Field(default=0.0, ge=0, description="wall time per solve [s]; 0 = none")
+    budget_ms: float | None = Field(default=None, gt=0, description="wall time per step [ms]")
     on_runaway: OnRunaway = Field(
         default="freeze", description="treatment of a body with more energy than accounted for"
     )
@@ -165,6 +166,11 @@ class SolverOptions(Parameters):
         """The method of a factor in a log, by name; "": the one of the scene."""
         known = {m.name: m for m in (Method(), self._incomplete)}
         return self.method if self.preconditioner != "auto" else known.get(name, Method())
+
+    @property
+    def step_budget(self) -> float:
+        """Wall time of a step [s]; 0: any."""
+        return (self.budget_ms or 0.0) / 1000
 
     @property
     def factor_dtype(self) -> Literal["float32", "float64"]:

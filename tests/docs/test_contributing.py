@@ -94,7 +94,7 @@ def test_the_record_column_is_in_records_messages_and_exports(tmp_path: Path) ->
             [sys.executable, *arguments], cwd=tmp_path / folder, env=variables, capture_output=True, text=True
         )
         assert run.returncode == 0, run.stdout + run.stderr
-    assert (tmp_path / "run.csv").read_text().splitlines()[0].endswith(",stable_step,iteration_rate")
+    assert (tmp_path / "run.csv").read_text().splitlines()[0].endswith(",step_error,iteration_rate")
 
 
 @pytest.mark.slow

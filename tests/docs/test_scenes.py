@@ -10,6 +10,7 @@ from annotated_types import Ge, Gt, Le, Lt, MaxLen, MinLen
 from pydantic.fields import FieldInfo
 
 from sim_server import effects
+from sim_server.scene.accuracy_options import AccuracyOptions
 from sim_server.scene.holders import Holder
 from sim_server.scene.integrator_options import IntegratorOptions
 from sim_server.scene.model import MeshSource, RecordOptions, Scene, SceneObject
@@ -27,6 +28,7 @@ BY_HAND = {
     ("[integrator]", "gamma"): ("1/2", None),
     ("[solver]", "preconditioner"): (None, ", ".join(f"`{p}`" for p in PRECONDITIONERS)),
     ("[solver]", "update"): (None, "`never`, `every-N`, `async`, `adaptive`, `lockstep-D`; N and D: 1 to 999,999"),
+    ("[accuracy]", "position"): (None, "above 0, or"),
     ("Objects", "density"): ("1000", None),
     ("Objects", "friction"): ("0.5", None),
     ("Obstacles", "scale"): ("1", None),
@@ -132,6 +134,7 @@ def rows_of(heading: str) -> dict[str, Row]:
         ("The scene", {k: f for k, f in Scene.model_fields.items() if k in ("dt", "name")}),
         ("[integrator]", IntegratorOptions.model_fields),
         ("[solver]", SolverOptions.model_fields),
+        ("[accuracy]", AccuracyOptions.model_fields),
         ("[record]", RecordOptions.model_fields),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
@@ -143,6 +146,7 @@ def test_keys_of_a_table(heading: str, fields: dict[str, FieldInfo]) -> None:
 def test_no_table_is_missing() -> None:
     tables = {field.alias or name for name, field in Scene.model_fields.items()} - {"dt", "name"}
     assert tables == {
+        "accuracy",
         "effects",
         "integrator",
         "solver",

@@ -151,9 +151,11 @@ static void report(GpuLoop& l, const StepBatch& batch, int64_t k, double end, do
         record.asked = r.asked;
         record.bad_node = r.bad_node;
         record.probe = r.probe;
+        if (r.solve_error > 0) record.solve_error = r.solve_error;
         if (l.newton_results) {
             record.nonlinear = l.newton_results[slot + i].nonlinear;
             record.linearizations = l.newton_results[slot + i].linearizations;
+            if (l.newton_results[slot + i].step_error > 0) record.step_error = l.newton_results[slot + i].step_error;
         }
         if (l.stage_results) {
             record.form = l.stage_results[slot + i].form;

@@ -49,6 +49,8 @@ struct PcgBody {
     int kind, max_iterations, warm_start, probe;
     int first_range;               // first of its thread blocks in PcgArguments.row_ranges
     double tolerance;
+    double position, trust, dx_dv; // see SolveSettings (backends/cpu/native/pcg.h)
+    double step_budget;            // likewise
     long long factor_step;         // step of the matrix of the factor
     const DevicePlan* plan;        // null: no factor yet
     const uint4* matrix;           // chunks

@@ -7,11 +7,13 @@ struct PcgResult {
     double seconds;
     long long factor_step;  // -1: no factor used
     int iterations, status, kind, asked, fallbacks, bad_node, probe;
+    double solve_error;     // estimated, largest of a node [m]; 0: not known
 };
 
 struct NewtonResult {
     double nonlinear;       // |b| at the end of the step over the first |b|
     int linearizations;
+    double step_error;      // estimated, largest of a node [m]; 0: not evaluated
 };
 
 struct StageResult {       // of a step by stages

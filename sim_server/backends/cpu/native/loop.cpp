@@ -227,12 +227,13 @@ static void finish_step(Loop* loop) {
         Body& body = loop->body[i];
         const SolveSettings& settings = body.now;
         int linearizations = 1;
-        double nonlinear = -1;
+        double nonlinear = -1, step_error = NAN;
         SolveResult r;
         if (loop->newton && (!loop->euler || is_made(*loop, i))) {
             r = as_solve_result(loop->newton->search[i]);
             linearizations = std::max(1, loop->newton->search[i].linearizations);
             nonlinear = residual_ratio(loop->newton->search[i]);
+            step_error = loop->newton->search[i].step_error;
         } else if (loop->substeps) {
             r = loop->substeps->result[i];
         } else if (loop->euler) {
@@ -258,6 +259,8 @@ static void finish_step(Loop* loop) {
         record.bad_node = r.status != NOT_FINITE ? -1 : first_bad_node(loop->substeps ? loop->substeps->force : loop->b, body);
         record.probe = settings.probe;
         record.linearizations = linearizations;
+        record.solve_error = r.solve_error;
+        record.step_error = step_error;
         if (loop->contact) note_contact(*loop, i, (first + i) % rings.record_capacity);
         if (loop->substeps) note_substeps(*loop->substeps, i, record);
         if (loop->euler && loop->euler->takes[i]) record.form = EULER;

@@ -131,5 +131,5 @@ static void end_search(Loop& loop, int index) {
 
 // The search in the form of one solve.
 static SolveResult as_solve_result(const Search& search) {
-    return SolveResult{search.residual, search.seconds, search.iterations, search.status, search.kind, search.fallbacks};
+    return SolveResult{search.residual, search.seconds, search.iterations, search.status, search.kind, search.fallbacks, 0, 0, search.solve_error};
 }

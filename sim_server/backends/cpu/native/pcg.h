@@ -26,6 +26,12 @@ struct SolveSettings {
     int32_t warm_start;
     int32_t probe;          // > 0: after so many iterations go from block Jacobi to the factor, or the other way
     double omega;           // of SSOR
+    double position;        // largest estimated error of a node at which a solve ends [m], 0: none (error_estimate.cuh)
+    double trust;           // times the estimate with a factor is at least the error
+    double dx_dv;           // of the step [s]
+    double step_budget;     // s of wall time from the beginning of the step, 0: none
+    double deadline;        // steady clock at which it ends [s], 0: none; set by the loop
+    int32_t most_linearizations;  // of the step, 0: those of the scene (replays of steps that a budget ended)
 };
 
 struct SolveResult {
@@ -36,6 +42,7 @@ struct SolveResult {
     int32_t fallbacks;      // 1: the factor was left in this solve
     int32_t switched_after; // iterations before a probe went over to the other kind, 0: it did not
     double residual_then;   // recursive, relative
+    double solve_error = NAN;  // estimated, of the solution, largest of a node [m]; NaN: not known
 };
 
 // Where a solve starts: from zero or from x if that is better, as the settings say; or from x, whose residual is what the tolerance

@@ -49,6 +49,8 @@ struct Record {
     int32_t clipped = 0;        // nodes held back at an obstacle beside the law
     int32_t substeps = 0;       // explicit ones of the step; 0: an implicit scheme
     double stable_step = NAN;   // largest stable substep as estimated last [s]; NaN: an implicit scheme
+    double solve_error = NAN;   // estimated, of the positions, by the last linear solve, largest of a node [m]; NaN: not known
+    double step_error = NAN;    // likewise of the step's equation, the former included; NaN: not evaluated
 };
 
 // b: Balance or EnergyRecord of the body (kernels/energy_balance.cuh).
