@@ -171,6 +171,10 @@ class Scene(Parameters):
                 '[accuracy] with integrator.solve = "factor", which makes steps without iterations; allowed: '
                 '"auto", "iterate"'
             )
+        if self.solver.preconditioner == "none":
+            raise complaint(
+                '[accuracy] with solver.preconditioner = "none", which tells nothing of errors; allowed: the others'
+            )
         one_solve = scheme == "ros2" or self.solver.budget or self.attachments or self.springs
         given = self.integrator.model_fields_set
         if "contact" not in self.effects and not one_solve:

@@ -27,6 +27,7 @@ class SolveObserver:
         self._driver = driver
         simulation = driver.simulation
         system, bodies = simulation.system, simulation.world.bodies
+        self._position = np.array([simulation.engine.settings(b.index).position for b in bodies])
         self._matrix_bytes = [BLOCK_BYTES * len(system.body_values(b.first, b.last)) for b in bodies]
 
     def observe(self, records: NDArray[Any]) -> None:
@@ -52,7 +53,7 @@ class SolveObserver:
                 continue
             method, solves = state.factors.method(step), max(int(r["linearizations"]), 1)
             waiting = driver.policy.waiting_cost(state.factors.method_cost(method)) if method else 0.0
-            shortfall, used = convergence(r, solver)
+            shortfall, used = convergence(r, solver, self._position[state.body.index])
             state.tuner.observe(
                 kind, iterations / solves, cost / solves, Kind(r["asked"]), (method, step), waiting,
                 Convergence(float(shortfall), float(used)), int(r["fallbacks"]),
@@ -65,7 +66,7 @@ class SolveObserver:
         observe_steps(states, r, driver.solver.update_floor_iterations)
         if all(state.tuner is None for state in states):
             return
-        shortfall, used = convergence(r, driver.solver)
+        shortfall, used = convergence(r, driver.solver, self._position)
         solves = np.maximum(r["linearizations"], 1)
         begun = (r["kind"], r["iterations"] / solves, r["solve"] / solves, r["asked"])
         ended = (shortfall, used, r["fallbacks"], r["factor_step"])

@@ -78,6 +78,7 @@ def test_linearizations_are_not_raised_where_one_is_all_there_may_be(scene, othe
 REFUSED = {
     (POSITION, "integrator.scheme=central_difference", "solver.preconditioner=auto"): "which solves no equations",
     (POSITION, "integrator.scheme=ros2", "integrator.solve=factor", "solver.preconditioner=auto"): "without iterations",
+    (POSITION, "solver.preconditioner=none"): "which tells nothing of errors",
     ("accuracy.positions=1e-3",): "unknown key; did you mean 'position'",
     ("solver.budget_ms=1", "solver.budget=1"): "solver.budget_ms = 1 with budget = 1",
     ("solver.budget_ms=1", "integrator.scheme=ros2"): '"ros2", which cannot end a step early',

@@ -225,7 +225,7 @@ class _NativeContact:
         self._result = (structs.SolveResult * bodies)()
         self._choice = (structs.PassChoice * bodies)()
         self._own = {
-            "active": np.zeros(rows, np.int32), "room": np.zeros((8, loop.nodes, 3)),
+            "active": np.zeros(rows, np.int32), "room": np.zeros((9, loop.nodes, 3)),
             "reaction": np.zeros((bodies, count, 6)), "mode": np.zeros(bodies, np.int32),
             "island": np.zeros(bodies, np.int32), "island_start": np.zeros(bodies + 1, np.int32),
             "island_rows": np.zeros(bodies, np.int32), "near": np.zeros(bodies, np.int32),
@@ -366,7 +366,7 @@ class CpuEngine(Reports):
         self._body = (structs.Body * bodies)()
         for entry_body, (first, last) in zip(self._body, ranges, strict=True):
             entry_body.first, entry_body.last, entry_body.snapshot_step = first, last, -1
-        self._work = np.zeros(27 * nodes)
+        self._work = np.zeros(structs.WORK * nodes)
         self._corrections: dict[int, Any] = {}
         self._arrays = arrays
         self._mail: list[Mailbox] = [Mailbox([]) for _ in ranges]

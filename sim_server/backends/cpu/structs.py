@@ -12,6 +12,7 @@ REACTION_KINDS = LOOP.enumeration("ReactionKind")
 CHANGE = LOOP.dtype("Change")  # of a diagonal entry: native/woodbury.h
 KNOWN_CONTACT = LOOP.dtype("KnownContact")  # contacts of a node: native/woodbury.h
 MAX_CORRECTED: int = LOOP.constant("MAX_CORRECTED")  # nodes of a Correction
+WORK: int = LOOP.constant("WORK")  # doubles a node: native/pcg.h
 STABLE_STEP = LOOP.dtype("StableStep")  # of a body: kernels/stable_step.cuh
 BALANCE = LOOP.dtype("Balance")  # kernels/energy_balance.cuh
 

@@ -74,7 +74,9 @@ static void solve_island(Loop& loop, int island, bool resumes) {
         const int64_t at = 3 * (int64_t)body.first;
         p.rows.actives = 0;
         tell_correction(p.rows, body);
-        p.result = pcg(matrix_of(loop, body), loop.b + at, body.factor, body.now, loop.y + at, loop.work + 27 * (int64_t)body.first,
+        SolveSettings settings = body.now;
+        settings.dx_dv = p.c.dx_dv;
+        p.result = pcg(matrix_of(loop, body), loop.b + at, body.factor, settings, loop.y + at, loop.work + WORK * (int64_t)body.first,
                        !loop.moving[first], &body.correction);
         if (p.result.status != NOT_FINITE) {
             p.move_points();

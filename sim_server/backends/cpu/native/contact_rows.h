@@ -64,7 +64,7 @@ struct Contact {
     const double *rotation, *predictor, *free;    // (nodes, 3, 3), (nodes, 3), (nodes,)
     RowState* state;                              // (rows,)
     int32_t *active, *used;                       // (rows,) rows that act, and that are not empty; those of an island one after another
-    double* room;                                 // 24 doubles a node
+    double* room;                                 // 27 doubles a node
     ContactReport* report;                        // (bodies,)
     double* reaction;                             // (bodies, obstacles, 6) force and torque on each obstacle
     int32_t* dropped;                             // (sites,)

@@ -177,7 +177,7 @@ static void make_own_step(Loop& loop) {
         if (!own(i)) continue;
         if (loop.newton) e.result[i] = as_solve_result(loop.newton->search[i]);
         else
-            e.result[i] = pcg(matrix_of(loop, body), loop.b + at, body.factor, body.now, loop.y + at, loop.work + 27 * (int64_t)body.first,
+            e.result[i] = pcg(matrix_of(loop, body), loop.b + at, body.factor, body.now, loop.y + at, loop.work + WORK * (int64_t)body.first,
                               !loop.moving[i], &body.correction);
     }
     for (int k = loop.before; k < loop.launches; ++k) run_for(loop, loop.launch[k], own);

@@ -12,6 +12,25 @@
 
 #include "loop.h"
 
+struct IslandNodes {
+    const Loop& loop;
+    const int32_t* bodies;
+    const int32_t count;
+    template <class F> double most(F f) const {
+        double found = 0;
+        for (int m = 0; m < count; ++m) {
+            const Body& body = loop.body[bodies[m]];
+            found = std::max(found, f(body.last - body.first, 3 * (int64_t)body.first));
+        }
+        return std::sqrt(found);
+    }
+    double peak(const double* a) const { return most([&](int nodes, int64_t at) { return peak2(nodes, a + at); }); }
+    double change(const double* a, const double* b) const { return most([&](int nodes, int64_t at) { return peak2(nodes, a + at, b + at); }); }
+    void copy(const double* from, double* to) const {
+        most([&](int nodes, int64_t at) { std::copy(from + at, from + at + 3 * (int64_t)nodes, to + at); return 0.0; });
+    }
+};
+
 constexpr int MODES = 6;  // of a body: translations, then rotations about its centre
 
 // Cholesky factor L of the symmetric a (size n, lower half, row stride), in place; false if it is not positive definite.
@@ -49,14 +68,14 @@ struct IslandSolver {
     const Rows& rows;
     int modes = 0;
     double *E, *c1, *c2;                // dense factor; coefficients
-    double *z, *p, *q;                  // of all nodes
+    double *z, *p, *q, *x_before;       // of all nodes
     std::vector<BlockCsr>& matrices;
     std::vector<Preconditioner>& single;  // of each body; they refer to `matrices`
 
     IslandSolver(Loop& loop, Contact& c, const int32_t* bodies, int count, const Rows& rows)
         : loop(loop), c(c), bodies(bodies), count(count), rows(rows), matrices(memory<BlockCsr>()), single(memory<Preconditioner>()) {
         const int64_t n = 3 * (int64_t)loop.nodes;
-        z = c.room + 5 * n; p = z + n; q = p + n;
+        z = c.room + 5 * n; p = z + n; q = p + n; x_before = q + n;
         E = c.coarse; c1 = E + (int64_t)c.most_modes * c.most_modes; c2 = c1 + c.most_modes;
     }
     template <class T> static std::vector<T>& memory() {
@@ -273,7 +292,7 @@ struct IslandSolver {
         matrices.clear();
         each_body([&](Body& body, int) { matrices.push_back(matrix_of(loop, body)); });
         each_body([&](Body& body, int m) {
-            double* work = loop.work + 27 * (int64_t)body.first;
+            double* work = loop.work + WORK * (int64_t)body.first;
             const int n = 3 * (body.last - body.first);
             body.correction.in_contact = 0;
             single.push_back({matrices[m], body.factor, BLOCK_JACOBI, work, work + 3 * n, 1, &body.correction});
@@ -364,13 +383,28 @@ struct IslandSolver {
         });
     }
 
+    // The bound of the island: the smallest one of its bodies, and what all estimates are to be trusted by.
+    struct Bound { double position, trust; };
+    Bound bound_of(const SolveSettings& settings) const {
+        Bound found{settings.position, OTHER_TRUST};
+        each_body([&](const Body& body, int) {
+            found.position = std::min(found.position, body.now.position);
+            found.trust = std::max(found.trust, body.now.trust);
+        });
+        return found;
+    }
+
     // Solves from zero; r: its residual at the end.
     SolveResult solve(const double* b, const SolveSettings& settings, double* x, double* r) {
         const double begin = now();
         const double b2 = norm2(b), goal = settings.tolerance * settings.tolerance * b2;
         SolveResult out{0, 0, 0, CONVERGED, settings.kind, 0, 0, 0};
         each_entry([&](int64_t k) { x[k] = 0; r[k] = b[k]; });
+        const Bound bound = bound_of(settings);
+        const double limit = settings.residual_limit > 0 ? settings.residual_limit * settings.residual_limit * b2 : INFINITY;
+        IterateError<IslandNodes> error{{loop, bodies, count}, x, z, x_before, 0};
         auto finish = [&](int status, double r2) {
+            error.tell(settings.dx_dv, r2, out);
             out.status = status;
             out.residual = b2 > 0 ? std::sqrt(r2 / b2) : 0;
             out.seconds = now() - begin;
@@ -382,10 +416,26 @@ struct IslandSolver {
             return norm2(r);
         };
         if (!std::isfinite(b2)) return finish(NOT_FINITE, b2);
-        if (b2 == 0) return finish(CONVERGED, 0);
+        if (b2 == 0) {
+            out.solve_error = 0;
+            return finish(CONVERGED, 0);
+        }
         prepare(settings.kind);
         double r2 = b2, rz = 0, last_true = INFINITY;
-        for (bool restart = true;;) {
+        bool restart = true;
+        auto is_enough = [&](bool ahead) {
+            return settings.position > 0 && r2 <= limit && may_end(r2, b2) && error.is_enough(settings.dx_dv, bound.trust, bound.position, r2, ahead);
+        };
+        auto ended = [&](bool enough) {  // as in pcg.h
+            const double found = r2;
+            r2 = true_residual();
+            if (r2 <= goal || (enough && r2 <= LOST_DIGITS * found)) return (int)CONVERGED;
+            if (!(r2 < 0.25 * last_true)) return (int)MAX_ITERATIONS;
+            last_true = r2;
+            restart = true;
+            return -1;
+        };
+        for (;;) {
             if (settings.probe > 0 && out.iterations == settings.probe && !out.switched_after) {
                 out.kind = out.kind == CHOLESKY ? BLOCK_JACOBI : CHOLESKY;
                 out.switched_after = out.iterations;
@@ -400,6 +450,12 @@ struct IslandSolver {
                 restart = true;
                 continue;
             }
+            error.apply(out.kind, zr, r2);
+            if (is_enough(false)) {
+                const int status = ended(true);
+                if (status >= 0) return finish(status, r2);
+                continue;
+            }
             const double beta = restart ? 0 : zr / rz;
             each_entry([&](int64_t k) { p[k] = z[k] + beta * p[k]; });
             rz = zr;
@@ -407,6 +463,7 @@ struct IslandSolver {
             if (out.iterations == settings.max_iterations) return finish(MAX_ITERATIONS, true_residual());
             const bool spent = settings.budget > 0 ? out.iterations > 0 && now() - begin > settings.budget : out.iterations + 1 == -settings.budget;
             if (spent) return finish(BUDGET, true_residual());
+            error.look();
             const double pq = product(p, q);
             ++out.iterations;
             if (!(pq > 0)) return finish(BREAKDOWN_MATRIX, true_residual());
@@ -415,12 +472,11 @@ struct IslandSolver {
                 const int64_t at = 3 * (int64_t)body.first;
                 return descend((int)(3 * (int64_t)(body.last - body.first)), alpha, p + at, q + at, x + at, r + at);
             });
-            if (r2 > goal) continue;
-            r2 = true_residual();
-            if (r2 <= goal) return finish(CONVERGED, r2);
-            if (!(r2 < 0.25 * last_true)) return finish(MAX_ITERATIONS, r2);
-            last_true = r2;
-            restart = true;
+            error.move(alpha);
+            const bool enough = is_enough(true);
+            if (r2 > goal && !enough) continue;
+            const int status = ended(enough);
+            if (status >= 0) return finish(status, r2);
         }
     }
 };

@@ -243,7 +243,7 @@ static void finish_step(Loop* loop) {
         } else {
             BlockCsr A{body.first, body.last, loop->row_start, loop->columns, loop->values};
             r = pcg(A, loop->b + 3 * body.first, body.factor, settings, loop->y + 3 * body.first,
-                    loop->work + 27 * (int64_t)body.first, !loop->moving[i], &body.correction);
+                    loop->work + WORK * (int64_t)body.first, !loop->moving[i], &body.correction);
         }
         ++body.steps;
         if (!keep) continue;

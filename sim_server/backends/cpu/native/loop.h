@@ -156,7 +156,7 @@ struct Loop {
     double* y;                         // (nodes, 3) start in, solution out
     double* x;                         // (nodes, 3) for frames
     double* v;
-    double* work;                      // 27 doubles a node
+    double* work;                      // WORK doubles a node
     Newton* newton;                    // null: one linearization a step
     Stages* stages;                    // null: another scheme
     EulerForm* euler;                  // null: all bodies take the steps of the scheme

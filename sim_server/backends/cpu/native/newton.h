@@ -77,7 +77,7 @@ static void solve(Loop& loop, int index) {
     if (search.phase != SOLVE) return;
     BodyRoom room(newton, body);
     const int64_t at = 3 * (int64_t)body.first;
-    double *y = loop.y + at, *work = loop.work + 27 * (int64_t)body.first, *material = work, *product = work + room.n;
+    double *y = loop.y + at, *work = loop.work + WORK * (int64_t)body.first, *material = work, *product = work + room.n;
     BlockCsr A{body.first, body.last, loop.row_start, loop.columns, loop.values};
     SolveSettings settings = body.now;
     settings.warm_start = settings.warm_start && search.linearizations == 0;  // the last step's is no guess for a correction
@@ -104,7 +104,7 @@ static int judge(Loop& loop, int index) {
     if (search.phase != TRY) return search.phase;
     BodyRoom room(newton, body);
     const double* b = loop.b + 3 * (int64_t)body.first;
-    double* material = loop.work + 27 * (int64_t)body.first;
+    double* material = loop.work + WORK * (int64_t)body.first;
     rotate(newton, body, true, room.direction, material);
     const int verdict = evaluate_trial(search, newton.most, norm(room.n, b), dot(room.n, material, b));
     if (verdict == SHORTER) set_state(loop, body, search.scale);

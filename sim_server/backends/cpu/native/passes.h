@@ -9,6 +9,8 @@
 #include "island_rows.h"
 #include "pass_choice.h"
 
+constexpr double WITHIN = 0.5;  // part of the law's tolerance that the last solve may leave where it ends by the error of positions
+
 struct Passes : IslandRows {
     double *left, *r, *dy, *before, *rest;  // b - A y; with contact; solution of a pass; r before its solve; residual of its solve
     const double scale2;                 // i c, of S
@@ -90,26 +92,30 @@ struct Passes : IslandRows {
     // replay knows from the count where the budget ended.
     bool cut() const { return result.status == BUDGET; }
 
-    SolveSettings settings_for(double tolerance) const {
+    // last: the solve may end by the error of the positions, within the law's tolerance of the residual.
+    SolveSettings settings_for(double tolerance, bool last, double most) const {
         SolveSettings s = loop.body[bodies[0]].now;
         s.tolerance = tolerance;
         s.warm_start = 0;
         s.probe = 0;
+        s.dx_dv = c.dx_dv;
+        if (!last) s.position = 0;
+        s.residual_limit = most;
         if (s.budget > 0) s.budget = std::max(s.budget - result.seconds, 1e-9);
         if (s.budget < 0) s.budget = cut() ? -2 : std::min(-1.0, s.budget + result.iterations);
         return s;
     }
 
     // dy of (A + H^T S H) dy = r, and its residual.
-    SolveResult solve_linear(double tolerance) {
-        SolveSettings settings = settings_for(tolerance);
+    SolveResult solve_linear(double tolerance, bool last, double most) {
+        SolveSettings settings = settings_for(tolerance, last, most);
         if (count > 1) return solve_together(settings);
         Body& body = loop.body[bodies[0]];
         const int64_t at = 3 * (int64_t)body.first;
         Rows own = rows;
         own.node_first = body.first;
         const BlockCsr A{body.first, body.last, loop.row_start, loop.columns, loop.values, &own};
-        double* work = loop.work + 27 * (int64_t)body.first;
+        double* work = loop.work + WORK * (int64_t)body.first;
         tell_correction(rows, body);
         auto solve_by = [&] { return pcg(A, r + at, body.factor, settings, dy + at, work, false, &body.correction); };
         SolveResult solved;
@@ -143,16 +149,18 @@ struct Passes : IslandRows {
         return solved;
     }
 
-    // Solves (A + H^T S H) dy = r and moves y by alpha dy, left accordingly. tolerance: of |r|. exactly: alpha is 1.
-    void pass(double tolerance, bool exactly) {
+    // Solves (A + H^T S H) dy = r and moves y by alpha dy, left accordingly. tolerance: of |r|. exactly: alpha is 1. most: of |r|, in a solve
+    // that ends by the error of positions.
+    void pass(double tolerance, bool exactly, double most) {
         each_entry([&](int64_t k) { before[k] = r[k]; });
-        const SolveResult solved = solve_linear(tolerance);
+        const SolveResult solved = solve_linear(tolerance, exactly, most);
         ++report.passes;
         result.seconds += solved.seconds;
         if (!cut()) result.iterations += solved.iterations;
         result.fallbacks += solved.fallbacks;
         result.kind = solved.kind;
         if (!cut() || solved.status == NOT_FINITE) result.status = solved.status;
+        result.solve_error = solved.solve_error;
         result.residual = solved.residual;  // of |r|; of what is given at the end of the step
         if (solved.status == NOT_FINITE) return;
         // A dy = r - (residual of the solve) - H^T S H dy: no more product with A.
@@ -220,7 +228,7 @@ struct Passes : IslandRows {
             }
             if (!last && report.passes >= c.passes) break;
             const double early = early_tolerance(report.residual, contact_tolerance, report.passes, c.passes);
-            pass(last ? goal / size : std::max(goal / size, early), last);
+            pass(last ? goal / size : std::max(goal / size, early), last, WITHIN * contact_tolerance * given / size);
             result.residual *= given > 0 ? size / given : 0;
             if (result.status == NOT_FINITE) return;
             spent = cut();

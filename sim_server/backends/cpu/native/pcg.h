@@ -11,12 +11,19 @@
 //     factor that still converges would be dropped. With few iterations the first ones tell nothing, and block Jacobi cannot use the
 //     rest;
 //   - a time budget allows at least one iteration: with none a body would miss its forces.
+// With `position` it ends, too, where the estimated error is below it. That takes an iteration at least, which tells the scale of P^-1,
+// unless an earlier solve of the step has.
 // An iteration is one application of A after the initial residual.
 #pragma once
 #include "bsr.h"
+#include "iterate_error.h"
 #include "kinds.h"
 #include "ring_buffers.h"
 #include "woodbury.h"
+
+constexpr double USEFUL = 1e-6;      // tolerance by which factors count as useless where `position` ends solves
+constexpr double LOST_DIGITS = 1.1;  // times |r|^2 as updated, within which the true one is taken for it
+constexpr int WORK = 30;    // doubles a node of a solve's memory
 
 struct SolveSettings {
     double tolerance;       // of |b|
@@ -32,6 +39,8 @@ struct SolveSettings {
     double step_budget;     // s of wall time from the beginning of the step, 0: none
     double deadline;        // steady clock at which it ends [s], 0: none; set by the loop
     int32_t most_linearizations;  // of the step, 0: those of the scene (replays of steps that a budget ended)
+    double factor_scale;    // of P^-1, of an earlier solve of the step (SolveResult), 0: not known
+    double residual_limit;  // of |b|, which the residual may not exceed where `position` ends a solve; 0: none
 };
 
 struct SolveResult {
@@ -43,6 +52,7 @@ struct SolveResult {
     int32_t switched_after; // iterations before a probe went over to the other kind, 0: it did not
     double residual_then;   // recursive, relative
     double solve_error = NAN;  // estimated, of the solution, largest of a node [m]; NaN: not known
+    double factor_scale = 0;   // of P^-1 at the end: the estimate over dx_dv |P^-1 r|; 0: not known
 };
 
 // Where a solve starts: from zero or from x if that is better, as the settings say; or from x, whose residual is what the tolerance
@@ -87,15 +97,18 @@ struct Preconditioner {
     }
 };
 
-// Solves A x = b. work: 9 n doubles; x: start in, solution out; rests: the body is at rest; correction: of the factor, or null.
+// Solves A x = b. work: 10 n doubles; x: start in, solution out; rests: the body is at rest; correction: of the factor, or null.
 static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor, const SolveSettings& settings, double* x,
                        double* work, bool rests = false, Correction* correction = nullptr, Start from = WARM_START) {
     double start = now();
     int n = A.size();
-    double *r = work, *z = r + n, *p = z + n, *q = p + n, *inverse = q + n, *scratch = inverse + 3 * n;
+    double *r = work, *z = r + n, *p = z + n, *q = p + n, *inverse = q + n, *scratch = inverse + 3 * n, *before = scratch + 2 * n;
+    const bool bounded = settings.position > 0;
     SolveResult out{0, 0, 0, CONVERGED, settings.kind, 0, 0, 0};
     if (out.kind == CHOLESKY && !factor) out.kind = BLOCK_JACOBI;
+    IterateError<BodyNodes> error{{n / 3}, x, z, before, settings.factor_scale};
     auto finish = [&](int status, double r2, double b2) {
+        error.tell(settings.dx_dv, r2, out);
         out.status = status;
         out.residual = b2 > 0 ? std::sqrt(r2 / b2) : 0;
         out.seconds = now() - start;
@@ -110,6 +123,7 @@ static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor,
     }
     if (from == GIVEN_START) b2 = residual(A, b, x, r);
     else if (b2 == 0) zero();
+    if (b2 == 0 || rests) out.solve_error = 0;
     if (b2 == 0) return finish(CONVERGED, 0, 0);
     double goal = settings.tolerance * settings.tolerance * b2;
     if (rests) return finish(CONVERGED, residual(A, b, x, r), b2);
@@ -123,7 +137,9 @@ static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor,
 
     Preconditioner P{A, factor, out.kind, inverse, scratch, settings.omega, correction};
     P.prepare();
-    double rz = 0, last_true = INFINITY, quarter = r2 * std::pow(goal / r2, 0.25);
+    const double useful = bounded ? std::max(goal, USEFUL * USEFUL * b2) : goal;
+    const double limit = settings.residual_limit > 0 ? settings.residual_limit * settings.residual_limit * b2 : INFINITY;
+    double rz = 0, last_true = INFINITY, quarter = r2 * std::pow(useful / r2, 0.25);
     bool restart = true, switched = false;
     auto leave_factor = [&] {
         P.kind = out.kind = BLOCK_JACOBI;
@@ -132,11 +148,31 @@ static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor,
         r2 = residual(A, b, x, r);
         restart = true;
     };
+    // Whether a solve ends by the estimate. ahead: z is of the iteration before.
+    auto is_enough = [&](bool ahead) {
+        return bounded && r2 <= limit && may_end(r2, b2) && error.is_enough(settings.dx_dv, trust_of(out.kind, settings.trust), settings.position, r2, ahead);
+    };
+    // The status with which the solve ends by its true residual, -1: it goes on from it.
+    auto ended = [&](bool enough) {
+        const double found = r2;
+        r2 = residual(A, b, x, r);
+        if (r2 <= goal || (enough && r2 <= LOST_DIGITS * found)) return (int)CONVERGED;
+        if (!(r2 < 0.25 * last_true)) return (int)MAX_ITERATIONS;                // limited by rounding: more iterations do not help
+        last_true = r2;
+        restart = true;
+        return -1;
+    };
     for (;;) {
         double zr = P.apply(r, std::sqrt(r2), z);                                // 1. 6. z = P^-1 r
         if (!(zr > 0 && zr < INFINITY)) {                                        // also NaN
             if (P.kind != CHOLESKY) return finish(BREAKDOWN_PRECONDITIONER, residual(A, b, x, r), b2);
             leave_factor();
+            continue;
+        }
+        error.apply(out.kind, zr, r2);
+        if (is_enough(false)) {
+            const int status = ended(true);
+            if (status >= 0) return finish(status, r2, b2);
             continue;
         }
         conjugate(n, restart ? 0 : zr / rz, z, p);                               // 7. 8. p = z + beta p
@@ -158,15 +194,15 @@ static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor,
         bool spent = settings.budget > 0 ? out.iterations > 0 && now() - start > settings.budget : out.iterations + 1 == -settings.budget;
         if (spent) return finish(BUDGET, residual(A, b, x, r), b2);
 
+        error.look();
         double pq = multiply(A, p, q);
         ++out.iterations;
         if (!(pq > 0)) return finish(BREAKDOWN_MATRIX, residual(A, b, x, r), b2);
         r2 = descend(n, rz / pq, p, q, x, r);                                    // 3. 4. 5.
-        if (r2 > goal) continue;
-        r2 = residual(A, b, x, r);
-        if (r2 <= goal) return finish(CONVERGED, r2, b2);
-        if (!(r2 < 0.25 * last_true)) return finish(MAX_ITERATIONS, r2, b2);     // limited by rounding: more iterations do not help
-        last_true = r2;
-        restart = true;
+        error.move(rz / pq);
+        const bool enough = is_enough(true);
+        if (r2 > goal && !enough) continue;
+        const int status = ended(enough);
+        if (status >= 0) return finish(status, r2, b2);
     }
 }

@@ -73,12 +73,14 @@ static void note(SolveResult& sum, const SolveResult& r) {
     sum.kind = r.kind;
     if (!(r.residual <= sum.residual)) sum.residual = r.residual;
     if (r.status != CONVERGED) sum.status = r.status;
+    sum.solve_error = std::isnan(sum.solve_error) ? r.solve_error : sum.solve_error + r.solve_error;
 }
 
 // The attempt is made again: what it cost counts, how it ended does not.
 static void forget(SolveResult& sum) {
     sum.status = CONVERGED;
     sum.residual = 0;
+    sum.solve_error = NAN;
 }
 
 struct FirstStage {  // views of a body's part of Stages::first_stage, (3 n,) each
@@ -113,7 +115,7 @@ static bool apply_alone(Loop& loop, int index, bool first) {
     const BlockCsr A = matrix_of(loop, body);
     const int n = A.size();
     const double *b = loop.b + 3 * (int64_t)body.first, begin = now();
-    double *y = loop.y + 3 * (int64_t)body.first, *work = loop.work + 27 * (int64_t)body.first;
+    double *y = loop.y + 3 * (int64_t)body.first, *work = loop.work + WORK * (int64_t)body.first;
     const FirstStage kept(*loop.stages, body);
     const double b2 = dot(n, b, b);
     SolveResult out{0, 0, 0, CONVERGED, CHOLESKY, 0};
@@ -143,11 +145,20 @@ static bool apply_alone(Loop& loop, int index, bool first) {
     return well;
 }
 
-static void iterate(Loop& loop, int index) {
+// Derivatives of the positions after the step by u_1 and u_2, over h (mechanics/rosenbrock.py); by u_1 at unchanged forces.
+constexpr double BY_FIRST = (1 + 1 / 0.29289321881345247559915563789515) / 2, BY_SECOND = 0.5;
+
+static void iterate(Loop& loop, int index, bool first) {
     StageState& s = loop.stages->state[index];
     Body& body = loop.body[index];
     const int64_t at = 3 * (int64_t)body.first;
-    note(s.result, pcg(matrix_of(loop, body), loop.b + at, body.factor, body.now, loop.y + at, loop.work + 27 * (int64_t)body.first,
+    SolveSettings settings = body.now;
+    settings.dx_dv = loop.rings.dt;
+    if (s.form != EULER) {
+        settings.dx_dv *= first ? BY_FIRST : BY_SECOND;
+        settings.position /= 2;  // of each stage
+    }
+    note(s.result, pcg(matrix_of(loop, body), loop.b + at, body.factor, settings, loop.y + at, loop.work + WORK * (int64_t)body.first,
                        !loop.moving[index], &body.correction, s.form == EULER ? WARM_START : GIVEN_START));
 }
 
@@ -158,7 +169,7 @@ template <class F> static void solve_stage(Loop& loop, bool first, F take_part) 
         StageState& s = loop.stages->state[i];
         if (!take_part(i) || s.form == FAILED) continue;
         if (!loop.moving[i] && s.form != EULER) { s.result.kind = loop.body[i].now.kind; continue; }
-        if (s.form != FACTOR) { iterate(loop, i); continue; }
+        if (s.form != FACTOR) { iterate(loop, i, first); continue; }
         if (apply_alone(loop, i, first)) continue;
         s.patience = PATIENCE;
         s.form = FAILED;
