@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 from sim_server.errors import InputError
 from sim_server.scene.parameters import Parameters, complaint
 
-MAX_STATES = 1024  # tried in a step on a GPU, whose graph of launches holds them all
+MAX_STATES = 1024  # tried in a step on a GPU whose graphs have no loops, so that they hold them all
 SchemeName = Literal["backward_euler", "newmark", "bdf2", "quasi_static", "ros2", "central_difference"]
 GAMMA = 0.29289321881345247559915563789515  # 1 - 1 / sqrt 2, of ros2 (mechanics/rosenbrock.py)
 
@@ -105,10 +105,11 @@ class IntegratorOptions(Parameters):
         """Largest number of states that a step tries: each linearization and the shorter steps of its line search."""
         return self.linearizations * (1 + self.trials)
 
-    def check_device(self, device: str) -> None:
-        """Raises InputError for options that the device ("cpu" or "gpu") does not have."""
-        if device == "gpu" and self.linearizations > 1 and self.rounds > MAX_STATES:
+    def check_unrolled(self) -> None:
+        """Raises InputError for more trials than fit into a step on a GPU whose graphs have no loops."""
+        if self.rounds > MAX_STATES:
             raise InputError(
-                f"integrator.linearizations = {self.linearizations} with trials = {self.trials}: a step on a GPU holds "
-                f"them all, {self.rounds}; allowed: linearizations * (1 + trials) up to {MAX_STATES}"
+                f"integrator.linearizations = {self.linearizations} with trials = {self.trials}: a step on this GPU "
+                f"holds them all, {self.rounds}, since the driver is older than CUDA 12.4; allowed: linearizations * "
+                f"(1 + trials) up to {MAX_STATES}"
             )

@@ -303,7 +303,6 @@ class Scene(Parameters):
     def check_device(self, device: str) -> None:
         """Raises InputError for what the device ("cpu" or "gpu") does not have."""
         self.solver.check_device(device)
-        self.integrator.check_device(device)
         check_holders_on(device, self.holders or [], self.integrator)
         if "contact" in self.effects:
             check_contact_on(device, self.effects["contact"], self.integrator)

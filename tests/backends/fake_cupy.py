@@ -2,11 +2,14 @@
 """A stand-in for CuPy without a GPU: arrays are NumPy's, kernels are compiled by NVRTC and their calls counted.
 
 What it cannot tell is what kernels compute; what it tells is whether a scene is built, each text compiles with the
-options of a run, and each launch of a fused kernel has as many arguments as the kernel.
+options of a run, each launch of a fused kernel has as many arguments as the kernel, and which launches a graph makes
+while decisions of kernels are those that a test gives in their place.
 """
 
+import ctypes as c
 import re
-from contextlib import nullcontext
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -14,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from tests.backends.fake_cuda import FakeDevice
+from tests.backends.fake_graphs import Graphs, Work
 from tests.support import nvrtc
 
 FUSED = r"\bfused\((int n[^)]*)\) \{"
@@ -37,10 +41,23 @@ class Array(np.ndarray):
         self[...] = values
 
 
+class Graph:
+    """A captured graph. The native loop launches all of them under one number, at which nothing is done."""
+
+    graphExec = 7
+
+    def __init__(self, run: Work):
+        self._run = run
+
+    def launch(self, stream: Any) -> None:
+        self._run()
+
+
 class Stream:
     """Does all at once."""
 
     ptr = 2
+    graphs: Graphs
 
     def __init__(self, **options: Any):
         self.options = options
@@ -48,10 +65,12 @@ class Stream:
     def __enter__(self) -> None: ...
     def __exit__(self, *error: object) -> None: ...
     def synchronize(self) -> None: ...
-    def begin_capture(self) -> None: ...
 
-    def end_capture(self) -> Any:
-        return SimpleNamespace(graphExec=7, launch=lambda stream: None)
+    def begin_capture(self) -> None:
+        self.graphs.begin()
+
+    def end_capture(self) -> Graph:
+        return Graph(self.graphs.end())
 
     def record(self) -> Any:
         return SimpleNamespace(ptr=5, synchronize=lambda: None)
@@ -60,26 +79,37 @@ class Stream:
 class Device(FakeDevice):
     """The driver's functions for the native loop, as CudaDevice offers them."""
 
+    has_conditions = True
+
     def __init__(self, cp: ModuleType):
         super().__init__()
-        self.step_stream, self.copy_stream, self.graphs = Stream(), Stream(), {7: lambda: None}
+        self.step_stream, self.copy_stream, self.graphs = Stream(), Stream(), {Graph.graphExec: lambda: None}
 
-    def branch(self, flag: Array) -> Any:
-        return nullcontext()
+    def branch(self, flag: Array) -> AbstractContextManager[None]:
+        return Stream.graphs.branch(flag)
 
-    repeat = branch
+    def repeat(self, flag: Array) -> AbstractContextManager[None]:
+        return Stream.graphs.branch(flag, repeats=True)
+
+
+def end_search(arguments: Any) -> None:
+    """In place of `accept_trial` (newton.cu): no body needs another trial."""
+    c.c_int32.from_address(int(arguments["active"])).value = 0
 
 
 def made(folder: Path, library: Any) -> ModuleType:
     """The module. Texts are compiled in `folder`.
 
     calls: (kernel, number of arguments) of each launch
+    ran: (kernel, text, grid, block, arguments) of each launch that was made, those of graphs when they ran
+    kernels: by name, what stands for a kernel and gets its arguments; others do nothing
     compiled: (text, options) of each module
     pending: arrays that were made since the host last waited for the current stream, and may not be there yet
     """
     cp: Any = ModuleType("cupy")
-    cp.calls, cp.pending, cp.compiled = [], 0, set()
-    compiled = cp.compiled
+    cp.calls, cp.pending, cp.compiled, cp.ran = [], 0, set(), []
+    kernels: dict[str, Callable[..., None]] = {"accept_trial": end_search}
+    compiled, cp.kernels, Stream.graphs = cp.compiled, kernels, Graphs()
 
     class CurrentStream(Stream):
         def synchronize(self) -> None:
@@ -90,12 +120,19 @@ def made(folder: Path, library: Any) -> ModuleType:
         return values.view(Array)
 
     class Function:
-        def __init__(self, kernel: str, arguments: int | None):
-            self.kernel, self.arguments, self.max_dynamic_shared_size_bytes = kernel, arguments, 0
+        def __init__(self, kernel: str, text: str, arguments: int | None):
+            self.kernel, self.text, self.arguments, self.max_dynamic_shared_size_bytes = kernel, text, arguments, 0
 
         def __call__(self, grid: Any, block: Any, arguments: Any, shared_mem: int = 0) -> None:
             assert self.arguments in (len(arguments), None), self.kernel
             cp.calls.append((self.kernel, len(arguments)))
+            given = tuple(np.array(x) for x in arguments)  # as they are now
+            Stream.graphs.put(lambda: self.run(grid, block, given))
+
+        def run(self, grid: Any, block: Any, arguments: Any) -> None:
+            cp.ran.append((self.kernel, self.text, grid, block, arguments))
+            if self.kernel in kernels:
+                kernels[self.kernel](*arguments)
 
     class RawModule:
         def __init__(self, code: str, options: Any = (), backend: str = "", enable_cooperative_groups: bool = False):
@@ -110,7 +147,7 @@ def made(folder: Path, library: Any) -> ModuleType:
                     raise CompileException(said)
                 compiled.add((self.code, self.options))
             found = re.search(FUSED, self.code) if kernel == "fused" else None
-            return Function(kernel, found[1].count(",") + 1 if found else None)
+            return Function(kernel, self.code, found[1].count(",") + 1 if found else None)
 
     memory = {"memGetInfo": lambda: (1, 1), "memcpyAsync": lambda *a: None, "memsetAsync": lambda *a: None}
     properties = {

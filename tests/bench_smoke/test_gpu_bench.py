@@ -18,9 +18,9 @@ from tests.bench.gpu import page
 from tests.bench.gpu import traffic as moved
 from tests.bench.gpu.others import lower
 from tests.bench.gpu.problem import BARS, MATERIALS, Problem
-from tests.bench.gpu.rows import row
+from tests.bench.gpu.rows import row, search_row
 from tests.bench.gpu.served import row as served_row
-from tests.bench.gpu.steps import STEPS, Beams, rounds
+from tests.bench.gpu.steps import SEARCHES, STEPS, Beams, Search, rounds
 from tests.docs.figures import table_under
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -64,6 +64,15 @@ def test_rounds_use_factors_of_the_age_they_claim(found: tuple[Beams, Any]) -> N
     assert one["CG iterations"] > 3 * one["iterations"] > 0
     assert 0 < one["residual"] <= 1.001e-6
     json.dumps(one)
+
+
+@pytest.mark.parametrize(("search", "made"), [(Search(2, 2, 1e-6), 2.0), (Search(4, 1, 1e-1), 1.0)])
+def test_scenes_make_the_linearizations_that_they_need(search: Search, made: float) -> None:
+    problem = Problem(540, law="stable_neo_hookean", dt=0.02)
+    beams = Beams(problem, device="cpu", overrides=("solver.projection=clamp", *search.overrides))
+    one = search_row(beams, search, rounds(beams, 1, 0))
+    assert one["made"] == made and one["linearizations"] == search.most and 0 < one["us p50"] <= one["us p99"]
+    assert {(s.most, s.needed) for s in SEARCHES} == {(1, 1), (4, 1), (2, 2), (4, 4)}
 
 
 def test_factor_of_the_sample_is_that_of_its_matrix(found: tuple[Beams, Any]) -> None:
@@ -111,7 +120,11 @@ def test_pieces_become_one_page(found: tuple[Beams, Any], tmp_path: Path) -> Non
     served = [
         {"tets": 540, "material": MATERIALS[0], "worker": "cpu", "settings": "", "us p50": 77.0, "factor age": 12.0}
     ]
-    first = piece(tmp_path / "a.json", [one | {"us p50": 90.0}, batch], others=others, served=served)
+    search = {"tets": 3000, "linearizations": 1, "needed": 1, "tolerance": 1e-6, "us p50": 80.0, "settings": ""}
+    searches = [search, search | {"linearizations": 2, "needed": 2, "tolerance": 0.1, "us p50": 100.0}]
+    first = piece(
+        tmp_path / "a.json", [one | {"us p50": 90.0}, batch], others=others, served=served, linearizations=searches
+    )
     other = one | {"us p50": 11.5, "settings": "solver.threads=2"}
     second = piece(tmp_path / "b.json", [one | {"us p50": 22.5}, other])
     gpu.merge([first, second], tmp_path / "out")
@@ -122,6 +135,8 @@ def test_pieces_become_one_page(found: tuple[Beams, Any], tmp_path: Path) -> Non
     assert text.count("| 540 tets |") == 1 and "| solver.threads=2 | 11.5 |" in text
     assert "pieces = 2" in text and "commit b" in text and "| 2026-01-01 | a | steps |" in text
     assert "| cpu | 77 | 12 |" in text
+    beside = table_under(text, "Several linearizations")
+    assert [row["of one"] for row in beside if row["needed"] == "2"] == ["1.25"]
     assert (tmp_path / "out" / "gpu.png").read_bytes().startswith(b"\x89PNG")
     again = json.loads((tmp_path / "out" / "gpu.json").read_text())
     assert page.merged([again["data"]]) == again["data"]

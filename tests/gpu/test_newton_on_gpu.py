@@ -14,6 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 from protocol.messages_pb2 import SolveStatus
+from sim_server.backends.gpu.cuda import CudaDevice
 from sim_server.backends.gpu.engine import FEW
 from sim_server.errors import InputError
 from sim_server.scene import Scene
@@ -274,16 +275,17 @@ def test_small_bodies_of_a_pool(bars):
 # --- what goes on around it -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("trials", [0, 3])
-def test_batches_of_steps_are_the_same_steps(trials):
-    """Also those of a graph of many steps, where few trials fit; the same bits, whoever adds them up."""
+@pytest.mark.parametrize(("trials", "loops"), [(0, False), (3, False), (3, True)])
+def test_batches_of_steps_are_the_same_steps(monkeypatch, trials, loops):
+    """Also those of a graph of many steps, where few trials fit without loops; the same bits, whoever adds them up."""
+    monkeypatch.setattr(CudaDevice, "has_conditions", loops)
     search = {"linearizations": 6, "trials": trials, "tolerance": 1e-7}
     one, many, again = (
         Simulation(scene(MODELS["corotational"](), dt=0.04, gravity=GRAVITY, integrator=search, **TIGHT), "gpu")
         for _ in range(3)
     )
-    rounds = 6 * (1 + trials)
-    assert [[bool(graph) for graph in row] for row in one.engine.loop.graphs] == [[True, rounds <= FEW]] * 2
+    many = loops or 6 * (1 + trials) <= FEW
+    assert [[bool(graph) for graph in row] for row in one.engine.loop.graphs] == [[True, many]] * 2
     for _ in range(20):
         one.engine.run(1)
     for sim in (many, again):
@@ -372,7 +374,59 @@ def test_a_step_with_one_linearization_has_nothing_of_it():
     assert all(all(row) for row in engine.loop.graphs)
 
 
-def test_more_trials_than_a_graph_holds_are_refused():
+def test_more_trials_than_a_graph_holds_are_refused_without_loops(monkeypatch):
     made = scene(MODELS["corotational"](), integrator={"linearizations": 300, "trials": 8})
-    with pytest.raises(InputError, match=r"linearizations = 300 with trials = 8: .* 2700; allowed: .* up to 1024"):
+    Simulation(made, "gpu").engine.run(1)
+    monkeypatch.setattr(CudaDevice, "has_conditions", False)
+    with pytest.raises(InputError, match=r"linearizations = 300 with trials = 8: .* 2700, .*; allowed: .* up to 1024"):
         Simulation(made, "gpu")
+
+
+# --- the loop of the graph ------------------------------------------------------------------------------------------
+
+LOOPED: dict[str, tuple[Callable[[], Scene], Prepare | None, int]] = {
+    "2 linearizations": (lambda: of_search(MODELS["stable_neo_hookean"](), linearizations=2), None, 12),
+    "4 linearizations": (lambda: of_search(MODELS["corotational"](), linearizations=4, scheme="bdf2"), None, 12),
+    "4, of which one is needed": (
+        lambda: of_search(MODELS["corotational"](), linearizations=4, tolerance=0.5), thrown((0, -0.2, 0)), 12
+    ),
+    "shorter steps": (
+        lambda: of_search(
+            of_law("st_venant_kirchhoff", constants={"young": 3e4, "poisson": 0.4}), scheme="quasi_static",
+            linearizations=25, trials=5, tolerance=1e-6,
+        ), None, 2,
+    ),
+    "not finite": (
+        lambda: of_search(of_law("neo_hookean", constants={"young": 2e4, "poisson": 0.3}), linearizations=4, trials=0),
+        thrown((-20.0, 6.0, 0.0)), 3,
+    ),
+    "several bodies": (crowd, stir, 6),
+}  # fmt: skip
+
+
+def of_search(held: dict, **search: Any) -> Scene:
+    return scene(held, dt=0.04, gravity=GRAVITY, integrator={"tolerance": 1e-7} | search, **TIGHT)
+
+
+@pytest.mark.parametrize("case", LOOPED)
+def test_a_loop_makes_the_steps_of_the_unrolled_form_to_the_bit(monkeypatch, case):
+    make, prepare, steps = LOOPED[case]
+    looped = run("gpu", make(), steps, prepare)
+    monkeypatch.setattr(CudaDevice, "has_conditions", False)
+    unrolled = run("gpu", make(), steps, prepare)
+    assert looped.x.tobytes() == unrolled.x.tobytes() and looped.v.tobytes() == unrolled.v.tobytes()
+    for name in ("iterations", "linearizations", "nonlinear", "residual", "status", "kind", "bad_node", "fallbacks"):
+        assert looped.records[name].tobytes() == unrolled.records[name].tobytes(), name
+    found = looped.records["linearizations"]
+    assert (found == 1).all() if case == "4, of which one is needed" else found.max() > 1
+
+
+def test_halves_of_a_step_are_the_step():
+    """The second half has a loop, which only graphs have."""
+    whole, halves = (Simulation(of_search(MODELS["exact"](), linearizations=4), "gpu") for _ in range(2))
+    for _ in range(4):
+        whole.engine.run(1)
+        halves.engine.assemble()
+        halves.engine.solve()
+    assert np.array_equal(whole.fetch().x, halves.fetch().x)
+    assert whole.engine.records()["linearizations"].tolist() == halves.engine.records()["linearizations"].tolist()

@@ -54,11 +54,16 @@ class Conditions:
         self._cp, self._driver, self._context = cp, driver, context
         missing = [name for name in FUNCTIONS if not hasattr(driver, name)]
         if missing:
-            raise DeviceError(
-                "the NVIDIA driver is too old for the schemes ros2 and central_difference and for contact: it has no "
-                f"{missing[0]}; CUDA 12.4 or above has it"
-            )
+            raise self._too_old(missing[0])
         self._module, self._set_condition = self._compiled()
+
+    @staticmethod
+    def _too_old(missing: str) -> DeviceError:
+        """Returns the error of a driver without a function."""
+        return DeviceError(
+            "the NVIDIA driver is too old for the schemes ros2 and central_difference and for contact: it has no "
+            f"{missing}; CUDA 12.4 or above has it"
+        )
 
     def _compiled(self) -> tuple[Any, KernelFunction]:
         """Compiles set_condition.cu to PTX, which the driver links with its own function."""
@@ -67,7 +72,10 @@ class Conditions:
         program = cp.cuda.nvrtc.createProgram(text, name, [], [])
         cp.cuda.nvrtc.compileProgram(program, ["-arch=compute_80", "-rdc=true", "-std=c++17"])
         module = cp.cuda.function.Module()
-        module.load(cp.cuda.nvrtc.getPTX(program))
+        try:
+            module.load(cp.cuda.nvrtc.getPTX(program))
+        except cp.cuda.driver.CUDADriverError as error:
+            raise self._too_old(f"cudaGraphSetConditional ({error})") from error
         cp.cuda.nvrtc.destroyProgram(program)
         return module, module.get_function("set_condition")
 

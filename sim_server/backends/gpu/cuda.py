@@ -70,6 +70,14 @@ class CudaDevice:
     def _conditions(self) -> Conditions:
         return Conditions(self.cp, self._driver, self.context)
 
+    @property
+    def has_conditions(self) -> bool:
+        """Whether the graphs of this driver have branches and loops."""
+        try:
+            return bool(self._conditions)
+        except DeviceError:
+            return False
+
     def branch(self, flag: DeviceArray) -> AbstractContextManager[None]:
         """What is launched inside runs only if `flag` (1,) is not 0. Only while the current stream is captured.
 

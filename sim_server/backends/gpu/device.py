@@ -8,6 +8,7 @@ device array of a host array, which it makes and fills at the first call.
 import hashlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from copy import copy
 from functools import cache
 from typing import Any
 
@@ -144,6 +145,18 @@ class DeviceLaunch(BoundKernel):
         if self.items or self.mailed:
             self._function(*grid_of(MAILED_THREADS if self.mailed else self.items), (argument,))
 
+    def with_array(self, array: DeviceArray, other: DeviceArray) -> "DeviceLaunch":
+        """Returns the same launch with `other` in place of `array`; itself if it does not use it."""
+        names = [name for name, mine in self.arrays.items() if mine is array]
+        if not names:
+            return self
+        assert not self.mailed
+        made = copy(self)
+        made.arrays, made.params = {**self.arrays, **dict.fromkeys(names, other)}, self.params.copy()
+        for name in names:
+            made.params[name] = other.data.ptr
+        return made
+
     def fetch(self, name: str) -> NDArray[Any]:
         """Copies one of its arrays to the host."""
         array: NDArray[Any] = self.arrays[name].get()
@@ -203,10 +216,10 @@ class Gpu:
             return known
         kept = self._kept.get(id(host))
         dtype = dtype or (kept and kept[1]) or (self._real if host.dtype == np.float64 else host.dtype)
-        copy: DeviceArray = self.cp.asarray(host.astype(dtype, copy=False))
+        made: DeviceArray = self.cp.asarray(host.astype(dtype, copy=False))
         if keep or kept:
-            self._twins[id(host)] = (host, copy)
-        return copy
+            self._twins[id(host)] = (host, made)
+        return made
 
     def keep(self, *hosts: NDArray[Any], exact: bool = False) -> None:
         """Declares arrays that stay for the whole run, with one twin each. exact: the twins have the same types."""

@@ -47,7 +47,7 @@ from sim_server.backends.newton import Newton
 MOST_GRABS = 1024  # pushes and grabs at a time, of which forces are told
 MOST_TOLD = 16  # other bodies whose forces on a body are told, at most
 GRAB_BLOCKS, GRAB_THREADS = 32, 128  # of the kernel react (effects/touch.cu)
-FEW = 16  # largest number of trials in a step for which MANY steps are captured in one graph
+FEW = 16  # largest number of trials in a step without loops for which MANY steps are captured in one graph
 EPILOGUE = Declarations("backends/gpu/step_epilogue.cu")
 STEP_EPILOGUE = EPILOGUE.dtype("StepEpilogue")
 
@@ -123,7 +123,7 @@ class GpuEngine(DeviceLoop):
             parts = newton.parts[len(self._first) :]
             newton = Newton(newton.options, newton.dx_dv, parts, newton.detect, **newton.arrays)
             self._newton = NewtonIteration(
-                gpu, newton, assemble, ranges, arrays, phases, self.solver, newton_results, settled
+                gpu, device, newton, assemble, ranges, arrays, phases, self.solver, newton_results, settled
             )  # fmt: skip
         self._contact, contact_results, reactions, told = None, None, None, None
         self._ties = given.contact.ties if given.contact else None
@@ -167,8 +167,6 @@ class GpuEngine(DeviceLoop):
         addresses = {name: int(twin.data.ptr) for name, twin in twins.items()}
         if self._contact:
             addresses["poses"] = self._contact.poses
-        if self._newton:
-            addresses["values"] = int(self._newton.first_values.data.ptr)
         stage_results = device.pinned(CAPACITY * STAGE_RESULT.itemsize * bodies) if stages else None
         super().__init__(
             device, ranges, arrays["row_start"], dt, mailboxes, self._results, self._timestamps, arrays["clock"],
@@ -246,7 +244,7 @@ class GpuEngine(DeviceLoop):
 
     def _capture(self) -> None:
         """Captures the graphs of the steps and of the energies."""
-        many = self._newton is None or self._newton.rounds <= FEW
+        many = self._newton is None or self._newton.loops or self._newton.rounds <= FEW
         for begin in (False, True):
             for steps in (1, MANY):
                 if steps > 1 and not many:
@@ -266,7 +264,7 @@ class GpuEngine(DeviceLoop):
         self.use_graphs(handles, *(int(graph.graphExec) for graph in others))
         self._graphs += others  # kept as long as the engine
         self._second_half = None
-        if self._stages or self._contact or self._substeps:
+        if self._stages or self._contact or self._substeps or (self._newton and self._newton.loops):
             self._second_half = self._captured(self._finish_step)
 
     def _report_grabs(self, device: CudaDevice, touch: DeviceLaunch) -> None:

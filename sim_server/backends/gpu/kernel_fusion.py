@@ -84,14 +84,31 @@ class PhaseGuard(NamedTuple):
     phase: int
     body: int
 
+    @property
+    def condition(self) -> str:
+        """What holds for the phase of a body that needs the launch."""
+        return f"!= {PHASE['DONE']}"
 
-DONE = Declarations("kernels/newton_line_search.cuh").enumeration("Phase")["DONE"]
-OPEN_ITEM = f"(!body || phase[body[i]] != {DONE})"
-PHASE_GUARD = [
-    "if (*active == 0) return;",
-    "if (body && !__syncthreads_or(threadIdx.x < BLOCK_ITEMS && block * BLOCK_ITEMS + threadIdx.x < n &&",
-    f"                              phase[body[block * BLOCK_ITEMS + threadIdx.x]] != {DONE})) return;",
-]
+    @property
+    def lines(self) -> list[str]:
+        """The beginning of a kernel."""
+        return [
+            "if (*active == 0) return;",
+            "if (body && !__syncthreads_or(threadIdx.x < BLOCK_ITEMS && block * BLOCK_ITEMS + threadIdx.x < n &&",
+            f"                              phase[body[block * BLOCK_ITEMS + threadIdx.x]] {self.condition})) return;",
+        ]
+
+
+class SolveGuard(PhaseGuard):
+    """The same of a launch that only bodies need whose linear system is solved next."""
+
+    @property
+    def condition(self) -> str:
+        return f"== {PHASE['SOLVE']}"
+
+
+PHASE = Declarations("kernels/newton_line_search.cuh").enumeration("Phase")
+OPEN_ITEM = f"(!body || phase[body[i]] != {PHASE['DONE']})"
 
 
 class FusedKernel:
@@ -179,7 +196,7 @@ class FusedSource:
             opening.append(f"if (block < 0) {{ {prologue.function}(prologue, blockIdx.x); return; }}")
         heading = f'extern "C" __global__ void __launch_bounds__({shape.threads}) fused(int n'
         parameters = "".join(f", {p}" for p in self._parameters)
-        opening += PHASE_GUARD if guard and not epilogue else []
+        opening += guard.lines if guard and not epilogue else []
         lines += [f"{heading}{parameters}) {{", *opening, *self._setup, *body_lines, "}"]
         self.source = "\n".join(lines)
 

@@ -1,8 +1,9 @@
 // SPDX-License-Identifier: MIT
 // Newton-Raphson iteration within a step on a GPU, independent for each body (decisions: kernels/newton_line_search.cuh). The graph of a step is
-//     assemble, begin_newton, rounds times (pcg, update_state, assemble, accept_trial), end_newton, integrate
-// A round is one trial: rounds = linearizations (1 + trials). The device decides: the phase of a body tells each launch whether it
-// applies to the body; once all bodies are done, the launches of the remaining rounds return at once.
+//     assemble, begin_newton, trial, while a body is not done (blocks of A, trial), end_newton, integrate
+//     trial: pcg, update_state, forces, accept_trial
+// with all trials that a scene allows in place of the loop where the driver has none: linearizations (1 + trials). The device decides:
+// the phase of a body tells each launch whether it applies to the body; once all bodies are done, launches return at once.
 //
 // A thread block has a range of a body's nodes; the last one of a body to finish adds the partial sums in a fixed order and makes
 // the body's decision. Sums and the increment are double for every `real`.

@@ -1,13 +1,16 @@
 # SPDX-License-Identifier: MIT
 """Newton-Raphson iteration within a step on a GPU (newton.cu): its memory and its launches.
 
-The graph of a step holds all trials that the scene allows, linearizations x (1 + trials); launches that no body needs
-any more return at once. The first assembly of a step is that of scenes with one linearization; the kernels of the later
-ones begin with a guard (kernel_fusion.PhaseGuard).
+The first assembly of a step is that of scenes with one linearization. A trial needs no more than the forces, so the
+blocks of A are made where a linearization follows. All after the first trial is a loop of the graph, which repeats
+while a body is not done. A driver without such loops has all trials that the scene allows in the graph of a step, one
+after another, linearizations x (1 + trials) of them, and launches that no body needs any more return at once. For the
+bodies that are done, the kernels of trials begin with a guard (kernel_fusion.PhaseGuard).
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from contextlib import AbstractContextManager
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +19,7 @@ from sim_server.arrays import Int32, Int64
 from sim_server.backends.declarations import Declarations
 from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction
 from sim_server.backends.gpu.device import DeviceLaunch, Gpu, compiled, options, own_headers
-from sim_server.backends.gpu.kernel_fusion import FusedKernel, PhaseGuard, fuse
+from sim_server.backends.gpu.kernel_fusion import FusedKernel, PhaseGuard, SolveGuard, fuse
 from sim_server.backends.gpu.solver import PcgSolver
 from sim_server.backends.gpu.structs import NEWTON_RESULT
 from sim_server.backends.newton import Newton
@@ -44,9 +47,25 @@ class NewtonPhases(NamedTuple):
         """Returns the state before the first step."""
         return cls(gpu.cp.full(1, bodies, np.int32), gpu.cp.zeros(bodies, np.int32))
 
-    def guard(self, body: DeviceArray | None) -> PhaseGuard:
-        """Returns the guard of a kernel. body: (items,), body of each item; None: not known."""
-        return PhaseGuard(self.active.data.ptr, self.phase.data.ptr, 0 if body is None else body.data.ptr)
+    def guard(self, body: DeviceArray | None, blocks: bool = False) -> PhaseGuard:
+        """Returns the guard of a kernel. body: (items,), body of each item; None: not known. blocks: it makes those
+        of A."""
+        kind = SolveGuard if blocks else PhaseGuard
+        return kind(self.active.data.ptr, self.phase.data.ptr, 0 if body is None else body.data.ptr)
+
+
+class Loops(Protocol):
+    """A device whose graphs may have loops (cuda.CudaDevice).
+
+    has_conditions: whether they do
+    """
+
+    @property
+    def has_conditions(self) -> bool: ...
+
+    def repeat(self, flag: DeviceArray) -> AbstractContextManager[None]:
+        """What is launched inside runs as long as `flag` (1,) is not 0."""
+        ...
 
 
 def node_ranges(ranges: Int64) -> tuple[NDArray[Any], Int32]:
@@ -77,6 +96,7 @@ def bodies_of(parts: Sequence[Int32 | None]) -> Int32 | None:
 class NewtonIteration:
     """Launches the Newton iteration of a step, between its first assembly and its end.
 
+    device: on which graphs are captured
     newton: options, arrays, and `parts` of the launches in `again`
     again: launches that assemble the system once more
     ranges: nodes [first, last) of each body
@@ -84,19 +104,30 @@ class NewtonIteration:
     results: host memory (capacity, bodies) of NEWTON_RESULT that the steps write to
     readers: launches after the step's end that read what the last assembly made
 
-    rounds: trials in a step
-    first_values: A of the first linearization of the step, from which factors are made
+    The array `values` keeps A of the first linearization of a step, from which factors are made; later ones have
+    another.
+
+    loops: whether the graph of a step has a loop
+    rounds: most trials in a step
+
+    Raises InputError for more trials than a graph without loops may hold.
     """
 
     def __init__(
-        self, gpu: Gpu, newton: Newton, again: Sequence[DeviceLaunch], ranges: Sequence[tuple[int, int]],
+        self, gpu: Gpu, device: Loops, newton: Newton, again: Sequence[DeviceLaunch], ranges: Sequence[tuple[int, int]],
         arrays: Mapping[str, NDArray[Any]], phases: NewtonPhases, solver: PcgSolver, results: NDArray[Any],
         readers: Sequence[DeviceLaunch] = (),
     ):  # fmt: skip
         cp, nodes, bodies = gpu.cp, len(arrays["x"]), len(ranges)
-        self._gpu, self._solver, self.rounds = gpu, solver, newton.options.rounds
+        self._gpu, self._device, self._solver, self.rounds = gpu, device, solver, newton.options.rounds
+        self.loops = device.has_conditions
+        if not self.loops:
+            newton.options.check_unrolled()
+        first_values: DeviceArray = gpu.twin(arrays["values"])
+        self._values: DeviceArray = cp.empty_like(first_values)  # A of later linearizations
         self._bodies: list[DeviceArray | None] = []  # of the items of each kernel
-        self._again = self._guarded(newton, again, phases, readers)
+        later = [launch.with_array(first_values, self._values) for launch in again]
+        self._forces, self._blocks = self._guarded(newton, later, phases, readers)
         names = ("row_start", "columns", "values", "b", "y", "x", "v")
         host = {name: arrays[name] for name in names} | newton.arrays
         twins = {name: gpu.twin(array) for name, array in host.items()}
@@ -119,7 +150,8 @@ class NewtonIteration:
         self._params["linearizations"], self._params["trials"] = newton.options.linearizations, newton.options.trials
         self._params["nodes"], self._params["count"] = nodes, bodies
         self._params["capacity"] = results.nbytes // NEWTON_RESULT.itemsize // bodies
-        self._values, self.first_values = twins["values"], cp.empty_like(twins["values"])
+        self._later_params = self._params.copy()
+        self._later_params["values"] = self._values.data.ptr
         flags = (*options(gpu.types), *own_headers())
         module = gpu.cp.RawModule(code=NEWTON.checked(), options=flags, backend="nvrtc")
         self._begin, self._update_state, self._accept_trial, self._end = (
@@ -129,31 +161,49 @@ class NewtonIteration:
 
     def _guarded(
         self, newton: Newton, again: Sequence[DeviceLaunch], phases: NewtonPhases, readers: Sequence[DeviceLaunch]
-    ) -> list[FusedKernel | DeviceLaunch]:
-        """Fuses the launches, each kernel with its guard."""
+    ) -> tuple[list[FusedKernel | DeviceLaunch], list[FusedKernel | DeviceLaunch]]:
+        """Fuses the launches, each kernel with its guard: those that make the forces, and those of the blocks of A."""
         parts = {id(launch): part for launch, part in zip(again, newton.parts, strict=True)}
 
         def guard(group: Sequence[DeviceLaunch]) -> PhaseGuard:
             known = [parts[id(launch)] for launch in group if not launch.mailed]
             body = bodies_of(known)
             self._bodies.append(None if body is None else self._gpu.cp.asarray(body))
-            return phases.guard(self._bodies[-1])
+            return phases.guard(self._bodies[-1], blocks=group[0].domain == "blocks")
 
-        return fuse(again, guard, readers=readers)
+        blocks = [launch for launch in again if launch.domain == "blocks"]
+        forces = [launch for launch in again if launch.domain != "blocks"]
+        made = fuse(forces, guard, readers=[*blocks, *readers])
+        return made, fuse(blocks, guard, readers=[*forces, *readers])
 
     def launch(self) -> None:
-        """Launches the whole iteration of a step whose first linearization has been assembled."""
-        cuda, kept, values = self._gpu.cp.cuda, self.first_values, self._values
-        to, stream = cuda.runtime.memcpyDeviceToDevice, cuda.get_current_stream().ptr
-        cuda.runtime.memcpyAsync(kept.data.ptr, values.data.ptr, values.nbytes, to, stream)
-        self._launch(self._begin, BLOCK_NODES)
-        for _ in range(self.rounds):
-            self._solver.launch()
-            self._launch(self._update_state, BLOCK_NODES * LANES)
-            for launch in self._again:
-                launch()
-            self._launch(self._accept_trial, BLOCK_NODES)
-        self._launch(self._end, BLOCK_NODES)
+        """Launches the whole iteration of a step whose first linearization has been assembled.
 
-    def _launch(self, function: KernelFunction, threads: int) -> None:
-        function((self._grid,), (threads,), (self._params,))
+        Where graphs have loops, only while one is captured.
+        """
+        self._launch(self._begin, BLOCK_NODES, self._params)
+        self._trial(self._params, None)
+        if self.loops:
+            with self._device.repeat(self._memory["active"]):
+                self._later_trial()
+        else:
+            for _ in range(self.rounds - 1):
+                self._later_trial()
+        self._launch(self._end, BLOCK_NODES, self._params)
+
+    def _later_trial(self) -> None:
+        """Launches a trial after the first one, of a new linearization or of a shorter step."""
+        for launch in self._blocks:
+            launch()
+        self._trial(self._later_params, self._values)
+
+    def _trial(self, params: NDArray[Any], values: DeviceArray | None) -> None:
+        """Launches a solve, the state that it gives, the forces there and the decision. values: A; None: the first."""
+        self._solver.launch(values)
+        self._launch(self._update_state, BLOCK_NODES * LANES, params)
+        for launch in self._forces:
+            launch()
+        self._launch(self._accept_trial, BLOCK_NODES, params)
+
+    def _launch(self, function: KernelFunction, threads: int, params: NDArray[Any]) -> None:
+        function((self._grid,), (threads,), (params,))

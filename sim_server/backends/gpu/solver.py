@@ -129,10 +129,14 @@ class PcgSolver:
         function.max_dynamic_shared_size_bytes = self._shared
         return function
 
-    def launch(self) -> None:
-        """Launches a solve of all bodies."""
+    def launch(self, values: DeviceArray | None = None) -> None:
+        """Launches a solve of all bodies. values: of A, in place of those of the scene's array."""
+        params = self.params
+        if values is not None:
+            params = params.copy()
+            params["values"] = values.data.ptr
         phases = (np.uint64(array.data.ptr) for array in self._phases)
-        arguments = (self.params, *phases, *self._corrected)
+        arguments = (params, *phases, *self._corrected)
         self._function((self.grid,), (self.threads,), arguments, shared_mem=self._shared)
 
     @property

@@ -22,7 +22,7 @@ from tests.bench.gpu import page
 from tests.bench.gpu.problem import BARS, BATCHES, MATERIALS, Problem
 from tests.bench.harness.report import Report
 
-SECTIONS = ("steps", "batches", "others", "served")
+SECTIONS = ("steps", "batches", "others", "served", "linearizations")
 ROUNDS = {540: 20, 3000: 20, 7350: 20, 24_000: 12, 98_304: 6, 405_600: 3, 1_029_000: 2}
 WITHOUT = {540: 4, 3000: 4, 7350: 2, 24_000: 2, 98_304: 2, 405_600: 1, 1_029_000: 1}  # steps of CG in each round
 
@@ -66,12 +66,27 @@ def beams(problem: Problem, o: argparse.Namespace, external: bool) -> tuple[Rows
     return rows, others
 
 
+def searches(tets: int, o: argparse.Namespace) -> Rows:
+    """Rows of a beam with several linearizations a step."""
+    from tests.bench.gpu.rows import search_row
+    from tests.bench.gpu.steps import SEARCHES, Beams, rounds
+
+    problem, found = Problem(tets, law="stable_neo_hookean", dt=0.02), []
+    for search in SEARCHES:
+        overrides = ("solver.projection=clamp", *search.overrides, *o.set)
+        scene = Beams(problem, o.library, overrides=overrides)
+        found.append(search_row(scene, search, rounds(scene, 2 if o.quick else ROUNDS[tets], 0)))
+        print(found[-1], flush=True)
+    return found
+
+
 def measure(o: argparse.Namespace) -> dict[str, Rows]:
     """All sections asked for, and what the device is."""
     from tests.bench.gpu.cudss import version
     from tests.bench.gpu.device import described
     from tests.bench.gpu.served import SIZES
     from tests.bench.gpu.served import measure as served
+    from tests.bench.gpu.steps import SEARCHED
 
     data: dict[str, Any] = {name: [] for name in page.KEYS}
     data["device"] = described() | {"cuDSS": version()}
@@ -91,6 +106,9 @@ def measure(o: argparse.Namespace) -> dict[str, Rows]:
                 rows, publishing = guarded(problem.name, lambda: served(problem, 1.0, overrides=tuple(o.set)))  # noqa: B023
                 data["served"] += rows
                 data["publishing"] += publishing
+    for tets in o.sizes if "linearizations" in o.only else ():
+        if tets in SEARCHED:
+            data["linearizations"] += guarded(f"{tets} tets", lambda: (searches(tets, o), []))[0]  # noqa: B023
     for section in page.KEYS:
         data[section] = [{"settings": " ".join(o.set), **row} for row in data[section]]
     return data

@@ -36,11 +36,13 @@ AIMS = {  # by (beams, tets of each)
 
 @dataclass(frozen=True)
 class Problem:
-    """A scene of the benchmark: `beams` beams of `tets` tetrahedra each."""
+    """A scene of the benchmark: `beams` beams of `tets` tetrahedra each, of a law."""
 
     tets: int
     material: str = "homogeneous"
     beams: int = 1
+    law: str = "corotational"
+    dt: float = 0.03  # s
 
     @property
     def name(self) -> str:
@@ -61,7 +63,7 @@ class Problem:
 
     def text(self) -> str:
         """The scene in TOML."""
-        return "\n".join([_HEAD, *(_object(self, beam) for beam in range(self.beams))])
+        return "\n".join([f"dt = {self.dt:g}\n{_HEAD}", *(_object(self, beam) for beam in range(self.beams))])
 
     def write(self, folder: Path) -> Path:
         """The scene as a file in `folder`."""
@@ -70,8 +72,7 @@ class Problem:
         return path
 
 
-_HEAD = """dt = 0.03
-
+_HEAD = """
 [effects]
 gravity = { g = [0, -9.81, 0] }
 
@@ -95,7 +96,7 @@ name = "beam{beam}"
 mesh = {{ bar = [{cells}], size = [1, 1, 4] }}
 density = 1000
 [object.effects]
-corotational = {{ young = {stiffness}, poisson = 0.45 }}
+{problem.law} = {{ young = {stiffness}, poisson = 0.45 }}
 rayleigh = {{ mass = 0.1 }}
 fixed = {{ where = "Z < 0.01" }}
 """

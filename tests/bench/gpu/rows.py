@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from sim_server.backends.rosenbrock import FORMS
 from tests.bench.gpu import traffic as moved
-from tests.bench.gpu.steps import WITHOUT, Beams, Found
+from tests.bench.gpu.steps import WITHOUT, Beams, Found, Search
 
 Row = dict[str, Any]
 
@@ -35,6 +35,17 @@ def row(beams: Beams, found: Found) -> Row:
         "phases": phases(beams) if problem.beams == 1 and size.factor else None,
         **{f"MB {what}": mb for what, mb in moved.step(size, iterations).items()},
         **_without(found),
+    }  # fmt: skip
+
+
+def search_row(beams: Beams, search: Search, found: Found) -> Row:
+    """A scene with several linearizations; made: of them, mean of a step."""
+    records = np.concatenate(found.records)
+    return {
+        "tets": beams.problem.tets, "linearizations": search.most, "needed": search.needed,
+        "tolerance": search.tolerance, **_times(records, "us"),
+        "solve us": 1e6 * float(np.median(_first(records)["solve"])),
+        "made": float(records["linearizations"].mean()), "iterations": float(records["iterations"].mean()),
     }  # fmt: skip
 
 

@@ -29,6 +29,26 @@ Reals = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
+class Search:
+    """Linearizations of a step. most: that the scene allows; needed: of these; tolerance: of each linear solve."""
+
+    most: int
+    needed: int
+    tolerance: float
+
+    @property
+    def overrides(self) -> tuple[str, ...]:
+        """Of the scene: a goal that is never reached, or at once."""
+        goal = 1e-14 if self.needed == self.most else 0.9
+        integrator = {"linearizations": self.most, "tolerance": goal}
+        return (*(f"integrator.{k}={v:g}" for k, v in integrator.items()), f"solver.tolerance={self.tolerance:g}")
+
+
+SEARCHES = tuple(Search(*n, tolerance) for tolerance in (1e-6, 1e-1) for n in ((1, 1), (4, 1), (2, 2), (4, 4)))
+SEARCHED = (3000, 24_000)  # tets
+
+
+@dataclass(frozen=True)
 class Sample:
     """System and factor of one body at one step, all on the host. solution: ours."""
 
@@ -158,8 +178,9 @@ def renewed(beams: Beams, found: Found) -> None:
         found.made.append(1e3 * (middle - begin) / len(factors))
         found.taken.append(1e3 * (time.perf_counter() - middle) / beams.problem.beams)
         found.sample = beams.sample(matrices[0], factors[0])
-    stages = beams.sim.scene.integrator.scheme == "ros2"  # b and y are those of the second one
-    found.residuals.append(np.nan if stages else found.sample.residual(found.sample.solution))
+    integrator = beams.sim.scene.integrator
+    several = integrator.scheme == "ros2" or integrator.linearizations > 1  # b and y are not those of one solve
+    found.residuals.append(np.nan if several else found.sample.residual(found.sample.solution))
 
 
 def rounds(beams: Beams, count: int, without: int) -> Found:
