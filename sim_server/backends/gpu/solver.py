@@ -88,7 +88,8 @@ class PcgSolver:
             "initial_range": cp.asarray(initial_ranges(assigned, partition, self.grid)),
             "halo": cp.asarray(partition.nodes.astype(ints)), "local_column": cp.asarray(partition.local.astype(ints)),
             "halo_values": cp.zeros(3 * len(partition.nodes), self.real),
-            "halo_position": cp.zeros(len(partition.nodes), ints), "own_vectors": cp.zeros((12 if errors else 9) * total, self.real),
+            "halo_position": cp.zeros(len(partition.nodes), ints),
+            "own_vectors": cp.zeros((12 if errors else 9) * total, self.real),
             "z": cp.zeros(6 * total), "diagonal": cp.zeros(9 * total, self.real),
             "block_sums": cp.zeros((20 if errors else 16) * self.grid * len(ranges)),
             "exchange_number": cp.ones(len(ranges), np.uint32),  # unwritten words have the number 0
