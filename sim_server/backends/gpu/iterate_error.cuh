@@ -4,7 +4,6 @@
 #pragma once
 #include "error_estimate.cuh"
 #include "pcg_structs.cuh"
-#include "step_form.h"
 
 constexpr double LOST_DIGITS = 1.1;   // as in backends/cpu/native/pcg.h
 constexpr double SHARE_OF_SOLVE = 0.3;  // of `position`, where a step has several linearizations
