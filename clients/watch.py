@@ -19,6 +19,11 @@ from clients.log.scalars import enum_name, reaction_name, status_name
 from protocol import messages_pb2 as pb
 
 PERIOD = 0.5  # s between two readings
+ERRORS = {  # fields of ObjectStep with estimated errors -> of what
+    "solve_error": "error of the linear solve",
+    "step_error": "of the step's equation",
+    "estimate": "of the time step",
+}
 COMPACT: dict[str, Any] = {"box": SIMPLE_HEAD, "padding": (0, 1), "pad_edge": False}  # fits 80 columns
 
 
@@ -93,12 +98,12 @@ def _status(found: pb.ObjectStatus) -> Text:
 
 
 def _errors(status: pb.Status) -> list[Table]:
-    """Table of the objects whose steps have an estimate of their error; empty without such objects."""
-    shown = [o for o in status.objects if o.last.form]
-    table = Table("object", "step by", "error of it [m]", **COMPACT)
+    """Table of estimated errors of the last step, of the objects that have any; empty without such objects."""
+    shown = [o for o in status.objects if o.last.form or any(o.last.HasField(name) for name in ERRORS)]
+    table = Table("object", "step by", *(f"{title} [m]" for title in ERRORS.values()), **COMPACT)
     for found in shown:
-        estimate = f"{found.last.estimate:.1e}" if found.last.HasField("estimate") else "-"
-        _add(table, found.object, enum_name("form", found.last.form), estimate)
+        errors = (f"{getattr(found.last, name):.1e}" if found.last.HasField(name) else "-" for name in ERRORS)
+        _add(table, found.object, enum_name("form", found.last.form), *errors)
     return [table] if shown else []
 
 

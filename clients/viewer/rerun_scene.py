@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Meshes and scalars of a run as rerun entities.
 
-/world/OBJECT holds the surface, /world/OBSTACLE too, /plots/QUANTITY/OBJECT a curve, /plots/energy/KIND/OBJECT curves
-of energies; timelines are `step` and `time` (simulated).
+/world/OBJECT holds the surface, /world/OBSTACLE too, /plots/QUANTITY/OBJECT a curve, /plots/energy/KIND/OBJECT and
+/plots/estimate/KIND/OBJECT curves of energies and estimated errors; timelines are `step` and `time` (simulated).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ PLOTS = {  # entity below /plots -> title
     "iterations": "PCG iterations",
     "residual": "true residual, log10",
     "factor_age": "factor age [steps]",
-    "estimate": "estimated error of a step, log10 m",
+    "estimate": "estimated errors of a step, log10 m",
     "step_time": "step time [ms]",
     "energy": "energy [J]",
 }
@@ -32,6 +32,7 @@ CONTACT_PLOTS = {  # of runs with contact
     "contact_residual": "contact residual, log10",
     "reaction": "force on obstacles, objects and hands [N]",
 }
+ERRORS = {"solve_error": "linear_solve", "step_error": "equation", "estimate": "time_step"}  # column -> entity
 ENERGIES = ("kinetic_energy", "elastic_energy", "gravity_energy", "work", "dissipated")
 
 
@@ -107,9 +108,10 @@ class RerunScene:
         self._curve("iterations", name, scalars, scalars["iterations"], np.ones(len(age), bool))
         self._curve("residual", name, scalars, residual, np.isfinite(residual))
         self._curve("factor_age", name, scalars, age, age >= 0)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            estimate = np.log10(scalars["estimate"])
-        self._curve("estimate", name, scalars, estimate, np.isfinite(estimate))
+        for column, kind in ERRORS.items():
+            with np.errstate(divide="ignore", invalid="ignore"):
+                error = np.log10(scalars[column])
+            self._curve(f"estimate/{kind}", name, scalars, error, np.isfinite(error))
         for energy in ENERGIES:
             values = scalars[energy]
             self._curve(f"energy/{energy.removesuffix('_energy')}", name, scalars, values, np.isfinite(values))

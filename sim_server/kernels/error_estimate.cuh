@@ -26,6 +26,7 @@ constexpr double FEW = 5;             // of z with other preconditioners, where 
 constexpr int LAG = 10;               // iterations d from one look at x to the next, at least
 constexpr int FEWEST = 4, FEWEST_WITH_FACTOR = 1;  // from which on the iterates tell
 constexpr double MOST_LEFT = 0.1;     // of |b|: a solve with more of a residual does not end by an estimate
+constexpr double MOST_LEFT_WITHOUT_FACTOR = 0.01;  // the same: the iterates have not seen soft modes of a stiff body before
 constexpr double MOST_ALPHA = 10;     // up to which P^-1 is taken as it is
 constexpr double SLOWEST = 0.95;      // fall of the error in d iterations; what falls less is taken for it
 
@@ -44,7 +45,10 @@ HOST_DEVICE double trust_of(int kind, double trust_in_factor) { return kind == C
 HOST_DEVICE int fewest_of(int kind) { return kind == CHOLESKY ? FEWEST_WITH_FACTOR : FEWEST; }
 
 // Whether an estimate may end a solve, with squares of |r| and |b|.
-HOST_DEVICE bool may_end(double r2, double b2) { return r2 <= MOST_LEFT * MOST_LEFT * b2; }
+HOST_DEVICE bool may_end(int kind, double r2, double b2) {
+    const double left = kind == CHOLESKY ? MOST_LEFT : MOST_LEFT_WITHOUT_FACTOR;
+    return r2 <= left * left * b2;
+}
 
 // Iterations from one look at x to the next: more where convergence is slow.
 HOST_DEVICE int lag_of(int looked) { return looked / 2 > LAG ? looked / 2 : LAG; }

@@ -30,6 +30,7 @@ constexpr double LINEAR_SHARE = 0.3;                          // of the bound of
 constexpr double NEAR = 2;                                    // scale of P^-1 within which it may be A^-1
 constexpr double LEFT_TRUST = 1.25;                           // of the estimate of what adding P^-1 b leaves
 constexpr double MOST_FORCING = 0.1, FORCING_FACTOR = 0.9;    // largest forcing term, also the first one; of the fall of |b|, squared
+constexpr double MOST_FORCING_WITHOUT_FACTOR = MOST_LEFT_WITHOUT_FACTOR;
 template <class T> constexpr double EPSILON = sizeof(T) == 8 ? 2.2e-16 : 1.2e-7;  // T: type in which forces are computed
 
 enum Phase { SOLVE = 0, TRY = 1, DONE = 2 };
@@ -137,8 +138,12 @@ HOST_DEVICE int evaluate_trial(Search& s, const Limits& most, double norm, doubl
     return s.verdict = TAKEN;
 }
 
-// Relative tolerance of a linear solve. tolerance: of the settings.
-HOST_DEVICE double solve_tolerance(const Search& s, double tolerance) { return s.forcing > tolerance ? s.forcing : tolerance; }
+// Relative tolerance of a linear solve. tolerance: of the settings; kind: its preconditioner.
+HOST_DEVICE double solve_tolerance(const Search& s, double tolerance, int kind) {
+    const bool less = kind != CHOLESKY && s.forcing > MOST_FORCING_WITHOUT_FACTOR;
+    const double forcing = less ? MOST_FORCING_WITHOUT_FACTOR : s.forcing;
+    return forcing > tolerance ? forcing : tolerance;
+}
 
 // Whether P^-1 b, which is made, takes off most of the error of a state that is exact enough. trust: in the factor.
 HOST_DEVICE bool adds_remaining(const Search& s, double trust) {

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """The [accuracy] table of a scene."""
 
-import math
 import re
+import sys
 from typing import Annotated, Any
 
 from pydantic import Field, PlainValidator
@@ -11,11 +11,12 @@ from sim_server.arrays import Float64
 from sim_server.scene.parameters import Parameters, complaint
 
 MOST_LINEARIZATIONS = 8  # of a step, where the scene does not say
+LONGEST = sys.float_info.max  # m
 ROUNDING = 1e-12  # relative residual at which an equation ends at the latest, where the scene does not say
 
 
 def _position(value: Any) -> float | str:
-    if isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < math.inf:
+    if isinstance(value, int | float) and not isinstance(value, bool) and 0 < value <= LONGEST:
         return float(value)
     if isinstance(value, str) and _percent(value) is not None:
         return value

@@ -60,7 +60,7 @@ struct IterateError {
     }
     // Whether z alone tells enough, so that it is worth while to look at the iterates. ahead: z is of the iteration before.
     __device__ __forceinline__ bool looks_enough(double r2_now, bool ahead) const {
-        if (!(position > 0 && r2_now <= limit2 && may_end(r2_now, b2))) return false;
+        if (!(position > 0 && r2_now <= limit2 && may_end(kind, r2_now, b2))) return false;
         const double cheap = dx_dv * by_factor(sqrt(least(r2_now, ahead) / r2)) / (kind == CHOLESKY ? 1 : FEW);
         return cheap >= 0 && is_exact_enough(cheap, trust_of(kind, trust), position, ahead);
     }

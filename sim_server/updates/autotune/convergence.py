@@ -51,4 +51,6 @@ def convergence(
     used = records["iterations"] / (solves * solver.max_iterations)
     if solver.budget:
         used = np.maximum(used, records["solve"] / (solves * solver.budget))
+    if solver.step_budget:
+        used = np.maximum(used, records["solve"] / solver.step_budget)
     return np.where(converged, 0.0, wanted / gained), used

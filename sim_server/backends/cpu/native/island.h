@@ -424,7 +424,7 @@ struct IslandSolver {
         double r2 = b2, rz = 0, last_true = INFINITY;
         bool restart = true;
         auto is_enough = [&](bool ahead) {
-            return settings.position > 0 && r2 <= limit && may_end(r2, b2) && error.is_enough(settings.dx_dv, bound.trust, bound.position, r2, ahead);
+            return settings.position > 0 && r2 <= limit && may_end(out.kind, r2, b2) && error.is_enough(settings.dx_dv, bound.trust, bound.position, r2, ahead);
         };
         auto ended = [&](bool enough) {  // as in pcg.h
             const double found = r2;
@@ -462,7 +462,7 @@ struct IslandSolver {
             restart = false;
             if (out.iterations == settings.max_iterations) return finish(MAX_ITERATIONS, true_residual());
             const bool spent = settings.budget > 0 ? out.iterations > 0 && now() - begin > settings.budget : out.iterations + 1 == -settings.budget;
-            if (spent) return finish(BUDGET, true_residual());
+            if (spent || (settings.deadline > 0 && out.iterations > 0 && now() > settings.deadline)) return finish(BUDGET, true_residual());
             error.look();
             const double pq = product(p, q);
             ++out.iterations;

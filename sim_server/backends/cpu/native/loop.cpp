@@ -228,9 +228,10 @@ static void finish_step(Loop* loop) {
     double entered = now();
     bool keep = room_for_records(rings, loop->bodies, [] { return true; });
     double waited = now() - entered;  // no part of the step
+    const double begun = now() - loop->assemble_seconds;  // but for what it waited for: room, and a factor
     for (int i = 0; i < loop->bodies; ++i) {
         SolveSettings& now = loop->body[i].now;
-        now.deadline = now.step_budget > 0 ? loop->assemble_begin + now.step_budget : 0;
+        now.deadline = now.step_budget > 0 ? begun + now.step_budget : 0;
     }
     if (loop->substeps) make_substeps(*loop);
     if (loop->euler) make_step(*loop);

@@ -94,7 +94,7 @@ static void solve(Loop& loop, int index) {
     BlockCsr A{body.first, body.last, loop.row_start, loop.columns, loop.values};
     SolveSettings settings = body.now;
     settings.warm_start = settings.warm_start && search.linearizations == 0;  // the last step's is no guess for a correction
-    settings.tolerance = solve_tolerance(search, settings.tolerance);
+    settings.tolerance = solve_tolerance(search, settings.tolerance, body.factor ? settings.kind : BLOCK_JACOBI);
     settings.position *= LINEAR_SHARE;
     settings.factor_scale = search.factor_scale;
     if (settings.budget < 0) settings.budget = std::min(-1.0, settings.budget + search.iterations);
@@ -163,7 +163,7 @@ static void end_by_budget(Loop& loop, int index) {
     Search& search = newton.search[index];
     const double next = newton.blocks_seconds + seconds_of_trial(newton, search) + 2 * search.seconds / std::max(1, search.iterations);
     const bool spent = body.now.deadline > 0 && search.phase == SOLVE && now() + next > body.now.deadline;
-    const bool was_spent = body.now.most_linearizations > 0 && search.status == MAX_LINEARIZATIONS;
+    const bool was_spent = body.now.most_linearizations > 0 && search.phase == DONE && search.verdict == TAKEN;
     if (spent || was_spent) {
         search.phase = DONE;
         search.status = BUDGET;

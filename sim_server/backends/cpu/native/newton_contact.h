@@ -85,6 +85,7 @@ struct ContactSearch : Passes {
             search.linearizations = std::max(search.linearizations, s.linearizations);
         }
         if (search.status == MAX_LINEARIZATIONS) search.status = CONVERGED;
+        search.step_error = NAN;  // what was known of it is of a motion without these contacts
         search.phase = SOLVE;
         const int most = std::max(newton.most.linearizations, search.linearizations + 1);
         for (int m = 0; m < count; ++m) {
@@ -110,6 +111,7 @@ struct ContactSearch : Passes {
         if (result.status == NOT_FINITE && first) search.norm = NAN;
         const int status = result.status == CONTACT ? CONVERGED : result.status;  // it is the end that counts
         record_solve(search, result.residual, result.seconds, result.iterations, result.fallbacks, result.kind, status);
+        search.solve_error = result.solve_error;
         if (search.phase == DONE) {
             move_on();
             share();

@@ -29,8 +29,9 @@ struct ChoiceOfPass {
         pass.factor_step = std::max(pass.factor_step, (long long)factor->step);
     }
 
-    void begin(SolveSettings& s) {
-        begin_pass(choice, pass, s.tolerance);
+    // end: relative residual at which the solve is to end
+    void begin(SolveSettings& s, double end) {
+        begin_pass(choice, pass, end);
         s.kind = pass.first ? BLOCK_JACOBI : CHOLESKY;
         s.probe = pass.probe;
     }

@@ -104,6 +104,9 @@ struct Passes : IslandRows {
         return s;
     }
 
+    // Relative residual at which a pass ends, as far as that is known beforehand.
+    static double expected_end(const SolveSettings& s) { return s.position > 0 ? std::max(s.tolerance, s.residual_limit) : s.tolerance; }
+
     // dy of (A + H^T S H) dy = r, and its residual.
     SolveResult solve_linear(double tolerance, bool last, double most) {
         SolveSettings settings = settings_for(tolerance, last, most);
@@ -120,7 +123,7 @@ struct Passes : IslandRows {
         if (settings.kind == CHOLESKY && body.factor) {
             ChoiceOfPass choice(c.choice[bodies[0]]);
             choice.add(A, body.factor);
-            choice.begin(settings);
+            choice.begin(settings, expected_end(settings));
             solved = solve_by();
             choice.end(solved, body.correction.spent);
         } else {
@@ -140,7 +143,7 @@ struct Passes : IslandRows {
         }
         settings.kind = BLOCK_JACOBI;
         const bool chooses = choice.pass.factor_step >= 0;
-        if (chooses) choice.begin(settings);
+        if (chooses) choice.begin(settings, expected_end(settings));
         const SolveResult solved = solver.solve(r, settings, dy, rest);
         double spent = 0;
         if (chooses) choice.end(solved, spent);

@@ -151,7 +151,7 @@ static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor,
     };
     // Whether a solve ends by the estimate. ahead: z is of the iteration before.
     auto is_enough = [&](bool ahead) {
-        return bounded && r2 <= limit && may_end(r2, b2) && error.is_enough(settings.dx_dv, trust_of(out.kind, settings.trust), settings.position, r2, ahead);
+        return bounded && r2 <= limit && may_end(out.kind, r2, b2) && error.is_enough(settings.dx_dv, trust_of(out.kind, settings.trust), settings.position, r2, ahead);
     };
     // The status with which the solve ends by its true residual, -1: it goes on from it.
     auto ended = [&](bool enough) {
