@@ -28,7 +28,7 @@ constexpr double LINEAR_SHARE = 0.3;                            // of the bound 
 constexpr double MOST_FORCING = 0.1, FORCING_FACTOR = 0.9;      // largest forcing term, also the first one; of the fall of |b|, squared
 template <class T> constexpr double EPSILON = sizeof(T) == 8 ? 2.2e-16 : 1.2e-7;  // T: type in which forces are computed
 
-enum Phase { SOLVE = 0, TRY = 1, DONE = 2 };
+enum Phase { SOLVE = 0, TRY = 1, DONE = 2, LAST = 3 };  // LAST, on a GPU: over, but its error is to be estimated
 enum Verdict { NONE_YET = 0, SHORTER = 1, TAKEN = 2, LOST = 3 };  // on a trial. LOST: no trial along the direction has a finite residual
 
 struct Search {                        // Newton iteration of a step, of one body
@@ -135,16 +135,25 @@ HOST_DEVICE int evaluate_trial(Search& s, const Limits& most, double norm, doubl
 // Relative tolerance of a linear solve. tolerance: of the settings.
 HOST_DEVICE double solve_tolerance(const Search& s, double tolerance) { return s.forcing > tolerance ? s.forcing : tolerance; }
 
+// Estimated error of the state of a trial [m], by z = |P^-1 b| there; NaN: not known.
+HOST_DEVICE double state_error(const Search& s, double z, double dx_dv) {
+    const double e = s.factor_scale > 0 ? dx_dv * s.factor_scale * z : not_known();
+    return e < s.solve_error ? s.solve_error : e;
+}
+
+// |b| at the start of the present linearization.
+HOST_DEVICE double norm_before(const Search& s) { return s.linearizations == 1 ? s.first : s.last; }
+
 // After a trial that was taken. estimate: of its error [m]; NaN: not known. Ends the iteration where trust * estimate is within
-// position; else sets the forcing term. before: |b| at the start of the linearization.
-HOST_DEVICE void bound_error(Search& s, double before, double estimate, double trust, double position) {
+// position; else sets the forcing term.
+HOST_DEVICE void bound_error(Search& s, double estimate, double trust, double position) {
     s.step_error = estimate;
     if (is_exact_enough(estimate, trust, position, false)) {
         s.phase = DONE;
         if (s.status == MAX_LINEARIZATIONS) s.status = CONVERGED;
         return;
     }
-    const double fall = s.norm / before, forcing = FORCING_FACTOR * fall * fall;
+    const double fall = s.norm / norm_before(s), forcing = FORCING_FACTOR * fall * fall;
     s.forcing = is_exact_enough(forcing * estimate, trust, position, false) ? 0 : forcing < MOST_FORCING ? forcing : MOST_FORCING;
 }
 

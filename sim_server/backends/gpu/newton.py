@@ -37,15 +37,22 @@ class NewtonPhases(NamedTuple):
 
     active: (1,), number of bodies whose iteration is not over
     phase: (bodies,), phase of each body's iteration (kernels/newton_line_search.cuh)
+    search: (bodies,) of SEARCH as bytes
     """
 
     active: DeviceArray
     phase: DeviceArray
+    search: DeviceArray
 
     @classmethod
     def initial(cls, gpu: Gpu, bodies: int) -> "NewtonPhases":
         """Returns the state before the first step."""
-        return cls(gpu.cp.full(1, bodies, np.int32), gpu.cp.zeros(bodies, np.int32))
+        zeros = gpu.cp.zeros
+        return cls(gpu.cp.full(1, bodies, np.int32), zeros(bodies, np.int32), zeros(bodies * SEARCH.itemsize, np.uint8))
+
+    def of_solves(self, errors: bool) -> tuple[DeviceArray, ...]:
+        """Returns what the solver reads. errors: whether it judges trials (bounded_search.cuh)."""
+        return (self.active, self.phase, self.search) if errors else (self.active, self.phase)
 
     def guard(self, body: DeviceArray | None, blocks: bool = False) -> PhaseGuard:
         """Returns the guard of a kernel. body: (items,), body of each item; None: not known. blocks: it makes those
@@ -103,12 +110,13 @@ class NewtonIteration:
     arrays: host arrays by name (row_start, columns, values, b, y, x, v)
     results: host memory (capacity, bodies) of NEWTON_RESULT that the steps write to
     readers: launches after the step's end that read what the last assembly made
+    errors: whether the error of positions is bounded: then a solve more than trials are allowed judges the last one
 
     The array `values` keeps A of the first linearization of a step, from which factors are made; later ones have
     another.
 
     loops: whether the graph of a step has a loop
-    rounds: most trials in a step
+    rounds: most times that the loop, or the graph, has the launches of a trial in a step
 
     Raises InputError for more trials than a graph without loops may hold.
     """
@@ -116,10 +124,10 @@ class NewtonIteration:
     def __init__(
         self, gpu: Gpu, device: Loops, newton: Newton, again: Sequence[DeviceLaunch], ranges: Sequence[tuple[int, int]],
         arrays: Mapping[str, NDArray[Any]], phases: NewtonPhases, solver: PcgSolver, results: NDArray[Any],
-        readers: Sequence[DeviceLaunch] = (),
+        readers: Sequence[DeviceLaunch] = (), errors: bool = False,
     ):  # fmt: skip
         cp, nodes, bodies = gpu.cp, len(arrays["x"]), len(ranges)
-        self._gpu, self._device, self._solver, self.rounds = gpu, device, solver, newton.options.rounds
+        self._gpu, self._device, self._solver, self.rounds = gpu, device, solver, newton.options.rounds + errors
         self.loops = device.has_conditions
         if not self.loops:
             newton.options.check_unrolled()
@@ -136,7 +144,7 @@ class NewtonIteration:
         self._memory = twins | {
             "ranges": cp.asarray(spans.view(np.int32)), "first_range": cp.asarray(starts),
             "partial_sums": cp.zeros(2 * len(spans)), "finished_blocks": cp.zeros(bodies, np.uint32),
-            "search": cp.zeros(bodies * SEARCH.itemsize, np.uint8), "phase": phases.phase, "active": phases.active,
+            "search": phases.search, "phase": phases.phase, "active": phases.active,
             "bad_node": cp.zeros(bodies, np.int32), "step": solver.counter, "pool_counter": solver.pool_counter,
             "results": solver.results,
             "initial_state": cp.zeros(12 * nodes, real), "increment": cp.zeros(3 * nodes),
@@ -152,7 +160,7 @@ class NewtonIteration:
         self._params["capacity"] = results.nbytes // NEWTON_RESULT.itemsize // bodies
         self._later_params = self._params.copy()
         self._later_params["values"] = self._values.data.ptr
-        flags = (*options(gpu.types), *own_headers())
+        flags = (*options(gpu.types), *own_headers(), *(["-DERRORS"] if errors else []))
         module = gpu.cp.RawModule(code=NEWTON.checked(), options=flags, backend="nvrtc")
         self._begin, self._update_state, self._accept_trial, self._end = (
             compiled("newton.cu", module, name)

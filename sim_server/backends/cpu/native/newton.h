@@ -127,8 +127,7 @@ static double remaining_error(Loop& loop, int index) {
     const double z = apply_to(matrix_of(loop, body), b, body.factor, search.kind, body.now.omega, loop.work + WORK * (int64_t)body.first,
                               &body.correction);
     search.applied = search.kind == CHOLESKY && body.now.kind == CHOLESKY && z > 0;
-    const double e = search.factor_scale > 0 ? body.now.dx_dv * search.factor_scale * z : not_known();
-    return e < search.solve_error ? search.solve_error : e;
+    return state_error(search, z, body.now.dx_dv);
 }
 
 // Ends the step where its budget does not allow another linearization, or ended a solve.
@@ -159,14 +158,14 @@ static int judge(Loop& loop, int index) {
     Limits most = newton.most;
     if (body.now.most_linearizations > 0) most.linearizations = body.now.most_linearizations;
     if (search.status == BUDGET) most.linearizations = search.linearizations;
-    const double before = search.linearizations == 1 ? search.first : search.last;
     const int verdict = evaluate_trial(search, most, norm(room.n, b), dot(room.n, material, b));
     if (verdict == SHORTER) {
         set_state(loop, body, search.scale);
         return search.phase;
     }
     for (int k = 0; k < room.n; ++k) room.increment[k] = increment_after(search, room.increment[k], room.direction[k]);
-    if (verdict == TAKEN && body.now.position > 0) bound_error(search, before, remaining_error(loop, index), trust_of(search.kind, body.now.trust), body.now.position);
+    if (verdict == TAKEN && body.now.position > 0)
+        bound_error(search, remaining_error(loop, index), trust_of(search.kind, body.now.trust), body.now.position);
     if (search.phase == DONE && search.applied && body.now.trust <= WARPED_TRUST) {
         double* z = loop.work + WORK * (int64_t)body.first + room.n;
         rotate(newton, body, false, z, room.direction);

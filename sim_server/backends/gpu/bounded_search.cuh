@@ -1,0 +1,29 @@
+// SPDX-License-Identifier: MIT
+// Newton-Raphson with a bound of the error of positions on a GPU (decisions: kernels/newton_line_search.cuh): what the solver (pcg.cu) decides
+// of a search (newton.cu). A trial that was taken is judged by the first z = P^-1 b of the next solve.
+#pragma once
+#include "newton_line_search.cuh"
+#include "pcg_structs.cuh"
+
+// Relative tolerance with which a solve begins. That of a later linearization is set when z is known.
+HOST_DEVICE double first_tolerance(const Search& s, double tolerance) { return s.linearizations == 0 ? solve_tolerance(s, tolerance) : tolerance; }
+
+// Judges the last trial by z = P^-1 b of `kind`, |z| = size. Returns whether the search ends; else the forcing term is that of the solve.
+HOST_DEVICE bool ends_by_start(Search& s, const PcgBody& settings, int kind, double size) {
+    if (s.linearizations == 0) return false;
+    if (kind != s.kind) s.factor_scale = 0;
+    bound_error(s, state_error(s, size, settings.dx_dv), trust_of(s.kind, settings.trust), settings.position);
+    return s.phase != SOLVE;
+}
+
+// Whether z that has ended a search is added to the solution.
+HOST_DEVICE bool is_added(const PcgBody& settings, int kind) { return kind == CHOLESKY && settings.trust <= WARPED_TRUST; }
+
+// After a solve: whether the search is over, since its start was exact enough, or nothing was to be estimated.
+HOST_DEVICE bool is_over(const Search& s, const PcgResult& r) {
+    return s.phase == DONE || s.phase == LAST || (s.linearizations > 0 && r.iterations == 0 && r.status == CONVERGED);
+}
+
+// A member of a result in which 0 is not known.
+HOST_DEVICE double as_known(double error) { return error > 0 ? error : not_known(); }
+HOST_DEVICE double as_told(double error) { return error > 0 ? error : 0; }
