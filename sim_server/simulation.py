@@ -120,7 +120,7 @@ class Simulation:
         held = w.reaction if w.reaction.size else None
         return EngineInput(
             assemble, integrate, names, ranges, w.dt, self.scene.solver, self.energies, newton, stages, euler, substeps,
-            contact, touch, held, arrays,
+            contact, touch, held, self.scene.accuracy is not None, arrays,
         )  # fmt: skip
 
     @classmethod

@@ -267,6 +267,7 @@ class EngineInput:
     contact: rows that launches among `assemble` fill in; None: nothing can be touched
     touch: the one of `assemble` that pushes and grabs (effects/touch.cu); None: no object lists the effect
     held: (bodies, k, 6) force [N] and torque [N m] on each holder, attachment and spring; None: there are none
+    errors: whether the estimated errors of positions are wanted where they cost time
     arrays: of the system by name: row_start, columns, values, b, y, x, v, clock, moving, rotation
     """
 
@@ -284,6 +285,7 @@ class EngineInput:
     contact: Contact | None
     touch: Launch | None
     held: Float64 | None
+    errors: bool
     arrays: Mapping[str, NDArray[Any]]
 
 

@@ -23,7 +23,7 @@ from sim_server.backends.gpu.correction import CORRECTED_BODY, FactorCorrection
 from sim_server.backends.gpu.row_partition import assign_blocks
 from sim_server.backends.gpu.solver import PCG_RESULT, PcgSolver
 from sim_server.backends.gpu.structs import CONTACT_RESULT, PCG
-from sim_server.backends.kinds import KINDS
+from sim_server.backends.kinds import FACTOR_TRUST, KINDS, WARPED_TRUST
 from sim_server.simulation import Simulation
 from tests.contact.kernels_beside import TESTS, Host, as_device
 
@@ -188,7 +188,8 @@ class Solver:
         self.correction = FactorCorrection(gpu, sim.scene.solver.woodbury, list(given.ranges), touch, sites)
         self.counter, contact = as_device(np.zeros(1, np.int64)), given.contact is not None
         self.solver = PcgSolver(
-            gpu, given.ranges, given.arrays, self.counter, 4, contact=contact, correction=self.correction
+            gpu, given.ranges, given.arrays, self.counter, 4, contact=contact, correction=self.correction,
+            errors=given.errors,
         )  # fmt: skip
         own = sim.scene.solver
         rows = self.solver.bodies
@@ -198,6 +199,9 @@ class Solver:
             own.max_iterations,
             own.warm_start,
         )
+        if sim.scene.accuracy:
+            rows["position"] = sim.scene.accuracy.position_of(sim.world.bodies[0].mesh.rest)
+            rows["trust"], rows["dx_dv"] = WARPED_TRUST if sim.warped else FACTOR_TRUST, sim.world.dx_dv
         rows["kind"], rows["factor_step"] = KINDS.enumeration("Kind")["CHOLESKY"], -1
         self.kept: list[Any] = []
 

@@ -101,13 +101,17 @@ struct BlockGroup {
     double (*scratch)[4];    // shared, 3 WARPS
     double* totals;  // shared, 4
     int lane, warp;
+    FlagWord<double>* peak_words;  // (2, grid) of this body; null, as `peaks`, where no largest values are asked for
+    double* peaks;                 // shared, WARPS + 1
 
     // Adds N <= 4 values over lanes 0 to LANES - 1 of all warps of the group; every thread gets the sums. Also a barrier.
     // fenced: writes to memory before it are visible to all after it.
-    template <int N, int LANES>
-    __device__ __forceinline__ void sums(const double mine[N], double out[N], bool fenced = false) {
+    // PEAK: `peak`, of each thread, becomes the largest of the group; none is below 0.
+    template <int N, int LANES, bool PEAK = false>
+    __device__ __forceinline__ void sums(const double mine[N], double out[N], bool fenced = false, [[maybe_unused]] double* peak = nullptr) {
         if (lane < LANES)
             for (int n = 0; n < N; ++n) scratch[LANES * warp + lane][n] = mine[n];
+        if constexpr (PEAK) keep_peak(*peak);
         ++number;
         __syncthreads();
         FlagWord<double>* row = block_sums + (number & 1) * 4 * grid;
@@ -119,6 +123,7 @@ struct BlockGroup {
             if (blocks == 1 && lane < N) totals[lane] = sum;
             if (fenced) __threadfence();
             if (blocks > 1 && lane < N) row[lane * grid + index].put(sum, number);
+            if constexpr (PEAK) put_peak();
         }
         if (blocks > 1)
             for (int n = warp; n < N; n += WARPS) {
@@ -126,8 +131,10 @@ struct BlockGroup {
                 if (fenced) __threadfence();
                 if (lane == 0) totals[n] = sum;
             }
+        if constexpr (PEAK) read_peak(N % WARPS);
         __syncthreads();
         for (int n = 0; n < N; ++n) out[n] = totals[n];
+        if constexpr (PEAK) *peak = total_peak();
     }
 
     __device__ __forceinline__ void barrier() {
@@ -136,7 +143,8 @@ struct BlockGroup {
         sums<1, 1>(none, sum, true);
     }
 
-    // Sum of the words of all thread blocks, by one warp; each lane adds every 32nd.
+    // Sum of the words of all thread blocks, by one warp; each lane adds every 32nd. MOST: the largest one instead.
+    template <bool MOST = false>
     __device__ __forceinline__ double read(const FlagWord<double>* row) const {
         double sum = 0;
         for (int first = lane; first < blocks + lane; first += 32 * AT_ONCE) {
@@ -152,10 +160,36 @@ struct BlockGroup {
                 for (int k = 0; k < AT_ONCE; ++k) all &= seen[k].unpack(got[k], number);
             } while (keep_polling(!all, spins));
 #pragma unroll
-            for (int k = 0; k < AT_ONCE; ++k) sum += first + 32 * k < blocks ? got[k] : 0;
+            for (int k = 0; k < AT_ONCE; ++k)
+                if constexpr (MOST) sum = first + 32 * k < blocks ? fmax(sum, got[k]) : sum;
+                else sum += first + 32 * k < blocks ? got[k] : 0;
         }
         __syncwarp();
-        for (int k = 16; k; k >>= 1) sum += __shfl_xor_sync(ALL, sum, k);
+        for (int k = 16; k; k >>= 1) {
+            const double other = __shfl_xor_sync(ALL, sum, k);
+            sum = MOST ? fmax(sum, other) : sum + other;
+        }
         return sum;
     }
+
+    static __device__ __forceinline__ double most_of_warp(double mine) {
+        for (int k = 16; k; k >>= 1) mine = fmax(mine, __shfl_xor_sync(ALL, mine, k));
+        return mine;
+    }
+    __device__ __forceinline__ void keep_peak(double mine) const {
+        mine = most_of_warp(mine);
+        if (lane == 0) peaks[warp] = mine;
+    }
+    // By the first warp.
+    __device__ __forceinline__ void put_peak() const {
+        const double most = most_of_warp(lane < WARPS ? peaks[lane] : 0);
+        if (lane == 0 && blocks == 1) peaks[WARPS] = most;
+        if (lane == 0 && blocks > 1) peak_words[(number & 1) * grid + index].put(most, number);
+    }
+    __device__ __forceinline__ void read_peak(int reader) const {
+        if (blocks == 1 || warp != reader) return;
+        const double most = read<true>(peak_words + (number & 1) * grid);
+        if (lane == 0) peaks[WARPS] = most;
+    }
+    __device__ __forceinline__ double total_peak() const { return peaks[WARPS]; }
 };

@@ -81,5 +81,8 @@ HOST_DEVICE void note_pass(ContactState& c, const ContactSolve& pass, int outcom
     sum.status = out.status;
     sum.bad_node = out.bad_node;
     sum.residual = out.residual;
+#ifdef ERRORS
+    sum.solve_error = out.solve_error;
+#endif
     if (out.factor_step >= 0) sum.factor_step = out.factor_step;
 }

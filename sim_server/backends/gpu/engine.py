@@ -115,7 +115,7 @@ class GpuEngine(DeviceLoop):
         self.solver = PcgSolver(
             gpu, ranges, arrays, self._counter, CAPACITY, planes, phases or (), ATTEMPTS if stages else 0,
             given.contact is not None,
-            given.contact is not None and bool(given.contact.surfaces or given.contact.ties), correction,
+            given.contact is not None and bool(given.contact.surfaces or given.contact.ties), correction, given.errors,
         )  # fmt: skip
         self._newton, newton_results = None, None
         if newton and phases:

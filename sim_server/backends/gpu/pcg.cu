@@ -7,6 +7,9 @@
 // |r|^2 - 2 alpha r.q + alpha^2 q.q, so that the preconditioner is not applied after convergence.
 //
 // Vectors and A have the type `real`, and so has the residual, for every precision of the preconditioner. No float atomics.
+#ifdef ERRORS
+#include "iterate_error.cuh"
+#endif
 #include "partitioned_inverse.cuh"
 #include "clock.cuh"
 #include "spmv.cuh"
@@ -39,6 +42,10 @@ struct BlockMemory {  // static shared memory of a thread block: data that is th
 #ifdef CORRECTED
     CorrectionMemory correction;
 #endif
+#ifdef ERRORS
+    double peaks[WARPS + 1];
+    IterateError error;
+#endif
 };
 __shared__ BlockMemory memory;
 
@@ -69,6 +76,10 @@ struct PcgSolver {
     bool corrects = false;  // applications are corrected
     int column = -1;        // of V, that the next application makes
     int body = 0;
+#endif
+#ifdef ERRORS
+    double x_change = 0;    // |x - x at the last look|, of the last exchange with it
+    bool enough = false;    // the estimated error ends the solve
 #endif
 
     __device__ __forceinline__ void set_up(const RowRange& range) {
@@ -138,6 +149,9 @@ struct PcgSolver {
         for (int k = threadIdx.x; k < 3 * rows.halo; k += THREADS)
             rows.values[k] = __ldcg(s.y + 3 * (first + rows.nodes[k / 3]) + k % 3);
         __syncthreads();
+#ifdef ERRORS
+        const double moved2 = largest2([&](int k) { return rows.values[k] - rows.before[k]; });
+#endif
 #ifdef CORRECTED
         double mine[3] = {0, 0, 0}, out[3];
         const double large = first_of_solve ? look_for_differences() : 0;
@@ -165,8 +179,14 @@ struct PcgSolver {
         into_three<2>(mine);
 #ifdef CORRECTED
         if (threadIdx.x % 32 == 0) mine[2] = large;
+#ifdef ERRORS
+        sums_and_change<3, 3>(mine, out, moved2);
+#else
         group.sums<3, 3>(mine, out);
+#endif
         if (first_of_solve) memory.correction.count = (int)out[2];  // the same in all threads
+#elif defined(ERRORS)
+        sums_and_change<2, 3>(mine, out, moved2);
 #else
         group.sums<2, 3>(mine, out);
 #endif
@@ -184,8 +204,71 @@ struct PcgSolver {
         }
     }
 
+#ifdef ERRORS
+    // Largest square of a vector at an own node of this thread. at(k): its entry k.
+    template <class At>
+    static __device__ __forceinline__ double largest2(At at) {
+        double most = 0;
+        for (int k = 3 * threadIdx.x; k < 3 * memory.rows.own; k += 3 * THREADS) {
+            const double a[3] = {(double)at(k), (double)at(k + 1), (double)at(k + 2)};
+            most = fmax(most, a[0] * a[0] + a[1] * a[1] + a[2] * a[2]);
+        }
+        return most;
+    }
+
+    // Sums over the group as BlockGroup.sums, and `x_change` from this thread's part of it.
+    template <int N, int LANES>
+    __device__ __forceinline__ void sums_and_change(const double mine[N], double out[N], double moved2) {
+        group.sums<N, LANES, true>(mine, out, false, &moved2);
+        x_change = sqrt(moved2);
+    }
+
+    // After an application and the next search direction: notes z, and keeps x where it is to be looked at. Returns whether the solve ends.
+    __device__ __forceinline__ bool ends_by(int kind, double zr, double r2, double size) {
+        IterateError& error = memory.error;
+        if (threadIdx.x == 0) error.apply(kind, zr, r2, size, x_change);
+        __syncthreads();
+        enough = error.enough;
+        const BlockRows& rows = memory.rows;
+        if (error.looks)
+            for (int k = threadIdx.x; k < 3 * rows.own; k += THREADS) rows.before[k] = rows.x[k];
+        return enough;
+    }
+
+    // After an iteration: whether the solve ends at x + alpha p.
+    __device__ __forceinline__ void look_ahead(real alpha, double r2) {
+        IterateError& error = memory.error;
+        const BlockRows& rows = memory.rows;
+        if (threadIdx.x == 0) error.move((double)alpha, r2);
+        __syncthreads();
+        if (!error.near) return;
+        double none[1] = {0};
+        sums_and_change<1, 1>(none, none, largest2([&](int k) { return rows.x[k] + alpha * rows.values[k] - rows.before[k]; }));
+        if (threadIdx.x == 0) error.enough = error.is_enough(r2, x_change, true);
+        __syncthreads();
+        enough = error.enough;
+    }
+
+    // Sets what the estimate may do. r2, b2: squares of the residual at the start and of b.
+    __device__ __forceinline__ void bound(double r2, double b2) const {
+        if (threadIdx.x > 0) return;
+        IterateError& error = memory.error;
+        error.b2 = given ? r2 : b2;
+#ifdef CONTACT_PASSES
+        const ContactState& c = memory.contact;
+        if (memory.outcome == PASSED) error.position = 0;
+        if (memory.outcome == LAST_PASSED) error.limit2 = WITHIN * WITHIN * pass.tolerance * pass.tolerance * c.given2;
+#endif
+    }
+#endif
+
     // 7. 8. 2. p = z + beta p, q = A p; sums p.q, r.q, q.q, r.r
+#ifdef ERRORS
+    // size: |z|
+    __device__ __forceinline__ void direction(real beta, double out[4], double& size) {
+#else
     __device__ __forceinline__ void direction(real beta, double out[4]) {
+#endif
         const BlockRows rows = memory.rows;
 #ifdef CORRECTED
         if (packed) rows.form(memory.inverse.z, z_number, beta, [&](int k) { return corrects ? correction_at(rows, k) : 0.0f; });
@@ -193,6 +276,10 @@ struct PcgSolver {
 #else
         if (packed) rows.form(memory.inverse.z, z_number, beta);
         else rows.form(s.z, z_number, beta);
+#endif
+#ifdef ERRORS
+        double z2 = largest2([&](int k) { return rows.q[k]; });
+        __syncthreads();
 #endif
         double mine[4] = {0, 0, 0, 0};
         rows.multiply([&](int node, int c, real q) {
@@ -207,7 +294,12 @@ struct PcgSolver {
         });
         q_number = group.number;
         into_three<4>(mine);
+#ifdef ERRORS
+        group.sums<4, 3, true>(mine, out, false, &z2);
+        size = sqrt(z2);
+#else
         group.sums<4, 3>(mine, out);
+#endif
     }
 
     // 3. 4. 5. 6. x += alpha p, r -= alpha q, z = P^-1 r; returns z . r. r2: |r|^2 after the update.
@@ -242,7 +334,11 @@ struct PcgSolver {
             mine[0] = by_diagonal(kind);
         }
         for (int k = 16; k; k >>= 1) mine[0] += __shfl_xor_sync(ALL, mine[0], k);
+#ifdef ERRORS
+        sums_and_change<1, 1>(mine, zr, largest2([&](int k) { return rows.x[k] - rows.before[k]; }));
+#else
         group.sums<1, 1>(mine, zr);
+#endif
         return zr[0];
     }
 
@@ -493,6 +589,9 @@ __device__ __forceinline__ void PcgSolver::solve() {
     for (;;) {
         if (measure) {  // the true residual
             double bb;
+#ifdef ERRORS
+            const double found = r2;
+#endif
             r2 = residual(bb, !begun);
             measure = false;
             alpha = 1;
@@ -516,6 +615,9 @@ __device__ __forceinline__ void PcgSolver::solve() {
 #ifdef CONTACT_PASSES
                 if (!refused && ends_before(r2)) return;
 #endif
+#ifdef ERRORS
+                bound(r2, bb);
+#endif
                 if ((!given || refused) && (!body.warm_start || !(r2 < bb))) { alpha = 0; r2 = bb; }
                 else fresh = true;
                 memory.quarter = r2 * sqrt(sqrt(memory.goal / r2));
@@ -532,6 +634,11 @@ __device__ __forceinline__ void PcgSolver::solve() {
                 prepares = kind == CHOLESKY && begin_correction();
 #endif
             } else {
+#ifdef ERRORS
+                if (enough && r2 <= LOST_DIGITS * found) memory.goal = fmax(memory.goal, r2);  // it is exact enough
+                enough = false;
+                if (threadIdx.x == 0) out.solve_error = memory.error.told(r2, x_change);
+#endif
                 if (stop == CONVERGED && r2 > memory.goal && !(r2 < 0.25 * last)) stop = MAX_ITERATIONS;  // rounding errors dominate
                 if (stop != CONVERGED || r2 <= memory.goal) {
                     out.status = stop;
@@ -544,6 +651,9 @@ __device__ __forceinline__ void PcgSolver::solve() {
             if (fresh) turn = 1 - turn;
         }
         stop = r2 <= memory.goal ? CONVERGED : -1;
+#ifdef ERRORS
+        if (enough) stop = CONVERGED;
+#endif
         if (stop < 0) {
 #ifdef CORRECTED
             if (prepares && column < 0) {
@@ -586,7 +696,13 @@ __device__ __forceinline__ void PcgSolver::solve() {
             }
             if (stop < 0) {
                 double sums[4];
+#ifdef ERRORS
+                double size;
+                direction(restart ? 0 : (real)(zr * inverse_of(memory.rz)), sums, size);
+                if (ends_by(kind, zr, r2, size)) continue;
+#else
                 direction(restart ? 0 : (real)(zr * inverse_of(memory.rz)), sums);
+#endif
                 memory.rz = zr;
                 restart = false;
                 out.iterations = ++iterations;
@@ -594,6 +710,9 @@ __device__ __forceinline__ void PcgSolver::solve() {
                 if (sums[0] > 0) {
                     alpha = (real)(zr * inverse_of(sums[0]));
                     r2 = fmax(0.0, sums[3] - 2 * alpha * sums[1] + alpha * alpha * sums[2]);
+#ifdef ERRORS
+                    if (usable(alpha) && isfinite(r2)) look_ahead((real)alpha, r2);
+#endif
                     if (usable(alpha) && isfinite(r2)) continue;
                     alpha = 0;
                 }
@@ -661,8 +780,26 @@ __device__ __forceinline__ void solve_body(const PcgArguments& s, const RowRange
 #endif
     __syncthreads();
     const long long begin = nanoseconds();
+#ifdef ERRORS
+    if (threadIdx.x == 0) {
+#ifdef STAGES
+        const double dt = memory.body.dx_dv / ROS2_GAMMA;
+        memory.error.begin(memory.body.position, memory.body.trust, dt);
+        if (stage.form != EULER) memory.error.of_stage(stage.first_of_attempt);
+#else
+        memory.error.begin(memory.body.position, memory.body.trust, memory.body.dx_dv);
+#endif
+#ifdef NEWTON_PHASES
+        memory.error.position *= SHARE_OF_SOLVE;
+#endif
+    }
+#endif
     PcgSolver solver = {s, {range.index, memory.body.blocks, s.exchange_number[k], s.block_sums + 8ll * s.grid * k, s.grid, memory.scratch, memory.totals,
-                         (int)threadIdx.x % 32, (int)threadIdx.x / 32}
+                         (int)threadIdx.x % 32, (int)threadIdx.x / 32
+#ifdef ERRORS
+                         , s.block_sums + (8ll * s.count + 2 * k) * s.grid, memory.peaks
+#endif
+                        }
 #ifdef CONTACT_PASSES
                         , 0, 0, 0, 0, false, false, false, false, memory.contact.phase == READY, pass
 #endif
@@ -691,6 +828,9 @@ __device__ __forceinline__ void solve_body(const PcgArguments& s, const RowRange
 #ifdef STAGES
         if (stage.first_of_step) result = no_solve(memory.body);
         if (stage.first_of_attempt) { result.status = CONVERGED; result.bad_node = -1; }
+#ifdef ERRORS
+        if (stage.first_of_attempt) result.solve_error = 0;
+#endif
         add_solve(result, out);
 #elif defined(CONTACT_PASSES)
         note_pass(pass.state[k], pass, memory.outcome, result, out);

@@ -79,10 +79,10 @@ struct PcgArguments {
     const int* local_column;       // (blocks of A,) column as an index into that list
     real* halo_values;             // (halo, 3) used if they do not fit into shared memory
     int* halo_position;            // (halo,) likewise
-    real* own_vectors;             // (3, nodes, 3) x, r, q likewise
+    real* own_vectors;             // (3, nodes, 3) x, r, q likewise; -DERRORS: (4, nodes, 3), x at the last look, too
     FlagWord<real>* z;             // (nodes, 3) without a factor
     real* diagonal;                // (nodes, 9) inverses of the diagonal blocks
-    FlagWord<double>* block_sums;  // (bodies, 2, 4, grid) partial sums
+    FlagWord<double>* block_sums;  // (bodies, 2, 4, grid) partial sums; -DERRORS: then (bodies, 2, grid) largest values
     unsigned* exchange_number;     // (bodies,) of the last exchange, counted from the first step on
     unsigned* pool_counter;        // (1,) zero at launch; bodies of the pool that were taken
     const long long* step;         // number of completed steps, which selects the slot of the result

@@ -45,6 +45,7 @@ class PcgSolver:
     contact: True for a scene with contact (contact_state.cuh)
     between: True if bodies touch each other, or are tied, there (island_state.cuh)
     correction: of factors for grabs and contacts; None: they are not corrected
+    errors: True for a scene whose solves estimate the errors of positions (iterate_error.cuh)
 
     params: arguments of the kernel (PCG_ARGUMENTS)
     bodies: host rows (PCG_BODY), one per body. The loop uploads the settings (the first SETTINGS_BYTES bytes of a row)
@@ -57,11 +58,11 @@ class PcgSolver:
     def __init__(
         self, gpu: Gpu, ranges: Sequence[tuple[int, int]], arrays: Mapping[str, NDArray[Any]], counter: DeviceArray,
         capacity: int, planes: int = 1, phases: Sequence[DeviceArray] = (), attempts: int = 0, contact: bool = False,
-        between: bool = False, correction: FactorCorrection | None = None,
+        between: bool = False, correction: FactorCorrection | None = None, errors: bool = False,
     ):  # fmt: skip
         cp, processors = gpu.cp, gpu.properties["multiProcessorCount"]
         self.gpu, self.counter, self._capacity, self.planes, self._phases = gpu, counter, capacity, planes, phases
-        self._attempts, self._contact, self._correction = attempts, contact, correction
+        self._attempts, self._contact, self._correction, self._errors = attempts, contact, correction, errors
         self._twins = {name: gpu.twin(arrays[name]) for name in ("row_start", "values", "b", "y", "moving")}
         self.real = np.dtype(self._twins["values"].dtype)
         self._types = {"real": "float" if self.real == np.float32 else "double"}
@@ -87,9 +88,9 @@ class PcgSolver:
             "initial_range": cp.asarray(initial_ranges(assigned, partition, self.grid)),
             "halo": cp.asarray(partition.nodes.astype(ints)), "local_column": cp.asarray(partition.local.astype(ints)),
             "halo_values": cp.zeros(3 * len(partition.nodes), self.real),
-            "halo_position": cp.zeros(len(partition.nodes), ints), "own_vectors": cp.zeros(9 * total, self.real),
+            "halo_position": cp.zeros(len(partition.nodes), ints), "own_vectors": cp.zeros((12 if errors else 9) * total, self.real),
             "z": cp.zeros(6 * total), "diagonal": cp.zeros(9 * total, self.real),
-            "block_sums": cp.zeros(16 * self.grid * len(ranges)),
+            "block_sums": cp.zeros((20 if errors else 16) * self.grid * len(ranges)),
             "exchange_number": cp.ones(len(ranges), np.uint32),  # unwritten words have the number 0
             "pool_counter": self.pool_counter, "results": self.results, "step": counter,
         }  # fmt: skip
@@ -121,6 +122,7 @@ class PcgSolver:
                 *(f"-D{name}={number}" for name, number in numbers.items()),
                 *(["-DNEWTON_PHASES"] if self._phases else []), *(["-DSTAGES"] if self._attempts else []),
                 *(["-DCONTACT_PASSES"] if self._contact else []), *(["-DCORRECTED"] if corrected else []),
+                *(["-DERRORS"] if self._errors and name == "pcg" else []),
             ),
             backend="nvrtc",
             enable_cooperative_groups=True,

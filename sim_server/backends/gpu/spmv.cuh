@@ -17,6 +17,9 @@ struct BlockRows {
     real* values;          // (halo, 3) of the vector that A multiplies
     int* place;            // (halo,) position from which its next values are read
     real *x, *r, *q;       // (own, 3)
+#ifdef ERRORS
+    real* before;          // (own, 3) x at the last look (iterate_error.cuh)
+#endif
     real* scale;           // (own, 3) of the inverse, or null
     const int* row_start;  // (own + 1,), less `base`
     const int* columns;    // indices into the halo
@@ -36,11 +39,19 @@ struct BlockRows {
         place = arena.take<int>(halo);
         if (!place) place = s.halo_position + range.halo_first;
         const long long row = body.first + begin, all = 3ll * s.nodes;
-        bring(s, (int)row, range, arena, (inverted ? 12 : 9) * own * (int)sizeof(real) + 64);
+#ifdef ERRORS
+        constexpr int KEPT = 3;  // entries of a node that are kept beside r, q and x
+#else
+        constexpr int KEPT = 0;
+#endif
+        bring(s, (int)row, range, arena, (inverted ? 12 + KEPT : 9 + KEPT) * own * (int)sizeof(real) + 64);
         scale = inverted ? arena.take<real>(3 * own) : nullptr;
         r = taken(arena, s.own_vectors + 3 * row + all);
         q = taken(arena, s.own_vectors + 3 * row + 2 * all);
         x = taken(arena, s.own_vectors + 3 * row);
+#ifdef ERRORS
+        before = taken(arena, s.own_vectors + 3 * row + 3 * all);
+#endif
         int* list = arena.take<int>(halo);
         if (!list) return;
         for (int k = threadIdx.x; k < halo; k += THREADS) copy_async(list + k, nodes + k, 4);
@@ -260,6 +271,9 @@ struct BlockRows {
                 const int k = first + n * THREADS;
 #ifdef CORRECTED
                 if (k < 3 * halo) got[n] -= less(k);
+#endif
+#ifdef ERRORS
+                if (k < 3 * own) q[k] = got[n];  // A p is formed next
 #endif
                 if (k < 3 * halo) values[k] = beta != 0 ? got[n] + beta * values[k] : got[n];
             }

@@ -69,6 +69,9 @@ DECIDES void add_solve(PcgResult& sum, const PcgResult& r) {
     sum.kind = r.kind;
     if (!(r.residual <= sum.residual)) sum.residual = r.residual;
     if (r.factor_step >= 0) sum.factor_step = r.factor_step;
+#ifdef ERRORS
+    sum.solve_error += r.solve_error;
+#endif
     if (r.status == CONVERGED) return;
     sum.status = r.status;
     sum.bad_node = r.bad_node;

@@ -9,8 +9,6 @@
 #include "island_rows.h"
 #include "pass_choice.h"
 
-constexpr double WITHIN = 0.5;  // part of the law's tolerance that the last solve may leave where it ends by the error of positions
-
 struct Passes : IslandRows {
     double *left, *r, *dy, *before, *rest;  // b - A y; with contact; solution of a pass; r before its solve; residual of its solve
     const double scale2;                 // i c, of S

@@ -145,8 +145,6 @@ static bool apply_alone(Loop& loop, int index, bool first) {
     return well;
 }
 
-// Derivatives of the positions after the step by u_1 and u_2, over h (mechanics/rosenbrock.py); by u_1 at unchanged forces.
-constexpr double BY_FIRST = (1 + 1 / 0.29289321881345247559915563789515) / 2, BY_SECOND = 0.5;
 
 static void iterate(Loop& loop, int index, bool first) {
     StageState& s = loop.stages->state[index];
