@@ -113,7 +113,8 @@ class GpuEngine(DeviceLoop):
         phases = NewtonPhases.initial(gpu, bodies) if newton else None
         correction = FactorCorrection.wanted(gpu, given)
         self.solver = PcgSolver(
-            gpu, ranges, arrays, self._counter, CAPACITY, planes, phases or (), ATTEMPTS if stages else 0,
+            gpu, ranges, arrays, self._counter, CAPACITY, planes,
+            phases.of_solves(given.errors) if phases else (), ATTEMPTS if stages else 0,
             given.contact is not None,
             given.contact is not None and bool(given.contact.surfaces or given.contact.ties), correction, given.errors,
         )  # fmt: skip
@@ -123,7 +124,8 @@ class GpuEngine(DeviceLoop):
             parts = newton.parts[len(self._first) :]
             newton = Newton(newton.options, newton.dx_dv, parts, newton.detect, **newton.arrays)
             self._newton = NewtonIteration(
-                gpu, device, newton, assemble, ranges, arrays, phases, self.solver, newton_results, settled
+                gpu, device, newton, assemble, ranges, arrays, phases, self.solver, newton_results, settled,
+                given.errors,
             )  # fmt: skip
         self._contact, contact_results, reactions, told = None, None, None, None
         self._ties = given.contact.ties if given.contact else None
