@@ -6,7 +6,8 @@
 //     eigenvalues of A^-1 P as its direction sees them: where it exceeds MOST_ALPHA P is too large, and alpha z is meant.
 //   - By the iterates: x_k - x_(k-d) is what d iterations took off the error, and sqrt(z.r) falls as the error in the norm of A does.
 // Where both are known the larger one counts. `trust` times an estimate is at least the error, as tests/accuracy measures: of a body
-// whose factor is far too stiff in a part of it, as where contacts have ended that it still knows, the error may be several times more.
+// whose factor is far too stiff in a part of it, as where contacts have ended that it still knows, the error may be several times more;
+// likewise where conjugate gradients stand still before they have seen the softest modes (block Jacobi in quasi-static scenes).
 #pragma once
 #ifndef __CUDACC__
 #include <cmath>
@@ -30,8 +31,10 @@ constexpr double SLOWEST = 0.95;      // fall of the error in d iterations; what
 // In place of an estimate that there is not.
 HOST_DEVICE double not_known() { return nan(""); }
 
+// Times an estimate of this kind is at least the error. trust_in_factor: WARPED_TRUST or FACTOR_TRUST.
 HOST_DEVICE double trust_of(int kind, double trust_in_factor) { return kind == CHOLESKY ? trust_in_factor : OTHER_TRUST; }
 
+// Iterations from which on the iterates tell.
 HOST_DEVICE int fewest_of(int kind) { return kind == CHOLESKY ? FEWEST_WITH_FACTOR : FEWEST; }
 
 // Whether an estimate may end a solve, with squares of |r| and |b|.
