@@ -138,7 +138,7 @@ class OnThreads:
         self.told = np.zeros((len(self.results), bodies), NEWTON_RESULT)
         self._solver: Any = SimpleNamespace(
             counter=counter, pool_counter=pool_counter, results=as_device(self.results), bodies_device=rows,
-            launch=self._solve,
+            launch=self._solve, errors=solves is not None,
         )  # fmt: skip
         arrays = {"row_start": s.row_start, "columns": s.columns, "values": s.values, "b": s.b_material, "y": s.y}
         arrays |= {"x": w.x, "v": w.v}
@@ -146,8 +146,7 @@ class OnThreads:
         device: Any = SimpleNamespace(has_conditions=loops, repeat=lambda flag: self._graphs.branch(flag, repeats=True))
         again: Any = [Launch(self, x) for x in self._assemble]
         self._iteration = NewtonIteration(
-            self._gpu, device, newton, again, ranges, arrays, self.phases, self._solver, self.told,
-            errors=solves is not None,
+            self._gpu, device, newton, again, ranges, arrays, self.phases, self._solver, self.told
         )  # fmt: skip
         self._graphs.begin()
         self._iteration.launch()

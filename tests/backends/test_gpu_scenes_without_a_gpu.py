@@ -26,7 +26,8 @@ SCENES = {
     "beam.toml, mixed": ("solver.precision=mixed", "solver.factor_precision=float32"),
     "beam.toml, float32": ("solver.precision=float32",),
     "beam.toml, Newton": ("integrator.linearizations=3", "integrator.scheme=newmark"),
-    "beam.toml, accuracy": ("accuracy.position=1e-4", "solver.precision=mixed"),
+    "beam.toml, accuracy": ("accuracy.position='1 %'", "solver.precision=mixed"),
+    "floor_drop.toml, accuracy": ("accuracy.position=1e-4",),
     "beam.toml, ros2": ("integrator.scheme=ros2", "solver.preconditioner=cholesky"),
     "beam.toml, ros2 in float32": (
         "integrator.scheme=ros2",

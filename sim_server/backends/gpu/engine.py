@@ -124,8 +124,7 @@ class GpuEngine(DeviceLoop):
             parts = newton.parts[len(self._first) :]
             newton = Newton(newton.options, newton.dx_dv, parts, newton.detect, **newton.arrays)
             self._newton = NewtonIteration(
-                gpu, device, newton, assemble, ranges, arrays, phases, self.solver, newton_results, settled,
-                given.errors,
+                gpu, device, newton, assemble, ranges, arrays, phases, self.solver, newton_results, settled
             )  # fmt: skip
         self._contact, contact_results, reactions, told = None, None, None, None
         self._ties = given.contact.ties if given.contact else None

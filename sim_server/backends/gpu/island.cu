@@ -12,6 +12,9 @@
 #endif
 #include "invert3.cuh"
 
+#ifdef ERRORS
+constexpr double WITHOUT_ESTIMATE = 1e-6;  // tolerance where `position` is to end solves: here nothing estimates the error
+#endif
 constexpr int ROW_SUMS = HAS_TIES ? 2 : 1;  // rows whose state is not that of the set, and those that are no ties
 
 enum Evaluation { WARM_START = 0, ZERO_START = 1, LAW_AT_START = 2, LAW = 3 };  // what rows are evaluated for
@@ -308,7 +311,11 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_decide(cons
         s.residual = given2 > 0 ? sqrt(size2 / given2) : 0;
         s.relist = s.hold = 0;
         const bool by_law = !s.set || changed[0] == 0, well = s.residual <= tolerance_of(a.c.tolerance, s.rested, s.passes, a.passes), was_last = s.last;
+#ifdef ERRORS
+        const double relative = body.position > 0 ? fmax(body.tolerance, WITHOUT_ESTIMATE) : body.tolerance, goal2 = relative * relative * given2;
+#else
         const double goal2 = body.tolerance * body.tolerance * given2;
+#endif
         const bool linear = HAS_TIES && changed[ROW_SUMS - 1] == 0;  // the law is linear where there are ties alone
         s.last = by_law && (linear || size2 <= tolerance2 * given2);
         if (!isfinite(size2)) {

@@ -187,7 +187,7 @@ class IslandPasses:
         texts += [(TIES, "ties.cu", KERNELS_OF_TIES)] if ties else []
         for text, name, kernels in texts:
             defined = (*([DEFINED] if faces else []), *(["-DTIES"] if ties else []))
-            given = (*options(gpu.types), *own_headers(), *defined)
+            given = (*options(gpu.types), *own_headers(), *defined, *(["-DERRORS"] if solver.errors else []))
             module = cp.RawModule(code=text.checked(), options=given, backend="nvrtc")
             self._kernels |= {kernel: compiled(name, module, kernel) for kernel in kernels}
 

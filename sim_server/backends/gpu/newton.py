@@ -110,7 +110,6 @@ class NewtonIteration:
     arrays: host arrays by name (row_start, columns, values, b, y, x, v)
     results: host memory (capacity, bodies) of NEWTON_RESULT that the steps write to
     readers: launches after the step's end that read what the last assembly made
-    errors: whether the error of positions is bounded: then a solve more than trials are allowed judges the last one
 
     The array `values` keeps A of the first linearization of a step, from which factors are made; later ones have
     another.
@@ -124,10 +123,11 @@ class NewtonIteration:
     def __init__(
         self, gpu: Gpu, device: Loops, newton: Newton, again: Sequence[DeviceLaunch], ranges: Sequence[tuple[int, int]],
         arrays: Mapping[str, NDArray[Any]], phases: NewtonPhases, solver: PcgSolver, results: NDArray[Any],
-        readers: Sequence[DeviceLaunch] = (), errors: bool = False,
+        readers: Sequence[DeviceLaunch] = (),
     ):  # fmt: skip
         cp, nodes, bodies = gpu.cp, len(arrays["x"]), len(ranges)
-        self._gpu, self._device, self._solver, self.rounds = gpu, device, solver, newton.options.rounds + errors
+        self._gpu, self._device, self._solver, self.rounds = gpu, device, solver, newton.options.rounds
+        self.rounds += solver.errors  # the last trial that is allowed is judged by one solve more
         self.loops = device.has_conditions
         if not self.loops:
             newton.options.check_unrolled()
@@ -160,7 +160,7 @@ class NewtonIteration:
         self._params["capacity"] = results.nbytes // NEWTON_RESULT.itemsize // bodies
         self._later_params = self._params.copy()
         self._later_params["values"] = self._values.data.ptr
-        flags = (*options(gpu.types), *own_headers(), *(["-DERRORS"] if errors else []))
+        flags = (*options(gpu.types), *own_headers(), *(["-DERRORS"] if solver.errors else []))
         module = gpu.cp.RawModule(code=NEWTON.checked(), options=flags, backend="nvrtc")
         self._begin, self._update_state, self._accept_trial, self._end = (
             compiled("newton.cu", module, name)

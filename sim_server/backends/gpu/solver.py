@@ -62,7 +62,7 @@ class PcgSolver:
     ):  # fmt: skip
         cp, processors = gpu.cp, gpu.properties["multiProcessorCount"]
         self.gpu, self.counter, self._capacity, self.planes, self._phases = gpu, counter, capacity, planes, phases
-        self._attempts, self._contact, self._correction, self._errors = attempts, contact, correction, errors
+        self._attempts, self._contact, self._correction, self.errors = attempts, contact, correction, errors
         self._twins = {name: gpu.twin(arrays[name]) for name in ("row_start", "values", "b", "y", "moving")}
         self.real = np.dtype(self._twins["values"].dtype)
         self._types = {"real": "float" if self.real == np.float32 else "double"}
@@ -88,7 +88,8 @@ class PcgSolver:
             "initial_range": cp.asarray(initial_ranges(assigned, partition, self.grid)),
             "halo": cp.asarray(partition.nodes.astype(ints)), "local_column": cp.asarray(partition.local.astype(ints)),
             "halo_values": cp.zeros(3 * len(partition.nodes), self.real),
-            "halo_position": cp.zeros(len(partition.nodes), ints), "own_vectors": cp.zeros((12 if errors else 9) * total, self.real),
+            "halo_position": cp.zeros(len(partition.nodes), ints),
+            "own_vectors": cp.zeros((12 if errors else 9) * total, self.real),
             "z": cp.zeros(6 * total), "diagonal": cp.zeros(9 * total, self.real),
             "block_sums": cp.zeros((20 if errors else 16) * self.grid * len(ranges)),
             "exchange_number": cp.ones(len(ranges), np.uint32),  # unwritten words have the number 0
@@ -122,7 +123,7 @@ class PcgSolver:
                 *(f"-D{name}={number}" for name, number in numbers.items()),
                 *(["-DNEWTON_PHASES"] if self._phases else []), *(["-DSTAGES"] if self._attempts else []),
                 *(["-DCONTACT_PASSES"] if self._contact else []), *(["-DCORRECTED"] if corrected else []),
-                *(["-DERRORS"] if self._errors and name == "pcg" else []),
+                *(["-DERRORS"] if self.errors and name == "pcg" else []),
             ),
             backend="nvrtc",
             enable_cooperative_groups=True,
