@@ -108,6 +108,21 @@ def test_a_search_judged_by_a_factor_ends_with_what_that_leaves(libraries, monke
     assert run.ran.count("pcg") == 3 and run.ran.count("accept_trial") == 2 and records["step_error"].min() > 0
 
 
+def test_shorter_trials_are_judged_too(libraries, monkeypatch):
+    """A soft bar falls into its equilibrium at once, along tangents that lead too far."""
+
+    def made() -> Simulation:
+        held = beam(young=None)
+        held["effects"]["stable_neo_hookean"] = {"young": 3e4, "poisson": 0.4}
+        search = {"scheme": "quasi_static", "linearizations": 25, "trials": 5, "tolerance": 1e-12}
+        return bounded(held, gravity=(0, -9.81, 0), integrator=search, projection="none", dt=0.2, position=1e-4)
+
+    run = OnThreads(libraries[0], made(), monkeypatch, solves=libraries[1])
+    records = compare(run, made(), 1)
+    assert run.ran.count("accept_trial") > records["linearizations"][0, 0] > 3
+    assert records["status"].tolist() == [[SolveStatus.CONVERGED]]
+
+
 @pytest.mark.parametrize("most", [2, 3])
 def test_a_step_that_may_make_no_more_says_what_is_left(libraries, monkeypatch, most):
     options: dict[str, Any] = {"position": 1e-9, "integrator": {"linearizations": most, "tolerance": 1e-12}}

@@ -8,9 +8,9 @@
 // Relative tolerance with which a solve begins. That of a later linearization is set when z is known.
 HOST_DEVICE double first_tolerance(const Search& s, double tolerance) { return s.linearizations == 0 ? solve_tolerance(s, tolerance) : tolerance; }
 
-// Judges the last trial by z = P^-1 b of `kind`, |z| = size. Returns whether the search ends; else the forcing term is that of the solve.
+// Judges the last trial by z = P^-1 b of `kind`, |z| = size, in the solve of a later linearization. Returns whether the search ends; else the
+// forcing term is that of the solve.
 HOST_DEVICE bool ends_by_start(Search& s, const PcgBody& settings, int kind, double size) {
-    if (s.linearizations == 0) return false;
     if (kind != s.kind) s.factor_scale = 0;
     bound_error(s, state_error(s, size, settings.dx_dv), trust_of(s.kind, settings.trust), settings.position);
     return s.phase != SOLVE;

@@ -605,9 +605,6 @@ __device__ __forceinline__ void PcgSolver::solve() {
     double r2 = 0, alpha = 0, last = 1e300;
     int stop = CONVERGED, iterations = 0;
     bool begun = false, measure = true, restart = true, switched = false;
-#ifdef JUDGES
-    bool judged = memory.search.linearizations == 0;
-#endif
 #ifdef CORRECTED
     bool prepares = false;
     int made = 0;  // columns of V
@@ -730,8 +727,7 @@ __device__ __forceinline__ void PcgSolver::solve() {
                 double size;
                 direction(restart ? 0 : (real)(zr * inverse_of(memory.rz)), sums, size);
 #ifdef JUDGES
-                if (!judged && ends_search(kind, size)) return;
-                judged = true;
+                if (iterations == 0 && memory.search.linearizations > 0 && ends_search(kind, size)) return;
 #endif
                 if (ends_by(kind, zr, r2, size)) continue;
 #else
