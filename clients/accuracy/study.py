@@ -49,7 +49,7 @@ class Study:
             shutil.rmtree(log, ignore_errors=True)
         self._what = "the scene is read"
         self._scene_run: Run | None = None
-        probed = self._probe(scene, device)
+        probed, _ = probe(scene, device, self._tick)
         self.values = SceneValues(probed.scene, probed.device)
         self.task = task_of(scene, self.values.dt, duration, device)
         fresh = _fresh(scene, self.task, probed)
@@ -76,16 +76,6 @@ class Study:
         if minutes > 0 or found.points:
             self._keep()
         return found
-
-    def _probe(self, scene: Path, device: str) -> Run:
-        if not scene.is_file():
-            raise BadInput(f"{scene}: no such file")
-        run = run_point(Task(scene, 1.0, 1.0, 1.0, device), {}, timeout=START_TIMEOUT, tick=self._tick)  # one step
-        if run.status == "refused":
-            raise BadInput(run.reason)
-        if not run.scene or run.trajectory is None:
-            raise ClientError(f"the scene could not be run: {run.reason}")
-        return run
 
     def _tick(self) -> None:
         self._progress(time.monotonic() - self._began, self._what)
@@ -266,6 +256,18 @@ class Study:
         return load_trajectory(self._file(role))
 
 
+def probe(scene: Path, device: str, tick: Callable[[], None] = lambda: None) -> tuple[Run, str]:
+    """Runs one step of a scene; returns the run and the digest of its points. Raises BadInput, ClientError."""
+    if not scene.is_file():
+        raise BadInput(f"{scene}: no such file")
+    run = run_point(Task(scene, 1.0, 1.0, 1.0, device), {}, timeout=START_TIMEOUT, tick=tick)
+    if run.status == "refused":
+        raise BadInput(run.reason)
+    if not run.scene or run.trajectory is None:
+        raise ClientError(f"{scene}: could not be run: {run.reason}")
+    return run, digest(run.scene, run.trajectory)
+
+
 def task_of(scene: Path, dt: float, duration: float, device: str) -> Task:
     """Returns the task whose duration and interval are whole numbers of every time step. Raises BadInput."""
     grid = COARSEST * dt
@@ -273,7 +275,7 @@ def task_of(scene: Path, dt: float, duration: float, device: str) -> Task:
         raise BadInput(
             f"--duration {duration:g}: allowed is {grid:g} s at least, {COARSEST} time steps of the scene ({dt:g} s)"
         )
-    interval = grid * max(1, int(duration / grid / FRAMES))
+    interval = grid * max(1, int(duration / grid / FRAMES * (1 + 1e-9)))
     return Task(scene, dt, interval * int(duration / interval * (1 + 1e-9)), interval, device)
 
 
@@ -282,9 +284,12 @@ def resumed(path: Path, fresh: Points) -> Points:
     if not path.exists():
         return fresh
     old = load(path)
-    for what in ("digest", "duration", "device"):
+    for what in ("digest", "duration", "interval", "device"):
         if getattr(old, what) != getattr(fresh, what):
-            words = {"digest": "the scene has changed since", "duration": f"they are of {old.duration:g} s simulated"}
+            words = {
+                "digest": "the scene has changed since", "duration": f"they are of {old.duration:g} s simulated",
+                "interval": f"they were compared every {old.interval:g} s",
+            }  # fmt: skip
             raise BadInput(
                 f"{path.parent} holds points that this run cannot go on with: "
                 f"{words.get(what, f'they were measured on another device ({old.device})')}; "

@@ -10,21 +10,10 @@ from clients.accuracy.axes import SceneValues
 from clients.accuracy.errors import point_of
 from clients.accuracy.points import Points, Settings, save
 from clients.accuracy.runs import Run, Task, run_point
-from clients.accuracy.study import START_TIMEOUT, digest
 from clients.accuracy.trajectories import load_trajectory
-from clients.errors import BadInput, ClientError
+from clients.errors import BadInput
 
 AXIS = "combination"  # of the points that are added
-
-
-def probe(scene: Path, device: str) -> tuple[Run, str]:
-    """Runs one step of a scene; returns the run and the digest that its points have. Raises BadInput, ClientError."""
-    run = run_point(Task(scene, 1.0, 1.0, 1.0, device), {}, timeout=START_TIMEOUT)
-    if run.status == "refused":
-        raise BadInput(run.reason)
-    if not run.scene or run.trajectory is None:
-        raise ClientError(f"{scene}: could not be run: {run.reason}")
-    return run, digest(run.scene, run.trajectory)
 
 
 def measure(

@@ -11,13 +11,13 @@ from pathlib import Path
 from clients.accuracy.axes import SceneValues
 from clients.accuracy.command import MOST_MINUTES, write
 from clients.accuracy.runs import Run
-from clients.accuracy.study import Study
+from clients.accuracy.study import Study, probe
 from clients.errors import BadInput
 from clients.plan import overlay
 from clients.plan.answer import Answer, words
 from clients.plan.combinations import untried
 from clients.plan.front import Wish, choose
-from clients.plan.measure import measure, probe
+from clients.plan.measure import measure
 from clients.plan.measurements import Measurements, read
 from clients.progress import titled_progress_bar
 

@@ -88,6 +88,7 @@ class SolveSettings(Protocol):
     kind: a Kind. budget: of wall time [s]; negative: of iterations. probe: a solve that `auto` measures. omega: of SSOR
     position: largest error of a node [m], 0: any. trust: times the estimate with a factor is at least the error
     dx_dv: of the step [s]. step_budget: of wall time of a step [s], 0: any
+    most_linearizations: of a step that a budget ended (replays), 0: those of the scene
     """
 
     tolerance: float
@@ -101,6 +102,7 @@ class SolveSettings(Protocol):
     trust: float
     dx_dv: float
     step_budget: float
+    most_linearizations: int
 
 
 class LoopState(Protocol):

@@ -12,7 +12,6 @@ constexpr int ROUNDS = 3;             // of passes after a sweep of the paths
 constexpr double HARDEST = 1000;      // times as stiff, at most
 constexpr double RESTING = 1e-5;      // contact residual of a step that began at rest
 constexpr int AT_REST = 4;            // passes of such a step, at most
-constexpr double WITHIN = 0.5;        // part of the law's tolerance that the last solve may leave where it ends by the error of positions
 
 // The contact residual with which a step may end. rested: the law held where it began. What is left of the residual then moves the body
 // in the next step: within `tolerance` alone one near the limit of friction would go to and fro for ever.

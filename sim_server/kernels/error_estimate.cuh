@@ -14,6 +14,7 @@
 #endif
 #include "host_device.cuh"
 #include "kinds.h"
+#include "step_form.h"
 
 constexpr double WARPED_TRUST = 1.5;  // with factors in the material frame
 constexpr double FACTOR_TRUST = 3;    // with factors in the world frame
@@ -27,6 +28,11 @@ constexpr int FEWEST = 4, FEWEST_WITH_FACTOR = 1;  // from which on the iterates
 constexpr double MOST_LEFT = 0.1;     // of |b|: a solve with more of a residual does not end by an estimate
 constexpr double MOST_ALPHA = 10;     // up to which P^-1 is taken as it is
 constexpr double SLOWEST = 0.95;      // fall of the error in d iterations; what falls less is taken for it
+
+constexpr double WITHIN = 0.5;        // part of the law's tolerance that the last pass of contact may leave where it ends by an estimate
+
+// Derivatives of the positions after a Rosenbrock-W step by u_1 and u_2, over h (mechanics/rosenbrock.py); by u_1 at unchanged forces.
+constexpr double BY_FIRST = (1 + 1 / ROS2_GAMMA) / 2, BY_SECOND = 0.5;
 
 // In place of an estimate that there is not.
 HOST_DEVICE double not_known() { return nan(""); }

@@ -14,7 +14,9 @@
 //   - The iteration ends when |b| <= tolerance |b of the step's first linearization|, or when b is rounding.
 // With a bound of the error of positions [m]
 //   - it ends, too, where P^-1 of the nonlinear residual, which is about the displacement that is left, is within the bound. That needs
-//     the forces at the trial and no blocks of A; these are made where another linearization follows;
+//     the forces at the trial and no blocks of A; these are made where another linearization follows. Where P is a factor in the
+//     material frame that displacement is added at the end, and a later linearization counts as the last one where what that leaves
+//     is within the bound;
 //   - linear solves end at a forcing term, choice 2 of Eisenstat and Walker 1996 (SIAM J. Sci. Comput. 17): not more exact than Newton's
 //     iteration converges. Where that says that the linearization is the last one, and in any case at LINEAR_SHARE of the bound, the
 //     estimated error of the solve ends it.
@@ -24,8 +26,10 @@
 #include "kinds.h"
 
 constexpr double SLOPE_REDUCTION = 0.9;
-constexpr double LINEAR_SHARE = 0.3;                            // of the bound of the error: of the last linear solve
-constexpr double MOST_FORCING = 0.1, FORCING_FACTOR = 0.9;      // largest forcing term, also the first one; of the fall of |b|, squared
+constexpr double LINEAR_SHARE = 0.3;                          // of the bound of the error: of the last linear solve
+constexpr double NEAR = 2;                                    // scale of P^-1 within which it may be A^-1
+constexpr double LEFT_TRUST = 1.25;                           // of the estimate of what adding P^-1 b leaves
+constexpr double MOST_FORCING = 0.1, FORCING_FACTOR = 0.9;    // largest forcing term, also the first one; of the fall of |b|, squared
 template <class T> constexpr double EPSILON = sizeof(T) == 8 ? 2.2e-16 : 1.2e-7;  // T: type in which forces are computed
 
 enum Phase { SOLVE = 0, TRY = 1, DONE = 2, LAST = 3 };  // LAST, on a GPU: over, but its error is to be estimated
@@ -44,6 +48,7 @@ struct Search {                        // Newton iteration of a step, of one bod
     double forcing;                    // relative tolerance of the next linear solve; 0: that of the settings
     double factor_scale;               // estimated error over that of P^-1, as the last solve has told; 0: not known
     int applied;                       // 1: P^-1 b is made for the next solve
+    double left, moved;                // error of P^-1 b as the last correction over P^-1 b, 0: not known; that correction [m]
 };
 
 struct Limits {
@@ -144,17 +149,33 @@ HOST_DEVICE double state_error(const Search& s, double z, double dx_dv) {
 // |b| at the start of the present linearization.
 HOST_DEVICE double norm_before(const Search& s) { return s.linearizations == 1 ? s.first : s.last; }
 
-// After a trial that was taken. estimate: of its error [m]; NaN: not known. Ends the iteration where trust * estimate is within
-// position; else sets the forcing term.
-HOST_DEVICE void bound_error(Search& s, double estimate, double trust, double position) {
-    s.step_error = estimate;
-    if (is_exact_enough(estimate, trust, position, false)) {
+// Whether P^-1 b, which is made, takes off most of the error of a state that is exact enough. trust: in the factor.
+HOST_DEVICE bool adds_remaining(const Search& s, double trust) {
+    return s.applied && trust <= WARPED_TRUST && s.factor_scale < NEAR && s.factor_scale > 1 / NEAR;
+}
+
+// Part of the error that adding P^-1 b leaves: by P, as in the last correction, and by the change of A in that correction, which is as
+// large, relative to A, as the error is to the correction. estimate: of the error [m].
+HOST_DEVICE double part_left(const Search& s, double estimate, double trust) {
+    const double part = s.left > 0 && adds_remaining(s, trust) ? LEFT_TRUST * (s.left + estimate / s.moved) : 1;
+    return part < 1 ? part : 1;
+}
+
+// After a trial that was taken. estimate: of its error [m]; NaN: not known. trust: in the factor. Ends the iteration where the error,
+// less what is added, is within position, and returns whether it is; else sets the forcing term.
+HOST_DEVICE bool bound_error(Search& s, double estimate, double trust, double position) {
+    const double left = part_left(s, estimate, trust) * estimate;
+    if (is_exact_enough(left, trust_of(s.kind, trust), position, false)) {
+        s.step_error = left;
         s.phase = DONE;
         if (s.status == MAX_LINEARIZATIONS) s.status = CONVERGED;
-        return;
+        return true;
     }
+    s.step_error = estimate;
     const double fall = s.norm / norm_before(s), forcing = FORCING_FACTOR * fall * fall;
-    s.forcing = is_exact_enough(forcing * estimate, trust, position, false) ? 0 : forcing < MOST_FORCING ? forcing : MOST_FORCING;
+    const bool last = is_exact_enough(forcing * estimate, trust_of(s.kind, trust), position, false);
+    s.forcing = last ? 0 : forcing < MOST_FORCING ? forcing : MOST_FORCING;
+    return false;
 }
 
 // A component of the increment after a verdict. NaN if no trial of the first linearization had a finite residual: then y is NaN,

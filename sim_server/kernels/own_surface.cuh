@@ -5,6 +5,8 @@
 #pragma once
 #include "edge_detection.cuh"
 
+constexpr int MAY_TOUCH_ITSELF = 2;  // bit of SurfaceTables::near
+
 struct OwnTables {           // what does not touch each other (backends/contact.py)
     const int *start, *node; // (nodes + 1,), of each node of a surface those near it and itself, ascending; null: bodies do not touch themselves
 };
@@ -126,28 +128,37 @@ template <class F> HOST_DEVICE void each_own_triangle(const SurfaceTables& c, in
     }
 }
 
-// Searches the body of a vertex, which it touches at one thickness; `meet_own` tells how. least: of the distances at the start of the step
-// from what is found, if that is less; null: not wanted
+template <class Motion> HOST_DEVICE TouchSearch<Motion> own_search_of(const Motion& m, int node, double thickness) {
+    return {&m, thickness, {}, {}, box_of(m, node, thickness), {-1, -1, {}}, {-1, -1, {}}, {-1, -1, {}}};
+}
+
+// As `consider` of pair_detection.cuh. least: of the distances at the start of the step, if that is less; null: not wanted
+template <class Motion>
+HOST_DEVICE void consider_own(const SurfaceTables& c, const OwnTables& o, const Motion& m, int body, int node, int triangle,
+                              TouchSearch<Motion>& search, double* least) {
+    if (is_nearby_triangle(o, node, c.triangle + 3 * triangle)) return;
+    const double thickness = search.thickness;
+    Meeting here = {body, triangle, {}}, &nearest = search.nearest;
+    const bool met = meet_own(own_paths(c, m, node, triangle), thickness, here.touch);
+    if (least) *least = fmin(*least, fabs(here.touch.distance));
+    if (!met) return;
+    const double farther = fabs(here.touch.distance) - fabs(nearest.touch.distance);
+    const bool as_near = fabs(farther) <= 1e-9 * thickness;
+    Meeting later = here;
+    if (nearest.other < 0 || (as_near ? here.touch.certainty > nearest.touch.certainty : farther < 0)) {
+        later = nearest;
+        nearest = here;
+    }
+    if (is_over(later, thickness) && (search.beside.other < 0 || later.touch.distance < search.beside.touch.distance)) search.beside = later;
+    if (here.touch.distance > 0 && here.touch.entry <= 1 && comes_before(here, search.first)) search.first = here;
+}
+
+// Searches the body of a vertex, which it touches at one thickness; `meet_own` tells how. least: as above
 template <class Motion>
 HOST_DEVICE TouchSearch<Motion> search_own(const SurfaceTables& c, const OwnTables& o, const Motion& m, int body, int node, double thickness,
                                            double* least = nullptr) {
-    TouchSearch<Motion> search = {&m, thickness, {}, {}, box_of(m, node, thickness), {-1, -1, {}}, {-1, -1, {}}, {-1, -1, {}}};
-    each_own_triangle(c, body, search.box, [&](int triangle) {
-        if (is_nearby_triangle(o, node, c.triangle + 3 * triangle)) return;
-        Meeting here = {body, triangle, {}}, &nearest = search.nearest;
-        const bool met = meet_own(own_paths(c, m, node, triangle), thickness, here.touch);
-        if (least) *least = fmin(*least, fabs(here.touch.distance));
-        if (!met) return;
-        const double farther = fabs(here.touch.distance) - fabs(nearest.touch.distance);
-        const bool as_near = fabs(farther) <= 1e-9 * thickness;
-        Meeting later = here;
-        if (nearest.other < 0 || (as_near ? here.touch.certainty > nearest.touch.certainty : farther < 0)) {
-            later = nearest;
-            nearest = here;
-        }
-        if (is_over(later, thickness) && (search.beside.other < 0 || later.touch.distance < search.beside.touch.distance)) search.beside = later;
-        if (here.touch.distance > 0 && here.touch.entry <= 1 && comes_before(here, search.first)) search.first = here;
-    });
+    TouchSearch<Motion> search = own_search_of(m, node, thickness);
+    each_own_triangle(c, body, search.box, [&](int triangle) { consider_own(c, o, m, body, node, triangle, search, least); });
     return search;
 }
 
@@ -230,7 +241,7 @@ HOST_DEVICE void each_own_edge(const SurfaceTables& c, const EdgeTables& e, cons
 }
 
 // f(meeting) of the edges of the same body that an edge may touch in the step: of sharp ones, and of those that it bore on in the last step.
-// least: of the distances at the start of the step, if that is less
+// least: of the distances at the start of the step, if that is less; null: not wanted
 template <class Motion, class F>
 HOST_DEVICE void meet_each_own_edge(const SurfaceTables& c, const EdgeTables& e, const OwnTables& o, const Motion& m, int body, int edge,
                                     double* least, F f) {
@@ -238,10 +249,20 @@ HOST_DEVICE void meet_each_own_edge(const SurfaceTables& c, const EdgeTables& e,
     each_own_edge(c, e, o, m, body, edge, [&](int facing) {
         EdgeTouch start;
         const EdgePath way = path_of(e, m, facing);
-        *least = fmin(*least, edges_apart(path, way, 0, start));
+        if (least) *least = fmin(*least, edges_apart(path, way, 0, start));
         const double* held = held_by(c, e, edge, body, facing);
         if (!held && !(e.wings[edge].sharp && e.wings[facing].sharp)) return;
         EdgeMeeting here = {body, facing, {}};
         if (meet_own_edges(path, e.wings[edge], way, e.wings[facing], thickness_of(c, body), held, here.touch)) f(here);
+    });
+}
+
+// f(facing, touch) of the edges of the same body that a solution takes an edge through.
+template <class Motion, class F>
+HOST_DEVICE void each_own_edge_passed(const SurfaceTables& c, const EdgeTables& e, const OwnTables& o, const Motion& m, int body, int edge, F f) {
+    const EdgePath path = path_of(e, m, edge);
+    each_own_edge(c, e, o, m, body, edge, [&](int facing) {
+        EdgeTouch t;
+        if (own_edges_pass(path, path_of(e, m, facing), thickness_of(c, body), t)) f(facing, t);
     });
 }

@@ -18,9 +18,6 @@ constexpr int PATIENCE = 8;  // steps that iterate after one whose factor alone 
 constexpr double INCONSISTENT = 0.1;
 constexpr double ROS2_GAMMA = 0.29289321881345247559915563789515;  // g = 1 - 1 / sqrt 2
 
-// Derivatives of the positions after the step by u_1 and u_2, over h (mechanics/rosenbrock.py); by u_1 at unchanged forces.
-constexpr double BY_FIRST = (1 + 1 / ROS2_GAMMA) / 2, BY_SECOND = 0.5;
-
 // Entry of b_1 - A y_1. start: theta s_1; first, second: b_1, b_2; diagonal: of A [kg]; the others at its node.
 HOST_DEVICE double first_residual(double start, double first, double second, double y, double theta, double w, double mass,
                                   double diagonal) {

@@ -258,7 +258,9 @@ class Replay:
         """Sets the solver settings of one solve as they were."""
         row, settings, solver = self._rows(name)[step], self.engine.settings(index), self.simulation.scene.solver
         settings.kind, settings.probe = int(row["asked"]), int(row["probe"])
-        settings.budget = -float(row["iterations"] + 1) if row["status"] == pb.BUDGET and solver.budget else 0.0
+        cut = row["status"] == pb.BUDGET and bool(solver.budget or solver.step_budget)
+        settings.budget = -float(row["iterations"] + 1) if cut else 0.0
+        settings.step_budget, settings.most_linearizations = 0.0, int(row["linearizations"]) if cut else 0
 
     def _use_factor(self, index: int, name: str, step: int, fresh: bool) -> None:
         """Posts the factor that a step used. fresh: the one made from the matrix of this step; else one made before."""

@@ -203,6 +203,11 @@ class Scene(Parameters):
                 f"solver.budget_ms = {given} with contact and integrator.scheme = "
                 f'"{scheme}", which may make a step twice; allowed: "backward_euler"'
             )
+        if "contact" in self.effects and self.integrator.linearizations > 1:
+            raise complaint(
+                f"solver.budget_ms = {given} with contact and integrator.linearizations = "
+                f"{self.integrator.linearizations}: there is no search in contact that a budget ends; allowed: 1"
+            )
         if other:
             raise complaint(f"solver.budget_ms = {given} with budget = {other:g}; allowed: one of both")
         return self

@@ -96,8 +96,6 @@ def check_contact_on(device: str, contact: Any, integrator: IntegratorOptions) -
             f"effects.contact with integrator.scheme = {integrator.scheme!r} on a GPU; allowed: 'backward_euler', or "
             "--device cpu"
         )
-    if device == "gpu" and contact.self:
-        raise InputError("effects.contact.self = true: objects touch themselves on CPUs alone; allowed: --device cpu")
     if device == "gpu" and integrator.linearizations > 1:
         raise InputError(
             f"effects.contact with integrator.linearizations = {integrator.linearizations} on a GPU; allowed: 1, or "

@@ -12,6 +12,7 @@ from sim_server.backends.gpu import engine as gpu_engine
 from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder
 from sim_server.backends.gpu.inverse.plan import plan
 from sim_server.backends.gpu.inverse.workspace import workspace
+from sim_server.backends.gpu.islands import OWN_SURFACES
 from sim_server.simulation import Simulation
 from tests.backends import fake_cupy
 from tests.contact.scenes import block, floor, over, ram
@@ -167,11 +168,28 @@ def test_a_scene_whose_bodies_touch_each_other_is_built(cupy, precision):
     at = names.index("island_factor") - 1
     assert names[at : at + len(iteration)] == iteration
     assert names.index("keep_pairs") < names.index("finish_contact") < names.index("know_pairs")
+    assert not any(OWN_SURFACES in options for _, options in cupy.compiled)
     engine = simulation.engine
     engine.run(3)
     engine.assemble()
     engine.solve()
     assert engine.records()["step"].tolist() == [1, 1, 2, 2, 3, 3, 4, 4]
+
+
+def test_a_scene_whose_body_touches_itself_is_built(cupy):
+    """With the launches of bodies that touch each other, from texts of their own, also where triangles have rows."""
+    table = ["obstacle.floor.shape=sphere", "obstacle.floor.radius=0.1"]
+    engine = Simulation.load("deploy/scenes/ribbon.toml", table, "gpu").engine
+    names = [kernel for kernel, _ in cupy.calls]
+    first = names.index("pair_boxes")
+    detection = ["pair_boxes", "pair_trees", "pair_sites", "pair_edges", "look_at_bodies"]
+    assert names[first : first + len(detection)] == detection and "sweep_island_faces" in names
+    assert sum(OWN_SURFACES in options for _, options in cupy.compiled) == 2
+    engine.run(3)
+    engine.assemble()
+    engine.solve()
+    records, reactions = engine.records_and_reactions()
+    assert records["step"].tolist() == [1, 2, 3, 4] and reactions.shape == (4, 1, 6)
 
 
 def test_bodies_that_are_told_not_to_touch_each_other_have_nothing_of_it(cupy):

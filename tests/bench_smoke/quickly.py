@@ -12,8 +12,8 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[2]
 UNKNOWN = ("age", "next factor")  # may be unknown in any bench
 UNKNOWN_IN = {  # of other steps; without a goal; of a step not ours; without potential energy, or an estimate
-    "accuracy": ("step error",), "contact": ("goal ms", "loop ms"), "cpu": ("iterations", "residual", "wall"),
-    "rosenbrock": ("energy", "estimate"),
+    "accuracy": ("step error", "solve error"), "contact": ("goal ms", "loop ms"),
+    "cpu": ("iterations", "residual", "wall"), "rosenbrock": ("energy", "estimate"),
 }  # fmt: skip
 
 

@@ -277,7 +277,7 @@ def test_points_of_something_else_are_refused(scene: Path, monkeypatch: pytest.M
     ("run", "said"),
     [
         (Run("refused", "dt = -1: must be above 0"), "dt = -1: must be above 0"),
-        (Run("failed", "no compiler"), "the scene could not be run: no compiler"),
+        (Run("failed", "no compiler"), "bar.toml: could not be run: no compiler"),
     ],
 )
 def test_a_scene_that_does_not_run(scene: Path, monkeypatch: pytest.MonkeyPatch, run: Run, said: str) -> None:

@@ -17,13 +17,13 @@ from typer.testing import CliRunner
 from clients.__main__ import app
 from clients.accuracy.points import Points
 from clients.accuracy.runs import Run
+from clients.accuracy.study import probe
 from clients.accuracy.trajectories import Trajectory, save_trajectory
 from clients.errors import BadInput
 from clients.load_test.processes import free_endpoint
 from clients.plan import overlay
 from clients.plan.combinations import untried
 from clients.plan.front import Budget, Exactness, Wish, bound, choose, front, wish_for
-from clients.plan.measure import probe
 from clients.plan.measurements import Measurement, Measurements, read
 from clients.plan.run import answer, measured, plan
 from sim_server.scene import load

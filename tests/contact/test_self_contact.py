@@ -9,7 +9,6 @@ import pytest
 from numpy.typing import NDArray
 
 from sim_server.backends.kinds import KINDS
-from sim_server.errors import InputError
 from sim_server.mesh import bar as bar_mesh
 from sim_server.mesh.own_surface import edges_through_triangles, nearby_nodes
 from sim_server.mesh.surface import surface_triangles
@@ -37,11 +36,11 @@ def body(mesh: dict, name: str = "body", young: float = 3e5, fixed: str | None =
 
 def made(
     *objects: dict, gravity: tuple = (0, 0, 0), contact: dict | None = None, solver: dict | None = None,
-    dt: float = 1 / 60, **table: Any,
+    dt: float = 1 / 60, device: str = "cpu", **table: Any,
 ) -> Simulation:  # fmt: skip
     effects = {"gravity": {"g": list(gravity)}, "contact": {"self": True, "thickness": D} | (contact or {})}
     scene = {"name": "test", "dt": dt, "effects": effects, "solver": solver or EXACT, "object": list(objects)} | table
-    return Simulation(Scene.model_validate(scene, context={"folder": "."}))
+    return Simulation(Scene.model_validate(scene, context={"folder": "."}), device)
 
 
 def crossings(sim: Simulation) -> int:
@@ -251,11 +250,3 @@ def test_a_body_that_begins_through_itself_is_told(tmp_path, caplog):
     with caplog.at_level(logging.WARNING):
         made(body(fork(tmp_path)))
     assert "passing through" not in caplog.text
-
-
-def test_on_a_gpu_the_key_is_refused(tmp_path):
-    scene = {
-        "name": "test", "dt": 0.01, "object": [body(fork(tmp_path))], "effects": {"contact": {"self": True}},
-    }  # fmt: skip
-    with pytest.raises(InputError, match=r"effects\.contact\.self = true: .* CPUs alone"):
-        Scene.model_validate(scene, context={"folder": "."}).check_device("gpu")

@@ -83,6 +83,7 @@ REFUSED = {
     ("solver.budget_ms=1", "solver.budget=1"): "solver.budget_ms = 1 with budget = 1",
     ("solver.budget_ms=1", "integrator.scheme=ros2"): '"ros2", which cannot end a step early',
     ("solver.budget_ms=1", "effects.contact.self=true", "integrator.scheme=bdf2"): "allowed: \"backward_euler\"",
+    ("solver.budget_ms=1", "effects.contact.self=true", "integrator.linearizations=2"): "no search in contact",
     ("solver.budget_ms=0",): "solver.budget_ms",
 }  # fmt: skip
 

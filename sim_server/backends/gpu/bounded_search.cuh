@@ -12,12 +12,13 @@ HOST_DEVICE double first_tolerance(const Search& s, double tolerance) { return s
 // forcing term is that of the solve.
 HOST_DEVICE bool ends_by_start(Search& s, const PcgBody& settings, int kind, double size) {
     if (kind != s.kind) s.factor_scale = 0;
-    bound_error(s, state_error(s, size, settings.dx_dv), trust_of(s.kind, settings.trust), settings.position);
+    s.applied = kind == CHOLESKY && kind == s.kind;
+    bound_error(s, state_error(s, size, settings.dx_dv), settings.trust, settings.position);
     return s.phase != SOLVE;
 }
 
 // Whether z that has ended a search is added to the solution.
-HOST_DEVICE bool is_added(const PcgBody& settings, int kind) { return kind == CHOLESKY && settings.trust <= WARPED_TRUST; }
+HOST_DEVICE bool is_added(const Search& s, const PcgBody& settings) { return s.phase == DONE && adds_remaining(s, settings.trust); }
 
 // After a solve: whether the search is over, since its start was exact enough, or nothing was to be estimated.
 HOST_DEVICE bool is_over(const Search& s, const PcgResult& r) {

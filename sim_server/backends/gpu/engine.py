@@ -63,7 +63,8 @@ class DeviceSettings:
         return self._row[name].item()
 
     def __setattr__(self, name: str, value: Any) -> None:
-        if name in ("budget", "omega") or self._row[name] == value:  # no budget of wall time and no SSOR on a GPU
+        unknown = ("budget", "omega", "most_linearizations")  # no budget of a solve and no SSOR on a GPU
+        if name in unknown or self._row[name] == value:
             return
         self._row[name] = value
         self._mailbox.post(self._row.tobytes()[:SETTINGS_BYTES])

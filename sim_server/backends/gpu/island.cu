@@ -408,7 +408,7 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) coarse_matrix(cons
         if (!mine && k < own + pairs) {
             const int* pair = a.pair_list + 3 * (k - own);
             row = pair[0];
-            which = pair[2] == body;
+            which = pair[2] == body && (!HAS_OWN || pair[1] != body);
             mine = pair[1] == body || which;
             if (mine && (!HAS_TIES || pair[which ? 1 : 2] >= 0)) mode_there = a.mode[pair[which ? 1 : 2]];
         }
@@ -954,7 +954,7 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) know_pairs(const I
     }
 }
 
-// Sums what a body's rows with others exert, for each of these, ascending. Done by a whole thread block.
+// Sums what a body's rows with others exert, for each of these, ascending; its contact with itself is none. Done by a whole thread block.
 __device__ void tell_pairs(const IslandArguments& a, int body) {
     __shared__ int next;
     const long long slot = (a.c.step[0] % a.c.capacity) * a.bodies_count + body;
@@ -965,7 +965,7 @@ __device__ void tell_pairs(const IslandArguments& a, int body) {
         if (threadIdx.x == 0) next = a.bodies_count;
         __syncthreads();
         for (int k = threadIdx.x; k < pairs; k += CONTACT_THREADS) {
-            const int r = list[k], other = a.t.obstacle[r];
+            const int r = list[k], other = HAS_OWN && a.t.obstacle[r] == body ? -1 : a.t.obstacle[r];
             if (other > last && __ldcg(a.t.force + r) > 0) atomicMin(&next, other);
         }
         __syncthreads();
@@ -1019,7 +1019,7 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) keep_pairs(const I
         const bool closed = well && a.t.obstacle[r] >= 0 && row.force.normal > 0;
         if (closed) {
             atomicAdd(a.c.pair_contacts + body, 1);
-            atomicAdd(a.c.pair_contacts + a.t.obstacle[r], 1);
+            atomicAdd(a.c.pair_contacts + a.t.obstacle[r], HAS_OWN && a.t.obstacle[r] == body ? 0 : 1);
         }
         const double before = a.t.force[r];
         a.t.force[r] = closed ? row.force.normal : 0;

@@ -20,10 +20,12 @@
 // leave theirs in arrays, and of these in the kernel that reads them. What acts at a node is a list, sorted by row.
 //
 // With TIES, attachments and springs have rows after all others; a body that has one is solved here even if it is alone. keep_ties comes last.
+// With OWN_SURFACES, bodies touch themselves, in rows whose other body is their own; one that has such rows is solved here, too.
 #pragma once
 #include "device_contact.cuh"
 #include "edge_detection.cuh"
 #include "hold_apart.cuh"
+#include "own_surface.cuh"
 #include "pass_choice.cuh"
 #include "reaction.h"
 #include "ties.cuh"
@@ -33,6 +35,12 @@ constexpr bool HAS_TIES = true;
 #else
 constexpr bool HAS_TIES = false;
 #endif
+#ifdef OWN_SURFACES
+constexpr bool HAS_OWN = true;
+#else
+constexpr bool HAS_OWN = false;
+#endif
+constexpr bool HAS_SINGLES = HAS_TIES || HAS_OWN;  // a body alone may be an island
 
 constexpr int MODES = 6;          // rigid motions of a body: translations, then rotations about its first node
 constexpr int CG_SUMS = 9;        // of an iteration
@@ -108,8 +116,8 @@ struct IslandArguments {
     const double* gravity;       // (3,)
     const int* tree_height;      // (tree,) of a box over its triangles
     const int* leaf;             // (triangles,) boxes of one triangle each
-    const int* leaf_start;       // (bodies + 1,) first one of each body
-    int *near, *was_near, *touched;  // (bodies,) 1: its box meets another's; in the last step; it got rows by a sweep
+    const int* leaf_start;       // (bodies + 1,) first one of each body; behind them own_tables
+    int *near, *was_near, *touched;  // (bodies,) 1: its box meets another's, and bit MAY_TOUCH_ITSELF; in the last step; it got rows by a sweep
     real* ends;                  // (nodes, 3) where nodes come to
     real* ways;                  // (nodes, 3) how they come there, over dx_dv
     const double* none;          // (3,) no gravity
@@ -163,6 +171,15 @@ __device__ __forceinline__ int island_of(const IslandArguments& a, int body) { r
 
 __device__ __forceinline__ bool is_tie(const IslandArguments& a, int row) { return HAS_TIES && row >= a.ties.first; }
 
+// Of OWN_SURFACES: 1 if bodies touch each other, too, the length of OwnTables::start, and both arrays, one behind the other. They have no
+// member of the arguments, so that kernels of other scenes stay as they are.
+__device__ __forceinline__ const int* own_numbers(const IslandArguments& a) { return a.leaf_start + a.bodies_count + 1; }
+__device__ __forceinline__ bool is_between(const IslandArguments& a) { return !HAS_OWN || own_numbers(a)[0]; }
+__device__ __forceinline__ OwnTables own_tables(const IslandArguments& a) {
+    const int* start = own_numbers(a) + 2;
+    return {start, start + start[-1]};
+}
+
 // Whether it is a row between two bodies.
 __device__ __forceinline__ bool is_pair(const IslandArguments& a, int row) {
     return is_tie(a, row) ? joins_bodies(a.ties, row - a.ties.first) : row >= a.t.pair_first;
@@ -172,8 +189,13 @@ __device__ __forceinline__ int body_of_row(const IslandArguments& a, int row, bo
     if (is_tie(a, row)) return a.ties.body[2 * (row - a.ties.first) + other];
     return other ? __ldcg(a.t.obstacle + row) : a.row_body[row];
 }
+// True if a row is of a body with itself: it counts as one with a single body.
+__device__ __forceinline__ bool is_own(const IslandArguments& a, int row) {
+    return HAS_OWN && !is_tie(a, row) && row >= a.t.pair_first && a.t.obstacle[row] == a.row_body[row];
+}
 // True if a corner of a row is of the other one of its two bodies: of edges the last two.
 __device__ __forceinline__ bool is_other_side(const IslandArguments& a, int row, int corner) {
+    if (is_own(a, row)) return false;
     return is_pair(a, row) && corner > (!is_tie(a, row) && row >= a.e.start[0]);
 }
 // True if there are rows of contact between bodies.

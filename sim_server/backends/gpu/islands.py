@@ -29,6 +29,7 @@ MODES, CG_SUMS, BASE_SUMS = (ISLAND.constant(name) for name in ("MODES", "CG_SUM
 LISTING, SEARCH = PAIRS.constant("LISTING_THREADS"), ISLAND.constant("SEARCH_THREADS")  # of a thread block
 WARM_START, ZERO_START, LAW_AT_START, LAW = ISLAND.enumeration("Evaluation").values()
 KERNELS_OF_TIES = ("begin_ties", "bind_edges", "keep_ties")
+OWN_SURFACES = "-DOWN_SURFACES"  # in texts of scenes whose bodies touch themselves
 SWEEP_OF_FACES = ("sweep_island_faces",)
 MOST_MODES = 600  # of the coarse space of an island of bodies
 DETECTION = (
@@ -78,6 +79,13 @@ def leaves_before(surfaces: Surfaces) -> Int32:
     return counted[surfaces.tree_start].astype(np.int32)
 
 
+def own_numbers(surfaces: Surfaces) -> list[Int32]:
+    """Returns what bodies need to touch themselves, as own_numbers of island_state.cuh has it; else nothing."""
+    if not (own := surfaces.own):
+        return []
+    return [np.array([surfaces.between, len(own.near_start)], np.int32), own.near_start, own.near_node]
+
+
 def bodies_of_rows(contact: Contact) -> Int32:
     """Returns the body of each row but those of ties, (rows,)."""
 
@@ -113,6 +121,8 @@ class IslandPasses:
     ):  # fmt: skip
         surfaces, ties, ints, doubles = contact.surfaces, contact.ties, np.int32, np.float64
         self._touching, self._ties = surfaces is not None, ties
+        own = surfaces.own if surfaces else None
+        self._singles = bool(ties or own)  # a body alone may be an island
         cp, bodies, rows, nodes = gpu.cp, len(ranges), len(contact.obstacle), len(arrays["x"])
         self._device, self._solver, self._threads, self._bodies = device, solver, threads, bodies
         sites, edges = int(contact.body_start[-1]) // 2, len(surfaces.edge) if surfaces else 0
@@ -161,7 +171,8 @@ class IslandPasses:
             held["other"] = -1
             self.memory |= {
                 "leaf": cp.asarray(np.flatnonzero(surfaces.tree_child[:, 0] < 0).astype(ints)),
-                "leaf_start": cp.asarray(leaves_before(surfaces)), "tree_height": cp.asarray(heights),
+                "leaf_start": cp.asarray(np.concatenate([leaves_before(surfaces), *own_numbers(surfaces)])),
+                "tree_height": cp.asarray(heights),
                 "edge_body": cp.asarray(row_body[surfaces.edge_start[0] : surfaces.edge_start[-1] : 2].copy()),
                 "gravity": gpu.twin(surfaces.gravity, dtype=surfaces.gravity.dtype),
                 "held": cp.asarray(held.view(np.uint8)), "mass": gpu.twin(contact.mass),
@@ -186,7 +197,7 @@ class IslandPasses:
         texts = [(PAIRS, "pairs.cu", DETECTION), (ISLAND, "island.cu", (*SOLVE, *(SWEEP_OF_FACES if faces else ())))]
         texts += [(TIES, "ties.cu", KERNELS_OF_TIES)] if ties else []
         for text, name, kernels in texts:
-            defined = (*([DEFINED] if faces else []), *(["-DTIES"] if ties else []))
+            defined = (*([DEFINED] if faces else []), *(["-DTIES"] if ties else []), *([OWN_SURFACES] if own else []))
             given = (*options(gpu.types), *own_headers(), *defined, *(["-DERRORS"] if solver.errors else []))
             module = cp.RawModule(code=text.checked(), options=given, backend="nvrtc")
             self._kernels |= {kernel: compiled(name, module, kernel) for kernel in kernels}
@@ -320,7 +331,7 @@ class IslandPasses:
 
     @property
     def _most_islands(self) -> int:
-        return self._bodies if self._ties else max(self._bodies // 2, 1)
+        return self._bodies if self._singles else max(self._bodies // 2, 1)
 
     def begin_pass(self) -> None:
         """Appends what comes before the iterations of a pass."""

@@ -4,7 +4,6 @@
 #pragma once
 #include "error_estimate.cuh"
 #include "pcg_structs.cuh"
-#include "step_form.h"
 
 constexpr double LOST_DIGITS = 1.1;   // as in backends/cpu/native/pcg.h
 constexpr double USEFUL = 1e-6;       // as in backends/cpu/native/pcg.h

@@ -13,6 +13,8 @@ __device__ __forceinline__ Motion way_of_step(const IslandArguments& a) {
 __device__ __forceinline__ int edges_before(const IslandArguments& a, int body) { return (a.e.start[body] - a.e.start[0]) / 2; }
 // Whether the sweeps are over: what still passes through a body is held apart.
 __device__ __forceinline__ bool holds_apart(const IslandArguments& a) { return __ldcg(&a.tally->rounds) >= ROUNDS; }
+// True if a body's box meets another's.
+__device__ __forceinline__ bool meets_others(const IslandArguments& a, int body) { return HAS_OWN ? a.near[body] & 1 : a.near[body]; }
 __device__ __forceinline__ bool is_lost(const IslandArguments& a, int body) {
     return a.c.results[(a.c.step[0] % a.c.capacity) * a.bodies_count + body].status == NOT_FINITE;
 }
@@ -61,11 +63,11 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) pair_boxes(const I
 extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) pair_trees(const IslandArguments a, int solved) {
     const int body = blockIdx.x;
     bool apart = true;
-    for (int other = threadIdx.x; other < a.bodies_count; other += CONTACT_THREADS)
+    for (int other = threadIdx.x; is_between(a) && other < a.bodies_count; other += CONTACT_THREADS)
         if (other != body && meet(a.t.body_box[body], a.t.body_box[other])) apart = false;
     apart = __syncthreads_and(apart);
-    if (threadIdx.x == 0) a.near[body] = !apart;
-    if (apart) return;
+    if (threadIdx.x == 0) a.near[body] = HAS_OWN ? !apart | MAY_TOUCH_ITSELF : !apart;
+    if (apart && !HAS_OWN) return;
     const Motion m = motion_of(a, solved);
     for (int height = 0; height <= a.highest_tree; ++height) {
         for (int k = a.t.tree_start[body] + threadIdx.x; k < a.t.tree_start[body + 1]; k += CONTACT_THREADS)
@@ -128,7 +130,9 @@ __device__ void agree(TouchSearch<Motion>& search) {
 }
 
 // Searches the triangles of a body, by a warp, once for all searches: all lanes have what was found. queue: (QUEUE,) of the warp.
-__device__ void search_body(const IslandArguments& a, int body, TouchSearch<Motion>* search, int count, int* queue) {
+// look(triangle, search): at one of them
+template <class Look>
+__device__ __forceinline__ void search_body(const IslandArguments& a, int body, TouchSearch<Motion>* search, int count, int* queue, Look look) {
     const int lane = threadIdx.x % 32, last = a.leaf_start[body + 1];
     Box box = search[0].box;
     for (int i = 1; i < count; ++i) box = joined(box, search[i].box);
@@ -147,9 +151,31 @@ __device__ void search_body(const IslandArguments& a, int body, TouchSearch<Moti
         waiting -= taken;
         if (mine >= 0)
             for (int i = 0; i < count; ++i)
-                if (count == 1 || meet(a.t.tree_box[mine], search[i].box)) consider(a.t, body, ~a.t.tree_child[2 * mine], search[i]);
+                if (count == 1 || meet(a.t.tree_box[mine], search[i].box)) look(~a.t.tree_child[2 * mine], search[i]);
     }
     for (int i = 0; i < count; ++i) agree(search[i]);
+}
+__device__ void search_body(const IslandArguments& a, int body, TouchSearch<Motion>* search, int count, int* queue) {
+    search_body(a, body, search, count, queue, [&](int triangle, TouchSearch<Motion>& one) { consider(a.t, body, triangle, one); });
+}
+
+// The same of a vertex and its own body, as search_own.
+__device__ __forceinline__ TouchSearch<Motion> search_own_body(const IslandArguments& a, const Motion& m, int body, int node, double thickness, int* queue) {
+    const OwnTables own = own_tables(a);
+    TouchSearch<Motion> search = own_search_of(m, node, thickness);
+    search_body(a, body, &search, 1, queue,
+                [&](int triangle, TouchSearch<Motion>& one) { consider_own(a.t, own, m, body, node, triangle, one, nullptr); });
+    return search;
+}
+// As passes_own.
+__device__ bool passes_own_body(const IslandArguments& a, const Motion& m, int body, int node, int* queue, Meeting& found) {
+    const double thickness = thickness_of(a.t, body);
+#pragma unroll 1
+    for (double near = THROUGH * thickness;; near = thickness) {  // one copy of a large text
+        found = found_by(search_own_body(a, m, body, node, near, queue));
+        if (near == thickness) return found.other >= 0;
+        if (!(found.other >= 0 && found.touch.entry <= 1)) return false;
+    }
 }
 
 // A warp has a vertex of a surface: sets its rows, as detect_site.
@@ -162,19 +188,23 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) pair_sites(const I
     const Motion m = motion_of(a, false);
     Meeting first = {-1, -1, {}}, second = first, beside = first;
     const Box box = a.c.free[node] == 0 ? empty_box() : box_of(m, node, thickness_of(a.t, body));
+    auto take = [&](const TouchSearch<Motion>& search) {
+        const Meeting t = found_by(search);
+        if (comes_before(t, first)) { second = first; first = t; }
+        else if (comes_before(t, second)) second = t;
+        if (in_crease(search) && comes_before(search.beside, beside)) beside = search.beside;
+    };
     for (int from = 0; from < a.bodies_count; from += 32) {
         const int there = from + lane;
-        const bool met = there < a.bodies_count && there != body && a.near[there] && meet(box, a.t.body_box[there]);
+        const bool met = there < a.bodies_count && there != body && meets_others(a, there) && meet(box, a.t.body_box[there]);
         for (unsigned lanes = __ballot_sync(WARP, met); lanes; lanes &= lanes - 1) {
             const int other = from + __ffs(lanes) - 1;
             TouchSearch<Motion> search = search_of(m, node, 0.5 * (thickness_of(a.t, body) + thickness_of(a.t, other)));
             search_body(a, other, &search, 1, queues[warp]);
-            const Meeting t = found_by(search);
-            if (comes_before(t, first)) { second = first; first = t; }
-            else if (comes_before(t, second)) second = t;
-            if (in_crease(search) && comes_before(search.beside, beside)) beside = search.beside;
+            take(search);
         }
     }
+    if (HAS_OWN && a.c.free[node] != 0 && !is_bound(a, node, body)) take(search_own_body(a, m, body, node, thickness_of(a.t, body), queues[warp]));
     if (lane > 0) return;
     if (second.other < 0) second = beside;
     const RowMemory last[2] = {memory_of(a.t, row), memory_of(a.t, row + 1)};
@@ -226,9 +256,20 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) pair_sweep(const I
     ended.x = a.ends;
     ended.predictor = nullptr;
     const Box box = box_of(m, node, thickness_of(a.t, body));
+    auto take = [&](int other, const Meeting& t, double thickness) {
+        if (holds) {
+            if (held < MOST_HELD && !is_lost(a, other)) {
+                a.held[MOST_HELD * (site + edges_before(a, body)) + held++] = held_vertex(a.t, node, body, t, thickness);
+                a.tally->found = 1;
+            }
+            return;
+        }
+        take_pair_row(a, site, t);
+        a.touched[body] = a.touched[other] = a.tally->found = 1;
+    };
     for (int from = 0; from < a.bodies_count; from += 32) {
         const int there = from + lane;
-        const bool met = there < a.bodies_count && there != body && a.near[there] && !is_bound(a, node, there) && meet(box, a.t.body_box[there]);
+        const bool met = there < a.bodies_count && there != body && meets_others(a, there) && !is_bound(a, node, there) && meet(box, a.t.body_box[there]);
         for (unsigned lanes = __ballot_sync(WARP, met); lanes; lanes &= lanes - 1) {
             const int other = from + __ffs(lanes) - 1;
             TouchSearch<Motion> search[3];
@@ -237,20 +278,25 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) pair_sweep(const I
             search_body(a, other, search, 3, queues[warp]);
             Meeting t;
             if (passage_found(search, t) == STAYS_OUT || lane > 0) continue;
-            if (holds) {
-                if (held < MOST_HELD && !is_lost(a, other)) {
-                    a.held[MOST_HELD * (site + edges_before(a, body)) + held++] = held_vertex(a.t, node, body, t, thickness);
-                    a.tally->found = 1;
-                }
-                continue;
-            }
-            take_pair_row(a, site, t);
-            a.touched[body] = a.touched[other] = a.tally->found = 1;
+            take(other, t, thickness);
         }
     }
+    if (!HAS_OWN || is_bound(a, node, body)) return;
+    Meeting t;
+    if (passes_own_body(a, m, body, node, queues[warp], t) && lane == 0) take(body, t, thickness_of(a.t, body));
 }
 
 // --- edges --------------------------------------------------------------------------------------------------------------------------
+
+// What an edge may touch of its own body.
+__device__ EdgeMeetings own_edges(const IslandArguments& a, const Motion& m, int body, int edge) {
+    EdgeMeetings found = no_edges();
+    if (!HAS_OWN) return found;
+    meet_each_own_edge(a.t, a.e, own_tables(a), m, body, edge, nullptr, [&](const EdgeMeeting& here) {
+        if (!are_bound(a, a.e.edge + 2 * edge, body, a.e.edge + 2 * here.edge, body)) take(found, here);
+    });
+    return found;
+}
 
 // A thread has an edge: sets its rows, as detect_edge.
 extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) pair_edges(const IslandArguments a) {
@@ -259,7 +305,8 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) pair_edges(const I
     const int body = a.edge_body[edge];
     if (!a.near[body] && !a.was_near[body]) return;
     if (!a.near[body]) a.e.wings[edge].sharp = 0;
-    const int dropped = detect_edge(a.t, a.e, motion_of(a, false), body, edge, no_edges());
+    const Motion m = motion_of(a, false);
+    const int dropped = detect_edge(a.t, a.e, m, body, edge, own_edges(a, m, body, edge));
     if (dropped)
         if (const int site = site_of_edge(a.t, a.e, edge); site >= 0) atomicAdd(a.dropped + site, dropped);
 }
@@ -273,7 +320,7 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) edge_sweep(const I
     if (holds && is_lost(a, body)) return;
     const Motion m = way_of_step(a);
     int held = 0;
-    each_edge_passed(a.t, a.e, m, body, edge, [&](int other, int facing, double thickness, const EdgeTouch& t) {
+    auto take = [&](int other, int facing, double thickness, const EdgeTouch& t) {
         if (are_bound(a, a.e.edge + 2 * edge, body, a.e.edge + 2 * facing, other)) return;
         if (holds) {
             if (held >= MOST_HELD || is_lost(a, other)) return;
@@ -285,7 +332,10 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) edge_sweep(const I
         const int r = take_edge_row(a.t, a.e, m, body, edge, {other, facing, t}, [&](int row) { return a.c.row[row].force.normal; });
         if (r >= 0) take_anew(a, r);
         a.touched[body] = a.touched[other] = a.tally->found = 1;
-    });
+    };
+    each_edge_passed(a.t, a.e, m, body, edge, take);
+    if (HAS_OWN)
+        each_own_edge_passed(a.t, a.e, own_tables(a), m, body, edge, [&](int facing, const EdgeTouch& t) { take(body, facing, thickness_of(a.t, body), t); });
 }
 
 // --- after a sweep ------------------------------------------------------------------------------------------------------------------
@@ -318,7 +368,7 @@ __device__ bool hold_places(const IslandArguments& a) {
             HeldPlace& p = a.held[a.held_list[k]];
             if (hold_apart(m, a.mass, p, a.c.y, [&](int corner) { return a.c.free[p.node[corner]] != 0; })) {
                 ++a.held_count[p.body];
-                ++a.held_count[p.other];
+                if (!HAS_OWN || p.other != p.body) ++a.held_count[p.other];
                 moved = true;
             }
             p.other = -1;
@@ -412,16 +462,17 @@ __device__ IslandState state_of(const IslandArguments& a, int first, int bodies,
     return s;
 }
 
-constexpr int LONE = HAS_TIES ? 0 : 1;  // what counts as the size of the island of a body that is none
+constexpr int LONE = HAS_SINGLES ? 0 : 1;  // what counts as the size of the island of a body that is none
 
-// True if the last one of a body's rows, whose ties come last, is a tie.
-__device__ bool is_tied(const IslandArguments& a, int body) {
+// True if a body that touches no other is an island: the last one of its rows, whose ties come last, is a tie, or it touches itself.
+__device__ bool is_single(const IslandArguments& a, int body) {
     const int rows = a.own_rows[body];
+    if (HAS_OWN) return a.pair_rows[body] > 0;
     return HAS_TIES && rows > 0 && is_tie(a, own_list(a, body)[rows - 1]);
 }
 
-// One thread block: groups the bodies that have rows with each other, each group's by number; one that is tied and touches no other is a
-// group. swept: only those that a sweep has touched are solved again.
+// One thread block: groups the bodies that have rows with each other, each group's by number; one that is tied or touches itself is a
+// group even alone. swept: only those that a sweep has touched are solved again.
 extern "C" __global__ void __launch_bounds__(LISTING_THREADS) find_islands(const IslandArguments a, int swept) {
     const int n = a.bodies_count, me = threadIdx.x, warp = me / 32, lane = me % 32;
     for (int i = me; i < n; i += LISTING_THREADS) {
@@ -455,7 +506,7 @@ extern "C" __global__ void __launch_bounds__(LISTING_THREADS) find_islands(const
     for (int i = me; i < n; i += LISTING_THREADS) {
         int size = 0;
         for (int j = 0; j < n; ++j) size += label[j] == label[i];
-        members[i] = HAS_TIES && size == 1 && !is_tied(a, i) ? LONE : size;
+        members[i] = HAS_SINGLES && size == 1 && !is_single(a, i) ? LONE : size;
     }
     __syncthreads();
     __shared__ int islands, active, alone;

@@ -281,7 +281,7 @@ struct PcgSolver {
             memory.quarter = memory.b2 * sqrt(useful);
         }
         __syncthreads();
-        if (memory.over) give(is_added(body, kind) && kind == memory.search.kind, 1);
+        if (memory.over) give(is_added(memory.search, body), 1);
         return memory.over;
     }
 #endif

@@ -96,6 +96,20 @@ def accepts(case: Case, settings: Settings) -> bool:
     return True
 
 
+def damped_by(case: Case, settings: Settings) -> Settings | None:
+    """What a reference needs to damp as these settings do: the tangent, where the stiffness damps.
+
+    Damping of the stiffness is by the tangent of corotational elements, which schemes choose. None: as the scene with
+    several linearizations does, which references have.
+    """
+    body = load(case.file, overrides(case, settings)).objects[0]
+    damping, law = body.effects.get("rayleigh"), body.effects.get("corotational")
+    if damping is None or law is None or not getattr(damping, "stiffness", 0.0):
+        return None
+    tangent = str(getattr(law, "tangent", ""))
+    return None if tangent == "usual" else {f"object.{case.object}.effects.corotational.tangent": tangent}
+
+
 def usual(*more: Settings) -> dict[str, str]:
     """USUAL and others; without a preconditioner where there is nothing to solve."""
     together: dict[str, str] = {}
@@ -103,4 +117,5 @@ def usual(*more: Settings) -> dict[str, str]:
         together |= one
     if together.get("integrator.scheme") == EXPLICIT["integrator.scheme"]:
         together = {key: value for key, value in together.items() if not key.startswith("solver.")}
+        together["solver.preconditioner"] = "none"
     return together

@@ -120,6 +120,11 @@ def exact_step(case: Case, more: Settings) -> Motion:
     return _kept(case, tuple(usual(more, NEWTON, case.exact).items()))
 
 
+def exact_solve(case: Case) -> Motion:
+    """The scene's time step and scheme, one linearization, its linear system solved to rounding."""
+    return _kept(case, tuple(usual({"solver.tolerance": "1e-12"}).items()))
+
+
 @dataclass
 class Reference:
     """The motion as small steps make it, and how far that of steps twice as long is apart [m]. settings: of it."""

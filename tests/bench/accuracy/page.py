@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from tests.bench.accuracy import peers, picture, words
-from tests.bench.accuracy.axes import SCHEME, STEPS, order_of
+from tests.bench.accuracy.axes import ERROR_OF, EXPLICIT_NAME, SCHEME, STEPS, order_of
 from tests.bench.accuracy.cases import CASES
-from tests.bench.accuracy.short import EXPLICIT, Tables, position_sentence, sentences
+from tests.bench.accuracy.short import Tables, position_sentence, sentences
 from tests.bench.accuracy.sources import length, orders, sentence
 from tests.bench.harness.pieces import Row
 from tests.bench.harness.report import Report
@@ -27,7 +27,7 @@ def write(report: Report, tables: Tables) -> None:
         report.say("## In short")
         report.table([{"to read from it": line} for _, line in said])
     if devices:
-        report.figure(picture.short(tables, devices), "accuracy.png", words.SHORT)
+        report.figure(picture.short(tables, devices), "accuracy.png", " ".join(words.SHORT.split()))
     report.say("## How", words.SETUP)
     shown: dict[str, Callable[[Report, list[Row]], None]] = {
         "sources": _sources, "points": _points, "meshes": _meshes, "effectivity": _effectivity, "peers": _peers,
@@ -137,7 +137,7 @@ def order_line(rows: list[Row]) -> Row | None:
 
     An explicit scheme has none: its substeps are as long as is stable, whatever the time step is.
     """
-    if rows[0]["series"].startswith(EXPLICIT):
+    if rows[0]["series"].startswith(EXPLICIT_NAME):
         return None
     sizes = [float(row["value"].split()[0]) for row in rows]
     errors = [row["rms"] if row["status"] == "done" else None for row in rows]
@@ -155,16 +155,18 @@ def _lines(rows: list[Row]) -> list[Row]:
     found = []
     for (series,), several in _by(rows, "series").items():
         by_value = {row["value"]: row for row in several}
-        found.append({"": series} | {value: _cell(by_value.get(value)) for value in values})
+        cells: Row = {value: _cell(by_value.get(value)) for value in values}
+        found.append({"": series} | cells)
     return found
 
 
 def _cell(row: Row | None) -> str | None:
     if row is None:
         return None
-    if row["error"] is None or row["seconds"] is None:
+    metres = row[ERROR_OF.get(row["axis"], "error")]
+    if metres is None or row["seconds"] is None:
         return str(row["status"])
-    return f"{1e3 * row['error']:.2g}, {row['seconds']:.3g}"
+    return f"{1e3 * metres:.2g}, {row['seconds']:.3g}"
 
 
 # --- the other parts --------------------------------------------------------------------------------------------------
@@ -216,7 +218,7 @@ def _peers(report: Report, rows: list[Row]) -> None:
 def _write_csv(path: Path, tables: Tables) -> None:
     """All points, one a line, with the settings that repeat it."""
     names = ("device", "scene", "who", "axis", "series", "value", "status", "reason", "error", "rms", "step error",
-             "seconds", "iterations", "unconverged")  # fmt: skip
+             "solve error", "seconds", "iterations", "unconverged")  # fmt: skip
     with path.open("w", newline="") as out:
         writer = csv.writer(out, lineterminator="\n")
         writer.writerow([*names, "p50 ms", "p99 ms", "max ms", "settings"])

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from sim_server.simulation import Simulation
-from tests.bench.accuracy.axes import SCHEMES
+from tests.bench.accuracy.axes import EXPLICIT_NAME, SCHEMES
 from tests.bench.accuracy.cases import BEAM, RUBBER, Settings, usual
 from tests.bench.accuracy.motion import LIMIT, Motion, error, exact_step, reference, rms
 from tests.bench.accuracy.points import measured
@@ -63,7 +63,7 @@ class Way:
 
 
 def _mujoco(series: str, young: float, milliseconds: Sequence[float], **settings: str) -> list[Way]:
-    limit = {"limit": 2.5e-4 if young < 5e6 else 1.25e-4, "limit_by": {"integrator": "RK4"}}
+    limit: dict[str, Any] = {"limit": 2.5e-4 if young < 5e6 else 1.25e-4, "limit_by": {"integrator": "RK4"}}
     return [
         Way("MuJoCo", series, f"{ms:g} ms", young, 1e-3 * ms, "peers_mujoco.py", "mujoco", settings, **limit)
         for ms in milliseconds
@@ -72,7 +72,7 @@ def _mujoco(series: str, young: float, milliseconds: Sequence[float], **settings
 
 def _semi_implicit(young: float, milliseconds: Sequence[float]) -> list[Way]:
     settings = {"solver": "semi-implicit"}
-    limit = {"limit": 2.5e-4 if young < 5e6 else 1.25e-4, "limit_by": settings, "on_gpu": True}
+    limit: dict[str, Any] = {"limit": 2.5e-4 if young < 5e6 else 1.25e-4, "limit_by": settings, "on_gpu": True}
     return [
         Way("Newton", "semi-implicit", f"{ms:g} ms", young, 1e-3 * ms, "peers_newton.py", "newton", settings, **limit)
         for ms in milliseconds
@@ -108,7 +108,7 @@ OURS: dict[str, tuple[tuple[float, ...], Settings]] = {  # time steps [ms] and s
     ),
     "Newmark": ((10.0, 5.0, 2.0), SCHEMES["Newmark"] | {"solver.tolerance": "1e-4"}),
     "ros2, factor": ((20.0, 10.0, 5.0), SCHEMES["ros2, factor"]),
-    "explicit substeps": ((20.0, 1.0, 0.5), SCHEMES["explicit substeps"]),
+    EXPLICIT_NAME: ((20.0, 1.0, 0.5), SCHEMES[EXPLICIT_NAME]),
 }
 STIFFNESSES = (1e6, 1e7)  # Pa
 SCIPY_STEPS = (0.02, 0.01, 0.005)  # s

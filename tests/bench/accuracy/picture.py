@@ -6,13 +6,15 @@ from typing import Any
 
 import numpy as np
 
-from tests.bench.accuracy.axes import SCHEME, STEPS
+from tests.bench.accuracy.axes import ERROR_OF, SCHEME
 from tests.bench.accuracy.cases import RUBBER
 from tests.bench.accuracy.peers import US
 from tests.bench.harness.pieces import Row
 from tests.bench.harness.report import plots
 
 MARKERS = "os^Dv<>P*X"
+COLOURS = {"-": [f"C{k}" for k in range(10)], "--": ["k", "0.4", "m", "0.6", "navy", "darkgreen", "0.75"]}  # by style
+WORDS = {"error": "error", "step error": "error of the steps", "solve error": "error of the linear solves"}
 
 
 def short(tables: dict[str, list[Row]], devices: Sequence[str]) -> Any:
@@ -23,11 +25,11 @@ def short(tables: dict[str, list[Row]], devices: Sequence[str]) -> Any:
     )
     for panel, device in zip(panels[0], devices, strict=True):
         ours = [r for r in tables.get("points", []) if r["device"] == device and r["axis"] == SCHEME]
-        ours = [r for r in ours if r["scene"] == RUBBER.name] or ours
+        ours = [r for r in ours if r["scene"] == RUBBER.name] or [r for r in ours if r["scene"] == ours[0]["scene"]]
         others = [r for r in tables.get("peers", []) if r["device"] == device and r["E MPa"] == 1 and r["who"] != US]
         named = [row | {"series": _who(row)} for row in others]
         curves(panel, ours, "error", style="-")
-        curves(panel, named, "error", style="--", first=len(_series(ours)))
+        curves(panel, named, "error", style="--")
         panel.set(title=device.upper(), ylabel="seconds of a simulated second")
     handles, labels = panels[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside right upper", fontsize=7)
@@ -50,7 +52,7 @@ def axes(rows: Sequence[Row]) -> Any:
     for panel in panels.flat[len(names) :]:
         panel.set_visible(False)
     for panel, name in zip(panels.flat, names, strict=False):
-        curves(panel, [row for row in rows if row["axis"] == name], "step error" if name == STEPS else "error")
+        curves(panel, [row for row in rows if row["axis"] == name], ERROR_OF.get(name, "error"))
         panel.set(title=name)
         panel.legend(fontsize=6)
     for panel in panels[:, 0]:
@@ -62,19 +64,22 @@ def _series(rows: Sequence[Row]) -> list[str]:
     return list(dict.fromkeys(row["series"] for row in rows))
 
 
-def curves(panel: Any, rows: Sequence[Row], which: str, style: str = "-", first: int = 0) -> None:
+def curves(panel: Any, rows: Sequence[Row], which: str, style: str = "-") -> None:
     """A curve for each series; what has no error stands as a cross at the right edge, at its time, or at the top."""
-    for number, series in enumerate(_series(rows), first):
+    for number, series in enumerate(_series(rows)):
         line = [row for row in rows if row["series"] == series]
         known = [row for row in line if row["status"] == "done" and row[which] and row["seconds"]]
-        look = {"color": f"C{number % 10}", "marker": MARKERS[number % len(MARKERS)]}
+        colours = COLOURS[style]
+        look = {"color": colours[number % len(colours)], "marker": MARKERS[number % len(MARKERS)]}
         errors, seconds = [row[which] / row["length"] for row in known], [row["seconds"] for row in known]
         panel.plot(errors, seconds, style, ms=4, lw=1.2, label=series, **look)
         for row in line:
             if row["status"] != "done":
                 edge = panel.get_yaxis_transform() if row["seconds"] else panel.transAxes
                 panel.plot([0.98], [row["seconds"] or 0.98], "x", color=look["color"], ms=7, transform=edge)
-    panel.set(xscale="log", yscale="log", xlabel=f"{'error of the steps' if which != 'error' else 'error'} / L")
+    panel.set(xscale="log", yscale="log", xlabel=f"{WORDS[which]} / L")
+    least, most = panel.get_xlim()
+    panel.set_xlim(min(least, np.sqrt(least * most / 10)), max(most, np.sqrt(least * most * 10)))  # a decade at least
     panel.grid(True, which="both", alpha=0.3)
 
 

@@ -7,11 +7,12 @@ import numpy as np
 
 from tests.bench.accuracy.axes import MESH, SCHEMES, Point
 from tests.bench.accuracy.cases import Case, Settings, usual
-from tests.bench.accuracy.motion import Motion, Reference, error, exact_step, move, reference, rms
+from tests.bench.accuracy.motion import Motion, Reference, error, exact_solve, exact_step, move, reference, rms
 from tests.bench.accuracy.sources import CELLS, on_mesh
 
 Row = dict[str, Any]
 OTHER_STEP = ("dt", "integrator.scheme")  # keys that make other steps than those of exact_step
+OTHER_SOLVE = ("integrator.linearizations", "accuracy.position")  # or other linear systems than those of one solve
 STATISTICS = (("p50", 50), ("p99", 99), ("max", 100))
 
 
@@ -48,19 +49,22 @@ def measured(
     """One point. settings: as `sim-server --set KEY=VALUE` takes them.
 
     error, rms [m] are against the motion that small steps make, of which `apart` [m] is known; step error [m] is
-    against that of the same steps solved exactly (None for another scheme or time step than the scene's). seconds: of
-    a simulated second, the median over rounds; step_ms: of a step, each the median over rounds. What ran away has its
-    time until then; what failed has none.
+    against that of the same steps solved exactly, solve error [m] against that of one linearization with exact linear
+    solves (None for another scheme or time step than the scene's, the latter for several linearizations, too).
+    seconds: of a simulated second, the median over rounds; step_ms: of a step, each the median over rounds. What ran
+    away has its time until then; what failed has none.
     """
     runs = [move(case, settings, device) for _ in range(rounds)]
     last = runs[-1]
     timed = [run for run in runs if len(run.records) > 1]
     whole = [seconds(run) for run in timed]
     same_step = against_steps and not any(key in settings for key in OTHER_STEP)
+    one_solve = same_step and not any(key in settings for key in OTHER_SOLVE)
     return {
         "settings": dict(settings), "status": last.status, "reason": last.reason,
         "error": error(last, true.motion), "rms": rms(last, true.motion), "apart": true.apart,
-        "step error": error(last, exact_step(case, {})) if same_step else None, "length": case.length,
+        "step error": error(last, exact_step(case, {})) if same_step else None,
+        "solve error": error(last, exact_solve(case)) if one_solve else None, "length": case.length,
         "seconds": float(np.median(whole)) if timed else None, "rounds": whole,
         "step_ms": {name: _percentile(timed, q) for name, q in STATISTICS},
         "iterations": _mean(last, "iterations"), "linearizations": _mean(last, "linearizations"),

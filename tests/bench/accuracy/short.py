@@ -3,13 +3,12 @@
 
 from collections.abc import Iterable, Sequence
 
-from tests.bench.accuracy.axes import SCHEME, STEPS
+from tests.bench.accuracy.axes import EXPLICIT_NAME, SCHEME, STEPS
 from tests.bench.accuracy.cases import RUBBER
 from tests.bench.accuracy.peers import US
 from tests.bench.accuracy.sources import length, sentence
 from tests.bench.harness.pieces import Row
 
-EXPLICIT = "explicit substeps"  # begins the name of a series
 BOUNDS = (1e-2, 1e-3)  # errors over L
 Tables = dict[str, list[Row]]
 
@@ -45,19 +44,19 @@ def sentences(tables: Tables, device: str) -> list[str]:
 
 def what_it_costs(points: Sequence[Row]) -> str:
     """The cheapest point for each bound, that of implicit steps if it is none, and the best of backward Euler."""
-    implicit = [row for row in points if not row["series"].startswith(EXPLICIT)]
+    implicit = [row for row in points if not row["series"].startswith(EXPLICIT_NAME)]
     parts = []
     for bound in BOUNDS:
         if (best := cheapest(points, bound)) is None:
             continue
-        part = f"of {100 * bound:g} % of the length {best['seconds']:.2g} s ({called(best)})"
+        part = f"{best['seconds']:.2g} s ({called(best)}) with an error of {100 * bound:g} % of the length"
         if best not in implicit and (other := cheapest(implicit, bound)) is not None:
-            part += f" or, with implicit steps, {other['seconds']:.2g} s ({called(other)})"
+            part += f", by implicit steps {other['seconds']:.2g} s ({called(other)})"
         parts.append(part)
     euler = [r for r in points if r["series"].startswith("backward Euler") and r["error"] is not None]
     if not parts:
         return ""
-    said = f"A simulated second with an error {', '.join(parts)}"
+    said = f"A simulated second takes {'; '.join(parts)}"
     if euler:
         best = min(euler, key=lambda r: r["error"])
         said += f"; backward Euler gets to {length(best['error'])} with {best['seconds']:.2g} s ({best['value']})"

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from tests.bench.accuracy.cases import Case, Settings, usual
-from tests.bench.accuracy.motion import Motion, common, error, exact_step, move, reference, rms
+from tests.bench.accuracy.motion import Motion, common, error, exact_solve, exact_step, move, reference, rms
 
 Row = dict[str, Any]
 LINEAR, LINEARIZATION, STEP, MESH, MODEL = "linear solve", "linearization", "time step", "mesh", "model"
@@ -32,7 +32,7 @@ CELLS = (2, 4, 8, 16)  # across, of the meshes that tell the order; four times a
 
 def rows(case: Case) -> list[Row]:
     """Errors [m] of a scene as its file is, each source alone: the largest distance of a node at any time."""
-    as_is, solved = move(case, usual()), move(case, usual({"solver.tolerance": "1e-12"}))
+    as_is, solved = move(case, usual()), exact_solve(case)
     exact, true = exact_step(case, {}), reference(case)
     other = reference(case, case.with_law(case.laws[0]))
     fine = on_mesh(case, _finer(case.cells))
@@ -67,10 +67,10 @@ def sentence(scene: str, found: Mapping[str, float | None]) -> str:
 
 def length(metres: float) -> str:
     """In words: 48 mm, 3.2 um."""
-    for unit, size in (("m", 1.0), ("mm", 1e-3), ("um", 1e-6)):
-        if metres >= size:
-            return f"{metres / size:.2g} {unit}" if metres < 99.5 * size else f"{metres / size:.0f} {unit}"
-    return f"{1e9 * metres:.2g} nm"
+    units = (("m", 1.0), ("mm", 1e-3), ("um", 1e-6), ("nm", 1e-9))
+    unit, size = next((u for u in units if metres >= u[1]), units[-1])
+    value = metres / size
+    return f"{value:.2g} {unit}" if value < 99.5 else f"{value:.0f} {unit}"
 
 
 # --- orders -----------------------------------------------------------------------------------------------------------

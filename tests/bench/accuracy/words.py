@@ -14,10 +14,12 @@ between steps and not counted: of a server a worker on another core makes them. 
 Errors are distances of nodes from where they are in another run on the same mesh with the same law, the largest of
 all nodes and steps. *Error*: from the motion that small steps make: explicit substeps (beam, neo-Hookean beam),
 Newmark with Newton-Raphson (heterogeneous beam), backward Euler at two small time steps, extrapolated (block).
-*Error of the steps*: from the trajectory of the same time steps of backward Euler, each solved to rounding. Errors
-do not depend on how busy the machine was; times are processor time of the loop's thread by its own clock, on a GPU
-time of the device, without the first step. L is the length of the beam, the width of the block. Each point's
-settings, as `sim-server SCENE --set KEY=VALUE` takes them, are in accuracy.csv."""
+Damping of the stiffness is by the tangent, which schemes choose: in the heterogeneous beam the small steps have
+that of the scheme they are compared with. *Error of the steps*: from the trajectory of the same time steps of
+backward Euler, each solved to rounding. Errors do not depend on how busy the machine was; times are processor time
+of the loop's thread by its own clock, on a GPU time of the device, without the first step. L is the length of the
+beam, the width of the block. Each point's settings, as `sim-server SCENE --set KEY=VALUE` takes them, are in
+accuracy.csv."""
 
 SHORT = """\
 Error against time, neo-Hookean beam, E = 1 MPa. Each curve is a method at several settings, each beside the motion
@@ -52,9 +54,10 @@ too stiff: both may make it smaller."""
 AXES = """\
 One axis at a time, or the two that matter together. Horizontal: error; vertical: seconds of a simulated second.
 Crosses at the right edge: ran away, failed or took too long. *tolerance, linearizations* is against the error of
-the steps, which the time step hides in the others. Preconditioners, age and precision of the factor and the drop
-tolerance change the time alone, but for ros2 with the factor as its matrix. *mesh*: beside 16 cells across, at the
-nodes that both have. *model*: each law beside its own small steps."""
+the steps, *tolerance, preconditioner* and *drop tolerance* (at 1e-6) against the error of the linear solves alone
+(from a run of the same steps, one linearization each, with linear solves to 1e-12): the time step would hide both.
+Age and precision of the factor change the time alone, but for ros2, which has the factor as its matrix. *mesh*:
+beside 16 cells across, at the nodes that both have. *model*: each law beside its own small steps."""
 
 CELLS = "In the cells: error [mm], seconds of a simulated second."
 

@@ -75,8 +75,8 @@ static double seconds_of_trial(const Newton& newton, const Search& search) {
     return newton.forces_seconds + search.seconds / std::max(1, search.iterations);
 }
 
-// Scale of P^-1 for the estimate at a trial, 0: not known. That of a factor is told by the end of a solve. With other
-// preconditioners it depends on how smooth the error is, and that of a trial is as smooth as the one at the start of a solve.
+// Scale of P^-1 for the estimate at a trial, 0: not known. It depends on how smooth the error is: that of a trial is about as smooth as
+// the one at the start of the solve before.
 static double scale_of(const Search& search, const SolveResult& r) {
     const double scale = std::max(r.factor_scale, r.start_scale);
     return scale > 0 ? scale : search.factor_scale;
@@ -99,9 +99,16 @@ static void solve(Loop& loop, int index) {
     settings.factor_scale = search.factor_scale;
     if (settings.budget < 0) settings.budget = std::min(-1.0, settings.budget + search.iterations);
     if (settings.deadline > 0) settings.deadline -= seconds_of_trial(newton, search);
+    const double* z = work + room.n;
+    if (search.applied) std::copy(z, z + room.n, room.direction);  // the direction is made below
     SolveResult r = pcg(A, loop.b + at, body.factor, settings, y, work, !loop.moving[index], &body.correction,
                         search.applied ? APPLIED_START : WARM_START);
     record_solve(search, r.residual, r.seconds, r.iterations, r.fallbacks, r.kind, r.status);
+    if (search.applied) {
+        const BodyNodes nodes{body.last - body.first};
+        search.moved = settings.dx_dv * nodes.peak(y);
+        search.left = (nodes.change(y, room.direction) + r.solve_error / settings.dx_dv) / nodes.peak(room.direction);
+    }
     search.applied = 0;
     search.solve_error = r.solve_error;
     search.factor_scale = scale_of(search, r);
@@ -123,11 +130,29 @@ static double remaining_error(Loop& loop, int index) {
     Body& body = loop.body[index];
     Search& search = loop.newton->search[index];
     if (!loop.moving[index]) return 0;
+    const double start = now();
     const double* b = loop.b + 3 * (int64_t)body.first;
     const double z = apply_to(matrix_of(loop, body), b, body.factor, search.kind, body.now.omega, loop.work + WORK * (int64_t)body.first,
                               &body.correction);
     search.applied = search.kind == CHOLESKY && body.now.kind == CHOLESKY && z > 0;
+    search.seconds += now() - start;
     return state_error(search, z, body.now.dx_dv);
+}
+
+// Ends the search where the estimated error is within the bound; returns whether it is.
+static bool bound_error(Loop& loop, int index) {
+    Search& search = loop.newton->search[index];
+    const SolveSettings& settings = loop.body[index].now;
+    return bound_error(search, remaining_error(loop, index), settings.trust, settings.position);
+}
+
+// Adds P^-1 of the nonlinear residual, which is made, to the increment: with a factor near A it takes off most of what is left.
+static void add_remaining(Loop& loop, int index) {
+    const Newton& newton = *loop.newton;
+    const Body& body = loop.body[index];
+    BodyRoom room(newton, body);
+    rotate(newton, body, false, loop.work + WORK * (int64_t)body.first + room.n, room.direction);
+    for (int k = 0; k < room.n; ++k) room.increment[k] += room.direction[k];
 }
 
 // Ends the step where its budget does not allow another linearization, or ended a solve.
@@ -164,13 +189,8 @@ static int judge(Loop& loop, int index) {
         return search.phase;
     }
     for (int k = 0; k < room.n; ++k) room.increment[k] = increment_after(search, room.increment[k], room.direction[k]);
-    if (verdict == TAKEN && body.now.position > 0)
-        bound_error(search, remaining_error(loop, index), trust_of(search.kind, body.now.trust), body.now.position);
-    if (search.phase == DONE && search.applied && body.now.trust <= WARPED_TRUST) {
-        double* z = loop.work + WORK * (int64_t)body.first + room.n;
-        rotate(newton, body, false, z, room.direction);
-        for (int k = 0; k < room.n; ++k) room.increment[k] += room.direction[k];
-    }
+    if (verdict == TAKEN && body.now.position > 0 && bound_error(loop, index) && adds_remaining(search, body.now.trust))
+        add_remaining(loop, index);
     if (body.now.step_budget > 0 || body.now.most_linearizations > 0) end_by_budget(loop, index);
     return search.phase;
 }

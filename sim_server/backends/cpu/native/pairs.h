@@ -9,8 +9,6 @@
 #include "loop.h"
 #include "own_contact.h"
 
-constexpr int MAY_TOUCH_ITSELF = 2;  // bit of Contact::near
-
 struct PairDetection {
     typedef SurfaceMotion<double, double> Motion;
     const Loop& loop;
@@ -194,11 +192,8 @@ struct PairDetection {
             if (!are_bound(edge, body, facing, other)) f(other, facing, thickness, t);
         });
         if (!own.exists() || !(c.near[body] & MAY_TOUCH_ITSELF) || !own.edge_may_pass(edge, body)) return;
-        const EdgePath path = path_of(edges, motion, edge);
-        each_own_edge(tables, edges, c.own.near, motion, body, edge, [&](int facing) {
-            EdgeTouch t;
-            if (are_bound(edge, body, facing, body) || !own_edges_pass(path, path_of(edges, motion, facing), thickness_of(tables, body), t)) return;
-            f(body, facing, thickness_of(tables, body), t);
+        each_own_edge_passed(tables, edges, c.own.near, motion, body, edge, [&](int facing, const EdgeTouch& t) {
+            if (!are_bound(edge, body, facing, body)) f(body, facing, thickness_of(tables, body), t);
         });
     }
     void find_held_edge(int body, int edge, std::vector<HeldPlace>& places) const {
