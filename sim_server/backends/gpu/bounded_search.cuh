@@ -20,6 +20,12 @@ HOST_DEVICE bool ends_by_start(Search& s, const PcgBody& settings, int kind, dou
 // Whether z that has ended a search is added to the solution.
 HOST_DEVICE bool is_added(const Search& s, const PcgBody& settings) { return s.phase == DONE && adds_remaining(s, settings.trust); }
 
+// Of a solve that began with z. solution, z: largest of a node; difference: of both; solve_error: of the solution [m], 0: not known.
+HOST_DEVICE void note_left(Search& s, double solution, double difference, double z, double solve_error, double dx_dv) {
+    s.moved = dx_dv * solution;
+    s.left = solve_error > 0 && z > 0 ? (difference + solve_error / dx_dv) / z : 0;
+}
+
 // After a solve: whether the search is over, since its start was exact enough, or nothing was to be estimated.
 HOST_DEVICE bool is_over(const Search& s, const PcgResult& r) {
     return s.phase == DONE || s.phase == LAST || (s.linearizations > 0 && r.iterations == 0 && r.status == CONVERGED);

@@ -53,6 +53,7 @@ struct BlockMemory {  // static shared memory of a thread block: data that is th
 #ifdef JUDGES
     Search search;
     bool over;
+    unsigned first_number;         // of the words of s.z that have the first z of a solve with a factor
 #endif
 };
 __shared__ BlockMemory memory;
@@ -282,7 +283,31 @@ struct PcgSolver {
         }
         __syncthreads();
         if (memory.over) give(is_added(memory.search, body), 1);
+        else if (memory.search.applied) keep_first();
         return memory.over;
+    }
+
+    // Keeps z = p where solves without a factor have theirs.
+    __device__ __forceinline__ void keep_first() const {
+        const BlockRows& rows = memory.rows;
+        if (threadIdx.x == 0) memory.first_number = group.number;
+        for (int k = threadIdx.x; k < 3 * rows.own; k += THREADS)
+            s.z[3ll * (memory.body.first + rows.begin) + k].put(rows.values[k], group.number);
+    }
+
+    // At the end, with the solution in rows.values: how far it is from the first z.
+    __device__ __forceinline__ void compare_with_first(double solve_error) {
+        const BlockRows& rows = memory.rows;
+        auto difference = [&](int k) {
+            real z;
+            const bool kept = s.z[3ll * (memory.body.first + rows.begin) + k].get(z, memory.first_number);
+            return rows.values[k] - (kept ? z : 0);
+        };
+        double none[1] = {0}, out[1], solution2 = largest2([&](int k) { return rows.values[k]; }), difference2 = largest2(difference);
+        group.sums<1, 1, true>(none, out, false, &solution2);
+        group.sums<1, 1, true>(none, out, false, &difference2);
+        if (threadIdx.x == 0)
+            note_left(memory.search, sqrt(solution2), sqrt(difference2), memory.error.first_size, solve_error, memory.body.dx_dv);
     }
 #endif
 
@@ -664,6 +689,7 @@ __device__ __forceinline__ void PcgSolver::solve() {
                 if (threadIdx.x == 0) out.solve_error = memory.error.told(r2, x_change);
 #ifdef JUDGES
                 if (threadIdx.x == 0) memory.search.factor_scale = memory.error.scale(r2, x_change, memory.search.factor_scale);
+                if (memory.search.applied) compare_with_first(out.solve_error);
 #endif
 #endif
                 if (stop == CONVERGED && r2 > memory.goal && !(r2 < 0.25 * last)) stop = MAX_ITERATIONS;  // rounding errors dominate
