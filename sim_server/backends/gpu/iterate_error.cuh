@@ -7,7 +7,6 @@
 
 constexpr double LOST_DIGITS = 1.1;   // as in backends/cpu/native/pcg.h
 constexpr double USEFUL = 1e-6;       // as in backends/cpu/native/pcg.h
-constexpr double SHARE_OF_SOLVE = 0.3;  // of `position`, where a step has several linearizations
 
 struct IterateError {
     double position, trust, dx_dv;       // see SolveSettings (backends/cpu/native/pcg.h); position 0: none

@@ -856,7 +856,7 @@ __device__ __forceinline__ void solve_body(const PcgArguments& s, const RowRange
         memory.error.begin(memory.body.position, memory.body.trust, memory.body.dx_dv);
 #endif
 #ifdef NEWTON_PHASES
-        memory.error.position *= SHARE_OF_SOLVE;
+        memory.error.position *= LINEAR_SHARE;
         memory.body.tolerance = first_tolerance(memory.search, memory.body.tolerance);
 #endif
     }
