@@ -33,7 +33,7 @@ constexpr double MOST_FORCING = 0.1, FORCING_FACTOR = 0.9;    // largest forcing
 constexpr double MOST_FORCING_WITHOUT_FACTOR = MOST_LEFT_WITHOUT_FACTOR;
 template <class T> constexpr double EPSILON = sizeof(T) == 8 ? 2.2e-16 : 1.2e-7;  // T: type in which forces are computed
 
-enum Phase { SOLVE = 0, TRY = 1, DONE = 2 };
+enum Phase { SOLVE = 0, TRY = 1, DONE = 2, LAST = 3 };  // LAST, on a GPU: over, but its error is to be estimated
 enum Verdict { NONE_YET = 0, SHORTER = 1, TAKEN = 2, LOST = 3 };  // on a trial. LOST: no trial along the direction has a finite residual
 
 struct Search {                        // Newton iteration of a step, of one body
@@ -145,6 +145,15 @@ HOST_DEVICE double solve_tolerance(const Search& s, double tolerance, int kind) 
     return forcing > tolerance ? forcing : tolerance;
 }
 
+// Estimated error of the state of a trial [m], by z = |P^-1 b| there; NaN: not known.
+HOST_DEVICE double state_error(const Search& s, double z, double dx_dv) {
+    const double e = s.factor_scale > 0 ? dx_dv * s.factor_scale * z : not_known();
+    return e < s.solve_error ? s.solve_error : e;
+}
+
+// |b| at the start of the present linearization.
+HOST_DEVICE double norm_before(const Search& s) { return s.linearizations == 1 ? s.first : s.last; }
+
 // Whether P^-1 b, which is made, takes off most of the error of a state that is exact enough. trust: in the factor.
 HOST_DEVICE bool adds_remaining(const Search& s, double trust) {
     return s.applied && trust <= WARPED_TRUST && s.factor_scale < NEAR && s.factor_scale > 1 / NEAR;
@@ -158,9 +167,8 @@ HOST_DEVICE double part_left(const Search& s, double estimate, double trust) {
 }
 
 // After a trial that was taken. estimate: of its error [m]; NaN: not known. trust: in the factor. Ends the iteration where the error,
-// less what is added, is within position, and returns whether it is; else sets the forcing term. before: |b| at the start of the
-// linearization.
-HOST_DEVICE bool bound_error(Search& s, double before, double estimate, double trust, double position) {
+// less what is added, is within position, and returns whether it is; else sets the forcing term.
+HOST_DEVICE bool bound_error(Search& s, double estimate, double trust, double position) {
     const double left = part_left(s, estimate, trust) * estimate;
     if (is_exact_enough(left, trust_of(s.kind, trust), position, false)) {
         s.step_error = left;
@@ -169,7 +177,7 @@ HOST_DEVICE bool bound_error(Search& s, double before, double estimate, double t
         return true;
     }
     s.step_error = estimate;
-    const double fall = s.norm / before, forcing = FORCING_FACTOR * fall * fall;
+    const double fall = s.norm / norm_before(s), forcing = FORCING_FACTOR * fall * fall;
     const bool last = is_exact_enough(forcing * estimate, trust_of(s.kind, trust), position, false);
     s.forcing = last ? 0 : forcing < MOST_FORCING ? forcing : MOST_FORCING;
     return false;

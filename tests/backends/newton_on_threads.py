@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: MIT
 """Newton-Raphson of a GPU: its launches in their order (gpu/newton.py), the kernels of newton.cu run by threads of the
-processor, assemblies by their texts as a CPU has them, linear systems solved directly."""
+processor, assemblies by their texts as a CPU has them, linear systems solved directly or by pcg.cu."""
 
 import ctypes as c
 import subprocess
@@ -26,6 +26,7 @@ from sim_server.backends.newton import Newton
 from sim_server.simulation import Simulation
 from tests.backends.fake_cupy import Array
 from tests.backends.fake_graphs import Graphs
+from tests.backends.pcg_on_threads import Solver, SolverHost
 
 TESTS = Path(__file__).parent.parent
 SOLVE = 0  # phase
@@ -44,13 +45,32 @@ STEP(end_newton, BLOCK_NODES)
 """
 
 
-def compiled(folder: Path) -> c.CDLL:
+JUDGING = """
+#include "pcg.cu"
+extern "C" void solve(const PcgArguments* s, const int* active, const int* phase, Search* search, const Correction* k) {
+    *s->pool_counter = 0;
+    launch_together(s->grid, THREADS, [&] { pcg(*s, active, phase, search, *k); },
+                    {{&memory, sizeof memory}, {shared_memory, sizeof shared_memory},
+                     {shared_vector, sizeof shared_vector}});
+}
+"""
+
+
+def compiled(folder: Path, *defined: str) -> c.CDLL:
     """Compiles newton.cu."""
     (folder / "newton.cpp").write_text(TEXT)
     paths = [f"-I{p}" for p in (TESTS / "backends", SOURCES / "backends/gpu", INCLUDE)]
     command = [compiler(), "-std=c++20", "-O1", "-shared", "-fPIC", "-Dreal=double", "-w", *paths]
+    command += [f"-D{word}" for word in defined]
     subprocess.run([*command, str(folder / "newton.cpp"), "-o", str(folder / "newton.so")], check=True)
     return c.CDLL(str(folder / "newton.so"))
+
+
+class SharedHost(SolverHost):
+    """Stands for a GPU that has the memory of the host."""
+
+    def twin(self, host: NDArray[Any], dtype: Any = None) -> Array:
+        return as_device(host)
 
 
 def as_device(array: NDArray[Any]) -> Array:
@@ -81,13 +101,18 @@ class Launch:
 class OnThreads:
     """Steps of a scene in the order of a GPU: holders move once, before the first assembly.
 
-    loops: whether its graphs have loops. ran: names of what the last step ran, but for kernels of bodies that are done
+    loops: whether its graphs have loops. solves: library of JUDGING, where the error of positions is bounded
+    blocks: thread blocks of pcg.cu. ran: names of what the last step ran, but for kernels of bodies that are done
     """
 
-    def __init__(self, library: c.CDLL, sim: Simulation, monkeypatch: pytest.MonkeyPatch, loops: bool = True):
+    def __init__(
+        self, library: c.CDLL, sim: Simulation, monkeypatch: pytest.MonkeyPatch, loops: bool = True,
+        solves: c.CDLL | None = None, blocks: int = 1,
+    ):  # fmt: skip
         self.sim, self._library, s, w = sim, library, sim.system, sim.world
         self.ran: list[str] = []
         monkeypatch.setattr(gpu_newton, "fuse", lambda launches, guard, readers: list(launches))
+        self._solves = solves
         self._graphs, zeros = Graphs(), lambda *shape: as_device(np.zeros(*shape))
         module = SimpleNamespace(get_function=self._kernel)
         cp = SimpleNamespace(
@@ -101,11 +126,19 @@ class OnThreads:
         newton = sim.integrator.newton(assemble, slice(0, 0), list(sim.effects.values()))
         assert newton is not None
         newton = Newton(newton.options, newton.dx_dv, newton.parts[len(self._held) :], newton.detect, **newton.arrays)
-        self.rows, self.results = np.zeros(bodies, PCG_BODY), np.zeros((1, bodies), PCG_RESULT)
-        self.told, self.phases = np.zeros((1, bodies), NEWTON_RESULT), NewtonPhases.initial(self._gpu, bodies)
+        self.phases = NewtonPhases.initial(self._gpu, bodies)
+        if solves:
+            self.pcg = Solver(sim, monkeypatch, 0, blocks, SharedHost(), self.phases.of_solves(True))
+            own = self.pcg.solver
+            self.results, rows = own.results.view(PCG_RESULT).reshape(-1, bodies), own.bodies_device
+            counter, pool_counter = self.pcg.counter, own.pool_counter
+        else:
+            self.rows, self.results = np.zeros(bodies, PCG_BODY), np.zeros((1, bodies), PCG_RESULT)
+            rows, counter, pool_counter = self.rows.ctypes.data, zeros(1, np.int64), zeros(1, np.uint32)
+        self.told = np.zeros((len(self.results), bodies), NEWTON_RESULT)
         self._solver: Any = SimpleNamespace(
-            counter=zeros(1, np.int64), pool_counter=zeros(1, np.uint32), results=as_device(self.results),
-            bodies_device=self.rows.ctypes.data, launch=self._solve,
+            counter=counter, pool_counter=pool_counter, results=as_device(self.results), bodies_device=rows,
+            launch=self._solve, errors=solves is not None,
         )  # fmt: skip
         arrays = {"row_start": s.row_start, "columns": s.columns, "values": s.values, "b": s.b_material, "y": s.y}
         arrays |= {"x": w.x, "v": w.v}
@@ -148,6 +181,12 @@ class OnThreads:
 
     def _solve_bodies(self, values: NDArray[Any]) -> None:
         s, w = self.sim.system, self.sim.world
+        if self._solves:
+            given = self.pcg.solver.params.copy()
+            given["values"] = values.ctypes.data
+            arguments = (given, *self.phases, self.pcg.correction.params)
+            self._solves.solve(*(c.c_void_p(x.ctypes.data) for x in arguments))
+            return
         for k in np.flatnonzero(self.phases.phase == SOLVE):
             body, result = w.bodies[k], self.results[0, k : k + 1]
             row_start, columns = s.body_pattern(body.first, body.last)
@@ -164,10 +203,13 @@ class OnThreads:
     def step(self, number: int) -> NDArray[Any]:
         """Makes a step; returns the result of each body."""
         self.sim.system.clock[0] = number * self.sim.world.dt
+        if self._solves:
+            self.pcg.renew()
+            self.pcg.counter[0] = number
         for launch in (*self._held, *self._assemble):
             launch()
         self.ran.clear()
         self._graph()
         for launch in self._integrate:
             launch()
-        return self.told[0].copy()
+        return self.told[number % len(self.told)].copy()

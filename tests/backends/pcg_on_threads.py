@@ -5,6 +5,7 @@ float16 in place of the partitioned one."""
 import ctypes as c
 import re
 import subprocess
+from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,7 +24,7 @@ from sim_server.backends.gpu.correction import CORRECTED_BODY, FactorCorrection
 from sim_server.backends.gpu.row_partition import assign_blocks
 from sim_server.backends.gpu.solver import PCG_RESULT, PcgSolver
 from sim_server.backends.gpu.structs import CONTACT_RESULT, PCG
-from sim_server.backends.kinds import FACTOR_TRUST, KINDS, WARPED_TRUST
+from sim_server.backends.kinds import KINDS
 from sim_server.simulation import Simulation
 from tests.contact.kernels_beside import TESTS, Host, as_device
 
@@ -170,14 +171,19 @@ class Solver:
 
     near: pieces of 512 bytes of an inverse that are in shared memory
     blocks: thread blocks of the body
+    host: stands for the GPU
+    phases: NewtonPhases.of_solves, where a step has several linearizations
     """
 
-    def __init__(self, sim: Simulation, monkeypatch: pytest.MonkeyPatch, near: int = 0, blocks: int = 1):
+    def __init__(
+        self, sim: Simulation, monkeypatch: pytest.MonkeyPatch, near: int = 0, blocks: int = 1,
+        host: SolverHost | None = None, phases: Sequence[Any] = (),
+    ):  # fmt: skip
         monkeypatch.setattr(gpu_solver, "compiled", lambda name, module, kernel: SimpleNamespace())
         assigned = lambda nodes, processors, most: (assign_blocks(nodes, blocks), blocks)  # noqa: E731
         monkeypatch.setattr(gpu_solver, "best_assignment", assigned)
         self.sim, self.near = sim, near
-        self.gpu: Any = SolverHost()
+        self.gpu: Any = host or SolverHost()
         given = sim.engine_input()
         self.arrays, gpu = given.arrays, self.gpu
         touch: Any = None
@@ -189,20 +195,22 @@ class Solver:
         self.counter, contact = as_device(np.zeros(1, np.int64)), given.contact is not None
         self.solver = PcgSolver(
             gpu, given.ranges, given.arrays, self.counter, 4, contact=contact, correction=self.correction,
-            errors=given.errors,
+            errors=given.errors, phases=phases,
         )  # fmt: skip
         own = sim.scene.solver
         rows = self.solver.bodies
-        assert rows["blocks"].tolist() == [blocks]
+        assert rows["blocks"].sum() == blocks
         rows["tolerance"], rows["max_iterations"], rows["warm_start"] = (
             own.tolerance,
             own.max_iterations,
             own.warm_start,
         )
-        if sim.scene.accuracy:
-            rows["position"] = sim.scene.accuracy.position_of(sim.world.bodies[0].mesh.rest)
-            rows["trust"], rows["dx_dv"] = WARPED_TRUST if sim.warped else FACTOR_TRUST, sim.world.dx_dv
-        rows["kind"], rows["factor_step"] = KINDS.enumeration("Kind")["CHOLESKY"], -1
+        for body, row in zip(sim.world.bodies, rows, strict=True):
+            settings = sim.engine.settings(body.index)
+            for name in ("position", "trust", "dx_dv"):
+                row[name] = getattr(settings, name)
+        rows["kind"] = KINDS.enumeration("Kind")["BLOCK_JACOBI" if own.preconditioner == "block_jacobi" else "CHOLESKY"]
+        rows["factor_step"] = -1
         self.kept: list[Any] = []
 
     @property

@@ -114,7 +114,8 @@ class GpuEngine(DeviceLoop):
         phases = NewtonPhases.initial(gpu, bodies) if newton else None
         correction = FactorCorrection.wanted(gpu, given)
         self.solver = PcgSolver(
-            gpu, ranges, arrays, self._counter, CAPACITY, planes, phases or (), ATTEMPTS if stages else 0,
+            gpu, ranges, arrays, self._counter, CAPACITY, planes,
+            phases.of_solves(given.errors) if phases else (), ATTEMPTS if stages else 0,
             given.contact is not None,
             given.contact is not None and bool(given.contact.surfaces or given.contact.ties), correction, given.errors,
         )  # fmt: skip

@@ -6,7 +6,7 @@
 #include "pcg_structs.cuh"
 
 constexpr double LOST_DIGITS = 1.1;   // as in backends/cpu/native/pcg.h
-constexpr double SHARE_OF_SOLVE = 0.3;  // of `position`, where a step has several linearizations
+constexpr double USEFUL = 1e-6;       // as in backends/cpu/native/pcg.h
 
 struct IterateError {
     double position, trust, dx_dv;       // see SolveSettings (backends/cpu/native/pcg.h); position 0: none
@@ -16,6 +16,7 @@ struct IterateError {
     bool enough, near, looks;            // decisions of the iteration, for all threads
     double rz, r2, size;                 // of the last z; r2 0: there is none
     double alpha, alpha_before;          // of the last iteration, and the largest one before
+    double first_size, travelled;        // |z| at the start; sum of the changes of x between looks
     double rz_looked, lagged;            // lagged: |e| by the iterates at the last look, -1: not known
 
     __device__ __forceinline__ void begin(double position_now, double trust_now, double dx_dv_now) {
@@ -26,6 +27,7 @@ struct IterateError {
         b2 = rz = 0;
         kind = NONE;
         iterations = 0;
+        first_size = travelled = 0;
         enough = near = looks = false;
         forget();
     }
@@ -80,10 +82,14 @@ struct IterateError {
         rz = zr;
         r2 = r2_now;
         size = z_size;
+        if (iterations == 0) first_size = z_size;
         enough = is_enough(r2_now, change, false);
         looks = !enough && (looked < 0 || iterations - looked >= lag_of(looked));
         if (!looks) return;
-        if (looked >= 0) lagged = error_by_iterates(change, zr, rz_looked);
+        if (looked >= 0) {
+            lagged = error_by_iterates(change, zr, rz_looked);
+            travelled += change;
+        }
         looked = iterations;
         rz_looked = zr;
     }
@@ -93,6 +99,15 @@ struct IterateError {
         alpha = by;
         ++iterations;
         near = looks_enough(r2_now, true);
+    }
+    // Scale of P^-1 at a trial, known: that of an earlier solve. That of a factor is told by the end of a solve, that of another
+    // preconditioner by its start (backends/cpu/native/newton.h).
+    __device__ __forceinline__ double scale(double r2_now, double change, double known) const {
+        const double e = estimate(r2_now, change), last = size * sqrt(r2_now / r2);
+        if (!(alpha > 0 && e > 0)) return known;
+        const double at_end = last > 0 ? e / last : 0, at_start = first_size > 0 ? (travelled + (looked >= 0 ? change : 0) + e) / first_size : 0;
+        const double larger = fmax(at_end, at_start);
+        return larger > 0 ? larger : known;
     }
     // Estimated error of the solution [m], 0: not known.
     __device__ __forceinline__ double told(double r2_now, double change) const {

@@ -5,10 +5,13 @@
 // with all trials that a scene allows in place of the loop where the driver has none: linearizations (1 + trials). The device decides:
 // the phase of a body tells each launch whether it applies to the body; once all bodies are done, launches return at once.
 //
+// With a bound of the error of positions (ERRORS), a trial that was taken is judged by the next solve, whose first P^-1 b tells the
+// displacement that is left: where that is within the bound, or no more linearizations are allowed, it ends the search (bounded_search.cuh).
+//
 // A thread block has a range of a body's nodes; the last one of a body to finish adds the partial sums in a fixed order and makes
 // the body's decision. Sums and the increment are double for every `real`.
 #include "pcg_structs.cuh"
-#include "newton_line_search.cuh"
+#include "bounded_search.cuh"
 
 #ifndef local
 #define local real
@@ -107,7 +110,11 @@ __device__ __forceinline__ PcgResult& result_of(const NewtonArguments& p, int bo
 // Publishes the phase of a body after a decision.
 __device__ __forceinline__ void decided(const NewtonArguments& p, int body) {
     const int phase = p.search[body].phase;
+#ifdef ERRORS
+    p.phase[body] = phase == LAST ? SOLVE : phase;
+#else
     p.phase[body] = phase;
+#endif
     if (phase == DONE) atomicSub(p.active, 1);
 }
 
@@ -158,9 +165,33 @@ extern "C" __global__ void __launch_bounds__(BLOCK_NODES) begin_newton(const New
     }
     if (!sum_body<BLOCK_NODES>(p, here.body, sum)) return;
     start_search(p.search[here.body], sqrt(sum[0]), EPSILON<local> * sqrt(sum[1]), p.bodies[here.body].kind);
+#ifdef ERRORS
+    p.search[here.body].forcing = MOST_FORCING;
+#endif
     p.phase[here.body] = SOLVE;
     p.bad_node[here.body] = NO_NODE;
 }
+
+#ifdef ERRORS
+// Ends a search whose state a solve has judged: adds z to the increment, which is zero where it is not to be.
+__device__ __forceinline__ void end_search(const NewtonArguments& p, int body, int i, bool mine) {
+    Search& search = p.search[body];
+    if (mine) {
+        double z[3];
+        direction_of(p, i, false, z);
+        for (int c = 0; c < 3; ++c) {
+            const int k = 3 * i + c;
+            p.increment[k] = increment_after(search, p.increment[k], p.direction[k]) + z[c];
+        }
+    }
+    double none[2] = {0, 0};
+    if (!sum_body<ALL_LANES>(p, body, none)) return;
+    search.seconds += result_of(p, body).seconds;
+    search.verdict = NONE_YET;
+    search.phase = DONE;
+    decided(p, body);
+}
+#endif
 
 // Sets the state of the next trial: along a new direction after a solve, else with a shorter step along the present one.
 extern "C" __global__ void __launch_bounds__(ALL_LANES) update_state(const NewtonArguments p) {
@@ -168,7 +199,11 @@ extern "C" __global__ void __launch_bounds__(ALL_LANES) update_state(const Newto
     if (*p.active == 0) return;
     const NodeRange here = p.ranges[blockIdx.x];
     Search& search = p.search[here.body];
+#ifdef ERRORS
+    if (p.phase[here.body] == DONE) return;  // that of the search may be what the solve has decided
+#else
     if (search.phase == DONE) return;
+#endif
     const int i = here.first + threadIdx.x / LANES, lane = threadIdx.x % LANES;
     const bool inside = i < here.last, mine = inside && lane == 0;
     if (search.phase == TRY) {
@@ -176,6 +211,9 @@ extern "C" __global__ void __launch_bounds__(ALL_LANES) update_state(const Newto
         return;
     }
     const PcgResult& r = result_of(p, here.body);
+#ifdef ERRORS
+    if (is_over(search, r)) return end_search(p, here.body, i, mine);
+#endif
     const bool lost = r.status == NOT_FINITE, first = search.linearizations == 0;
     double sum[2] = {0, 0};
     if (!lost) {
@@ -205,6 +243,9 @@ extern "C" __global__ void __launch_bounds__(ALL_LANES) update_state(const Newto
     }
     if (!sum_body<ALL_LANES>(p, here.body, sum)) return;
     record_solve(search, r.residual, r.seconds, r.iterations, r.fallbacks, r.kind, r.status);
+#ifdef ERRORS
+    search.solve_error = as_known(r.solve_error);
+#endif
     if (!lost) begin_line_search(search, sum[0], sqrt(sum[1]));
     decided(p, here.body);
 }
@@ -229,6 +270,10 @@ extern "C" __global__ void __launch_bounds__(BLOCK_NODES) accept_trial(const New
     }
     if (!sum_body<BLOCK_NODES>(p, here.body, sum)) return;
     evaluate_trial(search, {p.linearizations, p.trials, p.tolerance}, sqrt(sum[0]), sum[1]);
+#ifdef ERRORS
+    if (search.verdict == TAKEN) search.step_error = search.solve_error;
+    if (search.verdict == TAKEN && search.phase == DONE) search.phase = LAST;
+#endif
     decided(p, here.body);
 }
 
@@ -270,4 +315,8 @@ extern "C" __global__ void __launch_bounds__(BLOCK_NODES) end_newton(const Newto
     const int bad = __ldcg(p.bad_node + body);
     r.bad_node = s.status == NOT_FINITE && bad != NO_NODE ? bad : -1;
     p.newton_results[(p.step[0] % p.capacity) * p.count + body] = {residual_ratio(s), s.linearizations > 1 ? s.linearizations : 1};
+#ifdef ERRORS
+    r.solve_error = as_told(s.solve_error);
+    p.newton_results[(p.step[0] % p.capacity) * p.count + body].step_error = as_told(s.step_error);
+#endif
 }

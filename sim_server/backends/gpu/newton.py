@@ -37,15 +37,22 @@ class NewtonPhases(NamedTuple):
 
     active: (1,), number of bodies whose iteration is not over
     phase: (bodies,), phase of each body's iteration (kernels/newton_line_search.cuh)
+    search: (bodies,) of SEARCH as bytes
     """
 
     active: DeviceArray
     phase: DeviceArray
+    search: DeviceArray
 
     @classmethod
     def initial(cls, gpu: Gpu, bodies: int) -> "NewtonPhases":
         """Returns the state before the first step."""
-        return cls(gpu.cp.full(1, bodies, np.int32), gpu.cp.zeros(bodies, np.int32))
+        zeros = gpu.cp.zeros
+        return cls(gpu.cp.full(1, bodies, np.int32), zeros(bodies, np.int32), zeros(bodies * SEARCH.itemsize, np.uint8))
+
+    def of_solves(self, errors: bool) -> tuple[DeviceArray, ...]:
+        """Returns what the solver reads. errors: whether it judges trials (bounded_search.cuh)."""
+        return (self.active, self.phase, self.search) if errors else (self.active, self.phase)
 
     def guard(self, body: DeviceArray | None, blocks: bool = False) -> PhaseGuard:
         """Returns the guard of a kernel. body: (items,), body of each item; None: not known. blocks: it makes those
@@ -108,7 +115,7 @@ class NewtonIteration:
     another.
 
     loops: whether the graph of a step has a loop
-    rounds: most trials in a step
+    rounds: most times that the loop, or the graph, has the launches of a trial in a step
 
     Raises InputError for more trials than a graph without loops may hold.
     """
@@ -120,6 +127,7 @@ class NewtonIteration:
     ):  # fmt: skip
         cp, nodes, bodies = gpu.cp, len(arrays["x"]), len(ranges)
         self._gpu, self._device, self._solver, self.rounds = gpu, device, solver, newton.options.rounds
+        self.rounds += solver.errors  # the last trial that is allowed is judged by one solve more
         self.loops = device.has_conditions
         if not self.loops:
             newton.options.check_unrolled()
@@ -136,7 +144,7 @@ class NewtonIteration:
         self._memory = twins | {
             "ranges": cp.asarray(spans.view(np.int32)), "first_range": cp.asarray(starts),
             "partial_sums": cp.zeros(2 * len(spans)), "finished_blocks": cp.zeros(bodies, np.uint32),
-            "search": cp.zeros(bodies * SEARCH.itemsize, np.uint8), "phase": phases.phase, "active": phases.active,
+            "search": phases.search, "phase": phases.phase, "active": phases.active,
             "bad_node": cp.zeros(bodies, np.int32), "step": solver.counter, "pool_counter": solver.pool_counter,
             "results": solver.results,
             "initial_state": cp.zeros(12 * nodes, real), "increment": cp.zeros(3 * nodes),
@@ -152,7 +160,7 @@ class NewtonIteration:
         self._params["capacity"] = results.nbytes // NEWTON_RESULT.itemsize // bodies
         self._later_params = self._params.copy()
         self._later_params["values"] = self._values.data.ptr
-        flags = (*options(gpu.types), *own_headers())
+        flags = (*options(gpu.types), *own_headers(), *(["-DERRORS"] if solver.errors else []))
         module = gpu.cp.RawModule(code=NEWTON.checked(), options=flags, backend="nvrtc")
         self._begin, self._update_state, self._accept_trial, self._end = (
             compiled("newton.cu", module, name)

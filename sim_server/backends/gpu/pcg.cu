@@ -9,6 +9,10 @@
 // Vectors and A have the type `real`, and so has the residual, for every precision of the preconditioner. No float atomics.
 #ifdef ERRORS
 #include "iterate_error.cuh"
+#ifdef NEWTON_PHASES
+#include "bounded_search.cuh"
+#define JUDGES  // trials, by the first z of a solve
+#endif
 #endif
 #include "partitioned_inverse.cuh"
 #include "clock.cuh"
@@ -45,6 +49,11 @@ struct BlockMemory {  // static shared memory of a thread block: data that is th
 #ifdef ERRORS
     double peaks[WARPS + 1];
     IterateError error;
+#endif
+#ifdef JUDGES
+    Search search;
+    bool over;
+    unsigned first_number;         // of the words of s.z that have the first z of a solve with a factor
 #endif
 };
 __shared__ BlockMemory memory;
@@ -259,6 +268,46 @@ struct PcgSolver {
         if (memory.outcome == PASSED) error.position = 0;
         if (memory.outcome == LAST_PASSED) error.limit2 = WITHIN * WITHIN * pass.tolerance * pass.tolerance * c.given2;
 #endif
+    }
+#endif
+
+#ifdef JUDGES
+    // Judges the last trial by z = p = P^-1 b, |z| = size. Returns whether the search ends, with x as the solution; else sets the tolerance.
+    __device__ __forceinline__ bool ends_search(int kind, double size) {
+        const PcgBody& body = memory.body;
+        if (threadIdx.x == 0) {
+            memory.over = body.position > 0 && ends_by_start(memory.search, body, kind, size);
+            const double tolerance = solve_tolerance(memory.search, body.tolerance), useful = fmax(tolerance, USEFUL);
+            memory.goal = tolerance * tolerance * memory.b2;
+            memory.quarter = memory.b2 * sqrt(useful);
+        }
+        __syncthreads();
+        if (memory.over) give(is_added(memory.search, body), 1);
+        else if (memory.search.applied) keep_first();
+        return memory.over;
+    }
+
+    // Keeps z = p where solves without a factor have theirs.
+    __device__ __forceinline__ void keep_first() const {
+        const BlockRows& rows = memory.rows;
+        if (threadIdx.x == 0) memory.first_number = group.number;
+        for (int k = threadIdx.x; k < 3 * rows.own; k += THREADS)
+            s.z[3ll * (memory.body.first + rows.begin) + k].put(rows.values[k], group.number);
+    }
+
+    // At the end, with the solution in rows.values: how far it is from the first z.
+    __device__ __forceinline__ void compare_with_first(double solve_error) {
+        const BlockRows& rows = memory.rows;
+        auto difference = [&](int k) {
+            real z;
+            const bool kept = s.z[3ll * (memory.body.first + rows.begin) + k].get(z, memory.first_number);
+            return rows.values[k] - (kept ? z : 0);
+        };
+        double none[1] = {0}, out[1], solution2 = largest2([&](int k) { return rows.values[k]; }), difference2 = largest2(difference);
+        group.sums<1, 1, true>(none, out, false, &solution2);
+        group.sums<1, 1, true>(none, out, false, &difference2);
+        if (threadIdx.x == 0)
+            note_left(memory.search, sqrt(solution2), sqrt(difference2), memory.error.first_size, solve_error, memory.body.dx_dv);
     }
 #endif
 
@@ -638,6 +687,10 @@ __device__ __forceinline__ void PcgSolver::solve() {
                 if (enough && r2 <= LOST_DIGITS * found) memory.goal = fmax(memory.goal, r2);  // it is exact enough
                 enough = false;
                 if (threadIdx.x == 0) out.solve_error = memory.error.told(r2, x_change);
+#ifdef JUDGES
+                if (threadIdx.x == 0) memory.search.factor_scale = memory.error.scale(r2, x_change, memory.search.factor_scale);
+                if (memory.search.applied) compare_with_first(out.solve_error);
+#endif
 #endif
                 if (stop == CONVERGED && r2 > memory.goal && !(r2 < 0.25 * last)) stop = MAX_ITERATIONS;  // rounding errors dominate
                 if (stop != CONVERGED || r2 <= memory.goal) {
@@ -699,6 +752,9 @@ __device__ __forceinline__ void PcgSolver::solve() {
 #ifdef ERRORS
                 double size;
                 direction(restart ? 0 : (real)(zr * inverse_of(memory.rz)), sums, size);
+#ifdef JUDGES
+                if (iterations == 0 && memory.search.linearizations > 0 && ends_search(kind, size)) return;
+#endif
                 if (ends_by(kind, zr, r2, size)) continue;
 #else
                 direction(restart ? 0 : (real)(zr * inverse_of(memory.rz)), sums);
@@ -727,8 +783,13 @@ __device__ __forceinline__ void PcgSolver::solve() {
 #define KIND_OF_STEP , const StageSolve stage
 #define STAGE , stage
 #elif defined(NEWTON_PHASES)  // several linearizations a step: solve only the bodies in phase 0 (newton.cu)
+#ifdef JUDGES
+#define KIND_OF_STEP , const int* __restrict__ active, const int* __restrict__ phase, Search* search
+#define STAGE , search
+#else
 #define KIND_OF_STEP , const int* __restrict__ active, const int* __restrict__ phase
 #define STAGE
+#endif
 #elif defined(CONTACT_PASSES)  // contact: in the first solve of a step all bodies, then those that are READY (contact_state.cuh)
 #define KIND_OF_STEP , const ContactSolve pass
 #define STAGE , pass
@@ -747,6 +808,8 @@ __device__ __forceinline__ void PcgSolver::solve() {
 #endif
 #ifdef STAGES
 #define STAGE_PARAMETER , const StageSolve& stage
+#elif defined(JUDGES)
+#define STAGE_PARAMETER , Search* search
 #elif defined(CONTACT_PASSES)
 #define STAGE_PARAMETER , const ContactSolve& pass
 #else
@@ -759,6 +822,9 @@ __device__ __forceinline__ void solve_body(const PcgArguments& s, const RowRange
     if (threadIdx.x == THREADS - 1) memory.rests = s.moving[k] == 0;
 #ifdef CONTACT_PASSES
     if (threadIdx.x == 0) memory.contact = pass.state[k];
+#endif
+#ifdef JUDGES
+    for (int i = threadIdx.x; i < (int)(sizeof(Search) / 4); i += THREADS) ((int*)&memory.search)[i] = ((const int*)(search + k))[i];
 #endif
     __syncthreads();
 #ifdef CONTACT_PASSES
@@ -790,7 +856,8 @@ __device__ __forceinline__ void solve_body(const PcgArguments& s, const RowRange
         memory.error.begin(memory.body.position, memory.body.trust, memory.body.dx_dv);
 #endif
 #ifdef NEWTON_PHASES
-        memory.error.position *= SHARE_OF_SOLVE;
+        memory.error.position *= LINEAR_SHARE;
+        memory.body.tolerance = first_tolerance(memory.search, memory.body.tolerance);
 #endif
     }
 #endif
@@ -819,6 +886,9 @@ __device__ __forceinline__ void solve_body(const PcgArguments& s, const RowRange
     solver.solve();
 #ifdef CORRECTED
     if (range.index == 0) solver.keep_correction();
+#endif
+#ifdef JUDGES
+    if (range.index == 0 && threadIdx.x == 0) search[k] = memory.search;  // all thread blocks have read it
 #endif
     if (range.index == 0 && threadIdx.x == 0) {
         PcgResult out = memory.out;

@@ -40,7 +40,7 @@ class PcgSolver:
     counter: device array (1,), number of completed steps
     capacity: number of steps whose results are kept
     planes: float16 numbers per entry of an inverse; 1, or 2 for 22 bits
-    phases: newton.NewtonPhases; empty: one linearization a step
+    phases: NewtonPhases.of_solves (newton.py); empty: one linearization a step
     attempts: number of solves that the graph of a Rosenbrock-W step holds (stages.cuh); 0: another scheme
     contact: True for a scene with contact (contact_state.cuh)
     between: True if bodies touch each other, or are tied, there (island_state.cuh)

@@ -136,15 +136,14 @@ static double remaining_error(Loop& loop, int index) {
                               &body.correction);
     search.applied = search.kind == CHOLESKY && body.now.kind == CHOLESKY && z > 0;
     search.seconds += now() - start;
-    const double e = search.factor_scale > 0 ? body.now.dx_dv * search.factor_scale * z : not_known();
-    return e < search.solve_error ? search.solve_error : e;
+    return state_error(search, z, body.now.dx_dv);
 }
 
-// Ends the search where the estimated error is within the bound; returns whether it is. before: as of the other one.
-static bool bound_error(Loop& loop, int index, double before) {
+// Ends the search where the estimated error is within the bound; returns whether it is.
+static bool bound_error(Loop& loop, int index) {
     Search& search = loop.newton->search[index];
     const SolveSettings& settings = loop.body[index].now;
-    return bound_error(search, before, remaining_error(loop, index), settings.trust, settings.position);
+    return bound_error(search, remaining_error(loop, index), settings.trust, settings.position);
 }
 
 // Adds P^-1 of the nonlinear residual, which is made, to the increment: with a factor near A it takes off most of what is left.
@@ -184,14 +183,13 @@ static int judge(Loop& loop, int index) {
     Limits most = newton.most;
     if (body.now.most_linearizations > 0) most.linearizations = body.now.most_linearizations;
     if (search.status == BUDGET) most.linearizations = search.linearizations;
-    const double before = search.linearizations == 1 ? search.first : search.last;
     const int verdict = evaluate_trial(search, most, norm(room.n, b), dot(room.n, material, b));
     if (verdict == SHORTER) {
         set_state(loop, body, search.scale);
         return search.phase;
     }
     for (int k = 0; k < room.n; ++k) room.increment[k] = increment_after(search, room.increment[k], room.direction[k]);
-    if (verdict == TAKEN && body.now.position > 0 && bound_error(loop, index, before) && adds_remaining(search, body.now.trust))
+    if (verdict == TAKEN && body.now.position > 0 && bound_error(loop, index) && adds_remaining(search, body.now.trust))
         add_remaining(loop, index);
     if (body.now.step_budget > 0 || body.now.most_linearizations > 0) end_by_budget(loop, index);
     return search.phase;
