@@ -84,7 +84,7 @@ def test_bodies_decide_as_on_a_cpu_in_a_loop_and_unrolled(libraries, monkeypatch
     runs = [OnThreads(libraries[0], crowd(), monkeypatch, loops, libraries[1], 6) for loops in (True, False)]
     records = compare(runs[0], crowd(), 2)
     made = records["linearizations"]
-    assert made[0].tolist() == [1, 3, 2] and made[1, 0] == 1 and (records["status"] == 0).all()
+    assert made[0].tolist() == [1, 2, 2] and made[1, 0] == 1 and (records["status"] == 0).all()
     assert records["step_error"][:, 1:].min() > 0 and records["step_error"].max() * 3 <= BOUND
     for number in range(2):
         told = runs[1].step(number)
@@ -125,7 +125,7 @@ def test_shorter_trials_are_judged_too(libraries, monkeypatch):
 
 @pytest.mark.parametrize("most", [2, 3])
 def test_a_step_that_may_make_no_more_says_what_is_left(libraries, monkeypatch, most):
-    options: dict[str, Any] = {"position": 1e-9, "integrator": {"linearizations": most, "tolerance": 1e-12}}
+    options: dict[str, Any] = {"position": 1e-12, "integrator": {"linearizations": most, "tolerance": 1e-12}}
     run, cpu = OnThreads(libraries[0], falling(**options), monkeypatch, solves=libraries[1]), falling(**options)
     records = compare(run, cpu, 1)
-    assert records["status"].tolist() == [[SolveStatus.MAX_LINEARIZATIONS]] and 3 * records["step_error"][0, 0] > 1e-9
+    assert records["status"].tolist() == [[SolveStatus.MAX_LINEARIZATIONS]] and 3 * records["step_error"][0, 0] > 1e-12

@@ -217,6 +217,7 @@ class Beside:
         self.balance = as_device(np.zeros(bodies, BALANCE))
         self.bodies = np.zeros(bodies, PCG_BODY)
         solver: Any = SimpleNamespace(
+            errors=False,
             real=np.dtype(float), pool_counter=as_device(np.zeros(1, np.uint32)), results=self.results,
             counter=self.counter, bodies_device=self.bodies.ctypes.data,
         )  # fmt: skip

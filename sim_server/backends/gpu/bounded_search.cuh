@@ -6,7 +6,9 @@
 #include "pcg_structs.cuh"
 
 // Relative tolerance with which a solve begins. That of a later linearization is set when z is known.
-HOST_DEVICE double first_tolerance(const Search& s, double tolerance) { return s.linearizations == 0 ? solve_tolerance(s, tolerance) : tolerance; }
+HOST_DEVICE double first_tolerance(const Search& s, const PcgBody& body) {
+    return s.linearizations == 0 ? solve_tolerance(s, body.tolerance, body.plan ? body.kind : BLOCK_JACOBI) : body.tolerance;
+}
 
 // Judges the last trial by z = P^-1 b of `kind`, |z| = size, in the solve of a later linearization. Returns whether the search ends; else the
 // forcing term is that of the solve.

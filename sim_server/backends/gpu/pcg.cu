@@ -277,7 +277,7 @@ struct PcgSolver {
         const PcgBody& body = memory.body;
         if (threadIdx.x == 0) {
             memory.over = body.position > 0 && ends_by_start(memory.search, body, kind, size);
-            const double tolerance = solve_tolerance(memory.search, body.tolerance), useful = fmax(tolerance, USEFUL);
+            const double tolerance = solve_tolerance(memory.search, body.tolerance, kind), useful = fmax(tolerance, USEFUL);
             memory.goal = tolerance * tolerance * memory.b2;
             memory.quarter = memory.b2 * sqrt(useful);
         }
@@ -669,7 +669,12 @@ __device__ __forceinline__ void PcgSolver::solve() {
 #endif
                 if ((!given || refused) && (!body.warm_start || !(r2 < bb))) { alpha = 0; r2 = bb; }
                 else fresh = true;
-                memory.quarter = r2 * sqrt(sqrt(memory.goal / r2));
+#ifdef ERRORS
+                const double end = body.position > 0 ? fmax(memory.goal, USEFUL * USEFUL * bb) : memory.goal;
+#else
+                const double end = memory.goal;
+#endif
+                memory.quarter = r2 * sqrt(sqrt(end / r2));
                 if (refused || r2 <= memory.goal) {
                     if (refused) {
                         out.status = NOT_FINITE;
@@ -857,7 +862,7 @@ __device__ __forceinline__ void solve_body(const PcgArguments& s, const RowRange
 #endif
 #ifdef NEWTON_PHASES
         memory.error.position *= LINEAR_SHARE;
-        memory.body.tolerance = first_tolerance(memory.search, memory.body.tolerance);
+        memory.body.tolerance = first_tolerance(memory.search, memory.body);
 #endif
     }
 #endif
