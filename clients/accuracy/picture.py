@@ -44,7 +44,7 @@ def _points(plot: Any, found: Points, number: int) -> None:
             plot.plot(scene.error, scene.seconds, "k*", markersize=14, zorder=5, label="the scene")
         elif curve.diagram == number:
             where = [p.error for p in curve.points], [p.seconds for p in curve.points]
-            plot.plot(*where, "o-" if curve.joined else "o", markersize=5, linewidth=1, label=curve.axis)
+            plot.plot(*where, "o-" if curve.joined else "o", markersize=5, linewidth=1, label=curve.label)
     labels: set[str] = set()
     for point, error, seconds in at_the_edge(found):
         if int(point.axis not in SINGLE) == number:

@@ -40,6 +40,7 @@ class Point:
     unconverged: int = 0  # solves that did not reach their tolerance
     limit: float | None = None  # of one that timed out: wall time that its process had [s]
     against: str = "reference"  # what `error` is measured from; on the axis mesh its extrapolation
+    mesh_error: float | None = None  # of the scene: its distance from what the axis mesh is measured from [m]
 
 
 @dataclass
@@ -58,6 +59,7 @@ class Points:
     points: list[Point] = field(default_factory=list)
     left_out: list[dict[str, Any]] = field(default_factory=list)  # axis, settings, reason
     sources: dict[str, float | None] = field(default_factory=dict)  # m
+    at_least: list[str] = field(default_factory=list)  # sources whose errors may be larger than said
     sentence: str = ""
     version: int = VERSION
 
