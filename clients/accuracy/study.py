@@ -63,21 +63,30 @@ class Reference:
 class Study:
     """Measures a scene and keeps what it finds in a folder: points.json, and runs/*.npz to compare with.
 
-    Raises BadInput for a scene that the server refuses, or a folder with points of another scene.
+    Raises BadInput for a scene that the server refuses, a folder that cannot be written to or with points of another
+    scene.
     """
 
-    def __init__(self, scene: Path, folder: Path, duration: float, device: str, progress: Progress):
+    def __init__(self, scene: Path, folder: Path, duration: float | None, device: str, progress: Progress):
+        """Reads the scene. duration: simulated in each run [s]; None, to look only: that of the points in the folder"""
         self.folder, self._progress, self._began = folder, progress, time.monotonic()
         for log in folder.glob(f"{LOG_FOLDER}*"):  # of a run that was killed
             shutil.rmtree(log, ignore_errors=True)
         self._what = "the scene is read"
         self._scene_run: Run | None = None
-        probed, _ = probe(scene, device, self._tick)
+        path = folder / "points.json"
+        old = _to_look_at(scene, path) if duration is None else None
+        probed, _ = probe(scene, old.device if old is not None and device == "auto" else device, self._tick)
         self.values = SceneValues(probed.scene, probed.device)
-        self.task = task_of(scene, self.values.dt, duration, device)
-        fresh = _fresh(scene, self.task, probed)
-        self.found = resumed(folder / "points.json", fresh)
+        if duration is None:
+            assert old is not None
+            self.task = Task(scene, self.values.dt, old.duration, old.interval, device)
+        else:
+            self.task = task_of(scene, self.values.dt, duration, device)
+        self.found = resumed(path, _fresh(scene, self.task, probed))
         self._start = probed.wall  # s that a process takes beside its steps
+        self._began = time.monotonic()  # what the first start compiles takes none of the time given
+        _make(folder)
 
     def run(self, minutes: float) -> Points:
         """Measures for so many minutes, or until all is measured; 0: only what is there is looked at."""
@@ -343,10 +352,15 @@ class Study:
         return load_trajectory(self._file(role))
 
 
+def check_scene(scene: Path) -> None:
+    """Raises BadInput if there is no such file."""
+    if not scene.is_file():
+        raise BadInput(f"{scene}: is a folder, allowed is a scene" if scene.is_dir() else f"{scene}: no such file")
+
+
 def probe(scene: Path, device: str, tick: Callable[[], None] = lambda: None) -> tuple[Run, str]:
     """Runs one step of a scene; returns the run and the digest of its points. Raises BadInput, ClientError."""
-    if not scene.is_file():
-        raise BadInput(f"{scene}: no such file")
+    check_scene(scene)
     run = run_point(Task(scene, 1.0, 1.0, 1.0, device), {}, timeout=START_TIMEOUT, tick=tick)
     if run.status == "refused":
         raise BadInput(run.reason)
@@ -394,6 +408,24 @@ def resumed(path: Path, fresh: Points) -> Points:
 def _unconverged(made: list[Reference]) -> int:
     """Returns the number of solves of the last two that did not reach their tolerance."""
     return sum(each.unconverged for each in made[-2:])
+
+
+def _to_look_at(scene: Path, path: Path) -> Points:
+    """Reads points that are to be drawn only. Raises BadInput if there are none."""
+    check_scene(scene)
+    if not path.exists():
+        raise BadInput(f"{path}: no such file, so there is nothing to draw; --minutes above 0 measures")
+    return load(path)
+
+
+def _make(folder: Path) -> None:
+    """Makes the folder for the results. Raises BadInput."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise BadInput(f"{folder}: cannot be made: {error.strerror}") from None
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise BadInput(f"{folder}: cannot be written to")
 
 
 def _fresh(scene: Path, task: Task, probed: Run) -> Points:

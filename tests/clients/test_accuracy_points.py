@@ -159,10 +159,8 @@ def scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return path
 
 
-def study_of(scene: Path, minutes: float = 60, duration: float = 1.0, device: str = "auto") -> Points:
-    folder = scene.parent / "out"
-    folder.mkdir(exist_ok=True)
-    return Study(scene, folder, duration, device, lambda done, what: None).run(minutes)
+def study_of(scene: Path, minutes: float = 60, duration: float = 1.0, out: Path | None = None) -> Points:
+    return Study(scene, out or scene.parent / "out", duration, "auto", lambda done, what: None).run(minutes)
 
 
 def test_a_study_finds_each_source_of_a_known_error(scene: Path) -> None:
@@ -206,8 +204,7 @@ def test_sources_beyond_a_missing_run_are_told_together() -> None:
 
 
 def test_a_scene_without_a_point_beside_it_blames_no_source(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    measure = Study._measure
-    monkeypatch.setattr(Study, "_measure", lambda self, each: each.axis == "scene" and measure(self, each))
+    monkeypatch.setattr(study, "candidates", lambda values, size: [])
     found = study_of(scene)
     assert set(found.sources.values()) == {None}
     assert found.sentence == (
@@ -379,6 +376,36 @@ def test_a_short_time_leaves_the_rest_for_the_next_call(scene: Path, monkeypatch
     again = study_of(scene, 30)
     assert not [left for left in again.left_out if left["reason"] == study.NO_TIME]
     assert len(again.points) > len(found.points)
+
+
+def test_points_are_drawn_as_they_were_measured(scene: Path) -> None:
+    def drawn() -> Points:
+        return Study(scene, scene.parent / "out", None, "auto", lambda done, what: None).run(0)
+
+    with pytest.raises(BadInput, match=r"points\.json: no such file, so there is nothing to draw"):
+        drawn()
+    found = study_of(scene, duration=2.0)
+    again = drawn()
+    assert again.duration == found.duration and again.interval == found.interval and again.points == found.points
+    assert (again.sources, again.sentence) == (found.sources, found.sentence)
+
+
+def test_bad_input_leaves_no_folder(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = scene.parent / "new"
+    with pytest.raises(BadInput, match="is a folder, allowed is a scene"):
+        accuracy(scene.parent, out, 1.0, 1.0, "cpu", False)
+    with pytest.raises(BadInput, match="4 time steps of the scene"):
+        accuracy(scene, out, 1.0, 0.01, "cpu", False)
+    with pytest.raises(BadInput, match="nothing to draw"):
+        accuracy(scene, out, 0.0, 1.0, "cpu", False)
+    monkeypatch.setattr(study, "run_point", lambda *a, **k: Run("refused", "dt = -1"))
+    with pytest.raises(BadInput, match="dt = -1"):
+        accuracy(scene, out, 1.0, 1.0, "cpu", False)
+    assert not out.exists()
+    with pytest.raises(BadInput, match="cannot be made"):
+        monkeypatch.undo()
+        monkeypatch.setattr(study, "run_point", lambda task, settings, *a, **k: made_up(task, settings))
+        study_of(scene, out=scene / "out")
 
 
 def test_points_of_something_else_are_refused(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -576,6 +603,20 @@ def test_points_json_keeps_the_contract(tmp_path: Path) -> None:
         (tmp_path / "points.json").write_text(text)
         with pytest.raises(BadInput, match=r"points\.json: "):
             load(tmp_path / "points.json")
+    wrong_points = [
+        ("status", "weird"), ("settings", None), ("settings", {"dt": 1}), ("error", "x"), ("error", True),
+        ("step_ms", 3), ("step_ms", {"p99": None}), ("rounds", None), ("unconverged", 1.5), ("seconds", 10**400),
+    ]  # fmt: skip
+    wrong = [
+        ("reference", None), ("reference", {}), ("left_out", [1]), ("left_out", [{"axis": "a"}]), ("machine", None),
+        ("objects", {"bar": 1}), ("sources", {"mesh": "x"}), ("duration", "1"), ("points", {}),
+    ]  # fmt: skip
+    tables = [(f"point 1: {key} = ", {**table, "points": [{**table["points"][0], key: v}]}) for key, v in wrong_points]
+    tables += [(f"points: {key} = ", {**table, key: value}) for key, value in wrong]
+    for said, changed in tables:
+        (tmp_path / "points.json").write_text(json.dumps(changed))
+        with pytest.raises(BadInput, match=rf"points\.json: points that cannot be read: ({said}|int too large)"):
+            load(tmp_path / "points.json")
 
 
 def test_words_and_table_repeat_a_point() -> None:
@@ -620,7 +661,11 @@ def test_without_plotly_the_rest_is_written(tmp_path: Path, monkeypatch: pytest.
 def test_the_report_fits_a_terminal(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     from rich.console import Console
 
-    Console(width=80).print(report(sample(), tmp_path))
+    found = sample()
+    exact = {"solver.tolerance": "1e-9", "integrator.linearizations": "20", "integrator.tolerance": "1e-9"}
+    found.points.append(Point("linearizations", exact, "done", "", 0.1, 0.1, {}, 3.0, [3.0]))
+    Console(width=80).print(report(found, tmp_path))
     said = capsys.readouterr().out
+    assert "…" not in said and "..." not in said
     assert "diverged" in said and "dt=0.01" in said and "left out: position (position=1): unknown <key>" in said
     assert max(map(len, said.splitlines())) <= 80
