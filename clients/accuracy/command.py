@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from rich.console import Group
 
 DEVICES = ("auto", "cpu", "gpu")
-AXIS, SETTINGS = 14, 26  # characters of axis and settings of a point on a terminal, before they are folded
+AXIS, SETTINGS = 14, 25  # characters of axis and settings of a point on a terminal, before they are folded
 MOST_MINUTES = 10_000.0
 
 
@@ -79,12 +79,12 @@ def report(found: Points, folder: Path) -> Group:
 
     from clients.watch import COMPACT
 
-    table = Table("axis", "settings", "error [m]", "s / s", "p99 [ms]", "iter.", **COMPACT)
+    table = Table("axis", "settings", "error [m]", "s / s", "p99 [ms]", "iter.", **{**COMPACT, "padding": (0, 1, 0, 0)})
     table.columns[0].max_width, table.columns[1].overflow = AXIS, "fold"
     table.columns[1].min_width = min(SETTINGS, max((len(line) for p in found.points for line in _lines(p)), default=0))
     for p in found.points:
-        numbers = (p.error, p.seconds, (p.step_ms or {}).get("p99"), p.iterations)
-        table.add_row(Text(p.axis), Text("\n".join(_lines(p))), *(_cell(value) for value in numbers))
+        numbers = (_cell(p.error, 2), _cell(p.seconds, 2), _cell((p.step_ms or {}).get("p99")), _cell(p.iterations))
+        table.add_row(Text(p.axis), Text("\n".join(_lines(p))), *numbers)
     known = ", ".join(f"{name} {value:.2g} m" for name, value in found.sources.items() if value is not None)
     uncertainty = found.reference.get("uncertainty")
     lines = [
@@ -118,5 +118,5 @@ def _left_out(found: Points) -> list[str]:
     return lines
 
 
-def _cell(value: Any) -> str:
-    return "-" if value is None else f"{value:.3g}"
+def _cell(value: Any, digits: int = 3) -> str:
+    return "-" if value is None else f"{value:.{digits}g}"

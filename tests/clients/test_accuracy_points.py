@@ -6,6 +6,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import re
 import sys
 import tomllib
 from pathlib import Path
@@ -663,9 +664,11 @@ def test_the_report_fits_a_terminal(capsys: pytest.CaptureFixture[str], tmp_path
 
     found = sample()
     exact = {"solver.tolerance": "1e-9", "integrator.linearizations": "20", "integrator.tolerance": "1e-9"}
-    found.points.append(Point("linearizations", exact, "done", "", 0.1, 0.1, {}, 3.0, [3.0]))
+    times = {"p50": 1.0, "p99": 0.0634, "max": 3.0}
+    found.points.append(Point("linearizations and", exact, "done", "", 8.87e-4, 0.1, {}, 8.87e-4, [3.0], times, 0.0271))
     Console(width=80).print(report(found, tmp_path))
     said = capsys.readouterr().out
     assert "…" not in said and "..." not in said
+    assert re.search(r"linearizations *solver.tolerance=1e-9 *0.00089 *0.00089 *0.0634 *0.0271\b", said), said
     assert "diverged" in said and "dt=0.01" in said and "left out: position (position=1): unknown <key>" in said
     assert max(map(len, said.splitlines())) <= 80
