@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from clients.accuracy.page import render
 from clients.accuracy.picture import draw
 from clients.accuracy.points import Point, Points, short_words, to_csv, to_dict
+from clients.accuracy.sources import said_length
 from clients.accuracy.study import NO_TIME, Study
 from clients.errors import BadInput, ClientError
 from clients.log.atomic_file import atomic_file
@@ -85,7 +86,9 @@ def report(found: Points, folder: Path) -> Group:
     for p in found.points:
         numbers = (_cell(p.error, 2), _cell(p.seconds, 2), _cell((p.step_ms or {}).get("p99")), _cell(p.iterations))
         table.add_row(Text(p.axis), Text("\n".join(_lines(p))), *numbers)
-    known = ", ".join(f"{name} {value:.2g} m" for name, value in found.sources.items() if value is not None)
+    known = ", ".join(
+        f"{name} {said_length(found, name, value)}" for name, value in found.sources.items() if value is not None
+    )
     uncertainty = found.reference.get("uncertainty")
     lines = [
         f"{found.duration:g} s simulated on {found.device}; s / s: wall time of the steps of a simulated second; "

@@ -110,11 +110,9 @@ def sentence(found: Points, missing: Sequence[str] = (), rest: float | None = No
         text += _better(found, scene, first)
     text += _cheaper(found, scene, first)
     if (model := known.get(MODEL, 0.0)) > errors[first]:
-        text += (
-            f"; another law of the material moves it by {_length(model)}, more than any of these: be sure of the law"
-        )
+        text += f"; another law of the material moves it by {length(model)}, more than any of these: be sure of the law"
     if (uncertainty := found.reference.get("uncertainty") or 0.0) > HALF * errors[first]:
-        text += f"; the reference itself is uncertain by {_length(uncertainty)}, so all this is rough"
+        text += f"; the reference itself is uncertain by {length(uncertainty)}, so all this is rough"
     if unconverged := found.reference.get("unconverged"):
         text += f"; {unconverged} solves of the reference did not reach their tolerance"
     return f"{text}."
@@ -122,7 +120,7 @@ def sentence(found: Points, missing: Sequence[str] = (), rest: float | None = No
 
 def _dominant(found: Points, first: str, errors: dict[str, float], unknown: list[str]) -> str:
     """Says which error is the largest, and what the others are. unknown: sources that nothing is known of."""
-    values = {name: "at least " * (name in found.at_least) + _length(value) for name, value in errors.items()}
+    values = {name: said_length(found, name, value) for name, value in errors.items()}
     others = [f"{name} {values[name]}" for name in sorted(errors, key=_place) if name != first]
     others += [f"{name} not measured" for name in unknown]
     several = " and " in first
@@ -142,8 +140,8 @@ def _better(found: Points, scene: Point, first: str) -> str:
     text, better = f": {change}", best(found.points, scene, axes, HALF * (scene.error or 0.0))
     if better is not None and better.error is not None and scene.error is not None:
         text += (
-            f", for example {set_words(better.settings)}, which is {_length(better.error)} off instead of "
-            f"{_length(scene.error)} and takes {_times(better, scene):.2g} times the time"
+            f", for example {set_words(better.settings)}, which is {length(better.error)} off instead of "
+            f"{length(scene.error)} and takes {_times(better, scene):.2g} times the time"
         )
     return text
 
@@ -173,8 +171,17 @@ def best(points: list[Point], scene: Point, axes: tuple[str, ...], bound: float)
     return min((p for p in fit if (p.seconds or 0.0) <= NEAR * least), key=lambda p: p.error or 0.0, default=None)
 
 
-def _length(value: float) -> str:
-    return f"{value:.2g} m"
+def said_length(found: Points, source: str, error: float) -> str:
+    """Returns the error of a source [m] in words."""
+    return "at least " * (source in found.at_least) + length(error)
+
+
+def length(metres: float) -> str:
+    """Returns a length in words: 48 mm, 3.2 um."""
+    units = (("m", 1.0), ("mm", 1e-3), ("um", 1e-6), ("nm", 1e-9))
+    unit, size = next((u for u in units if metres >= 0.995 * u[1]), units[-1])
+    value = metres / size
+    return f"{value:.2g} {unit}" if value < 99.5 else f"{value:.0f} {unit}"
 
 
 def _times(point: Point, scene: Point) -> float:

@@ -172,7 +172,7 @@ def test_a_study_finds_each_source_of_a_known_error(scene: Path) -> None:
     assert found.sources["mesh"] == pytest.approx(OF_MESH * 0.25, rel=1e-6)
     assert found.sources["model"] == pytest.approx(0.01, rel=1e-6)
     assert found.sentence.startswith(
-        "The error of the mesh dominates with 0.13 m (linear solve 1e-08 m, linearization 0.001 m"
+        "The error of the mesh dominates with 125 mm (linear solve 10 nm, linearization 1 mm"
     )
     assert 0 < found.reference["uncertainty"] < 1e-5
     own = found.point({})
@@ -197,11 +197,11 @@ def test_sources_beyond_a_missing_run_are_told_together() -> None:
     told = sample()
     told.sources = dict.fromkeys(told.sources) | {"linear solve": 1e-6}
     assert sentence(told, ["linearization", "time step", "mesh"], 0.1).startswith(
-        "The errors of linearization and time step together are the largest measured, with 0.1 m "
-        "(linear solve 1e-06 m, mesh not measured); "
+        "The errors of linearization and time step together are the largest measured, with 100 mm "
+        "(linear solve 1 um, mesh not measured); "
     )
     told.sources["mesh"], told.at_least = 0.4, ["mesh"]
-    assert sentence(told).startswith("The error of the mesh dominates with at least 0.4 m (linear solve 1e-06 m): ")
+    assert sentence(told).startswith("The error of the mesh dominates with at least 400 mm (linear solve 1 um): ")
 
 
 def test_a_scene_without_a_point_beside_it_blames_no_source(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -209,7 +209,7 @@ def test_a_scene_without_a_point_beside_it_blames_no_source(scene: Path, monkeyp
     found = study_of(scene)
     assert set(found.sources.values()) == {None}
     assert found.sentence == (
-        "The errors of linear solve and linearization and time step together are the largest measured, with 0.081 m "
+        "The errors of linear solve and linearization and time step together are the largest measured, with 81 mm "
         "(mesh not measured)."
     )
 
@@ -564,14 +564,14 @@ def sample() -> Points:
 
 def test_the_sentence_names_the_first_change_and_what_is_cheaper() -> None:
     assert sample().sentence == (
-        "The error of the time step dominates with 0.1 m (linear solve 1e-06 m): take a smaller time step or a scheme "
-        "of second order (dt, integrator.scheme), for example --set dt=0.01, which is 0.04 m off instead of 0.1 m and "
+        "The error of the time step dominates with 100 mm (linear solve 1 um): take a smaller time step or a scheme "
+        "of second order (dt, integrator.scheme), for example --set dt=0.01, which is 40 mm off instead of 100 mm and "
         "takes 2 times the time; --set solver.tolerance=1e-2 is as exact as the scene and takes 0.25 times the time; "
-        "another law of the material moves it by 0.3 m, more than any of these: be sure of the law."
+        "another law of the material moves it by 300 mm, more than any of these: be sure of the law."
     )
     rough = sample()
     rough.reference["uncertainty"] = 0.09
-    assert sentence(rough).endswith("; the reference itself is uncertain by 0.09 m, so all this is rough.")
+    assert sentence(rough).endswith("; the reference itself is uncertain by 90 mm, so all this is rough.")
     failed = sample()
     failed.points[0].status, failed.points[0].reason = "diverged", "bar: runaway"
     assert sentence(failed) == "The scene's own settings do not work (bar: runaway): change them first."

@@ -158,7 +158,7 @@ def test_an_answer_tells_what_was_measured(tmp_path: Path) -> None:
     assert not told["more_exact"]["fits"] and told["uncertainty"] == 1e-5
     assert "p99 1.2 of 2 ms (40 % left), 0.24 of 1 s a simulated second (76 % left)" in told["notes"]
     assert any(note.startswith("measurements left out: 1 diverged, 1 of another body") for note in told["notes"])
-    assert "the mesh is off by about 0.04 m, which these settings do not change" in told["notes"]
+    assert "the mesh is off by about 40 mm, which these settings do not change" in told["notes"]
     assert "settings that had no time to be measured: 1; sim-client accuracy goes on with them" in told["notes"]
     json.dumps(told, allow_nan=False)
 

@@ -6,11 +6,12 @@ import shlex
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
+from clients.accuracy.sources import length
 from tests.bench.accuracy import peers, picture, words
 from tests.bench.accuracy.axes import ERROR_OF, EXPLICIT_NAME, SCHEME, STEPS, order_of
 from tests.bench.accuracy.cases import CASES
 from tests.bench.accuracy.short import Tables, position_sentence, sentences
-from tests.bench.accuracy.sources import length, orders, sentence
+from tests.bench.accuracy.sources import orders, sentence
 from tests.bench.harness.pieces import Row
 from tests.bench.harness.report import Report
 
