@@ -179,7 +179,7 @@ def said_length(found: Points, source: str, error: float) -> str:
 def length(metres: float) -> str:
     """Returns a length in words: 48 mm, 3.2 um."""
     units = (("m", 1.0), ("mm", 1e-3), ("um", 1e-6), ("nm", 1e-9))
-    unit, size = next((u for u in units if metres >= 0.995 * u[1]), units[-1])
+    unit, size = next((u for u in units if metres >= 0.9995 * u[1]), units[-1])
     value = metres / size
     return f"{value:.2g} {unit}" if value < 99.5 else f"{value:.0f} {unit}"
 

@@ -11,8 +11,9 @@ import numpy as np
 
 from clients.accuracy.sources import LINEAR, LINEARIZATION, MESH, MODEL, length
 from clients.accuracy.sources import TIME as STEP
+from clients.accuracy.trajectories import shared_nodes
 from tests.bench.accuracy.cases import Case, Settings, usual
-from tests.bench.accuracy.motion import Motion, common, error, exact_solve, exact_step, move, reference, rms
+from tests.bench.accuracy.motion import Motion, error, exact_solve, exact_step, move, reference, rms
 
 Row = dict[str, Any]
 COMPARED = {
@@ -114,5 +115,5 @@ def of_meshes(case: Case, cells: Sequence[int] = CELLS) -> list[Row]:
 
 def _at(motion: Motion, nodes: Motion) -> Motion:
     """The same at the nodes of a coarser mesh alone."""
-    kept, _ = common(motion.rest, nodes.rest)
+    kept, _ = shared_nodes(motion.rest, nodes.rest)
     return replace(motion, frames=motion.frames[:, kept], rest=motion.rest[kept])
