@@ -409,6 +409,20 @@ def test_bad_input_leaves_no_folder(scene: Path, monkeypatch: pytest.MonkeyPatch
         study_of(scene, out=scene / "out")
 
 
+def test_what_the_first_start_compiles_takes_none_of_the_time(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    now, compiled = [0.0], []
+    monkeypatch.setattr(study.time, "monotonic", lambda: now[0])
+
+    def run_point(task: Task, settings: Settings, *_: object, **__: object) -> Run:
+        now[0] += 0.1 if compiled else 100.0
+        compiled.append(True)
+        return made_up(task, settings)
+
+    monkeypatch.setattr(study, "run_point", run_point)
+    found = study_of(scene, 1)
+    assert len(found.points) > 20 and study.NO_TIME not in {left["reason"] for left in found.left_out}
+
+
 def test_points_of_something_else_are_refused(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     study_of(scene)
     with pytest.raises(BadInput, match=r"they are of 0\.96 s simulated; give another --out, or remove the folder"):
