@@ -16,6 +16,7 @@ EXACT = "1e-9"  # relative residual that counts as exact, of linear systems and 
 MANY = 20  # linearizations that a step solved exactly may take, or the scene's own if these are more
 EXACT_POSITION = "1e-12"  # m; a bound that counts as exact
 ITERATIONS = "100000"  # that a solve which counts as exact may take
+LONG = "1e9"  # ms of wall time; a budget of a step that never ends one
 STEPS = (0.5, 2.0, 0.25, 4.0, 0.125)  # over the scene's dt
 COARSEST = 4  # largest one of STEPS: the interval between compared times is a multiple of it
 SCHEMES = ("bdf2", "newmark", "generalized_alpha", "ros2", "central_difference", "backward_euler")
@@ -150,9 +151,12 @@ class SceneValues:
         return max(MANY, int(self.integrator["linearizations"]))
 
     def _without_budget(self) -> Settings:
+        """Returns settings with which no wall time ends a solve or a step."""
         found = {}
         if self.solver.get("budget"):
             found["solver.budget"] = "0"
+        if self.solver.get("budget_ms"):
+            found["solver.budget_ms"] = LONG
         return found
 
 

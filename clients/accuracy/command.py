@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import json
-import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 from clients.accuracy.page import render
 from clients.accuracy.picture import draw
-from clients.accuracy.points import Points, short_words, to_csv, to_dict
+from clients.accuracy.points import Point, Points, short_words, to_csv, to_dict
+from clients.accuracy.sources import said_length
 from clients.accuracy.study import NO_TIME, Study
 from clients.errors import BadInput, ClientError
 from clients.log.atomic_file import atomic_file
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from rich.console import Group
 
 DEVICES = ("auto", "cpu", "gpu")
+AXIS, SETTINGS = 14, 25  # characters of axis and settings of a point on a terminal, before they are folded
 MOST_MINUTES = 10_000.0
 
 
@@ -35,16 +36,11 @@ def accuracy(scene: Path, out: Path | None, minutes: float, duration: float, dev
         raise BadInput(f"--device {device}: allowed are {', '.join(DEVICES)}")
     folder = Path(f"accuracy-{scene.stem}") if out is None else out
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise BadInput(f"--out {folder}: cannot be made: {error.strerror}") from None
-    if not os.access(folder, os.W_OK | os.X_OK):
-        raise BadInput(f"--out {folder}: cannot be written to")
-    try:
         with titled_progress_bar(60 * minutes) as progress:
-            found = Study(scene, folder, duration, device, progress).run(minutes)
+            found = Study(scene, folder, duration if minutes else None, device, progress).run(minutes)
     except KeyboardInterrupt:
-        print(f"sim-client: points measured so far are in {folder}; the same command goes on", file=sys.stderr)
+        if (folder / "points.json").exists():
+            print(f"sim-client: points measured so far are in {folder}; the same command goes on", file=sys.stderr)
         raise
     missing = write(found, folder)
     for line in missing:
@@ -84,12 +80,15 @@ def report(found: Points, folder: Path) -> Group:
 
     from clients.watch import COMPACT
 
-    table = Table("axis", "settings", "error [m]", "s / s", "p99 [ms]", "iter.", "status", **COMPACT)
+    table = Table("axis", "settings", "error [m]", "s / s", "p99 [ms]", "iter.", **{**COMPACT, "padding": (0, 1, 0, 0)})
+    table.columns[0].max_width, table.columns[1].overflow = AXIS, "fold"
+    table.columns[1].min_width = min(SETTINGS, max((len(line) for p in found.points for line in _lines(p)), default=0))
     for p in found.points:
-        numbers = (p.error, p.seconds, (p.step_ms or {}).get("p99"), p.iterations)
-        status = p.status if p.status == "done" else f"{p.status}: {p.reason}"
-        table.add_row(Text(p.axis), Text(short_words(p.settings)), *(_cell(value) for value in numbers), Text(status))
-    known = ", ".join(f"{name} {value:.2g} m" for name, value in found.sources.items() if value is not None)
+        numbers = (_cell(p.error, 2), _cell(p.seconds, 2), _cell((p.step_ms or {}).get("p99")), _cell(p.iterations))
+        table.add_row(Text(p.axis), Text("\n".join(_lines(p))), *numbers)
+    known = ", ".join(
+        f"{name} {said_length(found, name, value)}" for name, value in found.sources.items() if value is not None
+    )
     uncertainty = found.reference.get("uncertainty")
     lines = [
         f"{found.duration:g} s simulated on {found.device}; s / s: wall time of the steps of a simulated second; "
@@ -100,6 +99,12 @@ def report(found: Points, folder: Path) -> Group:
         f"written to {folder}",
     ]
     return Group(table, Text("\n".join(lines)))
+
+
+def _lines(point: Point) -> list[str]:
+    """Returns a line for each setting, and one for what went wrong."""
+    lines = short_words(point.settings, "\n").splitlines()
+    return lines if point.status == "done" else [*lines, f"({point.status}: {point.reason})"]
 
 
 def _left_out(found: Points) -> list[str]:
@@ -116,5 +121,5 @@ def _left_out(found: Points) -> list[str]:
     return lines
 
 
-def _cell(value: Any) -> str:
-    return "-" if value is None else f"{value:.3g}"
+def _cell(value: Any, digits: int = 3) -> str:
+    return "-" if value is None else f"{value:.{digits}g}"

@@ -3,9 +3,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+import re
+from dataclasses import dataclass, replace
 
 from clients.accuracy.points import SCENE, Point, Points, set_words
+from clients.accuracy.sources import MESH
 
 TITLES = ("one setting at a time", "pairs, and how equations are solved")
 SINGLE = (SCENE, "tolerance", "linearizations", "time step", "scheme", "position", "mesh", "model")
@@ -30,6 +33,7 @@ class Curve:
     diagram: int
     points: list[Point]
     joined: bool
+    label: str
 
 
 def curves(found: Points) -> list[Curve]:
@@ -41,9 +45,19 @@ def curves(found: Points) -> list[Curve]:
         if key := JOINED.get(axis):
             points += scene if key in found.own else []
             points.sort(key=lambda p: _number({**found.own, **p.settings}.get(key, "")))
+        joined, label = axis in JOINED, axis
+        if axis == MESH and scene and scene[0].mesh_error is not None and points:
+            points.sort(key=_cells)
+            points.insert(1, replace(scene[0], error=scene[0].mesh_error, against=points[0].against))
+            joined, label = True, "mesh, from the extrapolated reference"
         if points:
-            result.append(Curve(axis, int(axis not in SINGLE), points, axis in JOINED))
+            result.append(Curve(axis, int(axis not in SINGLE), points, joined, label))
     return result
+
+
+def _cells(point: Point) -> int:
+    """Returns a number that grows with the cells of the bars of a point of the axis mesh."""
+    return math.prod(int(number) for value in point.settings.values() for number in re.findall(r"\d+", value))
 
 
 def _number(value: str) -> float:

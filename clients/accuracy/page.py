@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import html
+import math
 from typing import Any
 
 from clients.accuracy.curves import ERROR, SINGLE, TIME, TITLES, at_the_edge, curves, words
@@ -69,19 +70,23 @@ def _points(figure: Any, go: Any, found: Points) -> None:
         points, is_scene = curve.points, curve.axis == SCENE
         for column in (1, 2) if is_scene else (curve.diagram + 1,):
             trace = go.Scatter(
-                x=[p.error for p in points], y=[p.seconds for p in points], name=curve.axis, legendgroup=curve.axis,
+                x=[p.error for p in points], y=[p.seconds for p in points], name=curve.label, legendgroup=curve.axis,
                 mode="lines+markers" if curve.joined else "markers", showlegend=column == 1 or not is_scene,
                 marker={"symbol": "star", "size": 16, "color": "black"} if is_scene else {"size": 9}, **_said(points),
             )  # fmt: skip
             figure.add_trace(trace, row=1, col=column)
+    shown: set[str] = set()
     for point, error, seconds in at_the_edge(found):
         trace = go.Scatter(
-            x=[error], y=[seconds], mode="markers", name=f"{point.status}: {point.axis}", showlegend=False,
+            x=[error], y=[seconds], mode="markers", name=point.status, legendgroup=point.status,
+            showlegend=point.status not in shown,
             marker={"symbol": SYMBOLS[point.status], "size": 11, "color": "crimson"}, **_said([point]),
         )  # fmt: skip
         figure.add_trace(trace, row=1, col=1 + (point.axis not in SINGLE))
+        shown.add(point.status)
     if uncertainty := found.reference.get("uncertainty"):
-        figure.add_vline(x=uncertainty, line_dash="dot", line_color="gray", annotation_text="reference", row=1)  # type: ignore[arg-type]
+        label = {"text": "reference", "x": math.log10(uncertainty)}  # plotly takes the place of a text as a logarithm
+        figure.add_vline(x=uncertainty, line_dash="dot", line_color="gray", annotation=label, row=1)  # type: ignore[arg-type]
 
 
 def _said(points: list[Point]) -> dict[str, Any]:
@@ -102,7 +107,8 @@ def _page(found: Points, plots: str, bars: str) -> str:
 
 
 def _how(found: Points) -> str:
-    machine = ", ".join(value for key, value in found.machine.items() if key != "system")
+    shown = (f"{value} cores" if key == "cores" else value for key, value in found.machine.items() if key != "system")
+    machine = ", ".join(shown)
     reference = set_words(found.reference.get("settings", {}))
     uncertainty = found.reference.get("uncertainty") or 0.0
     return (

@@ -9,6 +9,7 @@ from typing import Any
 
 from clients.accuracy.curves import ERROR, SINGLE, TIME, TITLES, at_the_edge, curves
 from clients.accuracy.points import SCENE, Points
+from clients.accuracy.sources import said_length
 from clients.errors import ClientError
 from protocol.process.extras import to_install
 
@@ -44,7 +45,7 @@ def _points(plot: Any, found: Points, number: int) -> None:
             plot.plot(scene.error, scene.seconds, "k*", markersize=14, zorder=5, label="the scene")
         elif curve.diagram == number:
             where = [p.error for p in curve.points], [p.seconds for p in curve.points]
-            plot.plot(*where, "o-" if curve.joined else "o", markersize=5, linewidth=1, label=curve.axis)
+            plot.plot(*where, "o-" if curve.joined else "o", markersize=5, linewidth=1, label=curve.label)
     labels: set[str] = set()
     for point, error, seconds in at_the_edge(found):
         if int(point.axis not in SINGLE) == number:
@@ -67,5 +68,5 @@ def _sources(plot: Any, found: Points) -> None:
     if known:
         plot.set_xscale("log")
         plot.set_xlim(min(known.values()) / 10, max(known.values()) * 10)
-    for row, value in enumerate(known.values()):
-        plot.text(value, row, f" {value:.2g} m", va="center", fontsize="small")
+    for row, (name, value) in enumerate(known.items()):
+        plot.text(value, row, f" {said_length(found, name, value)}", va="center", fontsize="small")

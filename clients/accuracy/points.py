@@ -12,8 +12,10 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
+from clients.accuracy.checks import any_value, by_name, check, each, number, one_of, optional, text, whole, with_keys
 from clients.errors import BadInput
 from clients.log.atomic_file import atomic_file
+from protocol.printable import printable
 
 VERSION = 1
 STATUSES = ("done", "diverged", "failed", "timed out")
@@ -40,6 +42,7 @@ class Point:
     unconverged: int = 0  # solves that did not reach their tolerance
     limit: float | None = None  # of one that timed out: wall time that its process had [s]
     against: str = "reference"  # what `error` is measured from; on the axis mesh its extrapolation
+    mesh_error: float | None = None  # of the scene: its distance from what the axis mesh is measured from [m]
 
 
 @dataclass
@@ -58,6 +61,7 @@ class Points:
     points: list[Point] = field(default_factory=list)
     left_out: list[dict[str, Any]] = field(default_factory=list)  # axis, settings, reason
     sources: dict[str, float | None] = field(default_factory=dict)  # m
+    at_least: list[str] = field(default_factory=list)  # sources whose errors may be larger than said
     sentence: str = ""
     version: int = VERSION
 
@@ -75,14 +79,32 @@ class Points:
         return next((left["reason"] for left in self.left_out if left["settings"] == settings), None)
 
 
+POINT = {  # checks of what a file has for the fields of a Point, and below for those of Points
+    "axis": text, "settings": by_name(text), "status": one_of(*STATUSES), "reason": text, "error": optional(number),
+    "rms": optional(number), "errors": by_name(optional(number)), "seconds": optional(number), "rounds": each(number),
+    "step_ms": optional(by_name(number)), "iterations": optional(number), "unconverged": whole,
+    "limit": optional(number), "against": text, "mesh_error": optional(number),
+}  # fmt: skip
+POINTS = {
+    "points": each(by_name(any_value)), "scene": text, "digest": text, "duration": number, "interval": number,
+    "own": by_name(text), "device": text, "machine": by_name(text),
+    "reference": with_keys(settings=by_name(text), uncertainty=optional(number)),
+    "objects": by_name(with_keys(size=number)),
+    "left_out": each(with_keys(axis=text, settings=by_name(text), reason=text)),
+    "sources": by_name(optional(number)), "at_least": each(text), "sentence": text,
+}  # fmt: skip
+
+
 def set_words(settings: Settings) -> str:
     """Returns the words for the command line of sim-server that repeat a point."""
     return shlex.join(word for key, value in settings.items() for word in ("--set", f"{key}={value}"))
 
 
-def short_words(settings: Settings) -> str:
-    """Returns the settings with the last part of each key, to read only."""
-    return " ".join(f"{key.split('.')[-1]}={value}" for key, value in settings.items()) or "as the scene is"
+def short_words(settings: Settings, between: str = " ") -> str:
+    """Returns the settings with the last part of each key, or more where that is the same of several, to read only."""
+    last = [key.split(".")[-1] for key in settings]
+    short = {key: name if last.count(name) == 1 else key for key, name in zip(settings, last, strict=True)}
+    return between.join(f"{short[key]}={value}" for key, value in settings.items()) or "as the scene is"
 
 
 def to_dict(found: Points) -> dict[str, Any]:
@@ -102,15 +124,18 @@ def load(path: Path) -> Points:
     """Reads points.json. Raises BadInput if it is none or of another version."""
     try:
         table = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise BadInput(f"{path}: cannot be read: {error}") from None
     if not isinstance(table, dict) or table.get("version") != VERSION:
         raise BadInput(f"{path}: no points of version {VERSION}")
     try:
+        check(table, POINTS, "points")
+        for count, point in enumerate(table["points"], 1):
+            check(point, POINT, f"point {count}")
         table["points"] = [_of(Point, point) for point in table["points"]]
         return _of(Points, table)
-    except (KeyError, TypeError, AttributeError) as error:
-        raise BadInput(f"{path}: points that cannot be read: {error}") from None
+    except (KeyError, TypeError, AttributeError, OverflowError) as error:
+        raise BadInput(f"{path}: points that cannot be read: {printable(str(error))}") from None
 
 
 def to_csv(found: Points) -> str:

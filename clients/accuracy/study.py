@@ -5,11 +5,13 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 import platform
 import shutil
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +21,17 @@ from clients.accuracy.axes import COARSEST, Candidate, SceneValues, candidates, 
 from clients.accuracy.errors import add_round, measure, point_of
 from clients.accuracy.points import SCENE, Point, Points, Settings, load, save, short_words
 from clients.accuracy.runs import LOG_FOLDER, Run, Task, run_point
-from clients.accuracy.sources import MESH, MODEL, errors_by_source, mesh_error, sentence
+from clients.accuracy.sources import (
+    LINEAR,
+    LINEARIZATION,
+    MESH,
+    MODEL,
+    TIME,
+    errors_by_source,
+    is_rough,
+    mesh_error,
+    sentence,
+)
 from clients.accuracy.trajectories import Trajectory, distance, extrapolate, load_trajectory, save_trajectory
 from clients.errors import BadInput, ClientError
 
@@ -29,6 +41,7 @@ PARTS = (4, 8, 16, 32, 64)  # of dt: time steps of references; two of them at le
 REFERENCE_SHARE = 0.35  # of the time given, that references may take
 LONGEST_SHARE = 0.25  # of the time given, that one point may take before it counts as timed out
 FINE_ENOUGH = 1e-6  # uncertainty of the reference over the size of the objects, below which no finer one is made
+FINER = 2.2  # times the wall time of a reference that the next finer one takes
 SHORTEST_LIMIT = 30.0  # s; a point counts as timed out no sooner, and is tried again when there is more time
 START_TIMEOUT = 120.0  # s for the first start, which compiles
 NO_TIME = "no time"
@@ -37,24 +50,43 @@ ONE_BY_ONE = ("scheme", "model", "preconditioner")  # axes whose settings are re
 Progress = Callable[[float, str], None]  # seconds gone, and what runs
 
 
+@dataclass(frozen=True)
+class Reference:
+    """A run to compare with. wall: time of its process [s]; unconverged: its solves that were not exact."""
+
+    settings: Settings
+    trajectory: Trajectory
+    wall: float
+    unconverged: int = 0
+
+
 class Study:
     """Measures a scene and keeps what it finds in a folder: points.json, and runs/*.npz to compare with.
 
-    Raises BadInput for a scene that the server refuses, or a folder with points of another scene.
+    Raises BadInput for a scene that the server refuses, a folder that cannot be written to or with points of another
+    scene.
     """
 
-    def __init__(self, scene: Path, folder: Path, duration: float, device: str, progress: Progress):
+    def __init__(self, scene: Path, folder: Path, duration: float | None, device: str, progress: Progress):
+        """Reads the scene. duration: simulated in each run [s]; None, to look only: that of the points in the folder"""
         self.folder, self._progress, self._began = folder, progress, time.monotonic()
         for log in folder.glob(f"{LOG_FOLDER}*"):  # of a run that was killed
             shutil.rmtree(log, ignore_errors=True)
         self._what = "the scene is read"
         self._scene_run: Run | None = None
-        probed, _ = probe(scene, device, self._tick)
+        path = folder / "points.json"
+        old = _to_look_at(scene, path) if duration is None else None
+        probed, _ = probe(scene, old.device if old is not None and device == "auto" else device, self._tick)
         self.values = SceneValues(probed.scene, probed.device)
-        self.task = task_of(scene, self.values.dt, duration, device)
-        fresh = _fresh(scene, self.task, probed)
-        self.found = resumed(folder / "points.json", fresh)
+        if duration is None:
+            assert old is not None
+            self.task = Task(scene, self.values.dt, old.duration, old.interval, device)
+        else:
+            self.task = task_of(scene, self.values.dt, duration, device)
+        self.found = resumed(path, _fresh(scene, self.task, probed))
         self._start = probed.wall  # s that a process takes beside its steps
+        self._began = time.monotonic()  # what the first start compiles takes none of the time given
+        _make(folder)
 
     def run(self, minutes: float) -> Points:
         """Measures for so many minutes, or until all is measured; 0: only what is there is looked at."""
@@ -109,40 +141,91 @@ class Study:
     # -- the reference --
 
     def _reference(self) -> None:
-        """Makes references with ever smaller time steps; the finest is kept, and its distance from the one before."""
-        if (kept := self._kept("reference")) is not None and self.found.reference["uncertainty"] is not None:
-            self.reference = kept
-            return
+        """Makes references with ever smaller time steps; the finest is kept, and its distance from the one before.
+
+        One that is there is made finer where it is too rough for what the errors tell, and there is time.
+        """
         until = time.monotonic() + REFERENCE_SHARE * 60 * self._minutes
+        kept, about = self._kept("reference"), self.found.reference
+        if kept is not None and about["uncertainty"] is not None:
+            self.reference = kept
+            if is_rough(self.found):
+                self._refine(Reference(about["settings"], kept, about.get("wall", math.inf)), until)
+            return
         said: list[str] = []
+        doubtful: list[list[Reference]] = []
         for choice in range(len(self.values.references(1))):
-            made = self._references(choice, until, said)
-            if len(made) > 1:
+            if doubtful and time.monotonic() > until:
                 break
-        else:
+            made = self._references(choice, until, said, bool(doubtful))
+            if len(made) > 1 and not _unconverged(made):
+                return
+            doubtful += [made] if len(made) > 1 else []
+        if not doubtful:
             why = "; ".join(dict.fromkeys(said)) or "there was no time"
             raise ClientError(f"no two references could be made ({why}); more --minutes or less --duration may help")
-        (previous, before, _), (settings, finest, _) = made[-2:]
-        self.reference = finest
-        uncertainty = distance(finest, before).error
-        self.found.reference = {"settings": settings, "uncertainty": uncertainty, "compared_with": previous}
-        save_trajectory(finest, self._file("reference"))
+        self._take(*min(doubtful, key=_unconverged)[-2:])
+
+    def _references(self, choice: int, until: float, said: list[str], spare: bool) -> list[Reference]:
+        """Makes references of one choice of settings, each of which is kept once it is exact, as is the one before.
+
+        spare: there are others to be taken, so that also the first two have to end at `until`
+        """
+        made: list[Reference] = []
+        for parts in PARTS:
+            enough = len(made) > 1
+            if enough:
+                apart = distance(made[-1].trajectory, made[-2].trajectory).error
+                if not self._is_time_for_finer(made[-1], until) or apart < FINE_ENOUGH * self.found.size:
+                    break
+            limit = until - time.monotonic() if enough or spare else self._left()
+            found = self._make_reference(parts, choice, limit, said)
+            if found is None or (enough and found.unconverged):
+                break
+            made.append(found)
+            if len(made) > 1 and not _unconverged(made):
+                self._take(*made[-2:])
+        return made
+
+    def _make_reference(self, parts: int, choice: int, limit: float, said: list[str]) -> Reference | None:
+        """Runs a reference; None if that failed. said: takes the reason."""
+        settings = self.values.references(parts)[choice]
+        run = self._run(f"reference with dt / {parts}", settings, limit)
+        if run.status != "done" or run.trajectory is None:
+            said.append(f"dt / {parts}: {run.reason or run.status}")
+            return None
+        return Reference(settings, run.trajectory, run.wall, run.unconverged)
+
+    def _is_time_for_finer(self, last: Reference, until: float) -> bool:
+        return time.monotonic() + FINER * last.wall <= until
+
+    def _take(self, before: Reference, finest: Reference) -> None:
+        """Keeps a reference, and how far it is from the one before."""
+        self.reference = finest.trajectory
+        self.found.reference = {
+            "settings": finest.settings, "uncertainty": distance(finest.trajectory, before.trajectory).error,
+            "compared_with": before.settings, "wall": finest.wall, "unconverged": _unconverged([before, finest]),
+        }  # fmt: skip
+        save_trajectory(finest.trajectory, self._file("reference"))
         self._keep()
 
-    def _references(self, choice: int, until: float, said: list[str]) -> list[tuple[Settings, Trajectory, float]]:
-        made: list[tuple[Settings, Trajectory, float]] = []
-        for parts in PARTS:
-            settings = self.values.references(parts)[choice]
-            if made and len(made) > 1:
-                apart = distance(made[-1][1], made[-2][1]).error
-                if time.monotonic() + 2.2 * made[-1][2] > until or apart < FINE_ENOUGH * self.found.size:
-                    break
-            run = self._run(f"reference with dt / {parts}", settings, self._left())
-            if run.status != "done" or run.trajectory is None:
-                said.append(f"dt / {parts}: {run.reason or run.status}")
-                break
-            made.append((settings, run.trajectory, run.wall))
-        return made
+    def _refine(self, last: Reference, until: float) -> None:
+        """Makes finer references while there is time for them, and for all points once more: these are removed."""
+        found = self.found
+        seconds = [p.seconds for p in found.points if p.seconds is not None]
+        again = sum(self._start + each * self.task.duration for each in seconds)
+        while self._is_time_for_finer(last, min(until, self._deadline - again)) and is_rough(found):
+            parts = round(self.values.dt / float(last.settings["dt"]))
+            choices = self.values.references(parts)
+            finer = next((each for each in PARTS if each > parts), None)
+            if finer is None or last.settings not in choices:
+                return
+            made = self._make_reference(finer, choices.index(last.settings), until - time.monotonic(), [])
+            if made is None or made.unconverged:
+                return
+            found.points = []
+            self._take(last, made)
+            last = made
 
     # -- points --
 
@@ -202,8 +285,11 @@ class Study:
         scene, coarse, fine = (self._kept(name) for name in ("scene", "coarse", "fine"))
         if scene is None or (found := mesh_error(coarse, scene, fine)) is None:
             return
-        power = 2 ** found[1]
-        if fine is not None:
+        against, power = "reference extrapolated to a mesh of size zero", 2 ** (found[1] or 0.0)
+        if found[1] is None:
+            assert fine is not None
+            goal, against = extrapolate(self.reference, scene, fine, 1.0), "reference extrapolated to the finer mesh"
+        elif fine is not None:
             goal = extrapolate(self.reference, scene, fine, power / (power - 1))
         else:
             assert coarse is not None
@@ -212,7 +298,9 @@ class Study:
             point = self.found.point(mesh_settings(self.values, name == "fine"))
             if point is not None and trajectory is not None:
                 measure(point, trajectory, goal, self._sizes())
-                point.against = "reference extrapolated to a mesh of size zero"
+                point.against = against
+        if (own := self.found.point({})) is not None:
+            own.mesh_error = distance(scene, goal).error
 
     def _more_rounds(self) -> None:
         """Repeats points for the median of their times, those with the fewest rounds first, while there is time."""
@@ -231,17 +319,25 @@ class Study:
     # -- what follows from them --
 
     def _sources(self) -> None:
-        names = ("scene", "exact_solves", "exact_steps", "reference")
-        kept = {name: self._kept(name) for name in (*names, "coarse", "fine", "model")}
-        own = self.found.point({})
-        scene = kept["scene"] = kept["scene"] if own is not None and own.status == "done" else None
-        sources = errors_by_source(*(kept[name] for name in names))
-        if scene is not None and (mesh := mesh_error(kept["coarse"], scene, kept["fine"])) is not None:
+        own, values = self.found.point({}), self.values
+        scene = self._kept("scene") if own is not None and own.status == "done" else None
+        chain = {LINEAR: "exact_solves", LINEARIZATION: "exact_steps", TIME: "reference"}
+        if not values.exact_solves():
+            del chain[LINEAR]
+        if not values.exact_steps():
+            del chain[LINEARIZATION]
+        sources, rest = errors_by_source(scene, {name: self._kept(role) for name, role in chain.items()})
+        missing = [name for name in chain if sources[name] is None]
+        mesh = None if scene is None else mesh_error(self._kept("coarse"), scene, self._kept("fine"))
+        if mesh is not None:
             sources[MESH] = mesh[0]
-        if scene is not None and kept["model"] is not None:
-            sources[MODEL] = distance(scene, kept["model"]).error
+        elif mesh_settings(values, fine=True):
+            missing.append(MESH)
+        if scene is not None and (model := self._kept("model")) is not None:
+            sources[MODEL] = distance(scene, model).error
         self.found.sources = sources
-        self.found.sentence = sentence(self.found)
+        self.found.at_least = [MESH] if mesh is not None and mesh[1] is None else []
+        self.found.sentence = sentence(self.found, missing, rest)
         asked = [left for left in self.found.left_out if left["settings"]]
         without = [{"axis": axis, "settings": {}, "reason": reason} for axis, reason in left_out(self.values)]
         self.found.left_out = asked + without
@@ -256,10 +352,15 @@ class Study:
         return load_trajectory(self._file(role))
 
 
+def check_scene(scene: Path) -> None:
+    """Raises BadInput if there is no such file."""
+    if not scene.is_file():
+        raise BadInput(f"{scene}: is a folder, allowed is a scene" if scene.is_dir() else f"{scene}: no such file")
+
+
 def probe(scene: Path, device: str, tick: Callable[[], None] = lambda: None) -> tuple[Run, str]:
     """Runs one step of a scene; returns the run and the digest of its points. Raises BadInput, ClientError."""
-    if not scene.is_file():
-        raise BadInput(f"{scene}: no such file")
+    check_scene(scene)
     run = run_point(Task(scene, 1.0, 1.0, 1.0, device), {}, timeout=START_TIMEOUT, tick=tick)
     if run.status == "refused":
         raise BadInput(run.reason)
@@ -302,6 +403,29 @@ def resumed(path: Path, fresh: Points) -> Points:
         )
     old.scene, old.objects = fresh.scene, fresh.objects
     return old
+
+
+def _unconverged(made: list[Reference]) -> int:
+    """Returns the number of solves of the last two that did not reach their tolerance."""
+    return sum(each.unconverged for each in made[-2:])
+
+
+def _to_look_at(scene: Path, path: Path) -> Points:
+    """Reads points that are to be drawn only. Raises BadInput if there are none."""
+    check_scene(scene)
+    if not path.exists():
+        raise BadInput(f"{path}: no such file, so there is nothing to draw; --minutes above 0 measures")
+    return load(path)
+
+
+def _make(folder: Path) -> None:
+    """Makes the folder for the results. Raises BadInput."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise BadInput(f"{folder}: cannot be made: {error.strerror}") from None
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise BadInput(f"{folder}: cannot be written to")
 
 
 def _fresh(scene: Path, task: Task, probed: Run) -> Points:

@@ -7,6 +7,7 @@ import math
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
+from clients.accuracy.sources import MESH, length
 from clients.accuracy.study import NO_TIME, machine
 from clients.plan.front import Budget, Choice, Exactness, Wish, bound
 from clients.plan.measurements import Measurement, Measurements
@@ -48,9 +49,10 @@ class Answer:
         told = [self._margin(), *self._reference()]
         if points.found.machine.get("processor", here := machine("")["processor"]) != here:
             told.append(f"measured on another machine ({points.found.machine['processor']}): times differ on this one")
-        mesh = points.found.sources.get("mesh")
+        mesh = points.found.sources.get(MESH)
         if mesh is not None and mesh > point.error:
-            told.append(f"the mesh is off by about {mesh:.2g} m, which these settings do not change")
+            about = "at least" if MESH in points.found.at_least else "about"
+            told.append(f"the mesh is off by {about} {length(mesh)}, which these settings do not change")
         if point.slowest > 1 >= point.seconds:
             told.append(f"one round took {point.slowest:.3g} s a simulated second: real time is not certain")
         if point.unconverged:

@@ -9,6 +9,7 @@ from itertools import combinations
 from clients.plan.front import Choice, Wish
 from clients.plan.measurements import Measurement, Measurements
 
+OF_SOLVES = ("solver.", "accuracy.", "integrator.linearizations")  # keys that change nothing where none are solved
 WORTH = 0.9  # of the error or cost of the scene's own settings: below, others alone are of use
 
 
@@ -26,7 +27,7 @@ def untried(points: Measurements, wish: Wish, choice: Choice) -> list[dict[str, 
     useful = [p for p in points.usable if p.error < WORTH * own.error or wish.cost(p) < WORTH * wish.cost(own)]
     for a, b in combinations(useful, 2):
         settings = {**a.settings, **b.settings}
-        if _overlap(a.settings, b.settings) or settings in tried:
+        if settings in tried or _overlap(a.settings, b.settings) or _is_idle(a.settings, b.settings):
             continue
         guess = _product(own, a, b, settings)
         better = wish.cost(guess) < wish.cost(choice.point) if wish.cheapest else guess.error < choice.point.error
@@ -39,6 +40,15 @@ def untried(points: Measurements, wish: Wish, choice: Choice) -> list[dict[str, 
 def _overlap(a: dict[str, str], b: dict[str, str]) -> bool:
     """True if a key of one is one of the other, or the table that it is in."""
     return any(f"{x}.".startswith(f"{y}.") or f"{y}.".startswith(f"{x}.") for x in a for y in b)
+
+
+def _is_idle(a: dict[str, str], b: dict[str, str]) -> bool:
+    """True if one of both sets a scheme that solves no equations, and the other one only how they are solved."""
+    return any(
+        any(key.startswith("integrator") and "central_difference" in value for key, value in x.items())
+        and all(key.startswith(OF_SOLVES) for key in y)
+        for x, y in ((a, b), (b, a))
+    )
 
 
 def _product(own: Measurement, a: Measurement, b: Measurement, settings: dict[str, str]) -> Measurement:

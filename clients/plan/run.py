@@ -11,7 +11,7 @@ from pathlib import Path
 from clients.accuracy.axes import SceneValues
 from clients.accuracy.command import MOST_MINUTES, write
 from clients.accuracy.runs import Run
-from clients.accuracy.study import Study, probe
+from clients.accuracy.study import Study, check_scene, probe
 from clients.errors import BadInput
 from clients.plan import overlay
 from clients.plan.answer import Answer, words
@@ -35,8 +35,7 @@ def plan(scene: Path, wish: Wish, where: Path | None, to: Path | None, minutes: 
     """
     if not 0 <= minutes <= MOST_MINUTES:
         raise BadInput(f"--measure {minutes:g}: allowed is 0 (nothing is measured) to {MOST_MINUTES:g} minutes")
-    if not scene.is_file():
-        raise BadInput(f"{scene}: no such file")
+    check_scene(scene)
     to = to or scene.with_suffix(".plan.toml")
     overlay.check_path(to)
     where = where or Path(f"accuracy-{scene.stem}")
@@ -50,7 +49,8 @@ def plan(scene: Path, wish: Wish, where: Path | None, to: Path | None, minutes: 
         print(json.dumps(found.as_json() | written, allow_nan=False))
     else:
         show(found)
-        print(f"wrote {to}:\n  {use}" if found.choice.reached else "nothing is written")
+        nothing = f"nothing is written; {to} is of an earlier choice" if to.exists() else "nothing is written"
+        print(f"wrote {to}:\n  {use}" if found.choice.reached else nothing)
     return found.choice.reached
 
 
@@ -88,10 +88,6 @@ def measured(scene: Path, wish: Wish, path: Path, minutes: float) -> tuple[Answe
     began = time.monotonic()
     with titled_progress_bar(60 * minutes) as progress:
         if not path.exists():
-            try:
-                path.parent.mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                raise BadInput(f"--points {path.parent}: cannot be made: {error.strerror}") from None
             write(Study(scene, path.parent, DURATION, "auto", progress).run(SHARE * minutes), path.parent)
         points, probed = checked(scene, path)
         while found := chosen(wish, points).untried:

@@ -40,7 +40,7 @@ def readable(
     lines = []
     for e in error.errors(include_url=False):
         path = [part for part in e["loc"] if not str(part).startswith("<")]
-        lines.append(f"scene {file}{_with_overlays(path, overlays or {})}, {_line(e, path, table)}")
+        lines.append(f"scene {file}{_with_overlays(path, overlays or {})}{_line(e, path, table)}")
     return InputError("\n".join(lines))
 
 
@@ -51,6 +51,7 @@ def _with_overlays(path: list[str | int], overlays: Mapping[tuple[str | int, ...
 
 
 def _line(error: Any, path: list[str | int], table: dict[str, Any]) -> str:
+    """Returns place, value and message; the message alone where it is about several places, which it names."""
     key = ".".join(part for part in path if isinstance(part, str))
     message = deleted.advice(key, error["input"]) or _message(error)
     if path == ["object"] and error["type"] == "missing":
@@ -61,7 +62,7 @@ def _line(error: Any, path: list[str | int], table: dict[str, Any]) -> str:
     whole = len(path) == 1 and path[0] in NAMED
     if error["type"] != "missing" and not isinstance(error["input"], dict) and path[:1] and not whole:
         place += f" = {as_toml(error['input'])}"
-    return f"{place}: {message}"
+    return f", {place}: {message}" if place else f": {message}"
 
 
 def _message(error: Any) -> str:

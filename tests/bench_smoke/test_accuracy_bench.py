@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from clients.accuracy.trajectories import shared_nodes
 from tests.bench.accuracy import axes, page, short, sources
 from tests.bench.accuracy.cases import BANDS, BEAM, CASES, EXPLICIT, FLOOR, RUBBER, SMALL, accepts, damped_by, usual
 from tests.bench.accuracy.effectivity import judged
-from tests.bench.accuracy.motion import Motion, common, distances, error, extrapolated, move, rms
+from tests.bench.accuracy.motion import Motion, distances, error, extrapolated, move, rms
 from tests.bench.accuracy.peers import MODULES, US, missing, ways
 from tests.bench.accuracy.units import KEYS, units
 from tests.bench.harness.pieces import Merged, Piece, Row
@@ -54,7 +55,7 @@ def test_motions_are_compared_at_the_times_and_nodes_that_both_have() -> None:
     fine, coarse = moved(0.01, [1.0, 2.0, 3.0, 4.0]), moved(0.02, [2.5, 4.5])
     assert distances(fine, coarse).ravel() == pytest.approx([0.5, 0.5]) and error(fine, coarse) == pytest.approx(0.5)
     more = moved(0.02, [2.0, 5.0], [(9.0, 0, 0), (0.0, 0, 0)])
-    first, second = common(coarse.rest, more.rest)
+    first, second = shared_nodes(coarse.rest, more.rest)
     assert (first.tolist(), second.tolist()) == ([0], [1])
     assert error(coarse, more) == pytest.approx(0.5) and rms(coarse, more) == pytest.approx(0.5)
     assert error(moved(0.02, [1.0], status="diverged"), coarse) is None

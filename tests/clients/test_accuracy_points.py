@@ -6,6 +6,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import re
 import sys
 import tomllib
 from pathlib import Path
@@ -21,7 +22,7 @@ from clients.accuracy.curves import at_the_edge, curves
 from clients.accuracy.errors import add_round, order_of_convergence, point_of
 from clients.accuracy.points import Point, Points, Settings, load, save, set_words, to_csv, to_dict
 from clients.accuracy.runs import Run, Task, command, read_run
-from clients.accuracy.sources import best, mesh_error, sentence
+from clients.accuracy.sources import best, errors_by_source, mesh_error, sentence
 from clients.accuracy.study import Study, task_of
 from clients.accuracy.trajectories import Trajectory, distance, extrapolate, load_trajectory, save_trajectory
 from clients.errors import BadInput, ClientError
@@ -123,6 +124,8 @@ def test_richardson_finds_order_and_error_of_a_mesh() -> None:
     assert mesh_error(None, meshes[1], meshes[0.5]) == (pytest.approx(0.1), 2.0)
     assert mesh_error(meshes[2], meshes[1], None) == (pytest.approx(0.1), 2.0)
     assert mesh_error(None, meshes[1], None) is None
+    grows = mesh_error(trajectory(0.95, cells=2), meshes[1], meshes[0.5])
+    assert grows == (pytest.approx(0.075), None), "at least the change to the finer mesh"
     assert order_of_convergence(0.4, 0.1) == 2 and order_of_convergence(0.1, 0.4) is None
 
 
@@ -157,10 +160,8 @@ def scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return path
 
 
-def study_of(scene: Path, minutes: float = 60, duration: float = 1.0, device: str = "auto") -> Points:
-    folder = scene.parent / "out"
-    folder.mkdir(exist_ok=True)
-    return Study(scene, folder, duration, device, lambda done, what: None).run(minutes)
+def study_of(scene: Path, minutes: float = 60, duration: float = 1.0, out: Path | None = None) -> Points:
+    return Study(scene, out or scene.parent / "out", duration, "auto", lambda done, what: None).run(minutes)
 
 
 def test_a_study_finds_each_source_of_a_known_error(scene: Path) -> None:
@@ -171,7 +172,7 @@ def test_a_study_finds_each_source_of_a_known_error(scene: Path) -> None:
     assert found.sources["mesh"] == pytest.approx(OF_MESH * 0.25, rel=1e-6)
     assert found.sources["model"] == pytest.approx(0.01, rel=1e-6)
     assert found.sentence.startswith(
-        "The error of the mesh dominates with 0.13 m (linear solve 1e-08 m, linearization 0.001 m"
+        "The error of the mesh dominates with 125 mm (linear solve 10 nm, linearization 1 mm"
     )
     assert 0 < found.reference["uncertainty"] < 1e-5
     own = found.point({})
@@ -182,6 +183,130 @@ def test_a_study_finds_each_source_of_a_known_error(scene: Path) -> None:
     assert fine.error == pytest.approx(OF_MESH / 16 + OF_TIME * 0.02 + ONE_LINEARIZATION, rel=1e-2)
     second = found.point({"integrator.scheme": "bdf2"})
     assert second is not None and second.error == pytest.approx(OF_TIME * 4e-4 + ONE_LINEARIZATION, rel=1e-2)
+
+
+def test_sources_beyond_a_missing_run_are_told_together() -> None:
+    runs = {"linear solve": trajectory(1.3), "linearization": trajectory(1.2), "time step": trajectory(1.0)}
+    found, rest = errors_by_source(trajectory(1.6), runs)
+    assert list(found.values()) == [pytest.approx(0.3), pytest.approx(0.1), pytest.approx(0.2), None, None]
+    assert rest is None
+    found, rest = errors_by_source(trajectory(1.6), {**runs, "linearization": None})
+    assert found["linear solve"] == pytest.approx(0.3) and rest == pytest.approx(0.3)
+    assert found["linearization"] is None is found["time step"], "not all of it is due to the time step"
+    assert errors_by_source(None, runs)[1] is None is errors_by_source(trajectory(1), {"time step": None})[1]
+    told = sample()
+    told.sources = dict.fromkeys(told.sources) | {"linear solve": 1e-6}
+    assert sentence(told, ["linearization", "time step", "mesh"], 0.1).startswith(
+        "The errors of linearization and time step together are the largest measured, with 100 mm "
+        "(linear solve 1 um, mesh not measured); "
+    )
+    told.sources["mesh"], told.at_least = 0.4, ["mesh"]
+    assert sentence(told).startswith("The error of the mesh dominates with at least 400 mm (linear solve 1 um): ")
+
+
+def test_a_scene_without_a_point_beside_it_blames_no_source(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(study, "candidates", lambda values, size: [])
+    found = study_of(scene)
+    assert set(found.sources.values()) == {None}
+    assert found.sentence == (
+        "The errors of linear solve and linearization and time step together are the largest measured, with 81 mm "
+        "(mesh not measured)."
+    )
+
+
+def test_budgets_of_wall_time_end_no_exact_run() -> None:
+    hurried = values(solver={"budget_ms": 1.0})
+    for settings in (hurried.exact_solves(), hurried.exact_steps(), *hurried.references(4)):
+        assert float(settings["solver.budget_ms"]) == 1e9 and "solver.budget" not in settings
+    assert "solver.budget_ms" not in values().exact_steps()
+
+
+def references_of(monkeypatch: pytest.MonkeyPatch, wall: float = 1.0, doubtful: str = "nothing") -> list[float]:
+    """Makes references take `wall` seconds, or the time that they may; returns a list that takes the latter.
+
+    doubtful: in the settings of runs whose solves do not converge
+    """
+    now, limits = [0.0], []
+    monkeypatch.setattr(study.time, "monotonic", lambda: now[0])
+
+    def run_point(task: Task, settings: Settings, workers: int = 0, limit: float = 99.0, *_: object, **__: Any) -> Run:
+        run = made_up(task, settings)
+        if "solver.max_iterations" in settings and "dt" in settings:
+            limits.append(limit)
+            run.wall = min(wall, limit)
+            run.unconverged = 3 * (doubtful in str(settings))
+            if limit < wall:
+                run.status, run.trajectory = "timed out", None
+        now[0] += run.wall
+        return run
+
+    monkeypatch.setattr(study, "run_point", run_point)
+    return limits
+
+
+def test_a_reference_that_is_not_solved_is_no_reference(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    references_of(monkeypatch, doubtful="'integrator.linearizations': '20'")
+    found = study_of(scene)
+    assert found.reference["settings"]["integrator.linearizations"] == "1" and found.reference["unconverged"] == 0
+    assert "did not reach" not in found.sentence
+
+
+def test_where_no_reference_is_solved_it_is_told(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    references_of(monkeypatch, doubtful="max_iterations")
+    found = study_of(scene)
+    assert found.reference["settings"]["dt"] == "0.0025" and found.reference["unconverged"] == 6
+    assert found.sentence.endswith("; 6 solves of the reference did not reach their tolerance.")
+
+
+def test_finer_references_end_when_their_time_is_over(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    limits = references_of(monkeypatch, wall=40.0)
+    study_of(scene, 10)
+    assert limits[:2] == [600, 560] and limits[2] == 0.35 * 600 - 80 and len(limits) == 4, "until 35 % are gone"
+    assert sum(limit < 560 for limit in limits) == 2, "there is no time for a fifth one"
+
+
+def test_references_are_kept_as_they_come(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    limits = references_of(monkeypatch)
+    run_point = study.run_point
+
+    def cut(task: Task, settings: Settings, *arguments: Any, **more: Any) -> Run:
+        if settings.get("dt") == "0.00125":
+            raise KeyboardInterrupt
+        return run_point(task, settings, *arguments, **more)
+
+    monkeypatch.setattr(study, "run_point", cut)
+    with pytest.raises(KeyboardInterrupt):
+        study_of(scene)
+    assert load(scene.parent / "out" / "points.json").reference["settings"]["dt"] == "0.0025" and len(limits) == 2
+    study_of(scene)
+    assert len(limits) == 2
+
+
+def test_a_rough_reference_is_made_finer_when_there_is_time(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    limits = references_of(monkeypatch)
+    monkeypatch.setattr(study, "PARTS", (4, 8))
+    study_of(scene)
+    path = scene.parent / "out" / "points.json"
+    rough = load(path)
+    rough.reference["uncertainty"] = 1.0
+    monkeypatch.setattr(study, "PARTS", (4, 8, 16))
+    save(rough, path)
+    short = study_of(scene, 0.1)
+    assert short.reference == rough.reference and len(limits) == 2, "no time for it"
+    fine = study_of(scene)
+    assert len(limits) == 3 and fine.reference["settings"]["dt"] == "0.00125" and "rough" not in fine.sentence
+    assert len(fine.points) == len(rough.points) and fine.reference["uncertainty"] < 1e-3
+    own, before = fine.point({}), rough.point({})
+    assert own is not None and before is not None and own.error != before.error, "points are measured again"
+
+
+def test_the_scene_is_on_the_line_of_its_meshes(scene: Path) -> None:
+    found = study_of(scene)
+    line = next(curve for curve in curves(found) if curve.axis == "mesh")
+    assert line.joined and line.label == "mesh, from the extrapolated reference"
+    assert [p.settings.get("object.bar.mesh.bar") for p in line.points] == ["[1, 1, 2]", None, "[4, 4, 8]"]
+    assert line.points[1].error == pytest.approx(OF_MESH / 4 + OF_TIME * 0.02 + ONE_LINEARIZATION, rel=1e-2)
+    assert line.points[1].against == line.points[0].against != "reference"
 
 
 def test_failures_are_points_and_refusals_are_not(scene: Path) -> None:
@@ -252,6 +377,50 @@ def test_a_short_time_leaves_the_rest_for_the_next_call(scene: Path, monkeypatch
     again = study_of(scene, 30)
     assert not [left for left in again.left_out if left["reason"] == study.NO_TIME]
     assert len(again.points) > len(found.points)
+
+
+def test_points_are_drawn_as_they_were_measured(scene: Path) -> None:
+    def drawn() -> Points:
+        return Study(scene, scene.parent / "out", None, "auto", lambda done, what: None).run(0)
+
+    with pytest.raises(BadInput, match=r"points\.json: no such file, so there is nothing to draw"):
+        drawn()
+    found = study_of(scene, duration=2.0)
+    again = drawn()
+    assert again.duration == found.duration and again.interval == found.interval and again.points == found.points
+    assert (again.sources, again.sentence) == (found.sources, found.sentence)
+
+
+def test_bad_input_leaves_no_folder(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = scene.parent / "new"
+    with pytest.raises(BadInput, match="is a folder, allowed is a scene"):
+        accuracy(scene.parent, out, 1.0, 1.0, "cpu", False)
+    with pytest.raises(BadInput, match="4 time steps of the scene"):
+        accuracy(scene, out, 1.0, 0.01, "cpu", False)
+    with pytest.raises(BadInput, match="nothing to draw"):
+        accuracy(scene, out, 0.0, 1.0, "cpu", False)
+    monkeypatch.setattr(study, "run_point", lambda *a, **k: Run("refused", "dt = -1"))
+    with pytest.raises(BadInput, match="dt = -1"):
+        accuracy(scene, out, 1.0, 1.0, "cpu", False)
+    assert not out.exists()
+    with pytest.raises(BadInput, match="cannot be made"):
+        monkeypatch.undo()
+        monkeypatch.setattr(study, "run_point", lambda task, settings, *a, **k: made_up(task, settings))
+        study_of(scene, out=scene / "out")
+
+
+def test_what_the_first_start_compiles_takes_none_of_the_time(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    now, compiled = [0.0], []
+    monkeypatch.setattr(study.time, "monotonic", lambda: now[0])
+
+    def run_point(task: Task, settings: Settings, *_: object, **__: object) -> Run:
+        now[0] += 0.1 if compiled else 100.0
+        compiled.append(True)
+        return made_up(task, settings)
+
+    monkeypatch.setattr(study, "run_point", run_point)
+    found = study_of(scene, 1)
+    assert len(found.points) > 20 and study.NO_TIME not in {left["reason"] for left in found.left_out}
 
 
 def test_points_of_something_else_are_refused(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -396,8 +565,9 @@ def sample() -> Points:
         Point("age", {"dt": "2"}, "failed", "killed", float("nan")),
     ]
     found = Points(
-        "<i>.toml", "ab", 1.0, 0.1, {"dt": "0.02"}, "cpu", {"processor": "p"}, {"settings": {}, "uncertainty": 1e-4}
-    )
+        "<i>.toml", "ab", 1.0, 0.1, {"dt": "0.02"}, "cpu", {"processor": "p", "cores": "2"},
+        {"settings": {}, "uncertainty": 1e-4},
+    )  # fmt: skip
     found.objects = {"<b>": {"size": 1.0, "nodes": 3, "elements": 1}, "c": {"size": 1.0, "nodes": 3, "elements": 1}}
     found.points = points
     found.left_out = [{"axis": "position", "settings": {"accuracy.position": "1"}, "reason": "unknown <key>"}]
@@ -408,19 +578,25 @@ def sample() -> Points:
 
 def test_the_sentence_names_the_first_change_and_what_is_cheaper() -> None:
     assert sample().sentence == (
-        "The error of the time step dominates with 0.1 m (linear solve 1e-06 m): take a smaller time step or a scheme "
-        "of second order (dt, integrator.scheme), for example --set dt=0.01, which is 0.04 m off instead of 0.1 m and "
+        "The error of the time step dominates with 100 mm (linear solve 1 um): take a smaller time step or a scheme "
+        "of second order (dt, integrator.scheme), for example --set dt=0.01, which is 40 mm off instead of 100 mm and "
         "takes 2 times the time; --set solver.tolerance=1e-2 is as exact as the scene and takes 0.25 times the time; "
-        "another law of the material moves it by 0.3 m, more than any of these: be sure of the law."
+        "another law of the material moves it by 300 mm, more than any of these: be sure of the law."
     )
     rough = sample()
     rough.reference["uncertainty"] = 0.09
-    assert sentence(rough).endswith("; the reference itself is uncertain by 0.09 m, so all this is rough.")
+    assert sentence(rough).endswith("; the reference itself is uncertain by 90 mm, so all this is rough.")
     failed = sample()
     failed.points[0].status, failed.points[0].reason = "diverged", "bar: runaway"
     assert sentence(failed) == "The scene's own settings do not work (bar: runaway): change them first."
     assert sentence(Points("a")) == "No error could be told by its source."
     assert best(sample().points, sample().points[0], ("scheme",), 1.0) is None
+    exact = Point("scheme", {"integrator.scheme": "ros2"}, "done", "", 1e-3, 1e-3, {}, 0.52, [0.52])
+    points = [*sample().points, exact]
+    assert best(points, points[0], ("scheme", "tolerance"), 1.0) is exact, "4 % dearer and far more exact"
+    coarse = sample()
+    coarse.points = [coarse.points[0], Point("time step", {"dt": "0.04"}, "done", "", 0.1, 0.1, {}, 0.5, [0.5])]
+    assert "dt=0.04" not in sentence(coarse), "not in one breath with a smaller time step"
 
 
 def test_points_json_keeps_the_contract(tmp_path: Path) -> None:
@@ -441,6 +617,20 @@ def test_points_json_keeps_the_contract(tmp_path: Path) -> None:
     for text in ("{", "[]", '{"version": 2}', '{"version": 1}', '{"version": 1, "points": [1], "scene": "a"}'):
         (tmp_path / "points.json").write_text(text)
         with pytest.raises(BadInput, match=r"points\.json: "):
+            load(tmp_path / "points.json")
+    wrong_points = [
+        ("status", "weird"), ("settings", None), ("settings", {"dt": 1}), ("error", "x"), ("error", True),
+        ("step_ms", 3), ("step_ms", {"p99": None}), ("rounds", None), ("unconverged", 1.5), ("seconds", 10**400),
+    ]  # fmt: skip
+    wrong = [
+        ("reference", None), ("reference", {}), ("left_out", [1]), ("left_out", [{"axis": "a"}]), ("machine", None),
+        ("objects", {"bar": 1}), ("sources", {"mesh": "x"}), ("duration", "1"), ("points", {}),
+    ]  # fmt: skip
+    tables = [(f"point 1: {key} = ", {**table, "points": [{**table["points"][0], key: v}]}) for key, v in wrong_points]
+    tables += [(f"points: {key} = ", {**table, key: value}) for key, value in wrong]
+    for said, changed in tables:
+        (tmp_path / "points.json").write_text(json.dumps(changed))
+        with pytest.raises(BadInput, match=rf"points\.json: points that cannot be read: ({said}|int too large)"):
             load(tmp_path / "points.json")
 
 
@@ -470,6 +660,8 @@ def test_the_page_opens_alone_and_escapes_what_it_shows(tmp_path: Path) -> None:
     assert "<script>alert(1)" not in text and "unknown &lt;key&gt;" in text and "<title>&lt;i&gt;.toml" in text
     assert 'data-words="--set dt=0.01"' in text and "Plotly.newPlot" in text
     assert render(Points("a")).endswith("</html>\n")
+    assert '"text":"reference","x":-4.0' in text and text.count('"name":"timed out","showlegend":true') == 1
+    assert "(p, 2 cores)" in text
 
 
 def test_without_plotly_the_rest_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -484,7 +676,13 @@ def test_without_plotly_the_rest_is_written(tmp_path: Path, monkeypatch: pytest.
 def test_the_report_fits_a_terminal(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     from rich.console import Console
 
-    Console(width=80).print(report(sample(), tmp_path))
+    found = sample()
+    exact = {"solver.tolerance": "1e-9", "integrator.linearizations": "20", "integrator.tolerance": "1e-9"}
+    times = {"p50": 1.0, "p99": 0.0634, "max": 3.0}
+    found.points.append(Point("linearizations and", exact, "done", "", 8.87e-4, 0.1, {}, 8.87e-4, [3.0], times, 0.0271))
+    Console(width=80).print(report(found, tmp_path))
     said = capsys.readouterr().out
+    assert "…" not in said and "..." not in said
+    assert re.search(r"linearizations *solver.tolerance=1e-9 *0.00089 *0.00089 *0.0634 *0.0271\b", said), said
     assert "diverged" in said and "dt=0.01" in said and "left out: position (position=1): unknown <key>" in said
     assert max(map(len, said.splitlines())) <= 80

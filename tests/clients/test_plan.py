@@ -7,6 +7,7 @@ import json
 import subprocess
 import sys
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +43,7 @@ mesh = { bar = [3, 1, 1], size = [3, 1, 1] }
 corotational = { young = 1e5, poisson = 0.3 }
 fixed = { where = "X < 0.01" }
 """
+EXPLICIT = "central_difference"
 RESOLVED = {"dt": 0.02, "integrator": {"scheme": "backward_euler"}, "solver": {"preconditioner": "auto"}}
 
 
@@ -156,7 +158,7 @@ def test_an_answer_tells_what_was_measured(tmp_path: Path) -> None:
     assert not told["more_exact"]["fits"] and told["uncertainty"] == 1e-5
     assert "p99 1.2 of 2 ms (40 % left), 0.24 of 1 s a simulated second (76 % left)" in told["notes"]
     assert any(note.startswith("measurements left out: 1 diverged, 1 of another body") for note in told["notes"])
-    assert "the mesh is off by about 0.04 m, which these settings do not change" in told["notes"]
+    assert "the mesh is off by about 40 mm, which these settings do not change" in told["notes"]
     assert "settings that had no time to be measured: 1; sim-client accuracy goes on with them" in told["notes"]
     json.dumps(told, allow_nan=False)
 
@@ -171,6 +173,9 @@ def test_an_unreachable_wish_names_the_nearest_point_and_writes_nothing(tmp_path
     assert done.exit_code == 1 and done.stdout.endswith("nothing is written\n")
     assert json.loads(CliRunner().invoke(app, [*words, "--json"]).stdout)["reached"] is False
     assert not (tmp_path / "beam.plan.toml").exists()
+    (tmp_path / "beam.plan.toml").write_text(f"# {overlay.MARK}\n")
+    said = "".join(CliRunner().invoke(app, words).stdout.split())
+    assert said.endswith(f"nothingiswritten;{tmp_path}/beam.plan.tomlisofanearlierchoice")
     found = chosen(tmp_path, Exactness(1.05e-4))  # measured 1e-4, but the reference is not that certain
     assert not found.choice.reached and any("a finer one could confirm it" in note for note in found.notes())
 
@@ -194,6 +199,17 @@ def test_a_table_and_what_is_in_it_are_not_combined() -> None:
     wish = Exactness(1e-2)
     found = untried(points, wish, choose(points.usable, Exactness(1e-9), 0.0))
     assert found == [{"integrator": "1", "dt": "1"}, {"integrator.linearizations": "1", "dt": "1"}]
+
+
+def test_what_explicit_steps_do_not_have_is_not_combined_with_them() -> None:
+    own, explicit = made("own", 1e-1, 1, 1), replace(made("a", 1e-2, 1, 1), settings={"integrator.scheme": EXPLICIT})
+    others = [made(key, 2e-2, 1, 1) for key in ("solver.tolerance", "accuracy.position", "integrator.linearizations")]
+    points = Measurements(Points("x"), [own, explicit, *others, made("dt", 1e-2, 1, 1)], Counter(), None)
+    wish = Exactness(1e-2)
+    found = untried(points, wish, choose(points.usable, Exactness(1e-9), 0.0))
+    assert [settings for settings in found if EXPLICIT in settings.values()] == [
+        {"integrator.scheme": EXPLICIT, "dt": "1"}
+    ]
 
 
 @pytest.mark.usefixtures("resolved")
@@ -230,7 +246,9 @@ def test_combinations_are_measured_and_kept(tmp_path: Path, monkeypatch: pytest.
         ({"version": 2}, "no points of version 1"),
         ({"points": [row({"dt": "0.1\n#"}, 1.0, 1.0, 1.0)]}, "points that cannot be read.*setting dt"),
         ({"points": [row({"a b": "1"}, 1.0, 1.0, 1.0)]}, "points that cannot be read.*setting a b"),
-        ({"points": [row({}, float("nan"), 1.0, 1.0)]}, "no finite number"),
+        ({"points": [row({}, float("nan"), 1.0, 1.0)]}, "points that cannot be read: point 1: error = nan is"),
+        ({"points": [row({}, -1.0, 1.0, 1.0)]}, "no finite number of at least 0"),
+        ({"left_out": [1]}, "points that cannot be read"),
         ({"points": 3}, "points that cannot be read"),
         ({"reference": 3}, "points that cannot be read"),
     ],

@@ -47,6 +47,11 @@ def test_the_unchanged_scene_is_good(tmp_path):
     assert load(path).objects[0].name == "beam"
 
 
+def test_what_is_wrong_with_several_keys_names_them_and_no_place(tmp_path):
+    said = message(tmp_path, swap("tolerance = 1e-6", "budget = 1\nbudget_ms = 2"))
+    assert said == "scene beam.toml: solver.budget_ms = 2 with budget = 1; allowed: one of both"
+
+
 @pytest.mark.parametrize(
     ("text", "owner", "key", "value", "allowed"),
     [

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clients.accuracy.trajectories import shared_nodes
 from protocol import messages_pb2 as pb
 from sim_server.errors import InputError
 from sim_server.simulation import Simulation
@@ -84,18 +85,10 @@ def distances(a: Motion, b: Motion) -> Reals:
     interval = max(a.interval, b.interval)
     first, second = (m.frames[round(interval / m.interval) - 1 :: round(interval / m.interval)] for m in (a, b))
     if a.rest.shape != b.rest.shape:
-        first_nodes, second_nodes = common(a.rest, b.rest)
+        first_nodes, second_nodes = shared_nodes(a.rest, b.rest)
         first, second = first[:, first_nodes], second[:, second_nodes]
     number = min(len(first), len(second))
     return np.asarray(np.linalg.norm(first[:number] - second[:number], axis=2))
-
-
-def common(a: Reals, b: Reals) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Numbers of the nodes at the same places in two meshes."""
-    of_b = {tuple(x): k for k, x in enumerate(np.round(b, 9).tolist())}
-    pairs = [(k, of_b[tuple(x)]) for k, x in enumerate(np.round(a, 9).tolist()) if tuple(x) in of_b]
-    first, second = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
-    return first, second
 
 
 def error(a: Motion, b: Motion) -> float | None:

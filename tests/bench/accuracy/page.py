@@ -2,15 +2,16 @@
 """The page of bench accuracy: a section for each part that there are rows of."""
 
 import csv
-import shlex
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
+from clients.accuracy.points import set_words
+from clients.accuracy.sources import length
 from tests.bench.accuracy import peers, picture, words
 from tests.bench.accuracy.axes import ERROR_OF, EXPLICIT_NAME, SCHEME, STEPS, order_of
 from tests.bench.accuracy.cases import CASES
 from tests.bench.accuracy.short import Tables, position_sentence, sentences
-from tests.bench.accuracy.sources import length, orders, sentence
+from tests.bench.accuracy.sources import orders, sentence
 from tests.bench.harness.pieces import Row
 from tests.bench.harness.report import Report
 
@@ -223,6 +224,5 @@ def _write_csv(path: Path, tables: Tables) -> None:
         writer = csv.writer(out, lineterminator="\n")
         writer.writerow([*names, "p50 ms", "p99 ms", "max ms", "settings"])
         for row in (*tables.get("points", []), *tables.get("peers", [])):
-            times, settings = row.get("step_ms", {}), row["settings"].items()
-            said = shlex.join(word for key, value in settings for word in ("--set", f"{key}={value}"))
+            times, said = row.get("step_ms", {}), set_words(row["settings"])
             writer.writerow([row.get(name) for name in names] + [times.get(q) for q in ("p50", "p99", "max")] + [said])

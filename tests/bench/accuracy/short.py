@@ -3,10 +3,11 @@
 
 from collections.abc import Iterable, Sequence
 
+from clients.accuracy.sources import length
 from tests.bench.accuracy.axes import EXPLICIT_NAME, SCHEME, STEPS
 from tests.bench.accuracy.cases import RUBBER
 from tests.bench.accuracy.peers import US
-from tests.bench.accuracy.sources import length, sentence
+from tests.bench.accuracy.sources import sentence
 from tests.bench.harness.pieces import Row
 
 BOUNDS = (1e-2, 1e-3)  # errors over L

@@ -9,11 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from clients.accuracy.sources import LINEAR, LINEARIZATION, MESH, MODEL, length
+from clients.accuracy.sources import TIME as STEP
+from clients.accuracy.trajectories import shared_nodes
 from tests.bench.accuracy.cases import Case, Settings, usual
-from tests.bench.accuracy.motion import Motion, common, error, exact_solve, exact_step, move, reference, rms
+from tests.bench.accuracy.motion import Motion, error, exact_solve, exact_step, move, reference, rms
 
 Row = dict[str, Any]
-LINEAR, LINEARIZATION, STEP, MESH, MODEL = "linear solve", "linearization", "time step", "mesh", "model"
 COMPARED = {
     LINEAR: "as the scene is, and with linear solves to 1e-12",
     LINEARIZATION: "one linearization, and the step's equation solved to rounding",
@@ -65,14 +67,6 @@ def sentence(scene: str, found: Mapping[str, float | None]) -> str:
     return said
 
 
-def length(metres: float) -> str:
-    """In words: 48 mm, 3.2 um."""
-    units = (("m", 1.0), ("mm", 1e-3), ("um", 1e-6), ("nm", 1e-9))
-    unit, size = next((u for u in units if metres >= u[1]), units[-1])
-    value = metres / size
-    return f"{value:.2g} {unit}" if value < 99.5 else f"{value:.0f} {unit}"
-
-
 # --- orders -----------------------------------------------------------------------------------------------------------
 
 
@@ -121,5 +115,5 @@ def of_meshes(case: Case, cells: Sequence[int] = CELLS) -> list[Row]:
 
 def _at(motion: Motion, nodes: Motion) -> Motion:
     """The same at the nodes of a coarser mesh alone."""
-    kept, _ = common(motion.rest, nodes.rest)
+    kept, _ = shared_nodes(motion.rest, nodes.rest)
     return replace(motion, frames=motion.frames[:, kept], rest=motion.rest[kept])
