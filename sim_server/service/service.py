@@ -76,8 +76,8 @@ class Service:
     def run(self) -> None:
         """Blocks until the run is over; a KeyboardInterrupt ends the loop first and is then raised."""
         loop = threading.Thread(target=self._loop, name="loop")
-        loop.start()
         try:
+            loop.start()  # inside: a signal may come before it returns, when the thread runs already
             while loop.is_alive() and not self.commands.stopping:
                 self.round()
                 time.sleep(ROUND_PERIOD)

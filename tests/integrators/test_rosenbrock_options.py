@@ -39,7 +39,7 @@ def test_mistakes_are_told(tmp_path, table):
     path.write_text(SCENE + table)
     with pytest.raises(InputError) as error:
         load(path)
-    assert str(error.value).startswith("scene bad.toml, ") and BAD[table] in str(error.value)
+    assert str(error.value).startswith("scene bad.toml") and BAD[table] in str(error.value)
 
 
 ALONE = {

@@ -42,7 +42,7 @@ BAD = {
 def test_mistakes_are_told(tmp_path, table):
     path = tmp_path / "bad.toml"
     path.write_text(SCENE.format(table))
-    with pytest.raises(InputError, match=r"scene bad.toml, .*" + BAD[table].replace("(", r"\(")):
+    with pytest.raises(InputError, match=r"scene bad.toml[,:] .*" + BAD[table].replace("(", r"\(")):
         load(path)
 
 

@@ -227,7 +227,7 @@ REFUSED = [
 @pytest.mark.parametrize(("text", "said"), REFUSED)
 def test_what_cannot_be_is_refused_with_its_place(tmp_path, text, said):
     found = message(tmp_path, text)
-    assert found.startswith("scene scene.toml, ")
+    assert found.startswith("scene scene.toml")
     assert "\n" not in found
     for words in said:
         assert words in found
