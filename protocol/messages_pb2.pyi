@@ -546,34 +546,90 @@ class FactorUse(_message.Message):
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., pattern: _Optional[int] = ..., checksum: _Optional[int] = ..., dtype: _Optional[str] = ..., worker: _Optional[str] = ..., library: _Optional[str] = ..., threads: _Optional[int] = ..., seconds: _Optional[float] = ..., remedy: _Optional[str] = ..., method: _Optional[str] = ..., ahead: _Optional[float] = ..., later: _Optional[bool] = ...) -> None: ...
 
 class Command(_message.Message):
-    __slots__ = ("header", "client", "verb", "interaction", "secret", "target")
+    __slots__ = ("header", "client", "verb", "interaction", "secret", "target", "parameters", "object", "steps", "worker")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     CLIENT_FIELD_NUMBER: _ClassVar[int]
     VERB_FIELD_NUMBER: _ClassVar[int]
     INTERACTION_FIELD_NUMBER: _ClassVar[int]
     SECRET_FIELD_NUMBER: _ClassVar[int]
     TARGET_FIELD_NUMBER: _ClassVar[int]
+    PARAMETERS_FIELD_NUMBER: _ClassVar[int]
+    OBJECT_FIELD_NUMBER: _ClassVar[int]
+    STEPS_FIELD_NUMBER: _ClassVar[int]
+    WORKER_FIELD_NUMBER: _ClassVar[int]
     header: Header
     client: str
     verb: str
     interaction: Interaction
     secret: bytes
     target: ObstacleTarget
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., client: _Optional[str] = ..., verb: _Optional[str] = ..., interaction: _Optional[_Union[Interaction, _Mapping]] = ..., secret: _Optional[bytes] = ..., target: _Optional[_Union[ObstacleTarget, _Mapping]] = ...) -> None: ...
+    parameters: _containers.RepeatedCompositeFieldContainer[Parameter]
+    object: str
+    steps: int
+    worker: str
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., client: _Optional[str] = ..., verb: _Optional[str] = ..., interaction: _Optional[_Union[Interaction, _Mapping]] = ..., secret: _Optional[bytes] = ..., target: _Optional[_Union[ObstacleTarget, _Mapping]] = ..., parameters: _Optional[_Iterable[_Union[Parameter, _Mapping]]] = ..., object: _Optional[str] = ..., steps: _Optional[int] = ..., worker: _Optional[str] = ...) -> None: ...
 
 class Reply(_message.Message):
-    __slots__ = ("header", "error", "interaction", "status", "unchanged")
+    __slots__ = ("header", "error", "interaction", "status", "unchanged", "parameters", "worker")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     ERROR_FIELD_NUMBER: _ClassVar[int]
     INTERACTION_FIELD_NUMBER: _ClassVar[int]
     STATUS_FIELD_NUMBER: _ClassVar[int]
     UNCHANGED_FIELD_NUMBER: _ClassVar[int]
+    PARAMETERS_FIELD_NUMBER: _ClassVar[int]
+    WORKER_FIELD_NUMBER: _ClassVar[int]
     header: Header
     error: str
     interaction: Interaction
     status: Status
     unchanged: bool
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., error: _Optional[str] = ..., interaction: _Optional[_Union[Interaction, _Mapping]] = ..., status: _Optional[_Union[Status, _Mapping]] = ..., unchanged: _Optional[bool] = ...) -> None: ...
+    parameters: _containers.RepeatedCompositeFieldContainer[LiveParameter]
+    worker: str
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., error: _Optional[str] = ..., interaction: _Optional[_Union[Interaction, _Mapping]] = ..., status: _Optional[_Union[Status, _Mapping]] = ..., unchanged: _Optional[bool] = ..., parameters: _Optional[_Iterable[_Union[LiveParameter, _Mapping]]] = ..., worker: _Optional[str] = ...) -> None: ...
+
+class Parameter(_message.Message):
+    __slots__ = ("key", "value")
+    KEY_FIELD_NUMBER: _ClassVar[int]
+    VALUE_FIELD_NUMBER: _ClassVar[int]
+    key: str
+    value: str
+    def __init__(self, key: _Optional[str] = ..., value: _Optional[str] = ...) -> None: ...
+
+class LiveParameter(_message.Message):
+    __slots__ = ("now", "unit", "low", "high", "logarithmic", "about")
+    NOW_FIELD_NUMBER: _ClassVar[int]
+    UNIT_FIELD_NUMBER: _ClassVar[int]
+    LOW_FIELD_NUMBER: _ClassVar[int]
+    HIGH_FIELD_NUMBER: _ClassVar[int]
+    LOGARITHMIC_FIELD_NUMBER: _ClassVar[int]
+    ABOUT_FIELD_NUMBER: _ClassVar[int]
+    now: Parameter
+    unit: str
+    low: float
+    high: float
+    logarithmic: bool
+    about: str
+    def __init__(self, now: _Optional[_Union[Parameter, _Mapping]] = ..., unit: _Optional[str] = ..., low: _Optional[float] = ..., high: _Optional[float] = ..., logarithmic: _Optional[bool] = ..., about: _Optional[str] = ...) -> None: ...
+
+class ParameterSet(_message.Message):
+    __slots__ = ("header", "step", "parameters", "client")
+    HEADER_FIELD_NUMBER: _ClassVar[int]
+    STEP_FIELD_NUMBER: _ClassVar[int]
+    PARAMETERS_FIELD_NUMBER: _ClassVar[int]
+    CLIENT_FIELD_NUMBER: _ClassVar[int]
+    header: Header
+    step: int
+    parameters: _containers.RepeatedCompositeFieldContainer[Parameter]
+    client: str
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., parameters: _Optional[_Iterable[_Union[Parameter, _Mapping]]] = ..., client: _Optional[str] = ...) -> None: ...
+
+class Reset(_message.Message):
+    __slots__ = ("header", "step")
+    HEADER_FIELD_NUMBER: _ClassVar[int]
+    STEP_FIELD_NUMBER: _ClassVar[int]
+    header: Header
+    step: int
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ...) -> None: ...
 
 class ObjectStatus(_message.Message):
     __slots__ = ("object", "nodes", "tets", "last", "mean_iterations", "excess", "factors_used", "factors_refused", "in_flight", "factor_age", "factor_age_max", "factor_age_bound", "factors_mended", "refusal", "low", "high", "tip", "runaway_steps", "total_energy", "clipped", "crowded")
