@@ -284,8 +284,8 @@ def test_batches_of_steps_are_the_same_steps(monkeypatch, trials, loops):
         Simulation(scene(MODELS["corotational"](), dt=0.04, gravity=GRAVITY, integrator=search, **TIGHT), "gpu")
         for _ in range(3)
     )
-    many = loops or 6 * (1 + trials) <= FEW
-    assert [[bool(graph) for graph in row] for row in one.engine.loop.graphs] == [[True, many]] * 2
+    batches = loops or 6 * (1 + trials) <= FEW
+    assert [[bool(graph) for graph in row] for row in one.engine.loop.graphs] == [[True, batches]] * 2
     for _ in range(20):
         one.engine.run(1)
     for sim in (many, again):
