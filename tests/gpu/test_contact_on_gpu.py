@@ -138,9 +138,9 @@ def test_other_precisions_come_near(precision):
 
 def test_points_are_held_back_where_passes_run_out():
     short = {"thickness": 0.002, "passes": 1}
-    (g, c), apart, _ = both(CASES["is hit from below"], 4, contact=short)
+    (g, c), apart, _ = both(CASES["is hit from below"], 3, contact=short)  # later ones use factors of other precisions
     assert g["clipped"].max() > 0 and (g["clipped"] == c["clipped"]).all() and OUT_OF_PASSES in g["status"]
-    assert apart[:3].max() < 1e-9 and apart.max() < 1e-3  # such steps are not solved, so that they differ more and more
+    assert apart.max() < 1e-9  # such steps are not solved: what is left of them depends on the preconditioner
 
 
 @pytest.mark.parametrize("name", ["corner", "ball", "rod"])
