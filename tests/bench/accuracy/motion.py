@@ -1,9 +1,14 @@
 # SPDX-License-Identifier: MIT
 """Runs of a standard scene: positions at the ends of its time steps, times, how far two of them are apart."""
 
+import fcntl
+import tempfile
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -62,22 +67,34 @@ def move(case: Case, settings: Settings, device: str = "cpu", limit: float = LIM
     interval = max(dt, case.dt)
     each = round(interval / dt)
     driver, records, frames, status, reason = Driver(sim), [], [], "done", ""
-    began = time.monotonic()
-    for number in range(int(case.seconds / interval + 1e-6)):
-        first = number == 0 and driver.wants_factors
-        if first:
-            records.append(driver.step_with_fresh_factors())
-        records.append(driver.advance(each - first))
-        frames.append(sim.fetch().x.copy())
-        if np.isin(records[-1]["status"], AWAY).any() or not np.isfinite(frames[-1]).all():
-            status, reason = "diverged", f"at {(number + 1) * interval:.3g} s"
-            break
-        if time.monotonic() - began > limit:
-            status, reason = "timed out", f"after {limit:g} s, at {(number + 1) * interval:.3g} s"
-            break
+    with _alone(device):
+        began = time.monotonic()
+        for number in range(int(case.seconds / interval + 1e-6)):
+            first = number == 0 and driver.wants_factors
+            if first:
+                records.append(driver.step_with_fresh_factors())
+            records.append(driver.advance(each - first))
+            frames.append(sim.fetch().x.copy())
+            if np.isin(records[-1]["status"], AWAY).any() or not np.isfinite(frames[-1]).all():
+                status, reason = "diverged", f"at {(number + 1) * interval:.3g} s"
+                break
+            if time.monotonic() - began > limit:
+                status, reason = "timed out", f"after {limit:g} s, at {(number + 1) * interval:.3g} s"
+                break
     w = sim.world
     return Motion(interval, np.array(frames), w.rest.copy(), len(w.bodies[0].mesh.tets), np.concatenate(records),
                   device, status, reason)  # fmt: skip
+
+
+@contextmanager
+def _alone(device: str) -> Iterator[None]:
+    """Waits until no other process makes steps on a GPU: parts of the benchmark may run side by side."""
+    if device == "cpu":
+        yield
+        return
+    with (Path(tempfile.gettempdir()) / "warpfactor-bench-accuracy.lock").open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
 
 
 def distances(a: Motion, b: Motion) -> Reals:
