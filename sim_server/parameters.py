@@ -8,24 +8,23 @@ steps, without Python: launches, their arguments, factors and histories stay as 
 is an older factor.
 """
 
+import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 from pydantic import ValidationError
 
-from protocol.toml_text import toml
-from sim_server.backends.base import ArrayChange, PendingUpdate
+from sim_server.backends.base import ArrayChange, Engine, PendingUpdate
+from sim_server.effects._base import Effect
 from sim_server.errors import InputError
+from sim_server.mechanics.world import World
 from sim_server.scene import Scene, overrides
 from sim_server.scene.live import LiveField, Place, live_fields
 from sim_server.scene.messages import NAMED, readable
 from sim_server.scene.parameters import nearest
-
-if TYPE_CHECKING:
-    from sim_server.simulation import Simulation
 
 MOST, LONGEST_KEY, LONGEST_VALUE = 256, 300, 8192  # parameters of a command; characters
 
@@ -40,6 +39,15 @@ REASONS = {  # why keys cannot change while steps run, by how they begin
     "solver": "solver, factors and workers are set up by it when the simulation is built",
 }
 OTHER_REASON = "it is read when the simulation is built"
+
+
+class Simulated(Protocol):
+    """A simulation, as far as its parameters change."""
+
+    scene: Scene
+    world: World
+    effects: dict[str, Effect]
+    engine: Engine
 
 
 class BadParameter(ValueError):
@@ -81,7 +89,7 @@ class LiveParameters:
         comes is part of that one.
     """
 
-    def __init__(self, simulation: "Simulation"):
+    def __init__(self, simulation: Simulated):
         self._simulation, self.scene = simulation, simulation.scene
         self.on_set: list[Callable[[ParameterUpdate], None]] = []
         self._start = {field.key: field.value for field in live_fields(self.scene)}
@@ -243,6 +251,15 @@ def _plain(value: Any) -> Any:
     if hasattr(value, "model_dump"):
         return value.model_dump(mode="json", by_alias=True, exclude_none=True)
     return [_plain(v) for v in value] if isinstance(value, (list, tuple)) else value
+
+
+def toml(value: Any) -> str:
+    """Returns a JSON value as TOML in one line, from which the same value is read."""
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{json.dumps(key)} = {toml(each)}" for key, each in value.items()) + " }"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(toml, value)) + "]"
+    return json.dumps(value) if isinstance(value, (str, bool)) else repr(value)
 
 
 def _at(table: Any, place: Sequence[str | int]) -> Any:
