@@ -153,8 +153,8 @@ def _check_distances(points: Float64, distance: Float64, most: float) -> None:
         place = ", ".join(f"{c:.4g}" for c in points[worst])
         raise InputError(
             f"a vertex at ({place}) m lies {distance[worst]:.3g} m or more outside the mesh ({far.size} such "
-            f"vertices); allowed: {most:.3g} m, {MOST_OUTSIDE:.0%} of its size. A skin has the unit and the place of the mesh "
-            "before the pose"
+            f"vertices); allowed: {most:.3g} m, {MOST_OUTSIDE:.0%} of its size. A skin has the unit and the place of "
+            "the mesh before the pose"
         )
 
 
