@@ -201,6 +201,14 @@ class Client:
         """Ends the server, which then closes its log; the status of the reply has the number of steps."""
         return self.command("stop")
 
+    def add_worker(self) -> str:
+        """Has the server start one more local worker; returns its name. Raises BadInput without `--workers`."""
+        return self.command("add_worker").worker
+
+    def kill_worker(self, name: str) -> None:
+        """Has the server kill a local worker by SIGKILL, which it then restarts. Raises BadInput."""
+        self.command("kill_worker", worker=name)
+
     def states(self, objects: Sequence[str] | None = None) -> States:
         """Subscribes to frames of the named objects (all by default); only the newest of each is kept."""
         return States(self._session.zenoh, self.name, list(objects or self.scene().objects))

@@ -88,6 +88,7 @@ def serve(
         with ExitStack() as closing:
             with nullcontext() if quiet else compile_notices(say):
                 service, supervisor = _set_up(closing, options)
+            service.say = say
             _announce(say, service, scene, listen)
             _wait_for_workers(service, supervisor)
             _describe_objects(say, service, listen)
@@ -182,7 +183,7 @@ def _set_up(closing: ExitStack, o: Options) -> "tuple[Service, Supervisor | None
         endpoint = on_this_machine((o.listen or [DEFAULT_ENDPOINT])[0])
         supervisor = Supervisor(o.workers, o.name, [endpoint], ["--device", o.worker_device])
         closing.callback(supervisor.close)
-        service.check_workers, link.local_workers = supervisor.check, supervisor.local_workers
+        service.supervise(supervisor)
     return service, supervisor
 
 
