@@ -90,7 +90,8 @@ def serve(
     no_shared_memory: Annotated[bool, typer.Option("--no-shared-memory", help="Send arrays as bytes")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing but errors")] = False,
     list_: Annotated[
-        bool, typer.Option("--list", callback=list_gallery, is_eager=True, help="Show the scenes that come along, and end")
+        bool,
+        typer.Option("--list", callback=list_gallery, is_eager=True, help="Show the scenes that come along"),
     ] = False,
     version: Annotated[bool, PROGRAM.version_option()] = False,
 ) -> None:

@@ -77,13 +77,15 @@ def paint(pieces: Sequence[Piece], camera: Camera, size: tuple[int, int], floor:
     image = Image.new("RGB", (width, height), SKY)
     if floor is not None:
         image.paste(_backdrop(camera, floor, width, height))
-        mask = Image.new("L", (width, height), 0)
+        mask = Image.new("L", size, 0)
         draw = ImageDraw.Draw(mask)
         for piece in pieces:
             fallen = piece.x - np.outer((piece.x[:, 1] - floor) / LIGHT[1], LIGHT)
-            for corners in camera.seen(fallen, width, height)[0][piece.triangles]:
-                draw.polygon(corners.ravel().tolist(), fill=150)
-        image.paste(SHADOW, mask=mask.filter(ImageFilter.GaussianBlur(height / 90)))
+            corners = camera.seen(fallen, *size)[0][piece.triangles]
+            for flat in corners[_turn(corners) < 0].reshape(-1, 6).tolist():  # those that face the light
+                draw.polygon(flat, fill=150, outline=150)
+        mask = mask.filter(ImageFilter.GaussianBlur(size[1] / 100)).resize((width, height))
+        image.paste(SHADOW, mask=mask)
     draw = ImageDraw.Draw(image)
     corners, colors = _in_order(pieces, camera, width, height)
     for flat, color in zip(corners.reshape(-1, 6).tolist(), colors.tolist(), strict=True):
@@ -97,13 +99,19 @@ def _in_order(pieces: Sequence[Piece], camera: Camera, width: int, height: int) 
     for piece in pieces:
         place, depth = camera.seen(piece.x, width, height)
         p = place[piece.triangles]
-        a, b = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
-        front = (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0] < 0) & (depth[piece.triangles] > 0).all(axis=1)
+        front = (_turn(p) < 0) & (depth[piece.triangles] > 0).all(axis=1)
         corners.append(p[front])
         depths.append(depth[piece.triangles].mean(axis=1)[front])
         colors.append(_lit(piece, camera)[front])
     order = np.argsort(-np.concatenate(depths))
     return np.concatenate(corners)[order], np.concatenate(colors)[order]
+
+
+def _turn(corners: NDArray) -> NDArray[np.float64]:
+    """Returns twice the signed areas of triangles (t, 3, 2) in a picture; negative: seen from outside."""
+    a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    area: NDArray[np.float64] = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    return area
 
 
 def _lit(piece: Piece, camera: Camera) -> NDArray[np.uint8]:

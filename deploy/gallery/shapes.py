@@ -73,9 +73,7 @@ def creature() -> Shape:
     head = union([ellipsoid((0, 0.345, 0.01), (0.056, 0.05, 0.052)),
                   cone((0, 0.335, 0.04), (0, 0.325, 0.085), 0.032, 0.024)], 0.03)  # fmt: skip
     horn = mirrored(chain([(0.03, 0.37, 0), (0.062, 0.4, -0.005), (0.074, 0.44, 0)], [0.024, 0.02, 0.013], 0.01))
-    arm = mirrored(
-        chain([(0.045, 0.265, 0), (0.13, 0.25, 0.005), (0.205, 0.275, 0.03)], [0.032, 0.027, 0.023], 0.015)
-    )
+    arm = mirrored(chain([(0.045, 0.265, 0), (0.13, 0.25, 0.005), (0.205, 0.275, 0.03)], [0.032, 0.027, 0.023], 0.015))
     hand = mirrored(ellipsoid((0.225, 0.283, 0.038), (0.032, 0.03, 0.03)))
     leg = mirrored(cone((0.045, 0.14, 0), (0.065, 0.03, 0), 0.043, 0.034))
     foot = mirrored(cone((0.066, 0.02, -0.01), (0.075, 0.016, 0.055), 0.036, 0.028))
@@ -87,8 +85,9 @@ def creature() -> Shape:
 
 def liver() -> Shape:
     """An organ of 0.24 m: a large right lobe at x < 0, a thin left one, a hollow below; four ligaments lead up."""
-    lobes = union([ellipsoid((-0.045, 0, 0), (0.085, 0.045, 0.07)), ellipsoid((0.06, 0.012, 0.01), (0.075, 0.026, 0.052)),
-                   ellipsoid((-0.075, -0.02, 0.005), (0.05, 0.045, 0.055))], 0.04)  # fmt: skip
+    right = ellipsoid((-0.045, 0, 0), (0.085, 0.045, 0.07))
+    left = ellipsoid((0.06, 0.012, 0.01), (0.075, 0.026, 0.052))
+    lobes = union([right, left, ellipsoid((-0.075, -0.02, 0.005), (0.05, 0.045, 0.055))], 0.04)
     hollow = ellipsoid((0.01, -0.055, 0.02), (0.03, 0.035, 0.05))
 
     def organ(x: Floats) -> Floats:

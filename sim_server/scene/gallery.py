@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Scenes that come with the package, by name: gallery/NAME. Each begins with a comment that says in a sentence what it is."""
+"""Scenes that come with the package: gallery/NAME. Each begins with a comment that says in a sentence what it is."""
 
 from pathlib import Path
 
