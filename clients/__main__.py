@@ -61,6 +61,11 @@ Json = Annotated[bool, typer.Option("--json", help="For programs.")]
 MOVES_PER_SECOND = 30
 
 
+class Change(StrEnum):
+    add = "add"
+    kill = "kill"
+
+
 class Color(StrEnum):
     displacement = "displacement"
     von_mises = "von_mises"
@@ -314,6 +319,32 @@ def stop(as_json: Json = False, connect: Connect = None, server: Server = SERVER
       sim-client stop
     """
     _command("stop", connect, server, as_json)
+
+
+@app.command()
+def worker(
+    change: Annotated[Change, typer.Argument(metavar="add|kill", help="What to do.")],
+    name: Annotated[str, typer.Argument(metavar="[NAME]", help="Of the local worker to kill.")] = "",
+    connect: Connect = None,
+    server: Server = SERVER_NAME,
+) -> None:
+    """Add or kill a local worker of a server with --workers; it starts a killed one again, as after any death.
+
+    \b
+    Examples:
+      sim-client worker add
+      sim-client worker kill local-1
+    """
+    from clients.client import Client
+
+    if (change is Change.kill) != bool(name):
+        raise BadInput("worker: give the NAME of a worker to kill, and none to add one")
+    with Client(server, connect) as client:
+        if change is Change.kill:
+            client.kill_worker(name)
+            print(f"killed {name}")
+        else:
+            print(f"started {client.add_worker()}")
 
 
 @app.command()

@@ -8,7 +8,7 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from types import TracebackType
-from typing import Self, TypeVar
+from typing import Any, Self, TypeVar
 
 import zenoh
 from google.protobuf.message import Message
@@ -178,6 +178,14 @@ class Client:
         """Ends the server, which then closes its log; the status of the reply has the number of steps."""
         return self.command("stop")
 
+    def add_worker(self) -> str:
+        """Has the server start one more local worker; returns its name. Raises BadInput without `--workers`."""
+        return self.command("add_worker").worker
+
+    def kill_worker(self, name: str) -> None:
+        """Has the server kill a local worker by SIGKILL, which it then restarts. Raises BadInput."""
+        self.command("kill_worker", worker=name)
+
     def states(self, objects: Sequence[str] | None = None) -> States:
         """Subscribes to frames of the named objects (all by default); only the newest of each is kept."""
         return States(self._session.zenoh, self.name, list(objects or self.scene().objects))
@@ -209,10 +217,13 @@ class Client:
         return self.forces.between(first, second, self.timeout)
 
     def command(
-        self, verb: str, interaction: pb.Interaction | None = None, target: pb.ObstacleTarget | None = None
-    ) -> pb.Reply:
-        """Sends a command and waits for the reply. Raises BadInput if the server refuses it."""
-        found = self._query("command", pb.Reply, self._command(verb, interaction, target).SerializeToString())
+        self, verb: str, interaction: pb.Interaction | None = None, target: pb.ObstacleTarget | None = None,
+        **fields: Any,
+    ) -> pb.Reply:  # fmt: skip
+        """Sends a command and waits for the reply. fields: others of Command. Raises BadInput if the server refuses."""
+        command = self._command(verb, interaction, target)
+        command.MergeFrom(pb.Command(**fields))
+        found = self._query("command", pb.Reply, command.SerializeToString())
         if not found:
             raise self._no_server()
         if found[0].error:

@@ -207,7 +207,7 @@ def _set_up(closing: ExitStack, o: Options) -> "tuple[Service, Supervisor | None
         endpoint = on_this_machine((o.listen or [DEFAULT_ENDPOINT])[0])
         supervisor = Supervisor(o.workers, o.name, [endpoint], ["--device", o.worker_device])
         closing.callback(supervisor.close)
-        service.check_workers, link.local_workers = supervisor.check, supervisor.local_workers
+        service.supervise(supervisor)
     return service, supervisor
 
 

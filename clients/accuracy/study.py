@@ -443,8 +443,10 @@ def _fresh(scene: Path, task: Task, probed: Run) -> Points:
 
 
 def digest(resolved: dict[str, Any], trajectory: Trajectory) -> str:
-    """Returns a digest of a resolved scene, but for its name and what its log holds, and of the nodes at rest."""
+    """Returns a digest of a resolved scene, but for its name, what its log holds and what only viewers see, and of the
+    nodes at rest."""
     kept = {key: value for key, value in resolved.items() if key not in ("name", "record")}
+    kept["object"] = [{key: value for key, value in o.items() if key != "skin"} for o in kept.get("object", ())]
     found = hashlib.sha256(json.dumps(kept, sort_keys=True).encode())
     for name, rest in sorted(trajectory.rest.items()):
         found.update(name.encode() + rest.tobytes())

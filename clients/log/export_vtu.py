@@ -20,24 +20,22 @@ def write_vtu(
     """Writes one frame to `to`, or with frame = "all" a file per frame and a .pvd collection with their times.
 
     Point data: displacement [m], velocity [m/s], von_mises [Pa] (elastic bodies); cell data: young, poisson.
+    The skin of an object that has one is a second file, NAME_skin.vtu with the point data: part 1 of the collection.
     """
     count = len(log.object_log(name).frames)
     if count == 0:
         raise BadInput(f"{log.path}: no frames of object {name!r} were recorded")
     if frame != "all":
         found = log.frame(name, _number(frame))
-        _write(to, found, log.mesh(name, found.epoch))
-        return [to]
-    written: list[Path] = []
-    times: list[float] = []
+        return _write(to, found, log.mesh(name, found.epoch))[::-1]
+    listed: list[tuple[float, list[Path]]] = []
     for index, found in enumerate(log.frames(name)):
-        written.append(to.with_name(f"{to.stem}_{index:0{len(str(count - 1))}d}.vtu"))
-        times.append(found.time)
-        _write(written[-1], found, log.mesh(name, found.epoch))
+        path = to.with_name(f"{to.stem}_{index:0{len(str(count - 1))}d}.vtu")
+        listed.append((found.time, _write(path, found, log.mesh(name, found.epoch))))
         progress(index)
     collection = to.with_suffix(".pvd")
-    _write_pvd(collection, written, times)
-    return [*written, collection]
+    _write_pvd(collection, listed)
+    return [*(path for _, files in listed for path in files), collection]
 
 
 def _number(frame: str) -> int:
@@ -49,22 +47,36 @@ def _number(frame: str) -> int:
         raise BadInput(f"--frame {frame}: allowed are last, all, or a frame number") from None
 
 
-def _write(path: Path, frame: Frame, mesh: Mesh) -> None:
-    import meshio
-
+def _write(path: Path, frame: Frame, mesh: Mesh) -> list[Path]:
+    """Writes a frame; returns the files: of the mesh, then of its skin if it has one."""
     point_data: dict[str, Any] = {"displacement": frame.x - mesh.rest, "velocity": frame.v}
     cell_data: dict[str, Any] = {}
     if len(mesh.young):
         point_data["von_mises"] = StressField(mesh.rest, mesh.tets, mesh.young, mesh.poisson).nodes(frame.x)
         cell_data = {"young": [mesh.young], "poisson": [mesh.poisson]}
+    _write_mesh(path, frame.x, [("tetra", mesh.tets)], point_data, cell_data)
+    if mesh.skin is None:
+        return [path]
+    of_skin = path.with_name(f"{path.stem}_skin.vtu")
+    at_vertices = {key: mesh.skin.values(values) for key, values in point_data.items()}
+    _write_mesh(of_skin, mesh.skin.positions(frame.x), [("triangle", mesh.skin.triangles)], at_vertices, {})
+    return [path, of_skin]
+
+
+def _write_mesh(path: Path, *parts: Any) -> None:
+    """Writes points, cells, point data and cell data."""
+    import meshio
+
     with atomic_file(path) as part:
-        meshio.Mesh(frame.x, [("tetra", mesh.tets)], point_data, cell_data).write(part, file_format="vtu")
+        meshio.Mesh(*parts).write(part, file_format="vtu")
 
 
-def _write_pvd(path: Path, files: list[Path], times: list[float]) -> None:
+def _write_pvd(path: Path, listed: list[tuple[float, list[Path]]]) -> None:
+    """Writes a collection of the files of each time [s]."""
     sets = "\n".join(
-        f'    <DataSet timestep="{time!r}" part="0" file="{file.name}"/>'
-        for file, time in zip(files, times, strict=True)
+        f'    <DataSet timestep="{time!r}" part="{part}" file="{file.name}"/>'
+        for time, files in listed
+        for part, file in enumerate(files)
     )
     text = f"""<?xml version="1.0"?>
 <VTKFile type="Collection" version="0.1">

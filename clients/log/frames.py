@@ -12,6 +12,26 @@ from protocol import messages_pb2 as pb
 from protocol.refused import Refused
 from protocol.validate import array, check_range
 
+SUM_ERROR = 1e-6  # of the weights of a vertex of a skin
+
+
+@dataclass(frozen=True)
+class Skin:
+    """A finer surface that moves with a mesh: vertex k is the sum over c of weights[k, c] x[nodes[k, c]]."""
+
+    nodes: NDArray[np.int32]  # (s, 4) of the mesh
+    weights: NDArray[np.float64]  # (s, 4), sums 1
+    triangles: NDArray[np.int32]  # (t, 3) of vertices
+
+    def positions(self, x: NDArray) -> NDArray[np.float64]:
+        """Returns the positions (s, 3) [m] of the vertices, x (n, 3): of all nodes; velocities from velocities."""
+        return self.values(x)
+
+    def values(self, nodal: NDArray) -> NDArray[np.float64]:
+        """Returns what nodes have (n, ...) at the vertices, (s, ...)."""
+        found: NDArray[np.float64] = np.einsum("sc,sc...->s...", self.weights, nodal[self.nodes])
+        return found
+
 
 @dataclass(frozen=True)
 class Mesh:
@@ -25,6 +45,7 @@ class Mesh:
     fixed: NDArray[np.int32]  # (k,)
     young: NDArray[np.float32]  # (m,) [Pa]; empty = not elastic
     poisson: NDArray[np.float32]  # (m,)
+    skin: Skin | None = None
 
 
 @dataclass(frozen=True)
@@ -58,7 +79,21 @@ def mesh_of(message: pb.Topology) -> Mesh:
         fixed=fixed,
         young=_per_tet(message.young, len(tets), f"{name}: young"),
         poisson=_per_tet(message.poisson, len(tets), f"{name}: poisson"),
+        skin=_skin_of(message, name),
     )
+
+
+def _skin_of(message: pb.Topology, name: str) -> Skin | None:
+    if not message.skin_nodes and not message.skin_weights and not message.skin_triangles:
+        return None
+    nodes = array(message.skin_nodes, np.int32, (-1, 4), f"{name}: skin_nodes")
+    weights = array(message.skin_weights, np.float64, (len(nodes), 4), f"{name}: skin_weights", finite=True)
+    triangles = array(message.skin_triangles, np.int32, (-1, 3), f"{name}: skin_triangles")
+    check_range(nodes, 0, message.nodes, f"{name}: skin_nodes")
+    check_range(triangles, 0, len(nodes), f"{name}: skin_triangles")
+    if len(weights) and not (error := float(abs(weights.sum(axis=1) - 1).max())) <= SUM_ERROR:
+        raise Refused(f"{name}: skin_weights have sums off 1 by {error:.3g}; allowed: {SUM_ERROR:g}", "number")
+    return Skin(nodes, weights, triangles)
 
 
 def frame_of(message: pb.State) -> Frame:

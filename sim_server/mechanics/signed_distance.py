@@ -16,8 +16,7 @@ import numpy as np
 from sim_server.arrays import Float64, Int64
 from sim_server.backends.compiler import native
 from sim_server.errors import InputError
-from sim_server.mesh import check, meshio_read, read
-from sim_server.mesh.surface import surface_triangles
+from sim_server.mesh.surface_file import read_surface
 
 log = logging.getLogger(__name__)
 
@@ -61,31 +60,6 @@ def signed_distance_grid(path: str | Path, scale: float, spacing: float, margin:
         return grid_around(closed_surface(points * scale, triangles), spacing, margin)
     except InputError as error:
         raise InputError(f"surface {path}: {error}") from None
-
-
-def read_surface(path: str | Path) -> tuple[Float64, Int64]:
-    """Returns points (n, 3) and triangles (t, 3) of a file: of its volume cells if it has some, else of its faces."""
-    data = meshio_read(Path(path))
-    points = np.asarray(data.points, dtype=np.float64)
-    if points.shape[1:] != (3,) or not np.isfinite(points).all():
-        raise InputError(f"surface {path}: points of shape {points.shape}: must be finite, (n, 3)")
-    if any(block.dim == 3 and len(block.data) for block in data.cells):
-        mesh = check(read(path))
-        return mesh.rest, surface_triangles(mesh.tets).astype(np.int64)
-    faces = [np.zeros((0, 3), np.int64)]
-    for block in data.cells:
-        cells = np.asarray(block.data)
-        if block.type.startswith("triangle"):
-            faces.append(cells[:, :3])
-        elif block.type.startswith("quad"):
-            faces += [cells[:, [0, 1, 2]], cells[:, [0, 2, 3]]]
-    triangles = np.concatenate(faces).astype(np.int64)
-    if not len(triangles):
-        kinds = ", ".join(sorted({b.type for b in data.cells})) or "none"
-        raise InputError(f"surface {path}: no triangles; cells in it: {kinds}; allowed: triangles, quads, volume cells")
-    if triangles.min() < 0 or triangles.max() >= len(points):
-        raise InputError(f"surface {path}: numbers of points must be 0 to {len(points) - 1}")
-    return points, triangles
 
 
 def closed_surface(points: Float64, triangles: Int64) -> Surface:

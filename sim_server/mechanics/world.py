@@ -4,7 +4,7 @@
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,10 +18,16 @@ from sim_server.scene.holders import Holder
 from sim_server.scene.obstacles import Obstacle
 from sim_server.scene.ties import Attachment, Spring
 
+if TYPE_CHECKING:
+    from sim_server.mesh.skin import Skin
+
 
 @dataclass(frozen=True)
 class Body:
-    """The part of the arrays that belongs to one object: nodes [first, last). friction: of its surface; 0 if unused."""
+    """The part of the arrays that belongs to one object: nodes [first, last).
+
+    friction: of its surface; 0 if unused. skin: a finer surface for viewers, which no step uses
+    """
 
     index: int
     name: str
@@ -30,6 +36,7 @@ class Body:
     last: int
     effects: dict[str, Any]
     friction: float = 0.0
+    skin: "Skin | None" = None
 
     @property
     def nodes(self) -> slice:
@@ -89,7 +96,8 @@ class World:
         first = 0
         for o, mesh in meshes:
             last = first + len(mesh.rest)
-            self.bodies.append(Body(len(self.bodies), o.name, mesh, first, last, dict(o.effects), o.friction or 0.0))
+            given = dict(o.effects), o.friction or 0.0, o.load_skin(mesh)
+            self.bodies.append(Body(len(self.bodies), o.name, mesh, first, last, *given))
             first = last
         self.obstacles: Sequence[Obstacle] = scene.obstacles or []
         self.holders: Sequence[Holder] = scene.holders or []

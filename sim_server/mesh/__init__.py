@@ -114,21 +114,22 @@ def read(path: str | Path) -> Mesh:
     return Mesh(rest[used], number[tets].astype(np.int32), path.name, dropped)
 
 
-def meshio_read(path: Path) -> Any:
+def meshio_read(path: Path, what: str = "mesh") -> Any:
+    """Returns what meshio reads in a file. what: names it in messages. Raises InputError if it cannot be read."""
     import meshio
     from meshio._helpers import extension_to_filetypes
 
     formats = f"formats by extension: {' '.join(sorted(extension_to_filetypes))}"
     said = io.StringIO()  # meshio prints its reasons, and ends the process where it cannot read a file
     try:
-        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said), np.errstate(all="ignore"):
             return meshio.read(path)
     except ImportError as error:
-        raise InputError(f"mesh {path}: reading it needs the Python package {error.name!r}") from error
+        raise InputError(f"{what} {path}: reading it needs the Python package {error.name!r}") from error
     except (Exception, SystemExit) as error:
         text = said.getvalue().strip() or str(error)
         reason = " ".join(text.split())[:200] or type(error).__name__
-        raise InputError(f"mesh {path}: cannot be read ({reason}); {formats}") from error
+        raise InputError(f"{what} {path}: cannot be read ({reason}); {formats}") from error
 
 
 def check(mesh: Mesh) -> Mesh:

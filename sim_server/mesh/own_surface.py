@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: MIT
 """A surface and itself: which nodes of it are nearby, and where it passes through itself."""
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
 from sim_server.arrays import Float64, Int32, Int64
+from sim_server.mesh.proximity import triangle_distances, within
 
 RINGS = 2  # nodes so many edges of tetrahedra apart are nearby
 PART = 1 << 20  # pairs that are looked at together
@@ -52,40 +51,15 @@ def _close_pairs(x: Float64, nodes: Int32, triangles: Int32, distance: float) ->
     corners = x[triangles]
     middle = corners.mean(axis=1)
     reach = np.linalg.norm(corners - middle[:, None], axis=2).max() + distance
-    at, triangle = _within(x[nodes], middle, reach)
+    at, triangle = within(x[nodes], middle, reach)
     point = nodes[at]
     other = (triangles[triangle] != point[:, None]).all(axis=1)
     point, triangle = point[other], triangle[other]
     close = np.concatenate([
-        _distances(x[point[k : k + PART]], corners[triangle[k : k + PART]]) <= distance
+        triangle_distances(x[point[k : k + PART]], corners[triangle[k : k + PART]]) <= distance
         for k in range(0, max(len(point), 1), PART)
     ])  # fmt: skip
     return point[close].astype(np.int64), triangle[close]
-
-
-def _within(points: Float64, others: Float64, reach: float) -> tuple[Int64, Int64]:
-    """Returns the pairs of a point and another one that are no farther apart than `reach`."""
-    from scipy.spatial import cKDTree
-
-    found: Any = cKDTree(others).query_ball_point(points, reach)
-    count = np.array([len(f) for f in found], np.int64)
-    return np.repeat(np.arange(len(points)), count), np.concatenate([*found, []]).astype(np.int64)
-
-
-def _distances(p: Float64, corners: Float64) -> Float64:
-    """Returns the distance of each point (n, 3) from its triangle (n, 3, 3)."""
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    size = np.linalg.norm(normal, axis=1)
-    over, from_edges = size > 0, np.full(len(p), np.inf)
-    for k in range(3):
-        a, along = corners[:, k], corners[:, (k + 1) % 3] - corners[:, k]
-        off = p - a
-        t = np.einsum("ij,ij->i", off, along) / np.maximum(np.einsum("ij,ij->i", along, along), 1e-300)
-        nearest = off - np.clip(t, 0, 1)[:, None] * along
-        from_edges = np.minimum(from_edges, np.linalg.norm(nearest, axis=1))
-        over &= np.einsum("ij,ij->i", np.cross(along, off), normal) >= 0
-    height = abs(np.einsum("ij,ij->i", p - corners[:, 0], normal)) / np.maximum(size, 1e-300)
-    return np.where(over, height, from_edges)
 
 
 def edges_through_triangles(x: Float64, edges: Int32, triangles: Int32) -> tuple[Int64, Int64]:
@@ -94,7 +68,7 @@ def edges_through_triangles(x: Float64, edges: Int32, triangles: Int32) -> tuple
     middle = corners.mean(axis=1)
     reach = np.linalg.norm(corners - middle[:, None], axis=2).max()
     reach += 0.5 * np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).max()
-    edge, triangle = _within(ends.mean(axis=1), middle, reach)
+    edge, triangle = within(ends.mean(axis=1), middle, reach)
     apart = (edges[edge][:, :, None] != triangles[triangle][:, None, :]).all(axis=(1, 2))
     edge, triangle = edge[apart], triangle[apart]
     through = np.zeros(len(edge), bool)

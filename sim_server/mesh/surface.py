@@ -4,7 +4,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_server.arrays import Float64, Int32
+from sim_server.arrays import Float64, Int32, Int64
 
 # Faces of a tetrahedron of positive volume, normals outward by the right-hand rule.
 FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
@@ -18,13 +18,17 @@ def volumes(rest: Float64, tets: NDArray[np.integer]) -> Float64:
 
 def surface_triangles(tets: NDArray[np.integer]) -> Int32:
     """Returns the faces of one tetrahedron only, (t, 3), outward for positive volumes, in order of the tetrahedra."""
-    faces = tets[:, FACES].reshape(-1, 3)
-    corners = np.sort(faces, axis=1)
+    return tets[:, FACES].reshape(-1, 3)[surface_faces(tets)].astype(np.int32)
+
+
+def surface_faces(tets: NDArray[np.integer]) -> Int64:
+    """Returns the numbers of the faces of one tetrahedron only, (t,) ascending: 4 times its own + row of FACES."""
+    corners = np.sort(tets[:, FACES].reshape(-1, 3), axis=1)
     order = np.lexsort(corners.T)
     differs = np.any(np.diff(corners[order], axis=0) != 0, axis=1)
     starts = np.concatenate([[True], differs])  # where a new face begins in sorted order
     single = starts & np.concatenate([differs, [True]])
-    return faces[np.sort(order[single])].astype(np.int32)
+    return np.sort(order[single])
 
 
 def surface_edges(triangles: Int32) -> tuple[Int32, Int32, Int32]:

@@ -60,6 +60,9 @@ def topology(simulation: Simulation, body: Body) -> pb.Topology:
     )
     if any(pose.rotate) or any(pose.translate):
         message.reference = _bytes(body.mesh.rest, "<f8")
+    if body.skin is not None:
+        message.skin_nodes, message.skin_weights = _bytes(body.skin.nodes, "<i4"), _bytes(body.skin.weights, "<f8")
+        message.skin_triangles = _bytes(body.skin.triangles, "<i4")
     for e in simulation.effects.values():
         if body.index in e.elastic:
             young, poisson = e.elastic[body.index]

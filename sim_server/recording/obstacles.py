@@ -25,7 +25,7 @@ def obstacle_messages(simulation: Simulation) -> list[pb.Obstacle]:
             moved="keyframes" if obstacle.keyframes else obstacle.moved or "", position=position, rotation=rotation,
         )  # fmt: skip
         if obstacle.file is not None:
-            from sim_server.mechanics.signed_distance import read_surface
+            from sim_server.mesh.surface_file import read_surface
 
             points, triangles = read_surface(obstacle.file)
             message.vertices = np.ascontiguousarray(points * (obstacle.scale or 1.0), "<f8").tobytes()

@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from importlib.util import find_spec
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,7 +47,7 @@ class Replay:
     def __init__(self, recording: Recording):
         self.recording = recording
         try:
-            table = deleted.without(json.loads(recording.scene.resolved))
+            table = _without_skins(deleted.without(json.loads(recording.scene.resolved)))
             if table.get("solver", {}).get("warp") == "auto":
                 table["solver"]["warp"] = True
                 recording.notes.append(
@@ -295,6 +295,14 @@ def taken_up(rows: NDArray[np.void]) -> NDArray[np.int64]:
     and made from the very step; -1: none. rows: of a log (log.ROW), one a step."""
     used, fresh = rows["factor_step"], rows["factor_step"] == np.arange(len(rows))
     return np.stack([np.where(fresh, -1, used), np.where(fresh, used, -1)], axis=1)
+
+
+def _without_skins(resolved: Any) -> Any:
+    """Returns a resolved scene without skins: no step depends on them, and the log has them."""
+    for each in resolved.get("object", ()) if isinstance(resolved, dict) else ():
+        if isinstance(each, dict):
+            each.pop("skin", None)
+    return resolved
 
 
 def _library(name: str) -> str:

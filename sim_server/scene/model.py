@@ -4,7 +4,7 @@
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import (
     AfterValidator,
@@ -30,6 +30,9 @@ from sim_server.scene.parameters import Count, Counts, File, Name, NotNegative, 
 from sim_server.scene.pose import Pose
 from sim_server.scene.solver_options import SolverOptions
 from sim_server.scene.ties import Attachment, Spring, tie_errors
+
+if TYPE_CHECKING:
+    from sim_server.mesh.skin import Skin
 
 
 class MeshSource(Parameters):
@@ -75,6 +78,9 @@ class SceneObject(Parameters):
 
     name: Name
     mesh: MeshSource
+    skin: File | None = Field(
+        default=None, description="a finer surface that moves with the mesh, for viewers; a file that meshio reads"
+    )
     pose: Pose = Pose()
     density: Positive | None = Field(default=None, description="[kg/m3]; 1000 if neither density nor mass is given")
     mass: Positive | None = Field(default=None, description="of the whole object, instead of density [kg]")
@@ -116,6 +122,17 @@ class SceneObject(Parameters):
                 return check(replace(mesh, rest=mesh.rest * (source.scale or 1.0)))
             assert source.bar is not None and source.size is not None
             return bar(source.bar, source.size, source.split or "kuhn")
+        except InputError as error:
+            raise InputError(f"object {self.name!r}: {error}") from error
+
+    def load_skin(self, mesh: Mesh) -> "Skin | None":
+        """Returns the skin embedded in the mesh, None without one. Raises InputError that names the object."""
+        if self.skin is None:
+            return None
+        from sim_server.mesh.skin import read_skin
+
+        try:
+            return read_skin(self.skin, self.mesh.scale or 1.0, mesh)
         except InputError as error:
             raise InputError(f"object {self.name!r}: {error}") from error
 

@@ -14,6 +14,7 @@ from sim_server.simulation import Simulation
 if TYPE_CHECKING:
     from sim_server.effects._movable import Movable
     from sim_server.effects.touch import Interaction, Touch  # imported where a scene lists it
+    from sim_server.service.supervisor import Supervisor
 
 
 UNIT = 1e-6  # that the length of a quaternion may differ from 1 by
@@ -28,6 +29,8 @@ class Commands:
 
     on_interaction: called with every accepted push and grab and the present time [s]
     frozen: returns True for an object that has run away and moves no more
+
+    supervisor: of the local workers; None: the server has none
     """
 
     def __init__(
@@ -37,6 +40,7 @@ class Commands:
         self.simulation, self.engine = simulation, simulation.engine
         self.on_interaction, self.frozen = on_interaction, frozen
         self.stopping = False
+        self.supervisor: Supervisor | None = None
         self._owners: set[str] = set()
 
     @property
@@ -56,7 +60,7 @@ class Commands:
             if verb is None:
                 raise BadCommand(f"unknown verb {command.verb!r}; known: {', '.join(sorted(VERBS))}")
             return verb(self, command)
-        except ValueError as error:  # BadCommand, TouchError and MoveError
+        except ValueError as error:  # BadCommand, TouchError, MoveError and WorkerError
             return pb.Reply(error=str(error))
 
     def together(self) -> AbstractContextManager[None]:
@@ -137,6 +141,19 @@ class Commands:
         self.stopping = True
         return pb.Reply(status=self._status_of("stopping"))
 
+    def _add_worker(self, command: pb.Command) -> pb.Reply:
+        return pb.Reply(worker=self._local_workers().add())
+
+    def _kill_worker(self, command: pb.Command) -> pb.Reply:
+        self._local_workers().kill(command.worker)
+        return pb.Reply(worker=command.worker)
+
+    def _local_workers(self) -> "Supervisor":
+        """Returns the supervisor of local workers. Raises BadCommand if there is none."""
+        if self.supervisor is None:
+            raise BadCommand("this server has no local workers: it was started without --workers, or needs none")
+        return self.supervisor
+
     def _status_of(self, state: str) -> pb.Status:
         status = pb.Status(state=state)
         self.stamp(status)
@@ -202,4 +219,5 @@ VERBS: dict[str, Callable[[Commands, pb.Command], pb.Reply]] = {
     "push": Commands._push, "grab": Commands._grab, "move": Commands._move, "release": Commands._release,
     "move_obstacle": Commands._move_obstacle,
     "pause": Commands._pause, "resume": Commands._resume, "stop": Commands._stop,
+    "add_worker": Commands._add_worker, "kill_worker": Commands._kill_worker,
 }  # fmt: skip

@@ -15,7 +15,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,9 @@ from sim_server.service.pace import LOOK_PERIOD, PaceMonitor
 from sim_server.service.telemetry import Telemetry
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
+
+if TYPE_CHECKING:
+    from sim_server.service.supervisor import Supervisor
 
 log = logging.getLogger(__name__)
 
@@ -68,6 +71,11 @@ class Service:
         self.pace = PaceMonitor(simulation.world.dt, self._advice, not self._on_gpu) if realtime else None
         self._loop_alone = not self.driver.wants_factors or self.driver.policy.free  # no step waits for Python
         self.telemetry.open()
+
+    def supervise(self, supervisor: "Supervisor") -> None:
+        """Has the local workers of `supervisor` restarted, shown in the status, added and killed by clients."""
+        self.check_workers, self.link.local_workers = supervisor.check, supervisor.local_workers
+        self.commands.supervisor = supervisor
 
     def _frozen(self, name: str) -> bool:
         """Returns True for an object that has run away and is frozen."""

@@ -2,7 +2,8 @@
 """Starts, restarts and stops the local workers of `sim-server --workers N`.
 
 A worker that ends is started again after a pause that doubles with each restart in the last RESTART_PERIOD; after
-MAX_RESTARTS of them it is given up. The simulation goes on without it.
+MAX_RESTARTS of them it is given up. The simulation goes on without it. Clients may add workers, up to MAX_WORKERS in
+all, and kill them.
 """
 
 import logging
@@ -15,9 +16,14 @@ from protocol.messages_pb2 import LocalWorker
 
 log = logging.getLogger(__name__)
 
+MAX_WORKERS = 64  # of one server: as many as `--workers` takes
 MAX_RESTARTS = 5  # of one worker within RESTART_PERIOD
 RESTART_PERIOD = 60.0  # s
 BACK_OFF = 0.2  # s before the first restart, doubled each time
+
+
+class WorkerError(ValueError):
+    """A worker that cannot be added or killed; the text goes back to the client."""
 
 
 class _Process:
@@ -72,6 +78,33 @@ class Supervisor:
     def local_workers(self) -> list[LocalWorker]:
         """Returns the state of all local workers, alive or not."""
         return [worker.status() for worker in self.workers]
+
+    def add(self) -> str:
+        """Starts one more worker, or one again that was given up; returns its name. Raises WorkerError."""
+        worker = next((w for w in self.workers if w.given_up), None)
+        if worker is None and len(self.workers) >= MAX_WORKERS:
+            raise WorkerError(f"there are {MAX_WORKERS} local workers; allowed are at most {MAX_WORKERS}")
+        if worker is None:
+            worker = _Process(f"local-{len(self.workers) + 1}")
+        try:
+            self.start(worker)
+        except OSError as error:
+            raise WorkerError(f"worker {worker.name} cannot be started: {error}") from error
+        if worker.given_up:
+            worker.given_up, worker.restarts = False, []
+            worker.count += 1
+        else:
+            self.workers.append(worker)
+        return worker.name
+
+    def kill(self, name: str) -> None:
+        """Ends the process of a worker by SIGKILL; `check` restarts it as after any death. Raises WorkerError."""
+        worker = next((w for w in self.workers if w.name == name), None)
+        if worker is None:
+            raise WorkerError(f"no local worker {name!r}; there is {', '.join(w.name for w in self.workers)}")
+        if worker.process is None or worker.process.poll() is not None:
+            raise WorkerError(f"worker {name} has no process now: it is {worker.status().state}")
+        worker.process.kill()
 
     def check(self) -> None:
         """Restarts workers that have ended, after a pause that doubles; gives up one that keeps ending."""

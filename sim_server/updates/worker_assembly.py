@@ -88,7 +88,8 @@ def single_object_scene(resolved: str, name: str, mesh: Mesh) -> Scene:
         raise Refused(f"Scene.resolved is no scene: {type(error).__name__}", "malformed") from error
     if len(listed) != 1:
         raise Refused(f"Scene.resolved has {len(listed)} objects called {name!r}; allowed: 1", "object")
-    table["object"] = [{**listed[0], "mesh": {"bar": [1, 1, 1], "size": [1.0, 1.0, 1.0]}}]  # in place of its source
+    of_bar = {"mesh": {"bar": [1, 1, 1], "size": [1.0, 1.0, 1.0]}, "skin": None}  # in place of their sources
+    table["object"] = [{**listed[0], **of_bar}]
     scene = Scene.model_validate(table, context={"files": False})
     scene.objects[0].use_mesh(mesh)
     return scene

@@ -183,6 +183,7 @@ ERRORS: list[tuple[tuple[str, ...], int, str]] = [
     (("push", "--object", "b", "--at", "1", "2", "--force", "0", "0", "0"), 2, "--at 1 2: allowed are three"),
     (("status", "--connect", "tcp/no-such-host.invalid:1"), 1, "the name 'no-such-host.invalid' does not resolve"),
     (("status", "--connect", "tcp/127.0.0.1:9"), 1, "no server 'sim' at tcp/127.0.0.1:9; is it running?"),
+    (("worker", "kill"), 2, "worker: give the NAME of a worker to kill"),
     (("view",), 2, "give either a log or --live"),
     (("view", "x.mcap", "--live"), 2, "give either a log or --live"),
     (("view", "--live", "--save", "x.rrd"), 2, "need a log"),
@@ -190,7 +191,20 @@ ERRORS: list[tuple[tuple[str, ...], int, str]] = [
     (("export", "gone.mcap", "--object", "beam", "--to", "x.npz"), 2, "gone.mcap: cannot be read"),
     (("export", "pyproject.toml", "--object", "beam", "--to", "x.npz"), 2, "not an MCAP file"),
 ]
-COMMANDS = ("status", "watch", "push", "grab", "haptics", "move-obstacle", "pause", "resume", "stop", "view", "export")
+COMMANDS = (
+    "status",
+    "watch",
+    "push",
+    "grab",
+    "haptics",
+    "move-obstacle",
+    "pause",
+    "resume",
+    "stop",
+    "worker",
+    "view",
+    "export",
+)
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,10 @@ from collections.abc import Sequence
 
 import pytest
 
-from sim_server.service.supervisor import BACK_OFF, MAX_RESTARTS, RESTART_PERIOD, Supervisor
+from protocol import messages_pb2 as pb
+from sim_server.service.commands import Commands
+from sim_server.service.supervisor import BACK_OFF, MAX_RESTARTS, MAX_WORKERS, RESTART_PERIOD, Supervisor
+from tests.scenes import bar, simulation
 
 
 class Process:
@@ -17,6 +20,9 @@ class Process:
 
     def poll(self) -> int | None:
         return self.returncode
+
+    def kill(self) -> None:
+        self.returncode = -9
 
 
 class World:
@@ -80,3 +86,35 @@ def test_a_worker_that_lasts_gets_its_budget_back() -> None:
         assert world.pass_until_restart() == pytest.approx(BACK_OFF, abs=0.06)
     (report,) = world.supervisor.local_workers()
     assert (report.state, report.restarts, report.pid) == ("running", 3 * MAX_RESTARTS, world.started[-1].pid)
+
+
+def test_clients_add_and_kill_workers() -> None:
+    world = World()
+    commands = Commands(simulation(bar(young=1e5, fixed="X < 0.01")), lambda interaction, time: None)
+
+    def carry_out(verb: str, worker: str = "") -> tuple[str, str]:
+        reply = commands.carry_out(pb.Command(client="anna", verb=verb, worker=worker))
+        return reply.worker, reply.error
+
+    refused = "this server has no local workers: it was started without --workers, or needs none"
+    assert carry_out("add_worker") == carry_out("kill_worker", "local-1") == ("", refused)
+    commands.supervisor = world.supervisor
+    assert carry_out("add_worker") == ("local-2", "")
+    assert "local-2" in world.started[1].command
+    assert carry_out("kill_worker", "local-9") == ("", "no local worker 'local-9'; there is local-1, local-2")
+    assert carry_out("kill_worker", "local-2") == ("local-2", "") and world.started[1].returncode == -9
+    assert world.started[0].returncode is None
+    assert carry_out("kill_worker", "local-2")[1].startswith("worker local-2 has no process now")
+    world.supervisor.check()
+    assert world.pass_until_restart() == pytest.approx(BACK_OFF, abs=0.06)
+    assert [(w.state, w.restarts, w.exit_code) for w in world.supervisor.local_workers()][1] == ("running", 1, -9)
+
+
+def test_the_number_of_workers_is_bounded_and_one_left_alone_comes_first() -> None:
+    world = World()
+    world.supervisor.workers[0].given_up = True
+    names = [world.supervisor.add() for _ in range(MAX_WORKERS)]
+    assert names == [f"local-{i + 1}" for i in range(MAX_WORKERS)]
+    with pytest.raises(ValueError, match=f"there are {MAX_WORKERS} local workers; allowed are at most {MAX_WORKERS}"):
+        world.supervisor.add()
+    assert len(world.started) == 1 + MAX_WORKERS

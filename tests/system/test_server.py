@@ -141,6 +141,14 @@ def test_a_supervised_worker_is_started_again(stage: Stage, tmp_path: Path) -> N
         second = client.status().workers[0].pid
         used = client.status().objects[0].factors_used
         until(lambda: client.status().objects[0].factors_used > used, "and is used")
+        # A client adds one and kills it, and the server starts it again
+        assert client.add_worker() == "local-2"
+        until(lambda: len(client.status().workers) == 2, "the added worker has joined")
+        (added,) = (w.pid for w in client.status().workers if w.worker == "local-2")
+        done = run("clients", "worker", "kill", "local-2", "--connect", stage.endpoint)
+        assert (done.stdout, done.stderr) == ("killed local-2\n", "")
+        until(lambda: client.status().local_workers[1].restarts == 1, "it is started again")
+        assert not alive(added) and client.status().local_workers[1].exit_code == -signal.SIGKILL
     assert server.end() == 0
     until(lambda: not alive(second), "the worker ends with its server")
 
