@@ -143,7 +143,7 @@ class _Hands:
 
     def held(self, hand: pb.Interaction, x: NDArray) -> NDArray:
         """Returns the mean position of the nodes that a grab holds [m]. x (n, 3): of its object"""
-        nodes = self._nodes.get(hand.id, np.zeros(0, np.int32)) - self._first[hand.object]
+        nodes = self._nodes.get(hand.id, np.zeros(0, np.int32)) - self._first.get(hand.object, 0)
         if not len(nodes):
             return np.array([hand.point.x, hand.point.y, hand.point.z])
         mean: NDArray = x[nodes].mean(axis=0)

@@ -165,7 +165,7 @@ def rod(a: NDArray, b: NDArray, radius: float, color: Sequence[float], detail: i
     other = np.cross(along, side) / max(float(np.linalg.norm(along)), 1e-12)
     angle = np.linspace(0, 2 * np.pi, detail + 1)[:, None]
     ring = radius * (np.cos(angle) * side + np.sin(angle) * other)
-    return Piece(np.concatenate([b + ring, a + ring]), _grid(1, detail), np.array(color, float))
+    return Piece(np.concatenate([a + ring, b + ring]), _grid(1, detail), np.array(color, float))
 
 
 def _grid(rows: int, columns: int) -> NDArray[np.int64]:

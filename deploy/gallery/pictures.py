@@ -40,8 +40,8 @@ class Drag:
 DRAGS = {
     "beam": Drag("beam", (0.5, 0.5, 4.2), (1.2, 1.2, -0.4), 0.5, 3e4, 1.2e4, Angle(60, 12)),
     "creature": Drag("creature", (0.225, 0.283, 0.038), (0.05, 0.2, 0.12), 0.035, 400, 100),
-    "jelly": Drag("middle", (0.04, 0.13, 0.03), (0.035, 0.02, 0.03), 0.02, 60, 5),
-    "liver": Drag("liver", (-0.09, -0.06, 0.04), (0.01, -0.06, 0.08), 0.02, 150, 30, Angle(20, 8)),
+    "jelly": Drag("middle", (0.04, 0.13, 0.03), (0.035, 0.02, 0.03), 0.02, 60, 5, Angle(28, 10, 1.15)),
+    "liver": Drag("liver", (-0.09, -0.06, 0.04), (-0.1, 0.03, 0.1), 0.025, 250, 30, Angle(20, 8, 1.3)),
     "sheet": Drag("sheet", (0.35, 0.5, 0.3), (0.1, 0.2, 0.35), 0.05, 40, 15, Angle(35, 18)),
     "tentacle": Drag("tentacle", (0.19, 0.05, 0), (0.18, 0.12, 0.1), 0.03, 150, 25, Angle(20, 14)),
 }
@@ -77,7 +77,7 @@ def picture(name: str) -> None:
         with Log(log) as opened:
             stage = Stage(opened, SIZE, DRAGS[name].angle)
             drawn = stage.draw(stage.end, caption=False)
-    drawn.quantize(200).save(FOLDER / f"{name}.png", optimize=True)
+    drawn.save(FOLDER / f"{name}.png", optimize=True)
 
 
 def main(names: list[str]) -> None:
