@@ -1,31 +1,46 @@
 # SPDX-License-Identifier: MIT
-"""The demonstration of `deploy/run demo`: a beam bends, clients push and grab it, and a log and a picture remain.
+"""The demonstration of `deploy/run demo`: a creature that can be dragged, in a browser, or else in a film.
 
-Every process is started as a user would start it: sim-server with one precond-worker, then sim-client. What it leaves
-lies under out/demo: the log (beam.mcap), a rerun recording (beam.rrd), a picture (beam.png) and the arrays (beam.npz).
+Every process is started as a user would start it: sim-server with one precond-worker, then sim-client. On a machine
+with a display a page opens on which the creature is dragged with the mouse, until Ctrl-C. Elsewhere a client pushes and
+drags it; what that leaves lies under out/demo: the log (creature.mcap), a film (creature.gif), a rerun recording
+(creature.rrd), a picture (creature.png) and the arrays (creature.npz).
 """
 
+import importlib.util
+import os
 import subprocess
 import sys
 import time
+import webbrowser
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
 from clients.client import Client
 from clients.errors import ClientError
+from clients.log.reader import Log
 
 ROOT = Path(__file__).resolve().parent.parent
 OUT = ROOT / "out" / "demo"
-SCENE = ROOT / "deploy" / "scenes" / "beam.toml"
-STEPS = 430  # of 20 ms each; it ends while the beam hangs low
+SCENE = "gallery/creature"
+STEPS = 340  # of 20 ms each
 ENDPOINT = "tcp/127.0.0.1:7451"  # not the default one: a server of the user's may be running there
-PUSH_AT, GRAB_AT, RELEASE_AT = 200, 320, 400  # steps
+PAGE = 8085  # port of the page, not the default one
+PUSH_AT, GRAB_AT, RELEASE_AT = 60, 125, 265  # steps
+FILM = 2.3, 6.5  # s of simulation: first and last picture
+HAND = (0.225, 0.283, 0.038)  # of the creature, at rest [m]
+WAY = np.array(
+    [(0, 0, 0), (0.1, 0.16, 0.1), (-0.2, 0.18, 0.24), (-0.12, -0.14, 0.22), (0.12, -0.04, 0.04)]
+)  # of it [m]
+
+MADE = {"film": "gif", "recording": "rrd", "picture": "png", "arrays": "npz"}  # suffixes of what the log becomes
 
 console = Console()
 
@@ -67,28 +82,39 @@ def connected(server: "subprocess.Popen[bytes]") -> Client:
 
 
 def play(server: "subprocess.Popen[bytes]") -> None:
-    """Pushes the free end sideways, later grabs and releases it; shows the progress of the run."""
+    """Pushes the creature's head, later drags its hand about and lets go; shows the progress of the run."""
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}"))
     with connected(server) as client, Progress(*columns, TimeRemainingColumn(), console=console) as progress:
         task = progress.add_task("simulating in real time", total=STEPS)
-        states, touched, grab = client.states(["beam"]), set[int](), None
+        hand = int(np.linalg.norm(client.meshes()["creature"].rest - HAND, axis=1).argmin())
+        states, pushed, grab, start = client.states(["creature"]), False, None, np.zeros(3)
         while server.poll() is None:
             time.sleep(0.02)
             for frame in states.newest():
                 progress.update(task, completed=frame.step)
-                end = frame.x[-36:].mean(axis=0)  # the last layer of nodes
-                if frame.step >= PUSH_AT and PUSH_AT not in touched:
-                    touched.add(PUSH_AT)
-                    taken = client.push("beam", at=end, force=(9000, 0, 0), radius=0.8, duration=0.3)
-                    progress.console.print(f"step {frame.step}: a client pushes {taken.nodes} nodes of the free end")
-                if frame.step >= GRAB_AT and GRAB_AT not in touched:
-                    touched.add(GRAB_AT)
-                    grab = client.grab("beam", at=end, target=(0.5, 0.5, 3.5), radius=0.8, stiffness=2e4, max_force=1e4)
-                    progress.console.print(f"step {frame.step}: a client grabs the free end and pulls it up")
-                if grab is not None and frame.step >= RELEASE_AT:
+                if frame.step >= PUSH_AT and not pushed:
+                    pushed = True
+                    taken = client.push("creature", at="top", force=(0, 0, -12), radius=0.1, duration=0.2)
+                    progress.console.print(f"step {frame.step}: a client pushes {taken.nodes} nodes of the head")
+                if GRAB_AT <= frame.step < RELEASE_AT and grab is None:
+                    start = frame.x[hand]
+                    grab = client.grab("creature", at=tuple(start), radius=0.035, stiffness=400, max_force=100)
+                    progress.console.print(f"step {frame.step}: a client takes its hand and drags it about")
+                if grab is not None and frame.step < RELEASE_AT:
+                    grab.move(start + way((frame.step - GRAB_AT) / (RELEASE_AT - GRAB_AT)))
+                elif grab is not None and not grab.released:
                     grab.release()
-                    grab = None
         progress.update(task, completed=STEPS)
+
+
+def way(part: float) -> NDArray[np.float64]:
+    """Returns how far the hand is dragged at a part of the time, from 0 to 1 [m]: smooth from place to place of WAY."""
+    at = min(max(part, 0.0), 1.0) * (len(WAY) - 1)
+    k = min(int(at), len(WAY) - 2)
+    s = at - k
+    s = s * s * (3 - 2 * s)
+    there: NDArray[np.float64] = (1 - s) * WAY[k] + s * WAY[k + 1]
+    return there
 
 
 def summary(arrays: Path) -> Table:
@@ -110,30 +136,87 @@ def summary(arrays: Path) -> Table:
     return table
 
 
-def main() -> int:
-    """Runs the demonstration; returns the exit code of the server."""
-    OUT.mkdir(parents=True, exist_ok=True)
-    log = OUT / "beam.mcap"
-    console.print("a beam in real time: a server, a worker, a client that pushes and grabs it")
-    run = [str(SCENE), "--workers", "1", "--steps", str(STEPS), "--record", str(log), "--listen", ENDPOINT]
-    server = subprocess.Popen(tool("sim_server", *run), cwd=ROOT)
+def has_browser() -> bool:
+    """True if there are a display and a browser, and a page to show in it."""
+    if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        return False
+    if not (importlib.util.find_spec("clients.web") and importlib.util.find_spec("viser")):
+        return False
+    try:
+        webbrowser.get()
+    except webbrowser.Error:
+        return False
+    return True
+
+
+def start(scene: str, log: Path, *arguments: str) -> "subprocess.Popen[bytes]":
+    """Starts a server with a scene and a worker, and a log."""
+    run = [scene, "--workers", "1", "--record", str(log), "--listen", ENDPOINT, *arguments]
+    return subprocess.Popen(tool("sim_server", *run), cwd=ROOT)
+
+
+def ended(process: "subprocess.Popen[bytes]") -> None:
+    """Ends a process if it runs."""
+    if process.poll() is None:
+        process.terminate()
+        process.wait(10)
+
+
+def show() -> int:
+    """Opens the page on the creature, until Ctrl-C or the server ends; returns the exit code of what ended first."""
+    address = f"http://127.0.0.1:{PAGE}"
+    server = start(SCENE, OUT / "creature.mcap")
+    page = None
+    try:
+        with connected(server):
+            page = subprocess.Popen(tool("clients", "web", "--connect", ENDPOINT, "--port", str(PAGE)), cwd=ROOT)
+        console.print(f"drag the creature: {address} (Ctrl-C ends)", highlight=False)
+        webbrowser.open(address)
+        while server.poll() is None and page.poll() is None:
+            time.sleep(0.1)
+        return page.returncode if server.poll() is None else server.returncode
+    finally:
+        for process in (page, server):
+            if process is not None:
+                ended(process)
+
+
+def record() -> int:
+    """Plays with the creature and leaves a log, a film, a picture and arrays; returns the exit code of the server."""
+    console.print("a creature in real time: a server, a worker, a client that pushes it and drags it by its hand")
+    log = OUT / "creature.mcap"
+    server = start(SCENE, log, "--steps", str(STEPS))
     try:
         play(server)
     finally:
-        if server.poll() is None:
-            server.terminate()
-            server.wait(10)
+        ended(server)
     if server.returncode:
         return server.returncode
-    made = {"recording": OUT / "beam.rrd", "picture": OUT / "beam.png", "arrays": OUT / "beam.npz"}
+    made = {what: log.with_suffix(f".{end}") for what, end in MADE.items()}
+    with shown("drawing the film"):
+        film(log, made["film"])
     sim_client("making the recording for rerun", "view", str(log), "--save", str(made["recording"]))
     sim_client("drawing the picture", "view", str(log), "--screenshot", str(made["picture"]))
-    sim_client("writing the arrays", "export", str(log), "--object", "beam", "--to", str(made["arrays"]))
+    sim_client("writing the arrays", "export", str(log), "--object", "creature", "--to", str(made["arrays"]))
     console.print(summary(made["arrays"]))
     for what, path in {"log": log, **made}.items():
         console.print(f"{what:10} {path.relative_to(ROOT)}  ({path.stat().st_size / 1e6:.1f} MB)", highlight=False)
-    console.print("look at it with: .venv/bin/sim-client view out/demo/beam.mcap", highlight=False)
+    console.print("look at it with: .venv/bin/sim-client view out/demo/creature.mcap", highlight=False)
     return 0
+
+
+def film(log: Path, to: Path) -> None:
+    """Writes the film of the creature being dragged."""
+    from clients.viewer.film import gif
+
+    with Log(log) as opened:
+        to.write_bytes(gif(opened, *FILM))
+
+
+def main() -> int:
+    """Runs the demonstration; returns its exit code."""
+    OUT.mkdir(parents=True, exist_ok=True)
+    return show() if has_browser() else record()
 
 
 if __name__ == "__main__":

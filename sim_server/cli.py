@@ -27,6 +27,8 @@ app = typer.Typer(pretty_exceptions_enable=False, rich_markup_mode=None)
 
 EPILOG = """\b
 Examples:
+  sim-server gallery/creature --workers 1
+        a scene that comes along; sim-server --list tells them
   sim-server deploy/scenes/beam.toml --workers 1
         in real time, helped by one local worker
   sim-server beam.toml --steps 500 --free-run --record beam.mcap
@@ -42,9 +44,28 @@ Examples:
 WORKER_TIMEOUT = 15.0  # s that the start waits for the first local worker, at most
 
 
+def list_gallery(asked: bool) -> None:
+    """Option --list: shows the scenes that come along in a table, and ends."""
+    if not asked:
+        return
+    from rich.console import Console
+    from rich.table import Table
+
+    from sim_server.scene import gallery, load
+
+    table = Table("name", "what", "elements", "command", box=None, pad_edge=False)
+    table.columns[2].justify, table.columns[3].no_wrap = "right", True
+    for name in gallery.names():
+        path = Path(gallery.PREFIX, name)
+        elements = sum(len(o.load_mesh().tets) for o in load(path).objects)
+        table.add_row(name, gallery.sentence(name), str(elements), f"sim-server {path} --workers 1")
+    Console().print(table)
+    raise typer.Exit
+
+
 @app.command(epilog=EPILOG)
 def serve(
-    scene: Annotated[Path, typer.Argument(metavar="SCENE.toml", help="What to simulate")],
+    scene: Annotated[Path, typer.Argument(metavar="SCENE.toml", help="What to simulate; or gallery/NAME")],
     device: Annotated[
         str, typer.Option(metavar="auto|cpu|gpu", help="Where; auto: the GPU if there is a usable one, else the CPU")
     ] = "auto",
@@ -68,6 +89,10 @@ def serve(
     name: Annotated[str, typer.Option(metavar="NAME", help="Name of this server in all keys")] = "sim",
     no_shared_memory: Annotated[bool, typer.Option("--no-shared-memory", help="Send arrays as bytes")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing but errors")] = False,
+    list_: Annotated[
+        bool,
+        typer.Option("--list", callback=list_gallery, is_eager=True, help="Show the scenes that come along"),
+    ] = False,
     version: Annotated[bool, PROGRAM.version_option()] = False,
 ) -> None:
     """Simulate the objects of a scene, helped by preconditioner workers, open to clients."""

@@ -353,8 +353,8 @@ class Study:
 
 
 def check_scene(scene: Path) -> None:
-    """Raises BadInput if there is no such file."""
-    if not scene.is_file():
+    """Raises BadInput if there is no such file, and it cannot be a scene that comes with the server (gallery/NAME)."""
+    if not scene.is_file() and scene.parts[:-1] != ("gallery",):
         raise BadInput(f"{scene}: is a folder, allowed is a scene" if scene.is_dir() else f"{scene}: no such file")
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from sim_server.errors import InputError
-from sim_server.scene import overlay, toml_file
+from sim_server.scene import gallery, overlay, toml_file
 from sim_server.scene.messages import readable
 from sim_server.scene.model import Scene, SceneObject
 from sim_server.scene.overrides import Place, apply
@@ -22,10 +22,14 @@ __all__ = ["Scene", "SceneObject", "load"]
 def load(path: str | Path, overrides: Sequence[str] = ()) -> Scene:
     """Returns the validated scene in the TOML file `path` with `overrides` applied: KEY=VALUE, or @FILE, an overlay.
 
+    path: a file, or gallery/NAME, a scene of the package
     Raises InputError with one line for each error.
     """
-    path = Path(path)
-    text = toml_file.read_text(path, "scene")
+    path = gallery.found(Path(path))
+    try:
+        text = toml_file.read_text(path, "scene")
+    except InputError as error:
+        raise error if path.exists() else InputError(f"{error}; {gallery.known()}") from None
     table = toml_file.parse(text, path, "scene")
     overlays: dict[Place, str] = {}
     for override in overrides:
