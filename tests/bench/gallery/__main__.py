@@ -5,6 +5,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,7 +14,7 @@ import typer
 from numpy.typing import NDArray
 
 from clients.client import Client
-from clients.errors import ClientError
+from clients.errors import BadInput, ClientError
 from clients.log.reader import Log
 from tests.bench.harness.report import ROOT, Report, plots
 from tests.ports import free_port
@@ -42,7 +43,7 @@ Each scene runs as fast as it goes, `sim-server gallery/NAME --workers 1 --free-
 body and drags it around once in {PERIOD:g} s of wall time; server, worker and client are processes of one machine. The
 steps before the hand takes hold, and while a first factor is awaited, do not count. *steps a second*: those that count
 over the sum of their times; a step of 20 ms is in real time at 50. *age* of the factors used [steps], its mean. *not
-converged*: steps whose solve used up its iterations (500).""",
+converged*: steps whose solve used up its iterations.""",
     """\
 The paper (Courtecuisse et al. 2010, section 8.4) says of its interactive armadillo how many elements it had, that it
 ran at 50 to 80 frames a second on a Core i7 at 3.07 GHz with a GeForce GTX 480, and that without a preconditioner it
@@ -68,7 +69,8 @@ def drag(server: "subprocess.Popen[bytes]", endpoint: str, name: str, warm: int)
             frames = states.newest()
             if grab is None and frames and frames[-1].step >= warm:
                 start, first, begun = frames[-1].x[node], frames[-1].step, time.monotonic()
-                grab = client.grab(held, tuple(start), radius=radius, stiffness=stiffness, max_force=force)
+                with suppress(BadInput):  # the body has moved on meanwhile: then with the next frame
+                    grab = client.grab(held, tuple(start), radius=radius, stiffness=stiffness, max_force=force)
             elif grab is not None:
                 grab.move(start + reach * around((time.monotonic() - begun) / PERIOD), wait=False)
     return first
