@@ -113,6 +113,7 @@ def serve(
         with ExitStack() as closing:
             with nullcontext() if quiet else compile_notices(say):
                 service, supervisor = _set_up(closing, options)
+            service.say = say
             _announce(say, service, scene, listen)
             _wait_for_workers(service, supervisor)
             _describe_objects(say, service, listen)

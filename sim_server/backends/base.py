@@ -175,6 +175,10 @@ class Engine(Protocol):
         """Runs the second half: solve, integrate, report."""
         ...
 
+    def restart_clock(self) -> None:
+        """Between `assemble` and `solve`: what the step has waited for is no part of its time."""
+        ...
+
     def wait(self) -> bool:
         """Sleeps until the next step is due (real time) and while paused; returns False if the loop is to stop."""
         ...

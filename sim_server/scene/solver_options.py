@@ -90,6 +90,9 @@ class SolverOptions(Parameters):
         default="auto", description="treatment of negative eigenvalues of the stiffness of an element"
     )
     update: Annotated[Update, PlainValidator(_update), PlainSerializer(str)] = Update("async")
+    first_factor: Literal["wait", "go"] | None = Field(
+        default=None, description="a server's first step waits for its own factors or goes; None: waits in real time"
+    )
     precision: Precision = Field(
         default="float64", description="of the kernels: mixed = elements in float32, the rest in float64"
     )

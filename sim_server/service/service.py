@@ -32,6 +32,7 @@ from sim_server.service.pace import LOOK_PERIOD, PaceMonitor
 from sim_server.service.telemetry import Telemetry
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
+from sim_server.updates.first_factors import FirstFactors, few
 
 if TYPE_CHECKING:
     from sim_server.service.supervisor import Supervisor
@@ -40,6 +41,7 @@ log = logging.getLogger(__name__)
 
 ROUND_PERIOD = 1e-3  # s that the service thread sleeps between rounds
 WORKERS_PERIOD = 0.02  # s between checks of local workers
+SILENT_WAIT = 0.5  # s of waiting for first factors before a line tells of it
 STATUS_INTERVAL = 0.02  # s between two statuses that clients request, at least
 HALT_TIMEOUT = 1.0  # s that the answer to `pause` or `stop` waits for the end of the step under way, at most
 MAX_HALTS = 64  # answers that wait for the end of a step at a time
@@ -70,7 +72,17 @@ class Service:
         self.check_workers: Callable[[], None] = lambda: None  # called every WORKERS_PERIOD
         self.pace = PaceMonitor(simulation.world.dt, self._advice, not self._on_gpu) if realtime else None
         self._loop_alone = not self.driver.wants_factors or self.driver.policy.free  # no step waits for Python
+        self._first = self._first_factors(realtime)
+        self.say: Callable[[str], None] = lambda text: None  # tells of progress on the terminal
+        self._told_of_wait = False
         self.telemetry.open()
+
+    def _first_factors(self, realtime: bool) -> FirstFactors | None:
+        """Returns the first factors that the first step waits for; None: it goes without."""
+        driver, wish = self.driver, self.simulation.scene.solver.first_factor
+        if not (driver.wants_factors and driver.policy.free and (wish or ("wait" if realtime else "go")) == "wait"):
+            return None
+        return FirstFactors(driver)
 
     def supervise(self, supervisor: "Supervisor") -> None:
         """Has the local workers of `supervisor` restarted, shown in the status, added and killed by clients."""
@@ -83,6 +95,8 @@ class Service:
 
     def run(self) -> None:
         """Blocks until the run is over; a KeyboardInterrupt ends the loop first and is then raised."""
+        if not self.link.dispatch.workers():
+            self._first = None  # nobody makes any
         loop = threading.Thread(target=self._loop, name="loop")
         try:
             loop.start()  # inside: a signal may come before it returns, when the thread runs already
@@ -107,7 +121,8 @@ class Service:
                 os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), LOOP_NICE)
         try:
             if self._loop_alone:
-                self.engine.run(ENDLESS if self.steps is None else self.steps)
+                if self._first is None or self._first.run():
+                    self.engine.run(ENDLESS if self.steps is None else self.steps - self.engine.step)
                 return
             while not self.engine.loop.stop and (self.steps is None or self.engine.step < self.steps):
                 self._batches.append((self.driver.advance(1), self.driver.reactions, self.driver.other_reactions))
@@ -124,7 +139,8 @@ class Service:
         self._carry_out()
         self._answer_halts()
         self._publish_status()
-        self._check_pace()
+        if not self._awaits_factors():
+            self._check_pace()
         self.commands.release_absent(set(self.link.clients()))
         self.telemetry.publish_status(self._state(), force=False)
 
@@ -172,6 +188,29 @@ class Service:
                 reply(pb.Reply())
             self._status_replies.clear()
 
+    def _awaits_factors(self) -> bool:
+        """Returns True while the first step waits for factors. Tells of it: in the status, and if it lasts, a line."""
+        first = self._first
+        if first is None:
+            return False
+        if not first.done:
+            text = f"waiting for the first factor of {few(first.missing)}"
+            begins = not self.telemetry.pace
+            self.telemetry.pace = text if first.missing else self.telemetry.pace
+            if begins:
+                self.telemetry.publish_status(self._state())
+            if not self._told_of_wait and first.begun and time.monotonic() - first.begun > SILENT_WAIT:
+                self._told_of_wait = True
+                self.say(text)
+            return True
+        self._first, self.telemetry.pace = None, ""
+        if self._told_of_wait:
+            self.say(f"waited {first.seconds:.1f} s for first factors")
+        if first.missing:
+            log.warning("no first factor of %s after %.0f s: it goes on without", few(first.missing), first.seconds)
+        self.telemetry.publish_status(self._state())
+        return False
+
     def _check_pace(self) -> None:
         """Logs a line if the run does not keep pace with the clock."""
         now = time.monotonic()
@@ -201,6 +240,8 @@ class Service:
         return f"What helps: {', '.join(ways)}; --free-run does without the clock"
 
     def _drain(self) -> None:
+        if self._first is not None and not self._first.done:
+            return  # no step is made yet, and the policy is not to act
         if self._loop_alone:
             self._report(self.driver.pump(), self.driver.reactions, self.driver.other_reactions)
             return

@@ -101,12 +101,9 @@ class Driver:
     def solve_with_fresh_factors(self) -> None:
         """Makes a step that waits for the factors of its own matrices, made in this process."""
         self.engine.assemble()
-        step = self.engine.step
         for state in self.bodies:
             if not state.frozen:
-                values = self.engine.factor_matrix(state.body.index)
-                state.job.matrix = step, values
-                self.inline.submit(self._job(state, step, values))
+                self.inline.submit(self.assembled_job(state))
         self.receive(self.inline, self.adopt)
         self.engine.solve()
 
@@ -136,6 +133,12 @@ class Driver:
             return self._job(state, self.snapshots.step(state), state.job.copy)
         self.snapshots.discard(state)
         return None
+
+    def assembled_job(self, state: BodyUpdateState) -> Job:
+        """Returns the job of the matrix of a body as last assembled; between `assemble` and `solve` of the engine."""
+        step, values = self.engine.step, self.engine.factor_matrix(state.body.index)
+        state.job.matrix = step, values
+        return self._job(state, step, values)
 
     def _job(self, state: BodyUpdateState, step: int, values: NDArray[np.float64]) -> Job:
         name = state.body.name

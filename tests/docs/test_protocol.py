@@ -9,10 +9,12 @@ from protocol.channels import CHANNELS, PROTOCOL, Channel
 from protocol.push_limits import LONGEST_PUSH
 from protocol.shared_memory import limits
 from sim_server import cli
-from sim_server.mesh import MOST_TETS
+from sim_server.mesh import MOST_TETS, skin
 from sim_server.network import command_queue, leases, rate_limiter, worker_registry
 from sim_server.recording import recorder
 from sim_server.scene import integrator_options, where
+from sim_server.service import supervisor
+from sim_server.updates import first_factors
 from tests.docs.figures import DOCS, table_under
 
 UNITS = ((1 << 30, "GiB"), (1 << 20, "MiB"), (1 << 10, "KiB"))
@@ -57,6 +59,14 @@ def test_channels() -> None:
         ("protocol.md", f"no new jobs after {worker_registry.SILENCE:g} s;"),
         ("protocol.md", f"at most {LONGEST_PUSH:g} s of simulation"),
         ("protocol.md", f"`ulimit -l` of {(limits.POOL_LIMIT + limits.METADATA) >> 10:,} KiB"),
+        ("protocol.md", f"up to {supervisor.MAX_WORKERS} in all"),
+        ("scenes.md", f"at most {skin.MOST_VERTICES:,} vertices"),
+        ("scenes.md", f"magnitude {skin.MOST_WEIGHT:g} at most"),
+        ("use.md", f"up to {first_factors.TIMEOUT:g} s, before"),
+        (
+            "preconditioners.md",
+            f"after {first_factors.TIMEOUT:g} s, or after {first_factors.WORKER_TIMEOUT:g} s in which",
+        ),
         ("scenes.md", f"in at most {where.MAX_LENGTH} characters and {where.MAX_DEPTH} levels"),
         ("scenes.md", f"{MOST_TETS:,} tetrahedra in all"),
         ("use.md", f"above {recorder.FRAME_BYTES >> 20} MiB"),

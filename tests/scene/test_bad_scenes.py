@@ -110,6 +110,7 @@ def test_what_is_wrong_with_several_keys_names_them_and_no_place(tmp_path):
         (swap("tolerance = 1e-6", "drop_tolerance = 1"), "", "solver.drop_tolerance", "1", ["1"]),
         (swap("tolerance = 1e-6", "fill = -1"), "", "solver.fill", "-1", ["0"]),
         (swap("tolerance = 1e-6", 'schedule = "fair"'), "", "solver.schedule", "'fair'", ["'excess'", "'round_robin'"]),
+        (swap("tolerance = 1e-6", 'first_factor = "no"'), "", "solver.first_factor", "'no'", ["'wait'", "'go'"]),
         (swap("tolerance = 1e-6", "schedule_rounds = 0.5"), "", "solver.schedule_rounds", "0.5", ["1"]),
         (swap("tolerance = 1e-6", 'preconditioner = "ilu"'), "", "solver.preconditioner", "'ilu'", ["auto", "none", "jacobi", "ssor", "incomplete_cholesky", "cholesky"]),
         (swap("tolerance = 1e-6", 'warp = "true"'), "", "solver.warp", "'true'", ["true", "false"]),

@@ -6,6 +6,7 @@ reads what the loop has left in its rings, and may be called from another thread
 """
 
 import ctypes as c
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -437,6 +438,11 @@ class CpuEngine(Reports):
     def solve(self) -> None:
         """Second half: solve, integrate, report."""
         self._native.wf_solve(c.byref(self.loop))
+
+    def restart_clock(self) -> None:
+        """Takes what was waited for since `assemble` out of the time of the step."""
+        self.loop.assemble_begin = time.monotonic() - self.loop.assemble_seconds
+        self.loop.cpu_begin = time.thread_time() - self.loop.assemble_seconds
 
     def _begin(self) -> None:
         """Runs the launches of the scheme that come before the first step."""

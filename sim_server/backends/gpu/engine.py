@@ -6,6 +6,7 @@ The graph holds the launches of the scene and the persistent solver, whose stop 
 settings, factors and arguments.
 """
 
+import time
 from collections.abc import Callable, Sequence
 from typing import Any, cast
 
@@ -361,6 +362,12 @@ class GpuEngine(DeviceLoop):
         first, last = self._ranges[body]
         start = self._arrays["row_start"]
         return cast(Float64, self._known[start[first] : start[last]])
+
+    def restart_clock(self) -> None:
+        """Has the time of the step begin anew, without its assembly, and that of the loop's thread."""
+        with self._steps:
+            self._begin()
+        self.loop.cpu = time.thread_time()
 
     def solve(self) -> None:
         """Runs the second half: solve, integration, records."""

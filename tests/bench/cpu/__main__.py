@@ -15,7 +15,8 @@ import argparse
 import socket
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -27,12 +28,14 @@ from sim_server.recording import messages
 from sim_server.service.supervisor import Supervisor
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
+from sim_server.updates.first_factors import FirstFactors
 from tests.bench.cpu.scipy_step import ScipyStep
 from tests.bench.harness.report import ROOT, Report, plots
 
 SCENE = ROOT / "deploy" / "scenes" / "sofa_beam.toml"
 CELLS = {540: (3, 3, 10), 3000: (5, 5, 20), 7350: (7, 7, 25), 24000: (10, 10, 40)}
 STEPS = {540: 300, 3000: 300, 7350: 150, 24000: 100}
+FIRST_STEPS = 100
 # CPU ms per step of the simulation thread measured for SOFA v17.06 with the logic of its asynchronous solver (2.5 GHz
 # Cascade Lake class, dgemm 1000 at 35 ms on one thread), and what we aimed at.
 SOFA = {540: 1.1, 3000: 5.95, 7350: 29.4, 24000: 134.0}
@@ -72,9 +75,9 @@ def alone(preconditioner: str, update: str = "never") -> Callable[[int, int], di
     return run
 
 
-def with_worker(tets: int, steps: int) -> dict[str, Any]:
-    """async + warp with a worker process, the loop running on its own as in the server."""
-    sim = simulation(tets)
+@contextmanager
+def worker_of(sim: Simulation) -> Iterator[ServerLink]:
+    """A link with a worker process of its own that knows the scene."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
@@ -85,9 +88,16 @@ def with_worker(tets: int, steps: int) -> dict[str, Any]:
         try:
             while not link.dispatch.workers():
                 time.sleep(0.01)
-            return collected(_loop(sim, link, steps))
+            yield link
         finally:
             workers.close()
+
+
+def with_worker(tets: int, steps: int) -> dict[str, Any]:
+    """async + warp with a worker process, the loop running on its own as in the server."""
+    sim = simulation(tets)
+    with worker_of(sim) as link:
+        return collected(_loop(sim, link, steps))
 
 
 def _loop(sim: Simulation, link: ServerLink, steps: int) -> NDArray[Any]:
@@ -104,6 +114,36 @@ def _loop(sim: Simulation, link: ServerLink, steps: int) -> NDArray[Any]:
         sim.engine.loop.stop = 1
         loop.join()
     return np.concatenate(records)[:steps]
+
+
+def first_steps(tets: int, first_factor: str, steps: int) -> dict[str, Any]:
+    """A row about the first steps in real time, of a server whose first step waits for its factor, or goes."""
+    sim = simulation(tets)
+    sim.engine.loop.realtime = 1
+    with worker_of(sim) as link:
+        driver, records, begun = Driver(sim, link.dispatch), list[NDArray[Any]](), time.monotonic()
+        first = FirstFactors(driver) if first_factor == "wait" else None
+
+        def run() -> None:
+            if first is None or first.run():
+                sim.engine.run(steps - sim.engine.step)
+
+        loop = threading.Thread(target=run)
+        loop.start()
+        while loop.is_alive():
+            if first is None or first.done:
+                records.append(driver.pump())
+            time.sleep(1e-3)
+        seconds = time.monotonic() - begun
+        r = np.concatenate([*records, driver.pump()])
+    helped = np.flatnonzero(r["factor_step"] >= 0)
+    return {
+        "tets": tets, "first_factor": first_factor, "waited s": first.seconds if first else 0.0,
+        "steps without a factor": int(helped[0]) if len(helped) else len(r),
+        "iterations of all": int(r["iterations"].sum()), "most": int(r["iterations"].max()),
+        "longest step ms": 1e3 * float(r["whole"].max()), "late steps": int(sim.engine.loop.late_steps),
+        "s until the last": seconds,
+    }  # fmt: skip
 
 
 def scipy_steps(tets: int, steps: int) -> dict[str, Any]:
@@ -219,6 +259,16 @@ def main() -> None:
             for r in ours
         ]
     )
+    steps = FIRST_STEPS // (5 if options.quick else 1)
+    firsts = [first_steps(max(options.sizes), way, steps) for way in ("wait", "go")]
+    report.data["first steps"] = firsts
+    report.say(
+        "## The first steps",
+        f"The first {steps} steps in real time with a worker process: the first one waits for the factor of its "
+        "own matrix, or all go (`[solver] first_factor`). *waited*: until that factor came, before the clock starts; "
+        "*s until the last*: all of it.",
+    )
+    report.table(firsts)
     draw(report, rows)
     report.write()
 

@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: MIT
+"""The first factor of each body, made while the loop stands within its first step, where no other step waits.
+
+The step is assembled and not solved before its own matrices are factorized, so that no solve of a large body has to
+do without a factor. All of this is one step that takes long: a replay repeats it as any step with the factor of its
+own matrix.
+"""
+
+import time
+from collections.abc import Callable
+
+from sim_server.updates.body_state import BodyUpdateState
+from sim_server.updates.driver import Driver
+
+TIMEOUT = 60.0  # s until the first step goes on without factors
+WORKER_TIMEOUT = 3.0  # s without any worker, likewise
+MAX_FAILURES = 2  # jobs of a body that bring no factor, after which it is not waited for
+NAMED = 3  # objects named in a line
+
+
+class FirstFactors:
+    """Gives the matrices of the first step to workers and waits for their factors, for a bounded time.
+
+    `run` belongs to the thread of the loop; the policy of the driver must not act before it returns.
+
+    clock: monotonic time [s]; sleep: is called between two looks
+    """
+
+    def __init__(
+        self, driver: Driver, clock: Callable[[], float] = time.monotonic, sleep: Callable[[float], None] = time.sleep
+    ):
+        self._driver, self._clock, self._sleep = driver, clock, sleep
+        self._waiting = {state.body.name: state for state in driver.bodies}
+        self._failures: dict[str, int] = {}  # of each body when its matrix was sent
+        self.done = False
+        self.begun: float | None = None  # when `run` began to wait
+        self.seconds = 0.0  # that it has waited
+
+    @property
+    def missing(self) -> list[str]:
+        """Names of the bodies whose factor is waited for, or did not come in time."""
+        return list(self._waiting)
+
+    def run(self) -> bool:
+        """Makes the first step. False: the loop was stopped meanwhile, in the middle of it."""
+        engine = self._driver.engine
+        deadline, engine.loop.deadline = engine.loop.deadline, -1.0  # it stands still, but not between two steps
+        engine.assemble()
+        begun = seen = self.begun = self._clock()
+        while self._waiting and not engine.loop.stop:
+            self._look()
+            now = self._clock()
+            seen = now if self._driver.source.worker_count() else seen
+            if not self._waiting or now - begun > TIMEOUT or now - seen > WORKER_TIMEOUT:
+                break
+            self._sleep(1e-3)
+        self.seconds = self._clock() - begun
+        if engine.loop.stop:
+            return False
+        for name in self._waiting:
+            self._leave(self._driver.by_name[name])
+        engine.settle_factors()
+        engine.restart_clock()
+        engine.solve()
+        engine.loop.deadline = deadline
+        self.done = True
+        return True
+
+    def _look(self) -> None:
+        """Takes up factors that have come, and gives matrices to idle workers, those of large bodies first."""
+        driver, source = self._driver, self._driver.source
+        driver.receive(source, driver.adopt)
+        for name in source.reassigned():
+            self._failures.pop(name, None)
+        for name, state in list(self._waiting.items()):
+            failed = state.failures.in_a_row
+            if state.factors.newest >= 0 or failed >= MAX_FAILURES:
+                del self._waiting[name]
+            elif failed > self._failures.get(name, failed):
+                del self._failures[name]
+        unsent = [state for name, state in self._waiting.items() if name not in self._failures]
+        for state in sorted(unsent, key=lambda state: state.body.first - state.body.last)[: source.ready()]:
+            if source.submit(driver.assembled_job(state)):
+                self._failures[state.body.name] = state.failures.in_a_row
+
+    def _leave(self, state: BodyUpdateState) -> None:
+        """Leaves the job of a body that is under way to the policy, as one that it has sent."""
+        if state.body.name not in self._failures:
+            state.job.matrix = None
+        elif state.job.matrix is not None:
+            step, values = state.job.matrix
+            state.job.matrix = step, values.copy()[:]  # the next step assembles anew; a view is not recycled
+            state.job.in_flight, state.job.sent = True, step
+
+
+def few(missing: list[str]) -> str:
+    """Returns the first few names, and how many more there are."""
+    more = len(missing) - NAMED
+    return ", ".join(missing[:NAMED]) + (f" and {more} more" if more > 0 else "")
