@@ -1,9 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""What the demonstration says of its log."""
+"""What the demonstration says of its log, and what it does on a machine with a display."""
 
 import importlib.util
 import io
+import sys
+import webbrowser
+from contextlib import nullcontext
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -12,17 +16,21 @@ from rich.console import Console
 DEMO = Path(__file__).parents[1] / "deploy" / "demo.py"
 
 
-def said(ages: list[int], folder: Path) -> str:
+def the_demo() -> ModuleType:
     spec = importlib.util.spec_from_file_location("demo", DEMO)
     assert spec and spec.loader
     demo = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(demo)
-    count = len(ages)
+    return demo
+
+
+def said(ages: list[int], folder: Path) -> str:
+    demo, count = the_demo(), len(ages)
     scalars = {"iterations": np.arange(1, count + 1), "factor_age": np.array(ages)}
     scalars |= {"step_seconds": np.full(count, 2e-3), "residual": np.full(count, 9e-7)}
-    np.savez(folder / "beam.npz", **{f"scalars/{name}": values for name, values in scalars.items()})
+    np.savez(folder / "creature.npz", **{f"scalars/{name}": values for name, values in scalars.items()})
     out = io.StringIO()
-    Console(file=out, width=100).print(demo.summary(folder / "beam.npz"))
+    Console(file=out, width=100).print(demo.summary(folder / "creature.npz"))
     return out.getvalue()
 
 
@@ -45,3 +53,50 @@ def test_the_summary_holds_whenever_factors_came(ages, rows, tmp_path):
     shown = {name.strip(): value.strip() for _, name, value, _ in cells}
     assert {name: shown[name] for name in rows} == rows
     assert shown["steps"] == str(len(ages)) and shown["largest true residual"] == "9.0e-07"
+
+
+def test_the_hand_goes_smoothly_from_where_it_is_to_the_last_place() -> None:
+    demo = the_demo()
+    path = np.array([demo.way(part) for part in np.linspace(-0.1, 1.1, 241)])
+    assert (path[0] == 0).all() and (path[-1] == demo.WAY[-1]).all()
+    assert np.linalg.norm(np.diff(path, axis=0), axis=1).max() < 0.03  # m, in three quarters of a step
+
+
+@pytest.mark.parametrize(
+    ("display", "page", "browser", "shown"),
+    [(True, True, True, True), (False, True, True, False), (True, False, True, False), (True, True, False, False)],
+    ids=["all there", "no display", "no page", "no browser"],
+)
+def test_the_page_is_shown_where_it_can_be_seen(
+    display: bool, page: bool, browser: bool, shown: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def get() -> None:
+        if not browser:
+            raise webbrowser.Error("could not locate runnable browser")
+
+    demo = the_demo()
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setenv("DISPLAY", ":0") if display else monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.setattr(webbrowser, "get", get)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: object() if page else None)
+    assert demo.has_browser() is shown
+
+
+def test_the_page_opens_on_the_creature_and_ends_with_its_server(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Both programs are played by short scripts: the server ends by itself, the page would go on."""
+    demo, started, opened = the_demo(), [], []
+
+    def tool(package: str, *arguments: str) -> list[str]:
+        started.append((package, *arguments))
+        return [sys.executable, "-c", f"import time; time.sleep({0.3 if package == 'sim_server' else 60})"]
+
+    monkeypatch.setattr(demo, "tool", tool)
+    monkeypatch.setattr(demo, "connected", nullcontext)
+    monkeypatch.setattr(webbrowser, "open", opened.append)
+    assert demo.show() == 0
+    (server, page), (address,) = started, opened
+    assert server[:2] == ("sim_server", "gallery/creature") and "--steps" not in server
+    assert page[:2] == ("clients", "web") and page[page.index("--connect") + 1] == server[server.index("--listen") + 1]
+    assert address == f"http://127.0.0.1:{page[page.index('--port') + 1]}" and address in capsys.readouterr().out

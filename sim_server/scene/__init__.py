@@ -6,6 +6,7 @@ others.
 """
 
 from collections.abc import Sequence
+from os.path import exists
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -29,7 +30,7 @@ def load(path: str | Path, overrides: Sequence[str] = ()) -> Scene:
     try:
         text = toml_file.read_text(path, "scene")
     except InputError as error:
-        raise error if path.exists() else InputError(f"{error}; {gallery.known()}") from None
+        raise error if exists(path) else InputError(f"{error}; {gallery.known()}") from None
     table = toml_file.parse(text, path, "scene")
     overlays: dict[Place, str] = {}
     for override in overrides:

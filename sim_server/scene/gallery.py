@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Scenes that come with the package: gallery/NAME. Each begins with a comment that says in a sentence what it is."""
 
+from os.path import exists
 from pathlib import Path
 
 PREFIX = "gallery"
@@ -17,7 +18,7 @@ def found(path: Path) -> Path:
 
     What names neither is returned as it is.
     """
-    if path.exists() or len(path.parts) != 2 or path.parts[0] != PREFIX or path.suffix not in ("", ".toml"):
+    if exists(path) or len(path.parts) != 2 or path.parts[0] != PREFIX or path.suffix not in ("", ".toml"):
         return path
     return FOLDER / f"{path.stem}.toml" if path.stem in names() else path
 

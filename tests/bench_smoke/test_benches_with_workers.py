@@ -7,7 +7,7 @@ import pytest
 
 from tests.bench_smoke.quickly import writes_its_report
 
-BENCHES = ("build", "cpu", "faults", "figure4", "haptics", "scaling")
+BENCHES = ("build", "cpu", "faults", "figure4", "gallery", "haptics", "scaling")
 pytestmark = [pytest.mark.system, pytest.mark.slow]
 
 
