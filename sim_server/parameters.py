@@ -26,8 +26,6 @@ from sim_server.scene.live import LiveField, Place, live_fields
 from sim_server.scene.messages import NAMED, readable
 from sim_server.scene.parameters import nearest
 
-MOST, LONGEST_KEY, LONGEST_VALUE = 256, 300, 8192  # parameters of a command; characters
-
 REASONS = {  # why keys cannot change while steps run, by how they begin
     "dt": "the time step is an argument of every kernel and of the clock",
     "mesh": "all arrays are of the size of the mesh",
@@ -69,11 +67,16 @@ class LiveParameter:
 
 @dataclass
 class ParameterUpdate:
-    """New values on their way to the loop, by key, as TOML. pending: None until they have been given to it."""
+    """New values on their way to the loop, by key, as TOML.
+
+    pending: None until they have been given to it. replaces: an update that the loop has not taken up and that is part
+    of this one
+    """
 
     values: dict[str, str]
     client: str
     pending: PendingUpdate | None = None
+    replaces: "ParameterUpdate | None" = None
 
     @property
     def taken(self) -> int:
@@ -85,8 +88,7 @@ class LiveParameters:
     """The parameters of a simulation that may change, and their present values.
 
     scene: the scene with the values that were set last
-    on_set: called with each update that was given to the loop. One that the loop has not taken up when the next one
-        comes is part of that one.
+    on_set: called with each update that was given to the loop
     """
 
     def __init__(self, simulation: Simulated):
@@ -115,16 +117,10 @@ class LiveParameters:
 
         Raises BadParameter; nothing changes then.
         """
-        if not values or len(values) > MOST:
-            raise BadParameter(f"{len(values)} parameters; allowed: 1 to {MOST} at a time")
         table = deepcopy(self._table or self._simulation.scene.resolved())
         fields = {field.key: field for field in live_fields(self.scene)}
         given: dict[str, LiveField] = {}
         for key, text in values.items():
-            if len(key) > LONGEST_KEY or len(text) > LONGEST_VALUE:
-                raise BadParameter(
-                    f"{key[:40]!r} = {text[:40]!r}: at most {LONGEST_KEY} and {LONGEST_VALUE} characters"
-                )
             field = self._found(key, text, fields)
             if field.key in given:
                 raise BadParameter(f"{field.key} is set twice")
@@ -223,7 +219,8 @@ class LiveParameters:
         update = ParameterUpdate(texts, client)
         if simulation.engine.withdraw_changes():
             assert self._update is not None
-            update.values = self._update.values | update.values
+            update.values, update.replaces = self._update.values | update.values, self._update
+            self._update.replaces = None  # keep no chain of them
             if self._first is self._update:
                 self._first = None
         else:

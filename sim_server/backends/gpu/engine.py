@@ -232,6 +232,9 @@ class GpuEngine(DeviceLoop):
     def _make_ready(self) -> None:
         """Runs the launches before the first step, and takes the initial state of the energy balance."""
         begins = bool(self.begin or self._substeps) and self.step == 0
+        if self.step == 0:
+            self.take_changes()
+            self._steps.synchronize()
         if begins:
             for launch in self.begin:
                 launch()

@@ -254,6 +254,7 @@ int32_t wf_gpu_close(GpuLoop* loop) {
     return count(l, 1) && close_batch(l) && finish_down_to(l, 0) && finish_readbacks(l);
 }
 
+int32_t wf_gpu_take_changes(GpuLoop* loop) { return begin(*loop) && take_changes(*loop); }
 DeviceChanges* wf_gpu_post_changes(GpuLoop* loop, DeviceChanges* changes) { return loop->changes.exchange(changes); }
 Mail* wf_gpu_post(MailSlot* slot, Mail* mail) { return slot->posted.exchange(mail); }
 

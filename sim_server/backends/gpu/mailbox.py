@@ -20,7 +20,7 @@ def library() -> c.CDLL:
             "wf_gpu_run": (c.c_int64, [loop, c.c_int64]), "wf_gpu_wait": (c.c_int32, [loop]),
             "wf_gpu_open": (c.c_int32, [loop]), "wf_gpu_renew": (c.c_int32, [loop]),
             "wf_gpu_close": (c.c_int32, [loop]), "wf_gpu_post": (p, [c.POINTER(structs.MailSlot), p]),
-            "wf_gpu_post_changes": (p, [loop, p]),
+            "wf_gpu_post_changes": (p, [loop, p]), "wf_gpu_take_changes": (c.c_int32, [loop]),
             "wf_gpu_start_balance": (None, [p, p, c.c_double, c.c_int32]),
         },
     )  # fmt: skip
