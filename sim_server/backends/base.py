@@ -109,6 +109,8 @@ class LoopState(Protocol):
     """Memory that a running loop shares with other threads.
 
     realtime, patient, stop, pause: 0 or 1, set by others
+    single: steps that it is to make while it is paused
+    hold: number of a request to stand still between two steps, 0: none; held: the last one that it has followed
     frame_every, energy_every: steps between those that are reported, 0: none
     deadline: 0 while the loop stands still in a pause [s]
     late_steps, frames_dropped, records_dropped, others_dropped (reactions on what is no obstacle): numbers so far
@@ -118,6 +120,9 @@ class LoopState(Protocol):
     patient: int
     stop: int
     pause: int
+    single: int
+    hold: int
+    held: int
     deadline: float
     frame_every: int
     energy_every: int

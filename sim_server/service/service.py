@@ -28,6 +28,7 @@ from sim_server.network.link import ServerLink
 from sim_server.recording import messages
 from sim_server.recording.recorder import Recorder
 from sim_server.service.commands import Commands
+from sim_server.service.halts import Halts
 from sim_server.service.pace import LOOK_PERIOD, PaceMonitor
 from sim_server.service.telemetry import Telemetry
 from sim_server.simulation import Simulation
@@ -38,8 +39,6 @@ log = logging.getLogger(__name__)
 ROUND_PERIOD = 1e-3  # s that the service thread sleeps between rounds
 WORKERS_PERIOD = 0.02  # s between checks of local workers
 STATUS_INTERVAL = 0.02  # s between two statuses that clients request, at least
-HALT_TIMEOUT = 1.0  # s that the answer to `pause` or `stop` waits for the end of the step under way, at most
-MAX_HALTS = 64  # answers that wait for the end of a step at a time
 LOOP_NICE = -5  # of the loop's thread in real time: before workers, clients and our own threads on a full machine
 ENDLESS = 1 << 62
 
@@ -61,8 +60,7 @@ class Service:
         self._batches: deque[tuple[NDArray[Any], Float64, NDArray[Any]]] = deque()  # records and their reactions
         self._failure: BaseException | None = None
         self._status_replies: list[Callable[[pb.Reply], None]] = []  # of clients that requested a status
-        # deadline, reply and answer of each `pause` and `stop`
-        self._halts: list[tuple[float, Callable[[pb.Reply], None], pb.Reply]] = []
+        self._halts = Halts(self.commands)
         self._status_due = self._workers_due = self._pace_due = 0.0
         self.check_workers: Callable[[], None] = lambda: None  # called every WORKERS_PERIOD
         self.pace = PaceMonitor(simulation.world.dt, self._advice, not self._on_gpu) if realtime else None
@@ -85,9 +83,9 @@ class Service:
             self.engine.loop.stop = 1
             while loop.is_alive():  # it may wait for room in its rings
                 self._drain()
-                self._answer_halts()
+                self._halts.answer()
                 loop.join(0.01)
-            self._answer_halts(ended=True)
+            self._halts.answer(ended=True)
             self._drain()
             self.telemetry.publish_status("stopping")
         if self._failure is not None:
@@ -114,7 +112,7 @@ class Service:
             self.check_workers()
             self.link.check_name()
         self._carry_out()
-        self._answer_halts()
+        self._halts.answer()
         self._publish_status()
         self._check_pace()
         self.commands.release_absent(set(self.link.clients()))
@@ -133,27 +131,14 @@ class Service:
                     self._status_replies.append(reply)
                     continue
                 answer = self.commands.carry_out(command)
-                if command.verb in ("pause", "stop") and not answer.error and len(self._halts) < MAX_HALTS:
-                    self._halts.append((time.monotonic() + HALT_TIMEOUT, reply, answer))
-                else:
-                    answers.append((reply, answer))
-                    if not answer.error:
-                        done.append(command)
+                if self._halts.add(command, reply, answer):
+                    continue
+                answers.append((reply, answer))
+                if not answer.error:
+                    done.append(command)
         self.telemetry.reactions.moved(done)
         for reply, answer in answers:
             reply(answer)
-
-    def _answer_halts(self, ended: bool = False) -> None:
-        """Answers `pause` and `stop` once the loop has halted, with the number of its steps."""
-        waiting = []
-        for until, reply, answer in self._halts:
-            stands = self.commands.engine_halted or not self.commands.engine_paused  # or it goes on already
-            if (stands and answer.status.state == "paused") or ended or time.monotonic() >= until:
-                self.commands.stamp(answer.status)
-                reply(answer)
-            else:
-                waiting.append((until, reply, answer))
-        self._halts = waiting
 
     def _publish_status(self) -> None:
         """Publishes one status for all requests since the last: it costs more than any other command."""
