@@ -281,11 +281,20 @@ def _print_outcome(verb: str, reply: pb.Reply, as_json: bool) -> None:
         what = {"state": found.state, "step": found.step, "time": found.time, "changed": not reply.unchanged}
         print(json.dumps(what))
         return
-    said = {"pause": "paused at", "resume": "goes on from", "stop": "stopped after", "step": "paused at"}[verb]
+    said = {
+        "pause": "paused at",
+        "resume": "goes on from",
+        "stop": "stopped after",
+        "step": "paused at",
+        "reset": "put back at",
+    }[verb]
     if verb == "step" and found.state != "paused":
         said = f"{found.state} at"
     if reply.unchanged:
-        said = {"pause": "already paused, at", "resume": "already running, at"}[verb]
+        said = {
+        "pause": "paused at", "resume": "goes on from", "stop": "stopped after", "step": "paused at",
+        "reset": "put back at",
+    }[verb]  # fmt: skip
     steps = f"{found.step} step{'s' * (found.step != 1)}" if verb == "stop" else f"step {found.step}"
     print(f"{said} {steps} (t = {found.time:.3f} s)")
 
@@ -320,6 +329,27 @@ def step(
     with Client(server, connect) as client:
         reply = client.step(steps)
     _print_outcome("step", reply, as_json)
+
+
+@app.command()
+def reset(
+    object: Annotated[str | None, typer.Option("--object", metavar="NAME", help="Only this object.")] = None,
+    as_json: Json = False,
+    connect: Connect = None,
+    server: Server = SERVER_NAME,
+) -> None:
+    """Put all objects, or one, back to the start; steps and time go on.
+
+    \b
+    Examples:
+      sim-client reset
+      sim-client reset --object beam
+    """
+    from clients.client import Client
+
+    with Client(server, connect) as client:
+        reply = client.reset(object)
+    _print_outcome("reset", reply, as_json)
 
 
 @app.command()

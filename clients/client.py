@@ -187,6 +187,15 @@ class Client:
         command.steps = n
         return self._ask(command, self.timeout + LONGEST_STEPS)
 
+    def reset(self, object: str | None = None) -> pb.Reply:
+        """Puts an object, or all and what clients moved, back to the start; the status of the reply has the step.
+
+        Pushes and grabs on it end, broken attachments are whole again; step numbers and time go on.
+        """
+        command = self._command("reset", None, None)
+        command.object = object or ""
+        return self._ask(command)
+
     def stop(self) -> pb.Reply:
         """Ends the server, which then closes its log; the status of the reply has the number of steps."""
         return self.command("stop")

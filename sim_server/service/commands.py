@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Carries out commands of clients on a running simulation: to push, grab, move, pause, step, resume and stop."""
+"""Carries out commands of clients on a running simulation: to push, grab, move, pause, step, reset and stop."""
 
 import math
 from collections.abc import Callable
@@ -124,6 +124,12 @@ class Commands:
         mover.move(target.obstacle, _tuple(target.position), rotation)
         return pb.Reply()
 
+    def _reset(self, command: pb.Command) -> pb.Reply:
+        names = [body.name for body in self.simulation.world.bodies]
+        if command.object and command.object not in names:
+            raise BadCommand(f"no object {command.object[:80]!r}; objects of the scene: {', '.join(names)}")
+        return pb.Reply(status=self._status_of("paused" if self.engine_paused else "running"))
+
     def _pause(self, command: pb.Command) -> pb.Reply:
         unchanged, loop = self.engine_paused, self.engine.loop
         if not unchanged and not loop.realtime:
@@ -217,5 +223,6 @@ def _finite(i: pb.Interaction, *names: str) -> None:
 VERBS: dict[str, Callable[[Commands, pb.Command], pb.Reply]] = {
     "push": Commands._push, "grab": Commands._grab, "move": Commands._move, "release": Commands._release,
     "move_obstacle": Commands._move_obstacle,
-    "pause": Commands._pause, "resume": Commands._resume, "step": Commands._step, "stop": Commands._stop,
+    "pause": Commands._pause, "resume": Commands._resume, "step": Commands._step, "reset": Commands._reset,
+    "stop": Commands._stop,
 }  # fmt: skip

@@ -20,6 +20,8 @@ from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction
 from sim_server.backends.gpu.device import DeviceLaunch, Gpu, compiled, options, own_headers
 from sim_server.backends.gpu.kernel_fusion import FusedKernel, PhaseGuard, fuse
 from sim_server.backends.gpu.solver import PcgSolver
+from sim_server.backends.gpu.state import device_arrays
+from sim_server.backends.state import StateArray
 
 TEXT = Declarations("backends/gpu/central_difference.cu")
 SUBSTEPS, SUBSTEP_STATE = TEXT.dtype("Substeps"), TEXT.dtype("SubstepState")
@@ -83,6 +85,10 @@ class SubstepLoop:
         module = cp.RawModule(code=TEXT.checked(), options=flags_of_compiler, backend="nvrtc")
         names = ("measure_frequency", "begin_substeps", "shorten_substeps", "end_round")
         self._kernels: dict[str, KernelFunction] = {n: compiled("central_difference.cu", module, n) for n in names}
+
+    def state(self) -> list[StateArray]:
+        """Returns what steps carry on: the estimate of the stable substep."""
+        return device_arrays("engine.substeps", self._memory, "state", "stable", "mode")
 
     def start(self) -> None:
         """Estimates the stable step before the first step."""

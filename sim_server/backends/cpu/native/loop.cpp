@@ -339,6 +339,14 @@ int64_t wf_run(Loop* loop, int64_t steps) {
     return done;
 }
 
+// Begins the energy balance of a body that was put back to its start, also of a frozen one.
+void wf_restart(Loop* loop, int32_t body) {
+    if (!loop->energies) return;
+    measure_elastic(*loop);
+    loop->energies->balance[body].phase = WELL;
+    begin_balance(*loop, loop->body[body], loop->energies->balance[body]);
+}
+
 const Factor* wf_post_factor(Body* body, const Factor* factor) { return body->mail.exchange(factor); }
 Binding* wf_post_binding(Launch* launch, Binding* binding) { return launch->mail.exchange(binding); }
 
