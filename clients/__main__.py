@@ -333,14 +333,30 @@ def _command(verb: str, connect: Connect, server: str, as_json: bool) -> None:
 
     with Client(server, connect) as client:
         reply = client.command(verb)
+    _print_outcome(verb, reply, as_json)
+
+
+def _print_outcome(verb: str, reply: pb.Reply, as_json: bool) -> None:
+    """Prints in which state and at which step a command left the server."""
     found = reply.status
     if as_json:
         what = {"state": found.state, "step": found.step, "time": found.time, "changed": not reply.unchanged}
         print(json.dumps(what))
         return
-    said = {"pause": "paused at", "resume": "goes on from", "stop": "stopped after"}[verb]
+    said = {
+        "pause": "paused at",
+        "resume": "goes on from",
+        "stop": "stopped after",
+        "step": "paused at",
+        "reset": "put back at",
+    }[verb]
+    if verb == "step" and found.state != "paused":
+        said = f"{found.state} at"
     if reply.unchanged:
-        said = {"pause": "already paused, at", "resume": "already running, at"}[verb]
+        said = {
+        "pause": "paused at", "resume": "goes on from", "stop": "stopped after", "step": "paused at",
+        "reset": "put back at",
+    }[verb]  # fmt: skip
     steps = f"{found.step} step{'s' * (found.step != 1)}" if verb == "stop" else f"step {found.step}"
     print(f"{said} {steps} (t = {found.time:.3f} s)")
 
@@ -354,6 +370,48 @@ def pause(as_json: Json = False, connect: Connect = None, server: Server = SERVE
       sim-client pause
     """
     _command("pause", connect, server, as_json)
+
+
+@app.command()
+def step(
+    steps: Annotated[int, typer.Argument(metavar="[N]", min=1, help="How many.")] = 1,
+    as_json: Json = False,
+    connect: Connect = None,
+    server: Server = SERVER_NAME,
+) -> None:
+    """Have a paused server make a step, or N; it stays paused.
+
+    \b
+    Examples:
+      sim-client step
+      sim-client step 100
+    """
+    from clients.client import Client
+
+    with Client(server, connect) as client:
+        reply = client.step(steps)
+    _print_outcome("step", reply, as_json)
+
+
+@app.command()
+def reset(
+    object: Annotated[str | None, typer.Option("--object", metavar="NAME", help="Only this object.")] = None,
+    as_json: Json = False,
+    connect: Connect = None,
+    server: Server = SERVER_NAME,
+) -> None:
+    """Put all objects, or one, back to the start; steps and time go on.
+
+    \b
+    Examples:
+      sim-client reset
+      sim-client reset --object beam
+    """
+    from clients.client import Client
+
+    with Client(server, connect) as client:
+        reply = client.reset(object)
+    _print_outcome("reset", reply, as_json)
 
 
 @app.command()

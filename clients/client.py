@@ -34,6 +34,7 @@ from protocol.refused import Refused
 M = TypeVar("M", bound=Message)
 Point = Sequence[float]
 Value = float | bool | str | Sequence[Any]  # of a parameter; text is TOML
+LONGEST_STEPS = 60.0  # s that a server takes to answer `step`, at most
 
 
 class Client:
@@ -197,6 +198,27 @@ class Client:
         """Resumes the simulation; the status of the reply has the step."""
         return self.command("resume")
 
+    def step(self, n: int = 1) -> pb.Reply:
+        """Has a paused server make n steps (1 to 1,000,000). The reply comes after the last one, and holds its number.
+
+        After a minute it comes earlier: its status then says "running", and the other steps follow. In real time the
+        steps keep pace with the clock. Raises BadInput if the server is not paused.
+        """
+        if not 1 <= n < 1 << 32:
+            raise BadInput(f"{n} steps: allowed is a number of at least 1")
+        command = self._command("step", None, None)
+        command.steps = n
+        return self._ask(command, self.timeout + LONGEST_STEPS)
+
+    def reset(self, object: str | None = None) -> pb.Reply:
+        """Puts an object, or all and what clients moved, back to the start; the status of the reply has the step.
+
+        Pushes and grabs on it end, broken attachments are whole again; step numbers and time go on.
+        """
+        command = self._command("reset", None, None)
+        command.object = object or ""
+        return self._ask(command)
+
     def stop(self) -> pb.Reply:
         """Ends the server, which then closes its log; the status of the reply has the number of steps."""
         return self.command("stop")
@@ -249,11 +271,16 @@ class Client:
         """
         command = self._command(verb, interaction, target)
         command.MergeFrom(pb.Command(**fields))
-        found = self._query("command", pb.Reply, command.SerializeToString())
+        return self._ask(command)
+
+    def _ask(self, command: pb.Command, timeout: float | None = None) -> pb.Reply:
+        """Sends a command and waits for the reply, `self.timeout` unless told otherwise. Raises BadInput."""
+        payload = command.SerializeToString()
+        found = self._queries.ask("command", pb.Reply, payload, self.timeout if timeout is None else timeout)
         if not found:
             raise self._no_server()
         if found[0].error:
-            raise BadInput(f"{verb}: {found[0].error}")
+            raise BadInput(f"{command.verb}: {found[0].error}")
         return found[0]
 
     def send(

@@ -115,6 +115,8 @@ class Simulation:
         euler = self.integrator.euler_form(
             [*assemble, *integrate], assemble[numbers], euler_launches, settled, effects
         )  # fmt: skip
+        parts = [part.launches for part in (stages, euler, substeps) if part]
+        self.step_launches = list({id(x): x for x in (*assemble, *integrate, *(x for p in parts for x in p))}.values())
         contact = ties_alone(w, self.ties) if self.ties else None
         if self.contact:
             contact = self.contact.contact_input()
@@ -251,6 +253,11 @@ class Simulation:
     def holders(self) -> "Holders | None":
         """Groups of nodes that move as rigid bodies, if the scene has them."""
         return cast("Holders | None", self.effects.get("holders"))
+
+    @property
+    def movers(self) -> "list[Movable]":
+        """The effects that move obstacles and holders."""
+        return [m for m in (self.contact, self.holders) if m is not None]
 
     def movable(self, name: str) -> "Movable | None":
         """Returns the effect that moves the obstacle or holder of this name; an unknown name may be any's."""

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from protocol.factor import FactorPattern
 from sim_server.arrays import Float64
+from sim_server.backends.state import StateArray
 
 if TYPE_CHECKING:
     from sim_server.backends.central_difference import CentralDifference
@@ -43,6 +44,10 @@ class Launch(Protocol):
 
     def fetch(self, name: str) -> NDArray[Any]:
         """Returns one of its arrays as kernels have left it."""
+        ...
+
+    def written(self) -> list[tuple[str, NDArray[Any]]]:
+        """Returns the arrays of the host that it may write, by the names of its struct's members."""
         ...
 
     def __call__(self) -> None:
@@ -112,16 +117,24 @@ class SolveSettings(Protocol):
 class LoopState(Protocol):
     """Memory that a running loop shares with other threads.
 
+    step: number of completed steps. start_time: of the simulation at step 0 [s]
     realtime, patient, stop, pause: 0 or 1, set by others
+    single: steps that it is to make while it is paused
+    hold: number of a request to stand still between two steps, 0: none; held: the last one that it has followed
     frame_every, energy_every: steps between those that are reported, 0: none
     deadline: 0 while the loop stands still in a pause [s]
     late_steps, frames_dropped, records_dropped, others_dropped (reactions on what is no obstacle): numbers so far
     """
 
+    step: int
+    start_time: float
     realtime: int
     patient: int
     stop: int
     pause: int
+    single: int
+    hold: int
+    held: int
     deadline: float
     frame_every: int
     energy_every: int
@@ -272,6 +285,22 @@ class Engine(Protocol):
         """Takes back what `change` was given last and the loop has not taken up; False if there is nothing."""
         ...
 
+    def prepare(self) -> None:
+        """Makes the state before the first step, which `run` and `assemble` do otherwise."""
+        ...
+
+    def state(self) -> list[StateArray]:
+        """Returns what steps carry on beside the arrays that launches write."""
+        ...
+
+    def resume(self, step: int, start_time: float) -> None:
+        """Goes on after `step` steps, once all state arrays were written. start_time [s]: of step 0."""
+        ...
+
+    def restart(self, bodies: Sequence[int]) -> None:
+        """Begins the energy balances of bodies anew after a reset: with their positions and velocities, none frozen."""
+        ...
+
 
 @dataclass(frozen=True)
 class EngineInput:
@@ -340,4 +369,8 @@ class Backend(Protocol):
 
     def fetch(self, host: NDArray[Any]) -> NDArray[Any]:
         """Returns the array with what kernels have made of it."""
+        ...
+
+    def push(self, host: NDArray[Any]) -> None:
+        """Gives kernels the array as it is on the host. While the loop stands still."""
         ...

@@ -111,6 +111,11 @@ class BoundKernel:
             if not (isinstance(value, np.ndarray) and value.dtype in fits and value.flags.c_contiguous):
                 raise TypeError(f"{self.name}: {f.name} must be a contiguous array of {f.dtype}")
 
+    def written(self) -> list[tuple[str, np.ndarray]]:
+        """Returns the arrays of the host that it may write, by the names of its struct's members."""
+        given = zip(self.fields, self.values, strict=True)
+        return [(f.name, value) for f, value in given if f.dtype is not None and not f.constant]
+
     @property
     def domain(self) -> str:
         """What its items are: the first word behind `int n;` in its struct."""

@@ -2,6 +2,9 @@
 """Attachments and springs as input of an engine (forces: kernels/ties.cuh)."""
 
 from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
 
 from sim_server.arrays import Float64, Int32
 
@@ -36,3 +39,7 @@ class Ties:
     broken: Int32
     reaction: Float64
     column: int
+
+    def rows(self, body: int) -> Any:
+        """Returns the rows that bind a body to something."""
+        return np.flatnonzero((self.body == body).any(axis=1))

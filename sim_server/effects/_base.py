@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: MIT
 """Base of the effects: elements that couple nodes, and launches that add to the system of a step."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sim_server.arrays import Float64, Int32
 from sim_server.backends.base import Launch, PendingUpdate
@@ -94,6 +95,13 @@ class Effect:
 
     def connect(self, simulation: EffectUpdates) -> None:
         """Called once the loop exists. An effect that changes while steps run keeps `simulation`."""
+
+    def rows_of_bodies(self, array: NDArray[Any]) -> Callable[[int], Any] | None:
+        """Returns the function that finds the rows of a body in an array of this effect, for resets.
+
+        None for arrays that have a row for each node, body or element, or no rows of single bodies.
+        """
+        return None
 
     def balance_arrays(self) -> dict[str, Float64]:
         """Returns arrays that the energy balance of a step reads, by their names in backends.energies; {} for most.

@@ -19,7 +19,7 @@ its work.
 Sources: Hughes, The Finite Element Method, section 1.10 (prescribed boundary values).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from sim_server.arrays import Float64, Int32
 from sim_server.backends.base import Launch, Module
+from sim_server.backends.state import rows_in
 from sim_server.effects._movable import Movable, pose_of
 from sim_server.errors import InputError
 from sim_server.mechanics.system import Stencil, System
@@ -86,6 +87,10 @@ class Holders(Movable):
         exact = [a for a in vars(self).values() if isinstance(a, np.ndarray) and a is not self.load]
         world.backend.keep(*exact, exact=True)
         world.backend.keep(self.load)
+
+    def rows_of_bodies(self, array: NDArray[Any]) -> Callable[[int], Any] | None:
+        nodal = (self.next, self.later, self.velocity, self.force, self._shift, self._sum, self._settled)
+        return rows_in(self.world.body_of(self.node)) if any(array is each for each in nodal) else None
 
     def use_load(self, load: Float64) -> None:
         """Has forces added to `load` (nodes, 3), the array `force` of another effect, for the energy balance."""

@@ -3,8 +3,10 @@
 
 from collections.abc import Sequence
 from math import dist, hypot
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sim_server.arrays import Float64
 from sim_server.backends.base import Launch
@@ -53,6 +55,7 @@ class Movable(Effect):
         self._motion = np.array([MOTION[way] for way in ways], np.int32)
         self._first = np.concatenate([[0], np.cumsum([len(poses) for poses in given])]).astype(np.int32)
         self._time = np.array([time for poses in given for time, _ in poses])
+        self._given_time = self._time
         self.frames = np.array([pose for poses in given for _, pose in poses])
         self._speed = np.array([o.max_speed or 0.0 for o in listed])
         self._turn = np.array([o.max_turn or 0.0 for o in listed])
@@ -62,6 +65,10 @@ class Movable(Effect):
 
     def connect(self, simulation: EffectUpdates) -> None:
         self._simulation = simulation
+
+    def frame_arrays(self) -> list[NDArray[Any]]:
+        """Returns what steps carry on of the frames, with a row for each."""
+        return [self.begin, self.end, self.swept, self._placed]
 
     @property
     def targets(self) -> dict[str, Float64]:
@@ -99,6 +106,25 @@ class Movable(Effect):
         self._target = target
         assert self._simulation is not None and self._system is not None
         self._simulation.update_effect(self, self.place(self._system))
+
+    def restart(self, numbers: Sequence[int], time: float) -> None:
+        """Puts frames back to where they began; their keyframes are those of the time since `time` [s].
+
+        To be called while the loop stands still.
+        """
+        if not len(numbers):
+            return
+        for array in (self.begin, self.end, self._placed):
+            self.world.backend.fetch(array)
+        self._target, self._time = self._target.copy(), self._time.copy()
+        for k in numbers:
+            keys = slice(self._first[k], self._first[k + 1])
+            self.begin[k] = self.end[k] = self._target[k] = self.frames[self._first[k]]
+            self._placed[k] = -1.0
+            self._time[keys] = self._given_time[keys] + time
+        for array in (self.begin, self.end, self._placed):
+            self.world.backend.push(array)
+        self.restore({})
 
     def _check_name(self, name: str) -> int:
         """Returns the number of a frame that a client may move. Raises MoveError."""

@@ -26,11 +26,12 @@ steel) to 1 (rubber).
 """
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import hypot
 from typing import Annotated, Any
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field
 
 from sim_server.arrays import Float64, Int32
@@ -116,6 +117,8 @@ class Contact(Movable):
         body += [body[0], _body_of_rows(surfaces_of.edge_start)] if surfaces_of else []
         thickness = np.array(bounds)[np.concatenate(body).astype(np.int32)]
         own = len(thickness)  # rows of contact; those of attachments and springs follow
+        ties_of = ties.body[:, 0] if ties else np.zeros(0, np.int32)
+        self._row_body, self._first_pair = np.concatenate([*body, ties_of]).astype(np.int32), pairs - int(start[-1])
         thickness = np.concatenate([thickness, np.zeros(len(ties.corner) if ties else 0)])
         rows = len(thickness)
         corner, weight = np.full((rows, 4), -1, np.int32), np.zeros((rows, 4))
@@ -148,6 +151,17 @@ class Contact(Movable):
                 size[k], self.ball[k, 3] = _size(o)
         kind = np.array([ShapeKind[o.shape.upper()] for o in self.obstacles], np.int32)
         self._table = Obstacles(kind, size, np.concatenate(grids), place, nodes, self.begin, self.end)
+
+    def rows_of_bodies(self, array: NDArray[Any]) -> Callable[[int], Any] | None:
+        """Rows of a body, and of other bodies that it touches in this step."""
+        if not any(array is each for each in vars(self._input).values()) or len(array) != len(self._input.obstacle):
+            return None
+        return self._rows_of
+
+    def _rows_of(self, body: int) -> Any:
+        rows = np.flatnonzero(self.world.backend.fetch(self._input.obstacle) == body)
+        others = rows[rows >= self._first_pair]
+        return np.union1d(np.flatnonzero(self._row_body == body), others)
 
     def contact_input(self) -> ContactInput:
         """Returns the rows, which the launches fill in each step, and options of the solve."""

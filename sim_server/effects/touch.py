@@ -172,6 +172,13 @@ class Touch(Effect):
         self._put(alive)
         return old
 
+    def release_of(self, name: str = "") -> None:
+        """Ends all pushes and grabs on an object, or on all objects."""
+        alive = self._alive()
+        kept = {id: a for id, a in alive.items() if name and a.object != name}
+        if len(kept) < len(alive):
+            self._put(kept)
+
     def release_all(self, client: str) -> int:
         """Ends the grabs of a client that has gone, and its pushes ORPHANED_PUSH s from now at the latest.
 

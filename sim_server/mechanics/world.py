@@ -222,6 +222,11 @@ class World:
                 return body
         raise KeyError(f"no object {name!r}; there are {', '.join(b.name for b in self.bodies)}")
 
+    def body_of(self, nodes: Int32) -> Int32:
+        """Returns the index of the body of each node, (len(nodes),)."""
+        firsts = np.array([b.first for b in self.bodies])
+        return (np.searchsorted(firsts, nodes, "right") - 1).astype(np.int32)
+
     def with_effect(self, name: str) -> list[tuple[Body, Any]]:
         """The bodies that list the effect, with its parameters."""
         return [(b, b.effects[name]) for b in self.bodies if name in b.effects]

@@ -80,6 +80,7 @@ class Recording:
         self.obstacles: dict[str, pb.Obstacle] = {}
         self.targets: list[pb.ObstacleTargets] = []
         self.parameters: dict[int, list[pb.ParameterSet]] = {}  # by step
+        self.resets: list[pb.Reset] = []
         self.touched = False
         self.notes: list[str] = []
         self._file = LogFile.open(self.path)
@@ -133,6 +134,8 @@ class Recording:
         elif message.topic == "/parameters":
             found = pb.ParameterSet.FromString(message.data)
             self.parameters.setdefault(found.step, []).append(found)
+        elif message.topic == "/resets":
+            self.resets.append(pb.Reset.FromString(message.data))
         elif message.kind == "obstacle":
             self.obstacles[message.object] = pb.Obstacle.FromString(message.data)
         elif message.kind != "pose":  # which follow from the scene and the targets

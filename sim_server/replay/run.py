@@ -32,6 +32,7 @@ from sim_server.replay.report import Comparison
 from sim_server.scene import Scene, deleted
 from sim_server.scene.messages import readable
 from sim_server.simulation import Simulation
+from sim_server.state.start import Start
 from sim_server.updates.factor_source import Inline, Job
 from sim_server.updates.worker_assembly import Assembly
 
@@ -79,6 +80,10 @@ class Replay:
         self._targets: dict[int, list[pb.ObstacleTargets]] = {}
         for t in recording.targets:
             self._targets.setdefault(t.step, []).append(t)
+        self._resets: dict[int, list[str]] = {}
+        for r in recording.resets:
+            self._resets.setdefault(r.step, []).append(r.header.object)
+        self._start = Start(self.simulation) if self._resets else None
         self._nodes: dict[int, tuple[NDArray[np.int32], Float64]] = {}  # nodes and offsets of interactions, by id
         self._inline = self._library()
         self._positions: dict[str, Float64] = {}  # sent instead of a matrix, and not those of its step, by body
@@ -92,6 +97,7 @@ class Replay:
         """Repeats all steps and compares them; calls `progress` with the number of steps done."""
         self._compare_frames(0)
         for step in range(self.recording.steps):
+            self._reset(step)
             self._restore_interactions(step)
             self._restore_targets(step)
             self._restore_parameters(step)
@@ -164,6 +170,15 @@ class Replay:
         return Inline({b.name: system.body_pattern(b.first, b.last) for b in self.bodies}, choice)
 
     # --- input of a step ----------------------------------------------------------------------------------------
+
+    def _reset(self, step: int) -> None:
+        """Puts back what was put back before this step."""
+        for name in self._resets.get(step, ()):
+            try:
+                assert self._start is not None
+                self._start.reset(name)
+            except KeyError as error:
+                raise BadLog(f"{self.recording.path}: reset at step {step}: {error}") from error
 
     def _restore_interactions(self, step: int) -> None:
         """Sets the interactions that the loop took up at this step."""

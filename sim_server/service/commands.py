@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Carries out commands of clients on a running simulation: to push, grab, move, set, pause, resume and stop."""
+"""Carries out commands of clients on a running simulation: to push, grab, move, set, pause, step, reset and stop."""
 
 import math
 from collections.abc import Callable
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 MOST_LISTED = 2000  # live parameters in a reply
 MOST_SET, LONGEST_KEY, LONGEST_VALUE = 256, 300, 8192  # parameters of a command; characters
+MAX_STEPS = 1_000_000  # single ones of a command
 UNIT = 1e-6  # that the length of a quaternion may differ from 1 by
 
 
@@ -53,8 +54,12 @@ class Commands:
 
     @property
     def engine_halted(self) -> bool:
-        """True if the loop has halted after `pause`: it sets its deadline to 0 while it waits."""
-        return bool(self.engine.loop.deadline == 0)
+        """True if the loop stands still after `pause`: it sets its deadline to 0 then, and has no single steps left."""
+        return bool(self.engine.loop.single <= 0 and self.engine.loop.deadline == 0)
+
+    def make_steps(self, steps: int) -> None:
+        """Has the loop, which stands still in a pause, make some steps more."""
+        self.engine.loop.single = steps
 
     def carry_out(self, command: pb.Command) -> pb.Reply:
         """Carries out a command and returns the reply, with an error if it cannot be done."""
@@ -143,17 +148,34 @@ class Commands:
     def _parameters(self, command: pb.Command) -> pb.Reply:
         return pb.Reply(parameters=map(messages.live_parameter, islice(self.simulation.parameters, MOST_LISTED)))
 
+    def _reset(self, command: pb.Command) -> pb.Reply:
+        names = [body.name for body in self.simulation.world.bodies]
+        if command.object and command.object not in names:
+            raise BadCommand(f"no object {command.object[:80]!r}; objects of the scene: {', '.join(names)}")
+        return pb.Reply(status=self._status_of("paused" if self.engine_paused else "running"))
+
     def _pause(self, command: pb.Command) -> pb.Reply:
         unchanged, loop = self.engine_paused, self.engine.loop
         if not unchanged and not loop.realtime:
             loop.deadline = -1.0  # not looked at without a pace; 0 again once the loop stands still
+        loop.single = 0  # single steps end, too
         loop.pause = 1
         return pb.Reply(status=self._status_of("paused"), unchanged=unchanged)
+
+    def _step(self, command: pb.Command) -> pb.Reply:
+        if not self.engine_paused:
+            raise BadCommand("the server is not paused: only a paused one makes single steps")
+        if command.steps > MAX_STEPS:
+            raise BadCommand(f"steps = {command.steps}: at most {MAX_STEPS}")
+        if self.simulation.touch is not None:
+            self.simulation.touch.flush()  # what came before it holds from the first step on
+        return pb.Reply(status=self._status_of("paused"))
 
     def _resume(self, command: pb.Command) -> pb.Reply:
         unchanged = not self.engine_paused
         if self.simulation.touch is not None:
             self.simulation.touch.flush()  # what came before it holds from the first step on
+        self.engine.loop.single = 0
         self.engine.loop.pause = 0
         return pb.Reply(status=self._status_of("running"), unchanged=unchanged)
 
@@ -238,6 +260,6 @@ def _finite(i: pb.Interaction, *names: str) -> None:
 VERBS: dict[str, Callable[[Commands, pb.Command], pb.Reply]] = {
     "push": Commands._push, "grab": Commands._grab, "move": Commands._move, "release": Commands._release,
     "move_obstacle": Commands._move_obstacle, "set": Commands._set, "parameters": Commands._parameters,
-    "pause": Commands._pause, "resume": Commands._resume, "stop": Commands._stop,
-    "add_worker": Commands._add_worker, "kill_worker": Commands._kill_worker,
+    "pause": Commands._pause, "resume": Commands._resume, "step": Commands._step, "reset": Commands._reset,
+    "stop": Commands._stop, "add_worker": Commands._add_worker, "kill_worker": Commands._kill_worker,
 }  # fmt: skip

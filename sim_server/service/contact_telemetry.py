@@ -39,6 +39,10 @@ class ContactTelemetry:
             if self._recorder:
                 self._recorder.obstacle(obstacle)
 
+    def on_reset(self) -> None:
+        """Takes note that something was put back: what breaks again is told again."""
+        self._broken.clear()
+
     def look(self) -> bool:
         """Returns True if somebody wants poses."""
         return bool(self._simulation.reaction_names) and self._link.wants_pose()

@@ -15,6 +15,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -27,10 +28,13 @@ from sim_server.backends.cpu.structs import REACTION
 from sim_server.network.link import ServerLink
 from sim_server.recording import messages
 from sim_server.recording.recorder import Recorder
+from sim_server.service.between_steps import BetweenSteps
 from sim_server.service.commands import Commands
+from sim_server.service.halts import Halts
 from sim_server.service.pace import LOOK_PERIOD, PaceMonitor
 from sim_server.service.telemetry import Telemetry
 from sim_server.simulation import Simulation
+from sim_server.state.start import Start
 from sim_server.updates.driver import Driver
 from sim_server.updates.first_factors import FirstFactors, few
 
@@ -40,11 +44,10 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 ROUND_PERIOD = 1e-3  # s that the service thread sleeps between rounds
+HOLD_PERIOD = 1e-4  # the same while the loop is to stand still
 WORKERS_PERIOD = 0.02  # s between checks of local workers
 SILENT_WAIT = 0.5  # s of waiting for first factors before a line tells of it
 STATUS_INTERVAL = 0.02  # s between two statuses that clients request, at least
-HALT_TIMEOUT = 1.0  # s that the answer to `pause` or `stop` waits for the end of the step under way, at most
-MAX_HALTS = 64  # answers that wait for the end of a step at a time
 LOOP_NICE = -5  # of the loop's thread in real time: before workers, clients and our own threads on a full machine
 ENDLESS = 1 << 62
 
@@ -66,8 +69,9 @@ class Service:
         self._batches: deque[tuple[NDArray[Any], Float64, NDArray[Any]]] = deque()  # records and their reactions
         self._failure: BaseException | None = None
         self._status_replies: list[Callable[[pb.Reply], None]] = []  # of clients that requested a status
-        # deadline, reply and answer of each `pause` and `stop`
-        self._halts: list[tuple[float, Callable[[pb.Reply], None], pb.Reply]] = []
+        self._halts = Halts(self.commands)
+        self._between = BetweenSteps(self.engine.loop)
+        self._start = Start(simulation)
         self._status_due = self._workers_due = self._pace_due = 0.0
         self.check_workers: Callable[[], None] = lambda: None  # called every WORKERS_PERIOD
         self.pace = PaceMonitor(simulation.world.dt, self._advice, not self._on_gpu) if realtime else None
@@ -102,14 +106,15 @@ class Service:
             loop.start()  # inside: a signal may come before it returns, when the thread runs already
             while loop.is_alive() and not self.commands.stopping:
                 self.round()
-                time.sleep(ROUND_PERIOD)
+                time.sleep(HOLD_PERIOD if self._between.waits else ROUND_PERIOD)
         finally:
             self.engine.loop.stop = 1
             while loop.is_alive():  # it may wait for room in its rings
                 self._drain()
-                self._answer_halts()
+                self._halts.answer()
                 loop.join(0.01)
-            self._answer_halts(ended=True)
+            self._between.run()
+            self._halts.answer(ended=True)
             self._drain()
             self.telemetry.publish_status("stopping")
         if self._failure is not None:
@@ -137,7 +142,10 @@ class Service:
             self.check_workers()
             self.link.check_name()
         self._carry_out()
-        self._answer_halts()
+        if self._between.may_run:
+            self._drain()
+            self._between.run()
+        self._halts.answer()
         self._publish_status()
         if not self._awaits_factors():
             self._check_pace()
@@ -157,27 +165,29 @@ class Service:
                     self._status_replies.append(reply)
                     continue
                 answer = self.commands.carry_out(command)
-                if command.verb in ("pause", "stop") and not answer.error and len(self._halts) < MAX_HALTS:
-                    self._halts.append((time.monotonic() + HALT_TIMEOUT, reply, answer))
-                else:
-                    answers.append((reply, answer))
-                    if not answer.error:
-                        done.append(command)
+                if self._halts.add(command, reply, answer):
+                    continue
+                if command.verb == "reset" and not answer.error:
+                    self._between.add(partial(self._reset, command.object, reply, answer))
+                    continue
+                answers.append((reply, answer))
+                if not answer.error:
+                    done.append(command)
         self.telemetry.reactions.moved(done)
         for reply, answer in answers:
             reply(answer)
 
-    def _answer_halts(self, ended: bool = False) -> None:
-        """Answers `pause` and `stop` once the loop has halted, with the number of its steps."""
-        waiting = []
-        for until, reply, answer in self._halts:
-            stands = self.commands.engine_halted or not self.commands.engine_paused  # or it goes on already
-            if (stands and answer.status.state == "paused") or ended or time.monotonic() >= until:
-                self.commands.stamp(answer.status)
-                reply(answer)
-            else:
-                waiting.append((until, reply, answer))
-        self._halts = waiting
+    def _reset(self, name: str, reply: Callable[[pb.Reply], None], answer: pb.Reply) -> None:
+        """Puts an object or all back to the start, while the loop stands still."""
+        if self.simulation.touch is not None:
+            self.simulation.touch.release_of(name)
+        self._start.reset(name)
+        for state in self.driver.bodies:
+            if name in ("", state.body.name):
+                state.frozen = False
+        self.telemetry.on_reset(name, self.commands.engine_paused)
+        self.commands.stamp(answer.status)
+        reply(answer)
 
     def _publish_status(self) -> None:
         """Publishes one status for all requests since the last: it costs more than any other command."""

@@ -192,10 +192,28 @@ class Telemetry:
                 self._record_frame(step, x, v, self.engine.frame_poses[step])
         if frames and self._is_due("state", STATE_PERIOD):
             step, x, v = frames[-1]
-            for body in self.simulation.world.bodies:
-                if self.link.wants_state(body.name):
-                    self.link.publish_state(messages.state(body, step, step * self.simulation.world.dt, x, v))
+            self._publish_frame(step, x, v)
             self.contact.publish_poses(step, self.engine.frame_poses[step])
+
+    def _publish_frame(self, step: int, x: Float64, v: Float64) -> None:
+        for body in self.simulation.world.bodies:
+            if self.link.wants_state(body.name):
+                self.link.publish_state(messages.state(body, step, step * self.simulation.world.dt, x, v))
+
+    def on_reset(self, name: str, show: bool) -> None:
+        """Takes note that an object, or all, were put back to the start. show: to viewers, as no step follows soon."""
+        world, step = self.simulation.world, self.engine.step
+        for body in world.bodies:
+            if name in ("", body.name):
+                self.runaways.pop(body.index, None)
+                self._not_finite.discard(body.name)
+        self.contact.on_reset()
+        if self.recorder:
+            message = pb.Reset(header=pb.Header(object=name), step=step)
+            self.recorder.reset(message, step * world.dt, block=self.patient)
+        if show:
+            self.simulation.fetch()
+            self._publish_frame(step, world.x, world.v)
 
     def frame_interval(self) -> int:
         """Returns the steps between frames that the loop should copy out; 0 for none."""

@@ -412,6 +412,27 @@ def test_a_pause_ends_what_is_under_way_and_resumes():
     assert scene.loop.run(5) == 0
 
 
+def test_a_paused_loop_makes_single_steps_and_stands_still_on_request():
+    scene = FakeScene()
+    loop = scene.loop.loop
+    loop.pause = 1
+    thread = threading.Thread(target=lambda: scene.loop.run(30))
+    thread.start()
+    loop.single = 3
+    while not (scene.loop.step == 3 and loop.single == 0 and loop.deadline == 0):
+        time.sleep(1e-3)
+    assert loop.launched == 3
+    loop.hold = 7
+    while loop.held != 7:
+        time.sleep(1e-3)
+    loop.pause = 0
+    thread.join(0.02)
+    assert scene.loop.step == loop.launched == 3, "not before it is let go"
+    loop.hold = 0
+    thread.join(20)
+    assert scene.loop.step == 30
+
+
 @pytest.mark.parametrize("call", ["graph_launch", "event_query", "event_record"])
 def test_a_device_that_fails_is_told_with_the_call_that_failed(call):
     scene = FakeScene()

@@ -52,3 +52,13 @@ def test_pause_resume_and_stop_say_what_happened(commands: Commands) -> None:
     assert [done(verb) for verb in ("resume", "pause", "pause", "resume", "stop")] == [
         ("running", 3, True), ("paused", 3, False), ("paused", 3, True), ("running", 3, False), ("stopping", 3, False),
     ]  # fmt: skip
+
+
+def test_only_a_paused_server_takes_single_steps_and_only_so_many(commands: Commands) -> None:
+    step = pb.Command(client="anna", verb="step", steps=2)
+    assert "is not paused" in commands.carry_out(step).error
+    commands.carry_out(pb.Command(client="anna", verb="pause"))
+    assert commands.carry_out(step).status.state == "paused"
+    assert commands.carry_out(pb.Command(client="anna", verb="step", steps=1_000_001)).error == (
+        "steps = 1000001: at most 1000000"
+    )

@@ -131,6 +131,26 @@ def test_a_pause_is_answered_when_the_loop_stands_still(stage: Stage, tmp_path: 
     assert server.wait() == 0 and f"{steps} steps; last" in server.output()
 
 
+@pytest.mark.parametrize(
+    ("pace", "update"), [("--realtime", "async"), ("--free-run", "async"), ("--free-run", "every-2")]
+)
+def test_a_paused_server_makes_single_steps(stage: Stage, tmp_path: Path, pace: str, update: str) -> None:
+    stage.server(beam(tmp_path, (2, 2, 6), f'update = "{update}"'), pace)
+    with stage.client() as client:
+        with pytest.raises(BadInput, match="step: the server is not paused"):
+            client.step()
+        step = client.pause().status.step
+        for n in (1, 1, 7):
+            reply = client.step(n)
+            step += n
+            assert (reply.status.step, reply.status.state) == (step, "paused")
+            assert fresh(client).step == step, "it stands still"
+        said = sim_client(stage, "step", "2").stdout
+        assert said == f"paused at step {step + 2} (t = {0.02 * (step + 2):.3f} s)\n"
+        client.resume()
+        until(lambda: fresh(client).step > step + 2, "it goes on")
+
+
 def test_pushes_of_one_who_left_make_room_and_replay_to_the_bit(stage: Stage, tmp_path: Path) -> None:
     log = tmp_path / "run.mcap"
     scene = beam(tmp_path, (2, 2, 6), 'update = "never"')

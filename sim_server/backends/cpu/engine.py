@@ -29,6 +29,7 @@ from sim_server.backends.euler_form import EulerForm
 from sim_server.backends.newton import Newton
 from sim_server.backends.ring_buffers import Reports
 from sim_server.backends.rosenbrock import NODAL, Rosenbrock
+from sim_server.backends.state import StateArray, host_array, memory_of, numbers_of, same_body
 from sim_server.backends.ties import Ties
 
 Reals = NDArray[np.float64]
@@ -43,7 +44,8 @@ def _library() -> c.CDLL:
         "backends/cpu/native/loop.cpp",
         {
             "wf_assemble": (None, [loop]), "wf_solve": (None, [loop]), "wf_run": (c.c_int64, [loop, c.c_int64]),
-            "wf_wait": (c.c_int32, [loop]), "wf_copy_matrix": (None, [loop, c.c_int32, p]),
+            "wf_wait": (c.c_int32, [loop]), "wf_restart": (None, [loop, c.c_int32]),
+            "wf_copy_matrix": (None, [loop, c.c_int32, p]),
             "wf_post_factor": (p, [c.POINTER(structs.Body), p]), "wf_post_binding": (p, [c.POINTER(structs.Launch), p]),
             "wf_post_changes": (p, [loop, p]), "wf_take_changes": (None, [loop]),
             "wf_apply_factor": (None, [c.POINTER(structs.Factor), p, p, p]),
@@ -164,6 +166,10 @@ class _NativeStages:
         loop.stages = c.addressof(self.native)
         _tell_bodies_apart(stages.parts, launches, number)
 
+    def state(self) -> list[StateArray]:
+        """Returns what steps carry on."""
+        return [host_array("engine.stages", memory_of(self._state, len(self._state)), same_body)]
+
 
 def _tell_bodies_apart(parts: Mapping[int, Int32 | None], launches: Any, number: dict[int, int]) -> None:
     """Gives launches the first item of each body. parts: by id of a launch; number: of each launch by id."""
@@ -179,7 +185,7 @@ class _NativeEuler:
         self._launch = np.array([number[id(x)] for x in euler.assemble], np.int32)
         self._settle = np.array([number[id(x)] for x in euler.settle], np.int32)
         self._result = (structs.SolveResult * loop.bodies)()
-        self._own = {
+        self._own: dict[str, NDArray[Any]] = {
             "end_x": np.zeros_like(euler.start_x), "takes": np.zeros(loop.bodies, np.int32),
             "assembled": np.zeros(loop.bodies, np.int32), "launch": self._launch, "settle": self._settle,
             "touching": np.zeros(loop.bodies, np.int32), "solution": np.zeros_like(euler.start_x),
@@ -196,6 +202,13 @@ class _NativeEuler:
             setattr(self.native, name, getattr(euler, name).ctypes.data)
         loop.euler = c.addressof(self.native)
         _tell_bodies_apart(euler.parts, launches, number)
+
+    def state(self) -> list[StateArray]:
+        """Returns what steps carry on."""
+        return [
+            host_array("engine.euler.touching", self._own["touching"], same_body),
+            host_array("engine.euler.solution", self._own["solution"], resets=False),
+        ]
 
 
 class _NativeSubsteps:
@@ -215,6 +228,16 @@ class _NativeSubsteps:
         self.native.state.round = 1
         loop.substeps = c.addressof(self.native)
 
+    def state(self) -> list[StateArray]:
+        """Returns what steps carry on: the estimate of the stable substep, which no reset takes back."""
+        state = np.frombuffer(self.native.state, np.uint8)
+        arrays: dict[str, NDArray[Any]] = {
+            "stable": self._stable.view(np.uint8),
+            "state": state,
+            "mode": self._input.mode,
+        }
+        return [host_array(f"engine.substeps.{name}", array, resets=False) for name, array in arrays.items()]
+
 
 MOST_MODES = 600  # of the coarse space of an island of bodies
 
@@ -229,7 +252,7 @@ class _NativeContact:
         self._report = (structs.ContactReport * bodies)()
         self._result = (structs.SolveResult * bodies)()
         self._choice = (structs.PassChoice * bodies)()
-        self._own = {
+        self._own: dict[str, NDArray[Any]] = {
             "active": np.zeros(rows, np.int32), "room": np.zeros((9, loop.nodes, 3)),
             "reaction": np.zeros((bodies, count, 6)), "mode": np.zeros(bodies, np.int32),
             "island": np.zeros(bodies, np.int32), "island_start": np.zeros(bodies + 1, np.int32),
@@ -270,6 +293,33 @@ class _NativeContact:
             setattr(self.native, name, array.ctypes.data)
         self.native.rotation = arrays["rotation"].ctypes.data
         loop.contact = c.addressof(self.native)
+
+    def state(self) -> list[StateArray]:
+        """Returns what steps carry on beside the rows that launches write."""
+        own, count = self._own, len(self._report)
+        found = [
+            host_array("engine.contact.choice", memory_of(self._choice, count), same_body, resets=False),
+            host_array("engine.contact.report", memory_of(self._report, count), same_body),
+            host_array("engine.contact.was_near", own["was_near"], same_body),
+            host_array("engine.contact.near", own["near"], same_body),
+        ]
+        rows: dict[str, NDArray[Any]] = {
+            "state": memory_of(self._state, len(self._state)), "corner": self._input.corner,
+        }  # fmt: skip
+        rows |= {"weight": self._input.weight} | {k: own[k] for k in ("facing",) if k in own}
+        found += [host_array(f"engine.contact.{k}", array, resets=False) for k, array in rows.items()]
+        if self._input.surfaces and self._input.surfaces.own:
+            surfaces = self._own_surfaces
+            names = ("reference", "strain", "moved", "clear", "edge_clear", "apart", "edges_apart")
+            found.append(host_array("engine.own.body", memory_of(self._references, count), same_body))
+            found += [host_array(f"engine.own.{name}", surfaces[name], resets=False) for name in names]
+        if ties := self._input.ties:
+            named: dict[str, NDArray[Any]] = {
+                "stiffness": ties.stiffness, "force": ties.force, "broken": ties.broken,
+                "start_force": self._ties["start_force"], "slope": self._ties["slope"],
+            }  # fmt: skip
+            found += [host_array(f"engine.ties.{name}", array, ties.rows) for name, array in named.items()]
+        return found
 
     def surface_nodes(self, body: int) -> int:
         """Returns the number of a body's surface nodes."""
@@ -411,6 +461,7 @@ class CpuEngine(Reports):
         self._energies = NativeEnergies(given.energies)
         loop.energies = c.addressof(self._energies.native)
         self.begin: Sequence[Launch] = ()  # before the first step
+        self._begun = False
 
     # --- running ------------------------------------------------------------------------------------------------
 
@@ -450,8 +501,47 @@ class CpuEngine(Reports):
         """Runs the launches of the scheme that come before the first step."""
         if self.step == 0:
             self._native.wf_take_changes(c.byref(self.loop))
+        if self.step == 0 and not self._begun:
             for launch in self.begin:
                 launch()
+
+    def prepare(self) -> None:
+        """Makes the state before the first step now, and not again when it begins."""
+        self._begin()
+        self._begun = True
+
+    # --- what steps carry on --------------------------------------------------------------------------------------
+
+    def state(self) -> list[StateArray]:
+        """Returns what native code carries on beside the arrays that launches write."""
+        parts = [part.state() for part in (self._stages, self._euler, self._substeps, self._contact) if part]
+        corrections = [self._state_of_correction(k) for k in self._corrections]
+        own = [
+            host_array("engine.balance", self._energies.balance.view(np.uint8), resets=False),
+            host_array("engine.clock", self._arrays["clock"], resets=False),
+        ]
+        return [*own, *(a for part in parts for a in part), *(a for part in corrections for a in part)]
+
+    def _state_of_correction(self, body: int) -> list[StateArray]:
+        """Returns what is known of the changes since the matrix of the factor in use. No reset takes it back."""
+        name, entry = f"engine.correction{body}", self._body[body]
+        rooms = [(k, a) for k, a in self._corrections[body].items() if k not in ("diagonal", "block")]
+        numbers = numbers_of(entry.correction)
+        return [host_array(f"{name}.numbers", numbers, resets=False)] + [
+            host_array(f"{name}.{k}", a, resets=False) for k, a in rooms
+        ]
+
+    def resume(self, step: int, start_time: float) -> None:
+        """Goes on from a state that was written, after `step` steps."""
+        self.loop.step, self.loop.start_time, self._begun = step, start_time, True
+        for entry in self._body:
+            entry.steps = step
+        self._energies.resume(self._arrays["x"], self._arrays["v"])
+
+    def restart(self, bodies: Sequence[int]) -> None:
+        """Begins the energy balances of bodies anew."""
+        for body in bodies:
+            self._native.wf_restart(c.byref(self.loop), body)
 
     def wait(self) -> bool:
         """Sleeps until the next step is due (real time) and while paused, as `run` does before each step.

@@ -20,6 +20,8 @@ from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction
 from sim_server.backends.gpu.device import DeviceLaunch, Gpu, compiled, options, own_headers
 from sim_server.backends.gpu.kernel_fusion import FusedKernel, PhaseGuard, fuse
 from sim_server.backends.gpu.solver import PcgSolver
+from sim_server.backends.gpu.state import device_arrays
+from sim_server.backends.state import StateArray
 
 TEXT = Declarations("backends/gpu/central_difference.cu")
 SUBSTEPS, SUBSTEP_STATE = TEXT.dtype("Substeps"), TEXT.dtype("SubstepState")
@@ -91,6 +93,10 @@ class SubstepLoop:
         dtype, _offset = cast(dict[str, Any], SUBSTEP_STATE.fields)["since"][:2]
         assert dtype == np.int32
         return int(self._memory["state"].data.ptr) + int(_offset)
+
+    def state(self) -> list[StateArray]:
+        """Returns what steps carry on: the estimate of the stable substep."""
+        return device_arrays("engine.substeps", self._memory, "state", "stable", "mode")
 
     def start(self) -> None:
         """Estimates the stable step before the first step."""

@@ -18,7 +18,9 @@ from sim_server.backends.gpu.energies import node_chunks
 from sim_server.backends.gpu.faces import DEFINED, FaceRows
 from sim_server.backends.gpu.islands import Graphs, IslandPasses, PairsTold
 from sim_server.backends.gpu.solver import PcgSolver
+from sim_server.backends.gpu.state import device_arrays
 from sim_server.backends.gpu.structs import CONTACT_SOLVE, CONTACT_STATE
+from sim_server.backends.state import StateArray
 
 TEXT = Declarations("backends/gpu/contact.cu")
 THREADS: int = TEXT.constant("CONTACT_THREADS")  # of a thread block, each with a node
@@ -116,6 +118,13 @@ class ContactPasses:
             backend="nvrtc",
         )  # fmt: skip
         self._kernels: dict[str, KernelFunction] = {name: compiled("contact.cu", module, name) for name in KERNELS}
+
+    def state(self) -> list[StateArray]:
+        """Returns what steps carry on beside the rows that launches write."""
+        found = device_arrays("engine.contact", self.memory, "row", "state", "base", "known")
+        if self.faces:
+            found += device_arrays("engine.faces", self.faces.memory, "base", "known")
+        return found + (self.islands.state() if self.islands else [])
 
     def _arguments(self, contact: Contact, results: NDArray[Any], reactions: Float64) -> NDArray[Any]:
         """Returns the arguments of all kernels."""

@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 from sim_server.backends.base import EngineInput
 from sim_server.backends.gpu.cupy_types import DeviceArray
 from sim_server.backends.gpu.device import DeviceLaunch, Gpu
+from sim_server.backends.gpu.state import device_arrays
 from sim_server.backends.gpu.structs import CORRECTION
+from sim_server.backends.state import StateArray
 
 HISTORY, MOST_CORRECTED = CORRECTION.constant("HISTORY"), CORRECTION.constant("MOST_CORRECTED")
 CORRECTION_ARGUMENTS, CORRECTED_BODY = CORRECTION.dtype("Correction"), CORRECTION.dtype("CorrectedBody")
@@ -54,6 +56,10 @@ class FactorCorrection:
             self.params[name] = array.data.ptr
         self.params["capacity"], self.params["width"], self.params["sites"] = capacity, width, sites
         self.params["spring_scale"] = np.prod(touch.arrays["coefficients"].get().astype(float)) if touch else 0
+
+    def state(self) -> list[StateArray]:
+        """Returns what is known of the changes since the matrix of the factor in use."""
+        return device_arrays("engine.correction", self._memory, "bodies", "columns", "inner", "springs", "blocks_then")
 
     @classmethod
     def wanted(cls, gpu: Gpu, given: EngineInput) -> "FactorCorrection | None":

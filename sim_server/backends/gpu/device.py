@@ -236,6 +236,12 @@ class Gpu:
             host[...] = self.twin(host).get()
         return host
 
+    def push(self, host: NDArray[Any]) -> None:
+        """Copies the host array into its twin."""
+        if id(host) in self._twins:
+            twin = self.twin(host)
+            twin.set(host.astype(twin.dtype, copy=False))
+
     def engine(self, given: EngineInput) -> Engine:
         """Returns the loop over launches of this backend."""
         from sim_server.backends.gpu.engine import GpuEngine

@@ -5,6 +5,7 @@ All but the elastic energy is summed after each step by thread blocks of the fir
 (energy_balance.cu); the elastic energy is evaluated on demand (elastic_energy.cu).
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,8 @@ from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction
 from sim_server.backends.gpu.device import DeviceLaunch, Gpu, compiled, options, own_headers
 from sim_server.backends.gpu.kernel_fusion import Prologue
 from sim_server.backends.gpu.mailbox import library
+from sim_server.backends.gpu.state import device_arrays
+from sim_server.backends.state import StateArray
 
 BALANCE_TEXT = Declarations("backends/gpu/energy_balance.cu")
 ELASTIC_TEXT = Declarations("backends/gpu/elastic_energy.cu")
@@ -130,15 +133,28 @@ class DeviceEnergies:
         work["balance"], work["bodies"], work["after"] = self._balance.data.ptr, self._bodies, after
         self._work_kernel((-(-self._bodies // THREADS),), (THREADS,), (work,))
 
-    def start(self) -> None:
-        """Takes the state on the device as the initial state of the balance."""
+    def state(self) -> list[StateArray]:
+        """Returns what steps carry on."""
+        memory = {"balance": self._balance, "settled": self._settled, "sum": self._sum}
+        return device_arrays("engine.energies", memory, *memory)
+
+    def start(self, bodies: Sequence[int] | None = None) -> None:
+        """Takes the state on the device as the initial state of the balance.
+
+        bodies: only these, which were put back to the start, also if they were frozen
+        """
         e = self._energies
         self.launch_elastic()
         self._settled[:] = self._counter
         x, v = (self._gpu.twin(array).get().astype(float) for array in (e.x, e.v))
         balance = np.frombuffer(self._balance.get().tobytes(), BALANCE).copy()
-        balance["elastic"] = self._sum.get()
+        starts = range(len(balance)) if bodies is None else bodies
+        balance["elastic"][list(starts)] = self._sum.get()[list(starts)]
+        if bodies is not None:
+            balance["phase"][list(bodies)] = 0  # WELL
         for body, nodes in enumerate(map(slice, e.starts[:-1], e.starts[1:])):
+            if body not in starts:
+                continue
             row = balance[body : body + 1]
             sums = start_sums(e.mass[nodes], x[nodes], v[nodes], e.gravity, self._dt)
             library().wf_gpu_start_balance(row.ctypes.data, sums.ctypes.data, self._dt, int(e.inertia))

@@ -33,6 +33,7 @@ from sim_server.backends.gpu.mailbox import ChangeMailbox, DeviceMailbox
 from sim_server.backends.gpu.newton import NewtonIteration, NewtonPhases
 from sim_server.backends.gpu.rosenbrock import ATTEMPTS, RosenbrockStep
 from sim_server.backends.gpu.solver import PCG_BODY, PCG_RESULT, SETTINGS_BYTES, PcgSolver
+from sim_server.backends.gpu.state import device_array, device_arrays
 from sim_server.backends.gpu.structs import (
     CONTACT_RESULT,
     ENERGY_RECORD,
@@ -45,6 +46,7 @@ from sim_server.backends.gpu.structs import (
     Mail,
 )
 from sim_server.backends.newton import Newton
+from sim_server.backends.state import StateArray
 
 MOST_GRABS = 1024  # pushes and grabs at a time, of which forces are told
 MOST_TOLD = 16  # other bodies whose forces on a body are told, at most
@@ -114,7 +116,12 @@ class GpuEngine(DeviceLoop):
         self._first_launches = self._beginning(forces) if alone else self._whole_assembly
         self._forces = fuse(forces) if alone else ()  # after a whole assembly, whose energy balance is made already
         phases = NewtonPhases.initial(gpu, bodies) if newton else None
-        correction = FactorCorrection.wanted(gpu, given)
+        correction = self._correction = FactorCorrection.wanted(gpu, given)
+        surfaces = given.contact.surfaces if given.contact else None
+        self._rows_of_bodies: tuple[NDArray[Any], ...] = (
+            (given.contact.corner, given.contact.weight) if given.contact and surfaces else ()
+        )
+        self._prepared = False
         self.solver = PcgSolver(
             gpu, ranges, arrays, self._counter, CAPACITY, planes,
             phases.of_solves(given.errors) if phases else (), ATTEMPTS if stages else 0,
@@ -231,7 +238,7 @@ class GpuEngine(DeviceLoop):
 
     def _make_ready(self) -> None:
         """Runs the launches before the first step, and takes the initial state of the energy balance."""
-        begins = bool(self.begin or self._substeps) and self.step == 0
+        begins = bool(self.begin or self._substeps) and self.step == 0 and not self._prepared
         if self.step == 0:
             self.take_changes()
             self._steps.synchronize()
@@ -245,6 +252,37 @@ class GpuEngine(DeviceLoop):
             begins = True
         if begins:
             self.gpu.cp.cuda.get_current_stream().synchronize()
+
+    def prepare(self) -> None:
+        """Makes the state before the first step now, and not again when it begins."""
+        self._make_ready()
+        self._prepared = True
+
+    def state(self) -> list[StateArray]:
+        """Returns what the device carries on beside the arrays that launches write."""
+        parts = (self._energies, self._stages, self._substeps, self._contact, self._correction)
+        clock = self.gpu.twin(self._arrays["clock"])
+        found = [device_array("engine.clock", clock), *(a for part in parts if part for a in part.state())]
+        if self._rows_of_bodies:
+            names = ("corner", "weight")
+            twins = {name: self.gpu.twin(a, dtype=a.dtype) for name, a in zip(names, self._rows_of_bodies, strict=True)}
+            found += device_arrays("engine.contact", twins, *names)
+        return found
+
+    def resume(self, step: int, start_time: float) -> None:
+        """Goes on from a state that was written, after `step` steps."""
+        self.loop.step = self.loop.launched = step
+        self.loop.start_time, self._prepared, self._energies.started = start_time, True, True
+        self._counter[:] = step
+        self._arrays["clock"][:] = self.gpu.twin(self._arrays["clock"]).get()
+        self.gpu.cp.cuda.get_current_stream().synchronize()
+
+    def restart(self, bodies: Sequence[int]) -> None:
+        """Begins the energy balances of bodies anew after a reset, while the loop stands still."""
+        self._energies.start(bodies)
+        if self._ties:
+            self._broken[:] = self._ties.broken[:] = self.gpu.twin(self._ties.broken, dtype=np.dtype(np.int32)).get()
+        self.gpu.cp.cuda.get_current_stream().synchronize()
 
     def restart_energy(self) -> None:
         """Restarts the energy balance from the state at the beginning of the next step, after x or v were set."""

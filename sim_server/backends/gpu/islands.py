@@ -17,7 +17,9 @@ from sim_server.backends.gpu.device import Gpu, compiled, options, own_headers
 from sim_server.backends.gpu.energies import node_chunks
 from sim_server.backends.gpu.faces import DEFINED, FaceRows
 from sim_server.backends.gpu.solver import PcgSolver
+from sim_server.backends.gpu.state import device_array, device_arrays
 from sim_server.backends.gpu.tie_arguments import tie_arguments
+from sim_server.backends.state import StateArray
 
 PAIRS, ISLAND = Declarations("backends/gpu/pairs.cu"), Declarations("backends/gpu/island.cu")
 TIES = Declarations("backends/gpu/ties.cu")
@@ -188,8 +190,11 @@ class IslandPasses:
         self.params["edges"] = edges
         self.params["most_chunks"], self.params["highest_tree"] = np.diff(first).max(), heights.max()
         self.params["ties"]["first"] = rows - tied
+        self._tie_state: list[StateArray] = []
         if ties:
             self._tie_memory = tie_arguments(gpu, ties, nodes, broken, self.params)
+            named = {name: self._tie_memory[name] for name in ("stiffness", "force", "broken", "start_force", "slope")}
+            self._tie_state = [device_array(f"engine.ties.{k}", a, ties.rows, resets=True) for k, a in named.items()]
         if told:
             self.params["told"], self.params["told_count"] = (array.ctypes.data for array in told)
             self.params["most_told"] = told[0].shape[2]
@@ -246,6 +251,13 @@ class IslandPasses:
         memory = [gpu.cp.zeros(count * SIZES["EdgeWings"], np.uint8), gpu.cp.zeros(2 * count, np.int32)]
         params["e"]["wings"], params["e"]["facing"] = (array.data.ptr for array in memory)
         return memory
+
+    def state(self) -> list[StateArray]:
+        """Returns what steps carry on."""
+        names = ("near", "was_near", "touched", "state", "row", "choice", "held", "held_list", "held_count")
+        found = device_arrays("engine.islands", self.memory, *names)
+        found += [device_array(f"engine.edges.{k}", array) for k, array in enumerate(self._edge_memory)]
+        return found + self._tie_state
 
     def flag(self, name: str) -> DeviceArray:
         """Returns a number of the tally, (1,)."""

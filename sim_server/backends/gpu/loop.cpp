@@ -235,7 +235,7 @@ int64_t wf_gpu_run(GpuLoop* loop, int64_t steps) {
     while (well && left > 0) {
         well = finish_down_to(l, l.rings.realtime ? 0 : STEP_BATCHES - 1);
         if (!well || !wait(l)) break;
-        int64_t size = batch_size(l, left);
+        int64_t size = l.rings.pause.load() ? 1 : batch_size(l, left);  // single steps
         well = launch_batch(l, size);
         left -= size;
     }

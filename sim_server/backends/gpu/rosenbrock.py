@@ -22,8 +22,10 @@ from sim_server.backends.gpu.kernel_fusion import Epilogue, FusedKernel, PhaseGu
 from sim_server.backends.gpu.momentum import FreeMomenta
 from sim_server.backends.gpu.newton import bodies_of
 from sim_server.backends.gpu.solver import PcgSolver
+from sim_server.backends.gpu.state import device_array
 from sim_server.backends.gpu.structs import STAGE_SOLVE, STAGE_STATE
 from sim_server.backends.rosenbrock import FORMS, Rosenbrock
+from sim_server.backends.state import StateArray, same_body
 
 DECISION = Declarations("backends/gpu/stage_decision.cu")
 STAGE_DECISION = DECISION.dtype("StageDecision")
@@ -87,6 +89,11 @@ class RosenbrockStep:
         items = block_shape("elements", finish.items, processors()).threads
         self._free = FreeMomenta(gpu, stages, energies, b, items) if stages.unheld.any() else None
         self._make_kernels(assemble)
+
+    def state(self) -> list[StateArray]:
+        """Returns what steps carry on."""
+        state, bodies = self._memory["state"], len(self._stages.bound)
+        return [device_array("engine.stages", state, same_body, resets=True, bodies=bodies)]
 
     def _make_kernels(self, assemble: Sequence[DeviceLaunch]) -> None:
         stages = self._stages

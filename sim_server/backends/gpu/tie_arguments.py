@@ -26,7 +26,7 @@ def bindings(ties: Ties) -> tuple[Int32, Int32, Int32, Int32]:
     return bound.astype(np.int32), start, tie[order].astype(np.int32), other[order].astype(np.int32)
 
 
-def tie_arguments(gpu: Gpu, ties: Ties, nodes: int, broken: Int32, params: Any) -> list[DeviceArray]:
+def tie_arguments(gpu: Gpu, ties: Ties, nodes: int, broken: Int32, params: Any) -> dict[str, DeviceArray]:
     """Sets the part of ISLAND_ARGUMENTS that is of attachments and springs; returns memory to be kept.
 
     nodes: of the scene. broken: (ties,) host memory that the steps write to
@@ -50,4 +50,4 @@ def tie_arguments(gpu: Gpu, ties: Ties, nodes: int, broken: Int32, params: Any) 
     params["ties"]["count"], params["ties"]["tables"] = n, ties.tables
     params["ties"]["columns"], params["ties"]["column_first"] = ties.reaction.shape[1], ties.column
     params["bound_nodes"], params["broken_on_host"] = len(node), broken.ctypes.data
-    return [*kept.values(), *lists.values()]
+    return {**kept, **lists}

@@ -370,6 +370,14 @@ int64_t wf_run(Loop* loop, int64_t steps) {
     return done;
 }
 
+// Begins the energy balance of a body that was put back to its start, also of a frozen one.
+void wf_restart(Loop* loop, int32_t body) {
+    if (!loop->energies) return;
+    measure_elastic(*loop);
+    loop->energies->balance[body].phase = WELL;
+    begin_balance(*loop, loop->body[body], loop->energies->balance[body]);
+}
+
 const Factor* wf_post_factor(Body* body, const Factor* factor) { return body->mail.exchange(factor); }
 void wf_take_changes(Loop* loop) { take_changes(*loop); }
 Changes* wf_post_changes(Loop* loop, Changes* changes) { return loop->changes.exchange(changes); }

@@ -91,6 +91,8 @@ struct Rings {
     int32_t realtime;                      // keep pace with the wall clock
     int32_t patient;                       // wait for room in the rings instead of dropping (no deadline to miss)
     std::atomic<int32_t> stop, pause;
+    std::atomic<int64_t> single;           // steps that the loop is to make while it is paused
+    std::atomic<int64_t> hold, held;       // number of a request to stand still between two steps, 0: none; the last one that it has followed
     double deadline;                       // steady clock, of the next step; 0: now
     double late;                           // s that the step began after its deadline
 };
@@ -178,14 +180,23 @@ static int64_t begin_frame(Rings& rings, int64_t head, int64_t step, Meanwhile m
     return head % rings.frame_capacity;
 }
 
-// Before a step: sleep while paused and until it is due. False if the loop is to stop. `meanwhile` is called before each nap and
-// says whether it wants to be called again soon.
+// Before a step: stand still on request, sleep while paused and until it is due. False if the loop is to stop. `meanwhile` is called
+// before each nap and says whether it wants to be called again soon. A request to stand still is followed once nothing is under way;
+// what it changes may make the next step late, which the record tells.
 template <class Meanwhile>
 static bool wait_until_due(Rings& rings, Meanwhile meanwhile) {
-    while (rings.pause.load(std::memory_order_relaxed) && !rings.stop.load()) {
+    while (!rings.stop.load()) {
+        const int64_t request = rings.hold.load();
+        const bool paused = rings.pause.load(std::memory_order_relaxed) && rings.single.load() <= 0;
+        if (!request && !paused) break;
         meanwhile();
-        nap(1e-3);
-        rings.deadline = 0;
+        if (request) rings.held.store(request);
+        nap(request ? 1e-4 : 1e-3);
+        if (paused) rings.deadline = 0;
+    }
+    if (rings.pause.load(std::memory_order_relaxed) && rings.single.load() > 0) {  // a deadline of 0 would say that it stands still
+        if (rings.deadline == 0) rings.deadline = rings.realtime ? now() : -1;
+        rings.single.fetch_sub(1);
     }
     rings.late = 0;
     if (rings.realtime && !rings.stop.load()) {
