@@ -117,7 +117,7 @@ class LiveParameters:
 
         Raises BadParameter; nothing changes then.
         """
-        table = deepcopy(self._table or self._simulation.scene.resolved())
+        table = deepcopy(self._present())
         fields = {field.key: field for field in live_fields(self.scene)}
         given: dict[str, LiveField] = {}
         for key, text in values.items():
@@ -149,7 +149,9 @@ class LiveParameters:
         return self._first is None
 
     def _present(self) -> dict[str, Any]:
-        return self._table or self._simulation.scene.resolved()
+        if self._table is None:
+            self._table = self._simulation.scene.resolved()
+        return self._table
 
     def _found(self, key: str, text: str, fields: Mapping[str, LiveField]) -> LiveField:
         found = [f for f in fields.values() if key in (f.key, f.short)]

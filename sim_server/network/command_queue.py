@@ -18,6 +18,8 @@ LIMITED = (
     "grab",
     "move",
     "move_obstacle",
+    "set",
+    "parameters",
     "add_worker",
     "kill_worker",
 )  # verbs; with the others a client may owe a burst: it can always let go and stop

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from sim_server.scene.model import Scene
 
 Place = tuple[str | int, ...]
-NAMED = {"obstacles": "obstacle", "springs": "spring"}  # fields of a scene with live parameters, and their tables
+NAMED = {"obstacles": "obstacle"}  # fields of a scene with live parameters, and their tables
 
 
 @dataclass(frozen=True)

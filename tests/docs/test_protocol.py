@@ -13,7 +13,7 @@ from sim_server.mesh import MOST_TETS, skin
 from sim_server.network import command_queue, leases, rate_limiter, worker_registry
 from sim_server.recording import recorder
 from sim_server.scene import integrator_options, where
-from sim_server.service import supervisor
+from sim_server.service import commands, supervisor
 from sim_server.updates import first_factors
 from tests.docs.figures import DOCS, table_under
 
@@ -66,6 +66,10 @@ def test_channels() -> None:
         (
             "preconditioners.md",
             f"after {first_factors.TIMEOUT:g} s, or after {first_factors.WORKER_TIMEOUT:g} s in which",
+        (
+            "protocol.md",
+            f"at most {commands.MOST_SET} parameters, keys of {commands.LONGEST_KEY} and values of "
+            f"{commands.LONGEST_VALUE} characters; a server lists {commands.MOST_LISTED}.",
         ),
         ("scenes.md", f"in at most {where.MAX_LENGTH} characters and {where.MAX_DEPTH} levels"),
         ("scenes.md", f"{MOST_TETS:,} tetrahedra in all"),
