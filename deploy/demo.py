@@ -9,6 +9,7 @@ drags it; what that leaves lies under out/demo: the log (creature.mcap), a film 
 
 import importlib.util
 import os
+import socket
 import subprocess
 import sys
 import time
@@ -155,6 +156,15 @@ def start(scene: str, log: Path, *arguments: str) -> "subprocess.Popen[bytes]":
     return subprocess.Popen(tool("sim_server", *run), cwd=ROOT)
 
 
+def answers(port: int) -> bool:
+    """True if something of this machine listens there."""
+    try:
+        socket.create_connection(("127.0.0.1", port), 1).close()
+    except OSError:
+        return False
+    return True
+
+
 def ended(process: "subprocess.Popen[bytes]") -> None:
     """Ends a process if it runs."""
     if process.poll() is None:
@@ -170,10 +180,13 @@ def show() -> int:
     try:
         with connected(server):
             page = subprocess.Popen(tool("clients", "web", "--connect", ENDPOINT, "--port", str(PAGE)), cwd=ROOT)
-        console.print(f"drag the creature: {address} (Ctrl-C ends)", highlight=False)
-        webbrowser.open(address)
+        opened = False
         while server.poll() is None and page.poll() is None:
             time.sleep(0.1)
+            if not opened and answers(PAGE):
+                opened = True
+                console.print(f"drag the creature: {address} (Ctrl-C ends)", highlight=False)
+                webbrowser.open(address)
         return page.returncode if server.poll() is None else server.returncode
     finally:
         for process in (page, server):

@@ -3,6 +3,7 @@
 
 import importlib.util
 import io
+import subprocess
 import sys
 import webbrowser
 from contextlib import nullcontext
@@ -12,6 +13,8 @@ from types import ModuleType
 import numpy as np
 import pytest
 from rich.console import Console
+
+from tests.ports import free_port
 
 DEMO = Path(__file__).parents[1] / "deploy" / "demo.py"
 
@@ -85,16 +88,30 @@ def test_the_page_is_shown_where_it_can_be_seen(
 def test_the_page_opens_on_the_creature_and_ends_with_its_server(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Both programs are played by short scripts: the server ends by itself, the page would go on."""
+    """Both programs are played by short scripts: the page would go on, the server ends once it is opened."""
     demo, started, opened = the_demo(), [], []
+    demo.PAGE = free_port()
+    page_of = f"import socket, time; s = socket.create_server(('127.0.0.1', {demo.PAGE})); time.sleep(60)"
 
     def tool(package: str, *arguments: str) -> list[str]:
         started.append((package, *arguments))
-        return [sys.executable, "-c", f"import time; time.sleep({0.3 if package == 'sim_server' else 60})"]
+        return [sys.executable, "-c", "import sys; sys.stdin.read()" if package == "sim_server" else page_of]
 
+    def open_page(address: str) -> None:
+        opened.append(address)
+        servers[0].stdin.close()  # it ends
+
+    servers, popen = [], subprocess.Popen
+
+    def popen_with_input(command: list[str], **options: object) -> "subprocess.Popen[bytes]":
+        process = popen(command, stdin=subprocess.PIPE, stderr=subprocess.DEVNULL, **options)  # type: ignore[call-overload]
+        servers.append(process)
+        return process
+
+    monkeypatch.setattr(subprocess, "Popen", popen_with_input)
     monkeypatch.setattr(demo, "tool", tool)
     monkeypatch.setattr(demo, "connected", nullcontext)
-    monkeypatch.setattr(webbrowser, "open", opened.append)
+    monkeypatch.setattr(webbrowser, "open", open_page)
     assert demo.show() == 0
     (server, page), (address,) = started, opened
     assert server[:2] == ("sim_server", "gallery/creature") and "--steps" not in server

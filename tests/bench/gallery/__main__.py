@@ -20,7 +20,7 @@ from tests.bench.harness.report import ROOT, Report, plots
 from tests.ports import free_port
 
 CREATURE = "creature"
-SOLVERS = {"auto, factors by the worker": (), "block Jacobi": ("solver.preconditioner=block_jacobi",),
+SOLVERS = {"factors by a worker": (), "block Jacobi": ("solver.preconditioner=block_jacobi",),
            "no preconditioner": ("solver.preconditioner=none",)}  # fmt: skip
 FACTORS = next(iter(SOLVERS))
 HANDS = {  # object, nearest to which point at rest it is held [m], how far it is dragged [m], radius [m], N/m, N
