@@ -359,6 +359,31 @@ def view(
 
 
 @app.command()
+def web(
+    host: Annotated[
+        str, typer.Option(metavar="HOST", help="Where the page is served; who reaches it may do what this client may.")
+    ] = "127.0.0.1",
+    port: Annotated[int, typer.Option(metavar="PORT", min=1, max=65535, help="Of the page.")] = 8080,
+    exit_with_parent: Annotated[
+        bool, typer.Option("--exit-with-parent", help="End when the parent process ends.")
+    ] = False,
+    connect: Connect = None,
+    server: Server = SERVER_NAME,
+) -> None:
+    """Serve a page where bodies are dragged with the mouse, changed and watched, until Ctrl-C.
+
+    \b
+    Examples:
+      sim-client web
+      sim-client web --port 8090
+      sim-client web --connect tcp/192.168.1.5:7447
+    """
+    from clients.web import command
+
+    command.web(server, connect, host, port, exit_with_parent)
+
+
+@app.command()
 def export(
     log: Annotated[Path, typer.Argument(metavar="LOG.mcap", help="A recorded run.")],
     object: Object,
