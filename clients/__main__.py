@@ -24,6 +24,7 @@ from clients.errors import BadInput, ClientError
 from clients.point_option import AT_HELP, PointCommand, point
 from protocol.channels import DEFAULT_ENDPOINT, SERVER_NAME
 from protocol.network.endpoints import CONNECT
+from protocol.network.web_address import HOST, PORT
 from protocol.printable import printable
 from protocol.process.command_line import Program, handle, leave
 from protocol.process.exhausted import exhausted
@@ -362,8 +363,8 @@ def view(
 def web(
     host: Annotated[
         str, typer.Option(metavar="HOST", help="Where the page is served; who reaches it may do what this client may.")
-    ] = "127.0.0.1",
-    port: Annotated[int, typer.Option(metavar="PORT", min=1, max=65535, help="Of the page.")] = 8080,
+    ] = HOST,
+    port: Annotated[int, typer.Option(metavar="PORT", min=1, max=65535, help="Of the page.")] = PORT,
     exit_with_parent: Annotated[
         bool, typer.Option("--exit-with-parent", help="End when the parent process ends.")
     ] = False,

@@ -62,7 +62,7 @@ class History:
         number = Row._fields.index(field)
         values = np.stack([t[-length:, number] for t in tables])
         if len(tables) > OWN:
-            values = np.where(np.isnan(values).all(axis=0), np.nan, np.nanmax(np.nan_to_num(values, nan=-np.inf), axis=0))[None]
+            values = np.fmax.reduce(values)[None]  # NaN where all are
         times = tables[0][-length:, 0]
         bins = max(1, math.ceil(length / POINTS))
         starts = np.arange(0, length, bins)

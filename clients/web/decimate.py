@@ -12,9 +12,9 @@ ROUNDS = 24  # halvings of the interval of cell sizes, at most
 def decimated(points: NDArray, triangles: NDArray, most: int) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
     """Returns the kept vertices (k,), numbers of `points`, and triangles (t, 3) that count in them.
 
-    Vertex clustering (Rossignac and Borrel 1993): of the vertices in a cell of a grid, the one nearest to their mean stays;
-    triangles within a cell vanish. Vertices whose normals point to different sides are never joined, so that a thin sheet
-    keeps both. points: (n, 3) [m]; most: vertices that may stay.
+    Vertex clustering (Rossignac and Borrel 1993): of the vertices in a cell of a grid, the one nearest to their mean
+    stays; triangles within a cell vanish. Vertices whose normals point to different sides are never joined, so that a
+    thin sheet keeps both. points: (n, 3) [m]; most: vertices that may stay.
     """
     if len(points) <= most:
         return np.arange(len(points)), triangles.astype(np.int32)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """What the server tells: a connection that is made again when the server is gone, and the newest of everything.
 
-`Feed.link` has one connection; a thread of its own asks for the status and the parameters, so that a slow answer holds up
-no frame.
+`Feed.link` has one connection; a thread of its own asks for the status and the parameters, so that a slow answer holds
+up no frame.
 """
 
 from __future__ import annotations

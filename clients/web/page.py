@@ -143,8 +143,9 @@ class Page:
         self.surfaces = surfaces = Surfaces(link.meshes)
         if surfaces.full > MOST_VERTICES:
             log.warning(
-                "%d vertices on the surfaces: %d are shown, so that a browser keeps pace", surfaces.full, len(surfaces.points)
-            )
+                "%d vertices on the surfaces: %d are shown, so that a browser keeps pace",
+                surfaces.full, len(surfaces.points),
+            )  # fmt: skip
         described = described_objects(link.scene.resolved)
         self.grips = {name: grip(mesh, described.get(name, {})) for name, mesh in link.meshes.items()}
         low, high = surfaces.box()

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Colours of the surface: which triangles have which of a few colours.
 
-viser's meshes have one colour each, so a coloured surface is one mesh for each band of values. Bands change a few times a
-second, positions with each frame.
+viser's meshes have one colour each, so a coloured surface is one mesh for each band of values. Bands change a few times
+a second, positions with each frame.
 """
 
 from __future__ import annotations
@@ -74,8 +74,10 @@ class Paint:
         return values
 
     def _banded(self, values: NDArray) -> NDArray[np.int64]:
-        """Returns the band of each triangle (t,). The largest value so far has the last one; of stress the 99th percentile,
-        as it has no bound at corners and clamped edges."""
+        """Returns the band of each triangle (t,); the largest value so far has the last one.
+
+        Of stress it is the 99th percentile, as it has no bound at corners and clamped edges.
+        """
         if len(values):
             self._top = max(self._top, float(np.percentile(values, 99) if self.mode in _STEEP else values.max()))
         self.legend = f"{self.mode}: 0 (violet) to {self._top:.3g} {UNITS[self.mode]} (yellow)"
@@ -137,6 +139,8 @@ def _log_young(part: Part) -> NDArray[np.float64]:
 
 def _levels(surfaces: Surfaces) -> NDArray[np.float64]:
     """Returns the logarithms of Young's moduli that there are, or BANDS even ones between the extremes of many."""
-    young = np.concatenate([np.unique(p.mesh.young) for p in surfaces.parts.values() if len(p.mesh.young)] or [[1.0]])
+    young = np.concatenate(
+        [np.unique(p.mesh.young) for p in surfaces.parts.values() if len(p.mesh.young)] or [np.ones(1)]
+    )
     levels = np.unique(np.round(np.log10(np.maximum(young.astype(float), 1e-30)), 3))
     return levels if len(levels) <= BANDS else np.linspace(levels[0], levels[-1], BANDS)

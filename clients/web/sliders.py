@@ -27,7 +27,7 @@ def value_of(text: str) -> Any:
 
 
 def short_key(key: str) -> str:
-    """Returns a key without words that say nothing: object.beam.effects.corotational.young as beam.corotational.young."""
+    """Returns a key without words that say nothing: object.o.effects.e.young as o.e.young."""
     words = key.split(".")
     if words[0] == "object" and len(words) > 3 and words[2] == "effects":
         return ".".join([words[1], *words[3:]])
@@ -76,7 +76,7 @@ class Slider:
             low, high = self._bounds()
             return gui.add_slider(label, low, high, (high - low) / STEPS, self._shown(value), hint=hint)
         if isinstance(value, list) and len(value) == 3 and all(isinstance(v, int | float) for v in value):
-            return gui.add_vector3(label, tuple(float(v) for v in value), hint=hint)
+            return gui.add_vector3(label, (float(value[0]), float(value[1]), float(value[2])), hint=hint)
         return None  # a table, say: set by sim-client set
 
     def _bounds(self) -> tuple[float, float]:
@@ -103,7 +103,8 @@ class Slider:
         return float(f"{10**place:.4g}") if self._log and not isinstance(place, bool) else place
 
     def _label(self) -> str:
-        value = f"{self._value:.4g} " if isinstance(self._value, int | float) and not isinstance(self._value, bool) else ""
+        number = isinstance(self._value, int | float) and not isinstance(self._value, bool)
+        value = f"{self._value:.4g} " if number else ""
         unit = f"{value}{self._unit}".strip()
         return f"{short_key(self.key)}: {unit}" if unit else short_key(self.key)
 

@@ -62,7 +62,7 @@ class Surfaces:
             self.move(name, mesh.rest)
 
     def move(self, name: str, x: Float64) -> bool:
-        """Moves an object to the positions x (n, 3) [m]; False, and nothing is moved, if they do not fit or are not finite."""
+        """Moves an object to the positions x (n, 3) [m]; False: it stays, as they do not fit or are not finite."""
         part = self.parts.get(name)
         if part is None or len(x) != len(part.mesh.rest) or not np.isfinite(x).all():
             return False
@@ -83,7 +83,7 @@ class Surfaces:
 
 
 def _surface(mesh: Mesh) -> tuple[NDArray[np.int32], Float64, NDArray[np.int32]]:
-    """Returns nodes (s, c), weights (s, c) and triangles (t, 3) of the skin if there is one, else of the mesh's surface."""
+    """Returns nodes (s, c), weights (s, c) and triangles (t, 3) of the skin, or of the mesh's surface without one."""
     skin = getattr(mesh, "skin", None)
     if skin is not None:
         return skin.nodes, skin.weights, skin.triangles

@@ -132,7 +132,12 @@ class Tab:
                 "patch", 0.0, 40.0, 1.0, RADIUS, hint="radius of what a grab or push takes, % of the object's size"
             )
             self._strength = gui.add_slider(
-                "strength", 0.1, 10.0, 0.1, 1.0, hint="stiffness of the spring of a grab, and of pushes, times the default"
+                "strength",
+                0.1,
+                10.0,
+                0.1,
+                1.0,
+                hint="stiffness of the springs of grabs, and of pushes, over the default",
             )
             home = gui.add_button("Camera home")
 

@@ -26,9 +26,8 @@ def summary(status: pb.Status) -> str:
 
 def warning(text: str) -> str:
     """Returns a line of HTML that stands out."""
-    return (
-        f'<div style="font-size:0.85em;margin:0.3em 1em;padding:0.4em;background:#c92a2a;color:white">{escape(text)}</div>'
-    )
+    style = "font-size:0.85em;margin:0.3em 1em;padding:0.4em;background:#c92a2a;color:white"
+    return f'<div style="{style}">{escape(text)}</div>'
 
 
 def tables(status: pb.Status) -> str:

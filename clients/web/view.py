@@ -32,7 +32,7 @@ def up_of(resolved: str) -> NDArray[np.float64]:
 
 
 def home(low: NDArray, high: NDArray, up: NDArray) -> View:
-    """Returns a view of a box from above and in front: along the shorter of its horizontal sides, a little from the side."""
+    """Returns a view of a box from above and in front, along the shorter of its horizontal sides."""
     vertical = int(np.abs(up).argmax())
     first, second = (k for k in range(3) if k != vertical)
     long, short = (first, second) if high[first] - low[first] >= high[second] - low[second] else (second, first)
