@@ -6,9 +6,9 @@ from __future__ import annotations
 import contextlib
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import TracebackType
-from typing import Self, TypeVar
+from typing import Any, Self, TypeVar, overload
 
 import zenoh
 from google.protobuf.message import Message
@@ -29,9 +29,11 @@ from protocol.client_name import new_client
 from protocol.network.endpoints import BadEndpoint, usual_endpoints
 from protocol.network.session import ConnectionFailed, UnknownHost, open_session
 from protocol.refused import Refused
+from protocol.toml_text import toml
 
 M = TypeVar("M", bound=Message)
 Point = Sequence[float]
+Value = float | bool | str | Sequence[Any] | Mapping[str, Any]  # of a parameter; text is TOML
 
 
 class Client:
@@ -166,6 +168,31 @@ class Client:
             wanted.target.CopyFrom(vector(at if target is None else target, "target"))  # type: ignore[arg-type]
         return Grab(self, self.command("grab", wanted).interaction)
 
+    @overload
+    def set(self, key: str, value: Value) -> list[pb.LiveParameter]: ...
+    @overload
+    def set(self, key: Mapping[str, Value]) -> list[pb.LiveParameter]: ...
+    def set(self, key: str | Mapping[str, Value], value: Value | None = None) -> list[pb.LiveParameter]:
+        """Changes parameters of the scene while steps run, all between the same two steps; returns those that were set.
+
+        key: as after --set of sim-server, or NAME.EFFECT.KEY, EFFECT.KEY, NAME.KEY; or values by key. value: text is
+        TOML. Raises BadInput for what cannot change or is not allowed; nothing changes then.
+
+        >>> client.set("beam.corotational.young", 2e5)
+        >>> client.set({"gravity.g": [0, -1.6, 0], "beam.rayleigh.mass": 0.5})
+        """
+        given = key if isinstance(key, Mapping) else {key: value}
+        try:
+            texts = {name: each if isinstance(each, str) else toml(each) for name, each in given.items()}
+        except TypeError as error:
+            raise BadInput(f"set: {error}") from None
+        parameters = [pb.Parameter(key=name, value=text) for name, text in texts.items()]
+        return list(self.command("set", parameters=parameters).parameters)
+
+    def parameters(self) -> list[pb.LiveParameter]:
+        """Returns the parameters of the scene that may change while steps run, with the values set last."""
+        return list(self.command("parameters").parameters)
+
     def pause(self) -> pb.Reply:
         """Pauses the simulation. The reply comes after the present step; its status has the number of that step."""
         return self.command("pause")
@@ -209,10 +236,16 @@ class Client:
         return self.forces.between(first, second, self.timeout)
 
     def command(
-        self, verb: str, interaction: pb.Interaction | None = None, target: pb.ObstacleTarget | None = None
-    ) -> pb.Reply:
-        """Sends a command and waits for the reply. Raises BadInput if the server refuses it."""
-        found = self._query("command", pb.Reply, self._command(verb, interaction, target).SerializeToString())
+        self, verb: str, interaction: pb.Interaction | None = None, target: pb.ObstacleTarget | None = None,
+        **fields: Any,
+    ) -> pb.Reply:  # fmt: skip
+        """Sends a command and waits for the reply. Raises BadInput if the server refuses it.
+
+        fields: others of Command
+        """
+        command = self._command(verb, interaction, target)
+        command.MergeFrom(pb.Command(**fields))
+        found = self._query("command", pb.Reply, command.SerializeToString())
         if not found:
             raise self._no_server()
         if found[0].error:

@@ -32,6 +32,7 @@ from sim_server.mechanics.static_check import check_held
 from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.ties import make_ties, ties_alone
 from sim_server.mechanics.world import Body, World
+from sim_server.parameters import LiveParameters
 from sim_server.scene import Scene, load
 
 if TYPE_CHECKING:
@@ -65,6 +66,7 @@ class Simulation:
         self._detection = slice(0, 0)  # numbers of those that detect contacts
         with backend.building():
             self._build(backend, watched)
+        self.parameters = LiveParameters(self)
 
     def _build(self, backend: Backend, watched: bool) -> None:
         scene, solver = self.scene, self.scene.solver
@@ -333,6 +335,8 @@ def build_effects(scene: Scene, world: World) -> dict[str, Effect]:
             variants.setdefault(params.variant, []).append((body, params))
         for variant, listed in variants.items():
             built[name + variant] = effect(name).build(world, listed)
+            built[name + variant].name = name
     for name, params in scene.effects.items():
         built[name] = effect(name).build(world, [(body, params) for body in world.bodies])
+        built[name].name = name
     return built

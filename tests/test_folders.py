@@ -27,8 +27,8 @@ ALLOWED = {  # what each folder imports of its package
     "clients.plan": {"accuracy", "errors", "log", "progress", "watch"},
 }
 ORDER = (  # of sim_server: each imports of those before it
-    "errors", "arrays", "kernels", "mesh", "scene", "backends", "mechanics", "effects", "simulation", "updates",
-    "network", "recording", "service", "replay", "cli", "__main__",
+    "errors", "arrays", "kernels", "mesh", "scene", "backends", "mechanics", "effects", "parameters", "simulation",
+    "updates", "network", "recording", "service", "replay", "cli", "__main__",
 )  # fmt: skip
 REGISTRY = ("scene", "effects")  # a scene looks the names of effects up; the effects that it lists are imported later
 

@@ -61,8 +61,12 @@ class Module(Protocol):
         ...
 
 
+ArrayChange = tuple[NDArray[Any], NDArray[Any]]
+"""An array that kernels read, and its new contents, of the same shape and type."""
+
+
 class PendingUpdate(Protocol):
-    """New arguments of a launch on their way to the loop.
+    """New arguments of a launch, or new contents of arrays, on their way to the loop.
 
     taken: number of completed steps when the loop took them up; negative: not yet, or never if newer ones came
     """
@@ -251,6 +255,17 @@ class Engine(Protocol):
 
     def replace(self, launch: int, new: Launch) -> PendingUpdate:
         """Gives a mailed launch (its number among `launches`) new arguments, from one of the next steps on."""
+        ...
+
+    def change(self, changes: Sequence[ArrayChange]) -> PendingUpdate:
+        """Copies new contents into arrays of the host, or their twins, all between the same two steps.
+
+        Nothing else may wait to be copied: see `withdraw_changes`.
+        """
+        ...
+
+    def withdraw_changes(self) -> bool:
+        """Takes back what `change` was given last and the loop has not taken up; False if there is nothing."""
         ...
 
 

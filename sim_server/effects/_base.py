@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Base of the effects: elements that couple nodes, and launches that add to the system of a step."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, Protocol
@@ -13,6 +13,7 @@ from sim_server.backends.base import Launch, PendingUpdate
 from sim_server.backends.energies import ElementEnergies
 from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.world import Body, World
+from sim_server.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -43,12 +44,14 @@ class EffectUpdates(Protocol):
 class Effect:
     """Base of all effects. A file under effects/ has `build(world, listed) -> Effect`.
 
+    name: as scenes list it.
     elements (m, c): node numbers (of the scene) of the elements whose c = 2 or 4 corners the effect couples, or None.
     rotated: the bodies whose elements add their rotations to system.mean for the warp; nodes of other bodies get
     theirs by shape matching. elastic: by body index, Young's modulus [Pa] and Poisson's ratio of its elements, (m,)
     each, for viewers.
     """
 
+    name = ""
     elements: Int32 | None = None
     rotated: tuple[Body, ...] = ()
     elastic: Mapping[int, tuple[Float64, Float64]] = MappingProxyType({})
@@ -77,6 +80,17 @@ class Effect:
         .block, .sums. frames: add the rotations of the elements to .mean, too
         """
         return self.launches(system, stencil, False) if stencil is None else None
+
+    def elastic_in(self, scene: Scene) -> Mapping[int, tuple[Float64, Float64]]:
+        """Returns `elastic` by the parameters of a scene."""
+        return {}
+
+    def unchangeable(self, scene: Scene) -> Mapping[tuple[int, str], str]:
+        """Returns why live parameters cannot change to those of `scene` while steps run, {} for most.
+
+        Those whose change would need other launches, by index of the body (-1: of the whole scene) and key.
+        """
+        return {}
 
     def connect(self, simulation: EffectUpdates) -> None:
         """Called once the loop exists. An effect that changes while steps run keeps `simulation`."""
@@ -120,6 +134,11 @@ class Build(Protocol):
     """
 
     def __call__(self, world: World, listed: list[tuple[Body, Any]]) -> Effect: ...
+
+
+def params_in(scene: Scene, name: str, bodies: Sequence[Body]) -> list[Any]:
+    """Returns the parameters that bodies have in a scene, maybe with other values than at the start."""
+    return [scene.objects[body.index].effects[name] for body in bodies]
 
 
 def per_node(world: World, listed: list[tuple[Body, Any]], value: str) -> Float64:

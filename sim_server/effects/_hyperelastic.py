@@ -46,6 +46,7 @@ J has there, so that W stays twice continuously differentiable and pushes an inv
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -54,11 +55,13 @@ from pydantic import Field, create_model
 from sim_server.arrays import Float64, Int32
 from sim_server.backends.base import Launch
 from sim_server.backends.energies import ElementEnergies
-from sim_server.effects._base import Effect, Refusal
+from sim_server.effects._base import Effect, Refusal, params_in
 from sim_server.errors import InputError
 from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.world import Body, World
 from sim_server.mesh.shape_functions import shape_gradients
+from sim_server.scene import Scene
+from sim_server.scene.live import POISSON, STIFFNESS, Live
 from sim_server.scene.parameters import Parameters, Positive
 from sim_server.scene.regions import Poisson, Regional, by_region, constants_by_region
 
@@ -68,13 +71,17 @@ PROJECTIONS = {"none": 0, "clamp": 1, "absolute": 2, "excess": 3}  # kernels/hyp
 
 @dataclass(frozen=True)
 class Constant:
-    """A material constant in the scene: its type, and its unit and meaning. default: None where it is required."""
+    """A material constant in the scene: its type, and its unit and meaning. default: None where it is required.
+
+    live: its slider while steps run
+    """
 
     name: str
     kind: Any
     text: str
     default: Any = None
     unit: str = "Pa"
+    live: Live = STIFFNESS
 
 
 Inversion = Literal["refuse", "regularize"]
@@ -114,11 +121,10 @@ class Law:
         kinds = {c.name: c.kind for c in self.constants}
         fields: dict[str, Any] = {}
         for c in self.constants:
-            if c is self.constants[0]:
-                fields[c.name] = (by_region(kinds), Field(description=c.text))
-            else:  # None: required, unless every region gives it
-                kind = c.kind | None if c.default is None else c.kind
-                fields[c.name] = (kind, Field(default=c.default, description=c.text))
+            first = c is self.constants[0]  # None: required, unless every region gives it
+            kind = by_region(kinds) if first else c.kind | None if c.default is None else c.kind
+            given = {} if first else {"default": c.default}
+            fields[c.name] = (Annotated[kind, c.live], Field(description=c.text, **given))
         extra = INVERSION if self.refuses and self.regularizes else {}
         return create_model(f"Params of {self.name}", __base__=Regional, **fields, **extra)
 
@@ -140,7 +146,7 @@ class Tetrahedra(Effect):
     """
 
     def __init__(self, world: World, listed: list[tuple[Body, Any]]):
-        self.world = world
+        self.world, self.bodies = world, [body for body, _ in listed]
         tets = np.concatenate([body.tets for body, _ in listed])
         self.order = np.argsort(tets.min(axis=1), kind="stable")  # elements near in the mesh are near in memory
         self.elements: Int32 = np.ascontiguousarray(tets[self.order])
@@ -153,10 +159,25 @@ class Tetrahedra(Effect):
         self.corners, self.edges = np.zeros((4, m, 9)), np.zeros((6, m, 9))
         self._energy = np.zeros(m)
 
+    def values_in(self, scene: Scene, law: Law) -> list[Values]:
+        """Returns the constants of each body's elements by the parameters of a scene. Raises InputError."""
+        given = params_in(scene, law.name, self.bodies)
+        return [constants_of(law, body, params) for body, params in zip(self.bodies, given, strict=True)]
+
+    def packed(self, law: Law) -> Float64:
+        """Returns the constants (k, m) in the form of the kernel text, which follow the scene."""
+
+        def compute(scene: Scene) -> Float64:
+            packed = [np.stack(law.pack(values)) for values in self.values_in(scene, law)]
+            return np.asarray(np.concatenate(packed, axis=1)[:, self.order])
+
+        constants: Float64 = self.world.follow(law.name, compute=compute)
+        return constants
+
     def _of_a_step(self) -> dict[str, Any]:
         """Arguments of the integrator: coefficients of force and tangent, and the field that the tangent multiplies."""
         w = self.world
-        coefficient = w.stiffness_coefficient[self.owner]
+        coefficient = w.stiffness_coefficient(self.owner)
         return {"h": w.force_coefficient, "stiffness_coefficient": coefficient, "v": w.damping_velocity}
 
     def gathers(self, system: System, stencil: Stencil, accumulate: bool) -> list[Launch]:
@@ -179,17 +200,25 @@ class Hyperelastic(Tetrahedra):
     def __init__(self, world: World, listed: list[tuple[Body, Any]], law: Law):
         super().__init__(world, listed)
         self.law = law
-        values = [constants_of(law, body, params) for body, params in listed]
-        self.constants = np.concatenate([np.stack(law.pack(v)) for v in values], axis=1)[:, self.order].copy()
-        if law.elastic is not None:
-            self.elastic = {body.index: law.elastic(v) for (body, _), v in zip(listed, values, strict=True)}
+        self.constants = self.packed(law)
+        self.elastic = world.at_start(self.elastic_in)
         if law.axes is not None:
-            axes = np.concatenate([law.axes(v) for v in values])[self.order]
-            rows = self.gradients.T.reshape(-1, 3, 3) @ axes
-            self.gradients = np.ascontiguousarray(rows.reshape(-1, 9).T)
+            self.gradients = world.follow(law.name, compute=partial(self._gradients_along, law.axes, self.gradients))
         floors = [getattr(p, "floor", 0.0) if getattr(p, "inversion", "") == "regularize" else 0.0 for _, p in listed]
         self.floor = np.repeat(floors, [len(body.mesh.tets) for body, _ in listed])[self.order]
         self.refused = np.tile([-1.0, 0.0], (len(self.elements), 1))
+
+    def _gradients_along(self, axes_of: Callable[[Values], Float64], gradients: Float64, scene: Scene) -> Float64:
+        """Returns gradients (9, m) by the material axes."""
+        axes = np.concatenate([axes_of(values) for values in self.values_in(scene, self.law)])[self.order]
+        rows = gradients.T.reshape(-1, 3, 3) @ axes
+        return np.asarray(rows.reshape(-1, 9).T)
+
+    def elastic_in(self, scene: Scene) -> Mapping[int, tuple[Float64, Float64]]:
+        if self.law.elastic is None:
+            return {}
+        values = self.values_in(scene, self.law)
+        return {body.index: self.law.elastic(v) for body, v in zip(self.bodies, values, strict=True)}
 
     def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
         assert stencil is not None
@@ -245,7 +274,12 @@ def young_and_poisson_of(poisson: Any = Poisson) -> tuple[Constant, Constant]:
     """The constants of a law that is Hooke's at small strains. poisson: type of Poisson's ratio, with its bounds."""
     return (
         Constant("young", Positive, "Young's modulus at small strains [Pa], or a list of regions"),
-        Constant("poisson", poisson, "Poisson's ratio at small strains [-], of every element whose region gives none"),
+        Constant(
+            "poisson",
+            poisson,
+            "Poisson's ratio at small strains [-], of every element whose region gives none",
+            live=POISSON,
+        ),
     )
 
 

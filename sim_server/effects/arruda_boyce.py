@@ -27,6 +27,7 @@ from pydantic import Field
 from sim_server.arrays import Float64
 from sim_server.effects._hyperelastic import Constant, Hyperelastic, Law, Values, of_shear_and_bulk
 from sim_server.mechanics.world import Body, World
+from sim_server.scene.live import Live
 from sim_server.scene.parameters import Positive
 
 SCOPE = "object"
@@ -44,7 +45,7 @@ LAW = Law(
     "arruda_boyce",
     (
         Constant("shear", Positive, "n k T of the chains [Pa], or a list of regions"),
-        Constant("segments", Annotated[float, Field(gt=1)], "links of a chain [-]"),
+        Constant("segments", Annotated[float, Field(gt=1)], "links of a chain [-]", live=Live(2, 50, logarithmic=True)),
         Constant("bulk", Positive, "bulk modulus [Pa]"),
     ),
     pack=lambda values: [values["shear"], values["segments"], values["bulk"]],

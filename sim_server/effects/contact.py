@@ -48,6 +48,8 @@ from sim_server.mechanics.world import Body, World
 from sim_server.mesh.box_tree import box_tree
 from sim_server.mesh.own_surface import edges_through_triangles, nearby_nodes
 from sim_server.mesh.surface import edge_owners, surface_edges, surface_triangles
+from sim_server.scene import Scene
+from sim_server.scene.live import Live
 from sim_server.scene.obstacles import Obstacle
 from sim_server.scene.parameters import NotNegative, Parameters, Positive, as_tuple
 
@@ -78,7 +80,9 @@ class Params(Parameters):
     stiffness: float = Field(default=1.0, gt=0, le=1e4, description="of a contact over that of its node [-]")
     passes: int = Field(default=16, ge=1, le=1000, description="most solves of a linearization")
     tolerance: float = Field(default=1e-3, gt=0, lt=1, description="of the contact residual over the right-hand side")
-    friction: list[PairFriction] | None = Field(default=None, description="of pairs, instead of the geometric mean")
+    friction: Annotated[list[PairFriction] | None, Live()] = Field(
+        default=None, description="of pairs, instead of the geometric mean"
+    )
     between: bool = Field(default=True, description="objects touch each other, too")
     self: bool = Field(default=False, description="objects touch themselves, too")
 
@@ -101,7 +105,7 @@ class Contact(Movable):
         bounds = [_thickness(params, body) for body in world.bodies]
         self._shapes(max(bounds))
         self.dropped = np.zeros(len(self.node), np.int32)
-        self._pair_friction = _pair_friction(world, params)
+        self._pair_friction = world.follow("friction", "contact", compute=_pair_friction)
         touching = params.self or (len(world.bodies) > 1 and params.between)
         ties = make_ties(world)
         start = np.concatenate([[0], np.cumsum([2 * len(s) for s in surfaces])]).astype(np.int32)
@@ -151,7 +155,7 @@ class Contact(Movable):
 
     def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
         w, rows, table = self.world, self._input, self._table
-        gravity, block_scale = np.array(w.gravity), w.euler_block_scale
+        gravity, block_scale = w.gravity(), w.euler_block_scale()
         w.backend.keep(gravity, block_scale, exact=True)
         detect = w.backend.module(TEXT).bind(
             "detect", len(self.node), obstacles=len(self.obstacles), **vars(table), swept=self.swept,
@@ -271,7 +275,7 @@ def faces_of(world: World, friction: Float64, first: int) -> Faces | None:
     triangles = [surface_triangles(b.mesh.tets) + np.int32(b.first) for b in world.bodies]
     start = first + np.cumsum([0, *map(len, triangles)])
     triangle = np.concatenate(triangles).astype(np.int32)
-    return Faces(start.astype(np.int32), triangle, edge_owners(triangle), friction, np.array(world.gravity))
+    return Faces(start.astype(np.int32), triangle, edge_owners(triangle), friction, world.gravity())
 
 
 def _body_of_rows(start: Int32) -> Int32:
@@ -300,7 +304,8 @@ def _surfaces(
     return Surfaces(
         body, site, triangle, boxes.astype(np.int32), np.concatenate(shifted).astype(np.int32),
         (first + 2 * ends).astype(np.int32), edge, opposite, of_triangle, mean, np.array(thickness),
-        _friction_of_bodies(world, params), np.array(world.gravity), params.between,
+        world.follow("friction", "contact", compute=lambda scene: _friction_of_bodies(world, scene)), world.gravity(),
+        params.between,
         _own_surfaces(world, triangles, thickness) if params.self else None,
     )  # fmt: skip
 
@@ -319,13 +324,16 @@ def _own_surfaces(world: World, triangles: Sequence[Int32], thickness: Sequence[
     )  # fmt: skip
 
 
-def _friction_of_bodies(world: World, params: Params) -> Float64:
+def _friction_of_bodies(world: World, scene: Scene) -> Float64:
     """Returns the coefficient of each body on each other, (bodies, bodies)."""
-    listed = {frozenset(pair.between): pair.value for pair in params.friction or ()}
-    return np.array([
-        [listed.get(frozenset((a.name, b.name)), (a.friction * b.friction) ** 0.5) for b in world.bodies]
-        for a in world.bodies
-    ])  # fmt: skip
+    own = [(o.name, o.friction or 0.0) for o in scene.objects]
+    listed = _listed_friction(scene)
+    return np.array([[listed.get(frozenset((a, b)), (f * g) ** 0.5) for b, g in own] for a, f in own])
+
+
+def _listed_friction(scene: Scene) -> dict[frozenset[str], float]:
+    pairs = scene.effects["contact"].friction or ()  # type: ignore[attr-defined]
+    return {frozenset(pair.between): pair.value for pair in pairs}
 
 
 def _thickness(params: Params, body: Body) -> float:
@@ -363,12 +371,13 @@ def _size(o: Obstacle) -> tuple[list[float], float]:
     return [o.radius, half_axis, 0.0, 0.0], o.radius + half_axis
 
 
-def _pair_friction(world: World, params: Params) -> Float64:
+def _pair_friction(scene: Scene) -> Float64:
     """Returns the coefficient of each body on each obstacle, (bodies, m)."""
-    listed = {frozenset(pair.between): pair.value for pair in params.friction or ()}
+    listed = _listed_friction(scene)
+    bodies, obstacles = [(o.name, o.friction or 0.0) for o in scene.objects], scene.obstacles or []
     return np.array([
-        [listed.get(frozenset((b.name, o.name)), (b.friction * o.friction) ** 0.5) for o in world.obstacles]
-        for b in world.bodies
+        [listed.get(frozenset((name, o.name)), (friction * o.friction) ** 0.5) for o in obstacles]
+        for name, friction in bodies
     ])  # fmt: skip
 
 

@@ -43,7 +43,8 @@ Source: Müller and Gross, Interactive Virtual Materials, 2004; Nesme, Payan and
 and Schröder 2010, McAdams et al. 2011 (exact tangent); Felippa 2000.
 """
 
-from typing import Any, Literal
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,12 +53,14 @@ from pydantic import Field, model_validator
 from sim_server.arrays import Float64, Int32
 from sim_server.backends.base import Launch
 from sim_server.backends.energies import ElementEnergies
-from sim_server.effects._base import Effect
+from sim_server.effects._base import Effect, params_in
 from sim_server.errors import InputError
 from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.world import Body, World
 from sim_server.mesh.shape_functions import shape_gradients
+from sim_server.scene import Scene
 from sim_server.scene.integrator_options import IntegratorOptions
+from sim_server.scene.live import POISSON, STIFFNESS
 from sim_server.scene.parameters import complaint
 from sim_server.scene.regions import Poisson, Regional, Young, region_values
 
@@ -65,8 +68,10 @@ SCOPE = "object"
 
 
 class Params(Regional):
-    young: Young = Field(description="Young's modulus [Pa], or a list of regions { where, young, poisson }")
-    poisson: Poisson | None = Field(
+    young: Annotated[Young, STIFFNESS] = Field(
+        description="Young's modulus [Pa], or a list of regions { where, young, poisson }"
+    )
+    poisson: Annotated[Poisson | None, POISSON] = Field(
         default=None, description="Poisson's ratio [-], of every element whose region gives none"
     )
     rotation: Literal["polar", "qr"] = Field(default="polar", description="of the elements")
@@ -116,14 +121,17 @@ class Corotational(Effect):
         tets = np.concatenate([body.tets for body, _ in listed])
         order = np.argsort(tets.min(axis=1), kind="stable")  # elements near in the mesh are near in memory
         self.elements: Int32 = np.ascontiguousarray(tets[order])
-        self.elastic = {body.index: _constants(body, params) for body, params in listed}  # young, poisson
-        young = np.concatenate([self.elastic[body.index][0] for body, _ in listed])[order]
-        poisson = np.concatenate([self.elastic[body.index][1] for body, _ in listed])[order]
+        self.elastic = world.at_start(self.elastic_in)
         volume, gradients = shape_gradients(world.rest, self.elements)
         self.gradients = np.ascontiguousarray(gradients.reshape(-1, 9).T)
-        lam = young * poisson / ((1 + poisson) * (1 - 2 * poisson))
-        mu = young / (2 * (1 + poisson))
-        self.lame = np.stack([lam * volume, mu * volume])
+
+        def lame(scene: Scene) -> Float64:
+            young, poisson = np.concatenate([*self.elastic_in(scene).values()], axis=1)[:, order]
+            lam = young * poisson / ((1 + poisson) * (1 - 2 * poisson))
+            mu = young / (2 * (1 + poisson))
+            return np.stack([lam * volume, mu * volume])
+
+        self.lame = world.follow("corotational", compute=lame)
         owner = np.repeat([body.index for body, _ in listed], [len(body.mesh.tets) for body, _ in listed])
         self.owner = owner[order]
         m = len(self.elements)
@@ -132,6 +140,10 @@ class Corotational(Effect):
         self.near = np.zeros((m, 4))  # quaternions of `forces`, begun at those of its last state
         self.twist = np.zeros((m if self.variant == "_exact" else 0, 6))
         self._energy = np.zeros(m)
+
+    def elastic_in(self, scene: Scene) -> Mapping[int, tuple[Float64, Float64]]:
+        given = params_in(scene, "corotational", self.rotated)
+        return {body.index: _constants(body, params) for body, params in zip(self.rotated, given, strict=True)}
 
     def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
         assert stencil is not None
@@ -142,7 +154,7 @@ class Corotational(Effect):
         sums = text if exact else "effects/corotational"
         elements = w.backend.module(f"{text}.cu").bind(
             "elements", m, tets=self.elements, x=w.x, v=w.damping_velocity, gradients=self.gradients, lame=self.lame,
-            stiffness_coefficient=w.stiffness_coefficient[self.owner], h=w.force_coefficient,
+            stiffness_coefficient=w.stiffness_coefficient(self.owner), h=w.force_coefficient,
             quaternion=self.quaternion, scaled_gradients=self.scaled_gradients, nodal_impulse=self.nodal_impulse,
             **twist,
         )  # fmt: skip
@@ -165,7 +177,7 @@ class Corotational(Effect):
         damped = self.variant == "_exact" and w.beta[self.owner].any()  # by the tangent: without it both have one force
         forces = w.backend.module(f"effects/corotational{'_exact' if damped else ''}.cu").bind(
             "forces", len(self.elements), tets=self.elements, x=w.x, v=w.damping_velocity, gradients=self.gradients,
-            lame=self.lame, stiffness_coefficient=w.stiffness_coefficient[self.owner], h=w.force_coefficient,
+            lame=self.lame, stiffness_coefficient=w.stiffness_coefficient(self.owner), h=w.force_coefficient,
             quaternion=self.near, nodal_impulse=self.nodal_impulse,
         )  # fmt: skip
         rotations = {"quaternion": self.near, "mean": system.mean} if frames else {}

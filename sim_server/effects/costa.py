@@ -31,6 +31,7 @@ from sim_server.arrays import Float64
 from sim_server.effects._hyperelastic import Constant, Hyperelastic, Law, Values
 from sim_server.errors import InputError
 from sim_server.mechanics.world import Body, World
+from sim_server.scene.live import Live
 from sim_server.scene.parameters import NotNegative, Positive, Vector
 
 SCOPE = "object"
@@ -55,8 +56,8 @@ LAW = Law(
         Constant("a", Positive, "factor of the exponential [Pa], or a list of regions"),
         *(Constant(f"b_{k}", NotNegative, f"factor of E_{k}^2 in the exponent [-]", STIFFEST[k]) for k in PAIRS),
         Constant("bulk", Positive, "factor of J ln J - J + 1 [Pa]"),
-        Constant("fibre", Vector, "direction of the fibres at rest, before the pose"),
-        Constant("sheet", Vector, "a direction in the sheet, across the fibres"),
+        Constant("fibre", Vector, "direction of the fibres at rest, before the pose", live=Live()),
+        Constant("sheet", Vector, "a direction in the sheet, across the fibres", live=Live()),
     ),
     pack=lambda values: [values["a"], *(values[f"b_{k}"] for k in PAIRS), values["bulk"]],
     axes=axes,

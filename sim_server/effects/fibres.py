@@ -26,12 +26,15 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BeforeValidator, PlainSerializer
 
+from sim_server.arrays import Float64
 from sim_server.backends.base import Launch
 from sim_server.backends.energies import ElementEnergies
-from sim_server.effects._hyperelastic import Constant, Law, Tetrahedra, constants_of
+from sim_server.effects._hyperelastic import Constant, Law, Tetrahedra
 from sim_server.errors import InputError
 from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.world import Body, World
+from sim_server.scene import Scene
+from sim_server.scene.live import Live
 from sim_server.scene.parameters import NotNegative, Positive, complaint
 
 SCOPE = "object"
@@ -62,8 +65,8 @@ LAW = Law(
     "fibres",
     (
         Constant("stiffness", Positive, "of a family [Pa], or a list of regions"),
-        Constant("exponent", NotNegative, "how fast it stiffens [-]", 0.0),
-        Constant("direction", Families, "direction at rest, or two of them for two families"),
+        Constant("exponent", NotNegative, "how fast it stiffens [-]", 0.0, live=Live(0, 10)),
+        Constant("direction", Families, "direction at rest, or two of them for two families", live=Live()),
     ),
     pack=lambda values: [values["stiffness"], values["exponent"]],
     refuses=False,
@@ -76,11 +79,13 @@ class Fibres(Tetrahedra):
 
     def __init__(self, world: World, listed: list[tuple[Body, Any]]):
         super().__init__(world, listed)
-        values = [constants_of(LAW, body, params) for body, params in listed]
-        self.constants = np.concatenate([np.stack(LAW.pack(v)) for v in values], axis=1)[:, self.order].copy()
-        directions = np.concatenate([v["direction"].reshape(-1, 2, 3) for v in values])[self.order]
+        self.constants = self.packed(LAW)
+        self.directions = world.follow(LAW.name, compute=self._directions)
+
+    def _directions(self, scene: Scene) -> Float64:
+        directions = np.concatenate([v["direction"].reshape(-1, 2, 3) for v in self.values_in(scene, LAW)])[self.order]
         length = np.linalg.norm(directions, axis=2, keepdims=True)
-        self.directions = np.ascontiguousarray((directions / np.where(length > 0, length, 1)).reshape(-1, 6).T)
+        return np.asarray((directions / np.where(length > 0, length, 1)).reshape(-1, 6).T)
 
     def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
         assert stencil is not None

@@ -12,7 +12,7 @@ that does not list gravity has none. The static sag of a cantilever of length L,
 own weight is rho g A L^4 / (8 E I) as long as that is small against L (Euler and Bernoulli), a useful check.
 """
 
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field
@@ -22,21 +22,24 @@ from sim_server.backends.base import Launch
 from sim_server.effects._base import Effect
 from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.world import Body, World
+from sim_server.scene import Scene
+from sim_server.scene.live import Live
 from sim_server.scene.parameters import Parameters, Vector
 
 SCOPE = "scene"
 
 
 class Params(Parameters):
-    g: Vector = Field(default=(0.0, -9.81, 0.0), description="acceleration [m/s2]")
+    g: Annotated[Vector, Live(-20, 20)] = Field(default=(0.0, -9.81, 0.0), description="acceleration [m/s2]")
 
 
 class Gravity(Effect):
     """Adds the weight: b += h m g."""
 
-    def __init__(self, world: World, g: tuple[float, float, float]):
-        self.world, self.g = world, np.array(g, dtype=float)
-        world.gravity = g
+    def __init__(self, world: World):
+        self.world = world
+        world.gravity_of = _gravity_of
+        self.g = world.gravity()
 
     def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
         w = self.world
@@ -54,6 +57,12 @@ class Gravity(Effect):
         return -float(self.world.mass @ (self.world.x @ self.g))
 
 
+def _gravity_of(scene: Scene) -> Float64:
+    params = scene.effects["gravity"]
+    assert isinstance(params, Params)
+    return np.array(params.g, np.float64)
+
+
 def build(world: World, listed: list[tuple[Body, Any]]) -> Gravity:
     """Gravity on all nodes."""
-    return Gravity(world, listed[0][1].g)
+    return Gravity(world)

@@ -28,6 +28,7 @@ Source: van Gelder, Approximate simulation of elastic membranes by triangulated 
 but responsive cloth, 2002 (the tangent under compression); Love, Mathematical Theory of Elasticity, note B (Cauchy).
 """
 
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 import numpy as np
@@ -36,10 +37,12 @@ from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 from sim_server.arrays import Float64, Int32, Int64
 from sim_server.backends.base import Launch
 from sim_server.backends.energies import ElementEnergies
-from sim_server.effects._base import Effect
+from sim_server.effects._base import Effect, params_in
 from sim_server.errors import InputError
 from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.world import Body, World
+from sim_server.scene import Scene
+from sim_server.scene.live import STIFFNESS, Live
 from sim_server.scene.parameters import File, Parameters, Positive, as_tuple, complaint
 from sim_server.scene.regions import Young, region_values
 
@@ -67,10 +70,16 @@ RestLength = Annotated[
 
 
 class Params(Parameters):
-    young: Young | None = Field(default=None, description="Young's modulus [Pa], or a list of regions { where, young }")
+    young: Annotated[Young | None, STIFFNESS] = Field(
+        default=None, description="Young's modulus [Pa], or a list of regions { where, young }"
+    )
     springs: Pairs | None = Field(default=None, description="pairs of nodes, or a file of them, instead of the edges")
-    stiffness: Stiffness | None = Field(default=None, description="of the listed springs [N/m]: one for all, or each")
-    rest_length: RestLength | None = Field(default=None, description="of the listed springs [m]; default: as at rest")
+    stiffness: Annotated[Stiffness | None, STIFFNESS] = Field(
+        default=None, description="of the listed springs [N/m]: one for all, or each"
+    )
+    rest_length: Annotated[RestLength | None, Live(0.5, 1.5, relative=True)] = Field(
+        default=None, description="of the listed springs [m]; default: as at rest"
+    )
 
     @model_validator(mode="before")
     @classmethod
@@ -103,15 +112,21 @@ class MassSpring(Effect):
     """
 
     def __init__(self, world: World, listed: list[tuple[Body, Any]]):
-        self.world = world
-        self.elastic: dict[int, tuple[Float64, Float64]] = {}
+        self.world, self.bodies = world, [body for body, _ in listed]
+        self.elastic = world.at_start(self.elastic_in)
         self._from_files = any(isinstance(params.springs, str) for _, params in listed)
-        parts = [self._springs(body, params) for body, params in listed]
+        parts = [_springs(body, params) for body, params in listed]
         ends = np.concatenate([part[0] for part in parts])
         order = np.argsort(ends.min(axis=1), kind="stable")  # neighbours in memory
         self.elements: Int32 = np.ascontiguousarray(ends[order])
-        self.stiffness = np.concatenate([part[1] for part in parts])[order]
-        self.length = np.concatenate([part[2] for part in parts])[order]
+
+        def now(scene: Scene, part: int) -> Float64:
+            given = params_in(scene, "mass_spring", self.bodies)
+            parts = [_springs(body, params)[part] for body, params in zip(self.bodies, given, strict=True)]
+            return np.asarray(np.concatenate(parts)[order])
+
+        self.stiffness = world.follow("mass_spring", compute=lambda scene: now(scene, 1))
+        self.length = world.follow("mass_spring", compute=lambda scene: now(scene, 2))
         owner = np.repeat([body.index for body, _ in listed], [len(part[0]) for part in parts])
         self.owner = owner[order]
         m = len(self.elements)
@@ -122,24 +137,17 @@ class MassSpring(Effect):
         """False if springs come from files, which workers do not read."""
         return not self._from_files
 
-    def _springs(self, body: Body, params: Params) -> tuple[Int32, Float64, Float64]:
-        """Returns ends, stiffness and rest length of a body's springs."""
-        try:
-            if params.young is None:
-                return listed_springs(body, params)
-            young, _ = region_values(params.young, POISSON, body.centroids)
-        except InputError as error:
-            raise InputError(f"object {body.name!r}, effect mass_spring: {error}") from error
-        self.elastic[body.index] = young, np.full(len(young), POISSON)
-        ends, stiffness, length = edge_springs(body.mesh.rest, body.mesh.tets, young)
-        return ends + np.int32(body.first), stiffness, length
+    def elastic_in(self, scene: Scene) -> Mapping[int, tuple[Float64, Float64]]:
+        given = zip(self.bodies, params_in(scene, "mass_spring", self.bodies), strict=True)
+        found = {body.index: _young(body, params) for body, params in given if params.young is not None}
+        return {index: (young, np.full(len(young), POISSON)) for index, young in found.items()}
 
     def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
         assert stencil is not None
         w, m = self.world, len(self.elements)
         springs = w.backend.module("effects/mass_spring.cu").bind(
             "springs", m, ends=self.elements, x=w.x, v=w.damping_velocity, stiffness=self.stiffness, length=self.length,
-            stiffness_coefficient=w.stiffness_coefficient[self.owner], h=w.force_coefficient, tangent=self.tangent,
+            stiffness_coefficient=w.stiffness_coefficient(self.owner), h=w.force_coefficient, tangent=self.tangent,
             nodal_impulse=self.nodal_impulse,
         )  # fmt: skip
         gather = w.backend.module("effects/mass_spring_nodes.cu").bind(
@@ -159,6 +167,24 @@ class MassSpring(Effect):
             length=self.length, energy=self._energy,
         )  # fmt: skip
         return ElementEnergies(launch, self._energy, self.owner)
+
+
+def _young(body: Body, params: Params) -> Float64:
+    try:
+        return region_values(params.young or 0.0, POISSON, body.centroids)[0]
+    except InputError as error:
+        raise InputError(f"object {body.name!r}, effect mass_spring: {error}") from error
+
+
+def _springs(body: Body, params: Params) -> tuple[Int32, Float64, Float64]:
+    """Returns ends, stiffness and rest length of a body's springs."""
+    if params.young is None:
+        try:
+            return listed_springs(body, params)
+        except InputError as error:
+            raise InputError(f"object {body.name!r}, effect mass_spring: {error}") from error
+    ends, stiffness, length = edge_springs(body.mesh.rest, body.mesh.tets, _young(body, params))
+    return ends + np.int32(body.first), stiffness, length
 
 
 def edge_springs(rest: Float64, tets: Int32, young: Float64) -> tuple[Int32, Float64, Float64]:

@@ -29,6 +29,7 @@ from sim_server.arrays import Float64
 from sim_server.effects._hyperelastic import Constant, Hyperelastic, Law, Values, of_shear_and_bulk
 from sim_server.errors import InputError
 from sim_server.mechanics.world import Body, World
+from sim_server.scene.live import Live
 from sim_server.scene.parameters import Positive, complaint
 
 SCOPE = "object"
@@ -61,7 +62,7 @@ LAW = Law(
     "ogden",
     (
         Constant("mu", Terms, "factors of the terms [Pa], one to three, or a list of regions"),
-        Constant("alpha", Terms, "exponents of the stretches [-], as many"),
+        Constant("alpha", Terms, "exponents of the stretches [-], as many", live=Live()),
         Constant("bulk", Positive, "bulk modulus [Pa]"),
     ),
     pack=pack,

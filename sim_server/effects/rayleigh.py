@@ -18,30 +18,52 @@ stiffness = 0, since backward Euler damps fast modes by itself.
 Source: Rayleigh, The Theory of Sound, 1877; Hughes, The Finite Element Method, section 9.3.
 """
 
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field
 
+from sim_server.arrays import Float64
 from sim_server.backends.base import Launch
-from sim_server.effects._base import Effect, per_node
+from sim_server.effects._base import Effect, params_in
 from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.world import Body, World
+from sim_server.scene import Scene
+from sim_server.scene.live import Live
 from sim_server.scene.parameters import Parameters
 
 SCOPE = "object"
+KEYS = ("mass", "stiffness")
 
 
 class Params(Parameters):
-    mass: float = Field(default=0.0, ge=0, description="mass-proportional coefficient [1/s]")
-    stiffness: float = Field(default=0.0, ge=0, description="stiffness-proportional coefficient [s]")
+    mass: Annotated[float, Live(0, 20)] = Field(default=0.0, ge=0, description="mass-proportional coefficient [1/s]")
+    stiffness: Annotated[float, Live(0, 0.1)] = Field(
+        default=0.0, ge=0, description="stiffness-proportional coefficient [s]"
+    )
 
 
 class Drag(Effect):
     """The damping of the mass, b -= h alpha m v; that of the stiffness is in world.stiffness_coefficient."""
 
-    def __init__(self, world: World, alpha: np.ndarray):
-        self.world, self.alpha = world, alpha
+    def __init__(self, world: World, bodies: Sequence[Body]):
+        self.world, self.bodies = world, bodies
+        self.alpha = world.alpha_of_nodes()
+
+    def unchangeable(self, scene: Scene) -> Mapping[tuple[int, str], str]:
+        found: dict[tuple[int, str], str] = {}
+        if not self.world.inertia:
+            return {(b.index, key): "nothing moves in a quasi-static scene" for b in self.bodies for key in KEYS}
+        alpha, beta = self.world.damping(scene)
+        begun = "the scene began with 0 at all objects, so that its steps have no kernel for it"
+        if alpha.any() and not self.world.alpha.any() and not self.world.explicit:
+            found |= {(b.index, "mass"): begun for b in self.bodies}
+        if beta.any() and not self.world.beta.any() and self.world.forces_alone:
+            found |= {(b.index, "stiffness"): begun for b in self.bodies}
+        if self.world.explicit and (beta != self.world.beta).any():
+            found |= {(b.index, "stiffness"): "the stable step of an explicit scheme knows it" for b in self.bodies}
+        return found
 
     def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
         w = self.world
@@ -56,8 +78,14 @@ class Drag(Effect):
 
 def build(world: World, listed: list[tuple[Body, Any]]) -> Drag:
     """Sets world.alpha and world.beta and returns the damping of the mass; a quasi-static scene has neither."""
-    if not world.inertia:
-        return Drag(world, np.zeros(world.nodes))
-    for body, params in listed:
-        world.alpha[body.index], world.beta[body.index] = params.mass, params.stiffness
-    return Drag(world, per_node(world, listed, "mass"))
+    bodies = [body for body, _ in listed]
+
+    def damping(scene: Scene) -> tuple[Float64, Float64]:
+        alpha, beta = np.zeros((2, len(world.bodies)))
+        for body, params in zip(bodies, params_in(scene, "rayleigh", bodies), strict=True):
+            alpha[body.index], beta[body.index] = params.mass, params.stiffness
+        return alpha, beta
+
+    if world.inertia:
+        world.damp(damping)
+    return Drag(world, bodies)

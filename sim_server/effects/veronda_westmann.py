@@ -21,6 +21,7 @@ from typing import Any
 
 from sim_server.effects._hyperelastic import Constant, Hyperelastic, Law, of_shear_and_bulk
 from sim_server.mechanics.world import Body, World
+from sim_server.scene.live import Live
 from sim_server.scene.parameters import Positive
 
 SCOPE = "object"
@@ -28,7 +29,7 @@ LAW = Law(
     "veronda_westmann",
     (
         Constant("c1", Positive, "factor of the exponential [Pa], or a list of regions"),
-        Constant("c2", Positive, "factor in the exponent [-]"),
+        Constant("c2", Positive, "factor in the exponent [-]", live=Live(0.1, 10, logarithmic=True, relative=True)),
         Constant("bulk", Positive, "bulk modulus [Pa]"),
     ),
     pack=lambda values: [values["c1"], values["c2"], values["bulk"]],

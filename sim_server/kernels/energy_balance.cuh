@@ -5,6 +5,8 @@
 //     kinetic  sum m v.v / 2          gravity  -sum m g.x          work  of pushes, grabs and contact since the start
 //     budget   kinetic + elastic before the first step, + work, + what gravity has done since, sum m g.dx (g may change)
 //
+// What a change of parameters adds to the elastic energy is work, too.
+//
 // Elasticity and damping only take from the budget, so that kinetic <= budget up to the errors of the time step. A body runs away
 // in the step in which
 //   - kinetic > SLACK_OF_ENERGY max(budget, 0) + floor, or is NaN. Over all scenes and hard cases of the tests kinetic / budget is
@@ -88,6 +90,11 @@ HOST_DEVICE void start_balance(Balance& b, const Sums& s, double size, double dt
     b.floor = 0.5 * b.mass * square(SLOW * longest / dt);
     b.limit = LONG * longest + 2 * stride_of(s);
     b.phase = WELL;
+}
+
+// Adds what a change of parameters adds to the elastic energy of a state; nothing if the law defines no energy there.
+HOST_DEVICE void add_work(Balance& b, double change) {
+    if (is_finite(change)) b.work += change;
 }
 
 // Updates the balance after a step. True if the body is to be frozen now.

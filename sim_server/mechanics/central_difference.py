@@ -68,7 +68,7 @@ class CentralDifferenceIntegrator(Integrator):
         self.substep, self.failed = np.full(1, w.dt), np.zeros(len(w.bodies), np.int32)
         self.shift_time = np.zeros(1)
         self.start_v, self.mode, self.kept_x, self.kept_force = (np.zeros_like(w.v) for _ in range(4))
-        self.alpha = np.repeat(w.alpha, [b.last - b.first for b in w.bodies])
+        self.alpha = w.alpha_of_nodes()
         w.backend.keep(self.substep, self.shift_time, self.failed, self.alpha)
         w.backend.keep(self.start_v, self.mode, self.kept_x, self.kept_force)
 

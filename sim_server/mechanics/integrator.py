@@ -108,7 +108,7 @@ class Integrator:
         self.options, self.system, self.world = scene.integrator, system, system.world
         w = self.world
         self.inertial_increment = np.zeros((0 if w.plain else w.nodes, 3))
-        self.beta = np.repeat(w.beta, [b.last - b.first for b in w.bodies]) if not w.plain else np.zeros(0)
+        self.beta = w.beta_of_nodes() if not w.plain else np.zeros(0)
         self.before = w.x.copy()
         w.backend.keep(self.inertial_increment, self.beta, self.before)
         self.touches = "contact" in scene.effects and self.options.scheme != "backward_euler"
@@ -201,7 +201,7 @@ class Integrator:
         return EulerForm(
             assemble=euler, detect=detect, settle=settle, restore=restore, advance=advance, before=self.before, **start,
             parts=self.parts_of((*step, *euler, *settle, restore, advance), effects),
-            diagonal=self.system.diagonal, block_scale=w.euler_block_scale,
+            diagonal=self.system.diagonal, block_scale=w.euler_block_scale(),
             coefficients=w.coefficients, euler_coefficients=(w.dt, w.dt),
         )  # fmt: skip
 

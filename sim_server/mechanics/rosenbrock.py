@@ -76,9 +76,15 @@ class RosenbrockIntegrator(Integrator):
     def __init__(self, scene: Scene, system: System):
         super().__init__(scene, system)
         w = self.world
-        alpha = np.repeat(w.alpha, [b.last - b.first for b in w.bodies])
-        self.share = w.dx_dv / (w.dx_dv + self.beta)
-        self.weight = self.share * (1 + w.dx_dv * alpha)
+        counts = [b.last - b.first for b in w.bodies]
+
+        def share(scene: Scene) -> Float64:
+            return np.asarray(w.dx_dv / (w.dx_dv + np.repeat(w.damping(scene)[1], counts)))
+
+        def weight(scene: Scene) -> Float64:
+            return np.asarray(share(scene) * (1 + w.dx_dv * np.repeat(w.damping(scene)[0], counts)))
+
+        self.share, self.weight = w.follow("rayleigh", compute=share), w.follow("rayleigh", compute=weight)
         self.first, self.estimate, self.known = np.zeros_like(w.v), np.zeros(w.nodes), np.zeros((w.nodes, 6))
         self.bound = np.array([self._bound(b) for b in w.bodies])
         self.unheld = np.array([(w.free[b.nodes] > 0).all() for b in w.bodies], np.int32)

@@ -87,7 +87,9 @@ class System:
     def inverse_time(self) -> Float64:
         """1 / (dx_dv + beta) at each node, (n,) [1/s]."""
         w = self.world
-        return self._inverse_times.setdefault(w.dx_dv, 1 / (w.dx_dv + w.beta[self.body]))
+        if w.dx_dv not in self._inverse_times:
+            self._inverse_times[w.dx_dv] = w.inverse_time(self.body)
+        return self._inverse_times[w.dx_dv]
 
     def held_couplings(self, node: Int32) -> tuple[Int32, Int32]:
         """Returns where in `sums` the blocks of held nodes begin and end, (len(node),) each."""

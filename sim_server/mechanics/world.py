@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: MIT
 """The objects of a scene, one after another in the same arrays, so that one launch serves all of them."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sim_server.arrays import Float64, Int32
 from sim_server.backends.base import Backend
@@ -17,6 +18,8 @@ from sim_server.scene import Scene, SceneObject
 from sim_server.scene.holders import Holder
 from sim_server.scene.obstacles import Obstacle
 from sim_server.scene.ties import Attachment, Spring
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -48,6 +51,18 @@ class Body:
         return centroids
 
 
+@dataclass(frozen=True)
+class LiveArray:
+    """An array that kernels read and that follows parameters of the scene which may change while steps run.
+
+    of: tables of the scene with these parameters: names of effects, friction or spring. compute: its contents.
+    """
+
+    array: NDArray[Any]
+    of: tuple[str, ...]
+    compute: Callable[[Scene], NDArray[Any]]
+
+
 class World:
     """State and node data of a scene.
 
@@ -55,11 +70,13 @@ class World:
     free (n,): 1, or 0 at fixed nodes; held (n,): 1 at nodes of holders, which are fixed, too; held_nodes (held,): these
     nodes in the order of the launches over them; held_moves (bodies,): 1 where a holder moves in a step by stages;
     alpha, beta (bodies,):
-    Rayleigh damping of the mass [1/s] and of the stiffness [s]; dt: time step [s];
+    Rayleigh damping of the mass [1/s] and of the stiffness [s] at the start; damping: both by the
+    parameters of a scene; dt: time step [s];
+    live_arrays: those that follow parameters of the scene (`follow`);
     projection: of the elements' stiffness, the scene's choice;
     obstacles, holders, attachments, springs: of the scene; reaction (bodies, k, 6): force [N] and torque [N m] of each
-    body on each of the k holders, attachments and springs in the last step; gravity: acceleration, 0 without the effect
-    [m/s2];
+    body on each of the k holders, attachments and springs in the last step; gravity_of: acceleration by the parameters
+    of a scene, 0 without the effect [m/s2];
     backend: where kernels run.
 
     Effects use the following of the integrator in place of dt and v (formulas: integrator.py; symbols:
@@ -70,18 +87,20 @@ class World:
     balance_point: part of the step after which the forces balance, and for which the step solves; 1 but in
         generalized_alpha, where positions, velocities and dv of a solve are those of that point [-]
     coefficients (2,): force_coefficient and dx_dv as kernels read them whose arguments change while steps run
-    stiffness_coefficient (bodies,) [s2]: factor of K in A
     usual_tangent: an exact tangent of corotational elements is not wanted in the launches that are made
     predictor (n, 3) [m/s]: the step moves x by dx_dv (predictor + dv), dv the solution
     damping_velocity (n, 3) [m/s]: (dx_dv predictor + beta v) / (dx_dv + beta). Elements take it for their velocity: the
         impulse stiffness_coefficient (K damping_velocity) then holds displacement and damping
     explicit: True for explicit substeps (central_difference.py); b is then a force, and damping_velocity is v
+    forces_alone: True for schemes with launches that make forces without A
     inertia: False in a quasi-static scene. searches: True with several linearizations a step. plain: True for backward
         Euler with one
     """
 
     def __init__(self, scene: Scene, backend: Backend):
         self.backend = backend
+        self._scene = scene
+        self.live_arrays: list[LiveArray] = []
         self.dt = float(scene.dt)
         self.projection = scene.projection
         self.bodies: list[Body] = []
@@ -98,7 +117,7 @@ class World:
         columns = len(self.holders) + len(self.attachments) + len(self.springs)
         self.reaction = np.zeros((len(self.bodies), columns, 6))
         backend.keep(self.reaction, exact=True)
-        self.gravity = (0.0, 0.0, 0.0)
+        self.gravity_of: Callable[[Scene], Float64] = lambda _: np.zeros(3)
         self.rest = np.concatenate([mesh.rest for _, mesh in meshes])
         self.x = np.concatenate([posed(mesh.rest, o.pose.rotate, o.pose.translate) for o, mesh in meshes])
         self.v = np.zeros_like(self.x)
@@ -106,6 +125,7 @@ class World:
         self.free, self.held = np.ones(first), np.zeros(first, np.int32)
         self.held_nodes, self.held_moves = np.zeros(0, np.int32), np.zeros(len(self.bodies), np.int32)
         self.alpha, self.beta = np.zeros(len(self.bodies)), np.zeros(len(self.bodies))
+        self.damping: Callable[[Scene], tuple[Float64, Float64]] = lambda _: (self.alpha, self.beta)
         integrator = scene.integrator
         self.force_coefficient, self.dx_dv = integrator.force_coefficient(self.dt), integrator.dx_dv(self.dt)
         self.balance_point = integrator.balance_point
@@ -115,8 +135,22 @@ class World:
         self.searches = integrator.linearizations > 1
         self.plain = integrator.scheme == "backward_euler" and not self.searches
         self.explicit = integrator.explicit
+        self.forces_alone = self.explicit or integrator.scheme == "ros2"
         self.predictor = self.v if self.plain else np.zeros_like(self.v)
         self.damping_velocity = self.v if self.plain or self.explicit else np.zeros_like(self.v)
+
+    def at_start(self, compute: Callable[[Scene], T]) -> T:
+        """Returns compute(scene) of the scene as it was built."""
+        return compute(self._scene)
+
+    def follow(self, *of: str, compute: Callable[[Scene], NDArray[Any]]) -> Any:
+        """Returns compute(scene), an array whose contents are computed again when parameters of these tables change.
+
+        of: as of LiveArray. compute: must not change anything; raises InputError for values that cannot be used
+        """
+        array = np.ascontiguousarray(compute(self._scene))
+        self.live_arrays.append(LiveArray(array, of, compute))
+        return array
 
     @contextmanager
     def made_with(self, force_coefficient: float, dx_dv: float, usual_tangent: bool) -> Iterator[None]:
@@ -129,15 +163,44 @@ class World:
         finally:
             self.force_coefficient, self.dx_dv, self.usual_tangent, self.balance_point = given
 
-    @property
-    def stiffness_coefficient(self) -> Float64:
-        """force_coefficient (dx_dv + beta) of each body [s2]: factor of K in A."""
-        return self.force_coefficient * (self.dx_dv + self.beta)
+    def gravity(self) -> Float64:
+        """Acceleration (3,) [m/s2]."""
+        array: Float64 = self.follow("gravity", compute=self.gravity_of)
+        return array
 
-    @property
+    def damp(self, damping: Callable[[Scene], tuple[Float64, Float64]]) -> None:
+        """Sets alpha and beta, (bodies,) each, as functions of the parameters of a scene."""
+        self.damping = damping
+        self.alpha[:], self.beta[:] = damping(self._scene)
+
+    def stiffness_coefficient(self, owner: NDArray[Any]) -> Float64:
+        """force_coefficient (dx_dv + beta) of the body of each element, (len(owner),) [s2]: factor of K in A."""
+        force_coefficient, dx_dv = self.force_coefficient, self.dx_dv
+        return self._of_beta(lambda beta: (force_coefficient * (dx_dv + beta))[owner])
+
     def euler_block_scale(self) -> Float64:
         """Factor of K in A of backward Euler over that of the scheme, of each body [-]."""
-        return self.dt * (self.dt + self.beta) / self.stiffness_coefficient
+        force_coefficient, dx_dv = self.force_coefficient, self.dx_dv
+        return self._of_beta(lambda beta: self.dt * (self.dt + beta) / (force_coefficient * (dx_dv + beta)))
+
+    def inverse_time(self, owner: NDArray[Any]) -> Float64:
+        """1 / (dx_dv + beta) of the body of each node, (len(owner),) [1/s]."""
+        dx_dv = self.dx_dv
+        return self._of_beta(lambda beta: 1 / (dx_dv + beta[owner]))
+
+    def beta_of_nodes(self) -> Float64:
+        """beta of each node's body, (n,) [s]."""
+        return self._of_beta(lambda beta: np.repeat(beta, [b.last - b.first for b in self.bodies]))
+
+    def alpha_of_nodes(self) -> Float64:
+        """alpha of each node's body, (n,) [1/s]."""
+        counts = [b.last - b.first for b in self.bodies]
+        array: Float64 = self.follow("rayleigh", compute=lambda scene: np.repeat(self.damping(scene)[0], counts))
+        return array
+
+    def _of_beta(self, compute: Callable[[Float64], Float64]) -> Float64:
+        array: Float64 = self.follow("rayleigh", compute=lambda scene: compute(self.damping(scene)[1]))
+        return array
 
     @property
     def nodes(self) -> int:

@@ -19,6 +19,7 @@ from sim_server.mechanics.named_points import NamedPoints
 from sim_server.mechanics.world import Body
 from sim_server.mesh import posed
 from sim_server.mesh.surface import surface_triangles
+from sim_server.parameters import LiveParameter
 from sim_server.recording.object_steps import Reactions, object_step, rows
 from sim_server.scene.solver_options import FACTORS
 from sim_server.simulation import Simulation
@@ -97,6 +98,14 @@ def interaction(a: Any) -> pb.Interaction:
         id=a.id, client=a.client, object=a.object, kind="grab" if a.stiffness else "push", point=vector(a.point),
         radius=a.radius, force=vector(a.force), duration=a.duration, target=vector(a.target),
         stiffness=a.stiffness, max_force=a.limit, nodes=len(a.nodes), start=a.start,
+    )  # fmt: skip
+
+
+def live_parameter(p: LiveParameter) -> pb.LiveParameter:
+    """Converts a live parameter."""
+    return pb.LiveParameter(
+        now=pb.Parameter(key=p.field.key, value=p.text), unit=p.field.unit, low=p.low, high=p.high,
+        logarithmic=p.field.live.logarithmic, about=p.field.about,
     )  # fmt: skip
 
 

@@ -25,6 +25,7 @@ from sim_server.scene.accuracy_options import MOST_LINEARIZATIONS, ROUNDING, Acc
 from sim_server.scene.effect_tables import checked_effects
 from sim_server.scene.holders import Holder, check_holders_on, holder_errors
 from sim_server.scene.integrator_options import IntegratorOptions
+from sim_server.scene.live import Live
 from sim_server.scene.obstacles import FRICTION, Obstacle, check_contact_on, contact_errors
 from sim_server.scene.parameters import Count, Counts, File, Name, NotNegative, Parameters, Positive, Sizes, complaint
 from sim_server.scene.pose import Pose
@@ -81,7 +82,7 @@ class SceneObject(Parameters):
     masses: Literal["volume", "equal"] = Field(
         default="volume", description="nodal masses: a quarter of each adjacent element, or the same for every node"
     )
-    friction: NotNegative | None = Field(
+    friction: Annotated[NotNegative | None, Live(0, 1.5)] = Field(
         default=None, description="coefficient of its surface [-]; 0.5 where the scene lists contact"
     )
     effects: Annotated[dict[str, BaseModel], *_effects("object")] = Field(default_factory=dict)

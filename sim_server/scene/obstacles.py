@@ -2,13 +2,14 @@
 """The [[obstacle]] tables of a scene, and what contact needs of the scene as a whole."""
 
 from collections.abc import Iterator, Sequence
-from typing import Any, Literal, Protocol
+from typing import Annotated, Any, Literal, Protocol
 
 from pydantic import Field, model_validator
 from pydantic_core import InitErrorDetails
 
 from sim_server.errors import InputError
 from sim_server.scene.integrator_options import IntegratorOptions
+from sim_server.scene.live import Live
 from sim_server.scene.motion import Moved
 from sim_server.scene.parameters import File, NotNegative, Positive, Sizes, complaint, nearest
 from sim_server.scene.pose import Pose
@@ -29,7 +30,9 @@ class Obstacle(Moved):
     file: File | None = Field(default=None, description="a closed surface, in a file that meshio reads")
     scale: Positive | None = Field(default=None, description="scale of the coordinates in the file")
     spacing: Positive | None = Field(default=None, description="of the grid of distances from the surface [m]")
-    friction: NotNegative = Field(default=FRICTION, description="coefficient of its surface [-]")
+    friction: Annotated[NotNegative, Live(0, 1.5)] = Field(
+        default=FRICTION, description="coefficient of its surface [-]"
+    )
     pose: Pose = Pose()
 
     @model_validator(mode="after")

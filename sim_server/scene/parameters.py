@@ -85,6 +85,8 @@ def _readable_expression(text: str) -> str:
 def _found(name: str, info: ValidationInfo) -> str:
     if (info.context or {}).get("files") is False:
         raise complaint("names a file, which is not read here")
+    if (info.context or {}).get("files") == "known":  # of a resolved scene that is validated again
+        return name
     path = Path((info.context or {}).get("folder", ".")) / name
     if not isfile(path):  # unlike Path.is_file, never raises: names may be too long or hold a null byte
         raise complaint(

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Carries out commands of clients on a running simulation: to push, grab, move, pause, resume and stop."""
+"""Carries out commands of clients on a running simulation: to push, grab, move, set, pause, resume and stop."""
 
 import math
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
+from itertools import islice
 from typing import TYPE_CHECKING
 
 from protocol import messages_pb2 as pb
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from sim_server.effects.touch import Interaction, Touch  # imported where a scene lists it
 
 
+MOST_LISTED = 2000  # live parameters in a reply
 UNIT = 1e-6  # that the length of a quaternion may differ from 1 by
 
 
@@ -56,7 +58,7 @@ class Commands:
             if verb is None:
                 raise BadCommand(f"unknown verb {command.verb!r}; known: {', '.join(sorted(VERBS))}")
             return verb(self, command)
-        except ValueError as error:  # BadCommand, TouchError and MoveError
+        except ValueError as error:  # BadCommand, BadParameter, TouchError and MoveError
             return pb.Reply(error=str(error))
 
     def together(self) -> AbstractContextManager[None]:
@@ -118,6 +120,16 @@ class Commands:
             rotation = (1.0, 0.0, 0.0, 0.0) if now is None else tuple(now[3:].tolist())
         mover.move(target.obstacle, _tuple(target.position), rotation)
         return pb.Reply()
+
+    def _set(self, command: pb.Command) -> pb.Reply:
+        values = {p.key: p.value for p in command.parameters}
+        if len(values) < len(command.parameters):
+            raise BadCommand("a parameter is set twice")
+        done = self.simulation.parameters.set(values, command.client)
+        return pb.Reply(parameters=map(messages.live_parameter, done))
+
+    def _parameters(self, command: pb.Command) -> pb.Reply:
+        return pb.Reply(parameters=map(messages.live_parameter, islice(self.simulation.parameters, MOST_LISTED)))
 
     def _pause(self, command: pb.Command) -> pb.Reply:
         unchanged, loop = self.engine_paused, self.engine.loop
@@ -200,6 +212,6 @@ def _finite(i: pb.Interaction, *names: str) -> None:
 
 VERBS: dict[str, Callable[[Commands, pb.Command], pb.Reply]] = {
     "push": Commands._push, "grab": Commands._grab, "move": Commands._move, "release": Commands._release,
-    "move_obstacle": Commands._move_obstacle,
+    "move_obstacle": Commands._move_obstacle, "set": Commands._set, "parameters": Commands._parameters,
     "pause": Commands._pause, "resume": Commands._resume, "stop": Commands._stop,
 }  # fmt: skip

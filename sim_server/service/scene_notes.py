@@ -22,7 +22,11 @@ def scene_notes(simulation: Simulation) -> list[str]:
 
 def _loose(simulation: Simulation) -> str:
     world = simulation.world
-    pulled = world.inertia and not (world.obstacles or world.attachments or world.springs) and any(world.gravity)
+    pulled = (
+        world.inertia
+        and not (world.obstacles or world.attachments or world.springs)
+        and world.at_start(world.gravity_of).any()
+    )
     part, elastic = _parts(simulation)
     held = np.isin(part, part[world.free == 0])
     apart, falling, partly = [], [], []

@@ -57,11 +57,13 @@ class SnapshotPool:
         return sorted(there, key=lambda s: s.job.request)
 
     def suffices(self, state: BodyUpdateState) -> bool:
-        """True if the copy is all that a worker needs. Positions do not tell of the springs of a grab, which may have
-        begun between the request and the copy."""
+        """True if the copy is all that a worker needs. Positions do not tell of the springs of a grab, nor of other
+        parameters than those of the start, which may have come between the request and the copy."""
         assert state.job.copy is not None
         step = self.step(state)
-        return state.job.copy.ndim == 3 or all(e.known_to_workers_at(step) for e in self._simulation.effects.values())
+        simulation = self._simulation
+        known = all(e.known_to_workers_at(step) for e in simulation.effects.values())
+        return state.job.copy.ndim == 3 or (known and simulation.parameters.known_to_workers_at(step))
 
     def discard(self, state: BodyUpdateState) -> None:
         """Gives up a copy that is not sent."""
@@ -94,7 +96,7 @@ class SnapshotPool:
         if state.failures.assemblies >= MAX_FAILED_ASSEMBLIES:
             return False
         known = all(e.known_to_workers for e in self._simulation.effects.values())
-        return known and self._source.assembles_matrices()
+        return known and self._simulation.parameters.known_to_workers and self._source.assembles_matrices()
 
     def _extrapolated_time(self, state: BodyUpdateState) -> float:
         """Returns by how much positions are extrapolated [s]: to when the factor is expected."""

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from protocol.factor import FactorPattern
 from sim_server.arrays import Int32
-from sim_server.backends.base import Capability, EngineInput, Launch
+from sim_server.backends.base import ArrayChange, Capability, EngineInput, Launch
 from sim_server.backends.central_difference import NODAL as NODAL_OF_SUBSTEPS
 from sim_server.backends.central_difference import CentralDifference
 from sim_server.backends.compiler import native
@@ -44,6 +44,7 @@ def _library() -> c.CDLL:
             "wf_assemble": (None, [loop]), "wf_solve": (None, [loop]), "wf_run": (c.c_int64, [loop, c.c_int64]),
             "wf_wait": (c.c_int32, [loop]), "wf_copy_matrix": (None, [loop, c.c_int32, p]),
             "wf_post_factor": (p, [c.POINTER(structs.Body), p]), "wf_post_binding": (p, [c.POINTER(structs.Launch), p]),
+            "wf_post_changes": (p, [loop, p]),
             "wf_apply_factor": (None, [c.POINTER(structs.Factor), p, p, p]),
             "wf_precondition": (None, [loop, c.c_int32, p, p, p]),
         },
@@ -375,6 +376,7 @@ class CpuEngine(Reports):
         self._mail: list[Mailbox] = [Mailbox([]) for _ in ranges]
         self._copies: list[Reals | None] = [None] * bodies
         self._posted: dict[int, Any] = {}
+        self._changes: list[Any] = []  # those posted last, and what they point to
         loop = structs.Loop()
         super().__init__(loop, bodies, given.dt, records, np.zeros((frames, 2, nodes, 3)))
         loop.before, loop.launches = len(given.assemble), len(given.assemble) + len(given.integrate)
@@ -573,6 +575,25 @@ class CpuEngine(Reports):
     def matrix_step(self, body: int) -> int:
         """Step of the copy asked for last, -1 while it is not there. `step` counts the steps completed before it."""
         return int(self._body[body].snapshot_step)
+
+    def change(self, changes: Sequence[ArrayChange]) -> structs.Changes:
+        """Has the loop copy new contents into arrays between two steps: those after the result's `taken` steps, once it
+        is not below 0."""
+        copies = (structs.Copy * max(len(changes), 1))()
+        for copy, (target, source) in zip(copies, changes, strict=False):
+            copy.target, copy.source, copy.bytes = target.ctypes.data, source.ctypes.data, target.nbytes
+        posted = structs.Changes(copies=c.addressof(copies), count=len(changes), taken=-1)
+        under_way = [each for each in self._changes if each[0].taken < 0]
+        self._changes = [*under_way, (posted, copies, changes)]
+        self._native.wf_post_changes(c.byref(self.loop), c.addressof(posted))
+        return posted
+
+    def withdraw_changes(self) -> bool:
+        """Takes back what `change` posted and the loop has not taken up; False if there was nothing."""
+        back = bool(self._native.wf_post_changes(c.byref(self.loop), None))
+        if back:
+            self._changes.pop()
+        return back
 
     def replace(self, launch: int, new: Launch) -> structs.Binding:
         """Gives a launch other arguments, from the next step on: the one after the result's `taken` steps, once it is

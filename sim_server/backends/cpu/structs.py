@@ -43,6 +43,16 @@ class Binding(c.Structure):
 
 
 @LOOP.struct
+class Copy(c.Structure):
+    """New contents of an array."""
+
+
+@LOOP.struct
+class Changes(c.Structure):
+    """New contents of arrays, copied between the same two steps."""
+
+
+@LOOP.struct
 class Launch(c.Structure):
     """A kernel and its arguments."""
 

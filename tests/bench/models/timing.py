@@ -102,7 +102,7 @@ def generic(made: Model, kernel: str) -> Any:
     module = w.backend.module(f"{TEXTS}generic_elements.cu+{TEXTS}generic_{made.name}.cuh")
     return module.bind(
         kernel, len(e.elements), tets=e.elements, x=w.x, v=w.damping_velocity, gradients=e.gradients, volume=e.volume,
-        constants=e.constants, stiffness_coefficient=w.stiffness_coefficient[e.owner], h=w.force_coefficient,
+        constants=e.constants, stiffness_coefficient=w.stiffness_coefficient(e.owner), h=w.force_coefficient,
         corners=np.zeros_like(e.corners),
         edges=np.zeros_like(e.edges),
     )  # fmt: skip

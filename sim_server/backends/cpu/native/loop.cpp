@@ -21,6 +21,29 @@ static void take_mail(Launch& l, int64_t step) {
     }
 }
 
+static void copy_all(const Changes& changes) {
+    for (int i = 0; i < changes.count; ++i) std::memcpy(changes.copies[i].target, changes.copies[i].source, changes.copies[i].bytes);
+}
+
+// Makes the changes of parameters that wait. What they add to the elastic energy of the present state counts as work.
+static void take_changes(Loop& loop) {
+    if (!loop.changes.load(std::memory_order_relaxed)) return;
+    Changes* next = loop.changes.exchange(nullptr);
+    if (!next) return;
+    if (loop.energies && loop.energies->begun) {
+        std::vector<double> before(loop.bodies);
+        measure_elastic(loop);
+        for (int i = 0; i < loop.bodies; ++i) before[i] = loop.energies->balance[i].elastic;
+        copy_all(*next);
+        measure_elastic(loop);
+        for (int i = 0; i < loop.bodies; ++i) add_work(loop.energies->balance[i], loop.energies->balance[i].elastic - before[i]);
+    } else {
+        copy_all(*next);
+    }
+    if (loop.substeps) loop.substeps->state.since = ESTIMATE_EVERY;
+    next->taken = loop.rings.step;
+}
+
 static void run(const Launch& l, int threads) {
     const int64_t items = l.binding->items, grain = 512;
     int parts = (int)(items / grain < threads ? items / grain : threads);
@@ -170,6 +193,7 @@ static void assemble(Loop* loop, bool whole) {
     double begin = now();
     Rings& rings = loop->rings;
     loop->cpu_begin = thread_time();
+    take_changes(*loop);
     loop->clock[0] = rings.start_time + rings.step * rings.dt;
     for (int i = 0; i < loop->bodies; ++i) {
         take_orders(loop->body[i]);
@@ -305,10 +329,17 @@ static void finish_step(Loop* loop) {
     write_frame(*loop);
 }
 
+// Parameters that change before the first step are those of the energies that it begins with.
+static void begin_energies(Loop& loop) {
+    if (!loop.energies) return;
+    if (!loop.energies->begun) take_changes(loop);
+    enter(loop);
+}
+
 extern "C" {
 
 void wf_assemble(Loop* loop) {
-    if (loop->energies) enter(*loop);
+    begin_energies(*loop);
     assemble(loop, true);
 }
 
@@ -330,7 +361,7 @@ int32_t wf_wait(Loop* loop) { return wait_until_due(loop->rings, [] { return fal
 // Runs until `steps` are done or `stop` is set; returns the steps done.
 int64_t wf_run(Loop* loop, int64_t steps) {
     int64_t done = 0;
-    if (loop->energies) enter(*loop);
+    begin_energies(*loop);
     for (; done < steps && wf_wait(loop); ++done) {
         assemble(loop, false);
         finish_step(loop);
@@ -340,6 +371,7 @@ int64_t wf_run(Loop* loop, int64_t steps) {
 }
 
 const Factor* wf_post_factor(Body* body, const Factor* factor) { return body->mail.exchange(factor); }
+Changes* wf_post_changes(Loop* loop, Changes* changes) { return loop->changes.exchange(changes); }
 Binding* wf_post_binding(Launch* launch, Binding* binding) { return launch->mail.exchange(binding); }
 
 // One application of a factor, z = P^-1 r. A probe for tests and benchmarks.
@@ -362,7 +394,7 @@ void wf_precondition(Loop* loop, int32_t index, const double* r, double* z, doub
 const StructSize* wf_sizes() {
     static const StructSize sizes[] = {SIZE(Launch), SIZE(Body), SIZE(Loop), SIZE(Factor), SIZE(KnownContact), SIZE(Pattern), SIZE(Record),
                                        SIZE(Newton), SIZE(Search), SIZE(Stages), SIZE(StageState), SIZE(EulerForm), SIZE(Elastic), SIZE(Energies), SIZE(Balance),
-                                       SIZE(Contact), SIZE(RowState), SIZE(PassChoice), SIZE(OwnReference), SIZE(ContactReport), SIZE(Box), SIZE(Reaction), SIZE(CentralDifference), SIZE(StableStep), {}};
+                                       SIZE(Contact), SIZE(RowState), SIZE(PassChoice), SIZE(OwnReference), SIZE(ContactReport), SIZE(Box), SIZE(Reaction), SIZE(CentralDifference), SIZE(StableStep), SIZE(Copy), SIZE(Changes), {}};
     return sizes;
 }
 }

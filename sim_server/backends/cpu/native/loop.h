@@ -17,6 +17,18 @@ struct Binding {           // arguments of a launch, replaceable between steps
     int64_t taken;   // steps completed when the loop took it up, -1: it has not
 };
 
+struct Copy {              // new contents of an array that kernels read
+    void* target;
+    const void* source;
+    int64_t bytes;
+};
+
+struct Changes {           // of parameters: copies that are made between the same two steps
+    const Copy* copies;
+    int32_t count;
+    int64_t taken;   // steps completed when the loop made them, -1: it has not
+};
+
 struct Launch {
     Kernel kernel;
     Binding* binding;
@@ -173,6 +185,7 @@ struct Loop {
     double assemble_begin;
     double assemble_seconds;
     double cpu_begin;
+    std::atomic<Changes*> changes;     // of parameters, or null
     Rings rings;
 };
 

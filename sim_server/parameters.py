@@ -1,0 +1,266 @@
+# SPDX-License-Identifier: MIT
+"""Changes parameters of a scene while steps run: checks them as at the start, gives the loop new contents of arrays.
+
+What may change is marked beside its field (scene/live.py). A new value goes into a copy of the resolved scene, which
+is validated as a whole; what differs afterwards must be what was set. The arrays that follow these parameters
+(World.follow) are computed by the functions that made them, and the loop copies the results into them between two
+steps, without Python: launches, their arguments, factors and histories stay as they are. A factor of other parameters
+is an older factor.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from copy import deepcopy
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from protocol.toml_text import toml
+from sim_server.backends.base import ArrayChange, PendingUpdate
+from sim_server.errors import InputError
+from sim_server.scene import Scene, overrides
+from sim_server.scene.live import LiveField, Place, live_fields
+from sim_server.scene.messages import NAMED, readable
+from sim_server.scene.parameters import nearest
+
+if TYPE_CHECKING:
+    from sim_server.simulation import Simulation
+
+MOST, LONGEST_KEY, LONGEST_VALUE = 256, 300, 8192  # parameters of a command; characters
+
+REASONS = {  # why keys cannot change while steps run, by how they begin
+    "dt": "the time step is an argument of every kernel and of the clock",
+    "mesh": "all arrays are of the size of the mesh",
+    "pose": "it is where the object begins",
+    "density": "masses are taken when the simulation is built",
+    "mass": "masses are taken when the simulation is built",
+    "effects": "the kernels of a step are chosen by it when the simulation is built",
+    "integrator": "the kernels of a step are chosen by it when the simulation is built",
+    "solver": "solver, factors and workers are set up by it when the simulation is built",
+}
+OTHER_REASON = "it is read when the simulation is built"
+
+
+class BadParameter(ValueError):
+    """A parameter that is refused; the text is for the client."""
+
+
+@dataclass(frozen=True)
+class LiveParameter:
+    """A live parameter with its present value.
+
+    text: the value as TOML; low, high: of a slider, equal without one
+    """
+
+    field: LiveField
+    text: str
+    low: float
+    high: float
+
+
+@dataclass
+class ParameterUpdate:
+    """New values on their way to the loop, by key, as TOML. pending: None until they have been given to it."""
+
+    values: dict[str, str]
+    client: str
+    pending: PendingUpdate | None = None
+
+    @property
+    def taken(self) -> int:
+        """Steps completed when the loop took them up; negative: not yet, or never if newer ones came."""
+        return -1 if self.pending is None else self.pending.taken
+
+
+class LiveParameters:
+    """The parameters of a simulation that may change, and their present values.
+
+    scene: the scene with the values that were set last
+    on_set: called with each update that was given to the loop. One that the loop has not taken up when the next one
+        comes is part of that one.
+    """
+
+    def __init__(self, simulation: "Simulation"):
+        self._simulation, self.scene = simulation, simulation.scene
+        self.on_set: list[Callable[[ParameterUpdate], None]] = []
+        self._start = {field.key: field.value for field in live_fields(self.scene)}
+        self._table: dict[str, Any] | None = None  # the scene as TOML has it
+        self._waiting: dict[int, ArrayChange] = {}  # by id of the array: what the loop was given last
+        self._update: ParameterUpdate | None = None  # likewise
+        self._first: ParameterUpdate | None = None  # the first one that the loop took up, or is to
+
+    def __iter__(self) -> Iterator[LiveParameter]:
+        """All live parameters that the scene gives a value."""
+        for field in live_fields(self.scene):
+            yield self._described(field)
+
+    @property
+    def changed(self) -> dict[str, str]:
+        """Values that are not those of the start, by key, as TOML."""
+        return {f.key: toml(_plain(f.value)) for f in live_fields(self.scene) if f.value != self._start.get(f.key)}
+
+    def set(self, values: Mapping[str, str], client: str = "") -> list[LiveParameter]:
+        """Sets parameters, all between the same two steps; returns them.
+
+        values: TOML, by key as after --set (object.NAME.effects.EFFECT.KEY) or a short one (NAME.EFFECT.KEY)
+
+        Raises BadParameter; nothing changes then.
+        """
+        if not values or len(values) > MOST:
+            raise BadParameter(f"{len(values)} parameters; allowed: 1 to {MOST} at a time")
+        table = deepcopy(self._table or self._simulation.scene.resolved())
+        fields = {field.key: field for field in live_fields(self.scene)}
+        given: dict[str, LiveField] = {}
+        for key, text in values.items():
+            if len(key) > LONGEST_KEY or len(text) > LONGEST_VALUE:
+                raise BadParameter(
+                    f"{key[:40]!r} = {text[:40]!r}: at most {LONGEST_KEY} and {LONGEST_VALUE} characters"
+                )
+            field = self._found(key, text, fields)
+            if field.key in given:
+                raise BadParameter(f"{field.key} is set twice")
+            given[field.key] = field
+            try:
+                overrides.assign(field.key, overrides.value(text.strip()), text, table)
+            except InputError as error:
+                raise BadParameter(f"{key} = {text}: {error}") from None
+        scene = self._validated(table)
+        resolved = scene.resolved()
+        changed = [f for f in given.values() if _at(resolved, f.place) != _at(self._present(), f.place)]
+        self._check(scene, resolved, changed)
+        if changed:
+            self._give(scene, changed, client)
+            self._table = resolved
+        return [self._described(f) for f in live_fields(scene) if f.key in given]
+
+    def known_to_workers_at(self, step: int) -> bool:
+        """True if the matrix assembled after `step` completed steps has the parameters of the start."""
+        first = self._first
+        return first is None or (first.pending is not None and not 0 <= first.taken <= step)
+
+    @property
+    def known_to_workers(self) -> bool:
+        """True if no parameter was set: workers that assemble matrices know those of the start."""
+        return self._first is None
+
+    def _present(self) -> dict[str, Any]:
+        return self._table or self._simulation.scene.resolved()
+
+    def _found(self, key: str, text: str, fields: Mapping[str, LiveField]) -> LiveField:
+        found = [f for f in fields.values() if key in (f.key, f.short)]
+        exact = [f for f in found if f.key == key] or found
+        if len(exact) == 1:
+            return exact[0]
+        if exact:
+            raise BadParameter(f"{key} may be {' or '.join(f.key for f in exact)}; write one of these")
+        short = sorted(f.short for f in fields.values())
+        allowed = f"live parameters: {', '.join(short[:20]) or 'none'}{', ...' if len(short) > 20 else ''}"
+        reason = self._reason(key)
+        if reason:
+            raise BadParameter(f"{key} = {text[:80]}: cannot change while steps run, since {reason}; {allowed}")
+        raise BadParameter(f"no parameter {key!r}" + nearest(key, short[:100], "live parameters"))
+
+    def _reason(self, key: str) -> str:
+        """Returns why the value of a key of the scene cannot change; "" if there is no such key."""
+        table = self._present()
+        tables = [("", table), ("effects.", table.get("effects", {})), ("", table.get("effects", {}))]
+        for kind in NAMED:
+            for named in table.get(kind, []):
+                inside = named | named.get("effects", {})  # of an object: NAME.EFFECT.KEY
+                tables += [(f"{begin}{named['name']}.", inside) for begin in (f"{kind}.", "")]
+        for begin, inside in tables:
+            path = key.removeprefix(begin).split(".")
+            if key.startswith(begin) and _at(inside, path) is not None:
+                return next((why for name, why in REASONS.items() if path[0] == name), OTHER_REASON)
+        return ""
+
+    def _validated(self, table: dict[str, Any]) -> Scene:
+        try:
+            return Scene.model_validate(table, context={"files": "known"})
+        except ValidationError as error:
+            raise BadParameter(str(readable(error, "", table)).removeprefix("scene , ")) from None
+
+    def _check(self, scene: Scene, resolved: dict[str, Any], changed: Sequence[LiveField]) -> None:
+        """Raises BadParameter for what cannot change while steps run."""
+        places = [field.place for field in changed]
+        for place in _differing(self._present(), resolved):
+            if not any(place[: len(p)] == p for p in places):
+                raise BadParameter(f"would change {'.'.join(map(str, place))}, which cannot change while steps run")
+        for effect in self._simulation.effects.values():
+            why = effect.unchangeable(scene)
+            for f in changed:
+                body = f.place[1] if f.place[0] == "object" else -1
+                if f.of == effect.name and (reason := why.get((int(body), str(f.place[-1])))):
+                    raise BadParameter(f"{f.key}: cannot change to this value, since {reason}")
+
+    def _give(self, scene: Scene, changed: Sequence[LiveField], client: str) -> None:
+        """Has the loop copy the arrays that follow what changed."""
+        tables = {field.of for field in changed}
+        simulation = self._simulation
+        try:
+            new = [(a.array, np.ascontiguousarray(a.compute(scene))) for a in simulation.world.live_arrays
+                   if tables & set(a.of)]  # fmt: skip
+            elastic = {e: e.elastic_in(scene) for e in simulation.effects.values() if e.name in tables}
+        except InputError as error:
+            raise BadParameter(str(error)) from None
+        for array, contents in new:
+            if contents.shape != array.shape or contents.dtype != array.dtype:
+                raise BadParameter("would change the size of an array")
+            if not np.isfinite(contents).all():
+                raise BadParameter("gives values that are not finite")
+        for effect, found in elastic.items():
+            effect.elastic = found
+        texts = {f.key: toml(_plain(f.value)) for f in live_fields(scene) if f.key in {c.key for c in changed}}
+        update = ParameterUpdate(texts, client)
+        if simulation.engine.withdraw_changes():
+            assert self._update is not None
+            update.values = self._update.values | update.values
+            if self._first is self._update:
+                self._first = None
+        else:
+            self._waiting = {}
+        if self._first is None:
+            self._first = update  # before the loop may take it up
+        self._waiting |= {id(array): (array, contents) for array, contents in new}
+        self._update, self.scene = update, scene
+        update.pending = simulation.engine.change(list(self._waiting.values()))
+        for observe in self.on_set:
+            observe(update)
+
+    def _described(self, field: LiveField) -> LiveParameter:
+        low, high, value = field.live.low, field.live.high, _plain(field.value)
+        if field.live.relative:
+            start = self._start.get(field.key)
+            low, high = (low * start, high * start) if isinstance(start, (int, float)) else (0.0, 0.0)
+        if not isinstance(value, (int, float)) and any(not isinstance(v, (int, float)) for v in value):
+            low = high = 0.0
+        return LiveParameter(replace(field, value=value), toml(value), low, high)
+
+
+def _plain(value: Any) -> Any:
+    """Returns the value of a field as JSON has it."""
+    if hasattr(value, "model_dump"):
+        return value.model_dump(mode="json", by_alias=True, exclude_none=True)
+    return [_plain(v) for v in value] if isinstance(value, (list, tuple)) else value
+
+
+def _at(table: Any, place: Sequence[str | int]) -> Any:
+    for part in place:
+        if isinstance(table, list) and isinstance(part, int):
+            table = table[part]
+        else:
+            table = table.get(part) if isinstance(table, dict) else None
+    return table
+
+
+def _differing(old: Any, new: Any, place: Place = ()) -> Iterator[Place]:
+    """Yields the places of values that differ; lists of other lengths differ as a whole."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        for key in old.keys() | new.keys():
+            yield from _differing(old.get(key), new.get(key), (*place, key))
+    elif isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
+        for k, (a, b) in enumerate(zip(old, new, strict=True)):
+            yield from _differing(a, b, (*place, k))
+    elif old != new:
+        yield place
