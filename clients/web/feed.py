@@ -12,7 +12,6 @@ import logging
 import threading
 import time
 from collections.abc import Sequence
-from typing import Any
 
 from clients.client import Client
 from clients.errors import BadInput, ClientError
@@ -83,7 +82,7 @@ class Link:
                 if status.header.incarnation != self.incarnation:
                     raise ClientError("the server was started again")
                 self.status, failures = status, 0
-                self.parameters = _parameters(self.client)
+                self.parameters = self.client.parameters()
             except (ClientError, BadInput) as error:
                 failures += 1
                 if failures >= LOST_AFTER or "started again" in str(error):
@@ -96,14 +95,6 @@ class Link:
                 return
             self._asked.wait(STATUS_PERIOD)
             self._asked.clear()
-
-
-def _parameters(client: Any) -> list[pb.LiveParameter]:
-    """Returns the live parameters; none of a server that has no such verb."""
-    try:
-        return list(client.parameters()) if hasattr(client, "parameters") else []
-    except BadInput:
-        return []
 
 
 class Feed:

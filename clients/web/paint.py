@@ -140,7 +140,7 @@ def _log_young(part: Part) -> NDArray[np.float64]:
 def _levels(surfaces: Surfaces) -> NDArray[np.float64]:
     """Returns the logarithms of Young's moduli that there are, or BANDS even ones between the extremes of many."""
     young = np.concatenate(
-        [np.unique(p.mesh.young) for p in surfaces.parts.values() if len(p.mesh.young)] or [np.ones(1)]
+        [np.unique(p.mesh.young) for p in surfaces.parts.values() if len(p.mesh.young)] or [np.ones(1, np.float32)]
     )
     levels = np.unique(np.round(np.log10(np.maximum(young.astype(float), 1e-30)), 3))
     return levels if len(levels) <= BANDS else np.linspace(levels[0], levels[-1], BANDS)

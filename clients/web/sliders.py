@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 HANDS_ON = 1.5  # s after a change here in which the server's value does not move the slider
 STEPS = 200  # of a slider
+OPEN = 4  # folders that are open at first, if there are no more
 
 
 def value_of(text: str) -> Any:
@@ -26,12 +27,14 @@ def value_of(text: str) -> Any:
         return None
 
 
-def short_key(key: str) -> str:
-    """Returns a key without words that say nothing: object.o.effects.e.young as o.e.young."""
+def named(key: str) -> tuple[str, str]:
+    """Returns what a parameter belongs to, and its name there: object.o.effects.e.young as o and e.young."""
     words = key.split(".")
-    if words[0] == "object" and len(words) > 3 and words[2] == "effects":
-        return ".".join([words[1], *words[3:]])
-    return ".".join(words[1:]) if words[0] in ("obstacle", "effects") else key
+    if words[0] == "object" and len(words) > 2:
+        return words[1], ".".join(words[3:] if words[2] == "effects" else words[2:])
+    if words[0] == "obstacle" and len(words) > 2:
+        return words[1], ".".join(words[2:])
+    return "scene", ".".join(words[1:] if words[0] == "effects" else words)
 
 
 class Slider:
@@ -63,10 +66,6 @@ class Slider:
         self._value = value
         self._handle.label = self._label()
         self._handle.value = self._shown(value)
-
-    def remove(self) -> None:
-        if self._handle is not None:
-            self._handle.remove()
 
     def _build(self, gui: viser.GuiApi, about: str) -> Any:
         value, label, hint = self._value, self._label(), about or None
@@ -105,8 +104,8 @@ class Slider:
     def _label(self) -> str:
         number = isinstance(self._value, int | float) and not isinstance(self._value, bool)
         value = f"{self._value:.4g} " if number else ""
-        unit = f"{value}{self._unit}".strip()
-        return f"{short_key(self.key)}: {unit}" if unit else short_key(self.key)
+        shown = f"{value}{self._unit if self._unit != '-' else ''}".strip()
+        return f"{named(self.key)[1]}: {shown}" if shown else named(self.key)[1]
 
 
 class Sliders:
@@ -115,13 +114,26 @@ class Sliders:
     def __init__(self, gui: viser.GuiApi, container: Any, change: Callable[[int, str, Any], None]) -> None:
         self._gui, self._container, self._change = gui, container, change
         self._sliders: dict[str, Slider] = {}
+        self._folders: list[Any] = []
 
     def update(self, parameters: Sequence[pb.LiveParameter]) -> None:
         """Shows the parameters as the server has them."""
-        if [p.now.key for p in parameters] != list(self._sliders):
-            for slider in self._sliders.values():
-                slider.remove()
-            with self._container:
-                self._sliders = {p.now.key: Slider(self._gui, p, self._change) for p in parameters}
+        if {p.now.key for p in parameters} != set(self._sliders):
+            self._build(parameters)
         for parameter in parameters:
             self._sliders[parameter.now.key].show(parameter)
+
+    def _build(self, parameters: Sequence[pb.LiveParameter]) -> None:
+        """Makes them anew, those of an object in a folder of its own."""
+        for folder in self._folders:
+            folder.remove()
+        self._folders, self._sliders = [], {}
+        owners = list(dict.fromkeys(named(p.now.key)[0] for p in parameters))
+        for owner in owners:
+            with self._container:
+                folder = self._gui.add_folder(owner, expand_by_default=len(owners) <= OPEN)
+            self._folders.append(folder)
+            with folder:
+                for p in parameters:
+                    if named(p.now.key)[0] == owner:
+                        self._sliders[p.now.key] = Slider(self._gui, p, self._change)
