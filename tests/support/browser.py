@@ -14,8 +14,9 @@ from clients.web.view import View
 
 # WebGL in software, as there may be no GPU; no sandbox, as root may run this, and only our page is opened.
 ARGUMENTS = (
-    "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-dev-shm-usage",
-    "--disable-background-timer-throttling", "--disable-renderer-backgrounding", "--disable-backgrounding-occluded-windows",
+    "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
+    "--disable-dev-shm-usage", "--disable-background-timer-throttling", "--disable-renderer-backgrounding",
+    "--disable-backgrounding-occluded-windows",
 )  # fmt: skip
 FIELD_OF_VIEW = math.radians(75)  # of viser's camera, vertical
 SIZE = {"width": 900, "height": 480}
