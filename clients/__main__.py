@@ -243,7 +243,7 @@ def _show_parameters(found: list[pb.LiveParameter], as_json: bool) -> None:
         return
     from rich.console import Console
 
-    from clients.parameter_table import parameter_table
+    from clients.watch import parameter_table
 
     Console().print(parameter_table(found))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from types import TracebackType
@@ -29,11 +30,10 @@ from protocol.client_name import new_client
 from protocol.network.endpoints import BadEndpoint, usual_endpoints
 from protocol.network.session import ConnectionFailed, UnknownHost, open_session
 from protocol.refused import Refused
-from protocol.toml_text import toml
 
 M = TypeVar("M", bound=Message)
 Point = Sequence[float]
-Value = float | bool | str | Sequence[Any] | Mapping[str, Any]  # of a parameter; text is TOML
+Value = float | bool | str | Sequence[Any]  # of a parameter; text is TOML
 
 
 class Client:
@@ -182,11 +182,7 @@ class Client:
         >>> client.set({"gravity.g": [0, -1.6, 0], "beam.rayleigh.mass": 0.5})
         """
         given = key if isinstance(key, Mapping) else {key: value}
-        try:
-            texts = {name: each if isinstance(each, str) else toml(each) for name, each in given.items()}
-        except TypeError as error:
-            raise BadInput(f"set: {error}") from None
-        parameters = [pb.Parameter(key=name, value=text) for name, text in texts.items()]
+        parameters = [pb.Parameter(key=name, value=_toml(name, each)) for name, each in given.items()]
         return list(self.command("set", parameters=parameters).parameters)
 
     def parameters(self) -> list[pb.LiveParameter]:
@@ -335,6 +331,15 @@ def _begin(wanted: pb.Interaction, at: Point | str) -> None:
         wanted.at = at
     else:
         wanted.point.CopyFrom(vector(at, "at"))
+
+
+def _toml(key: str, value: Any) -> str:
+    """Returns the value of a parameter as TOML; text is TOML already. Raises BadInput."""
+    try:
+        plain = value.tolist() if hasattr(value, "tolist") else value  # of NumPy
+        return plain if isinstance(plain, str) else json.dumps(plain)
+    except TypeError as error:
+        raise BadInput(f"set: {key} = {value!r}: {error}") from None
 
 
 def vector(values: Point, what: str) -> pb.Vector:

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""The server's health as tables on a terminal."""
+"""The server's health, and parameters that may change, as tables on a terminal."""
 
 from __future__ import annotations
 
 import math
 import signal
 import time
+from collections.abc import Sequence
 from typing import Any
 
 from rich.box import SIMPLE_HEAD
@@ -152,6 +153,21 @@ def _local(status: pb.Status) -> Table:
         ended = _end(worker.exit_code) if worker.restarts or worker.state != "running" else "-"
         _add(table, worker.worker, worker.state, str(worker.pid or "-"), str(worker.restarts), ended)
     return table
+
+
+def parameter_table(found: Sequence[pb.LiveParameter]) -> Table:
+    """Returns a table of keys, values, units and meanings."""
+    table = Table("key", "value", "unit", "about", **COMPACT)
+    table.columns[0].overflow = table.columns[1].overflow = "fold"
+    for each in found:
+        _add(table, short_key(each.now.key), each.now.value, each.unit, each.about.split(", or ")[0])
+    return table
+
+
+def short_key(key: str) -> str:
+    """Returns a key without what the server can do without: NAME.EFFECT.KEY, EFFECT.KEY, NAME.KEY."""
+    kind, _, rest = key.partition(".")
+    return rest.replace(".effects.", ".", 1) if kind in ("object", "obstacle", "effects") else key
 
 
 def _add(table: Table, *cells: str | Text) -> None:

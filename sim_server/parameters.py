@@ -8,26 +8,23 @@ steps, without Python: launches, their arguments, factors and histories stay as 
 is an older factor.
 """
 
+import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 from pydantic import ValidationError
 
-from protocol.toml_text import toml
-from sim_server.backends.base import ArrayChange, PendingUpdate
+from sim_server.backends.base import ArrayChange, Engine, PendingUpdate
+from sim_server.effects._base import Effect
 from sim_server.errors import InputError
+from sim_server.mechanics.world import World
 from sim_server.scene import Scene, overrides
 from sim_server.scene.live import LiveField, Place, live_fields
 from sim_server.scene.messages import NAMED, readable
 from sim_server.scene.parameters import nearest
-
-if TYPE_CHECKING:
-    from sim_server.simulation import Simulation
-
-MOST, LONGEST_KEY, LONGEST_VALUE = 256, 300, 8192  # parameters of a command; characters
 
 REASONS = {  # why keys cannot change while steps run, by how they begin
     "dt": "the time step is an argument of every kernel and of the clock",
@@ -40,6 +37,15 @@ REASONS = {  # why keys cannot change while steps run, by how they begin
     "solver": "solver, factors and workers are set up by it when the simulation is built",
 }
 OTHER_REASON = "it is read when the simulation is built"
+
+
+class Simulated(Protocol):
+    """A simulation, as far as its parameters change."""
+
+    scene: Scene
+    world: World
+    effects: dict[str, Effect]
+    engine: Engine
 
 
 class BadParameter(ValueError):
@@ -61,11 +67,16 @@ class LiveParameter:
 
 @dataclass
 class ParameterUpdate:
-    """New values on their way to the loop, by key, as TOML. pending: None until they have been given to it."""
+    """New values on their way to the loop, by key, as TOML.
+
+    pending: None until they have been given to it. replaces: an update that the loop has not taken up and that is part
+    of this one
+    """
 
     values: dict[str, str]
     client: str
     pending: PendingUpdate | None = None
+    replaces: "ParameterUpdate | None" = None
 
     @property
     def taken(self) -> int:
@@ -77,11 +88,10 @@ class LiveParameters:
     """The parameters of a simulation that may change, and their present values.
 
     scene: the scene with the values that were set last
-    on_set: called with each update that was given to the loop. One that the loop has not taken up when the next one
-        comes is part of that one.
+    on_set: called with each update that was given to the loop
     """
 
-    def __init__(self, simulation: "Simulation"):
+    def __init__(self, simulation: Simulated):
         self._simulation, self.scene = simulation, simulation.scene
         self.on_set: list[Callable[[ParameterUpdate], None]] = []
         self._start = {field.key: field.value for field in live_fields(self.scene)}
@@ -107,16 +117,10 @@ class LiveParameters:
 
         Raises BadParameter; nothing changes then.
         """
-        if not values or len(values) > MOST:
-            raise BadParameter(f"{len(values)} parameters; allowed: 1 to {MOST} at a time")
         table = deepcopy(self._table or self._simulation.scene.resolved())
         fields = {field.key: field for field in live_fields(self.scene)}
         given: dict[str, LiveField] = {}
         for key, text in values.items():
-            if len(key) > LONGEST_KEY or len(text) > LONGEST_VALUE:
-                raise BadParameter(
-                    f"{key[:40]!r} = {text[:40]!r}: at most {LONGEST_KEY} and {LONGEST_VALUE} characters"
-                )
             field = self._found(key, text, fields)
             if field.key in given:
                 raise BadParameter(f"{field.key} is set twice")
@@ -215,7 +219,8 @@ class LiveParameters:
         update = ParameterUpdate(texts, client)
         if simulation.engine.withdraw_changes():
             assert self._update is not None
-            update.values = self._update.values | update.values
+            update.values, update.replaces = self._update.values | update.values, self._update
+            self._update.replaces = None  # keep no chain of them
             if self._first is self._update:
                 self._first = None
         else:
@@ -243,6 +248,15 @@ def _plain(value: Any) -> Any:
     if hasattr(value, "model_dump"):
         return value.model_dump(mode="json", by_alias=True, exclude_none=True)
     return [_plain(v) for v in value] if isinstance(value, (list, tuple)) else value
+
+
+def toml(value: Any) -> str:
+    """Returns a JSON value as TOML in one line, from which the same value is read."""
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{json.dumps(key)} = {toml(each)}" for key, each in value.items()) + " }"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(toml, value)) + "]"
+    return json.dumps(value) if isinstance(value, (str, bool)) else repr(value)
 
 
 def _at(table: Any, place: Sequence[str | int]) -> Any:

@@ -53,6 +53,7 @@ class Log:
         self.objects: dict[str, ObjectLog] = {}
         self.obstacles: dict[str, Obstacle] = {}
         self.poses: dict[str, list[ObstacleFrame]] = {}  # of obstacles that move, at recorded frames
+        self.parameters: list[pb.ParameterSet] = []  # set while the run was made
         self._malformed: list[str] = []
         with bad_log_is_bad_input():
             self._file = LogFile.open(self.path)
@@ -135,6 +136,9 @@ class Log:
     def _decode(self, message: LogMessage) -> None:
         if message.topic == "/scene":
             self.scene = pb.Scene.FromString(message.data)
+            return
+        if message.topic == "/parameters":
+            self.parameters.append(pb.ParameterSet.FromString(message.data))
             return
         if message.topic in ("/touch", "/targets"):
             return  # for replays that simulate

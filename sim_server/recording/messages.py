@@ -19,7 +19,7 @@ from sim_server.mechanics.named_points import NamedPoints
 from sim_server.mechanics.world import Body
 from sim_server.mesh import posed
 from sim_server.mesh.surface import surface_triangles
-from sim_server.parameters import LiveParameter
+from sim_server.parameters import LiveParameter, ParameterUpdate
 from sim_server.recording.object_steps import Reactions, object_step, rows
 from sim_server.scene.solver_options import FACTORS
 from sim_server.simulation import Simulation
@@ -107,6 +107,12 @@ def live_parameter(p: LiveParameter) -> pb.LiveParameter:
         now=pb.Parameter(key=p.field.key, value=p.text), unit=p.field.unit, low=p.low, high=p.high,
         logarithmic=p.field.live.logarithmic, about=p.field.about,
     )  # fmt: skip
+
+
+def parameter_set(step: int, update: ParameterUpdate) -> pb.ParameterSet:
+    """Converts parameters that the loop took up after `step` completed steps."""
+    values = [pb.Parameter(key=key, value=value) for key, value in update.values.items()]
+    return pb.ParameterSet(step=step, parameters=values, client=update.client)
 
 
 def steps(

@@ -45,7 +45,7 @@ class Recorder:
     """Writes scene, topologies, states, steps, interactions and obstacles to an MCAP file from a thread of its own.
 
     Messages are stored under /scene, /topology/OBJECT, /state/OBJECT, /step/OBJECT, /interaction/OBJECT, /touch,
-    /factor/OBJECT, /obstacle/OBSTACLE, /pose/OBSTACLE and /targets with `log_time` = simulation time and
+    /factor/OBJECT, /obstacle/OBSTACLE, /pose/OBSTACLE, /targets and /parameters with `log_time` = simulation time and
     `publish_time` = wall clock, both in ns.
 
     Appending does not wait for the disk unless `block` is true (for runs without a pace). While more than FRAME_BYTES
@@ -114,6 +114,10 @@ class Recorder:
     def touch_set(self, message: pb.TouchSet, time: float, block: bool = False) -> None:
         """Appends the interactions that the loop works with from `time` [s of simulation] on."""
         self._append("/touch", message, self._stamp(time), message.step, block)
+
+    def parameters(self, message: pb.ParameterSet, time: float, block: bool = False) -> None:
+        """Appends parameters of the scene that the loop works with from `time` [s of simulation] on."""
+        self._append("/parameters", message, self._stamp(time), message.step, block)
 
     def factor(self, message: pb.FactorUse, block: bool = False) -> None:
         """Appends the origin of a factor that the loop was given."""

@@ -3,8 +3,8 @@
 
 The loop decides at which step a push, a move or a release takes effect, when it reads its mailbox; so the whole list
 of interactions is written with the step at which the loop took it up, and so are the poses that clients gave to
-obstacles and holders. Each factor is written with the step of its
-matrix and its maker; step records tell which one a solve used.
+obstacles and holders, and parameters of the scene that were set. Each factor is written with the step of its matrix and
+its maker; step records tell which one a solve used.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from sim_server.arrays import Float64
 from sim_server.backends.base import PendingUpdate
 from sim_server.effects._base import Effect
 from sim_server.network.link import ServerLink
+from sim_server.parameters import ParameterUpdate
 from sim_server.recording import messages
 from sim_server.recording.obstacles import target_messages
 from sim_server.recording.recorder import Recorder
@@ -49,7 +50,7 @@ def _taken(updates: Updates[T]) -> list[tuple[int, T]]:
 
 
 class ReplayRecorder:
-    """Collects factors, interactions and moves of obstacles and holders as the loop gets them.
+    """Collects factors, interactions, moves of obstacles and holders, and parameters as the loop gets them.
 
     Call `write` before the steps that they act in are recorded.
     """
@@ -65,6 +66,8 @@ class ReplayRecorder:
         driver.on_adopt.append(self._factors.append)
         self._touch = driver.simulation.touch
         driver.simulation.on_effect_update.append(self._on_update)
+        self._parameters: deque[ParameterUpdate] = deque()
+        driver.simulation.parameters.on_set.append(self._on_set)
 
     def _on_update(self, effect: Effect, pending: PendingUpdate) -> None:
         if self._touch is not None and effect is self._touch:
@@ -73,12 +76,21 @@ class ReplayRecorder:
             if effect is mover:
                 moved.append((pending, mover.targets))
 
+    def _on_set(self, update: ParameterUpdate) -> None:
+        if self._parameters and self._parameters[-1] is update.replaces:  # which the loop never took up
+            self._parameters.pop()
+        self._parameters.append(update)
+
     def write(self, block: bool) -> None:
         """Writes all that was taken up since the last call; so a log that is cut off holds the inputs of its steps."""
         for _ in range(len(self._factors)):
             self._recorder.factor(self._factor(self._factors.popleft()), block)
         for step, interactions in _taken(self._touched):
             self._recorder.touch_set(self._touch_set(step, interactions), self._dt * step, block)
+        while self._parameters and self._parameters[0].taken >= 0:
+            update = self._parameters.popleft()
+            message = messages.parameter_set(update.taken, update)
+            self._recorder.parameters(message, self._dt * update.taken, block)
         taken = [each for moved in self._movers.values() for each in _taken(moved)]
         for step, targets in sorted(taken, key=lambda each: each[0]):
             self._recorder.targets(target_messages(step, targets), self._dt * step, block)

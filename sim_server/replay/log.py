@@ -79,6 +79,7 @@ class Recording:
         self.touch: list[pb.TouchSet] = []
         self.obstacles: dict[str, pb.Obstacle] = {}
         self.targets: list[pb.ObstacleTargets] = []
+        self.parameters: dict[int, list[pb.ParameterSet]] = {}  # by step
         self.touched = False
         self.notes: list[str] = []
         self._file = LogFile.open(self.path)
@@ -129,6 +130,9 @@ class Recording:
             self.touch.append(pb.TouchSet.FromString(message.data))
         elif message.topic == "/targets":
             self.targets.append(pb.ObstacleTargets.FromString(message.data))
+        elif message.topic == "/parameters":
+            found = pb.ParameterSet.FromString(message.data)
+            self.parameters.setdefault(found.step, []).append(found)
         elif message.kind == "obstacle":
             self.obstacles[message.object] = pb.Obstacle.FromString(message.data)
         elif message.kind != "pose":  # which follow from the scene and the targets

@@ -94,6 +94,7 @@ class Replay:
         for step in range(self.recording.steps):
             self._restore_interactions(step)
             self._restore_targets(step)
+            self._restore_parameters(step)
             for body in self.bodies:
                 self._apply_settings(body.index, body.name, step)
                 self._use_factor(body.index, body.name, step, fresh=False)
@@ -186,6 +187,14 @@ class Replay:
                 mover.restore(targets)
             except ValueError as error:
                 raise BadLog(f"{self.recording.path}: obstacles moved at step {step}: {error}") from error
+
+    def _restore_parameters(self, step: int) -> None:
+        """Sets the parameters that the loop took up at this step."""
+        for found in self.recording.parameters.get(step, ()):
+            try:
+                self.simulation.parameters.set({p.key: p.value for p in found.parameters})
+            except ValueError as error:
+                raise BadLog(f"{self.recording.path}: parameters set at step {step}: {error}") from error
 
     def _interaction(self, m: pb.Interaction) -> Interaction:
         from sim_server.effects.touch import Interaction

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 
 MOST_LISTED = 2000  # live parameters in a reply
+MOST_SET, LONGEST_KEY, LONGEST_VALUE = 256, 300, 8192  # parameters of a command; characters
 UNIT = 1e-6  # that the length of a quaternion may differ from 1 by
 
 
@@ -122,6 +123,13 @@ class Commands:
         return pb.Reply()
 
     def _set(self, command: pb.Command) -> pb.Reply:
+        if not 0 < len(command.parameters) <= MOST_SET:
+            raise BadCommand(f"{len(command.parameters)} parameters; allowed: 1 to {MOST_SET} at a time")
+        for p in command.parameters:
+            if len(p.key) > LONGEST_KEY or len(p.value) > LONGEST_VALUE:
+                raise BadCommand(
+                    f"{p.key[:40]}...: at most {LONGEST_KEY} characters of a key, {LONGEST_VALUE} of a value"
+                )
         values = {p.key: p.value for p in command.parameters}
         if len(values) < len(command.parameters):
             raise BadCommand("a parameter is set twice")

@@ -95,6 +95,25 @@ def test_a_scene_with_explicit_substeps_is_built(cupy, name, precision):
     assert engine.step == 3
 
 
+@pytest.mark.parametrize("scheme", ["backward_euler", "central_difference"])
+def test_parameters_are_copied_into_the_arrays_of_the_device(cupy, scheme):
+    """And of the type that these have there; what makes work of the elastic energy compiles and is launched around."""
+    given = bar((2, 1, 1), fixed="X < 0.01", damping=(0.1, 0.0))
+    sim = Simulation(scene(given, integrator={"scheme": scheme}, precision="mixed"), "gpu")
+    lame = sim.world.backend.known_twin(sim.effects["corotational"].lame)
+    sim.engine.run(2)
+    before = np.array(lame)
+    sim.parameters.set({"bar.corotational.young": "1e6", "bar.rayleigh.mass": "3"})
+    update = sim.parameters.set({"bar.corotational.young": "2e5"}) and sim.parameters.changed
+    assert list(update.values()) == ["200000.0", "3.0"]
+    assert np.array_equal(lame, before), "not before the next batch"
+    sim.engine.run(1)
+    assert lame.dtype == np.float32 and np.allclose(lame, 2 * before, rtol=1e-6)
+    alpha = sim.integrator.alpha if scheme == "central_difference" else sim.effects["rayleigh"].alpha
+    assert (sim.world.backend.known_twin(alpha) == 3).all()
+    assert {"elastic_work"} <= {kernel for kernel, _ in cupy.calls}
+
+
 @pytest.mark.parametrize(
     ("fixed", "solve", "precision"),
     [(None, "auto", "mixed"), (None, "iterate", "float32"), ("X < 0.01", "auto", "float64")],

@@ -29,6 +29,7 @@ TYPES: dict[str, type[Message]] = {
     "scene": pb.Scene, "topology": pb.Topology, "step": pb.ObjectStep, "state": pb.State,
     "interaction": pb.Interaction, "touch": pb.TouchSet, "factor": pb.FactorUse,
     "obstacle": pb.Obstacle, "pose": pb.ObstaclePose, "targets": pb.ObstacleTargets,
+    "parameters": pb.ParameterSet,
 }  # fmt: skip
 Change = Callable[[Any], bool]  # of a message in place; False: leave it out
 

@@ -44,7 +44,7 @@ def _library() -> c.CDLL:
             "wf_assemble": (None, [loop]), "wf_solve": (None, [loop]), "wf_run": (c.c_int64, [loop, c.c_int64]),
             "wf_wait": (c.c_int32, [loop]), "wf_copy_matrix": (None, [loop, c.c_int32, p]),
             "wf_post_factor": (p, [c.POINTER(structs.Body), p]), "wf_post_binding": (p, [c.POINTER(structs.Launch), p]),
-            "wf_post_changes": (p, [loop, p]),
+            "wf_post_changes": (p, [loop, p]), "wf_take_changes": (None, [loop]),
             "wf_apply_factor": (None, [c.POINTER(structs.Factor), p, p, p]),
             "wf_precondition": (None, [loop, c.c_int32, p, p, p]),
         },
@@ -443,6 +443,7 @@ class CpuEngine(Reports):
     def _begin(self) -> None:
         """Runs the launches of the scheme that come before the first step."""
         if self.step == 0:
+            self._native.wf_take_changes(c.byref(self.loop))
             for launch in self.begin:
                 launch()
 

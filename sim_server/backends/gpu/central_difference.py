@@ -26,6 +26,7 @@ SUBSTEPS, SUBSTEP_STATE = TEXT.dtype("Substeps"), TEXT.dtype("SubstepState")
 THREADS: int = 128  # of a thread block: 32 WARPS of energy_balance.cu
 ROUND = 4  # substeps between two decisions
 FIRST_ITERATIONS: int = TEXT.constant("FIRST_ITERATIONS")
+ESTIMATE_EVERY: int = TEXT.constant("ESTIMATE_EVERY")
 
 
 class Branches(Protocol):
@@ -83,6 +84,13 @@ class SubstepLoop:
         module = cp.RawModule(code=TEXT.checked(), options=flags_of_compiler, backend="nvrtc")
         names = ("measure_frequency", "begin_substeps", "shorten_substeps", "end_round")
         self._kernels: dict[str, KernelFunction] = {n: compiled("central_difference.cu", module, n) for n in names}
+
+    @property
+    def since(self) -> int:
+        """Device address of the number of substeps since the last estimate of the stable step."""
+        dtype, _offset = cast(dict[str, Any], SUBSTEP_STATE.fields)["since"][:2]
+        assert dtype == np.int32
+        return int(self._memory["state"].data.ptr) + int(_offset)
 
     def start(self) -> None:
         """Estimates the stable step before the first step."""

@@ -221,6 +221,10 @@ class Gpu:
             self._twins[id(host)] = (host, made)
         return made
 
+    def known_twin(self, host: NDArray[Any]) -> DeviceArray | None:
+        """Returns the device array of a host array, if it has one."""
+        return self._twins[id(host)][1] if id(host) in self._twins else None
+
     def keep(self, *hosts: NDArray[Any], exact: bool = False) -> None:
         """Declares arrays that stay for the whole run, with one twin each. exact: the twins have the same types."""
         for host in hosts:

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: MIT
 // Elastic energy of the bodies, on demand after a step: sums of the element energies of an effect in a fixed order. One launch per
-// effect, one thread block per body.
+// effect, one thread block per body. Also what a change of parameters between two steps adds to it.
 #ifndef local
 #define local real
 #endif
@@ -14,6 +14,13 @@ struct ElasticEnergy {
     Balance* balance;            // (bodies,)
     EnergyRecord* records;       // (capacity, bodies) on the host
     int capacity, first_effect;  // 1: the first effect
+};
+
+struct ElasticWork {             // of a change of parameters
+    const double* sum;           // (bodies,) elastic energy [J]
+    double* before;              // (bodies,) before the change [J]
+    Balance* balance;            // (bodies,)
+    int bodies, after;           // after: 1 once it is made
 };
 
 constexpr int THREADS = 128;
@@ -32,4 +39,12 @@ extern "C" __global__ void __launch_bounds__(THREADS) elastic_energy(const Elast
     p.sum[body] = sum;
     const long long done = p.step[0];
     if (done > 0 && !p.balance[body].found) p.records[(done - 1) % p.capacity * gridDim.x + body].elastic = sum;
+}
+
+// Launched twice, each time after the elastic energy: what a change of parameters adds to it is work.
+extern "C" __global__ void __launch_bounds__(THREADS) elastic_work(const ElasticWork p) {
+    const int body = blockIdx.x * blockDim.x + threadIdx.x;
+    if (body >= p.bodies) return;
+    if (p.after) add_work(p.balance[body], p.sum[body] - p.before[body]);
+    else p.before[body] = p.sum[body];
 }

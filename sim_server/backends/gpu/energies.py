@@ -26,7 +26,7 @@ ENERGY_BALANCE = BALANCE_TEXT.dtype("EnergyBalance")
 BALANCE, ENERGY_RECORD = BALANCE_TEXT.dtype("Balance"), BALANCE_TEXT.dtype("EnergyRecord")
 NODE_CHUNK = BALANCE_TEXT.dtype("NodeChunk")
 SUMS = BALANCE_TEXT.dtype("Sums").itemsize // 8  # numbers
-ELASTIC_ENERGY = ELASTIC_TEXT.dtype("ElasticEnergy")
+ELASTIC_ENERGY, ELASTIC_WORK = ELASTIC_TEXT.dtype("ElasticEnergy"), ELASTIC_TEXT.dtype("ElasticWork")
 
 
 class DeviceEnergies:
@@ -111,6 +111,24 @@ class DeviceEnergies:
             if launch is not None:
                 launch()
             self._elastic_kernel((self._bodies,), (THREADS,), (params,))
+
+    def launch_work(self, after: bool) -> None:
+        """Launches what makes work of the elastic energy that a change of parameters adds. after: it is made."""
+        cp = self._gpu.cp
+        if "scratch" not in self._memory:
+            self._memory["scratch"] = cp.zeros(self._bodies * ENERGY_RECORD.itemsize, np.uint8)
+            self._memory["before"] = cp.zeros(self._bodies)
+            self._work_kernel = self._kernel(ELASTIC_TEXT, "elastic_work")
+        for launch, _, params in self._launches:
+            if launch is not None:
+                launch()
+            apart = params.copy()  # no record of a step tells of it
+            apart["records"], apart["capacity"] = self._memory["scratch"].data.ptr, 1
+            self._elastic_kernel((self._bodies,), (THREADS,), (apart,))
+        work = np.zeros((), ELASTIC_WORK)
+        work["sum"], work["before"] = self._sum.data.ptr, self._memory["before"].data.ptr
+        work["balance"], work["bodies"], work["after"] = self._balance.data.ptr, self._bodies, after
+        self._work_kernel((-(-self._bodies // THREADS),), (THREADS,), (work,))
 
     def start(self) -> None:
         """Takes the state on the device as the initial state of the balance."""

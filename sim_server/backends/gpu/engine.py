@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from protocol.factor import FactorPattern
 from sim_server.arrays import Float64
-from sim_server.backends.base import Capability, EngineInput, Launch
+from sim_server.backends.base import ArrayChange, Capability, EngineInput, Launch
 from sim_server.backends.cpu.structs import REACTION
 from sim_server.backends.declarations import Declarations
-from sim_server.backends.gpu.central_difference import SubstepLoop
+from sim_server.backends.gpu.central_difference import ESTIMATE_EVERY, SubstepLoop
 from sim_server.backends.gpu.contact import ContactPasses
 from sim_server.backends.gpu.correction import FactorCorrection
 from sim_server.backends.gpu.cuda import CudaDevice
@@ -28,7 +28,7 @@ from sim_server.backends.gpu.factor_upload import FactorUpload
 from sim_server.backends.gpu.held import HeldForces, leading
 from sim_server.backends.gpu.kernel_fusion import DOMAINS, Epilogue, FusedKernel, fuse
 from sim_server.backends.gpu.loop import CAPACITY, MANY, DeviceLoop
-from sim_server.backends.gpu.mailbox import DeviceMailbox
+from sim_server.backends.gpu.mailbox import ChangeMailbox, DeviceMailbox
 from sim_server.backends.gpu.newton import NewtonIteration, NewtonPhases
 from sim_server.backends.gpu.rosenbrock import ATTEMPTS, RosenbrockStep
 from sim_server.backends.gpu.solver import PCG_BODY, PCG_RESULT, SETTINGS_BYTES, PcgSolver
@@ -40,6 +40,7 @@ from sim_server.backends.gpu.structs import (
     STAGE_RESULT,
     STEP_TIMESTAMP,
     SUBSTEP_RESULT,
+    DeviceChanges,
     Mail,
 )
 from sim_server.backends.newton import Newton
@@ -183,6 +184,7 @@ class GpuEngine(DeviceLoop):
             self.mailboxes[k].post(whole[:SETTINGS_BYTES])
             self.mailboxes[bodies + k].post(whole[SETTINGS_BYTES:])
         self.begin: Sequence[Launch] = ()  # launches before the first step
+        self._changes, self._work_graphs = ChangeMailbox(self.loop), list[Graph]()
         self._graphs: list[Graph | None] = []
         self._epilogue = self._epilogue_params(dt)
         self._integrate, self._stages = None, None
@@ -229,6 +231,9 @@ class GpuEngine(DeviceLoop):
     def _make_ready(self) -> None:
         """Runs the launches before the first step, and takes the initial state of the energy balance."""
         begins = bool(self.begin or self._substeps) and self.step == 0
+        if self.step == 0:
+            self.take_changes()
+            self._steps.synchronize()
         if begins:
             for launch in self.begin:
                 launch()
@@ -409,6 +414,32 @@ class GpuEngine(DeviceLoop):
         """
         self.gpu.cp.cuda.get_current_stream().synchronize()  # its arrays are complete
         return self.mailboxes[self._mailed[launch]].post(cast(DeviceLaunch, new).params.tobytes(), keep=new)
+
+    def change(self, changes: Sequence[ArrayChange]) -> DeviceChanges:
+        """Copies new contents into the twins of arrays between two batches: those after the result's `taken` steps."""
+        cp, copies, kept = self.gpu.cp, [], []
+        for host, contents in changes:
+            host[...] = contents
+            if (twin := self.gpu.known_twin(host)) is not None:
+                kept.append(cp.asarray(contents.astype(twin.dtype)))
+                copies.append((int(twin.data.ptr), int(kept[-1].data.ptr), int(twin.nbytes)))
+        if self._substeps:
+            kept.append(cp.asarray(np.array([ESTIMATE_EVERY], np.int32)))
+            copies.append((self._substeps.since, int(kept[-1].data.ptr), 4))
+        if not self._work_graphs:  # in a stream of their own: steps are under way
+            stream = cp.cuda.Stream(non_blocking=True)
+            for after in (False, True):
+                with stream:
+                    stream.begin_capture()
+                    self._energies.launch_work(after)
+                    self._work_graphs.append(stream.end_capture())
+        cp.cuda.get_current_stream().synchronize()  # what is copied is complete
+        before, after_changes = (int(graph.graphExec) for graph in self._work_graphs)
+        return self._changes.post(copies, before, after_changes, kept)
+
+    def withdraw_changes(self) -> bool:
+        """Takes back what `change` was given last and the loop has not taken up; False if there is nothing."""
+        return self._changes.withdraw()
 
     def records_and_reactions(self) -> tuple[NDArray[Any], Float64]:
         """Returns the records since the last call, oldest first, and reactions of obstacles (Reports); also begins to

@@ -32,12 +32,25 @@ static bool deliver(GpuLoop& l, StepBatch& batch, int slots) {
     return !l.error;
 }
 
+// Makes the changes of parameters that wait, in the order of the steps; the balance of the last step has been made.
+static bool take_changes(GpuLoop& l) {
+    if (!l.changes.load(std::memory_order_relaxed)) return true;
+    DeviceChanges* next = l.changes.exchange(nullptr);
+    if (!next) return true;
+    CALL(graph_launch, next->before, l.stream);
+    for (int64_t i = 0; i < next->count; ++i)
+        CALL(on_device, next->copies[i].target, next->copies[i].source, (size_t)next->copies[i].bytes, l.stream);
+    CALL(graph_launch, next->after, l.stream);
+    next->taken.store(l.launched, std::memory_order_release);
+    return true;
+}
+
 static bool open_batch(GpuLoop& l) {
     StepBatch& batch = l.batches[l.begun % STEP_BATCHES];
     batch.first = l.launched;
     batch.steps = 0;
     batch.late = l.rings.late;
-    if (!deliver(l, batch, l.mail_slot_count)) return false;
+    if (!deliver(l, batch, l.mail_slot_count) || !take_changes(l)) return false;
     batch.touched = l.grabs && l.touched;
     return true;
 }
@@ -241,6 +254,8 @@ int32_t wf_gpu_close(GpuLoop* loop) {
     return count(l, 1) && close_batch(l) && finish_down_to(l, 0) && finish_readbacks(l);
 }
 
+int32_t wf_gpu_take_changes(GpuLoop* loop) { return begin(*loop) && take_changes(*loop); }
+DeviceChanges* wf_gpu_post_changes(GpuLoop* loop, DeviceChanges* changes) { return loop->changes.exchange(changes); }
 Mail* wf_gpu_post(MailSlot* slot, Mail* mail) { return slot->posted.exchange(mail); }
 
 // Starts the balance of a body. sums: kinetic and potential energy [J], largest difference of dt v [m], diagonal [m].
@@ -256,7 +271,7 @@ void wf_gpu_start_balance(Balance* balance, const double* sums, double dt, int32
 const StructSize* wf_sizes() {
     static const StructSize sizes[] = {SIZE(CudaDriver), SIZE(Mail), SIZE(MailSlot), SIZE(PcgResult), SIZE(StepTimestamp),
                                        SIZE(NewtonResult), SIZE(StageResult), SIZE(ContactResult), SIZE(SubstepResult), SIZE(BodyReadback), SIZE(GpuLoop), SIZE(Record), SIZE(EnergyRecord),
-                                       SIZE(Balance), SIZE(Reaction), SIZE(PairSum), {}};
+                                       SIZE(Balance), SIZE(Reaction), SIZE(PairSum), SIZE(DeviceCopy), SIZE(DeviceChanges), {}};
     return sizes;
 }
 }

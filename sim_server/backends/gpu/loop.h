@@ -38,6 +38,18 @@ struct MailSlot {               // bytes on the device that are replaced between
     std::atomic<int64_t> taken;  // number of the mail that was copied to the device last
 };
 
+struct DeviceCopy {             // new contents of an array on the device
+    Address target, source;
+    int64_t bytes;
+};
+
+struct DeviceChanges {          // of parameters: copies that are made between the same two steps
+    const DeviceCopy* copies;
+    void *before, *after;        // graphs that make work of the elastic energy that they add
+    int64_t count;
+    std::atomic<int64_t> taken;  // steps launched before them, -1: not yet
+};
+
 enum Request { REQUEST_VALUES = 1, REQUEST_POSITIONS = 2 };
 
 struct BodyReadback {                    // copies of a body's matrix or positions to the host
@@ -114,6 +126,7 @@ struct GpuLoop {
     char failed_call[28];
     StepBatch batches[STEP_BATCHES];
     FrameCopy frame_copies[FRAME_COPIES];
+    std::atomic<DeviceChanges*> changes;   // of parameters, or null
     Rings rings;
 };
 

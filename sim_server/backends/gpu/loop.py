@@ -193,6 +193,11 @@ class DeviceLoop(Reports):
         self._native.wf_gpu_open(c.byref(self.loop))
         self._check()
 
+    def take_changes(self) -> None:
+        """Makes the changes of parameters that wait, while no step is under way."""
+        self._native.wf_gpu_take_changes(c.byref(self.loop))
+        self._check()
+
     def renew_mail(self) -> None:
         """Reads the mailboxes of settings and factors again within such a step; the stream must be empty."""
         self._native.wf_gpu_renew(c.byref(self.loop))

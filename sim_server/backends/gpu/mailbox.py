@@ -2,6 +2,7 @@
 """The compiled GPU loop (loop.cpp) and its mailboxes."""
 
 import ctypes as c
+from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
@@ -19,11 +20,45 @@ def library() -> c.CDLL:
             "wf_gpu_run": (c.c_int64, [loop, c.c_int64]), "wf_gpu_wait": (c.c_int32, [loop]),
             "wf_gpu_open": (c.c_int32, [loop]), "wf_gpu_renew": (c.c_int32, [loop]),
             "wf_gpu_close": (c.c_int32, [loop]), "wf_gpu_post": (p, [c.POINTER(structs.MailSlot), p]),
+            "wf_gpu_post_changes": (p, [loop, p]), "wf_gpu_take_changes": (c.c_int32, [loop]),
             "wf_gpu_start_balance": (None, [p, p, c.c_double, c.c_int32]),
         },
     )  # fmt: skip
     structs.LOOP.check_sizes(compiled)
     return compiled
+
+
+class ChangeMailbox:
+    """Has the loop copy new contents into arrays on the device, all between the same two batches.
+
+    Keeps their memory until no step under way copies it.
+    """
+
+    def __init__(self, loop: structs.GpuLoop):
+        self._loop = loop
+        self._kept: list[tuple[structs.DeviceChanges, Any]] = []
+
+    def post(
+        self, copies: Sequence[tuple[int, int, int]], before: int, after: int, keep: Any = None
+    ) -> structs.DeviceChanges:
+        """Posts copies: device addresses of target and source, and bytes. Nothing else may wait (`withdraw`).
+
+        before, after: handles of graphs that are launched around them. keep: objects that own the memory.
+        The contents are valid from the step after the result's `taken` steps, once that is not below 0.
+        """
+        native = (structs.DeviceCopy * max(len(copies), 1))(*(structs.DeviceCopy(*each) for each in copies))
+        made = structs.DeviceChanges(c.addressof(native), before, after, len(copies), -1)
+        self._kept = [each for each in self._kept if not 0 <= each[0].taken < self._loop.step]
+        self._kept.append((made, (native, keep)))
+        library().wf_gpu_post_changes(c.byref(self._loop), c.addressof(made))
+        return made
+
+    def withdraw(self) -> bool:
+        """Takes back what the loop has not begun to copy; True if there was anything."""
+        back = bool(library().wf_gpu_post_changes(c.byref(self._loop), None))
+        if back:
+            self._kept.pop()
+        return back
 
 
 class DeviceMailbox:

@@ -41,6 +41,16 @@ class MailSlot(c.Structure):
 
 
 @LOOP.struct
+class DeviceCopy(c.Structure):
+    """New contents of an array on the device."""
+
+
+@LOOP.struct
+class DeviceChanges(c.Structure):
+    """New contents of arrays, copied between the same two steps."""
+
+
+@LOOP.struct
 class BodyReadback(c.Structure):
     """Copies of the matrix or the positions of a body to the host."""
 

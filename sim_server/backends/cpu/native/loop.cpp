@@ -329,7 +329,7 @@ static void finish_step(Loop* loop) {
     write_frame(*loop);
 }
 
-// Parameters that change before the first step are those of the energies that it begins with.
+// Parameters that change before the first step are those that it begins with.
 static void begin_energies(Loop& loop) {
     if (!loop.energies) return;
     if (!loop.energies->begun) take_changes(loop);
@@ -371,6 +371,7 @@ int64_t wf_run(Loop* loop, int64_t steps) {
 }
 
 const Factor* wf_post_factor(Body* body, const Factor* factor) { return body->mail.exchange(factor); }
+void wf_take_changes(Loop* loop) { take_changes(*loop); }
 Changes* wf_post_changes(Loop* loop, Changes* changes) { return loop->changes.exchange(changes); }
 Binding* wf_post_binding(Launch* launch, Binding* binding) { return launch->mail.exchange(binding); }
 

@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: MIT
+"""Scenes with every live parameter, and other values of it."""
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sim_server.parameters import toml
+from sim_server.scene.model import Scene
+from sim_server.simulation import Simulation
+from tests.state import put
+
+FIXED = {"fixed": {"where": "X < 0.01"}}
+BAR = {"bar": [3, 1, 1], "size": [1.5, 0.5, 0.5]}
+REGIONS = [{"where": "X < 0.7", "young": 2e5}, {"young": 5e4, "poisson": 0.2}]
+YOUNG = {"young": 1e5, "poisson": 0.3}
+STRETCHED = {"direction": [[1, 0, 0], [0, 1, 0]]}
+
+
+class Case(NamedTuple):
+    """A bar with effects, and what is set. `start` says that it is set before the first step, since what follows
+    depends on more than positions and velocities."""
+
+    effects: dict[str, Any]
+    values: dict[str, Any]  # by key; a scene with them has the same steps
+    scene: Mapping[str, Any] = MappingProxyType({})
+    start: bool = False
+
+
+def law(name: str, given: dict[str, Any], **values: Any) -> Case:
+    """A bar of one law."""
+    return Case({name: given}, {f"bar.{name}.{key}": value for key, value in values.items()})
+
+
+COSTA = {f"b_{k}": 2.0 for k in ("ff", "fs", "fn", "ss", "sn", "nn")}
+SPRINGS = {"springs": [[k, k + 1] for k in range(12)], "stiffness": 900.0, "rest_length": 0.4}
+PAIR = {"between": ["bar", "floor"], "value": 0.3}
+CONTACT = {
+    "effects": {"gravity": {"g": [0, -9.81, 0]}, "contact": {"friction": [PAIR], "thickness": 0.02}},
+    "obstacle": [{"name": "floor", "shape": "plane", "pose": {"rotate": [0, 0, -20], "translate": [0, -0.3, 0]}},
+                 {"name": "wall", "shape": "plane", "pose": {"rotate": [0, 0, 15], "translate": [0, -0.2, 0]}}],
+}  # fmt: skip
+CASES = {
+    "corotational": law("corotational", YOUNG, young=3e4, poisson=0.4),
+    "exact": law("corotational", YOUNG | {"tangent": "exact"}, young=4e5),
+    "qr": law("corotational", YOUNG | {"rotation": "qr"}, young=4e5),
+    "regions": law("corotational", YOUNG | {"young": REGIONS}, young=[REGIONS[0], {"young": 3e5}]),
+    "springs": law("mass_spring", SPRINGS, stiffness=500.0, rest_length=0.3),
+    "edges": law("mass_spring", {"young": 1e5}, young=2e4),
+    "st_venant_kirchhoff": law("st_venant_kirchhoff", YOUNG, young=3e5, poisson=0.2),
+    "neo_hookean": law("neo_hookean", YOUNG, young=3e5, poisson=0.2),
+    "stable_neo_hookean": law("stable_neo_hookean", YOUNG, young=3e5, poisson=0.2),
+    "mooney_rivlin": law("mooney_rivlin", {"c1": 2e4, "c2": 1e4, "bulk": 1e5}, c1=3e4, c2=2e4, bulk=3e5),
+    "veronda_westmann": law("veronda_westmann", {"c1": 2e4, "c2": 1.0, "bulk": 1e5}, c1=3e4, c2=1.5, bulk=2e5),
+    "arruda_boyce": law(
+        "arruda_boyce", {"shear": 3e4, "segments": 8.0, "bulk": 1e5}, shear=5e4, segments=12.0, bulk=2e5
+    ),
+    "ogden": law("ogden", {"mu": [3e4], "alpha": [2.0], "bulk": 1e5}, mu=[2e4, -1e4], alpha=[2.0, -2.0], bulk=2e5),
+    "costa": law("costa", COSTA | {"a": 2e4, "bulk": 1e5, "fibre": [1, 0, 0], "sheet": [0, 1, 0]},
+                 **{key: 3.0 for key in COSTA}, a=3e4, bulk=2e5, fibre=[0, 1, 0.5], sheet=[0, 0, 1]),
+    "fibres": Case({"corotational": YOUNG, "fibres": {"stiffness": 2e4} | STRETCHED},
+                   {"bar.fibres.stiffness": 9e4, "bar.fibres.exponent": 2.0, "bar.fibres.direction": [0, 1, 1]}),
+    "rayleigh": Case({"corotational": YOUNG, "rayleigh": {"mass": 0.1}},
+                     {"bar.rayleigh.mass": 3.0, "bar.rayleigh.stiffness": 0.02}),
+    "gravity": law("corotational", YOUNG)._replace(values={"gravity.g": [4.0, 1.0, 0.0]}),
+    "friction": Case({"corotational": YOUNG}, {"bar.friction": 0.2, "floor.friction": 0.1, "wall.friction": 0.3,
+                     "contact.friction": [PAIR | {"value": 0.9}], "gravity.g": [1, -9, 0]}, CONTACT, True),
+}  # fmt: skip
+EVERYTHING = {"bar.corotational.young": 3e4, "bar.rayleigh.mass": 3.0, "bar.rayleigh.stiffness": 0.02,
+              "gravity.g": [4, 1, 0]}  # fmt: skip
+for scheme in ("newmark", "bdf2", "generalized_alpha", "ros2", "central_difference"):
+    values = {key: value for key, value in EVERYTHING.items() if scheme != "central_difference" or "stiff" not in key}
+    CASES[scheme] = Case({"corotational": YOUNG, "rayleigh": {"mass": 0.1, "stiffness": 0.01}}, values,
+                         {"integrator": {"scheme": scheme}}, True)  # fmt: skip
+CASES["factor"] = CASES["ros2"]._replace(  # which is there with no worker only in the lists of launches
+    scene={"integrator": {"scheme": "ros2"}, "solver": {"preconditioner": "cholesky"}}
+)
+CASES["quasi_static"] = law("neo_hookean", YOUNG, young=3e5)._replace(
+    scene={"integrator": {"scheme": "quasi_static"}}, start=True
+)
+CASES["linearizations"] = CASES["newmark"]._replace(scene={"integrator": {"linearizations": 4}})
+CASES["contact"] = CASES["friction"]._replace(
+    effects={"corotational": YOUNG, "rayleigh": {"mass": 0.1}},
+    values={"bar.corotational.young": 2e5, "bar.rayleigh.stiffness": 0.01, "bar.rayleigh.mass": 0.3},
+)
+
+
+def table(case: Case) -> dict[str, Any]:
+    """The scene of a case."""
+    effects = case.effects if "obstacle" in case.scene else case.effects | FIXED
+    explicit = case.scene.get("integrator", {}).get("scheme") == "central_difference"
+    return {
+        "name": "case", "dt": 0.01, "effects": {"gravity": {"g": [0, -9.81, 0]}},
+        "solver": {"preconditioner": "none" if explicit else "block_jacobi", "warm_start": False},
+        "object": [{"name": "bar", "mesh": BAR, "effects": effects}], **case.scene,
+    }  # fmt: skip
+
+
+def with_values(case: Case) -> dict[str, Any]:
+    """The same scene with the other values from the start."""
+    found = table(case)
+    scene = Scene.model_validate(found).resolved()
+    for key, value in case.values.items():
+        name, *path = key.split(".")
+        tables = {t["name"]: t for kind in ("object", "obstacle") for t in scene.get(kind, [])}
+        inside = tables.get(name, {"effects": {name: scene["effects"].get(name)}})
+        path = path if name in tables else [name, *path]
+        (inside["effects"][path[0]] if len(path) == 2 else inside)[path[-1]] = value
+    return scene
+
+
+def texts(case: Case) -> dict[str, str]:
+    """Its values as commands have them."""
+    return {key: toml(value) for key, value in case.values.items()}
+
+
+def both(case: Case, device: str = "cpu", steps: int = 6) -> tuple[Simulation, Simulation]:
+    """A simulation in which the values were set, and one that had them from the start, after the same steps."""
+    one = Simulation(Scene.model_validate(table(case)), device)
+    other = Simulation(Scene.model_validate(with_values(case)), device)
+    if not case.start:
+        one.engine.run(5)
+        one.fetch()
+        put(other, other.world.x, one.world.x)
+        put(other, other.world.v, one.world.v)
+    one.parameters.set(texts(case))
+    for simulation in (one, other):
+        simulation.engine.run(steps)
+        simulation.fetch()
+    return one, other
+
+
+def same(one: Simulation, other: Simulation) -> bool:
+    """Whether positions and velocities are the same, bit for bit."""
+    pairs = ((one.world.x, other.world.x), (one.world.v, other.world.v))
+    return all(np.array_equal(a, b) for a, b in pairs)
