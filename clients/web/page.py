@@ -15,11 +15,11 @@ from typing import Any
 import viser
 
 from clients.log.frames import Mesh
-from clients.web.curves import History
 from clients.web.feed import Feed, Link
 from clients.web.hand import Grip, Hand, described_objects, grip
 from clients.web.paint import Paint
-from clients.web.panels import Panels
+from clients.web.panel.curves import History
+from clients.web.panel.panels import Panels
 from clients.web.solids import Obstacles, Springs
 from clients.web.surfaces import MOST_VERTICES, Surfaces
 from clients.web.tab import Tab

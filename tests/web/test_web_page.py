@@ -110,7 +110,6 @@ def test_a_drag_moves_the_body_and_letting_go_releases_it(world: World, tab: Any
     assert world.moved(FRONT) < 0.01
     world.drag(tab, FRONT)
     until(lambda: world.moved(FRONT) > 0.2 and len(world.grabs()) == 1, "a body that follows the pointer")
-    tab.get_by_text(r" N").first.wait_for()
     tab.mouse.up()
     until(lambda: not world.grabs(), "the release")
     until(lambda: world.moved(FRONT) < 0.05, "a body that goes back")

@@ -12,14 +12,14 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from clients.log.frames import Mesh
-from clients.web.curves import POINTS, History
 from clients.web.decimate import decimated
 from clients.web.feed import Feed
 from clients.web.hand import Hand, described_objects, grip
 from clients.web.paint import BANDS, Paint, split
-from clients.web.sliders import named, value_of
+from clients.web.panel.curves import POINTS, History
+from clients.web.panel.sliders import named, value_of
+from clients.web.panel.tables import tables
 from clients.web.surfaces import Surfaces
-from clients.web.tables import tables
 from clients.web.view import home, up_of
 from protocol import messages_pb2 as pb
 from protocol.network.web_address import exposed, hindrance, shown, web_address

@@ -6,9 +6,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from clients.web.curves import Curves, History
-from clients.web.sliders import Sliders
-from clients.web.tables import summary, tables, warning
+from clients.web.panel.curves import Curves, History
+from clients.web.panel.sliders import Sliders
+from clients.web.panel.tables import summary, tables, warning
 from protocol import messages_pb2 as pb
 
 if TYPE_CHECKING:
