@@ -24,6 +24,7 @@ from clients.errors import BadInput, ClientError
 from clients.point_option import AT_HELP, PointCommand, point
 from protocol.channels import DEFAULT_ENDPOINT, SERVER_NAME
 from protocol.network.endpoints import CONNECT
+from protocol.network.web_address import HOST, PORT
 from protocol.printable import printable
 from protocol.process.command_line import Program, handle, leave
 from protocol.process.exhausted import exhausted
@@ -502,6 +503,31 @@ def view(
             viewing.save_screenshot(opened, screenshot, color.value)
         if not save and not screenshot:
             viewing.view_log(opened, color.value, web)
+
+
+@app.command()
+def web(
+    host: Annotated[
+        str, typer.Option(metavar="HOST", help="Where the page is served; who reaches it may do what this client may.")
+    ] = HOST,
+    port: Annotated[int, typer.Option(metavar="PORT", min=1, max=65535, help="Of the page.")] = PORT,
+    exit_with_parent: Annotated[
+        bool, typer.Option("--exit-with-parent", help="End when the parent process ends.")
+    ] = False,
+    connect: Connect = None,
+    server: Server = SERVER_NAME,
+) -> None:
+    """Serve a page where bodies are dragged with the mouse, changed and watched, until Ctrl-C.
+
+    \b
+    Examples:
+      sim-client web
+      sim-client web --port 8090
+      sim-client web --connect tcp/192.168.1.5:7447
+    """
+    from clients.web import command
+
+    command.web(server, connect, host, port, exit_with_parent)
 
 
 @app.command()

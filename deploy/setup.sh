@@ -68,9 +68,11 @@ have_python_headers() {
 have_compiler() { have "${CXX:-g++}" || have g++ || have clang++; }  # what sim_server/backends/compiler.py looks for
 have_suitesparse() { [ -n "${SUITESPARSE_INCLUDE_DIR:-}" ] || [ -e /usr/include/suitesparse/cholmod.h ]; }
 have_openblas() { compgen -G '/usr/lib/*/libopenblas.so.0' >/dev/null || ! have apt-get; }
+have_chromium() { have chromium || have chromium-browser || have google-chrome; }
+is_debian() { grep -qx 'ID=debian' /etc/os-release 2>/dev/null; }  # Ubuntu has chromium as a snap only
 have_software_vulkan() { compgen -G '/usr/share/vulkan/icd.d/lvp_icd*.json' >/dev/null; }
 
-# missing_packages [mesa-vulkan-drivers]: names of the Debian packages for what is not there.
+# missing_packages [mesa-vulkan-drivers] [chromium]: names of the Debian packages for what is not there.
 missing_packages() {
     if [ -z "${PYTHON:-}" ]; then  # another interpreter brings its own
         have_python || echo python3
@@ -81,9 +83,13 @@ missing_packages() {
     # CHOLMOD, and OpenBLAS for it: on the reference BLAS a factorization takes 4 to 10 times as long.
     have_suitesparse || echo libsuitesparse-dev
     have_openblas || echo libopenblas-dev
-    if [ "${1:-}" = mesa-vulkan-drivers ]; then
-        have_software_vulkan || echo mesa-vulkan-drivers  # draws the demonstration's picture without a GPU or a screen
-    fi
+    case " $* " in
+        # draws the demonstration's picture without a GPU or a screen
+        *" mesa-vulkan-drivers "*) have_software_vulkan || echo mesa-vulkan-drivers ;;
+    esac
+    case " $* " in
+        *" chromium "*) have_chromium || ! is_debian || echo chromium ;;  # tests and benches open the page in it
+    esac
 }
 
 # --- system packages ------------------------------------------------------------------------------------------------
@@ -215,7 +221,7 @@ install_python_packages() {
     have_sksparse || say "without scikit-sparse: factors come from SciPy's SuperLU, right but slower to make"
 }
 
-# set_up EXTRAS [mesa-vulkan-drivers]
+# set_up EXTRAS [mesa-vulkan-drivers] [chromium]
 set_up() {
     local extras=$1
     shift

@@ -78,7 +78,7 @@ def work(
     end_with_any_thread()
     try:
         if exit_with_parent:
-            from precond_worker.die_with_parent import die_with_parent
+            from protocol.process.die_with_parent import die_with_parent
 
             die_with_parent()
         library = chosen_library(device, precision)

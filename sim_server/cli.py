@@ -17,6 +17,7 @@ from protocol.process.command_line import Program, Terminated, end_in_order
 from protocol.process.nvidia import nvidia_device
 from sim_server.errors import DeviceError, DeviceLost, InputError, NameTaken
 from sim_server.service.compile_notice import compile_notices
+from sim_server.service.web_page import WebCommand
 
 if TYPE_CHECKING:
     from sim_server.service.service import Service
@@ -31,6 +32,8 @@ Examples:
         a scene that comes along; sim-server --list tells them
   sim-server deploy/scenes/beam.toml --workers 1
         in real time, helped by one local worker
+  sim-server beam.toml --workers 1 --web
+        with a page in the browser where it is dragged
   sim-server beam.toml --steps 500 --free-run --record beam.mcap
         as fast as it goes, with a log
   sim-server beam.toml --listen tcp/0.0.0.0:7447
@@ -63,7 +66,7 @@ def list_gallery(asked: bool) -> None:
     raise typer.Exit
 
 
-@app.command(epilog=EPILOG)
+@app.command(epilog=EPILOG, cls=WebCommand)
 def serve(
     scene: Annotated[Path, typer.Argument(metavar="SCENE.toml", help="What to simulate; or gallery/NAME")],
     device: Annotated[
@@ -86,6 +89,12 @@ def serve(
     worker_device: Annotated[
         str, typer.Option(metavar="auto|cpu|gpu", help="What local workers factorize on (precond-worker --device)")
     ] = "cpu",
+    web: Annotated[
+        str | None,
+        typer.Option(
+            metavar="[HOST:PORT]", help="Serve a page where bodies are dragged (sim-client web), at 127.0.0.1:8080"
+        ),
+    ] = None,
     name: Annotated[str, typer.Option(metavar="NAME", help="Name of this server in all keys")] = "sim",
     no_shared_memory: Annotated[bool, typer.Option("--no-shared-memory", help="Send arrays as bytes")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing but errors")] = False,
@@ -108,7 +117,7 @@ def serve(
     try:
         options = Options(
             scene, set_ or [], choose_device(device, say), name, listen, connect, not no_shared_memory, record, steps,
-            realtime, workers, worker_device,
+            realtime, workers, worker_device, web, quiet,
         )  # fmt: skip
         with ExitStack() as closing:
             with nullcontext() if quiet else compile_notices(say):
@@ -168,6 +177,8 @@ class Options:
     realtime: bool
     workers: int
     worker_device: str
+    web: str | None
+    quiet: bool
 
 
 def _set_up(closing: ExitStack, o: Options) -> "tuple[Service, Supervisor | None]":
@@ -182,10 +193,12 @@ def _set_up(closing: ExitStack, o: Options) -> "tuple[Service, Supervisor | None
     from sim_server.recording.recorder import Recorder
     from sim_server.service.service import Service
     from sim_server.service.supervisor import Supervisor
+    from sim_server.service.web_page import WebPage
     from sim_server.simulation import Simulation
 
     end_in_order()
     try:
+        page = _page_address(o.web)
         simulation = Simulation.load(o.scene, o.overrides, o.device)
         link = closing.enter_context(ServerLink(o.name, o.listen, o.connect, shared_memory=o.shared_memory))
         recorder = None
@@ -209,7 +222,24 @@ def _set_up(closing: ExitStack, o: Options) -> "tuple[Service, Supervisor | None
         supervisor = Supervisor(o.workers, o.name, [endpoint], ["--device", o.worker_device])
         closing.callback(supervisor.close)
         service.supervise(supervisor)
+    if page is not None:
+        endpoint = on_this_machine((o.listen or [DEFAULT_ENDPOINT])[0])
+        web = WebPage(o.name, endpoint, *page, quiet=o.quiet)
+        closing.callback(web.close)
+        service.check_page = web.check
     return service, supervisor
+
+
+def _page_address(web: str | None) -> tuple[str, int] | None:
+    """Returns host and port of the page, None without one. Raises InputError if it cannot be served there."""
+    from protocol.network.web_address import hindrance, web_address
+
+    if web is None:
+        return None
+    host, port = web_address(web)
+    if why := hindrance(host, port):
+        raise InputError(f"--web: {why}")
+    return host, port
 
 
 def _check_log_path(path: Path) -> None:

@@ -19,6 +19,7 @@ TOGETHER = {
     "tests/faults/": "real time",
     "tests/gpu/": "GPU",
     "tests/system/": "real time",
+    "tests/web/": "real time",
 }
 
 

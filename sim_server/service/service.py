@@ -74,6 +74,7 @@ class Service:
         self._start = Start(simulation)
         self._status_due = self._workers_due = self._pace_due = 0.0
         self.check_workers: Callable[[], None] = lambda: None  # called every WORKERS_PERIOD
+        self.check_page: Callable[[], None] = lambda: None  # as often
         self.pace = PaceMonitor(simulation.world.dt, self._advice, not self._on_gpu) if realtime else None
         self._loop_alone = not self.driver.wants_factors or self.driver.policy.free  # no step waits for Python
         self._first = self._first_factors(realtime)
@@ -140,6 +141,7 @@ class Service:
         if time.monotonic() >= self._workers_due:
             self._workers_due = time.monotonic() + WORKERS_PERIOD
             self.check_workers()
+            self.check_page()
             self.link.check_name()
         self._carry_out()
         if self._between.may_run:

@@ -66,6 +66,7 @@ def test_channels() -> None:
         (
             "preconditioners.md",
             f"after {first_factors.TIMEOUT:g} s, or after {first_factors.WORKER_TIMEOUT:g} s in which",
+        ),
         (
             "protocol.md",
             f"at most {commands.MOST_SET} parameters, keys of {commands.LONGEST_KEY} and values of "

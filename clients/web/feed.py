@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: MIT
+"""What the server tells: a connection that is made again when the server is gone, and the newest of everything.
+
+`Feed.link` has one connection; a thread of its own asks for the status and the parameters, so that a slow answer holds
+up no frame.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import threading
+import time
+from collections.abc import Sequence
+
+from clients.client import Client
+from clients.errors import BadInput, ClientError
+from clients.log.frames import Frame, Mesh
+from clients.log.obstacles import Obstacle, ObstacleFrame
+from protocol import messages_pb2 as pb
+
+STATUS_PERIOD = 0.5  # s between two questions for status and parameters
+LOST_AFTER = 2  # questions without an answer
+RETRY_PERIOD = 0.5  # s between two attempts to connect
+QUESTION_TIMEOUT = 2.0  # s
+
+log = logging.getLogger(__name__)
+
+
+class Link:
+    """One connection to one run of the server. Raises ClientError, BadInput."""
+
+    def __init__(self, server: str, connect: Sequence[str] | None) -> None:
+        self.client = Client(server, connect, timeout=QUESTION_TIMEOUT)
+        try:
+            self.scene: pb.Scene = self.client.scene()
+            self.meshes: dict[str, Mesh] = self.client.meshes()
+            self.obstacles: dict[str, Obstacle] = self.client.obstacles()
+            if set(self.scene.objects) != set(self.meshes):
+                raise ClientError("the server has not announced all its meshes")
+            self._states = self.client.states(sorted(self.meshes))
+            self._steps = self.client.steps()
+            self._poses = self.client.poses(sorted(self.obstacles)) if self.obstacles else None
+        except BaseException:
+            self.client.close()
+            raise
+        self.incarnation = self.scene.header.incarnation
+        self.status = pb.Status()
+        self.parameters: list[pb.LiveParameter] = []
+        self.lost = ""  # why the connection is over; empty: it is not
+        self._stop, self._asked = threading.Event(), threading.Event()
+        self._thread = threading.Thread(target=self._ask, name="status", daemon=True)
+        self._thread.start()
+
+    def frames(self) -> list[Frame]:
+        """Returns new frames, of each object the newest."""
+        return self._states.newest()
+
+    def steps(self) -> list[pb.ObjectStep]:
+        """Returns new steps of all objects."""
+        return self._steps.new()
+
+    def poses(self) -> list[ObstacleFrame]:
+        """Returns new poses, of each obstacle the newest."""
+        return self._poses.newest() if self._poses is not None else []
+
+    def ask_now(self) -> None:
+        """Has status and parameters asked for at once."""
+        self._asked.set()
+
+    def close(self) -> None:
+        self._stop.set()
+        self._asked.set()
+        with contextlib.suppress(Exception):  # zenoh's, of a session that is broken already
+            self.client.close()
+
+    def _ask(self) -> None:
+        failures = 0
+        while not self._stop.is_set():
+            try:
+                status = self.client.status()
+                if status.header.incarnation != self.incarnation:
+                    raise ClientError("the server was started again")
+                self.status, failures = status, 0
+                self.parameters = self.client.parameters()
+            except (ClientError, BadInput) as error:
+                failures += 1
+                if failures >= LOST_AFTER or "started again" in str(error):
+                    self.lost = str(error)
+                    return
+            except Exception:
+                if not self._stop.is_set():
+                    log.exception("the status of the server cannot be read")
+                    self.lost = "its status cannot be read"
+                return
+            self._asked.wait(STATUS_PERIOD)
+            self._asked.clear()
+
+
+class Feed:
+    """The link to the server while there is one. `error`: why there is none."""
+
+    def __init__(self, server: str, connect: Sequence[str] | None) -> None:
+        self.server, self.connect = server, connect
+        self.link: Link | None = None
+        self.error = ""
+        self._due = 0.0
+
+    def check(self) -> bool:
+        """Connects if that is due, drops a link that is lost; True if the link is another one than before."""
+        if self.link is not None:
+            if not self.link.lost:
+                return False
+            self.error = self.link.lost
+            self.link.close()
+            self.link, self._due = None, time.monotonic() + RETRY_PERIOD
+            return True
+        if time.monotonic() < self._due:
+            return False
+        self._due = time.monotonic() + RETRY_PERIOD
+        try:
+            self.link = Link(self.server, self.connect)
+        except ClientError as error:
+            self.error = str(error)
+            return False
+        self.error = ""
+        return True
+
+    def close(self) -> None:
+        if self.link is not None:
+            self.link.close()

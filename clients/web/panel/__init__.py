@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""What stands beside the bodies on the page: curves, tables, sliders, buttons."""

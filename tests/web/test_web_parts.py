@@ -1,0 +1,298 @@
+# SPDX-License-Identifier: MIT
+"""The page without a browser: surfaces, colours, curves, grabs, addresses, a server that goes and comes."""
+
+import json
+import urllib.request
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from clients.log.frames import Mesh
+from clients.web.decimate import decimated
+from clients.web.feed import Feed
+from clients.web.hand import Hand, described_objects, grip
+from clients.web.paint import BANDS, Paint, split
+from clients.web.panel.curves import POINTS, History
+from clients.web.panel.sliders import named, value_of
+from clients.web.panel.tables import tables
+from clients.web.surfaces import Surfaces
+from clients.web.view import home, up_of
+from protocol import messages_pb2 as pb
+from protocol.network.web_address import exposed, hindrance, shown, web_address
+from protocol.refused import Refused
+from sim_server.service.web_page import FIRST_PAUSE, WebPage
+from tests.clients.fake_server import FakeServer
+from tests.ports import free_port
+from tests.system.server_process import Stage, beam, until
+
+
+def grid(side: int) -> tuple[np.ndarray, np.ndarray]:
+    """A sheet of side x side points and its triangles, seen from +z."""
+    x, y = np.meshgrid(np.arange(side, dtype=float), np.arange(side, dtype=float), indexing="ij")
+    points = np.stack([x.ravel(), y.ravel(), np.zeros(side * side)], axis=1)
+    a = (np.arange(side - 1)[:, None] * side + np.arange(side - 1)).ravel()
+    return points, np.concatenate([np.stack([a, a + side, a + 1], 1), np.stack([a + 1, a + side, a + side + 1], 1)])
+
+
+def tet(object: str = "a", young: float = 1e5, shift: float = 0.0) -> Mesh:
+    """One tetrahedron with edges of 1 m along the axes."""
+    rest = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], float) + shift
+    sides = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32)
+    one = np.float32
+    return Mesh(
+        object=object, epoch=1, rest=rest, tets=np.array([[0, 1, 2, 3]], np.int32), triangles=sides,
+        fixed=np.zeros(0, np.int32), young=np.array([young], one), poisson=np.array([0.3], one),
+    )  # fmt: skip
+
+
+def test_a_coarser_surface_has_few_vertices_of_the_finer_one_and_covers_it() -> None:
+    points, triangles = grid(60)
+    kept, coarse = decimated(points, triangles, 400)
+    assert 200 < len(kept) <= 400 and len(set(kept)) == len(kept)
+    assert coarse.max() < len(kept)
+    corners = points[kept][coarse]
+    areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, 2] / 2
+    assert (areas > -1e-9).all()  # none is turned over
+    assert areas.sum() == pytest.approx(59**2, rel=0.15)
+
+
+def test_both_sides_of_a_thin_sheet_stay_apart() -> None:
+    points, triangles = grid(30)
+    both = np.concatenate([points, points - np.array([0, 0, 1e-3])])
+    kept, coarse = decimated(both, np.concatenate([triangles, triangles[:, ::-1] + len(points)]), 300)
+    below = both[kept][coarse][:, :, 2] < -5e-4
+    assert (below.all(axis=1) | ~below.any(axis=1)).all()
+    assert below.any() and not below.all()
+
+
+def test_surfaces_follow_nodes_and_refuse_what_does_not_fit() -> None:
+    surfaces = Surfaces({"a": tet(), "b": tet("b", shift=5.0)})
+    assert len(surfaces.points) == 8 and len(surfaces.triangles) == 8
+    moved = surfaces.parts["b"].mesh.rest + np.array([0, 0, 2])
+    assert surfaces.move("b", moved)
+    assert_allclose(surfaces.points[4:], moved)
+    assert surfaces.nearest(np.array([5.1, 5.1, 8.2])) == ("b", 7)
+    assert (
+        not surfaces.move("b", moved[:3]) and not surfaces.move("b", moved * np.nan) and not surfaces.move("c", moved)
+    )
+    assert_allclose(surfaces.points[4:], moved)
+
+
+def test_a_skin_is_drawn_in_place_of_the_surface() -> None:
+    mesh = tet()
+    skin = SimpleNamespace(
+        nodes=np.array([[0, 1, 2, 3]] * 3, np.int32), triangles=np.array([[0, 1, 2]], np.int32),
+        weights=np.array([[0.25] * 4, [1, 0, 0, 0], [0, 0.5, 0.5, 0]]),
+    )  # fmt: skip
+    surfaces = Surfaces({"a": SimpleNamespace(**vars(mesh), skin=skin)})  # type: ignore[dict-item]
+    surfaces.move("a", mesh.rest * 2)
+    assert_allclose(surfaces.points, [[0.5, 0.5, 0.5], [0, 0, 0], [1, 1, 0]], atol=1e-7)
+
+
+def test_bands_have_each_triangle_once_in_the_colour_of_its_value() -> None:
+    triangles = grid(20)[1]
+    band = (triangles[:, 0] * 3) % BANDS
+    found = split(triangles, band, [(k, k, k) for k in range(BANDS)])
+    assert_array_equal(
+        np.concatenate([b.vertices[b.triangles] for b in found]), triangles[np.argsort(band, kind="stable")]
+    )
+    assert [b.color[0] for b in found] == list(range(BANDS))
+
+
+@pytest.mark.parametrize(("mode", "legend"), [("displacement", "to 1 m"), ("von Mises stress", "Pa")])
+def test_the_largest_value_has_the_last_colour(mode: str, legend: str) -> None:
+    surfaces = Surfaces({"a": tet(), "b": tet("b", shift=5.0)})
+    paint = Paint(surfaces, mode)
+    before = paint.version
+    pulled = surfaces.parts["b"].mesh.rest.copy()
+    pulled[:, 0] = 5 + 2 * (pulled[:, 0] - 5)
+    surfaces.move("b", pulled)
+    paint.update()
+    assert paint.version > before and legend in paint.legend
+    last, first = paint.bands[-1].vertices, paint.bands[0].vertices
+    assert set(first) >= {0, 1, 2, 3} and set(last) <= {4, 5, 6, 7}
+    assert mode == "displacement" or set(last) == {
+        4,
+        5,
+        6,
+        7,
+    }  # of a displacement triangles have the mean of their corners
+
+
+def test_materials_have_a_colour_each() -> None:
+    paint = Paint(Surfaces({"a": tet(), "b": tet("b", young=1e6, shift=5.0), "c": tet("c", shift=9.0)}), "material")
+    assert [len(band.triangles) for band in paint.bands][:2] == [8, 4]
+    assert "1e+05, 1e+06" in paint.legend
+
+
+def test_curves_show_the_worst_of_several_steps_and_begin_anew_after_a_reset() -> None:
+    history = History(["a"])
+    header = pb.Header(object="a")
+    for step in range(1000):
+        count = 77 if step == 501 else 5
+        history.add([pb.ObjectStep(header=header, time=0.005 * step, iterations=count, factor_age=-1, residual=1e-7)])
+    times, (iterations,) = history.columns("iterations")
+    assert len(times) <= POINTS and iterations.max() == 77
+    assert np.isnan(history.columns("age")[1][0]).all()
+    history.add([pb.ObjectStep(header=header, time=0.0, iterations=3)])
+    assert_array_equal(history.columns("iterations")[1][0], [3])
+
+
+def test_many_objects_share_one_curve() -> None:
+    history = History([f"o{k}" for k in range(9)])
+    history.add([pb.ObjectStep(header=pb.Header(object=f"o{k}"), time=1.0, iterations=k) for k in range(9)])
+    assert history.names == ["largest"]
+    assert_array_equal(history.columns("iterations")[1][0], [8])
+
+
+class Server:
+    """Remembers commands; the answer to a grab comes when the test says so."""
+
+    def __init__(self) -> None:
+        self.sent: list[tuple[str, int, float]] = []
+        self.answer: Callable[[pb.Reply | None], None] = lambda reply: None
+
+    def send(self, verb: str, interaction: pb.Interaction, answered: Callable[[pb.Reply | None], None]) -> int:
+        self.sent.append((verb, interaction.id, interaction.target.x))
+        if verb == "grab":
+            self.answer = answered
+        return len(self.sent)
+
+
+def hand(server: Server, refused: Callable[[str], None] = lambda why: None) -> Hand:
+    return Hand(server, "a", 0, (0, 0, 0), (0, 0, 0), 0.1, 10.0, 5.0, refused)  # type: ignore[arg-type]
+
+
+def test_a_grab_that_is_not_known_yet_is_moved_and_released_once_it_is() -> None:
+    server = Server()
+    held = hand(server)
+    held.move((1, 0, 0))
+    held.move((2, 0, 0))
+    assert [verb for verb, *_ in server.sent] == ["grab"]
+    server.answer(pb.Reply(interaction=pb.Interaction(id=9)))
+    held.move((3, 0, 0))
+    held.release()
+    held.release()
+    held.move((4, 0, 0))
+    assert server.sent[1:] == [("move", 9, 2), ("move", 9, 3), ("release", 9, 0)]
+    early = hand(server)
+    early.release()
+    server.answer(pb.Reply(interaction=pb.Interaction(id=10)))
+    assert server.sent[-1] == ("release", 10, 0)
+
+
+def test_a_refused_grab_is_told_once() -> None:
+    server, why = Server(), list[str]()
+    held = hand(server, why.append)
+    server.answer(pb.Reply(error="no"))
+    held.move((1, 0, 0))
+    held.release()
+    assert why == ["no"] and held.over and len(server.sent) == 1
+
+
+def test_a_spring_bears_the_weight_and_bends_what_is_stiff() -> None:
+    soft = grip(tet(young=1e2), {"density": 600, "effects": {"touch": {"max_force": 7}}})
+    assert soft.stiffness == pytest.approx(9.81 * 100 / (0.25 * soft.size)) and soft.limit == 7
+    stiff = grip(tet(young=1e9), {"density": [1], "effects": {"touch": True}})
+    assert stiff.stiffness == pytest.approx(0.02 * 1e9 * stiff.size) and stiff.limit == 1e4
+    assert described_objects(json.dumps({"object": [{"name": "a", "density": 3}]})) == {
+        "a": {"name": "a", "density": 3}
+    }
+    assert described_objects("no JSON") == {}
+
+
+def test_the_camera_sees_the_whole_box_from_above() -> None:
+    view = home(np.zeros(3), np.array([1.0, 2.0, 8.0]), up_of('{"effects": {"gravity": {"g": [0, -9.81, 0]}}}'))
+    assert_allclose(view.up, [0, 1, 0])
+    assert view.position[1] > 2 and view.position[0] - view.target[0] > abs(view.position[2] - view.target[2])
+    assert_allclose(up_of("{}"), [0, 1, 0])
+
+
+def test_names_and_values_of_parameters() -> None:
+    assert named("object.a.effects.corotational.young") == ("a", "corotational.young")
+    assert named("effects.gravity.g") == ("scene", "gravity.g") and named("dt") == ("scene", "dt")
+    assert named("obstacle.floor.friction") == ("floor", "friction")
+    assert value_of("[0, -1.5, 0]") == [0, -1.5, 0] and value_of("= no TOML") is None
+
+
+def test_names_in_tables_are_no_markup() -> None:
+    status = pb.Status(objects=[pb.ObjectStatus(object="<b>x</b>")])
+    assert "&lt;b&gt;x" in tables(status) and "<b>" not in tables(status)
+
+
+@pytest.mark.parametrize(
+    ("text", "found"), [("8081", ("127.0.0.1", 8081)), ("0.0.0.0:80", ("0.0.0.0", 80)), ("[::1]:9", ("::1", 9))]
+)
+def test_addresses_of_the_page(text: str, found: tuple[str, int]) -> None:
+    assert web_address(text) == found
+    assert bool(exposed(*found)) == (found[0] == "0.0.0.0")
+
+
+@pytest.mark.parametrize("text", ["", "host", "host:0", "host:70000", "a b:80", "8x"])
+def test_bad_addresses_are_refused(text: str) -> None:
+    with pytest.raises(Refused, match="HOST:PORT"):
+        web_address(text)
+
+
+def test_the_page_says_why_it_cannot_be_served(monkeypatch: pytest.MonkeyPatch) -> None:
+    with FakeServer() as taken:
+        port = int(taken.endpoint.rpartition(":")[2])
+        assert shown("127.0.0.1", port) in hindrance("127.0.0.1", port)
+    monkeypatch.setattr("protocol.network.web_address.find_spec", lambda name: None)
+    assert "pip install" in hindrance("127.0.0.1", 8080)
+
+
+def test_a_page_that_ends_is_started_again_after_a_pause_that_doubles() -> None:
+    now, started = [0.0], list[SimpleNamespace]()
+
+    def start(command: object) -> SimpleNamespace:
+        started.append(SimpleNamespace(returncode=None, poll=lambda: started[-1].returncode))
+        return started[-1]
+
+    page = WebPage("sim", "tcp/h:1", "127.0.0.1", 8080, clock=lambda: now[0], start=start)  # type: ignore[arg-type]
+    page.check()
+    assert len(started) == 1
+    for pause in (FIRST_PAUSE, 2 * FIRST_PAUSE):
+        started[-1].returncode, count = 1, len(started)
+        page.check()
+        now[0] += 0.9 * pause
+        page.check()
+        assert len(started) == count
+        now[0] += 0.2 * pause
+        page.check()
+        assert len(started) == count + 1
+
+
+@pytest.mark.system
+def test_a_page_notices_that_its_server_is_gone() -> None:
+    with FakeServer() as server:
+        feed = Feed("sim", [server.endpoint])
+        assert feed.check() and feed.link is not None
+        assert set(feed.link.meshes) == {"beam", "liver"}
+    try:
+        until(feed.check, "the loss of the server")
+        assert feed.link is None and feed.error
+    finally:
+        feed.close()
+
+
+@pytest.mark.system
+def test_a_server_starts_a_page_and_ends_it(tmp_path: Path) -> None:
+    pytest.importorskip("viser")
+    stage, port = Stage(tmp_path), free_port()
+    try:
+        server = stage.server(beam(tmp_path), "--web", str(port))
+        address = f"http://127.0.0.1:{port}"
+        until(lambda: address in server.output(), "a page")
+        with urllib.request.urlopen(address, timeout=60) as answer:
+            assert answer.status == 200 and b"<html" in answer.read(1000).lower()
+        assert server.end() == 0
+        assert not hindrance("127.0.0.1", port)  # nobody listens there any more
+        again = stage.server(beam(tmp_path), "--web", "nonsense:1x")
+        assert again.wait() == 2 and "HOST:PORT" in again.output()
+    finally:
+        stage.close()
