@@ -11,10 +11,11 @@ is an older factor.
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from sim_server.backends.base import ArrayChange, Engine, PendingUpdate
 from sim_server.effects._base import Effect
@@ -165,16 +166,21 @@ class LiveParameters:
 
     def _reason(self, key: str) -> str:
         """Returns why the value of a key of the scene cannot change; "" if there is no such key."""
-        table = self.scene.resolved()
-        tables = [("", table), ("effects.", table.get("effects", {})), ("", table.get("effects", {}))]
-        for kind in NAMED:
-            for named in table.get(kind, []):
-                inside = named | named.get("effects", {})  # of an object: NAME.EFFECT.KEY
-                tables += [(f"{begin}{named['name']}.", inside) for begin in (f"{kind}.", "")]
-        for begin, inside in tables:
-            path = key.removeprefix(begin).split(".")
-            if key.startswith(begin) and _at(inside, path) is not None:
-                return next((why for name, why in REASONS.items() if path[0] == name), OTHER_REASON)
+        scene, effects = self.scene, self.scene.effects
+        tables: list[tuple[str, Callable[[str], Any]]] = [("", partial(_field, scene))]
+        tables += [(begin, effects.get) for begin in ("effects.", "")]
+        for o in scene.objects:  # NAME.KEY, NAME.EFFECT.KEY
+            for begin in (f"object.{o.name}.", f"{o.name}."):
+                tables += [(begin, partial(_field, o)), (begin, o.effects.get)]
+        for listed in (scene.obstacles, scene.holders, scene.attachments, scene.springs):
+            for named in listed or ():
+                kind = type(named).__name__.lower()
+                tables += [(f"{begin}{named.name}.", partial(_field, named)) for begin in (f"{kind}.", "")]
+        for begin, find in tables:
+            if key.startswith(begin):
+                first, *path = key.removeprefix(begin).split(".")
+                if _at(_plain(find(first)), path) is not None:
+                    return next((why for name, why in REASONS.items() if first == name), OTHER_REASON)
         return ""
 
     def _validated(self, draft: dict[str, Any]) -> Scene:
@@ -251,6 +257,8 @@ class LiveParameters:
 
 def _plain(value: Any) -> Any:
     """Returns the value of a field as JSON has it."""
+    if isinstance(value, dict):
+        return {key: _plain(each) for key, each in value.items()}
     if hasattr(value, "model_dump"):
         return value.model_dump(mode="json", by_alias=True, exclude_none=True)
     return [_plain(v) for v in value] if isinstance(value, (list, tuple)) else value
@@ -288,6 +296,10 @@ def _draft(scene: Scene, places: Sequence[Place], kinds: Iterable[str] = ()) -> 
         listed: Sequence[SceneObject | Obstacle] = scene.objects if kind == "object" else scene.obstacles or []
         draft[kind] = [_plain(each) if index in touched else _named(each) for index, each in enumerate(listed)]
     return draft
+
+
+def _field(table: BaseModel, name: str) -> Any:
+    return getattr(table, name) if name in type(table).model_fields else None
 
 
 def _named(table: Any) -> dict[str, Any]:
