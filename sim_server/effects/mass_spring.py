@@ -37,7 +37,7 @@ from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 from sim_server.arrays import Float64, Int32, Int64
 from sim_server.backends.base import Launch
 from sim_server.backends.energies import ElementEnergies
-from sim_server.effects._base import Effect, params_in
+from sim_server.effects._base import Effect, PerBody, params_in
 from sim_server.errors import InputError
 from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.world import Body, World
@@ -115,16 +115,15 @@ class MassSpring(Effect):
         self.world, self.bodies = world, [body for body, _ in listed]
         self.elastic = world.at_start(self.elastic_in)
         self._from_files = any(isinstance(params.springs, str) for _, params in listed)
-        pairs = [_pairs(body, params) for body, params in listed]  # files are read once
-        parts = [_springs(body, params, own) for (body, params), own in zip(listed, pairs, strict=True)]
+        pairs = {body.index: _pairs(body, params) for body, params in listed}  # files are read once
+        springs = PerBody("mass_spring", self.bodies, lambda body, params: _springs(body, params, pairs[body.index]))
+        parts = world.at_start(springs)
         ends = np.concatenate([part[0] for part in parts])
         order = np.argsort(ends.min(axis=1), kind="stable")  # neighbours in memory
         self.elements: Int32 = np.ascontiguousarray(ends[order])
 
         def now(scene: Scene, part: int) -> Float64:
-            given = params_in(scene, "mass_spring", self.bodies)
-            parts = [_springs(*of)[part] for of in zip(self.bodies, given, pairs, strict=True)]
-            return np.asarray(np.concatenate(parts)[order])
+            return np.asarray(np.concatenate([found[part] for found in springs(scene)])[order])
 
         self.stiffness = world.follow("mass_spring", compute=lambda scene: now(scene, 1))
         self.length = world.follow("mass_spring", compute=lambda scene: now(scene, 2))

@@ -48,6 +48,7 @@ HOLD_PERIOD = 1e-4  # the same while the loop is to stand still
 WORKERS_PERIOD = 0.02  # s between checks of local workers
 SILENT_WAIT = 0.5  # s of waiting for first factors before a line tells of it
 STATUS_INTERVAL = 0.02  # s between two statuses that clients request, at least
+MAX_SETS = 64  # commands that wait to set parameters
 LOOP_NICE = -5  # of the loop's thread in real time: before workers, clients and our own threads on a full machine
 ENDLESS = 1 << 62
 
@@ -72,7 +73,8 @@ class Service:
         self._halts = Halts(self.commands)
         self._between = BetweenSteps(self.engine.loop)
         self._start = Start(simulation)
-        self._status_due = self._workers_due = self._pace_due = 0.0
+        self._sets: deque[tuple[pb.Command, Callable[[pb.Reply], None]]] = deque()  # that set parameters
+        self._status_due = self._workers_due = self._pace_due = self._set_due = 0.0
         self.check_workers: Callable[[], None] = lambda: None  # called every WORKERS_PERIOD
         self.check_page: Callable[[], None] = lambda: None  # as often
         self.pace = PaceMonitor(simulation.world.dt, self._advice, not self._on_gpu) if realtime else None
@@ -144,10 +146,6 @@ class Service:
             self.check_page()
             self.link.check_name()
         self._carry_out()
-        if self._between.may_run:
-            self._drain()
-            self._between.run()
-        self._halts.answer()
         self._publish_status()
         if not self._awaits_factors():
             self._check_pace()
@@ -163,6 +161,9 @@ class Service:
         done: list[pb.Command] = []
         with self.commands.together():
             for command, reply in waiting:
+                if command.verb == "set":
+                    self._defer(command, reply)
+                    continue
                 if command.verb == "status":
                     self._status_replies.append(reply)
                     continue
@@ -179,17 +180,6 @@ class Service:
         for reply, answer in answers:
             reply(answer)
 
-    def _reset(self, name: str, reply: Callable[[pb.Reply], None], answer: pb.Reply) -> None:
-        """Puts an object or all back to the start, while the loop stands still."""
-        if self.simulation.touch is not None:
-            self.simulation.touch.release_of(name)
-        self._start.reset(name)
-        for state in self.driver.bodies:
-            if name in ("", state.body.name):
-                state.frozen = False
-        self.telemetry.on_reset(name, self.commands.engine_paused)
-        self.commands.stamp(answer.status)
-        reply(answer)
 
     def _publish_status(self) -> None:
         """Publishes one status for all requests since the last: it costs more than any other command."""
