@@ -70,10 +70,9 @@ def test_server_worker_client_and_log(stage: Stage, tmp_path: Path) -> None:
     assert data["scalars/step"].tolist() == list(range(1, 151))
     assert np.allclose(data["time"], 0.02 * data["step"])
     assert set(data["scalars/status"]) == {"converged"} and data["scalars/residual"].max() <= 1e-6
-    helped = data["scalars/factor_step"] >= 0
-    iterations = data["scalars/iterations"]
-    assert helped.sum() > 100 and iterations[helped].mean() < iterations[~helped].mean() / 4
-    assert (data["scalars/factor_age"][helped] >= 1).all()
+    ages = data["scalars/factor_age"]
+    assert ages[0] == 0 and (ages[1:] >= 1).all(), "the first step has waited for its own factor, the others for none"
+    assert data["scalars/iterations"].max() < 15, "without a factor it takes several times as many"
     pushed = [step.step for step in logged(log, "/step/beam") if step.interactions]
     assert len(logged(log, "/interaction/beam")) == 1 and len(pushed) == 10, "0.2 s of push are ten steps"
 
