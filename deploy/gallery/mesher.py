@@ -165,7 +165,7 @@ def _compact(x: Floats, tets: Ints) -> tuple[Floats, Ints]:
 
 
 def _moved(shape: Shape, x: Floats, tets: Ints, cell: float, weight: float) -> Floats:
-    """Returns the positions of least distortion and distance, by the method of Fletcher and Reeves' successors, L-BFGS.
+    """Returns the positions of least distortion and distance.
 
     weight: of squared distances [cell^2] beside the distortion of an element
     """

@@ -79,6 +79,16 @@ def test_elements_are_good_and_bodies_may_be_touched(name: str) -> None:
         assert "touch" in o.effects
 
 
+def test_its_page_shows_each_scene_with_its_sentence_and_its_command() -> None:
+    docs = Path(__file__).parents[2] / "docs"
+    parts = dict(part.split("\n", 1) for part in (docs / "gallery.md").read_text().split("\n## ")[1:])
+    for name in gallery.names():
+        assert f"sim-server gallery/{name} --workers 1\n" in parts[name]
+        assert gallery.sentence(name) in parts[name] and f"](figures/gallery/{name}.png)" in parts[name]
+        assert (docs / "figures" / "gallery" / f"{name}.png").stat().st_size < 200_000
+    assert (docs / "figures" / "creature.gif").stat().st_size < 1_500_000
+
+
 @pytest.mark.parametrize("name", sorted(LITRES))
 def test_meshes_and_skins_are_closed(name: str) -> None:
     found = read(gallery.FOLDER / f"{name}.msh")
