@@ -19,6 +19,7 @@ ARGUMENTS = (
     "--disable-backgrounding-occluded-windows",
 )  # fmt: skip
 FIELD_OF_VIEW = math.radians(75)  # of viser's camera, vertical
+PATIENCE = 90_000.0  # ms that a step in the browser may take: it draws in software, maybe on a full machine
 SIZE = {"width": 900, "height": 480}
 
 
@@ -80,10 +81,11 @@ def pixels(tab: Any, at: tuple[float, float], size: int = 40) -> NDArray[np.int6
     return np.array(tab.evaluate(READ, [*at, size])).reshape(size, size, 4)
 
 
-def open_page(browser: Any, address: str, size: dict[str, int] | None = None) -> Any:
-    """Opens the page in a tab of its own, and waits until it is connected and has a body to show."""
+def open_page(browser: Any, address: str, size: dict[str, int] | None = None, script: str = KEEP) -> Any:
+    """Opens the page in a tab of its own, and waits until it is connected. script: runs in it before all others."""
     tab = browser.new_page(viewport=size or SIZE)
-    tab.add_init_script(KEEP)
+    tab.set_default_timeout(PATIENCE)
+    tab.add_init_script(script)
     tab.goto(address)
     tab.get_by_text("running", exact=True).first.wait_for()
     tab.get_by_text("This tab", exact=True).wait_for()
@@ -91,6 +93,18 @@ def open_page(browser: Any, address: str, size: dict[str, int] | None = None) ->
     with contextlib.suppress(Exception):  # viser's note about WebGL in software
         tab.locator(".mantine-Notification-closeButton").first.click(timeout=500)
     return tab
+
+
+def field(tab: Any, label: str) -> Any:
+    """Returns the visible input beside a label of the panel."""
+    beside = "xpath=ancestor::*[.//input][1]//input[not(@type='hidden')]"
+    return tab.locator("label", has_text=label).locator(beside).first
+
+
+def choose_colour(tab: Any, mode: str) -> None:
+    """Has a tab colour its bodies so (clients.web.paint.MODES)."""
+    field(tab, "colour").click()
+    tab.get_by_role("option", name=mode, exact=True).click()
 
 
 def on_screen(tab: Any, view: View, point: Sequence[float] | NDArray) -> tuple[float, float]:
