@@ -23,6 +23,7 @@ PAGES = (
     "scheduler",
     "scaling",
     "haptics",
+    "web",
     "faults",
 )
 
