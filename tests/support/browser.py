@@ -56,6 +56,8 @@ HTMLCanvasElement.prototype.getContext = function (kind, options) {
     return get.call(this, kind, kind.startsWith("webgl") ? {...options, preserveDrawingBuffer: true} : options);
 };
 """
+# Closes viser's note about WebGL in software.
+NO_NOTES = "() => document.querySelectorAll('.mantine-Notification-root button').forEach((button) => button.click())"
 # The charts have canvases too; the scene's is the largest.
 CANVAS = """
 const canvas = Array.from(document.querySelectorAll("canvas")).reduce(
@@ -90,8 +92,7 @@ def open_page(browser: Any, address: str, size: dict[str, int] | None = None, sc
     tab.get_by_text("running", exact=True).first.wait_for()
     tab.get_by_text("This tab", exact=True).wait_for()
     tab.wait_for_function(f"() => {{ {CANVAS} return canvas.width * canvas.height > 40_000; }}")
-    with contextlib.suppress(Exception):  # viser's note about WebGL in software
-        tab.locator(".mantine-Notification-closeButton").first.click(timeout=500)
+    tab.evaluate(NO_NOTES)
     return tab
 
 

@@ -310,10 +310,9 @@ def test_a_server_starts_a_page_and_ends_it(tmp_path: Path) -> None:
         until(lambda: address in server.output(), "a page")
         with urllib.request.urlopen(address, timeout=60) as answer:
             assert answer.status == 200 and b"<html" in answer.read(1000).lower()
+        foreign_request = urllib.request.Request(address, headers={"Origin": "http://evil.example"})
         with pytest.raises(urllib.error.HTTPError, match="403"):
-            urllib.request.urlopen(
-                urllib.request.Request(address, headers={"Origin": "http://evil.example"}), timeout=60
-            )
+            urllib.request.urlopen(foreign_request, timeout=60)
         assert server.end() == 0
         assert not hindrance("127.0.0.1", port)  # nobody listens there any more
         again = stage.server(beam(tmp_path), "--web", "nonsense:1x")

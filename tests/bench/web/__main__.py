@@ -65,7 +65,8 @@ def process(package: str, *words: str, log: Path) -> Iterator[Any]:
 @contextlib.contextmanager
 def page(endpoint: str, folder: Path) -> Iterator[str]:
     """The page of a server; its address."""
-    port, log = free_port(), folder / "page.log"
+    port = free_port()
+    log = folder / f"page-{port}.log"
     with process("clients", "web", "--connect", endpoint, "--port", str(port), log=log):
         end = time.monotonic() + PATIENCE
         while "the page is at" not in log.read_text() and time.monotonic() < end:
@@ -74,13 +75,13 @@ def page(endpoint: str, folder: Path) -> Iterator[str]:
 
 
 @contextlib.contextmanager
-def served(folder: Path, *settings: str) -> Iterator[tuple[Client, str]]:
-    """A server of the beam with a worker whose factor is in use, and a client of it; its endpoint."""
+def served(folder: Path, *settings: str, scene: Path = BEAM) -> Iterator[tuple[Client, str]]:
+    """A server with a worker whose factor is in use, and a client of it; its endpoint."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     words = [word for setting in settings for word in ("--set", setting)]
     log = folder / "server.log"
     with process(
-        "sim_server", str(BEAM), "--listen", endpoint, "--workers", "1", "--device", "cpu", "--quiet", *words, log=log
+        "sim_server", str(scene), "--listen", endpoint, "--workers", "1", "--device", "cpu", "--quiet", *words, log=log
     ):
         end = time.monotonic() + PATIENCE
         while True:
