@@ -1,29 +1,30 @@
 # SPDX-License-Identifier: MIT
 """Changes parameters of a scene while steps run: checks them as at the start, gives the loop new contents of arrays.
 
-What may change is marked beside its field (scene/live.py). A new value goes into a copy of the resolved scene, which
-is validated as a whole; what differs afterwards must be what was set. The arrays that follow these parameters
+What may change is marked beside its field (scene/live.py). A new value goes into a copy of its table, with which
+the scene is validated as a whole; what differs afterwards must be what was set. The arrays that follow these parameters
 (World.follow) are computed by the functions that made them, and the loop copies the results into them between two
 steps, without Python: launches, their arguments, factors and histories stay as they are. A factor of other parameters
 is an older factor.
 """
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from copy import deepcopy
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from sim_server.backends.base import ArrayChange, Engine, PendingUpdate
 from sim_server.effects._base import Effect
 from sim_server.errors import InputError
 from sim_server.mechanics.world import World
-from sim_server.scene import Scene, overrides
+from sim_server.scene import Scene, SceneObject, overrides
 from sim_server.scene.live import LiveField, Place, live_fields
 from sim_server.scene.messages import NAMED, readable
+from sim_server.scene.obstacles import Obstacle
 from sim_server.scene.parameters import nearest
 
 REASONS = {  # why keys cannot change while steps run, by how they begin
@@ -95,7 +96,6 @@ class LiveParameters:
         self._simulation, self.scene = simulation, simulation.scene
         self.on_set: list[Callable[[ParameterUpdate], None]] = []
         self._start = {field.key: field.value for field in live_fields(self.scene)}
-        self._table: dict[str, Any] | None = None  # the scene as TOML has it
         self._waiting: dict[int, ArrayChange] = {}  # by id of the array: what the loop was given last
         self._update: ParameterUpdate | None = None  # likewise
         self._first: ParameterUpdate | None = None  # the first one that the loop took up, or is to
@@ -117,7 +117,6 @@ class LiveParameters:
 
         Raises BadParameter; nothing changes then.
         """
-        table = deepcopy(self._table or self._simulation.scene.resolved())
         fields = {field.key: field for field in live_fields(self.scene)}
         given: dict[str, LiveField] = {}
         for key, text in values.items():
@@ -125,18 +124,21 @@ class LiveParameters:
             if field.key in given:
                 raise BadParameter(f"{field.key} is set twice")
             given[field.key] = field
+        draft = _draft(self.scene, [f.place for f in given.values()])
+        for (key, text), field in zip(values.items(), given.values(), strict=True):
             try:
-                overrides.assign(field.key, overrides.value(text.strip()), text, table)
+                overrides.assign(field.key, overrides.value(text.strip()), text, draft)
             except InputError as error:
                 raise BadParameter(f"{key} = {text}: {error}") from None
-        scene = self._validated(table)
-        resolved = scene.resolved()
-        changed = [f for f in given.values() if _at(resolved, f.place) != _at(self._present(), f.place)]
-        self._check(scene, resolved, changed)
+        scene = self._validated(draft)
+        new = {f.key: f for f in live_fields(scene) if f.key in given}
+        if len(new) < len(given):
+            raise BadParameter(f"{', '.join(given.keys() - new.keys())}: needs a value")
+        changed = [f for f in new.values() if _plain(f.value) != _plain(given[f.key].value)]
+        self._check(scene, draft, changed)
         if changed:
             self._give(scene, changed, client)
-            self._table = resolved
-        return [self._described(f) for f in live_fields(scene) if f.key in given]
+        return [self._described(new[key]) for key in given]
 
     def known_to_workers_at(self, step: int) -> bool:
         """True if the matrix assembled after `step` completed steps has the parameters of the start."""
@@ -147,9 +149,6 @@ class LiveParameters:
     def known_to_workers(self) -> bool:
         """True if no parameter was set: workers that assemble matrices know those of the start."""
         return self._first is None
-
-    def _present(self) -> dict[str, Any]:
-        return self._table or self._simulation.scene.resolved()
 
     def _found(self, key: str, text: str, fields: Mapping[str, LiveField]) -> LiveField:
         found = [f for f in fields.values() if key in (f.key, f.short)]
@@ -167,28 +166,42 @@ class LiveParameters:
 
     def _reason(self, key: str) -> str:
         """Returns why the value of a key of the scene cannot change; "" if there is no such key."""
-        table = self._present()
-        tables = [("", table), ("effects.", table.get("effects", {})), ("", table.get("effects", {}))]
-        for kind in NAMED:
-            for named in table.get(kind, []):
-                inside = named | named.get("effects", {})  # of an object: NAME.EFFECT.KEY
-                tables += [(f"{begin}{named['name']}.", inside) for begin in (f"{kind}.", "")]
-        for begin, inside in tables:
-            path = key.removeprefix(begin).split(".")
-            if key.startswith(begin) and _at(inside, path) is not None:
-                return next((why for name, why in REASONS.items() if path[0] == name), OTHER_REASON)
+        scene, effects = self.scene, self.scene.effects
+        tables: list[tuple[str, Callable[[str], Any]]] = [("", partial(_field, scene))]
+        tables += [(begin, effects.get) for begin in ("effects.", "")]
+        for o in scene.objects:  # NAME.KEY, NAME.EFFECT.KEY
+            for begin in (f"object.{o.name}.", f"{o.name}."):
+                tables += [(begin, partial(_field, o)), (begin, o.effects.get)]
+        for listed in (scene.obstacles, scene.holders, scene.attachments, scene.springs):
+            for named in listed or ():
+                kind = type(named).__name__.lower()
+                tables += [(f"{begin}{named.name}.", partial(_field, named)) for begin in (f"{kind}.", "")]
+        for begin, find in tables:
+            if key.startswith(begin):
+                first, *path = key.removeprefix(begin).split(".")
+                if _at(_plain(find(first)), path) is not None:
+                    return next((why for name, why in REASONS.items() if first == name), OTHER_REASON)
         return ""
 
-    def _validated(self, table: dict[str, Any]) -> Scene:
+    def _validated(self, draft: dict[str, Any]) -> Scene:
+        """Returns the scene with the tables of a draft, validated as a whole. Raises BadParameter."""
+        table = {field.alias or name: getattr(self.scene, name) for name, field in Scene.model_fields.items()}
+        for kind, new in draft.items():
+            whole = isinstance(new, dict)
+            table[kind] = new if whole else [n if len(n) > 1 else o for n, o in zip(new, table[kind], strict=True)]
         try:
-            return Scene.model_validate(table, context={"files": "known"})
+            return Scene.model_validate({k: v for k, v in table.items() if v is not None}, context={"files": "known"})
         except ValidationError as error:
-            raise BadParameter(str(readable(error, "", table)).removeprefix("scene , ")) from None
+            names = {kind: [_named(each) for each in table[kind] or ()] for kind in NAMED}
+            raise BadParameter(str(readable(error, "", names | draft)).removeprefix("scene , ")) from None
 
-    def _check(self, scene: Scene, resolved: dict[str, Any], changed: Sequence[LiveField]) -> None:
+    def _check(self, scene: Scene, draft: Mapping[str, Any], changed: Sequence[LiveField]) -> None:
         """Raises BadParameter for what cannot change while steps run."""
         places = [field.place for field in changed]
-        for place in _differing(self._present(), resolved):
+        old, new = _draft(self.scene, places, draft), _draft(scene, places, draft)
+        for name in Scene.model_fields.keys() - {"effects", "objects", "obstacles"}:
+            old[name], new[name] = getattr(self.scene, name), getattr(scene, name)
+        for place in _differing(old, new):
             if not any(place[: len(p)] == p for p in places):
                 raise BadParameter(f"would change {'.'.join(map(str, place))}, which cannot change while steps run")
         for effect in self._simulation.effects.values():
@@ -215,8 +228,7 @@ class LiveParameters:
                 raise BadParameter("gives values that are not finite")
         for effect, found in elastic.items():
             effect.elastic = found
-        texts = {f.key: toml(_plain(f.value)) for f in live_fields(scene) if f.key in {c.key for c in changed}}
-        update = ParameterUpdate(texts, client)
+        update = ParameterUpdate({f.key: toml(_plain(f.value)) for f in changed}, client)
         if simulation.engine.withdraw_changes():
             assert self._update is not None
             update.values, update.replaces = self._update.values | update.values, self._update
@@ -245,6 +257,8 @@ class LiveParameters:
 
 def _plain(value: Any) -> Any:
     """Returns the value of a field as JSON has it."""
+    if isinstance(value, dict):
+        return {key: _plain(each) for key, each in value.items()}
     if hasattr(value, "model_dump"):
         return value.model_dump(mode="json", by_alias=True, exclude_none=True)
     return [_plain(v) for v in value] if isinstance(value, (list, tuple)) else value
@@ -266,6 +280,31 @@ def _at(table: Any, place: Sequence[str | int]) -> Any:
         else:
             table = table.get(part) if isinstance(table, dict) else None
     return table
+
+
+def _draft(scene: Scene, places: Sequence[Place], kinds: Iterable[str] = ()) -> dict[str, Any]:
+    """Returns as JSON the tables that hold these places; others in the same list have their name alone.
+
+    kinds: lists and tables to be there in any case
+    """
+    draft: dict[str, Any] = {}
+    for kind in {*kinds, *(str(place[0]) for place in places)}:
+        if kind == "effects":
+            draft[kind] = {name: _plain(params) for name, params in scene.effects.items()}
+            continue
+        touched = {place[1] for place in places if place[0] == kind}
+        listed: Sequence[SceneObject | Obstacle] = scene.objects if kind == "object" else scene.obstacles or []
+        draft[kind] = [_plain(each) if index in touched else _named(each) for index, each in enumerate(listed)]
+    return draft
+
+
+def _field(table: BaseModel, name: str) -> Any:
+    return getattr(table, name) if name in type(table).model_fields else None
+
+
+def _named(table: Any) -> dict[str, Any]:
+    """Returns the name alone of a table in a list."""
+    return {"name": table["name"] if isinstance(table, dict) else table.name}
 
 
 def _differing(old: Any, new: Any, place: Place = ()) -> Iterator[Place]:

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Base of the effects: elements that couple nodes, and launches that add to the system of a step."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, Protocol
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
@@ -14,6 +14,8 @@ from sim_server.backends.energies import ElementEnergies
 from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.world import Body, World
 from sim_server.scene import Scene
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -139,6 +141,24 @@ class Build(Protocol):
 def params_in(scene: Scene, name: str, bodies: Sequence[Body]) -> list[Any]:
     """Returns the parameters that bodies have in a scene, maybe with other values than at the start."""
     return [scene.objects[body.index].effects[name] for body in bodies]
+
+
+class PerBody(Generic[T]):
+    """A function of bodies and their parameters, which is called again only for other parameters than the last.
+
+    name: of the effect whose parameters these are. compute: may raise InputError
+    """
+
+    def __init__(self, name: str, bodies: Sequence[Body], compute: Callable[[Body, Any], T]):
+        self._name, self._bodies, self._compute = name, bodies, compute
+        self._last: dict[int, tuple[Any, T]] = {}  # by index of the body: parameters, result
+
+    def __call__(self, scene: Scene) -> list[T]:
+        """Returns the results by the parameters of a scene, in the order of the bodies."""
+        for body, params in zip(self._bodies, params_in(scene, self._name, self._bodies), strict=True):
+            if body.index not in self._last or self._last[body.index][0] is not params:
+                self._last[body.index] = params, self._compute(body, params)
+        return [self._last[body.index][1] for body in self._bodies]
 
 
 def per_node(world: World, listed: list[tuple[Body, Any]], value: str) -> Float64:

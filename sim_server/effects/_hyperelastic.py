@@ -55,7 +55,7 @@ from pydantic import Field, create_model
 from sim_server.arrays import Float64, Int32
 from sim_server.backends.base import Launch
 from sim_server.backends.energies import ElementEnergies
-from sim_server.effects._base import Effect, Refusal, params_in
+from sim_server.effects._base import Effect, PerBody, Refusal
 from sim_server.errors import InputError
 from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.world import Body, World
@@ -147,6 +147,7 @@ class Tetrahedra(Effect):
 
     def __init__(self, world: World, listed: list[tuple[Body, Any]]):
         self.world, self.bodies = world, [body for body, _ in listed]
+        self._constants_of: PerBody[Values] | None = None
         tets = np.concatenate([body.tets for body, _ in listed])
         self.order = np.argsort(tets.min(axis=1), kind="stable")  # elements near in the mesh are near in memory
         self.elements: Int32 = np.ascontiguousarray(tets[self.order])
@@ -161,8 +162,9 @@ class Tetrahedra(Effect):
 
     def values_in(self, scene: Scene, law: Law) -> list[Values]:
         """Returns the constants of each body's elements by the parameters of a scene. Raises InputError."""
-        given = params_in(scene, law.name, self.bodies)
-        return [constants_of(law, body, params) for body, params in zip(self.bodies, given, strict=True)]
+        if self._constants_of is None:
+            self._constants_of = PerBody(law.name, self.bodies, partial(constants_of, law))
+        return self._constants_of(scene)
 
     def packed(self, law: Law) -> Float64:
         """Returns the constants (k, m) in the form of the kernel text, which follow the scene."""

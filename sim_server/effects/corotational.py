@@ -53,7 +53,7 @@ from pydantic import Field, model_validator
 from sim_server.arrays import Float64, Int32
 from sim_server.backends.base import Launch
 from sim_server.backends.energies import ElementEnergies
-from sim_server.effects._base import Effect, params_in
+from sim_server.effects._base import Effect, PerBody
 from sim_server.errors import InputError
 from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.world import Body, World
@@ -121,6 +121,7 @@ class Corotational(Effect):
         tets = np.concatenate([body.tets for body, _ in listed])
         order = np.argsort(tets.min(axis=1), kind="stable")  # elements near in the mesh are near in memory
         self.elements: Int32 = np.ascontiguousarray(tets[order])
+        self._constants = PerBody("corotational", self.rotated, _constants)
         self.elastic = world.at_start(self.elastic_in)
         volume, gradients = shape_gradients(world.rest, self.elements)
         self.gradients = np.ascontiguousarray(gradients.reshape(-1, 9).T)
@@ -142,8 +143,7 @@ class Corotational(Effect):
         self._energy = np.zeros(m)
 
     def elastic_in(self, scene: Scene) -> Mapping[int, tuple[Float64, Float64]]:
-        given = params_in(scene, "corotational", self.rotated)
-        return {body.index: _constants(body, params) for body, params in zip(self.rotated, given, strict=True)}
+        return {body.index: found for body, found in zip(self.rotated, self._constants(scene), strict=True)}
 
     def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
         assert stencil is not None

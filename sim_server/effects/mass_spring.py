@@ -37,7 +37,7 @@ from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 from sim_server.arrays import Float64, Int32, Int64
 from sim_server.backends.base import Launch
 from sim_server.backends.energies import ElementEnergies
-from sim_server.effects._base import Effect, params_in
+from sim_server.effects._base import Effect, PerBody, params_in
 from sim_server.errors import InputError
 from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.world import Body, World
@@ -115,15 +115,15 @@ class MassSpring(Effect):
         self.world, self.bodies = world, [body for body, _ in listed]
         self.elastic = world.at_start(self.elastic_in)
         self._from_files = any(isinstance(params.springs, str) for _, params in listed)
-        parts = [_springs(body, params) for body, params in listed]
+        pairs = {body.index: _pairs(body, params) for body, params in listed}  # files are read once
+        springs = PerBody("mass_spring", self.bodies, lambda body, params: _springs(body, params, pairs[body.index]))
+        parts = world.at_start(springs)
         ends = np.concatenate([part[0] for part in parts])
         order = np.argsort(ends.min(axis=1), kind="stable")  # neighbours in memory
         self.elements: Int32 = np.ascontiguousarray(ends[order])
 
         def now(scene: Scene, part: int) -> Float64:
-            given = params_in(scene, "mass_spring", self.bodies)
-            parts = [_springs(body, params)[part] for body, params in zip(self.bodies, given, strict=True)]
-            return np.asarray(np.concatenate(parts)[order])
+            return np.asarray(np.concatenate([found[part] for found in springs(scene)])[order])
 
         self.stiffness = world.follow("mass_spring", compute=lambda scene: now(scene, 1))
         self.length = world.follow("mass_spring", compute=lambda scene: now(scene, 2))
@@ -176,11 +176,21 @@ def _young(body: Body, params: Params) -> Float64:
         raise InputError(f"object {body.name!r}, effect mass_spring: {error}") from error
 
 
-def _springs(body: Body, params: Params) -> tuple[Int32, Float64, Float64]:
+def _pairs(body: Body, params: Params) -> Int64 | None:
+    """Returns the pairs of nodes that the scene lists, (k, 2); None for springs on the edges."""
+    if params.springs is None:
+        return None
+    try:
+        return _pairs_of(params.springs) if isinstance(params.springs, str) else np.array(params.springs, np.int64)
+    except InputError as error:
+        raise InputError(f"object {body.name!r}, effect mass_spring: {error}") from error
+
+
+def _springs(body: Body, params: Params, pairs: Int64 | None) -> tuple[Int32, Float64, Float64]:
     """Returns ends, stiffness and rest length of a body's springs."""
-    if params.young is None:
+    if pairs is not None:
         try:
-            return listed_springs(body, params)
+            return listed_springs(body, params, pairs)
         except InputError as error:
             raise InputError(f"object {body.name!r}, effect mass_spring: {error}") from error
     ends, stiffness, length = edge_springs(body.mesh.rest, body.mesh.tets, _young(body, params))
@@ -199,9 +209,11 @@ def edge_springs(rest: Float64, tets: Int32, young: Float64) -> tuple[Int32, Flo
     return ends, CALIBRATION * share / length**2, length
 
 
-def listed_springs(body: Body, params: Params) -> tuple[Int32, Float64, Float64]:
-    """Ends (of the scene), stiffness and length of the springs that the scene lists; raises InputError."""
-    ends = _pairs_of(params.springs) if isinstance(params.springs, str) else np.array(params.springs or [], np.int64)
+def listed_springs(body: Body, params: Params, ends: Int64) -> tuple[Int32, Float64, Float64]:
+    """Ends (of the scene), stiffness and length of the springs that the scene lists; raises InputError.
+
+    ends: (k, 2) node numbers of the body
+    """
     nodes = body.last - body.first
     if body.mesh.dropped:
         raise InputError(

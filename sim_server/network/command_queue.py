@@ -18,6 +18,8 @@ LIMITED = (
     "grab",
     "move",
     "move_obstacle",
+    "set",
+    "parameters",
 )  # verbs; with the others a client may owe a burst: it can always let go and stop
 
 ReplyFunction = Callable[[Reply], None]

@@ -154,6 +154,13 @@ class ServerLink:
             lambda: self._session.zenoh.put(name, data, congestion_control=zenoh.CongestionControl.BLOCK)
         )
 
+    def renew_topology(self, object: str, change: Callable[[Topology], None]) -> None:
+        """Changes the answer to queries for the topology of an object, whose epoch goes on."""
+        name = key("topology", self.name, object=object)
+        topology = Topology.FromString(self._queryables.answer(name))
+        change(topology)
+        self._queryables.set_answer(name, topology.SerializeToString())
+
     def set_scene(self, scene: Scene) -> None:
         """Sets the answer to queries for the scene."""
         self._queryables.set_answer(key("scene", self.name), self._encoded(scene))

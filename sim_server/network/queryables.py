@@ -65,6 +65,10 @@ class Queryables:
         """Sets the answer to queries of the key `name`."""
         self._answers[name] = answer
 
+    def answer(self, name: str) -> bytes:
+        """Returns the answer that was set; KeyError without one."""
+        return self._answers[name]
+
     def commands(self) -> list[PendingCommand]:
         """Returns the commands that came since the last call, each with the function that answers it."""
         return self._queue.take_all()

@@ -61,11 +61,16 @@ def topology(simulation: Simulation, body: Body) -> pb.Topology:
     )
     if any(pose.rotate) or any(pose.translate):
         message.reference = _bytes(body.mesh.rest, "<f8")
+    moduli(simulation, body, message)
+    return message
+
+
+def moduli(simulation: Simulation, body: Body, message: pb.Topology) -> None:
+    """Sets Young's moduli and Poisson's ratios of the elements in a topology, as they are now."""
     for e in simulation.effects.values():
         if body.index in e.elastic:
             young, poisson = e.elastic[body.index]
             message.young, message.poisson = _bytes(young, "<f4"), _bytes(poisson, "<f4")
-    return message
 
 
 def add_places(points: list[NamedPoints], status: pb.Status) -> None:

@@ -4,6 +4,7 @@
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel
@@ -12,7 +13,7 @@ if TYPE_CHECKING:
     from sim_server.scene.model import Scene
 
 Place = tuple[str | int, ...]
-NAMED = {"obstacles": "obstacle", "springs": "spring"}  # fields of a scene with live parameters, and their tables
+NAMED = {"obstacles": "obstacle"}  # fields of a scene with live parameters, and their tables
 
 
 @dataclass(frozen=True)
@@ -66,14 +67,22 @@ def live_fields(scene: "Scene") -> Iterator[LiveField]:
 
 
 def _fields(params: BaseModel, key: str, place: Place, short: str, of: str = "") -> Iterator[LiveField]:
-    for name, field in type(params).model_fields.items():
-        live = next((m for m in field.metadata if isinstance(m, Live)), None)
+    for name, live, unit, about in _marked(type(params)):
         value = getattr(params, name)
-        if live is not None and value is not None:
-            unit, about = unit_and_meaning(field.description or "")
-            yield LiveField(
-                f"{key}.{name}", (*place, name), f"{short}.{name}", of or name, live, unit, about, value
-            )  # fmt: skip
+        if value is not None:
+            where = f"{key}.{name}", (*place, name), f"{short}.{name}"
+            yield LiveField(*where, of or name, live, unit, about, value)
+
+
+@cache
+def _marked(model: type[BaseModel]) -> list[tuple[str, Live, str, str]]:
+    """Returns name, mark, unit and meaning of the live fields of a table."""
+    found = []
+    for name, field in model.model_fields.items():
+        live = next((m for m in field.metadata if isinstance(m, Live)), None)
+        if live is not None:
+            found.append((name, live, *unit_and_meaning(field.description or "")))
+    return found
 
 
 def unit_and_meaning(description: str) -> tuple[str, str]:

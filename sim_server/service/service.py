@@ -39,6 +39,7 @@ ROUND_PERIOD = 1e-3  # s that the service thread sleeps between rounds
 WORKERS_PERIOD = 0.02  # s between checks of local workers
 STATUS_INTERVAL = 0.02  # s between two statuses that clients request, at least
 HALT_TIMEOUT = 1.0  # s that the answer to `pause` or `stop` waits for the end of the step under way, at most
+MAX_SETS = 64  # commands that wait to set parameters
 MAX_HALTS = 64  # answers that wait for the end of a step at a time
 LOOP_NICE = -5  # of the loop's thread in real time: before workers, clients and our own threads on a full machine
 ENDLESS = 1 << 62
@@ -63,7 +64,8 @@ class Service:
         self._status_replies: list[Callable[[pb.Reply], None]] = []  # of clients that requested a status
         # deadline, reply and answer of each `pause` and `stop`
         self._halts: list[tuple[float, Callable[[pb.Reply], None], pb.Reply]] = []
-        self._status_due = self._workers_due = self._pace_due = 0.0
+        self._sets: deque[tuple[pb.Command, Callable[[pb.Reply], None]]] = deque()  # that set parameters
+        self._status_due = self._workers_due = self._pace_due = self._set_due = 0.0
         self.check_workers: Callable[[], None] = lambda: None  # called every WORKERS_PERIOD
         self.check_page: Callable[[], None] = lambda: None  # as often
         self.pace = PaceMonitor(simulation.world.dt, self._advice, not self._on_gpu) if realtime else None
@@ -116,6 +118,7 @@ class Service:
             self.check_page()
             self.link.check_name()
         self._carry_out()
+        self._set_parameters()
         self._answer_halts()
         self._publish_status()
         self._check_pace()
@@ -131,6 +134,9 @@ class Service:
         done: list[pb.Command] = []
         with self.commands.together():
             for command, reply in waiting:
+                if command.verb == "set":
+                    self._defer(command, reply)
+                    continue
                 if command.verb == "status":
                     self._status_replies.append(reply)
                     continue
@@ -144,6 +150,23 @@ class Service:
         self.telemetry.reactions.moved(done)
         for reply, answer in answers:
             reply(answer)
+
+    def _defer(self, command: pb.Command, reply: Callable[[pb.Reply], None]) -> None:
+        """Has parameters set in one of the next rounds."""
+        if len(self._sets) < MAX_SETS:
+            self._sets.append((command, reply))
+        else:
+            reply(pb.Reply(error=f"the server is busy: {MAX_SETS} commands wait to set parameters"))
+
+    def _set_parameters(self) -> None:
+        """Carries out the oldest command that sets parameters. With large bodies one takes as long as many rounds, so
+        that half of the time is kept for all else."""
+        begin = time.monotonic()
+        if self._sets and begin >= self._set_due:
+            command, reply = self._sets.popleft()
+            reply(self.commands.carry_out(command))
+            end = time.monotonic()
+            self._set_due = 2 * end - begin
 
     def _answer_halts(self, ended: bool = False) -> None:
         """Answers `pause` and `stop` once the loop has halted, with the number of its steps."""

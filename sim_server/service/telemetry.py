@@ -4,6 +4,7 @@
 import os
 import time
 from collections import Counter, deque
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -79,6 +80,8 @@ class Telemetry:
         self._has_viewers = False
         self._interactions: dict[int, pb.Interaction] = {}
         self._points: list[NamedPoints] = []
+        self._stale_moduli: set[str] = set()  # keys of parameters that were set
+        self.simulation.parameters.on_set.append(lambda update: self._stale_moduli.update(update.values))
 
     def open(self) -> None:
         """Sends scene, topologies and the initial state, before anything else, to log and network."""
@@ -222,11 +225,19 @@ class Telemetry:
             self.recorder.state(message, block=self.patient)
         self.contact.record_poses(step, poses, block=self.patient)
 
+    def _renew_moduli(self) -> None:
+        """Tells those who ask for topologies from now on of moduli that were set."""
+        stale, self._stale_moduli = self._stale_moduli, set()
+        for body in self.simulation.world.bodies:
+            if any(key.startswith(f"object.{body.name}.effects.") for key in stale):
+                self.link.renew_topology(body.name, partial(messages.moduli, self.simulation, body))
+
     def publish_status(self, state: str, force: bool = True, where: bool = False) -> None:
         """Publishes the status of the scene. where: with the places of its objects, which are fetched from a GPU."""
         if not self._is_due("status", STATUS_PERIOD) and not force:
             return
         self._due["status"] = time.monotonic() + STATUS_PERIOD
+        self._renew_moduli()
         loop, world = self.engine.loop, self.simulation.world
         p50, p99, most = self.percentiles()
         status = pb.Status(

@@ -5,12 +5,15 @@ import gc
 import threading
 import time
 import weakref
+from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
 
 from sim_server.backends.cpu.structs import REACTION, REACTION_KINDS
 from sim_server.backends.gpu.loop import BATCH, CAPACITY, FRAMES
+from sim_server.backends.gpu.mailbox import ChangeMailbox
 from sim_server.backends.gpu.structs import NEWTON_RESULT, PAIR_SUM, STAGE_RESULT
 from sim_server.backends.rosenbrock import FORMS
 from sim_server.errors import DeviceLost
@@ -515,3 +518,32 @@ def test_forces_wait_for_the_record_of_their_step():
     assert len(scene.loop.other_reactions()) == 0
     scene.loop.records()
     assert scene.loop.other_reactions()["step"].tolist() == [1, 2, 3, 4, 5]
+
+
+def test_parameters_are_copied_between_batches_all_together() -> None:
+    """In the order of the steps, with the graphs that make work of them around; what waits can be taken back."""
+    scene, order = FakeScene(), []
+    box, other = ChangeMailbox(scene.loop.loop), np.zeros(2)
+    for name, graph in (("before", 21), ("after", 22)):
+        scene.device.graphs[graph] = partial(lambda name: order.append((name, int(scene.argument[0]), other[1])), name)
+
+    def post(first: int, second: float) -> Any:
+        new = np.array([first]), np.array([0, second])
+        targets = zip((scene.argument, other), new, strict=True)
+        copies = [(int(a.ctypes.data), int(b.ctypes.data), int(a.nbytes)) for a, b in targets]
+        return box.post(copies, 21, 22, new)
+
+    scene.loop.run(3)
+    waits = post(5, 6.0)
+    assert box.withdraw() and not box.withdraw() and waits.taken == -1
+    scene.loop.run(2)
+    taken = post(7, 8.0)
+    assert taken.taken == -1
+    scene.loop.run(20)
+    assert not box.withdraw() and taken.taken == 5
+    assert scene.seen == [0] * 5 + [7] * 20
+    assert order == [("before", 0, 0.0), ("after", 7, 8.0)]
+    post(9, 9.0)
+    scene.device.fail = "on_device"
+    with pytest.raises(DeviceLost, match="on_device"):
+        scene.loop.run(1)

@@ -13,6 +13,7 @@ from sim_server.mesh import MOST_TETS
 from sim_server.network import command_queue, leases, rate_limiter, worker_registry
 from sim_server.recording import recorder
 from sim_server.scene import integrator_options, where
+from sim_server.service import commands
 from tests.docs.figures import DOCS, table_under
 
 UNITS = ((1 << 30, "GiB"), (1 << 20, "MiB"), (1 << 10, "KiB"))
@@ -57,6 +58,11 @@ def test_channels() -> None:
         ("protocol.md", f"no new jobs after {worker_registry.SILENCE:g} s;"),
         ("protocol.md", f"at most {LONGEST_PUSH:g} s of simulation"),
         ("protocol.md", f"`ulimit -l` of {(limits.POOL_LIMIT + limits.METADATA) >> 10:,} KiB"),
+        (
+            "protocol.md",
+            f"at most {commands.MOST_SET} parameters, keys of {commands.LONGEST_KEY} and values of "
+            f"{commands.LONGEST_VALUE} characters; a server lists {commands.MOST_LISTED}.",
+        ),
         ("scenes.md", f"in at most {where.MAX_LENGTH} characters and {where.MAX_DEPTH} levels"),
         ("scenes.md", f"{MOST_TETS:,} tetrahedra in all"),
         ("use.md", f"above {recorder.FRAME_BYTES >> 20} MiB"),

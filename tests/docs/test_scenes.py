@@ -13,6 +13,7 @@ from sim_server import effects
 from sim_server.scene.accuracy_options import AccuracyOptions
 from sim_server.scene.holders import Holder
 from sim_server.scene.integrator_options import IntegratorOptions
+from sim_server.scene.live import Live
 from sim_server.scene.model import MeshSource, RecordOptions, Scene, SceneObject
 from sim_server.scene.obstacles import Obstacle
 from sim_server.scene.pose import Pose
@@ -201,3 +202,15 @@ def test_keys_of_an_effect(name: str) -> None:
 
 def test_all_effects_are_listed() -> None:
     assert {row["effect"].split("]")[0][1:] for row in table_under(TEXT, "Effects")} == set(effects.known_effects())
+
+
+def test_live_keys() -> None:
+    rows = table_under(TEXT, "Parameters while it runs")
+    said = {row["table"].strip("`[]"): set(re.findall(r"`(\w+)`", row["live keys"])) for row in rows}
+    models: dict[str, Any] = {name: effects.effect(name).Params for name in effects.known_effects()}
+    models |= {"object": SceneObject, "obstacle": Obstacle, "holder": Holder, "spring": Spring}
+    marked = {
+        name: {key for key, field in model.model_fields.items() if any(isinstance(m, Live) for m in field.metadata)}
+        for name, model in models.items()
+    }
+    assert said == {name: keys for name, keys in marked.items() if keys}

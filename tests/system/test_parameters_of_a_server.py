@@ -10,7 +10,7 @@ import pytest
 from clients.client import Client
 from clients.errors import BadInput
 from clients.log.reader import Log
-from tests.system.server_process import run
+from tests.system.server_process import run, until
 from tests.system.test_replay_of_a_server import messages, recorded, replayed
 
 pytestmark = pytest.mark.system
@@ -51,6 +51,7 @@ def by_command_line(client: Client) -> None:
     assert bad.returncode == 2 and "must be greater than 0" in bad.stderr
     listed = json.loads(run("clients", "parameters", "--json", *where).stdout)
     assert {"key": "object.beam.effects.corotational.young", "value": "500000.0"} in [p["now"] for p in listed]
+    until(lambda: (client.meshes()["beam"].young == 5e5).all(), "who asks for the mesh is told the new modulus")
     client.resume()
 
 
