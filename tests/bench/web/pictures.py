@@ -7,6 +7,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from clients.web.view import home, up_of
 from tests.bench.harness.report import ROOT
 from tests.bench.web.__main__ import BEAM, page, served
@@ -33,7 +35,8 @@ def main() -> None:
     scene = Path(sys.argv[1]) if len(sys.argv) > 1 else BEAM
     with (
         tempfile.TemporaryDirectory(prefix="warpfactor-web-") as name, browser() as chromium,
-        served(Path(name), "solver.preconditioner=cholesky", scene=scene) as (client, endpoint), page(endpoint, Path(name)) as address,
+        served(Path(name), "solver.preconditioner=cholesky", scene=scene) as (client, endpoint),
+        page(endpoint, Path(name)) as address,
     ):  # fmt: skip
         tab = open_page(chromium, address, WINDOW)
         time.sleep(5.0)
@@ -43,11 +46,10 @@ def main() -> None:
         while not (newest := states.newest()):
             time.sleep(0.05)
         body = newest[0]
-        side = mesh.rest[:, 0].max() - 1e-6
-        shown = [
-            k for k in set(mesh.triangles.ravel().tolist()) if mesh.rest[k, 0] > side and 0.3 < mesh.rest[k, 1] < 0.7
-        ]
-        tip = max(shown, key=lambda k: mesh.rest[k, 2])
+        rest, half = mesh.rest, (mesh.rest.min(axis=0) + mesh.rest.max(axis=0)) / 2
+        side = np.flatnonzero(rest[:, 0] > rest[:, 0].max() - 1e-6)  # which the camera sees
+        end = side[rest[side, 2] > rest[side, 2].max() - 1e-6]
+        tip = int(end[np.abs(rest[end, 1] - half[1]).argmin()])
         drag(tab, on_screen(tab, view, body.x[tip]), PULL)
         tab.screenshot(path=FIGURES / "web.png")
         tab.mouse.up()
