@@ -28,7 +28,7 @@ from clients.web.view import View, home, up_of
 from protocol import messages_pb2 as pb
 from protocol.network.web_address import exposed
 
-PERIOD = 1 / 60  # s between two looks for new frames, which come 30 times a second
+PERIOD = 1 / 120  # s between two looks for new frames, which come 30 times a second
 PAINT_PERIOD = 0.2  # s between two colourings
 PAINT_SHARE = 0.2  # of the time that colouring may take
 CURVE_PERIOD = 0.25  # s

@@ -169,6 +169,7 @@ class Tab:
                 for node in self._nodes[len(paint.bands) :]:
                     node.visible = False
                 self._legend.content = paint.legend
+        self.viewer.flush()  # viser would wait for more, up to a 60th of a second
         self._shown = (paint, paint.version)
 
     def clear(self) -> None:
