@@ -17,9 +17,9 @@ log = logging.getLogger(__name__)
 
 
 def web(server: str, connect: Sequence[str] | None, host: str, port: int, exit_with_parent: bool) -> None:
-    """Serves the page until Ctrl-C, or with exit_with_parent until the parent process ends. Raises ClientError, BadInput.
+    """Serves the page until Ctrl-C, or with exit_with_parent until the parent process ends.
 
-    The server need not run yet.
+    The server need not run yet. Raises ClientError, BadInput.
     """
     logging.basicConfig(format="sim-client: %(message)s")
     try:
