@@ -2,9 +2,11 @@
 """The page in a browser: how late it shows what the pointer does, frames a second, and what tabs cost the steps."""
 
 import contextlib
+import math
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -27,6 +29,7 @@ BEAM = ROOT / "deploy" / "scenes" / "beam.toml"
 AT_REST = ("effects.gravity.g=[0, 0, 0]", "object.beam.effects.rayleigh.mass=5")  # nothing moves but by the pointer
 PATIENCE = 60.0  # s for processes to start
 JUMP, REST = 40, 0.7  # pixels that the pointer jumps; s until the next jump, when the body is at rest again
+WARM = 5.0  # s until the motion is the same in all runs
 SMALL = {"width": 700, "height": 360}  # window of tabs that are only to be there
 TABS = (0, 1, 4)
 SIDES = (32, 71, 122, 200)  # of sheets, vertices
@@ -41,9 +44,9 @@ EXPLAINED = (
     "pointer keeps moving viser sends 20 events a second, which adds up to 50 ms.",
     "*frames*: a sheet waves 30 times a second by itself; frames that showed other positions than the one before. "
     f"Above {MOST_VERTICES} vertices the page shows a coarser surface.",
-    "*steps*: of the same beam, with gravity, in real time, while so many tabs are open; the runs follow one another "
-    "several times. *processor* is the processor time of the simulation thread for a step, which does not count the "
-    "wait for a processor that a browser has taken.",
+    "*steps*: of the same beam, with gravity, led around by its tip in real time, while so many tabs are open; the "
+    "runs follow one another several times. *processor* is the processor time of the simulation thread for a step, "
+    "which does not count the wait for a processor that a browser has taken.",
 )
 
 
@@ -98,6 +101,28 @@ def served(folder: Path, *settings: str, scene: Path = BEAM) -> Iterator[tuple[C
             yield client, endpoint
 
 
+@contextlib.contextmanager
+def stirred(client: Client) -> Iterator[None]:
+    """The tip of the beam is led around in a circle, so that steps have the same work at all times."""
+    stop = threading.Event()
+    with client.grab("beam", at="tip", radius=0.3, stiffness=2e4, max_force=1e4) as held:
+        at = held.interaction.point
+
+        def lead() -> None:
+            begun = time.monotonic()
+            while not stop.wait(1 / 30):
+                turn = 2 * math.pi * (time.monotonic() - begun) / 4
+                held.move((at.x + 0.6 * math.cos(turn), at.y + 0.6 * math.sin(turn), at.z), wait=False)
+
+        thread = threading.Thread(target=lead)
+        thread.start()
+        try:
+            yield
+        finally:
+            stop.set()
+            thread.join()
+
+
 def latency(chromium: Any, folder: Path, jumps: int) -> list[dict[str, Any]]:
     """Times from the pointer to the frame, one row of percentiles."""
     with served(folder, *AT_REST) as (client, endpoint), page(endpoint, folder) as address:
@@ -146,8 +171,9 @@ def costs(chromium: Any, folder: Path, seconds: float, rounds: int) -> list[dict
     wall: dict[int, list[float]] = {n: [] for n in TABS}
     processor: dict[int, list[float]] = {n: [] for n in TABS}
     late = dict.fromkeys(TABS, 0)
-    with served(folder) as (client, endpoint), page(endpoint, folder) as address:
+    with served(folder) as (client, endpoint), page(endpoint, folder) as address, stirred(client):
         steps = client.steps()
+        time.sleep(WARM)
         for _ in range(rounds):
             for count in TABS:
                 tabs = [watched(chromium, address, SMALL) for _ in range(count)]
