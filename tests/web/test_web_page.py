@@ -13,7 +13,12 @@ from tests.ports import free_port
 from tests.support.browser import browser, choose_colour, field, missing, on_screen, open_page, pixels
 from tests.system.server_process import Stage, until
 
-pytestmark = [pytest.mark.system, pytest.mark.skipif(bool(missing()), reason=missing() or "-")]
+# A browser that draws in software takes its time on a full machine.
+pytestmark = [
+    pytest.mark.system,
+    pytest.mark.timeout(300),
+    pytest.mark.skipif(bool(missing()), reason=missing() or "-"),
+]
 
 SCENE = """
 dt = 0.02
