@@ -6,16 +6,28 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 
-from clients.errors import ClientError
+from clients.errors import BadInput, ClientError
+from protocol.channels import check_name
+from protocol.network.endpoints import BadEndpoint, check_endpoint, usual_endpoints
 from protocol.network.web_address import exposed, hindrance, shown
 from protocol.process.die_with_parent import die_with_parent
+from protocol.refused import Refused
 
 log = logging.getLogger(__name__)
 
 
 def web(server: str, connect: Sequence[str] | None, host: str, port: int, exit_with_parent: bool) -> None:
-    """Serves the page until Ctrl-C, or with exit_with_parent until the parent process ends. Raises ClientError."""
+    """Serves the page until Ctrl-C, or with exit_with_parent until the parent process ends.
+
+    The server need not run yet. Raises ClientError, BadInput.
+    """
     logging.basicConfig(format="sim-client: %(message)s")
+    try:
+        check_name(server, "server name")
+        for endpoint in connect or usual_endpoints():
+            check_endpoint(endpoint)
+    except (Refused, BadEndpoint) as error:
+        raise BadInput(str(error)) from None
     if why := hindrance(host, port):
         raise ClientError(why)
     if warning := exposed(host, port):

@@ -78,14 +78,14 @@ class Link:
         failures = 0
         while not self._stop.is_set():
             try:
-                status = self.client.status()
-                if status.header.incarnation != self.incarnation:
+                self.status = self.client.status()
+                if self.status.header.incarnation != self.incarnation:
                     raise ClientError("the server was started again")
-                self.status, failures = status, 0
-                self.parameters = self.client.parameters()
+                failures = 0
+                self._ask_parameters()
             except (ClientError, BadInput) as error:
                 failures += 1
-                if failures >= LOST_AFTER or "started again" in str(error):
+                if failures >= LOST_AFTER or self.status.header.incarnation not in (0, self.incarnation):
                     self.lost = str(error)
                     return
             except Exception:
@@ -95,6 +95,15 @@ class Link:
                 return
             self._asked.wait(STATUS_PERIOD)
             self._asked.clear()
+
+    def _ask_parameters(self) -> None:
+        """Gets the parameters; a replay of a log has none, and a late answer leaves those that are known."""
+        try:
+            self.parameters = self.client.parameters()
+        except BadInput:
+            self.parameters = []
+        except ClientError:
+            pass
 
 
 class Feed:

@@ -17,6 +17,7 @@ import viser
 from clients.log.frames import Mesh
 from clients.web.feed import Feed, Link
 from clients.web.hand import Grip, Hand, described_objects, grip
+from clients.web.origin import own_pages_only
 from clients.web.paint import Paint
 from clients.web.panel.curves import History
 from clients.web.panel.panels import Panels
@@ -25,8 +26,9 @@ from clients.web.surfaces import MOST_VERTICES, Surfaces
 from clients.web.tab import Tab
 from clients.web.view import View, home, up_of
 from protocol import messages_pb2 as pb
+from protocol.network.web_address import exposed
 
-PERIOD = 1 / 60  # s between two looks for new frames, which come 30 times a second
+PERIOD = 1 / 120  # s between two looks for new frames, which come 30 times a second
 PAINT_PERIOD = 0.2  # s between two colourings
 PAINT_SHARE = 0.2  # of the time that colouring may take
 CURVE_PERIOD = 0.25  # s
@@ -51,7 +53,7 @@ class Page:
         self._tabs: dict[int, Tab] = {}
         self._new: list[viser.ClientHandle] = []  # tabs that are to be built in the loop
         self._lock = threading.Lock()
-        with _quiet():
+        with _quiet(), own_pages_only(loopback=not exposed(host, port)):
             self._viser = viser.ViserServer(host=host, port=port, label="Warpfactor", verbose=False)
         self._viser.request_share_url = _no_share_url  # type: ignore[method-assign]
         self._viser.gui.configure_theme(show_logo=False, show_share_button=False)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import threading
+import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-FORCED = 0.02  # s from the first change of a slider to the command that has all that came meanwhile
+TOGETHER = 0.02  # s from the first change of a slider to the command that has all that came meanwhile
 NOTHING, FLAT = np.zeros((3, 3), np.float32), np.array([[0, 1, 2]], np.uint32)  # what a band without triangles shows
 RADIUS = 8.0  # % of the object's size: default of the patch that a grab takes
 
@@ -94,7 +95,7 @@ class Tab:
             self.ask(self._set_pending)
 
     def _set_pending(self, client: Any) -> None:
-        threading.Event().wait(FORCED)
+        time.sleep(TOGETHER)
         with self._lock:
             values, self._pending = self._pending, {}
         client.set(values)
@@ -169,6 +170,7 @@ class Tab:
                 for node in self._nodes[len(paint.bands) :]:
                     node.visible = False
                 self._legend.content = paint.legend
+        self.viewer.flush()  # viser would wait for more, up to a 60th of a second
         self._shown = (paint, paint.version)
 
     def clear(self) -> None:

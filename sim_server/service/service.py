@@ -146,6 +146,11 @@ class Service:
             self.check_page()
             self.link.check_name()
         self._carry_out()
+        self._set_parameters()
+        if self._between.may_run:
+            self._drain()
+            self._between.run()
+        self._halts.answer()
         self._publish_status()
         if not self._awaits_factors():
             self._check_pace()
@@ -180,6 +185,34 @@ class Service:
         for reply, answer in answers:
             reply(answer)
 
+    def _defer(self, command: pb.Command, reply: Callable[[pb.Reply], None]) -> None:
+        """Has parameters set in one of the next rounds."""
+        if len(self._sets) < MAX_SETS:
+            self._sets.append((command, reply))
+        else:
+            reply(pb.Reply(error=f"the server is busy: {MAX_SETS} commands wait to set parameters"))
+
+    def _set_parameters(self) -> None:
+        """Carries out the oldest command that sets parameters. With large bodies one takes as long as many rounds, so
+        that half of the time is kept for all else."""
+        begin = time.monotonic()
+        if self._sets and begin >= self._set_due:
+            command, reply = self._sets.popleft()
+            reply(self.commands.carry_out(command))
+            end = time.monotonic()
+            self._set_due = 2 * end - begin
+
+    def _reset(self, name: str, reply: Callable[[pb.Reply], None], answer: pb.Reply) -> None:
+        """Puts an object or all back to the start, while the loop stands still."""
+        if self.simulation.touch is not None:
+            self.simulation.touch.release_of(name)
+        self._start.reset(name)
+        for state in self.driver.bodies:
+            if name in ("", state.body.name):
+                state.frozen = False
+        self.telemetry.on_reset(name, self.commands.engine_paused)
+        self.commands.stamp(answer.status)
+        reply(answer)
 
     def _publish_status(self) -> None:
         """Publishes one status for all requests since the last: it costs more than any other command."""

@@ -19,6 +19,7 @@ ARGUMENTS = (
     "--disable-backgrounding-occluded-windows",
 )  # fmt: skip
 FIELD_OF_VIEW = math.radians(75)  # of viser's camera, vertical
+PATIENCE = 90_000.0  # ms that a step in the browser may take: it draws in software, maybe on a full machine
 SIZE = {"width": 900, "height": 480}
 
 
@@ -55,6 +56,8 @@ HTMLCanvasElement.prototype.getContext = function (kind, options) {
     return get.call(this, kind, kind.startsWith("webgl") ? {...options, preserveDrawingBuffer: true} : options);
 };
 """
+# Closes viser's note about WebGL in software.
+NO_NOTES = "() => document.querySelectorAll('.mantine-Notification-root button').forEach((button) => button.click())"
 # The charts have canvases too; the scene's is the largest.
 CANVAS = """
 const canvas = Array.from(document.querySelectorAll("canvas")).reduce(
@@ -80,17 +83,29 @@ def pixels(tab: Any, at: tuple[float, float], size: int = 40) -> NDArray[np.int6
     return np.array(tab.evaluate(READ, [*at, size])).reshape(size, size, 4)
 
 
-def open_page(browser: Any, address: str, size: dict[str, int] | None = None) -> Any:
-    """Opens the page in a tab of its own, and waits until it is connected and has a body to show."""
+def open_page(browser: Any, address: str, size: dict[str, int] | None = None, script: str = KEEP) -> Any:
+    """Opens the page in a tab of its own, and waits until it is connected. script: runs in it before all others."""
     tab = browser.new_page(viewport=size or SIZE)
-    tab.add_init_script(KEEP)
+    tab.set_default_timeout(PATIENCE)
+    tab.add_init_script(script)
     tab.goto(address)
     tab.get_by_text("running", exact=True).first.wait_for()
     tab.get_by_text("This tab", exact=True).wait_for()
     tab.wait_for_function(f"() => {{ {CANVAS} return canvas.width * canvas.height > 40_000; }}")
-    with contextlib.suppress(Exception):  # viser's note about WebGL in software
-        tab.locator(".mantine-Notification-closeButton").first.click(timeout=500)
+    tab.evaluate(NO_NOTES)
     return tab
+
+
+def field(tab: Any, label: str) -> Any:
+    """Returns the visible input beside a label of the panel."""
+    beside = "xpath=ancestor::*[.//input][1]//input[not(@type='hidden')]"
+    return tab.locator("label", has_text=label).locator(beside).first
+
+
+def choose_colour(tab: Any, mode: str) -> None:
+    """Has a tab colour its bodies so (clients.web.paint.MODES)."""
+    field(tab, "colour").click()
+    tab.get_by_role("option", name=mode, exact=True).click()
 
 
 def on_screen(tab: Any, view: View, point: Sequence[float] | NDArray) -> tuple[float, float]:

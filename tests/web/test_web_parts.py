@@ -2,6 +2,7 @@
 """The page without a browser: surfaces, colours, curves, grabs, addresses, a server that goes and comes."""
 
 import json
+import urllib.error
 import urllib.request
 from collections.abc import Callable
 from pathlib import Path
@@ -238,6 +239,25 @@ def test_bad_addresses_are_refused(text: str) -> None:
         web_address(text)
 
 
+@pytest.mark.parametrize(
+    ("origin", "host", "loopback", "refused"),
+    [
+        ("http://127.0.0.1:8080", "127.0.0.1:8080", True, False),
+        (None, "localhost:8080", True, False),  # a program, not a browser
+        ("http://evil.example", "127.0.0.1:8080", True, True),
+        ("http://127.0.0.1:9", "127.0.0.1:8080", True, True),
+        ("http://evil.example:8080", "evil.example:8080", True, True),  # a name that was made to mean loopback
+        ("http://lab:8080", "lab:8080", False, False),
+        ("null", "lab:8080", False, True),
+    ],
+)
+def test_other_sites_are_kept_out(origin: str | None, host: str, loopback: bool, refused: bool) -> None:
+    pytest.importorskip("viser")
+    from clients.web.origin import foreign
+
+    assert foreign(origin, host, loopback) == refused
+
+
 def test_the_page_says_why_it_cannot_be_served(monkeypatch: pytest.MonkeyPatch) -> None:
     with FakeServer() as taken:
         port = int(taken.endpoint.rpartition(":")[2])
@@ -290,6 +310,9 @@ def test_a_server_starts_a_page_and_ends_it(tmp_path: Path) -> None:
         until(lambda: address in server.output(), "a page")
         with urllib.request.urlopen(address, timeout=60) as answer:
             assert answer.status == 200 and b"<html" in answer.read(1000).lower()
+        foreign_request = urllib.request.Request(address, headers={"Origin": "http://evil.example"})
+        with pytest.raises(urllib.error.HTTPError, match="403"):
+            urllib.request.urlopen(foreign_request, timeout=60)
         assert server.end() == 0
         assert not hindrance("127.0.0.1", port)  # nobody listens there any more
         again = stage.server(beam(tmp_path), "--web", "nonsense:1x")

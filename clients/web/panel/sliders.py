@@ -85,14 +85,16 @@ class Slider:
             low, high = (now / 10, now * 10) if now > 0 else (now - 1, now + 1)
         low, high = min(low, now), max(high, now)
         self._log = self._log and low > 0
-        return (math.log10(low), math.log10(high)) if self._log else (low, high)
+        if not self._log:
+            return low, high
+        return math.floor(100 * math.log10(low)) / 100, math.ceil(100 * math.log10(high)) / 100
 
     def _shown(self, value: Any) -> Any:
         if isinstance(value, list):
             return tuple(float(v) for v in value)
         if isinstance(value, bool):
             return value
-        place = math.log10(value) if self._log and value > 0 else float(value)
+        place = round(math.log10(value), 2) if self._log and value > 0 else float(value)
         handle = getattr(self, "_handle", None)
         return place if handle is None else min(max(place, handle.min), handle.max)
 

@@ -24,6 +24,7 @@ PAGES = (
     "scaling",
     "haptics",
     "gallery",
+    "web",
     "faults",
 )
 
