@@ -136,7 +136,7 @@ class Log:
         if message.topic == "/scene":
             self.scene = pb.Scene.FromString(message.data)
             return
-        if message.topic in ("/touch", "/targets", "/resets"):
+        if message.topic in ("/touch", "/targets", "/resets", "/checkpoint"):
             return  # for replays that simulate
         if message.kind in ("obstacle", "pose") and message.object:
             self._decode_obstacle(message)

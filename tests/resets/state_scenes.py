@@ -48,7 +48,9 @@ SCENES: dict[str, dict[str, Any]] = {
     "bdf2": table([beam()], integrator={"scheme": "bdf2"}),
     "generalized_alpha": table([beam()], integrator={"scheme": "generalized_alpha", "linearizations": 2}),
     "ros2": table([beam()], integrator={"scheme": "ros2"}),
-    "central_difference": table([beam()], integrator={"scheme": "central_difference"}, solver={"update": "never"}),
+    "central_difference": table(
+        [beam()], integrator={"scheme": "central_difference"}, solver={"preconditioner": "none"}
+    ),
     "friction": table([cube(), cube("next", x=0.21)], obstacle=[SLOPE, TOOL]),
     "friction, bdf2": table([cube()], obstacle=[SLOPE, TOOL], integrator={"scheme": "bdf2"}),
     "attached": table(halves(), attachment=[WEAK]),
