@@ -98,17 +98,20 @@ def written_back(simulation):
 
 def test_a_scene_is_reset_saved_and_resumed(cupy):
     """State on the device is read and written; with contact and ties: below."""
-    sims = [made("held", "gpu", preconditioner="block_jacobi") for _ in range(2)]
-    start = Start(sims[0])
-    names = [a.name for a in state_arrays(sims[0])]
+    simulation = made("held", "gpu", preconditioner="block_jacobi")
+    start = Start(simulation)
+    names = [a.name for a in state_arrays(simulation)]
     assert len(set(names)) == len(names) and "engine.energies.balance" in names
-    driver = Driver(sims[0])
+    driver = Driver(simulation)
     driver.advance(3)
     start.reset("beam")
     start.reset()
     driver.advance(2)
-    again = resumed(capture(sims[0], driver, "test").to_bytes(), sims[1])
-    assert again.advance(2)["step"].max() == sims[1].engine.step == 7
+    data = capture(simulation, driver, "test").to_bytes()
+    driver.advance(2)
+    again = resumed(data, simulation)  # the same one, since another takes as long to compile
+    assert simulation.engine.step == 5
+    assert again.advance(2)["step"].max() == simulation.engine.step == 7
 
 
 @pytest.mark.parametrize(("name", "precision"), [("beam.toml", "float64"), ("springs.toml", "float32")])

@@ -8,7 +8,7 @@ import numpy as np
 from sim_server.checkpoint.content import capture, restore, restore_driver, saved_factors
 from sim_server.checkpoint.file import from_bytes
 from sim_server.simulation import Simulation
-from sim_server.state.arrays import state_arrays
+from sim_server.state.arrays import DERIVED, state_arrays
 from sim_server.updates.driver import Driver
 from tests.resets.state_scenes import made
 
@@ -36,6 +36,14 @@ def resumed(data: bytes, sim: Simulation) -> Driver:
     return driver
 
 
+def spoil_derived(sim: Simulation) -> None:
+    """Sets to NaN what is said to be made anew by each step before it is read."""
+    for launch in sim.step_launches:
+        for name, array in launch.written():
+            if name in DERIVED and array.dtype == np.float64:
+                array[...] = np.nan
+
+
 def differing(a: Any, b: Any) -> list[str]:
     """Names of columns of records that differ, without those that a clock makes."""
     names = [name for name in a.dtype.names if name not in TIMED]
@@ -53,6 +61,8 @@ def check_that_it_goes_on(name: str, update: str, device: str = "cpu") -> None:
     records = driver.advance(AFTER)
     other = made(name, device, update=update)
     again = resumed(data, other)
+    if device == "cpu":
+        spoil_derived(other)
     assert other.engine.step == BEFORE
     assert differing(again.advance(AFTER), records) == []
     np.testing.assert_array_equal(other.fetch().x, sim.fetch().x)
