@@ -350,6 +350,7 @@ def _print_outcome(verb: str, reply: pb.Reply, as_json: bool) -> None:
         "stop": "stopped after",
         "step": "paused at",
         "reset": "put back at",
+        "save": "saved at",
     }[verb]
     if verb == "step" and found.state != "paused":
         said = f"{found.state} at"
@@ -413,6 +414,26 @@ def reset(
     with Client(server, connect) as client:
         reply = client.reset(object)
     _print_outcome("reset", reply, as_json)
+
+
+@app.command()
+def save(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Where to write it (replaces the file).")],
+    as_json: Json = False,
+    connect: Connect = None,
+    server: Server = SERVER_NAME,
+) -> None:
+    """Save the state, with which sim-server SCENE --resume FILE goes on.
+
+    \b
+    Examples:
+      sim-client save beam.npz
+    """
+    from clients.client import Client
+
+    with Client(server, connect) as client:
+        reply = client.save(file)
+    _print_outcome("save", reply, as_json)
 
 
 @app.command()

@@ -8,6 +8,7 @@ import itertools
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TypeVar, overload
 
@@ -17,6 +18,7 @@ from google.protobuf.message import Message
 from clients.errors import BadInput, ClientError
 from clients.forces import Forces, Load
 from clients.grab import Grab
+from clients.log.atomic_file import atomic_file
 from clients.log.frames import Mesh, mesh_of
 from clients.log.obstacles import Obstacle as ObstacleShape
 from clients.log.obstacles import obstacle_of
@@ -34,6 +36,7 @@ from protocol.refused import Refused
 M = TypeVar("M", bound=Message)
 Point = Sequence[float]
 Value = float | bool | str | Sequence[Any]  # of a parameter; text is TOML
+LONGEST_SAVE = 60.0  # s that a checkpoint takes to be made and sent, at most
 LONGEST_STEPS = 60.0  # s that a server takes to answer `step`, at most
 
 
@@ -218,6 +221,24 @@ class Client:
         command = self._command("reset", None, None)
         command.object = object or ""
         return self._ask(command)
+
+    def save(self, path: str | Path) -> pb.Reply:
+        """Writes a checkpoint, with which `sim-server SCENE --resume FILE` goes on; the status has its step.
+
+        The file appears whole or not at all. Raises ClientError if it cannot be written.
+        """
+        path = Path(path)
+        reply = self._ask(self._command("save", None, None), self.timeout + LONGEST_SAVE)
+        newest = lambda found: bool(found) and found[0].step >= reply.status.step  # noqa: E731
+        found = self._queries.ask("checkpoint", pb.Checkpoint, None, self.timeout + LONGEST_SAVE, newest)
+        if not newest(found):
+            raise ClientError(f"server {self.name!r} sent no checkpoint of step {reply.status.step}")
+        try:
+            with atomic_file(path) as part:
+                part.write_bytes(found[0].data)
+        except OSError as error:
+            raise ClientError(f"{path}: cannot be written: {error.strerror}") from None
+        return reply
 
     def stop(self) -> pb.Reply:
         """Ends the server, which then closes its log; the status of the reply has the number of steps."""

@@ -34,6 +34,9 @@ CHANNELS: dict[str, Channel] = {
     "topology": Channel(
         "topology/{object}", "Topology", "server", "once per epoch, queryable", 256 * MIB, 0, "mesh, pattern of A"
     ),
+    "checkpoint": Channel(
+        "checkpoint", "Checkpoint", "server", "queryable", 256 * MIB, 0, "the state that was saved last"
+    ),
     "matrix": Channel("matrix/{worker}/{object}", "Matrix", "server", "one in flight per object", 64 * KIB, GIB, "job"),
     "pattern": Channel("pattern/{object}", "FactorPattern", "worker", "when it is new", 256 * MIB, 0, "pattern of L"),
     "factor": Channel("factor/{object}", "Factor", "worker", "one per matrix", 64 * KIB, GIB, "values of L"),

@@ -77,6 +77,7 @@ def serve(
         bool, typer.Option("--realtime/--free-run", help="Keep pace with the clock, or as fast as it goes")
     ] = True,
     record: Annotated[Path | None, typer.Option(metavar="FILE.mcap", help="Write a log (replaces the file)")] = None,
+    resume: Annotated[Path | None, typer.Option(metavar="FILE", help="Go on where sim-client save saved this")] = None,
     connect: Annotated[list[str] | None, typer.Option(metavar="EP", help="Link with another server or router")] = None,
     listen: Annotated[
         list[str] | None, typer.Option(metavar="EP", help="Where to be reached [default: tcp/127.0.0.1:7447]")
@@ -117,7 +118,7 @@ def serve(
     try:
         options = Options(
             scene, set_ or [], choose_device(device, say), name, listen, connect, not no_shared_memory, record, steps,
-            realtime, workers, worker_device, web, quiet,
+            realtime, workers, worker_device, web, quiet, resume,
         )  # fmt: skip
         with ExitStack() as closing:
             with nullcontext() if quiet else compile_notices(say):
@@ -179,6 +180,7 @@ class Options:
     worker_device: str
     web: str | None
     quiet: bool
+    resume: Path | None
 
 
 def _set_up(closing: ExitStack, o: Options) -> "tuple[Service, Supervisor | None]":
@@ -189,6 +191,7 @@ def _set_up(closing: ExitStack, o: Options) -> "tuple[Service, Supervisor | None
     from protocol.network.session import AddressInUse, ConnectionFailed
     from protocol.refused import Refused
     from sim_server.backends.compiler import CompileError
+    from sim_server.checkpoint.file import read
     from sim_server.network.link import ServerLink
     from sim_server.recording.recorder import Recorder
     from sim_server.service.service import Service
@@ -199,6 +202,7 @@ def _set_up(closing: ExitStack, o: Options) -> "tuple[Service, Supervisor | None
     end_in_order()
     try:
         page = _page_address(o.web)
+        checkpoint = None if o.resume is None else read(o.resume)
         simulation = Simulation.load(o.scene, o.overrides, o.device)
         link = closing.enter_context(ServerLink(o.name, o.listen, o.connect, shared_memory=o.shared_memory))
         recorder = None
@@ -206,7 +210,10 @@ def _set_up(closing: ExitStack, o: Options) -> "tuple[Service, Supervisor | None
             _check_log_path(o.record)
             compression = simulation.scene.record.compression
             recorder = closing.enter_context(Recorder(o.record, compression, overwrite=True, report=logging.error))
-        service = Service(simulation, link, recorder, o.steps, o.realtime)
+        try:
+            service = Service(simulation, link, recorder, o.steps, o.realtime, checkpoint)
+        except InputError as error:
+            raise InputError(f"--resume {o.resume}: {error}" if o.resume else str(error)) from None
     except AddressInUse as error:
         PROGRAM.bad_input(f"{error}; is another sim-server there? --listen tcp/127.0.0.1:7448 takes another port")
     except (InputError, BadEndpoint, ConnectionFailed, Refused, CompileError) as error:

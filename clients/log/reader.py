@@ -140,7 +140,7 @@ class Log:
         if message.topic == "/parameters":
             self.parameters.append(pb.ParameterSet.FromString(message.data))
             return
-        if message.topic in ("/touch", "/targets", "/resets"):
+        if message.topic in ("/touch", "/targets", "/resets", "/checkpoint"):
             return  # for replays that simulate
         if message.kind in ("obstacle", "pose") and message.object:
             self._decode_obstacle(message)

@@ -231,6 +231,10 @@ class Engine(Protocol):
         """Copies a factor of the matrix of `step`; one of the next solves of the body takes it up."""
         ...
 
+    def resume_factor(self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int) -> None:
+        """As `post_factor`, of the factor that was in use when the state that was written was saved."""
+        ...
+
     def settle_factors(self) -> None:
         """Blocks until the next solves will use what was posted."""
         ...

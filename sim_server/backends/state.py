@@ -40,6 +40,24 @@ def host_array(
     return StateArray(name, array.copy, write, rows, resets)
 
 
+def numbers_array(name: str, struct: Any) -> StateArray:
+    """Returns the numbers of a ctypes structure, without its pointers, as one packed row; no reset takes them back."""
+    numbers = numbers_of(struct)
+    packed = np.dtype([(n, numbers.dtype[n]) for n in numbers.dtype.names or ()])
+
+    def write(values: NDArray[Any]) -> None:
+        for member in packed.names or ():
+            numbers[member] = values[member]
+
+    def read() -> NDArray[Any]:
+        found = np.zeros(len(numbers), packed)
+        for member in packed.names or ():
+            found[member] = numbers[member]
+        return found
+
+    return StateArray(name, read, write, resets=False)
+
+
 def memory_of(structs: Any, count: int) -> NDArray[np.uint8]:
     """Returns an array of ctypes structures, none of which holds a pointer, as bytes (count, size)."""
     return np.frombuffer(structs, np.uint8).reshape(count, -1)

@@ -107,6 +107,15 @@ class Movable(Effect):
         assert self._simulation is not None and self._system is not None
         self._simulation.update_effect(self, self.place(self._system))
 
+    def given(self) -> dict[str, Float64]:
+        """Returns what changes of a frame's motion: poses that clients want, and times of keyframes [s]."""
+        return {"target": self._target, "time": self._time}
+
+    def give(self, values: dict[str, Float64]) -> None:
+        """Sets what `given` returned. To be called while the loop stands still."""
+        self._target, self._time = values["target"].copy(), values["time"].copy()
+        self.restore({})
+
     def restart(self, numbers: Sequence[int], time: float) -> None:
         """Puts frames back to where they began; their keyframes are those of the time since `time` [s].
 

@@ -91,6 +91,7 @@ class TouchError(ValueError):
 class Touch(Effect):
     """All interactions of a scene. Changes go to the loop as new arguments of the launch.
 
+    last_id: of the interactions so far
     force (n, 3) [N], spring (n,) [N/m], anchor (n, 3) [m]: what they exert on each node in a step.
     """
 
@@ -108,7 +109,7 @@ class Touch(Effect):
         self._changed: dict[int, Interaction] | None = None  # by id: what the loop is to be given after `together`
         self._same: tuple[list[int], dict[str, Any]] | None = None  # ids, and what of a launch no move changes
         self._launch: Launch | None = None  # in use, or about to be; it writes when each interaction began
-        self._last_id = 0
+        self.last_id = 0
         self._points: dict[str, NamedPoints] = {}
         self.force, self.spring, self.anchor = np.zeros_like(world.x), np.zeros(world.nodes), np.zeros_like(world.x)
         world.backend.keep(self.force, self.spring, self.anchor)
@@ -336,8 +337,8 @@ class Touch(Effect):
                 f"object {new.object!r}: {new.largest:g} N beside the {taken:g} N of {len(others)} others: "
                 f"at most max_total_force = {params.total:g} N together"
             )
-        self._last_id += 1
-        alive[self._last_id] = new = replace(new, id=self._last_id)
+        self.last_id += 1
+        alive[self.last_id] = new = replace(new, id=self.last_id)
         self._put(alive)
         return new
 

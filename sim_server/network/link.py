@@ -18,6 +18,7 @@ from zenoh.handlers import RingChannel
 from protocol.channels import PROTOCOL, SERVER_NAME, check_name, key, name_in
 from protocol.counters import Counters
 from protocol.messages_pb2 import (
+    Checkpoint,
     Command,
     LocalWorker,
     Obstacle,
@@ -44,7 +45,8 @@ log = logging.getLogger(__name__)
 TOKENS = 4096  # liveliness tokens of clients that may wait to be read
 REPLIES = 1024  # replies to commands that may wait to be sent
 
-Stamped = Obstacle | ObstaclePose | Scene | State | Status | Steps | Topology  # messages with a header of the server
+Stamped = Checkpoint | Obstacle | ObstaclePose | Scene | State | Status | Steps | Topology
+"""Messages with a header of the server."""
 
 
 class ServerLink:
@@ -164,6 +166,10 @@ class ServerLink:
     def set_scene(self, scene: Scene) -> None:
         """Sets the answer to queries for the scene."""
         self._queryables.set_answer(key("scene", self.name), self._encoded(scene))
+
+    def set_checkpoint(self, checkpoint: Checkpoint) -> None:
+        """Sets the answer to queries for the state that was saved last."""
+        self._queryables.set_answer(key("checkpoint", self.name), self._encoded(checkpoint))
 
     def set_obstacle(self, obstacle: Obstacle) -> None:
         """Sets the answer to queries for an obstacle."""

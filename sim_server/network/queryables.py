@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 MAX_QUERIES = 256  # queries of a channel that may wait for its thread; beyond that the oldest is dropped
 LONGEST_NAME = 64  # characters of the name of an obstacle
 MAX_WARNED_WORKERS = 64  # workers of another wire version that are warned of one by one
-QUERYABLES = ("command", "status", "scene", "topology", "obstacle", "echo")  # channels
+QUERYABLES = ("command", "status", "scene", "topology", "obstacle", "echo", "checkpoint")  # channels
 
 
 class Queryables:

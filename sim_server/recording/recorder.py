@@ -45,8 +45,8 @@ class Recorder:
     """Writes scene, topologies, states, steps, interactions and obstacles to an MCAP file from a thread of its own.
 
     Messages are stored under /scene, /topology/OBJECT, /state/OBJECT, /step/OBJECT, /interaction/OBJECT, /touch,
-    /factor/OBJECT, /obstacle/OBSTACLE, /pose/OBSTACLE, /targets, /parameters and /resets with `log_time` = simulation
-    time and `publish_time` = wall clock, both in ns.
+    /factor/OBJECT, /obstacle/OBSTACLE, /pose/OBSTACLE, /targets, /parameters, /resets and /checkpoint with `log_time` =
+    simulation time and `publish_time` = wall clock, both in ns.
 
     Appending does not wait for the disk unless `block` is true (for runs without a pace). While more than FRAME_BYTES
     wait, states are dropped and counted in `dropped`; other records are kept up to TOTAL_BYTES, and counted in `lost`
@@ -122,6 +122,10 @@ class Recorder:
     def reset(self, message: pb.Reset, time: float, block: bool = False) -> None:
         """Appends that an object, or all, were put back to the start at `time` [s of simulation]."""
         self._append("/resets", message, self._stamp(time), message.step, block)
+
+    def checkpoint(self, message: pb.Checkpoint, time: float) -> None:
+        """Appends where the run begins, `time` [s of simulation] after the start of the scene."""
+        self._append("/checkpoint", message, self._stamp(time), message.step, block=True)
 
     def factor(self, message: pb.FactorUse, block: bool = False) -> None:
         """Appends the origin of a factor that the loop was given."""

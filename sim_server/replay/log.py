@@ -50,7 +50,7 @@ class RecordedObject:
     packed: step records in the order of the log, packed; empty once `rows` is made
     frames: (offset, number) of each (log_file.py), by step
     factors: by the step whose matrix they were made from
-    rows: of type ROW; rows[k] is of step k + 1
+    rows: of type ROW; rows[k] is of step first + k + 1
     reactions: by step and kind, digests of those that there are
     """
 
@@ -67,6 +67,7 @@ class Recording:
 
     Raises BadLog if the file is no log, is of another protocol version, or cannot be repeated at all.
 
+    first: steps before the run began, 0 unless it went on from a checkpoint; checkpoint: that file
     steps: last step that can be repeated
     notes: why the replay ends there, and what is missing in the log
     touched: the run had pushes or grabs
@@ -81,6 +82,7 @@ class Recording:
         self.targets: list[pb.ObstacleTargets] = []
         self.parameters: dict[int, list[pb.ParameterSet]] = {}  # by step
         self.resets: list[pb.Reset] = []
+        self.first, self.checkpoint = 0, b""
         self.touched = False
         self.notes: list[str] = []
         self._file = LogFile.open(self.path)
@@ -134,6 +136,9 @@ class Recording:
         elif message.topic == "/parameters":
             found = pb.ParameterSet.FromString(message.data)
             self.parameters.setdefault(found.step, []).append(found)
+        elif message.topic == "/checkpoint":
+            saved = pb.Checkpoint.FromString(message.data)
+            self.first, self.checkpoint = saved.step, saved.data
         elif message.topic == "/resets":
             self.resets.append(pb.Reset.FromString(message.data))
         elif message.kind == "obstacle":
@@ -168,12 +173,12 @@ class Recording:
             rows = np.sort(np.frombuffer(bytes(found.packed), ROW), order="step")
             found.packed = bytearray()
             whole = len(rows)
-            wrong = np.flatnonzero(rows["step"] != np.arange(1, len(rows) + 1))
+            wrong = np.flatnonzero(rows["step"] != self.first + np.arange(1, len(rows) + 1))
             if len(wrong):
                 whole = int(wrong[0])
-                gap = f"{self.path}: no record of object {name!r}, step {whole + 1}"
+                gap = f"{self.path}: no record of object {name!r}, step {self.first + whole + 1}"
             found.rows = rows[:whole]
-            last.append(whole)
+            last.append(self.first + whole)
             most = max(most, int(rows["step"].max(initial=0)))
         steps = min(last, default=0)
         if steps < most and gap:
@@ -185,7 +190,7 @@ class Recording:
             raise BadLog(f"{self.path}: the log holds no scene; its beginning is damaged")
         if missing := [name for name in self.scene.objects if self.objects[name].topology is None]:
             raise BadLog(f"{self.path}: the log holds no mesh of {', '.join(missing)}; it is damaged")
-        if not self.steps:
+        if self.steps <= self.first:
             raise BadLog(f"{self.path}: the log holds no step that could be repeated")
         if self.device == "gpu" and self.touched and not self.touch:
             self.notes.append(

@@ -85,7 +85,10 @@ class Comparison:
 
     def lines(self) -> list[str]:
         """Returns the result as text."""
-        steps, counts = self.recording.steps, f"{self.solves_compared} solves, {self.frames_compared} frames"
+        steps, counts = (
+            self.recording.steps - self.recording.first,
+            f"{self.solves_compared} solves, {self.frames_compared} frames",
+        )
         lines = [f"note: {note}" for note in self.notes]
         if self.other_factor:
             f = self.other_factor
@@ -108,9 +111,10 @@ class Comparison:
 
     def plain(self) -> dict[str, Any]:
         """Returns the result as JSON types."""
+        steps = self.recording.steps - self.recording.first
         largest = self.largest and {**self.largest, "distance": _finite(self.largest["distance"])}
         return {
-            "same": self.same, "steps": self.recording.steps, "first": self.first, "largest": largest,
+            "same": self.same, "steps": steps, "first": self.first, "largest": largest,
             "other_factor": self.other_factor, "solves": self.solves_compared,
             "solves_different": self.solves_different, "frames": self.frames_compared,
             "frames_different": self.frames_different, "notes": self.notes,

@@ -23,7 +23,9 @@ from protocol.log_chunks import BadLog
 from protocol.refused import Refused
 from protocol.validate import array, check_range, checksum
 from sim_server.arrays import Float64
-from sim_server.errors import DeviceError
+from sim_server.checkpoint.content import SavedFactors, restore, saved_factors
+from sim_server.checkpoint.file import from_bytes
+from sim_server.errors import DeviceError, InputError
 from sim_server.mechanics.world import Body
 from sim_server.recording import messages
 from sim_server.recording.obstacles import obstacle_messages, targets_of
@@ -71,7 +73,7 @@ class Replay:
         self.compared = Comparison(recording)
         self._same_meshes()
         self._same_obstacles()
-        self._taken = {b.name: taken_up(self._rows(b.name)) for b in self.bodies}
+        self._taken = {b.name: taken_up(self._rows(b.name), recording.first) for b in self.bodies}
         self._last_use = self._last_uses()
         self._needed = set(self._last_use)  # (object, step) of matrices whose factor the loop used
         self._factors: dict[tuple[str, int], Factor] = {}
@@ -84,19 +86,38 @@ class Replay:
         for r in recording.resets:
             self._resets.setdefault(r.step, []).append(r.header.object)
         self._start = Start(self.simulation) if self._resets else None
+        self._saved = SavedFactors([], [])
+        if recording.checkpoint:
+            self._resume(recording)
         self._nodes: dict[int, tuple[NDArray[np.int32], Float64]] = {}  # nodes and offsets of interactions, by id
         self._inline = self._library()
         self._positions: dict[str, Float64] = {}  # sent instead of a matrix, and not those of its step, by body
         self._assemblies: dict[str, Assembly] = {}
+        for factor in self._saved.factors:
+            self._factors[factor.object, factor.step] = factor
+        for job in self._saved.jobs:
+            if (job.object, job.step) in self._needed:
+                self._inline.submit(job)
+        self._collect(recording.first)
         if self.simulation.world.backend.build() != recording.scene.build and recording.scene.build:
             self.compared.notes.append(
                 "another build than the recorded one (kernels, compiler, processor or GPU): last digits may differ"
             )
 
+    def _resume(self, recording: Recording) -> None:
+        """Goes to where the recorded run began: the checkpoint of the log."""
+        try:
+            checkpoint = from_bytes(recording.checkpoint)
+            manifest = restore(self.simulation, checkpoint)
+            self._saved = saved_factors(self.simulation, checkpoint, manifest)
+        except InputError as error:
+            raise BadLog(f"{recording.path}: the checkpoint in the log: {error}") from error
+        self.compared.notes.append(f"it went on from a checkpoint of step {manifest.step}, which the log holds")
+
     def run(self, progress: Callable[[int], None] = lambda _: None) -> Comparison:
         """Repeats all steps and compares them; calls `progress` with the number of steps done."""
-        self._compare_frames(0)
-        for step in range(self.recording.steps):
+        self._compare_frames(self.recording.first)
+        for step in range(self.recording.first, self.recording.steps):
             self._reset(step)
             self._restore_interactions(step)
             self._restore_targets(step)
@@ -111,7 +132,7 @@ class Replay:
                 self._use_factor(body.index, body.name, step, fresh=True)
             self.engine.solve()
             records, on_obstacles = self.engine.records_and_reactions()
-            self.compared.solves(records, [self._rows(b.name)[step] for b in self.bodies])
+            self.compared.solves(records, [self._row(b.name, step) for b in self.bodies])
             if self.compared.kinds:
                 exerted = messages.reactions(self.simulation, on_obstacles, self.engine.other_reactions())
                 self.compared.reactions(messages.steps(self.simulation, records, reactions=exerted))
@@ -120,12 +141,16 @@ class Replay:
         return self.compared
 
     def _rows(self, name: str) -> NDArray[np.void]:
-        return self.recording.objects[name].rows[: self.recording.steps]
+        return self.recording.objects[name].rows[: self.recording.steps - self.recording.first]
+
+    def _row(self, name: str, step: int) -> np.void:
+        row: np.void = self._rows(name)[step - self.recording.first]
+        return row
 
     def _last_uses(self) -> dict[tuple[str, int], int]:
         uses: dict[tuple[str, int], int] = {}
         for body in self.bodies:
-            for step, both in enumerate(self._taken[body.name].tolist()):
+            for step, both in enumerate(self._taken[body.name].tolist(), self.recording.first):
                 uses |= {(body.name, made): step for made in both if made >= 0}
         return uses
 
@@ -280,7 +305,7 @@ class Replay:
 
     def _apply_settings(self, index: int, name: str, step: int) -> None:
         """Sets the solver settings of one solve as they were."""
-        row, settings, solver = self._rows(name)[step], self.engine.settings(index), self.simulation.scene.solver
+        row, settings, solver = self._row(name, step), self.engine.settings(index), self.simulation.scene.solver
         settings.kind, settings.probe = int(row["asked"]), int(row["probe"])
         cut = row["status"] == pb.BUDGET and bool(solver.budget or solver.step_budget)
         settings.budget = -float(row["iterations"] + 1) if cut else 0.0
@@ -288,7 +313,7 @@ class Replay:
 
     def _use_factor(self, index: int, name: str, step: int, fresh: bool) -> None:
         """Posts the factor that a step used. fresh: the one made from the matrix of this step; else one made before."""
-        made = int(self._taken[name][step, int(fresh)])
+        made = int(self._taken[name][step - self.recording.first, int(fresh)])
         if made < 0:
             return
         if self._in_use.get(name) != made:
@@ -296,7 +321,9 @@ class Replay:
             if factor is None:
                 self.compared.diverged(step + 1, name, "factor", f"used that of step {made}, which there is not yet")
                 return
-            self.engine.post_factor(index, factor.pattern, factor.values, made)
+            in_use_when_saved = step == self.recording.first and any(f is factor for f in self._saved.factors)
+            post = self.engine.resume_factor if in_use_when_saved else self.engine.post_factor
+            post(index, factor.pattern, factor.values, made)
             self._in_use[name] = made
         if self._last_use[name, made] == step:
             self._factors.pop((name, made), None)
@@ -314,10 +341,10 @@ class Replay:
                 self.compared.frame(step, body.name, frame, (world.x[body.nodes], world.v[body.nodes]))
 
 
-def taken_up(rows: NDArray[np.void]) -> NDArray[np.int64]:
+def taken_up(rows: NDArray[np.void], first: int = 0) -> NDArray[np.int64]:
     """Finds of which steps the factors were that a body's solves used, (steps, 2): taken up before the step assembled,
-    and made from the very step; -1: none. rows: of a log (log.ROW), one a step."""
-    used, fresh = rows["factor_step"], rows["factor_step"] == np.arange(len(rows))
+    and made from the very step; -1: none. rows: of a log (log.ROW), one a step. first: steps before them."""
+    used, fresh = rows["factor_step"], rows["factor_step"] == first + np.arange(len(rows))
     return np.stack([np.where(fresh, -1, used), np.where(fresh, used, -1)], axis=1)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Carries out commands of clients on a running simulation: to push, grab, move, set, pause, step, reset and stop."""
+"""Carries out commands of clients on a running simulation: to push, grab, set, pause, step, reset, save and so on."""
 
 import math
 from collections.abc import Callable
@@ -154,6 +154,9 @@ class Commands:
             raise BadCommand(f"no object {command.object[:80]!r}; objects of the scene: {', '.join(names)}")
         return pb.Reply(status=self._status_of("paused" if self.engine_paused else "running"))
 
+    def _save(self, command: pb.Command) -> pb.Reply:
+        return pb.Reply(status=self._status_of("paused" if self.engine_paused else "running"))
+
     def _pause(self, command: pb.Command) -> pb.Reply:
         unchanged, loop = self.engine_paused, self.engine.loop
         if not unchanged and not loop.realtime:
@@ -261,5 +264,6 @@ VERBS: dict[str, Callable[[Commands, pb.Command], pb.Reply]] = {
     "push": Commands._push, "grab": Commands._grab, "move": Commands._move, "release": Commands._release,
     "move_obstacle": Commands._move_obstacle, "set": Commands._set, "parameters": Commands._parameters,
     "pause": Commands._pause, "resume": Commands._resume, "step": Commands._step, "reset": Commands._reset,
-    "stop": Commands._stop, "add_worker": Commands._add_worker, "kill_worker": Commands._kill_worker,
+    "save": Commands._save, "stop": Commands._stop,
+    "add_worker": Commands._add_worker, "kill_worker": Commands._kill_worker,
 }  # fmt: skip

@@ -23,8 +23,11 @@ from numpy.typing import NDArray
 
 from protocol import messages_pb2 as pb
 from protocol.process.nvidia import nvidia_device
+from protocol.process.version import version
 from sim_server.arrays import Float64
 from sim_server.backends.cpu.structs import REACTION
+from sim_server.checkpoint.content import capture, restore, restore_driver, saved_factors
+from sim_server.checkpoint.file import Checkpoint
 from sim_server.network.link import ServerLink
 from sim_server.recording import messages
 from sim_server.recording.recorder import Recorder
@@ -54,11 +57,14 @@ ENDLESS = 1 << 62
 
 
 class Service:
-    """Runs `simulation` on `link` until `steps` are done (None: until told to stop)."""
+    """Runs `simulation` on `link` until `steps` are done (None: until told to stop).
+
+    resume: where it goes on; None: at the start. Raises InputError if that is of another scene, or damaged
+    """
 
     def __init__(
         self, simulation: Simulation, link: ServerLink, recorder: Recorder | None = None, steps: int | None = None,
-        realtime: bool = True,
+        realtime: bool = True, resume: Checkpoint | None = None,
     ):  # fmt: skip
         self.simulation, self.link, self.recorder, self.steps = simulation, link, recorder, steps
         self.engine = simulation.engine
@@ -82,7 +88,11 @@ class Service:
         self._first = self._first_factors(realtime)
         self.say: Callable[[str], None] = lambda text: None  # tells of progress on the terminal
         self._told_of_wait = False
-        self.telemetry.open()
+        if resume is not None:
+            manifest = restore(simulation, resume)
+            restore_driver(self.driver, manifest, saved_factors(simulation, resume, manifest))
+        self._last = None if steps is None else self.engine.step + steps
+        self.telemetry.open(resume)
 
     def _first_factors(self, realtime: bool) -> FirstFactors | None:
         """Returns the first factors that the first step waits for; None: it goes without."""
@@ -130,9 +140,9 @@ class Service:
         try:
             if self._loop_alone:
                 if self._first is None or self._first.run():
-                    self.engine.run(ENDLESS if self.steps is None else self.steps - self.engine.step)
+                    self.engine.run(ENDLESS if self._last is None else self._last - self.engine.step)
                 return
-            while not self.engine.loop.stop and (self.steps is None or self.engine.step < self.steps):
+            while not self.engine.loop.stop and (self._last is None or self.engine.step < self._last):
                 self._batches.append((self.driver.advance(1), self.driver.reactions, self.driver.other_reactions))
         except BaseException as error:
             self._failure = error
@@ -175,8 +185,9 @@ class Service:
                 answer = self.commands.carry_out(command)
                 if self._halts.add(command, reply, answer):
                     continue
-                if command.verb == "reset" and not answer.error:
-                    self._between.add(partial(self._reset, command.object, reply, answer))
+                if command.verb in ("reset", "save") and not answer.error:
+                    change = self._save if command.verb == "save" else partial(self._reset, command.object)
+                    self._between.add(partial(change, reply, answer))
                     continue
                 answers.append((reply, answer))
                 if not answer.error:
@@ -201,6 +212,21 @@ class Service:
             reply(self.commands.carry_out(command))
             end = time.monotonic()
             self._set_due = 2 * end - begin
+
+    def _save(self, reply: Callable[[pb.Reply], None], answer: pb.Reply) -> None:
+        """Copies the state while the loop stands still; a thread makes the file of it, offers it and answers."""
+        self.commands.stamp(answer.status)
+        checkpoint = capture(self.simulation, self.driver, f"warpfactor {version()}")
+
+        def offer() -> None:
+            try:
+                self.link.set_checkpoint(pb.Checkpoint(step=answer.status.step, data=checkpoint.to_bytes()))
+            except ValueError as error:  # too large
+                reply(pb.Reply(error=str(error)))
+                return
+            reply(answer)
+
+        threading.Thread(target=offer, name="checkpoint", daemon=True).start()
 
     def _reset(self, name: str, reply: Callable[[pb.Reply], None], answer: pb.Reply) -> None:
         """Puts an object or all back to the start, while the loop stands still."""

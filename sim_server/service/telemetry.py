@@ -14,6 +14,7 @@ from protocol import messages_pb2 as pb
 from protocol.method import Method
 from sim_server.arrays import Float64
 from sim_server.backends.kinds import SLACK_OF_ENERGY
+from sim_server.checkpoint.file import Checkpoint
 from sim_server.mechanics.named_points import NamedPoints
 from sim_server.network.link import ServerLink
 from sim_server.recording import messages
@@ -83,8 +84,11 @@ class Telemetry:
         self._stale_moduli: set[str] = set()  # keys of parameters that were set
         self.simulation.parameters.on_set.append(lambda update: self._stale_moduli.update(update.values))
 
-    def open(self) -> None:
-        """Sends scene, topologies and the initial state, before anything else, to log and network."""
+    def open(self, resumed: Checkpoint | None = None) -> None:
+        """Sends scene, topologies and the initial state, before anything else, to log and network.
+
+        resumed: where the run goes on; the log has it, too, so that it can be repeated
+        """
         message = messages.scene(self.simulation)
         message.server = self.link.name
         self.link.set_scene(message)
@@ -97,7 +101,11 @@ class Telemetry:
                 self.recorder.topology(topology)
         self.contact.open()
         if self.recorder:
-            self._record_frame(0, self.simulation.world.x, self.simulation.world.v)
+            if resumed is not None:
+                start = pb.Checkpoint(step=self.engine.step, data=resumed.to_bytes())
+                self.recorder.checkpoint(start, self.engine.step * self.simulation.world.dt)
+            world = self.simulation.fetch()
+            self._record_frame(self.engine.step, world.x, world.v)
         self.publish_status("running")
 
     def _is_due(self, what: str, period: float) -> bool:

@@ -87,6 +87,7 @@ class FactorStatistics:
     used: int = 0
     regularized: int = 0  # of these, made from a matrix that was not positive definite
     newest: int = -1  # step of the matrix of the newest factor
+    kept: Factor | None = None  # the newest one, under policies by which a run repeats
     dropped: tuple[int, int] | None = None  # the newest factor is useless: its step, kind of the solves until then
     latency: RunningMean = field(default_factory=RunningMean)  # steps from a matrix to its factor
     cost: RunningMean = field(default_factory=RunningMean)  # s, or operations, of a factorization

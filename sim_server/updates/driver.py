@@ -173,6 +173,8 @@ class Driver:
         if not state.on_factor(factor, self.engine.step):
             return
         self.engine.post_factor(state.body.index, factor.pattern, factor.values, factor.step)
+        if not self.policy.free:
+            state.factors.kept = replace(factor, values=factor.values.copy())
         # Tell observers how it was made
         method, extrapolated = state.factors.method(factor.step), state.job.extrapolated
         at_end = Capability.MATRIX_POSITIONS not in self.engine.capabilities
@@ -186,6 +188,15 @@ class Driver:
             state.tuner.on_factor(method)
             self.apply_choice(state)
         self.useless_factors.resume(state)
+
+    def take_back(self, factor: Factor) -> None:
+        """Gives the loop a factor that was in use when the run was saved; nobody is told of it."""
+        state = self.by_name[factor.object]
+        state.on_job(factor.step, self.solver.method_named(factor.method))
+        state.on_factor(factor, self.engine.step)
+        state.factors.kept = factor
+        self.engine.resume_factor(state.body.index, factor.pattern, factor.values, factor.step)
+        self.engine.settle_factors()
 
     def fail(self, name: str, reason: str) -> None:
         """Takes note of a job without a factor; the object may be sent again."""

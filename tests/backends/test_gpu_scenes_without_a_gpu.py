@@ -13,10 +13,16 @@ from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder
 from sim_server.backends.gpu.inverse.plan import plan
 from sim_server.backends.gpu.inverse.workspace import workspace
 from sim_server.backends.gpu.islands import OWN_SURFACES
+from sim_server.checkpoint.content import capture
 from sim_server.simulation import Simulation
+from sim_server.state.arrays import state_arrays
+from sim_server.state.start import Start
+from sim_server.updates.driver import Driver
 from tests.backends import fake_cupy
 from tests.contact.scenes import block, floor, over, ram
 from tests.holders.holder_scenes import held_bar, left, right
+from tests.resets.going_on import resumed
+from tests.resets.state_scenes import made
 from tests.scenes import bar, scene
 from tests.support import nvrtc
 from tests.worker.block_matrices import bar_edges, pattern
@@ -80,6 +86,32 @@ def test_a_scene_is_built_and_its_kernels_compile(cupy, name):
     engine.settle_factors()
     engine.run(1)
     assert engine.factor_bytes(body.index) > 9 * nodes
+
+
+def written_back(simulation):
+    """Reads and writes all state of a simulation."""
+    arrays = state_arrays(simulation)
+    for array in arrays:
+        array.write(array.read())
+    assert len({array.name for array in arrays}) == len(arrays)
+
+
+def test_a_scene_is_reset_saved_and_resumed(cupy):
+    """State on the device is read and written; with contact and ties: below."""
+    simulation = made("held", "gpu", preconditioner="block_jacobi")
+    start = Start(simulation)
+    names = [a.name for a in state_arrays(simulation)]
+    assert len(set(names)) == len(names) and "engine.energies.balance" in names
+    driver = Driver(simulation)
+    driver.advance(3)
+    start.reset("beam")
+    start.reset()
+    driver.advance(2)
+    data = capture(simulation, driver, "test").to_bytes()
+    driver.advance(2)
+    again = resumed(data, simulation)  # the same one, since another takes as long to compile
+    assert simulation.engine.step == 5
+    assert again.advance(2)["step"].max() == simulation.engine.step == 7
 
 
 @pytest.mark.parametrize(("name", "precision"), [("beam.toml", "float64"), ("springs.toml", "float32")])
@@ -148,6 +180,7 @@ def test_a_scene_with_contact_is_built(cupy, precision):
     engine.run(3)
     records, reactions = engine.records_and_reactions()
     assert records["step"].tolist() == [1, 2, 3] and reactions.shape == (3, 2, 6)
+    written_back(simulation)
     exact = vars(simulation.contact.contact_input())
     twins = {name: engine.gpu.twin(array) for name, array in exact.items() if name in ("gap", "force", "normal")}
     assert {twin.dtype for twin in twins.values()} == {np.dtype("f8")}
@@ -193,6 +226,7 @@ def test_a_scene_whose_bodies_touch_each_other_is_built(cupy, precision):
     engine.assemble()
     engine.solve()
     assert engine.records()["step"].tolist() == [1, 1, 2, 2, 3, 3, 4, 4]
+    written_back(simulation)
 
 
 def test_a_scene_whose_body_touches_itself_is_built(cupy):
@@ -219,7 +253,8 @@ def test_bodies_that_are_told_not_to_touch_each_other_have_nothing_of_it(cupy):
 
 def test_a_scene_with_attachments_and_springs_alone_is_built(cupy):
     """They begin before islands are searched and end after all that moves nodes; nothing is detected."""
-    engine = Simulation.load("deploy/scenes/graft.toml", ["solver.precision=float32"], "gpu").engine
+    simulation = Simulation.load("deploy/scenes/graft.toml", ["solver.precision=float32"], "gpu")
+    engine = simulation.engine
     names = [kernel for kernel, _ in cupy.calls]
     first, last = names.index("begin_ties"), names.index("finish_contact")
     assert names[first : first + 4] == ["begin_ties", "look_at_bodies", "list_island_rows", "find_islands"]
@@ -231,6 +266,7 @@ def test_a_scene_with_attachments_and_springs_alone_is_built(cupy):
     engine.solve()
     records, reactions = engine.records_and_reactions()
     assert records["step"].tolist() == [1, 1, 2, 2, 3, 3, 4, 4] and reactions.shape == (8, 3, 6)
+    written_back(simulation)
 
 
 def test_a_scene_without_contact_has_nothing_of_it(cupy):

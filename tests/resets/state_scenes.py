@@ -42,13 +42,21 @@ def table(objects: list[dict[str, Any]], **keys: Any) -> dict[str, Any]:
     return {"name": "state", "dt": 0.01, "object": objects, "effects": effects, "solver": solver, **keys}
 
 
+LAWS = {
+    "neo_hookean": {"young": 3e5, "poisson": 0.4}, "mass_spring": {"young": 1e5}, "fixed": {"where": "X < 0.01"},
+    "touch": True,
+}  # fmt: skip
+MIXED = bar(cells=(2, 2, 2), size=(0.2, 0.2, 0.2), name="cube", density=1000, young=None) | {"effects": LAWS}
 SCENES: dict[str, dict[str, Any]] = {
+    "laws": table([beam(tangent="exact"), MIXED]),
     "newton": table([beam()], integrator=NEWTON),
     "newmark": table([beam()], integrator={"scheme": "newmark"}),
     "bdf2": table([beam()], integrator={"scheme": "bdf2"}),
     "generalized_alpha": table([beam()], integrator={"scheme": "generalized_alpha", "linearizations": 2}),
     "ros2": table([beam()], integrator={"scheme": "ros2"}),
-    "central_difference": table([beam()], integrator={"scheme": "central_difference"}, solver={"update": "never"}),
+    "central_difference": table(
+        [beam()], integrator={"scheme": "central_difference"}, solver={"preconditioner": "none"}
+    ),
     "friction": table([cube(), cube("next", x=0.21)], obstacle=[SLOPE, TOOL]),
     "friction, bdf2": table([cube()], obstacle=[SLOPE, TOOL], integrator={"scheme": "bdf2"}),
     "attached": table(halves(), attachment=[WEAK]),

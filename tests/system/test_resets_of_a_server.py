@@ -48,3 +48,35 @@ def test_resets_are_seen_and_replay_to_the_bit(tmp_path: Path) -> None:
     with_resets = [m for m in LogFile.open(log).messages() if m.topic == "/resets"]
     found = [pb.Reset.FromString(m.data) for m in with_resets]
     assert [(r.header.object, r.step) for r in found] == [("beam", running.step), ("", paused.step), ("", paused.step)]
+
+
+def test_a_saved_run_goes_on_and_its_log_replays_to_the_bit(tmp_path: Path) -> None:
+    """A factor is in use and a grab held when it is saved, and both are when it goes on."""
+    stage, log, file = Stage(tmp_path), tmp_path / "run.mcap", tmp_path / "beam.npz"
+    scene = beam(tmp_path, (2, 2, 6), 'update = "every-7"')
+    try:
+        server = stage.server(scene)
+        with stage.client() as client:
+            client.grab("beam", at="tip", target=(0.9, 0.5, 4), stiffness=1e5, max_force=9000)
+            until(lambda: fresh(client).step > 10, "it is pulled")
+            client.pause()
+            step = client.step(3).status.step
+            said = CliRunner().invoke(app, ["save", str(file), "--connect", stage.endpoint]).output
+            assert said.startswith(f"saved at step {step} ") and file.stat().st_size > 1000
+            low = [fresh(client).objects[0].low]
+            client.step(20)
+            low.append(fresh(client).objects[0].low)
+            client.stop()
+        assert server.wait() == 0, server.output()
+        server = stage.server(scene, "--resume", str(file), "--record", str(log), "--steps", "40", "--free-run")
+        assert server.wait() == 0, server.output()
+    finally:
+        stage.close()
+    done = run("clients", "replay", str(log), "--simulate")
+    assert done.returncode == 0 and "the same bit for bit" in done.stdout, done.stdout + done.stderr
+    assert "40 steps repeated" in done.stdout
+    assert f"it went on from a checkpoint of step {step}, which the log holds" in done.stdout + done.stderr
+    frames = [pb.State.FromString(m.data) for m in LogFile.open(log).messages() if m.topic == "/state/beam"]
+    found = {f.step: np.frombuffer(f.x).reshape(-1, 3).min(axis=0).tolist() for f in frames}
+    assert found[step] == [low[0].x, low[0].y, low[0].z]
+    assert found[step + 20] == [low[1].x, low[1].y, low[1].z], "as if it had not been interrupted"

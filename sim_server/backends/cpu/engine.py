@@ -29,7 +29,7 @@ from sim_server.backends.euler_form import EulerForm
 from sim_server.backends.newton import Newton
 from sim_server.backends.ring_buffers import Reports
 from sim_server.backends.rosenbrock import NODAL, Rosenbrock
-from sim_server.backends.state import StateArray, host_array, memory_of, numbers_of, same_body
+from sim_server.backends.state import StateArray, host_array, memory_of, numbers_array, same_body
 from sim_server.backends.ties import Ties
 
 Reals = NDArray[np.float64]
@@ -462,6 +462,7 @@ class CpuEngine(Reports):
         loop.energies = c.addressof(self._energies.native)
         self.begin: Sequence[Launch] = ()  # before the first step
         self._begun = False
+        self._corrects_resumed: dict[int, bool] = {}  # bodies whose correction is of the factor that was in use
 
     # --- running ------------------------------------------------------------------------------------------------
 
@@ -526,10 +527,16 @@ class CpuEngine(Reports):
         """Returns what is known of the changes since the matrix of the factor in use. No reset takes it back."""
         name, entry = f"engine.correction{body}", self._body[body]
         rooms = [(k, a) for k, a in self._corrections[body].items() if k not in ("diagonal", "block")]
-        numbers = numbers_of(entry.correction)
-        return [host_array(f"{name}.numbers", numbers, resets=False)] + [
-            host_array(f"{name}.{k}", a, resets=False) for k, a in rooms
-        ]
+
+        def is_of_factor() -> NDArray[Any]:
+            return np.array([bool(entry.factor) and not entry.mail and entry.correction.factor == entry.factor])
+
+        def set_of_factor(value: NDArray[Any]) -> None:
+            self._corrects_resumed[body] = bool(value[0])
+
+        found = [numbers_array(f"{name}.numbers", entry.correction)]
+        found.append(StateArray(f"{name}.is_of_factor", is_of_factor, set_of_factor, resets=False))
+        return found + [host_array(f"{name}.{k}", a, resets=False) for k, a in rooms]
 
     def resume(self, step: int, start_time: float) -> None:
         """Goes on from a state that was written, after `step` steps."""
@@ -537,6 +544,9 @@ class CpuEngine(Reports):
         for entry in self._body:
             entry.steps = step
         self._energies.resume(self._arrays["x"], self._arrays["v"])
+        for number, (*_, (binding, _)) in self._posted.items():  # what was posted is what the loop had: no news
+            if self._native.wf_post_binding(c.byref(self._launch[number]), None):
+                self._launch[number].binding, binding.taken = c.addressof(binding), step
 
     def restart(self, bodies: Sequence[int]) -> None:
         """Begins the energy balances of bodies anew."""
@@ -612,6 +622,13 @@ class CpuEngine(Reports):
         buffer.fill(values, step)
         self._mail[body].waiting = buffer
         self._native.wf_post_factor(c.byref(self._body[body]), buffer.address)
+
+    def resume_factor(self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int) -> None:
+        """Posts the factor that was in use when the state was saved; what is known of its correction holds."""
+        self.post_factor(body, pattern, values, step)
+        buffer = self._mail[body].waiting
+        if self._corrects_resumed.get(body) and buffer is not None:
+            self._body[body].correction.factor = buffer.address
 
     def settle_factors(self) -> None:
         """Blocks until posted factors are in use. No-op on the CPU."""

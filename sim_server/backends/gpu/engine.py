@@ -434,6 +434,10 @@ class GpuEngine(DeviceLoop):
         """Builds the inverse of a factor beside the steps; it is used from the first batch after its completion on."""
         self._factor_upload.post(body, pattern, values, step)
 
+    def resume_factor(self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int) -> None:
+        """Posts the factor that was in use when the state was saved."""
+        self._factor_upload.post(body, pattern, values, step)
+
     def settle_factors(self) -> None:
         """Blocks until the next solve will use the posted factors (deterministic policies)."""
         self._factor_upload.settle()

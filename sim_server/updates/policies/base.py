@@ -4,10 +4,12 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from protocol.factor import Factor
 from sim_server.updates.body_state import BodyUpdateState
+from sim_server.updates.factor_source import Job
 from sim_server.updates.scheduler import UpdateRequest
 
 if TYPE_CHECKING:
@@ -45,6 +47,10 @@ class UpdatePolicy(ABC):
 
     def on_job_end(self) -> None:
         """Takes note that an object may be sent again, as its job has brought a factor or failed."""
+        return
+
+    def take_back(self, jobs: Sequence[Job]) -> None:
+        """Takes the jobs that were in flight when the run was saved."""
         return
 
     def pump(self) -> None:

@@ -5,10 +5,12 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from protocol.factor import Factor
 from sim_server.updates.body_state import BodyUpdateState
+from sim_server.updates.factor_source import Job
 from sim_server.updates.policies.base import UpdatePolicy
 from sim_server.updates.scheduler import UpdateRequest
 
@@ -29,12 +31,20 @@ class Lockstep(UpdatePolicy):
         super().__init__(driver, n)
         self._due: dict[str, int] = {}  # objects with a job, and the steps of their matrices
         self._arrived: dict[tuple[str, int], Factor] = {}  # by object and step
+        self._saved: Sequence[Job] = ()  # in flight when the run was saved
         self._without_workers = False  # the last matrix was factorized in this process
 
     def step(self) -> None:
         """Uses the factors that are due, makes a step, and sends the matrices of bodies without a job."""
         driver, engine = self.driver, self.driver.engine
         now = engine.step
+        for job in self._saved:
+            state = driver.by_name[job.object]
+            state.job.copy = job.values
+            state.on_job(job.step, job.method)
+            if self._submit(state, job):
+                self._due[job.object] = job.step
+        self._saved = ()
         for name, made in list(self._due.items()):
             if made + self.n == now:
                 self._use(name, made)
@@ -59,6 +69,10 @@ class Lockstep(UpdatePolicy):
     def on_factor(self, factor: Factor) -> None:
         """Keeps a factor until it is due."""
         self._arrived[factor.object, factor.step] = factor
+
+    def take_back(self, jobs: Sequence[Job]) -> None:
+        """Has the jobs sent again before the next step."""
+        self._saved = jobs
 
     def expected_latency(self, state: BodyUpdateState) -> float:
         """Returns n."""
@@ -89,10 +103,11 @@ class Lockstep(UpdatePolicy):
     def _send(self, state: BodyUpdateState) -> bool:
         """Sends the copied matrix to a worker as soon as one is idle; factorizes it in this process if there is no
         worker at all. False: the loop was stopped, or the copy does not suffice."""
+        job = self.driver.make_job(state)
+        return job is not None and self._submit(state, job)
+
+    def _submit(self, state: BodyUpdateState, job: Job) -> bool:
         driver, source = self.driver, self.driver.source
-        job = driver.make_job(state)
-        if job is None:
-            return False
         begun = time.monotonic()
         while not (source.ready() and source.submit(job)):
             if driver.engine.loop.stop:

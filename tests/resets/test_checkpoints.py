@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: MIT
+"""A run that is saved, and goes on in another simulation, agrees to the bit with one that just goes on."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sim_server.checkpoint.content import capture, restore
+from sim_server.checkpoint.file import from_bytes, read
+from sim_server.errors import InputError
+from sim_server.updates.driver import Driver
+from tests.resets.going_on import check_that_it_goes_on
+from tests.resets.state_scenes import SCENES, made
+
+CASES = [(name, "every-3") for name in SCENES if name != "central_difference"] + [
+    ("central_difference", "never"), ("bdf2", "lockstep-4"), ("friction", "lockstep-4"), ("ros2", "lockstep-3"),
+    ("attached", "never"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "update"), CASES)
+def test_a_run_goes_on_to_the_bit(name: str, update: str) -> None:
+    check_that_it_goes_on(name, update)
+
+
+def test_a_checkpoint_of_another_scene_or_a_damaged_one_is_refused(tmp_path: Path) -> None:
+    sim = made("newmark")
+    driver = Driver(sim)
+    driver.advance(2)
+    checkpoint = capture(sim, driver, "test")
+    data = checkpoint.to_bytes()
+
+    def refused(match: str, scene: str = "newmark", **changes: Any) -> None:
+        changed = from_bytes(data)
+        changed.manifest |= changes
+        with pytest.raises(InputError, match=match):
+            restore(made(scene), from_bytes(changed.to_bytes()))
+
+    refused(r"of another scene \(integrator.scheme: saved with newmark, here bdf2\)", "bdf2")
+    refused("step = 'many'", step="many")
+    refused("made on a gpu", device="gpu")
+    (tmp_path / "half").write_bytes(data[: len(data) // 2])
+    (tmp_path / "other").write_text("not at all")
+    for name in ("half", "other"):
+        with pytest.raises(InputError, match=f"{name}: no checkpoint, or a damaged one"):
+            read(tmp_path / name)
+    missing = from_bytes(data)
+    key = next(k for k in missing.arrays if k.endswith(".x"))
+    missing.arrays[key] = missing.arrays[key][:-1]
+    with pytest.raises(InputError, match=r"is float64 of shape \(19, 3\); expected: float64 of shape \(20, 3\)"):
+        restore(made("newmark"), missing)
+    del missing.arrays[key]
+    with pytest.raises(InputError, match="is missing"):
+        restore(made("newmark"), missing)
