@@ -77,7 +77,8 @@ class TouchEntry(Entry):
 
 
 class Manifest(Entry):
-    """digest: of the scene with all defaults and overrides, `resolved`. start_time: of the simulation at step 0 [s]."""
+    """digest: of the scene with all defaults and overrides, `resolved`. start_time: of the simulation at step 0 [s].
+    parameters: that were set since, by key, as TOML."""
 
     format: str
     version: int
@@ -92,6 +93,7 @@ class Manifest(Entry):
     bodies: list[BodyEntry]
     interactions: list[TouchEntry]
     last_interaction: int
+    parameters: dict[str, str]
 
 
 @dataclass(frozen=True)
@@ -139,6 +141,7 @@ def capture(simulation: Simulation, driver: Driver, software: str) -> Checkpoint
         build=simulation.world.backend.build(), scene=simulation.scene.name, digest=digest(simulation),
         resolved=simulation.scene.resolved(), step=engine.step, start_time=engine.loop.start_time, bodies=bodies,
         interactions=[_touch_entry(a) for a in interactions], last_interaction=touch.last_id if touch else 0,
+        parameters=simulation.parameters.changed,
     )  # fmt: skip
     return Checkpoint(manifest.model_dump(exclude={"format", "version"}), arrays)
 
@@ -171,6 +174,11 @@ def restore(simulation: Simulation, checkpoint: Checkpoint) -> Manifest:
     interactions = [_interaction(simulation, checkpoint, entry) for entry in manifest.interactions]
     if interactions and touch is None:
         raise InputError("manifest.json: interactions in a scene that takes none")
+    try:
+        if manifest.parameters:
+            simulation.parameters.set(manifest.parameters)
+    except ValueError as error:
+        raise InputError(f"manifest.json: parameters: {error}") from None
     engine.prepare()
     for array, value in zip(arrays, values, strict=True):
         array.write(value)

@@ -28,6 +28,13 @@ def touched(sim: Simulation) -> None:
             mover.move(name, (x, y, z), (1.0, 0.0, 0.0, 0.0))
 
 
+def changed(sim: Simulation) -> None:
+    """Halves one parameter of each effect that has any."""
+    of = {p.field.of: p for p in sim.parameters if isinstance(p.field.value, float) and p.field.value}
+    if of:
+        sim.parameters.set({p.field.key: repr(p.field.value / 2) for p in of.values()})
+
+
 def resumed(data: bytes, sim: Simulation) -> Driver:
     """A driver of the simulation, which goes on where the file was saved."""
     driver, checkpoint = Driver(sim), from_bytes(data)
@@ -56,6 +63,7 @@ def check_that_it_goes_on(name: str, update: str, device: str = "cpu") -> None:
     driver = Driver(sim)
     driver.advance(2)
     touched(sim)
+    changed(sim)
     driver.advance(BEFORE - 2)
     data = capture(sim, driver, "test").to_bytes()
     records = driver.advance(AFTER)
