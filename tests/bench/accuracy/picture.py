@@ -13,7 +13,10 @@ from tests.bench.harness.pieces import Row
 from tests.bench.harness.report import plots
 
 MARKERS = "os^Dv<>P*X"
-COLOURS = {"-": [f"C{k}" for k in range(10)], "--": ["k", "0.4", "m", "0.6", "navy", "darkgreen", "0.75"]}  # by style
+COLOURS = {
+    "-": [*(f"C{k}" for k in range(10)), "gold"],
+    "--": ["k", "0.4", "m", "0.6", "navy", "darkgreen", "0.75"],
+}  # by style
 WORDS = {"error": "error", "step error": "error of the steps", "solve error": "error of the linear solves"}
 
 
