@@ -13,10 +13,10 @@ from tests.bench.harness.pieces import Row
 from tests.bench.harness.report import plots
 
 MARKERS = "os^Dv<>P*X"
-COLOURS = {
+COLOURS = {  # by style
     "-": [*(f"C{k}" for k in range(10)), "gold"],
     "--": ["k", "0.4", "m", "0.6", "navy", "darkgreen", "0.75"],
-}  # by style
+}
 WORDS = {"error": "error", "step error": "error of the steps", "solve error": "error of the linear solves"}
 
 
