@@ -21,14 +21,14 @@ from clients.web.surfaces import MOST_VERTICES
 from clients.web.view import home, up_of
 from tests.bench.harness.report import ROOT, Report, plots
 from tests.bench.web.player import Player
-from tests.bench.web.watcher import frames, jump, watched
+from tests.bench.web.watcher import frames, jump, still, watched
 from tests.ports import free_port
 from tests.support.browser import browser, missing, on_screen
 
 BEAM = ROOT / "deploy" / "scenes" / "beam.toml"
 AT_REST = ("effects.gravity.g=[0, 0, 0]", "object.beam.effects.rayleigh.mass=5")  # nothing moves but by the pointer
 PATIENCE = 60.0  # s for processes to start
-JUMP, REST = 40, 0.7  # pixels that the pointer jumps; s until the next jump, when the body is at rest again
+JUMP = 40  # pixels that the pointer jumps
 WARM = 5.0  # s until the motion is the same in all runs
 SMALL = {"width": 700, "height": 360}  # window of tabs that are only to be there
 TABS = (0, 1, 4)
@@ -135,7 +135,7 @@ def latency(chromium: Any, folder: Path, jumps: int) -> list[dict[str, Any]]:
         tab.mouse.move(x - JUMP, y, steps=5)
         found = []
         for number in range(jumps):
-            time.sleep(REST)
+            still(tab)
             found.append(jump(tab, x - JUMP * (number % 2), y - JUMP))
         tab.mouse.up()
         tab.close()
