@@ -112,13 +112,15 @@ class DeviceEnergies:
                 launch()
             self._elastic_kernel((self._bodies,), (THREADS,), (params,))
 
+    def prepare_work(self) -> None:
+        """Allocates and compiles what `launch_work` needs."""
+        cp = self._gpu.cp
+        self._memory["scratch"] = cp.zeros(self._bodies * ENERGY_RECORD.itemsize, np.uint8)
+        self._memory["before"] = cp.zeros(self._bodies)
+        self._work_kernel = self._kernel(ELASTIC_TEXT, "elastic_work")
+
     def launch_work(self, after: bool) -> None:
         """Launches what makes work of the elastic energy that a change of parameters adds. after: it is made."""
-        cp = self._gpu.cp
-        if "scratch" not in self._memory:
-            self._memory["scratch"] = cp.zeros(self._bodies * ENERGY_RECORD.itemsize, np.uint8)
-            self._memory["before"] = cp.zeros(self._bodies)
-            self._work_kernel = self._kernel(ELASTIC_TEXT, "elastic_work")
         for launch, _, params in self._launches:
             if launch is not None:
                 launch()

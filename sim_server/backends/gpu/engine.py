@@ -427,6 +427,7 @@ class GpuEngine(DeviceLoop):
             kept.append(cp.asarray(np.array([ESTIMATE_EVERY], np.int32)))
             copies.append((self._substeps.since, int(kept[-1].data.ptr), 4))
         if not self._work_graphs:  # in a stream of their own: steps are under way
+            self._energies.prepare_work()
             stream = cp.cuda.Stream(non_blocking=True)
             for after in (False, True):
                 with stream:
