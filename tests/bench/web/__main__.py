@@ -105,6 +105,7 @@ def served(folder: Path, *settings: str, scene: Path = BEAM) -> Iterator[tuple[C
 def stirred(client: Client) -> Iterator[None]:
     """The tip of the beam is led around in a circle, so that steps have the same work at all times."""
     stop = threading.Event()
+    time.sleep(WARM)  # until it has come down
     with client.grab("beam", at="tip", radius=0.3, stiffness=2e4, max_force=1e4) as held:
         at = held.interaction.point
 
