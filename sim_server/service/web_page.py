@@ -26,9 +26,9 @@ class WebCommand(TyperCommand):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Gives --web its default where no HOST:PORT follows, then parses as typer does."""
         filled: list[str] = []
-        for word, following in zip(args, [*args[1:], ""], strict=True):
+        for number, word in enumerate(args, start=1):
             filled.append(word)
-            if word == "--web" and not _is_address(following):
+            if word == "--web" and not (number < len(args) and _is_address(args[number])):
                 filled.append(shown(HOST, PORT))
         return super().parse_args(ctx, filled)
 

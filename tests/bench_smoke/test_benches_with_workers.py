@@ -6,11 +6,14 @@ from pathlib import Path
 import pytest
 
 from tests.bench_smoke.quickly import writes_its_report
+from tests.support.browser import missing
 
-BENCHES = ("build", "cpu", "faults", "figure4", "gallery", "haptics", "scaling")
+BENCHES = ("build", "cpu", "faults", "figure4", "gallery", "haptics", "scaling", "web")
 pytestmark = [pytest.mark.system, pytest.mark.slow]
 
 
 @pytest.mark.parametrize("name", BENCHES)
 def test_bench_writes_its_report(name: str, tmp_path: Path) -> None:
+    if name == "web" and missing():
+        pytest.skip(missing())
     writes_its_report(name, tmp_path)

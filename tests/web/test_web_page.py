@@ -122,6 +122,16 @@ def test_a_drag_moves_the_body_and_letting_go_releases_it(world: World, tab: Any
     until(lambda: world.moved(FRONT) < 0.05, "a body that goes back")
 
 
+def test_a_drag_with_shift_pushes(world: World, tab: Any) -> None:
+    tab.keyboard.down("Shift")
+    world.drag(tab, FRONT)
+    tab.mouse.up()
+    tab.keyboard.up("Shift")
+    until(lambda: world.moved(FRONT) > 0.02, "a push")
+    assert not world.grabs()
+    until(lambda: world.moved(FRONT) < 0.01, "a body that goes back")
+
+
 def test_a_slider_changes_the_stiffness_and_follows_others(world: World, tab: Any) -> None:
     value = field(tab, "corotational.young")
     value.fill("4.5")

@@ -89,7 +89,7 @@ def test_a_skin_is_drawn_in_place_of_the_surface() -> None:
         nodes=np.array([[0, 1, 2, 3]] * 3, np.int32), triangles=np.array([[0, 1, 2]], np.int32),
         weights=np.array([[0.25] * 4, [1, 0, 0, 0], [0, 0.5, 0.5, 0]]),
     )  # fmt: skip
-    surfaces = Surfaces({"a": SimpleNamespace(**vars(mesh), skin=skin)})  # type: ignore[dict-item]
+    surfaces = Surfaces({"a": SimpleNamespace(**vars(mesh) | {"skin": skin})})  # type: ignore[dict-item]
     surfaces.move("a", mesh.rest * 2)
     assert_allclose(surfaces.points, [[0.5, 0.5, 0.5], [0, 0, 0], [1, 1, 0]], atol=1e-7)
 

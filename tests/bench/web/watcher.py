@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: MIT
 """What a tab shows, noted in the tab itself: when positions of a surface that has moved were drawn."""
 
+import time
 from typing import Any
 
 from tests.support.browser import choose_colour, open_page
 
+STILL, LONGEST = 0.5, 10.0  # s without motion before the pointer jumps, and that this may take at most
 MOVED = 1e-3  # m, of a coordinate between two frames: what counts as motion
 
 # three.js gives new positions to the graphics driver in the task that draws the frame with them; the callback before
@@ -49,6 +51,15 @@ def watched(browser: Any, address: str, size: dict[str, int] | None = None) -> A
     tab = open_page(browser, address, size, WATCH)
     choose_colour(tab, "plain")
     return tab
+
+
+def still(tab: Any) -> None:
+    """Waits until nothing has moved for a while."""
+    end, before, since = time.monotonic() + LONGEST, frames(tab), time.monotonic()
+    while time.monotonic() < min(end, since + STILL):
+        time.sleep(0.05)
+        if (now := frames(tab)) != before:
+            before, since = now, time.monotonic()
 
 
 def jump(tab: Any, x: float, y: float) -> float:
