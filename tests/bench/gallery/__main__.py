@@ -16,9 +16,11 @@ from numpy.typing import NDArray
 from clients.client import Client
 from clients.errors import BadInput, ClientError
 from clients.log.reader import Log
-from tests.bench.harness.report import ROOT, Report, plots
+from tests.bench.harness.pieces import Merged
+from tests.bench.harness.report import ROOT, Report
 from tests.ports import free_port
 
+TITLE = "Dragging the creature"
 CREATURE = "creature"
 SOLVERS = {"factors by a worker": (), "block Jacobi": ("solver.preconditioner=block_jacobi",),
            "no preconditioner": ("solver.preconditioner=none",)}  # fmt: skip
@@ -37,13 +39,14 @@ PATIENCE = 60.0  # s for a server to be there
 PAPER = {"scene": "the paper's armadillo", "solver": "asynchronous, warped", "tets": 4406, "steps a second": "50 to 80"}
 COLUMNS = ("device", "scene", "solver", "tets", "steps a second", "step p50 ms", "step p99 ms", "iterations",
            "iterations p99", "age", "age, max", "not converged")  # fmt: skip
+KEYS = ("device", "scene", "solver")  # what tells rows apart
 EXPLAINED = (
     f"""\
 Each scene runs as fast as it goes, `sim-server gallery/NAME --workers 1 --free-run`, with a log, while a client holds a
 body and drags it around once in {PERIOD:g} s of wall time; server, worker and client are processes of one machine. The
 steps before the hand takes hold, and while a first factor is awaited, do not count. *steps a second*: those that count
 over the sum of their times; a step of 20 ms is in real time at 50. *age* of the factors used [steps], its mean. *not
-converged*: steps whose solve used up its iterations.""",
+converged*: steps whose solve used up its iterations. The committed page's runs on a CPU had two cores, `taskset -c 0,1`.""",
     """\
 The paper (Courtecuisse et al. 2010, section 8.4) says of its interactive armadillo how many elements it had, that it
 ran at 50 to 80 frames a second on a Core i7 at 3.07 GHz with a GeForce GTX 480, and that without a preconditioner it
@@ -87,8 +90,8 @@ def _client(server: "subprocess.Popen[bytes]", endpoint: str) -> Client:
             time.sleep(0.05)
 
 
-def measured(name: str, solver: str, device: str, steps: int) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-    """Returns a row, and iterations and milliseconds of the steps that count."""
+def measured(name: str, solver: str, device: str, steps: int) -> dict[str, Any]:
+    """Returns a row."""
     warm = steps // 4
     with tempfile.TemporaryDirectory(prefix="warpfactor-gallery-") as folder:
         log, endpoint = Path(folder) / "run.mcap", f"tcp/127.0.0.1:{free_port()}"
@@ -117,7 +120,7 @@ def measured(name: str, solver: str, device: str, steps: int) -> tuple[dict[str,
     row |= {"step p50 ms": np.percentile(ms, 50), "step p99 ms": np.percentile(ms, 99)}
     row |= {"iterations": iterations.mean(), "iterations p99": np.percentile(iterations, 99)}
     row |= {"age": _known(age, np.mean), "age, max": _known(age, np.max), "not converged": lost}
-    return row, {"iterations": iterations, "ms": ms}
+    return row
 
 
 def _with_a_factor(scalars: dict[str, Any]) -> int:
@@ -130,16 +133,15 @@ def _known(age: NDArray[Any], what: Any) -> float | None:
     return float(what(age[age >= 0])) if (age >= 0).any() else None
 
 
-def picture(series: dict[str, dict[str, NDArray[Any]]]) -> Any:
-    """Iterations and times of the creature's steps by solver."""
-    figure, axes = plots().subplots(2, 1, figsize=(8, 6), sharex=True, layout="constrained")
-    for solver, found in series.items():
-        for axis, what in zip(axes, ("iterations", "ms"), strict=True):
-            axis.plot(found[what], lw=0.8, label=solver)
-    axes[0].set(ylabel="iterations", yscale="log", title="The creature while its hand is dragged")
-    axes[1].set(xlabel="steps since the hand took hold", ylabel="step [ms]", yscale="log")
-    axes[0].legend()
-    return figure
+def write(report: Report, rows: list[dict[str, Any]], others: list[dict[str, Any]]) -> None:
+    """Makes the page. rows: of the creature"""
+    report.say(*EXPLAINED, "## The creature")
+    report.table([*rows, PAPER], COLUMNS)
+    report.say("## The other scenes")
+    report.table(others, COLUMNS)
+    report.data |= {"creature": rows, "others": others}
+    report.remember([*rows, *others], KEYS, ("steps a second", "iterations"))
+    report.write()
 
 
 def main(
@@ -149,29 +151,28 @@ def main(
     device: Annotated[str, typer.Option(metavar="cpu|gpu", help="Of the servers")] = "cpu",
     quick: Annotated[bool, typer.Option("--quick", help="A small smoke run")] = False,
     out: Annotated[Path | None, typer.Option(help="Folder of the results [default: out/bench/gallery]")] = None,
+    merge: Annotated[
+        list[Path] | None, typer.Option(metavar="JSON", help="Only make one page of these results, as of both devices")
+    ] = None,
 ) -> None:
     """Steps a second, iterations and ages of factors of the gallery's scenes while a hand drags them."""
     if device not in ("cpu", "gpu"):
         raise typer.BadParameter(f"--device {device}: allowed are cpu, gpu")
+    if merge:
+        merged = Merged("gallery", TITLE, merge, out)
+        write(merged, merged.rows("creature", KEYS), merged.rows("others", KEYS))
+        return
     steps = 60 if quick else steps
-    report = Report("gallery", "Dragging the creature", {"steps": steps, "device": device}, out, quick)
-    rows, series = [], {}
+    report = Report("gallery", TITLE, {"steps": steps, "device": device}, out, quick)
+    rows = []
     for solver in list(SOLVERS)[: 2 if quick else None]:
-        row, series[solver] = measured(CREATURE, solver, device, steps)
-        rows.append(row)
+        rows.append(measured(CREATURE, solver, device, steps))
         print(f"{CREATURE}, {solver}: done", flush=True)
     others = []
     for name in ("tentacle",) if quick else [name for name in HANDS if name != CREATURE]:
-        others.append(measured(name, FACTORS, device, steps)[0])
+        others.append(measured(name, FACTORS, device, steps))
         print(f"{name}: done", flush=True)
-    report.say(*EXPLAINED, "## The creature")
-    report.table([*rows, PAPER], COLUMNS)
-    report.figure(picture(series), "gallery.png", "Iterations and times of the creature's steps by solver.")
-    report.say("## The other scenes")
-    report.table(others, COLUMNS)
-    report.data |= {"creature": rows, "others": others}
-    report.remember([*rows, *others], ("device", "scene", "solver"), ("steps a second", "iterations"))
-    report.write()
+    write(report, rows, others)
 
 
 if __name__ == "__main__":
