@@ -131,7 +131,7 @@ def test_a_file_of_that_name_wins(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.chdir(tmp_path)
     assert load("gallery/sheet").objects[0].name == load("gallery/sheet.toml").objects[0].name == "sheet"
     (tmp_path / "gallery" / "sheet").mkdir(parents=True)
-    assert load("gallery/sheet").path == load("gallery/sheet.toml").path == Path("gallery/sheet"), "a folder is no scene"
+    assert load("gallery/sheet").path == load("gallery/sheet.toml").path == Path("gallery/sheet")
     text = (gallery.FOLDER / "sheet.toml").read_text().replace('name = "sheet"', 'name = "mine"')
     (tmp_path / "gallery" / "sheet.toml").write_text(text)
     assert load("gallery/sheet.toml").objects[0].name == load("gallery/sheet").objects[0].name == "mine"
