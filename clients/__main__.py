@@ -355,10 +355,7 @@ def _print_outcome(verb: str, reply: pb.Reply, as_json: bool) -> None:
     if verb == "step" and found.state != "paused":
         said = f"{found.state} at"
     if reply.unchanged:
-        said = {
-        "pause": "paused at", "resume": "goes on from", "stop": "stopped after", "step": "paused at",
-        "reset": "put back at",
-    }[verb]  # fmt: skip
+        said = {"pause": "already paused, at", "resume": "already running, at"}[verb]
     steps = f"{found.step} step{'s' * (found.step != 1)}" if verb == "stop" else f"step {found.step}"
     print(f"{said} {steps} (t = {found.time:.3f} s)")
 

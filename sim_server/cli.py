@@ -59,9 +59,12 @@ def list_gallery(asked: bool) -> None:
     table = Table("name", "what", "elements", "command", box=None, pad_edge=False)
     table.columns[2].justify, table.columns[3].no_wrap = "right", True
     for name in gallery.names():
-        path = Path(gallery.PREFIX, name)
-        elements = sum(len(o.load_mesh().tets) for o in load(path).objects)
-        table.add_row(name, gallery.sentence(name), str(elements), f"sim-server {path} --workers 1")
+        file = gallery.FOLDER / f"{name}.toml"
+        try:
+            elements = sum(len(o.load_mesh().tets) for o in load(file).objects)
+        except InputError as error:
+            PROGRAM.bad_input(f"{file}: {error}")
+        table.add_row(name, gallery.sentence(name), str(elements), f"sim-server {gallery.name_of(file)} --workers 1")
     Console().print(table)
     raise typer.Exit
 

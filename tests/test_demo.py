@@ -67,15 +67,22 @@ def test_the_hand_goes_smoothly_from_where_it_is_to_the_last_place() -> None:
 
 @pytest.mark.parametrize(
     ("display", "page", "browser", "shown"),
-    [(True, True, True, True), (False, True, True, False), (True, False, True, False), (True, True, False, False)],
-    ids=["all there", "no display", "no page", "no browser"],
+    [
+        (True, True, "xdg-open", True),
+        (False, True, "xdg-open", False),
+        (True, False, "xdg-open", False),
+        (True, True, "", False),
+        (True, True, "/usr/bin/w3m", False),
+    ],
+    ids=["all there", "no display", "no page", "no browser", "a browser for text"],
 )
 def test_the_page_is_shown_where_it_can_be_seen(
-    display: bool, page: bool, browser: bool, shown: bool, monkeypatch: pytest.MonkeyPatch
+    display: bool, page: bool, browser: str, shown: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def get() -> None:
+    def get() -> webbrowser.BaseBrowser:
         if not browser:
             raise webbrowser.Error("could not locate runnable browser")
+        return webbrowser.GenericBrowser(browser)
 
     demo = the_demo()
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
@@ -114,6 +121,6 @@ def test_the_page_opens_on_the_creature_and_ends_with_its_server(
     monkeypatch.setattr(webbrowser, "open", open_page)
     assert demo.show() == 0
     (server, page), (address,) = started, opened
-    assert server[:2] == ("sim_server", "gallery/creature") and "--steps" not in server
+    assert server[:2] == ("sim_server", "gallery/creature") and not {"--steps", "--record"} & set(server)
     assert page[:2] == ("clients", "web") and page[page.index("--connect") + 1] == server[server.index("--listen") + 1]
     assert address == f"http://127.0.0.1:{page[page.index('--port') + 1]}" and address in capsys.readouterr().out

@@ -7,6 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from clients.errors import BadInput
 from clients.log.atomic_file import atomic_file
 from clients.log.frames import Frame, Mesh
@@ -59,6 +61,8 @@ def _write(path: Path, frame: Frame, mesh: Mesh) -> list[Path]:
         return [path]
     of_skin = path.with_name(f"{path.stem}_skin.vtu")
     at_vertices = {key: mesh.skin.values(values) for key, values in point_data.items()}
+    if "von_mises" in at_vertices:
+        at_vertices["von_mises"] = np.maximum(at_vertices["von_mises"], 0.0)  # weights beyond the mesh may be negative
     _write_mesh(of_skin, mesh.skin.positions(frame.x), [("triangle", mesh.skin.triangles)], at_vertices, {})
     return [path, of_skin]
 

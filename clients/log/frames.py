@@ -13,6 +13,7 @@ from protocol.refused import Refused
 from protocol.validate import array, check_range
 
 SUM_ERROR = 1e-6  # of the weights of a vertex of a skin
+MOST_WEIGHT = 4.0  # magnitude of such a weight, as servers bound it
 
 
 @dataclass(frozen=True)
@@ -93,6 +94,8 @@ def _skin_of(message: pb.Topology, name: str) -> Skin | None:
     check_range(triangles, 0, len(nodes), f"{name}: skin_triangles")
     if len(weights) and not (error := float(abs(weights.sum(axis=1) - 1).max())) <= SUM_ERROR:
         raise Refused(f"{name}: skin_weights have sums off 1 by {error:.3g}; allowed: {SUM_ERROR:g}", "number")
+    if len(weights) and (largest := float(abs(weights).max())) > MOST_WEIGHT + SUM_ERROR:
+        raise Refused(f"{name}: skin_weights of magnitude {largest:.3g}; allowed: {MOST_WEIGHT:g}", "number")
     return Skin(nodes, weights, triangles)
 
 

@@ -36,7 +36,7 @@ def plan(scene: Path, wish: Wish, where: Path | None, to: Path | None, minutes: 
     if not 0 <= minutes <= MOST_MINUTES:
         raise BadInput(f"--measure {minutes:g}: allowed is 0 (nothing is measured) to {MOST_MINUTES:g} minutes")
     check_scene(scene)
-    to = to or (scene if scene.exists() else Path(scene.name)).with_suffix(".plan.toml")
+    to = to or (scene if scene.is_file() else Path(scene.name)).with_suffix(".plan.toml")
     overlay.check_path(to)
     where = where or Path(f"accuracy-{scene.stem}")
     path = where if where.is_file() else where / "points.json"

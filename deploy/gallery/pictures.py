@@ -68,7 +68,7 @@ def picture(name: str) -> None:
     """Runs a scene and writes its picture."""
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder) / f"{name}.mcap"
-        server = start(f"gallery/{name}", log, "--quiet", "--steps", str(STEPS))
+        server = start(f"gallery/{name}", "--record", str(log), "--quiet", "--steps", str(STEPS))
         try:
             with connected(server) as client:
                 play(client, server, DRAGS[name])

@@ -27,7 +27,8 @@ MOST_VERTICES = 1_000_000
 MOST_OUTSIDE = 0.1  # distance of a vertex from the mesh, of the largest extent of the mesh
 MOST_WEIGHT = 4.0  # magnitude of a weight
 ROUNDING = 1e-9  # of the largest extent: vertices outside by less are inside
-TOLD = 1e-6  # of the largest extent: vertices outside by more are told
+COUNTED = 1e-6  # of the largest extent: vertices outside, or moved, by more are counted
+WARNED = 0.05  # of the largest extent: a vertex outside by more is a warning; round parts of a coarse mesh take less
 PART = 8192  # vertices that are looked at together
 
 
@@ -46,8 +47,8 @@ class Skin:
 def read_skin(path: str | Path, scale: float, mesh: Mesh) -> Skin:
     """Returns the surface in a file that meshio reads, embedded in a mesh. scale: of the coordinates in the file.
 
-    Logs how far outside the mesh vertices lie. Raises InputError for a file that has no surface, too many vertices, or
-    one that is too far outside.
+    Warns of vertices that lie far outside the mesh, or had to be moved. Raises InputError for a file that has no
+    surface, too many vertices, or one that is too far outside.
     """
     points, triangles = read_surface(path, "skin")
     used, numbers = np.unique(triangles, return_inverse=True)
@@ -59,13 +60,14 @@ def read_skin(path: str | Path, scale: float, mesh: Mesh) -> Skin:
     except InputError as error:
         raise InputError(f"skin {path}: {error}") from None
     size = _size(mesh)
-    if (told := outside > TOLD * size).any():
-        moved = np.linalg.norm(np.einsum("sc,scd->sd", weights, mesh.rest[nodes]) - points, axis=1)
+    by = np.linalg.norm(np.einsum("sc,scd->sd", weights, mesh.rest[nodes]) - points, axis=1)
+    moved = by > COUNTED * size
+    if outside.max() > WARNED * size or moved.any():
         log.warning(
             "skin %s: %d of %d vertices lie outside the mesh, up to %.3g m (%.2g %% of its size)%s",
-            path, told.sum(), len(points), outside.max(), 100 * outside.max() / size,
-            f"; {(moved > TOLD * size).sum()} were moved by up to {moved.max():.3g} m, since the tetrahedra there are "
-            "too flat" if (moved > TOLD * size).any() else "",
+            path, (outside > COUNTED * size).sum(), len(points), outside.max(), 100 * outside.max() / size,
+            f"; {moved.sum()} were moved by up to {by.max():.3g} m, since the tetrahedra there are too flat"
+            if moved.any() else "",
         )  # fmt: skip
     return Skin(nodes, weights, numbers.reshape(-1, 3).astype(np.int32))
 

@@ -45,5 +45,5 @@ def load(path: str | Path, overrides: Sequence[str] = ()) -> Scene:
         scene = Scene.model_validate({"name": path.stem, **table}, context={"folder": path.parent})
     except ValidationError as error:
         raise readable(error, path.name, table, overlays) from None
-    scene._path, scene._text = path, text
+    scene._path, scene._text = gallery.name_of(path), text
     return scene

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: MIT
 """Scenes that come with the package: gallery/NAME. Each begins with a comment that says in a sentence what it is."""
 
-from os.path import exists
 from pathlib import Path
 
 PREFIX = "gallery"
@@ -9,18 +8,24 @@ FOLDER = Path(__file__).resolve().parent.parent / PREFIX
 
 
 def names() -> list[str]:
-    """Returns the names of all scenes, in alphabetical order."""
-    return sorted(path.stem for path in FOLDER.glob("*.toml"))
+    """Returns the names of all scenes, in alphabetical order; NAME.plan.toml, an overlay, is none."""
+    return sorted(path.stem for path in FOLDER.glob("*.toml") if "." not in path.stem)
 
 
 def found(path: Path) -> Path:
-    """Returns the scene that `path` names: a file, or else gallery/NAME or gallery/NAME.toml of the package.
-
-    What names neither is returned as it is.
+    """Returns the file of the scene that `path` names: gallery/NAME and gallery/NAME.toml are of the package, unless
+    there is such a file in the working folder. Any other path is returned as it is.
     """
-    if exists(path) or len(path.parts) != 2 or path.parts[0] != PREFIX or path.suffix not in ("", ".toml"):
+    if path.is_file() or len(path.parts) != 2 or path.parts[0] != PREFIX or path.suffix not in ("", ".toml"):
         return path
+    if (own := path.with_suffix(".toml")).is_file():
+        return own
     return FOLDER / f"{path.stem}.toml" if path.stem in names() else path
+
+
+def name_of(file: Path) -> Path:
+    """Returns by which path a scene is asked for: gallery/NAME for one of the package, else its file."""
+    return Path(PREFIX, file.stem) if file.parent == FOLDER and file.stem in names() else file
 
 
 def sentence(name: str) -> str:

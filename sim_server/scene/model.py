@@ -340,7 +340,7 @@ class Scene(Parameters):
 
     @property
     def path(self) -> Path:
-        """The file that the scene was read from."""
+        """The file that the scene was read from; gallery/NAME if it comes with the package."""
         return self._path
 
     @property

@@ -197,8 +197,8 @@ class BodyUpdateState:
         self.job.in_flight = False
         self.solves.excess += self.job.excess
 
-    def on_failure(self, reason: str) -> None:
-        """Takes note that its job failed; it may be sent again."""
+    def on_failure(self, reason: str, refused: bool = False) -> None:
+        """Takes note that its job failed; it may be sent again. refused: it brought a factor that is not used."""
         self.on_reassignment()
         failures = self.failures
         failures.reason = reason
@@ -206,7 +206,7 @@ class BodyUpdateState:
         failures.in_a_row += 1
         failures.assemblies += self.job.positions
         if self.tuner is not None:
-            self.tuner.factorization.on_failure()
+            self.tuner.factorization.on_failure(refused)
 
     def observe(self, record: Any, floor: int, cost: float) -> None:
         """Takes note of a solve (a record of the loop).

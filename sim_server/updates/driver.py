@@ -167,7 +167,7 @@ class Driver:
         is_new = factor.step > state.factors.newest and not state.frozen
         if is_new and (why := self.check.reject_reason(factor, matrix)):
             self.useless_factors.on_rejected(factor)
-            self.fail(factor.object, f"that of {factor.worker} is not used: {why}")
+            self.fail(factor.object, f"that of {factor.worker} is not used: {why}", refused=True)
             return
         # Post it, unless it is older than the newest
         if not state.on_factor(factor, self.engine.step):
@@ -198,11 +198,11 @@ class Driver:
         self.engine.resume_factor(state.body.index, factor.pattern, factor.values, factor.step)
         self.engine.settle_factors()
 
-    def fail(self, name: str, reason: str) -> None:
-        """Takes note of a job without a factor; the object may be sent again."""
+    def fail(self, name: str, reason: str, refused: bool = False) -> None:
+        """Takes note of a job without a factor, or with one that is refused; the object may be sent again."""
         state = self.by_name[name]
         self.snapshots.release(state)
-        state.on_failure(reason)
+        state.on_failure(reason, refused)
         self.policy.on_job_end()
         self.report(state, reason)
 

@@ -52,6 +52,7 @@ def test_it_moves_with_the_nodes() -> None:
         ({"nodes": NODES - 1}, "skin_nodes"),
         ({"weights": WEIGHTS * 1.001}, r"skin_weights have sums off 1 by 0\.001; allowed: 1e-06"),
         ({"weights": WEIGHTS * np.nan}, "skin_weights"),
+        ({"weights": WEIGHTS + np.array([4, -4, 0, 0])}, "skin_weights of magnitude 5.5; allowed: 4"),
         ({"triangles": TRIANGLES + 1}, "skin_triangles"),
     ],
 )
@@ -78,13 +79,18 @@ def test_an_export_has_it_in_a_second_file(tmp_path: Path) -> None:
         recorder.topology(message())
         for step in range(2):
             recorder.state(state("beam", step))
+        apart = state("beam", 2)  # the second element alone is strained
+        apart.x = np.vstack([REST[:4], [[2, 1, 1]]]).tobytes()
+        recorder.state(apart)
     with Log(tmp_path / "run.mcap") as log:
-        assert [path.name for path in export(log, "beam", tmp_path / "one.vtu")] == ["one_skin.vtu", "one.vtu"]
+        assert [path.name for path in export(log, "beam", tmp_path / "one.vtu", "1")] == ["one_skin.vtu", "one.vtu"]
         export(log, "beam", tmp_path / "all.vtu", frame="all")
     found = meshio.read(tmp_path / "one_skin.vtu")
     np.testing.assert_allclose(found.points, at_vertices(positions(1)), atol=1e-15)
     np.testing.assert_array_equal(found.cells_dict["triangle"], TRIANGLES)
     assert {"displacement", "velocity", "von_mises"} <= set(found.point_data)
+    stress = meshio.read(tmp_path / "all_2_skin.vtu").point_data["von_mises"]
+    assert stress[2] == 0 and stress[1] > 0, "weights beyond the mesh make no negative ones"
     text = (tmp_path / "all.pvd").read_text()
     assert 'part="0" file="all_1.vtu"' in text and 'part="1" file="all_1_skin.vtu"' in text
 

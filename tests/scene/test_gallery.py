@@ -130,11 +130,13 @@ def test_meshes_are_made_from_distances() -> None:
 def test_a_file_of_that_name_wins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert load("gallery/sheet").objects[0].name == load("gallery/sheet.toml").objects[0].name == "sheet"
-    (tmp_path / "gallery").mkdir()
+    (tmp_path / "gallery" / "sheet").mkdir(parents=True)
+    assert load("gallery/sheet").path == load("gallery/sheet.toml").path == Path("gallery/sheet")
     text = (gallery.FOLDER / "sheet.toml").read_text().replace('name = "sheet"', 'name = "mine"')
     (tmp_path / "gallery" / "sheet.toml").write_text(text)
-    assert load("gallery/sheet.toml").objects[0].name == "mine"
-    assert load("gallery/sheet").objects[0].name == "sheet"
+    assert load("gallery/sheet.toml").objects[0].name == load("gallery/sheet").objects[0].name == "mine"
+    assert load("gallery/sheet").path == Path("gallery/sheet.toml")
+    assert load(gallery.FOLDER / "sheet.toml").path == Path("gallery/sheet"), "not where the package lies"
 
 
 @pytest.mark.parametrize(
@@ -143,6 +145,13 @@ def test_a_file_of_that_name_wins(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 def test_other_names_are_answered_with_those_that_are_there(name: str) -> None:
     with pytest.raises(InputError, match=r"No such file .*; scenes that come along: gallery/beam, .*gallery/tentacle"):
         load(name)
+
+
+def test_an_overlay_beside_a_scene_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("sheet.toml", "sheet.plan.toml"):
+        (tmp_path / name).touch()
+    monkeypatch.setattr(gallery, "FOLDER", tmp_path)
+    assert gallery.names() == ["sheet"]
 
 
 def test_clients_leave_names_of_the_gallery_to_the_server() -> None:

@@ -113,6 +113,17 @@ def test_a_method_whose_jobs_fail_is_left():
     assert tuner.method == EXACT
 
 
+@pytest.mark.parametrize(("factors", "method"), [(0, EXACT), (1, IC)])
+def test_the_exact_factor_is_asked_for_at_once_where_the_first_one_is_refused(factors, method):
+    tuner = FactorizationTuner([IC, EXACT])
+    for _ in range(factors):
+        tuner.on_sent()
+        tuner.on_factor()
+    tuner.on_sent()
+    tuner.on_failure(refused=True)
+    assert tuner.method == method
+
+
 def test_a_trial_whose_job_fails_is_over():
     tuner = FactorizationTuner([IC, EXACT])
     for step in range(MIN_SOLVES):

@@ -52,6 +52,7 @@ class FactorizationTuner(Tuner[Method, RecentCosts]):
         self._factors: set[int] = set()  # steps of the matrices of the trial's factors
         self._sent = self.current
         self._failures = 0
+        self._has_factor = False  # a job has brought one
 
     @property
     def method(self) -> Method:
@@ -85,14 +86,19 @@ class FactorizationTuner(Tuner[Method, RecentCosts]):
 
     def on_factor(self) -> None:
         """Takes note that a job brought a factor."""
-        self._failures = 0
+        self._failures, self._has_factor = 0, True
 
-    def on_failure(self) -> None:
-        """Takes note that the last job came back without a factor."""
+    def on_failure(self, refused: bool = False) -> None:
+        """Takes note that the last job came back without a factor, or with one that was refused.
+
+        A refused factor is a matter of its method and not of chance: where it would be the first one, solves have none
+        yet, and the last method is asked at once.
+        """
         if self._sent == self.candidate:
             self.reject()
         self._failures += 1
-        if self._failures >= MAX_FAILURES and self.current == self._sent != self.arms[-1]:
+        enough = self._failures >= MAX_FAILURES or (refused and not self._has_factor)
+        if enough and self.current == self._sent != self.arms[-1]:
             self._failures = 0
             self.use(self.arms[-1])
             self.wait = MAX_TRIAL_INTERVAL
