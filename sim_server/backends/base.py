@@ -289,6 +289,10 @@ class Engine(Protocol):
         """Takes back what `change` was given last and the loop has not taken up; False if there is nothing."""
         ...
 
+    def take_changes(self) -> None:
+        """Copies what waits of `change` at once, while the loop stands still between two steps."""
+        ...
+
     def prepare(self) -> None:
         """Makes the state before the first step, which `run` and `assemble` do otherwise."""
         ...

@@ -219,6 +219,8 @@ class Telemetry:
                 self.runaways.pop(body.index, None)
                 self._not_finite.discard(body.name)
         self.contact.on_reset()
+        if self.replay_recorder:
+            self.replay_recorder.write(self.patient)  # parameters that the loop had before
         if self.recorder:
             message = pb.Reset(header=pb.Header(object=name), step=step)
             self.recorder.reset(message, step * world.dt, block=self.patient)

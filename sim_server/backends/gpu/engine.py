@@ -241,7 +241,6 @@ class GpuEngine(DeviceLoop):
         begins = bool(self.begin or self._substeps) and self.step == 0 and not self._prepared
         if self.step == 0:
             self.take_changes()
-            self._steps.synchronize()
         if begins:
             for launch in self.begin:
                 launch()
@@ -486,6 +485,13 @@ class GpuEngine(DeviceLoop):
         cp.cuda.get_current_stream().synchronize()  # what is copied is complete
         before, after_changes = (int(graph.graphExec) for graph in self._work_graphs)
         return self._changes.post(copies, before, after_changes, kept)
+
+    def take_changes(self) -> None:
+        """Copies what waits at once, while the loop stands still."""
+        cpu = self.loop.cpu  # of the loop's thread, which may be another
+        super().take_changes()
+        self._steps.synchronize()
+        self.loop.cpu = cpu
 
     def withdraw_changes(self) -> bool:
         """Takes back what `change` was given last and the loop has not taken up; False if there is nothing."""
