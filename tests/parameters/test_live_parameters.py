@@ -103,6 +103,16 @@ def test_what_cannot_change_is_refused_with_the_reason(two_bars, key):
     assert two_bars.parameters.changed == {} and not two_bars.engine.withdraw_changes()
 
 
+def test_damping_of_the_stiffness_is_refused_where_stages_have_no_kernel_for_it():
+    """A law leaves it out if none of its bodies has any at the start, whatever others have."""
+    law = {"neo_hookean": {"young": 1e5, "poisson": 0.3}}
+    plain = bar((2, 1, 1), young=None, effects=law | {"rayleigh": {"mass": 0.1}})
+    sim = simulation(plain, bar((2, 1, 1), name="other", damping=(0.0, 0.01)), integrator={"scheme": "ros2"})
+    with pytest.raises(BadParameter, match="the object began with 0"):
+        sim.parameters.set({"bar.rayleigh.stiffness": "0.05"})
+    sim.parameters.set({"other.rayleigh.stiffness": "0.05"})
+
+
 def test_regions_are_refused_where_an_element_is_in_none(two_bars):
     with pytest.raises(BadParameter, match="is in no region of young"):
         two_bars.parameters.set({"other.corotational.young": '[{ where = "X < 1", young = 1e5 }]'})
