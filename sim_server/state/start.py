@@ -56,12 +56,12 @@ class Start:
         for launch in s.engine.begin:
             if not launch.mailed:  # nothing pushes the bodies, and poses do not matter
                 launch()
-        own = [s.world.backend.fetch(array)[rows] for array in made]
+        own = [(each, s.world.backend.fetch(each)[rows]) for each in made]
         for array, value in kept:
             array.write(value)
-        for array, values in zip(made, own, strict=True):
-            array[rows] = values
-            s.world.backend.push(array)
+        for each, values in own:
+            each[rows] = values
+            s.world.backend.push(each)
 
 
 def _with_rows(array: StateArray, start: NDArray[Any], body: int) -> NDArray[Any]:

@@ -690,6 +690,10 @@ class CpuEngine(Reports):
         """Step of the copy asked for last, -1 while it is not there. `step` counts the steps completed before it."""
         return int(self._body[body].snapshot_step)
 
+    def stage(self, changes: Sequence[ArrayChange]) -> list[ArrayChange]:
+        """Returns the changes, which are ready."""
+        return list(changes)
+
     def change(self, changes: Sequence[ArrayChange]) -> structs.Changes:
         """Has the loop copy new contents into arrays between two steps: those after the result's `taken` steps, once it
         is not below 0."""
