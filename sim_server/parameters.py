@@ -17,7 +17,7 @@ from typing import Any, Protocol
 import numpy as np
 from pydantic import BaseModel, ValidationError
 
-from sim_server.backends.base import ArrayChange, Engine, PendingUpdate
+from sim_server.backends.base import Engine, PendingUpdate, StagedChange
 from sim_server.effects._base import Effect
 from sim_server.errors import InputError
 from sim_server.mechanics.world import World
@@ -71,7 +71,7 @@ class ParameterUpdate:
     """New values on their way to the loop, by key, as TOML.
 
     pending: None until they have been given to it. replaces: an update that the loop has not taken up and that is part
-    of this one
+    of this one. No values: those of the update that it replaces are taken back, the loop has these
     """
 
     values: dict[str, str]
@@ -96,7 +96,8 @@ class LiveParameters:
         self._simulation, self.scene = simulation, simulation.scene
         self.on_set: list[Callable[[ParameterUpdate], None]] = []
         self._start = {field.key: field.value for field in live_fields(self.scene)}
-        self._waiting: dict[int, ArrayChange] = {}  # by id of the array: what the loop was given last
+        self._taken = self.scene  # with the values that the loop has if it does not take up what waits
+        self._waiting: dict[int, StagedChange] = {}  # by id of the array: what the loop was given last
         self._update: ParameterUpdate | None = None  # likewise
         self._first: ParameterUpdate | None = None  # the first one that the loop took up, or is to
 
@@ -219,31 +220,44 @@ class LiveParameters:
             new = [(a.array, np.ascontiguousarray(a.compute(scene))) for a in simulation.world.live_arrays
                    if tables & set(a.of)]  # fmt: skip
             elastic = {e: e.elastic_in(scene) for e in simulation.effects.values() if e.name in tables}
+            for array, contents in new:
+                if contents.shape != array.shape or contents.dtype != array.dtype:
+                    raise BadParameter("would change the size of an array")
+                if not np.isfinite(contents).all():
+                    raise BadParameter("gives values that are not finite")
+            with simulation.world.backend.building():
+                staged = simulation.engine.stage(new)
         except InputError as error:
             raise BadParameter(str(error)) from None
-        for array, contents in new:
-            if contents.shape != array.shape or contents.dtype != array.dtype:
-                raise BadParameter("would change the size of an array")
-            if not np.isfinite(contents).all():
-                raise BadParameter("gives values that are not finite")
         for effect, found in elastic.items():
             effect.elastic = found
-        update = ParameterUpdate({f.key: toml(_plain(f.value)) for f in changed}, client)
+        update, keys = ParameterUpdate({}, client), {f.key for f in changed}
         if simulation.engine.withdraw_changes():
             assert self._update is not None
-            update.values, update.replaces = self._update.values | update.values, self._update
+            update.replaces = self._update
+            keys |= self._update.values.keys()
             self._update.replaces = None  # keep no chain of them
             if self._first is self._update:
                 self._first = None
         else:
-            self._waiting = {}
-        if self._first is None:
-            self._first = update  # before the loop may take it up
-        self._waiting |= {id(array): (array, contents) for array, contents in new}
+            self._waiting, self._taken = {}, self.scene
+        self._waiting |= {id(array): each for (array, _), each in zip(new, staged, strict=True)}
         self._update, self.scene = update, scene
-        update.pending = simulation.engine.change(list(self._waiting.values()))
+        has = {f.key: _plain(f.value) for f in live_fields(self._taken) if f.key in keys}
+        news = [f for f in live_fields(scene) if f.key in keys and _plain(f.value) != has.get(f.key)]
+        if news:
+            self._post(update, news)
         for observe in self.on_set:
             observe(update)
+
+    def _post(self, update: ParameterUpdate, news: Sequence[LiveField]) -> None:
+        """Gives an update to the loop. news: what the loop does not have; a replay knows of nothing else."""
+        update.values = {f.key: toml(_plain(f.value)) for f in news}
+        if self._first is None:
+            self._first = update  # before the loop may take it up
+        tables = {f.of for f in news}
+        follow = [id(a.array) for a in self._simulation.world.live_arrays if tables & set(a.of)]
+        update.pending = self._simulation.engine.change([self._waiting[k] for k in dict.fromkeys(follow)])
 
     def _described(self, field: LiveField) -> LiveParameter:
         low, high, value = field.live.low, field.live.high, _plain(field.value)

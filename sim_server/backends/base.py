@@ -70,6 +70,10 @@ ArrayChange = tuple[NDArray[Any], NDArray[Any]]
 """An array that kernels read, and its new contents, of the same shape and type."""
 
 
+StagedChange = Any
+"""An ArrayChange that the engine has made ready (`stage`)."""
+
+
 class PendingUpdate(Protocol):
     """New arguments of a launch, or new contents of arrays, on their way to the loop.
 
@@ -278,7 +282,11 @@ class Engine(Protocol):
         """Gives a mailed launch (its number among `launches`) new arguments, from one of the next steps on."""
         ...
 
-    def change(self, changes: Sequence[ArrayChange]) -> PendingUpdate:
+    def stage(self, changes: Sequence[ArrayChange]) -> list[StagedChange]:
+        """Makes all memory ready that `change` of these needs; steps see nothing of it. May fail as a build does."""
+        ...
+
+    def change(self, changes: Sequence[StagedChange]) -> PendingUpdate:
         """Copies new contents into arrays of the host, or their twins, all between the same two steps.
 
         Nothing else may wait to be copied: see `withdraw_changes`.
@@ -287,6 +295,10 @@ class Engine(Protocol):
 
     def withdraw_changes(self) -> bool:
         """Takes back what `change` was given last and the loop has not taken up; False if there is nothing."""
+        ...
+
+    def take_changes(self) -> None:
+        """Copies what waits of `change` at once, while the loop stands still between two steps."""
         ...
 
     def prepare(self) -> None:

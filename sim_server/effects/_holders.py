@@ -123,7 +123,7 @@ class Holders(Movable):
         whole, search = 1 / w.balance_point, w.searches and not euler  # of the step, over what is solved for
         w.backend.keep(unused)
         if whole != 1:
-            beta = whole * beta
+            beta = w.beta_of_nodes(whole)
             w.backend.keep(beta)
         text = w.backend.module(TEXT)
         hold: Launch = text.bind(

@@ -57,10 +57,12 @@ class Drag(Effect):
             return {(b.index, key): "nothing moves in a quasi-static scene" for b in self.bodies for key in KEYS}
         alpha, beta = self.world.damping(scene)
         begun = "the scene began with 0 at all objects, so that its steps have no kernel for it"
+        own = "the object began with 0, so that stages without a matrix may have no kernel for it"
         if alpha.any() and not self.world.alpha.any() and not self.world.explicit:
             found |= {(b.index, "mass"): begun for b in self.bodies}
-        if beta.any() and not self.world.beta.any() and self.world.forces_alone:
-            found |= {(b.index, "stiffness"): begun for b in self.bodies}
+        if self.world.forces_alone:  # laws look at the bodies that they have (_hyperelastic.py, corotational.py)
+            damped = (beta > 0) & (self.world.beta == 0)
+            found |= {(b.index, "stiffness"): own for b in self.bodies if damped[b.index]}
         if self.world.explicit and (beta != self.world.beta).any():
             found |= {(b.index, "stiffness"): "the stable step of an explicit scheme knows it" for b in self.bodies}
         return found

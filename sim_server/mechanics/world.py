@@ -196,9 +196,9 @@ class World:
         dx_dv = self.dx_dv
         return self._of_beta(lambda beta: 1 / (dx_dv + beta[owner]))
 
-    def beta_of_nodes(self) -> Float64:
-        """beta of each node's body, (n,) [s]."""
-        return self._of_beta(lambda beta: np.repeat(beta, [b.last - b.first for b in self.bodies]))
+    def beta_of_nodes(self, factor: float = 1.0) -> Float64:
+        """factor times beta of each node's body, (n,) [s]."""
+        return self._of_beta(lambda beta: factor * np.repeat(beta, [b.last - b.first for b in self.bodies]))
 
     def alpha_of_nodes(self) -> Float64:
         """alpha of each node's body, (n,) [1/s]."""

@@ -79,7 +79,8 @@ class ReplayRecorder:
     def _on_set(self, update: ParameterUpdate) -> None:
         if self._parameters and self._parameters[-1] is update.replaces:  # which the loop never took up
             self._parameters.pop()
-        self._parameters.append(update)
+        if update.values:
+            self._parameters.append(update)
 
     def write(self, block: bool) -> None:
         """Writes all that was taken up since the last call; so a log that is cut off holds the inputs of its steps."""

@@ -81,7 +81,7 @@ class Recording:
         self.obstacles: dict[str, pb.Obstacle] = {}
         self.targets: list[pb.ObstacleTargets] = []
         self.parameters: dict[int, list[pb.ParameterSet]] = {}  # by step
-        self.resets: list[pb.Reset] = []
+        self.resets: list[tuple[pb.Reset, int]] = []  # and how many of `parameters` of its step came before
         self.first, self.checkpoint = 0, b""
         self.touched = False
         self.notes: list[str] = []
@@ -140,7 +140,8 @@ class Recording:
             saved = pb.Checkpoint.FromString(message.data)
             self.first, self.checkpoint = saved.step, saved.data
         elif message.topic == "/resets":
-            self.resets.append(pb.Reset.FromString(message.data))
+            reset = pb.Reset.FromString(message.data)
+            self.resets.append((reset, len(self.parameters.get(reset.step, ()))))
         elif message.kind == "obstacle":
             self.obstacles[message.object] = pb.Obstacle.FromString(message.data)
         elif message.kind != "pose":  # which follow from the scene and the targets

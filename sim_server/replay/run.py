@@ -82,9 +82,10 @@ class Replay:
         self._targets: dict[int, list[pb.ObstacleTargets]] = {}
         for t in recording.targets:
             self._targets.setdefault(t.step, []).append(t)
-        self._resets: dict[int, list[str]] = {}
-        for r in recording.resets:
-            self._resets.setdefault(r.step, []).append(r.header.object)
+        self._resets: dict[int, list[tuple[str, int]]] = {}  # by step: objects, parameter sets before
+        for r, sets in recording.resets:
+            self._resets.setdefault(r.step, []).append((r.header.object, sets))
+        self.engine.prepare()  # as a server, with the parameters of the scene
         self._start = Start(self.simulation) if self._resets else None
         self._saved = SavedFactors([], [])
         if recording.checkpoint:
@@ -118,10 +119,10 @@ class Replay:
         """Repeats all steps and compares them; calls `progress` with the number of steps done."""
         self._compare_frames(self.recording.first)
         for step in range(self.recording.first, self.recording.steps):
-            self._reset(step)
+            sets = self._reset(step)
             self._restore_interactions(step)
             self._restore_targets(step)
-            self._restore_parameters(step)
+            self._restore_parameters(step, slice(sets, None))
             for body in self.bodies:
                 self._apply_settings(body.index, body.name, step)
                 self._use_factor(body.index, body.name, step, fresh=False)
@@ -196,14 +197,18 @@ class Replay:
 
     # --- input of a step ----------------------------------------------------------------------------------------
 
-    def _reset(self, step: int) -> None:
-        """Puts back what was put back before this step."""
-        for name in self._resets.get(step, ()):
+    def _reset(self, step: int) -> int:
+        """Puts back what was put back before this step; returns how many sets of parameters came before that."""
+        done = 0
+        for name, sets in self._resets.get(step, ()):
+            self._restore_parameters(step, slice(done, sets))
+            done = sets
             try:
                 assert self._start is not None
                 self._start.reset(name)
             except KeyError as error:
                 raise BadLog(f"{self.recording.path}: reset at step {step}: {error}") from error
+        return done
 
     def _restore_interactions(self, step: int) -> None:
         """Sets the interactions that the loop took up at this step."""
@@ -228,9 +233,9 @@ class Replay:
             except ValueError as error:
                 raise BadLog(f"{self.recording.path}: obstacles moved at step {step}: {error}") from error
 
-    def _restore_parameters(self, step: int) -> None:
-        """Sets the parameters that the loop took up at this step."""
-        for found in self.recording.parameters.get(step, ()):
+    def _restore_parameters(self, step: int, which: slice) -> None:
+        """Sets the parameters that the loop took up at this step. which: of several sets"""
+        for found in self.recording.parameters.get(step, [])[which]:
             try:
                 self.simulation.parameters.set({p.key: p.value for p in found.parameters})
             except ValueError as error:

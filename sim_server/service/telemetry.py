@@ -17,6 +17,7 @@ from sim_server.backends.kinds import SLACK_OF_ENERGY
 from sim_server.checkpoint.file import Checkpoint
 from sim_server.mechanics.named_points import NamedPoints
 from sim_server.network.link import ServerLink
+from sim_server.parameters import ParameterUpdate
 from sim_server.recording import messages
 from sim_server.recording.object_steps import Reactions
 from sim_server.recording.obstacles import pose_messages
@@ -82,7 +83,7 @@ class Telemetry:
         self._interactions: dict[int, pb.Interaction] = {}
         self._points: list[NamedPoints] = []
         self._stale_moduli: set[str] = set()  # keys of parameters that were set
-        self.simulation.parameters.on_set.append(lambda update: self._stale_moduli.update(update.values))
+        self.simulation.parameters.on_set.append(self._on_set)
 
     def open(self, resumed: Checkpoint | None = None) -> None:
         """Sends scene, topologies and the initial state, before anything else, to log and network.
@@ -219,6 +220,8 @@ class Telemetry:
                 self.runaways.pop(body.index, None)
                 self._not_finite.discard(body.name)
         self.contact.on_reset()
+        if self.replay_recorder:
+            self.replay_recorder.write(self.patient)  # parameters that the loop had before
         if self.recorder:
             message = pb.Reset(header=pb.Header(object=name), step=step)
             self.recorder.reset(message, step * world.dt, block=self.patient)
@@ -250,6 +253,11 @@ class Telemetry:
             message = messages.state(body, step, step * self.simulation.world.dt, x, v)
             self.recorder.state(message, block=self.patient)
         self.contact.record_poses(step, poses, block=self.patient)
+
+    def _on_set(self, update: ParameterUpdate) -> None:
+        self._stale_moduli.update(update.values)
+        if update.replaces is not None:  # some of its values may have been taken back
+            self._stale_moduli.update(update.replaces.values)
 
     def _renew_moduli(self) -> None:
         """Tells those who ask for topologies from now on of moduli that were set."""

@@ -26,6 +26,11 @@ TOTALS = frozenset({"refused", "dropped"})  # counted or first times of a run, w
 
 def state_arrays(simulation: Simulation) -> list[StateArray]:
     """Returns all arrays that one step leaves to the next, but for interactions and poses of what clients move."""
+    return [*launch_arrays(simulation), *simulation.engine.state()]
+
+
+def launch_arrays(simulation: Simulation) -> list[StateArray]:
+    """Returns those of them that launches write, or other code of effects and of the world."""
     found: dict[int, StateArray] = {}
     moved = {id(a) for m in simulation.movers for a in m.frame_arrays()}
     for launch in simulation.step_launches:
@@ -44,7 +49,7 @@ def state_arrays(simulation: Simulation) -> list[StateArray]:
     for name, array in others.items():
         if array.size and id(array) not in found:
             found[id(array)] = _array(simulation, name, array, None, True)
-    return [*found.values(), *simulation.engine.state()]
+    return list(found.values())
 
 
 def _array(

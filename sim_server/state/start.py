@@ -5,8 +5,15 @@ The state is that before the first step, but for step number and time, which go 
 their corrections and what is known of costs stay in use. Keyframes are those of the time since the reset.
 """
 
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_server.backends.state import StateArray
 from sim_server.simulation import Simulation
-from sim_server.state.arrays import state_arrays
+from sim_server.state.arrays import launch_arrays, state_arrays
 
 
 class Start:
@@ -25,18 +32,41 @@ class Start:
     def reset(self, name: str = "") -> None:
         """Puts an object with its holders, or the whole scene (no name), back. Raises KeyError for an unknown one.
 
-        Of all that touches the object, or is tied to it, the forces, friction and breaks are forgotten.
+        Of all that touches the object, or is tied to it, the forces, friction and breaks are forgotten. Parameters that
+        were set stay, and the loop has those that wait before.
         """
         s = self._simulation
         bodies = [s.world.body(name).index] if name else [b.index for b in s.world.bodies]
-        for array, value in self._arrays:
-            if not name:
-                array.write(value)
-            elif array.rows is not None:
-                now, rows = array.read(), array.rows(bodies[0])
-                now[rows] = value[rows]
-                array.write(now)
+        s.engine.take_changes()
+        back = self._arrays if not name else [(a, _with_rows(a, v, bodies[0])) for a, v in self._arrays if a.rows]
+        for array, value in back:
+            array.write(value)
         time = s.engine.loop.start_time + s.engine.step * s.world.dt
         for mover in s.movers:
             mover.restart([k for k, o in enumerate(mover.listed) if not name or getattr(o, "object", "") == name], time)
+        if s.parameters.changed:
+            self._begin_again(bodies)
         s.engine.restart(bodies)
+
+    def _begin_again(self, bodies: Sequence[int]) -> None:
+        """Makes what the scheme begins with from the present parameters: of these bodies, and of nothing else."""
+        s = self._simulation
+        rows, made = np.isin(s.system.body, bodies), s.integrator.still
+        kept = [(a, a.read()) for a in launch_arrays(s)] if s.engine.begin else []
+        for launch in s.engine.begin:
+            if not launch.mailed:  # nothing pushes the bodies, and poses do not matter
+                launch()
+        own = [(each, s.world.backend.fetch(each)[rows]) for each in made]
+        for array, value in kept:
+            array.write(value)
+        for each, values in own:
+            each[rows] = values
+            s.world.backend.push(each)
+
+
+def _with_rows(array: StateArray, start: NDArray[Any], body: int) -> NDArray[Any]:
+    """Returns the array as it is, with the rows of a body as they were at the start."""
+    assert array.rows is not None
+    now, rows = array.read(), array.rows(body)
+    now[rows] = start[rows]
+    return now

@@ -77,6 +77,11 @@ for scheme in ("newmark", "bdf2", "generalized_alpha", "ros2", "central_differen
 CASES["factor"] = CASES["ros2"]._replace(  # which is there with no worker only in the lists of launches
     scene={"integrator": {"scheme": "ros2"}, "solver": {"preconditioner": "cholesky"}}
 )
+HAND = {"name": "hand", "object": "bar", "where": "X > 1.4",
+        "keyframes": [{"time": 0.0}, {"time": 0.1, "translate": [0, 0.05, 0]}]}  # fmt: skip
+CASES["holder"] = CASES["generalized_alpha"]._replace(
+    scene={"integrator": {"scheme": "generalized_alpha"}, "holder": [HAND]},
+)
 CASES["quasi_static"] = law("neo_hookean", YOUNG, young=3e5)._replace(
     scene={"integrator": {"scheme": "quasi_static"}}, start=True
 )

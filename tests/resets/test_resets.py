@@ -6,9 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sim_server.scene.model import Scene
 from sim_server.simulation import Simulation
 from sim_server.state.start import Start
 from tests.physics.test_runaway import WILD
+from tests.resets import state_scenes
 from tests.resets.state_scenes import SCENES, made
 from tests.scenes import bar, simulation
 
@@ -95,3 +97,39 @@ def test_the_start_is_before_the_first_step() -> None:
     sim.engine.run(1)
     with pytest.raises(ValueError, match="has made 1 steps"):
         Start(sim)
+
+
+@pytest.mark.parametrize("scheme", ["newmark", "bdf2", "generalized_alpha"])
+def test_a_reset_begins_with_the_parameters_that_were_set(scheme: str) -> None:
+    """Without weight a body at rest stays so, while another one goes on as if there had been no reset."""
+    pair = bar(fixed="X < 0.01", name="a"), bar(fixed="X < 0.01", name="b", pose={"translate": [0, 5, 0]})
+    sims = [simulation(*pair, gravity=(0, -9.81, 0), integrator={"scheme": scheme}) for _ in "xy"]
+    start, x0 = Start(sims[0]), sims[0].world.x.copy()
+    sims[1].engine.prepare()
+    a, b = (sims[0].world.body(name).nodes for name in "ab")
+    for sim in sims:
+        sim.engine.run(10)
+        sim.parameters.set({"gravity.g": "[0, 0, 0]"})
+    start.reset("a")
+    assert not sims[0].engine.withdraw_changes(), "the loop has them before the reset"
+    (x, records), (alone, _) = (course(sim, 5) for sim in sims)
+    np.testing.assert_allclose(x[a], x0[a], rtol=0, atol=1e-15)
+    assert (records["status"] == 0).all()
+    np.testing.assert_array_equal(x[b], alone[b])
+    start.reset()
+    np.testing.assert_allclose(course(sims[0], 5)[0], x0, rtol=0, atol=1e-15)
+
+
+def test_a_reset_finds_all_rows_of_contacts_before_it_writes_any() -> None:
+    """Those of the other object that touched it, too, are as at the start in all that is known of them."""
+    table = state_scenes.table([state_scenes.cube(), state_scenes.cube("next", y=0.205)], obstacle=[state_scenes.FLOOR])
+    sim = Simulation(Scene.model_validate(table | {"solver": {"preconditioner": "block_jacobi", "update": "never"}}))
+    start = Start(sim)
+    sim.engine.run(80)
+    assert sim.contact is not None
+    rows = sim.contact.contact_input()
+    touching = (rows.obstacle >= 0) & (np.abs(rows.force) > 0)
+    of_pair = np.flatnonzero(touching)[np.flatnonzero(touching) >= len(sim.contact.node) * 2]
+    assert len(of_pair), "the one rests on the other"
+    start.reset("next")
+    assert (rows.obstacle[of_pair] == -1).all() and not rows.force[of_pair].any() and not rows.normal[of_pair].any()

@@ -19,7 +19,8 @@ pytestmark = pytest.mark.system
 def test_resets_are_seen_and_replay_to_the_bit(tmp_path: Path) -> None:
     stage, log = Stage(tmp_path), tmp_path / "run.mcap"
     try:
-        server = stage.server(beam(tmp_path, (2, 2, 6)), "--record", str(log))
+        scene = beam(tmp_path, (2, 2, 6), '[integrator]\nscheme = "newmark"')
+        server = stage.server(scene, "--record", str(log))
         with stage.client() as client:
             start = client.meshes()["beam"].rest
             held = client.grab("beam", at="tip", target=(0.9, 0.5, 4), stiffness=1e5, max_force=9000)
@@ -34,10 +35,12 @@ def test_resets_are_seen_and_replay_to_the_bit(tmp_path: Path) -> None:
             states = client.states()
             until(lambda: bool(states.newest()), "frames come")
             paused = client.pause().status
+            client.set("gravity.g", [0, -1, 0])  # which the scheme begins with
             assert client.reset().status.step == paused.step
             until(lambda: any(np.array_equal(f.x, start) for f in states.newest()), "the pause shows it")
             said = CliRunner().invoke(app, ["reset", "--connect", stage.endpoint]).output
             assert said.startswith(f"put back at step {paused.step} ")
+            client.set("gravity.g", [0, -2, 0])
             client.step(5)
             client.stop()
         assert server.wait() == 0, server.output()

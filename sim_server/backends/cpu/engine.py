@@ -501,7 +501,7 @@ class CpuEngine(Reports):
     def _begin(self) -> None:
         """Runs the launches of the scheme that come before the first step."""
         if self.step == 0:
-            self._native.wf_take_changes(c.byref(self.loop))
+            self.take_changes()
         if self.step == 0 and not self._begun:
             for launch in self.begin:
                 launch()
@@ -690,6 +690,10 @@ class CpuEngine(Reports):
         """Step of the copy asked for last, -1 while it is not there. `step` counts the steps completed before it."""
         return int(self._body[body].snapshot_step)
 
+    def stage(self, changes: Sequence[ArrayChange]) -> list[ArrayChange]:
+        """Returns the changes, which are ready."""
+        return list(changes)
+
     def change(self, changes: Sequence[ArrayChange]) -> structs.Changes:
         """Has the loop copy new contents into arrays between two steps: those after the result's `taken` steps, once it
         is not below 0."""
@@ -708,6 +712,10 @@ class CpuEngine(Reports):
         if back:
             self._changes.pop()
         return back
+
+    def take_changes(self) -> None:
+        """Copies what waits at once, while the loop stands still."""
+        self._native.wf_take_changes(c.byref(self.loop))
 
     def replace(self, launch: int, new: Launch) -> structs.Binding:
         """Gives a launch other arguments, from the next step on: the one after the result's `taken` steps, once it is

@@ -241,7 +241,6 @@ class GpuEngine(DeviceLoop):
         begins = bool(self.begin or self._substeps) and self.step == 0 and not self._prepared
         if self.step == 0:
             self.take_changes()
-            self._steps.synchronize()
         if begins:
             for launch in self.begin:
                 launch()
@@ -464,28 +463,48 @@ class GpuEngine(DeviceLoop):
         self.gpu.cp.cuda.get_current_stream().synchronize()  # its arrays are complete
         return self.mailboxes[self._mailed[launch]].post(cast(DeviceLaunch, new).params.tobytes(), keep=new)
 
-    def change(self, changes: Sequence[ArrayChange]) -> DeviceChanges:
-        """Copies new contents into the twins of arrays between two batches: those after the result's `taken` steps."""
-        cp, copies, kept = self.gpu.cp, [], []
+    def stage(self, changes: Sequence[ArrayChange]) -> list[tuple[int, int, int, Any] | None]:
+        """Copies new contents to the device beside the arrays: target, source, bytes and memory; None: no kernel has it.
+
+        Arrays of the host have them at once.
+        """
+        cp, staged = self.gpu.cp, list[tuple[int, int, int, Any] | None]()
         for host, contents in changes:
-            host[...] = contents
-            if (twin := self.gpu.known_twin(host)) is not None:
-                kept.append(cp.asarray(contents.astype(twin.dtype)))
-                copies.append((int(twin.data.ptr), int(kept[-1].data.ptr), int(twin.nbytes)))
-        if self._substeps:
-            kept.append(cp.asarray(np.array([ESTIMATE_EVERY], np.int32)))
-            copies.append((self._substeps.since, int(kept[-1].data.ptr), 4))
+            if (twin := self.gpu.known_twin(host)) is None:
+                staged.append(None)
+                continue
+            made = cp.asarray(contents.astype(twin.dtype))
+            staged.append((int(twin.data.ptr), int(made.data.ptr), int(twin.nbytes), made))
         if not self._work_graphs:  # in a stream of their own: steps are under way
             self._energies.prepare_work()
+            self._estimate_now = cp.asarray(np.array([ESTIMATE_EVERY], np.int32))
             stream = cp.cuda.Stream(non_blocking=True)
+            graphs = []
             for after in (False, True):
                 with stream:
                     stream.begin_capture()
                     self._energies.launch_work(after)
-                    self._work_graphs.append(stream.end_capture())
+                    graphs.append(stream.end_capture())
+            self._work_graphs = graphs
         cp.cuda.get_current_stream().synchronize()  # what is copied is complete
-        before, after_changes = (int(graph.graphExec) for graph in self._work_graphs)
-        return self._changes.post(copies, before, after_changes, kept)
+        for host, contents in changes:
+            host[...] = contents
+        return staged
+
+    def change(self, changes: Sequence[tuple[int, int, int, Any] | None]) -> DeviceChanges:
+        """Copies new contents into the twins of arrays between two batches: those after the result's `taken` steps."""
+        copies = [each[:3] for each in changes if each is not None]
+        if self._substeps:
+            copies.append((self._substeps.since, int(self._estimate_now.data.ptr), 4))
+        before, after = (int(graph.graphExec) for graph in self._work_graphs)
+        return self._changes.post(copies, before, after, (changes, self._estimate_now))
+
+    def take_changes(self) -> None:
+        """Copies what waits at once, while the loop stands still."""
+        cpu = self.loop.cpu  # of the loop's thread, which may be another
+        super().take_changes()
+        self._steps.synchronize()
+        self.loop.cpu = cpu
 
     def withdraw_changes(self) -> bool:
         """Takes back what `change` was given last and the loop has not taken up; False if there is nothing."""
