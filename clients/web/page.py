@@ -9,7 +9,7 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import viser
@@ -114,6 +114,9 @@ class Page:
             self._begin(self.feed.link)
         self._build_tabs()
         link = self.feed.link
+        if link is not None:
+            for tab in self._all():
+                tab.keep_connected()
         if link is None:
             if self._is_due("panels", PANEL_PERIOD):
                 self._panels.lost(self.feed.error)
@@ -123,8 +126,9 @@ class Page:
             self._obstacles.move(link.poses())
         assert self.surfaces is not None
         moved = [frame for frame in link.frames() if self.surfaces.move(frame.object, frame.x)]
-        self._colour(bool(moved))
-        self._show(bool(moved))
+        modes = {tab: tab.mode.value for tab in self._all()}  # a person may change them at any time: read once
+        self._colour(bool(moved), set(modes.values()))
+        self._show(bool(moved), modes)
         if self._is_due("curves", CURVE_PERIOD):
             self._panels.draw()
         if self._is_due("panels", PANEL_PERIOD) and link.status.scene:
@@ -170,10 +174,9 @@ class Page:
                 f = forces[hand.id]
                 hand.force = math.hypot(f.x, f.y, f.z)
 
-    def _colour(self, moved: bool) -> None:
+    def _colour(self, moved: bool, wanted: set[str]) -> None:
         """Colours the surface in each way that a tab wants, a few times a second."""
         assert self.surfaces is not None
-        wanted = {tab.mode.value for tab in self._all()}
         for mode in set(self._paints) - wanted:
             del self._paints[mode]
         for mode in wanted - set(self._paints):
@@ -185,12 +188,12 @@ class Page:
             took = time.monotonic() - began
             self._due["paint"] = time.monotonic() + max(PAINT_PERIOD, took / PAINT_SHARE)
 
-    def _show(self, moved: bool) -> None:
+    def _show(self, moved: bool, modes: Mapping[Tab, str]) -> None:
         assert self.surfaces is not None
-        for tab in self._all():
-            tab.show(self.surfaces, self._paints[tab.mode.value], moved)
+        for tab, mode in modes.items():
+            tab.show(self.surfaces, self._paints[mode], moved)
         self._springs.update(self._hands(), self.surfaces)
-        for tab in self._all():
+        for tab in modes:
             for hand in [h for h in tab.hands.values() if h.over]:
                 tab.hands.pop(hand.number, None)
 

@@ -7,11 +7,13 @@ import urllib.request
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from clients.errors import ClientError
 from clients.log.frames import Mesh
 from clients.web.decimate import decimated
 from clients.web.feed import Feed
@@ -21,6 +23,7 @@ from clients.web.panel.curves import POINTS, History
 from clients.web.panel.sliders import named, value_of
 from clients.web.panel.tables import tables
 from clients.web.surfaces import Surfaces
+from clients.web.tab import Tab
 from clients.web.view import home, up_of
 from protocol import messages_pb2 as pb
 from protocol.network.web_address import exposed, hindrance, shown, web_address
@@ -319,3 +322,49 @@ def test_a_server_starts_a_page_and_ends_it(tmp_path: Path) -> None:
         assert again.wait() == 2 and "HOST:PORT" in again.output()
     finally:
         stage.close()
+
+
+class Viewer:
+    """Stands in for viser's handle of a tab: remembers what the person is told."""
+
+    client_id = 1
+
+    def __init__(self) -> None:
+        self.told: list[str] = []
+        self.gui = MagicMock()
+
+    def add_notification(self, title: str, text: str, **options: object) -> None:
+        self.told.append(text)
+
+
+def test_a_tab_tries_again_to_connect_says_so_and_its_sliders_live_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    connected = list[object]()
+    server = SimpleNamespace(sent=list[object](), close=lambda: None)
+    server.set = server.sent.append
+
+    def connect(*arguments: object) -> object:
+        connected.append(arguments)
+        if len(connected) == 1:
+            raise ClientError("it is busy")
+        return server
+
+    monkeypatch.setattr("clients.web.tab.Client", connect)
+    monkeypatch.setattr("clients.web.tab.RETRY_PERIOD", 0.0)
+    link = SimpleNamespace(client=SimpleNamespace(name="sim"))
+    page = SimpleNamespace(
+        asked=lambda: None, surfaces=None, grips={}, feed=SimpleNamespace(link=link, connect=None), home=None
+    )
+    viewer = Viewer()
+    tab = Tab(page, viewer, "plain")  # type: ignore[arg-type]
+    try:
+        tab.set("a", 1)
+        until(lambda: len(viewer.told) == 1, "word of the change that was not made")
+        assert "it is busy" in viewer.told[0]
+        tab.keep_connected()
+        until(lambda: tab.client is server, "another attempt")
+        tab.keep_connected()
+        tab.set("a", 2)
+        until(lambda: server.sent == [{"a": 2}], "the change")
+        assert len(connected) == 2
+    finally:
+        tab.close()
