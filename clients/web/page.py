@@ -125,6 +125,7 @@ class Page:
         if self._obstacles is not None:
             self._obstacles.move(link.poses())
         assert self.surfaces is not None
+        self._take_moduli(link)
         moved = [frame for frame in link.frames() if self.surfaces.move(frame.object, frame.x)]
         modes = {tab: tab.mode.value for tab in self._all()}  # a person may change them at any time: read once
         self._colour(bool(moved), set(modes.values()))
@@ -143,28 +144,50 @@ class Page:
             self._obstacles.remove()
             self._obstacles = None
         self._paints.clear()
+        self.surfaces = None
         if link is None:
             self._panels.lost(self.feed.error)
             return
-        self.surfaces = surfaces = Surfaces(link.meshes)
+        try:
+            self._take_up(link)
+        except Exception:
+            self.surfaces = None
+            self.feed.drop("the scene of the server cannot be shown")
+            raise
+
+    def _take_up(self, link: Link) -> None:
+        """Takes up the scene of a link; `surfaces` is set last, as all else needs the rest."""
+        surfaces = Surfaces(link.meshes)
         if surfaces.full > MOST_VERTICES:
             log.warning(
                 "%d vertices on the surfaces: %d are shown, so that a browser keeps pace",
                 surfaces.full, len(surfaces.points),
             )  # fmt: skip
-        described = described_objects(link.scene.resolved)
-        self.grips = {name: grip(mesh, described.get(name, {})) for name, mesh in link.meshes.items()}
         low, high = surfaces.box()
-        self._up = up_of(link.scene.resolved)
-        self._viser.scene.set_up_direction(self._up)
-        self.home = home(low, high, self._up)
+        up = up_of(link.scene.resolved)
+        history = History(link.meshes)
+        self._grip(link)
+        self._obstacles = Obstacles(self._viser.scene, link.obstacles, low, high)
+        self._panels.begin(history, link.scene.dt)
+        self._history, self._up, self.home = history, up, home(low, high, up)
+        self._viser.scene.set_up_direction(up)
         self._viser.initial_camera.position = self.home.position
         self._viser.initial_camera.look_at = self.home.target
-        self._obstacles = Obstacles(self._viser.scene, link.obstacles, low, high)
-        self._history = History(link.meshes)
-        self._panels.begin(self._history, link.scene.dt)
+        self.surfaces = surfaces
         for tab in self._all():
             tab.look_home()
+
+    def _grip(self, link: Link) -> None:
+        described = described_objects(link.scene.resolved)
+        self.grips = {name: grip(mesh, described.get(name, {})) for name, mesh in link.meshes.items()}
+
+    def _take_moduli(self, link: Link) -> None:
+        """Takes up moduli that were set: colours and springs of the old ones are made anew."""
+        assert self.surfaces is not None
+        if link.take_moduli():
+            self.surfaces.take_moduli(link.meshes)
+            self._paints.clear()
+            self._grip(link)
 
     def _take_steps(self, steps: Sequence[pb.ObjectStep]) -> None:
         self._history.add(steps)

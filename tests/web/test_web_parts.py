@@ -5,6 +5,7 @@ import json
 import urllib.error
 import urllib.request
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import MagicMock
@@ -14,7 +15,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from clients.errors import ClientError
-from clients.log.frames import Mesh
+from clients.log.frames import Mesh, Skin
 from clients.web.decimate import decimated
 from clients.web.feed import Feed
 from clients.web.hand import Hand, described_objects, grip
@@ -131,6 +132,40 @@ def test_materials_have_a_colour_each() -> None:
     paint = Paint(Surfaces({"a": tet(), "b": tet("b", young=1e6, shift=5.0), "c": tet("c", shift=9.0)}), "material")
     assert [len(band.triangles) for band in paint.bands][:2] == [8, 4]
     assert "1e+05, 1e+06" in paint.legend
+
+
+def test_no_material_is_shown_that_is_not_there() -> None:
+    """Three elements in a row, the outer ones soft and stiff: nothing between them is a mean of both."""
+    rest = np.array([[k, float(k % 2), float(k % 3 == 0)] for k in range(6)])
+    tets = np.array([[0, 1, 2, 3], [1, 2, 3, 4], [2, 3, 4, 5]], np.int32)
+    young = np.array([1e3, 1e7, 1e7], np.float32)
+    mesh = replace(tet(), rest=rest, tets=tets, young=young, poisson=np.full(3, 0.3, np.float32))
+    other = tet("b", young=1e5, shift=20.0)  # a modulus between both, elsewhere
+    rubber = replace(tet("c", shift=40.0), young=np.zeros(0, np.float32))
+    paint = Paint(Surfaces({"a": mesh, "b": other, "c": rubber}), "material")
+    assert "1e+03, 1e+05, 1e+07; grey" in paint.legend
+    assert set(paint.bands[1].vertices) == {4, 5, 6, 7} and len(paint.bands[3].triangles) == 4
+    skin = Skin(tets, np.full((3, 4), 0.25), np.array([[0, 1, 2]], np.int32))
+    paint = Paint(Surfaces({"a": replace(mesh, skin=skin)}), "material")
+    assert len(paint.bands[1].triangles) == 1  # of its vertices two lie in stiff elements
+
+
+def test_a_scale_follows_what_becomes_less_and_ends_above_nothing() -> None:
+    surfaces = Surfaces({"a": tet()})
+    surfaces.move("a", tet().rest * 2)
+    paint = Paint(surfaces, "displacement")
+    assert "to 1 m" in paint.legend
+    surfaces.move("a", tet().rest)
+    for _ in range(500):
+        paint.update()
+    assert "to 1e-05 m" in paint.legend
+
+
+def test_stresses_and_materials_take_moduli_that_were_set() -> None:
+    surfaces = Surfaces({"a": tet()})
+    surfaces.take_moduli({"a": tet(young=3e6)})
+    assert "3e+06" in Paint(surfaces, "material").legend
+    assert surfaces.parts["a"].mesh.young[0] == 3e6 and len(surfaces.points) == 4
 
 
 def test_curves_show_the_worst_of_several_steps_and_begin_anew_after_a_reset() -> None:
