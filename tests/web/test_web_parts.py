@@ -174,18 +174,20 @@ def test_curves_show_the_worst_of_several_steps_and_begin_anew_after_a_reset() -
     for step in range(1000):
         count = 77 if step == 501 else 5
         history.add([pb.ObjectStep(header=header, time=0.005 * step, iterations=count, factor_age=-1, residual=1e-7)])
-    times, (iterations,) = history.columns("iterations")
-    assert len(times) <= POINTS and iterations.max() == 77
-    assert np.isnan(history.columns("age")[1][0]).all()
+    times, columns = history.columns()
+    assert len(times) <= POINTS and (np.diff(times) > 0).all()
+    assert columns["iterations"].max() == 77 and np.isnan(columns["age"]).all()
+    history.add([pb.ObjectStep(header=header, time=11.0, iterations=3)])
+    assert history.columns()[0][0] == pytest.approx(1.04, abs=0.02)
     history.add([pb.ObjectStep(header=header, time=0.0, iterations=3)])
-    assert_array_equal(history.columns("iterations")[1][0], [3])
+    assert_array_equal(history.columns()[1]["iterations"], [[3]])
 
 
 def test_many_objects_share_one_curve() -> None:
     history = History([f"o{k}" for k in range(9)])
     history.add([pb.ObjectStep(header=pb.Header(object=f"o{k}"), time=1.0, iterations=k) for k in range(9)])
     assert history.names == ["largest"]
-    assert_array_equal(history.columns("iterations")[1][0], [8])
+    assert_array_equal(history.columns()[1]["iterations"], [[8]])
 
 
 class Server:
