@@ -11,7 +11,7 @@ import contextlib
 import logging
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from clients.client import Client
 from clients.errors import BadInput, ClientError
@@ -23,6 +23,8 @@ STATUS_PERIOD = 0.5  # s between two questions for status and parameters
 LOST_AFTER = 2  # questions without an answer
 RETRY_PERIOD = 0.5  # s between two attempts to connect
 QUESTION_TIMEOUT = 2.0  # s
+RENEWED_AFTER = 1.5  # s after a change of parameters; a server renews moduli each second
+DROPPED_FOR = 10.0  # s before another attempt with a scene that cannot be shown
 
 log = logging.getLogger(__name__)
 
@@ -47,6 +49,9 @@ class Link:
         self.incarnation = self.scene.header.incarnation
         self.status = pb.Status()
         self.parameters: list[pb.LiveParameter] = []
+        self._new_meshes: dict[str, Mesh] | None = None  # with moduli that were set
+        self._elastic: dict[str, str] | None = None  # values of the effects of objects
+        self._renew_at: float | None = None  # when the meshes are to be asked for again
         self.lost = ""  # why the connection is over; empty: it is not
         self._stop, self._asked = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._ask, name="status", daemon=True)
@@ -63,6 +68,14 @@ class Link:
     def poses(self) -> list[ObstacleFrame]:
         """Returns new poses, of each obstacle the newest."""
         return self._poses.newest() if self._poses is not None else []
+
+    def take_moduli(self) -> bool:
+        """Returns True if moduli were set since the last call; `meshes` has them then."""
+        new, self._new_meshes = self._new_meshes, None
+        if new is None:
+            return False
+        self.meshes = new
+        return True
 
     def ask_now(self) -> None:
         """Has status and parameters asked for at once."""
@@ -83,6 +96,7 @@ class Link:
                     raise ClientError("the server was started again")
                 failures = 0
                 self._ask_parameters()
+                self._ask_moduli()
             except (ClientError, BadInput) as error:
                 failures += 1
                 if failures >= LOST_AFTER or self.status.header.incarnation not in (0, self.incarnation):
@@ -104,6 +118,30 @@ class Link:
             self.parameters = []
         except ClientError:
             pass
+
+    def _ask_moduli(self) -> None:
+        """Gets the meshes again once parameters of the objects' effects have changed, and then rest for a while."""
+        values = {p.now.key: p.now.value for p in self.parameters if p.now.key.startswith("object.")}
+        known, self._elastic = self._elastic, values
+        if not known or not values:
+            return
+        if values != known:
+            self._renew_at = time.monotonic() + RENEWED_AFTER
+        elif self._renew_at is not None and time.monotonic() >= self._renew_at:
+            self._renew_at = None
+            with contextlib.suppress(ClientError):  # a late answer: colours and springs stay as they are
+                found = self.client.meshes()
+                if _other_moduli(found, self.meshes):
+                    self._new_meshes = found
+
+
+def _other_moduli(new: Mapping[str, Mesh], old: Mapping[str, Mesh]) -> bool:
+    """Returns True if the same objects have other moduli."""
+    if new.keys() != old.keys() or any(len(new[name].young) != len(old[name].young) for name in old):
+        return False
+    return any(
+        (new[name].young != mesh.young).any() or (new[name].poisson != mesh.poisson).any() for name, mesh in old.items()
+    )
 
 
 class Feed:
@@ -134,6 +172,12 @@ class Feed:
             return False
         self.error = ""
         return True
+
+    def drop(self, why: str) -> None:
+        """Gives up a link that cannot be used, and waits longer than usual before the next one."""
+        if self.link is not None:
+            self.link.close()
+        self.link, self.error, self._due = None, why, time.monotonic() + DROPPED_FOR
 
     def close(self) -> None:
         if self.link is not None:

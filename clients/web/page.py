@@ -9,7 +9,7 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import viser
@@ -114,6 +114,9 @@ class Page:
             self._begin(self.feed.link)
         self._build_tabs()
         link = self.feed.link
+        if link is not None:
+            for tab in self._all():
+                tab.keep_connected()
         if link is None:
             if self._is_due("panels", PANEL_PERIOD):
                 self._panels.lost(self.feed.error)
@@ -122,9 +125,11 @@ class Page:
         if self._obstacles is not None:
             self._obstacles.move(link.poses())
         assert self.surfaces is not None
+        self._take_moduli(link)
         moved = [frame for frame in link.frames() if self.surfaces.move(frame.object, frame.x)]
-        self._colour(bool(moved))
-        self._show(bool(moved))
+        modes = {tab: tab.mode.value for tab in self._all()}  # a person may change them at any time: read once
+        self._colour(bool(moved), set(modes.values()))
+        self._show(bool(moved), modes)
         if self._is_due("curves", CURVE_PERIOD):
             self._panels.draw()
         if self._is_due("panels", PANEL_PERIOD) and link.status.scene:
@@ -139,28 +144,50 @@ class Page:
             self._obstacles.remove()
             self._obstacles = None
         self._paints.clear()
+        self.surfaces = None
         if link is None:
             self._panels.lost(self.feed.error)
             return
-        self.surfaces = surfaces = Surfaces(link.meshes)
+        try:
+            self._take_up(link)
+        except Exception:
+            self.surfaces = None
+            self.feed.drop("the scene of the server cannot be shown")
+            raise
+
+    def _take_up(self, link: Link) -> None:
+        """Takes up the scene of a link; `surfaces` is set last, as all else needs the rest."""
+        surfaces = Surfaces(link.meshes)
         if surfaces.full > MOST_VERTICES:
             log.warning(
                 "%d vertices on the surfaces: %d are shown, so that a browser keeps pace",
                 surfaces.full, len(surfaces.points),
             )  # fmt: skip
-        described = described_objects(link.scene.resolved)
-        self.grips = {name: grip(mesh, described.get(name, {})) for name, mesh in link.meshes.items()}
         low, high = surfaces.box()
-        self._up = up_of(link.scene.resolved)
-        self._viser.scene.set_up_direction(self._up)
-        self.home = home(low, high, self._up)
+        up = up_of(link.scene.resolved)
+        history = History(link.meshes)
+        self._grip(link)
+        self._obstacles = Obstacles(self._viser.scene, link.obstacles, low, high)
+        self._panels.begin(history, link.scene.dt)
+        self._history, self._up, self.home = history, up, home(low, high, up)
+        self._viser.scene.set_up_direction(up)
         self._viser.initial_camera.position = self.home.position
         self._viser.initial_camera.look_at = self.home.target
-        self._obstacles = Obstacles(self._viser.scene, link.obstacles, low, high)
-        self._history = History(link.meshes)
-        self._panels.begin(self._history, link.scene.dt)
+        self.surfaces = surfaces
         for tab in self._all():
             tab.look_home()
+
+    def _grip(self, link: Link) -> None:
+        described = described_objects(link.scene.resolved)
+        self.grips = {name: grip(mesh, described.get(name, {})) for name, mesh in link.meshes.items()}
+
+    def _take_moduli(self, link: Link) -> None:
+        """Takes up moduli that were set: colours and springs of the old ones are made anew."""
+        assert self.surfaces is not None
+        if link.take_moduli():
+            self.surfaces.take_moduli(link.meshes)
+            self._paints.clear()
+            self._grip(link)
 
     def _take_steps(self, steps: Sequence[pb.ObjectStep]) -> None:
         self._history.add(steps)
@@ -170,10 +197,9 @@ class Page:
                 f = forces[hand.id]
                 hand.force = math.hypot(f.x, f.y, f.z)
 
-    def _colour(self, moved: bool) -> None:
+    def _colour(self, moved: bool, wanted: set[str]) -> None:
         """Colours the surface in each way that a tab wants, a few times a second."""
         assert self.surfaces is not None
-        wanted = {tab.mode.value for tab in self._all()}
         for mode in set(self._paints) - wanted:
             del self._paints[mode]
         for mode in wanted - set(self._paints):
@@ -185,12 +211,12 @@ class Page:
             took = time.monotonic() - began
             self._due["paint"] = time.monotonic() + max(PAINT_PERIOD, took / PAINT_SHARE)
 
-    def _show(self, moved: bool) -> None:
+    def _show(self, moved: bool, modes: Mapping[Tab, str]) -> None:
         assert self.surfaces is not None
-        for tab in self._all():
-            tab.show(self.surfaces, self._paints[tab.mode.value], moved)
+        for tab, mode in modes.items():
+            tab.show(self.surfaces, self._paints[mode], moved)
         self._springs.update(self._hands(), self.surfaces)
-        for tab in self._all():
+        for tab in modes:
             for hand in [h for h in tab.hands.values() if h.over]:
                 tab.hands.pop(hand.number, None)
 

@@ -18,6 +18,8 @@ from clients.viewer.colors import colors
 from clients.web.surfaces import Part, Surfaces
 
 BANDS = 12
+FADING = 0.97  # factor of the end of a scale by one update, five of which come in a second
+LEAST = 1e-5  # displacement over size, and strain of a stress, that the end of a scale has at least
 MODES = ("displacement", "von Mises stress", "material", "object", "plain")
 UNITS = {"displacement": "m", "von Mises stress": "Pa"}
 PLAIN = (224, 140, 110)
@@ -43,7 +45,8 @@ class Paint:
     def __init__(self, surfaces: Surfaces, mode: str) -> None:
         self.mode, self.version, self.legend = mode, 0, ""
         self.smooth = mode in ("plain", "object")  # shaded across edges: bands would show as creases
-        self._surfaces, self._top = surfaces, 0.0
+        self._surfaces = surfaces
+        self._top = self._least = _least(surfaces, mode)
         self._stress = _stress_fields(surfaces) if mode == "von Mises stress" else {}
         self.bands: list[Band] = []
         self._band = np.full(len(surfaces.triangles), -1)
@@ -74,12 +77,13 @@ class Paint:
         return values
 
     def _banded(self, values: NDArray) -> NDArray[np.int64]:
-        """Returns the band of each triangle (t,); the largest value so far has the last one.
+        """Returns the band of each triangle (t,); the largest value of the last seconds has the last one.
 
         Of stress it is the 99th percentile, as it has no bound at corners and clamped edges.
         """
         if len(values):
-            self._top = max(self._top, float(np.percentile(values, 99) if self.mode in _STEEP else values.max()))
+            now = float(np.percentile(values, 99) if self.mode in _STEEP else values.max())
+            self._top = max(now, FADING * self._top, self._least)
         self.legend = f"{self.mode}: 0 (violet) to {self._top:.3g} {UNITS[self.mode]} (yellow)"
         of = values[self._surfaces.triangles].mean(axis=1)
         return np.clip((of / (self._top or 1.0) * BANDS).astype(int), 0, BANDS - 1)
@@ -90,18 +94,25 @@ class Paint:
             return np.zeros(len(self._surfaces.triangles), int), [PLAIN]
         if self.mode not in ("object", "material"):
             return None
-        values = np.zeros(len(self._surfaces.points))
         if self.mode == "object":
+            values = np.zeros(len(self._surfaces.points), int)
             for number, part in enumerate(self._surfaces.parts.values()):
                 values[part.vertices] = number % len(DISTINCT)
-            return values[self._surfaces.triangles[:, 0]].astype(int), DISTINCT
-        for part in self._surfaces.parts.values():
-            values[part.vertices] = part.at(_log_young(part))
+            return values[self._surfaces.triangles[:, 0]], DISTINCT
+        return self._materials()
+
+    def _materials(self) -> tuple[NDArray[np.int64], Sequence[tuple[int, int, int]]]:
+        """Returns bands (t,) and colours by Young's modulus: a triangle has that of most of its vertices."""
         levels = _levels(self._surfaces)
+        palette = [*(DISTINCT if len(levels) <= len(DISTINCT) else _VIRIDIS)[: len(levels)], GREY]
         self.legend = "Young's modulus [Pa]: " + ", ".join(f"{10**level:.3g}" for level in levels)
-        of = values[self._surfaces.triangles].mean(axis=1)
-        band = np.abs(of[:, None] - levels).argmin(axis=1)
-        return band, DISTINCT if len(levels) <= len(DISTINCT) else _VIRIDIS
+        number = np.full(len(self._surfaces.points), len(levels))
+        for part in self._surfaces.parts.values():
+            if len(part.mesh.young):
+                number[part.vertices] = _material(part, levels)
+            else:
+                self.legend += "; grey: not elastic" if "grey" not in self.legend else ""
+        return np.sort(number[self._surfaces.triangles], axis=1)[:, 1], palette
 
 
 _VIRIDIS = [(int(r), int(g), int(b)) for r, g, b, _ in colors(np.linspace(0.0, 1.0, BANDS), 1.0)]
@@ -126,15 +137,34 @@ def _stress_fields(surfaces: Surfaces) -> dict[str, StressField]:
     return fields
 
 
-def _log_young(part: Part) -> NDArray[np.float64]:
-    """Returns the mean logarithm of the Young's moduli [Pa] around each node (n,); 0 where it is not elastic."""
+def _least(surfaces: Surfaces, mode: str) -> float:
+    """Returns what the end of a scale is at least, so that what rests has one colour."""
+    if mode == "displacement":
+        return LEAST * max((float(np.ptp(p.mesh.rest, axis=0).max()) for p in surfaces.parts.values()), default=0.0)
+    return LEAST * min((float(p.mesh.young.min()) for p in surfaces.parts.values() if len(p.mesh.young)), default=0.0)
+
+
+def _material(part: Part, levels: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Returns the number of the level at each vertex (s,).
+
+    It is that of the element in which the vertex of a skin lies, else of most of the elements around.
+    """
     mesh = part.mesh
-    if not len(mesh.young):
-        return np.zeros(len(mesh.rest))
-    logs = np.log10(np.maximum(mesh.young.astype(float), 1e-30))
-    count = np.bincount(mesh.tets.ravel(), minlength=len(mesh.rest))
-    total = np.bincount(mesh.tets.ravel(), np.repeat(logs, 4), len(mesh.rest))
-    return np.divide(total, count, out=np.zeros(len(total)), where=count > 0)
+    of = np.abs(_log(mesh.young)[:, None] - levels).argmin(axis=1)
+    votes = np.zeros((len(mesh.rest), len(levels)))
+    np.add.at(votes, (mesh.tets.ravel(), np.repeat(of, 4)), 1)
+    found = part.at(votes).argmax(axis=1)
+    if part.nodes.shape[1] == 4:
+        both = np.sort(np.concatenate([mesh.tets, part.nodes]), axis=1)
+        _, first, inverse = np.unique(both, axis=0, return_index=True, return_inverse=True)
+        element = first[inverse.reshape(-1)[len(of) :]]
+        inside = element < len(of)
+        found[inside] = of[element[inside]]
+    return found
+
+
+def _log(young: NDArray) -> NDArray[np.float64]:
+    return np.log10(np.maximum(young.astype(float), 1e-30))
 
 
 def _levels(surfaces: Surfaces) -> NDArray[np.float64]:
@@ -142,5 +172,5 @@ def _levels(surfaces: Surfaces) -> NDArray[np.float64]:
     young = np.concatenate(
         [np.unique(p.mesh.young) for p in surfaces.parts.values() if len(p.mesh.young)] or [np.ones(1, np.float32)]
     )
-    levels = np.unique(np.round(np.log10(np.maximum(young.astype(float), 1e-30)), 3))
+    levels = np.unique(np.round(_log(young), 3))
     return levels if len(levels) <= BANDS else np.linspace(levels[0], levels[-1], BANDS)

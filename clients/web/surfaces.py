@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,6 +69,13 @@ class Surfaces:
         self.nodes[name] = x
         self.points[part.vertices] = part.at(x)
         return True
+
+    def take_moduli(self, meshes: Mapping[str, Mesh]) -> None:
+        """Takes Young's moduli and Poisson's ratios of other meshes; all else stays."""
+        for name, part in self.parts.items():
+            new = meshes[name]
+            mesh = replace(part.mesh, young=new.young, poisson=new.poisson)
+            self.parts[name] = replace(part, mesh=mesh)
 
     def nearest(self, point: NDArray) -> tuple[str, int]:
         """Returns the object and the vertex that is nearest to a point [m]."""

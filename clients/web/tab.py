@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+RETRY_PERIOD = 1.0  # s between two attempts of a tab to connect
 TOGETHER = 0.02  # s from the first change of a slider to the command that has all that came meanwhile
 NOTHING, FLAT = np.zeros((3, 3), np.float32), np.array([[0, 1, 2]], np.uint32)  # what a band without triangles shows
 RADIUS = 8.0  # % of the object's size: default of the patch that a grab takes
@@ -47,6 +48,7 @@ class Tab:
         self._nodes: list[Any] = []
         self._shown: tuple[Paint | None, int] = (None, 0)
         self._pending: dict[str, Any] = {}
+        self._connecting, self._due, self._why = False, 0.0, ""  # when to try again; why there is no client
         self._lock = threading.Lock()
         self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix=f"tab-{viewer.client_id}")
         self._build(mode)
@@ -57,15 +59,27 @@ class Tab:
     def connect(self) -> None:
         """Makes a client of the server that the page has now, in place of an older one."""
         self.hands_off()
+        with self._lock:
+            self._pending = {}
+        self._connecting = True
         self._submit(self._reconnect)
 
+    def keep_connected(self) -> None:
+        """Tries again if there is no client of the server that the page has. Does not wait."""
+        if self.client is None and not self._connecting and time.monotonic() >= self._due:
+            self.connect()
+
     def _reconnect(self) -> None:
-        self._disconnect()
-        link = self.page.feed.link
-        if link is None or self.closed:
-            return
-        with contextlib.suppress(ClientError, BadInput):
-            self.client = Client(link.client.name, self.page.feed.connect)
+        try:
+            self._disconnect()
+            link = self.page.feed.link
+            if link is not None and not self.closed:
+                self.client = Client(link.client.name, self.page.feed.connect)
+        except (ClientError, BadInput) as error:
+            self._why = str(error)
+        finally:
+            self._due = time.monotonic() + RETRY_PERIOD
+            self._connecting = False
 
     def _disconnect(self) -> None:
         client, self.client = self.client, None
@@ -74,17 +88,19 @@ class Tab:
 
     def ask(self, what: Callable[[Any], object]) -> None:
         """Has a command of this tab sent by a thread of its own; the person is told why it was refused."""
+        self._submit(lambda: self._do(what))
 
-        def work() -> None:
-            try:
-                if self.client is None:
-                    raise ClientError("there is no connection to the server")
-                what(self.client)
-                self.page.asked()
-            except (BadInput, ClientError) as error:
-                self.tell(str(error))
+    def _do(self, what: Callable[[Any], object]) -> None:
+        try:
+            if self.client is None:
+                raise ClientError(self._unconnected())
+            what(self.client)
+            self.page.asked()
+        except (BadInput, ClientError) as error:
+            self.tell(str(error))
 
-        self._submit(work)
+    def _unconnected(self) -> str:
+        return f"this tab has no connection to the server, and tries again{f': {self._why}' if self._why else ''}"
 
     def set(self, key: str, value: Any) -> None:
         """Sets a live parameter; of several changes that come while one is on its way the newest counts."""
@@ -92,13 +108,14 @@ class Tab:
             first = not self._pending
             self._pending[key] = value
         if first:
-            self.ask(self._set_pending)
+            self._submit(self._set_pending)
 
-    def _set_pending(self, client: Any) -> None:
+    def _set_pending(self) -> None:
         time.sleep(TOGETHER)
         with self._lock:
             values, self._pending = self._pending, {}
-        client.set(values)
+        if values:
+            self._do(lambda client: client.set(values))
 
     def tell(self, text: str) -> None:
         """Shows a message in this tab."""
@@ -202,22 +219,29 @@ class Tab:
             self._hand = None
 
     def _take(self, point: Sequence[float], target: Sequence[float]) -> None:
+        self.hands_off()
         surfaces, client = self.page.surfaces, self.client
         if surfaces is None or client is None or self.closed:
+            self.tell(self._unconnected())
             return
-        self.hands_off()
         name, vertex = surfaces.nearest(np.asarray(point))
-        grip = self.page.grips[name]
+        grip = self.page.grips.get(name)
+        if grip is None:
+            return
         stiffness = grip.stiffness * self._strength.value
         self._hand = Hand(
             client, name, vertex, surfaces.points[vertex], target, self._radius.value / 100 * grip.size, stiffness,
             min(stiffness * grip.size, grip.limit), lambda why: self.tell(f"{name}: {why}"),
         )  # fmt: skip
         self.hands[self._hand.number] = self._hand
+        if self.page.surfaces is not surfaces:  # another scene came meanwhile
+            self.hands_off()
 
     async def _push(self, event: viser.SceneNodeDragEvent) -> None:
         surfaces, client = self.page.surfaces, self.client
         if surfaces is None or client is None:
+            if event.phase == "start":
+                self.tell(self._unconnected())
             return
         if event.phase == "start":
             self._from = surfaces.nearest(np.asarray(event.start_position))

@@ -5,14 +5,17 @@ import json
 import urllib.error
 import urllib.request
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from clients.log.frames import Mesh
+from clients.errors import ClientError
+from clients.log.frames import Mesh, Skin
 from clients.web.decimate import decimated
 from clients.web.feed import Feed
 from clients.web.hand import Hand, described_objects, grip
@@ -21,6 +24,7 @@ from clients.web.panel.curves import POINTS, History
 from clients.web.panel.sliders import named, value_of
 from clients.web.panel.tables import tables
 from clients.web.surfaces import Surfaces
+from clients.web.tab import Tab
 from clients.web.view import home, up_of
 from protocol import messages_pb2 as pb
 from protocol.network.web_address import exposed, hindrance, shown, web_address
@@ -130,24 +134,60 @@ def test_materials_have_a_colour_each() -> None:
     assert "1e+05, 1e+06" in paint.legend
 
 
+def test_no_material_is_shown_that_is_not_there() -> None:
+    """Three elements in a row, the outer ones soft and stiff: nothing between them is a mean of both."""
+    rest = np.array([[k, float(k % 2), float(k % 3 == 0)] for k in range(6)])
+    tets = np.array([[0, 1, 2, 3], [1, 2, 3, 4], [2, 3, 4, 5]], np.int32)
+    young = np.array([1e3, 1e7, 1e7], np.float32)
+    mesh = replace(tet(), rest=rest, tets=tets, young=young, poisson=np.full(3, 0.3, np.float32))
+    other = tet("b", young=1e5, shift=20.0)  # a modulus between both, elsewhere
+    rubber = replace(tet("c", shift=40.0), young=np.zeros(0, np.float32))
+    paint = Paint(Surfaces({"a": mesh, "b": other, "c": rubber}), "material")
+    assert "1e+03, 1e+05, 1e+07; grey" in paint.legend
+    assert set(paint.bands[1].vertices) == {4, 5, 6, 7} and len(paint.bands[3].triangles) == 4
+    skin = Skin(tets, np.full((3, 4), 0.25), np.array([[0, 1, 2]], np.int32))
+    paint = Paint(Surfaces({"a": replace(mesh, skin=skin)}), "material")
+    assert len(paint.bands[1].triangles) == 1  # of its vertices two lie in stiff elements
+
+
+def test_a_scale_follows_what_becomes_less_and_ends_above_nothing() -> None:
+    surfaces = Surfaces({"a": tet()})
+    surfaces.move("a", tet().rest * 2)
+    paint = Paint(surfaces, "displacement")
+    assert "to 1 m" in paint.legend
+    surfaces.move("a", tet().rest)
+    for _ in range(500):
+        paint.update()
+    assert "to 1e-05 m" in paint.legend
+
+
+def test_stresses_and_materials_take_moduli_that_were_set() -> None:
+    surfaces = Surfaces({"a": tet()})
+    surfaces.take_moduli({"a": tet(young=3e6)})
+    assert "3e+06" in Paint(surfaces, "material").legend
+    assert surfaces.parts["a"].mesh.young[0] == 3e6 and len(surfaces.points) == 4
+
+
 def test_curves_show_the_worst_of_several_steps_and_begin_anew_after_a_reset() -> None:
     history = History(["a"])
     header = pb.Header(object="a")
     for step in range(1000):
         count = 77 if step == 501 else 5
         history.add([pb.ObjectStep(header=header, time=0.005 * step, iterations=count, factor_age=-1, residual=1e-7)])
-    times, (iterations,) = history.columns("iterations")
-    assert len(times) <= POINTS and iterations.max() == 77
-    assert np.isnan(history.columns("age")[1][0]).all()
+    times, columns = history.columns()
+    assert len(times) <= POINTS and (np.diff(times) > 0).all()
+    assert columns["iterations"].max() == 77 and np.isnan(columns["age"]).all()
+    history.add([pb.ObjectStep(header=header, time=11.0, iterations=3)])
+    assert history.columns()[0][0] == pytest.approx(1.04, abs=0.02)
     history.add([pb.ObjectStep(header=header, time=0.0, iterations=3)])
-    assert_array_equal(history.columns("iterations")[1][0], [3])
+    assert_array_equal(history.columns()[1]["iterations"], [[3]])
 
 
 def test_many_objects_share_one_curve() -> None:
     history = History([f"o{k}" for k in range(9)])
     history.add([pb.ObjectStep(header=pb.Header(object=f"o{k}"), time=1.0, iterations=k) for k in range(9)])
     assert history.names == ["largest"]
-    assert_array_equal(history.columns("iterations")[1][0], [8])
+    assert_array_equal(history.columns()[1]["iterations"], [[8]])
 
 
 class Server:
@@ -319,3 +359,49 @@ def test_a_server_starts_a_page_and_ends_it(tmp_path: Path) -> None:
         assert again.wait() == 2 and "HOST:PORT" in again.output()
     finally:
         stage.close()
+
+
+class Viewer:
+    """Stands in for viser's handle of a tab: remembers what the person is told."""
+
+    client_id = 1
+
+    def __init__(self) -> None:
+        self.told: list[str] = []
+        self.gui = MagicMock()
+
+    def add_notification(self, title: str, text: str, **options: object) -> None:
+        self.told.append(text)
+
+
+def test_a_tab_tries_again_to_connect_says_so_and_its_sliders_live_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    connected = list[object]()
+    server = SimpleNamespace(sent=list[object](), close=lambda: None)
+    server.set = server.sent.append
+
+    def connect(*arguments: object) -> object:
+        connected.append(arguments)
+        if len(connected) == 1:
+            raise ClientError("it is busy")
+        return server
+
+    monkeypatch.setattr("clients.web.tab.Client", connect)
+    monkeypatch.setattr("clients.web.tab.RETRY_PERIOD", 0.0)
+    link = SimpleNamespace(client=SimpleNamespace(name="sim"))
+    page = SimpleNamespace(
+        asked=lambda: None, surfaces=None, grips={}, feed=SimpleNamespace(link=link, connect=None), home=None
+    )
+    viewer = Viewer()
+    tab = Tab(page, viewer, "plain")  # type: ignore[arg-type]
+    try:
+        tab.set("a", 1)
+        until(lambda: len(viewer.told) == 1, "word of the change that was not made")
+        assert "it is busy" in viewer.told[0]
+        tab.keep_connected()
+        until(lambda: tab.client is server, "another attempt")
+        tab.keep_connected()
+        tab.set("a", 2)
+        until(lambda: server.sent == [{"a": 2}], "the change")
+        assert len(connected) == 2
+    finally:
+        tab.close()

@@ -4,9 +4,9 @@
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,61 +17,72 @@ if TYPE_CHECKING:
     import viser
 
 SECONDS = 10.0  # of simulation that are shown
-POINTS = 250  # of a curve; of more steps each point is the largest of several
+POINTS = 250  # of a curve at most; each is the largest value of the steps in its part of the time
 OWN = 3  # objects that have curves of their own; of more the largest value is shown
 COLORS = ("#0072b2", "#d55e00", "#009e73")
 HEIGHT = 120  # pixels
 
 
-class Row(NamedTuple):
-    """What is shown of one object and step."""
+FIELDS = ("iterations", "age", "residual", "milliseconds")  # age: steps; residual: log10
+
+
+@dataclass
+class Bin:
+    """The largest values of the steps in a part of the time. time: of its first step [s]"""
 
     time: float
-    iterations: float
-    age: float  # steps; NaN: no factor
-    residual: float  # log10
-    milliseconds: float
+    values: list[list[float]]  # of each curve and field; -inf: none
 
 
 class History:
-    """The rows of the last seconds of each object."""
+    """Largest values in each part of the last seconds: a curve for each object, or one for all if they are many."""
 
     def __init__(self, objects: Iterable[str]) -> None:
-        self.rows: dict[str, deque[Row]] = {name: deque() for name in objects}
+        objects = list(objects)
+        own = len(objects) <= OWN
+        self.names = objects if own else ["largest"]
+        self._curve = {name: number if own else 0 for number, name in enumerate(objects)}
+        self._last: dict[str, float] = {}  # time of the newest step of an object
+        self._bins: dict[int, Bin] = {}
 
     def add(self, steps: Iterable[pb.ObjectStep]) -> None:
         """Adds steps; one that is earlier than the last, of a run put back to its start, begins anew."""
         for step in steps:
-            rows = self.rows.get(step.header.object)
-            if rows is None:
+            name, time = step.header.object, step.time
+            curve = self._curve.get(name)
+            if curve is None:
                 continue
-            if rows and step.time <= rows[-1].time:
-                rows.clear()
-            age = float(step.factor_age) if step.factor_age >= 0 else math.nan
-            residual = math.log10(max(step.residual, 1e-16))
-            rows.append(Row(step.time, step.iterations, age, residual, 1e3 * step.step_seconds))
-            while rows and rows[0].time < step.time - SECONDS:
-                rows.popleft()
+            if time <= self._last.get(name, -math.inf):
+                self._bins.clear()
+                self._last.clear()
+            self._last[name] = time
+            values = self._bin(time).values[curve]
+            new = (
+                float(step.iterations), float(step.factor_age) if step.factor_age >= 0 else -math.inf,
+                math.log10(max(step.residual, 1e-16)), 1e3 * step.step_seconds,
+            )  # fmt: skip
+            for field, value in enumerate(new):
+                if value > values[field]:
+                    values[field] = value
 
-    def columns(self, field: str) -> tuple[NDArray[np.float64], list[NDArray[np.float64]]]:
-        """Returns times and one array per object that has a curve of its own, else one array of the largest values."""
-        tables = [np.array(rows, float).reshape(-1, len(Row._fields)) for rows in self.rows.values()]
-        length = min((len(t) for t in tables), default=0)
-        if not length:
-            return np.zeros(1), [np.zeros(1) for _ in range(len(self.names))]
-        number = Row._fields.index(field)
-        values = np.stack([t[-length:, number] for t in tables])
-        if len(tables) > OWN:
-            values = np.fmax.reduce(values)[None]  # NaN where all are
-        times = tables[0][-length:, 0]
-        bins = max(1, math.ceil(length / POINTS))
-        starts = np.arange(0, length, bins)
-        return times[starts], [np.fmax.reduceat(row, starts) for row in values]
+    def _bin(self, time: float) -> Bin:
+        number = int(time / SECONDS * POINTS)
+        found = self._bins.get(number)
+        if found is None:
+            newest = max(self._bins, default=number)
+            for old in [k for k in self._bins if k <= max(newest, number) - POINTS]:
+                del self._bins[old]
+            found = self._bins[number] = Bin(time, [[-math.inf] * len(FIELDS) for _ in self.names])
+        return found
 
-    @property
-    def names(self) -> list[str]:
-        """Names of the curves."""
-        return list(self.rows) if len(self.rows) <= OWN else ["largest"]
+    def columns(self) -> tuple[NDArray[np.float64], dict[str, NDArray[np.float64]]]:
+        """Returns times (p,) [s] and for each field the curves (c, p); NaN where there is no value."""
+        if not self._bins:
+            return np.zeros(1), {field: np.zeros((len(self.names), 1)) for field in FIELDS}
+        bins = [self._bins[number] for number in sorted(self._bins)]
+        table = np.array([found.values for found in bins])  # (p, c, fields)
+        table[np.isneginf(table)] = np.nan
+        return np.array([found.time for found in bins]), {f: table[:, :, k].T for k, f in enumerate(FIELDS)}
 
 
 class Curves:
@@ -92,8 +103,9 @@ class Curves:
 
     def update(self) -> None:
         """Shows what the history has now."""
+        times, columns = self.history.columns()
         for field, chart in self._charts.items():
-            times, values = self.history.columns(field)
+            values = list(columns[field])
             if field == "milliseconds":
                 values = [np.fmax.reduce(values), np.full(len(times), 1e3 * self._dt)]
             chart.data = (times, *values)
