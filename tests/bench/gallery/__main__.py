@@ -166,7 +166,7 @@ def main(
     steps = 60 if quick else steps
     report = Report("gallery", TITLE, {"steps": steps, "device": device}, out, quick)
     rows = []
-    for solver in list(SOLVERS)[: 1 if quick else None]:
+    for solver in list(SOLVERS)[: 2 if quick else None]:
         rows.append(measured(CREATURE, solver, device, steps))
         print(f"{CREATURE}, {solver}: done", flush=True)
     others = []
