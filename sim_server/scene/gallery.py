@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Scenes that come with the package: gallery/NAME. Each begins with a comment that says in a sentence what it is."""
 
+from os.path import isfile
 from pathlib import Path
 
 PREFIX = "gallery"
@@ -16,9 +17,9 @@ def found(path: Path) -> Path:
     """Returns the file of the scene that `path` names: gallery/NAME and gallery/NAME.toml are of the package, unless
     there is such a file in the working folder. Any other path is returned as it is.
     """
-    if path.is_file() or len(path.parts) != 2 or path.parts[0] != PREFIX or path.suffix not in ("", ".toml"):
+    if isfile(path) or len(path.parts) != 2 or path.parts[0] != PREFIX or path.suffix not in ("", ".toml"):
         return path
-    if (own := path.with_suffix(".toml")).is_file():
+    if isfile(own := path.with_suffix(".toml")):
         return own
     return FOLDER / f"{path.stem}.toml" if path.stem in names() else path
 
