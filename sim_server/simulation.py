@@ -343,7 +343,7 @@ def build_effects(scene: Scene, world: World) -> dict[str, Effect]:
         for variant, listed in variants.items():
             built[name + variant] = effect(name).build(world, listed)
             built[name + variant].name = name
-    for name, params in scene.effects.items():
+    for name, params in sorted(scene.effects.items(), key=lambda item: item[0] != "gravity"):  # contact asks for it
         built[name] = effect(name).build(world, [(body, params) for body in world.bodies])
         built[name].name = name
     return built

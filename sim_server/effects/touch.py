@@ -20,7 +20,7 @@ of a grab near young times the size of the grabbed patch moves that patch withou
 """
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from math import dist, hypot
@@ -173,10 +173,10 @@ class Touch(Effect):
         self._put(alive)
         return old
 
-    def release_of(self, name: str = "") -> None:
-        """Ends all pushes and grabs on an object, or on all objects."""
+    def release_of(self, name: str = "", ids: Container[int] = range(1 << 62)) -> None:
+        """Ends pushes and grabs on an object, or on all objects. ids: of those that may end"""
         alive = self._alive()
-        kept = {id: a for id, a in alive.items() if name and a.object != name}
+        kept = {id: a for id, a in alive.items() if (name and a.object != name) or id not in ids}
         if len(kept) < len(alive):
             self._put(kept)
 

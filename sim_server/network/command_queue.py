@@ -20,6 +20,7 @@ LIMITED = (
     "move_obstacle",
     "set",
     "parameters",
+    "reset",
     "add_worker",
     "kill_worker",
 )  # verbs; with the others a client may owe a burst: it can always let go and stop

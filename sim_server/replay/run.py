@@ -93,6 +93,7 @@ class Replay:
         self._nodes: dict[int, tuple[NDArray[np.int32], Float64]] = {}  # nodes and offsets of interactions, by id
         self._inline = self._library()
         self._positions: dict[str, Float64] = {}  # sent instead of a matrix, and not those of its step, by body
+        self._later: dict[str, Float64] = {}  # those at the end of the last step
         self._assemblies: dict[str, Assembly] = {}
         for factor in self._saved.factors:
             self._factors[factor.object, factor.step] = factor
@@ -119,6 +120,7 @@ class Replay:
         """Repeats all steps and compares them; calls `progress` with the number of steps done."""
         self._compare_frames(self.recording.first)
         for step in range(self.recording.first, self.recording.steps):
+            self._fetch_later(step)
             sets = self._reset(step)
             self._restore_interactions(step)
             self._restore_targets(step)
@@ -267,6 +269,13 @@ class Replay:
                 self._positions[body.name] = np.empty((body.last - body.first, 3))
                 self.engine.request_positions(body.index, self._positions[body.name], use.ahead)
 
+    def _fetch_later(self, step: int) -> None:
+        """Keeps the positions at the end of the last step that were sent for factors of it, before a reset."""
+        for body in self.bodies:
+            use = self.recording.objects[body.name].factors.get(step - 1)
+            if use is not None and use.later and (body.name, step - 1) in self._needed:
+                self._later[body.name] = self.simulation.fetch().x[body.nodes].copy()
+
     def _make_factors(self, step: int) -> None:
         """Makes the factors of this step, and those of the last one whose positions were sent at its end."""
         for body in self.bodies:
@@ -275,7 +284,7 @@ class Replay:
                 later = use is not None and use.later
                 if (body.name, made) in self._needed and later == (made < step):
                     if later:
-                        self._positions[body.name] = self.simulation.fetch().x[body.nodes].copy()
+                        self._positions[body.name] = self._later[body.name]
                     self._submit(body, made)
         self._collect(step)
 

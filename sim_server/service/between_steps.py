@@ -38,7 +38,7 @@ class BetweenSteps:
         return self.waits and self._loop.held == self._loop.hold
 
     def run(self) -> None:
-        """Runs all that waits, and lets the loop go. The loop must stand still, or have ended."""
+        """Runs all that waits, and lets the loop go. The loop must stand still, or have ended. They raise nothing."""
         try:
             while self._waiting:
                 self._waiting.popleft()()

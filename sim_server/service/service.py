@@ -54,6 +54,10 @@ STATUS_INTERVAL = 0.02  # s between two statuses that clients request, at least
 MAX_SETS = 64  # commands that wait to set parameters
 LOOP_NICE = -5  # of the loop's thread in real time: before workers, clients and our own threads on a full machine
 ENDLESS = 1 << 62
+AFTER_SETS = ("step", "resume", "reset", "save")  # verbs that wait for parameters that were to be set before
+
+Change = Callable[[Callable[[pb.Reply], None], pb.Reply], None]
+"""A command that waits until the loop stands still; it gives the answer to the reply function."""
 
 
 class Service:
@@ -119,7 +123,7 @@ class Service:
             loop.start()  # inside: a signal may come before it returns, when the thread runs already
             while loop.is_alive() and not self.commands.stopping:
                 self.round()
-                time.sleep(HOLD_PERIOD if self._between.waits else ROUND_PERIOD)
+                time.sleep(HOLD_PERIOD if self._between.waits and self._first is None else ROUND_PERIOD)
         finally:
             self.engine.loop.stop = 1
             while loop.is_alive():  # it may wait for room in its rings
@@ -128,6 +132,9 @@ class Service:
                 loop.join(0.01)
             self._between.run()
             self._halts.answer(ended=True)
+            for _, reply in self._sets:
+                reply(pb.Reply(error="the server stops: nothing was set"))
+            self._sets.clear()
             self._drain()
             self.telemetry.publish_status("stopping")
         if self._failure is not None:
@@ -139,7 +146,8 @@ class Service:
                 os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), LOOP_NICE)
         try:
             if self._loop_alone:
-                if self._first is None or self._first.run():
+                first = self._first if self._last is None or self.engine.step < self._last else None
+                if first is None or (self.engine.wait() and first.run()):
                     self.engine.run(ENDLESS if self._last is None else self._last - self.engine.step)
                 return
             while not self.engine.loop.stop and (self._last is None or self.engine.step < self._last):
@@ -182,12 +190,14 @@ class Service:
                 if command.verb == "status":
                     self._status_replies.append(reply)
                     continue
+                while self._sets and command.verb in AFTER_SETS:
+                    self._set_oldest()
                 answer = self.commands.carry_out(command)
                 if self._halts.add(command, reply, answer):
                     continue
                 if command.verb in ("reset", "save") and not answer.error:
-                    change = self._save if command.verb == "save" else partial(self._reset, command.object)
-                    self._between.add(partial(change, reply, answer))
+                    change = self._save if command.verb == "save" else self._resetting(command.object)
+                    self._between.add(partial(self._carry_out_between, change, reply, answer))
                     continue
                 answers.append((reply, answer))
                 if not answer.error:
@@ -208,10 +218,24 @@ class Service:
         that half of the time is kept for all else."""
         begin = time.monotonic()
         if self._sets and begin >= self._set_due:
-            command, reply = self._sets.popleft()
-            reply(self.commands.carry_out(command))
+            self._set_oldest()
             end = time.monotonic()
             self._set_due = 2 * end - begin
+
+    def _set_oldest(self) -> None:
+        command, reply = self._sets.popleft()
+        reply(self.commands.carry_out(command))
+
+    def _carry_out_between(self, change: Change, reply: Callable[[pb.Reply], None], answer: pb.Reply) -> None:
+        """Carries out what was to wait until the loop stands still. If it fails the client is told; others go on."""
+        if self._failure is not None:
+            reply(pb.Reply(error="the loop has failed"))
+            return
+        try:
+            change(reply, answer)
+        except Exception as error:
+            log.exception("a command between two steps failed")
+            reply(pb.Reply(error=f"it failed: {error}"))
 
     def _save(self, reply: Callable[[pb.Reply], None], answer: pb.Reply) -> None:
         """Copies the state while the loop stands still; a thread makes the file of it, offers it and answers."""
@@ -228,11 +252,27 @@ class Service:
 
         threading.Thread(target=offer, name="checkpoint", daemon=True).start()
 
-    def _reset(self, name: str, reply: Callable[[pb.Reply], None], answer: pb.Reply) -> None:
-        """Puts an object or all back to the start, while the loop stands still."""
+    def _resetting(self, name: str) -> Change:
+        """Returns the reset of an object or all. What clients push and move until it is carried out comes after it."""
+        touch = self.simulation.touch
+        known = {a.id for a in touch.alive()} if touch is not None else set[int]()
+        return partial(self._reset, name, known, [m.targets for m in self.simulation.movers])
+
+    def _reset(
+        self, name: str, touching: set[int], targets: list[dict[str, Float64]], reply: Callable[[pb.Reply], None],
+        answer: pb.Reply,
+    ) -> None:  # fmt: skip
+        """Puts an object or all back to the start, while the loop stands still.
+
+        touching, targets: ids of pushes and grabs, and poses that were wanted, when it was commanded
+        """
         if self.simulation.touch is not None:
-            self.simulation.touch.release_of(name)
+            self.simulation.touch.release_of(name, touching)
+        now = [m.targets for m in self.simulation.movers]
         self._start.reset(name)
+        for mover, old, new in zip(self.simulation.movers, targets, now, strict=True):
+            if moved := {k: pose for k, pose in new.items() if not np.array_equal(pose, old[k])}:
+                mover.restore(moved)
         for state in self.driver.bodies:
             if name in ("", state.body.name):
                 state.frozen = False

@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 from sim_server.mesh.surface import surface_triangles
+from sim_server.scene.model import Scene
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
 from tests.contact.scenes import D, over
+from tests.contact_scene import table
 from tests.reference.contact import Rows
 
 SMALL = {"cells": (2, 2, 2), "size": (0.1, 0.1, 0.1), "young": 3e5}  # edges of 0.05 m
@@ -162,3 +164,13 @@ def test_a_triangle_row_is_joined_to_its_corners_by_weights_of_its_nearest_point
     stiffness = [given.stiffness[2 * sites.index(n)] for n in triangle]
     assert given.stiffness[row] == pytest.approx(given.weight[row, :3] @ stiffness)
     assert triangle.tolist() in surface_triangles(sim.world.bodies[0].mesh.tets).tolist()
+
+
+def test_sweeps_know_gravity_wherever_the_scene_lists_it() -> None:
+    given = table()
+    given["effects"] = dict(reversed(given["effects"].items()))
+    assert list(given["effects"]) == ["contact", "gravity"]
+    contact = Simulation(Scene.model_validate(given)).contact
+    assert contact is not None
+    faces = contact.contact_input().faces
+    assert faces is not None and faces.gravity.tolist() == [0, -9.81, 0]

@@ -464,7 +464,7 @@ class GpuEngine(DeviceLoop):
         return self.mailboxes[self._mailed[launch]].post(cast(DeviceLaunch, new).params.tobytes(), keep=new)
 
     def stage(self, changes: Sequence[ArrayChange]) -> list[tuple[int, int, int, Any] | None]:
-        """Copies new contents to the device beside the arrays: target, source, bytes and memory; None: no kernel has it.
+        """Copies new contents to the device beside the arrays: target, source, bytes, memory; None: no kernel has it.
 
         Arrays of the host have them at once.
         """

@@ -41,7 +41,7 @@ static void take_changes(Loop& loop) {
         copy_all(*next);
     }
     if (loop.substeps) loop.substeps->state.since = ESTIMATE_EVERY;
-    next->taken = loop.rings.step;
+    next->taken.store(loop.rings.step, std::memory_order_release);
 }
 
 static void run(const Launch& l, int threads) {

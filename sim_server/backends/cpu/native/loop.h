@@ -26,7 +26,7 @@ struct Copy {              // new contents of an array that kernels read
 struct Changes {           // of parameters: copies that are made between the same two steps
     const Copy* copies;
     int32_t count;
-    int64_t taken;   // steps completed when the loop made them, -1: it has not
+    std::atomic<int64_t> taken;   // steps completed when the loop made them, -1: it has not
 };
 
 struct Launch {
