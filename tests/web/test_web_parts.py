@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The page without a browser: surfaces, colours, curves, grabs, addresses, a server that goes and comes."""
 
+import asyncio
 import json
 import urllib.error
 import urllib.request
@@ -21,7 +22,7 @@ from clients.web.feed import Feed
 from clients.web.hand import Hand, described_objects, grip
 from clients.web.paint import BANDS, Paint, split
 from clients.web.panel.curves import POINTS, History
-from clients.web.panel.sliders import named, value_of
+from clients.web.panel.sliders import Slider, Sliders, named, value_of
 from clients.web.panel.tables import tables
 from clients.web.surfaces import Surfaces
 from clients.web.tab import Tab
@@ -405,3 +406,41 @@ def test_a_tab_tries_again_to_connect_says_so_and_its_sliders_live_on(monkeypatc
         assert len(connected) == 2
     finally:
         tab.close()
+
+
+def live(
+    value: str, low: float = 0.0, high: float = 0.0, key: str = "object.a.effects.corotational.young"
+) -> pb.LiveParameter:
+    return pb.LiveParameter(now=pb.Parameter(key=key, value=value), unit="Pa", low=low, high=high, logarithmic=True)
+
+
+def test_one_slider_is_a_factor_of_the_stiffness_of_all_regions() -> None:
+    handle, sent = SimpleNamespace(min=-1.0, max=1.0, value=0.0, label="", moved=None), list[object]()
+    handle.on_update = lambda function: setattr(handle, "moved", function)
+    gui = MagicMock()
+    gui.add_slider.return_value = handle
+    start = live('[{ "where" = "Z < \\"1\\"", "young" = 4e4 }, { "young" = 2000000 }]')
+    Slider(gui, start, lambda *change: sent.append(change))
+    assert gui.add_slider.call_args.args[:3] == ("corotational.young: stiffness x 1", -1.0, 1.0)
+    handle.value = 0.4
+    asyncio.run(handle.moved(SimpleNamespace(client_id=7)))
+    ((number, key, text),) = sent
+    assert (number, key) == (7, start.now.key) and handle.label.endswith("stiffness x 2.512")
+    assert value_of(text) == [{"where": 'Z < "1"', "young": 100480.0}, {"young": 5024000.0}]
+    fresh = Slider(gui, start, lambda *change: None)
+    fresh.show(live(text))
+    assert handle.value == 0.4 and handle.label.endswith("x 2.512")
+    fresh.show(live('[{ "where" = "Z < 2", "young" = 1e4 }, { "young" = 1e4 }]'))  # other regions, by another client
+    assert handle.value == 0.0 and handle.label.endswith("x 1")
+
+
+def test_sliders_are_made_anew_for_other_bounds_and_other_kinds_of_values() -> None:
+    gui = MagicMock()
+    gui.add_slider.return_value = MagicMock(min=-9.0, max=9.0)
+    sliders = Sliders(gui, MagicMock(), lambda *change: None)
+    counts = []
+    for value, high in (("1e5", 1e6), ("2e5", 1e6), ("2e5", 1e7), ('[{ "young" = 1e5 }]', 1e7)):
+        sliders.update([live(value, 1e4, high)])
+        counts.append(gui.add_slider.call_count)
+    assert counts == [1, 1, 2, 3]
+    assert gui.add_slider.call_args_list[1].args[2] == 7.0
