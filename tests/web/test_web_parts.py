@@ -3,6 +3,7 @@
 
 import asyncio
 import json
+import os
 import urllib.error
 import urllib.request
 from collections.abc import Callable
@@ -30,7 +31,7 @@ from clients.web.view import home, up_of
 from protocol import messages_pb2 as pb
 from protocol.network.web_address import exposed, hindrance, shown, web_address
 from protocol.refused import Refused
-from sim_server.service.web_page import FIRST_PAUSE, WebPage
+from sim_server.service.web_page import FIRST_PAUSE, LASTED, MOST_RESTARTS, WebPage
 from tests.clients.fake_server import FakeServer
 from tests.ports import free_port
 from tests.system.server_process import Stage, beam, until
@@ -267,7 +268,15 @@ def test_names_in_tables_are_no_markup() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "found"), [("8081", ("127.0.0.1", 8081)), ("0.0.0.0:80", ("0.0.0.0", 80)), ("[::1]:9", ("::1", 9))]
+    ("text", "found"),
+    [
+        ("8081", ("127.0.0.1", 8081)),
+        ("0.0.0.0:80", ("0.0.0.0", 80)),
+        ("[::1]:9", ("::1", 9)),
+        ("0.0.0.0", ("0.0.0.0", 8080)),
+        ("localhost", ("localhost", 8080)),
+        ("::1", ("::1", 8080)),
+    ],
 )
 def test_addresses_of_the_page(text: str, found: tuple[str, int]) -> None:
     assert web_address(text) == found
@@ -307,17 +316,20 @@ def test_the_page_says_why_it_cannot_be_served(monkeypatch: pytest.MonkeyPatch) 
     assert "pip install" in hindrance("127.0.0.1", 8080)
 
 
-def test_a_page_that_ends_is_started_again_after_a_pause_that_doubles() -> None:
+def test_a_page_that_ends_is_started_again_after_a_pause_that_doubles_and_given_up_at_last() -> None:
     now, started = [0.0], list[SimpleNamespace]()
 
-    def start(command: object) -> SimpleNamespace:
+    def start(command: list[str]) -> SimpleNamespace:
+        assert command[command.index("--parent") + 1] == str(os.getpid())
         started.append(SimpleNamespace(returncode=None, poll=lambda: started[-1].returncode))
+        if len(started) == 3:
+            raise OSError("no memory")
         return started[-1]
 
     page = WebPage("sim", "tcp/h:1", "127.0.0.1", 8080, clock=lambda: now[0], start=start)  # type: ignore[arg-type]
-    page.check()
-    assert len(started) == 1
-    for pause in (FIRST_PAUSE, 2 * FIRST_PAUSE):
+
+    def end(pause: float, starts: int = 1) -> None:
+        """Ends the page; it is started again after a pause."""
         started[-1].returncode, count = 1, len(started)
         page.check()
         now[0] += 0.9 * pause
@@ -325,7 +337,17 @@ def test_a_page_that_ends_is_started_again_after_a_pause_that_doubles() -> None:
         assert len(started) == count
         now[0] += 0.2 * pause
         page.check()
-        assert len(started) == count + 1
+        assert len(started) == count + starts
+
+    page.check()
+    assert len(started) == 1
+    for restart in range(MOST_RESTARTS):
+        end(2**restart * FIRST_PAUSE)
+    now[0] += 1.1 * LASTED
+    for restart in range(MOST_RESTARTS):
+        end(2**restart * FIRST_PAUSE)
+    end(1e6, starts=0)
+    page.close()
 
 
 @pytest.mark.system
