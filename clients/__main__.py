@@ -532,6 +532,7 @@ def web(
     exit_with_parent: Annotated[
         bool, typer.Option("--exit-with-parent", help="End when the parent process ends.")
     ] = False,
+    parent: Annotated[int | None, typer.Option("--parent", hidden=True, help="Its process id.")] = None,
     connect: Connect = None,
     server: Server = SERVER_NAME,
 ) -> None:
@@ -545,7 +546,7 @@ def web(
     """
     from clients.web import command
 
-    command.web(server, connect, host, port, exit_with_parent)
+    command.web(server, connect, host, port, exit_with_parent, parent)
 
 
 @app.command()

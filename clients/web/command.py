@@ -16,10 +16,14 @@ from protocol.refused import Refused
 log = logging.getLogger(__name__)
 
 
-def web(server: str, connect: Sequence[str] | None, host: str, port: int, exit_with_parent: bool) -> None:
+def web(
+    server: str, connect: Sequence[str] | None, host: str, port: int, exit_with_parent: bool, parent: int | None = None
+) -> None:
     """Serves the page until Ctrl-C, or with exit_with_parent until the parent process ends.
 
-    The server need not run yet. Raises ClientError, BadInput.
+    parent: its process id, by which one that is dead already is noticed. The server need not run yet.
+
+    Raises ClientError, BadInput.
     """
     logging.basicConfig(format="sim-client: %(message)s")
     try:
@@ -33,7 +37,7 @@ def web(server: str, connect: Sequence[str] | None, host: str, port: int, exit_w
     if warning := exposed(host, port):
         log.warning("%s", warning)
     if exit_with_parent:
-        die_with_parent()
+        die_with_parent(parent)
     from clients.web.page import Page
 
     page = Page(server, connect, host, port)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Keeps other web sites out, which a browser on this machine lets connect to a page of loopback.
+"""Keeps other web sites out, which a browser on this machine lets connect to a page of loopback, and lets go of lost tabs.
 
 viser takes every connection. Its server is made here with a check before each request: a connection has to come from a
 page of the same address (header Origin, RFC 6454), and by a name of loopback where the page is (against DNS rebinding).
@@ -15,6 +15,7 @@ from urllib.parse import urlsplit
 
 import websockets.asyncio.server as server
 
+PING_PERIOD, PING_TIMEOUT = 5.0, 10.0  # s: a tab whose network is gone lets go after the sum of both at the latest
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
 
@@ -28,7 +29,7 @@ def foreign(origin: str | None, host: str | None, loopback: bool) -> bool:
 
 @contextlib.contextmanager
 def own_pages_only(loopback: bool) -> Iterator[None]:
-    """A server that is started in this context refuses requests by other sites."""
+    """A server that is started in this context refuses requests by other sites, and notices soon when a tab is gone."""
     serve = server.serve
 
     def guarded(*arguments: Any, process_request: Any, **options: Any) -> Any:
@@ -37,7 +38,8 @@ def own_pages_only(loopback: bool) -> Iterator[None]:
                 return connection.respond(http.HTTPStatus.FORBIDDEN, "this page is not for other sites\n")
             return process_request(connection, request)
 
-        return serve(*arguments, process_request=check, **options)
+        pings = {"ping_interval": PING_PERIOD, "ping_timeout": PING_TIMEOUT}
+        return serve(*arguments, process_request=check, **options, **pings)
 
     server.serve = guarded  # type: ignore[assignment,misc]
     try:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Where the page of `sim-client web` is served: HOST:PORT, and whether it can be."""
 
+import ipaddress
 import re
 import socket
 from importlib.util import find_spec
@@ -14,12 +15,22 @@ _ADDRESS = re.compile(r"(?:(?P<host>\[[0-9A-Fa-f:.%\w]+\]|[^:\s/\[\]]*):)?(?P<po
 
 
 def web_address(text: str) -> tuple[str, int]:
-    """Returns host and port of HOST:PORT, :PORT or PORT. Raises Refused."""
+    """Returns host and port of HOST:PORT, :PORT, PORT, or of an IP address or localhost alone. Raises Refused."""
+    if text == "localhost" or _is_ip(text.strip("[]")):
+        return text.strip("[]"), PORT
     match = _ADDRESS.fullmatch(text)
     if match is None or not 1 <= int(match["port"]) <= 65535:
         allowed = f"HOST:PORT or PORT, PORT from 1 to 65535, for example {HOST}:{PORT}"
         raise Refused(f"--web {text}: allowed is {allowed}", "malformed")
     return (match["host"] or HOST).strip("[]"), int(match["port"])
+
+
+def _is_ip(text: str) -> bool:
+    try:
+        ipaddress.ip_address(text)
+    except ValueError:
+        return False
+    return True
 
 
 def shown(host: str, port: int) -> str:

@@ -2,6 +2,7 @@
 """Starts, restarts and stops the process of `sim-server --web`: a client that serves a page for browsers."""
 
 import logging
+import os
 import subprocess
 import sys
 import time
@@ -16,7 +17,8 @@ from protocol.refused import Refused
 log = logging.getLogger(__name__)
 
 FIRST_PAUSE = 1.0  # s before the first restart; doubled each time
-LONGEST_PAUSE = 60.0  # s
+LASTED = 60.0  # s that a page runs before it counts as one that lasts
+MOST_RESTARTS = 5  # of pages that did not last, one after the other
 PATIENCE = 2.0  # s for its end
 
 
@@ -45,7 +47,7 @@ Start = Callable[[Sequence[str]], "subprocess.Popen[bytes]"]
 
 
 class WebPage:
-    """Keeps `sim-client web` running as long as `check` is called.
+    """Keeps `sim-client web` running as long as `check` is called, and gives it up when it does not last.
 
     server, connect: name and endpoint of the server
     quiet: it says nothing on standard output
@@ -56,31 +58,46 @@ class WebPage:
         clock: Callable[[], float] = time.monotonic, start: Start | None = None,
     ):  # fmt: skip
         self._command = [
-            sys.executable, "-m", "clients", "web", "--exit-with-parent", "--server", server, "--connect", connect,
-            "--host", host, "--port", str(port),
+            sys.executable, "-m", "clients", "web", "--exit-with-parent", "--parent", str(os.getpid()),
+            "--server", server, "--connect", connect, "--host", host, "--port", str(port),
         ]  # fmt: skip
         output = subprocess.DEVNULL if quiet else None
         self._clock = clock
         self._start = start or (lambda command: subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=output))
-        self._pause, self._due = FIRST_PAUSE, 0.0
-        self.process = self._start(self._command)
+        self._restarts = 0  # since a page lasted
+        self._due: float | None = None  # time of the next start
+        self._began = clock()
+        self.process: subprocess.Popen[bytes] | None = None  # None: it is to be started again, or given up
+        self._launch()
 
     def check(self) -> None:
-        """Restarts the page if it has ended, after a pause that doubles."""
-        if self.process.poll() is None:
-            return
-        now = self._clock()
-        if self._due == 0.0:
-            self._due = now + self._pause
-            log.warning("the page ended with %s: starting it again in %g s", self.process.returncode, self._pause)
-            self._pause = min(2 * self._pause, LONGEST_PAUSE)
-        elif now >= self._due:
-            self._due = 0.0
+        """Restarts the page if it has ended, after a pause that doubles. Raises nothing."""
+        if self.process is not None and self.process.poll() is not None:
+            self._ended(f"the page ended with {self.process.returncode}")
+        elif self._due is not None and self._clock() >= self._due:
+            self._launch()
+
+    def _launch(self) -> None:
+        self._due, self._began = None, self._clock()
+        try:
             self.process = self._start(self._command)
+        except OSError as error:
+            self._ended(f"the page cannot be started ({error})")
+
+    def _ended(self, why: str) -> None:
+        self.process, now = None, self._clock()
+        if now - self._began >= LASTED:
+            self._restarts = 0
+        if self._restarts == MOST_RESTARTS:
+            log.error("%s: it is not started again; sim-client web serves one too", why)
+            return
+        pause = FIRST_PAUSE * 2**self._restarts
+        log.warning("%s: starting it again in %g s", why, pause)
+        self._restarts, self._due = self._restarts + 1, now + pause
 
     def close(self) -> None:
         """Ends it by SIGTERM, and by SIGKILL if that does not help."""
-        if self.process.poll() is None:
+        if self.process is not None and self.process.poll() is None:
             self.process.terminate()
             try:
                 self.process.wait(PATIENCE)

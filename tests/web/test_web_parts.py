@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: MIT
 """The page without a browser: surfaces, colours, curves, grabs, addresses, a server that goes and comes."""
 
+import asyncio
 import json
+import os
 import urllib.error
 import urllib.request
 from collections.abc import Callable
@@ -21,7 +23,7 @@ from clients.web.feed import Feed
 from clients.web.hand import Hand, described_objects, grip
 from clients.web.paint import BANDS, Paint, split
 from clients.web.panel.curves import POINTS, History
-from clients.web.panel.sliders import named, value_of
+from clients.web.panel.sliders import Slider, Sliders, named, value_of
 from clients.web.panel.tables import tables
 from clients.web.surfaces import Surfaces
 from clients.web.tab import Tab
@@ -29,7 +31,7 @@ from clients.web.view import home, up_of
 from protocol import messages_pb2 as pb
 from protocol.network.web_address import exposed, hindrance, shown, web_address
 from protocol.refused import Refused
-from sim_server.service.web_page import FIRST_PAUSE, WebPage
+from sim_server.service.web_page import FIRST_PAUSE, LASTED, MOST_RESTARTS, WebPage
 from tests.clients.fake_server import FakeServer
 from tests.ports import free_port
 from tests.system.server_process import Stage, beam, until
@@ -266,7 +268,15 @@ def test_names_in_tables_are_no_markup() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "found"), [("8081", ("127.0.0.1", 8081)), ("0.0.0.0:80", ("0.0.0.0", 80)), ("[::1]:9", ("::1", 9))]
+    ("text", "found"),
+    [
+        ("8081", ("127.0.0.1", 8081)),
+        ("0.0.0.0:80", ("0.0.0.0", 80)),
+        ("[::1]:9", ("::1", 9)),
+        ("0.0.0.0", ("0.0.0.0", 8080)),
+        ("localhost", ("localhost", 8080)),
+        ("::1", ("::1", 8080)),
+    ],
 )
 def test_addresses_of_the_page(text: str, found: tuple[str, int]) -> None:
     assert web_address(text) == found
@@ -306,17 +316,20 @@ def test_the_page_says_why_it_cannot_be_served(monkeypatch: pytest.MonkeyPatch) 
     assert "pip install" in hindrance("127.0.0.1", 8080)
 
 
-def test_a_page_that_ends_is_started_again_after_a_pause_that_doubles() -> None:
+def test_a_page_that_ends_is_started_again_after_a_pause_that_doubles_and_given_up_at_last() -> None:
     now, started = [0.0], list[SimpleNamespace]()
 
-    def start(command: object) -> SimpleNamespace:
+    def start(command: list[str]) -> SimpleNamespace:
+        assert command[command.index("--parent") + 1] == str(os.getpid())
         started.append(SimpleNamespace(returncode=None, poll=lambda: started[-1].returncode))
+        if len(started) == 3:
+            raise OSError("no memory")
         return started[-1]
 
     page = WebPage("sim", "tcp/h:1", "127.0.0.1", 8080, clock=lambda: now[0], start=start)  # type: ignore[arg-type]
-    page.check()
-    assert len(started) == 1
-    for pause in (FIRST_PAUSE, 2 * FIRST_PAUSE):
+
+    def end(pause: float, starts: int = 1) -> None:
+        """Ends the page; it is started again after a pause."""
         started[-1].returncode, count = 1, len(started)
         page.check()
         now[0] += 0.9 * pause
@@ -324,7 +337,17 @@ def test_a_page_that_ends_is_started_again_after_a_pause_that_doubles() -> None:
         assert len(started) == count
         now[0] += 0.2 * pause
         page.check()
-        assert len(started) == count + 1
+        assert len(started) == count + starts
+
+    page.check()
+    assert len(started) == 1
+    for restart in range(MOST_RESTARTS):
+        end(2**restart * FIRST_PAUSE)
+    now[0] += 1.1 * LASTED
+    for restart in range(MOST_RESTARTS):
+        end(2**restart * FIRST_PAUSE)
+    end(1e6, starts=0)
+    page.close()
 
 
 @pytest.mark.system
@@ -405,3 +428,41 @@ def test_a_tab_tries_again_to_connect_says_so_and_its_sliders_live_on(monkeypatc
         assert len(connected) == 2
     finally:
         tab.close()
+
+
+def live(
+    value: str, low: float = 0.0, high: float = 0.0, key: str = "object.a.effects.corotational.young"
+) -> pb.LiveParameter:
+    return pb.LiveParameter(now=pb.Parameter(key=key, value=value), unit="Pa", low=low, high=high, logarithmic=True)
+
+
+def test_one_slider_is_a_factor_of_the_stiffness_of_all_regions() -> None:
+    handle, sent = SimpleNamespace(min=-1.0, max=1.0, value=0.0, label="", moved=None), list[object]()
+    handle.on_update = lambda function: setattr(handle, "moved", function)
+    gui = MagicMock()
+    gui.add_slider.return_value = handle
+    start = live('[{ "where" = "Z < \\"1\\"", "young" = 4e4 }, { "young" = 2000000 }]')
+    Slider(gui, start, lambda *change: sent.append(change))
+    assert gui.add_slider.call_args.args[:3] == ("corotational.young: stiffness x 1", -1.0, 1.0)
+    handle.value = 0.4
+    asyncio.run(handle.moved(SimpleNamespace(client_id=7)))
+    ((number, key, text),) = sent
+    assert (number, key) == (7, start.now.key) and handle.label.endswith("stiffness x 2.512")
+    assert value_of(text) == [{"where": 'Z < "1"', "young": 100480.0}, {"young": 5024000.0}]
+    fresh = Slider(gui, start, lambda *change: None)
+    fresh.show(live(text))
+    assert handle.value == 0.4 and handle.label.endswith("x 2.512")
+    fresh.show(live('[{ "where" = "Z < 2", "young" = 1e4 }, { "young" = 1e4 }]'))  # other regions, by another client
+    assert handle.value == 0.0 and handle.label.endswith("x 1")
+
+
+def test_sliders_are_made_anew_for_other_bounds_and_other_kinds_of_values() -> None:
+    gui = MagicMock()
+    gui.add_slider.return_value = MagicMock(min=-9.0, max=9.0)
+    sliders = Sliders(gui, MagicMock(), lambda *change: None)
+    counts = []
+    for value, high in (("1e5", 1e6), ("2e5", 1e6), ("2e5", 1e7), ('[{ "young" = 1e5 }]', 1e7)):
+        sliders.update([live(value, 1e4, high)])
+        counts.append(gui.add_slider.call_count)
+    assert counts == [1, 1, 2, 3]
+    assert gui.add_slider.call_args_list[1].args[2] == 7.0

@@ -9,6 +9,7 @@ import tomllib
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
+from clients.web.panel.regions import Regions, has_regions
 from protocol import messages_pb2 as pb
 
 if TYPE_CHECKING:
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
 
 HANDS_ON = 1.5  # s after a change here in which the server's value does not move the slider
 STEPS = 200  # of a slider
+FACTORS = 0.1, 10.0  # ends of the slider of a parameter with a value for each region
 OPEN = 4  # folders that are open at first, if there are no more
 
 
@@ -37,13 +39,31 @@ def named(key: str) -> tuple[str, str]:
     return "scene", ".".join(words[1:] if words[0] == "effects" else words)
 
 
+def kind(parameter: pb.LiveParameter) -> str:
+    """Returns how a parameter is shown: number, yes, vector, regions, or table, which has no slider."""
+    value = value_of(parameter.now.value)
+    if isinstance(value, bool):
+        return "yes"
+    if isinstance(value, int | float):
+        return "number"
+    if isinstance(value, list) and len(value) == 3 and all(isinstance(v, int | float) for v in value):
+        return "vector"
+    return "regions" if parameter.logarithmic and has_regions(parameter.now.key, value) else "table"
+
+
 class Slider:
-    """One parameter: a slider for a number, three numbers for a vector, a box for yes and no."""
+    """One parameter: a slider for a number, or for a factor of those of all regions, three numbers for a vector, a box
+    for yes and no.
+    """
 
     def __init__(self, gui: viser.GuiApi, parameter: pb.LiveParameter, change: Callable[[int, str, Any], None]) -> None:
         self.key, self._unit = parameter.now.key, parameter.unit
         self._log, self._low, self._high = parameter.logarithmic, parameter.low, parameter.high
-        self._value = value_of(parameter.now.value)
+        self._kind = kind(parameter)
+        self._regions = Regions(self.key, value_of(parameter.now.value)) if self._kind == "regions" else None
+        if self._regions is not None:
+            self._unit, (self._low, self._high) = "-", FACTORS
+        self._value = self._read(parameter)
         self._touched = 0.0
         self._handle: Any = self._build(gui, parameter.about)
         if self._handle is None:
@@ -56,25 +76,31 @@ class Slider:
             self._touched = time.monotonic()
             self._value = self._meant(self._handle.value)
             self._handle.label = self._label()
-            change(event.client_id, self.key, self._value)
+            regions = self._regions
+            change(event.client_id, self.key, self._value if regions is None else regions.times(self._value))
 
     def show(self, parameter: pb.LiveParameter) -> None:
         """Moves it to the server's value, unless somebody has a hand on it."""
-        value = value_of(parameter.now.value)
+        value = self._read(parameter)
         if self._handle is None or value == self._value or time.monotonic() < self._touched + HANDS_ON:
             return
         self._value = value
         self._handle.label = self._label()
         self._handle.value = self._shown(value)
 
+    def _read(self, parameter: pb.LiveParameter) -> Any:
+        """Returns the value, of regions their factor."""
+        value = value_of(parameter.now.value)
+        return value if self._regions is None else self._regions.factor(value)
+
     def _build(self, gui: viser.GuiApi, about: str) -> Any:
         value, label, hint = self._value, self._label(), about or None
-        if isinstance(value, bool):
+        if self._kind == "yes":
             return gui.add_checkbox(label, value, hint=hint)
-        if isinstance(value, int | float):
+        if self._kind in ("number", "regions"):
             low, high = self._bounds()
             return gui.add_slider(label, low, high, (high - low) / STEPS, self._shown(value), hint=hint)
-        if isinstance(value, list) and len(value) == 3 and all(isinstance(v, int | float) for v in value):
+        if self._kind == "vector":
             return gui.add_vector3(label, (float(value[0]), float(value[1]), float(value[2])), hint=hint)
         return None  # a table, say: set by sim-client set
 
@@ -104,10 +130,14 @@ class Slider:
         return float(f"{10**place:.4g}") if self._log and not isinstance(place, bool) else place
 
     def _label(self) -> str:
+        name = named(self.key)[1]
+        if self._regions is not None:
+            what = "stiffness" if name.endswith("young") else "all regions"
+            return f"{name}: {what} x {self._value:.4g}"
         number = isinstance(self._value, int | float) and not isinstance(self._value, bool)
         value = f"{self._value:.4g} " if number else ""
         shown = f"{value}{self._unit if self._unit != '-' else ''}".strip()
-        return f"{named(self.key)[1]}: {shown}" if shown else named(self.key)[1]
+        return f"{name}: {shown}" if shown else name
 
 
 class Sliders:
@@ -116,11 +146,14 @@ class Sliders:
     def __init__(self, gui: viser.GuiApi, container: Any, change: Callable[[int, str, Any], None]) -> None:
         self._gui, self._container, self._change = gui, container, change
         self._sliders: dict[str, Slider] = {}
+        self._described: list[pb.LiveParameter] = []  # all but the values of those that have sliders
         self._folders: list[Any] = []
 
     def update(self, parameters: Sequence[pb.LiveParameter]) -> None:
         """Shows the parameters as the server has them."""
-        if {p.now.key for p in parameters} != set(self._sliders):
+        described = [_described(p) for p in parameters]
+        if described != self._described:
+            self._described = described
             self._build(parameters)
         for parameter in parameters:
             self._sliders[parameter.now.key].show(parameter)
@@ -139,3 +172,11 @@ class Sliders:
                 for p in parameters:
                     if named(p.now.key)[0] == owner:
                         self._sliders[p.now.key] = Slider(self._gui, p, self._change)
+
+
+def _described(parameter: pb.LiveParameter) -> pb.LiveParameter:
+    """Returns a parameter with the kind of its value in place of the value."""
+    found = pb.LiveParameter()
+    found.CopyFrom(parameter)
+    found.now.value = kind(parameter)
+    return found
