@@ -44,6 +44,7 @@ def test_a_reset_begins_with_the_parameters_that_were_set(name: str) -> None:
     sim.parameters.set({"gravity.g": "[0, 0, 0]"})
     start.reset("beam")
     assert not sim.engine.withdraw_changes()
+    sim.engine.records()
     sim.engine.run(5)
     assert (sim.engine.records()["status"] == 0).all()
     np.testing.assert_allclose(sim.fetch().x, x0, rtol=0, atol=1e-9)
