@@ -35,6 +35,21 @@ def test_a_scene_that_is_reset_does_the_same_again(name: str) -> None:
     assert courses[0][1] == courses[1][1]
 
 
+@pytest.mark.parametrize("name", ["newmark", "bdf2", "generalized_alpha"])
+def test_a_reset_begins_with_the_parameters_that_were_set(name: str) -> None:
+    """Without weight a body at rest stays so; changes that wait are made before the reset."""
+    sim = made(name, DEVICE, preconditioner="block_jacobi")
+    start, x0 = Start(sim), sim.world.x.copy()
+    sim.engine.run(10)
+    sim.parameters.set({"gravity.g": "[0, 0, 0]"})
+    start.reset("beam")
+    assert not sim.engine.withdraw_changes()
+    sim.engine.records()
+    sim.engine.run(5)
+    assert (sim.engine.records()["status"] == 0).all()
+    np.testing.assert_allclose(sim.fetch().x, x0, rtol=0, atol=1e-9)
+
+
 @pytest.mark.parametrize("pace", ["--realtime", "--free-run"])
 def test_single_steps_resets_and_saves_of_a_server(tmp_path: Path, pace: str) -> None:
     stage, log, file = Stage(tmp_path), tmp_path / "run.mcap", tmp_path / "beam.npz"

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Commands that come at once act one after another, with a service that the test drives."""
 
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,12 +10,15 @@ import pytest
 
 from protocol import messages_pb2 as pb
 from sim_server.network.link import ServerLink
+from sim_server.recording.recorder import Recorder
+from sim_server.replay.log import Recording
+from sim_server.replay.run import Replay
 from sim_server.service.service import Service
 from sim_server.simulation import Simulation
 from sim_server.state.start import Start
 from tests.resets.state_scenes import made
 from tests.system.link_helpers import free_endpoint
-from tests.system.server_process import beam
+from tests.system.server_process import beam, until
 
 pytestmark = pytest.mark.system
 GRAB = pb.Interaction(object="beam", kind="grab", at="tip", target=pb.Vector(x=1, z=4), stiffness=10, max_force=5)
@@ -96,3 +100,30 @@ def test_sets_that_wait_at_the_end_are_answered(service: Service, monkeypatch: p
     service.run()
     assert [bool(r.error) for r in replies] == [False, True, True]
     assert np.isfinite(service.simulation.fetch().x).all()
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_sets_and_resets_before_the_same_step_are_repeated_in_their_order(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, first: bool
+) -> None:
+    """first: one before the first step, which a server has begun with the parameters of the scene, and no reset."""
+    reset, step, set_now = pb.Command(verb="reset"), pb.Command(verb="step", steps=4), setting(-2)
+    waves = [[step], [setting(-3), *([] if first else [reset])], [setting(-4)], [step], [pb.Command(verb="stop")]]
+    scene = beam(tmp_path, (1, 1, 2), '[integrator]\nscheme = "newmark"')
+    given: list[list[pb.Command]] = [[set_now] if first else [reset, set_now]]
+    replies: list[pb.Reply] = []
+    with ServerLink(listen=[free_endpoint()]) as link, Recorder(tmp_path / "run.mcap") as recorder:
+        service = Service(Simulation.load(scene), link, recorder, realtime=False)
+        service.engine.loop.pause = 1
+        monkeypatch.setattr(link, "commands", lambda: [(c, replies.append) for c in (given.pop(0) if given else [])])
+        thread = threading.Thread(target=service.run)
+        thread.start()
+        wanted = len(given[0])
+        for wave in waves:
+            given.append(wave)
+            wanted += len(wave)
+            until(lambda wanted=wanted: len(replies) >= wanted, "all are answered")
+        thread.join()
+    assert not any(r.error for r in replies)
+    with Recording(tmp_path / "run.mcap") as recording:
+        assert recording.steps == 8 and Replay(recording).run().same
