@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Keeps other web sites out, which a browser on this machine lets connect to a page of loopback, and lets go of lost tabs.
+"""Keeps other web sites out, which a browser on this machine lets connect to a page of loopback.
 
 viser takes every connection. Its server is made here with a check before each request: a connection has to come from a
 page of the same address (header Origin, RFC 6454), and by a name of loopback where the page is (against DNS rebinding).
+It also asks tabs for a sign of life more often than by default, so that one that is gone lets go soon.
 """
 
 from __future__ import annotations
@@ -38,8 +39,8 @@ def own_pages_only(loopback: bool) -> Iterator[None]:
                 return connection.respond(http.HTTPStatus.FORBIDDEN, "this page is not for other sites\n")
             return process_request(connection, request)
 
-        pings = {"ping_interval": PING_PERIOD, "ping_timeout": PING_TIMEOUT}
-        return serve(*arguments, process_request=check, **options, **pings)
+        options |= {"ping_interval": PING_PERIOD, "ping_timeout": PING_TIMEOUT}
+        return serve(*arguments, process_request=check, **options)
 
     server.serve = guarded  # type: ignore[assignment,misc]
     try:
