@@ -102,10 +102,13 @@ def served(folder: Path, *settings: str, scene: Path = BEAM) -> Iterator[tuple[C
 
 
 @contextlib.contextmanager
-def stirred(client: Client) -> Iterator[None]:
-    """The tip of the beam is led around in a circle, so that steps have the same work at all times."""
+def stirred(client: Client, warm: float) -> Iterator[None]:
+    """The tip of the beam is led around in a circle, so that steps have the same work at all times.
+
+    warm: seconds until it has come down
+    """
     stop = threading.Event()
-    time.sleep(WARM)  # until it has come down
+    time.sleep(warm)
     with client.grab("beam", at="tip", stiffness=5e3, max_force=5e3) as held:
         at = held.interaction.point
 
@@ -167,14 +170,16 @@ def rates(chromium: Any, folder: Path, seconds: float, sides: tuple[int, ...]) -
     return rows
 
 
-def costs(chromium: Any, folder: Path, seconds: float, rounds: int, numbers: tuple[int, ...]) -> list[dict[str, Any]]:
-    """Times of steps with so many tabs open, a row for each number of tabs."""
+def costs(
+    chromium: Any, folder: Path, seconds: float, rounds: int, numbers: tuple[int, ...], warm: float = WARM
+) -> list[dict[str, Any]]:
+    """Times of steps with so many tabs open, a row for each number of tabs. warm: as of `stirred`."""
     wall: dict[int, list[float]] = {n: [] for n in numbers}
     processor: dict[int, list[float]] = {n: [] for n in numbers}
     late = dict.fromkeys(numbers, 0)
-    with served(folder) as (client, endpoint), page(endpoint, folder) as address, stirred(client):
+    with served(folder) as (client, endpoint), page(endpoint, folder) as address, stirred(client, warm):
         steps = client.steps()
-        time.sleep(WARM)
+        time.sleep(warm)
         for _ in range(rounds):
             for count in numbers:
                 tabs = [watched(chromium, address, SMALL) for _ in range(count)]
@@ -228,14 +233,14 @@ def main(
         raise SystemExit(why)
     sides = SIDES[:1] if quick else SIDES
     if quick:
-        seconds, jumps, rounds = 2.0, 4, 1
+        seconds, jumps, rounds = 1.0, 2, 1
     report = Report("web", "The page in a browser", {"seconds": seconds, "jumps": jumps, "rounds": rounds}, out, quick)
     with tempfile.TemporaryDirectory(prefix="warpfactor-web-") as name, browser() as chromium:
         folder = Path(name)
         late = latency(chromium, folder, jumps)
         print("latency done", flush=True)
         shown = rates(chromium, folder, seconds, sides)
-        cost = costs(chromium, folder, seconds, rounds, TABS[:2] if quick else TABS)
+        cost = costs(chromium, folder, seconds, rounds, TABS[:2] if quick else TABS, 0.5 if quick else WARM)
     report.say(*EXPLAINED)
     for title, rows in (("From pointer to frame", late), ("Frames a second", shown), ("What tabs cost", cost)):
         report.say(f"## {title}")
