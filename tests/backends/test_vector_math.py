@@ -46,8 +46,8 @@ def of(texts, name: str, a: np.ndarray, real: str = "double") -> np.ndarray:
 @pytest.mark.parametrize("name", GIVEN)
 def test_within_two_units_in_the_last_place(texts, name):
     a = GIVEN[name]
-    found, expected = of(texts, name, a), getattr(np, name)(a)
-    assert np.abs((found - expected) / np.spacing(np.abs(expected))).max() <= 2
+    exact = getattr(np, name)(a.astype(np.longdouble))  # the system's in double precision errs by a unit or two itself
+    assert np.abs((of(texts, name, a) - exact) / np.spacing(np.abs(exact.astype(float)))).max() <= 2
 
 
 def test_limits_and_what_is_no_number(texts):
