@@ -44,6 +44,14 @@ class Mesh:
     dropped: int = 0
     quadratic: Int32 | None = None
 
+    @property
+    def centroids(self) -> Float64:
+        """Centroid of each tet [m], (m, 3); in a quadratic mesh that of the corners of its element."""
+        if self.quadratic is None:
+            linear: Float64 = self.rest[self.tets].mean(axis=1)
+            return linear
+        return np.repeat(self.rest[self.quadratic[:, :4]].mean(axis=1), 8, axis=0)
+
     def with_mid_nodes(self) -> "Mesh":
         """Returns the mesh with quadratic elements: a linear one gets a node in the middle of each edge, behind its
         own nodes."""
@@ -126,10 +134,10 @@ def read(path: str | Path, quadratic: bool = False) -> Mesh:
         changed.append(f"{dropped} of {len(rest)} nodes dropped, {where}")
     if changed:
         log.warning("mesh %s: %s", path, "; ".join(changed))
-    rest, cells = rest[used], (np.cumsum(used) - 1)[cells].astype(np.int32)
+    rest, numbered = rest[used], (np.cumsum(used) - 1)[cells].astype(np.int32)
     if kept:
-        return Mesh(rest, sub_tetrahedra(rest, cells), path.name, dropped, cells)
-    return Mesh(rest, cells, path.name, dropped)
+        return Mesh(rest, sub_tetrahedra(rest, numbered), path.name, dropped, numbered)
+    return Mesh(rest, numbered, path.name, dropped)
 
 
 def meshio_read(path: Path, what: str = "mesh") -> Any:

@@ -11,6 +11,9 @@ from sim_server.mesh.quadratic import EDGES
 # the weight: Hammer, Marlowe and Stroud, Numerical Integration over Simplexes and Cones, 1956.
 NEAR, FAR = (5 + 3 * 5**0.5) / 20, (5 - 5**0.5) / 20
 POINTS = np.where(np.eye(4) > 0, NEAR, FAR)
+# Of the mass of an element, at corners and at nodes on edges: the diagonal of the consistent mass matrix of a straight
+# one, scaled to its sum (Hinton, Rock and Zienkiewicz 1976); sums of the rows would be negative at corners.
+MASS_PARTS = np.array([1 / 36] * 4 + [4 / 27] * 6)
 
 
 def shape_gradients(rest: Float64, tets: Int32) -> tuple[Float64, Float64]:
