@@ -33,11 +33,11 @@ from sim_server.backends.base import Launch
 from sim_server.backends.energies import ElementEnergies
 from sim_server.backends.state import rows_in
 from sim_server.effects._base import Effect, PerBody
-from sim_server.errors import InputError
 from sim_server.mechanics.clusters import PatchedCells, sliced, united
 from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.world import Body, World
 from sim_server.mesh.cell_builders import edge_cells, tetrahedron_cells
+from sim_server.mesh.quadratic_cells import quadratic_cells
 from sim_server.mesh.strain_cells import StrainCells, joined
 from sim_server.scene import Scene
 from sim_server.scene.regions import region_numbers
@@ -238,10 +238,11 @@ class StrainCellElements(Effect):
 
 
 def cells_of(body: Body, params: Any) -> StrainCells:
-    """Strain cells of a body, in an order that keeps neighbours near in memory; raises InputError."""
+    """Strain cells of a body, in an order that keeps neighbours near in memory."""
     mesh = body.mesh
     if body.elements == "quadratic":
-        raise InputError(f'object {body.name!r}: elements = "quadratic" cannot be built; allowed: the others')
+        assert mesh.quadratic is not None
+        return quadratic_cells(mesh.rest, mesh.quadratic).in_order()
     region = region_numbers(params.young, body.centroids)
     make = edge_cells if body.elements == "smoothed" else tetrahedron_cells
     return make(mesh.rest, mesh.tets, region).in_order()
