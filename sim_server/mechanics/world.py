@@ -13,8 +13,10 @@ from sim_server.arrays import Float64, Int32
 from sim_server.backends.base import Backend
 from sim_server.errors import InputError
 from sim_server.mesh import Mesh, posed
+from sim_server.mesh.shape_functions import MASS_PARTS, quadratic_gradients
 from sim_server.mesh.surface import volumes
 from sim_server.scene import Scene, SceneObject
+from sim_server.scene.elements import Kind, kind_of_elements
 from sim_server.scene.holders import Holder
 from sim_server.scene.obstacles import Obstacle
 from sim_server.scene.ties import Attachment, Spring
@@ -29,7 +31,7 @@ T = TypeVar("T")
 class Body:
     """The part of the arrays that belongs to one object: nodes [first, last).
 
-    friction: of its surface; 0 if unused. skin: a finer surface for viewers, which no step uses
+    friction: of its surface; 0 if unused. skin: a finer surface for viewers, which no step uses. elements: their kind
     """
 
     index: int
@@ -40,6 +42,7 @@ class Body:
     effects: dict[str, Any]
     friction: float = 0.0
     skin: "Skin | None" = None
+    elements: Kind = "linear"
 
     @property
     def nodes(self) -> slice:
@@ -53,9 +56,9 @@ class Body:
 
     @property
     def centroids(self) -> Float64:
-        """Centroids (m, 3) of the elements at rest, before the pose [m]."""
-        centroids: Float64 = self.mesh.rest[self.mesh.tets].mean(axis=1)
-        return centroids
+        """Centroids (m, 3) of the elements at rest, before the pose [m]; of a quadratic one for each of its eight tets,
+        which thus have the same constants."""
+        return self.mesh.centroids
 
 
 @dataclass(frozen=True)
@@ -115,7 +118,8 @@ class World:
         first = 0
         for o, mesh in meshes:
             last = first + len(mesh.rest)
-            given = dict(o.effects), o.friction or 0.0, o.load_skin(mesh)
+            kind = kind_of_elements(o, mesh, scene.integrator)
+            given = dict(o.effects), o.friction or 0.0, o.load_skin(mesh), kind
             self.bodies.append(Body(len(self.bodies), o.name, mesh, first, last, *given))
             first = last
         self.obstacles: Sequence[Obstacle] = scene.obstacles or []
@@ -233,12 +237,18 @@ class World:
 
 
 def _lumped(o: SceneObject, mesh: Mesh) -> Float64:
-    """Nodal masses [kg], (n,): a quarter of each adjacent element's, or all equal."""
-    volume = volumes(mesh.rest, mesh.tets)
+    """Nodal masses [kg], (n,): parts of each adjacent element's, a quarter of a linear one's, or all equal."""
+    if mesh.quadratic is None:
+        volume = volumes(mesh.rest, mesh.tets)
+    else:
+        volume = quadratic_gradients(mesh.rest, mesh.quadratic)[0].sum(axis=1)
     total = o.mass if o.mass is not None else (o.density or 0) * volume.sum()
     if not np.isfinite(total):
         raise InputError(f"object {o.name!r}: its mass is not finite")
     if o.masses == "equal":
         return np.full(len(mesh.rest), total / len(mesh.rest))
-    share = np.repeat(total * volume / volume.sum() / 4, 4)
-    return np.bincount(mesh.tets.ravel(), weights=share, minlength=len(mesh.rest)).astype(np.float64)
+    if mesh.quadratic is not None:
+        nodes, share = mesh.quadratic, (total * volume[:, None] / volume.sum() * MASS_PARTS).ravel()
+    else:
+        nodes, share = mesh.tets, np.repeat(total * volume / volume.sum() / 4, 4)
+    return np.bincount(nodes.ravel(), weights=share, minlength=len(mesh.rest)).astype(np.float64)
