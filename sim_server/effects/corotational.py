@@ -222,4 +222,6 @@ def rotation_matrices(quaternion: NDArray[Any]) -> Float64:
 
 def build(world: World, listed: list[tuple[Body, Any]]) -> Corotational:
     """The elements; raises InputError for an element in no region of young."""
+    if other := [body for body, _ in listed if body.elements != "linear"]:
+        raise InputError(f'object {other[0].name!r}: elements = "{other[0].elements}" cannot be built yet')
     return Corotational(world, listed)

@@ -15,6 +15,7 @@ from sim_server.errors import InputError
 from sim_server.mesh import Mesh, posed
 from sim_server.mesh.surface import volumes
 from sim_server.scene import Scene, SceneObject
+from sim_server.scene.elements import Kind, kind_of_elements
 from sim_server.scene.holders import Holder
 from sim_server.scene.obstacles import Obstacle
 from sim_server.scene.ties import Attachment, Spring
@@ -29,7 +30,7 @@ T = TypeVar("T")
 class Body:
     """The part of the arrays that belongs to one object: nodes [first, last).
 
-    friction: of its surface; 0 if unused. skin: a finer surface for viewers, which no step uses
+    friction: of its surface; 0 if unused. skin: a finer surface for viewers, which no step uses. elements: their kind
     """
 
     index: int
@@ -40,6 +41,7 @@ class Body:
     effects: dict[str, Any]
     friction: float = 0.0
     skin: "Skin | None" = None
+    elements: Kind = "linear"
 
     @property
     def nodes(self) -> slice:
@@ -115,7 +117,8 @@ class World:
         first = 0
         for o, mesh in meshes:
             last = first + len(mesh.rest)
-            given = dict(o.effects), o.friction or 0.0, o.load_skin(mesh)
+            kind = kind_of_elements(o, mesh, scene.integrator)
+            given = dict(o.effects), o.friction or 0.0, o.load_skin(mesh), kind
             self.bodies.append(Body(len(self.bodies), o.name, mesh, first, last, *given))
             first = last
         self.obstacles: Sequence[Obstacle] = scene.obstacles or []

@@ -23,6 +23,7 @@ from sim_server.errors import InputError
 from sim_server.mesh import Mesh, bar, check, read
 from sim_server.scene.accuracy_options import MOST_LINEARIZATIONS, ROUNDING, AccuracyOptions
 from sim_server.scene.effect_tables import checked_effects
+from sim_server.scene.elements import Elements, element_errors
 from sim_server.scene.holders import Holder, check_holders_on, holder_errors
 from sim_server.scene.integrator_options import IntegratorOptions
 from sim_server.scene.live import Live
@@ -97,6 +98,7 @@ class SceneObject(Parameters):
     masses: Literal["volume", "equal"] = Field(
         default="volume", description="nodal masses: a quarter of each adjacent element, or the same for every node"
     )
+    elements: Elements = Field(default="auto", description="of the effect corotational: what shares one strain")
     friction: Annotated[NotNegative | None, Live(0, 1.5)] = Field(
         default=None, description="coefficient of its surface [-]; 0.5 where the scene lists contact"
     )
@@ -301,6 +303,12 @@ class Scene(Parameters):
                     place = ("object", index, "effects", name)
                     errors.append(InitErrorDetails(type=error, loc=place, input={}))
         if errors:
+            raise ValidationError.from_exception_data("Scene", errors)
+        return self
+
+    @model_validator(mode="after")
+    def _as_elements_need(self) -> "Scene":
+        if errors := list(element_errors(self.objects, self.integrator)):
             raise ValidationError.from_exception_data("Scene", errors)
         return self
 

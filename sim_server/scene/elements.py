@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: MIT
+"""Kinds of elements that an object may have, and what each needs of its effects and of the integrator."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Literal, Protocol
+
+from pydantic_core import InitErrorDetails
+
+from sim_server.errors import InputError
+from sim_server.mesh import Mesh
+from sim_server.scene.integrator_options import IntegratorOptions
+from sim_server.scene.parameters import complaint
+
+Elements = Literal["auto", "linear", "patch", "smoothed", "quadratic"]
+Kind = Literal["linear", "patch", "smoothed", "quadratic"]
+LAWS = ("arruda_boyce", "costa", "mooney_rivlin", "neo_hookean", "ogden", "stable_neo_hookean", "st_venant_kirchhoff",
+        "veronda_westmann")  # fmt: skip
+
+
+class HasElements(Protocol):
+    """An object of a scene, as far as its elements go."""
+
+    @property
+    def name(self) -> str:
+        """For messages."""
+
+    @property
+    def elements(self) -> Elements:
+        """As the scene gives it."""
+
+    @property
+    def effects(self) -> dict[str, Any]:
+        """Parameters by name of the effect."""
+
+
+def element_errors(objects: Sequence[HasElements], integrator: IntegratorOptions) -> Iterator[InitErrorDetails]:
+    """Yields an error for each object whose effects or integrator have no such elements."""
+    for index, o in enumerate(objects):
+        wrong = _reason(o.effects, integrator)
+        if wrong and o.elements not in ("auto", "linear"):
+            message = f'elements = "{o.elements}" {wrong}'
+            yield InitErrorDetails(type=complaint(message), loc=("object", index, "elements"), input=o.elements)
+
+
+def kind_of_elements(o: HasElements, mesh: Mesh, integrator: IntegratorOptions) -> Kind:
+    """Returns the kind that an object has; raises InputError for quadratic elements of a mesh without mid-nodes."""
+    quadratic = getattr(mesh, "quadratic", None) is not None
+    if o.elements == "quadratic" and not quadratic:
+        raise InputError(
+            f'object {o.name!r}: elements = "quadratic": mesh {mesh.name} has no mid-nodes; allowed: "auto", '
+            '"linear", "patch", "smoothed"'
+        )
+    if o.elements != "auto":
+        return o.elements
+    return "quadratic" if quadratic and not _reason(o.effects, integrator) else "linear"
+
+
+def _reason(effects: Mapping[str, Any], integrator: IntegratorOptions) -> str:
+    """Returns why an object can have linear elements alone; empty if it may have others."""
+    if laws := [name for name in LAWS if name in effects]:
+        return f'with the effect {laws[0]}, which has linear elements alone; allowed: "auto", "linear"'
+    if "corotational" not in effects:
+        return 'without the effect corotational, which alone has such elements; allowed: "auto", "linear"'
+    if effects["corotational"].rotation == "qr":
+        return 'with corotational.rotation = "qr", which is that of tetrahedra; allowed: "auto", "linear"'
+    if integrator.explicit:
+        given = f'integrator.scheme = "{integrator.scheme}"'
+        return f'with {given}, which has linear elements alone; allowed: "auto", "linear"'
+    return ""
