@@ -15,6 +15,8 @@ from scipy.sparse.linalg import splu
 
 Reals = NDArray[np.float64]
 Ints = NDArray[np.integer]
+FACES = [((0, 1, 2), (4, 5, 6)), ((0, 1, 3), (4, 8, 7)), ((0, 2, 3), (6, 9, 7)), ((1, 2, 3), (5, 9, 8))]
+"""Of an element: corners, and the nodes in the middle of the face's edges."""
 PAIRS = [(0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3)]  # corners of the mid-nodes
 A, B = (5 + 3 * np.sqrt(5)) / 20, (5 - np.sqrt(5)) / 20
 POINTS = B + (A - B) * np.eye(4)  # barycentric, of equal weight, exact to second degree
@@ -78,6 +80,21 @@ def body_force(mesh: Mesh10, force: Reals) -> Reals:
     volume = gradients(mesh)[1]
     share = np.outer(volume, [-0.05] * 4 + [0.2] * 6)
     return np.bincount(mesh.tets.ravel(), share.ravel(), len(mesh.rest))[:, None] * force
+
+
+def face_shares(rest: Reals, tets: Ints, on: NDArray[np.bool_]) -> Reals:
+    """Returns the area (n,) [m2] that each node bears of a plane face under a constant stress.
+
+    tets: (m, 4) or (m, 10), of which mid-nodes alone bear anything; on: nodes of the face (n,)
+    """
+    share = np.zeros(len(rest))
+    for corners, mids in FACES:
+        nodes = tets[on[tets[:, corners]].all(axis=1)]
+        a, b, c = (rest[nodes[:, k]] for k in corners)
+        area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+        for k in corners if tets.shape[1] == 4 else mids:
+            np.add.at(share, nodes[:, k], area / 3)
+    return share
 
 
 def _solved(matrix: coo_array, b: Reals) -> Reals:

@@ -87,7 +87,7 @@ def test_defaults_and_resolved(tmp_path):
                 "pose": {"rotate": [0.0, 0.0, 0.0], "translate": [0.0, 0.0, 0.0]},
                 "density": 1000.0,
                 "masses": "volume",
-                    "elements": "auto",
+                "elements": "auto",
                 "effects": {},
             }
         ],
